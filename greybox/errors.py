@@ -1,0 +1,49 @@
+"""Every error that a user can meet.
+
+Each class is also a built-in exception, so callers that know nothing of this
+package can still catch it. A message says what happened with both numbers,
+names the channel or parameter, and ends with the next step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from difflib import get_close_matches
+
+
+class GreyboxError(Exception):
+    """Base of every error that this package raises on purpose."""
+
+
+class VesselError(GreyboxError, ValueError):
+    """The vessel file is malformed or contradicts itself."""
+
+
+class LogError(GreyboxError, ValueError):
+    """The trial log lacks something, or what it holds cannot be a log."""
+
+
+class StructureError(GreyboxError, ValueError):
+    """A model structure names a term, state or signal that does not exist."""
+
+
+class ExcitationError(GreyboxError, ValueError):
+    """The data do not determine some direction of the parameters."""
+
+
+class DivergenceError(GreyboxError, ArithmeticError):
+    """A free run left every plausible bound."""
+
+
+class ModelFileError(GreyboxError, ValueError):
+    """The file is not a model of this package, or of a version it cannot read."""
+
+
+class UsageError(GreyboxError, ValueError):
+    """Options that exclude one another, or that need another one beside them."""
+
+
+def suggestion(name: str, known: Iterable[str]) -> str:
+    """Return `` Did you mean 'x'?`` for the known name nearest to `name`, or ``""``."""
+    near = get_close_matches(name, list(known), n=1, cutoff=0.6)
+    return f" Did you mean '{near[0]}'?" if near else ""

@@ -1,0 +1,203 @@
+"""Covariance of the estimates when residuals are coloured, as they always are.
+
+The equation error of (4.3) holds the measurement noise of two neighbouring
+samples, so it is a moving average even where everything else is white; process
+noise and wind add longer memory. A white-noise formula is off by up to a factor
+six (FORMULAS).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+CovarianceKind = Literal["hac", "ma", "white"]
+
+
+def correlation_lags(residuals: Sequence[Array], largest: int | None = None) -> int:
+    """Return the lag after which the autocorrelation stays insignificant.
+
+    Parameters
+    ----------
+    residuals : sequence of ndarray
+        (N,) an uninterrupted stretch each.
+    largest : int, optional
+        Upper limit; by default N/10.
+
+    References
+    ----------
+    Politis (2003), empirical rule for flat-top kernels: the smallest m with
+    |ρ(m+k)| < 2√(log₁₀ N / N) for k = 1 … K.
+    """
+    total = sum(len(r) for r in residuals)
+    if largest is None:
+        largest = max(1, min(total // 10, 200))
+    mean = sum(float(r.sum()) for r in residuals) / max(total, 1)
+    residuals = [r - mean for r in residuals]
+    variance = sum(float(r @ r) for r in residuals)
+    if variance == 0.0:
+        return 0
+    look = max(5, int(np.sqrt(np.log10(max(total, 10)))) + 3)
+    limit = 2.0 * np.sqrt(np.log10(max(total, 10)) / total)
+    rho = np.array(
+        [
+            sum(float(r[lag:] @ r[: len(r) - lag]) for r in residuals if len(r) > lag) / variance
+            for lag in range(1, largest + look + 1)
+        ]
+    )
+    small = np.abs(rho) < limit
+    for m in range(largest + 1):
+        if small[m : m + look].all():
+            return m
+    return largest
+
+
+def flat_top(lag: int, m: int) -> float:
+    """Return the flat-top weight of a lag: 1 up to m, falling to 0 at 2m + 1."""
+    if lag <= m:
+        return 1.0
+    return max(0.0, (2 * m + 1 - lag) / (m + 1))
+
+
+def score_covariance(
+    projected: Sequence[Sequence[Array]],
+    residuals: Sequence[Sequence[Array]],
+    kind: CovarianceKind = "hac",
+    lags: int | None = None,
+) -> tuple[Array, int]:
+    """Estimate the covariance of the summed scores Σ ẑ e, equations together.
+
+    Parameters
+    ----------
+    projected : sequence over equations of sequence over experiments of ndarray
+        (p_i, N) combined instruments, zero in rows that do not take part.
+    residuals : alike, of ndarray
+        (N,) residuals, zero in rows that do not take part.
+    kind : {"hac", "ma", "white"}
+        ``hac``: robust to colour and to variance that changes, flat-top kernel;
+        ``ma``: Σ Z R Zᵀ with the residuals' own autocovariance, for
+        instruments independent of the noise; ``white``: no memory.
+    lags : int, optional
+        Memory in samples; by default found from the residuals.
+
+    Returns
+    -------
+    tuple
+        (p, p) covariance of the sum, and the lags used.
+
+    References
+    ----------
+    Ljungberg (2020), eq. 2.21; Newey and West (1987); Politis (2003).
+    """
+    if lags is None:
+        lags = 0
+        if kind != "white":
+            lags = max(correlation_lags(equation) for equation in residuals)
+    sizes = [equation[0].shape[0] for equation in projected]
+    if kind == "ma":
+        return _positive(_moving_average(projected, residuals, sizes, lags)), lags
+    total = np.zeros((sum(sizes), sum(sizes)))
+    spread = np.repeat(np.arange(len(sizes)), sizes)
+    reach = 0 if kind == "white" else 2 * lags
+    for e in range(len(projected[0])):
+        stacked = np.vstack([equation[e] for equation in projected])
+        samples = stacked.shape[1]
+        scores = stacked * np.array([equation[e] for equation in residuals])[spread]
+        for lag in range(min(reach, samples - 1) + 1):
+            weight = flat_top(lag, lags)
+            block = scores[:, lag:] @ scores[:, : samples - lag].T
+            total += weight * (block if lag == 0 else block + block.T)
+    return _positive(total), lags
+
+
+def _moving_average(
+    projected: Sequence[Sequence[Array]],
+    residuals: Sequence[Sequence[Array]],
+    sizes: list[int],
+    lags: int,
+) -> Array:
+    """Return Σ Z R Zᵀ with R the residuals' autocovariance over all experiments."""
+    p = sum(sizes)
+    counts = sum(len(r) for r in residuals[0])
+    spread = np.repeat(np.arange(len(sizes)), sizes)
+    total = np.zeros((p, p))
+    for lag in range(lags + 1):
+        gamma = np.zeros((len(sizes), len(sizes)))
+        outer = np.zeros((p, p))
+        for e in range(len(projected[0])):
+            errors = np.array([equation[e] for equation in residuals])
+            stacked = np.vstack([equation[e] for equation in projected])
+            samples = stacked.shape[1]
+            gamma += errors[:, lag:] @ errors[:, : samples - lag].T / counts
+            outer += stacked[:, lag:] @ stacked[:, : samples - lag].T
+        block = outer * gamma[np.ix_(spread, spread)]
+        total += block if lag == 0 else block + block.T
+    return total
+
+
+def _positive(matrix: Array) -> Array:
+    """Return the nearest matrix without negative variances, in correlation units."""
+    scale = np.sqrt(np.maximum(np.diag(matrix), 0.0))
+    if not (scale > 0).all():
+        scale = np.where(scale > 0, scale, 1.0)
+    unit = matrix / np.outer(scale, scale)
+    values, vectors = np.linalg.eigh((unit + unit.T) / 2)
+    if values[0] >= 0:
+        return matrix
+    floor = 1e-6 * values[-1]
+    fixed = (vectors * np.maximum(values, floor)) @ vectors.T
+    return np.asarray(fixed * np.outer(scale, scale))
+
+
+def block_bootstrap(
+    projected: Sequence[Array],
+    phi: Sequence[Array],
+    y: Sequence[Array],
+    rng: np.random.Generator,
+    *,
+    draws: int = 500,
+    block: int | None = None,
+) -> Array:
+    """Draw estimates of one equation by resampling blocks of rows.
+
+    The normal equations add over blocks, so a draw is a weighted sum of block
+    sums and costs nothing more than a solve.
+
+    Parameters
+    ----------
+    projected, phi : sequence of ndarray
+        (p, N) a experiment.
+    y : sequence of ndarray
+        (N,) a experiment.
+    rng : numpy.random.Generator
+    draws : int
+    block : int, optional
+        Rows a block; by default about N^(1/2), at least 10.
+
+    Returns
+    -------
+    ndarray
+        (draws, p)
+
+    References
+    ----------
+    Künsch (1989); Politis and Romano (1994).
+    """
+    total = sum(len(e) for e in y)
+    if block is None:
+        block = max(10, round(total**0.5))
+    information, right = [], []
+    for hat, fe, ye in zip(projected, phi, y, strict=True):
+        for start in range(0, len(ye), block):
+            part = slice(start, start + block)
+            information.append(hat[:, part] @ fe[:, part].T)
+            right.append(hat[:, part] @ ye[part])
+    blocks = len(right)
+    counts = rng.multinomial(blocks, np.full(blocks, 1 / blocks), size=draws).astype(float)
+    a = np.tensordot(counts, np.array(information), axes=1)
+    b = counts @ np.array(right)
+    return np.asarray(np.linalg.solve(a, b[..., None])[..., 0])

@@ -1,0 +1,105 @@
+"""The current that the bias-capturing terms reveal (5.30), (5.31).
+
+The asymptotic coefficient of a bias-capturing regressor is a known parameter
+times a disturbance mean, (5.63), (5.72): −Xu ν_c for cos ψ in surge, Xvr ν_c
+for r sin ψ, and so on. The thesis takes the ratio of one pair. All pairs that
+involve estimated parameters only are used here together, weighted by their
+covariance; those that hold an unknown wind are left out.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.model.disturbances import CURRENT
+from greybox.model.predictor import Predictor
+
+Array = NDArray[np.float64]
+
+
+def current_equations(predictor: Predictor, theta: Array) -> tuple[list[int], Array, Array]:
+    """Return the first-order bias coefficients as linear functions of the current.
+
+    Parameters
+    ----------
+    predictor : Predictor
+    theta : ndarray
+        (p,) coefficients of all columns.
+
+    Returns
+    -------
+    tuple
+        Positions of the bias columns (m,); A (m, 2) with b = A·current; and its
+        derivative dA (m, 2, p) in the coefficients.
+    """
+    p = len(predictor.columns)
+    wanted = [predictor.structure.disturbances.index(n) for n in CURRENT]
+    coefficient: dict[tuple[int, int], Array] = {}
+    spoilt: set[int] = set()
+    for share in predictor.biases:
+        columns = predictor.equation(share.state)
+        owner = next(i for i in columns if share.term in predictor.columns[i].terms)
+        merged = len(predictor.columns[owner].terms) > 1
+        for column, value in zip(columns, share.shares, strict=True):
+            if abs(value) < 1e-9:
+                continue
+            if len(share.monomial) > 1 or share.monomial[0] not in wanted or merged:
+                # second moments, the unknown wind, or half of a sum
+                spoilt.add(column)
+                continue
+            key = (column, wanted.index(share.monomial[0]))
+            row = coefficient.setdefault(key, np.zeros(p))
+            row[owner] += share.weight * value
+    usable = sorted({c for c, _ in coefficient} - spoilt)
+    usable = [c for c in usable if predictor.columns[c].is_bias]
+    derivative = np.zeros((len(usable), 2, p))
+    for (column, component), row in coefficient.items():
+        if column in usable:
+            derivative[usable.index(column), component] = row
+    return usable, derivative @ theta, derivative
+
+
+def estimate_current(
+    predictor: Predictor, theta: Array, covariance: Array
+) -> tuple[tuple[str, float, float], ...]:
+    """Estimate the mean current, north and east.
+
+    Parameters
+    ----------
+    predictor : Predictor
+        ``augmented`` or ``wind``; empty is returned for the others.
+    theta, covariance : ndarray
+        (p,) and (p, p) of all columns.
+
+    Returns
+    -------
+    tuple of (name, value, standard error)
+        [m/s]; scaled by 1/ρ_ψ of the heading noise, as (5.30) says.
+
+    References
+    ----------
+    Ljungberg (2020), eqs. 5.30, 5.31, 5.63, 5.72; generalised least squares.
+    """
+    if predictor.structure.disturbance != "marine" or not predictor.biases:
+        return ()
+    rows, a, derivative = current_equations(predictor, theta)
+    if len(rows) < 2 or np.linalg.matrix_rank(a) < 2:
+        return ()
+    b = theta[rows]
+    current = np.linalg.lstsq(a, b, rcond=None)[0]
+    spread = np.zeros((2, 2))
+    for _ in range(3):
+        # errors of b − A(θ)·current, to first order in the errors of all coefficients
+        sensitivity = -np.einsum("mcp,c->mp", derivative, current)
+        sensitivity[np.arange(len(rows)), rows] += 1.0
+        noise = sensitivity @ covariance @ sensitivity.T
+        scale = np.sqrt(np.maximum(np.diag(noise), 1e-300))
+        whiten = np.linalg.pinv(noise / np.outer(scale, scale), rcond=1e-10, hermitian=True)
+        aw = a / scale[:, None]
+        spread = np.linalg.pinv(aw.T @ whiten @ aw)
+        current = spread @ aw.T @ whiten @ (b / scale)
+    std = np.sqrt(np.maximum(np.diag(spread), 0.0))
+    return tuple(
+        (name, float(v), float(s)) for name, v, s in zip(CURRENT, current, std, strict=True)
+    )

@@ -1,0 +1,383 @@
+"""Least squares and instrumental variables on the regressions of a predictor."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.errors import ExcitationError, UsageError
+from greybox.estimation.covariance import (
+    CovarianceKind,
+    block_bootstrap,
+    score_covariance,
+)
+from greybox.estimation.disturbance import estimate_current
+from greybox.estimation.moments import Solution, solve_stacked
+from greybox.estimation.result import Estimate
+from greybox.model.predictor import Predictor
+from greybox.regression.instruments import Instruments, build_instruments
+from greybox.regression.regression import Regression, build_regression
+from greybox.trial.log import TrialLog
+
+Array = NDArray[np.float64]
+Covariance = Literal["hac", "ma", "white", "bootstrap"]
+
+# scaled singular value below which a direction counts as not excited
+SINGULAR = 1e-8
+_REFINE_TOLERANCE = 1e-4
+_MAX_REFINEMENTS = 30
+
+
+def estimate_ls(
+    predictor: Predictor,
+    logs: Sequence[TrialLog],
+    *,
+    margins: dict[str, float] | None = None,
+    covariance: Covariance = "hac",
+    seed: int = 0,
+) -> Estimate:
+    """Estimate the parameters by least squares, experiments pooled.
+
+    Parameters
+    ----------
+    predictor : Predictor
+        With an intercept where it is augmented: only zero-mean instruments
+        remove the constants that its derivation leaves out.
+    logs : sequence of TrialLog
+        One experiment each.
+    margins : dict of str to float, optional
+        Rows with |state| below are left out (Remark 4.2) [m/s, rad/s].
+    covariance : {"hac", "ma", "white", "bootstrap"}
+        ``hac`` by default: regressors that hold the noise rule ``ma`` out.
+    seed : int
+        For the bootstrap.
+
+    Returns
+    -------
+    Estimate
+        Biased by measurement noise in the regressors, however long the log.
+
+    Raises
+    ------
+    ExcitationError
+        Some direction is not excited; its parameters are named.
+
+    References
+    ----------
+    Ljungberg (2020), eq. 2.17.
+    """
+    regression = build_regression(predictor, logs, margins=margins)
+    instruments = Instruments(
+        tuple(e.phi for e in regression.experiments), tuple(e.keep for e in regression.experiments)
+    )
+    solutions = _solve(regression, instruments)
+    return _result("ls", regression, instruments, solutions, logs, covariance, seed)
+
+
+def estimate_iv(
+    predictor: Predictor,
+    logs: Sequence[TrialLog],
+    *,
+    start: Array | Estimate | None = None,
+    zero_mean: bool = True,
+    refine: bool = True,
+    heading: Literal["measured", "simulated"] = "measured",
+    lag: int = 0,
+    margins: dict[str, float] | None = None,
+    covariance: Covariance = "ma",
+    metric: str = "moments",
+    seed: int = 0,
+) -> Estimate:
+    """Estimate the parameters by instrumental variables, experiments stacked (4.5).
+
+    Parameters
+    ----------
+    predictor : Predictor
+    logs : sequence of TrialLog
+        One experiment each.
+    start : ndarray or Estimate, optional
+        (p,) parameters of the structure that simulate the first instruments: a
+        nominal model. By default the least-squares estimate (4.60).
+    zero_mean : bool
+        Remove each instrument's mean in each experiment (4.63): IV2. Kept: IV1.
+    refine : bool
+        Simulate the instruments again from each estimate until it stops moving.
+    heading : {"measured", "simulated"}
+        Heading in the instruments.
+    lag : int
+        Delay of the instruments in samples, for logs in closed loop.
+    covariance : {"ma", "hac", "white", "bootstrap"}
+        ``ma`` by default, C = G⁻¹ (Σ Z R Zᵀ) G⁻ᵀ: the equation error is a moving
+        average and the instruments are independent of it. ``hac`` where the
+        noise changes its size along the log; it is noisier.
+    margins, seed
+        As `estimate_ls`.
+    metric : {"moments", "identity"}
+        How the stacked equations of several experiments are weighted.
+
+    Returns
+    -------
+    Estimate
+        ``status`` says whether the refinement converged. Where an instrument
+        simulation diverges, the step is halved; where that does not help, the
+        last estimate with bounded instruments is returned and the status says so.
+
+    Raises
+    ------
+    ExcitationError
+        Some direction is not excited, or even the first simulation diverges.
+
+    References
+    ----------
+    Ljungberg (2020), eqs. 2.21, 4.5, 4.60-4.63; Young (2008).
+    """
+    if not zero_mean and predictor.augmented and "1" not in {c.name for c in predictor.columns}:
+        raise UsageError(
+            "instruments that keep their mean do not remove the constants that the augmented "
+            "predictor leaves out: build it with an intercept, or use zero-mean instruments."
+        )
+    regression = build_regression(predictor, logs)
+    theta = _start(predictor, logs, start)
+    if margins is not None:
+        build_regression(predictor, logs, margins=margins)  # enough rows remain
+
+    def instruments_of(theta: Array) -> Instruments:
+        return build_instruments(
+            predictor,
+            logs,
+            theta,
+            zero_mean=zero_mean,
+            heading=heading,
+            lag=lag,
+            margins=margins,
+        )
+
+    instruments = instruments_of(theta)
+    if instruments.diverged:
+        raise ExcitationError(
+            f"{instruments.diverged} already with the first model, so there are no instruments: "
+            f"give a nominal model that is stable, or use --method ls."
+        )
+    solutions = _solve(regression, instruments, metric)
+    status, iterations = "one step, instruments not refined", 0
+    if refine:
+        status = f"the refinement still moved after {_MAX_REFINEMENTS} steps"
+        for iterations in range(1, _MAX_REFINEMENTS + 1):
+            previous = _coefficients(solutions)
+            target = _structure_theta(predictor, previous)
+            candidate, fresh = target, instruments_of(target)
+            for _ in range(4):
+                if not fresh.diverged:
+                    break
+                candidate = (candidate + theta) / 2
+                fresh = instruments_of(candidate)
+            if fresh.diverged:
+                status = (
+                    f"stopped after {iterations - 1} refinements: {fresh.diverged}; "
+                    f"the last estimate with bounded instruments is given"
+                )
+                break
+            theta, instruments = candidate, fresh
+            solutions = _solve(regression, instruments, metric)
+            moved = np.abs(_coefficients(solutions) - previous)
+            scale = np.abs(previous) + 1e-12
+            if (moved < _REFINE_TOLERANCE * scale).all():
+                status = f"converged after {iterations} refinements"
+                break
+    return _result(
+        "iv",
+        regression,
+        instruments,
+        solutions,
+        logs,
+        covariance,
+        seed,
+        iterations,
+        status,
+        centred=zero_mean,
+    )
+
+
+def _start(
+    predictor: Predictor, logs: Sequence[TrialLog], start: Array | Estimate | None
+) -> Array:
+    if isinstance(start, Estimate):
+        return start.structure_theta()
+    if start is not None:
+        return np.asarray(start, float)
+    return estimate_ls(predictor, logs, covariance="white").structure_theta()
+
+
+def _structure_theta(predictor: Predictor, coefficients: Array) -> Array:
+    theta = np.zeros(len(predictor.structure.terms))
+    for i in predictor.parameter_columns:
+        theta[predictor.structure.index(predictor.columns[i].terms[0])] = coefficients[i]
+    return theta
+
+
+def _coefficients(solutions: Sequence[Solution]) -> Array:
+    return np.concatenate([s.theta for s in solutions])
+
+
+def _solve(
+    regression: Regression, instruments: Instruments, metric: str = "moments"
+) -> list[Solution]:
+    predictor = regression.predictor
+    solutions = []
+    for row, state in enumerate(predictor.structure.states):
+        mine = predictor.equation(state)
+        phi = [
+            e.phi[mine][:, k] for e, k in zip(regression.experiments, instruments.keep, strict=True)
+        ]
+        y = [e.y[row, k] for e, k in zip(regression.experiments, instruments.keep, strict=True)]
+        z = [z[mine][:, k] for z, k in zip(instruments.z, instruments.keep, strict=True)]
+        _require_excited(predictor, mine, phi, z)
+        solution = solve_stacked(z, phi, y, metric=metric)
+        if not solution.singular_values[-1] > SINGULAR * solution.singular_values[0]:
+            raise ExcitationError(_singular(predictor, mine, solution, regression))
+        solutions.append(solution)
+    return solutions
+
+
+def _require_excited(
+    predictor: Predictor, mine: list[int], phi: Sequence[Array], z: Sequence[Array]
+) -> None:
+    """Name the first parameter whose regressor or instrument does not vary at all."""
+    for i, column in enumerate(mine):
+        for rows, what in ((phi, "regressor"), (z, "instrument")):
+            largest = max(float(np.abs(r[i]).max(initial=0.0)) for r in rows)
+            if largest < 1e-13:
+                label = predictor.columns[column].label
+                raise ExcitationError(
+                    f"parameter {label} is not excited: its {what} stays within {largest:.1g} "
+                    f"over the whole log. Move what it multiplies, or leave it out "
+                    f"(--structure '{predictor.structure.name}-{predictor.columns[column].name}')."
+                )
+
+
+def _singular(
+    predictor: Predictor, mine: list[int], solution: Solution, regression: Regression
+) -> str:
+    size = np.abs(solution.weakest)
+    involved = [predictor.columns[mine[i]].label for i in np.argsort(-size) if size[i] > 0.2]
+    ratio = solution.singular_values[-1] / solution.singular_values[0]
+    return (
+        f"the instruments are singular: {', '.join(involved)} cannot be told apart in the "
+        f"{predictor.columns[mine[0]].state} equation (relative singular value {ratio:.1e}, "
+        f"needs {SINGULAR:.0e}) on {regression.samples} samples. Excite them separately, or "
+        f"leave one out."
+    )
+
+
+def _masked(
+    solutions: Sequence[Solution],
+    regression: Regression,
+    instruments: Instruments,
+    *,
+    centred: bool,
+) -> tuple[list[list[Array]], list[list[Array]]]:
+    """Return projected instruments and residuals on all rows, zero where cut out.
+
+    Zero-mean instruments leave the constant of each experiment undetermined; it
+    belongs to the equation, not to the residual, so those are `centred`.
+    """
+    predictor = regression.predictor
+    projected, residuals = [], []
+    for row, (state, solution) in enumerate(
+        zip(predictor.structure.states, solutions, strict=True)
+    ):
+        mine = predictor.equation(state)
+        hats, errors = [], []
+        for e, keep, hat in zip(
+            regression.experiments, instruments.keep, solution.projected, strict=True
+        ):
+            full = np.zeros((len(mine), len(keep)))
+            full[:, keep] = hat
+            error = e.y[row] - solution.theta @ e.phi[mine]
+            if centred:
+                error = error - error[keep].mean()
+            error = np.where(keep, error, 0.0)
+            hats.append(full)
+            errors.append(error)
+        projected.append(hats)
+        residuals.append(errors)
+    return projected, residuals
+
+
+def _covariance(
+    solutions: Sequence[Solution],
+    regression: Regression,
+    projected: list[list[Array]],
+    residuals: list[list[Array]],
+    kind: Covariance,
+    seed: int,
+) -> tuple[Array, int]:
+    predictor = regression.predictor
+    p = len(predictor.columns)
+    if kind == "bootstrap":
+        rng = np.random.default_rng(seed)
+        total = np.zeros((p, p))
+        for row, state in enumerate(predictor.structure.states):
+            mine = predictor.equation(state)
+            draws = block_bootstrap(
+                projected[row],
+                [e.phi[mine] for e in regression.experiments],
+                [e.y[row] for e in regression.experiments],
+                rng,
+            )
+            total[np.ix_(mine, mine)] = np.cov(draws.T).reshape(len(mine), len(mine))
+        return total, 0
+    robust: CovarianceKind = kind
+    middle, lags = score_covariance(projected, residuals, robust)
+    inverse = np.zeros((p, p))
+    for state, solution in zip(predictor.structure.states, solutions, strict=True):
+        mine = predictor.equation(state)
+        inverse[np.ix_(mine, mine)] = np.linalg.pinv(solution.information, rcond=1e-15)
+    # degrees of freedom, as statsmodels counts them
+    rows = regression.kept
+    largest = max(len(predictor.equation(s)) for s in predictor.structure.states)
+    return inverse @ middle @ inverse.T * rows / max(rows - largest, 1), lags
+
+
+def _result(
+    method: str,
+    regression: Regression,
+    instruments: Instruments,
+    solutions: Sequence[Solution],
+    logs: Sequence[TrialLog],
+    kind: Covariance,
+    seed: int,
+    iterations: int = 0,
+    status: str = "solved",
+    centred: bool = False,
+) -> Estimate:
+    predictor = regression.predictor
+    projected, residuals = _masked(solutions, regression, instruments, centred=centred)
+    covariance, lags = _covariance(solutions, regression, projected, residuals, kind, seed)
+    kept = sum(int(k.sum()) for k in instruments.keep)
+    theta = _coefficients(solutions)
+    residual_std = np.array(
+        [np.sqrt(sum(float(e @ e) for e in equation) / max(kept, 1)) for equation in residuals]
+    )
+    return Estimate(
+        predictor=predictor,
+        method=method,
+        theta=theta,
+        covariance=covariance,
+        residual_std=residual_std,
+        vessel=logs[0].vessel,
+        sample_time=regression.sample_time,
+        samples=regression.samples,
+        kept=kept,
+        covariance_kind=kind,
+        lags=lags,
+        iterations=iterations,
+        status=status,
+        current=estimate_current(predictor, theta, covariance),
+        logs=tuple(
+            {"name": log.name, "sha256": log.provenance.sha256, "samples": len(log)} for log in logs
+        ),
+    )

@@ -1,0 +1,220 @@
+"""What an estimate is: named values with their covariance, tests and reasons."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.model.model import ManoeuvringModel
+from greybox.model.predictor import Predictor
+from greybox.model.units import parameter_unit
+from greybox.vessel.vessel import Vessel
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class TestResult:
+    """One test: what it supposes, what it found, and a sentence to act on.
+
+    ``statistic`` and ``p_value`` are None where the test does not apply; the
+    sentence then says why.
+    """
+
+    name: str
+    null: str
+    statistic: float | None
+    p_value: float | None
+    sentence: str
+
+    __test__ = False  # not a test case
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fields for JSON."""
+        return {
+            "null": self.null,
+            "statistic": self.statistic,
+            "p_value": self.p_value,
+            "sentence": self.sentence,
+        }
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Parameters of a predictor, estimated from logs.
+
+    Parameters
+    ----------
+    predictor : Predictor
+    method : str
+        ``ls`` or ``iv``.
+    theta : ndarray
+        (p,) coefficients of every column, biases included.
+    covariance : ndarray
+        (p, p) all equations together.
+    residual_std : ndarray
+        (nx,) of the one-step residuals.
+    vessel : Vessel
+    sample_time : float
+        [s]
+    samples, kept : int
+        Rows there were, and rows that took part.
+    covariance_kind : str
+    lags : int
+        Memory of the residuals that the covariance allows for, in samples.
+    iterations : int
+        Refinements of the instruments.
+    status : str
+        A sentence on how the estimation ended.
+    current : tuple
+        (name, value, standard error) of each current component; empty where the
+        predictor cannot tell it.
+    tests : tuple of TestResult
+    notes : tuple of str
+        Choices made and warnings.
+    fit : dict
+        Free-run fit (6.12) on the estimation logs [%].
+    logs : tuple of dict
+        Name, hash and length of each log.
+    """
+
+    predictor: Predictor
+    method: str
+    theta: Array
+    covariance: Array
+    residual_std: Array
+    vessel: Vessel
+    sample_time: float
+    samples: int
+    kept: int
+    covariance_kind: str
+    lags: int
+    iterations: int = 0
+    status: str = "solved"
+    current: tuple[tuple[str, float, float], ...] = ()
+    tests: tuple[TestResult, ...] = ()
+    notes: tuple[str, ...] = ()
+    fit: dict[str, float] = field(default_factory=dict)
+    logs: tuple[dict[str, Any], ...] = ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters, biases left out."""
+        return self.predictor.parameter_names
+
+    @property
+    def std(self) -> Array:
+        """Standard errors of all columns, (p,)."""
+        return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+
+    def __getitem__(self, name: str) -> float:
+        """Return the value of a parameter by name."""
+        wanted = [i for i in self.predictor.parameter_columns]
+        return float(self.theta[wanted[self.names.index(name)]])
+
+    def structure_theta(self) -> Array:
+        """Return the parameters of the predictor's full structure, (p_structure,).
+
+        A sum stands at its first term, the others of the sum at zero: that gives
+        the same motion in still air.
+        """
+        theta = np.zeros(len(self.predictor.structure.terms))
+        for i in self.predictor.parameter_columns:
+            first = self.predictor.columns[i].terms[0]
+            theta[self.predictor.structure.index(first)] = self.theta[i]
+        return theta
+
+    def model(self) -> ManoeuvringModel:
+        """Return the identified model, without the bias-capturing terms.
+
+        Its disturbance means hold the current that the estimate found.
+        """
+        keep = self.predictor.parameter_columns
+        columns = [self.predictor.columns[i] for i in keep]
+        full = self.predictor.structure
+        terms = tuple(full.terms[full.index(c.terms[0])] for c in columns)
+        return ManoeuvringModel(
+            structure=replace(full, terms=terms),
+            theta=self.theta[keep],
+            covariance=self.covariance[np.ix_(keep, keep)],
+            sample_time=self.sample_time,
+            vessel=self.vessel,
+            disturbances={n: (v, s) for n, v, s in self.current},
+            residual_std=self.residual_std,
+            sums={c.name: c.terms for c in columns if len(c.terms) > 1},
+            record=self.record(),
+        )
+
+    def record(self) -> dict[str, Any]:
+        """Return what a model file keeps beside the model itself."""
+        biases = [i for i, c in enumerate(self.predictor.columns) if c.is_bias]
+        return {
+            "method": self.method,
+            "predictor": self.predictor.kind,
+            "regime": {s: list(v) for s, v in self.predictor.regime},
+            "fit": self.fit,
+            "tests": {t.name: t.to_dict() for t in self.tests},
+            "notes": list(self.notes),
+            "status": self.status,
+            "covariance_kind": self.covariance_kind,
+            "lags": self.lags,
+            "iterations": self.iterations,
+            "samples": self.samples,
+            "samples_used": self.kept,
+            "nuisance": {
+                "names": [f"{self.predictor.columns[i].state}: {self.predictor.columns[i].name}" for i in biases],
+                "theta": self.theta[biases],
+                "std": self.std[biases],
+            },
+            "logs": list(self.logs),
+        }
+
+    def summary(self) -> str:
+        """Return the result as text, in the manner of a regression table."""
+        width = 78
+        unit = self.vessel.thrusters[0].thrust.unit if self.vessel.thrusters else "n"
+        lines = [
+            f"{'Estimate of ' + self.vessel.name:^{width}}",
+            "=" * width,
+            f"{'Method:':<18}{self.method:<22}{'Samples:':<18}{self.samples}",
+            f"{'Predictor:':<18}{self.predictor.kind:<22}{'Samples used:':<18}{self.kept}",
+            f"{'Structure:':<18}{self.predictor.structure.name:<22}{'Sample time:':<18}"
+            f"{self.sample_time:g} s",
+            f"{'Std errors:':<18}{self.covariance_kind + f', {self.lags} lags':<22}"
+            f"{'Refinements:':<18}{self.iterations}",
+            "=" * width,
+            f"{'parameter':<14}{'value':>12}{'std err':>11}{'[0.025':>12}{'0.975]':>12}"
+            f"{'per second':>12}  unit",
+        ]
+        for state in self.predictor.structure.states:
+            lines.append("-" * width)
+            for i in self.predictor.equation(state):
+                column = self.predictor.columns[i]
+                if column.is_bias:
+                    continue
+                value, std = self.theta[i], self.std[i]
+                term = self.predictor.structure.terms[
+                    self.predictor.structure.index(column.terms[0])
+                ]
+                lines.append(
+                    f"{column.label:<14}{value:>12.4g}{std:>11.2g}{value - 1.96 * std:>12.4g}"
+                    f"{value + 1.96 * std:>12.4g}{value / self.sample_time:>12.4g}  "
+                    f"{parameter_unit(term, unit)}"
+                )
+        lines.append("=" * width)
+        for name, value, std in self.current:
+            lines.append(f"{name:<16}{value:>10.3f} ± {1.96 * std:.3f} m/s (95 %)")
+        if self.fit:
+            shown = ", ".join(f"{k} {v:.1f} %" for k, v in self.fit.items())
+            lines.append(f"Free-run fit on the estimation logs: {shown}")
+        lines += [f"{t.name}: {t.sentence}" for t in self.tests]
+        lines += [f"Note: {n}" for n in self.notes]
+        return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        from html import escape
+
+        return f"<pre>{escape(self.summary())}</pre>"

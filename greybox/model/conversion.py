@@ -1,0 +1,257 @@
+"""Between discrete parameters and continuous-time quantities (Table 3.1).
+
+A discrete parameter is Ts times a force coefficient over an inertia. Ratios of
+inertias show in the ties of Table 3.1; their scale does not, so it takes a mass
+and either a thrust law in newtons or an assumed added mass in surge.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from greybox.errors import StructureError
+from greybox.model.structure import Structure
+from greybox.model.terms import Term
+
+# added mass in surge as a share of the mass, where nothing better is known;
+# slender-body values lie between 0.03 and 0.07 (Clarke, Gedling and Hine, 1983)
+SURGE_ADDED_MASS = 0.05
+
+
+@dataclass(frozen=True)
+class Inertia:
+    """Masses with added mass, the denominators of Table 3.1.
+
+    Parameters
+    ----------
+    surge : float
+        m − X_u̇ [kg]
+    sway : float
+        m − Y_v̇ [kg]
+    yaw : float
+        I_z − N_ṙ [kg m²]
+    """
+
+    surge: float
+    sway: float
+    yaw: float
+
+    def of(self, state: str) -> float:
+        """Return the inertia of one equation."""
+        return {"u": self.surge, "v": self.sway, "r": self.yaw}[state]
+
+
+@dataclass(frozen=True)
+class Tie:
+    """A relation that Table 3.1 implies between discrete parameters.
+
+    ``holds`` is true when the two sides differ by less than the tolerance.
+    """
+
+    name: str
+    left: float
+    right: float
+    holds: bool
+    sentence: str
+
+
+def _is_coriolis(term: Term) -> bool:
+    return term.name in ("Xvr", "Yur", "Nuv")
+
+
+def to_continuous(
+    theta: Mapping[str, float], structure: Structure, sample_time: float, inertia: Inertia
+) -> dict[str, float]:
+    """Return force coefficients from discrete parameters.
+
+    Parameters
+    ----------
+    theta : mapping of str to float
+        Discrete parameters by name.
+    structure : Structure
+    sample_time : float
+        Ts [s].
+    inertia : Inertia
+
+    Returns
+    -------
+    dict of str to float
+        Coefficient of each term [N per unit of the regressor, N m in yaw], with
+        the sign of Table 3.1: ``θ = Ts C / inertia``.
+    """
+    return {
+        t.name: theta[t.name] * inertia.of(t.state) / sample_time
+        for t in structure.terms
+        if t.name in theta
+    }
+
+
+def to_discrete(
+    coefficients: Mapping[str, float], structure: Structure, sample_time: float, inertia: Inertia
+) -> dict[str, float]:
+    """Return discrete parameters from force coefficients; inverse of `to_continuous`.
+
+    Coriolis terms that `coefficients` lacks follow from the inertias:
+    Xvr = Ts (m−Y_v̇)/(m−X_u̇), Yur = −Ts (m−X_u̇)/(m−Y_v̇),
+    Nuv = −Ts (X_u̇−Y_v̇)/(I_z−N_ṙ).
+    """
+    found = {
+        t.name: coefficients[t.name] * sample_time / inertia.of(t.state)
+        for t in structure.terms
+        if t.name in coefficients
+    }
+    coriolis = {
+        "Xvr": inertia.sway / inertia.surge,
+        "Yur": -inertia.surge / inertia.sway,
+        "Nuv": -(inertia.sway - inertia.surge) / inertia.yaw,
+    }
+    for term in structure.terms:
+        if _is_coriolis(term) and term.name not in found:
+            found[term.name] = sample_time * coriolis[term.name]
+    return found
+
+
+def change_sample_time(theta: float, old: float, new: float) -> float:
+    """Return an increment parameter at another sample time: θ is proportional to Ts (2.6)."""
+    return theta * new / old
+
+
+def estimate_inertia(
+    theta: Mapping[str, float],
+    sample_time: float,
+    *,
+    mass: float,
+    thrust_in_newtons: bool,
+    surge_added_mass: float = SURGE_ADDED_MASS,
+) -> Inertia:
+    """Return the inertias that a mass and the input gains imply.
+
+    Parameters
+    ----------
+    theta : mapping of str to float
+        Discrete parameters; ``Xmu``, ``Ymu`` and ``Nmu`` are used.
+    sample_time : float
+        [s]
+    mass : float
+        m [kg]
+    thrust_in_newtons : bool
+        True: µ = 1, so m − X_u̇ = Ts/Xmu. False: m − X_u̇ = m (1 + added mass).
+    surge_added_mass : float
+        −X_u̇/m that is assumed without a thrust in newtons.
+
+    Raises
+    ------
+    StructureError
+        An input gain is missing or zero.
+
+    References
+    ----------
+    Ljungberg (2020), Table 3.1.
+    """
+    gains = {n: theta.get(n, 0.0) for n in ("Xmu", "Ymu", "Nmu")}
+    zero = [n for n, g in gains.items() if g == 0.0]
+    if zero:
+        raise StructureError(
+            f"the inertias need the input gains Xmu, Ymu and Nmu, and {zero[0]} is "
+            f"{gains[zero[0]]:g}: estimate it first."
+        )
+    surge = sample_time / gains["Xmu"] if thrust_in_newtons else mass * (1 + surge_added_mass)
+    return Inertia(
+        surge, surge * gains["Xmu"] / gains["Ymu"], surge * gains["Xmu"] / gains["Nmu"]
+    )
+
+
+def check_ties(
+    theta: Mapping[str, float], sample_time: float, tolerance: float = 0.1
+) -> list[Tie]:
+    """Compare the relations that Table 3.1 implies: Xvr·Yur = −Ts² and Ymu/Xmu = −Yur/Ts.
+
+    Parameters
+    ----------
+    tolerance : float
+        Relative difference up to which a tie counts as held.
+    """
+    ties = []
+    for name, needed, left, right in (
+        ("Xvr·Yur = −Ts²", ("Xvr", "Yur"), lambda p: p["Xvr"] * p["Yur"], -(sample_time**2)),
+        (
+            "Ymu/Xmu = −Yur/Ts",
+            ("Xmu", "Ymu", "Yur"),
+            lambda p: p["Ymu"] / p["Xmu"] if p["Xmu"] else float("nan"),
+            -theta.get("Yur", float("nan")) / sample_time,
+        ),
+    ):
+        if not all(n in theta for n in needed):
+            continue
+        value = float(left(theta))
+        holds = bool(abs(value - right) <= tolerance * max(abs(value), abs(right)))
+        ties.append(
+            Tie(
+                name,
+                value,
+                float(right),
+                holds,
+                f"{name}: {value:.4g} against {right:.4g}"
+                + (
+                    ", holds."
+                    if holds
+                    else ", does not hold: masses from Table 3.1 are only nominal."
+                ),
+            )
+        )
+    return ties
+
+
+def to_prime(
+    coefficients: Mapping[str, float],
+    structure: Structure,
+    *,
+    length: float,
+    speed: float,
+    density: float = 1025.0,
+) -> dict[str, float]:
+    """Return non-dimensional prime coefficients of the hydrodynamic terms.
+
+    A force is divided by ½ρU²L², a moment by ½ρU²L³, velocities by U and the yaw
+    rate by U/L, so C′ = C · Π(scale of each factor) / (½ρU²L² or ½ρU²L³).
+
+    Parameters
+    ----------
+    coefficients : mapping of str to float
+        As `to_continuous` gives them; terms with inputs are left out.
+    length, speed : float
+        L [m] and U [m/s].
+    density : float
+        ρ [kg/m³].
+
+    References
+    ----------
+    SNAME (1950); Fossen (2011), prime system I.
+    """
+    scale = {"u": speed, "v": speed, "uq": speed, "vq": speed, "r": speed / length}
+    found = {}
+    for term in structure.terms:
+        if term.name not in coefficients or any(f.signal not in scale for f in term.factors):
+            continue
+        force = 0.5 * density * speed**2 * length ** (3 if term.state == "r" else 2)
+        regressor = float(np.prod([scale[f.signal] for f in term.factors]))
+        found[term.name] = coefficients[term.name] * regressor / force
+    return found
+
+
+def from_prime(
+    primes: Mapping[str, float],
+    structure: Structure,
+    *,
+    length: float,
+    speed: float,
+    density: float = 1025.0,
+) -> dict[str, float]:
+    """Return force coefficients from prime ones; inverse of `to_prime`."""
+    unit = to_prime(
+        dict.fromkeys(primes, 1.0), structure, length=length, speed=speed, density=density
+    )
+    return {name: primes[name] / unit[name] for name in unit}

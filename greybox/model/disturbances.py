@@ -1,0 +1,74 @@
+"""How disturbance means enter the signals that terms are made of.
+
+The velocity through the water and through the air differ from the measured
+velocity over ground by the current and the wind, constant in the n-frame and
+therefore turning with the heading in the body frame (5.2), (5.3). Keeping their
+means symbolic is what lets the bias-capturing regressors be derived.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Literal
+
+import casadi as ca
+
+DisturbanceKind = Literal["marine", "additive", "none"]
+
+CURRENT = ("current_north", "current_east")
+WIND = ("wind_north", "wind_east")
+
+
+def disturbance_names(kind: DisturbanceKind, states: Sequence[str]) -> tuple[str, ...]:
+    """Return the names of the disturbance means, in the order of their symbol ``d``."""
+    if kind == "marine":
+        return CURRENT + WIND
+    if kind == "additive":
+        return tuple(f"{state}_disturbance" for state in states)
+    return ()
+
+
+def rotate_to_body(psi: ca.SX, north: ca.SX, east: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """Return the body components of an n-frame vector, Rᵀ(ψ)·vector (5.2)."""
+    c, s = ca.cos(psi), ca.sin(psi)
+    return c * north + s * east, -s * north + c * east
+
+
+def disturbed_signals(
+    kind: DisturbanceKind,
+    states: Mapping[str, ca.SX],
+    psi: ca.SX,
+    d: ca.SX,
+    air: ca.SX | None,
+) -> dict[str, ca.SX]:
+    """Return the signals that terms see: relative velocities and states.
+
+    Parameters
+    ----------
+    kind : {"marine", "additive", "none"}
+        ``marine``: current and wind in the n-frame (5.2), (5.3);
+        ``additive``: each state is seen as x + v (4.1).
+    states : mapping of str to SX
+        Symbols of the states over ground [m/s, rad/s].
+    psi : SX
+        Heading [rad].
+    d : SX
+        (nd, 1) disturbance means in the order of `disturbance_names` [m/s].
+    air : SX or None
+        (2, 1) measured velocity through the air, body axes [m/s]; None to form
+        it from the wind mean in `d`.
+    """
+    signals = dict(states)
+    if kind == "additive":
+        return {name: x + d[i] for i, (name, x) in enumerate(states.items())}
+    if kind == "none":
+        return signals
+    u_c, v_c = rotate_to_body(psi, d[0], d[1])
+    u_w, v_w = rotate_to_body(psi, d[2], d[3])
+    if "u" in states:
+        signals["u"] = states["u"] - u_c
+        signals["uq"] = states["u"] - u_w if air is None else air[0]
+    if "v" in states:
+        signals["v"] = states["v"] - v_c
+        signals["vq"] = states["v"] - v_w if air is None else air[1]
+    return signals

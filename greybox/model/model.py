@@ -1,0 +1,258 @@
+"""An identified model: structure, parameters, their covariance, and where they came from."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.errors import GreyboxError, ModelFileError
+from greybox.files import plain, write_json
+from greybox.model.structure import Structure
+from greybox.model.terms import Factor, Term
+from greybox.model.units import parameter_unit
+from greybox.vessel.toml import vessel_from_dict, vessel_to_dict
+from greybox.vessel.vessel import Vessel
+
+Array = NDArray[np.float64]
+
+FORMAT = "greybox-model"
+VERSION = 1
+_MAX_BYTES = 50_000_000
+
+
+@dataclass(frozen=True)
+class ManoeuvringModel:
+    """A model that can be simulated, compared, saved and designed with.
+
+    Parameters
+    ----------
+    structure : Structure
+    theta : ndarray
+        (p,) discrete parameters at `sample_time`, in the order of the structure.
+    covariance : ndarray
+        (p, p)
+    sample_time : float
+        Ts [s].
+    vessel : Vessel
+    integrator : {"euler", "rk4"}
+    disturbances : mapping of str to (float, float)
+        Known disturbance means and their standard errors [m/s].
+    residual_std : ndarray
+        (nx,) standard deviation of the one-step residuals.
+    sums : mapping of str to tuple of str
+        Parameters that stand for a sum, such as Xuu for Xuu + Wuu.
+    record : mapping
+        What the estimate reported: fit, tests, method, notes, provenance.
+    """
+
+    structure: Structure
+    theta: Array
+    covariance: Array
+    sample_time: float
+    vessel: Vessel
+    integrator: Literal["euler", "rk4"] = "euler"
+    disturbances: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    residual_std: Array = field(default_factory=lambda: np.zeros(0))
+    sums: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    record: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return self.structure.parameters
+
+    @property
+    def std(self) -> Array:
+        """Standard errors, (p,)."""
+        return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+
+    @property
+    def force_unit(self) -> str:
+        """Unit of the generalised force: N, or that of the propeller speed."""
+        units = {t.thrust.unit for t in self.vessel.thrusters}
+        return units.pop() if len(units) == 1 else "mixed"
+
+    @property
+    def units(self) -> list[str]:
+        """Unit of each parameter."""
+        return [parameter_unit(t, self.force_unit) for t in self.structure.terms]
+
+    @property
+    def d(self) -> Array:
+        """Disturbance means in the order of the structure, zero where unknown (nd,)."""
+        return np.array([self.disturbances.get(n, (0.0, 0.0))[0] for n in self.structure.disturbances])
+
+    def label(self, name: str) -> str:
+        """Return a parameter's name with the terms it sums, such as ``Xuu+Wuu``."""
+        return "+".join(self.sums.get(name, (name,)))
+
+    def summary(self) -> str:
+        """Return the equations and the parameters, per sample and per second."""
+        lines = [
+            f"Model of {self.vessel.name}: structure '{self.structure.name}', "
+            f"sample time {self.sample_time:g} s, {self.integrator}",
+            "",
+            *self.structure.equations(),
+            "u_r, v_r: velocity through the water; u_q, v_q: through the air",
+            "",
+            f"{'parameter':<16}{'value':>13}{'std err':>12}{'per second':>13}  unit per sample",
+        ]
+        for i, name in enumerate(self.names):
+            lines.append(
+                f"{self.label(name):<16}{self.theta[i]:>13.5g}{self.std[i]:>12.2g}"
+                f"{self.theta[i] / self.sample_time:>13.5g}  {self.units[i]}"
+            )
+        for name, (value, std) in self.disturbances.items():
+            lines.append(f"{name:<16}{value:>13.5g}{std:>12.2g}{'':>13}  m/s")
+        return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        from html import escape
+
+        return f"<pre>{escape(self.summary())}</pre>"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the model as the tables of its JSON file."""
+        s = self.structure
+        data = {
+            "format": FORMAT,
+            "version": VERSION,
+            "sample_time": self.sample_time,
+            "integrator": self.integrator,
+            "structure": {
+                "name": s.name,
+                "reference": s.reference,
+                "states": list(s.states),
+                "inputs": list(s.inputs),
+                "disturbance": s.disturbance,
+                "increment": s.increment,
+                "terms": [
+                    {"name": t.name, "state": t.state, "factors": [str(f) for f in t.factors]}
+                    for t in s.terms
+                ],
+                "equations": s.equations(),
+            },
+            "names": list(self.names),
+            "theta": self.theta,
+            "std": self.std,
+            "units": self.units,
+            "theta_per_second": self.theta / self.sample_time,
+            "covariance": self.covariance,
+            "sums": {k: list(v) for k, v in self.sums.items()},
+            "disturbances": {
+                k: {"value": v, "std": e, "unit": "m/s"} for k, (v, e) in self.disturbances.items()
+            },
+            "residual_std": dict(zip(s.states, self.residual_std, strict=False)),
+            "vessel": vessel_to_dict(self.vessel),
+        }
+        out: dict[str, Any] = plain(data | dict(self.record))
+        return out
+
+    def save(self, path: str | Path) -> None:
+        """Write the model as JSON, in one step."""
+        write_json(self.to_dict(), path)
+
+
+_CORE = {
+    "format", "version", "sample_time", "integrator", "structure", "names", "theta", "std",
+    "units", "theta_per_second", "covariance", "sums", "disturbances", "residual_std", "vessel",
+}  # fmt: skip
+
+
+def model_from_dict(data: Any, source: str = "model") -> ManoeuvringModel:
+    """Build a model from the tables of its file.
+
+    Raises
+    ------
+    ModelFileError
+        It is not a model, of a newer version, or inconsistent.
+    """
+    if not isinstance(data, dict) or data.get("format") != FORMAT:
+        raise ModelFileError(
+            f"'{source}' is not a model file: make one with 'greybox estimate … --out MODEL'."
+        )
+    if not isinstance(data.get("version"), int) or data["version"] > VERSION:
+        raise ModelFileError(
+            f"'{source}' has version {data.get('version')!r}, this program reads up to {VERSION}: "
+            f"update the program."
+        )
+    try:
+        s = data["structure"]
+        terms = tuple(
+            Term(
+                str(t["name"]),
+                str(t["state"]),
+                tuple(Factor(str(f).strip("|"), str(f).startswith("|")) for f in t["factors"]),
+            )
+            for t in s["terms"]
+        )
+        structure = Structure(
+            str(s["name"]),
+            terms,
+            tuple(s["states"]),
+            tuple(s["inputs"]),
+            s["disturbance"],
+            bool(s["increment"]),
+            str(s.get("reference", "")),
+        )
+        theta = np.array(data["theta"], float)
+        covariance = np.array(data["covariance"], float)
+        if theta.shape != (len(terms),) or covariance.shape != (len(terms), len(terms)):
+            raise ModelFileError(
+                f"'{source}' has {len(terms)} terms but {theta.size} parameters: "
+                f"estimate the model again."
+            )
+        if not np.isfinite(theta).all():
+            raise ModelFileError(f"'{source}' holds a parameter that is not a finite number.")
+        list(structure.regressors(air_measured=False))
+        return ManoeuvringModel(
+            structure=structure,
+            theta=theta,
+            covariance=np.nan_to_num(covariance),
+            sample_time=float(data["sample_time"]),
+            vessel=vessel_from_dict(data["vessel"]),
+            integrator="rk4" if data["integrator"] == "rk4" else "euler",
+            disturbances={
+                k: (float(v["value"]), float(v["std"] or 0.0))
+                for k, v in data.get("disturbances", {}).items()
+            },
+            residual_std=np.array(list(data.get("residual_std", {}).values()), float),
+            sums={k: tuple(v) for k, v in data.get("sums", {}).items()},
+            record={k: v for k, v in data.items() if k not in _CORE},
+        )
+    except ModelFileError:
+        raise
+    except (KeyError, TypeError, ValueError, AttributeError, GreyboxError) as error:
+        raise ModelFileError(
+            f"'{source}' is a damaged model file ({type(error).__name__}: {error}): "
+            f"estimate the model again."
+        ) from error
+
+
+def load_model(path: str | Path) -> ManoeuvringModel:
+    """Read a model file.
+
+    Raises
+    ------
+    ModelFileError
+        The file is missing, no JSON, or no model.
+    """
+    path = Path(path)
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise ModelFileError(f"'{path.name}' is larger than any model file: is it a log?")
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ModelFileError(f"cannot read '{path}': {error.strerror}.") from error
+    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
+        raise ModelFileError(
+            f"'{path.name}' is not a model file ({error}): name the file that "
+            f"'greybox estimate … --out' wrote."
+        ) from error
+    return model_from_dict(data, path.name)

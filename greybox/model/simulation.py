@@ -1,0 +1,287 @@
+"""Free runs of a model on the inputs of a log, or of many ships at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.errors import DivergenceError
+from greybox.model.functions import (
+    MANY_RUNS,
+    FreeRunKernel,
+    Heading,
+    Integrator,
+    OverRunsKernel,
+    RunVariant,
+)
+from greybox.model.structure import Structure
+
+Array = NDArray[np.float64]
+
+
+# runs stepped together: enough to hide the call, few enough to bound memory
+_BATCH_RUNS = 256
+
+
+@dataclass(frozen=True)
+class FreeRun:
+    """What a free run gave.
+
+    Parameters
+    ----------
+    x : ndarray
+        (R, N+1, nx) states [m/s, rad/s], initial state first.
+    psi : ndarray
+        (R, N+1) heading [rad]: simulated, or the measured one that was used.
+    diverged : ndarray of int
+        (R,) first sample outside the bound, −1 where the run stayed inside.
+    bound : ndarray
+        (nx,) the bound on each state's magnitude.
+    """
+
+    x: Array
+    psi: Array
+    diverged: NDArray[np.int64]
+    bound: Array
+
+    def require_bounded(self, states: tuple[str, ...], what: str) -> None:
+        """Raise if some run diverged.
+
+        Raises
+        ------
+        DivergenceError
+            Names the state, the sample and the bound.
+        """
+        if (self.diverged < 0).all():
+            return
+        run = int(np.flatnonzero(self.diverged >= 0)[0])
+        k = int(self.diverged[run])
+        size = np.abs(self.x[run, k])
+        worst = int(np.argmax(np.where(np.isfinite(size), size / self.bound, np.inf)))
+        raise DivergenceError(
+            f"{what} diverged: |{states[worst]}| passed {self.bound[worst]:.3g} at sample {k} "
+            f"of {self.x.shape[1] - 1}. Estimate with another method or structure, "
+            f"or on a log with more excitation."
+        )
+
+
+def simulate(
+    structure: Structure,
+    theta: Array,
+    x0: Array,
+    tau: Array,
+    sample_time: float,
+    *,
+    psi: Array | None = None,
+    psi0: Array | float = 0.0,
+    d: Array | None = None,
+    air: Array | None = None,
+    process_noise: Array | None = None,
+    integrator: Integrator = "euler",
+    bound: Array | None = None,
+) -> FreeRun:
+    """Run one or many ships freely from their initial states.
+
+    Parameters
+    ----------
+    structure : Structure
+    theta : ndarray
+        (p,) or (R, p) discrete parameters at `sample_time`.
+    x0 : ndarray
+        (nx,) or (R, nx) initial states [m/s, rad/s].
+    tau : ndarray
+        (N, nu) or (R, N, nu) generalised inputs, held over each sample.
+    sample_time : float
+        Ts [s].
+    psi : ndarray, optional
+        (N+1,) or (R, N+1) measured heading [rad]; without it the heading is simulated.
+    psi0 : float or ndarray
+        Initial heading of a simulated one [rad].
+    d : ndarray, optional
+        (nd,), (N, nd) or (R, N, nd) disturbances [m/s]: constant, or a series
+        such as `stationary_disturbance` gives. None: still water and air.
+    air : ndarray, optional
+        (N, 2) or (R, N, 2) measured velocity through the air [m/s].
+    process_noise : ndarray, optional
+        (N, nx) or (R, N, nx) noise added to each next state, w of (4.1a).
+    integrator : {"euler", "rk4"}
+    bound : ndarray, optional
+        (nx,) magnitude past which a state counts as diverged.
+
+    Returns
+    -------
+    FreeRun
+        R = 1 when no argument has runs.
+    """
+    theta = np.atleast_2d(np.asarray(theta, float))
+    x0 = np.atleast_2d(np.asarray(x0, float))
+    tau = np.asarray(tau, float)
+    tau = tau[None] if tau.ndim == 2 else tau
+    samples = tau.shape[1]
+    runs = max(
+        len(theta),
+        len(x0),
+        len(tau),
+        *[len(a) for a in (d, process_noise) if a is not None and np.ndim(a) == 3],
+    )
+    heading: Heading = "simulated"
+    if psi is not None or "r" not in structure.states or structure.disturbance != "marine":
+        heading = "measured"
+    nx = len(structure.states)
+    series: list[Array] = [np.broadcast_to(tau, (runs, samples, tau.shape[2]))]
+    if heading == "measured" and structure.disturbance == "marine":
+        measured = np.zeros(samples + 1) if psi is None else np.asarray(psi, float)
+        series.append(np.broadcast_to(measured[..., :samples, None], (runs, samples, 1)))
+    if d is not None:
+        d = np.asarray(d, float)
+        series.append(np.broadcast_to(d, (runs, samples, d.shape[-1])))
+    if air is not None:
+        series.append(np.broadcast_to(np.asarray(air, float), (runs, samples, 2)))
+    x0 = np.broadcast_to(x0, (runs, nx))
+    start = np.broadcast_to(np.asarray(psi0, float), (runs,))
+    theta = np.broadcast_to(theta, (runs, theta.shape[1]))
+    if process_noise is not None:
+        series.append(np.broadcast_to(np.asarray(process_noise, float), (runs, samples, nx)))
+    variant = RunVariant(
+        heading, air is not None, d is not None, process_noise is not None, integrator
+    )
+    out = np.empty((runs, samples + 1, nx + (heading == "simulated")))
+    with np.errstate(all="ignore"):
+        if runs < MANY_RUNS:
+            _few(structure, variant, series, x0, start, theta, sample_time, out)
+        else:
+            _many(structure, variant, series, x0, start, theta, sample_time, out)
+    x = out[:, :, :nx]
+    if heading == "simulated":
+        angle = out[:, :, nx]
+    elif psi is not None:
+        angle = np.broadcast_to(np.asarray(psi, float)[..., : samples + 1], (runs, samples + 1))
+    else:
+        angle = np.zeros((runs, samples + 1))
+    if bound is None:
+        bound = np.full(nx, 1e6)
+    with np.errstate(invalid="ignore"):
+        outside = ~(np.abs(x) <= bound).all(axis=2)
+    diverged = np.where(outside.any(axis=1), outside.argmax(axis=1), -1)
+    return FreeRun(x, angle, diverged, np.asarray(bound, float))
+
+
+def _few(
+    structure: Structure,
+    variant: RunVariant,
+    series: list[Array],
+    x0: Array,
+    psi0: Array,
+    theta: Array,
+    sample_time: float,
+    out: Array,
+) -> None:
+    """Fill `out` run by run."""
+    runs, samples = series[0].shape[:2]
+    nx = x0.shape[1]
+    kernel = FreeRunKernel(structure, samples, 1, variant)
+    for run in range(runs):
+        kernel.w[0, :samples] = np.concatenate([part[run] for part in series], axis=1)
+        kernel.x0[0, :nx] = x0[run]
+        kernel.x0[0, nx:] = psi0[run]
+        kernel.theta[0] = theta[run]
+        kernel(sample_time, out[run : run + 1])
+
+
+def _many(
+    structure: Structure,
+    variant: RunVariant,
+    series: list[Array],
+    x0: Array,
+    psi0: Array,
+    theta: Array,
+    sample_time: float,
+    out: Array,
+) -> None:
+    """Fill `out` in batches of runs; the last batch reaches back to be a full one."""
+    runs, samples = series[0].shape[:2]
+    nx = x0.shape[1]
+    size = min(runs, _BATCH_RUNS)
+    kernel = OverRunsKernel(structure, samples, size, variant)
+    for first in range(0, runs, size):
+        batch = slice(min(first, runs - size), min(first, runs - size) + size)
+        column = 0
+        for part in series:
+            kernel.w[:, column : column + part.shape[2]] = part[batch].transpose(1, 2, 0)
+            column += part.shape[2]
+        kernel.x[0, :nx] = x0[batch].T
+        kernel.x[0, nx:] = psi0[batch]
+        kernel.theta[:] = theta[batch].T
+        kernel(sample_time)
+        out[batch] = kernel.x.transpose(2, 0, 1)
+
+
+def stationary_disturbance(
+    rng: np.random.Generator,
+    mean: Array,
+    std: Array | float,
+    samples: int,
+    *,
+    runs: int = 1,
+    correlation_time: float = 0.0,
+    sample_time: float = 1.0,
+) -> Array:
+    """Draw n-frame current and wind as stationary processes.
+
+    Each component is its mean plus a first-order Gauss-Markov process; with no
+    correlation time, white noise as (6.2e-h).
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+    mean : ndarray
+        (nd,) means [m/s].
+    std : float or ndarray
+        Stationary standard deviation of each [m/s].
+    samples, runs : int
+        N and R.
+    correlation_time : float
+        Time constant [s].
+    sample_time : float
+        Ts [s].
+
+    Returns
+    -------
+    ndarray
+        (R, N, nd) [m/s].
+    """
+    from scipy.signal import lfilter
+
+    mean = np.asarray(mean, float)
+    white = rng.standard_normal((runs, samples, mean.size))
+    if correlation_time > 0:
+        a = float(np.exp(-sample_time / correlation_time))
+        gain = np.sqrt(1 - a**2)
+        start = rng.standard_normal((runs, 1, mean.size)) * a
+        white = lfilter([gain], [1.0, -a], white, axis=1, zi=start)[0]
+    return np.asarray(mean + np.asarray(std) * white)
+
+
+def positions(x: Array, psi: Array, sample_time: float, start: Array | None = None) -> Array:
+    """Integrate body velocities to north-east positions by Euler, p⁺ = p + Ts·R(ψ)(u, v).
+
+    Parameters
+    ----------
+    x : ndarray
+        (..., N, ≥2) with surge and sway first [m/s].
+    psi : ndarray
+        (..., N) heading [rad].
+
+    Returns
+    -------
+    ndarray
+        (..., N, 2) positions [m].
+    """
+    c, s = np.cos(psi), np.sin(psi)
+    u, v = x[..., 0], x[..., 1]
+    rate = np.stack([c * u - s * v, s * u + c * v], axis=-1) * sample_time
+    out = np.zeros_like(rate)
+    np.cumsum(rate[..., :-1, :], axis=-2, out=out[..., 1:, :])
+    return out + (0.0 if start is None else np.asarray(start))

@@ -1,0 +1,198 @@
+"""A structure: which terms stand in which equation, as one symbolic expression.
+
+f(x, psi, tau, d, air, theta) is the one-step increment of the states with the
+sampling time absorbed in the parameters (3.51). Everything else in the package
+is a derivative or an evaluation of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+
+import casadi as ca
+
+from greybox.errors import StructureError, suggestion
+from greybox.model.disturbances import DisturbanceKind, disturbance_names, disturbed_signals
+from greybox.model.terms import SIGNALS, Term, parse_term
+
+
+@dataclass(frozen=True)
+class Symbols:
+    """The symbols of f, each a column vector.
+
+    ``x`` (nx,) states [m/s, rad/s]; ``psi`` heading [rad]; ``tau`` (nu,)
+    generalised inputs; ``d`` (nd,) disturbance means [m/s]; ``air`` (2,)
+    measured velocity through the air [m/s]; ``theta`` (p,) parameters.
+    """
+
+    x: ca.SX
+    psi: ca.SX
+    tau: ca.SX
+    d: ca.SX
+    air: ca.SX
+    theta: ca.SX
+
+
+@dataclass(frozen=True)
+class Structure:
+    """A set of terms over named states, inputs and disturbances.
+
+    Parameters
+    ----------
+    name : str
+        Name by which commands and model files know the structure.
+    terms : tuple of Term
+        In the order of the parameter vector.
+    states : tuple of str
+        One equation each.
+    inputs : tuple of str
+        Generalised inputs that terms may use.
+    disturbance : {"marine", "additive", "none"}
+        How disturbance means enter the signals.
+    increment : bool
+        True: the terms give x(k+1) − x(k), as (3.51). False: x(k+1), as (4.58).
+    reference : str
+        Where the structure was published.
+    """
+
+    name: str
+    terms: tuple[Term, ...]
+    states: tuple[str, ...] = ("u", "v", "r")
+    inputs: tuple[str, ...] = ("taux", "tauy", "taun")
+    disturbance: DisturbanceKind = "marine"
+    increment: bool = True
+    reference: str = ""
+
+    def __post_init__(self) -> None:
+        names = [term.name for term in self.terms]
+        doubled = sorted({n for n in names if names.count(n) > 1})
+        if doubled:
+            raise StructureError(
+                f"structure '{self.name}' has {doubled[0]} {names.count(doubled[0])} times, "
+                f"a parameter stands once: remove the others."
+            )
+        keys: dict[object, str] = {}
+        for term in self.terms:
+            if term.state not in self.states:
+                raise StructureError(
+                    f"term {term.name} belongs to the equation of '{term.state}', which "
+                    f"structure '{self.name}' lacks: it has {', '.join(self.states)}."
+                )
+            if term.key in keys:
+                raise StructureError(
+                    f"terms {keys[term.key]} and {term.name} are the same function, so their "
+                    f"parameters cannot be told apart: remove one."
+                )
+            keys[term.key] = term.name
+
+    def __getstate__(self) -> dict[str, object]:
+        """Drop the cached symbols, which belong to one process, when pickled."""
+        return {f.name: getattr(self, f.name) for f in fields(self)}
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the parameters, in the order of ``theta``."""
+        return tuple(term.name for term in self.terms)
+
+    @property
+    def disturbances(self) -> tuple[str, ...]:
+        """Names of the disturbance means, in the order of ``d``."""
+        return disturbance_names(self.disturbance, self.states)
+
+    def index(self, name: str) -> int:
+        """Return the position of a parameter.
+
+        Raises
+        ------
+        StructureError
+            There is no such parameter; the nearest is suggested.
+        """
+        if name not in self.parameters:
+            raise StructureError(
+                f"structure '{self.name}' has no parameter '{name}'."
+                f"{suggestion(name, self.parameters)} It has: {', '.join(self.parameters)}."
+            )
+        return self.parameters.index(name)
+
+    def with_terms(self, *names: str | Term) -> Structure:
+        """Return the structure with more terms, each a `Term` or its spelling.
+
+        Examples
+        --------
+        >>> from greybox.model.catalogue import get_structure
+        >>> get_structure("thesis").with_terms("N_|r|r", "X_uuu").parameters[-2:]
+        ('N_|r|r', 'X_uuu')
+        """
+        added = tuple(parse_term(n) if isinstance(n, str) else n for n in names)
+        inputs = self.inputs
+        for term in added:
+            for factor in term.factors:
+                known = factor.signal in (*self.states, *inputs, "uq", "vq")
+                if not known and factor.signal in SIGNALS:
+                    inputs = (*inputs, factor.signal)
+        return replace(self, terms=self.terms + added, inputs=inputs)
+
+    def without(self, *names: str) -> Structure:
+        """Return the structure without the named terms."""
+        drop = {self.parameters[self.index(n)] for n in names}
+        return replace(self, terms=tuple(t for t in self.terms if t.name not in drop))
+
+    @cached_property
+    def symbols(self) -> Symbols:
+        """The symbols that every expression of this structure is written in."""
+        return Symbols(
+            x=ca.vertcat(*[ca.SX.sym(s) for s in self.states]),
+            psi=ca.SX.sym("psi"),
+            tau=ca.vertcat(*[ca.SX.sym(s) for s in self.inputs]),
+            d=ca.vertcat(*[ca.SX.sym(s) for s in self.disturbances]),
+            air=ca.vertcat(ca.SX.sym("u_q"), ca.SX.sym("v_q")),
+            theta=ca.vertcat(*[ca.SX.sym(p) for p in self.parameters]),
+        )
+
+    def regressors(self, *, air_measured: bool) -> list[ca.SX]:
+        """Return ∂f/∂θ, one expression per term, in the order of the terms."""
+        s = self.symbols
+        signals = disturbed_signals(
+            self.disturbance,
+            {name: s.x[i] for i, name in enumerate(self.states)},
+            s.psi,
+            s.d,
+            s.air if air_measured else None,
+        )
+        signals |= {name: s.tau[i] for i, name in enumerate(self.inputs)}
+        return [term.expression(signals) for term in self.terms]
+
+    def increment_expression(self, *, air_measured: bool) -> ca.SX:
+        """Return f, (nx,): the sum of the terms in each equation (3.51)."""
+        rows = [ca.SX(0)] * len(self.states)
+        for i, regressor in enumerate(self.regressors(air_measured=air_measured)):
+            row = self.states.index(self.terms[i].state)
+            rows[row] = rows[row] + self.symbols.theta[i] * regressor
+        return ca.vertcat(*rows)
+
+    @property
+    def uses_air(self) -> bool:
+        """Whether some term sees the velocity through the air."""
+        return any(f.signal in ("uq", "vq") for t in self.terms for f in t.factors)
+
+    def equations(self) -> list[str]:
+        """Return the equations as readable lines, such as ``u⁺ = u + Xu·u_r + …``."""
+        marine = self.disturbance == "marine"
+        shown = {"u": "u_r", "v": "v_r", "uq": "u_q", "vq": "v_q"} if marine else {}
+        lines = []
+        for state in self.states:
+            terms = [
+                f"{t.name}·"
+                + "·".join(
+                    f"|{shown.get(f.signal, f.signal)}|"
+                    if f.modulus
+                    else shown.get(f.signal, f.signal)
+                    for f in t.factors
+                )
+                for t in self.terms
+                if t.state == state
+            ]
+            start = [state] if self.increment else []
+            lines.append(f"{state}⁺ = " + " + ".join(start + terms))
+        return lines

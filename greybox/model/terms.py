@@ -1,0 +1,169 @@
+"""One term of a structure: a parameter times a product of signals and moduli.
+
+A term is data, not code: it can be written to a model file and read back
+without evaluating anything. Its regressor is a CasADi expression, so that every
+derivative of the model follows by differentiation.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import casadi as ca
+
+from greybox.errors import StructureError, suggestion
+
+# equation letter of SNAME -> state whose increment the equation gives
+EQUATIONS = {"X": "u", "Y": "v", "N": "r"}
+
+# signals that a term may name, longest first so that greedy reading is unambiguous
+SIGNALS = (
+    "rudder_drag",
+    "race_drag",
+    "rudder",
+    "race",
+    "taux",
+    "tauy",
+    "taun",
+    "uq",
+    "vq",
+    "u",
+    "v",
+    "r",
+)
+
+
+@dataclass(frozen=True)
+class Factor:
+    """One signal, or its modulus, in a product."""
+
+    signal: str
+    modulus: bool = False
+
+    def __str__(self) -> str:
+        return f"|{self.signal}|" if self.modulus else self.signal
+
+
+@dataclass(frozen=True)
+class Term:
+    """A parameter times a product of factors, added to one equation.
+
+    Parameters
+    ----------
+    name : str
+        Name of the parameter, unique in a structure.
+    state : str
+        State whose one-step increment the term enters.
+    factors : tuple of Factor
+        The regressor is their product.
+    """
+
+    name: str
+    state: str
+    factors: tuple[Factor, ...]
+
+    def expression(self, signals: Mapping[str, ca.SX]) -> ca.SX:
+        """Return the regressor as a symbolic expression of `signals`.
+
+        Raises
+        ------
+        StructureError
+            A factor is not among `signals`.
+        """
+        product = ca.SX(1)
+        for factor in self.factors:
+            if factor.signal not in signals:
+                raise StructureError(
+                    f"term {self.name} uses the signal '{factor.signal}', which this structure "
+                    f"does not have.{suggestion(factor.signal, signals)} "
+                    f"It has: {', '.join(signals)}."
+                )
+            value = signals[factor.signal]
+            product = product * (ca.fabs(value) if factor.modulus else value)
+        return product
+
+    @property
+    def key(self) -> tuple[str, tuple[tuple[str, bool], ...]]:
+        """Equation and factors without order: equal for terms that are the same function."""
+        return self.state, tuple(sorted((f.signal, f.modulus) for f in self.factors))
+
+    def __str__(self) -> str:
+        return f"{self.name}·" + "·".join(str(f) for f in self.factors)
+
+
+def _term(name: str, equation: str, *factors: str) -> Term:
+    return Term(
+        name,
+        EQUATIONS.get(equation, equation),
+        tuple(Factor(f.strip("|"), f.startswith("|")) for f in factors),
+    )
+
+
+# the terms of (3.51), by the names that the thesis gives their parameters (3.55)
+THESIS_TERMS: dict[str, Term] = {
+    t.name: t
+    for t in (
+        _term("Xu", "X", "u"),
+        _term("Xvr", "X", "v", "r"),
+        _term("Xuu", "X", "|u|", "u"),
+        _term("Wuu", "X", "|uq|", "uq"),
+        _term("Xmu", "X", "taux"),
+        _term("Xkappa", "X", "u", "taux"),
+        _term("Yv", "Y", "v"),
+        _term("Yur", "Y", "u", "r"),
+        _term("Yvv", "Y", "|v|", "v"),
+        _term("Yvr", "Y", "|v|", "r"),
+        _term("Wvv", "Y", "|vq|", "vq"),
+        _term("Ymu", "Y", "tauy"),
+        _term("Nr", "N", "r"),
+        _term("Nuv", "N", "u", "v"),
+        _term("Nvv", "N", "|v|", "v"),
+        _term("Nvr", "N", "|v|", "r"),
+        _term("Wuv", "N", "uq", "vq"),
+        _term("Nmu", "N", "taun"),
+    )
+}
+_BY_KEY = {t.key: t for t in THESIS_TERMS.values()}
+_TOKEN = re.compile(
+    r"\|(?P<modulus>" + "|".join(SIGNALS) + r")\||(?P<plain>" + "|".join(SIGNALS) + r")|[*.]"
+)
+
+
+def parse_term(name: str) -> Term:
+    """Return the term that `name` spells.
+
+    A name of (3.55) such as ``Xvr`` or ``Nmu`` gives that term. Any other is
+    spelled by equation and factors: ``N_|r|r``, ``Y_|r|v``, ``X_uuu``,
+    ``Y_race``, ``Y_u*race``. A spelling that equals a term of (3.55) gets its
+    name there (``X_|u|u`` is ``Xuu``).
+
+    Raises
+    ------
+    StructureError
+        The name is neither; the nearest known name is suggested.
+    """
+    if name in THESIS_TERMS:
+        return THESIS_TERMS[name]
+    equation, separator, body = name.partition("_")
+    if not separator or equation not in EQUATIONS or not body:
+        raise StructureError(
+            f"'{name}' is not a term.{suggestion(name, THESIS_TERMS)} Use a name of (3.55) or "
+            f"spell it by equation and factors, such as N_|r|r or X_uuu."
+        )
+    factors: list[Factor] = []
+    position = 0
+    while position < len(body):
+        match = _TOKEN.match(body, position)
+        if match is None:
+            raise StructureError(
+                f"term '{name}' cannot be read at '{body[position:]}': factors are "
+                f"{', '.join(reversed(SIGNALS))}, in bars for the modulus."
+            )
+        signal = match["modulus"] or match["plain"]
+        if signal:
+            factors.append(Factor(signal, bool(match["modulus"])))
+        position = match.end()
+    term = Term(name, EQUATIONS[equation], tuple(factors))
+    return _BY_KEY.get(term.key, term)

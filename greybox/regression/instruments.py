@@ -1,0 +1,180 @@
+"""Instruments: the regressors of a simulated model.
+
+They follow the noise-free regressors and are independent of the measurement
+noise, because only the inputs and the heading of the log enter the simulation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.model.predictor import Predictor
+from greybox.model.simulation import FreeRun, simulate
+from greybox.model.structure import Structure
+from greybox.regression.regression import within_margins
+from greybox.trial.log import TrialLog
+
+Array = NDArray[np.float64]
+
+# samples averaged for the initial state of a simulation
+START_SAMPLES = 5
+# a simulated state this many times beyond the largest measured one has diverged
+DIVERGENCE_FACTOR = 10.0
+
+
+@dataclass(frozen=True)
+class Instruments:
+    """Instruments of each experiment.
+
+    Parameters
+    ----------
+    z : tuple of ndarray
+        (p, N) a log, rows in the order of the predictor's columns.
+    keep : tuple of ndarray of bool
+        (N,) rows that take part: those whose simulated states keep the margins,
+        which, unlike measured ones, do not select on the noise.
+    diverged : str
+        Empty, or which simulation left its bound and where.
+    """
+
+    z: tuple[Array, ...]
+    keep: tuple[NDArray[np.bool_], ...]
+    diverged: str = ""
+
+
+def initial_state(log: TrialLog, states: tuple[str, ...]) -> Array:
+    """Return the mean of a log's first samples, (nx,)."""
+    return np.asarray(log.states(states)[:START_SAMPLES].mean(axis=0))
+
+
+def state_bound(log: TrialLog, states: tuple[str, ...]) -> Array:
+    """Return the magnitude past which a simulated state counts as diverged, (nx,)."""
+    largest = np.abs(log.states(states)).max(axis=0)
+    return DIVERGENCE_FACTOR * np.maximum(largest, 1e-6)
+
+
+def simulate_log(
+    structure: Structure,
+    theta: Array,
+    log: TrialLog,
+    *,
+    heading: Literal["measured", "simulated"] = "measured",
+    d: Array | None = None,
+    use_wind: bool = False,
+    integrator: Literal["euler", "rk4"] = "euler",
+) -> FreeRun:
+    """Run a model freely on the inputs of a log, from its first samples.
+
+    Parameters
+    ----------
+    structure : Structure
+    theta : ndarray
+        (p,) parameters of the structure.
+    log : TrialLog
+    heading : {"measured", "simulated"}
+    d : ndarray, optional
+        (nd,) disturbance means [m/s].
+    use_wind : bool
+        Whether the measured velocity through the air drives the wind terms.
+
+    Returns
+    -------
+    FreeRun
+        One run of N−1 steps, (1, N, nx).
+    """
+    marine = structure.disturbance == "marine"
+    if marine:
+        tau = log.forces(structure.inputs)[:-1]
+    else:
+        tau = np.column_stack([log[n] for n in structure.inputs])[:-1]
+    air = log.air if use_wind and structure.uses_air else None
+    has_yaw = "r" in structure.states
+    return simulate(
+        structure,
+        theta,
+        initial_state(log, structure.states),
+        tau,
+        log.sample_time,
+        psi=log["psi"] if marine and (heading == "measured" or not has_yaw) else None,
+        psi0=float(log["psi"][0]) if "psi" in log else 0.0,
+        d=d,
+        air=None if air is None else air[:-1],
+        integrator=integrator,
+        bound=state_bound(log, structure.states),
+    )
+
+
+def build_instruments(
+    predictor: Predictor,
+    logs: Sequence[TrialLog],
+    theta: Array,
+    *,
+    zero_mean: bool = True,
+    heading: Literal["measured", "simulated"] = "measured",
+    lag: int = 0,
+    margins: dict[str, float] | None = None,
+) -> Instruments:
+    """Simulate a model on each log and form its regressors.
+
+    Parameters
+    ----------
+    predictor : Predictor
+        Whose regressors to form.
+    logs : sequence of TrialLog
+    theta : ndarray
+        (p,) parameters of the predictor's structure, simulated without disturbances (4.61).
+    zero_mean : bool
+        Subtract each instrument's mean in each experiment (4.63).
+    heading : {"measured", "simulated"}
+        Heading inside the instruments. Measured is the one measured quantity
+        allowed there; a simulated one drifts out of phase in long logs.
+    lag : int
+        Samples by which simulated states and inputs are delayed, for logs in
+        closed loop: what was commanded before the noise cannot depend on it.
+    margins : dict of str to float, optional
+        As `build_regression`.
+
+    Returns
+    -------
+    Instruments
+    """
+    structure = predictor.structure
+    zs, keeps = [], []
+    for log in logs:
+        run = simulate_log(structure, theta, log, heading=heading)
+        if run.diverged[0] >= 0:
+            k = int(run.diverged[0])
+            return Instruments(
+                (), (), f"the simulation of '{log.name}' left its bound at sample {k} of {len(log)}"
+            )
+        x = run.x[0][:-1]
+        samples = len(x)
+        keep = within_margins(x, structure.states, margins)
+        tau = (
+            log.forces(structure.inputs)[:-1]
+            if structure.disturbance == "marine"
+            else np.column_stack([log[n] for n in structure.inputs])[:-1]
+        )
+        if lag:
+            shift = np.maximum(np.arange(samples) - lag, 0)
+            x, tau = x[shift], tau[shift]
+            keep[:lag] = False
+        psi: Array | float = 0.0
+        if structure.disturbance == "marine":
+            psi = (log["psi"] if heading == "measured" else run.psi[0])[:samples]
+        z = predictor.evaluate(
+            [np.ascontiguousarray(x[:, j]) for j in range(x.shape[1])],
+            psi,
+            [np.ascontiguousarray(c) for c in tau.T],
+            (log["u_q"][:-1], log["v_q"][:-1]) if predictor.air_measured else None,
+        )
+        if zero_mean:
+            z = z - z[:, keep].mean(axis=1, keepdims=True)
+        zs.append(z)
+        keeps.append(keep)
+    return Instruments(tuple(zs), tuple(keeps))

@@ -1,0 +1,258 @@
+"""Many virtual trials estimated at once.
+
+The same predictors, free runs and instruments as for one log, on arrays with
+runs in front: regressors are evaluated in one call for all runs, free runs in
+one compiled function, normal equations by one batched product. Runs that have
+converged leave the refinement.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.model.predictor import Predictor
+from greybox.model.simulation import simulate
+
+Array = NDArray[np.float64]
+
+# simulated states beyond this multiple of the largest measured one have diverged
+_BOUND = 10.0
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Measured logs of R virtual trials of N+1 samples, with runs in front.
+
+    Parameters
+    ----------
+    x : ndarray
+        (R, N+1, nx) measured states.
+    psi : ndarray or float
+        (R, N+1) measured heading [rad]; 0 where there is none.
+    tau : ndarray
+        (R or 1, N, nu) generalised inputs.
+    air : tuple of ndarray, optional
+        (R, N) each, measured velocity through the air [m/s].
+    start : ndarray
+        (nx,) or (R, nx) known initial state of simulated instruments.
+    seen : ndarray, optional
+        (R, N+1, nx) states as the regressors see them (4.13); by default `x`.
+    """
+
+    x: Array
+    psi: Array | float
+    tau: Array
+    air: tuple[Array, Array] | None
+    start: Array
+    seen: Array | None = None
+
+    @property
+    def runs(self) -> int:
+        """R"""
+        return self.x.shape[0]
+
+
+@dataclass(frozen=True)
+class BatchEstimate:
+    """Estimates of every run.
+
+    ``theta`` (R, p) coefficients of all columns; ``iterations`` the refinements
+    that the slowest run took; ``unconverged`` (R,) runs that never stopped
+    moving or whose instruments diverged.
+    """
+
+    theta: Array
+    iterations: int
+    unconverged: NDArray[np.bool_]
+
+
+class BatchRegression:
+    """y, Φ and the refinement of IV for one predictor on a batch.
+
+    Parameters
+    ----------
+    predictor : Predictor
+    batch : Batch
+    phi : ndarray, optional
+        (p, R, N) regressors, when a wider predictor already has them.
+    """
+
+    def __init__(self, predictor: Predictor, batch: Batch, phi: Array | None = None) -> None:
+        self.predictor = predictor
+        self.batch = batch
+        structure = predictor.structure
+        self._tau = [np.ascontiguousarray(c) for c in np.moveaxis(batch.tau, 2, 0)]
+        self._psi = batch.psi[:, :-1] if isinstance(batch.psi, np.ndarray) else batch.psi
+        increments = np.diff(batch.x, axis=1) if structure.increment else batch.x[:, 1:]
+        self._y = np.ascontiguousarray(np.moveaxis(increments, 2, 0))
+        seen = batch.x if batch.seen is None else batch.seen
+        self.phi = self.regressors(seen[:, :-1]) if phi is None else phi
+        self._equations = [predictor.equation(s) for s in structure.states]
+        self._bound = _BOUND * np.abs(batch.x).max(axis=(0, 1))
+
+    def regressors(self, x: Array, runs: Sequence[int] | NDArray[np.intp] | None = None) -> Array:
+        """Return the regressors (p, R, N) at states (R, N, nx) of some runs."""
+        psi, tau, air = self._psi, self._tau, self.batch.air
+        if runs is not None:
+            psi = psi[runs] if isinstance(psi, np.ndarray) else psi
+            tau = [t if len(t) == 1 else t[runs] for t in tau]
+            air = None if air is None else (air[0][runs], air[1][runs])
+        states = [np.ascontiguousarray(x[..., i]) for i in range(x.shape[-1])]
+        return self.predictor.evaluate(states, psi, tau, air)
+
+    def solve(self, z: Array, runs: NDArray[np.intp] | None = None) -> Array:
+        """Solve Σ Z Φᵀ θ = Σ Z y for each run (2.21).
+
+        Parameters
+        ----------
+        z : ndarray
+            (p, R, N) instruments of some runs.
+
+        Returns
+        -------
+        ndarray
+            (R, p)
+        """
+        index = slice(None) if runs is None else runs
+        theta = np.empty((z.shape[1], len(self.predictor.columns)))
+        for row, mine in enumerate(self._equations):
+            first, last = mine[0], mine[-1] + 1
+            zr = z[first:last].transpose(1, 0, 2)
+            fr = self.phi[first:last, index].transpose(1, 2, 0)
+            gram = np.matmul(zr, fr)
+            right = np.matmul(zr, self._y[row, index][..., None])[..., 0]
+            theta[:, first:last] = _solve_scaled(gram, right)
+        return theta
+
+    def least_squares(self) -> Array:
+        """Return the least-squares estimates (R, p)."""
+        return self.solve(self.phi)
+
+    def structure_theta(self, theta: Array) -> Array:
+        """Return (R, p_structure) parameters to simulate, sums at their first term."""
+        structure = self.predictor.structure
+        out = np.zeros((len(theta), len(structure.terms)))
+        for i in self.predictor.parameter_columns:
+            out[:, structure.index(self.predictor.columns[i].terms[0])] = theta[:, i]
+        return out
+
+    def instruments(
+        self, theta: Array, runs: NDArray[np.intp], *, zero_mean: bool
+    ) -> tuple[Array, NDArray[np.bool_]]:
+        """Simulate models and return their regressors, and which runs diverged.
+
+        Parameters
+        ----------
+        theta : ndarray
+            (n, p_structure) parameters of the runs.
+        runs : ndarray of int
+            (n,)
+
+        Returns
+        -------
+        tuple
+            (p, n, N) instruments; (n,) diverged, whose instruments are not usable.
+        """
+        batch = self.batch
+        start = batch.start if batch.start.ndim == 1 else batch.start[runs]
+        tau = batch.tau if len(batch.tau) == 1 else batch.tau[runs]
+        # in still water and air the heading plays no part in the states
+        psi = np.zeros(tau.shape[1] + 1) if "r" in self.predictor.structure.states else None
+        run = simulate(
+            self.predictor.structure,
+            theta,
+            np.broadcast_to(start, (len(runs), batch.x.shape[2])),
+            np.broadcast_to(tau, (len(runs), *tau.shape[1:])),
+            1.0,
+            psi=psi,
+            bound=self._bound,
+        )
+        bad = run.diverged >= 0
+        x = run.x[:, :-1]
+        x[bad] = 0.0
+        z = self.regressors(x, runs)
+        if zero_mean:
+            z -= z.mean(axis=2, keepdims=True)
+        return z, bad
+
+    def refine(
+        self,
+        start: Array,
+        *,
+        zero_mean: bool = True,
+        tolerance: float = 1e-4,
+        most: int = 30,
+    ) -> BatchEstimate:
+        """Estimate by IV, simulating the instruments anew until nothing moves (4.60-4.63).
+
+        Parameters
+        ----------
+        start : ndarray
+            (R, p_structure) or (p_structure,) models of the first instruments.
+        tolerance : float
+            Relative change of every parameter below which a run has converged.
+        most : int
+            Refinements at most.
+
+        Returns
+        -------
+        BatchEstimate
+        """
+        runs = np.arange(self.batch.runs)
+        model = np.broadcast_to(start, (len(runs), start.shape[-1])).copy()
+        theta = np.full((len(runs), len(self.predictor.columns)), np.nan)
+        last = model.copy()
+        wanted = self.predictor.parameter_columns
+        for iteration in range(most + 1):
+            z, bad = self.instruments(model[runs], runs, zero_mean=zero_mean)
+            for _ in range(4):
+                if not bad.any() or iteration == 0:
+                    break
+                # step halfway back to the last model whose simulation was bounded
+                model[runs[bad]] = (model[runs[bad]] + last[runs[bad]]) / 2
+                again, still = self.instruments(model[runs[bad]], runs[bad], zero_mean=zero_mean)
+                z[:, bad] = again
+                where = np.flatnonzero(bad)
+                bad = np.zeros(len(runs), bool)
+                bad[where[still]] = True
+            fine = ~bad
+            runs = runs[fine]
+            if not len(runs):
+                break
+            new = self.solve(z[:, fine] if not fine.all() else z, runs)
+            old = theta[runs]
+            theta[runs] = new
+            last[runs] = model[runs]
+            model[runs] = self.structure_theta(new)
+            with np.errstate(invalid="ignore"):
+                change = np.abs(new - old)[:, wanted] / (np.abs(new[:, wanted]) + 1e-12)
+            moving = ~(change.max(axis=1) < tolerance)
+            runs = runs[moving]
+            if not len(runs):
+                break
+        unconverged = np.zeros(self.batch.runs, bool)
+        unconverged[runs] = True
+        unconverged |= ~np.isfinite(theta).all(axis=1)
+        return BatchEstimate(theta, iteration, unconverged)
+
+
+def _solve_scaled(gram: Array, right: Array) -> Array:
+    """Solve (R, p, p) systems after scaling rows and columns to unit size."""
+    row = np.sqrt((gram**2).sum(axis=2))
+    row[row == 0] = 1.0
+    gram = gram / row[..., None]
+    column = np.sqrt((gram**2).sum(axis=1))
+    column[column == 0] = 1.0
+    gram = gram / column[:, None, :]
+    try:
+        solution = np.linalg.solve(gram, (right / row)[..., None])[..., 0]
+    except np.linalg.LinAlgError:
+        solution = np.full(right.shape, np.nan)
+        for i in range(len(gram)):
+            if np.linalg.matrix_rank(gram[i]) == gram.shape[1]:
+                solution[i] = np.linalg.solve(gram[i], (right / row)[i])
+    return np.asarray(solution / column)

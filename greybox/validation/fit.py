@@ -1,0 +1,135 @@
+"""Free-run fit of a model on a log (6.12)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.errors import LogError
+from greybox.model.model import ManoeuvringModel
+from greybox.regression.instruments import simulate_log
+from greybox.trial.conditioning import decimate
+from greybox.trial.log import TrialLog
+
+Array = NDArray[np.float64]
+
+
+def fit_percent(measured: Array, simulated: Array) -> Array:
+    """Return 100 (1 − ‖y − ŷ‖ / ‖y − mean y‖) for each column.
+
+    Parameters
+    ----------
+    measured, simulated : ndarray
+        (N, n) or (N,)
+
+    Returns
+    -------
+    ndarray
+        (n,) or scalar [%]; 100 is perfect, 0 no better than the mean. −inf where
+        the measured signal never changes.
+
+    References
+    ----------
+    Ljungberg (2020), eq. 6.12.
+    """
+    error = np.linalg.norm(measured - simulated, axis=0)
+    spread = np.linalg.norm(measured - measured.mean(axis=0), axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(
+            np.where(spread > 0, 100 * (1 - error / spread), np.where(error == 0, 100.0, -np.inf))
+        )
+
+
+@dataclass(frozen=True)
+class LogFit:
+    """A free run beside its log.
+
+    Parameters
+    ----------
+    log : TrialLog
+        At the model's sample time.
+    x : ndarray
+        (N, nx) simulated states [m/s, rad/s].
+    psi : ndarray
+        (N,) heading of the simulation [rad].
+    fit : dict of str to float
+        (6.12) a state [%].
+    diverged : int
+        First sample outside the bound, −1 if none.
+    """
+
+    log: TrialLog
+    x: Array
+    psi: Array
+    fit: dict[str, float]
+    diverged: int
+
+
+def at_model_rate(log: TrialLog, model: ManoeuvringModel) -> TrialLog:
+    """Return the log at the model's sample time.
+
+    Raises
+    ------
+    LogError
+        The model's sample time is not a whole multiple of the log's.
+    """
+    if abs(log.sample_time - model.sample_time) < 1e-6 * model.sample_time:
+        return log
+    if model.sample_time < log.sample_time:
+        raise LogError(
+            f"the model's sample time is {model.sample_time:g} s and '{log.name}' has "
+            f"{log.sample_time:g} s: use a log sampled at least as fast as the model."
+        )
+    return decimate(log, model.sample_time)
+
+
+def run_model(
+    model: ManoeuvringModel,
+    log: TrialLog,
+    *,
+    heading: Literal["measured", "simulated"] = "measured",
+) -> LogFit:
+    """Run a model freely on a log and compare.
+
+    The run starts from the mean of the log's first samples, uses the model's
+    current, and the wind where the log has it and the model has wind terms.
+
+    Parameters
+    ----------
+    model : ManoeuvringModel
+    log : TrialLog
+    heading : {"measured", "simulated"}
+
+    Returns
+    -------
+    LogFit
+    """
+    log = at_model_rate(log, model)
+    run = simulate_log(
+        model.structure,
+        model.theta,
+        log,
+        heading=heading,
+        d=model.d if model.disturbances else None,
+        use_wind=log.has_wind,
+        integrator=model.integrator,
+    )
+    states = model.structure.states
+    fit = fit_percent(log.states(states), run.x[0])
+    return LogFit(
+        log,
+        run.x[0],
+        run.psi[0],
+        {s: float(f) for s, f in zip(states, np.nan_to_num(fit, nan=-np.inf), strict=True)},
+        int(run.diverged[0]),
+    )
+
+
+def average_fit(fits: Sequence[LogFit]) -> dict[str, float]:
+    """Return the mean fit a state over logs [%]."""
+    states = fits[0].fit
+    return {s: float(np.mean([f.fit[s] for f in fits])) for s in states}

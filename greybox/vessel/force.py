@@ -1,0 +1,125 @@
+"""From thruster commands to the generalised force, symbolically.
+
+Azimuth, fixed and tunnel thrusters give the force and moment of (3.46),
+
+    taux = Σ T cos α,  tauy = Σ T sin α,  taun = Σ T (Δx sin α − Δy cos α),
+
+with T the thrust law of the propeller speed. A propeller with a rudder gives
+its thrust along the bow and a rudder force from the inflow. In MMG form the
+normal force of a rudder at angle δ is F_N = ½ρ A f U_R² sin δ, with the force
+−F_N sin δ along and −F_N cos δ across the ship (Yasukawa and Yoshimura, 2015).
+The inflow over the rudder follows from momentum theory: far behind a propeller
+with thrust T in the inflow u_a the race has u_a² + 2T/(ρA_p), and a rudder of
+which a share η lies in the race sees U_R² = u_a² + η·2T/(ρA_p); in a
+second-order model U_R² = c_u u|u| + c_T T (Norrbin, 1970; Blanke, 1981), the
+race only for T > 0, since astern it leaves forward. Sorting by unknown
+coefficient gives four inputs, summed over the rudders,
+
+    race = Σ T⁺ sin δ cos δ,       rudder = Σ sin δ cos δ,
+    race_drag = Σ T⁺ sin² δ,       rudder_drag = Σ sin² δ,
+
+that enter as Y_race, Y_|u|u*rudder, N_race, N_|u|u*rudder, X_race_drag and
+X_|u|u*rudder_drag. Sway and yaw have their own coefficients, because the hull
+behind which the rudder works moves the point where its force acts. At small
+incidence the inflow angle from v and r adds to terms that hulls have anyway.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.model.vectorised import Vectorised
+from greybox.vessel.vessel import Thruster, Vessel
+
+Array = NDArray[np.float64]
+
+
+def force_inputs(vessel: Vessel) -> tuple[str, ...]:
+    """Return the generalised inputs that the thrusters can produce."""
+    names = []
+    moved = [t for t in vessel.thrusters if t.type != "propeller_rudder"]
+    if any(isinstance(t.angle, str) or abs(np.cos(t.angle)) > 1e-9 for t in vessel.thrusters):
+        names.append("taux")
+    if any(isinstance(t.angle, str) or abs(np.sin(t.angle)) > 1e-9 for t in moved):
+        names.append("tauy")
+    if moved or any(t.y != 0 for t in vessel.thrusters):
+        names.append("taun")
+    if len(moved) < len(vessel.thrusters):
+        names += ["race", "rudder", "race_drag", "rudder_drag"]
+    return tuple(names)
+
+
+def force_expressions(vessel: Vessel, commands: ca.SX) -> dict[str, ca.SX]:
+    """Return each generalised input as an expression of the commands (3.46).
+
+    Parameters
+    ----------
+    vessel : Vessel
+    commands : SX
+        (nc,) in the order of `Vessel.commands`: speeds in the unit of the log, angles [rad].
+    """
+    column = {name: commands[i] for i, name in enumerate(vessel.commands)}
+    total = {n: ca.SX(0) for n in force_inputs(vessel)}
+
+    def add(name: str, value: ca.SX) -> None:
+        if name in total:
+            total[name] = total[name] + value
+
+    for t in vessel.thrusters:
+        thrust = t.thrust.force(column[t.speed])
+        if isinstance(t.angle, str):
+            c, s = ca.cos(column[t.angle]), ca.sin(column[t.angle])
+        else:  # rounded, so that a tunnel thruster has exactly no force along the ship
+            c, s = round(float(np.cos(t.angle)), 15), round(float(np.sin(t.angle)), 15)
+        along, across = thrust * c, thrust * s
+        add("taux", along)
+        add("tauy", across)
+        add("taun", t.x * across - t.y * along)
+        if t.rudder is not None:
+            delta = column[t.rudder]
+            race = ca.fmax(thrust, 0)
+            add("race", race * ca.sin(delta) * ca.cos(delta))
+            add("rudder", ca.sin(delta) * ca.cos(delta))
+            add("race_drag", race * ca.sin(delta) ** 2)
+            add("rudder_drag", ca.sin(delta) ** 2)
+    return total
+
+
+def force_function(vessel: Vessel) -> ca.Function:
+    """Return ``commands (nc,) -> generalised inputs (nu,)`` in the order of `force_inputs`."""
+    commands = ca.SX.sym("commands", len(vessel.commands))
+    inputs = ca.vertcat(*force_expressions(vessel, commands).values())
+    return ca.Function("force", [commands], [inputs], ["commands"], ["tau"])
+
+
+def generalised_force(vessel: Vessel, commands: dict[str, Array]) -> dict[str, Array]:
+    """Evaluate the generalised inputs on logged commands.
+
+    Parameters
+    ----------
+    vessel : Vessel
+    commands : dict of str to ndarray
+        Each column of `Vessel.commands`, all of one shape.
+
+    Returns
+    -------
+    dict of str to ndarray
+        Each input of `force_inputs`, of that shape.
+    """
+    program = _compiled(vessel.thrusters)
+    arrays = [np.asarray(commands[c], float) for c in vessel.commands]
+    names = force_inputs(vessel)
+    out = program(arrays, np.empty((len(names), *arrays[0].shape)))
+    return dict(zip(names, out, strict=True))
+
+
+@lru_cache(maxsize=16)
+def _compiled(thrusters: tuple[Thruster, ...]) -> Vectorised:
+    vessel = Vessel("", 1.0, thrusters)
+    commands = ca.SX.sym("commands", len(vessel.commands))
+    expressions = list(force_expressions(vessel, commands).values())
+    return Vectorised(expressions, ca.vertsplit(commands))

@@ -1,0 +1,67 @@
+"""Thrust laws: how the force of a propeller depends on its speed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import casadi as ca
+
+from greybox.errors import VesselError
+
+
+@dataclass(frozen=True)
+class ThrustLaw:
+    """Force of one thruster at bollard condition as a function of its speed.
+
+    Parameters
+    ----------
+    kind : {"linear", "quadratic", "table"}
+        Force proportional to n; to n|n|; or interpolated between bollard points.
+    table : tuple of (float, float)
+        Speed and force [N] of the bollard points, speed increasing. Points with
+        zero force make a dead band; the ends are extended by their last slope.
+    """
+
+    kind: Literal["linear", "quadratic", "table"] = "linear"
+    table: tuple[tuple[float, float], ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.kind != "table":
+            return
+        if len(self.table) < 2:
+            raise VesselError(
+                f"a bollard table has {len(self.table)} point, at least 2 are needed: "
+                f"add [speed, force] pairs."
+            )
+        for (n0, _), (n1, _) in zip(self.table, self.table[1:], strict=False):
+            if n1 <= n0:
+                raise VesselError(
+                    f"in a bollard table the speed goes from {n0:g} to {n1:g}: "
+                    f"list the points with increasing speed."
+                )
+
+    @property
+    def unit(self) -> str:
+        """Unit of the force: N for a table, else that of the speed itself."""
+        return {"linear": "n", "quadratic": "n²", "table": "N"}[self.kind]
+
+    def force(self, speed: ca.SX) -> ca.SX:
+        """Return the force as an expression of the speed.
+
+        A table becomes a sum of hinges, so the expression stays one branch-free
+        formula that can be differentiated and designed with.
+        """
+        if self.kind == "linear":
+            return speed
+        if self.kind == "quadratic":
+            return speed * ca.fabs(speed)
+        slopes = [
+            (f1 - f0) / (n1 - n0)
+            for (n0, f0), (n1, f1) in zip(self.table, self.table[1:], strict=False)
+        ]
+        force = self.table[0][1] + slopes[0] * (speed - self.table[0][0])
+        for (n, _), before, after in zip(self.table[1:-1], slopes, slopes[1:], strict=False):
+            if after != before:
+                force = force + (after - before) * ca.fmax(speed - n, 0)
+        return force

@@ -1,0 +1,138 @@
+"""What is known of a vessel before any model: geometry, thrusters, sensors, columns."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from greybox.vessel.thrust import ThrustLaw
+
+ThrusterType = Literal["azimuth", "fixed", "tunnel", "propeller_rudder"]
+THRUSTER_TYPES: tuple[ThrusterType, ...] = ("azimuth", "fixed", "tunnel", "propeller_rudder")
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Range and rate of one command; None where the file states none."""
+
+    lower: float | None = None
+    upper: float | None = None
+    rate: float | None = None
+
+
+@dataclass(frozen=True)
+class Thruster:
+    """One thruster: where it sits, what moves it, what force it gives.
+
+    Parameters
+    ----------
+    type : {"azimuth", "fixed", "tunnel", "propeller_rudder"}
+    x, y : float
+        Position from the body origin, forward and starboard positive [m].
+    speed : str
+        Log column that holds the propeller speed.
+    angle : str or float
+        Column, or constant, with the direction of the force at positive speed,
+        from bow to starboard [rad].
+    rudder : str
+        Column with the rudder angle, positive turns to starboard [rad].
+    thrust : ThrustLaw
+    speed_limits, angle_limits, rudder_limits : Limits
+    """
+
+    type: ThrusterType
+    x: float
+    y: float
+    speed: str
+    angle: str | float = 0.0
+    rudder: str | None = None
+    thrust: ThrustLaw = ThrustLaw()
+    speed_limits: Limits = Limits()
+    angle_limits: Limits = Limits()
+    rudder_limits: Limits = Limits()
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Log columns that move this thruster."""
+        names = [self.speed]
+        if isinstance(self.angle, str):
+            names.append(self.angle)
+        if self.rudder is not None:
+            names.append(self.rudder)
+        return tuple(names)
+
+
+@dataclass(frozen=True)
+class ColumnMapping:
+    """A log column under another name or unit than the canonical one."""
+
+    name: str
+    unit: str | None
+
+
+@dataclass(frozen=True)
+class Vessel:
+    """A vessel as its TOML file describes it.
+
+    Parameters
+    ----------
+    name : str
+    length : float
+        [m]
+    thrusters : tuple of Thruster
+    columns : mapping of str to ColumnMapping
+        Log column -> canonical name, with unit.
+    sensors : mapping of str to float or tuple
+        Standard deviations and positions of the sensors.
+    closed_loop : pair, optional
+        Log column and its values under which a controller moves the thrusters.
+    mass : float, optional
+        [kg]
+    """
+
+    name: str
+    length: float
+    thrusters: tuple[Thruster, ...]
+    columns: Mapping[str, ColumnMapping] = field(default_factory=dict)
+    sensors: Mapping[str, Any] = field(default_factory=dict)
+    closed_loop: tuple[str, tuple[str, ...]] | None = None
+    mass: float | None = None
+
+    @property
+    def commands(self) -> tuple[str, ...]:
+        """Log columns that move the thrusters, each once."""
+        return tuple(dict.fromkeys(c for t in self.thrusters for c in t.columns))
+
+    @property
+    def angle_commands(self) -> frozenset[str]:
+        """Those of `commands` that are angles [rad]."""
+        names = {t.angle for t in self.thrusters if isinstance(t.angle, str)}
+        return frozenset(names | {t.rudder for t in self.thrusters if t.rudder is not None})
+
+    @property
+    def limits(self) -> dict[str, Limits]:
+        """Limits of each command; of those that share a column, the tightest."""
+        found: dict[str, list[Limits]] = {}
+        for t in self.thrusters:
+            found.setdefault(t.speed, []).append(t.speed_limits)
+            if isinstance(t.angle, str):
+                found.setdefault(t.angle, []).append(t.angle_limits)
+            if t.rudder is not None:
+                found.setdefault(t.rudder, []).append(t.rudder_limits)
+        return {name: _tightest(limits) for name, limits in found.items()}
+
+    def std(self, channel: str) -> float | None:
+        """Return the measurement noise of a channel where the file states it."""
+        key = {"psi": "heading_std"}.get(channel, f"{channel}_std")
+        value = self.sensors.get(key)
+        return None if value is None else float(value)
+
+
+def _tightest(limits: list[Limits]) -> Limits:
+    lower = [x.lower for x in limits if x.lower is not None]
+    upper = [x.upper for x in limits if x.upper is not None]
+    rate = [x.rate for x in limits if x.rate is not None]
+    return Limits(
+        max(lower) if lower else None, min(upper) if upper else None, min(rate) if rate else None
+    )
