@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import ExcitationError, UsageError
+from greybox.estimation.checks import excitation, sign_margins, whiteness
 from greybox.estimation.covariance import (
     CovarianceKind,
     block_bootstrap,
@@ -74,7 +75,9 @@ def estimate_ls(
         tuple(e.phi for e in regression.experiments), tuple(e.keep for e in regression.experiments)
     )
     solutions = _solve(regression, instruments)
-    return _result("ls", regression, instruments, solutions, logs, covariance, seed)
+    return _result(
+        "ls", regression, instruments, solutions, logs, covariance, seed, margins=margins
+    )
 
 
 def estimate_iv(
@@ -198,6 +201,7 @@ def estimate_iv(
         iterations,
         status,
         centred=zero_mean,
+        margins=margins,
     )
 
 
@@ -353,12 +357,20 @@ def _result(
     iterations: int = 0,
     status: str = "solved",
     centred: bool = False,
+    margins: dict[str, float] | None = None,
 ) -> Estimate:
     predictor = regression.predictor
     projected, residuals = _masked(solutions, regression, instruments, centred=centred)
     covariance, lags = _covariance(solutions, regression, projected, residuals, kind, seed)
     kept = sum(int(k.sum()) for k in instruments.keep)
     theta = _coefficients(solutions)
+    states = predictor.structure.states
+    tests = [excitation(predictor, s, x) for s, x in zip(states, solutions, strict=True)]
+    for state, equation in zip(states, residuals, strict=True):
+        rows = [e[k] - e[k].mean() for e, k in zip(equation, instruments.keep, strict=True)]
+        tests.append(whiteness(state, rows, len(predictor.equation(state))))
+    if predictor.structure.disturbance == "marine":
+        tests += sign_margins(logs, states, margins, regression.samples - kept)
     residual_std = np.array(
         [np.sqrt(sum(float(e @ e) for e in equation) / max(kept, 1)) for equation in residuals]
     )
@@ -377,6 +389,7 @@ def _result(
         iterations=iterations,
         status=status,
         current=estimate_current(predictor, theta, covariance),
+        tests=tuple(tests),
         logs=tuple(
             {"name": log.name, "sha256": log.provenance.sha256, "samples": len(log)} for log in logs
         ),

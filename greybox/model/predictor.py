@@ -113,6 +113,16 @@ class Predictor:
         return [i for i, c in enumerate(self.columns) if c.state == state]
 
     @property
+    def constants(self) -> list[int]:
+        """Positions of the columns that never vary."""
+        structure = self.structure
+        return [
+            i
+            for i, c in enumerate(self.columns)
+            if c.name == "1" or (c.terms and not structure.terms[structure.index(c.terms[0])].factors)
+        ]
+
+    @property
     def parameter_columns(self) -> list[int]:
         """Positions of the columns that carry parameters of the structure."""
         return [i for i, c in enumerate(self.columns) if not c.is_bias]
@@ -451,7 +461,7 @@ def build_predictor(
                 merged = columns[same[0]]
                 columns[same[0]] = Column(merged.name, state, (*merged.terms, term.name))
                 continue
-            if not span.add_if_new(own[t]):
+            if term.factors and not span.add_if_new(own[t]):
                 raise StructureError(
                     f"in the regime {dict(regime)} the regressor of {term.name} is a combination "
                     f"of the others in its equation: widen the regime or remove the term."
@@ -492,6 +502,10 @@ def build_predictor(
         if mine:
             basis = np.array(span.values).T
             solution = np.linalg.lstsq(basis, derived_values[mine].T, rcond=None)[0][1:].T
+            # a constant term is no column of the basis, which has the constant already
+            for position, column in enumerate(columns[start:]):
+                if column.terms and not structure.terms[structure.index(column.terms[0])].factors:
+                    solution = np.insert(solution, position, 0.0, axis=1)
             for k, row in zip(mine, solution, strict=True):
                 t, monomial, _ = derived[k]
                 weight = 1.0

@@ -183,12 +183,14 @@ class Structure:
         lines = []
         for state in self.states:
             terms = [
-                f"{t.name}·"
-                + "·".join(
-                    f"|{shown.get(f.signal, f.signal)}|"
-                    if f.modulus
-                    else shown.get(f.signal, f.signal)
-                    for f in t.factors
+                "·".join(
+                    [t.name]
+                    + [
+                        f"|{shown.get(f.signal, f.signal)}|"
+                        if f.modulus
+                        else shown.get(f.signal, f.signal)
+                        for f in t.factors
+                    ]
                 )
                 for t in self.terms
                 if t.state == state

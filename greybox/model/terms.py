@@ -90,7 +90,7 @@ class Term:
         return self.state, tuple(sorted((f.signal, f.modulus) for f in self.factors))
 
     def __str__(self) -> str:
-        return f"{self.name}·" + "·".join(str(f) for f in self.factors)
+        return "·".join([self.name, *map(str, self.factors)])
 
 
 def _term(name: str, equation: str, *factors: str) -> Term:
@@ -136,7 +136,7 @@ def parse_term(name: str) -> Term:
 
     A name of (3.55) such as ``Xvr`` or ``Nmu`` gives that term. Any other is
     spelled by equation and factors: ``N_|r|r``, ``Y_|r|v``, ``X_uuu``,
-    ``Y_race``, ``Y_u*race``. A spelling that equals a term of (3.55) gets its
+    ``Y_race``, ``Y_u*race``; ``X_0`` is a constant force. A spelling that equals a term of (3.55) gets its
     name there (``X_|u|u`` is ``Xuu``).
 
     Raises
@@ -152,6 +152,8 @@ def parse_term(name: str) -> Term:
             f"'{name}' is not a term.{suggestion(name, THESIS_TERMS)} Use a name of (3.55) or "
             f"spell it by equation and factors, such as N_|r|r or X_uuu."
         )
+    if body == "0":
+        return Term(name, EQUATIONS[equation], ())
     factors: list[Factor] = []
     position = 0
     while position < len(body):

@@ -174,7 +174,9 @@ def build_instruments(
             (log["u_q"][:-1], log["v_q"][:-1]) if predictor.air_measured else None,
         )
         if zero_mean:
-            z = z - z[:, keep].mean(axis=1, keepdims=True)
+            # a constant keeps itself as instrument: its equation gives the mean residual
+            varying = np.setdiff1d(np.arange(len(z)), predictor.constants)
+            z[varying] -= z[np.ix_(varying, np.flatnonzero(keep))].mean(axis=1, keepdims=True)
         zs.append(z)
         keeps.append(keep)
     return Instruments(tuple(zs), tuple(keeps))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,7 +27,13 @@ _MIN_SAMPLES = 3
 _JITTER = 0.2
 
 
-def read_log(path: str | Path, vessel: Vessel, *, states: tuple[str, ...] = ()) -> TrialLog:
+def read_log(
+    path: str | Path,
+    vessel: Vessel,
+    *,
+    states: tuple[str, ...] = (),
+    fill: Mapping[str, float] | None = None,
+) -> TrialLog:
     """Read one log file for a vessel.
 
     Parameters
@@ -37,6 +44,9 @@ def read_log(path: str | Path, vessel: Vessel, *, states: tuple[str, ...] = ()) 
         Its ``[columns]`` rename and convert; its thruster columns are required.
     states : tuple of str
         States that must be there or follow from the rest; u, v, r by default.
+    fill : mapping of str to float, optional
+        Constant values of channels that the file may lack, such as the start of
+        a plan that holds commands only.
 
     Returns
     -------
@@ -75,6 +85,8 @@ def read_log(path: str | Path, vessel: Vessel, *, states: tuple[str, ...] = ()) 
     if "V_q" in channels and "gamma_q" in channels and "u_q" not in channels:
         channels["u_q"], channels["v_q"] = relative_wind(channels["V_q"], channels["gamma_q"])
         derived.append("u_q, v_q from V_q, gamma_q (5.41-5.43)")
+    for name, value in (fill or {}).items():
+        channels.setdefault(name, np.full(len(t), float(value)))
     _require(channels, vessel, states or ("u", "v", "r"), path.name, [str(c) for c in table])
     closed, known = np.zeros(len(t), bool), False
     if vessel.closed_loop is not None and vessel.closed_loop[0] in text:

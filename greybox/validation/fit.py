@@ -17,6 +17,8 @@ from greybox.trial.log import TrialLog
 
 Array = NDArray[np.float64]
 
+_HUGE = 1e6
+
 
 def fit_percent(measured: Array, simulated: Array) -> Array:
     """Return 100 (1 − ‖y − ŷ‖ / ‖y − mean y‖) for each column.
@@ -36,6 +38,8 @@ def fit_percent(measured: Array, simulated: Array) -> Array:
     ----------
     Ljungberg (2020), eq. 6.12.
     """
+    # beyond this no simulation is a simulation, and its square overflows
+    simulated = np.clip(np.nan_to_num(simulated, nan=_HUGE), -_HUGE, _HUGE)
     error = np.linalg.norm(measured - simulated, axis=0)
     spread = np.linalg.norm(measured - measured.mean(axis=0), axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -57,7 +61,7 @@ class LogFit:
     psi : ndarray
         (N,) heading of the simulation [rad].
     fit : dict of str to float
-        (6.12) a state [%].
+        (6.12) a state [%]; −inf where the run diverged.
     diverged : int
         First sample outside the bound, −1 if none.
     """
@@ -120,11 +124,13 @@ def run_model(
     )
     states = model.structure.states
     fit = fit_percent(log.states(states), run.x[0])
+    if run.diverged[0] >= 0:
+        fit = np.full(len(states), -np.inf)
     return LogFit(
         log,
         run.x[0],
         run.psi[0],
-        {s: float(f) for s, f in zip(states, np.nan_to_num(fit, nan=-np.inf), strict=True)},
+        {s: float(f) for s, f in zip(states, fit, strict=True)},
         int(run.diverged[0]),
     )
 

@@ -1,0 +1,59 @@
+"""What sub-commands share: logs, progress, the record of a computation."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from greybox.trial.log import TrialLog
+    from greybox.vessel.vessel import Vessel
+
+
+def add_logs(parser: argparse.ArgumentParser) -> None:
+    """Add the log files as positional arguments, and the vessel."""
+    parser.add_argument("logs", nargs="+", metavar="LOG", help="log files, CSV or Parquet")
+    parser.add_argument("--vessel", required=True, metavar="V", help="vessel file (TOML)")
+
+
+def add_seed(parser: argparse.ArgumentParser) -> None:
+    """Add --seed."""
+    parser.add_argument("--seed", type=int, default=0, help="seed of whatever is random (0)")
+
+
+def read_logs(
+    paths: Sequence[str], vessel: Vessel, sample_time: float | None = None
+) -> list[TrialLog]:
+    """Read log files, and decimate them where a sample time is asked for."""
+    from greybox.trial.conditioning import decimate
+    from greybox.trial.reading import read_log
+
+    logs = [read_log(path, vessel) for path in paths]
+    return logs if sample_time is None else [decimate(log, sample_time) for log in logs]
+
+
+def progress(title: str) -> Callable[[int, int], None]:
+    """Return a callback that shows progress on a terminal and is silent elsewhere."""
+    if not sys.stderr.isatty():
+        return lambda done, total: None
+
+    def show(done: int, total: int) -> None:
+        end = "\n" if done >= total else ""
+        sys.stderr.write(f"\r{title}: {done} of {total}{end}")
+        sys.stderr.flush()
+
+    return show
+
+
+def provenance(options: argparse.Namespace) -> dict[str, Any]:
+    """Return how a file was made: version and command, without wall time."""
+    shown = {k: v for k, v in vars(options).items() if k not in ("run",) and v is not None}
+    return {"program": f"greybox-marine {version('greybox-marine')}", "command": shown}
+
+
+def say(text: str) -> None:
+    """Print a result for the user."""
+    sys.stdout.write(text + "\n")

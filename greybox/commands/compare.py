@@ -1,0 +1,55 @@
+"""`greybox compare`: measured against simulated, for models and logs."""
+
+from __future__ import annotations
+
+import argparse
+
+from greybox.commands.common import provenance, say
+
+HELP = "compare free runs of models with logs"
+EXAMPLES = """examples:
+  greybox compare model.json --log trial.csv --report compare.html
+  greybox compare ls.json iv.json --log day2_a.csv day2_b.csv --json result.json
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("models", nargs="+", metavar="MODEL", help="model files")
+    parser.add_argument("--log", nargs="+", required=True, metavar="LOG", help="logs to compare on")
+    parser.add_argument(
+        "--heading", choices=("measured", "simulated"), default="measured", help="heading of the run"
+    )
+    parser.add_argument("--json", metavar="F", help="write the result as JSON; - is stdout")
+    parser.add_argument("--report", metavar="HTML", help="write a page with plots")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Read, run, report."""
+    from pathlib import Path
+
+    from greybox.files import write_json
+    from greybox.model.model import load_model
+    from greybox.trial.reading import read_log
+    from greybox.validation.comparison import compare_models
+
+    models = [load_model(path) for path in options.models]
+    names = [Path(path).stem for path in options.models]
+    if len(set(names)) < len(names):
+        names = list(options.models)
+    logs = [[read_log(path, model.vessel) for path in options.log] for model in models]
+    comparison = compare_models(models, names, logs, heading=options.heading)
+    record = provenance(options) | {
+        "logs": [log.provenance.source + " " + log.provenance.sha256[:12] for log in logs[0]]
+    }
+    if options.json:
+        write_json(comparison.to_dict() | {"provenance": record}, options.json)
+    if options.report:
+        from greybox.report.comparison import comparison_page
+        from greybox.report.page import write_page
+
+        write_page(comparison_page(comparison, models, record), options.report)
+    if options.json != "-":
+        say(comparison.summary())
+        if options.report:
+            say(f"wrote {options.report}")

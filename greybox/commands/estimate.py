@@ -1,0 +1,108 @@
+"""`greybox estimate`: parameters with standard errors, and whether to trust them."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+
+from greybox.commands.common import add_logs, add_seed, provenance, read_logs, say
+
+HELP = "estimate a model from logs"
+EXAMPLES = """examples:
+  greybox estimate trial.csv --vessel ship.toml --out model.json
+  greybox estimate a.csv b.csv --vessel ship.toml --method iv --predictor augmented --out m.json
+  greybox estimate trial.csv --vessel ship.toml --structure 'thesis+N_|r|r-Xkappa' --out m.json
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add_logs(parser)
+    parser.add_argument("--method", choices=("ls", "iv"), help="by default chosen, and said why")
+    parser.add_argument(
+        "--predictor",
+        choices=("basic", "augmented", "wind", "basic+wind"),
+        help="which disturbances are captured or measured; by default chosen",
+    )
+    parser.add_argument(
+        "--structure",
+        metavar="NAME",
+        help="thesis, surge, blanke, modulus, abkowitz; +TERM and -TERM change it (thesis)",
+    )
+    parser.add_argument(
+        "--sample-time", type=float, metavar="S", help="decimate the logs to this sample time [s]"
+    )
+    parser.add_argument(
+        "--margin-u", type=float, metavar="M", help="cut out samples with |u| below M [m/s]"
+    )
+    parser.add_argument(
+        "--margin-v", type=float, metavar="M", help="cut out samples with |v| below M [m/s]"
+    )
+    parser.add_argument(
+        "--heading",
+        choices=("measured", "simulated"),
+        default="measured",
+        help="heading inside the instruments",
+    )
+    parser.add_argument(
+        "--instruments",
+        choices=("zero-mean", "mean-kept"),
+        default="zero-mean",
+        help="zero-mean instruments (IV2, IV3) or with their mean (IV1)",
+    )
+    parser.add_argument(
+        "--loop",
+        choices=("auto", "open", "closed"),
+        default="auto",
+        help="whether a controller moved the thrusters",
+    )
+    parser.add_argument(
+        "--covariance",
+        choices=("ma", "hac", "white", "bootstrap"),
+        help="standard errors: moving average (iv), robust (ls), white, block bootstrap",
+    )
+    parser.add_argument("--mass", type=float, metavar="KG", help="mass, for physical coefficients")
+    parser.add_argument("--out", metavar="MODEL", help="write the model to this JSON file")
+    parser.add_argument("--json", metavar="F", help="write the result as JSON; - is stdout")
+    add_seed(parser)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Read, estimate, report, write."""
+    from greybox.files import write_json
+    from greybox.report.physical import physical_summary
+    from greybox.validation.choose import Request, estimate_model
+    from greybox.vessel.toml import load_vessel
+
+    vessel = load_vessel(options.vessel)
+    logs = read_logs(options.logs, vessel, options.sample_time)
+    margins = {
+        k: v for k, v in (("u", options.margin_u), ("v", options.margin_v)) if v is not None
+    }
+    estimate = estimate_model(
+        logs,
+        Request(
+            method=options.method,
+            predictor=options.predictor,
+            structure=options.structure,
+            margins=margins or None,
+            covariance=options.covariance,
+            heading=options.heading,
+            loop=options.loop,
+            zero_mean=options.instruments == "zero-mean",
+            seed=options.seed,
+        ),
+    )
+    model = estimate.model()
+    model = replace(model, record={**model.record, "provenance": provenance(options)})
+    if options.out:
+        model.save(options.out)
+    if options.json:
+        write_json(model.to_dict(), options.json)
+    if options.json != "-":
+        say(estimate.summary())
+        mass = options.mass if options.mass is not None else vessel.mass
+        if mass is not None:
+            say("\n" + physical_summary(model, mass))
+        if options.out:
+            say(f"\nwrote {options.out}")

@@ -1,0 +1,93 @@
+"""`greybox reproduce`: the studies of the thesis, with tables, figures and a page."""
+
+from __future__ import annotations
+
+import argparse
+
+from greybox.commands.common import add_seed, progress, provenance, say
+
+HELP = "repeat the studies of the thesis"
+EXAMPLES = """examples:
+  greybox reproduce chapter4 --out chapter4
+  greybox reproduce chapter6 --runs 500 --out chapter6
+  greybox reproduce chapter7 --out chapter7
+  greybox reproduce chapter7 --vessel ship.toml --estimate windy*.csv --validate calm*.csv
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("study", choices=("chapter4", "chapter6", "chapter7"))
+    parser.add_argument("--runs", type=int, default=500, metavar="N", help="Monte Carlo runs (500)")
+    parser.add_argument("--out", metavar="DIR", help="folder for tables.csv, figures and the page")
+    parser.add_argument("--estimate", nargs="+", metavar="LOG", help="chapter 7: estimation logs")
+    parser.add_argument("--validate", nargs="+", metavar="LOG", help="chapter 7: validation logs")
+    parser.add_argument("--vessel", metavar="V", help="chapter 7: vessel file of those logs")
+    parser.add_argument(
+        "--sample-time", type=float, metavar="S", help="chapter 7: decimate the logs to this [s]"
+    )
+    parser.add_argument("--structure", metavar="NAME", help="chapter 7: structure (thesis)")
+    parser.add_argument("--workers", type=int, metavar="N", help="processes (one a processor)")
+    add_seed(parser)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Run a study and write what it found."""
+    from greybox.errors import UsageError
+
+    if options.runs < 2:
+        raise UsageError(f"--runs is {options.runs}, a standard deviation needs at least 2 runs.")
+    if options.study != "chapter7" and (options.estimate or options.validate or options.vessel):
+        raise UsageError(
+            f"--estimate, --validate and --vessel belong to chapter7, not to {options.study}."
+        )
+    from greybox.report import studies
+
+    record = provenance(options)
+    if options.study == "chapter4":
+        from greybox.study.chapter4 import reproduce_chapter4
+
+        four = reproduce_chapter4(
+            options.runs, options.seed, workers=options.workers, progress=progress("chapter 4")
+        )
+        output = studies.chapter4_output(four, record)
+    elif options.study == "chapter6":
+        from greybox.study.chapter6 import reproduce_chapter6
+
+        six = reproduce_chapter6(
+            options.runs,
+            options.seed,
+            fit_runs=min(100, options.runs) if options.out else 0,
+            workers=options.workers,
+            progress=progress("chapter 6"),
+        )
+        output = studies.chapter6_output(six, record)
+    else:
+        output = studies.chapter7_output(_chapter7(options), record)
+    say(output.text)
+    if options.out:
+        studies.write_output(output, options.out)
+        say(f"wrote {options.out}/tables.csv, {options.out}/report.html and the figures")
+
+
+def _chapter7(options: argparse.Namespace):  # type: ignore[no-untyped-def]
+    from greybox.commands.common import read_logs
+    from greybox.errors import UsageError
+    from greybox.model.catalogue import get_structure
+    from greybox.study.chapter7 import reproduce_chapter7, virtual_day
+    from greybox.vessel.toml import load_vessel
+
+    given = (options.estimate, options.validate, options.vessel)
+    if any(given) and not all(given):
+        raise UsageError("chapter7 on logs needs --vessel, --estimate and --validate together.")
+    if all(given):
+        vessel = load_vessel(options.vessel)
+        estimation = read_logs(options.estimate, vessel, options.sample_time)
+        validation = read_logs(options.validate, vessel, options.sample_time)
+    else:
+        estimation = virtual_day(options.seed, 10.0, "windy")
+        validation = virtual_day(options.seed + 1000, 2.0, "calm")
+    structure = get_structure(options.structure) if options.structure else None
+    return reproduce_chapter7(
+        estimation, validation, structure=structure, progress=progress("chapter 7")
+    )

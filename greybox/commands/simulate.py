@@ -1,0 +1,83 @@
+"""`greybox simulate`: a free run of a model on the inputs of a log."""
+
+from __future__ import annotations
+
+import argparse
+
+from greybox.commands.common import say
+
+HELP = "run a model freely on the inputs of a log"
+EXAMPLES = """examples:
+  greybox simulate model.json trial.csv --out run.csv
+  greybox simulate model.json plan.csv --start 1.5,1.2,0,0 --heading simulated --out run.csv
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("model", metavar="MODEL", help="model file of greybox estimate")
+    parser.add_argument("log", metavar="LOG", help="log with the vessel's thruster columns")
+    parser.add_argument("--out", required=True, metavar="CSV", help="where to write the run")
+    parser.add_argument(
+        "--heading", choices=("measured", "simulated"), help="measured, where the log has it"
+    )
+    parser.add_argument(
+        "--start",
+        metavar="U,V,R,PSI",
+        help="start of the run where the log holds commands only [m/s, m/s, rad/s, rad]",
+    )
+
+
+def run(options: argparse.Namespace) -> None:
+    """Read, simulate, write."""
+    import numpy as np
+
+    from greybox.errors import UsageError
+    from greybox.files import replacing
+    from greybox.model.model import load_model
+    from greybox.model.simulation import positions
+    from greybox.trial.reading import read_log
+    from greybox.validation.fit import run_model
+
+    model = load_model(options.model)
+    fill: dict[str, float] = {}
+    if options.start is not None:
+        try:
+            values = [float(v) for v in options.start.split(",")]
+        except ValueError:
+            values = []
+        if len(values) != 4:
+            raise UsageError(
+                f"--start is '{options.start}', four numbers are needed: u,v,r,psi such as "
+                f"1.5,1.2,0,0."
+            )
+        fill = dict(zip(("u", "v", "r", "psi"), values, strict=True))
+    log = read_log(options.log, model.vessel, fill=fill)
+    heading = options.heading or ("simulated" if fill else "measured")
+    result = run_model(model, log, heading=heading)
+    if result.diverged >= 0:
+        from greybox.errors import DivergenceError
+
+        raise DivergenceError(
+            f"the free run left its bound at sample {result.diverged} of {len(result.log)}: "
+            f"this model cannot be simulated on '{log.name}'. Estimate a smaller structure."
+        )
+    states = model.structure.states
+    columns = {"t": result.log.t} | {s: result.x[:, i] for i, s in enumerate(states)}
+    columns["psi"] = result.psi
+    if "u" in states and "v" in states:
+        start = (
+            np.array([result.log["x_n"][0], result.log["y_n"][0]])
+            if "x_n" in result.log and "y_n" in result.log
+            else np.zeros(2)
+        )
+        track = positions(result.x, result.psi, model.sample_time, start)
+        columns |= {"x_n": track[:, 0], "y_n": track[:, 1]}
+    with replacing(options.out) as handle:
+        handle.write(",".join(columns) + "\n")
+        for row in zip(*columns.values(), strict=True):
+            handle.write(",".join(f"{value:.9g}" for value in row) + "\n")
+    shown = ", ".join(f"{k} {v:.1f} %" for k, v in result.fit.items())
+    if not fill:
+        say(f"free run of {len(result.log)} samples, fit {shown}")
+    say(f"wrote {options.out}")

@@ -1,0 +1,93 @@
+"""The page of `greybox compare`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from greybox.model.model import ManoeuvringModel
+from greybox.report.figures import comparison_figure, to_svg
+from greybox.report.page import Page, Picture, Table, flatten
+from greybox.validation.comparison import Comparison
+
+_NAMES = {"u": "surge", "v": "sway", "r": "yaw rate"}
+
+
+def headline(comparison: Comparison) -> str:
+    """Return one sentence on which model fits best and how well."""
+    fits = comparison.fits()
+    means = [float(np.mean([max(v, -1000.0) for v in fit.values()])) for fit in fits]
+    best = int(np.argmax(means))
+    shown = ", ".join(f"{_NAMES.get(s, s)} {v:.0f} %" for s, v in fits[best].items())
+    count = len(comparison.runs[0])
+    logs = f"{count} log" + ("s" if count > 1 else "")
+    if len(fits) == 1:
+        return f"The free run of {comparison.names[0]} explains of {logs}: {shown} (fit, 100 is perfect)."
+    return f"{comparison.names[best]} fits best on {logs}: {shown} (fit of the free run, 100 is perfect)."
+
+
+def comparison_page(
+    comparison: Comparison, models: Sequence[ManoeuvringModel], record: dict[str, Any]
+) -> Page:
+    """Return the page: one picture a log, the fits, errors ahead, sign tests, equations."""
+    states = list(comparison.runs[0][0].fit)
+    pictures = []
+    for i, first in enumerate(comparison.runs[0]):
+        runs = [row[i] for row in comparison.runs]
+        caption = (
+            f"Free run on {first.log.name} ({len(first.log)} samples of "
+            f"{first.log.sample_time:g} s): measured, simulated, and their difference below."
+        )
+        figure = comparison_figure(comparison.names, runs)
+        pictures.append(Picture(to_svg(figure, f"log{i}{first.log.name}"), caption))
+    fit_rows, ahead_rows = [], []
+    for name, row, errors, aheads in zip(
+        comparison.names, comparison.runs, comparison.rmse, comparison.ahead, strict=True
+    ):
+        for run, rmse, ahead in zip(row, errors, aheads, strict=True):
+            fit_rows.append(
+                [name, run.log.name]
+                + [f"{run.fit[s]:.1f}" if run.fit[s] > -1e4 else "diverged" for s in states]
+                + [f"{rmse[s]:.3g}" for s in states]
+            )
+            for horizon, value in ahead.items():
+                ahead_rows.append(
+                    [name, run.log.name, horizon] + [f"{value[s]:.3g}" for s in states]
+                )
+    tables = [
+        Table(
+            "Fit (6.12) of the free run [%] and root mean square error [m/s, rad/s]",
+            ["model", "log", *[f"fit {s}" for s in states], *[f"rmse {s}" for s in states]],
+            fit_rows,
+        ),
+        Table(
+            "Root mean square error some seconds ahead of measured states [m/s, rad/s]",
+            ["model", "log", "ahead [s]", *states],
+            ahead_rows,
+        ),
+    ]
+    if comparison.sign_tests:
+        tables.append(
+            Table(
+                "Sign test: logs on which a model fits better than the first",
+                ["model", "against", "state", "wins", "p-value (two-sided)"],
+                [
+                    [t.model, t.against, t.state, f"{t.wins}/{t.of}", f"{t.p_value:.2g}"]
+                    for t in comparison.sign_tests
+                ],
+            )
+        )
+    return Page(
+        title="Measured against simulated",
+        headline=headline(comparison),
+        sentences=[t.sentence for t in comparison.sign_tests],
+        pictures=pictures,
+        tables=tables,
+        texts=[
+            (f"Model {name}", model.summary())
+            for name, model in zip(comparison.names, models, strict=True)
+        ],
+        computed=flatten(record) | {"start": "mean of the log's first 5 samples"},
+    )

@@ -1,0 +1,237 @@
+"""Figures as Matplotlib objects; nothing here opens a window."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from greybox.validation.fit import LogFit
+
+Array = NDArray[np.float64]
+
+# Okabe and Ito (2008): told apart by readers with any colour vision
+BLACK, ORANGE, SKY, GREEN, BLUE, VERMILION, PURPLE = (
+    "#000000", "#E69F00", "#56B4E9", "#009E73", "#0072B2", "#D55E00", "#CC79A7",
+)  # fmt: skip
+COLOURS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY)
+STYLES = ("-", "--", "-.", ":")
+LABELS = {
+    "u": "surge u [m/s]",
+    "v": "sway v [m/s]",
+    "r": "yaw rate r [rad/s]",
+    "psi": "heading ψ [rad]",
+    "u_q": "u_q [m/s]",
+    "v_q": "v_q [m/s]",
+}
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """Return an empty figure of a size in inches, laid out without overlaps."""
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def tidy(axes: Any) -> None:
+    """Apply the common look to one pair of axes."""
+    axes.grid(True, alpha=0.25, linewidth=0.6)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+
+
+def comparison_figure(names: Sequence[str], runs: Sequence[LogFit]) -> Figure:
+    """Draw measured against simulated states, with residuals and the track.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Of the models.
+    runs : sequence of LogFit
+        One a model, all of one log.
+    """
+    log = runs[0].log
+    states = list(runs[0].fit)
+    figure = new_figure(11, 2.4 * len(states) + 0.6)
+    grid = figure.add_gridspec(2 * len(states), 2, width_ratios=[3.2, 1.3])
+    t = log.t - log.t[0]
+    first: Any = None
+    for i, state in enumerate(states):
+        top = figure.add_subplot(grid[2 * i, 0], sharex=first)
+        first = first or top
+        below = figure.add_subplot(grid[2 * i + 1, 0], sharex=first)
+        measured = log[state]
+        top.plot(t, measured, color=BLACK, linewidth=1.0, label="measured")
+        spread = float(np.ptp(measured)) or 1.0
+        low, high = measured.min() - 0.6 * spread, measured.max() + 0.6 * spread
+        for j, (name, run) in enumerate(zip(names, runs, strict=True)):
+            x = np.where(np.isfinite(run.x[:, i]), run.x[:, i], np.nan)
+            style = {"color": COLOURS[j % 6], "linestyle": STYLES[j % 4], "linewidth": 1.3}
+            shown = f"{run.fit[state]:.1f} %" if run.fit[state] > -1000 else "diverged"
+            top.plot(t, np.clip(x, low, high), label=f"{name}: fit {shown}", **style)
+            error = measured - x
+            below.plot(t, np.clip(error, -spread, spread), **style)
+        below.axhline(0, color=BLACK, linewidth=0.6)
+        top.set_ylabel(LABELS.get(state, state), fontsize=9)
+        below.set_ylabel("measured −\nsimulated", fontsize=8)
+        top.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+        tidy(top)
+        tidy(below)
+        top.tick_params(labelbottom=False)
+        below.tick_params(labelbottom=i == len(states) - 1)
+        if i == len(states) - 1:
+            below.set_xlabel("time [s]")
+    figure.suptitle(f"Free run on {log.name}", fontsize=11)
+    return figure
+
+
+def fit_figure(
+    lengths: Sequence[int], fits: dict[str, Array], states: Sequence[str], title: str
+) -> Figure:
+    """Draw fit against log length for several estimators (Figures 6.2, 6.3).
+
+    Parameters
+    ----------
+    lengths : sequence of int
+    fits : dict of str to ndarray
+        estimator -> (lengths, runs, states) [%].
+    """
+    figure = new_figure(10, 3.4)
+    axes = figure.subplots(1, len(states), sharey=True)
+    for i, state in enumerate(states):
+        for j, (name, value) in enumerate(fits.items()):
+            part = np.maximum(value[:, :, i], -1e3)
+            mean, sd = part.mean(axis=1), part.std(axis=1)
+            shift = (j - len(fits) / 2) * 25
+            axes[i].errorbar(
+                np.asarray(lengths) + shift,
+                np.where(mean > -20, mean, np.nan),
+                yerr=np.where(mean > -20, sd, np.nan),
+                color=COLOURS[j % 6],
+                linestyle=STYLES[j % 4],
+                marker="v",
+                markersize=4,
+                capsize=2,
+                linewidth=1.1,
+                label=name,
+            )
+        axes[i].set_title(LABELS.get(state, state).split(" [")[0], fontsize=10)
+        axes[i].set_xlabel("N [samples]")
+        axes[i].set_ylim(0, 105)
+        tidy(axes[i])
+    axes[0].set_ylabel("fit (6.12) [%]")
+    figure.legend(
+        *axes[0].get_legend_handles_labels(), loc="outside right center", fontsize=8, frameon=False
+    )
+    figure.suptitle(title, fontsize=11)
+    return figure
+
+
+def error_histograms(errors: dict[str, Array], names: Sequence[str], title: str) -> Figure:
+    """Draw histograms of normalised errors, one row an estimator (Figures 4.1-4.11).
+
+    Parameters
+    ----------
+    errors : dict of str to ndarray
+        estimator -> (runs, parameters).
+    """
+    figure = new_figure(7.5, 1.7 * len(errors) + 0.5)
+    axes = figure.subplots(len(errors), len(names), sharex="col", squeeze=False)
+    for i, (estimator, value) in enumerate(errors.items()):
+        for j, name in enumerate(names):
+            ax = axes[i, j]
+            ax.hist(value[:, j], bins=30, color=COLOURS[i % 6], alpha=0.85)
+            ax.axvline(0, color=BLACK, linewidth=1)
+            ax.set_title(
+                f"{estimator}: {value[:, j].mean():.4f} ± {value[:, j].std(ddof=1):.4f}",
+                fontsize=9,
+            )
+            tidy(ax)
+            if i == len(errors) - 1:
+                ax.set_xlabel(f"({name} estimate − true) / |true|")
+    for row in axes:
+        row[0].set_ylabel("runs")
+    figure.suptitle(title, fontsize=11)
+    return figure
+
+
+def bias_figure(rows: Sequence[Any], title: str) -> Figure:
+    """Draw mean ± sd of each parameter against the published mean ± sd.
+
+    Parameters
+    ----------
+    rows : sequence of greybox.study.tables.Row
+        Of one estimator.
+    """
+    figure = new_figure(9, 2.6)
+    ax = figure.subplots()
+    position = np.arange(len(rows))
+    scale = np.array([max(r.published_sd or r.sd, 1e-12) for r in rows])
+    for shift, colour, label, mean, sd in (
+        (-0.12, BLUE, "this study", [r.mean for r in rows], [r.sd for r in rows]),
+        (
+            0.12,
+            VERMILION,
+            "published",
+            [r.published_mean if r.published_mean is not None else np.nan for r in rows],
+            [r.published_sd if r.published_sd is not None else np.nan for r in rows],
+        ),
+    ):
+        ax.errorbar(
+            position + shift,
+            np.array(mean) / scale,
+            yerr=np.array(sd) / scale,
+            fmt="o" if colour == BLUE else "s",
+            markersize=4,
+            capsize=3,
+            color=colour,
+            label=label,
+        )
+    ax.set_yscale("symlog", linthresh=3)
+    ax.axhline(0, color=BLACK, linewidth=0.8)
+    ax.set_xticks(position, [r.parameter for r in rows], rotation=40, ha="right", fontsize=8)
+    ax.set_ylabel("error / published sd")
+    ax.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+    tidy(ax)
+    ax.set_title(title, fontsize=10)
+    return figure
+
+
+def overview_figure(signals: dict[str, Array], title: str, sample_time: float = 1.0) -> Figure:
+    """Draw signals of one log under one another (Figure 6.1)."""
+    figure = new_figure(9, 1.25 * len(signals) + 0.6)
+    axes = figure.subplots(len(signals), 1, sharex=True, squeeze=False)[:, 0]
+    for ax, (name, value) in zip(axes, signals.items(), strict=True):
+        ax.plot(np.arange(len(value)) * sample_time, value, color=BLUE, linewidth=0.7)
+        ax.set_ylabel(LABELS.get(name, name), fontsize=8)
+        tidy(ax)
+    axes[-1].set_xlabel("time [s]")
+    figure.suptitle(title, fontsize=11)
+    return figure
+
+
+def to_svg(figure: Figure, title: str) -> str:
+    """Return a figure as an SVG element for a page, with a title for screen readers."""
+    import matplotlib as mpl
+
+    out = io.StringIO()
+    with mpl.rc_context({"svg.fonttype": "path", "svg.hashsalt": title}):
+        figure.savefig(out, format="svg", metadata={"Date": None, "Creator": None})
+    text = out.getvalue()
+    text = text[text.index("<svg") :]
+    # identifiers are local to a page with many figures
+    prefix = re.sub(r"\W", "", title)[:24]
+    text = re.sub(r'\bid="([^"]+)"', rf'id="{prefix}-\1"', text)
+    text = re.sub(r'(xlink:href="#|url\(#)', rf"\g<1>{prefix}-", text)
+    return text
+
+
+def save_png(figure: Figure, path: str) -> None:
+    """Write a figure as PNG, replacing the file in one step."""
+    from greybox.files import replacing
+
+    with replacing(path, "wb") as handle:
+        figure.savefig(handle, format="png", dpi=130)

@@ -1,0 +1,117 @@
+"""One self-contained HTML page: a headline, pictures, tables, how it was computed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from greybox.files import write_text
+
+
+@dataclass(frozen=True)
+class Picture:
+    """An SVG with the text that stands for it."""
+
+    svg: str
+    caption: str
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of already formatted cells."""
+
+    caption: str
+    header: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+
+@dataclass(frozen=True)
+class Page:
+    """What a page shows, in its order."""
+
+    title: str
+    headline: str
+    sentences: Sequence[str] = ()
+    pictures: Sequence[Picture] = ()
+    tables: Sequence[Table] = ()
+    texts: Sequence[tuple[str, str]] = ()
+    computed: dict[str, Any] = field(default_factory=dict)
+
+
+_TEMPLATE = """<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{{ page.title }}</title>
+<style>
+:root { color-scheme: light; }
+body { font: 16px/1.5 system-ui, sans-serif; margin: 0 auto; padding: 1rem; max-width: 70rem;
+       color: #1a1a1a; background: #fff; }
+h1 { font-size: 1.5rem; line-height: 1.25; margin: 0.5rem 0; }
+h2 { font-size: 1.15rem; margin: 1.6rem 0 0.4rem; }
+.headline { font-size: 1.15rem; border-left: 4px solid #0072B2; padding-left: 0.8rem; }
+figure { margin: 1rem 0; }
+figure svg { width: 100%; height: auto; }
+figcaption { font-size: 0.9rem; color: #444; }
+.wide { overflow-x: auto; }
+table { border-collapse: collapse; font-size: 0.9rem; font-variant-numeric: tabular-nums; }
+th, td { padding: 0.2rem 0.6rem; border-bottom: 1px solid #ddd; text-align: right;
+         white-space: nowrap; }
+th:first-child, td:first-child { text-align: left; }
+caption { text-align: left; font-weight: 600; padding: 0.3rem 0; }
+pre { font-size: 0.8rem; overflow-x: auto; background: #f6f6f6; padding: 0.6rem; }
+@media print { body { max-width: none; font-size: 11px; } figure { break-inside: avoid; } }
+</style>
+</head>
+<body>
+<h1>{{ page.title }}</h1>
+<p class="headline">{{ page.headline }}</p>
+{% for sentence in page.sentences %}<p>{{ sentence }}</p>
+{% endfor %}
+{% for picture in page.pictures %}<figure role="group" aria-label="{{ picture.caption }}">
+{{ picture.svg | safe }}
+<figcaption>{{ picture.caption }}</figcaption></figure>
+{% endfor %}
+{% for table in page.tables %}<div class="wide"><table><caption>{{ table.caption }}</caption>
+<thead><tr>{% for cell in table.header %}<th scope="col">{{ cell }}</th>{% endfor %}</tr></thead>
+<tbody>{% for row in table.rows %}<tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}</tr>
+{% endfor %}</tbody></table></div>
+{% endfor %}
+{% for heading, text in page.texts %}<h2>{{ heading }}</h2><pre>{{ text }}</pre>
+{% endfor %}
+<h2>How this was computed</h2>
+<div class="wide"><table><tbody>
+{% for key, value in page.computed.items() %}<tr><td>{{ key }}</td><td>{{ value }}</td></tr>
+{% endfor %}</tbody></table></div>
+</body>
+</html>
+"""
+
+
+def render(page: Page) -> str:
+    """Return the page as HTML; every value from a log is escaped."""
+    from jinja2 import Environment
+
+    template = Environment(autoescape=True, trim_blocks=True).from_string(_TEMPLATE)
+    return template.render(page=page)
+
+
+def write_page(page: Page, path: str | Path) -> None:
+    """Write the page, replacing the file in one step."""
+    write_text(render(page), path)
+
+
+def flatten(record: dict[str, Any]) -> dict[str, str]:
+    """Return a record of a computation as rows of text."""
+    rows: dict[str, str] = {}
+    for key, value in record.items():
+        if isinstance(value, dict):
+            rows |= {f"{key} {k}": v for k, v in flatten(value).items()}
+        elif isinstance(value, (list, tuple)):
+            rows[key] = ", ".join(str(v) for v in value)
+        else:
+            rows[key] = str(value)
+    return rows

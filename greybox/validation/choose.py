@@ -1,0 +1,305 @@
+"""Choosing method and predictor when the user does not, and saying why."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from greybox.errors import ExcitationError, GreyboxError, LogError
+from greybox.estimation.estimate import Covariance, estimate_iv, estimate_ls
+from greybox.estimation.loop import CLOSED_LOOP_LAG, Loop, assess_loop
+from greybox.estimation.result import Estimate
+from greybox.model.catalogue import for_inputs, get_structure
+from greybox.model.predictor import Predictor, Regime, build_predictor
+from greybox.model.structure import Structure
+from greybox.regression.regression import common_sample_time
+from greybox.trial.log import TrialLog
+from greybox.validation.fit import average_fit, run_model
+from greybox.vessel.force import force_inputs
+
+# heading range that current north and east need to be told apart; least and advised [rad]
+LEAST_HEADING, ADVISED_HEADING = np.deg2rad(20), np.deg2rad(90)
+# held-out share of each log when alternatives are compared
+_HELD_OUT = 1 / 3
+# points of fit that a simpler or less robust alternative must gain to be preferred
+_PREFERENCE = 3.0
+# share of samples that must meet a sign condition
+_KEPT = 0.9
+
+
+@dataclass(frozen=True)
+class Request:
+    """What to estimate; None leaves the choice to the data.
+
+    ``margins`` are |u|, |v| [m/s] below which samples are cut out.
+    """
+
+    method: str | None = None
+    predictor: str | None = None
+    structure: str | None = None
+    margins: dict[str, float] | None = None
+    covariance: Covariance | None = None
+    heading: str = "measured"
+    loop: Loop = "auto"
+    zero_mean: bool = True
+    seed: int = 0
+
+
+def heading_range(logs: Sequence[TrialLog]) -> float:
+    """Return the range that the heading covers over all logs, at most a full turn [rad]."""
+    psi = np.concatenate([log["psi"] for log in logs])
+    return float(min(psi.max() - psi.min(), 2 * np.pi))
+
+
+def regime_of(logs: Sequence[TrialLog], structure: Structure) -> Regime:
+    """Return the signs that each state takes, samples within its noise apart."""
+    regime = []
+    for state in structure.states:
+        value = np.concatenate([log[state] for log in logs])
+        noise = 3 * (logs[0].vessel.std(state) or 0.0)
+        signs = tuple(
+            s for s in (1, -1) if float((s * value > noise).mean()) > 0.01 or len(value) == 0
+        )
+        regime.append((state, signs or (1, -1)))
+    return tuple(regime)
+
+
+def require_informative(logs: Sequence[TrialLog], predictor: str) -> None:
+    """Refuse logs that cannot answer, before any algebra does so obscurely.
+
+    Raises
+    ------
+    ExcitationError
+        No thruster command changes, or the heading does not for a predictor
+        that must tell current north from east.
+    """
+    commands = logs[0].vessel.commands
+    moved = {
+        c: max(float(np.ptp(log[c])) for log in logs)
+        + float(np.ptp([float(log[c][0]) for log in logs]))
+        for c in commands
+    }
+    if all(v == 0.0 for v in moved.values()):
+        raise ExcitationError(
+            f"every thruster command is constant over the log ({', '.join(commands)}), so its "
+            f"effect cannot be told from a constant: change the commands during the trial."
+        )
+    if predictor in ("augmented", "wind"):
+        turned = heading_range(logs)
+        if turned < LEAST_HEADING:
+            raise ExcitationError(
+                f"heading stays within {np.degrees(turned):.0f} deg, so current_north and "
+                f"current_east cannot be told apart (needs about "
+                f"{np.degrees(ADVISED_HEADING):.0f} deg). Turn during the trial, or use "
+                f"--predictor {'basic' if predictor == 'augmented' else 'basic+wind'}."
+            )
+
+
+def _predictor(structure: Structure, kind: str, logs: Sequence[TrialLog], ls: bool) -> Predictor:
+    return build_predictor(
+        structure,
+        kind,
+        regime_of(logs, structure),
+        intercept=ls and kind in ("augmented", "wind"),
+    )
+
+
+def estimate_once(
+    logs: Sequence[TrialLog], structure: Structure, method: str, kind: str, request: Request
+) -> Estimate:
+    """Estimate with one method and predictor.
+
+    Raises
+    ------
+    ExcitationError
+        The logs cannot determine the parameters.
+    LogError
+        A channel is missing.
+    """
+    require_informative(logs, kind)
+    closed, loop_test = assess_loop(logs, request.loop)
+    common: dict[str, Any] = {"margins": request.margins, "seed": request.seed}
+    if request.covariance is not None:
+        common["covariance"] = request.covariance
+    keep_constant = method == "ls" or not request.zero_mean
+    predictor = _predictor(structure, kind, logs, keep_constant)
+    if method == "ls":
+        estimate = estimate_ls(predictor, logs, **common)
+    else:
+        estimate = estimate_iv(
+            predictor,
+            logs,
+            zero_mean=request.zero_mean,
+            heading=request.heading,
+            lag=CLOSED_LOOP_LAG if closed else 0,
+            **common,
+        )
+    return replace(estimate, tests=(*estimate.tests, loop_test))
+
+
+def estimate_model(logs: Sequence[TrialLog], request: Request = Request()) -> Estimate:
+    """Estimate a model, choosing what the request leaves open.
+
+    Parameters
+    ----------
+    logs : sequence of TrialLog
+        One experiment each, of one vessel and sample time.
+    request : Request
+
+    Returns
+    -------
+    Estimate
+        With its free-run fit on `logs` and notes on every choice.
+
+    Raises
+    ------
+    ExcitationError
+        No alternative can be estimated.
+    LogError
+        Logs differ in sample time, or lack a channel.
+    """
+    common_sample_time(logs)
+    notes = []
+    structure = for_inputs(
+        get_structure(request.structure or "thesis"), force_inputs(logs[0].vessel)
+    )
+    if request.structure is None:
+        notes.append(
+            f"structure 'thesis' (3.51) was taken, with the {len(structure.terms)} terms that "
+            f"the thrusters of this vessel can excite."
+        )
+    wind = all(log.has_wind for log in logs)
+    methods = [request.method] if request.method else ["iv", "ls"]
+    kinds = [request.predictor] if request.predictor else _plausible(logs, structure, wind, notes)
+    for kind in kinds:
+        if kind in ("wind", "basic+wind") and not wind:
+            lacking = next(log.name for log in logs if not log.has_wind)
+            raise LogError(
+                f"predictor '{kind}' needs the wind, and '{lacking}' has neither u_q, v_q nor "
+                f"V_q, gamma_q: use --predictor augmented or basic."
+            )
+    pairs = [(m, k) for m in methods for k in kinds]
+    if len(pairs) > 1:
+        theory = _theory(logs, structure, wind)
+        if theory is not None and ("iv", theory) in pairs:
+            notes.append(
+                f"iv with predictor '{theory}' was taken: heading turns enough and the states "
+                f"keep their signs, so its estimates are consistent (chapter 5)."
+            )
+            pairs = [("iv", theory), *[p for p in pairs if p != ("iv", theory)]]
+        else:
+            pairs = _compare(logs, structure, pairs, request, notes)
+    failures: list[GreyboxError] = []
+    for method, kind in pairs:
+        try:
+            estimate = estimate_once(logs, structure, method, kind, request)
+        except GreyboxError as error:
+            failures.append(error)
+            continue
+        model = estimate.model()
+        runs = [run_model(model, log) for log in logs]
+        if any(r.diverged >= 0 for r in runs) and len(failures) + 1 < len(pairs):
+            failures.append(ExcitationError("its free run diverges"))
+            notes.append(f"{method} with predictor '{kind}' was left: its free run diverges.")
+            continue
+        if any(r.diverged >= 0 for r in runs):
+            notes.append(
+                "the free run of this model diverges on the estimation logs: do not simulate "
+                "with it. Use a smaller structure or a longer, more exciting log."
+            )
+        if estimate.method == "iv":
+            notes.append(f"instruments: {estimate.status}.")
+        if estimate.predictor.contaminated:
+            notes.append(
+                f"{', '.join(estimate.predictor.contaminated)} also carry a second moment of the "
+                f"current, which this structure cannot separate."
+            )
+        return replace(estimate, notes=(*notes, *estimate.notes), fit=average_fit(runs))
+    raise failures[0]
+
+
+def _plausible(
+    logs: Sequence[TrialLog], structure: Structure, wind: bool, notes: list[str]
+) -> list[str]:
+    """Return the predictors that the logs can support."""
+    turned = heading_range(logs)
+    rows = sum(len(log) for log in logs)
+    measured = wind and structure.uses_air
+    kinds = ["basic+wind"] if measured else ["basic"]
+    most = 20 * 16
+    if turned >= ADVISED_HEADING and rows >= most:
+        kinds = ["wind", "augmented", *kinds] if measured else ["augmented", *kinds]
+    else:
+        notes.append(
+            f"bias-capturing terms were left out: heading covers {np.degrees(turned):.0f} deg "
+            f"(about {np.degrees(ADVISED_HEADING):.0f} are needed) on {rows} samples "
+            f"(about {most})."
+        )
+    return kinds
+
+
+def _theory(logs: Sequence[TrialLog], structure: Structure, wind: bool) -> str | None:
+    """Return the predictor whose consistency conditions the logs meet, if one does.
+
+    Without wind measurement u_r, u_q and u share a sign, likewise in sway (5.7),
+    (5.68); with it only u_r and v_r must keep theirs (5.50), (5.77).
+    """
+    if structure.disturbance != "marine":
+        return None
+    for log in logs:
+        for state in set(structure.states) & {"u", "v"}:
+            margin = 3 * (log.vessel.std(state) or 0.0)
+            sign = np.sign(np.median(log[state]))
+            if float((sign * log[state] > margin).mean()) < _KEPT:
+                return None
+    if not (wind and structure.uses_air):
+        return "augmented"
+    same = all(
+        float((log[air] * log[state] > 0).mean()) >= _KEPT
+        for log in logs
+        for state, air in (("u", "u_q"), ("v", "v_q"))
+        if state in structure.states
+    )
+    return "augmented" if same else "wind"
+
+
+def _compare(
+    logs: Sequence[TrialLog],
+    structure: Structure,
+    pairs: list[tuple[str, str]],
+    request: Request,
+    notes: list[str],
+) -> list[tuple[str, str]]:
+    """Order the alternatives by the held-out free run, the more robust ones preferred."""
+    fitting, held = [], []
+    for log in logs:
+        cut = len(log) - int(len(log) * _HELD_OUT)
+        fitting.append(log.window(0, cut, log.name))
+        held.append(log.window(cut, len(log), log.name))
+    scores: list[float] = []
+    for rank, (method, kind) in enumerate(pairs):
+        try:
+            model = estimate_once(fitting, structure, method, kind, request).model()
+            runs = [run_model(model, log) for log in held]
+            value = average_fit(runs)
+            score = float(np.mean([max(v, -100.0) for v in value.values()]))
+            if any(r.diverged >= 0 for r in runs):
+                score = -np.inf
+        except GreyboxError:
+            score = -np.inf
+        scores.append(score - _PREFERENCE * rank)
+    order = sorted(range(len(pairs)), key=lambda i: -scores[i])
+    shown = ", ".join(
+        f"{pairs[i][0]} {pairs[i][1]} "
+        + (f"{scores[i] + _PREFERENCE * i:.1f}" if np.isfinite(scores[i]) else "diverged")
+        for i in order
+    )
+    notes.append(
+        f"chosen by the free run on the last third of each log when estimated on the first two "
+        f"(mean fit in %, cut at −100): {shown}; ties within {_PREFERENCE:g} points go to the "
+        f"method that noise biases less."
+    )
+    return [pairs[i] for i in order]

@@ -1,0 +1,261 @@
+"""Several models on several logs: fit, error in units, errors ahead, sign tests."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.model.model import ManoeuvringModel
+from greybox.model.simulation import simulate
+from greybox.regression.instruments import state_bound
+from greybox.trial.log import TrialLog
+from greybox.validation.fit import LogFit, run_model
+
+Array = NDArray[np.float64]
+
+HORIZONS = (10.0, 30.0, 60.0)
+_MOST_STARTS = 300
+
+
+@dataclass(frozen=True)
+class SignTest:
+    """How often one model fits better than another (Tables 7.2, 7.6).
+
+    ``p_value`` is two-sided under the null that either is better with equal
+    chance; logs of one trial are related, so it is a lower bound.
+    """
+
+    model: str
+    against: str
+    state: str
+    wins: int
+    of: int
+    p_value: float
+
+    @property
+    def sentence(self) -> str:
+        """The result in words."""
+        return (
+            f"{self.model} fits {self.state} better than {self.against} in {self.wins} of "
+            f"{self.of} (p = {self.p_value:.2g})."
+        )
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Models (rows) on logs (columns).
+
+    Parameters
+    ----------
+    names : tuple of str
+        Of the models.
+    runs : tuple of tuple of LogFit
+        One row a model, one column a log.
+    rmse : tuple of tuple of dict
+        Root mean square error of the free run, state -> [m/s, rad/s].
+    ahead : tuple of tuple of dict
+        Horizon [s] -> state -> root mean square error of runs that start from
+        the measured state.
+    sign_tests : tuple of SignTest
+        Each model against the first, over the logs.
+    """
+
+    names: tuple[str, ...]
+    runs: tuple[tuple[LogFit, ...], ...]
+    rmse: tuple[tuple[dict[str, float], ...], ...]
+    ahead: tuple[tuple[dict[str, dict[str, float]], ...], ...]
+    sign_tests: tuple[SignTest, ...]
+
+    def fits(self) -> list[dict[str, float]]:
+        """Return the mean fit a model [%]."""
+        return [
+            {s: float(np.mean([r.fit[s] for r in row])) for s in row[0].fit} for row in self.runs
+        ]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the comparison for JSON."""
+        return {
+            "models": [
+                {
+                    "model": name,
+                    "fit": fit,
+                    "logs": [
+                        {
+                            "log": run.log.name,
+                            "samples": len(run.log),
+                            "fit": run.fit,
+                            "rmse": rmse,
+                            "ahead": ahead,
+                            "diverged_at_sample": run.diverged if run.diverged >= 0 else None,
+                        }
+                        for run, rmse, ahead in zip(row, errors, aheads, strict=True)
+                    ],
+                }
+                for name, fit, row, errors, aheads in zip(
+                    self.names, self.fits(), self.runs, self.rmse, self.ahead, strict=True
+                )
+            ],
+            "sign_test": [
+                {
+                    "model": t.model,
+                    "against": t.against,
+                    "state": t.state,
+                    "wins": t.wins,
+                    "of": t.of,
+                    "p_value": t.p_value,
+                    "sentence": t.sentence,
+                }
+                for t in self.sign_tests
+            ],
+            "start": "mean of the log's first 5 samples",
+        }
+
+    def summary(self) -> str:
+        """Return the tables as text."""
+        states = list(self.runs[0][0].fit)
+        lines = [
+            f"{'model':<24}{'log':<26}" + "".join(f"{'fit ' + s + ' [%]':>12}" for s in states)
+            + "".join(f"{'rmse ' + s:>11}" for s in states)
+        ]
+        for name, row, errors in zip(self.names, self.runs, self.rmse, strict=True):
+            for run, rmse in zip(row, errors, strict=True):
+                lines.append(
+                    f"{name[:23]:<24}{run.log.name[:25]:<26}"
+                    + "".join(f"{run.fit[s]:>12.1f}" for s in states)
+                    + "".join(f"{rmse[s]:>11.3g}" for s in states)
+                    + (f"  diverged at sample {run.diverged}" if run.diverged >= 0 else "")
+                )
+            if len(row) > 1:
+                mean = {s: float(np.mean([r.fit[s] for r in row])) for s in states}
+                lines.append(
+                    f"{name[:23]:<24}{'mean':<26}" + "".join(f"{mean[s]:>12.1f}" for s in states)
+                )
+        for name, row in zip(self.names, self.ahead, strict=True):
+            for horizon in row[0]:
+                shown = ", ".join(
+                    f"{s} {np.sqrt(np.mean([a[horizon][s] ** 2 for a in row if horizon in a])):.3g}"
+                    for s in states
+                )
+                lines.append(f"{name[:23]:<24}{horizon} s ahead, rms error: {shown}")
+        lines += [t.sentence for t in self.sign_tests]
+        return "\n".join(lines)
+
+
+def sign_test(
+    name: str, against: str, state: str, first: Sequence[float], second: Sequence[float]
+) -> SignTest:
+    """Count how often the second series of fits exceeds the first, with its p-value."""
+    from scipy.stats import binomtest
+
+    wins = sum(b > a for a, b in zip(first, second, strict=True))
+    ties = sum(b == a for a, b in zip(first, second, strict=True))
+    count = len(first) - ties
+    p = float(binomtest(wins, count).pvalue) if count else 1.0
+    return SignTest(name, against, state, wins, count, p)
+
+
+def errors_ahead(
+    model: ManoeuvringModel,
+    run: LogFit,
+    heading: Literal["measured", "simulated"] = "measured",
+) -> dict[str, dict[str, float]]:
+    """Return root mean square errors some seconds ahead of measured states.
+
+    Parameters
+    ----------
+    model : ManoeuvringModel
+    run : LogFit
+        Whose log, at the model's rate, to start from.
+    heading : {"measured", "simulated"}
+
+    Returns
+    -------
+    dict
+        Horizon in seconds -> state -> error [m/s, rad/s]; horizons longer than
+        half the log are left out.
+    """
+    log, structure = run.log, model.structure
+    x = log.states(structure.states)
+    tau = log.forces(structure.inputs)
+    found = {}
+    for horizon in HORIZONS:
+        steps = round(horizon / log.sample_time)
+        if steps < 1 or steps > len(log) // 2:
+            continue
+        last = len(log) - steps
+        starts = np.unique(np.linspace(0, last - 1, min(last, _MOST_STARTS)).astype(int))
+        window = starts[:, None] + np.arange(steps + 1)
+        air = log.air if log.has_wind and structure.uses_air else None
+        ahead = simulate(
+            structure,
+            model.theta,
+            x[starts],
+            tau[window[:, :-1]],
+            log.sample_time,
+            psi=log["psi"][window] if heading == "measured" else None,
+            psi0=log["psi"][starts],
+            d=model.d if model.disturbances else None,
+            air=None if air is None else air[window[:, :-1]],
+            integrator=model.integrator,
+            bound=state_bound(log, structure.states),
+        )
+        bounded = ahead.diverged < 0
+        error = np.full(x.shape[1], np.inf)
+        if bounded.all():
+            error = np.sqrt(((ahead.x[:, -1] - x[starts + steps]) ** 2).mean(axis=0))
+        found[f"{horizon:g}"] = dict(zip(structure.states, map(float, error), strict=True))
+    return found
+
+
+def compare_models(
+    models: Sequence[ManoeuvringModel],
+    names: Sequence[str],
+    logs: Sequence[Sequence[TrialLog]],
+    *,
+    heading: Literal["measured", "simulated"] = "measured",
+) -> Comparison:
+    """Run every model freely on every log.
+
+    Parameters
+    ----------
+    models : sequence of ManoeuvringModel
+    names : sequence of str
+    logs : sequence of sequence of TrialLog
+        The logs as each model reads them (its vessel's columns).
+    heading : {"measured", "simulated"}
+
+    Returns
+    -------
+    Comparison
+    """
+    runs = tuple(
+        tuple(run_model(model, log, heading=heading) for log in mine)
+        for model, mine in zip(models, logs, strict=True)
+    )
+    rmse = tuple(
+        tuple(
+            {
+                s: float(np.sqrt(np.mean((r.log[s] - r.x[:, i]) ** 2)))
+                if r.diverged < 0
+                else float("inf")
+                for i, s in enumerate(model.structure.states)
+            }
+            for r in row
+        )
+        for model, row in zip(models, runs, strict=True)
+    )
+    ahead = tuple(
+        tuple(errors_ahead(model, r, heading) for r in row)
+        for model, row in zip(models, runs, strict=True)
+    )
+    tests = [
+        sign_test(name, names[0], s, [r.fit[s] for r in runs[0]], [r.fit[s] for r in row])
+        for name, row in zip(names[1:], runs[1:], strict=True)
+        for s in runs[0][0].fit
+        if s in row[0].fit
+    ]
+    return Comparison(tuple(names), runs, rmse, ahead, tuple(tests))
