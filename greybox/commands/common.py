@@ -25,13 +25,16 @@ def add_seed(parser: argparse.ArgumentParser) -> None:
 
 
 def read_logs(
-    paths: Sequence[str], vessel: Vessel, sample_time: float | None = None
+    paths: Sequence[str],
+    vessel: Vessel,
+    sample_time: float | None = None,
+    states: tuple[str, ...] = (),
 ) -> list[TrialLog]:
     """Read log files, and decimate them where a sample time is asked for."""
     from greybox.trial.conditioning import decimate
     from greybox.trial.reading import read_log
 
-    logs = [read_log(path, vessel) for path in paths]
+    logs = [read_log(path, vessel, states=states) for path in paths]
     return logs if sample_time is None else [decimate(log, sample_time) for log in logs]
 
 

@@ -18,7 +18,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("models", nargs="+", metavar="MODEL", help="model files")
     parser.add_argument("--log", nargs="+", required=True, metavar="LOG", help="logs to compare on")
     parser.add_argument(
-        "--heading", choices=("measured", "simulated"), default="measured", help="heading of the run"
+        "--heading",
+        choices=("measured", "simulated"),
+        default="measured",
+        help="heading of the run",
     )
     parser.add_argument("--json", metavar="F", help="write the result as JSON; - is stdout")
     parser.add_argument("--report", metavar="HTML", help="write a page with plots")
@@ -37,7 +40,10 @@ def run(options: argparse.Namespace) -> None:
     names = [Path(path).stem for path in options.models]
     if len(set(names)) < len(names):
         names = list(options.models)
-    logs = [[read_log(path, model.vessel) for path in options.log] for model in models]
+    logs = [
+        [read_log(path, model.vessel, states=model.structure.states) for path in options.log]
+        for model in models
+    ]
     comparison = compare_models(models, names, logs, heading=options.heading)
     record = provenance(options) | {
         "logs": [log.provenance.source + " " + log.provenance.sha256[:12] for log in logs[0]]

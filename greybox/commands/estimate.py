@@ -27,7 +27,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--structure",
         metavar="NAME",
-        help="thesis, surge, blanke, modulus, abkowitz; +TERM and -TERM change it (thesis)",
+        help="thesis, surge, linear, blanke, modulus, abkowitz; +TERM and -TERM change it; "
+        "by default chosen",
     )
     parser.add_argument(
         "--sample-time", type=float, metavar="S", help="decimate the logs to this sample time [s]"
@@ -70,15 +71,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Read, estimate, report, write."""
     from greybox.files import write_json
+    from greybox.model.catalogue import get_structure
     from greybox.report.physical import physical_summary
     from greybox.validation.choose import Request, estimate_model
     from greybox.vessel.toml import load_vessel
 
     vessel = load_vessel(options.vessel)
-    logs = read_logs(options.logs, vessel, options.sample_time)
-    margins = {
-        k: v for k, v in (("u", options.margin_u), ("v", options.margin_v)) if v is not None
-    }
+    states = get_structure(options.structure or "thesis").states
+    logs = read_logs(options.logs, vessel, options.sample_time, states)
+    margins = {k: v for k, v in (("u", options.margin_u), ("v", options.margin_v)) if v is not None}
     estimate = estimate_model(
         logs,
         Request(

@@ -44,7 +44,9 @@ def build_parser(only: str | None = None) -> argparse.ArgumentParser:
         "estimate, show what the simulation gets wrong.",
         epilog="greybox COMMAND --help tells the options of one command.",
     )
-    parser.add_argument("--version", action="version", version=f"greybox {version('greybox-marine')}")
+    parser.add_argument(
+        "--version", action="version", version=f"greybox {version('greybox-marine')}"
+    )
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     found = {e.name: e.value for e in entry_points(group=GROUP)}
     for name in sorted(found):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from typing import Literal
 
 from greybox.commands.common import say
 
@@ -52,8 +53,10 @@ def run(options: argparse.Namespace) -> None:
                 f"1.5,1.2,0,0."
             )
         fill = dict(zip(("u", "v", "r", "psi"), values, strict=True))
-    log = read_log(options.log, model.vessel, fill=fill)
-    heading = options.heading or ("simulated" if fill else "measured")
+    log = read_log(options.log, model.vessel, states=model.structure.states, fill=fill)
+    heading: Literal["measured", "simulated"] = options.heading or (
+        "simulated" if fill else "measured"
+    )
     result = run_model(model, log, heading=heading)
     if result.diverged >= 0:
         from greybox.errors import DivergenceError

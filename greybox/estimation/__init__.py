@@ -1,0 +1,1 @@
+"""Estimators, their covariance and their tests."""

@@ -115,7 +115,8 @@ def sign_margins(
                 null,
                 share,
                 None,
-                f"{100 * share:.1f} % of the samples have |{state}| below {margin:.3g} m/s{advice}.",
+                f"{100 * share:.1f} % of the samples have |{state}| below {margin:.3g} m/s"
+                f"{advice}.",
             )
         )
     return out

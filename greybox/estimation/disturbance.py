@@ -87,7 +87,7 @@ def estimate_current(
     if len(rows) < 2 or np.linalg.matrix_rank(a) < 2:
         return ()
     b = theta[rows]
-    current = np.linalg.lstsq(a, b, rcond=None)[0]
+    current = np.asarray(np.linalg.lstsq(a, b, rcond=None)[0], float)
     spread = np.zeros((2, 2))
     for _ in range(3):
         # errors of b − A(θ)·current, to first order in the errors of all coefficients
@@ -97,8 +97,8 @@ def estimate_current(
         scale = np.sqrt(np.maximum(np.diag(noise), 1e-300))
         whiten = np.linalg.pinv(noise / np.outer(scale, scale), rcond=1e-10, hermitian=True)
         aw = a / scale[:, None]
-        spread = np.linalg.pinv(aw.T @ whiten @ aw)
-        current = spread @ aw.T @ whiten @ (b / scale)
+        spread = np.asarray(np.linalg.pinv(aw.T @ whiten @ aw), float)
+        current = np.asarray(spread @ aw.T @ whiten @ (b / scale), float)
     std = np.sqrt(np.maximum(np.diag(spread), 0.0))
     return tuple(
         (name, float(v), float(s)) for name, v, s in zip(CURRENT, current, std, strict=True)

@@ -205,9 +205,7 @@ def estimate_iv(
     )
 
 
-def _start(
-    predictor: Predictor, logs: Sequence[TrialLog], start: Array | Estimate | None
-) -> Array:
+def _start(predictor: Predictor, logs: Sequence[TrialLog], start: Array | Estimate | None) -> Array:
     if isinstance(start, Estimate):
         return start.structure_theta()
     if start is not None:

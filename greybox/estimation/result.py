@@ -112,8 +112,7 @@ class Estimate:
 
     def __getitem__(self, name: str) -> float:
         """Return the value of a parameter by name."""
-        wanted = [i for i in self.predictor.parameter_columns]
-        return float(self.theta[wanted[self.names.index(name)]])
+        return float(self.theta[self.predictor.parameter_columns[self.names.index(name)]])
 
     def structure_theta(self) -> Array:
         """Return the parameters of the predictor's full structure, (p_structure,).
@@ -165,7 +164,10 @@ class Estimate:
             "samples": self.samples,
             "samples_used": self.kept,
             "nuisance": {
-                "names": [f"{self.predictor.columns[i].state}: {self.predictor.columns[i].name}" for i in biases],
+                "names": [
+                    f"{self.predictor.columns[i].state}: {self.predictor.columns[i].name}"
+                    for i in biases
+                ],
                 "theta": self.theta[biases],
                 "std": self.std[biases],
             },

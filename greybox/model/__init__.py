@@ -1,0 +1,1 @@
+"""Symbolic models: terms, structures, predictors, free runs."""

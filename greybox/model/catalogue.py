@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 
 from greybox.errors import StructureError, suggestion
@@ -36,10 +37,17 @@ def _surge() -> Structure:
     )
 
 
+def _linear() -> Structure:
+    names = "Xu Xvr Xmu Yv Yur Ymu Nr Nuv Nmu".split()
+    return Structure(
+        "linear",
+        tuple(THESIS_TERMS[n] for n in names),
+        reference="Fossen (2011): linear damping with the Coriolis terms of (3.51)",
+    )
+
+
 def _blanke() -> Structure:
-    names = (
-        "Xvr Xuu Wuu Xmu Xkappa Yur Y_uv Yvv Yvr Wvv Ymu N_ur Nuv Nvv Nvr Wuv Nmu"
-    ).split()
+    names = ("Xvr Xuu Wuu Xmu Xkappa Yur Y_uv Yvv Yvr Wvv Ymu N_ur Nuv Nvv Nvr Wuv Nmu").split()
     return Structure(
         "blanke",
         tuple(parse_term(n) for n in names),
@@ -49,9 +57,7 @@ def _blanke() -> Structure:
 
 
 def _modulus() -> Structure:
-    more = (
-        "X_vv X_rr Y_r Y_|r|r Y_|r|v Y_|u|v Y_|u|r N_v N_|r|r N_|r|v N_|u|v N_|u|r"
-    ).split()
+    more = ("X_vv X_rr Y_r Y_|r|r Y_|r|v Y_|u|v Y_|u|r N_v N_|r|r N_|r|v N_|u|v N_|u|r").split()
     return Structure(
         "modulus",
         tuple(THESIS_TERMS.values()),
@@ -90,6 +96,7 @@ def _siso() -> Structure:
 _CATALOGUE = {
     "thesis": _thesis,
     "surge": _surge,
+    "linear": _linear,
     "blanke": _blanke,
     "modulus": _modulus,
     "abkowitz": _abkowitz,
@@ -109,7 +116,7 @@ def get_structure(name: str) -> Structure:
     Parameters
     ----------
     name : str
-        ``thesis`` (3.51), ``surge`` (3.56), ``blanke``, ``modulus``,
+        ``thesis`` (3.51), ``surge`` (3.56), ``linear``, ``blanke``, ``modulus``,
         ``abkowitz`` or ``siso`` (4.58); ``thesis+N_|r|r-Xkappa`` adds and
         removes terms.
 
@@ -129,7 +136,7 @@ def get_structure(name: str) -> Structure:
     for part in parts[1:]:
         change, term = part[0], part[1:].strip()
         structure = structure.with_terms(term) if change == "+" else structure.without(term)
-    return structure
+    return replace(structure, name="".join(p.strip() for p in parts))
 
 
 def for_inputs(structure: Structure, inputs: tuple[str, ...]) -> Structure:

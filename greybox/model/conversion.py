@@ -159,14 +159,10 @@ def estimate_inertia(
             f"{gains[zero[0]]:g}: estimate it first."
         )
     surge = sample_time / gains["Xmu"] if thrust_in_newtons else mass * (1 + surge_added_mass)
-    return Inertia(
-        surge, surge * gains["Xmu"] / gains["Ymu"], surge * gains["Xmu"] / gains["Nmu"]
-    )
+    return Inertia(surge, surge * gains["Xmu"] / gains["Ymu"], surge * gains["Xmu"] / gains["Nmu"])
 
 
-def check_ties(
-    theta: Mapping[str, float], sample_time: float, tolerance: float = 0.1
-) -> list[Tie]:
+def check_ties(theta: Mapping[str, float], sample_time: float, tolerance: float = 0.1) -> list[Tie]:
     """Compare the relations that Table 3.1 implies: Xvr·Yur = −Ts² and Ymu/Xmu = −Yur/Ts.
 
     Parameters
@@ -174,19 +170,15 @@ def check_ties(
     tolerance : float
         Relative difference up to which a tie counts as held.
     """
+    sides: list[tuple[str, float, float]] = []
+    if "Xvr" in theta and "Yur" in theta:
+        sides.append(("Xvr·Yur = −Ts²", theta["Xvr"] * theta["Yur"], -(sample_time**2)))
+    if "Yur" in theta and "Ymu" in theta and theta.get("Xmu"):
+        sides.append(
+            ("Ymu/Xmu = −Yur/Ts", theta["Ymu"] / theta["Xmu"], -theta["Yur"] / sample_time)
+        )
     ties = []
-    for name, needed, left, right in (
-        ("Xvr·Yur = −Ts²", ("Xvr", "Yur"), lambda p: p["Xvr"] * p["Yur"], -(sample_time**2)),
-        (
-            "Ymu/Xmu = −Yur/Ts",
-            ("Xmu", "Ymu", "Yur"),
-            lambda p: p["Ymu"] / p["Xmu"] if p["Xmu"] else float("nan"),
-            -theta.get("Yur", float("nan")) / sample_time,
-        ),
-    ):
-        if not all(n in theta for n in needed):
-            continue
-        value = float(left(theta))
+    for name, value, right in sides:
         holds = bool(abs(value - right) <= tolerance * max(abs(value), abs(right)))
         ties.append(
             Tie(

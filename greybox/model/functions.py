@@ -10,6 +10,7 @@ mapaccum of the step.) NumPy buffers go in and out without conversion.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal
@@ -113,6 +114,11 @@ def jacobians(structure: Structure, *, air_measured: bool = False) -> ca.Functio
     )
 
 
+def _bind(setter: Callable[..., None], index: int, array: Array) -> None:
+    """Point an argument or a result of a buffered call at a contiguous array."""
+    setter(index, memoryview(array))  # type: ignore[arg-type]
+
+
 @dataclass(frozen=True)
 class RunVariant:
     """What a free run reads beside the inputs.
@@ -170,18 +176,20 @@ def _unrolled(
     channels = run_channels(structure, variant)
     w = ca.SX.sym("w", len(channels), steps)
     dt = ca.SX.sym("dt")
-    nx, current, history = s.x.numel(), state, []
+    nx = s.x.numel()
+    current: ca.SX = state
+    history: list[ca.SX] = []
     for k in range(steps):
         value = {name: w[i, k] for i, name in enumerate(channels)}
         x, psi = current[:nx], current[nx] if simulated else value.get("psi", ca.SX(0))
         tau = ca.vertcat(*[value[n] for n in structure.inputs])
         d = ca.vertcat(*[value.get(n, ca.SX(0)) for n in structure.disturbances])
         air = ca.vertcat(value.get("u_q", ca.SX(0)), value.get("v_q", ca.SX(0)))
-        after = step(x, psi, tau, d, air, s.theta, dt)
-        current = ca.vertcat(*after) if simulated else after
+        after = step.call([x, psi, tau, d, air, s.theta, dt])
+        current = ca.SX(ca.vertcat(*after))
         for i, name in enumerate(structure.states):
             if f"w_{name}" in value:
-                current[i] += value[f"w_{name}"]
+                current[i] = current[i] + value[f"w_{name}"]
         history.append(current)
     return ca.Function(
         "steps", [state, w, s.theta, dt], [current, ca.horzcat(*history)], {"cse": True}
@@ -238,8 +246,8 @@ class FreeRunKernel:
         self._history = np.zeros((size, self._padded, nx))
         buffer, self._trigger = _free_run(structure, variant, blocks, size).buffer()
         for i, argument in enumerate((self.x0, self.w, self.theta, self._dt)):
-            buffer.set_arg(i, memoryview(argument))
-        buffer.set_res(0, memoryview(self._history))
+            _bind(buffer.set_arg, i, argument)
+        _bind(buffer.set_res, 0, self._history)
         self._buffer = buffer
 
     def __call__(self, dt: float, out: Array) -> None:
@@ -321,10 +329,10 @@ class OverRunsKernel:
         """Run from ``x[0]``, filling ``x[1:]``."""
         buffer, trigger = self._step.buffer()
         step_length = np.array([float(dt)])
-        buffer.set_arg(2, memoryview(self.theta))
-        buffer.set_arg(3, memoryview(step_length))
+        _bind(buffer.set_arg, 2, self.theta)
+        _bind(buffer.set_arg, 3, step_length)
         for k in range(len(self.w)):
-            buffer.set_arg(0, memoryview(self.x[k]))
-            buffer.set_arg(1, memoryview(self.w[k]))
-            buffer.set_res(0, memoryview(self.x[k + 1]))
+            _bind(buffer.set_arg, 0, self.x[k])
+            _bind(buffer.set_arg, 1, self.w[k])
+            _bind(buffer.set_res, 0, self.x[k + 1])
             trigger()

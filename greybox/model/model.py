@@ -86,7 +86,9 @@ class ManoeuvringModel:
     @property
     def d(self) -> Array:
         """Disturbance means in the order of the structure, zero where unknown (nd,)."""
-        return np.array([self.disturbances.get(n, (0.0, 0.0))[0] for n in self.structure.disturbances])
+        return np.array(
+            [self.disturbances.get(n, (0.0, 0.0))[0] for n in self.structure.disturbances]
+        )
 
     def label(self, name: str) -> str:
         """Return a parameter's name with the terms it sums, such as ``Xuu+Wuu``."""

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from greybox.errors import StructureError, suggestion
 from greybox.model.disturbances import CURRENT
 from greybox.model.structure import Structure
-from greybox.model.vectorised import Vectorised
+from greybox.vectorised import Vectorised
 
 Array = NDArray[np.float64]
 PredictorKind = Literal["basic", "augmented", "wind", "basic+wind"]
@@ -119,7 +119,8 @@ class Predictor:
         return [
             i
             for i, c in enumerate(self.columns)
-            if c.name == "1" or (c.terms and not structure.terms[structure.index(c.terms[0])].factors)
+            if c.name == "1"
+            or (c.terms and not structure.terms[structure.index(c.terms[0])].factors)
         ]
 
     @property
@@ -354,7 +355,8 @@ def _derivative_by_name(structure: Structure, air_measured: bool, spelling: str)
 
 
 def _unit_rows(values: Array) -> Array:
-    return values / np.maximum(np.linalg.norm(values, axis=1), 1e-300)[:, None]
+    size = np.maximum(np.linalg.norm(values, axis=1), 1e-300)
+    return np.asarray(values / size[:, None])
 
 
 def _same_direction(unit: Array, value: Array) -> int | None:
@@ -516,6 +518,4 @@ def build_predictor(
                 shares.append(
                     BiasShare(state, structure.terms[t].name, monomial, weight, tuple(clean))
                 )
-    return Predictor(
-        structure, kind, regime, tuple(columns), tuple(shares), tuple(spelled)
-    )
+    return Predictor(structure, kind, regime, tuple(columns), tuple(shares), tuple(spelled))

@@ -163,7 +163,7 @@ def simulate(
     if bound is None:
         bound = np.full(nx, 1e6)
     with np.errstate(invalid="ignore"):
-        outside = ~(np.abs(x) <= bound).all(axis=2)
+        outside = np.asarray(~(np.abs(x) <= bound).all(axis=2))
     diverged = np.where(outside.any(axis=1), outside.argmax(axis=1), -1)
     return FreeRun(x, angle, diverged, np.asarray(bound, float))
 

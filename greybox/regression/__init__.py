@@ -1,0 +1,1 @@
+"""Regressions and instruments, formed from symbolic derivatives."""

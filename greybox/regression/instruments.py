@@ -55,7 +55,7 @@ def initial_state(log: TrialLog, states: tuple[str, ...]) -> Array:
 def state_bound(log: TrialLog, states: tuple[str, ...]) -> Array:
     """Return the magnitude past which a simulated state counts as diverged, (nx,)."""
     largest = np.abs(log.states(states)).max(axis=0)
-    return DIVERGENCE_FACTOR * np.maximum(largest, 1e-6)
+    return np.asarray(DIVERGENCE_FACTOR * np.maximum(largest, 1e-6))
 
 
 def simulate_log(
@@ -94,14 +94,15 @@ def simulate_log(
         tau = np.column_stack([log[n] for n in structure.inputs])[:-1]
     air = log.air if use_wind and structure.uses_air else None
     has_yaw = "r" in structure.states
+    psi = log["psi"] if "psi" in log else np.zeros(len(log))
     return simulate(
         structure,
         theta,
         initial_state(log, structure.states),
         tau,
         log.sample_time,
-        psi=log["psi"] if marine and (heading == "measured" or not has_yaw) else None,
-        psi0=float(log["psi"][0]) if "psi" in log else 0.0,
+        psi=psi if marine and (heading == "measured" or not has_yaw) else None,
+        psi0=float(psi[0]),
         d=d,
         air=None if air is None else air[:-1],
         integrator=integrator,
@@ -166,7 +167,7 @@ def build_instruments(
             keep[:lag] = False
         psi: Array | float = 0.0
         if structure.disturbance == "marine":
-            psi = (log["psi"] if heading == "measured" else run.psi[0])[:samples]
+            psi = run.psi[0][:samples]
         z = predictor.evaluate(
             [np.ascontiguousarray(x[:, j]) for j in range(x.shape[1])],
             psi,

@@ -124,7 +124,9 @@ def build_regression(
             else [log[n][:-1] for n in structure.inputs],
             (log["u_q"][:-1], log["v_q"][:-1]) if predictor.air_measured else None,
         )
-        experiments.append(Experiment(log.name, y, phi, within_margins(x[:-1], structure.states, margins)))
+        experiments.append(
+            Experiment(log.name, y, phi, within_margins(x[:-1], structure.states, margins))
+        )
     regression = Regression(predictor, tuple(experiments), sample_time)
     most = max(len(predictor.equation(s)) for s in structure.states)
     if regression.kept <= 2 * most:

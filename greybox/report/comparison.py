@@ -68,21 +68,22 @@ def comparison_page(
             ahead_rows,
         ),
     ]
-    if comparison.sign_tests:
+    tests = comparison.sign_tests if len(comparison.runs[0]) > 1 else ()
+    if tests:
         tables.append(
             Table(
                 "Sign test: logs on which a model fits better than the first",
                 ["model", "against", "state", "wins", "p-value (two-sided)"],
                 [
                     [t.model, t.against, t.state, f"{t.wins}/{t.of}", f"{t.p_value:.2g}"]
-                    for t in comparison.sign_tests
+                    for t in tests
                 ],
             )
         )
     return Page(
         title="Measured against simulated",
         headline=headline(comparison),
-        sentences=[t.sentence for t in comparison.sign_tests],
+        sentences=[t.sentence for t in tests],
         pictures=pictures,
         tables=tables,
         texts=[

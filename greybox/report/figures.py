@@ -55,21 +55,25 @@ def comparison_figure(names: Sequence[str], runs: Sequence[LogFit]) -> Figure:
     """
     log = runs[0].log
     states = list(runs[0].fit)
-    figure = new_figure(11, 2.4 * len(states) + 0.6)
-    grid = figure.add_gridspec(2 * len(states), 2, width_ratios=[3.2, 1.3])
+    figure = new_figure(10, 2.7 * len(states) + 0.6)
+    grid = figure.add_gridspec(2 * len(states), 1, height_ratios=[1.6, 1] * len(states))
     t = log.t - log.t[0]
     first: Any = None
     for i, state in enumerate(states):
-        top = figure.add_subplot(grid[2 * i, 0], sharex=first)
+        top = figure.add_subplot(grid[2 * i], sharex=first)
         first = first or top
-        below = figure.add_subplot(grid[2 * i + 1, 0], sharex=first)
+        below = figure.add_subplot(grid[2 * i + 1], sharex=first)
         measured = log[state]
         top.plot(t, measured, color=BLACK, linewidth=1.0, label="measured")
         spread = float(np.ptp(measured)) or 1.0
         low, high = measured.min() - 0.6 * spread, measured.max() + 0.6 * spread
         for j, (name, run) in enumerate(zip(names, runs, strict=True)):
             x = np.where(np.isfinite(run.x[:, i]), run.x[:, i], np.nan)
-            style = {"color": COLOURS[j % 6], "linestyle": STYLES[j % 4], "linewidth": 1.3}
+            style: dict[str, Any] = {
+                "color": COLOURS[j % 6],
+                "linestyle": STYLES[j % 4],
+                "linewidth": 1.3,
+            }
             shown = f"{run.fit[state]:.1f} %" if run.fit[state] > -1000 else "diverged"
             top.plot(t, np.clip(x, low, high), label=f"{name}: fit {shown}", **style)
             error = measured - x
@@ -77,7 +81,14 @@ def comparison_figure(names: Sequence[str], runs: Sequence[LogFit]) -> Figure:
         below.axhline(0, color=BLACK, linewidth=0.6)
         top.set_ylabel(LABELS.get(state, state), fontsize=9)
         below.set_ylabel("measured −\nsimulated", fontsize=8)
-        top.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+        top.legend(
+            fontsize=8,
+            loc="lower left",
+            bbox_to_anchor=(0.0, 1.0),
+            borderaxespad=0.2,
+            ncols=4,
+            frameon=False,
+        )
         tidy(top)
         tidy(below)
         top.tick_params(labelbottom=False)

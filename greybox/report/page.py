@@ -56,7 +56,7 @@ h2 { font-size: 1.15rem; margin: 1.6rem 0 0.4rem; }
 figure { margin: 1rem 0; }
 figure svg { width: 100%; height: auto; }
 figcaption { font-size: 0.9rem; color: #444; }
-.wide { overflow-x: auto; }
+.wide { overflow-x: auto; margin: 1rem 0; }
 table { border-collapse: collapse; font-size: 0.9rem; font-variant-numeric: tabular-nums; }
 th, td { padding: 0.2rem 0.6rem; border-bottom: 1px solid #ddd; text-align: right;
          white-space: nowrap; }

@@ -28,9 +28,7 @@ def physical_summary(model: ManoeuvringModel, mass: float, speed: float | None =
     theta = dict(zip(model.names, map(float, model.theta), strict=True))
     newtons = model.force_unit == "N"
     try:
-        inertia = estimate_inertia(
-            theta, model.sample_time, mass=mass, thrust_in_newtons=newtons
-        )
+        inertia = estimate_inertia(theta, model.sample_time, mass=mass, thrust_in_newtons=newtons)
     except StructureError as error:
         return f"Physical quantities: not available, because {error}"
     length = model.vessel.length

@@ -171,7 +171,9 @@ def chapter6_output(result: Chapter6, record: dict[str, Any]) -> StudyOutput:
                 f"the published sd.",
             )
     consistent = [
-        r for r in rows if (r.set, r.estimator) in (("1 m/s", "IV2"), ("1 m/s", "IV3"), ("10 m/s", "IV3"))
+        r
+        for r in rows
+        if (r.set, r.estimator) in (("1 m/s", "IV2"), ("1 m/s", "IV3"), ("10 m/s", "IV3"))
     ]
     inside = sum(abs(r.mean) < r.sd for r in consistent)
     bad = sum(result.unconverged.values())
@@ -284,7 +286,7 @@ def _fit_bars(result: Chapter7) -> Figure:
         axes[i].bar(
             names,
             np.clip(value, -50, 100),
-            yerr=np.where(value > -50, np.minimum(sd, 100), 0.0),
+            yerr=np.where(value > -50, np.minimum(sd, 100), np.nan),
             color=[COLOURS[j % 6] for j in range(len(names))],
             capsize=3,
         )

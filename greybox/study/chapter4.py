@@ -94,9 +94,7 @@ def virtual_batch(rng: np.random.Generator, case: MonteCarloSet, runs: int, samp
     given = offset_gaussian(np.random.default_rng([4, INPUT_SEED]), samples, case.floor)
     v = case.mean + np.sqrt(DISTURBANCE_VARIANCE) * rng.standard_normal((runs, samples, 1))
     w = PROCESS_MEAN + np.sqrt(PROCESS_VARIANCE) * rng.standard_normal((runs, samples, 1))
-    run = simulate(
-        structure, TRUE, np.zeros(1), given[None, :, None], 1.0, d=v, process_noise=w
-    )
+    run = simulate(structure, TRUE, np.zeros(1), given[None, :, None], 1.0, d=v, process_noise=w)
     noise = np.sqrt(NOISE_VARIANCE)
     y1 = run.x + noise * rng.standard_normal(run.x.shape)
     seen = None

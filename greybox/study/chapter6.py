@@ -142,7 +142,9 @@ def validation_run(samples: int = 600) -> tuple[Array, Array]:
     return tau, run.x[0]
 
 
-def virtual_batch(rng: np.random.Generator, runs: int, samples: int, wind: float, tau: Array) -> Batch:
+def virtual_batch(
+    rng: np.random.Generator, runs: int, samples: int, wind: float, tau: Array
+) -> Batch:
     """Simulate R disturbed ships and measure them with the noise of (6.2).
 
     Parameters
@@ -207,7 +209,8 @@ def estimate_batch(batch: Batch) -> dict[str, tuple[Array, Array, NDArray[np.boo
 
 
 def _truncated(batch: Batch, samples: int) -> Batch:
-    assert isinstance(batch.psi, np.ndarray) and batch.air is not None
+    assert isinstance(batch.psi, np.ndarray)
+    assert batch.air is not None
     return Batch(
         batch.x[:, : samples + 1],
         batch.psi[:, : samples + 1],
@@ -334,15 +337,13 @@ def reproduce_chapter6(
     example = virtual_batch(
         np.random.default_rng([seed, winds[0], 0]), 1, samples, winds[0], pulse_forces(samples)
     )
-    assert isinstance(example.psi, np.ndarray) and example.air is not None
+    assert isinstance(example.psi, np.ndarray)
+    assert example.air is not None
     return Chapter6(
         runs,
         samples,
         {k: np.concatenate(v) for k, v in theta.items()},
-        {
-            k: tuple(c.label for c in p.columns if not c.is_bias)
-            for k, p in predictors().items()
-        },
+        {k: tuple(c.label for c in p.columns if not c.is_bias) for k, p in predictors().items()},
         unconverged,
         {k: np.concatenate(v, axis=1) for k, v in fits.items()},
         lengths,

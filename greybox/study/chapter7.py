@@ -101,9 +101,7 @@ class Chapter7:
             good = value[np.isfinite(value)]
             mean = float(good.mean()) if len(good) else float("nan")
             sd = float(good.std(ddof=1)) if len(good) > 1 else 0.0
-            rows.append(
-                Row(table, "all sets", estimator, name, mean, sd, None, None, len(good))
-            )
+            rows.append(Row(table, "all sets", estimator, name, mean, sd, None, None, len(good)))
 
         for estimator, fit in self.fits.items():
             for i, state in enumerate(self.states):
@@ -212,9 +210,7 @@ def reproduce_chapter7(
     """
     if not estimation or not validation:
         raise UsageError("chapter 7 needs logs of both days: give --estimate and --validate.")
-    structure = for_inputs(
-        structure or get_structure("thesis"), force_inputs(estimation[0].vessel)
-    )
+    structure = for_inputs(structure or get_structure("thesis"), force_inputs(estimation[0].vessel))
     wind = all(log.has_wind for log in [*estimation, *validation]) and structure.uses_air
     sets = estimation_sets(estimation)
     fits: dict[str, list[list[float]]] = {}

@@ -52,8 +52,8 @@ class Batch:
 
     @property
     def runs(self) -> int:
-        """R"""
-        return self.x.shape[0]
+        """Number of runs R."""
+        return len(self.x)
 
 
 @dataclass(frozen=True)

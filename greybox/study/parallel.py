@@ -57,7 +57,9 @@ def map_pieces(
     elif options["n_jobs"] == 1 or len(work) == 1:
         yield from map(function, work)
         return
-    with parallel_config(**options, inner_max_num_threads=1) if cluster is None else (
-        parallel_config(**options)
+    with (
+        parallel_config(**options, inner_max_num_threads=1)
+        if cluster is None
+        else (parallel_config(**options))
     ):
         yield from Parallel(return_as="generator")(delayed(function)(piece) for piece in work)

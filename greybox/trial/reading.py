@@ -125,9 +125,7 @@ def _read_table(path: Path) -> pd.DataFrame:
             f"cannot read '{path.name}' as {'Parquet' if 'p' in suffix else 'CSV'}: {reason}. "
             f"Name a table with one header line."
         ) from None
-    raise LogError(
-        f"'{path.name}' ends in '{suffix}': logs are CSV (.csv) or Parquet (.parquet)."
-    )
+    raise LogError(f"'{path.name}' ends in '{suffix}': logs are CSV (.csv) or Parquet (.parquet).")
 
 
 def _canonical(
@@ -247,11 +245,8 @@ def _require(
                 f"'{name}' has no '{state}' and it cannot be derived without {need}."
                 f"{suggestion(state, columns)} Map the columns in the vessel file's [columns]."
             )
-    if "psi" not in channels and any(s in "uvr" for s in states):
+    if "psi" not in channels and set(states) & {"v", "r"}:
         raise LogError(
             f"'{name}' has no heading 'psi'.{suggestion('psi', columns)} "
             f"Map it in the vessel file's [columns] with its unit."
         )
-
-
-

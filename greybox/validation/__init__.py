@@ -1,0 +1,1 @@
+"""Free runs against logs, comparisons, choices."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -31,6 +31,20 @@ _KEPT = 0.9
 
 
 @dataclass(frozen=True)
+class Alternative:
+    """One way to estimate."""
+
+    structure: Structure
+    method: str
+    kind: str
+
+    @property
+    def label(self) -> str:
+        """Method, predictor and structure in words."""
+        return f"{self.method} with predictor '{self.kind}' of structure '{self.structure.name}'"
+
+
+@dataclass(frozen=True)
 class Request:
     """What to estimate; None leaves the choice to the data.
 
@@ -42,7 +56,7 @@ class Request:
     structure: str | None = None
     margins: dict[str, float] | None = None
     covariance: Covariance | None = None
-    heading: str = "measured"
+    heading: Literal["measured", "simulated"] = "measured"
     loop: Loop = "auto"
     zero_mean: bool = True
     seed: int = 0
@@ -162,18 +176,15 @@ def estimate_model(logs: Sequence[TrialLog], request: Request = Request()) -> Es
         Logs differ in sample time, or lack a channel.
     """
     common_sample_time(logs)
-    notes = []
-    structure = for_inputs(
-        get_structure(request.structure or "thesis"), force_inputs(logs[0].vessel)
-    )
-    if request.structure is None:
-        notes.append(
-            f"structure 'thesis' (3.51) was taken, with the {len(structure.terms)} terms that "
-            f"the thrusters of this vessel can excite."
-        )
+    notes: list[str] = []
+    inputs = force_inputs(logs[0].vessel)
     wind = all(log.has_wind for log in logs)
+    names = [request.structure] if request.structure else _structures(logs, wind)
+    structures = [for_inputs(get_structure(name), inputs) for name in names]
     methods = [request.method] if request.method else ["iv", "ls"]
-    kinds = [request.predictor] if request.predictor else _plausible(logs, structure, wind, notes)
+    kinds = (
+        [request.predictor] if request.predictor else _plausible(logs, structures[0], wind, notes)
+    )
     for kind in kinds:
         if kind in ("wind", "basic+wind") and not wind:
             lacking = next(log.name for log in logs if not log.has_wind)
@@ -181,44 +192,77 @@ def estimate_model(logs: Sequence[TrialLog], request: Request = Request()) -> Es
                 f"predictor '{kind}' needs the wind, and '{lacking}' has neither u_q, v_q nor "
                 f"V_q, gamma_q: use --predictor augmented or basic."
             )
-    pairs = [(m, k) for m in methods for k in kinds]
-    if len(pairs) > 1:
-        theory = _theory(logs, structure, wind)
-        if theory is not None and ("iv", theory) in pairs:
+    alternatives = [Alternative(s, m, k) for s in structures for m in methods for k in kinds]
+    if len(alternatives) > 1:
+        theory = _theory(logs, structures[0], wind)
+        first = [
+            a
+            for a in alternatives
+            if a.structure is structures[0] and a.method == "iv" and a.kind == theory
+        ]
+        if first:
             notes.append(
-                f"iv with predictor '{theory}' was taken: heading turns enough and the states "
-                f"keep their signs, so its estimates are consistent (chapter 5)."
+                f"{first[0].label} was taken: heading turns enough and the states keep their "
+                f"signs, so its estimates are consistent (chapter 5)."
             )
-            pairs = [("iv", theory), *[p for p in pairs if p != ("iv", theory)]]
+            alternatives = [*first, *[a for a in alternatives if a not in first]]
         else:
-            pairs = _compare(logs, structure, pairs, request, notes)
+            alternatives = _compare(logs, alternatives, request, notes)
+    return _first_that_runs(logs, alternatives, request, notes)
+
+
+def _first_that_runs(
+    logs: Sequence[TrialLog],
+    alternatives: Sequence[Alternative],
+    request: Request,
+    notes: list[str],
+) -> Estimate:
+    """Return the first estimate whose free run stays bounded, else the first one at all."""
     failures: list[GreyboxError] = []
-    for method, kind in pairs:
+    fallback: Estimate | None = None
+    for alternative in alternatives:
         try:
-            estimate = estimate_once(logs, structure, method, kind, request)
+            estimate = estimate_once(
+                logs, alternative.structure, alternative.method, alternative.kind, request
+            )
         except GreyboxError as error:
             failures.append(error)
             continue
         model = estimate.model()
         runs = [run_model(model, log) for log in logs]
-        if any(r.diverged >= 0 for r in runs) and len(failures) + 1 < len(pairs):
-            failures.append(ExcitationError("its free run diverges"))
-            notes.append(f"{method} with predictor '{kind}' was left: its free run diverges.")
-            continue
-        if any(r.diverged >= 0 for r in runs):
-            notes.append(
-                "the free run of this model diverges on the estimation logs: do not simulate "
-                "with it. Use a smaller structure or a longer, more exciting log."
-            )
+        own = []
         if estimate.method == "iv":
-            notes.append(f"instruments: {estimate.status}.")
+            own.append(f"instruments: {estimate.status}.")
         if estimate.predictor.contaminated:
-            notes.append(
+            own.append(
                 f"{', '.join(estimate.predictor.contaminated)} also carry a second moment of the "
                 f"current, which this structure cannot separate."
             )
-        return replace(estimate, notes=(*notes, *estimate.notes), fit=average_fit(runs))
-    raise failures[0]
+        estimate = replace(estimate, notes=(*notes, *own), fit=average_fit(runs))
+        if all(r.diverged < 0 for r in runs):
+            return estimate
+        notes.append(f"{alternative.label} was left: its free run diverges.")
+        fallback = fallback or estimate
+    if fallback is None:
+        raise failures[0]
+    warning = (
+        "the free run of this model diverges on the estimation logs: do not simulate with it. "
+        "Use a smaller structure or a longer, more exciting log."
+    )
+    return replace(fallback, notes=(*fallback.notes, warning))
+
+
+def _structures(logs: Sequence[TrialLog], wind: bool) -> list[str]:
+    """Return the structures to try where the user names none, the fullest first.
+
+    On a nearly constant heading an unmeasured wind or current is a constant
+    force, which the bias-capturing terms cannot be told from.
+    """
+    if wind:
+        return ["thesis", "linear+Wuu+Wvv+Wuv"]
+    if heading_range(logs) < ADVISED_HEADING:
+        return ["thesis", "linear", "linear+X_0+Y_0+N_0"]
+    return ["thesis", "linear"]
 
 
 def _plausible(
@@ -268,38 +312,38 @@ def _theory(logs: Sequence[TrialLog], structure: Structure, wind: bool) -> str |
 
 def _compare(
     logs: Sequence[TrialLog],
-    structure: Structure,
-    pairs: list[tuple[str, str]],
+    alternatives: list[Alternative],
     request: Request,
     notes: list[str],
-) -> list[tuple[str, str]]:
-    """Order the alternatives by the held-out free run, the more robust ones preferred."""
+) -> list[Alternative]:
+    """Order the alternatives by the held-out free run, the earlier ones preferred."""
     fitting, held = [], []
     for log in logs:
         cut = len(log) - int(len(log) * _HELD_OUT)
         fitting.append(log.window(0, cut, log.name))
         held.append(log.window(cut, len(log), log.name))
     scores: list[float] = []
-    for rank, (method, kind) in enumerate(pairs):
+    for rank, alternative in enumerate(alternatives):
+        score = -np.inf
         try:
-            model = estimate_once(fitting, structure, method, kind, request).model()
+            model = estimate_once(
+                fitting, alternative.structure, alternative.method, alternative.kind, request
+            ).model()
             runs = [run_model(model, log) for log in held]
-            value = average_fit(runs)
-            score = float(np.mean([max(v, -100.0) for v in value.values()]))
-            if any(r.diverged >= 0 for r in runs):
-                score = -np.inf
+            if all(r.diverged < 0 for r in runs):
+                score = float(np.mean([max(v, -100.0) for v in average_fit(runs).values()]))
         except GreyboxError:
-            score = -np.inf
+            pass
         scores.append(score - _PREFERENCE * rank)
-    order = sorted(range(len(pairs)), key=lambda i: -scores[i])
+    order = sorted(range(len(alternatives)), key=lambda i: -scores[i])
     shown = ", ".join(
-        f"{pairs[i][0]} {pairs[i][1]} "
+        f"{alternatives[i].label} "
         + (f"{scores[i] + _PREFERENCE * i:.1f}" if np.isfinite(scores[i]) else "diverged")
         for i in order
     )
     notes.append(
         f"chosen by the free run on the last third of each log when estimated on the first two "
-        f"(mean fit in %, cut at −100): {shown}; ties within {_PREFERENCE:g} points go to the "
-        f"method that noise biases less."
+        f"(mean fit in %, cut at −100; {_PREFERENCE:g} points must be gained to prefer a smaller "
+        f"structure or a method that noise biases more): {shown}."
     )
-    return [pairs[i] for i in order]
+    return [alternatives[i] for i in order]

@@ -118,7 +118,8 @@ class Comparison:
         """Return the tables as text."""
         states = list(self.runs[0][0].fit)
         lines = [
-            f"{'model':<24}{'log':<26}" + "".join(f"{'fit ' + s + ' [%]':>12}" for s in states)
+            f"{'model':<24}{'log':<26}"
+            + "".join(f"{'fit ' + s + ' [%]':>12}" for s in states)
             + "".join(f"{'rmse ' + s:>11}" for s in states)
         ]
         for name, row, errors in zip(self.names, self.runs, self.rmse, strict=True):
@@ -134,14 +135,15 @@ class Comparison:
                 lines.append(
                     f"{name[:23]:<24}{'mean':<26}" + "".join(f"{mean[s]:>12.1f}" for s in states)
                 )
-        for name, row in zip(self.names, self.ahead, strict=True):
-            for horizon in row[0]:
+        for name, aheads in zip(self.names, self.ahead, strict=True):
+            for horizon in aheads[0]:
                 shown = ", ".join(
-                    f"{s} {np.sqrt(np.mean([a[horizon][s] ** 2 for a in row if horizon in a])):.3g}"
+                    f"{s} {np.sqrt(np.mean([a[horizon][s] ** 2 for a in aheads if horizon in a])):.3g}"
                     for s in states
                 )
                 lines.append(f"{name[:23]:<24}{horizon} s ahead, rms error: {shown}")
-        lines += [t.sentence for t in self.sign_tests]
+        if len(self.runs[0]) > 1:
+            lines += [t.sentence for t in self.sign_tests]
         return "\n".join(lines)
 
 
@@ -181,6 +183,7 @@ def errors_ahead(
     log, structure = run.log, model.structure
     x = log.states(structure.states)
     tau = log.forces(structure.inputs)
+    psi = log["psi"] if "psi" in log else np.zeros(len(log))
     found = {}
     for horizon in HORIZONS:
         steps = round(horizon / log.sample_time)
@@ -196,8 +199,8 @@ def errors_ahead(
             x[starts],
             tau[window[:, :-1]],
             log.sample_time,
-            psi=log["psi"][window] if heading == "measured" else None,
-            psi0=log["psi"][starts],
+            psi=psi[window] if heading == "measured" or "r" not in structure.states else None,
+            psi0=psi[starts],
             d=model.d if model.disturbances else None,
             air=None if air is None else air[window[:, :-1]],
             integrator=model.integrator,

@@ -1,0 +1,1 @@
+"""What is known of a vessel: geometry, thrusters, limits, sensors, and its force."""

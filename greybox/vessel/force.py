@@ -32,7 +32,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.model.vectorised import Vectorised
+from greybox.vectorised import Vectorised
 from greybox.vessel.vessel import Thruster, Vessel
 
 Array = NDArray[np.float64]
@@ -71,6 +71,8 @@ def force_expressions(vessel: Vessel, commands: ca.SX) -> dict[str, ca.SX]:
 
     for t in vessel.thrusters:
         thrust = t.thrust.force(column[t.speed])
+        c: ca.SX | float
+        s: ca.SX | float
         if isinstance(t.angle, str):
             c, s = ca.cos(column[t.angle]), ca.sin(column[t.angle])
         else:  # rounded, so that a tunnel thruster has exactly no force along the ship

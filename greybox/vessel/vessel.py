@@ -47,10 +47,10 @@ class Thruster:
     speed: str
     angle: str | float = 0.0
     rudder: str | None = None
-    thrust: ThrustLaw = ThrustLaw()
-    speed_limits: Limits = Limits()
-    angle_limits: Limits = Limits()
-    rudder_limits: Limits = Limits()
+    thrust: ThrustLaw = field(default_factory=ThrustLaw)
+    speed_limits: Limits = field(default_factory=Limits)
+    angle_limits: Limits = field(default_factory=Limits)
+    rudder_limits: Limits = field(default_factory=Limits)
 
     @property
     def columns(self) -> tuple[str, ...]:

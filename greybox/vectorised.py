@@ -72,9 +72,7 @@ class Vectorised:
     """
 
     def __init__(self, expressions: Sequence[ca.SX], symbols: Sequence[ca.SX]) -> None:
-        function = ca.Function(
-            "f", list(symbols), [ca.vertcat(*expressions)], {"cse": True}
-        )
+        function = ca.Function("f", list(symbols), [ca.vertcat(*expressions)], {"cse": True})
         self.size = len(expressions)
         self._program: list[tuple[str, Any, tuple[int, ...], int]] = []
         rows = function.sparsity_out(0).row()
