@@ -14,6 +14,16 @@ from greybox.errors import GreyboxError, suggestion
 GROUP = "greybox.commands"
 
 
+def _options(parser: argparse.ArgumentParser) -> list[str]:
+    """Return the option strings of a parser and of its sub-commands."""
+    found = []
+    for action in parser._actions:
+        found += action.option_strings
+        if isinstance(action, argparse._SubParsersAction):
+            found += [o for sub in action.choices.values() for o in _options(sub)]
+    return found
+
+
 class _Parser(argparse.ArgumentParser):
     """A parser that suggests the nearest name for a mistyped one."""
 
@@ -24,7 +34,7 @@ class _Parser(argparse.ArgumentParser):
             message += suggestion(typed, known)
         if message.startswith("unrecognized arguments: "):
             typed = message.split(": ")[1].split()[0]
-            known = [o for a in self._actions for o in a.option_strings]
+            known = _options(self)
             message += suggestion(typed, known)
         self.print_usage(sys.stderr)
         self.exit(2, f"{self.prog}: {message}\n")

@@ -142,12 +142,10 @@ def estimate_iv(
             "instruments that keep their mean do not remove the constants that the augmented "
             "predictor leaves out: build it with an intercept, or use zero-mean instruments."
         )
-    regression = build_regression(predictor, logs)
+    regression = build_regression(predictor, logs, margins=margins)
     theta = _start(predictor, logs, start)
-    if margins is not None:
-        build_regression(predictor, logs, margins=margins)  # enough rows remain
 
-    def instruments_of(theta: Array) -> Instruments:
+    def instruments_of(theta: Array, keep: Sequence[NDArray[np.bool_]] | None) -> Instruments:
         return build_instruments(
             predictor,
             logs,
@@ -156,9 +154,11 @@ def estimate_iv(
             heading=heading,
             lag=lag,
             margins=margins,
+            keep=keep,
         )
 
-    instruments = instruments_of(theta)
+    # the first model may be far off: rows are first cut by the measured states
+    instruments = instruments_of(theta, [e.keep for e in regression.experiments])
     if instruments.diverged:
         raise ExcitationError(
             f"{instruments.diverged} already with the first model, so there are no instruments: "
@@ -171,12 +171,12 @@ def estimate_iv(
         for iterations in range(1, _MAX_REFINEMENTS + 1):
             previous = _coefficients(solutions)
             target = _structure_theta(predictor, previous)
-            candidate, fresh = target, instruments_of(target)
+            candidate, fresh = target, instruments_of(target, None)
             for _ in range(4):
                 if not fresh.diverged:
                     break
                 candidate = (candidate + theta) / 2
-                fresh = instruments_of(candidate)
+                fresh = instruments_of(candidate, None)
             if fresh.diverged:
                 status = (
                     f"stopped after {iterations - 1} refinements: {fresh.diverged}; "
@@ -316,6 +316,7 @@ def _covariance(
     residuals: list[list[Array]],
     kind: Covariance,
     seed: int,
+    centred: bool,
 ) -> tuple[Array, int]:
     predictor = regression.predictor
     p = len(predictor.columns)
@@ -324,12 +325,13 @@ def _covariance(
         total = np.zeros((p, p))
         for row, state in enumerate(predictor.structure.states):
             mine = predictor.equation(state)
-            draws = block_bootstrap(
-                projected[row],
-                [e.phi[mine] for e in regression.experiments],
-                [e.y[row] for e in regression.experiments],
-                rng,
-            )
+            phi = [e.phi[mine] for e in regression.experiments]
+            y = [e.y[row] for e in regression.experiments]
+            if centred:
+                # the constant of each experiment belongs to the equation, not to a block
+                phi = [f - f.mean(axis=1, keepdims=True) for f in phi]
+                y = [v - v.mean() for v in y]
+            draws = block_bootstrap(projected[row], phi, y, rng)
             total[np.ix_(mine, mine)] = np.cov(draws.T).reshape(len(mine), len(mine))
         return total, 0
     robust: CovarianceKind = kind
@@ -359,7 +361,7 @@ def _result(
 ) -> Estimate:
     predictor = regression.predictor
     projected, residuals = _masked(solutions, regression, instruments, centred=centred)
-    covariance, lags = _covariance(solutions, regression, projected, residuals, kind, seed)
+    covariance, lags = _covariance(solutions, regression, projected, residuals, kind, seed, centred)
     kept = sum(int(k.sum()) for k in instruments.keep)
     theta = _coefficients(solutions)
     states = predictor.structure.states

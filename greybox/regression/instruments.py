@@ -25,6 +25,7 @@ Array = NDArray[np.float64]
 START_SAMPLES = 5
 # a simulated state this many times beyond the largest measured one has diverged
 DIVERGENCE_FACTOR = 10.0
+_ANY_SHIP = 1e3
 
 
 @dataclass(frozen=True)
@@ -54,8 +55,10 @@ def initial_state(log: TrialLog, states: tuple[str, ...]) -> Array:
 
 def state_bound(log: TrialLog, states: tuple[str, ...]) -> Array:
     """Return the magnitude past which a simulated state counts as diverged, (nx,)."""
-    largest = np.abs(log.states(states)).max(axis=0)
-    return np.asarray(DIVERGENCE_FACTOR * np.maximum(largest, 1e-6))
+    x = log.states(states)
+    # a plan holds its start only, which says nothing of what the ship will reach
+    bound = np.where(np.ptp(x, axis=0) > 0, DIVERGENCE_FACTOR * np.abs(x).max(axis=0), _ANY_SHIP)
+    return np.asarray(bound)
 
 
 def simulate_log(
@@ -119,6 +122,7 @@ def build_instruments(
     heading: Literal["measured", "simulated"] = "measured",
     lag: int = 0,
     margins: dict[str, float] | None = None,
+    keep: Sequence[NDArray[np.bool_]] | None = None,
 ) -> Instruments:
     """Simulate a model on each log and form its regressors.
 
@@ -138,7 +142,9 @@ def build_instruments(
         Samples by which simulated states and inputs are delayed, for logs in
         closed loop: what was commanded before the noise cannot depend on it.
     margins : dict of str to float, optional
-        As `build_regression`.
+        Rows whose simulated states come closer to the origin are left out.
+    keep : sequence of ndarray of bool, optional
+        (N,) a log: the rows that take part, in place of those that keep the margins.
 
     Returns
     -------
@@ -146,7 +152,7 @@ def build_instruments(
     """
     structure = predictor.structure
     zs, keeps = [], []
-    for log in logs:
+    for i, log in enumerate(logs):
         run = simulate_log(structure, theta, log, heading=heading)
         if run.diverged[0] >= 0:
             k = int(run.diverged[0])
@@ -155,7 +161,7 @@ def build_instruments(
             )
         x = run.x[0][:-1]
         samples = len(x)
-        keep = within_margins(x, structure.states, margins)
+        rows = within_margins(x, structure.states, margins) if keep is None else keep[i].copy()
         tau = (
             log.forces(structure.inputs)[:-1]
             if structure.disturbance == "marine"
@@ -164,7 +170,7 @@ def build_instruments(
         if lag:
             shift = np.maximum(np.arange(samples) - lag, 0)
             x, tau = x[shift], tau[shift]
-            keep[:lag] = False
+            rows[:lag] = False
         psi: Array | float = 0.0
         if structure.disturbance == "marine":
             psi = run.psi[0][:samples]
@@ -177,7 +183,7 @@ def build_instruments(
         if zero_mean:
             # a constant keeps itself as instrument: its equation gives the mean residual
             varying = np.setdiff1d(np.arange(len(z)), predictor.constants)
-            z[varying] -= z[np.ix_(varying, np.flatnonzero(keep))].mean(axis=1, keepdims=True)
+            z[varying] -= z[np.ix_(varying, np.flatnonzero(rows))].mean(axis=1, keepdims=True)
         zs.append(z)
-        keeps.append(keep)
+        keeps.append(rows)
     return Instruments(tuple(zs), tuple(keeps))

@@ -239,6 +239,24 @@ class BatchRegression:
         unconverged |= ~np.isfinite(theta).all(axis=1)
         return BatchEstimate(theta, iteration, unconverged)
 
+    def with_instruments_of(self, theta: Array, doubtful: NDArray[np.bool_]) -> BatchEstimate:
+        """Estimate once, with instruments simulated from given models.
+
+        Parameters
+        ----------
+        theta : ndarray
+            (R, p_structure) models, such as another predictor's estimates.
+        doubtful : ndarray of bool
+            (R,) runs whose models did not converge.
+        """
+        runs = np.arange(self.batch.runs)
+        z, bad = self.instruments(np.nan_to_num(theta), runs, zero_mean=True)
+        out = np.full((len(runs), len(self.predictor.columns)), np.nan)
+        fine = ~bad
+        if fine.any():
+            out[fine] = self.solve(z[:, fine] if bad.any() else z, runs[fine])
+        return BatchEstimate(out, 0, doubtful | bad)
+
 
 def _solve_scaled(gram: Array, right: Array) -> Array:
     """Solve (R, p, p) systems after scaling rows and columns to unit size."""

@@ -1,0 +1,183 @@
+"""The commands as a user types them."""
+
+from __future__ import annotations
+
+import csv
+import json
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from virtual import virtual_log, write_csv
+
+from greybox.commands.main import main
+
+SCRIPT = [sys.executable, "-m", "greybox.commands.main"]
+
+
+def run(*arguments):
+    return main([str(a) for a in arguments])
+
+
+def test_estimate_simulate_compare(noisy_csv, tmp_path, capsys):
+    model = tmp_path / "m.json"
+    assert run("estimate", noisy_csv, "--vessel", "thesis", "--out", model) == 0
+    shown = capsys.readouterr().out
+    assert "Estimate of Thesis ship" in shown
+    data = json.loads(model.read_text())
+    assert data["names"][0] == "Xu"
+    assert data["sample_time"] == 1.0
+    assert data["provenance"]["command"]["vessel"] == "thesis"
+    assert set(data["fit"]) == {"u", "v", "r"}
+
+    out = tmp_path / "run.csv"
+    assert run("simulate", model, noisy_csv, "--out", out) == 0
+    with open(out) as handle:
+        rows = list(csv.DictReader(handle))
+    assert list(rows[0]) == ["t", "u", "v", "r", "psi", "x_n", "y_n"]
+    assert len(rows) == 5000
+
+    other = tmp_path / "ls.json"
+    assert run("estimate", noisy_csv, "--vessel", "thesis", "--method", "ls", "--predictor", "basic",
+               "--structure", "thesis", "--out", other) == 0  # fmt: skip
+    page, result = tmp_path / "c.html", tmp_path / "c.json"
+    capsys.readouterr()
+    assert run("compare", model, other, "--log", noisy_csv, "--json", result, "--report", page) == 0
+    compared = json.loads(result.read_text())
+    assert [m["model"] for m in compared["models"]] == ["m", "ls"]
+    assert set(compared["models"][0]["logs"][0]["fit"]) == {"u", "v", "r"}
+    html = page.read_text()
+    assert html.count("<svg") == 1
+    assert "http://" not in html.replace("http://www.w3.org", "").replace(
+        "http://purl.org", ""
+    ).replace("http://creativecommons.org", "")
+    assert "<script" not in html
+
+
+def test_same_input_same_bytes(noisy_csv, tmp_path):
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        assert run("estimate", noisy_csv, "--vessel", "thesis", "--covariance", "bootstrap",
+                   "--method", "iv", "--predictor", "augmented", "--seed", "4",
+                   "--out", tmp_path / name / "m.json") == 0  # fmt: skip
+    one, two = (json.loads((tmp_path / n / "m.json").read_text()) for n in "ab")
+    one["provenance"] = two["provenance"] = None
+    assert one == two
+
+
+def test_json_to_standard_output(noisy_csv, capsys):
+    assert run("estimate", noisy_csv, "--vessel", "thesis", "--method", "ls", "--predictor",
+               "basic", "--json", "-") == 0  # fmt: skip
+    assert json.loads(capsys.readouterr().out)["method"] == "ls"
+
+
+def test_a_plan_of_commands_is_simulated_from_a_start(noisy_csv, tmp_path, capsys):
+    model = tmp_path / "m.json"
+    assert run("estimate", noisy_csv, "--vessel", "thesis", "--out", model) == 0
+    plan = tmp_path / "plan.csv"
+    t = np.arange(50)
+    np.savetxt(plan, np.column_stack([t, 0 * t + 15, 0 * t + 0.8, 0 * t + 0.8]), delimiter=",",
+               header="t,n,alpha1,alpha2", comments="")  # fmt: skip
+    assert run("simulate", model, plan, "--out", tmp_path / "r.csv") == 1
+    assert "cannot be derived" in capsys.readouterr().err
+    assert run("simulate", model, plan, "--start", "1.5,1.2,0,0", "--out", tmp_path / "r.csv") == 0
+    assert run("simulate", model, plan, "--start", "1.5,1.2", "--out", tmp_path / "r.csv") == 1
+    assert "four numbers are needed" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["estimate", "none.csv", "--vessel", "thesis"], "there is no file 'none.csv'"),
+        (["estimate", "{log}", "--vessel", "none.toml"], "cannot read the vessel file"),
+        (["estimate", "{log}", "--vessel", "thesis", "--structure", "thesys"], "Did you mean"),
+        (["estimate", "{log}", "--vessel", "thesis", "--sample-time", "1.5"], "whole multiple"),
+        (["compare", "{log}", "--log", "{log}"], "is not a model file"),
+        (["reproduce", "chapter4", "--runs", "1"], "needs at least 2 runs"),
+        (["reproduce", "chapter4", "--estimate", "x"], "belong to chapter7"),
+        (["reproduce", "chapter7", "--estimate", "x"], "together"),
+    ],
+)
+def test_input_at_fault_is_one_sentence(noisy_csv, capsys, arguments, message):
+    status = run(*[a.replace("{log}", str(noisy_csv)) for a in arguments])
+    error = capsys.readouterr().err
+    assert status == 1
+    assert message in error
+    assert error.count("\n") == 1
+    assert "Traceback" not in error
+
+
+def test_nothing_is_left_half_written(noisy_csv, tmp_path, capsys):
+    out = tmp_path / "folder" / "m.json"
+    assert run("estimate", noisy_csv, "--vessel", "thesis", "--out", out) == 1
+    assert "cannot write" in capsys.readouterr().err
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["trial.csv"]
+
+
+def test_wrong_usage_exits_with_2(capsys):
+    with pytest.raises(SystemExit) as stop:
+        run("estmate")
+    assert stop.value.code == 2
+    assert "Did you mean 'estimate'" in capsys.readouterr().err
+    with pytest.raises(SystemExit) as stop:
+        run("estimate", "x.csv", "--vessel", "v", "--metod", "ls")
+    assert stop.value.code == 2
+    assert "Did you mean '--method'" in capsys.readouterr().err
+
+
+def test_help_of_every_command(capsys):
+    for command in ("estimate", "simulate", "compare", "reproduce"):
+        with pytest.raises(SystemExit) as stop:
+            run(command, "--help")
+        assert stop.value.code == 0
+        assert f"greybox {command}" in capsys.readouterr().out
+
+
+def test_entry_points_are_the_declared_ones():
+    declared = tomllib.loads(Path("pyproject.toml").read_text())["project"]["entry-points"]
+    done = subprocess.run([*SCRIPT, "--help"], capture_output=True, text=True, check=True)
+    for name in declared["greybox.commands"]:
+        assert name in done.stdout
+
+
+def test_help_imports_nothing_heavy():
+    code = (
+        "import sys; from greybox.commands.main import main\n"
+        "try: main(['--help'])\nexcept SystemExit: pass\n"
+        "assert not {'casadi', 'numpy', 'pandas', 'matplotlib'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
+
+
+def test_reproduce_writes_tables_figures_and_page(tmp_path, capsys):
+    out = tmp_path / "c4"
+    assert run("reproduce", "chapter4", "--runs", "5", "--workers", "1", "--out", out) == 0
+    with open(out / "tables.csv") as handle:
+        rows = list(csv.DictReader(handle))
+    assert list(rows[0]) == ["table", "set", "estimator", "parameter", "mean", "sd",
+                             "published_mean", "published_sd", "runs"]  # fmt: skip
+    assert {r["set"] for r in rows} == {"4.1-4.2", "4.3-4.5", "4.6-4.8", "4.9-4.11"}
+    assert (out / "report.html").read_text().count("<svg") == 4
+    assert len(list(out.glob("*.png"))) == 4
+
+
+def test_reproduce_chapter7_on_logs(tmp_path, capsys):
+    files = []
+    for i in range(3):
+        log = virtual_log(30 + i, 500, wind=3.0 if i < 2 else 0.5, name=f"day{i}")
+        files.append(write_csv(log, tmp_path / f"day{i}.csv"))
+    assert run("reproduce", "chapter7", "--vessel", "thesis", "--estimate", *files[:2],
+               "--validate", files[2], "--out", tmp_path / "c7") == 0  # fmt: skip
+    assert "estimation sets: 2 of 1 logs" in capsys.readouterr().out
+    assert (tmp_path / "c7" / "table_7.1.png").exists()
+
+
+def test_physical_quantities_when_a_mass_is_given(noisy_csv, capsys):
+    assert run("estimate", noisy_csv, "--vessel", "thesis", "--mass", "150000") == 0
+    shown = capsys.readouterr().out
+    assert "Physical quantities for m = 150000 kg" in shown
+    assert "assumed added mass" in shown
+    assert "Xvr·Yur = −Ts²" in shown

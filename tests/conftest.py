@@ -1,0 +1,58 @@
+"""Logs and vessels that several tests share."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from virtual import PARAMETERS, virtual_log, write_csv
+
+from greybox.model.catalogue import get_structure
+from greybox.study.chapter6 import NOMINAL, TRUE
+from greybox.vessel.toml import load_vessel
+
+
+@pytest.fixture(scope="session")
+def thesis():
+    return get_structure("thesis")
+
+
+@pytest.fixture(scope="session")
+def ship():
+    return load_vessel("thesis")
+
+
+@pytest.fixture(scope="session")
+def true_theta():
+    return np.array([TRUE[n] for n in PARAMETERS])
+
+
+@pytest.fixture(scope="session")
+def nominal_theta():
+    return np.array([NOMINAL[n] for n in PARAMETERS])
+
+
+@pytest.fixture(scope="session")
+def data_folder():
+    folder = Path(os.environ.get("GREYBOX_DATA", "../shared/data"))
+    if not folder.is_dir():
+        pytest.skip(f"no logs in {folder}: set GREYBOX_DATA")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def clean_log():
+    """Noise-free, undisturbed."""
+    return virtual_log(1, 600, wind=0.0, current=(0.0, 0.0), noise=0.0, spread=0.0)
+
+
+@pytest.fixture(scope="session")
+def noisy_log():
+    return virtual_log(2, 5000)
+
+
+@pytest.fixture
+def noisy_csv(noisy_log, tmp_path):
+    return write_csv(noisy_log, tmp_path / "trial.csv")

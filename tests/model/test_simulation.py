@@ -1,0 +1,110 @@
+"""Free runs: both compiled forms against a slow loop, RK4 against scipy, divergence."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from greybox.errors import DivergenceError, StructureError
+from greybox.model.catalogue import get_structure
+from greybox.model.functions import MANY_RUNS, step_function
+from greybox.model.simulation import positions, simulate, stationary_disturbance
+
+
+def slow_run(structure, theta, x0, psi0, tau, d):
+    step = step_function(structure, heading="simulated")
+    x, psi, out = np.array(x0, float), psi0, [np.array(x0, float)]
+    for k in range(len(tau)):
+        x, psi = (np.array(v).ravel() for v in step(x, psi, tau[k], d[k], [0, 0], theta, 1.0))
+        psi = float(psi[0])
+        out.append(x)
+    return np.array(out), psi
+
+
+@pytest.mark.parametrize("runs", [2, MANY_RUNS + 3])
+def test_both_forms_equal_a_slow_loop(thesis, true_theta, runs):
+    rng = np.random.default_rng(0)
+    samples = 60
+    tau = rng.uniform(0, 10, (runs, samples, 3)) * [1, 1, 0.1]
+    d = stationary_disturbance(rng, np.array([0.2, -0.2, 1, 1]), 0.03, samples, runs=runs)
+    theta = true_theta * rng.uniform(0.9, 1.1, (runs, len(true_theta)))
+    x0 = np.column_stack([rng.uniform(0.5, 1.5, runs), rng.uniform(0.5, 1, runs), np.zeros(runs)])
+    run = simulate(thesis, theta, x0, tau, 1.0, d=d, psi0=0.3)
+    for i in (0, runs - 1):
+        want, psi = slow_run(thesis, theta[i], x0[i], 0.3, tau[i], d[i])
+        np.testing.assert_allclose(run.x[i], want, rtol=1e-10, atol=1e-12)
+        np.testing.assert_allclose(run.psi[i, -1], psi, rtol=1e-10)
+
+
+def test_length_need_not_fill_the_unrolled_block(thesis, true_theta):
+    tau = np.ones((7, 3))
+    short = simulate(thesis, true_theta, np.array([1.0, 0.5, 0.0]), tau, 1.0)
+    long = simulate(thesis, true_theta, np.array([1.0, 0.5, 0.0]), np.ones((90, 3)), 1.0)
+    np.testing.assert_array_equal(short.x[0], long.x[0, :8])
+
+
+def test_rk4_follows_the_differential_equation(thesis, true_theta):
+    step = step_function(thesis)
+    tau = np.array([10.0, 8.0, 3.0])
+
+    def rate(_, z):
+        x = z[:3]
+        return np.append(
+            np.array(step(x, z[3], tau, np.zeros(4), [0, 0], true_theta, 1)).ravel() - x, x[2]
+        )
+
+    exact = solve_ivp(rate, (0, 20), [1.0, 0.5, 0.0, 0.1], rtol=1e-10, atol=1e-12).y[:, -1]
+    ship = simulate(
+        thesis, true_theta, np.array([1.0, 0.5, 0.0]), np.tile(tau, (20, 1)), 1.0,
+        psi0=0.1, integrator="rk4",
+    )  # fmt: skip
+    np.testing.assert_allclose(ship.x[0, -1], exact[:3], atol=2e-4)
+    euler = simulate(
+        thesis, true_theta, np.array([1.0, 0.5, 0.0]), np.tile(tau, (20, 1)), 1.0, psi0=0.1
+    )
+    assert abs(euler.x[0, -1, 0] - exact[0]) > abs(ship.x[0, -1, 0] - exact[0])
+
+
+def test_divergence_is_reported_with_its_place(thesis, true_theta):
+    bad = true_theta.copy()
+    bad[2] = 0.5
+    run = simulate(
+        thesis, bad, np.array([1.0, 0.5, 0.0]), np.ones((100, 3)), 1.0, bound=np.full(3, 50.0)
+    )
+    assert run.diverged[0] > 0
+    with pytest.raises(DivergenceError, match=r"passed 50 at sample \d+ of 100"):
+        run.require_bounded(thesis.states, "the run")
+
+
+def test_process_noise_adds_to_the_next_state():
+    structure = get_structure("siso")
+    w = np.array([[0.5], [0.0], [-1.0]])
+    run = simulate(
+        structure, np.array([0.0, 0.0]), np.zeros(1), np.zeros((3, 1)), 1.0, process_noise=w
+    )
+    np.testing.assert_allclose(run.x[0, :, 0], [0, 0.5, 0, -1])
+
+
+def test_stationary_disturbances_have_their_moments():
+    rng = np.random.default_rng(4)
+    d = stationary_disturbance(
+        rng, np.array([0.2, 5.0]), np.array([0.1, 2.0]), 4000, runs=50, correlation_time=20.0
+    )
+    effective = 50 * 4000 / 40
+    np.testing.assert_allclose(d.mean((0, 1)), [0.2, 5.0], atol=4 * 2.0 / np.sqrt(effective))
+    np.testing.assert_allclose(d.std((0, 1)), [0.1, 2.0], rtol=0.05)
+    lag = ((d[:, 20:, 1] - 5) * (d[:, :-20, 1] - 5)).mean() / 4.0
+    assert abs(lag - np.exp(-1)) < 0.06
+
+
+def test_positions_turn_with_the_heading():
+    track = positions(np.array([[1.0, 0.0]] * 3), np.full(3, np.pi / 2), 2.0)
+    np.testing.assert_allclose(track, [[0, 0], [0, 2], [0, 4]], atol=1e-12)
+
+
+def test_a_map_cannot_be_integrated_by_rk4():
+    with pytest.raises(StructureError, match="is a map"):
+        step_function(get_structure("siso"), integrator="rk4")
+    with pytest.raises(StructureError, match="no yaw rate"):
+        step_function(get_structure("surge"), heading="simulated")

@@ -1,0 +1,100 @@
+"""Pages: escaped, self-contained, and legible in a real browser."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import tempfile
+
+import numpy as np
+import pytest
+
+from greybox.report.figures import comparison_figure, overview_figure, to_svg
+from greybox.report.page import Page, Picture, Table, flatten, render, write_page
+
+CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+
+
+def page(width=3):
+    figure = overview_figure({"u": np.sin(np.arange(50)), "psi": np.arange(50.0)}, "A log")
+    return Page(
+        "Title <b>",
+        "A headline & more.",
+        ["One sentence."],
+        [Picture(to_svg(figure, "one"), "Two signals <x>.")],
+        [
+            Table(
+                "Numbers",
+                ["name"] + ["value"] * width,
+                [["<script>alert(1)</script>"] + ["1.0"] * width],
+            )
+        ],
+        [("Model", "u⁺ = u + Xu·u_r")],
+        flatten({"program": "greybox", "command": {"logs": ["a.csv", "b.csv"]}}),
+    )
+
+
+def test_values_are_escaped():
+    html = render(page())
+    assert "<script>" not in html
+    assert "&lt;script&gt;" in html
+    assert "Title &lt;b&gt;" in html
+    assert "command logs" in html
+    assert "a.csv, b.csv" in html
+
+
+def test_identifiers_of_figures_do_not_collide():
+    figures = [overview_figure({"u": np.arange(5.0)}, "x") for _ in range(2)]
+    one, two = (to_svg(f, t) for f, t in zip(figures, ("a", "b"), strict=True))
+    import re
+
+    ids = [set(re.findall(r'\bid="([^"]+)"', s)) for s in (one, two)]
+    assert ids[0]
+    assert not ids[0] & ids[1]
+
+
+def test_comparison_figure_has_labels_and_units(clean_log, thesis, true_theta):
+    from greybox.estimation.estimate import estimate_ls
+    from greybox.model.predictor import build_predictor
+    from greybox.validation.fit import run_model
+
+    model = estimate_ls(
+        build_predictor(thesis, "basic", (("u", (1,)), ("v", (1,)))), [clean_log]
+    ).model()
+    figure = comparison_figure(["m"], [run_model(model, clean_log)])
+    labels = [a.get_ylabel() for a in figure.axes]
+    assert "surge u [m/s]" in labels
+    assert figure.axes[-1].get_xlabel() == "time [s]"
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no browser installed")
+@pytest.mark.parametrize("width", [390, 1200])
+def test_in_a_browser(tmp_path, width):
+    """Opens, shows its figure, and does not scroll sideways."""
+    path = tmp_path / "page.html"
+    write_page(page(width=12), path)
+    probe = (
+        "<script>addEventListener('load',()=>{const e=document.documentElement;"
+        "document.title=JSON.stringify([e.scrollWidth<=e.clientWidth,"
+        "document.querySelector('svg').getBoundingClientRect().width>200,e.clientWidth])})"
+        "</script></body>"
+    )
+    frame = tmp_path / "probe.html"
+    frame.write_text(path.read_text().replace("</body>", probe))
+    # an own width needs a frame: a headless window is never narrower than 500 px
+    outer = tmp_path / "outer.html"
+    outer.write_text(
+        f"<iframe id=f src=probe.html width={width} height=800></iframe><script>"
+        "addEventListener('load',()=>{document.title=f.contentDocument.title})</script>"
+    )
+    with tempfile.TemporaryDirectory() as profile:
+        done = subprocess.run(
+            [
+                CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic",
+                "--no-first-run", "--disable-background-networking", "--disable-component-update",
+                "--disable-sync", "--allow-file-access-from-files", f"--user-data-dir={profile}",
+                "--virtual-time-budget=5000", "--dump-dom", f"file://{outer}",
+            ],
+            capture_output=True, text=True, timeout=120, check=False,
+        )  # fmt: skip
+    assert "<title>[true,true," in done.stdout, done.stdout[:500] + done.stderr[-500:]

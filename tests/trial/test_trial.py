@@ -1,0 +1,184 @@
+"""Reading and conditioning of logs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from greybox.errors import LogError
+from greybox.trial.conditioning import decimate, relative_wind, velocities_from_positions
+from greybox.trial.log import make_log
+from greybox.trial.reading import read_log
+from greybox.vessel.toml import vessel_from_dict
+
+SHIP = {
+    "name": "S",
+    "length": 5,
+    "thruster": [{"type": "azimuth", "speed": "n", "angle": "a"}],
+}
+
+
+def table(n=20, **replace):
+    t = np.arange(n) * 0.5
+    columns = {
+        "t": t, "x_n": t * 2, "y_n": t * 0, "psi": 0 * t + 0.1, "u": 0 * t + 2, "v": 0 * t,
+        "r": 0 * t, "n": t, "a": 0 * t,
+    }  # fmt: skip
+    return pd.DataFrame(columns | replace)
+
+
+def read(frame, tmp_path, vessel=SHIP, **kw):
+    path = tmp_path / "log.csv"
+    frame.to_csv(path, index=False)
+    return read_log(path, vessel_from_dict(vessel), **kw)
+
+
+def test_csv_and_parquet_give_the_same_log(tmp_path):
+    frame = table()
+    one = read(frame, tmp_path)
+    frame.to_parquet(tmp_path / "log.parquet")
+    two = read_log(tmp_path / "log.parquet", vessel_from_dict(SHIP))
+    assert one.sample_time == two.sample_time == 0.5
+    for name in one.channels:
+        np.testing.assert_array_equal(one[name], two[name])
+
+
+def test_names_and_units_of_the_vessel_file(tmp_path):
+    frame = table().rename(columns={"psi": "Heading", "t": "ms", "u": "SOG"})
+    frame["Heading"] = np.degrees(np.linspace(3.0, 3.4, 20) % 6.28)
+    frame["ms"] *= 1000
+    frame["SOG"] = 10.0
+    ship = SHIP | {
+        "columns": {
+            "Heading": {"name": "psi", "unit": "deg"},
+            "ms": {"name": "t", "unit": "ms"},
+            "SOG": {"name": "u", "unit": "kn"},
+        }
+    }
+    log = read(frame, tmp_path, ship)
+    assert log.sample_time == pytest.approx(0.5)
+    np.testing.assert_allclose(log["psi"], np.linspace(3.0, 3.4, 20))
+    np.testing.assert_allclose(log["u"], 10 * 1852 / 3600)
+
+
+def test_heading_is_unwrapped(tmp_path):
+    psi = np.linspace(3.0, 9.0, 20)
+    log = read(table(psi=(psi + np.pi) % (2 * np.pi) - np.pi), tmp_path)
+    np.testing.assert_allclose(log["psi"], psi)
+
+
+def test_velocities_come_from_positions_where_absent(tmp_path):
+    t = np.arange(200) * 0.1
+    psi = 0.3 * np.sin(0.2 * t)
+    rate = 0.06 * np.cos(0.2 * t)
+    u, v = 1.5 + 0.2 * np.sin(0.3 * t), 0.3 * np.cos(0.4 * t)
+    fine = np.linspace(0, t[-1], 200001)
+
+    def integral(f):
+        value = np.interp(fine, t, f)
+        return np.interp(t, fine, np.concatenate([[0], np.cumsum(value[:-1]) * fine[1]]))
+
+    north = integral(np.cos(psi) * u - np.sin(psi) * v)
+    east = integral(np.sin(psi) * u + np.cos(psi) * v)
+    ax, ay = 1.2, -0.4
+    frame = pd.DataFrame(
+        {
+            "t": t,
+            "x_n": north + np.cos(psi) * ax - np.sin(psi) * ay,
+            "y_n": east + np.sin(psi) * ax + np.cos(psi) * ay,
+            "psi": psi, "n": t, "a": t,
+        }
+    )  # fmt: skip
+    log = read(frame, tmp_path, SHIP | {"sensors": {"antenna": [ax, ay]}})
+    assert "3.57" in log.provenance.derived[0]
+    np.testing.assert_allclose(log["u"], u[1:-1], atol=2e-3)
+    np.testing.assert_allclose(log["v"], v[1:-1], atol=2e-3)
+    np.testing.assert_allclose(log["r"], rate[1:-1], atol=1e-4)
+
+
+def test_heading_noise_is_divided_out():
+    """(3.64): the mean of u shrinks by exp(−λ/2) without the correction."""
+    rng = np.random.default_rng(0)
+    n, std = 40000, 0.3
+    x = 2.0 * np.arange(n)
+    psi = std * rng.standard_normal(n)
+    raw, _, _ = velocities_from_positions(x, 0 * x, psi, 1.0)
+    mended, _, _ = velocities_from_positions(x, 0 * x, psi, 1.0, heading_std=std)
+    error = 3 * raw.std() / np.sqrt(n)
+    assert abs(raw.mean() - 2 * np.exp(-(std**2) / 2)) < error
+    assert abs(mended.mean() - 2) < error * 1.1
+
+
+def test_polar_wind():
+    """(5.41), (5.42), and the sign of CONTRACT: wind from starboard gives v_q > 0."""
+    from_starboard = np.pi / 2
+    u_q, v_q = relative_wind(np.array([3.0]), np.array([-from_starboard]))
+    np.testing.assert_allclose([u_q[0], v_q[0]], [0, 3], atol=1e-12)
+
+
+def test_decimation_averages_what_the_ship_feels(ship):
+    n = 40
+    signal = np.arange(n, dtype=float)
+    log = make_log(
+        ship,
+        {"n": signal, "alpha1": signal, "alpha2": signal, "u": signal, "v": signal, "r": signal,
+         "psi": signal},
+        0.5,
+    )  # fmt: skip
+    slow = decimate(log, 2.0)
+    assert slow.sample_time == 2.0
+    k = np.flatnonzero(np.isin(log.t, slow.t))
+    np.testing.assert_allclose(slow["u"], signal[k])  # centred: a ramp keeps its value
+    np.testing.assert_allclose(slow["n"], [signal[i : i + 4].mean() for i in k])  # ahead
+    with pytest.raises(LogError, match=r"1\.5 times"):
+        decimate(log, 0.75)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda f: f.rename(columns={"n": "m"}), "no column 'n', which moves a thruster"),
+        (lambda f: f.drop(columns=["t"]), "no column 't'"),
+        (lambda f: f.drop(columns=["u", "x_n"]), "no 'u' and it cannot be derived"),
+        (lambda f: f.drop(columns=["psi"]), "no heading 'psi'"),
+        (lambda f: f.assign(u=f["u"].where(f.index != 4)), "holds 'nan' in row 6 and 1 of 20"),
+        (lambda f: f.assign(v="x"), "no finite number"),
+        (lambda f: f.assign(t=f["t"][::-1].to_numpy()), "must increase"),
+        (lambda f: f.assign(t=np.r_[np.arange(10), 10 + 2 * np.arange(10)]), "two sample times"),
+        (lambda f: f.head(2), "has 2 samples, at least 3"),
+    ],
+)
+def test_bad_logs(tmp_path, change, message):
+    with pytest.raises(LogError, match=message):
+        read(change(table()), tmp_path)
+
+
+def test_bad_files(tmp_path):
+    ship = vessel_from_dict(SHIP)
+    with pytest.raises(LogError, match="there is no file"):
+        read_log(tmp_path / "none.csv", ship)
+    (tmp_path / "log.xlsx").write_text("t")
+    with pytest.raises(LogError, match=r"logs are CSV \(.csv\) or Parquet"):
+        read_log(tmp_path / "log.xlsx", ship)
+    (tmp_path / "log.parquet").write_text("not parquet")
+    with pytest.raises(LogError, match="as Parquet"):
+        read_log(tmp_path / "log.parquet", ship)
+    (tmp_path / "empty.csv").write_text("")
+    with pytest.raises(LogError, match="as CSV"):
+        read_log(tmp_path / "empty.csv", ship)
+
+
+def test_closed_loop_is_read_from_the_mode(tmp_path):
+    frame = table()
+    frame["mode"] = ["dp"] * 15 + ["manual"] * 5
+    log = read(frame, tmp_path, SHIP | {"closed_loop": {"column": "mode", "values": ["dp"]}})
+    assert log.loop_known
+    assert log.closed_loop.sum() == 15
+
+
+def test_make_log_refuses_uneven_and_infinite(ship):
+    with pytest.raises(LogError, match="has 2 samples and 'v' has 3"):
+        make_log(ship, {"u": np.zeros(2), "v": np.zeros(3)}, 1.0)
+    with pytest.raises(LogError, match="not finite at sample 1"):
+        make_log(ship, {"u": np.array([0, np.inf])}, 1.0)

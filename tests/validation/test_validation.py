@@ -1,0 +1,204 @@
+"""Fit, comparison, choice, conversion."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from virtual import virtual_log
+
+from greybox.errors import ExcitationError, LogError, ModelFileError, StructureError
+from greybox.estimation.estimate import estimate_ls
+from greybox.model.catalogue import get_structure
+from greybox.model.conversion import (
+    Inertia,
+    change_sample_time,
+    check_ties,
+    estimate_inertia,
+    from_prime,
+    to_continuous,
+    to_discrete,
+    to_prime,
+)
+from greybox.model.model import load_model, model_from_dict
+from greybox.model.predictor import build_predictor
+from greybox.trial.log import make_log
+from greybox.validation.choose import Request, estimate_model, regime_of
+from greybox.validation.comparison import compare_models, sign_test
+from greybox.validation.fit import fit_percent, run_model
+
+
+@pytest.fixture(scope="module")
+def true_model(thesis_model):
+    return thesis_model
+
+
+@pytest.fixture(scope="module")
+def thesis_model():
+    log = virtual_log(1, 600, wind=0.0, current=(0.0, 0.0), noise=0.0, spread=0.0)
+    predictor = build_predictor(get_structure("thesis"), "basic", (("u", (1,)), ("v", (1,))))
+    return estimate_ls(predictor, [log]).model()
+
+
+def test_fit_is_the_published_formula():
+    y = np.array([1.0, 2.0, 4.0, 5.0])
+    assert fit_percent(y, y) == 100
+    assert fit_percent(y, np.full(4, 3.0)) == pytest.approx(0)
+    want = 100 * (1 - np.linalg.norm([1, 0, 0, 0]) / np.linalg.norm(y - 3))
+    assert fit_percent(y, y + [1, 0, 0, 0]) == pytest.approx(want)
+    assert fit_percent(np.ones(3), np.zeros(3)) == -np.inf
+
+
+def test_a_true_model_runs_true(thesis_model, clean_log):
+    fit = run_model(thesis_model, clean_log).fit
+    assert min(fit.values()) > 90  # the start is the mean of five samples
+
+
+def test_models_survive_their_file(thesis_model, tmp_path):
+    path = tmp_path / "model.json"
+    thesis_model.save(path)
+    again = load_model(path)
+    np.testing.assert_array_equal(again.theta, thesis_model.theta)
+    np.testing.assert_array_equal(again.covariance, thesis_model.covariance)
+    assert again.structure == thesis_model.structure
+    assert again.sums == thesis_model.sums
+    again.save(tmp_path / "again.json")
+    assert (tmp_path / "again.json").read_bytes() == path.read_bytes()
+    data = json.loads(path.read_text())
+    for key in ("theta", "std", "names", "units", "fit", "tests"):
+        assert key in data
+    assert len(data["theta"]) == len(data["names"]) == len(data["std"]) == len(data["units"])
+    for test in data["tests"].values():
+        assert {"statistic", "p_value", "sentence"} <= set(test)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"format": "x"}, "is not a model file"),
+        ({"version": 99}, "has version 99"),
+        ({"theta": [1.0]}, "15 terms but 1 parameters"),
+        ({"vessel": {}}, "damaged model file"),
+        ({"structure": {"name": 3}}, "damaged model file"),
+    ],
+)
+def test_bad_model_files(thesis_model, change, message):
+    with pytest.raises(ModelFileError, match=message):
+        model_from_dict(thesis_model.to_dict() | change)
+
+
+def test_foreign_model_files(tmp_path):
+    with pytest.raises(ModelFileError, match="cannot read"):
+        load_model(tmp_path / "none.json")
+    (tmp_path / "x.json").write_text("{")
+    with pytest.raises(ModelFileError, match="is not a model file"):
+        load_model(tmp_path / "x.json")
+
+
+def test_comparison_tells_models_apart(thesis_model, clean_log, noisy_log):
+    from dataclasses import replace
+
+    worse = replace(thesis_model, theta=thesis_model.theta * 0.8)
+    logs = [clean_log, noisy_log]
+    c = compare_models([worse, thesis_model], ["worse", "true"], [logs, logs])
+    assert c.fits()[1]["u"] > c.fits()[0]["u"]
+    assert {t.wins for t in c.sign_tests} <= {1, 2}
+    assert set(c.ahead[0][0]) == {"10", "30", "60"}
+    assert c.ahead[1][0]["10"]["u"] < c.ahead[0][0]["10"]["u"]
+    assert c.rmse[1][0]["u"] == pytest.approx(
+        float(np.sqrt(np.mean((clean_log["u"] - c.runs[1][0].x[:, 0]) ** 2)))
+    )
+    json.dumps(c.to_dict())
+    assert "fit u [%]" in c.summary()
+
+
+def test_sign_test_is_binomial():
+    t = sign_test("b", "a", "u", [1, 2, 3, 4, 5], [2, 3, 4, 5, 5])
+    assert (t.wins, t.of) == (4, 4)
+    assert t.p_value == pytest.approx(2 / 16)
+
+
+def test_the_theory_chooses_where_its_conditions_hold(noisy_log):
+    e = estimate_model([noisy_log])
+    assert e.method == "iv"
+    assert e.predictor.kind in ("wind", "augmented")
+    assert any("consistent (chapter 5)" in n for n in e.notes)
+    assert e.fit["u"] > 50
+
+
+def test_held_out_runs_choose_elsewhere():
+    log = virtual_log(4, 900)
+    straight = make_log(log.vessel, {**log.channels, "psi": log["psi"] * 0.01}, 1.0, "straight")
+    without_wind = type(straight)(
+        **{
+            **straight.__dict__,
+            "channels": {k: v for k, v in straight.channels.items() if k not in ("u_q", "v_q")},
+        }
+    )
+    e = estimate_model([without_wind])
+    assert any("chosen by the free run on the last third" in n for n in e.notes)
+    assert any("bias-capturing terms were left out" in n for n in e.notes)
+
+
+def test_uninformative_logs_are_refused(noisy_log):
+    straight = {**noisy_log.channels, "psi": noisy_log["psi"] * 1e-4}
+    log = make_log(noisy_log.vessel, straight, 1.0, "straight")
+    with pytest.raises(ExcitationError, match=r"heading stays within \d+ deg"):
+        estimate_model([log], Request(method="iv", predictor="augmented"))
+    dead = {**noisy_log.channels, **{c: 0 * noisy_log[c] + 1 for c in noisy_log.vessel.commands}}
+    log = make_log(noisy_log.vessel, dead, 1.0, "dead")
+    with pytest.raises(ExcitationError, match="every thruster command is constant"):
+        estimate_model([log], Request(method="ls", predictor="basic"))
+    no_wind = {k: v for k, v in noisy_log.channels.items() if k not in ("u_q", "v_q")}
+    log = make_log(noisy_log.vessel, no_wind, 1.0, "calm")
+    with pytest.raises(LogError, match="needs the wind"):
+        estimate_model([log], Request(predictor="wind"))
+
+
+def test_regime_is_read_from_the_log(noisy_log, thesis):
+    assert dict(regime_of([noisy_log], thesis)) == {"u": (1,), "v": (1,), "r": (1, -1)}
+
+
+def test_table_3_1_and_back(thesis):
+    inertia = Inertia(surge=1.05e5, sway=1.7e5, yaw=9e6)
+    physical = {n: 10.0 * (i + 1) for i, n in enumerate(thesis.parameters)}
+    for name in ("Xvr", "Yur", "Nuv"):
+        del physical[name]
+    theta = to_discrete(physical, thesis, 0.5, inertia)
+    assert theta["Xu"] == pytest.approx(0.5 * 10 / 1.05e5)
+    assert theta["Xvr"] == pytest.approx(0.5 * 1.7 / 1.05)
+    assert theta["Yur"] == pytest.approx(-0.5 * 1.05 / 1.7)
+    assert theta["Nuv"] == pytest.approx(-0.5 * (1.7e5 - 1.05e5) / 9e6)
+    assert all(t.holds for t in check_ties({k: theta[k] for k in ("Xvr", "Yur")}, 0.5))
+    back = to_continuous(theta, thesis, 0.5, inertia)
+    for name, value in physical.items():
+        assert back[name] == pytest.approx(value)
+    assert change_sample_time(theta["Xu"], 0.5, 2.0) == pytest.approx(4 * theta["Xu"])
+
+
+def test_masses_follow_from_the_gains():
+    theta = {"Xmu": 2e-5, "Ymu": 1e-5, "Nmu": 1e-7}
+    inertia = estimate_inertia(theta, 1.0, mass=4e4, thrust_in_newtons=True)
+    assert (inertia.surge, inertia.sway, inertia.yaw) == pytest.approx((5e4, 1e5, 1e7))
+    assumed = estimate_inertia(theta, 1.0, mass=4e4, thrust_in_newtons=False)
+    assert assumed.surge == pytest.approx(4.2e4)
+    with pytest.raises(StructureError, match="Ymu is 0"):
+        estimate_inertia({"Xmu": 1, "Nmu": 1}, 1.0, mass=1, thrust_in_newtons=True)
+
+
+def test_ties_of_table_6_1_do_not_hold(thesis, true_theta):
+    ties = check_ties(dict(zip(thesis.parameters, true_theta, strict=True)), 1.0)
+    assert [t.holds for t in ties] == [False, False]
+    assert "only nominal" in ties[0].sentence
+
+
+def test_prime_coefficients(thesis):
+    c = {"Xu": 3.0, "Xuu": 5.0, "Nvr": 7.0, "Xmu": 1.0}
+    prime = to_prime(c, thesis, length=30.0, speed=4.0, density=1000.0)
+    assert prime["Xuu"] == pytest.approx(5.0 / (0.5 * 1000 * 30**2))
+    assert prime["Xu"] == pytest.approx(3.0 / (0.5 * 1000 * 30**2 * 4))
+    assert prime["Nvr"] == pytest.approx(7.0 / (0.5 * 1000 * 30**4))
+    assert "Xmu" not in prime
+    back = from_prime(prime, thesis, length=30.0, speed=4.0, density=1000.0)
+    assert back["Nvr"] == pytest.approx(7.0)
