@@ -8,7 +8,7 @@ is written a second time.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import casadi as ca
@@ -74,26 +74,58 @@ class Vectorised:
     def __init__(self, expressions: Sequence[ca.SX], symbols: Sequence[ca.SX]) -> None:
         function = ca.Function("f", list(symbols), [ca.vertcat(*expressions)], {"cse": True})
         self.size = len(expressions)
-        self._program: list[tuple[str, Any, tuple[int, ...], int]] = []
+        # (target, operation, sources); targets are numbered once, work slots are not reused
+        self._calls: list[tuple[int, Callable[..., Any], tuple[int, ...]]] = []
+        self._inputs: list[tuple[int, int]] = []
+        self._constants: dict[int, float] = {}
+        self._outputs: list[tuple[int, int]] = []
         rows = function.sparsity_out(0).row()
+        holder: dict[int, int] = {}
         for k in range(function.n_instructions()):
             op = function.instruction_id(k)
-            source = tuple(function.instruction_input(k))
+            slots = function.instruction_input(k)
             target = function.instruction_output(k)
+            if op == ca.OP_OUTPUT:
+                self._outputs.append((rows[target[1]], holder[slots[0]]))
+                continue
             if op == ca.OP_CONST:
-                self._program.append(("const", function.instruction_constant(k), (), target[0]))
+                self._constants[k] = function.instruction_constant(k)
             elif op == ca.OP_INPUT:
-                self._program.append(("input", source[0], (), target[0]))
-            elif op == ca.OP_OUTPUT:
-                self._program.append(("output", rows[target[1]], source, -1))
+                self._inputs.append((k, slots[0]))
             elif op in _UNARY:
-                self._program.append(("call", _UNARY[op], source[:1], target[0]))
+                self._calls.append((k, _UNARY[op], (holder[slots[0]],)))
             elif op in _BINARY:
-                self._program.append(("call", _BINARY[op], source[:2], target[0]))
+                self._calls.append((k, _BINARY[op], (holder[slots[0]], holder[slots[1]])))
             else:
                 raise NotImplementedError(f"operation {op} has no array form")
+            holder[target[0]] = k
 
-    def __call__(self, arrays: Sequence[Array | float], out: Array) -> Array:
+    def prepare(self, known: Mapping[int, Array | float]) -> dict[int, Any]:
+        """Evaluate once what depends on some arguments only.
+
+        Parameters
+        ----------
+        known : mapping of int to ndarray
+            Position of an argument -> its array.
+
+        Returns
+        -------
+        dict
+            To be given to calls whose other arguments change.
+        """
+        work: dict[int, Any] = dict(self._constants)
+        work |= {k: known[i] for k, i in self._inputs if i in known}
+        for target, call, sources in self._calls:
+            if all(i in work for i in sources):
+                work[target] = call(*[work[i] for i in sources])
+        return work
+
+    def __call__(
+        self,
+        arrays: Sequence[Array | float],
+        out: Array,
+        prepared: Mapping[int, Any] | None = None,
+    ) -> Array:
         """Fill ``out[i]`` with expression i evaluated on `arrays`.
 
         Parameters
@@ -102,16 +134,17 @@ class Vectorised:
             One a symbol, of shapes that broadcast to ``out.shape[1:]``.
         out : ndarray
             (size, ...) array to fill; returned.
+        prepared : mapping, optional
+            What `prepare` returned for some of the same arguments.
         """
-        work: dict[int, Any] = {}
-        out[...] = 0.0
-        for kind, what, source, target in self._program:
-            if kind == "call":
-                work[target] = what(*[work[i] for i in source])
-            elif kind == "input":
-                work[target] = arrays[what]
-            elif kind == "const":
-                work[target] = what
-            else:
-                out[what] = work[source[0]]
+        work = dict(self._constants) if prepared is None else dict(prepared)
+        for k, i in self._inputs:
+            work.setdefault(k, arrays[i])
+        for target, call, sources in self._calls:
+            if target not in work:
+                work[target] = call(*[work[i] for i in sources])
+        if len(self._outputs) < self.size:
+            out[...] = 0.0
+        for row, source in self._outputs:
+            out[row] = work[source]
         return out

@@ -28,7 +28,9 @@ Heading = Literal["measured", "simulated"]
 
 _UNROLLED = 25
 # from so many runs on the form over runs is the faster one
-MANY_RUNS = 64
+MANY_RUNS = 24
+# steps of that form in one call, so that the call itself costs little
+_GROUP = 10
 
 
 def _rate(structure: Structure, air_measured: bool) -> ca.Function:
@@ -305,10 +307,37 @@ def _step_over_runs(
     return ca.Function("step", inputs, [ca.horzcat(*rows)], {"cse": True})
 
 
+@lru_cache(maxsize=32)
+def _steps_over_runs(structure: Structure, variant: RunVariant, runs: int) -> ca.Function:
+    """Return `_GROUP` steps of `runs` ships in one call, ``(x, w, theta, dt) -> X``."""
+    step = _step_over_runs(structure, variant, runs)
+    nx, width = step.size2_in(0), step.size2_in(1)
+    x = ca.MX.sym("x", runs, nx)
+    w = ca.MX.sym("w", runs, width * _GROUP)
+    theta = ca.MX.sym("theta", runs, step.size2_in(2))
+    dt = ca.MX.sym("dt")
+    current, history = x, []
+    for part in ca.horzsplit(w, width):
+        current = step(current, part, theta, dt)
+        history.append(current)
+    return ca.Function("steps", [x, w, theta, dt], [ca.horzcat(*history)])
+
+
 class OverRunsKernel:
     """The free run of many ships, one compiled vector operation an instruction.
 
-    Same use as `FreeRunKernel`; `w` is (N, m, size) and `x0`, `theta` are (·, size).
+    Parameters
+    ----------
+    structure : Structure
+    samples : int
+        N, steps of a run.
+    size : int
+        Runs evaluated together.
+    variant : RunVariant
+
+    Notes
+    -----
+    Fill ``w`` (N, m, size), ``x[0]`` (nx, size) and ``theta`` (p, size) before a call.
     """
 
     def __init__(
@@ -318,21 +347,26 @@ class OverRunsKernel:
         size: int,
         variant: RunVariant,
     ) -> None:
-        self._step = _step_over_runs(structure, variant, size)
+        self._steps = _steps_over_runs(structure, variant, size)
         self.channels = run_channels(structure, variant)
         nx = len(structure.states) + (variant.heading == "simulated")
-        self.w = np.zeros((samples, len(self.channels), size))
-        self.x = np.zeros((samples + 1, nx, size))
+        padded = -(-samples // _GROUP) * _GROUP
+        self._w = np.zeros((padded, len(self.channels), size))
+        self._x = np.zeros((padded + 1, nx, size))
+        self.w = self._w[:samples]
+        self.x = self._x[: samples + 1]
         self.theta = np.zeros((len(structure.terms), size))
 
     def __call__(self, dt: float) -> None:
         """Run from ``x[0]``, filling ``x[1:]``."""
-        buffer, trigger = self._step.buffer()
+        samples = len(self.w)
+        self._w[samples:] = self._w[samples - 1]
+        buffer, trigger = self._steps.buffer()
         step_length = np.array([float(dt)])
         _bind(buffer.set_arg, 2, self.theta)
         _bind(buffer.set_arg, 3, step_length)
-        for k in range(len(self.w)):
-            _bind(buffer.set_arg, 0, self.x[k])
-            _bind(buffer.set_arg, 1, self.w[k])
-            _bind(buffer.set_res, 0, self.x[k + 1])
+        for k in range(0, len(self._w), _GROUP):
+            _bind(buffer.set_arg, 0, self._x[k])
+            _bind(buffer.set_arg, 1, self._w[k : k + _GROUP])
+            _bind(buffer.set_res, 0, self._x[k + 1 : k + 1 + _GROUP])
             trigger()

@@ -197,8 +197,34 @@ class Predictor:
             )
         if out is None:
             out = np.empty((len(self.columns), *np.shape(x[0])))
-        wind = air if air is not None else (x[0], x[0])
-        return self._program([*x, psi, *tau, *wind], out)
+        return self._program(self._arguments(x, psi, tau, air), out)
+
+    def _arguments(
+        self,
+        x: list[Array],
+        psi: Array | float,
+        tau: list[Array],
+        air: tuple[Array, Array] | None,
+    ) -> list[Array | float]:
+        return [*x, psi, *tau, *(air if air is not None else (0.0, 0.0))]
+
+    def prepare(
+        self,
+        psi: Array | float,
+        tau: list[Array],
+        air: tuple[Array, Array] | None,
+    ) -> dict[int, Array | float]:
+        """Evaluate once what does not depend on the states, for `evaluate_prepared`."""
+        states = len(self.structure.states)
+        known = self._arguments([], psi, tau, air)
+        return self._program.prepare({states + i: a for i, a in enumerate(known)})
+
+    def evaluate_prepared(
+        self, x: list[Array], prepared: dict[int, Array | float], out: Array
+    ) -> Array:
+        """Fill `out` (p, *S) with the regressors at states `x`, the rest being prepared."""
+        rest = len(self.structure.inputs) + 3
+        return self._program([*x, *[0.0] * rest], out, prepared)
 
 
 def basic_regime(structure: Structure) -> Regime:

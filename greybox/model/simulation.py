@@ -23,6 +23,7 @@ Array = NDArray[np.float64]
 
 # runs stepped together: enough to hide the call, few enough to bound memory
 _BATCH_RUNS = 256
+_STEP_RUNS = 16
 
 
 @dataclass(frozen=True)
@@ -200,22 +201,27 @@ def _many(
     sample_time: float,
     out: Array,
 ) -> None:
-    """Fill `out` in batches of runs; the last batch reaches back to be a full one."""
+    """Fill `out` in batches of runs."""
     runs, samples = series[0].shape[:2]
     nx = x0.shape[1]
-    size = min(runs, _BATCH_RUNS)
+    # few sizes are compiled: the last batch holds copies of its last run
+    size = min(-(-runs // _STEP_RUNS) * _STEP_RUNS, _BATCH_RUNS)
     kernel = OverRunsKernel(structure, samples, size, variant)
     for first in range(0, runs, size):
-        batch = slice(min(first, runs - size), min(first, runs - size) + size)
+        batch = slice(first, min(first + size, runs))
+        n = batch.stop - first
         column = 0
         for part in series:
-            kernel.w[:, column : column + part.shape[2]] = part[batch].transpose(1, 2, 0)
-            column += part.shape[2]
-        kernel.x[0, :nx] = x0[batch].T
-        kernel.x[0, nx:] = psi0[batch]
-        kernel.theta[:] = theta[batch].T
+            width = part.shape[2]
+            kernel.w[:, column : column + width, :n] = part[batch].transpose(1, 2, 0)
+            column += width
+        kernel.x[0, :nx, :n] = x0[batch].T
+        kernel.x[0, nx:, :n] = psi0[batch]
+        kernel.theta[:, :n] = theta[batch].T
+        for a in (kernel.w, kernel.x[0], kernel.theta):
+            a[..., n:] = a[..., n - 1 : n]
         kernel(sample_time)
-        out[batch] = kernel.x.transpose(2, 0, 1)
+        out[batch] = kernel.x[:, :, :n].transpose(2, 0, 1)
 
 
 def stationary_disturbance(

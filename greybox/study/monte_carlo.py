@@ -8,7 +8,6 @@ converged leave the refinement.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +18,8 @@ from greybox.model.simulation import simulate
 
 Array = NDArray[np.float64]
 
+# values of one array that are worked on together
+_CACHED = 40_000
 # simulated states beyond this multiple of the largest measured one have diverged
 _BOUND = 10.0
 
@@ -77,11 +78,9 @@ class BatchRegression:
     ----------
     predictor : Predictor
     batch : Batch
-    phi : ndarray, optional
-        (p, R, N) regressors, when a wider predictor already has them.
     """
 
-    def __init__(self, predictor: Predictor, batch: Batch, phi: Array | None = None) -> None:
+    def __init__(self, predictor: Predictor, batch: Batch) -> None:
         self.predictor = predictor
         self.batch = batch
         structure = predictor.structure
@@ -90,27 +89,43 @@ class BatchRegression:
         increments = np.diff(batch.x, axis=1) if structure.increment else batch.x[:, 1:]
         self._y = np.ascontiguousarray(np.moveaxis(increments, 2, 0))
         seen = batch.x if batch.seen is None else batch.seen
-        self.phi = self.regressors(seen[:, :-1]) if phi is None else phi
+        self._prepared = predictor.prepare(self._psi, self._tau, batch.air)
+        self.phi = self.regressors(seen[:, :-1])
+        self._phi_mean = self.phi.mean(axis=2).T
+        self._y_mean = self._y.mean(axis=2).T
         self._equations = [predictor.equation(s) for s in structure.states]
         self._bound = _BOUND * np.abs(batch.x).max(axis=(0, 1))
 
-    def regressors(self, x: Array, runs: Sequence[int] | NDArray[np.intp] | None = None) -> Array:
-        """Return the regressors (p, R, N) at states (R, N, nx) of some runs."""
-        psi, tau, air = self._psi, self._tau, self.batch.air
-        if runs is not None:
-            psi = psi[runs] if isinstance(psi, np.ndarray) else psi
-            tau = [t if len(t) == 1 else t[runs] for t in tau]
-            air = None if air is None else (air[0][runs], air[1][runs])
-        states = [np.ascontiguousarray(x[..., i]) for i in range(x.shape[-1])]
-        return self.predictor.evaluate(states, psi, tau, air)
+    def regressors(self, x: Array, runs: NDArray[np.intp] | None = None) -> Array:
+        """Return the regressors (p, R, N) at states (R, N, nx) of some runs.
 
-    def solve(self, z: Array, runs: NDArray[np.intp] | None = None) -> Array:
+        A few runs at a time, so that the working arrays stay in the cache.
+        """
+        index = np.arange(self.batch.runs) if runs is None else runs
+        out = np.empty((len(self.predictor.columns), *x.shape[:2]))
+        step = max(1, _CACHED // x.shape[1])
+        for first in range(0, len(index), step):
+            part = slice(first, first + step)
+            prepared = {
+                k: v[index[part]] if isinstance(v, np.ndarray) and len(v) > 1 else v
+                for k, v in self._prepared.items()
+            }
+            states = [np.ascontiguousarray(x[part, :, i]) for i in range(x.shape[2])]
+            self.predictor.evaluate_prepared(states, prepared, out[:, part])
+        return out
+
+    def solve(
+        self, z: Array, runs: NDArray[np.intp] | None = None, *, zero_mean: bool = False
+    ) -> Array:
         """Solve Σ Z Φᵀ θ = Σ Z y for each run (2.21).
 
         Parameters
         ----------
         z : ndarray
             (p, R, N) instruments of some runs.
+        zero_mean : bool
+            Take each instrument's mean away (4.63), from the sums rather than
+            from the instruments: Σ (z − z̄) φ = Σ z φ − N z̄ φ̄.
 
         Returns
         -------
@@ -118,13 +133,20 @@ class BatchRegression:
             (R, p)
         """
         index = slice(None) if runs is None else runs
+        samples = z.shape[2]
+        ones = np.full(samples, 1.0 / samples)
         theta = np.empty((z.shape[1], len(self.predictor.columns)))
         for row, mine in enumerate(self._equations):
             first, last = mine[0], mine[-1] + 1
             zr = z[first:last].transpose(1, 0, 2)
             fr = self.phi[first:last, index].transpose(1, 2, 0)
+            y = self._y[row, index]
             gram = np.matmul(zr, fr)
-            right = np.matmul(zr, self._y[row, index][..., None])[..., 0]
+            right = np.matmul(zr, y[..., None])[..., 0]
+            if zero_mean:
+                mean = np.matmul(zr, ones)
+                gram -= samples * mean[:, :, None] * self._phi_mean[index, None, first:last]
+                right -= samples * mean * self._y_mean[index, row, None]
             theta[:, first:last] = _solve_scaled(gram, right)
         return theta
 
@@ -141,7 +163,7 @@ class BatchRegression:
         return out
 
     def instruments(
-        self, theta: Array, runs: NDArray[np.intp], *, zero_mean: bool
+        self, theta: Array, runs: NDArray[np.intp]
     ) -> tuple[Array, NDArray[np.bool_]]:
         """Simulate models and return their regressors, and which runs diverged.
 
@@ -174,10 +196,7 @@ class BatchRegression:
         bad = run.diverged >= 0
         x = run.x[:, :-1]
         x[bad] = 0.0
-        z = self.regressors(x, runs)
-        if zero_mean:
-            z -= z.mean(axis=2, keepdims=True)
-        return z, bad
+        return self.regressors(x, runs), bad
 
     def refine(
         self,
@@ -208,13 +227,13 @@ class BatchRegression:
         last = model.copy()
         wanted = self.predictor.parameter_columns
         for iteration in range(most + 1):
-            z, bad = self.instruments(model[runs], runs, zero_mean=zero_mean)
+            z, bad = self.instruments(model[runs], runs)
             for _ in range(4):
                 if not bad.any() or iteration == 0:
                     break
                 # step halfway back to the last model whose simulation was bounded
                 model[runs[bad]] = (model[runs[bad]] + last[runs[bad]]) / 2
-                again, still = self.instruments(model[runs[bad]], runs[bad], zero_mean=zero_mean)
+                again, still = self.instruments(model[runs[bad]], runs[bad])
                 z[:, bad] = again
                 where = np.flatnonzero(bad)
                 bad = np.zeros(len(runs), bool)
@@ -223,7 +242,7 @@ class BatchRegression:
             runs = runs[fine]
             if not len(runs):
                 break
-            new = self.solve(z[:, fine] if not fine.all() else z, runs)
+            new = self.solve(z if fine.all() else z[:, fine], runs, zero_mean=zero_mean)
             old = theta[runs]
             theta[runs] = new
             last[runs] = model[runs]
@@ -250,11 +269,12 @@ class BatchRegression:
             (R,) runs whose models did not converge.
         """
         runs = np.arange(self.batch.runs)
-        z, bad = self.instruments(np.nan_to_num(theta), runs, zero_mean=True)
+        z, bad = self.instruments(np.nan_to_num(theta), runs)
         out = np.full((len(runs), len(self.predictor.columns)), np.nan)
         fine = ~bad
         if fine.any():
-            out[fine] = self.solve(z[:, fine] if bad.any() else z, runs[fine])
+            part = z[:, fine] if bad.any() else z
+            out[fine] = self.solve(part, runs[fine], zero_mean=True)
         return BatchEstimate(out, 0, doubtful | bad)
 
 
