@@ -137,7 +137,7 @@ class Vectorised:
         prepared : mapping, optional
             What `prepare` returned for some of the same arguments.
         """
-        work = dict(self._constants) if prepared is None else dict(prepared)
+        work: dict[int, Any] = dict(self._constants if prepared is None else prepared)
         for k, i in self._inputs:
             work.setdefault(k, arrays[i])
         for target, call, sources in self._calls:

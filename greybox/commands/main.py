@@ -16,7 +16,7 @@ GROUP = "greybox.commands"
 
 def _options(parser: argparse.ArgumentParser) -> list[str]:
     """Return the option strings of a parser and of its sub-commands."""
-    found = []
+    found: list[str] = []
     for action in parser._actions:
         found += action.option_strings
         if isinstance(action, argparse._SubParsersAction):

@@ -136,8 +136,8 @@ def parse_term(name: str) -> Term:
 
     A name of (3.55) such as ``Xvr`` or ``Nmu`` gives that term. Any other is
     spelled by equation and factors: ``N_|r|r``, ``Y_|r|v``, ``X_uuu``,
-    ``Y_race``, ``Y_u*race``; ``X_0`` is a constant force. A spelling that equals a term of (3.55) gets its
-    name there (``X_|u|u`` is ``Xuu``).
+    ``Y_race``, ``Y_u*race``; ``X_0`` is a constant force. A spelling that
+    equals a term of (3.55) gets its name there (``X_|u|u`` is ``Xuu``).
 
     Raises
     ------

@@ -24,8 +24,8 @@ def headline(comparison: Comparison) -> str:
     count = len(comparison.runs[0])
     logs = f"{count} log" + ("s" if count > 1 else "")
     if len(fits) == 1:
-        return f"The free run of {comparison.names[0]} explains of {logs}: {shown} (fit, 100 is perfect)."
-    return f"{comparison.names[best]} fits best on {logs}: {shown} (fit of the free run, 100 is perfect)."
+        return f"The free run of {comparison.names[0]} fits {logs}: {shown} (100 is perfect)."
+    return f"{comparison.names[best]} fits {logs} best: {shown} (free run, 100 is perfect)."
 
 
 def comparison_page(

@@ -162,9 +162,7 @@ class BatchRegression:
             out[:, structure.index(self.predictor.columns[i].terms[0])] = theta[:, i]
         return out
 
-    def instruments(
-        self, theta: Array, runs: NDArray[np.intp]
-    ) -> tuple[Array, NDArray[np.bool_]]:
+    def instruments(self, theta: Array, runs: NDArray[np.intp]) -> tuple[Array, NDArray[np.bool_]]:
         """Simulate models and return their regressors, and which runs diverged.
 
         Parameters

@@ -137,10 +137,11 @@ class Comparison:
                 )
         for name, aheads in zip(self.names, self.ahead, strict=True):
             for horizon in aheads[0]:
-                shown = ", ".join(
-                    f"{s} {np.sqrt(np.mean([a[horizon][s] ** 2 for a in aheads if horizon in a])):.3g}"
+                error = {
+                    s: np.sqrt(np.mean([a[horizon][s] ** 2 for a in aheads if horizon in a]))
                     for s in states
-                )
+                }
+                shown = ", ".join(f"{s} {e:.3g}" for s, e in error.items())
                 lines.append(f"{name[:23]:<24}{horizon} s ahead, rms error: {shown}")
         if len(self.runs[0]) > 1:
             lines += [t.sentence for t in self.sign_tests]

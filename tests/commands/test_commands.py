@@ -41,8 +41,8 @@ def test_estimate_simulate_compare(noisy_csv, tmp_path, capsys):
     assert len(rows) == 5000
 
     other = tmp_path / "ls.json"
-    assert run("estimate", noisy_csv, "--vessel", "thesis", "--method", "ls", "--predictor", "basic",
-               "--structure", "thesis", "--out", other) == 0  # fmt: skip
+    assert run("estimate", noisy_csv, "--vessel", "thesis", "--method", "ls",
+               "--predictor", "basic", "--structure", "thesis", "--out", other) == 0  # fmt: skip
     page, result = tmp_path / "c.html", tmp_path / "c.json"
     capsys.readouterr()
     assert run("compare", model, other, "--log", noisy_csv, "--json", result, "--report", page) == 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from experiment_design import predict_precision, prbs, random_two_level, to_log
+from experiment_design import prbs, predict_precision, random_two_level, to_log
 from greybox.errors import ExcitationError, VesselError
 from greybox.model.predictor import build_predictor
 from greybox.model.simulation import simulate

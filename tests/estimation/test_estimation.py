@@ -100,8 +100,7 @@ def test_robust_covariance_equals_a_slow_sum():
                 * np.outer(z[:, i] * e[i], z[:, j] * e[j])
                 * (abs(i - j) <= 6)
             )
-    values, vectors = np.linalg.eigh(slow)
-    if values[0] > 0:
+    if np.linalg.eigvalsh(slow)[0] > 0:
         np.testing.assert_allclose(fast, slow, rtol=1e-10)
     gamma = [float(e[k:] @ e[: 80 - k]) / 80 for k in range(3)]
     r = sum(gamma[k] * (np.eye(80, k=k) + (np.eye(80, k=-k) if k else 0)) for k in range(3))
@@ -205,7 +204,7 @@ def test_margins_cut_samples_and_count_them(thesis, noisy_log, nominal_theta):
     assert 0.4 * e.samples < e.kept < e.samples
     ls = estimate_ls(predictor, [noisy_log], margins={"u": limit})
     assert abs(ls.kept / ls.samples - 0.7) < 0.02
-    cut = [t for t in e.tests if t.name == "margin_u"][0]
+    cut = next(t for t in e.tests if t.name == "margin_u")
     assert f"{e.samples - e.kept} samples were cut out" in cut.sentence
 
 

@@ -50,7 +50,7 @@ def test_unknown_structure_suggests():
 
 
 def test_a_term_twice_is_refused():
-    with pytest.raises(StructureError, match="same function|times"):
+    with pytest.raises(StructureError, match="same function"):
         get_structure("thesis").with_terms("X_u")
     with pytest.raises(StructureError, match="2 times"):
         get_structure("thesis").with_terms("Xu")
@@ -130,7 +130,8 @@ def test_vectorised_equals_the_virtual_machine():
     x, y = ca.SX.sym("x"), ca.SX.sym("y")
     expressions = [
         x * ca.fabs(y), ca.sin(x) ** 2, ca.sign(y) / (1 + x**2), ca.fmax(x, y), ca.SX(3),
-        ca.exp(-x) + ca.sqrt(ca.fabs(y)), ca.if_else(x > y, x, y), ca.tanh(x) - ca.atan2(y, 1 + x**2),
+        ca.exp(-x) + ca.sqrt(ca.fabs(y)), ca.if_else(x > y, x, y),
+        ca.tanh(x) - ca.atan2(y, 1 + x**2),
         x**3 + 2 * x, ca.fmin(x, 0), ca.SX(0),
     ]  # fmt: skip
     rng = np.random.default_rng(2)

@@ -46,7 +46,7 @@ def test_fit_is_the_published_formula():
     assert fit_percent(y, y) == 100
     assert fit_percent(y, np.full(4, 3.0)) == pytest.approx(0)
     want = 100 * (1 - np.linalg.norm([1, 0, 0, 0]) / np.linalg.norm(y - 3))
-    assert fit_percent(y, y + [1, 0, 0, 0]) == pytest.approx(want)
+    assert fit_percent(y, y + np.array([1, 0, 0, 0])) == pytest.approx(want)
     assert fit_percent(np.ones(3), np.zeros(3)) == -np.inf
 
 
