@@ -71,9 +71,7 @@ def estimate_ls(
     Ljungberg (2020), eq. 2.17.
     """
     regression = build_regression(predictor, logs, margins=margins)
-    instruments = Instruments(
-        tuple(e.phi for e in regression.experiments), tuple(e.keep for e in regression.experiments)
-    )
+    instruments = _regressors_as_instruments(regression)
     solutions = _solve(regression, instruments)
     return _result(
         "ls", regression, instruments, solutions, logs, covariance, seed, margins=margins
@@ -86,7 +84,7 @@ def estimate_iv(
     *,
     start: Array | Estimate | None = None,
     zero_mean: bool = True,
-    refine: bool = True,
+    refine: bool | int = True,
     heading: Literal["measured", "simulated"] = "measured",
     lag: int = 0,
     margins: dict[str, float] | None = None,
@@ -106,8 +104,9 @@ def estimate_iv(
         nominal model. By default the least-squares estimate (4.60).
     zero_mean : bool
         Remove each instrument's mean in each experiment (4.63): IV2. Kept: IV1.
-    refine : bool
-        Simulate the instruments again from each estimate until it stops moving.
+    refine : bool or int
+        Simulate the instruments again from each estimate until it stops moving,
+        or as many times at most.
     heading : {"measured", "simulated"}
         Heading in the instruments.
     lag : int
@@ -143,7 +142,7 @@ def estimate_iv(
             "predictor leaves out: build it with an intercept, or use zero-mean instruments."
         )
     regression = build_regression(predictor, logs, margins=margins)
-    theta = _start(predictor, logs, start)
+    theta = _start(regression, start)
 
     def instruments_of(theta: Array, keep: Sequence[NDArray[np.bool_]] | None) -> Instruments:
         return build_instruments(
@@ -167,8 +166,9 @@ def estimate_iv(
     solutions = _solve(regression, instruments, metric)
     status, iterations = "one step, instruments not refined", 0
     if refine:
-        status = f"the refinement still moved after {_MAX_REFINEMENTS} steps"
-        for iterations in range(1, _MAX_REFINEMENTS + 1):
+        most = _MAX_REFINEMENTS if refine is True else int(refine)
+        status = f"the refinement still moved after {most} steps"
+        for iterations in range(1, most + 1):
             previous = _coefficients(solutions)
             target = _structure_theta(predictor, previous)
             candidate, fresh = target, instruments_of(target, None)

@@ -232,12 +232,13 @@ def basic_regime(structure: Structure) -> Regime:
     return tuple((s, (1,)) for s in structure.states)
 
 
-def _spelled_expression(structure: Structure, name: str) -> ca.SX:
-    """Return a bias-capturing function from its spelling, such as ``|u|*cos(psi)``."""
+@lru_cache(maxsize=64)
+def _atoms(structure: Structure) -> dict[str, ca.SX]:
+    """Return the functions that spelled regressors are products of."""
     s = structure.symbols
     named = {n: s.x[i] for i, n in enumerate(structure.states)}
     named |= {n: s.tau[i] for i, n in enumerate(structure.inputs)}
-    functions = {
+    atoms = {
         "1": ca.SX(1),
         "cos(psi)": ca.cos(s.psi),
         "sin(psi)": ca.sin(s.psi),
@@ -245,15 +246,21 @@ def _spelled_expression(structure: Structure, name: str) -> ca.SX:
         "sin(2psi)": ca.sin(2 * s.psi),
     }
     for n, x in named.items():
-        functions |= {n: x, f"|{n}|": ca.fabs(x), f"sgn({n})": ca.sign(x)}
+        atoms |= {n: x, f"|{n}|": ca.fabs(x), f"sgn({n})": ca.sign(x)}
+    return atoms
+
+
+def _spelled_expression(structure: Structure, name: str) -> ca.SX:
+    """Return a bias-capturing function from its spelling, such as ``|u|*cos(psi)``."""
+    atoms = _atoms(structure)
     product = ca.SX(1)
     for factor in name.split("*"):
-        if factor not in functions:
+        if factor not in atoms:
             raise StructureError(
                 f"'{factor}' in the bias regressor '{name}' is not known."
-                f"{suggestion(factor, functions)}"
+                f"{suggestion(factor, atoms)}"
             )
-        product = product * functions[factor]
+        product = product * atoms[factor]
     return product
 
 
@@ -464,11 +471,10 @@ def build_predictor(
     )
     derived_values = values([e for _, _, e in derived]) if derived else np.empty((0, _POINTS))
     spellings = _spellings(structure) if derived else []
-    spelled_values = (
-        values([_spelled_expression(structure, n) for n in spellings])
-        if derived
-        else np.empty((0, _POINTS))
-    )
+    atoms = dict(zip(_atoms(structure), values(list(_atoms(structure).values())), strict=True))
+    spelled_values = np.array(
+        [np.prod([atoms[f] for f in n.split("*")], axis=0) for n in spellings]
+    ).reshape(-1, _POINTS)
     unit = _unit_rows(spelled_values)
 
     columns: list[Column] = []

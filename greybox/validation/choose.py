@@ -26,6 +26,8 @@ LEAST_HEADING, ADVISED_HEADING = np.deg2rad(20), np.deg2rad(90)
 _HELD_OUT = 1 / 3
 # points of fit that a simpler or less robust alternative must gain to be preferred
 _PREFERENCE = 3.0
+# refinements of the instruments while alternatives are compared
+_RANKING_REFINEMENTS = 4
 # share of samples that must meet a sign condition
 _KEPT = 0.9
 
@@ -59,6 +61,7 @@ class Request:
     heading: Literal["measured", "simulated"] = "measured"
     loop: Loop = "auto"
     zero_mean: bool = True
+    refine: bool | int = True
     seed: int = 0
 
 
@@ -147,6 +150,7 @@ def estimate_once(
             predictor,
             logs,
             zero_mean=request.zero_mean,
+            refine=request.refine,
             heading=request.heading,
             lag=CLOSED_LOOP_LAG if closed else 0,
             **common,
@@ -317,6 +321,8 @@ def _compare(
     notes: list[str],
 ) -> list[Alternative]:
     """Order the alternatives by the held-out free run, the earlier ones preferred."""
+    # a ranking needs neither standard errors nor the last digit
+    request = replace(request, covariance="white", refine=_RANKING_REFINEMENTS)
     fitting, held = [], []
     for log in logs:
         cut = len(log) - int(len(log) * _HELD_OUT)
