@@ -205,12 +205,19 @@ def estimate_iv(
     )
 
 
-def _start(predictor: Predictor, logs: Sequence[TrialLog], start: Array | Estimate | None) -> Array:
+def _regressors_as_instruments(regression: Regression) -> Instruments:
+    return Instruments(
+        tuple(e.phi for e in regression.experiments), tuple(e.keep for e in regression.experiments)
+    )
+
+
+def _start(regression: Regression, start: Array | Estimate | None) -> Array:
     if isinstance(start, Estimate):
         return start.structure_theta()
     if start is not None:
         return np.asarray(start, float)
-    return estimate_ls(predictor, logs, covariance="white").structure_theta()
+    ls = _solve(regression, _regressors_as_instruments(regression))
+    return _structure_theta(regression.predictor, _coefficients(ls))
 
 
 def _structure_theta(predictor: Predictor, coefficients: Array) -> Array:
