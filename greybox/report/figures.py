@@ -102,7 +102,9 @@ def comparison_figure(names: Sequence[str], runs: Sequence[LogFit]) -> Figure:
 def fit_figure(
     lengths: Sequence[int], fits: dict[str, Array], states: Sequence[str], title: str
 ) -> Figure:
-    """Draw fit against log length for several estimators (Figures 6.2, 6.3).
+    """Draw the median fit and its quartiles against log length (Figures 6.2, 6.3).
+
+    The thesis draws means; a single diverging run would take a mean off the axes.
 
     Parameters
     ----------
@@ -114,13 +116,14 @@ def fit_figure(
     axes = figure.subplots(1, len(states), sharey=True)
     for i, state in enumerate(states):
         for j, (name, value) in enumerate(fits.items()):
-            part = np.maximum(value[:, :, i], -1e3)
-            mean, sd = part.mean(axis=1), part.std(axis=1)
+            low, middle, high = np.percentile(
+                np.maximum(value[:, :, i], -1e3), (25, 50, 75), axis=1
+            )
             shift = (j - len(fits) / 2) * 25
             axes[i].errorbar(
                 np.asarray(lengths) + shift,
-                np.where(mean > -20, mean, np.nan),
-                yerr=np.where(mean > -20, sd, np.nan),
+                np.where(middle > -20, middle, np.nan),
+                yerr=np.where(middle > -20, [middle - low, high - middle], np.nan),
                 color=COLOURS[j % 6],
                 linestyle=STYLES[j % 4],
                 marker="v",
@@ -201,7 +204,8 @@ def bias_figure(rows: Sequence[Any], title: str) -> Figure:
             color=colour,
             label=label,
         )
-    ax.set_yscale("symlog", linthresh=3)
+    if max(abs(v) for line in ax.lines for v in np.nan_to_num(line.get_ydata())) > 6:
+        ax.set_yscale("symlog", linthresh=3)
     ax.axhline(0, color=BLACK, linewidth=0.8)
     ax.set_xticks(position, [r.parameter for r in rows], rotation=40, ha="right", fontsize=8)
     ax.set_ylabel("error / published sd")

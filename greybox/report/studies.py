@@ -159,8 +159,8 @@ def chapter6_output(result: Chapter6, record: dict[str, Any]) -> StudyOutput:
                     ("u", "v", "r"),
                     f"Fit on an undisturbed zig-zag, wind {wind} m/s (Figure {label})",
                 ),
-                f"Mean fit ± sd against log length, wind {wind} m/s; means below −20 % are "
-                f"not shown.",
+                f"Median fit with quartiles against log length, wind {wind} m/s; medians below "
+                f"−20 % are not shown.",
             )
     for wind, estimator in ((1, "IV2"), (1, "IV3"), (10, "IV3"), (10, "IV2")):
         part = [r for r in rows if r.set == f"{wind} m/s" and r.estimator == estimator]

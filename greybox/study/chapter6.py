@@ -139,9 +139,9 @@ def pulse_forces(samples: int, seed: int = INPUT_SEED) -> Array:
 def validation_run(samples: int = 600) -> tuple[Array, Array]:
     """Return forces (N, 3) and true states (N+1, 3) of an undisturbed zig-zag ahead."""
     angle = zig_zag(samples, 1.0, amplitude=0.35, period=100.0)
+    speed = zig_zag(samples, 1.0, amplitude=4.0, period=240.0, centre=14.0)
     made = generalised_force(
-        load_vessel("thesis"),
-        {"n": np.full(samples, 15.0), "alpha1": np.zeros(samples), "alpha2": angle},
+        load_vessel("thesis"), {"n": speed, "alpha1": np.zeros(samples), "alpha2": angle}
     )
     structure = get_structure("thesis")
     tau = np.column_stack([made[n] for n in structure.inputs])
