@@ -32,6 +32,7 @@ PREDICTORS: tuple[PredictorKind, ...] = ("basic", "augmented", "wind", "basic+wi
 # signs that each state takes in the data, such as {"u": (1,), "v": (1, -1)}
 Regime = tuple[tuple[str, tuple[int, ...]], ...]
 
+_SIGNS = {(1,): "positive only", (-1,): "negative only", (1, -1): "of both signs"}
 _POINTS = 400
 _TOLERANCE = 1e-8
 
@@ -496,9 +497,15 @@ def build_predictor(
                 columns[same[0]] = Column(merged.name, state, (*merged.terms, term.name))
                 continue
             if term.factors and not span.add_if_new(own[t]):
+                kept = ", ".join(
+                    f"{s} {_SIGNS.get(v, 'of both signs')}"
+                    for s, v in regime
+                    if s in structure.states
+                )
                 raise StructureError(
-                    f"in the regime {dict(regime)} the regressor of {term.name} is a combination "
-                    f"of the others in its equation: widen the regime or remove the term."
+                    f"with {kept} the regressor of {term.name} is a combination of the others in "
+                    f"its equation (Remark 4.1): use trials with both signs, or leave it out "
+                    f"(--structure '{structure.name}-{term.name}')."
                 )
             columns.append(Column(term.name, state, (term.name,)))
             spelled.append("")

@@ -2,10 +2,10 @@
 
 The thesis's input is "smoothed pulses of varying width", not specified further,
 and its standard deviations of LS show that one sequence served all runs. Here
-too one sequence, fixed by `INPUT_SEED`, serves all runs of both winds; the seed
-of a study draws the noise only. How far the inconsistent estimators are off, and
-in which direction, depends on that sequence: it was drawn until their signs
-agreed with the published ones.
+too one sequence, kept as a list of pulses in ``input_chapter6.csv``, serves all
+runs of both winds; the seed of a study draws the noise only. How far the
+inconsistent estimators are off, and in which direction, depends on that
+sequence: pulses were drawn again until the signs agreed with the published ones.
 
 IV1 (basic predictor) takes its instruments from the model that IV2 ends with.
 Refined with its own estimates it does not converge: they are so far off that
@@ -15,9 +15,11 @@ yaw, is that of instruments from an accurate model.
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
+from importlib import resources
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +27,7 @@ from numpy.typing import NDArray
 from greybox.model.catalogue import get_structure
 from greybox.model.predictor import Predictor, build_predictor
 from greybox.model.simulation import simulate, stationary_disturbance
-from greybox.study.inputs import smoothed_pulses, zig_zag
+from greybox.study.inputs import smooth, zig_zag
 from greybox.study.monte_carlo import Batch, BatchEstimate, BatchRegression
 from greybox.study.parallel import map_pieces
 from greybox.study.tables import Row, normalised, published, summarise
@@ -57,7 +59,8 @@ TABLES = {
     (10, "IV1"): "6.6", (10, "IV2"): "6.6", (10, "LS3"): "6.7", (10, "IV3"): "6.7",
 }  # fmt: skip
 
-INPUT_SEED = 1
+# length of the window that rounds the pulses [samples]
+_SMOOTHING = 30
 _CHUNK = 64
 _REGIME = (("u", (1,)), ("v", (1,)), ("r", (1, -1)))
 
@@ -124,14 +127,26 @@ def _vector(values: dict[str, float]) -> Array:
 
 
 @lru_cache(maxsize=8)
-def pulse_forces(samples: int, seed: int = INPUT_SEED) -> Array:
-    """Return the generalised force (N, 3) of the pulses (6.11), and keep it."""
-    rng = np.random.default_rng([6, seed])
-    commands = {
-        "n": smoothed_pulses(rng, samples, 10.0, 20.0),
-        "alpha1": smoothed_pulses(rng, samples, 0.7, 1.1),
-        "alpha2": smoothed_pulses(rng, samples, 0.7, 1.1),
-    }
+def pulse_commands(samples: int) -> dict[str, Array]:
+    """Return the commands of the study, (N,) each: pulses with rounded edges (6.11)."""
+    text = (resources.files("greybox.study") / "input_chapter6.csv").read_text("utf-8")
+    rows = list(csv.DictReader(text.splitlines()))
+    commands = {}
+    for name in ("n", "alpha1", "alpha2"):
+        mine = [r for r in rows if r["command"] == name]
+        commands[name] = smooth(
+            [int(r["samples"]) for r in mine],
+            [float(r["level"]) for r in mine],
+            samples,
+            _SMOOTHING,
+        )
+    return commands
+
+
+@lru_cache(maxsize=8)
+def pulse_forces(samples: int) -> Array:
+    """Return the generalised force (N, 3) of the pulses, and keep it."""
+    commands = pulse_commands(samples)
     made = generalised_force(load_vessel("thesis"), commands)
     return np.column_stack([made[n] for n in get_structure("thesis").inputs])
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -48,7 +50,34 @@ def smoothed_pulses(
     count = (samples + smoothing) // shortest + 1
     lengths = rng.integers(shortest, longest + 1, count)
     levels = rng.uniform(lower, upper, count)
-    raw = np.repeat(levels, lengths)[: samples + smoothing - 1]
+    return smooth(lengths, levels, samples, smoothing)
+
+
+def smooth(
+    lengths: Sequence[int] | NDArray[np.int64],
+    levels: Sequence[float] | Array,
+    samples: int,
+    smoothing: int,
+) -> Array:
+    """Return pulses of given lengths and levels with edges rounded by a Hann window.
+
+    Parameters
+    ----------
+    lengths : sequence of int
+        In samples; the sequence is repeated where it is too short.
+    levels : sequence of float
+    samples : int
+        N
+    smoothing : int
+        Length of the window, in samples.
+
+    Returns
+    -------
+    ndarray
+        (N,)
+    """
+    once = np.repeat(np.asarray(levels, float), lengths)
+    raw = np.resize(once, samples + smoothing - 1)
     window = np.hanning(smoothing + 2)[1:-1]
     return np.asarray(np.convolve(raw, window / window.sum(), "valid"))
 

@@ -72,14 +72,11 @@ def heading_range(logs: Sequence[TrialLog]) -> float:
 
 
 def regime_of(logs: Sequence[TrialLog], structure: Structure) -> Regime:
-    """Return the signs that each state takes, samples within its noise apart."""
+    """Return the signs that each state takes in more than one sample of a hundred."""
     regime = []
     for state in structure.states:
         value = np.concatenate([log[state] for log in logs])
-        noise = 3 * (logs[0].vessel.std(state) or 0.0)
-        signs = tuple(
-            s for s in (1, -1) if float((s * value > noise).mean()) > 0.01 or len(value) == 0
-        )
+        signs = tuple(s for s in (1, -1) if float((s * value > 0).mean()) > 0.01)
         regime.append((state, signs or (1, -1)))
     return tuple(regime)
 

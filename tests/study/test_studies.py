@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from greybox.study.chapter4 import reproduce_chapter4
-from greybox.study.chapter6 import ESTIMATORS, INPUT_SEED, pulse_forces, reproduce_chapter6
+from greybox.study.chapter6 import ESTIMATORS, pulse_commands, pulse_forces, reproduce_chapter6
 from greybox.study.chapter7 import (
     estimation_sets,
     predictors,
@@ -75,7 +75,12 @@ def test_chapter6_gives_the_same_bytes_for_the_same_seed():
 
 
 def test_the_input_belongs_to_the_study_not_to_the_seed():
-    np.testing.assert_array_equal(pulse_forces(800), pulse_forces(800, INPUT_SEED))
+    commands = pulse_commands(5000)
+    assert commands["n"].min() >= 10
+    assert commands["n"].max() <= 20
+    assert commands["alpha1"].min() >= 0.7
+    assert commands["alpha2"].max() <= 1.1
+    np.testing.assert_allclose(pulse_forces(800), pulse_forces(5000)[:800], rtol=1e-12)
     assert set(ESTIMATORS.values()) == {"basic", "augmented", "wind"}
 
 
