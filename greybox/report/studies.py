@@ -183,7 +183,7 @@ def chapter6_output(result: Chapter6, record: dict[str, Any]) -> StudyOutput:
     )
     text = rows_text(rows) + "\n" + headline
     if bad:
-        text += f"\n{bad} refinements did not converge: " + ", ".join(
+        text += f"\n{bad} refinements did not converge and are left out: " + ", ".join(
             f"{e} at {w} m/s {n}" for (w, e), n in result.unconverged.items() if n
         )
     page = Page(

@@ -226,8 +226,10 @@ def estimate_batch(batch: Batch) -> dict[str, tuple[Array, Array, NDArray[np.boo
         if k == "1" and refined is not None:
             iv = regression.with_instruments_of(found["IV2"][1], refined.unconverged)
         else:
-            iv = regression.refine(_vector(NOMINAL))
+            iv = regression.refine(_vector(NOMINAL), again=regression.structure_theta(ls))
         refined = refined or iv
+        # a run that never stops moving has no estimate: it is left out and counted
+        iv.theta[iv.unconverged] = np.nan
         found[f"IV{k}"] = (
             iv.theta[:, wanted],
             regression.structure_theta(iv.theta),

@@ -203,6 +203,7 @@ class BatchRegression:
         zero_mean: bool = True,
         tolerance: float = 1e-4,
         most: int = 30,
+        again: Array | None = None,
     ) -> BatchEstimate:
         """Estimate by IV, simulating the instruments anew until nothing moves (4.60-4.63).
 
@@ -214,18 +215,42 @@ class BatchRegression:
             Relative change of every parameter below which a run has converged.
         most : int
             Refinements at most.
+        again : ndarray, optional
+            (R, p_structure) models from which runs that fail are tried once more.
 
         Returns
         -------
         BatchEstimate
         """
-        runs = np.arange(self.batch.runs)
-        model = np.broadcast_to(start, (len(runs), start.shape[-1])).copy()
-        theta = np.full((len(runs), len(self.predictor.columns)), np.nan)
+        every = np.arange(self.batch.runs)
+        first = np.broadcast_to(start, (len(every), start.shape[-1]))
+        theta = np.full((len(every), len(self.predictor.columns)), np.nan)
+        iterations, failed = self._refine_runs(theta, first, every, zero_mean, tolerance, most)
+        if again is not None and failed.any():
+            runs = every[failed]
+            more, still = self._refine_runs(theta, again, runs, zero_mean, tolerance, most)
+            failed, iterations = still, max(iterations, more)
+        return BatchEstimate(theta, iterations, failed | ~np.isfinite(theta).all(axis=1))
+
+    def _refine_runs(
+        self,
+        theta: Array,
+        start: Array,
+        runs: NDArray[np.intp],
+        zero_mean: bool,
+        tolerance: float,
+        most: int,
+    ) -> tuple[int, NDArray[np.bool_]]:
+        """Refine some runs, filling `theta`; return the iterations and who failed, (R,)."""
+        model = start.copy()
+        theta[runs] = np.nan
+        failed = np.zeros(self.batch.runs, bool)
         last = model.copy()
         wanted = self.predictor.parameter_columns
         for iteration in range(most + 1):
             z, bad = self.instruments(model[runs], runs)
+            # halfway models settle too, but not at an estimate that can be simulated
+            halfway = bad.copy()
             for _ in range(4):
                 if not bad.any() or iteration == 0:
                     break
@@ -237,6 +262,7 @@ class BatchRegression:
                 bad = np.zeros(len(runs), bool)
                 bad[where[still]] = True
             fine = ~bad
+            failed[runs[bad]] = True
             runs = runs[fine]
             if not len(runs):
                 break
@@ -247,14 +273,12 @@ class BatchRegression:
             model[runs] = self.structure_theta(new)
             with np.errstate(invalid="ignore"):
                 change = np.abs(new - old)[:, wanted] / (np.abs(new[:, wanted]) + 1e-12)
-            moving = ~(change.max(axis=1) < tolerance)
+            moving = ~(change.max(axis=1) < tolerance) | halfway[fine]
             runs = runs[moving]
             if not len(runs):
                 break
-        unconverged = np.zeros(self.batch.runs, bool)
-        unconverged[runs] = True
-        unconverged |= ~np.isfinite(theta).all(axis=1)
-        return BatchEstimate(theta, iteration, unconverged)
+        failed[runs] = True
+        return iteration, failed
 
     def with_instruments_of(self, theta: Array, doubtful: NDArray[np.bool_]) -> BatchEstimate:
         """Estimate once, with instruments simulated from given models.
