@@ -18,24 +18,51 @@ import numpy as np
 from greybox.errors import LogError
 
 
-@contextmanager
-def replacing(path: str | Path, mode: str = "w") -> Iterator[IO[Any]]:
-    """Open a file beside `path` and rename it over `path` when the block ends well.
+def check_targets(*paths: str | Path | None) -> None:
+    """Refuse targets that cannot be written, before anything is computed.
 
     Raises
     ------
     LogError
-        The folder does not exist or cannot be written.
+        A path is empty, a folder, or in a folder that does not exist.
     """
+    for path in paths:
+        if path is None or str(path) == "-":
+            continue
+        if not str(path):
+            raise LogError("an output file has an empty name: name a file.")
+        target = Path(path)
+        if target.is_dir():
+            raise LogError(f"cannot write '{path}': it is a folder. Name a file in it.")
+        if not target.parent.is_dir() or not os.access(target.parent, os.W_OK):
+            raise LogError(
+                f"cannot write '{path}': there is no folder '{target.parent}' to write in. "
+                f"Name a file in a folder that exists."
+            )
+
+
+@contextmanager
+def replacing(path: str | Path, mode: str = "w") -> Iterator[IO[Any]]:
+    """Open a file beside `path` and rename it over `path` when the block ends well.
+
+    A device or a pipe is written directly, never replaced.
+
+    Raises
+    ------
+    LogError
+        As `check_targets`.
+    """
+    check_targets(path)
     path = Path(path)
+    options: dict[str, Any] = {} if "b" in mode else {"encoding": "utf-8", "newline": "\n"}
+    if path.exists() and not path.is_file():
+        with open(path, mode, **options) as handle:
+            yield handle
+        return
+    path = path.resolve()
     try:
         handle = tempfile.NamedTemporaryFile(  # noqa: SIM115 - closed below
-            mode,
-            dir=path.parent,
-            prefix=f".{path.name}.",
-            delete=False,
-            encoding=None if "b" in mode else "utf-8",
-            newline=None if "b" in mode else "\n",
+            mode, dir=path.parent, prefix=f".{path.name}.", delete=False, **options
         )
     except OSError as error:
         raise LogError(

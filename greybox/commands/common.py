@@ -19,6 +19,14 @@ def add_logs(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--vessel", required=True, metavar="V", help="vessel file (TOML)")
 
 
+def positive(text: str) -> float:
+    """Return a positive finite number, as an option's type."""
+    value = float(text)
+    if not 0 < value < float("inf"):
+        raise ValueError(text)
+    return value
+
+
 def add_seed(parser: argparse.ArgumentParser) -> None:
     """Add --seed."""
     parser.add_argument("--seed", type=int, default=0, help="seed of whatever is random (0)")

@@ -31,11 +31,12 @@ def run(options: argparse.Namespace) -> None:
     """Read, run, report."""
     from pathlib import Path
 
-    from greybox.files import write_json
+    from greybox.files import check_targets, write_json
     from greybox.model.model import load_model
     from greybox.trial.reading import read_log
     from greybox.validation.comparison import compare_models
 
+    check_targets(options.json, options.report)
     models = [load_model(path) for path in options.models]
     names = [Path(path).stem for path in options.models]
     if len(set(names)) < len(names):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 
-from greybox.commands.common import add_logs, add_seed, provenance, read_logs, say
+from greybox.commands.common import add_logs, add_seed, positive, provenance, read_logs, say
 
 HELP = "estimate a model from logs"
 EXAMPLES = """examples:
@@ -31,13 +31,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "by default chosen",
     )
     parser.add_argument(
-        "--sample-time", type=float, metavar="S", help="decimate the logs to this sample time [s]"
+        "--sample-time",
+        type=positive,
+        metavar="S",
+        help="decimate the logs to this sample time [s]",
     )
     parser.add_argument(
-        "--margin-u", type=float, metavar="M", help="cut out samples with |u| below M [m/s]"
+        "--margin-u", type=positive, metavar="M", help="cut out samples with |u| below M [m/s]"
     )
     parser.add_argument(
-        "--margin-v", type=float, metavar="M", help="cut out samples with |v| below M [m/s]"
+        "--margin-v", type=positive, metavar="M", help="cut out samples with |v| below M [m/s]"
     )
     parser.add_argument(
         "--heading",
@@ -62,7 +65,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=("ma", "hac", "white", "bootstrap"),
         help="standard errors: moving average (iv), robust (ls), white, block bootstrap",
     )
-    parser.add_argument("--mass", type=float, metavar="KG", help="mass, for physical coefficients")
+    parser.add_argument(
+        "--mass", type=positive, metavar="KG", help="mass, for physical coefficients"
+    )
     parser.add_argument("--out", metavar="MODEL", help="write the model to this JSON file")
     parser.add_argument("--json", metavar="F", help="write the result as JSON; - is stdout")
     add_seed(parser)
@@ -70,14 +75,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Read, estimate, report, write."""
-    from greybox.files import write_json
+    from greybox.files import check_targets, write_json
     from greybox.model.catalogue import get_structure
     from greybox.report.physical import physical_summary
     from greybox.validation.choose import Request, estimate_model
     from greybox.vessel.toml import load_vessel
 
+    check_targets(options.out, options.json)
     vessel = load_vessel(options.vessel)
-    states = get_structure(options.structure or "thesis").states
+    # the vessel's own terms may be changed too: here only the states matter
+    states = get_structure((options.structure or "thesis").split("+")[0].split("-")[0]).states
     logs = read_logs(options.logs, vessel, options.sample_time, states)
     margins = {k: v for k, v in (("u", options.margin_u), ("v", options.margin_v)) if v is not None}
     estimate = estimate_model(

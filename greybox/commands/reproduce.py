@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from greybox.commands.common import add_seed, progress, provenance, say
+from greybox.commands.common import add_seed, positive, progress, provenance, say
 
 HELP = "repeat the studies of the thesis"
 EXAMPLES = """examples:
@@ -24,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--validate", nargs="+", metavar="LOG", help="chapter 7: validation logs")
     parser.add_argument("--vessel", metavar="V", help="chapter 7: vessel file of those logs")
     parser.add_argument(
-        "--sample-time", type=float, metavar="S", help="chapter 7: decimate the logs to this [s]"
+        "--sample-time", type=positive, metavar="S", help="chapter 7: decimate the logs to this [s]"
     )
     parser.add_argument("--structure", metavar="NAME", help="chapter 7: structure (thesis)")
     parser.add_argument("--workers", type=int, metavar="N", help="processes (one a processor)")
@@ -73,8 +73,9 @@ def run(options: argparse.Namespace) -> None:
 def _chapter7(options: argparse.Namespace):  # type: ignore[no-untyped-def]
     from greybox.commands.common import read_logs
     from greybox.errors import UsageError
-    from greybox.model.catalogue import get_structure
+    from greybox.model.catalogue import structure_for
     from greybox.study.chapter7 import reproduce_chapter7, virtual_day
+    from greybox.vessel.force import force_inputs
     from greybox.vessel.toml import load_vessel
 
     given = (options.estimate, options.validate, options.vessel)
@@ -87,7 +88,9 @@ def _chapter7(options: argparse.Namespace):  # type: ignore[no-untyped-def]
     else:
         estimation = virtual_day(options.seed, 10.0, "windy")
         validation = virtual_day(options.seed + 1000, 2.0, "calm")
-    structure = get_structure(options.structure) if options.structure else None
+    structure = None
+    if options.structure is not None:
+        structure = structure_for(options.structure, force_inputs(estimation[0].vessel))
     return reproduce_chapter7(
         estimation, validation, structure=structure, progress=progress("chapter 7")
     )

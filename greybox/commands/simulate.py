@@ -25,7 +25,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--start",
         metavar="U,V,R,PSI",
-        help="start of the run where the log holds commands only [m/s, m/s, rad/s, rad]",
+        help="start of the run where the log holds commands only [m/s, m/s, rad/s, rad]; "
+        "write --start=-1,0,0,0 where the first number is negative",
     )
 
 
@@ -34,12 +35,13 @@ def run(options: argparse.Namespace) -> None:
     import numpy as np
 
     from greybox.errors import UsageError
-    from greybox.files import replacing
+    from greybox.files import check_targets, replacing
     from greybox.model.model import load_model
     from greybox.model.simulation import positions
     from greybox.trial.reading import read_log
     from greybox.validation.fit import run_model
 
+    check_targets(options.out)
     model = load_model(options.model)
     fill: dict[str, float] = {}
     if options.start is not None:
@@ -79,8 +81,15 @@ def run(options: argparse.Namespace) -> None:
     with replacing(options.out) as handle:
         handle.write(",".join(columns) + "\n")
         for row in zip(*columns.values(), strict=True):
-            handle.write(",".join(f"{value:.9g}" for value in row) + "\n")
+            # a time may be seconds since 1970
+            cells = [f"{row[0]:.15g}", *(f"{value:.9g}" for value in row[1:])]
+            handle.write(",".join(cells) + "\n")
     shown = ", ".join(f"{k} {v:.1f} %" for k, v in result.fit.items())
+    winds = [
+        t.name for t in model.structure.terms if any(f.signal in ("uq", "vq") for f in t.factors)
+    ]
+    if winds and not result.log.has_wind:
+        say(f"note: {', '.join(winds)} act as in still air, because the log has no wind")
     if not fill:
         say(f"free run of {len(result.log)} samples, fit {shown}")
     say(f"wrote {options.out}")

@@ -122,18 +122,21 @@ def _moving_average(
 ) -> Array:
     """Return Σ Z R Zᵀ with R the residuals' autocovariance over all experiments."""
     p = sum(sizes)
-    counts = sum(len(r) for r in residuals[0])
     spread = np.repeat(np.arange(len(sizes)), sizes)
     total = np.zeros((p, p))
     for lag in range(lags + 1):
         gamma = np.zeros((len(sizes), len(sizes)))
         outer = np.zeros((p, p))
+        pairs = 0
         for e in range(len(projected[0])):
             errors = np.array([equation[e] for equation in residuals])
             stacked = np.vstack([equation[e] for equation in projected])
             samples = stacked.shape[1]
-            gamma += errors[:, lag:] @ errors[:, : samples - lag].T / counts
+            gamma += errors[:, lag:] @ errors[:, : samples - lag].T
+            taking_part = np.asarray(stacked.any(axis=0))
+            pairs += int((taking_part[lag:] & taking_part[: samples - lag]).sum())
             outer += stacked[:, lag:] @ stacked[:, : samples - lag].T
+        gamma /= max(pairs, 1)
         block = outer * gamma[np.ix_(spread, spread)]
         total += block if lag == 0 else block + block.T
     return total

@@ -61,7 +61,12 @@ def current_equations(predictor: Predictor, theta: Array) -> tuple[list[int], Ar
 
 
 def estimate_current(
-    predictor: Predictor, theta: Array, covariance: Array
+    predictor: Predictor,
+    theta: Array,
+    covariance: Array,
+    *,
+    heading_std: float = 0.0,
+    heading_measured: bool = True,
 ) -> tuple[tuple[str, float, float], ...]:
     """Estimate the mean current, north and east.
 
@@ -71,11 +76,16 @@ def estimate_current(
         ``augmented`` or ``wind``; empty is returned for the others.
     theta, covariance : ndarray
         (p,) and (p, p) of all columns.
+    heading_std : float
+        Noise of the measured heading [rad], whose ρ_ψ = exp(−λ/2) is divided out.
+    heading_measured : bool
+        Whether the instruments hold the measured heading. Their own noise then
+        shrinks the estimate by ρ_ψ; with a simulated heading it grows by 1/ρ_ψ (5.30).
 
     Returns
     -------
     tuple of (name, value, standard error)
-        [m/s]; scaled by 1/ρ_ψ of the heading noise, as (5.30) says.
+        [m/s]
 
     References
     ----------
@@ -100,6 +110,9 @@ def estimate_current(
         spread = np.asarray(np.linalg.pinv(aw.T @ whiten @ aw), float)
         current = np.asarray(spread @ aw.T @ whiten @ (b / scale), float)
     std = np.sqrt(np.maximum(np.diag(spread), 0.0))
+    rho = float(np.exp(-(heading_std**2) / 2))
+    stretch = 1 / rho if heading_measured else rho
     return tuple(
-        (name, float(v), float(s)) for name, v, s in zip(CURRENT, current, std, strict=True)
+        (name, float(v) * stretch, float(s) * stretch)
+        for name, v, s in zip(CURRENT, current, std, strict=True)
     )

@@ -32,6 +32,17 @@ _REFINE_TOLERANCE = 1e-4
 _MAX_REFINEMENTS = 30
 
 
+class UnexcitedBiasError(ExcitationError):
+    """A bias-capturing regressor, or its instrument, does not vary and can be left out."""
+
+    def __init__(self, column: int, label: str) -> None:
+        super().__init__(
+            f"the bias-capturing regressor {label} or its instrument does not vary over the whole "
+            f"log: leave it out of the predictor."
+        )
+        self.column = column
+
+
 def estimate_ls(
     predictor: Predictor,
     logs: Sequence[TrialLog],
@@ -171,12 +182,14 @@ def estimate_iv(
         for iterations in range(1, most + 1):
             previous = _coefficients(solutions)
             target = _structure_theta(predictor, previous)
-            candidate, fresh = target, instruments_of(target, None)
+            # rows are cut once by a refined model and then kept, or the cut would chatter
+            rows = None if iterations == 1 else instruments.keep
+            candidate, fresh = target, instruments_of(target, rows)
             for _ in range(4):
                 if not fresh.diverged:
                     break
                 candidate = (candidate + theta) / 2
-                fresh = instruments_of(candidate, None)
+                fresh = instruments_of(candidate, rows)
             if fresh.diverged:
                 status = (
                     f"stopped after {iterations - 1} refinements: {fresh.diverged}; "
@@ -203,6 +216,7 @@ def estimate_iv(
         status,
         centred=zero_mean,
         margins=margins,
+        heading=heading,
     )
 
 
@@ -239,6 +253,13 @@ def _solve(
     solutions = []
     for row, state in enumerate(predictor.structure.states):
         mine = predictor.equation(state)
+        kept = sum(int(k.sum()) for k in instruments.keep)
+        if kept <= 2 * len(mine):
+            raise ExcitationError(
+                f"{kept} of {regression.samples} samples keep the margins and the {state} equation "
+                f"has {len(mine)} coefficients, more than {2 * len(mine)} are needed: use smaller "
+                f"margins or a longer log."
+            )
         phi = [
             e.phi[mine][:, k] for e, k in zip(regression.experiments, instruments.keep, strict=True)
         ]
@@ -261,6 +282,8 @@ def _require_excited(
             largest = max(float(np.abs(r[i]).max(initial=0.0)) for r in rows)
             if largest < 1e-13:
                 label = predictor.columns[column].label
+                if predictor.columns[column].is_bias:
+                    raise UnexcitedBiasError(column, label)
                 raise ExcitationError(
                     f"parameter {label} is not excited: its {what} stays within {largest:.1g} "
                     f"over the whole log. Move what it multiplies, or leave it out "
@@ -307,7 +330,7 @@ def _masked(
             full = np.zeros((len(mine), len(keep)))
             full[:, keep] = hat
             error = e.y[row] - solution.theta @ e.phi[mine]
-            if centred:
+            if centred and keep.any():
                 error = error - error[keep].mean()
             error = np.where(keep, error, 0.0)
             hats.append(full)
@@ -366,6 +389,7 @@ def _result(
     status: str = "solved",
     centred: bool = False,
     margins: dict[str, float] | None = None,
+    heading: str = "measured",
 ) -> Estimate:
     predictor = regression.predictor
     projected, residuals = _masked(solutions, regression, instruments, centred=centred)
@@ -375,7 +399,9 @@ def _result(
     states = predictor.structure.states
     tests = [excitation(predictor, s, x) for s, x in zip(states, solutions, strict=True)]
     for state, equation in zip(states, residuals, strict=True):
-        rows = [e[k] - e[k].mean() for e, k in zip(equation, instruments.keep, strict=True)]
+        rows = [
+            e[k] - e[k].mean() for e, k in zip(equation, instruments.keep, strict=True) if k.any()
+        ]
         tests.append(whiteness(state, rows, len(predictor.equation(state))))
     if predictor.structure.disturbance == "marine":
         tests += sign_margins(logs, states, margins, regression.samples - kept)
@@ -396,7 +422,13 @@ def _result(
         lags=lags,
         iterations=iterations,
         status=status,
-        current=estimate_current(predictor, theta, covariance),
+        current=estimate_current(
+            predictor,
+            theta,
+            covariance,
+            heading_std=logs[0].vessel.std("psi") or 0.0,
+            heading_measured=heading == "measured",
+        ),
         tests=tuple(tests),
         logs=tuple(
             {"name": log.name, "sha256": log.provenance.sha256, "samples": len(log)} for log in logs

@@ -29,12 +29,15 @@ def closed_loop_share(logs: Sequence[TrialLog]) -> float | None:
     return float(np.concatenate([log.closed_loop for log in known]).mean())
 
 
-def assess_loop(logs: Sequence[TrialLog], loop: Loop = "auto") -> tuple[bool, TestResult]:
+def assess_loop(
+    logs: Sequence[TrialLog], loop: Loop = "auto", method: str = "iv"
+) -> tuple[bool, TestResult]:
     """Decide whether to treat the logs as closed loop.
 
     Parameters
     ----------
     logs : sequence of TrialLog
+    method : {"iv", "ls"}
     loop : {"open", "closed", "auto"}
         ``auto`` follows the mode column that the vessel file names in
         ``[closed_loop]``; without one the logs count as open loop.
@@ -49,9 +52,14 @@ def assess_loop(logs: Sequence[TrialLog], loop: Loop = "auto") -> tuple[bool, Te
     if closed:
         amount = "the user says so" if share is None else f"{100 * share:.0f} % of the samples"
         sentence = (
-            f"closed loop ({amount}): a controller moved the thrusters, so instruments are "
-            f"delayed by {CLOSED_LOOP_LAG} samples; that removes the dependence on measurement "
-            f"noise, not on slow gusts. Prefer a trial with open-loop commands."
+            f"closed loop ({amount}): a controller moved the thrusters, "
+            + (
+                f"so instruments are delayed by {CLOSED_LOOP_LAG} samples; that removes the "
+                f"dependence on measurement noise, not on slow gusts. "
+                if method == "iv"
+                else "and least squares has nothing against it: its bias is not known. "
+            )
+            + "Prefer a trial with open-loop commands."
         )
     elif share is None and loop == "auto":
         sentence = (

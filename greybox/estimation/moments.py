@@ -46,6 +46,12 @@ class Solution:
     weakest: Array
 
 
+def _centred_squares(rows: Array) -> Array:
+    if not rows.shape[1]:
+        return np.zeros(len(rows))
+    return np.asarray(((rows - rows.mean(axis=1, keepdims=True)) ** 2).sum(axis=1))
+
+
 def solve_stacked(
     z: Sequence[Array], phi: Sequence[Array], y: Sequence[Array], *, metric: str = "moments"
 ) -> Solution:
@@ -69,19 +75,20 @@ def solve_stacked(
     Ljungberg (2020), eqs. 2.17, 2.21, 4.5.
     """
     p = phi[0].shape[0]
-    size = np.sqrt(sum(((f - f.mean(axis=1, keepdims=True)) ** 2).sum(axis=1) for f in phi))
+    size = np.sqrt(sum(_centred_squares(f) for f in phi))
     size[size == 0] = 1.0
     bases, rows, targets = [], [], []
     for ze, fe, ye in zip(z, phi, y, strict=True):
-        scale = np.sqrt((ze**2).mean(axis=1))
+        scale = np.sqrt((ze**2).sum(axis=1) / max(ze.shape[1], 1))
         scale[scale == 0] = 1.0
         basis = ze / scale[:, None]
         if metric == "moments":
             # an orthonormal basis of the instruments, never their squared moments
             _, values, vt = np.linalg.svd(basis, full_matrices=False)
-            basis = vt[values > _RANK * values[0]]
+            # an experiment of which every row was cut has no singular values
+            basis = vt[values > _RANK * values.max(initial=0.0)]
         else:
-            basis = basis / np.sqrt(fe.shape[1])
+            basis = basis / np.sqrt(max(fe.shape[1], 1))
         bases.append(basis)
         rows.append(basis @ (fe / size[:, None]).T)
         targets.append(basis @ ye)

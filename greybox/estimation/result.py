@@ -177,7 +177,7 @@ class Estimate:
     def summary(self) -> str:
         """Return the result as text, in the manner of a regression table."""
         width = 78
-        unit = self.vessel.thrusters[0].thrust.unit if self.vessel.thrusters else "n"
+        unit = self.vessel.force_unit
         lines = [
             f"{'Estimate of ' + self.vessel.name:^{width}}",
             "=" * width,

@@ -125,18 +125,45 @@ def get_structure(name: str) -> Structure:
     StructureError
         There is no such structure or term; the nearest name is suggested.
     """
-    parts = name.replace("+", "\n+").replace("-", "\n-").split("\n")
-    base = parts[0].strip()
+    base, changes = _split(name)
     if base not in _CATALOGUE:
         raise StructureError(
             f"there is no structure '{base}'.{suggestion(base, _CATALOGUE)} "
             f"Published structures: {', '.join(_CATALOGUE)}."
         )
-    structure = _CATALOGUE[base]()
-    for part in parts[1:]:
+    return _changed(_CATALOGUE[base](), changes)
+
+
+def _split(name: str) -> tuple[str, list[str]]:
+    parts = [p.strip() for p in name.replace("+", "\n+").replace("-", "\n-").split("\n")]
+    return parts[0], parts[1:]
+
+
+def _changed(structure: Structure, changes: list[str]) -> Structure:
+    name = structure.name + "".join(changes)
+    for part in changes:
         change, term = part[0], part[1:].strip()
         structure = structure.with_terms(term) if change == "+" else structure.without(term)
-    return replace(structure, name="".join(p.strip() for p in parts))
+    return replace(structure, name=name)
+
+
+def structure_for(name: str, inputs: tuple[str, ...]) -> Structure:
+    """Return a published structure for a vessel, then with the changes in the name.
+
+    Parameters
+    ----------
+    name : str
+        As `get_structure`.
+    inputs : tuple of str
+        Generalised inputs that the vessel's thrusters produce.
+
+    Raises
+    ------
+    StructureError
+        As `get_structure`.
+    """
+    base, changes = _split(name)
+    return _changed(for_inputs(get_structure(base), inputs), changes)
 
 
 def for_inputs(structure: Structure, inputs: tuple[str, ...]) -> Structure:

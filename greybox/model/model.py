@@ -75,8 +75,7 @@ class ManoeuvringModel:
     @property
     def force_unit(self) -> str:
         """Unit of the generalised force: N, or that of the propeller speed."""
-        units = {t.thrust.unit for t in self.vessel.thrusters}
-        return units.pop() if len(units) == 1 else "mixed"
+        return self.vessel.force_unit
 
     @property
     def units(self) -> list[str]:
@@ -209,6 +208,12 @@ def model_from_dict(data: Any, source: str = "model") -> ManoeuvringModel:
             raise ModelFileError(
                 f"'{source}' has {len(terms)} terms but {theta.size} parameters: "
                 f"estimate the model again."
+            )
+        if s["disturbance"] not in ("marine", "additive", "none"):
+            raise ModelFileError(f"'{source}' has the disturbance '{s['disturbance']}', unknown.")
+        if not 0 < float(data["sample_time"]) < float("inf"):
+            raise ModelFileError(
+                f"'{source}' has the sample time {data['sample_time']}, it must be positive."
             )
         if not np.isfinite(theta).all():
             raise ModelFileError(f"'{source}' holds a parameter that is not a finite number.")

@@ -10,7 +10,7 @@ points of the regime, constants apart (zero-mean instruments remove those).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from itertools import combinations_with_replacement
 from math import factorial
@@ -133,6 +133,25 @@ class Predictor:
     def parameter_names(self) -> tuple[str, ...]:
         """Names of the parameters that the predictor estimates."""
         return tuple(c.name for c in self.columns if not c.is_bias)
+
+    def without_bias(self, column: int) -> Predictor:
+        """Return the predictor without one bias-capturing column."""
+        state = self.columns[column].state
+        position = self.equation(state).index(column)
+        shares = tuple(
+            replace(b, shares=b.shares[:position] + b.shares[position + 1 :])
+            if b.state == state
+            else b
+            for b in self.biases
+        )
+        return Predictor(
+            self.structure,
+            self.kind,
+            self.regime,
+            self.columns[:column] + self.columns[column + 1 :],
+            shares,
+            self._spelled[:column] + self._spelled[column + 1 :],
+        )
 
     @property
     def contaminated(self) -> tuple[str, ...]:
@@ -509,6 +528,11 @@ def build_predictor(
                 )
             columns.append(Column(term.name, state, (term.name,)))
             spelled.append("")
+        if len(columns) == start:
+            raise StructureError(
+                f"structure '{structure.name}' has no term in the {state} equation: add one "
+                f"(+TERM), or use a structure without that state."
+            )
         mine = [k for k, (t, _, _) in enumerate(derived) if structure.terms[t].state == state]
         # first derivatives before second ones, those with a plain name before the others
         named = {k: _same_direction(unit, derived_values[k]) for k in mine}

@@ -7,8 +7,8 @@ is a derivative or an evaluation of it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import casadi as ca
 
@@ -32,6 +32,16 @@ class Symbols:
     d: ca.SX
     air: ca.SX
     theta: ca.SX
+
+
+@lru_cache(maxsize=256)
+def _symbols(*names: tuple[str, ...]) -> Symbols:
+    """Return the same symbols for equal structures, so that expressions can be shared."""
+    states, inputs, disturbances, parameters = (
+        ca.vertcat(*[ca.SX.sym(n) for n in group]) for group in names
+    )
+    air = ca.vertcat(ca.SX.sym("u_q"), ca.SX.sym("v_q"))
+    return Symbols(states, ca.SX.sym("psi"), inputs, disturbances, air, parameters)
 
 
 @dataclass(frozen=True)
@@ -86,10 +96,6 @@ class Structure:
                 )
             keys[term.key] = term.name
 
-    def __getstate__(self) -> dict[str, object]:
-        """Drop the cached symbols, which belong to one process, when pickled."""
-        return {f.name: getattr(self, f.name) for f in fields(self)}
-
     @property
     def parameters(self) -> tuple[str, ...]:
         """Names of the parameters, in the order of ``theta``."""
@@ -138,17 +144,10 @@ class Structure:
         drop = {self.parameters[self.index(n)] for n in names}
         return replace(self, terms=tuple(t for t in self.terms if t.name not in drop))
 
-    @cached_property
+    @property
     def symbols(self) -> Symbols:
         """The symbols that every expression of this structure is written in."""
-        return Symbols(
-            x=ca.vertcat(*[ca.SX.sym(s) for s in self.states]),
-            psi=ca.SX.sym("psi"),
-            tau=ca.vertcat(*[ca.SX.sym(s) for s in self.inputs]),
-            d=ca.vertcat(*[ca.SX.sym(s) for s in self.disturbances]),
-            air=ca.vertcat(ca.SX.sym("u_q"), ca.SX.sym("v_q")),
-            theta=ca.vertcat(*[ca.SX.sym(p) for p in self.parameters]),
-        )
+        return _symbols(self.states, self.inputs, self.disturbances, self.parameters)
 
     def regressors(self, *, air_measured: bool) -> list[ca.SX]:
         """Return ∂f/∂θ, one expression per term, in the order of the terms."""

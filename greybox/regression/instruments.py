@@ -180,7 +180,7 @@ def build_instruments(
             [np.ascontiguousarray(c) for c in tau.T],
             (log["u_q"][:-1], log["v_q"][:-1]) if predictor.air_measured else None,
         )
-        if zero_mean:
+        if zero_mean and rows.any():
             # a constant keeps itself as instrument: its equation gives the mean residual
             varying = np.setdiff1d(np.arange(len(z)), predictor.constants)
             z[varying] -= z[np.ix_(varying, np.flatnonzero(rows))].mean(axis=1, keepdims=True)

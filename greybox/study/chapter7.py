@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from greybox.errors import GreyboxError, UsageError
 from greybox.estimation.estimate import estimate_iv, estimate_ls
 from greybox.estimation.result import Estimate
-from greybox.model.catalogue import for_inputs, get_structure
+from greybox.model.catalogue import get_structure, structure_for
 from greybox.model.predictor import Predictor, build_predictor
 from greybox.model.simulation import positions, simulate, stationary_disturbance
 from greybox.model.structure import Structure
@@ -210,7 +210,7 @@ def reproduce_chapter7(
     """
     if not estimation or not validation:
         raise UsageError("chapter 7 needs logs of both days: give --estimate and --validate.")
-    structure = for_inputs(structure or get_structure("thesis"), force_inputs(estimation[0].vessel))
+    structure = structure or structure_for("thesis", force_inputs(estimation[0].vessel))
     wind = all(log.has_wind for log in [*estimation, *validation]) and structure.uses_air
     sets = estimation_sets(estimation)
     fits: dict[str, list[list[float]]] = {}

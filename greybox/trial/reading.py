@@ -25,6 +25,8 @@ Array = NDArray[np.float64]
 _MIN_SAMPLES = 3
 # share of a sample by which a time step may differ from the others
 _JITTER = 0.2
+# samples by which a time may differ from a uniform clock
+_DRIFT = 0.6
 
 
 def read_log(
@@ -62,7 +64,7 @@ def read_log(
     """
     path = Path(path)
     table = _read_table(path)
-    channels, text = _canonical(table, vessel, path)
+    channels, text = _canonical(table, vessel, path, plan=bool(fill))
     if "t" not in channels:
         raise LogError(
             f"'{path.name}' has no column 't'.{suggestion('t', map(str, table.columns))} "
@@ -129,7 +131,7 @@ def _read_table(path: Path) -> pd.DataFrame:
 
 
 def _canonical(
-    table: pd.DataFrame, vessel: Vessel, path: Path
+    table: pd.DataFrame, vessel: Vessel, path: Path, *, plan: bool
 ) -> tuple[dict[str, Array], dict[str, NDArray[Any]]]:
     """Return the numeric channels in SI, and the text columns, by canonical name."""
     columns = [str(c) for c in table.columns]
@@ -143,6 +145,11 @@ def _canonical(
     loop = vessel.closed_loop[0] if vessel.closed_loop else None
     if loop is not None and loop in columns:
         text[loop] = table[loop].astype(str).to_numpy()
+    positions = {"x_n", "y_n"}
+    if {"u", "v"} | positions <= source.keys():
+        # positions are not needed where velocities were logged: they may have holes
+        holes = table[[source[n] for n in sorted(positions)]].isna().to_numpy().any()
+        source = {n: raw for n, raw in source.items() if not holes or n not in positions}
     for name, raw in source.items():
         target = CHANNELS[name].unit if name in CHANNELS else None
         if name in vessel.angle_commands:
@@ -154,7 +161,7 @@ def _canonical(
         channels[name] = _numeric(table[raw], raw, path.name) * factor
     for raw in missing:
         name = vessel.columns[raw].name
-        if name not in channels and name in vessel.commands:
+        if name not in channels and (name in vessel.commands or not plan):
             raise LogError(
                 f"'{path.name}' has no column '{raw}', which [columns] maps to '{name}'."
                 f"{suggestion(raw, columns)} Correct the name in the vessel file."
@@ -196,6 +203,14 @@ def _sample_time(t: Array, name: str) -> float:
             f"Resample it to one, or split it at the gaps."
         )
     mean = float((t[-1] - t[0]) / (len(t) - 1))
+    drift = np.abs(t - t[0] - mean * np.arange(len(t)))
+    if drift.max() > _DRIFT * mean:
+        k = len(t) // 2
+        one, two = ((t[k] - t[0]) / k, (t[-1] - t[k]) / (len(t) - 1 - k))
+        raise LogError(
+            f"'{name}' has two sample times: {one:.6g} s on average in its first half and "
+            f"{two:.6g} s in its second. Resample it to one."
+        )
     return round(mean, 9)
 
 

@@ -9,10 +9,15 @@ from typing import Any, Literal
 import numpy as np
 
 from greybox.errors import ExcitationError, GreyboxError, LogError
-from greybox.estimation.estimate import Covariance, estimate_iv, estimate_ls
+from greybox.estimation.estimate import (
+    Covariance,
+    UnexcitedBiasError,
+    estimate_iv,
+    estimate_ls,
+)
 from greybox.estimation.loop import CLOSED_LOOP_LAG, Loop, assess_loop
 from greybox.estimation.result import Estimate
-from greybox.model.catalogue import for_inputs, get_structure
+from greybox.model.catalogue import structure_for
 from greybox.model.predictor import Predictor, Regime, build_predictor
 from greybox.model.structure import Structure
 from greybox.regression.regression import common_sample_time
@@ -39,6 +44,7 @@ class Alternative:
     structure: Structure
     method: str
     kind: str
+    reason: str = ""
 
     @property
     def label(self) -> str:
@@ -66,9 +72,13 @@ class Request:
 
 
 def heading_range(logs: Sequence[TrialLog]) -> float:
-    """Return the range that the heading covers over all logs, at most a full turn [rad]."""
-    psi = np.concatenate([log["psi"] for log in logs])
-    return float(min(psi.max() - psi.min(), 2 * np.pi))
+    """Return how much of the circle the headings of all logs cover [rad].
+
+    Whole turns between logs do not count: 2π less the largest gap.
+    """
+    psi = np.sort(np.concatenate([log["psi"] for log in logs]) % (2 * np.pi))
+    gaps = np.append(np.diff(psi), psi[0] + 2 * np.pi - psi[-1])
+    return float(2 * np.pi - gaps.max())
 
 
 def regime_of(logs: Sequence[TrialLog], structure: Structure) -> Regime:
@@ -134,25 +144,46 @@ def estimate_once(
         A channel is missing.
     """
     require_informative(logs, kind)
-    closed, loop_test = assess_loop(logs, request.loop)
+    closed, loop_test = assess_loop(logs, request.loop, method)
     common: dict[str, Any] = {"margins": request.margins, "seed": request.seed}
     if request.covariance is not None:
         common["covariance"] = request.covariance
     keep_constant = method == "ls" or not request.zero_mean
     predictor = _predictor(structure, kind, logs, keep_constant)
-    if method == "ls":
-        estimate = estimate_ls(predictor, logs, **common)
-    else:
-        estimate = estimate_iv(
-            predictor,
-            logs,
-            zero_mean=request.zero_mean,
-            refine=request.refine,
-            heading=request.heading,
-            lag=CLOSED_LOOP_LAG if closed else 0,
-            **common,
+    notes = []
+    while True:
+        try:
+            if method == "ls":
+                estimate = estimate_ls(predictor, logs, **common)
+            else:
+                estimate = estimate_iv(
+                    predictor,
+                    logs,
+                    zero_mean=request.zero_mean,
+                    refine=request.refine,
+                    heading=request.heading,
+                    lag=CLOSED_LOOP_LAG if closed else 0,
+                    **common,
+                )
+            break
+        except UnexcitedBiasError as error:
+            label = predictor.columns[error.column].label
+            notes.append(f"the bias-capturing regressor {label} does not vary and was left out.")
+            predictor = predictor.without_bias(error.column)
+    if kind in ("wind", "basic+wind") and method == "iv":
+        notes.append(
+            "the instruments hold the measured wind as it is: its noise moves the wind terms "
+            "towards zero and, in a nearly steady wind, the current with them. Trust them where "
+            "the wind changed by much more than its sensor's noise."
         )
-    return replace(estimate, tests=(*estimate.tests, loop_test))
+    coarse = [d for log in logs for d in log.provenance.derived if "3.57" in d or "decimated" in d]
+    if coarse:
+        notes.append(
+            f"the logs were conditioned ({coarse[0]}) and the model steps by Euler: damping and "
+            f"current carry a bias of the order of the damping over one sample, which the "
+            f"standard errors leave out. Compare with a shorter sample time."
+        )
+    return replace(estimate, tests=(*estimate.tests, loop_test), notes=tuple(notes))
 
 
 def estimate_model(logs: Sequence[TrialLog], request: Request = Request()) -> Estimate:
@@ -180,8 +211,8 @@ def estimate_model(logs: Sequence[TrialLog], request: Request = Request()) -> Es
     notes: list[str] = []
     inputs = force_inputs(logs[0].vessel)
     wind = all(log.has_wind for log in logs)
-    names = [request.structure] if request.structure else _structures(logs, wind)
-    structures = [for_inputs(get_structure(name), inputs) for name in names]
+    names = [request.structure] if request.structure is not None else _structures(logs, wind)
+    structures = [structure_for(name, inputs) for name in names]
     methods = [request.method] if request.method else ["iv", "ls"]
     kinds = (
         [request.predictor] if request.predictor else _plausible(logs, structures[0], wind, notes)
@@ -202,11 +233,13 @@ def estimate_model(logs: Sequence[TrialLog], request: Request = Request()) -> Es
             if a.structure is structures[0] and a.method == "iv" and a.kind == theory
         ]
         if first:
-            notes.append(
-                f"{first[0].label} was taken: heading turns enough and the states keep their "
-                f"signs, so its estimates are consistent (chapter 5)."
+            first[0] = replace(
+                first[0],
+                reason="heading turns enough and the states keep their signs, so its estimates "
+                "are consistent as long as current and unmeasured wind stay slower than the ship "
+                "(chapter 5)",
             )
-            alternatives = [*first, *[a for a in alternatives if a not in first]]
+            alternatives = [*first, *[a for a in alternatives if a.label != first[0].label]]
         else:
             alternatives = _compare(logs, alternatives, request, notes)
     return _first_that_runs(logs, alternatives, request, notes)
@@ -228,10 +261,13 @@ def _first_that_runs(
             )
         except GreyboxError as error:
             failures.append(error)
+            notes.append(f"{alternative.label} was left: {error}")
             continue
         model = estimate.model()
         runs = [run_model(model, log) for log in logs]
-        own = []
+        own = list(estimate.notes)
+        if alternative.reason:
+            own.append(f"{alternative.label} was taken: {alternative.reason}.")
         if estimate.method == "iv":
             own.append(f"instruments: {estimate.status}.")
         if estimate.predictor.contaminated:
@@ -239,7 +275,14 @@ def _first_that_runs(
                 f"{', '.join(estimate.predictor.contaminated)} also carry a second moment of the "
                 f"current, which this structure cannot separate."
             )
-        estimate = replace(estimate, notes=(*notes, *own), fit=average_fit(runs))
+        fit = average_fit(runs)
+        poor = [s for s, v in fit.items() if v < 0]
+        if poor and all(r.diverged < 0 for r in runs):
+            own.append(
+                f"the free run of {', '.join(poor)} is worse than a constant on the very logs it "
+                f"was estimated on: this model does not explain that motion."
+            )
+        estimate = replace(estimate, notes=(*notes, *own), fit=fit)
         if all(r.diverged < 0 for r in runs):
             return estimate
         notes.append(f"{alternative.label} was left: its free run diverges.")

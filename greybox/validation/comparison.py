@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.errors import UsageError
 from greybox.model.model import ManoeuvringModel
 from greybox.model.simulation import simulate
 from greybox.regression.instruments import state_bound
@@ -236,6 +237,13 @@ def compare_models(
     -------
     Comparison
     """
+    states = {model.structure.states for model in models}
+    if len(states) > 1:
+        one, two = sorted(states)[:2]
+        raise UsageError(
+            f"models with the states {', '.join(one)} and {', '.join(two)} cannot stand in one "
+            f"table: compare those of the same states."
+        )
     runs = tuple(
         tuple(run_model(model, log, heading=heading) for log in mine)
         for model, mine in zip(models, logs, strict=True)

@@ -87,7 +87,7 @@ def load_vessel(path: str | Path) -> Vessel:
         ) from error
     except UnicodeDecodeError as error:
         raise VesselError(f"'{source}' is not a text file: name a TOML vessel file.") from error
-    except tomllib.TOMLDecodeError as error:
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise VesselError(f"'{source}' is not TOML: {error}. Correct that line.") from error
     return vessel_from_dict(data)
 

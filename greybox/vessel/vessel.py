@@ -122,6 +122,12 @@ class Vessel:
                 found.setdefault(t.rudder, []).append(t.rudder_limits)
         return {name: _tightest(limits) for name, limits in found.items()}
 
+    @property
+    def force_unit(self) -> str:
+        """Unit of the generalised force: N, or that of the propeller speed; else ``mixed``."""
+        units = {t.thrust.unit for t in self.thrusters}
+        return units.pop() if len(units) == 1 else "mixed"
+
     def std(self, channel: str) -> float | None:
         """Return the measurement noise of a channel where the file states it."""
         key = {"psi": "heading_std"}.get(channel, f"{channel}_std")

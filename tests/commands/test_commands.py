@@ -117,6 +117,20 @@ def test_nothing_is_left_half_written(noisy_csv, tmp_path, capsys):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["trial.csv"]
 
 
+def test_targets_are_checked_before_anything_is_written(noisy_csv, tmp_path, capsys):
+    model = tmp_path / "m.json"
+    assert run("estimate", noisy_csv, "--vessel", "thesis", "--out", model,
+               "--json", tmp_path / "none" / "x.json") == 1  # fmt: skip
+    assert run("estimate", noisy_csv, "--vessel", "thesis", "--out", tmp_path) == 1
+    assert "it is a folder" in capsys.readouterr().err
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["trial.csv"]
+
+
+def test_a_device_is_written_and_not_replaced(noisy_csv):
+    assert run("estimate", noisy_csv, "--vessel", "thesis", "--out", "/dev/null") == 0
+    assert not Path("/dev/null").is_file()
+
+
 def test_wrong_usage_exits_with_2(capsys):
     with pytest.raises(SystemExit) as stop:
         run("estmate")

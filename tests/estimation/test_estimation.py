@@ -102,12 +102,22 @@ def test_robust_covariance_equals_a_slow_sum():
             )
     if np.linalg.eigvalsh(slow)[0] > 0:
         np.testing.assert_allclose(fast, slow, rtol=1e-10)
-    gamma = [float(e[k:] @ e[: 80 - k]) / 80 for k in range(3)]
+    gamma = [float(e[k:] @ e[: 80 - k]) / (80 - k) for k in range(3)]
     r = sum(gamma[k] * (np.eye(80, k=k) + (np.eye(80, k=-k) if k else 0)) for k in range(3))
     ma, _ = score_covariance([[z]], [[e]], "ma", lags=2)
     want = z @ r @ z.T
     if np.linalg.eigvalsh(want)[0] > 0:
         np.testing.assert_allclose(ma, want, rtol=1e-10)
+
+
+def test_cut_rows_do_not_shrink_the_covariance():
+    rng = np.random.default_rng(5)
+    z, e = rng.normal(size=(2, 4000)), rng.normal(size=4000)
+    keep = np.arange(4000) % 4 == 0
+    z[:, ~keep], e[~keep] = 0.0, 0.0
+    for kind in ("white", "hac", "ma"):
+        total, _ = score_covariance([[z]], [[e]], kind, lags=0)
+        np.testing.assert_allclose(np.diag(total), 1000, rtol=0.15)
 
 
 def test_memory_of_a_moving_average_is_found():

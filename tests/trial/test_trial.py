@@ -147,6 +147,10 @@ def test_decimation_averages_what_the_ship_feels(ship):
         (lambda f: f.assign(t=f["t"][::-1].to_numpy()), "must increase"),
         (lambda f: f.assign(t=np.r_[np.arange(10), 10 + 2 * np.arange(10)]), "two sample times"),
         (lambda f: f.head(2), "has 2 samples, at least 3"),
+        (
+            lambda f: f.assign(t=np.r_[np.arange(10), 9 + 1.15 * np.arange(1, 11)]),
+            "on average in its first half",
+        ),
     ],
 )
 def test_bad_logs(tmp_path, change, message):
@@ -167,6 +171,18 @@ def test_bad_files(tmp_path):
     (tmp_path / "empty.csv").write_text("")
     with pytest.raises(LogError, match="as CSV"):
         read_log(tmp_path / "empty.csv", ship)
+
+
+def test_a_mapped_column_must_be_there(tmp_path):
+    ship = SHIP | {"columns": {"wind_u": {"name": "u_q", "unit": "m/s"}}}
+    with pytest.raises(LogError, match="no column 'wind_u', which .columns. maps to 'u_q'"):
+        read(table(), tmp_path, ship)
+
+
+def test_holes_in_positions_do_not_matter_beside_velocities(tmp_path):
+    frame = table()
+    frame.loc[7, "x_n"] = np.nan
+    assert "x_n" not in read(frame, tmp_path)
 
 
 def test_closed_loop_is_read_from_the_mode(tmp_path):

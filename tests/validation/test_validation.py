@@ -8,9 +8,15 @@ import numpy as np
 import pytest
 from virtual import virtual_log
 
-from greybox.errors import ExcitationError, LogError, ModelFileError, StructureError
+from greybox.errors import (
+    ExcitationError,
+    LogError,
+    ModelFileError,
+    StructureError,
+    UsageError,
+)
 from greybox.estimation.estimate import estimate_ls
-from greybox.model.catalogue import get_structure
+from greybox.model.catalogue import get_structure, structure_for
 from greybox.model.conversion import (
     Inertia,
     change_sample_time,
@@ -24,7 +30,7 @@ from greybox.model.conversion import (
 from greybox.model.model import load_model, model_from_dict
 from greybox.model.predictor import build_predictor
 from greybox.trial.log import make_log
-from greybox.validation.choose import Request, estimate_model, regime_of
+from greybox.validation.choose import Request, estimate_model, heading_range, regime_of
 from greybox.validation.comparison import compare_models, sign_test
 from greybox.validation.fit import fit_percent, run_model
 
@@ -123,7 +129,7 @@ def test_the_theory_chooses_where_its_conditions_hold(noisy_log):
     e = estimate_model([noisy_log])
     assert e.method == "iv"
     assert e.predictor.kind in ("wind", "augmented")
-    assert any("consistent (chapter 5)" in n for n in e.notes)
+    assert any("was taken" in n and "(chapter 5)" in n for n in e.notes)
     assert e.fit["u"] > 50
 
 
@@ -154,6 +160,39 @@ def test_uninformative_logs_are_refused(noisy_log):
     log = make_log(noisy_log.vessel, no_wind, 1.0, "calm")
     with pytest.raises(LogError, match="needs the wind"):
         estimate_model([log], Request(predictor="wind"))
+
+
+def test_whole_turns_between_logs_are_no_coverage(noisy_log):
+    north = make_log(noisy_log.vessel, {"psi": np.linspace(0.0, 0.1, 50)}, 1.0)
+    again = make_log(noisy_log.vessel, {"psi": np.linspace(0.0, 0.1, 50) + 2 * np.pi}, 1.0)
+    assert heading_range([north, again]) == pytest.approx(0.1, abs=1e-3)
+    assert heading_range([noisy_log]) > 6
+
+
+def test_bias_columns_that_do_not_vary_are_left_out(noisy_log):
+    """A few measured v < 0 add sgn(v), which the simulated v never changes."""
+    v = noisy_log["v"].copy()
+    v[::60] = -0.01
+    log = make_log(noisy_log.vessel, {**noisy_log.channels, "v": v}, 1.0)
+    e = estimate_model([log], Request(method="iv", predictor="augmented", structure="thesis"))
+    assert any("does not vary and was left out" in n for n in e.notes)
+    assert "sgn(v)" not in {c.name for c in e.predictor.columns}
+
+
+def test_models_of_other_states_are_not_compared(thesis_model, noisy_log):
+    surge = estimate_model(
+        [noisy_log], Request(method="ls", predictor="basic", structure="surge")
+    ).model()
+    with pytest.raises(UsageError, match="cannot stand in one table"):
+        compare_models([thesis_model, surge], ["a", "b"], [[noisy_log], [noisy_log]])
+
+
+def test_rudder_terms_can_be_removed():
+    inputs = ("taux", "race", "rudder", "race_drag", "rudder_drag")
+    structure = structure_for("thesis-X_race_drag", inputs)
+    assert "X_race_drag" not in structure.parameters
+    assert {"Y_race", "N_race"} <= set(structure.parameters)
+    assert "Ymu" not in structure.parameters
 
 
 def test_regime_is_read_from_the_log(noisy_log, thesis):
