@@ -82,11 +82,15 @@ def heading_range(logs: Sequence[TrialLog]) -> float:
 
 
 def regime_of(logs: Sequence[TrialLog], structure: Structure) -> Regime:
-    """Return the signs that each state takes in more than one sample of a hundred."""
+    """Return the signs that each state takes in more than one sample of twenty.
+
+    Rarer ones are noise or short passages, which simulated instruments may not
+    repeat; columns for them would have no instrument.
+    """
     regime = []
     for state in structure.states:
         value = np.concatenate([log[state] for log in logs])
-        signs = tuple(s for s in (1, -1) if float((s * value > 0).mean()) > 0.01)
+        signs = tuple(s for s in (1, -1) if float((s * value > 0).mean()) > 0.05)
         regime.append((state, signs or (1, -1)))
     return tuple(regime)
 

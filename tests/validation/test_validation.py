@@ -15,7 +15,7 @@ from greybox.errors import (
     StructureError,
     UsageError,
 )
-from greybox.estimation.estimate import estimate_ls
+from greybox.estimation.estimate import UnexcitedBiasError, estimate_iv, estimate_ls
 from greybox.model.catalogue import get_structure, structure_for
 from greybox.model.conversion import (
     Inertia,
@@ -169,14 +169,26 @@ def test_whole_turns_between_logs_are_no_coverage(noisy_log):
     assert heading_range([noisy_log]) > 6
 
 
-def test_bias_columns_that_do_not_vary_are_left_out(noisy_log):
-    """A few measured v < 0 add sgn(v), which the simulated v never changes."""
+def test_rare_signs_make_no_regime_of_their_own(noisy_log, thesis):
+    """A few measured v < 0 would add sgn(v), which the simulated v never changes."""
     v = noisy_log["v"].copy()
     v[::60] = -0.01
     log = make_log(noisy_log.vessel, {**noisy_log.channels, "v": v}, 1.0)
+    assert dict(regime_of([log], thesis))["v"] == (1,)
     e = estimate_model([log], Request(method="iv", predictor="augmented", structure="thesis"))
-    assert any("does not vary and was left out" in n for n in e.notes)
     assert "sgn(v)" not in {c.name for c in e.predictor.columns}
+
+
+def test_bias_columns_that_do_not_vary_are_left_out(thesis, noisy_log, true_theta):
+    predictor = build_predictor(thesis, "augmented")
+    labels = [c.label for c in predictor.columns]
+    column = labels.index("sgn(u)")
+    with pytest.raises(UnexcitedBiasError, match=r"sgn\(u\) or its instrument does not vary"):
+        estimate_iv(predictor, [noisy_log], start=true_theta)
+    smaller = predictor.without_bias(column)
+    assert [c.label for c in smaller.columns] == labels[:column] + labels[column + 1 :]
+    lengths = {b.state: len(b.shares) for b in smaller.biases}
+    assert lengths == {s: len(smaller.equation(s)) for s in "uvr"}
 
 
 def test_models_of_other_states_are_not_compared(thesis_model, noisy_log):
