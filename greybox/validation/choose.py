@@ -22,7 +22,7 @@ from greybox.model.predictor import Predictor, Regime, build_predictor
 from greybox.model.structure import Structure
 from greybox.regression.regression import common_sample_time
 from greybox.trial.log import TrialLog
-from greybox.validation.fit import average_fit, run_model
+from greybox.validation.fit import LogFit, average_fit, run_model
 from greybox.vessel.force import force_inputs
 
 # heading range that current north and east need to be told apart; least and advised [rad]
@@ -358,6 +358,20 @@ def _theory(logs: Sequence[TrialLog], structure: Structure, wind: bool) -> str |
     return "augmented" if same else "wind"
 
 
+def _held_out_score(runs: Sequence[LogFit], spread: dict[str, float]) -> float:
+    """Return the fit against the spread of whole logs, averaged over the states [%].
+
+    A held-out third in which little moves would otherwise count for everything.
+    """
+    values = []
+    for i, state in enumerate(runs[0].fit):
+        error = np.concatenate([r.log[state] - r.x[:, i] for r in runs])
+        if spread[state] > 0:
+            ratio = float(np.sqrt(np.mean(error**2))) / spread[state]
+            values.append(max(100 * (1 - ratio), -100.0))
+    return float(np.mean(values)) if values else -np.inf
+
+
 def _compare(
     logs: Sequence[TrialLog],
     alternatives: list[Alternative],
@@ -372,6 +386,10 @@ def _compare(
         cut = len(log) - int(len(log) * _HELD_OUT)
         fitting.append(log.window(0, cut, log.name))
         held.append(log.window(cut, len(log), log.name))
+    spread = {
+        s: float(np.std(np.concatenate([log[s] for log in logs])))
+        for s in alternatives[0].structure.states
+    }
     scores: list[float] = []
     for rank, alternative in enumerate(alternatives):
         score = -np.inf
@@ -381,7 +399,7 @@ def _compare(
             ).model()
             runs = [run_model(model, log) for log in held]
             if all(r.diverged < 0 for r in runs):
-                score = float(np.mean([max(v, -100.0) for v in average_fit(runs).values()]))
+                score = _held_out_score(runs, spread)
         except GreyboxError:
             pass
         scores.append(score - _PREFERENCE * rank)
@@ -393,7 +411,7 @@ def _compare(
     )
     notes.append(
         f"chosen by the free run on the last third of each log when estimated on the first two "
-        f"(mean fit in %, cut at −100; {_PREFERENCE:g} points must be gained to prefer a smaller "
-        f"structure or a method that noise biases more): {shown}."
+        f"(mean fit in % of the whole logs' spread, cut at −100; {_PREFERENCE:g} points must be "
+        f"gained to prefer a smaller structure or a method that noise biases more): {shown}."
     )
     return [alternatives[i] for i in order]
