@@ -97,6 +97,7 @@ def estimate_iv(
     zero_mean: bool = True,
     refine: bool | int = True,
     heading: Literal["measured", "simulated"] = "measured",
+    wind: Literal["smoothed", "measured"] = "smoothed",
     lag: int = 0,
     margins: dict[str, float] | None = None,
     covariance: Covariance = "ma",
@@ -120,6 +121,8 @@ def estimate_iv(
         or as many times at most.
     heading : {"measured", "simulated"}
         Heading in the instruments.
+    wind : {"smoothed", "measured"}
+        Wind in the instruments, as `build_instruments`.
     lag : int
         Delay of the instruments in samples, for logs in closed loop.
     covariance : {"ma", "hac", "white", "bootstrap"}
@@ -162,6 +165,7 @@ def estimate_iv(
             theta,
             zero_mean=zero_mean,
             heading=heading,
+            wind=wind,
             lag=lag,
             margins=margins,
             keep=keep,

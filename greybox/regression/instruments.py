@@ -23,6 +23,9 @@ Array = NDArray[np.float64]
 
 # samples averaged for the initial state of a simulation
 START_SAMPLES = 5
+# seconds, and at least so many samples, over which the wind in an instrument is averaged
+WIND_WINDOW = 60.0
+_LEAST_WINDOW = 30
 # a simulated state this many times beyond the largest measured one has diverged
 DIVERGENCE_FACTOR = 10.0
 _ANY_SHIP = 1e3
@@ -113,6 +116,26 @@ def simulate_log(
     )
 
 
+def _air_instrument(log: TrialLog, x: Array, psi: Array, wind: str) -> tuple[Array, Array]:
+    """Return the velocity through the air of a simulated ship in the smoothed wind.
+
+    The n-frame wind follows from what was measured, averaged over a minute, so
+    that hardly any of the sensor's noise at a sample is left in its instrument.
+    """
+    known = {"u", "v", "psi"} <= log.channels.keys() and x.shape[1] > 1
+    if wind == "measured" or not known:
+        return log["u_q"][: len(x)], log["v_q"][: len(x)]
+    from scipy.ndimage import uniform_filter1d
+
+    u_w, v_w = log["u"] - log["u_q"], log["v"] - log["v_q"]
+    c, s = np.cos(log["psi"]), np.sin(log["psi"])
+    window = min(max(_LEAST_WINDOW, round(WIND_WINDOW / log.sample_time)), len(log))
+    north = uniform_filter1d(c * u_w - s * v_w, window, mode="nearest")[: len(x)]
+    east = uniform_filter1d(s * u_w + c * v_w, window, mode="nearest")[: len(x)]
+    c, s = np.cos(psi), np.sin(psi)
+    return x[:, 0] - (c * north + s * east), x[:, 1] - (-s * north + c * east)
+
+
 def build_instruments(
     predictor: Predictor,
     logs: Sequence[TrialLog],
@@ -120,6 +143,7 @@ def build_instruments(
     *,
     zero_mean: bool = True,
     heading: Literal["measured", "simulated"] = "measured",
+    wind: Literal["smoothed", "measured"] = "smoothed",
     lag: int = 0,
     margins: dict[str, float] | None = None,
     keep: Sequence[NDArray[np.bool_]] | None = None,
@@ -138,6 +162,9 @@ def build_instruments(
     heading : {"measured", "simulated"}
         Heading inside the instruments. Measured is the one measured quantity
         allowed there; a simulated one drifts out of phase in long logs.
+    wind : {"smoothed", "measured"}
+        Wind inside the instruments: the measured one averaged over a minute, or
+        as it is, noise included (section 7.2).
     lag : int
         Samples by which simulated states and inputs are delayed, for logs in
         closed loop: what was commanded before the noise cannot depend on it.
@@ -178,7 +205,9 @@ def build_instruments(
             [np.ascontiguousarray(x[:, j]) for j in range(x.shape[1])],
             psi,
             [np.ascontiguousarray(c) for c in tau.T],
-            (log["u_q"][:-1], log["v_q"][:-1]) if predictor.air_measured else None,
+            _air_instrument(log, x, np.broadcast_to(psi, samples), wind)
+            if predictor.air_measured
+            else None,
         )
         if zero_mean and rows.any():
             # a constant keeps itself as instrument: its equation gives the mean residual

@@ -169,6 +169,7 @@ def _estimates(structure: Structure, logs: list[TrialLog], wind: bool) -> dict[s
                 logs,
                 start=ls,
                 zero_mean=predictor.augmented,
+                wind="measured",
                 refine=False,
                 covariance="white",
             )

@@ -20,6 +20,7 @@ from greybox.estimation.result import Estimate
 from greybox.model.catalogue import structure_for
 from greybox.model.predictor import Predictor, Regime, build_predictor
 from greybox.model.structure import Structure
+from greybox.regression.instruments import WIND_WINDOW
 from greybox.regression.regression import common_sample_time
 from greybox.trial.log import TrialLog
 from greybox.validation.fit import LogFit, average_fit, run_model
@@ -154,6 +155,7 @@ def estimate_once(
         common["covariance"] = request.covariance
     keep_constant = method == "ls" or not request.zero_mean
     predictor = _predictor(structure, kind, logs, keep_constant)
+    noisy_wind = float(logs[0].vessel.sensors.get("wind_std", 0.0)) > 0
     notes = []
     while True:
         try:
@@ -166,6 +168,7 @@ def estimate_once(
                     zero_mean=request.zero_mean,
                     refine=request.refine,
                     heading=request.heading,
+                    wind="smoothed" if noisy_wind else "measured",
                     lag=CLOSED_LOOP_LAG if closed else 0,
                     **common,
                 )
@@ -174,11 +177,16 @@ def estimate_once(
             label = predictor.columns[error.column].label
             notes.append(f"the bias-capturing regressor {label} does not vary and was left out.")
             predictor = predictor.without_bias(error.column)
-    if kind in ("wind", "basic+wind") and method == "iv":
+    if kind in ("wind", "basic+wind") and method == "iv" and noisy_wind:
         notes.append(
-            "the instruments hold the measured wind as it is: its noise moves the wind terms "
-            "towards zero and, in a nearly steady wind, the current with them. Trust them where "
-            "the wind changed by much more than its sensor's noise."
+            f"the wind in the instruments is the measured one averaged over {WIND_WINDOW:g} s, "
+            f"because its sensor is noisy; terms that only faster gusts could tell stay uncertain."
+        )
+    elif kind in ("wind", "basic+wind") and method == "iv":
+        notes.append(
+            "the instruments hold the measured wind as it is: noise of its sensor would move the "
+            "wind terms towards zero and, in a nearly steady wind, the current with them. Give "
+            "wind_std in [sensors] where there is some; the wind is then averaged."
         )
     coarse = [d for log in logs for d in log.provenance.derived if "3.57" in d or "decimated" in d]
     if coarse:

@@ -22,6 +22,7 @@ from greybox.model.catalogue import get_structure
 from greybox.model.predictor import build_predictor
 from greybox.regression.instruments import build_instruments
 from greybox.regression.regression import build_regression
+from greybox.trial.log import make_log
 
 REGIME = (("u", (1,)), ("v", (1,)))
 
@@ -229,6 +230,23 @@ def test_second_measurement_of_the_disturbance():
     iv2 = regression.refine(regression.least_squares())
     error = iv2.theta.mean(axis=0) - [-0.1, 1.0]
     assert (np.abs(error) < 4 * iv2.theta.std(axis=0) / np.sqrt(40) + [0.003, 0.002]).all()
+
+
+def test_anemometer_noise_does_not_bias_the_wind_terms(thesis, true_theta):
+    """Smoothed wind in the instruments; as measured, its noise biases Wuu towards zero."""
+    predictor = build_predictor(thesis, "wind", REGIME)
+    found = {"smoothed": [], "measured": []}
+    for seed in range(10):
+        log = virtual_log(700 + seed, 3000, wind=5.0, wind_spread=0.8**2)
+        rng = np.random.default_rng(seed)
+        noisy = {k: log[k] + 1.5 * rng.standard_normal(len(log)) for k in ("u_q", "v_q")}
+        log = make_log(log.vessel, {**log.channels, **noisy}, 1.0)
+        for wind, values in found.items():
+            values.append(estimate_iv(predictor, [log], start=true_theta, wind=wind)["Wuu"])
+    truth = true_theta[thesis.index("Wuu")]
+    smoothed, measured = (np.array(found[k]) for k in ("smoothed", "measured"))
+    assert abs(np.median(smoothed) - truth) < 4 * smoothed.std() / np.sqrt(10)
+    assert np.median(measured) / truth < 0.6
 
 
 def test_a_constant_term_takes_the_mean_residual(clean_log):
