@@ -15,6 +15,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.errors import StructureError
+
 Array = NDArray[np.float64]
 
 _UNARY: dict[int, Callable[..., Any]] = {
@@ -67,7 +69,7 @@ class Vectorised:
 
     Raises
     ------
-    NotImplementedError
+    StructureError
         The expression uses an operation that has no array form here.
     """
 
@@ -97,7 +99,10 @@ class Vectorised:
             elif op in _BINARY:
                 self._calls.append((k, _BINARY[op], (holder[slots[0]], holder[slots[1]])))
             else:
-                raise NotImplementedError(f"operation {op} has no array form")
+                raise StructureError(
+                    f"an expression uses the CasADi operation {op}, which has no array form here: "
+                    f"write the term with products, moduli and trigonometric functions."
+                )
             holder[target[0]] = k
 
     def prepare(self, known: Mapping[int, Array | float]) -> dict[int, Any]:

@@ -55,6 +55,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="zero-mean instruments (IV2, IV3) or with their mean (IV1)",
     )
     parser.add_argument(
+        "--nominal",
+        metavar="MODEL",
+        help="model that simulates the first instruments (least squares by default)",
+    )
+    parser.add_argument(
         "--loop",
         choices=("auto", "open", "closed"),
         default="auto",
@@ -77,6 +82,7 @@ def run(options: argparse.Namespace) -> None:
     """Read, estimate, report, write."""
     from greybox.files import check_targets, write_json
     from greybox.model.catalogue import get_structure
+    from greybox.model.model import load_model
     from greybox.report.physical import physical_summary
     from greybox.validation.choose import Request, estimate_model
     from greybox.vessel.toml import load_vessel
@@ -98,6 +104,7 @@ def run(options: argparse.Namespace) -> None:
             heading=options.heading,
             loop=options.loop,
             zero_mean=options.instruments == "zero-mean",
+            nominal=load_model(options.nominal) if options.nominal else None,
             seed=options.seed,
         ),
     )

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from greybox.errors import StructureError, suggestion
 from greybox.model.disturbances import CURRENT
+from greybox.model.spelling import atoms, spelled_expression, spellings
 from greybox.model.structure import Structure
 from greybox.vectorised import Vectorised
 
@@ -252,53 +253,6 @@ def basic_regime(structure: Structure) -> Regime:
     return tuple((s, (1,)) for s in structure.states)
 
 
-@lru_cache(maxsize=64)
-def _atoms(structure: Structure) -> dict[str, ca.SX]:
-    """Return the functions that spelled regressors are products of."""
-    s = structure.symbols
-    named = {n: s.x[i] for i, n in enumerate(structure.states)}
-    named |= {n: s.tau[i] for i, n in enumerate(structure.inputs)}
-    atoms = {
-        "1": ca.SX(1),
-        "cos(psi)": ca.cos(s.psi),
-        "sin(psi)": ca.sin(s.psi),
-        "cos²(psi)": ca.cos(s.psi) ** 2,
-        "sin(2psi)": ca.sin(2 * s.psi),
-    }
-    for n, x in named.items():
-        atoms |= {n: x, f"|{n}|": ca.fabs(x), f"sgn({n})": ca.sign(x)}
-    return atoms
-
-
-def _spelled_expression(structure: Structure, name: str) -> ca.SX:
-    """Return a bias-capturing function from its spelling, such as ``|u|*cos(psi)``."""
-    atoms = _atoms(structure)
-    product = ca.SX(1)
-    for factor in name.split("*"):
-        if factor not in atoms:
-            raise StructureError(
-                f"'{factor}' in the bias regressor '{name}' is not known."
-                f"{suggestion(factor, atoms)}"
-            )
-        product = product * atoms[factor]
-    return product
-
-
-def _spellings(structure: Structure) -> list[str]:
-    """Return the names that a derivative is recognised by, simplest first."""
-    signals = [*structure.states, *structure.inputs]
-    atoms = [f(n) for n in signals for f in ("{}".format, "|{}|".format, "sgn({})".format)]
-    pairs = [
-        f"{a}*{b}"
-        for i, a in enumerate(atoms)
-        for b in atoms[i + 1 :]
-        if a.strip("|") not in b and b.strip("|") not in a
-    ]
-    trig = ["cos(psi)", "sin(psi)", "cos²(psi)", "sin(2psi)"]
-    plain = ["1", *atoms, *pairs]
-    return trig + [f"{a}*{t}" for t in trig for a in [*atoms, *pairs]] + plain
-
-
 def _sample_points(structure: Structure, regime: Regime, seed: int) -> list[Array]:
     """Return arrays for x, psi, tau and air at random points of the regime."""
     rng = np.random.default_rng(seed)
@@ -395,7 +349,7 @@ def _column_expressions(
         elif spelling.startswith("d/"):
             out.append(_derivative_by_name(structure, air_measured, spelling))
         else:
-            out.append(_spelled_expression(structure, spelling))
+            out.append(spelled_expression(structure, spelling))
     return out
 
 
@@ -490,10 +444,11 @@ def build_predictor(
         else []
     )
     derived_values = values([e for _, _, e in derived]) if derived else np.empty((0, _POINTS))
-    spellings = _spellings(structure) if derived else []
-    atoms = dict(zip(_atoms(structure), values(list(_atoms(structure).values())), strict=True))
+    names = spellings(structure) if derived else []
+    known = atoms(structure)
+    at_points = dict(zip(known, values(list(known.values())), strict=True))
     spelled_values = np.array(
-        [np.prod([atoms[f] for f in n.split("*")], axis=0) for n in spellings]
+        [np.prod([at_points[f] for f in n.split("*")], axis=0) for n in names]
     ).reshape(-1, _POINTS)
     unit = _unit_rows(spelled_values)
 
@@ -547,7 +502,7 @@ def build_predictor(
                 # a function that completes the same span under a plain name
                 plain = _same_direction(_unit_rows(span.residual(spelled_values)), beyond)
             if plain is not None:
-                name = code = spellings[plain]
+                name = code = names[plain]
                 span.add_if_new(spelled_values[plain])
             else:
                 means = [structure.disturbances[i] for i in monomial]

@@ -8,9 +8,9 @@ inconsistent estimators are off, and in which direction, depends on that
 sequence: pulses were drawn again until the signs agreed with the published ones.
 
 IV1 (basic predictor) takes its instruments from the model that IV2 ends with.
-Refined with its own estimates it does not converge: they are so far off that
-their simulation oscillates, while the small published spread of IV1, also in
-yaw, is that of instruments from an accurate model.
+Refined with its own estimates it scatters by many times the published spread:
+they are so far off that their simulation oscillates, while the small published
+spread of IV1, also in yaw, is that of instruments from an accurate model.
 """
 
 from __future__ import annotations

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from greybox.errors import ExcitationError, GreyboxError, LogError
 from greybox.estimation.estimate import (
@@ -18,6 +19,7 @@ from greybox.estimation.estimate import (
 from greybox.estimation.loop import CLOSED_LOOP_LAG, Loop, assess_loop
 from greybox.estimation.result import Estimate
 from greybox.model.catalogue import structure_for
+from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor import Predictor, Regime, build_predictor
 from greybox.model.structure import Structure
 from greybox.regression.instruments import WIND_WINDOW
@@ -57,7 +59,8 @@ class Alternative:
 class Request:
     """What to estimate; None leaves the choice to the data.
 
-    ``margins`` are |u|, |v| [m/s] below which samples are cut out.
+    ``margins`` are |u|, |v| [m/s] below which samples are cut out; ``nominal``
+    simulates the first instruments (least squares does without it).
     """
 
     method: str | None = None
@@ -69,6 +72,7 @@ class Request:
     loop: Loop = "auto"
     zero_mean: bool = True
     refine: bool | int = True
+    nominal: ManoeuvringModel | None = None
     seed: int = 0
 
 
@@ -136,6 +140,16 @@ def _predictor(structure: Structure, kind: str, logs: Sequence[TrialLog], ls: bo
     )
 
 
+def _nominal_theta(
+    nominal: ManoeuvringModel | None, structure: Structure
+) -> NDArray[np.float64] | None:
+    """Return a nominal model's parameters in the order of a structure, absent ones zero."""
+    if nominal is None:
+        return None
+    known = dict(zip(nominal.names, nominal.theta, strict=True))
+    return np.array([known.get(name, 0.0) for name in structure.parameters])
+
+
 def estimate_once(
     logs: Sequence[TrialLog], structure: Structure, method: str, kind: str, request: Request
 ) -> Estimate:
@@ -165,6 +179,7 @@ def estimate_once(
                 estimate = estimate_iv(
                     predictor,
                     logs,
+                    start=_nominal_theta(request.nominal, predictor.structure),
                     zero_mean=request.zero_mean,
                     refine=request.refine,
                     heading=request.heading,

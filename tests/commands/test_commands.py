@@ -68,6 +68,18 @@ def test_same_input_same_bytes(noisy_csv, tmp_path):
     assert one == two
 
 
+def test_a_nominal_model_starts_the_refinement(noisy_csv, tmp_path):
+    """From least squares or from a nominal model, the refinement ends at one estimate."""
+    iv = ["--method", "iv", "--predictor", "augmented", "--structure", "thesis"]
+    one, two = tmp_path / "one.json", tmp_path / "two.json"
+    assert run("estimate", noisy_csv, "--vessel", "thesis", *iv, "--out", one) == 0
+    assert run("estimate", noisy_csv, "--vessel", "thesis", *iv, "--nominal", one,
+               "--out", two) == 0  # fmt: skip
+    first, second = (json.loads(p.read_text()) for p in (one, two))
+    np.testing.assert_allclose(second["theta"], first["theta"], rtol=1e-3)
+    assert second["iterations"] < first["iterations"]
+
+
 def test_json_to_standard_output(noisy_csv, capsys):
     assert run("estimate", noisy_csv, "--vessel", "thesis", "--method", "ls", "--predictor",
                "basic", "--json", "-") == 0  # fmt: skip
