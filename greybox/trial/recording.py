@@ -1,0 +1,108 @@
+"""What a file holds before it is a log: signals, each on its own clock.
+
+Readers return a `Recording`: nothing has been resampled, mended or judged.
+Values are in the units that the source states; names are the source's own,
+or canonical where the format itself says what they are (NMEA 0183, ROS).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Signal:
+    """One measured quantity on its own clock.
+
+    Parameters
+    ----------
+    name : str
+        Name in the source, or a canonical name where the format defines it.
+    t : ndarray
+        (N,) time [s], as recorded: it may repeat, go back or have holes.
+    value : ndarray
+        (N,), in `unit`; NaN where the source holds no number.
+    unit : str or None
+        Unit as `greybox.channels` spells it; None where the source states none.
+    source : str
+        Where it stands: column, sentence, topic and field, variable.
+    canonical : bool
+        Whether `name` is canonical because the format says so.
+    """
+
+    name: str
+    t: Array
+    value: Array
+    unit: str | None = None
+    source: str = ""
+    canonical: bool = False
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def with_value(self, value: Array) -> Signal:
+        """Return the signal with other values on the same clock."""
+        return replace(self, value=value)
+
+
+@dataclass(frozen=True)
+class SourceFile:
+    """One file that was read."""
+
+    name: str
+    sha256: str
+    format: str
+
+
+@dataclass(frozen=True)
+class Recording:
+    """All that was read from the files of one trial.
+
+    Parameters
+    ----------
+    name : str
+    signals : tuple of Signal
+    text : mapping of str to tuple of (t, values)
+        Columns that hold words, such as the mode of a controller: (N,) time [s]
+        and (N,) str.
+    epoch : float, optional
+        UNIX time [s] of ``t = 0``, None where the file holds relative times only.
+    files : tuple of SourceFile
+    notes : tuple of str
+        What was guessed, skipped or recovered while reading, one sentence each.
+    """
+
+    name: str
+    signals: tuple[Signal, ...]
+    text: Mapping[str, tuple[Array, NDArray[np.str_]]] = field(default_factory=dict)
+    epoch: float | None = None
+    files: tuple[SourceFile, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    def __contains__(self, name: object) -> bool:
+        return any(s.name == name for s in self.signals)
+
+    def __getitem__(self, name: str) -> Signal:
+        for signal in self.signals:
+            if signal.name == name:
+                return signal
+        raise KeyError(name)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the signals, in the order of the source."""
+        return tuple(s.name for s in self.signals)
+
+    def with_signals(self, signals: Iterable[Signal], *notes: str) -> Recording:
+        """Return the recording with other signals and more notes."""
+        return replace(self, signals=tuple(signals), notes=(*self.notes, *notes))
+
+
+Kind = Literal["motion", "input", "wind", "other"]
