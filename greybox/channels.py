@@ -35,10 +35,22 @@ CHANNELS: dict[str, Channel] = {
         Channel("v_q", "m/s", "velocity of the ship through the air, starboard"),
         Channel("V_q", "m/s", "apparent wind speed"),
         Channel("gamma_q", "rad", "minus the direction the apparent wind comes from (5.40)"),
+        Channel("lat", "deg", "latitude, north positive"),
+        Channel("lon", "deg", "longitude, east positive"),
+        Channel("v_n", "m/s", "velocity over ground, north"),
+        Channel("v_e", "m/s", "velocity over ground, east"),
+        Channel("sog", "m/s", "speed over ground"),
+        Channel("cog", "rad", "course over ground, clockwise from north"),
+        Channel("dir_q", "rad", "direction the apparent wind comes from, clockwise from the bow"),
+        Channel("dir_t", "rad", "direction the true wind comes from, clockwise from the bow"),
+        Channel("V_w", "m/s", "true wind speed"),
+        Channel("dir_w", "rad", "direction the true wind comes from, clockwise from north"),
     )
 }
 
-ANGLES = frozenset({"psi", "gamma_q"})
+ANGLES = frozenset({"psi", "gamma_q", "cog", "dir_q", "dir_t", "dir_w"})
+# what a log keeps; the rest only serves to derive these
+LOGGED = ("t", "x_n", "y_n", "psi", "u", "v", "r", "u_q", "v_q")
 
 # factor to the SI unit of the same dimension
 _UNITS: dict[str, tuple[str, float]] = {
@@ -56,6 +68,7 @@ _UNITS: dict[str, tuple[str, float]] = {
     "nmi": ("m", 1852.0),
     "rad": ("rad", 1.0),
     "deg": ("rad", math.pi / 180.0),
+    "arcmin": ("rad", math.pi / 10800.0),
     "m/s": ("m/s", 1.0),
     "km/h": ("m/s", 1 / 3.6),
     "kn": ("m/s", 1852.0 / 3600.0),
@@ -94,6 +107,9 @@ def unit_factor(unit: str, target: str | None, name: str) -> float:
             f"Known units: {', '.join(sorted(_UNITS))}."
         )
     dimension, factor = _UNITS[unit]
+    if target == "deg" and dimension == "rad":
+        # geographic angles stay in degrees, the unit of every geodesy library
+        return factor * 180.0 / math.pi
     if target is None:
         return factor if dimension in ("rad", "s", "m", "m/s", "rad/s", "N") else 1.0
     if dimension != target:

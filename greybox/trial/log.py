@@ -17,12 +17,31 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Provenance:
-    """Where a log came from and what was done to it."""
+    """Where a log came from and what was done to it.
+
+    Parameters
+    ----------
+    source, sha256 : str
+        File and its hash; several files by name, with the hashes in `files`.
+    derived, fixed : tuple of str
+        What was derived and what was mended, one sentence each.
+    files : tuple of (name, sha256, format)
+    read : tuple of str
+        What was guessed, skipped or recovered while reading.
+    epoch : float, optional
+        UNIX time [s] of ``t = 0``.
+    notes : mapping of str to str
+        Draught, loading, depth, sea state and what else was noted of the trial.
+    """
 
     source: str = ""
     sha256: str = ""
     derived: tuple[str, ...] = ()
     fixed: tuple[str, ...] = ()
+    files: tuple[tuple[str, str, str], ...] = ()
+    read: tuple[str, ...] = ()
+    epoch: float | None = None
+    notes: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

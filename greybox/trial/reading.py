@@ -1,11 +1,15 @@
-"""Reading a log from CSV or Parquet, with the vessel's column names and units."""
+"""Reading a clean log from CSV or Parquet, with the vessel's column names and units.
+
+Logs that may hold defects are read by `greybox.trial.canonical` and made clean
+by `greybox.trial.importing`; this reader refuses what it would have to mend.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,12 +17,15 @@ from numpy.typing import NDArray
 from greybox.channels import CHANNELS, unit_factor
 from greybox.errors import LogError, suggestion
 from greybox.files import sha256
-from greybox.trial.conditioning import relative_wind, velocities_from_positions
+from greybox.trial.conditioning import velocities_from_positions
 from greybox.trial.log import Provenance, TrialLog
+from greybox.trial.names import Assigned, assign
+from greybox.trial.readers.formats import open_raw
+from greybox.trial.readers.table import Batch, TableFile, read_columns
+from greybox.trial.recording import Recording
+from greybox.trial.wind import relative_wind, relative_wind_from_direction
+from greybox.trial.writing import read_record, recorded_provenance
 from greybox.vessel.vessel import Vessel
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 Array = NDArray[np.float64]
 
@@ -36,12 +43,12 @@ def read_log(
     states: tuple[str, ...] = (),
     fill: Mapping[str, float] | None = None,
 ) -> TrialLog:
-    """Read one log file for a vessel.
+    """Read one log file without gaps for a vessel.
 
     Parameters
     ----------
     path : str or Path
-        CSV or Parquet (by its ending), one row a sample.
+        CSV or Parquet, one row a sample.
     vessel : Vessel
         Its ``[columns]`` rename and convert; its thruster columns are required.
     states : tuple of str
@@ -59,159 +66,213 @@ def read_log(
     ------
     LogError
         The file cannot be read; a column is missing (the nearest name is
-        suggested); a value is not a number; time does not increase; or there
-        are two sample times.
+        suggested); a value is not a number; time does not increase; there are
+        two sample times, or a gap.
+    """
+    segments = read_segments(path, vessel, states=states, fill=fill)
+    if len(segments) > 1:
+        raise LogError(
+            f"'{Path(path).name}' has {len(segments) - 1} gaps in its time, and one run cannot "
+            f"cross them: cut the log at them, or read it as segments."
+        )
+    return segments[0]
+
+
+def read_segments(
+    path: str | Path,
+    vessel: Vessel,
+    *,
+    states: tuple[str, ...] = (),
+    fill: Mapping[str, float] | None = None,
+) -> list[TrialLog]:
+    """Read one log file as the segments between its gaps.
+
+    Parameters and errors as `read_log`. A gap is a step of a whole number of
+    sample times, as `write_log` leaves it; segments of fewer than three
+    samples are dropped.
+
+    Returns
+    -------
+    list of TrialLog
+        In order of time, at least one.
     """
     path = Path(path)
-    table = _read_table(path)
-    channels, text = _canonical(table, vessel, path, plan=bool(fill))
-    if "t" not in channels:
+    table = open_raw(path)
+    if isinstance(table, Recording):
         raise LogError(
-            f"'{path.name}' has no column 't'.{suggestion('t', map(str, table.columns))} "
-            f"Map the time column in the vessel file's [columns] with its unit."
+            f"'{path.name}' is a raw file ({table.files[0].format if table.files else 'raw'}): "
+            f"make a log of it first with greybox import {path.name} --vessel V --out LOG.csv."
         )
+    record = read_record(path)
+    if record is not None:
+        # what greybox wrote is canonical already: the raw names were mapped before
+        vessel = replace(vessel, columns={})
+    channels, text = _canonical(table, vessel, path, plan=bool(fill))
     t = channels.pop("t")
     if len(t) < _MIN_SAMPLES:
         raise LogError(
             f"'{path.name}' has {len(t)} samples, at least {_MIN_SAMPLES} are needed: "
             f"use a longer log."
         )
-    sample_time = _sample_time(t, path.name)
-    derived: list[str] = []
-    for name in ("psi", "gamma_q"):
-        if name in channels:
-            channels[name] = np.unwrap(channels[name])
-    for name in vessel.angle_commands & channels.keys():
+    stretches, sample_time = _stretches(t, path.name)
+    for name in {"psi", "gamma_q", *vessel.angle_commands} & channels.keys():
         channels[name] = np.unwrap(channels[name])
+    provenance = recorded_provenance(record) if record is not None else None
+    segments = []
+    for k, (start, stop) in enumerate(stretches):
+        part = {n: v[start:stop] for n, v in channels.items()}
+        words = {n: v[start:stop] for n, v in text.items()}
+        name = path.stem if len(stretches) == 1 else f"{path.stem}[{k + 1}]"
+        log = _segment(
+            name, path, vessel, t[start:stop], sample_time, part, words, states, fill or {},
+            [str(c) for c in table.columns],
+        )  # fmt: skip
+        segments.append(log)
+    if provenance is None:
+        provenance = Provenance(path.name, sha256(path), segments[0].provenance.derived)
+    return [replace(s, provenance=provenance) for s in segments]
+
+
+def _segment(
+    name: str,
+    path: Path,
+    vessel: Vessel,
+    t: Array,
+    sample_time: float,
+    channels: dict[str, Array],
+    text: Mapping[str, NDArray[Any]],
+    states: tuple[str, ...],
+    fill: Mapping[str, float],
+    columns: list[str],
+) -> TrialLog:
+    derived: list[str] = []
     _derive_velocities(channels, vessel, sample_time, derived)
-    if "V_q" in channels and "gamma_q" in channels and "u_q" not in channels:
-        channels["u_q"], channels["v_q"] = relative_wind(channels["V_q"], channels["gamma_q"])
-        derived.append("u_q, v_q from V_q, gamma_q (5.41-5.43)")
-    for name, value in (fill or {}).items():
-        channels.setdefault(name, np.full(len(t), float(value)))
-    _require(channels, vessel, states or ("u", "v", "r"), path.name, [str(c) for c in table])
+    if "V_q" in channels and "u_q" not in channels:
+        if "gamma_q" in channels:
+            pair = relative_wind(channels["V_q"], channels["gamma_q"])
+            derived.append("u_q, v_q from V_q, gamma_q (5.41-5.43)")
+            channels["u_q"], channels["v_q"] = pair
+        elif "dir_q" in channels:
+            pair = relative_wind_from_direction(channels["V_q"], channels["dir_q"])
+            derived.append("u_q, v_q from the apparent wind's speed and direction (5.40)")
+            channels["u_q"], channels["v_q"] = pair
+    for other, value in fill.items():
+        channels.setdefault(other, np.full(len(t), float(value)))
+    _require(channels, vessel, states or ("u", "v", "r"), path.name, columns)
     closed, known = np.zeros(len(t), bool), False
     if vessel.closed_loop is not None and vessel.closed_loop[0] in text:
         closed = np.isin(text[vessel.closed_loop[0]], vessel.closed_loop[1])
         known = True
     log = TrialLog(
-        path.stem,
-        sample_time,
-        t,
-        channels,
-        vessel,
-        closed,
-        known,
-        Provenance(path.name, sha256(path), tuple(derived)),
+        name, sample_time, t, channels, vessel, closed, known, Provenance(derived=tuple(derived))
     )
-    if any(d.startswith("u, v") for d in derived):
+    if any(d.startswith("u, v") and "(3.57)" in d for d in derived):
         # the first and last sample have only one neighbour (3.57)
-        log = replace(log.window(1, len(log) - 1), name=log.name)
+        log = replace(log.window(1, len(log) - 1), name=name)
     return log
 
 
-def _read_table(path: Path) -> pd.DataFrame:
-    if not path.exists():
-        raise LogError(f"there is no file '{path}': name an existing log.")
-    import pandas as pd
-
-    suffix = path.suffix.lower()
-    try:
-        if suffix in (".parquet", ".pq"):
-            return pd.read_parquet(path)
-        if suffix in (".csv", ".txt", ""):
-            return pd.read_csv(path, skipinitialspace=True)
-    except (OSError, ValueError, pd.errors.ParserError, ImportError) as error:
-        reason = " ".join(str(error).split())
-        raise LogError(
-            f"cannot read '{path.name}' as {'Parquet' if 'p' in suffix else 'CSV'}: {reason}. "
-            f"Name a table with one header line."
-        ) from None
-    raise LogError(f"'{path.name}' ends in '{suffix}': logs are CSV (.csv) or Parquet (.parquet).")
-
-
 def _canonical(
-    table: pd.DataFrame, vessel: Vessel, path: Path, *, plan: bool
+    table: TableFile, vessel: Vessel, path: Path, *, plan: bool
 ) -> tuple[dict[str, Array], dict[str, NDArray[Any]]]:
     """Return the numeric channels in SI, and the text columns, by canonical name."""
-    columns = [str(c) for c in table.columns]
+    assigned = assign(table.columns, vessel, units=table.units, guess=False)
+    missing = [raw for raw in vessel.columns if raw not in table.columns]
+    if "t" not in assigned:
+        raise LogError(
+            f"'{path.name}' has no column 't'.{suggestion('t', table.columns)} "
+            f"Map the time column in the vessel file's [columns] with its unit."
+        )
+    batch = read_columns(table, [a.raw for a in assigned.values()])
     channels: dict[str, Array] = {}
     text: dict[str, NDArray[Any]] = {}
-    source = {m.name: raw for raw, m in vessel.columns.items() if raw in columns}
-    missing = [raw for raw, m in vessel.columns.items() if raw not in columns]
-    for name in [*CHANNELS, *vessel.commands]:
-        if name in columns and name not in source:
-            source[name] = name
     loop = vessel.closed_loop[0] if vessel.closed_loop else None
-    if loop is not None and loop in columns:
-        text[loop] = table[loop].astype(str).to_numpy()
-    positions = {"x_n", "y_n"}
-    if {"u", "v"} | positions <= source.keys():
+    if loop is not None and loop in assigned:
+        text[loop] = batch[assigned.pop(loop).raw].astype(str)
+    positions = [n for n in ("x_n", "y_n") if n in assigned]
+    if {"u", "v"} <= assigned.keys() and any(
+        not np.isfinite(_floats(batch, assigned[n])).all() for n in positions
+    ):
         # positions are not needed where velocities were logged: they may have holes
-        holes = table[[source[n] for n in sorted(positions)]].isna().to_numpy().any()
-        source = {n: raw for n, raw in source.items() if not holes or n not in positions}
-    for name, raw in source.items():
+        for name in positions:
+            assigned.pop(name)
+    for name, a in assigned.items():
         target = CHANNELS[name].unit if name in CHANNELS else None
         if name in vessel.angle_commands:
             target = "rad"
-        mapping = vessel.columns.get(raw)
-        factor = 1.0
-        if mapping is not None and mapping.unit is not None:
-            factor = unit_factor(mapping.unit, target, raw)
-        channels[name] = _numeric(table[raw], raw, path.name) * factor
+        factor = a.sign * (unit_factor(a.unit, target, a.raw) if a.unit is not None else 1.0)
+        value = _finite(_floats(batch, a), a.raw, path.name)
+        if a.raw in table.dates and name == "t":
+            value = value - value[0]
+        channels[name] = value if factor == 1.0 else value * factor
     for raw in missing:
         name = vessel.columns[raw].name
         if name not in channels and (name in vessel.commands or not plan):
             raise LogError(
                 f"'{path.name}' has no column '{raw}', which [columns] maps to '{name}'."
-                f"{suggestion(raw, columns)} Correct the name in the vessel file."
+                f"{suggestion(raw, table.columns)} Correct the name in the vessel file."
             )
     return channels, text
 
 
-def _numeric(column: pd.Series[Any], name: str, source: str) -> Array:
-    import pandas as pd
+def _floats(batch: Batch, a: Assigned) -> Array:
+    values = batch[a.raw]
+    if values.dtype == object:
+        return np.full(len(values), np.nan)
+    return np.asarray(values, float)
 
-    values = np.array(pd.to_numeric(column, errors="coerce"), dtype=float)
+
+def _finite(values: Array, name: str, source: str) -> Array:
     bad = np.flatnonzero(~np.isfinite(values))
     if len(bad):
-        raw = column.iloc[int(bad[0])]
         raise LogError(
-            f"column '{name}' of '{source}' holds '{raw}' in row {int(bad[0]) + 2} and "
-            f"{len(bad)} of {len(values)} values that are no finite number: "
-            f"cut those rows or repair them."
+            f"column '{name}' of '{source}' holds no finite number in row {int(bad[0]) + 2} and "
+            f"in {len(bad)} of {len(values)} rows: greybox import reads such logs and keeps the "
+            f"holes as gaps."
         )
     return values
 
 
-def _sample_time(t: Array, name: str) -> float:
+def _stretches(t: Array, name: str) -> tuple[list[tuple[int, int]], float]:
+    """Return the stretches between gaps, and the sample time."""
     steps = np.diff(t)
     wrong = np.flatnonzero(steps <= 0)
     if len(wrong):
         k = int(wrong[0])
         raise LogError(
             f"time in '{name}' goes from {t[k]:.6g} to {t[k + 1]:.6g} s in row {k + 3}, "
-            f"it must increase: sort the rows and drop repeated ones."
+            f"it must increase: greybox import sorts the rows and drops repeated ones."
         )
     usual = float(np.median(steps))
-    off = np.flatnonzero(np.abs(steps - usual) > _JITTER * usual)
-    if len(off):
-        k = int(off[0])
+    multiple = np.round(steps / usual)
+    off = np.abs(steps - multiple * usual) > _JITTER * usual
+    gaps = (multiple > 1) & ~off
+    if off.any() or gaps.sum() > 0.2 * len(steps):
+        k = int(np.flatnonzero(off | gaps)[0])
         raise LogError(
             f"'{name}' has two sample times: {usual:.6g} s, but {steps[k]:.6g} s after "
-            f"t = {t[k]:.6g} s ({len(off)} of {len(steps)} steps differ). "
-            f"Resample it to one, or split it at the gaps."
+            f"t = {t[k]:.6g} s ({int((off | gaps).sum())} of {len(steps)} steps differ). "
+            f"Resample it to one with greybox import."
         )
-    mean = float((t[-1] - t[0]) / (len(t) - 1))
-    drift = np.abs(t - t[0] - mean * np.arange(len(t)))
-    if drift.max() > _DRIFT * mean:
-        k = len(t) // 2
-        one, two = ((t[k] - t[0]) / k, (t[-1] - t[k]) / (len(t) - 1 - k))
+    edges = [0, *(np.flatnonzero(gaps) + 1).tolist(), len(t)]
+    found = [(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True) if b - a >= _MIN_SAMPLES]
+    if not found:
         raise LogError(
-            f"'{name}' has two sample times: {one:.6g} s on average in its first half and "
-            f"{two:.6g} s in its second. Resample it to one."
+            f"'{name}' has no {_MIN_SAMPLES} samples between two gaps: use a log with fewer."
         )
-    return round(mean, 9)
+    means = []
+    for a, b in found:
+        mean = float((t[b - 1] - t[a]) / (b - 1 - a))
+        drift = np.abs(t[a:b] - t[a] - mean * np.arange(b - a))
+        if drift.max() > _DRIFT * mean:
+            k = a + (b - a) // 2
+            one, two = (t[k] - t[a]) / (k - a), (t[b - 1] - t[k]) / (b - 1 - k)
+            raise LogError(
+                f"'{name}' has two sample times: {one:.6g} s on average in its first half and "
+                f"{two:.6g} s in its second. Resample it to one with greybox import."
+            )
+        means.append((b - a, mean))
+    return found, round(max(means)[1], 9)
 
 
 def _derive_velocities(

@@ -281,7 +281,7 @@ def _columns(table: Any, vessel: Vessel) -> dict[str, ColumnMapping]:
     if not isinstance(table, dict):
         raise VesselError('[columns] must hold lines such as "psi [deg]" = { name = "psi", … }.')
     for raw, entry in table.items():
-        _known_keys(entry, {"name", "unit"}, f"column '{raw}'")
+        _known_keys(entry, {"name", "unit", "sign"}, f"column '{raw}'")
         name = entry.get("name")
         if name not in known:
             raise VesselError(
@@ -304,7 +304,10 @@ def _columns(table: Any, vessel: Vessel) -> dict[str, ColumnMapping]:
                 raise VesselError(str(error)) from None
         if any(c.name == name for c in found.values()):
             raise VesselError(f"two columns are mapped to '{name}': keep one of them.")
-        found[raw] = ColumnMapping(name, unit)
+        sign = entry.get("sign", 1)
+        if sign not in (1, -1) or isinstance(sign, bool):
+            raise VesselError(f"column '{raw}' has sign = {sign}: write 1, or -1 to reverse it.")
+        found[raw] = ColumnMapping(name, unit, int(sign))
     return found
 
 

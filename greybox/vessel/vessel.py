@@ -65,10 +65,11 @@ class Thruster:
 
 @dataclass(frozen=True)
 class ColumnMapping:
-    """A log column under another name or unit than the canonical one."""
+    """A log column under another name, unit or sign than the canonical one."""
 
     name: str
     unit: str | None
+    sign: int = 1
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,48 @@
+"""What CSV and Parquet share: a table that is read in batches, never as a whole."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Batch = dict[str, NDArray[Any]]
+
+
+class TableFile(Protocol):
+    """A table on disk: its header is known, its rows come in batches."""
+
+    path: Path
+    columns: tuple[str, ...]
+    units: dict[str, str]
+    text: frozenset[str]
+    dates: frozenset[str]
+    notes: list[str]
+    format: str
+
+    def batches(self, columns: Sequence[str]) -> Iterator[Batch]:
+        """Yield the named columns: (n,) float each, str where in `text`, UNIX s where in `dates`.
+
+        Raises
+        ------
+        LogError
+            A row cannot be read.
+        """
+
+
+def read_columns(table: TableFile, columns: Sequence[str]) -> Batch:
+    """Return whole columns of a table, (N,) each."""
+    parts: dict[str, list[NDArray[Any]]] = {c: [] for c in columns}
+    for batch in table.batches(columns):
+        for name in columns:
+            parts[name].append(batch[name])
+    whole: Batch = {}
+    for name in columns:
+        # released one by one, so that a column is never held twice with all the others
+        pieces = parts.pop(name)
+        empty = np.empty(0, object if name in table.text else float)
+        whole[name] = np.concatenate(pieces) if pieces else empty
+    return whole

@@ -1,0 +1,170 @@
+"""From signals on their own clocks to one sample time; holes stay holes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+# a step of more than this many usual steps is a hole
+HOLE = 2.5
+# low-pass of the signals that are faster than the log: cut-off as a share of its Nyquist rate
+_CUT_OFF = 0.8
+_TAPS_PER_RATIO = 8
+
+
+@dataclass(frozen=True)
+class Clock:
+    """Times of one signal, in order, and where they have holes.
+
+    Parameters
+    ----------
+    t : ndarray
+        (N,) [s], increasing.
+    period : float
+        Usual step [s].
+    starts, stops : ndarray
+        (S,) first and one-past-last index of each stretch without a hole.
+    """
+
+    t: Array
+    period: float
+    starts: NDArray[np.int64]
+    stops: NDArray[np.int64]
+
+
+def clock(t: Array, hole: float | None = None) -> Clock:
+    """Return the usual step of times and the stretches without a hole.
+
+    Parameters
+    ----------
+    t : ndarray
+        (N,) [s], increasing, N >= 1.
+    hole : float, optional
+        Shortest step that counts as a hole [s]; 2.5 usual steps by default.
+    """
+    steps = np.diff(t)
+    period = float(np.median(steps)) if len(steps) else 0.0
+    # merged or bursty clocks have many short steps: the usual one carries half of the time
+    if len(steps) and float(np.mean(steps)) > 1.5 * period:
+        order = np.sort(steps)
+        covered = np.cumsum(order)
+        period = float(order[np.searchsorted(covered, covered[-1] / 2)])
+    limit = HOLE * period if hole is None else max(hole, 1.01 * period)
+    breaks = np.flatnonzero(steps > limit) + 1
+    starts = np.concatenate([[0], breaks]).astype(np.int64)
+    stops = np.concatenate([breaks, [len(t)]]).astype(np.int64)
+    return Clock(t, period, starts, stops)
+
+
+def covered(grid: Array, of: Clock) -> Mask:
+    """Whether each time of a grid lies within a stretch of the clock, (M,) bool."""
+    slack = 1e-6 * max(of.period, 1e-9) + 1e-9
+    first, last = of.t[of.starts], of.t[of.stops - 1]
+    k = np.searchsorted(first, grid + slack, side="right") - 1
+    inside = (k >= 0) & (grid <= last[np.clip(k, 0, None)] + slack)
+    return np.asarray(inside)
+
+
+def interpolate(of: Clock, value: Array, grid: Array, sample_time: float) -> Array:
+    """Bring a continuous signal to a grid.
+
+    Signals slower than the grid are held, as their sensor held them; signals
+    faster than it are low-pass filtered first, so that what the grid cannot
+    show does not fold back; between equal rates the interpolation is linear.
+
+    Parameters
+    ----------
+    of : Clock
+    value : ndarray
+        (N,), angles unwrapped.
+    grid : ndarray
+        (M,) [s], spaced by `sample_time`.
+    sample_time : float
+        [s]
+
+    Returns
+    -------
+    ndarray
+        (M,); values outside the clock's stretches are those of their ends.
+    """
+    if of.period > 1.5 * sample_time:
+        return hold(of, value, grid)
+    if of.period <= 0 or sample_time < 1.5 * of.period:
+        return np.interp(grid, of.t, value)
+    out = np.interp(grid, of.t, value)
+    for start, stop in zip(of.starts, of.stops, strict=True):
+        t, part = of.t[start:stop], value[start:stop]
+        inside = (grid >= t[0]) & (grid <= t[-1])
+        if inside.any() and len(t) > 2:
+            out[inside] = _low_pass(t, part, grid[inside], of.period, sample_time)
+    return out
+
+
+def _low_pass(t: Array, value: Array, grid: Array, period: float, sample_time: float) -> Array:
+    from scipy.signal import firwin, oaconvolve
+
+    ratio = sample_time / period
+    # an odd number of taps keeps the filter without delay
+    taps = 2 * int(np.ceil(_TAPS_PER_RATIO * ratio / 2)) + 1
+    count = max(int(np.floor((t[-1] - t[0]) / period + 1e-9)) + 1, 2)
+    fine = t[0] + period * np.arange(count)
+    even = np.interp(fine, t, value)
+    kernel = firwin(taps, _CUT_OFF / ratio)
+    half = taps // 2
+    # mirrored about its ends through the end value: a ramp stays a ramp
+    half = min(half, len(even) - 1)
+    kernel = kernel[taps // 2 - half : taps // 2 + half + 1]
+    kernel = kernel / kernel.sum()
+    before = 2 * even[0] - even[half:0:-1]
+    after = 2 * even[-1] - even[-2 : -half - 2 : -1]
+    smooth = oaconvolve(np.concatenate([before, even, after]), kernel, mode="valid")
+    return np.interp(grid, fine, smooth)
+
+
+def hold(of: Clock, value: Array, grid: Array) -> Array:
+    """Return the last value at or before each time of a grid, (M,)."""
+    slack = 1e-6 * max(of.period, 1e-9) + 1e-9
+    k = np.searchsorted(of.t, grid + slack, side="right") - 1
+    return np.asarray(value[np.clip(k, 0, len(value) - 1)])
+
+
+def hold_mean(of: Clock, value: Array, grid: Array, sample_time: float) -> Array:
+    """Return the mean of a held signal over the sample that follows each time, (M,).
+
+    An input that changes within a sample acts on the ship by its mean; one that
+    changes at samples only is held as it is.
+    """
+    if len(of.t) < 2 or of.period > 0.75 * sample_time:
+        return hold(of, value, grid)
+    area = np.concatenate([[0.0], np.cumsum(value[:-1] * np.diff(of.t))])
+
+    def integral(at: Array) -> Array:
+        k = np.clip(np.searchsorted(of.t, at, side="right") - 1, 0, len(of.t) - 1)
+        return np.asarray(area[k] + value[k] * (at - of.t[k]))
+
+    return (integral(grid + sample_time) - integral(grid)) / sample_time
+
+
+def runs(keep: Mask) -> list[tuple[int, int]]:
+    """Return (start, stop) of each run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], keep, [False]])))
+    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def nice_period(period: float) -> float:
+    """Return a sample time that people would write for a measured period [s].
+
+    The clock of a logger is known to a few parts in a thousand: 0.0998 is 0.1.
+    """
+    if period <= 0:
+        return 0.0
+    scale = 10.0 ** np.floor(np.log10(period))
+    for digits in (1.0, 2.0, 2.5, 4.0, 5.0, 8.0, 10.0):
+        if abs(period / scale - digits) < 0.02 * digits:
+            return float(f"{digits * scale:.6g}")
+    return float(f"{period:.3g}")

@@ -1,0 +1,164 @@
+"""Writing a log, and beside it where it came from."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from greybox.channels import LOGGED
+from greybox.errors import LogError
+from greybox.files import check_targets, replacing, sha256, write_json
+from greybox.trial.log import Provenance, TrialLog
+
+_MAX_RECORD = 4_000_000
+
+
+def record_path(path: str | Path) -> Path:
+    """Return where the record of a log stands: beside it, ``.json`` added to its name."""
+    return Path(f"{path}.json")
+
+
+def write_log(
+    segments: Iterable[TrialLog], path: str | Path, *, extra: Mapping[str, Any] | None = None
+) -> None:
+    """Write the segments of a log as one table, and its record beside it.
+
+    Rows that are missing between segments are the gaps. The record is a JSON
+    file with sources, hashes, units, what was derived and what was mended.
+
+    Parameters
+    ----------
+    segments : iterable of TrialLog
+        In order of time, of one sample time; written one after another, so that
+        they need not be in memory together.
+    path : str or Path
+        CSV, or Parquet where it ends so.
+    extra : mapping, optional
+        More entries of the record.
+
+    Raises
+    ------
+    LogError
+        The file cannot be written.
+    """
+    path = Path(path)
+    check_targets(path, record_path(path))
+    iterator = iter(segments)
+    first = next(iterator, None)
+    if first is None:
+        raise LogError("there is no segment to write: import at least one.")
+    names = _columns(first)
+    rows, spans = 0, []
+    import pyarrow as pa
+
+    loop = first.vessel.closed_loop if first.loop_known else None
+    fields = [(n, pa.float64()) for n in names]
+    if loop is not None:
+        fields.append((loop[0], pa.string()))
+    schema = pa.schema(fields)
+    with replacing(path, "wb") as handle:
+        if path.suffix.lower() in (".parquet", ".pq"):
+            from pyarrow import parquet
+
+            writer: Any = parquet.ParquetWriter(handle, schema)
+        else:
+            from pyarrow import csv
+
+            options = csv.WriteOptions(quoting_style="needed")
+            writer = csv.CSVWriter(handle, schema, write_options=options)
+        try:
+            for log in chain([first], iterator):
+                rows += len(log)
+                spans.append([float(log.t[0]), float(log.t[-1]), len(log)])
+                for start in range(0, len(log), 1 << 17):
+                    part = slice(start, start + (1 << 17))
+                    arrays = [pa.array((log.t if n == "t" else log[n])[part]) for n in names]
+                    if loop is not None:
+                        words = np.where(log.closed_loop[part], loop[1][0], "open")
+                        arrays.append(pa.array(words.astype(str)))
+                    writer.write_table(pa.Table.from_arrays(arrays, schema=schema))
+        finally:
+            writer.close()
+    record = {
+        "format": "greybox-log",
+        "version": 1,
+        "log": path.name,
+        "log_sha256": sha256(path),
+        "rows": rows,
+        "sample_time": first.sample_time,
+        "units": _units(first, names),
+        "segments": _merged(spans, first.sample_time)[:1000],
+        **asdict(first.provenance),
+        **(extra or {}),
+    }
+    write_json(record, record_path(path))
+
+
+def read_record(path: Path) -> dict[str, Any] | None:
+    """Return the record beside a log, None where there is none or it is of another file."""
+    beside = record_path(path)
+    try:
+        if not beside.is_file() or beside.stat().st_size > _MAX_RECORD:
+            return None
+        record = json.loads(beside.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return None
+    if not isinstance(record, dict) or record.get("format") != "greybox-log":
+        return None
+    return record if record.get("log_sha256") == sha256(path) else None
+
+
+def recorded_provenance(record: Mapping[str, Any]) -> Provenance:
+    """Return the provenance that a record holds; what is malformed is left out."""
+
+    def words(key: str) -> tuple[str, ...]:
+        value = record.get(key)
+        return tuple(str(v) for v in value) if isinstance(value, list) else ()
+
+    epoch = record.get("epoch")
+    notes = record.get("notes")
+    files = record.get("files")
+    return Provenance(
+        str(record.get("source", "")),
+        str(record.get("sha256", "")),
+        words("derived"),
+        words("fixed"),
+        tuple((str(f[0]), str(f[1]), str(f[2])) for f in files if len(f) == 3)
+        if isinstance(files, list)
+        else (),
+        words("read"),
+        float(epoch) if isinstance(epoch, int | float) else None,
+        {str(k): str(v) for k, v in notes.items()} if isinstance(notes, dict) else {},
+    )
+
+
+def _columns(log: TrialLog) -> list[str]:
+    known = [n for n in LOGGED if n == "t" or n in log]
+    return known + [n for n in log.channels if n not in known]
+
+
+def _units(log: TrialLog, names: Sequence[str]) -> dict[str, str]:
+    from greybox.channels import CHANNELS
+
+    angles = log.vessel.angle_commands
+    return {
+        n: CHANNELS[n].unit if n in CHANNELS else ("rad" if n in angles else "as logged")
+        for n in names
+    }
+
+
+def _merged(spans: list[list[float]], sample_time: float) -> list[list[float]]:
+    """Join spans that follow each other without a gap."""
+    joined: list[list[float]] = []
+    for start, stop, count in spans:
+        if joined and start - joined[-1][1] < 1.5 * sample_time:
+            joined[-1] = [joined[-1][0], stop, joined[-1][2] + count]
+        else:
+            joined.append([start, stop, count])
+    return joined
