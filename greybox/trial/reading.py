@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from greybox.channels import CHANNELS, unit_factor
 from greybox.errors import LogError, suggestion
 from greybox.files import sha256
-from greybox.trial.conditioning import relative_wind, velocities_from_positions
+from greybox.trial.conditioning import velocities_from_positions
 from greybox.trial.log import Provenance, TrialLog
+from greybox.trial.wind import relative_wind
 from greybox.vessel.vessel import Vessel
 
 if TYPE_CHECKING:
