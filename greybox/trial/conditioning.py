@@ -1,4 +1,4 @@
-"""From what sensors give to what models need: velocities, relative wind, sample time."""
+"""From what sensors give to what models need: velocities and sample time."""
 
 from __future__ import annotations
 
@@ -58,32 +58,6 @@ def velocities_from_positions(
     rho = np.exp(-(heading_std**2) / 2)
     u, v = (c * north + s * east) / rho, (-s * north + c * east) / rho
     return u + r * antenna[1], v - r * antenna[0], r
-
-
-def relative_wind(speed: Array, angle: Array, angle_std: float = 0.0) -> tuple[Array, Array]:
-    """Return the velocity through the air from a polar measurement.
-
-    Parameters
-    ----------
-    speed : ndarray
-        V_q, apparent wind speed [m/s].
-    angle : ndarray
-        γ_q, minus the direction that the apparent wind comes from, clockwise
-        from the bow [rad].
-    angle_std : float
-        Noise of the angle [rad]; its shrinking by ρ_γ (5.46) is divided out.
-
-    Returns
-    -------
-    tuple of ndarray
-        u_q, v_q [m/s], body axes.
-
-    References
-    ----------
-    Ljungberg (2020), eq. 5.40-5.46.
-    """
-    rho = np.exp(-(angle_std**2) / 2)
-    return speed * np.cos(angle) / rho, -speed * np.sin(angle) / rho
 
 
 def decimate(log: TrialLog, sample_time: float) -> TrialLog:

@@ -1,0 +1,168 @@
+"""Velocity through the air: signs by hand, round trips, lever arm, height."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from greybox.errors import LogError
+from greybox.trial.wind import (
+    direction_from,
+    height_profile,
+    move_anemometer,
+    relative_wind,
+    relative_wind_from_direction,
+    relative_wind_from_true,
+    true_wind,
+    wind_at_height,
+)
+
+NORTH, EAST, SOUTH, WEST = np.radians([0.0, 90.0, 180.0, 270.0])
+STILL = np.zeros(1)
+
+
+def one(value):
+    return np.array([float(value)])
+
+
+@pytest.mark.parametrize(
+    ("from_bow", "u_q", "v_q"),
+    [(0, 4, 0), (90, 0, 4), (180, -4, 0), (270, 0, -4), (-30, 4 * np.cos(np.pi / 6), -2)],
+)
+def test_apparent_wind_from_ahead_is_forward_and_from_starboard_is_starboard(from_bow, u_q, v_q):
+    got = relative_wind_from_direction(one(4), np.radians(one(from_bow)))
+    np.testing.assert_allclose(np.ravel(got), [u_q, v_q], atol=1e-12)
+    # CONTRACT: γ_q is minus that direction, so γ_q < 0 from starboard
+    same = relative_wind(one(4), -np.radians(one(from_bow)))
+    np.testing.assert_allclose(np.ravel(same), [u_q, v_q], atol=1e-12)
+
+
+def test_noise_of_the_vane_is_divided_out():
+    """(5.44)-(5.46): the mean shrinks by exp(−λ/2) without the correction."""
+    rng = np.random.default_rng(1)
+    n, std = 20000, 0.4
+    vane = np.pi / 3 + std * rng.standard_normal(n)
+    got = np.array(relative_wind_from_direction(np.full(n, 5.0), vane, std))
+    expected = 5 * np.array([np.cos(np.pi / 3), np.sin(np.pi / 3)])
+    error = got.std(axis=1) / np.sqrt(n)
+    assert (np.abs(got.mean(axis=1) - expected) < 4 * error).all()
+    raw = np.array(relative_wind_from_direction(np.full(n, 5.0), vane))
+    assert raw.mean(axis=1)[1] < expected[1] - 10 * error[1]
+
+
+@pytest.mark.parametrize(
+    ("wind_from", "heading", "u_q", "v_q"),
+    [
+        (NORTH, NORTH, 6, 0),  # head wind
+        (SOUTH, NORTH, -6, 0),  # from astern
+        (EAST, NORTH, 0, 6),  # from starboard
+        (WEST, NORTH, 0, -6),  # from port
+        (NORTH, EAST, 0, -6),  # heading east, north is to port
+        (NORTH, WEST, 0, 6),
+        (EAST, EAST, 6, 0),
+    ],
+)
+def test_true_wind_on_a_ship_at_rest(wind_from, heading, u_q, v_q):
+    got = relative_wind_from_true(one(6), one(wind_from), one(heading), STILL, STILL)
+    np.testing.assert_allclose(np.ravel(got), [u_q, v_q], atol=1e-12)
+
+
+def test_true_wind_on_a_moving_ship():
+    # north at 5 m/s with 3 m/s from the north: 8 m/s from ahead
+    got = relative_wind_from_true(one(3), one(NORTH), one(NORTH), one(5), STILL)
+    np.testing.assert_allclose(np.ravel(got), [8, 0], atol=1e-12)
+    # with the wind at its own speed: calm on deck
+    got = relative_wind_from_true(one(5), one(SOUTH), one(NORTH), one(5), STILL)
+    np.testing.assert_allclose(np.ravel(got), [0, 0], atol=1e-12)
+    # still air: the velocity through the air is the velocity over ground
+    got = relative_wind_from_true(one(0), one(1.0), one(0.7), one(5), one(-0.4))
+    np.testing.assert_allclose(np.ravel(got), [5, -0.4], atol=1e-12)
+
+
+def test_true_wind_is_the_inverse():
+    rng = np.random.default_rng(2)
+    speed, origin = rng.uniform(0.1, 20, 200), rng.uniform(0, 2 * np.pi, 200)
+    psi, u, v = rng.uniform(-20, 20, 200), rng.normal(3, 4, 200), rng.normal(0, 1, 200)
+    north, east = true_wind(*relative_wind_from_true(speed, origin, psi, u, v), psi, u, v)
+    np.testing.assert_allclose(north, -speed * np.cos(origin), atol=1e-12)
+    np.testing.assert_allclose(east, -speed * np.sin(origin), atol=1e-12)
+    again, origin_again = direction_from(north, east)
+    np.testing.assert_allclose(again, speed)
+    np.testing.assert_allclose(origin_again, origin)
+
+
+def test_wind_of_the_virtual_ship(noisy_log):
+    """The body-frame wind of the simulated thesis ship, 1 m/s towards north and east."""
+    psi, u, v = noisy_log["psi"], noisy_log["u"], noisy_log["v"]
+    wind = np.array(true_wind(noisy_log["u_q"], noisy_log["v_q"], psi, u, v))
+    np.testing.assert_allclose(wind.mean(axis=1), 1.0, atol=0.02)
+
+
+def test_lever_arm_against_finite_differences_of_the_anemometer():
+    h = 1e-4
+    t = np.arange(0, 10, h)
+    psi = 0.8 * np.sin(0.5 * t)
+    north, east = 3 * t + np.sin(0.4 * t), 2 * np.cos(0.3 * t)
+    x, y = 4.0, -1.5
+    mast_north = north + np.cos(psi) * x - np.sin(psi) * y
+    mast_east = east + np.sin(psi) * x + np.cos(psi) * y
+    air = 5.0, -2.0
+
+    def through_air(n, e):
+        n, e = np.gradient(n, h) - air[0], np.gradient(e, h) - air[1]
+        return np.cos(psi) * n + np.sin(psi) * e, -np.sin(psi) * n + np.cos(psi) * e
+
+    moved = move_anemometer(*through_air(mast_north, mast_east), np.gradient(psi, h), x, y)
+    for got, expected in zip(moved, through_air(north, east), strict=True):
+        np.testing.assert_allclose(got[1:-1], expected[1:-1], atol=1e-6)
+
+
+def test_an_anemometer_on_the_bow_of_a_ship_that_turns_in_calm_air():
+    # turning to starboard the bow moves to starboard: it feels wind from starboard
+    r, x = one(0.1), 20.0
+    got = move_anemometer(one(0), r * x, r, x, 0.0)
+    np.testing.assert_allclose(np.ravel(got), [0, 0], atol=1e-15)
+
+
+def test_the_profile_scales_the_true_wind_only():
+    psi, u, v = one(0.6), one(4), one(-0.5)
+    low = relative_wind_from_true(one(7), one(2.0), psi, u, v)
+    k = (10 / 3) ** (1 / 7)
+    np.testing.assert_allclose(
+        wind_at_height(*low, u, v, 3.0, reference_height=10.0),
+        relative_wind_from_true(one(7 * k), one(2.0), psi, u, v),
+    )
+    # still air has no profile, however fast the ship
+    np.testing.assert_allclose(wind_at_height(u, v, u, v, 30.0, reference_height=10.0), [u, v])
+
+
+def test_nothing_is_scaled_unless_asked():
+    u_q, v_q = one(3), one(2)
+    assert wind_at_height(u_q, v_q, one(1), one(0), 25.0) == (u_q, v_q)
+
+
+def test_profiles():
+    assert height_profile(10.0) == 1.0
+    assert height_profile(20.0) == pytest.approx(0.5 ** (1 / 7))
+    assert height_profile(20.0, 5.0, exponent=0.11) == pytest.approx(0.25**0.11)
+    assert height_profile(20.0, roughness=2e-4) == pytest.approx(np.log(5e4) / np.log(1e5))
+    # both laws nearly agree over open water
+    assert height_profile(20.0, roughness=2e-4) == pytest.approx(height_profile(20.0), rel=0.05)
+    # there and back
+    assert height_profile(7.0, 12.0) * height_profile(12.0, 7.0) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("height", "options", "message"),
+    [
+        (0.0, {}, "an anemometer at 0 m and a reference height of 10 m: both must be above the w"),
+        (5.0, {"reference": -1.0}, "reference height of -1 m"),
+        (np.nan, {}, "an anemometer at nan m"),
+        (0.1, {"roughness": 0.2}, r"above the roughness 0\.2 m"),
+        (5.0, {"roughness": 0.0}, "no logarithmic profile: give about 2e-4"),
+        (5.0, {"roughness": -1.0}, "above the roughness -1 m"),
+    ],
+)
+def test_impossible_heights(height, options, message):
+    with pytest.raises(LogError, match=message):
+        height_profile(height, **options)
