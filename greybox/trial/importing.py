@@ -88,6 +88,7 @@ def import_recording(
     options: ImportOptions | None = None,
     *,
     fixed: tuple[str, ...] = (),
+    zero: float | None = None,
 ) -> Imported:
     """Make a log of a recording.
 
@@ -99,6 +100,9 @@ def import_recording(
     options : ImportOptions
     fixed : tuple of str
         What was mended before, for the provenance.
+    zero : float, optional
+        A time [s] that the samples are to meet, so that blocks of one file share
+        their grid; the first common time by default.
 
     Returns
     -------
@@ -136,7 +140,7 @@ def import_recording(
         )
     leading = motion or inputs
     sample_time = options.sample_time or _sample_time([by_name[n] for n in leading])
-    grid, keep = _grid([by_name[n] for n in leading], sample_time, recording.name)
+    grid, keep = _grid([by_name[n] for n in leading], sample_time, recording.name, zero)
     channels = _resample(signals, by_name, vessel, grid, sample_time)
     stretches = [r for r in runs(keep) if r[1] - r[0] >= _MIN_SEGMENT]
     short = len(runs(keep)) - len(stretches)
@@ -238,8 +242,12 @@ def _sample_time(clocks: list[Clock]) -> float:
     return nice_period(mean if abs(mean - slowest.period) < 0.2 * mean else slowest.period)
 
 
-def _grid(clocks: list[Clock], sample_time: float, name: str) -> tuple[Array, NDArray[np.bool_]]:
+def _grid(
+    clocks: list[Clock], sample_time: float, name: str, zero: float | None
+) -> tuple[Array, NDArray[np.bool_]]:
     start = max(float(c.t[0]) for c in clocks)
+    if zero is not None:
+        start = zero + sample_time * np.ceil((start - zero) / sample_time - 1e-6)
     stop = min(float(c.t[-1]) for c in clocks)
     if stop - start < _MIN_SEGMENT * sample_time:
         raise LogError(
@@ -332,11 +340,11 @@ def _derive(
 def _derive_wind(
     part: dict[str, Array], vessel: Vessel, options: ImportOptions, derived: list[str]
 ) -> None:
-    from greybox.trial.wind import height_profile, move_anemometer
+    from greybox.trial.wind import move_anemometer, wind_at_height
 
     psi, u, v = part.get("psi"), part.get("u"), part.get("v")
-    moving = psi is not None and u is not None and v is not None
-    if "u_q" not in part and moving and psi is not None and u is not None and v is not None:
+    height = vessel.sensors.get("anemometer", (0.0, 0.0, 0.0))[2]
+    if "u_q" not in part and psi is not None and u is not None and v is not None:
         if "w_n" in part:
             # components of where it comes from: the air moves the other way
             from_x, from_y = earth_to_body(part["w_n"], part["w_e"], psi)
@@ -351,15 +359,14 @@ def _derive_wind(
         part["u_q"], part["v_q"] = move_anemometer(part["u_q"], part["v_q"], part["r"], x, y)
         if x or y:
             derived.append(f"u_q, v_q moved from the anemometer at ({x:g}, {y:g}) m to the origin")
-    if options.reference_height is not None and "u_q" in part and moving:
+    if options.reference_height is not None and "u_q" in part and u is not None and v is not None:
         if "anemometer" not in vessel.sensors:
             raise LogError(
                 f"the wind cannot be brought to {options.reference_height:g} m without the height "
                 f"of the anemometer: add anemometer = [x, y, height] to [sensors]."
             )
-        height = vessel.sensors["anemometer"][2]
-        part["u_q"], part["v_q"] = height_profile(
-            part["u_q"], part["v_q"], psi, u, v, height=height, reference=options.reference_height
+        part["u_q"], part["v_q"] = wind_at_height(
+            part["u_q"], part["v_q"], u, v, height, reference_height=options.reference_height
         )
         derived.append(
             f"true wind brought from {height:g} to {options.reference_height:g} m (1/7 power law)"

@@ -1,0 +1,174 @@
+"""`greybox import`: raw files of one trial become one log."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING, Any
+
+from greybox.commands.common import positive, provenance, say
+
+if TYPE_CHECKING:
+    from greybox.trial.importing import ImportOptions
+
+HELP = "make a log of raw files: CSV, Parquet, NMEA 0183, MATLAB, ROS bags, MCAP"
+EXAMPLES = """examples:
+  greybox import trial.nmea --vessel ship.toml --out trial.csv
+  greybox import gnss.nmea thrusters.csv --vessel ship.toml --sample-time 0.5 --out trial.parquet
+  greybox import raw.csv --vessel ship.toml --fix --out trial.csv --note draught="1.2 m"
+
+Files of one trial are merged on their clocks. Columns are found by the vessel file's
+[columns], by canonical name, or guessed; every guess is stated. Gaps stay gaps.
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("raw", nargs="+", metavar="RAW", help="raw files of one trial")
+    parser.add_argument("--vessel", required=True, metavar="V", help="vessel file (TOML)")
+    parser.add_argument("--out", required=True, metavar="LOG", help="log, .csv or .parquet")
+    parser.add_argument(
+        "--sample-time",
+        type=positive,
+        metavar="S",
+        help="sample time of the log [s]; that of the slowest motion sensor by default",
+    )
+    parser.add_argument(
+        "--hole",
+        type=positive,
+        metavar="S",
+        help="shortest step that is a gap [s]; 2.5 usual steps of the sensor by default",
+    )
+    parser.add_argument(
+        "--fix", action="store_true", help="mend what greybox check finds, where that is safe"
+    )
+    parser.add_argument(
+        "--fix-also",
+        action="append",
+        default=[],
+        metavar="ID",
+        help="mend this finding too although it needs your judgement, such as heading_bias",
+    )
+    parser.add_argument(
+        "--velocities",
+        choices=("central", "savgol"),
+        default="central",
+        help="velocities from positions: central differences (3.57), or Savitzky-Golay",
+    )
+    parser.add_argument(
+        "--window",
+        type=positive,
+        default=2.0,
+        metavar="S",
+        help="window of Savitzky-Golay [s] (2)",
+    )
+    parser.add_argument(
+        "--reference-height",
+        type=positive,
+        metavar="M",
+        help="bring the wind to this height [m] by the power law 1/7; as measured by default",
+    )
+    parser.add_argument(
+        "--origin",
+        metavar="LAT,LON",
+        help="where x_n = y_n = 0 [deg]; the first position by default",
+    )
+    parser.add_argument(
+        "--topic",
+        action="append",
+        default=[],
+        metavar="TOPIC[=NAME]",
+        help="topic of a bag to use, and the name of its signal or field=name,... (repeat)",
+    )
+    parser.add_argument(
+        "--note",
+        action="append",
+        default=[],
+        metavar="KEY=TEXT",
+        help="a note of the trial, such as draught, loading, depth, sea_state (repeat)",
+    )
+    parser.add_argument("--json", metavar="F", help="write the record as JSON; - is stdout")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Read, merge, mend, resample, write."""
+    from pathlib import Path
+
+    from greybox.files import check_targets, write_json
+    from greybox.trial.stream import import_files
+    from greybox.trial.writing import read_record, record_path
+    from greybox.vessel.toml import load_vessel
+
+    check_targets(options.out, record_path(options.out), options.json)
+    vessel = load_vessel(options.vessel)
+    summary = import_files(
+        options.raw,
+        vessel,
+        options.out,
+        import_options(options),
+        fix=options.fix,
+        fix_also=tuple(options.fix_also),
+        reader={"topics": pairs(options.topic, "--topic", empty=True)} if options.topic else {},
+        extra=provenance(options),
+    )
+    if options.json:
+        record: Any = read_record(Path(options.out))
+        write_json(record, options.json)
+    if options.json != "-":
+        say(summary)
+        say(f"wrote {options.out} and {record_path(options.out).name}")
+
+
+def import_options(options: argparse.Namespace) -> ImportOptions:
+    """Return the options of the import, checked."""
+    from greybox.trial.importing import ImportOptions
+
+    return ImportOptions(
+        sample_time=options.sample_time,
+        hole=options.hole,
+        velocities=options.velocities,
+        window=options.window,
+        reference_height=options.reference_height,
+        origin=_origin(options.origin),
+        notes=pairs(options.note, "--note"),
+    )
+
+
+def pairs(given: list[str], option: str, *, empty: bool = False) -> dict[str, str]:
+    """Return KEY=TEXT options as a dictionary.
+
+    Raises
+    ------
+    UsageError
+        There is no ``=``, or a key stands twice.
+    """
+    from greybox.errors import UsageError
+
+    found: dict[str, str] = {}
+    for item in given:
+        key, sign, text = item.partition("=")
+        if not key.strip() or not (sign or empty):
+            raise UsageError(f"{option} {item} has no value: write {option} KEY=TEXT.")
+        if key.strip() in found:
+            raise UsageError(f"{option} gives '{key.strip()}' twice: keep one of them.")
+        found[key.strip()] = text.strip()
+    return found
+
+
+def _origin(text: str | None) -> tuple[float, float] | None:
+    from greybox.errors import UsageError
+
+    if text is None:
+        return None
+    try:
+        lat, lon = (float(x) for x in text.split(","))
+    except ValueError:
+        raise UsageError(
+            f"--origin is '{text}', it must be latitude and longitude in degrees: "
+            f"write --origin 63.44,10.42."
+        ) from None
+    if not (-90 <= lat <= 90 and -180 <= lon <= 360):
+        raise UsageError(
+            f"--origin is {lat:g}, {lon:g} deg, latitude must be within 90 and longitude within "
+            f"360: write --origin LAT,LON."
+        )
+    return lat, lon

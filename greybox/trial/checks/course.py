@@ -1,0 +1,118 @@
+"""Course against heading, where no velocity sensor of its own can judge the compass."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.trial.checks.finding import Finding, Outcome, Repair
+from greybox.trial.checks.motion import make_motion, turn
+from greybox.trial.recording import Recording
+from greybox.vessel.vessel import Vessel
+
+Array = NDArray[np.float64]
+
+# a hull that goes ahead drifts by less than this; thrusters that push sideways may do more
+_PLAUSIBLE = np.radians(20)
+_LEAST_TURN = np.radians(20)
+_LEAST_SHARE = 0.95
+_WINDOW = 2.0
+
+
+def course_findings(recording: Recording, vessel: Vessel) -> tuple[list[Finding], list[Outcome]]:
+    """Find a compass that points elsewhere than the vessel goes.
+
+    The velocity over ground is a body-fixed direction turned by the heading,
+    plus a current: where the direction is far off the bow on every heading and
+    no thruster pushes that way, the heading is wrong.
+
+    Parameters
+    ----------
+    recording : Recording
+        Canonical, with positions or velocities over ground, and heading.
+    vessel : Vessel
+    """
+    names = ("v_n", "v_e", "psi") if "v_n" in recording else ("x_n", "y_n", "psi")
+    vague = "the log has no velocity sensor of its own, only course and heading"
+    motion = make_motion(recording, names)
+    if motion is None or not all(n in motion for n in names):
+        return [], [Outcome("heading_bias", "cannot tell", "needs positions and heading")]
+    velocity = _velocity(motion.t, motion[names[0]], motion[names[1]], motion.step, names[0])
+    speed = np.hypot(*velocity.T)
+    under_way = speed > 0.5 * np.quantile(speed, 0.9)
+    if under_way.sum() < 50 or np.quantile(speed, 0.9) < 0.2:
+        return [], [Outcome("heading_bias", "cannot tell", f"{vague}, and it hardly moves")]
+    psi = motion["psi"]
+    track = velocity[:, 0] + 1j * velocity[:, 1]
+    drift = (track * np.exp(-1j * psi))[under_way]
+    unit = drift / np.abs(drift)
+    mean = complex(unit.mean())
+    angle = float(np.angle(mean))
+    spread = float(np.ptp(psi[under_way]))
+    sentence = f"{vague}: a bias and a drift angle of {np.degrees(angle):.0f} deg look alike"
+    astern = abs(abs(angle) - np.pi) < _PLAUSIBLE
+    if abs(mean) < _LEAST_SHARE or abs(angle) < _PLAUSIBLE or astern or spread < _LEAST_TURN:
+        return [], [Outcome("heading_bias", "cannot tell", sentence)]
+    if _pushed(recording, vessel, angle):
+        return [], [
+            Outcome("heading_bias", "cannot tell", f"{sentence}, and the thrusters push that way")
+        ]
+    # a current beside the body-fixed direction: both are fitted
+    rows = np.flatnonzero(under_way)
+    turned = np.exp(1j * psi[rows]) * np.median(np.abs(drift))
+    design = np.column_stack([turned, np.ones(len(rows))])
+    estimate = np.linalg.lstsq(design, track[rows], rcond=None)[0]
+    bias = -float(np.angle(estimate[0]))
+    rest = track[rows] - design @ estimate
+    blocks = np.array_split(np.arange(len(rows)), 12)
+    error = float(np.std([np.angle(np.mean(unit[b])) for b in blocks])) / np.sqrt(len(blocks))
+    del rest
+    # what a drifting hull may add is unknown: the interval allows for a plausible drift angle
+    half = float(np.hypot(1.96 * error, _PLAUSIBLE / 2))
+    finding = Finding(
+        "heading_bias",
+        "psi",
+        bias,
+        (bias - half, bias + half),
+        "rad",
+        f"under way the course lies {np.degrees(angle):.0f} deg "
+        f"{'to starboard' if angle > 0 else 'to port'} of the heading on all headings (over "
+        f"{np.degrees(spread):.0f} deg): a vessel does not go so sideways, its compass or antenna "
+        f"pair is turned",
+        f"subtract {bias:.3f} rad from psi once its mounting is known (import --fix-also "
+        f"heading_bias does)",
+        ("psi",),
+        (Repair("turn", ("psi",), (bias,)),),
+        False,
+        {"t": motion.t[rows], "drift": np.angle(drift)},
+    )
+    return [finding], []
+
+
+def _velocity(t: Array, north: Array, east: Array, step: float, name: str) -> Array:
+    if name == "v_n":
+        return np.column_stack([north, east])
+    half = max(1, round(_WINDOW / 2 / step))
+    position = np.column_stack([north, east])
+    out = np.zeros_like(position)
+    out[half:-half] = (position[2 * half :] - position[: -2 * half]) / (
+        t[2 * half :] - t[: -2 * half]
+    )[:, None]
+    return out
+
+
+def _pushed(recording: Recording, vessel: Vessel, angle: float) -> bool:
+    """Whether the thrusters' mean force lies on the same side as the drift."""
+    from greybox.vessel.force import generalised_force
+
+    if not all(c in recording for c in vessel.commands):
+        return False
+    commands = {c: recording[c].value[np.isfinite(recording[c].value)] for c in vessel.commands}
+    size = min(len(v) for v in commands.values())
+    made = generalised_force(vessel, {c: v[:size] for c, v in commands.items()})
+    across = float(np.mean(made.get("Y", np.zeros(1))))
+    total = sum(float(np.mean(np.abs(v))) for v in made.values()) or 1.0
+    return across * np.sin(angle) > 0.05 * total
+
+
+__all__ = ["course_findings", "turn"]

@@ -1,0 +1,162 @@
+"""What a check returns: a finding with its interval, evidence and fix, or why it has none."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+IDS = (
+    "gap", "duplicate_time", "nan", "outlier", "stuck", "quantised", "unit", "frame", "sign",
+    "clock_offset", "lever_arm", "heading_bias",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Repair:
+    """What would mend a finding, for `greybox.trial.repair`.
+
+    Parameters
+    ----------
+    kind : str
+        ``order``, ``drop``, ``scale``, ``move`` (columns change places), ``rotate``
+        (earth-fixed to body axes), ``shift`` (in time), ``lever``, ``turn``.
+    channels : tuple of str
+    values : tuple of float
+        Factor, seconds, metres, radians or times of samples, as `kind` needs.
+    """
+
+    kind: Literal["order", "drop", "scale", "move", "rotate", "shift", "lever", "turn", "offset"]
+    channels: tuple[str, ...]
+    values: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One defect of a log.
+
+    Parameters
+    ----------
+    id : str
+        One of `IDS`.
+    channel : str
+        The channel at fault; of several, the first.
+    value : float or tuple of float
+        Size of the defect, in `unit`.
+    ci : tuple
+        95 % interval (low, high), one for each component of `value`; low = high
+        where the value is counted.
+    unit : str
+    evidence : str
+        One sentence that an engineer can check.
+    fix : str
+        What to do.
+    channels : tuple of str
+        All channels at fault.
+    repair : tuple of Repair
+        What ``import --fix`` does; empty where nothing can be done.
+    safe : bool
+        Whether the repair needs no judgement.
+    picture : mapping
+        Arrays that the report draws.
+    """
+
+    id: str
+    channel: str
+    value: float | tuple[float, ...]
+    ci: tuple[Any, ...]
+    unit: str
+    evidence: str
+    fix: str
+    channels: tuple[str, ...] = ()
+    repair: tuple[Repair, ...] = ()
+    safe: bool = False
+    picture: Mapping[str, Any] = field(default_factory=dict)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the finding as CONTRACT's JSON, with `channels` and `safe` beside."""
+        vector = isinstance(self.value, tuple)
+        return {
+            "id": self.id,
+            "channel": self.channel,
+            "value": list(self.value) if isinstance(self.value, tuple) else self.value,
+            "ci": [list(c) for c in self.ci] if vector else list(self.ci),
+            "unit": self.unit,
+            "evidence": self.evidence,
+            "fix": self.fix,
+            "channels": list(self.channels or (self.channel,)),
+            "safe": self.safe,
+        }
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one check.
+
+    Parameters
+    ----------
+    id : str
+    status : {"clean", "found", "cannot tell"}
+    sentence : str
+        What was looked at, or why nothing in the log can show it.
+    """
+
+    id: str
+    status: Literal["clean", "found", "cannot tell"]
+    sentence: str
+
+
+@dataclass(frozen=True)
+class CheckReport:
+    """All findings of one log, and what became of every check.
+
+    Parameters
+    ----------
+    name : str
+    findings : tuple of Finding
+    outcomes : tuple of Outcome
+    notes : tuple of str
+        What was guessed or skipped while reading.
+    """
+
+    name: str
+    findings: tuple[Finding, ...]
+    outcomes: tuple[Outcome, ...]
+    notes: tuple[str, ...] = ()
+
+    def summary(self) -> str:
+        """Return the findings as text."""
+        count = len(self.findings)
+        lines = [
+            f"{self.name}: " + (f"{count} finding{'s' if count > 1 else ''}" if count else "clean")
+        ]
+        for f in self.findings:
+            lines.append(f"  {f.id} ({', '.join(f.channels or (f.channel,))}): {_size(f)}")
+            lines.append(f"    {f.evidence}")
+            lines.append(f"    fix: {f.fix}")
+        lines += [f"  {o.id}: {o.sentence}" for o in self.outcomes if o.status == "cannot tell"]
+        lines += [f"  note: {n}" for n in self.notes]
+        return "\n".join(lines)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the report as CONTRACT's JSON, with `checks` and `notes` beside."""
+        return {
+            "log": self.name,
+            "findings": [f.to_dict() for f in self.findings],
+            "checks": [
+                {"id": o.id, "status": o.status, "sentence": o.sentence} for o in self.outcomes
+            ],
+            "notes": list(self.notes),
+        }
+
+
+def _size(f: Finding) -> str:
+    if isinstance(f.value, tuple):
+        parts = [
+            f"{v:.3g} ({c[0]:.3g} to {c[1]:.3g})" for v, c in zip(f.value, f.ci, strict=True)
+        ]
+        return f"{', '.join(parts)} {f.unit}"
+    unit = "" if f.unit == "1" else f" {f.unit}"
+    if f.ci[0] == f.ci[1]:
+        return f"{f.value:.4g}{unit}"
+    return f"{f.value:.3g} ({f.ci[0]:.3g} to {f.ci[1]:.3g}){unit}"

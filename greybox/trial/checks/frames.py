@@ -1,0 +1,330 @@
+"""Frame, sign and unit of each motion channel, by which reading the kinematics agree.
+
+Each alternative is a small change to how columns are read. All are compared by
+the likelihood of positions against velocities and of heading against yaw rate;
+the fewest changes win unless the gain is beyond doubt.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.trial.checks.finding import Finding, Outcome, Repair
+from greybox.trial.checks.motion import Motion, integrate, levels, profile, turn
+from greybox.trial.checks.rows import continuous
+
+Array = NDArray[np.float64]
+Values = dict[str, Array]
+
+# what one more change must gain in log-likelihood, and in share of the residual
+_LEAST_GAIN = 15.0
+_LEAST_SHARE = 0.15
+# a gross error shows in a part of a long log
+_EXCERPT = 8000
+_DEG = np.pi / 180
+_KNOT = 1852 / 3600
+
+
+@dataclass(frozen=True)
+class Change:
+    """One alternative reading of some columns.
+
+    Parameters
+    ----------
+    id : {"unit", "frame", "sign"}
+    group : str
+        Columns that are read otherwise; two changes of one group exclude each other.
+    channels : tuple of str
+    apply : callable
+        Values -> values, on the grid.
+    repair : tuple of Repair
+    words : str
+        What the log holds, for the evidence.
+    fix : str
+    value : float
+    unit : str
+    cost : float
+        Changes that it counts for.
+    """
+
+    id: str
+    group: str
+    channels: tuple[str, ...]
+    apply: Callable[[Values], Values]
+    repair: tuple[Repair, ...]
+    words: str
+    fix: str
+    value: float = -1.0
+    unit: str = "1"
+    cost: float = 1.0
+
+
+def _scaled(names: tuple[str, ...], factor: float) -> Callable[[Values], Values]:
+    return lambda x: {**x, **{n: x[n] * factor for n in names if n in x}}
+
+
+def _permuted(names: tuple[str, ...]) -> Callable[[Values], Values]:
+    a, b = names
+    return lambda x: {**x, a: x[b], b: x[a]}
+
+
+def _sign(*names: str, group: str, cost: float = 1.0) -> Change:
+    return Change(
+        "sign", group, names, _scaled(names, -1.0), (Repair("scale", names, (-1.0,)),),
+        f"{' and '.join(names)} {'is' if len(names) == 1 else 'are'} reversed",
+        f"change the sign of {' and '.join(names)} (import --fix does), or map it with sign = -1",
+        cost=cost,
+    )  # fmt: skip
+
+
+def _unit(names: tuple[str, ...], group: str, factor: float, said: str, held: str) -> Change:
+    return Change(
+        "unit", group, names, _scaled(names, factor), (Repair("scale", names, (factor,)),),
+        f"{' and '.join(names)} {'holds' if len(names) == 1 else 'hold'} {held} under a {said} "
+        f"name",
+        f"multiply by {factor:.5g} (import --fix does), or map with unit = \"{held}\"",
+        1 / factor, f"{held} per {said}",
+    )  # fmt: skip
+
+
+def _swap(a: str, b: str, *, group: str, words: str = "") -> Change:
+    return Change(
+        "sign", group, (a, b), _permuted((a, b)), (Repair("move", (a, b)),),
+        f"{a} and {b} are swapped{words}",
+        f"exchange {a} and {b} (import --fix does), or correct [columns]",
+        0.0,
+    )  # fmt: skip
+
+
+def _earth(names: tuple[str, str], words: str) -> Change:
+    def apply(x: Values) -> Values:
+        north, east = x[names[0]], x[names[1]]
+        c, s = np.cos(x["psi"]), np.sin(x["psi"])
+        return {**x, "u": c * north + s * east, "v": c * east - s * north}
+
+    return Change(
+        "frame", "velocity", ("u", "v"), apply, (Repair("rotate", names),),
+        f"u and v are velocities {words}, not along the body's axes",
+        "turn them by the heading into body axes (import --fix does), or map them to "
+        f"{'v_n and v_e' if names[0] == 'u' else 'v_e and v_n'} in [columns]",
+        0.0, "1",
+    )  # fmt: skip
+
+
+def _degrees(x: Values) -> Values:
+    return {**x, "psi": np.unwrap(continuous(x["psi"]) * _DEG)}
+
+
+_PSI = (
+    _sign("psi", group="psi"),
+    Change(
+        "frame", "psi", ("psi",), lambda x: {**x, "psi": np.pi / 2 - x["psi"]},
+        (Repair("scale", ("psi",), (-1.0,)), Repair("offset", ("psi",), (np.pi / 2,))),
+        "psi counts from east, anticlockwise, not from north, clockwise",
+        "replace psi by pi/2 - psi (import --fix does)", 0.0, "1",
+    ),
+    Change(
+        "unit", "psi", ("psi",), _degrees, (Repair("scale", ("psi",), (_DEG,)),),
+        "psi holds degrees under a radian name",
+        "multiply psi by pi/180 (import --fix does), or map it with unit = \"deg\" in [columns]",
+        180 / np.pi, "deg per rad",
+    ),
+    Change(
+        "sign", "psi", ("psi",), lambda x: {**x, "psi": x["psi"] + np.pi},
+        (Repair("offset", ("psi",), (np.pi,)),),
+        "psi points astern",
+        "add half a turn to psi", np.pi, "rad", cost=1.1,
+    ),
+)  # fmt: skip
+_RATE = (
+    _sign("r", group="r"),
+    _unit(("r",), "r", _DEG, "rad/s", "deg/s"),
+    _unit(("r",), "r", _DEG / 60, "rad/s", "deg/min"),
+)
+_VELOCITY = (
+    _sign("u", group="velocity"),
+    _sign("v", group="velocity"),
+    _sign("u", "v", group="velocity", cost=1.2),
+    _swap("u", "v", group="velocity"),
+    _unit(("u", "v"), "speed", _KNOT, "m/s", "kn"),
+    _unit(("u", "v"), "speed", 1 / 3.6, "m/s", "km/h"),
+    _unit(("u",), "speed", _KNOT, "m/s", "kn"),
+    _unit(("v",), "speed", _KNOT, "m/s", "kn"),
+    _earth(("u", "v"), "north and east"),
+    _earth(("v", "u"), "east and north"),
+)
+_POSITION = (
+    _sign("y_n", group="position"),
+    _sign("x_n", group="position"),
+    _swap("x_n", "y_n", group="position", words=" (east before north)"),
+    _unit(("x_n", "y_n"), "length", 1000.0, "m", "km"),
+)
+_ACROSS = (
+    _swap("psi", "r", group="psi"),
+    _swap("v", "r", group="velocity"),
+    _swap("u", "r", group="velocity"),
+)
+
+
+@dataclass(frozen=True)
+class Reading:
+    """The reading of the columns that the kinematics agree with.
+
+    Parameters
+    ----------
+    changes : tuple of Change
+        Empty where the log is as its names say.
+    motion : Motion
+        Read so.
+    gain : float
+        Log-likelihood gained over the names as they are.
+    """
+
+    changes: tuple[Change, ...]
+    motion: Motion
+    gain: float
+
+
+def find_reading(motion: Motion) -> Reading:
+    """Choose among the readings of the columns.
+
+    Parameters
+    ----------
+    motion : Motion
+        As named.
+
+    Returns
+    -------
+    Reading
+        Fewest changes first: each must gain 15 in log-likelihood (a chance of
+        1e-7) and shrink the residual by 15 %.
+    """
+    scorer = _Scorer(motion)
+    usable = [c for c in (*_PSI, *_RATE, *_VELOCITY, *_POSITION, *_ACROSS) if scorer.applies(c)]
+    base = scorer.score(())
+    ranked = [((), base, 0.0)]
+    ranked += [((c,), scorer.score((c,)), c.cost) for c in usable]
+    for a, b in combinations(usable, 2):
+        if a.group == b.group or set(a.channels) & set(b.channels):
+            continue
+        ranked.append(((a, b), scorer.score((a, b)), a.cost + b.cost))
+    penalty = _LEAST_GAIN * scorer.inflation
+    worth = [score - penalty * cost for _, score, cost in ranked]
+    changes, score, cost = ranked[int(np.argmax(worth))]
+    gain = score - base
+    samples = scorer.samples
+    share = 1.0 - np.exp(-2 * gain / samples) if samples else 0.0
+    if not changes or share < _LEAST_SHARE * cost:
+        return Reading((), motion, 0.0)
+    return Reading(changes, read(motion, changes), float(gain))
+
+
+def read(motion: Motion, changes: tuple[Change, ...]) -> Motion:
+    """Return the motion with its columns read otherwise."""
+    values = dict(motion.values)
+    for change in sorted(changes, key=_order):
+        values = change.apply(values)
+    return replace(motion, values=values)
+
+
+def reading_findings(reading: Reading) -> list[Finding]:
+    """Return one finding for each change of a reading."""
+    found = []
+    for c in reading.changes:
+        tied = "positions and velocities" if c.group in ("velocity", "speed", "position", "length")\
+            else "heading and the other channels"
+        found.append(
+            Finding(
+                c.id,
+                c.channels[0],
+                c.value,
+                (c.value, c.value),
+                c.unit,
+                f"{c.words}: only so do {tied} agree (log-likelihood higher by "
+                f"{reading.gain:.0f})",
+                c.fix,
+                c.channels,
+                c.repair,
+                True,
+                {"changes": reading.changes},
+            )
+        )
+    return found
+
+
+def frame_outcomes(motion: Motion | None) -> list[Outcome]:
+    """Say what could be compared, for the checks of unit, frame and sign."""
+    if motion is None or not (motion.positioned or motion.turned):
+        why = "needs positions, heading and velocities, or heading and yaw rate, that overlap"
+        return [Outcome(i, "cannot tell", why) for i in ("unit", "frame", "sign")]
+    seen = []
+    if motion.positioned:
+        seen.append("positions against velocities and heading")
+    if motion.turned:
+        seen.append("heading against yaw rate")
+    return [Outcome(i, "clean", " and ".join(seen)) for i in ("unit", "frame", "sign")]
+
+
+class _Scorer:
+    """Log-likelihood of a reading; what does not change between readings is kept."""
+
+    def __init__(self, motion: Motion) -> None:
+        self.motion = motion.excerpt(_EXCERPT)
+        motion = self.motion
+        self.cache: dict[tuple[str, tuple[str, ...]], float] = {}
+        self.level = levels(motion)
+        n = len(motion)
+        self.samples = (2 * n if motion.positioned else 0) + (n if motion.turned else 0)
+        # neighbouring samples of a fast log say the same: its likelihood counts them all
+        self.inflation = max(1.0, 0.5 / motion.step / 5)
+
+    def applies(self, change: Change) -> bool:
+        if not all(c in self.motion for c in change.channels):
+            return False
+        if change.group in ("velocity", "position", "speed", "length"):
+            return self.motion.positioned
+        return self.motion.positioned or self.motion.turned
+
+    def score(self, changes: tuple[Change, ...]) -> float:
+        as_read = read(self.motion, changes)
+        total = 0.0
+        if as_read.positioned:
+            total += self._cached("position", changes, as_read)
+        if as_read.turned:
+            total += self._cached("heading", changes, as_read)
+        return total
+
+    def _cached(self, what: str, changes: tuple[Change, ...], as_read: Motion) -> float:
+        relevant = {"x_n", "y_n", "u", "v", "psi"} if what == "position" else {"psi", "r"}
+        key = (what, tuple(c.words for c in changes if set(c.channels) & relevant))
+        if key not in self.cache:
+            score = _position_score if what == "position" else _heading_score
+            self.cache[key] = score(as_read, self.level)
+        return self.cache[key]
+
+
+def _order(change: Change) -> int:
+    # the heading must be right before velocities are turned by it
+    return 1 if change.id == "frame" and change.group == "velocity" else 0
+
+
+def _position_score(m: Motion, level: Array) -> float:
+    walked = integrate(turn(m["psi"], m["u"], m["v"]), m)
+    position = np.column_stack([m["x_n"], m["y_n"]])
+    drift = (m.t - m.t[0])[:, None]
+    # a reading is judged per metre, so that one in kilometres has no advantage
+    scale = float(np.std(np.diff(position, axis=0))) or 1.0
+    found = profile((position - walked) / scale, np.hstack([level, drift]), m)
+    return found.loglik
+
+
+def _heading_score(m: Motion, level: Array) -> float:
+    scale = float(np.std(np.diff(m["psi"]))) or 1.0
+    drift = (m.t - m.t[0])[:, None]
+    rest = (m["psi"] - integrate(m["r"], m)) / scale
+    return profile(rest, np.hstack([level, drift]), m).loglik

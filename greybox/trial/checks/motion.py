@@ -1,0 +1,245 @@
+"""Positions, heading and velocities of a log on one grid, and the likelihood of what ties them.
+
+Positions are the integral of the velocity, turned by the heading; the heading
+is the integral of the yaw rate. What remains of either is white noise of the
+position (or heading) sensor on top of a random walk, the integrated noise of
+the velocity (or rate) sensor: a local-level model. Its innovations are white,
+come from one recursive filter with gain K, and weigh slow and fast
+disagreement as the noises demand; K is estimated by maximum likelihood.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.trial.checks.rows import continuous
+from greybox.trial.recording import Recording, Signal
+from greybox.trial.resampling import clock, covered, runs
+
+Array = NDArray[np.float64]
+
+NAMES = ("x_n", "y_n", "psi", "u", "v", "r")
+_MAX_SAMPLES = 40_000
+_MAX_STRETCHES = 30
+_MIN_STRETCH = 20
+# gains of the local-level filter; 1 is a pure random walk
+GAINS = np.geomspace(0.003, 1.0, 9)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Motion channels on a uniform grid, stretches without a gap one after another.
+
+    Parameters
+    ----------
+    t : ndarray
+        (N,) [s].
+    step : float
+        [s]
+    values : dict of str to ndarray
+        (N,) of those of ``NAMES`` that the log has; ψ continuous.
+    stretches : tuple of (start, stop)
+    """
+
+    t: Array
+    step: float
+    values: dict[str, Array]
+    stretches: tuple[tuple[int, int], ...]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.values
+
+    def __getitem__(self, name: str) -> Array:
+        return self.values[name]
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def excerpt(self, samples: int, pieces: int = 8) -> Motion:
+        """Return at most about `samples` samples, in pieces spread over the log."""
+        if len(self) <= samples:
+            return self
+        size = samples // pieces
+        rows, stretches, at = [], [], 0
+        for k in range(pieces):
+            start = round(k * (len(self) - size) / (pieces - 1))
+            a, b = next(
+                (s for s in self.stretches if s[0] <= start < s[1]), self.stretches[-1]
+            )
+            part = np.arange(max(start, a), min(start + size, b))
+            if len(part) >= _MIN_STRETCH:
+                rows.append(part)
+                stretches.append((at, at + len(part)))
+                at += len(part)
+        index = np.concatenate(rows)
+        values = {n: v[index] for n, v in self.values.items()}
+        return Motion(self.t[index], self.step, values, tuple(stretches))
+
+    @property
+    def positioned(self) -> bool:
+        """Whether positions, heading and velocities are all there."""
+        return all(n in self.values for n in ("x_n", "y_n", "psi", "u", "v"))
+
+    @property
+    def turned(self) -> bool:
+        """Whether heading and yaw rate are there."""
+        return "psi" in self.values and "r" in self.values
+
+
+def make_motion(recording: Recording, names: tuple[str, ...] = NAMES) -> Motion | None:
+    """Bring the motion channels of a recording to one grid; None where too few overlap.
+
+    The grid has the step of the slowest channel; long logs are cut to their
+    first 40000 samples.
+    """
+    signals = {}
+    for name in names:
+        if name in recording:
+            s = _orderly(recording[name])
+            if len(s) >= _MIN_STRETCH:
+                signals[name] = s
+    if not signals:
+        return None
+    clocks = {n: clock(s.t) for n, s in signals.items()}
+    step = max(c.period for c in clocks.values())
+    start = max(float(c.t[0]) for c in clocks.values())
+    stop = min(float(c.t[-1]) for c in clocks.values())
+    if step <= 0 or stop - start < _MIN_STRETCH * step:
+        return None
+    count = min(int((stop - start) / step + 1e-6) + 1, _MAX_SAMPLES)
+    grid = start + step * np.arange(count)
+    keep = np.ones(count, bool)
+    for c in clocks.values():
+        keep &= covered(grid, c)
+    longest = sorted((r for r in runs(keep) if r[1] - r[0] >= _MIN_STRETCH), key=_length)
+    kept = sorted(longest[-_MAX_STRETCHES:])
+    if not kept:
+        return None
+    rows = np.concatenate([np.arange(a, b) for a, b in kept])
+    values = {n: np.interp(grid[rows], s.t, s.value) for n, s in signals.items()}
+    edges = np.concatenate([[0], np.cumsum([b - a for a, b in kept])])
+    stretches = tuple((int(a), int(b)) for a, b in zip(edges[:-1], edges[1:], strict=True))
+    return Motion(grid[rows], step, values, stretches)
+
+
+def _length(run: tuple[int, int]) -> int:
+    return run[1] - run[0]
+
+
+def _orderly(s: Signal) -> Signal:
+    keep = np.isfinite(s.value) & np.isfinite(s.t)
+    t, value = s.t[keep], s.value[keep]
+    t, once = np.unique(t, return_index=True)
+    value = value[once]
+    if s.name == "psi" and len(value):
+        value = continuous(value)
+    return Signal(s.name, t, value, s.unit)
+
+
+def integrate(rate: Array, motion: Motion) -> Array:
+    """Integrate (N,) or (N, m) over time within each stretch, from zero.
+
+    Fourth-order rule on the two samples beside each step, so that a turn
+    between samples is not cut short.
+    """
+    out = np.zeros_like(rate)
+    h = motion.step
+    for a, b in motion.stretches:
+        f = rate[a:b]
+        steps = 0.5 * (f[1:] + f[:-1])
+        if len(f) > 3:
+            steps[1:-1] = (13 * (f[1:-2] + f[2:-1]) - f[:-3] - f[3:]) / 24
+        out[a + 1 : b] = h * np.cumsum(steps, axis=0)
+    return out
+
+
+def whiten(z: Array, gain: float, motion: Motion) -> Array:
+    """Return the innovations of the local-level model along axis 0, stretch by stretch."""
+    from scipy.signal import lfilter
+
+    out = np.empty_like(z)
+    for a, b in motion.stretches:
+        out[a:b] = lfilter([1.0, -1.0], [1.0, gain - 1.0], z[a:b], axis=0)
+    return out
+
+
+def levels(motion: Motion) -> Array:
+    """Return one column of ones for each stretch, (N, S): the unknown start of each."""
+    out = np.zeros((len(motion), len(motion.stretches)))
+    for k, (a, b) in enumerate(motion.stretches):
+        out[a:b, k] = 1.0
+    return out
+
+
+@dataclass(frozen=True)
+class Profile:
+    """Best gain of one residual.
+
+    Parameters
+    ----------
+    loglik : float
+        Concentrated Gaussian log-likelihood, constants left out.
+    gain : float
+    std : float
+        Standard deviation of the innovations.
+    """
+
+    loglik: float
+    gain: float
+    std: float
+
+
+def profile(z: Array, nuisance: Array, motion: Motion, gains: Array = GAINS) -> Profile:
+    """Return the likelihood of a residual, its nuisance fitted, over the gains.
+
+    Parameters
+    ----------
+    z : ndarray
+        (N,) or (N, m) residual, m components that share the nuisance's columns.
+    nuisance : ndarray
+        (N, q), or (N, m, q) where the columns join the components.
+    """
+    best: Profile | None = None
+    joint = nuisance.ndim == 3
+    for gain in gains:
+        e = whiten(z, float(gain), motion)
+        x = whiten(nuisance, float(gain), motion)
+        if joint:
+            e, x = e.reshape(-1), x.reshape(-1, x.shape[-1])
+        rest = e - x @ solve(x, e)
+        variance = float(np.mean(rest**2))
+        loglik = -0.5 * rest.size * np.log(max(variance, 1e-300))
+        if best is None or loglik > best.loglik:
+            best = Profile(loglik, float(gain), float(np.sqrt(variance)))
+    assert best is not None
+    return best
+
+
+def solve(x: Array, y: Array) -> Array:
+    """Return least squares coefficients; directions that are not there get none."""
+    scale = np.sqrt(np.einsum("ij,ij->j", x, x))
+    scale[scale == 0] = 1.0
+    xs = x / scale
+    gram = xs.T @ xs
+    found = np.linalg.lstsq(gram, xs.T @ y, rcond=1e-11)[0]
+    return np.asarray((found.T / scale).T)
+
+
+def smooth(value: Array, motion: Motion, seconds: float) -> Array:
+    """Return a channel without its noise, for derivatives and regressors only."""
+    from scipy.ndimage import gaussian_filter1d
+
+    width = max(seconds / motion.step, 0.5)
+    out = np.empty_like(value)
+    for a, b in motion.stretches:
+        out[a:b] = gaussian_filter1d(value[a:b], width, mode="nearest", truncate=3.0)
+    return out
+
+
+def turn(psi: Array, forward: Array, starboard: Array) -> Array:
+    """Return north and east (N, 2) of body components."""
+    c, s = np.cos(psi), np.sin(psi)
+    return np.column_stack([c * forward - s * starboard, s * forward + c * starboard])

@@ -1,0 +1,572 @@
+"""Clock offsets, lever arm and heading bias, estimated together and named one by one.
+
+Each candidate is one or two parameters of the tie between position, heading,
+velocity and yaw rate; the one that explains most is taken first, the others
+are then judged beside it, so that a late compass is not called a lever arm
+unless the motion cannot tell them apart.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.trial.checks.finding import Finding, Outcome, Repair
+from greybox.trial.checks.motion import (
+    GAINS,
+    Motion,
+    integrate,
+    levels,
+    profile,
+    smooth,
+    solve,
+    turn,
+    whiten,
+)
+from greybox.vessel.vessel import Vessel
+
+Array = NDArray[np.float64]
+
+_CLOCKS = ("x_n", "y_n", "psi", "u", "v", "r")
+# what is too small to matter, and how many standard errors prove it
+_LEAST_CLOCK = 0.1
+_LEAST_HEADING = np.radians(0.75)
+_LEAST_ARM = (0.1, 0.02)
+_SIGMAS = 4.5
+_LEAST_GAIN = 12.0
+# wide enough to see a whole turn, which tells a late compass from a lever arm
+_SCAN = (-8.0, -6.0, -4.5, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 4.5, 6.0, 8.0)
+_ROUNDS = 4
+_MOST = 3
+_SMOOTH = 0.8
+# beyond these nothing can be said
+_VAGUE_HEADING = np.radians(1.0)
+_VAGUE_CLOCK = 0.3
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One defect as directions of the parameters.
+
+    Parameters
+    ----------
+    id : {"clock_offset", "lever_arm", "heading_bias"}
+    channels : tuple of str
+    parameters : tuple of str
+        Names among ``clock`` (its channels late together), ``arm_x``, ``arm_y``, ``bias``.
+    cost : float
+        In log-likelihood: what many columns together must explain more than one.
+    """
+
+    id: str
+    channels: tuple[str, ...]
+    cost: float = 0.0
+
+
+_CANDIDATES = (
+    Candidate("clock_offset", ("psi",)),
+    Candidate("clock_offset", ("r",)),
+    Candidate("clock_offset", ("x_n", "y_n")),
+    Candidate("clock_offset", ("u", "v")),
+    Candidate("clock_offset", ("psi", "r"), 1.0),
+    Candidate("clock_offset", ("u", "v", "r"), 1.0),
+    Candidate("clock_offset", ("u",), 3.0),
+    Candidate("clock_offset", ("v",), 3.0),
+    Candidate("clock_offset", ("x_n",), 3.0),
+    Candidate("clock_offset", ("y_n",), 3.0),
+    Candidate("lever_arm", ("x_n", "y_n"), 1.0),
+    Candidate("heading_bias", ("psi",)),
+)
+
+
+@dataclass(frozen=True)
+class State:
+    """Parameters of the tie.
+
+    Parameters
+    ----------
+    late : dict of str to float
+        By channel: seconds by which it is late.
+    bias : float
+        Measured minus true heading [rad].
+    arm : tuple of float
+        Antenna, forward and starboard of the body origin [m].
+    """
+
+    late: dict[str, float] = field(default_factory=dict)
+    bias: float = 0.0
+    arm: tuple[float, float] = (0.0, 0.0)
+
+    def moved(self, candidate: Candidate, step: Array) -> State:
+        """Return the state with a candidate's parameters moved."""
+        if candidate.id == "clock_offset":
+            late = dict(self.late)
+            for c in candidate.channels:
+                late[c] = late.get(c, 0.0) + float(step[0])
+            return replace(self, late=late)
+        if candidate.id == "heading_bias":
+            return replace(self, bias=self.bias + float(step[0]))
+        return replace(self, arm=(self.arm[0] + float(step[0]), self.arm[1] + float(step[1])))
+
+
+def size(candidate: Candidate) -> int:
+    """Return the number of parameters of a candidate."""
+    return 2 if candidate.id == "lever_arm" else 1
+
+
+class Tie:
+    """Residuals of positions and heading for given parameters, and their derivatives."""
+
+    def __init__(self, motion: Motion) -> None:
+        self.motion = motion
+        self.smooth = {n: smooth(v, motion, _SMOOTH) for n, v in motion.values.items()}
+        self.level = levels(motion)
+        n, s = self.level.shape
+        self.drift = (motion.t - motion.t[0]) / max(float(np.ptp(motion.t)), 1e-9)
+        self.columns = 2 * s + 3
+        self.positioned, self.turned = motion.positioned, motion.turned
+        self.samples = (2 * n if self.positioned else 0) + (n if self.turned else 0)
+
+    def _at(self, name: str, state: State, values: dict[str, Array]) -> Array:
+        late = state.late.get(name, 0.0)
+        if late == 0.0:
+            return values[name]
+        # what is true now is recorded `late` seconds later
+        out = np.empty_like(values[name])
+        for a, b in self.motion.stretches:
+            t = self.motion.t[a:b]
+            out[a:b] = np.interp(t + late, t, values[name][a:b])
+        return out
+
+    def walked(self, state: State, values: dict[str, Array]) -> Array:
+        """Return the way made by velocities and heading (N, 2) [m]."""
+        psi = self._at("psi", state, values) - state.bias
+        return integrate(
+            turn(psi, self._at("u", state, values), self._at("v", state, values)), self.motion
+        )
+
+    def position(self, state: State, values: dict[str, Array], walked: Array | None = None) -> (
+        Array
+    ):
+        """Return measured position minus that of velocity, heading and lever arm (N, 2) [m]."""
+        if walked is None:
+            walked = self.walked(state, values)
+        psi = self._at("psi", state, values) - state.bias
+        arm = turn(psi, np.full(len(psi), state.arm[0]), np.full(len(psi), state.arm[1]))
+        measured = np.column_stack(
+            [self._at("x_n", state, values), self._at("y_n", state, values)]
+        )
+        return measured - walked - arm
+
+    def heading(self, state: State, values: dict[str, Array]) -> Array:
+        """Return measured heading minus that of the yaw rate (N,) [rad]."""
+        return self._at("psi", state, values) - integrate(
+            self._at("r", state, values), self.motion
+        )
+
+    def nuisance(self, state: State) -> tuple[Array, Array]:
+        """Return the columns for starts, a constant velocity, and scales, (N, 2, q) and (N, q)."""
+        n, s = self.level.shape
+        pos = np.zeros((n, 2, 2 * s + 3))
+        if self.positioned:
+            pos[:, 0, :s] = self.level
+            pos[:, 1, s : 2 * s] = self.level
+            pos[:, 0, 2 * s] = self.drift
+            pos[:, 1, 2 * s + 1] = self.drift
+            pos[:, :, 2 * s + 2] = self.walked(state, self.smooth)
+        head = np.zeros((n, s + 2))
+        if self.turned:
+            head[:, :s] = self.level
+            head[:, s] = self.drift
+            head[:, s + 1] = integrate(self._at("r", state, self.smooth), self.motion)
+        return pos, head
+
+    def derivative(self, candidate: Candidate, state: State) -> tuple[Array, Array]:
+        """Return minus the derivatives of both residuals, (N, 2, k) and (N, k)."""
+        n, k = len(self.motion), size(candidate)
+        pos, head = np.zeros((n, 2, k)), np.zeros((n, k))
+        for j in range(k):
+            unit = np.zeros(k)
+            unit[j] = 0.5 * {"clock_offset": max(0.2, self.motion.step)}.get(candidate.id, 0.02)
+            plus, minus = state.moved(candidate, unit), state.moved(candidate, -unit)
+            if self.positioned:
+                change = self.position(plus, self.smooth) - self.position(minus, self.smooth)
+                pos[:, :, j] = -change / (2 * unit[j])
+            if self.turned and candidate.id == "clock_offset":
+                turned = self.heading(plus, self.smooth) - self.heading(minus, self.smooth)
+                head[:, j] = -turned / (2 * unit[j])
+        return pos, head
+
+
+@dataclass(frozen=True)
+class Gain:
+    """Gains and innovations of both residuals at some parameters."""
+
+    position: tuple[float, float]
+    heading: tuple[float, float]
+    loglik: float
+
+
+def _gain(tie: Tie, state: State, gains: Array = GAINS) -> Gain:
+    pos, head = tie.nuisance(state)
+    total = 0.0
+    p = h = (1.0, 1.0)
+    values = tie.motion.values
+    if tie.positioned:
+        found = profile(tie.position(state, values), pos, tie.motion, gains)
+        total += found.loglik
+        p = (found.gain, found.std)
+    if tie.turned:
+        found = profile(tie.heading(state, values), head, tie.motion, gains)
+        total += found.loglik
+        h = (found.gain, found.std)
+    return Gain(p, h, total)
+
+
+def _stack(tie: Tie, gain: Gain, pos: Array, head: Array) -> Array:
+    """Whiten both blocks and stack them to rows, (3 N or less, q)."""
+    rows = []
+    if tie.positioned:
+        white = whiten(pos, gain.position[0], tie.motion) / gain.position[1]
+        rows.append(white.reshape(-1, *white.shape[2:]))
+    if tie.turned:
+        rows.append(whiten(head, gain.heading[0], tie.motion) / gain.heading[1])
+    return np.concatenate(rows)
+
+
+def _residual(tie: Tie, state: State, gain: Gain) -> Array:
+    values = tie.motion.values
+    n = len(tie.motion)
+    pos = tie.position(state, values) if tie.positioned else np.zeros((n, 2))
+    head = tie.heading(state, values) if tie.turned else np.zeros(n)
+    return _stack(tie, gain, pos, head)
+
+
+def _columns(tie: Tie, state: State, gain: Gain) -> Array:
+    pos, head = tie.nuisance(state)
+    n, q = len(tie.motion), pos.shape[2] + head.shape[1]
+    wide_pos, wide_head = np.zeros((n, 2, q)), np.zeros((n, q))
+    wide_pos[:, :, : pos.shape[2]] = pos
+    wide_head[:, pos.shape[2] :] = head
+    return _stack(tie, gain, wide_pos, wide_head)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Estimate of the parameters of some candidates together.
+
+    Parameters
+    ----------
+    state : State
+    candidates : tuple of Candidate
+    covariance : ndarray
+        (k, k) of the candidates' parameters in order, robust to coloured residuals.
+    loglik : float
+    """
+
+    state: State
+    candidates: tuple[Candidate, ...]
+    covariance: Array
+    loglik: float
+    value: Array
+
+
+def fit(tie: Tie, candidates: tuple[Candidate, ...], start: State, rounds: int = _ROUNDS) -> Fit:
+    """Estimate the parameters of some candidates together, by Gauss-Newton.
+
+    Parameters
+    ----------
+    tie : Tie
+    candidates : tuple of Candidate
+    start : State
+    rounds : int
+        Steps at most.
+
+    Returns
+    -------
+    Fit
+    """
+    state = start
+    sizes = [size(c) for c in candidates]
+    edges = np.concatenate([[0], np.cumsum(sizes)]).astype(int)
+    total = np.zeros(int(edges[-1]))
+    gain = _gain(tie, state)
+    x = rest = np.zeros((0, 0))
+    for _ in range(rounds):
+        blocks = [_stack(tie, gain, *tie.derivative(c, state)) for c in candidates]
+        nuisance = _columns(tie, state, gain)
+        x = np.hstack([*blocks, nuisance])
+        y = _residual(tie, state, gain)
+        step = solve(x, y)
+        rest = y - x @ step
+        step = np.clip(step[: edges[-1]], -4.0, 4.0)
+        for c, a, b in zip(candidates, edges[:-1], edges[1:], strict=True):
+            state = state.moved(c, step[a:b])
+        total += step
+        gain = _gain(tie, state)
+        if np.all(np.abs(step) < 1e-3):
+            break
+    covariance = _robust(x, rest, int(edges[-1]), tie)
+    return Fit(state, candidates, covariance, gain.loglik, total)
+
+
+def _robust(x: Array, rest: Array, wanted: int, tie: Tie) -> Array:
+    """Return the covariance (wanted, wanted) by Newey and West, components side by side."""
+    scale = np.sqrt(np.einsum("ij,ij->j", x, x))
+    scale[scale == 0] = 1.0
+    xs = x / scale
+    bread = np.linalg.pinv(xs.T @ xs, rcond=1e-11)
+    scores = xs * rest[:, None]
+    n = len(tie.motion)
+    lags = int(min(max(8.0 / tie.motion.step, 4 * (n / 100) ** (2 / 9)), n / 5))
+    meat = np.zeros_like(bread)
+    at = 0
+    blocks = ([(2, n)] if tie.positioned else []) + ([(1, n)] if tie.turned else [])
+    for width, count in blocks:
+        part = scores[at : at + width * count].reshape(count, width, -1).sum(axis=1)
+        at += width * count
+        meat += part.T @ part
+        for lag in range(1, lags + 1):
+            cross = part[lag:].T @ part[:-lag]
+            meat += (1 - lag / (lags + 1)) * (cross + cross.T)
+    full = bread @ meat @ bread
+    plain = bread * float(np.mean(rest**2))
+    # the robust one has few degrees of freedom: never below what white noise would give
+    factor = np.sqrt(np.maximum(np.diag(full), np.diag(plain)) / np.maximum(np.diag(full), 1e-300))
+    full = full * np.outer(factor, factor)
+    out = full[:wanted, :wanted] / np.outer(scale[:wanted], scale[:wanted])
+    return np.asarray(out)
+
+
+def find_offsets(motion: Motion, vessel: Vessel) -> tuple[list[Finding], list[Outcome]]:
+    """Find clock offsets, lever arm and heading bias.
+
+    Parameters
+    ----------
+    motion : Motion
+        Columns read as they are meant (see `find_reading`).
+    vessel : Vessel
+        Its antenna is where the positions are taken to be measured.
+
+    Returns
+    -------
+    findings : list of Finding
+    outcomes : list of Outcome
+        What was compared, or why nothing in the log can show it.
+    """
+    antenna = tuple(float(a) for a in vessel.sensors.get("antenna", (0.0, 0.0))[:2])
+    if not (motion.positioned or motion.turned):
+        why = "needs heading and yaw rate, or positions, heading and velocities of their own sensor"
+        return [], [Outcome(i, "cannot tell", why) for i in _IDS]
+    tie = Tie(motion)
+    usable = [c for c in _CANDIDATES if _usable(c, motion)]
+    chosen: tuple[Candidate, ...] = ()
+    start = State(arm=(antenna[0], antenna[1]))
+    best = Fit(start, (), np.zeros((0, 0)), _gain(tie, start).loglik, np.zeros(0))
+    inflation = max(1.0, 0.1 / motion.step)
+    for _ in range(_MOST):
+        trials = []
+        for c in usable:
+            if any(c.id == k.id and set(c.channels) & set(k.channels) for k in chosen):
+                continue
+            trial = fit(tie, (*chosen, c), _scan(tie, c, best.state))
+            trials.append((trial.loglik - c.cost * inflation, trial))
+        if not trials:
+            break
+        worth, trial = max(trials, key=_first)
+        if worth - best.loglik < _LEAST_GAIN * inflation:
+            break
+        best, chosen = trial, trial.candidates
+    final = fit(tie, chosen, best.state) if chosen else best
+    return _findings(final, motion, vessel, antenna), _outcomes(tie, final, usable)
+
+
+_IDS = ("clock_offset", "lever_arm", "heading_bias")
+
+
+def _first(pair: tuple[float, Fit]) -> float:
+    return pair[0]
+
+
+def _usable(c: Candidate, motion: Motion) -> bool:
+    if not all(n in motion for n in c.channels):
+        return False
+    if c.id != "clock_offset":
+        return motion.positioned
+    if not motion.positioned:
+        # heading against yaw rate alone: which of the two is late cannot be told
+        return c.channels == ("r",)
+    if c.channels in (("psi", "r"), ("u", "v", "r")):
+        return motion.turned
+    return motion.turned or "r" not in c.channels
+
+
+def _scan(tie: Tie, candidate: Candidate, state: State) -> State:
+    """Return a start near the best of a coarse scan, so that large offsets are found."""
+    if candidate.id == "lever_arm":
+        return state
+    gain = _gain(tie, state, GAINS[2::3])
+    steps = (
+        np.array(_SCAN)
+        if candidate.id == "clock_offset"
+        else np.radians([-90, -60, -40, -25, -12, 0, 12, 25, 40, 60, 90, 180])
+    )
+    nuisance = _columns(tie, state, gain)
+    scores = []
+    for step in steps:
+        y = _residual(tie, state.moved(candidate, np.array([step])), gain)
+        rest = y - nuisance @ solve(nuisance, y)
+        scores.append(float(rest @ rest))
+    return state.moved(candidate, np.array([steps[int(np.argmin(scores))]]))
+
+
+def _findings(
+    found: Fit, motion: Motion, vessel: Vessel, antenna: tuple[float, ...]
+) -> list[Finding]:
+    findings = []
+    at = 0
+    for c in found.candidates:
+        k = size(c)
+        cov = found.covariance[at : at + k, at : at + k]
+        at += k
+        std = np.sqrt(np.diag(cov))
+        if c.id == "clock_offset":
+            value = found.state.late.get(c.channels[0], 0.0)
+            others = [o for o in found.candidates if o is not c and o.id == c.id]
+            del others
+            least = _LEAST_CLOCK
+            if abs(value) < least or abs(value) < _SIGMAS * std[0]:
+                continue
+            findings.append(_clock_finding(c, value, float(std[0]), motion))
+        elif c.id == "heading_bias":
+            value = float(np.angle(np.exp(1j * found.state.bias)))
+            if abs(value) < _LEAST_HEADING or abs(value) < _SIGMAS * std[0]:
+                continue
+            findings.append(_heading_finding(value, float(std[0])))
+        else:
+            arm = np.array(found.state.arm)
+            off = arm - np.array(antenna)
+            least = _LEAST_ARM[0] + _LEAST_ARM[1] * vessel.length
+            wald = float(off @ np.linalg.solve(cov + 1e-12 * np.eye(2), off))
+            if np.hypot(*off) < least or wald < _SIGMAS**2 + 4:
+                continue
+            findings.append(_arm_finding(arm, std, antenna))
+    return findings
+
+
+def _clock_finding(c: Candidate, value: float, std: float, motion: Motion) -> Finding:
+    names = " and ".join(c.channels)
+    late = "late" if value > 0 else "early"
+    against = [n for n in ("x_n", "psi", "u", "r") if n in motion and n not in c.channels]
+    return Finding(
+        "clock_offset",
+        c.channels[0],
+        value,
+        (value - 1.96 * std, value + 1.96 * std),
+        "s",
+        f"{names} {'comes' if len(c.channels) == 1 else 'come'} {abs(value):.2f} s {late} against "
+        f"{_words(against)}: shifted so, positions, velocities and heading agree",
+        f"shift {names} by {-value:+.2f} s (import --fix does), and look for the delay in the "
+        f"logger or a filter",
+        c.channels,
+        (Repair("shift", c.channels, (value,)),),
+        True,
+    )
+
+
+def _words(names: list[str]) -> str:
+    said = {"x_n": "the positions", "psi": "the heading", "u": "the velocities", "r": "the rate"}
+    return " and ".join(said[n] for n in names) or "the rest"
+
+
+def _heading_finding(value: float, std: float) -> Finding:
+    return Finding(
+        "heading_bias",
+        "psi",
+        value,
+        (value - 1.96 * std, value + 1.96 * std),
+        "rad",
+        f"the heading is {np.degrees(abs(value)):.1f} deg "
+        f"{'clockwise' if value > 0 else 'anticlockwise'} of the direction in which u and v carry "
+        f"the positions ({np.degrees(std) * 1.96:.1f} deg at 95 %); a constant velocity of the "
+        f"water is allowed for",
+        f"subtract {value:.4f} rad from psi if the compass is misaligned (import --fix-also "
+        f"heading_bias does), or turn u, v by as much if the velocity sensor is",
+        ("psi",),
+        (Repair("turn", ("psi",), (value,)),),
+        False,
+    )
+
+
+def _arm_finding(arm: Array, std: Array, antenna: tuple[float, ...]) -> Finding:
+    ci = tuple((float(a - 1.96 * s), float(a + 1.96 * s)) for a, s in zip(arm, std, strict=True))
+    said = f"({antenna[0]:g}, {antenna[1]:g})"
+    return Finding(
+        "lever_arm",
+        "x_n",
+        (float(arm[0]), float(arm[1])),
+        ci,
+        "m",
+        f"the positions are those of a point {arm[0]:+.2f} m forward and {arm[1]:+.2f} m to "
+        f"starboard of where u and v hold (the vessel file says {said}): they swing by so much "
+        f"when the ship turns",
+        f"write antenna = [{arm[0]:.2f}, {arm[1]:.2f}] in [sensors], or import --fix, which moves "
+        f"the positions to where the vessel file has them",
+        ("x_n", "y_n"),
+        (Repair("lever", ("x_n", "y_n"), (float(arm[0] - antenna[0]), float(arm[1] - antenna[1]))),),
+        True,
+    )
+
+
+def _outcomes(tie: Tie, found: Fit, usable: list[Candidate]) -> list[Outcome]:
+    """Say for each id what its standard error would allow to see."""
+    outcomes = []
+    m = tie.motion
+    for kind in _IDS:
+        members = [c for c in usable if c.id == kind and c not in found.candidates]
+        if not any(c.id == kind for c in usable):
+            outcomes.append(
+                Outcome(
+                    kind, "cannot tell",
+                    "needs positions, heading and velocities of a sensor of their own",
+                )
+            )  # fmt: skip
+            continue
+        if kind == "clock_offset" and not m.positioned:
+            outcomes.append(
+                Outcome(kind, "clean", "heading against yaw rate; no positions to tell which")
+            )
+            continue
+        if not members or kind == "clock_offset":
+            outcomes.append(Outcome(kind, "clean", "positions, velocities and heading compared"))
+            continue
+        with_it = fit(tie, (*found.candidates, members[0]), found.state, rounds=1)
+        k = size(members[0])
+        std = np.sqrt(np.diag(with_it.covariance))[-k:]
+        span = np.degrees(np.ptp(m["psi"]))
+        if kind == "heading_bias" and std[0] > _VAGUE_HEADING:
+            outcomes.append(
+                Outcome(
+                    kind, "cannot tell",
+                    f"the heading stays within {span:.0f} deg and the speed nearly constant: a "
+                    f"bias cannot be told from a current (standard error "
+                    f"{np.degrees(std[0]):.1f} deg)",
+                )
+            )  # fmt: skip
+        elif kind == "lever_arm" and float(np.max(std)) > 0.5:
+            outcomes.append(
+                Outcome(
+                    kind, "cannot tell",
+                    f"the heading turns too little ({span:.0f} deg): standard error "
+                    f"{float(np.max(std)):.2g} m",
+                )
+            )  # fmt: skip
+        else:
+            error = (
+                f"{np.degrees(std[0]):.2f} deg" if kind == "heading_bias" else
+                f"{std[0]:.2g} and {std[1]:.2g} m"
+            )
+            outcomes.append(Outcome(kind, "clean", f"standard error {error}"))
+    return outcomes

@@ -1,0 +1,392 @@
+"""Defects that show in one signal alone: times, holes, spikes, stuck and coarse values."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.channels import ANGLES
+from greybox.trial.checks.finding import Finding, Repair
+from greybox.trial.recording import Recording, Signal
+from greybox.trial.resampling import HOLE, clock, runs
+from greybox.vessel.vessel import Vessel
+
+Array = NDArray[np.float64]
+
+MOTION = ("x_n", "y_n", "psi", "u", "v", "r", "v_n", "v_e", "u_q", "v_q")
+
+# a spike stands out of its neighbours by this many robust standard deviations
+_SPIKE = 10.0
+_LOCAL_SPIKE = 7.0
+_SPIKE_WIDTH = 3
+# a sensor that is stuck repeats itself this long
+_STUCK_SECONDS = 3.0
+_STUCK_SAMPLES = 8
+
+
+def time_findings(recording: Recording) -> list[Finding]:
+    """Find repeated, reversed and missing times, once for every clock.
+
+    Parameters
+    ----------
+    recording : Recording
+        Canonical signals.
+    """
+    found: list[Finding] = []
+    for names, t in _clocks(recording):
+        finite = t[np.isfinite(t)]
+        steps = np.diff(finite)
+        repeated, back = int((steps == 0).sum()), int((steps < 0).sum())
+        if repeated or back:
+            count = repeated + back
+            k = int(np.flatnonzero(steps <= 0)[0])
+            what = [f"{repeated} repeat the one before"] if repeated else []
+            what += [f"{back} go back"] if back else []
+            found.append(
+                Finding(
+                    "duplicate_time",
+                    "t",
+                    float(count),
+                    (float(count), float(count)),
+                    "1",
+                    f"of {len(finite)} times of {_listed(names)}, {' and '.join(what)}, the first "
+                    f"after t = {finite[k]:.6g} s",
+                    "sort the rows by time and keep the first of those that repeat "
+                    "(import --fix does)",
+                    ("t",),
+                    (Repair("order", names),),
+                    True,
+                    {"t": finite, "steps": steps},
+                )
+            )
+        found += _gaps(names, np.unique(finite))
+    return found
+
+
+def _gaps(names: tuple[str, ...], t: Array) -> list[Finding]:
+    if len(t) < 4:
+        return []
+    usual = clock(t).period
+    steps = np.diff(t)
+    wide = np.flatnonzero(steps > HOLE * usual)
+    if not len(wide):
+        return []
+    longest = int(wide[np.argmax(steps[wide])])
+    size = float(steps[longest])
+    return [
+        Finding(
+            "gap",
+            "t",
+            size,
+            (size, size),
+            "s",
+            f"{len(wide)} time{'s' if len(wide) > 1 else ''} {_listed(names)} has no value for "
+            f"more than {HOLE:g} usual steps of {usual:.4g} s, the longest {size:.4g} s after "
+            f"t = {t[longest]:.6g} s",
+            "none needed: import keeps gaps as gaps, and each stretch becomes a segment",
+            ("t",),
+            (),
+            False,
+            {"t": t, "gaps": [(float(t[k]), float(t[k + 1])) for k in wide[:200]]},
+        )
+    ]
+
+
+def missing_findings(recording: Recording) -> list[Finding]:
+    """Find samples without a number, one finding for all columns that miss the same rows."""
+    groups: dict[bytes, list[Signal]] = {}
+    for s in recording.signals:
+        bad = ~np.isfinite(s.value)
+        if bad.any() and not _own_rate(bad):
+            groups.setdefault(np.packbits(bad).tobytes(), []).append(s)
+    # rows without a time are no rows at all
+    found = []
+    for members in groups.values():
+        bad = ~np.isfinite(members[0].value)
+        stretches = runs(bad)
+        names = tuple(s.name for s in members)
+        t, n = members[0].t, len(bad)
+        start = t[stretches[0][0]]
+        where = "at the end" if len(stretches) == 1 and stretches[0][1] == n else (
+            f"first at t = {start:.6g} s" if np.isfinite(start) else
+            f"first in row {stretches[0][0] + 1}"
+        )
+        count = float(bad.sum())
+        found.append(
+            Finding(
+                "nan",
+                names[0],
+                count,
+                (count, count),
+                "1",
+                f"{int(count)} of {n} samples of {_listed(names)} hold no number, in "
+                f"{len(stretches)} stretch{'es' if len(stretches) > 1 else ''}, {where}",
+                "leave them out: import does, and keeps longer stretches as gaps",
+                names,
+                (Repair("drop", names),),
+                True,
+                {"t": t, "bad": bad},
+            )
+        )
+    return found
+
+
+def _own_rate(bad: NDArray[np.bool_]) -> bool:
+    """Whether the holes are those of a slow sensor in a fast table: most rows, evenly."""
+    good = np.flatnonzero(~bad)
+    if len(good) < 5 or bad.mean() < 0.4:
+        return False
+    steps = np.diff(good)
+    return bool(np.mean(np.abs(steps - np.median(steps)) <= 1) > 0.95)
+
+
+def spike_findings(recording: Recording) -> list[Finding]:
+    """Find single samples, or up to three, that leave their neighbours and come back."""
+    found = []
+    for s in _motion(recording):
+        t, value = _clean(s)
+        if len(value) < 30:
+            continue
+        spikes, scale, gap = _spikes(value)
+        if not len(spikes):
+            continue
+        worst = spikes[np.argmax(np.abs(gap[spikes]))]
+        size = float(gap[worst])
+        half = 1.96 * scale
+        found.append(
+            Finding(
+                "outlier",
+                s.name,
+                size,
+                (size - half, size + half),
+                s.unit or "1",
+                f"{len(spikes)} sample{'s' if len(spikes) > 1 else ''} of {s.name} stand out of "
+                f"their neighbours, the largest by {size:.3g} {s.unit} at t = {t[worst]:.6g} s, "
+                f"where the neighbours scatter by {scale:.2g}",
+                "leave those samples out (import --fix does; what is missing is bridged where "
+                "one sample is, else a gap)",
+                (s.name,),
+                (Repair("drop", (s.name,), tuple(float(x) for x in t[spikes])),),
+                True,
+                {"t": t, "value": value, "spikes": spikes},
+            )
+        )
+    return found
+
+
+def _spikes(value: Array) -> tuple[NDArray[np.int64], float, Array]:
+    """Return indices, robust scatter, and each sample's distance from its neighbours."""
+    from scipy.ndimage import median_filter
+
+    width = 2 * _SPIKE_WIDTH + 3
+    gap = value - median_filter(value, size=width, mode="nearest")
+    scale = 1.4826 * float(np.median(np.abs(gap)))
+    step = _quantum(value)
+    scale = max(scale, step / np.sqrt(12), 1e-12 * max(float(np.abs(value).max()), 1e-300))
+    local = 1.4826 * median_filter(np.abs(gap), size=51, mode="nearest")
+    limit = np.maximum(_SPIKE * scale, _LOCAL_SPIKE * local) + 2 * step
+    out = np.abs(gap) > limit
+    wide = [k for a, b in runs(out) if b - a <= _SPIKE_WIDTH for k in range(a, b)]
+    return np.array(wide, dtype=np.int64), scale, gap
+
+
+def coarse_findings(recording: Recording) -> list[Finding]:
+    """Find signals that move in steps coarser than what they measure."""
+    found = []
+    for s in _motion(recording):
+        t, value = _clean(s)
+        step = _quantum(value)
+        if step <= 0 or len(value) < 50:
+            continue
+        change = np.abs(np.diff(value))
+        moving = change > 0
+        if moving.sum() < 10:
+            continue
+        # held samples of a slow sensor repeat too, but then jump by many steps
+        still = 1.0 - moving.mean()
+        single = float(np.mean(change[moving] < 1.5 * step))
+        if still < 0.5 or single < 0.5:
+            continue
+        found.append(
+            Finding(
+                "quantised",
+                s.name,
+                step,
+                (step, step),
+                s.unit or "1",
+                f"{s.name} moves in steps of {step:.4g} {s.unit} and repeats itself in "
+                f"{100 * still:.0f} % of the samples: its changes are finer than its steps",
+                "record it with more digits; until then use a longer sample time, and expect "
+                f"an error of {step / np.sqrt(12):.2g} {s.unit} (standard deviation)",
+                (s.name,),
+                (),
+                False,
+                {"t": t, "value": value},
+            )
+        )
+    return found
+
+
+def _quantum(value: Array) -> float:
+    """Return the step of which all values are multiples; 0 where there is none."""
+    part = value[: min(len(value), 20000)]
+    unique = np.unique(part)
+    if not 3 <= len(unique) <= 0.3 * len(part) + 3:
+        return 0.0
+    steps = np.diff(unique)
+    fine = float(np.quantile(steps, 0.1))
+    near = steps[steps < 1.2 * fine]
+    step = float(np.mean(near))
+    multiple = steps / step
+    # positions from latitude and longitude lie on a grid that bends a little
+    return step if np.mean(np.abs(multiple - np.round(multiple)) < 0.1) > 0.9 else 0.0
+
+
+def stuck_findings(recording: Recording, vessel: Vessel) -> list[Finding]:
+    """Find signals that repeat one value while the ship moves by the others."""
+    found = []
+    signals = list(_motion(recording))
+    for s in signals:
+        t, value = _clean(s)
+        if len(value) < 50:
+            continue
+        same = np.diff(value) == 0
+        stretches = [(a, b + 1) for a, b in runs(same)]
+        if not stretches:
+            continue
+        period = clock(t).period
+        lengths = np.array([b - a for a, b in stretches])
+        longest = int(np.argmax(lengths))
+        a, b = stretches[longest]
+        span = float(t[b - 1] - t[a])
+        # runs of a held or coarse signal are its habit; a stuck one is far longer
+        usual = float(np.quantile(lengths, 0.9)) if len(lengths) > 5 else 1.0
+        enough = max(_STUCK_SECONDS, 5 * usual * period)
+        if span < enough or lengths[longest] < _STUCK_SAMPLES:
+            continue
+        if not _moves(s.name, t[a], t[b - 1], signals, _quantum(value)):
+            continue
+        found.append(
+            Finding(
+                "stuck",
+                s.name,
+                span,
+                (span, span),
+                "s",
+                f"{s.name} stays at {value[a]:.6g} {s.unit} for {span:.4g} s from "
+                f"t = {t[a]:.6g} s ({b - a} samples), while the other channels move",
+                "leave that stretch out (import --fix makes it a gap) and look at the sensor",
+                (s.name,),
+                (Repair("drop", (s.name,), tuple(float(x) for x in t[a + 1 : b])),),
+                True,
+                {"t": t, "value": value, "stretch": (float(t[a]), float(t[b - 1]))},
+            )
+        )
+    return found
+
+
+def _moves(name: str, start: float, stop: float, signals: list[Signal], step: float) -> bool:
+    """Whether the rest of the log says that this channel should have changed."""
+    def part(other: str) -> Array | None:
+        for s in signals:
+            if s.name == other:
+                t, value = _clean(s)
+                inside = value[(t >= start) & (t <= stop)]
+                return inside if len(inside) > 3 else None
+        return None
+
+    span = stop - start
+    if name in ("x_n", "y_n"):
+        u, v = part("u"), part("v")
+        if u is None or v is None:
+            u, v = part("v_n"), part("v_e")
+        psi = part("psi")
+        if u is not None and v is not None and psi is not None and len(u) == len(v) == len(psi):
+            c, s = np.cos(psi), np.sin(psi)
+            rate = c * u - s * v if name == "x_n" else s * u + c * v
+            return bool(abs(rate.mean()) * span > max(0.3, 3 * step))
+    if name == "psi":
+        r = part("r")
+        if r is not None:
+            return bool(abs(r.mean()) * span > max(0.03, 3 * step))
+    # a velocity repeats exactly only where everything stands still, or it is stuck
+    for other in signals:
+        inside = part(other.name)
+        if other.name == name or inside is None:
+            continue
+        whole = _clean(other)[1]
+        if np.ptp(inside) > 0.3 * np.std(whole) > 0:
+            return True
+    return False
+
+
+def angle_unit_findings(recording: Recording, vessel: Vessel) -> list[Finding]:
+    """Find degrees under a radian name by range: angles of wind and thrusters."""
+    found = []
+    rudders = {t.rudder for t in vessel.thrusters if t.rudder}
+    for s in recording.signals:
+        if s.name not in (ANGLES | vessel.angle_commands) - {"psi", "cog"}:
+            continue
+        _, value = _clean(s)
+        if len(value) < 3:
+            continue
+        largest = float(np.quantile(np.abs(value), 0.98))
+        # no rudder passes a right angle, no wrapped angle two turns
+        limit = np.pi / 2 if s.name in rudders else 4 * np.pi
+        if largest > limit:
+            factor = float(np.pi / 180)
+            found.append(
+                Finding(
+                    "unit",
+                    s.name,
+                    180 / np.pi,
+                    (180 / np.pi, 180 / np.pi),
+                    "deg per rad",
+                    f"{s.name} reaches {largest:.4g}, which cannot be radians: degrees under a "
+                    f"radian name",
+                    f"multiply {s.name} by pi/180 (import --fix does), or map it with "
+                    f"unit = \"deg\" in [columns]",
+                    (s.name,),
+                    (Repair("scale", (s.name,), (factor,)),),
+                    True,
+                    {"t": s.t, "value": s.value},
+                )
+            )
+    return found
+
+
+def _motion(recording: Recording) -> Iterable[Signal]:
+    return (s for s in recording.signals if s.name in MOTION)
+
+
+def _clean(s: Signal) -> tuple[Array, Array]:
+    keep = np.isfinite(s.value) & np.isfinite(s.t)
+    t, value = (s.t, s.value) if keep.all() else (s.t[keep], s.value[keep])
+    if s.name == "psi":
+        value = continuous(value)
+    return t, value
+
+
+def continuous(angle: Array) -> Array:
+    """Return an angle without its wraps, be they of 2π or of 360."""
+    jumps = np.abs(np.diff(angle))
+    if np.any((jumps > 300) & (jumps < 361)):
+        return np.asarray(np.unwrap(angle, period=360.0))
+    return np.asarray(np.unwrap(angle))
+
+
+def _clocks(recording: Recording) -> list[tuple[tuple[str, ...], Array]]:
+    """Return the signals that share each clock."""
+    groups: dict[int, tuple[list[str], Array]] = {}
+    for s in recording.signals:
+        groups.setdefault(id(s.t), ([], s.t))[0].append(s.name)
+    return [(tuple(names), t) for names, t in groups.values()]
+
+
+def _listed(names: Iterable[str]) -> str:
+    names = list(names)
+    if len(names) > 4:
+        return f"{', '.join(names[:3])} and {len(names) - 3} more"
+    return ", ".join(names)

@@ -1,0 +1,181 @@
+"""Mending a recording by what the checks found."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.errors import UsageError, suggestion
+from greybox.trial.checks.finding import IDS, CheckReport, Finding, Repair
+from greybox.trial.deriving import derive_signals
+from greybox.trial.recording import Recording, Signal
+from greybox.vessel.vessel import Vessel
+
+Array = NDArray[np.float64]
+
+
+def repair(
+    recording: Recording, vessel: Vessel, report: CheckReport, *, also: tuple[str, ...] = ()
+) -> tuple[Recording, tuple[str, ...], list[str]]:
+    """Mend what is safe to mend.
+
+    Parameters
+    ----------
+    recording : Recording
+        As it was checked.
+    vessel : Vessel
+    report : CheckReport
+    also : tuple of str
+        Ids of findings to mend although they need judgement.
+
+    Returns
+    -------
+    recording : Recording
+    fixed : tuple of str
+        What was done, one sentence each.
+    left : list of str
+        What was found and left.
+
+    Raises
+    ------
+    UsageError
+        `also` names no id of a check.
+    """
+    for name in also:
+        if name not in IDS:
+            raise UsageError(
+                f"there is no check '{name}'.{suggestion(name, IDS)} Checks: {', '.join(IDS)}."
+            )
+    wanted = [f for f in report.findings if f.repair and (f.safe or f.id in also)]
+    left = [
+        f"{f.id} ({', '.join(f.channels or (f.channel,))}): {f.fix}"
+        for f in report.findings
+        if f not in wanted and f.id != "gap"
+    ]
+    mended = apply_repairs(recording, wanted)
+    fixed = tuple(
+        f"{f.id} of {', '.join(f.channels or (f.channel,))}: {f.evidence}" for f in wanted
+    )
+    return mended, fixed, left
+
+
+def apply_repairs(recording: Recording, findings: Iterable[Finding]) -> Recording:
+    """Return the recording with the repairs of the findings applied in order."""
+    steps = [step for f in findings for step in f.repair]
+    if any(s.kind in ("rotate", "lever", "shift", "turn") for s in steps):
+        # these act on positions and unwrapped headings
+        recording = derive_signals(recording)
+    for step in steps:
+        recording = _ACTIONS[step.kind](recording, step)
+    return recording
+
+
+def _order(recording: Recording, step: Repair) -> Recording:
+    clocks: dict[int, tuple[NDArray[np.int64], Array]] = {}
+    out = []
+    for s in recording.signals:
+        if s.name in step.channels:
+            if id(s.t) not in clocks:
+                order = np.argsort(s.t, kind="stable")
+                t = s.t[order]
+                once = np.concatenate([[True], np.diff(t) != 0])
+                clocks[id(s.t)] = (order[once], t[once])
+            rows, t = clocks[id(s.t)]
+            s = replace(s, t=t, value=s.value[rows])
+        out.append(s)
+    return recording.with_signals(out)
+
+
+def _drop(recording: Recording, step: Repair) -> Recording:
+    out = []
+    times = np.array(step.values)
+    shared: dict[tuple[int, bytes], Array] = {}
+    for s in recording.signals:
+        if s.name in step.channels:
+            keep = np.isfinite(s.value) & np.isfinite(s.t)
+            if len(times):
+                keep &= ~np.isin(s.t, times)
+            # signals that keep the same rows keep sharing one clock
+            t = shared.setdefault((id(s.t), np.packbits(keep).tobytes()), s.t[keep])
+            s = replace(s, t=t, value=s.value[keep])
+        out.append(s)
+    return recording.with_signals(out)
+
+
+def _scale(recording: Recording, step: Repair) -> Recording:
+    return recording.with_signals(
+        s.with_value(s.value * step.values[0]) if s.name in step.channels else s
+        for s in recording.signals
+    )
+
+
+def _offset(recording: Recording, step: Repair) -> Recording:
+    return recording.with_signals(
+        s.with_value(s.value + step.values[0]) if s.name in step.channels else s
+        for s in recording.signals
+    )
+
+
+def _move(recording: Recording, step: Repair) -> Recording:
+    new = dict(zip(step.channels, (*step.channels[1:], step.channels[0]), strict=True))
+    return recording.with_signals(
+        replace(s, name=new.get(s.name, s.name)) for s in recording.signals
+    )
+
+
+def _shift(recording: Recording, step: Repair) -> Recording:
+    late = step.values[0]
+    shared: dict[int, Array] = {}
+    out = []
+    for s in recording.signals:
+        if s.name in step.channels:
+            s = replace(s, t=shared.setdefault(id(s.t), s.t - late))
+        out.append(s)
+    return recording.with_signals(out)
+
+
+def _turn(recording: Recording, step: Repair) -> Recording:
+    return _offset(recording, Repair("offset", ("psi",), (-step.values[0],)))
+
+
+def _rotate(recording: Recording, step: Repair) -> Recording:
+    north, east = (recording[n] for n in step.channels)
+    psi = _heading_at(recording, north.t)
+    c, s = np.cos(psi), np.sin(psi)
+    east_value = np.interp(north.t, east.t, east.value)
+    made = {
+        "u": c * north.value + s * east_value,
+        "v": c * east_value - s * north.value,
+    }
+    return recording.with_signals(
+        replace(x, t=north.t, value=made[x.name]) if x.name in made else x
+        for x in recording.signals
+    )
+
+
+def _lever(recording: Recording, step: Repair) -> Recording:
+    x, y = step.values
+    out: list[Signal] = []
+    for s in recording.signals:
+        if s.name in ("x_n", "y_n"):
+            psi = _heading_at(recording, s.t)
+            c, si = np.cos(psi), np.sin(psi)
+            arm = c * x - si * y if s.name == "x_n" else si * x + c * y
+            s = s.with_value(s.value - arm)
+        out.append(s)
+    return recording.with_signals(out)
+
+
+def _heading_at(recording: Recording, t: Array) -> Array:
+    psi = recording["psi"]
+    keep = np.isfinite(psi.value) & np.isfinite(psi.t)
+    return np.interp(t, psi.t[keep], np.unwrap(psi.value[keep]))
+
+
+_ACTIONS = {
+    "order": _order, "drop": _drop, "scale": _scale, "offset": _offset, "move": _move,
+    "shift": _shift, "turn": _turn, "rotate": _rotate, "lever": _lever,
+}  # fmt: skip
