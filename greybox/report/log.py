@@ -206,7 +206,7 @@ def _facts(log: TrialLog, clock: _Clock) -> str:
     gaps = clock.all_gaps
     if len(gaps):
         missing = float(np.sum(log.t[gaps + 1] - log.t[gaps] - log.sample_time))
-        found.append(f"{len(gaps)} gap{'s' * (len(gaps) > 1)}, {missing:.4g} s missing")
+        found.append(f"{len(gaps)} gap{'s' * (len(gaps) > 1)}, {missing:.6g} s missing")
     else:
         found.append("no gaps")
     if log.loop_known:

@@ -140,9 +140,9 @@ def _draw_ships(
         ],
         axis=-1,
     )
-    label = f"ship every {step:g} s"
+    label = f"ship every {step:g} s" if step < 3600 else f"ship every {step / 3600:g} h"
     if scale != 1:
-        label += f", {scale:.2g} × its size"
+        label += f", {scale:.2g} × its size" if scale < 10 else f", {scale:.0f} × its size"
     axes.add_collection(
         PolyCollection(
             list(hulls), facecolor="0.6", edgecolor=BLACK, alpha=0.5, linewidth=0.7, zorder=3
@@ -167,17 +167,19 @@ def _draw_wind(
     strongest = float(np.hypot(*means).max())
     if strongest <= 0:
         return []
+    foot, unit = (log["y_n"][chosen], log["x_n"][chosen]), _LONGEST_ARROW * extent / strongest
     axes.quiver(
-        log["y_n"][chosen],
-        log["x_n"][chosen],
+        *foot,
         means[1],
         means[0],
         angles="xy",
         scale_units="xy",
-        scale=strongest / (_LONGEST_ARROW * extent),
+        scale=1 / unit,
         width=0.004,
         color=SKY,
         zorder=4,
     )
+    # limits follow only the feet of arrows by themselves
+    axes.update_datalim(np.column_stack([foot[0] + unit * means[1], foot[1] + unit * means[0]]))
     label = f"true wind blows, up to {strongest:.2g} m/s"
     return [Line2D([], [], linestyle="none", marker=r"$\rightarrow$", color=SKY, label=label)]
