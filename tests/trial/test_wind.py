@@ -166,3 +166,17 @@ def test_profiles():
 def test_impossible_heights(height, options, message):
     with pytest.raises(LogError, match=message):
         height_profile(height, **options)
+
+
+def test_true_wind_of_a_measured_turn(data_folder):
+    """The pond's own file gives both winds: an oracle from outside."""
+    import pandas as pd
+
+    table = pd.read_csv(data_folder / "esso_osaka/turn_14-Oct-2020_14_08_51.csv")
+    relative = table["wind_velo_relative_mid [m/s]"], table["wind_dir_relative_mid [rad]"]
+    u_q, v_q = relative_wind_from_direction(*(c.to_numpy() for c in relative))
+    motion = (table[c].to_numpy() for c in ("psi_hat [rad]", "u_velo [m/s]", "vm_velo [m/s]"))
+    speed, origin = direction_from(*true_wind(u_q, v_q, *motion))
+    np.testing.assert_allclose(speed, table["wind_velo_true [m/s]"], atol=0.005)
+    off = np.exp(1j * (origin - table["wind_dir_true [rad]"].to_numpy()))
+    assert np.abs(np.angle(off)).max() < 0.01

@@ -1,0 +1,314 @@
+"""Pictures of one log before any model: where the ship went, what moved it, what blew."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from textwrap import fill
+from typing import Any, Literal
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, FuncFormatter, MultipleLocator
+from numpy.typing import NDArray
+
+from greybox.report.figures import BLACK, COLOURS, ORANGE, STYLES, new_figure, tidy
+from greybox.report.thinning import find_gaps, longest, pick, thin
+from greybox.report.track import draw_track
+from greybox.trial.log import TrialLog
+from greybox.trial.wind import direction_from, true_wind
+
+Array = NDArray[np.float64]
+
+# of gaps and of spans under a controller: more would be one grey block anyway
+_MOST_SPANS = 300
+_HOURS_FROM = 3 * 3600.0
+_DOTS = 1500
+_GREY = "0.82"
+_DEGREES = (1, 2, 5, 10, 15, 30, 45, 90, 180, 360, 720, 1440, 3600, 7200, 36000)
+
+
+@dataclass(frozen=True)
+class _Clock:
+    """Time as it is drawn, with the gaps worth drawing."""
+
+    time: Array
+    unit: str
+    gaps: NDArray[np.intp]
+    all_gaps: NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class _Panel:
+    """Signals of one unit that share one pair of axes."""
+
+    label: str
+    lines: Mapping[str, Array]
+    kind: Literal["number", "angle", "direction"] = "number"
+    controlled: Sequence[tuple[float, float]] = field(default=())
+
+
+def log_figure(log: TrialLog, *, wind_arrows: bool = True) -> Figure:
+    """Draw one log as a whole: track, states, inputs and wind, as far as it has them.
+
+    Gaps (steps above 1.5 sample times) interrupt the lines and are shaded. Long
+    logs are drawn by their envelopes: about 2000 points a line, no peak lost.
+
+    Parameters
+    ----------
+    log : TrialLog
+    wind_arrows : bool
+        Whether arrows on the track show where the true wind blows.
+
+    Returns
+    -------
+    Figure
+        Track with north up beside the signals against time; without positions
+        the signals alone.
+    """
+    clock = _clock(log)
+    panels = [*_states(log), *_inputs(log, clock), *_wind(log)]
+    tracked = "x_n" in log and "y_n" in log
+    rows = max(len(panels), 1)
+    height = max(1.25 * rows + 0.9, 5.5 if tracked else 2.0)
+    left, covered = _room_for_track(log, rows, height - 1.5) if tracked else (0.0, 0)
+    right = (7.0 if tracked else 9.0) if panels else 0.0
+    figure = new_figure(left + right, height)
+    widths = [w for w in (left, right) if w]
+    grid = figure.add_gridspec(rows, len(widths), width_ratios=widths)
+    if tracked:
+        draw_track(figure.add_subplot(grid[:covered, 0]), log, clock.gaps, wind_arrows=wind_arrows)
+    axes: list[Any] = []
+    for i in range(len(panels)):
+        axes.append(figure.add_subplot(grid[i, -1], sharex=axes[0] if axes else None))
+    _draw(axes, panels, clock)
+    title = f"{log.name}: {log.vessel.name}", _facts(log, clock)
+    figure.suptitle("\n".join(fill(line, int(11 * (left + right))) for line in title), fontsize=10)
+    return figure
+
+
+def overview_figures(log: TrialLog, *, wind_arrows: bool = True) -> dict[str, Figure]:
+    """Draw the parts of `log_figure` apart, for pages that show them in turn.
+
+    Parameters
+    ----------
+    log : TrialLog
+    wind_arrows : bool
+        As in `log_figure`.
+
+    Returns
+    -------
+    dict of str to Figure
+        Of ``track``, ``states``, ``inputs`` and ``wind`` those that the log has
+        channels for.
+    """
+    clock = _clock(log)
+    figures: dict[str, Figure] = {}
+    if "x_n" in log and "y_n" in log:
+        figures["track"] = new_figure(6.5, 6.5)
+        draw_track(figures["track"].subplots(), log, clock.gaps, wind_arrows=wind_arrows)
+    groups = {"states": _states(log), "inputs": _inputs(log, clock), "wind": _wind(log)}
+    for name, made in groups.items():
+        panels = list(made)
+        if panels:
+            figures[name] = new_figure(9, 1.5 * len(panels) + 0.6)
+            axes = figures[name].subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
+            _draw(list(axes), panels, clock)
+    for name, figure in figures.items():
+        figure.suptitle(f"{log.name}: {name}", fontsize=11)
+    return figures
+
+
+def _room_for_track(log: TrialLog, rows: int, height: float) -> tuple[float, int]:
+    """Return the width [inch] of the map and how many rows of panels it stands beside."""
+    north, east = (max(float(np.ptp(log[n])), 1e-3) for n in ("x_n", "y_n"))
+    width = float(np.clip(height * east / north, 4.4, 5.4))
+    tall = (width * north / east + 1.0) / height
+    return width, int(np.clip(np.ceil(rows * tall), min(rows, 3, np.ceil(rows / 2)), rows))
+
+
+def _clock(log: TrialLog) -> _Clock:
+    time = log.t - log.t[0]
+    unit = "s"
+    if time[-1] > _HOURS_FROM:
+        time, unit = time / 3600, "h"
+    gaps = find_gaps(log.t, log.sample_time)
+    return _Clock(time, unit, longest(gaps, log.t, _MOST_SPANS), gaps)
+
+
+def _states(log: TrialLog) -> Iterator[_Panel]:
+    speeds = {f"{word} {n}": log[n] for n, word in (("u", "surge"), ("v", "sway")) if n in log}
+    if speeds:
+        yield _Panel("velocity over\nground [m/s]", speeds)
+    if "r" in log:
+        yield _Panel("yaw rate r\n[deg/s]", {"r": np.degrees(log["r"])})
+    if "psi" in log:
+        yield _Panel("heading ψ\n[deg]", {"ψ": np.degrees(log["psi"])}, "angle")
+
+
+def _inputs(log: TrialLog, clock: _Clock) -> Iterator[_Panel]:
+    units = {m.name: m.unit for m in log.vessel.columns.values()}
+    speeds: dict[str, dict[str, Array]] = {}
+    angles: dict[str, Array] = {}
+    for name in log.vessel.commands:
+        if name not in log:
+            continue
+        if name in log.vessel.angle_commands:
+            angles[name] = np.degrees(log[name])
+        else:
+            speeds.setdefault(units.get(name) or "unit of the log", {})[name] = log[name]
+    controlled = _controlled(log, clock)
+    for unit, lines in speeds.items():
+        yield _Panel(f"propeller speed{_only(lines)}\n[{unit}]", lines, "number", controlled)
+    if angles:
+        rudders = {t.rudder for t in log.vessel.thrusters}
+        word = "rudder angle" if angles.keys() <= rudders else "thruster angle"
+        yield _Panel(f"{word}{_only(angles)}\n[deg]", angles, "angle", controlled)
+
+
+def _only(lines: Mapping[str, Array]) -> str:
+    """Return the name of a single line, which needs no legend."""
+    return f" {next(iter(lines))}" if len(lines) == 1 else ""
+
+
+def _controlled(log: TrialLog, clock: _Clock) -> list[tuple[float, float]]:
+    """Return start and length of the spans in which a controller moves the thrusters."""
+    if not log.loop_known or not log.closed_loop.any():
+        return []
+    change = np.diff(np.r_[0, log.closed_loop.astype(int), 0])
+    start, stop = np.flatnonzero(change > 0), np.flatnonzero(change < 0) - 1
+    if len(start) > _MOST_SPANS:
+        return []
+    return [
+        (clock.time[a], clock.time[b] - clock.time[a]) for a, b in zip(start, stop, strict=True)
+    ]
+
+
+def _wind(log: TrialLog) -> Iterator[_Panel]:
+    if not log.has_wind:
+        return
+    u_q, v_q = log["u_q"], log["v_q"]
+    if all(n in log for n in ("psi", "u", "v")):
+        speed, origin = direction_from(*true_wind(u_q, v_q, log["psi"], log["u"], log["v"]))
+        yield _Panel("true wind\nspeed [m/s]", {"speed": speed})
+        yield _Panel("true wind from\n[deg from north]", {"from": np.degrees(origin)}, "direction")
+        return
+    yield _Panel("apparent wind\nspeed [m/s]", {"speed": np.hypot(u_q, v_q)})
+    origin = np.degrees(np.arctan2(v_q, u_q))
+    yield _Panel("apparent wind from\n[deg from bow]", {"from": origin}, "direction")
+
+
+def _facts(log: TrialLog, clock: _Clock) -> str:
+    found = [
+        f"{len(log)} samples of {log.sample_time:g} s",
+        f"{log.t[-1] - log.t[0]:.6g} s from t = {log.t[0]:.10g} s",
+    ]
+    gaps = clock.all_gaps
+    if len(gaps):
+        missing = float(np.sum(log.t[gaps + 1] - log.t[gaps] - log.sample_time))
+        found.append(f"{len(gaps)} gap{'s' * (len(gaps) > 1)}, {missing:.6g} s missing")
+    else:
+        found.append("no gaps")
+    if log.loop_known:
+        found.append(f"{100 * log.closed_loop.mean():.0f} % under a controller")
+    return ", ".join(found)
+
+
+def _draw(axes: list[Any], panels: Sequence[_Panel], clock: _Clock) -> None:
+    for ax, panel in zip(axes, panels, strict=True):
+        (_draw_direction if panel.kind == "direction" else _draw_lines)(ax, panel, clock)
+        ax.set_ylabel(panel.label, fontsize=8)
+        ax.tick_params(labelsize=8, labelbottom=ax is axes[-1])
+        tidy(ax)
+        # bars reach over the whole height whatever the values are
+        across = ax.get_xaxis_transform()
+        time = clock.time
+        spans = [(time[k], time[k + 1] - time[k]) for k in clock.gaps]
+        if spans:
+            ax.broken_barh(
+                spans, (0, 1), transform=across, color=_GREY, linewidth=0.5, zorder=0, label="gap"
+            )
+        if panel.controlled:
+            ax.broken_barh(
+                list(panel.controlled),
+                (0, 0.05),
+                transform=across,
+                color=ORANGE,
+                linewidth=0,
+                zorder=0,
+                label="controller on",
+            )
+        shown = len(panel.lines) > 1 or panel.controlled or (spans and ax is axes[0])
+        if shown:
+            handles, labels = ax.get_legend_handles_labels()
+            if len(panel.lines) == 1:
+                # the label of the axis names the only line
+                handles, labels = handles[1:], labels[1:]
+            ax.legend(
+                handles,
+                labels,
+                fontsize=8,
+                loc="lower left",
+                bbox_to_anchor=(0.0, 1.0),
+                borderaxespad=0.1,
+                ncols=6,
+                frameon=False,
+                handlelength=1.6,
+                columnspacing=1.2,
+            )
+    if axes:
+        axes[0].figure.align_ylabels(axes)
+        axes[-1].set_xlabel(f"time from the first sample [{clock.unit}]", fontsize=9)
+        if len(clock.time) > 1:
+            axes[0].set_xlim(clock.time[0], clock.time[-1])
+
+
+def _draw_lines(ax: Any, panel: _Panel, clock: _Clock) -> None:
+    for j, (name, value) in enumerate(panel.lines.items()):
+        index = thin(clock.gaps, value)
+        ax.plot(
+            pick(clock.time, index),
+            pick(value, index),
+            color=COLOURS[j % 6] if len(panel.lines) > 1 else BLACK,
+            linestyle=STYLES[j // 6 % 4],
+            linewidth=0.9,
+            label=name,
+        )
+    if panel.kind == "angle":
+        ax.yaxis.set_major_locator(_degree_ticks(panel.lines.values()))
+
+
+def _degree_ticks(values: Any) -> Any:
+    spread = max(float(v.max()) for v in values) - min(float(v.min()) for v in values)
+    step = next((d for d in _DEGREES if spread <= 4 * d), None)
+    return MultipleLocator(step or 10 ** np.ceil(np.log10(spread / 4)))
+
+
+def _draw_direction(ax: Any, panel: _Panel, clock: _Clock) -> None:
+    """Draw a direction on a circle as dots: lines would jump across the page at 0/360."""
+    ((name, value),) = panel.lines.items()
+    radians = np.radians(value)
+    mean = np.degrees(np.arctan2(np.sin(radians).mean(), np.cos(radians).mean()))
+    near = mean + np.mod(value - mean + 180, 360) - 180
+    if np.ptp(near) > 270:
+        near = np.mod(value, 360)
+    # extremes of a circle mean little: every so many samples, not the envelope
+    index = np.arange(0, len(near), -(-len(near) // _DOTS))
+    ax.plot(
+        clock.time[index],
+        near[index],
+        linestyle="none",
+        marker=".",
+        markersize=1.8,
+        color=BLACK,
+        label=name,
+    )
+    low, high = float(near.min()), float(near.max())
+    step = next(d for d in (5, 10, 15, 30, 45, 90) if high - low <= 4 * d or d == 90)
+    low, high = step * np.floor(low / step), step * np.ceil(high / step + 1e-9)
+    ax.yaxis.set_major_locator(FixedLocator(np.arange(low, high + step / 2, step).tolist()))
+    ax.yaxis.set_major_formatter(
+        FuncFormatter(lambda y, _: f"{y if 0 <= y <= 360 else y % 360:.0f}")
+    )
+    margin = 0.05 * (high - low)
+    ax.set_ylim(low - margin, high + margin)
