@@ -236,13 +236,13 @@ def read_messages(
     before = budget.messages
     with open(path, "rb") as handle:
         magic = handle.read(16)
+        handle.seek(0)
         if mode == "file" and magic[:4] == b"\x28\xb5\x2f\xfd":
             with tempfile.TemporaryDirectory() as folder:
                 plain = Path(folder) / "storage"
                 _inflate_file(handle, plain, budget)
                 yield from read_messages(plain, "", budget, notes, wanted)
             return
-        handle.seek(0)
         try:
             if magic.startswith(b"#ROSBAG V"):
                 yield from _bag(handle, budget, notes, wanted)
@@ -315,6 +315,11 @@ def _inflate(data: bytes, kind: str, stated: int, budget: Budget) -> bytes:
     """Return a chunk's content: what the file states is checked before and after."""
     if kind in ("none", ""):
         return data
+    if kind not in ("lz4", "bz2", "zstd"):
+        raise LogError(
+            f"'{budget.name}' is compressed with '{kind}', which is not read "
+            f"(lz4, bz2, zstd and none are): write it again without compression."
+        )
     budget.charge(stated)
     limit = stated + 1
     try:
@@ -324,13 +329,8 @@ def _inflate(data: bytes, kind: str, stated: int, budget: Budget) -> bytes:
             raw = bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=limit))
         elif kind == "bz2":
             raw = bz2.BZ2Decompressor().decompress(data, max_length=limit)
-        elif kind == "zstd":
-            raw = _zstd(data, limit)
         else:
-            raise LogError(
-                f"'{budget.name}' is compressed with '{kind}', which is not read "
-                f"(lz4, bz2, zstd and none are): write it again without compression."
-            )
+            raw = _zstd(data, limit)
     # lz4 and bz2 say damaged data in their own ways
     except (RuntimeError, OSError, ValueError, EOFError):
         return b""

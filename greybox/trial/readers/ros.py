@@ -160,11 +160,11 @@ class _Topic:
     words: list[str] = field(default_factory=list)
     skipped: dict[str, int] = field(default_factory=dict)
     remarks: dict[str, None] = field(default_factory=dict)
+    fields: dict[str, None] = field(default_factory=dict)
+    converted: set[str] = field(default_factory=set)
     unstamped: int = 0
     stamped: bool = False
-    _decoders: dict[Channel, Callable[[bytes], Decoded] | DecodeError] = field(
-        default_factory=dict
-    )
+    _decoders: dict[Channel, Callable[[bytes], Decoded] | DecodeError] = field(default_factory=dict)
 
     @property
     def dotted(self) -> str:
@@ -187,7 +187,9 @@ class _Topic:
             message = decode(data)
         except DecodeError as error:
             # only the kind: bytes and positions differ from message to message
-            self._skip("cannot be decoded" if self.columns else f"cannot be decoded: {error}")
+            self._skip(
+                "they cannot be decoded" if self.columns else f"they cannot be decoded: {error}"
+            )
             return
         try:
             found = self._extract(message)
@@ -215,6 +217,7 @@ class _Topic:
         if handle is not None:
             try:
                 found = handle(message, self.remarks)
+                self.converted.update(found.keys() & _UNITS.keys())
             # the definition in the file is not that of the type's name
             except (KeyError, TypeError, ValueError, IndexError):
                 self.remarks["does not have the fields of its type, so it was not converted"] = None
@@ -228,6 +231,7 @@ class _Topic:
                 elif name not in found:
                     found[name] = value
         if chosen:
+            self.fields.update(dict.fromkeys(list(found)[:MAX_FIELDS]))
             return {n: v for n, v in found.items() if n in chosen}
         return found
 
@@ -390,9 +394,9 @@ def _imu(m: Decoded, remarks: dict[str, None]) -> Fields:
 def _fix(m: Decoded, remarks: dict[str, None]) -> Fields:
     status, lat, lon = m["status"]["status"], float(m["latitude"]), float(m["longitude"])
     if status < 0:
-        raise _SkipError("have no fix (status < 0)")
+        raise _SkipError("they have no fix (status < 0)")
     if not (abs(lat) <= 90 and abs(lon) <= 360):
-        raise _SkipError("hold no position")
+        raise _SkipError("they hold no position")
     return {"lat": lat, "lon": lon, "altitude": float(m["altitude"])}
 
 
@@ -416,9 +420,7 @@ HANDLERS: dict[str, Callable[[Decoded, dict[str, None]], Fields]] = {
 
 def _recording(
     path: Path, topics: list[_Topic], notes: list[str]
-) -> tuple[
-    tuple[Signal, ...], dict[str, tuple[Array, NDArray[np.str_]]], float | None
-]:
+) -> tuple[tuple[Signal, ...], dict[str, tuple[Array, NDArray[np.str_]]], float | None]:
     full = [t for t in topics if len(t.logged)]
     for topic in topics:
         _remark(topic, notes)
@@ -442,11 +444,11 @@ def _recording(
     text: dict[str, tuple[Array, NDArray[np.str_]]] = {}
     for topic, clock in zip(full, clocks, strict=True):
         # the difference is exact in integers, a float of the epoch would round to 0.2 us
-        t = (clock - first) * 1e-9
+        t: Array = np.asarray((clock - first) * 1e-9, np.float64)
         if topic.words:
             text[_free(topic.rule or topic.dotted, used)] = (t, np.array(topic.words))
         for name in topic.columns:
-            converted = name in _UNITS and topic.channel.msgtype in HANDLERS
+            converted = name in topic.converted
             final, canonical = _named(topic, name, converted, keepers, notes)
             signals.append(
                 Signal(
@@ -465,9 +467,9 @@ def _keepers(topics: list[_Topic]) -> dict[str, _Topic]:
     """Return by canonical name the topic that keeps it: the first of those with most messages."""
     keepers: dict[str, _Topic] = {}
     for topic in topics:
-        if topic.rule or topic.channel.msgtype not in HANDLERS:
+        if topic.rule:
             continue
-        for name in topic.columns.keys() & _CANONICAL:
+        for name in topic.columns.keys() & topic.converted & _CANONICAL:
             if name not in keepers or len(topic.logged) > len(keepers[name].logged):
                 keepers[name] = topic
     return keepers
@@ -507,12 +509,7 @@ def _remark(topic: _Topic, notes: list[str]) -> None:
     for remark in topic.remarks:
         notes.append(f"{label}: {remark}.")
     for reason, count in topic.skipped.items():
-        notes.append(f"{label}: {count} messages were skipped: they {reason}." if _verb(reason)
-                     else f"{label}: {count} messages were skipped: {reason}.")
-
-
-def _verb(reason: str) -> bool:
-    return reason.startswith(("have", "hold"))
+        notes.append(f"{label}: {count} messages were skipped: {reason}.")
 
 
 def _check_rules(topics: list[_Topic]) -> None:
@@ -522,7 +519,7 @@ def _check_rules(topics: list[_Topic]) -> None:
         if lost and (topic.logged or not topic.skipped):
             raise LogError(
                 f"topic '{topic.channel.topic}' ({topic.channel.msgtype}) has no numeric field "
-                f"'{lost[0]}'.{suggestion(lost[0], topic.columns)} Name the path of a field in "
+                f"'{lost[0]}'.{suggestion(lost[0], topic.fields)} Name the path of a field in "
                 f"its message, as in 'twist.twist.linear.x'."
             )
 
