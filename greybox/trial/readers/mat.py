@@ -21,6 +21,7 @@ from greybox.trial.recording import Array, Recording, Signal, SourceFile
 
 MAX_COLUMNS = 64
 MAX_NOTES = 60
+MAX_SCALARS = 40
 # characters of a text that are kept, so that one long line does not widen a column of words
 _MAX_TEXT = 200
 
@@ -28,6 +29,7 @@ _MAX_TEXT = 200
 _DATENUM = (7e5, 8e5)
 _DATENUM_1970 = 719529.0
 _UNIX = 1e8
+_RISING = 0.9
 
 _TIME = re.compile(
     r"(?:.*[_.])?(?:t|time|times|tout|timestamps?|time_?stamps?|unix_?time|posix_?time|utc|"
@@ -48,7 +50,7 @@ _UNITS = {
 # the one column of a timeseries has the name of the series
 _BARE = frozenset({"data", "values", "value"})
 _LABELS = ("variablenames", "columns", "names", "labels", "channels", "header", "headers")
-_MATRICES = frozenset({"variables", "data", "values", "x", "y"})
+_MATRICES = frozenset({"variables", "data", "values"})
 
 
 def read_mat(path: Path) -> Recording:
@@ -152,6 +154,11 @@ class _Reader:
             if time is not None:
                 scope.times.append(time)
                 self.times.append(time)
+        if len(scope.times) > 1 and "T" in tree:
+            # beside another time a capital T is a thrust, torque or temperature
+            capital = _join(name, "T")
+            scope.times = [t for t in scope.times if t.name != capital]
+            self.times = [t for t in self.times if t.name != capital]
         own = {t.name for t in scope.times}
         for key, value in tree.items():
             path = _join(name, key)
@@ -175,8 +182,7 @@ class _Reader:
             if value:
                 self._scalar(path, value[:_MAX_TEXT])
         elif value.size == 1:
-            self._scalar(path, f"{value.ravel()[0]:.12g}")
-            self.found.append(_Found(path, value, scope))
+            self._scalar(path, f"{float(value.ravel()[0]):.12g}")
         elif value.size:
             bare = key.casefold() in _BARE and scope.name
             labels, units = _labels(tree, key)
@@ -185,8 +191,10 @@ class _Reader:
             )
 
     def _scalar(self, path: str, value: str) -> None:
+        # notes of what was left out must not drown in a struct of settings
         self.scalars += 1
-        self.note(f"{path} = {value}")
+        if self.scalars <= MAX_SCALARS:
+            self.note(f"{path} = {value}")
 
     def _list(self, path: str, key: str, value: list[Any], scope: _Scope) -> None:
         if value and all(isinstance(v, str) for v in value):
@@ -255,8 +263,6 @@ class _Reader:
                 if time is not None:
                     words = np.array([w[:_MAX_TEXT] for w in item.value])
                     text[_free(item.name, used)] = (clocks[id(time)], words)
-                continue
-            if item.value.size == 1:
                 continue
             time = self._own_time(item, item.value.shape)
             if time is None:
@@ -451,7 +457,11 @@ def _time(name: str, value: Any, factor: float) -> _Time | None:
     if raw.dtype.kind == "b":
         return None
     known = raw[np.isfinite(raw)]
-    if not len(known):
+    if len(known) < 2:
+        return None
+    steps = np.diff(known.astype(float))
+    # repeated, lost and reset times are for the checks to find, but a time does rise
+    if not steps.max() > 0 or np.mean(steps >= 0) < _RISING:
         return None
     middle = float(np.median(known))
     if _DATENUM[0] <= middle <= _DATENUM[1]:

@@ -1,9 +1,9 @@
-"""MATLAB files as plain trees, measured before they are loaded.
+"""MATLAB files as plain trees, every size checked before it is believed.
 
 A tree holds dictionaries (structs), lists (cells and struct arrays), arrays as
 MATLAB shapes them, texts, and `Unreadable` in the place of what cannot be had.
-SciPy and h5py do the reading; before that the file is walked once without
-keeping anything, so that sizes, nesting and counts are known to be sane.
+Versions 4 to 7.2 are read here and not by SciPy, whose reader ends the whole
+process on some damaged files; 7.3 is read by h5py.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 import os
 import struct
-import warnings
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -83,12 +82,10 @@ def load_tree(path: Path) -> tuple[Tree, str]:
         if len(head) < 20:
             raise _MalformedError(f"has only {len(head)} bytes")
         if 0 in head[:4]:
-            _measure_four(path)
-            return _load_scipy(path), "MAT 4"
+            return _load_four(path), "MAT 4"
         if head[126:128] not in (b"IM", b"MI"):
             raise _MalformedError("does not begin like a MATLAB file")
-        _Five(path).measure()
-        return _load_scipy(path), "MAT 5"
+        return _Five(path).tree(), "MAT 5"
     except _MalformedError as error:
         raise LogError(
             f"'{path.name}' {error}: it is damaged or no MATLAB file. "
@@ -112,17 +109,27 @@ def _too_large(name: str, what: str, found: int, bound: int) -> LogError:
 # version 5: tagged elements, each variable compressed by itself
 
 _MATRIX, _COMPRESSED = 14, 15
-_CELL, _STRUCT, _OBJECT, _CHAR, _SPARSE, _OPAQUE = 1, 2, 3, 4, 5, 17
-_FIRST_NUMERIC, _LAST_NUMERIC = 6, 15
+_CELL, _STRUCT, _OBJECT, _CHAR, _SPARSE, _FUNCTION, _OPAQUE = 1, 2, 3, 4, 5, 16, 17
+_COMPLEX = 0x08
+
+# types of elements, and the classes that MATLAB makes of them
+_STORED = {
+    1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8",
+}  # fmt: skip
+_CLASSES = {
+    6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8",
+}  # fmt: skip
+_ENCODED = {16: "utf-8", 17: "utf-16", 18: "utf-32"}
 
 
 class _Flow:
-    """Reads one element's bytes, inflated or plain, and keeps count of them."""
+    """Hands out one element's bytes, inflated or plain, never more than it has."""
 
     def __init__(self, handle: IO[bytes], size: int, owner: _Five, *, packed: bool) -> None:
         self.handle, self.left, self.owner = handle, size, owner
         self.inflater = zlib.decompressobj() if packed else None
         self.pending = b""
+        self.used = 0
 
     def read(self, count: int) -> bytes:
         """Return exactly `count` bytes."""
@@ -139,20 +146,23 @@ class _Flow:
             count -= len(self._some(min(count, _BLOCK)))
 
     def _some(self, limit: int) -> bytes:
-        if self.inflater is None:
-            part = self._raw(limit)
-        else:
-            part = b""
-            while not part:
-                if self.inflater.eof:
-                    raise _MalformedError("holds a variable that ends too early")
-                feed = self.pending or self._raw(_BLOCK)
-                try:
-                    part = self.inflater.decompress(feed, limit)
-                except zlib.error as error:
-                    raise _MalformedError(f"holds damaged compressed data ({error})") from None
-                self.pending = self.inflater.unconsumed_tail
+        part = self._raw(limit) if self.inflater is None else self._inflated(limit)
+        self.used += len(part)
         self.owner.count(len(part))
+        return part
+
+    def _inflated(self, limit: int) -> bytes:
+        assert self.inflater is not None
+        part = b""
+        while not part:
+            if self.inflater.eof:
+                raise _MalformedError("holds a variable that ends too early")
+            feed = self.pending or self._raw(_BLOCK)
+            try:
+                part = self.inflater.decompress(feed, limit)
+            except zlib.error as error:
+                raise _MalformedError(f"holds damaged compressed data ({error})") from None
+            self.pending = self.inflater.unconsumed_tail
         return part
 
     def _raw(self, limit: int) -> bytes:
@@ -164,19 +174,20 @@ class _Flow:
 
 
 class _Five:
-    """Walks the elements of a file of version 5 to 7.2 without keeping them."""
+    """Reads a file of version 5 to 7.2, as its format description has it."""
 
     def __init__(self, path: Path) -> None:
         self.path, self.bytes, self.items, self.values = path, 0, 0, 0
+        self.order = "<"
 
     def count(self, count: int) -> None:
         self.bytes += count
         if self.bytes > MAX_BYTES:
             raise _too_large(self.path.name, "bytes or more once inflated", self.bytes, MAX_BYTES)
 
-    def measure(self) -> None:
-        """Raise unless every element is whole and within the bounds."""
+    def tree(self) -> Tree:
         size = self.path.stat().st_size
+        tree: Tree = {}
         with open(self.path, "rb") as handle:
             self.order = "<" if handle.read(128)[126:128] == b"IM" else ">"
             while (start := handle.tell()) < size:
@@ -188,20 +199,22 @@ class _Five:
                     raise _MalformedError(
                         f"ends at byte {size}, but a variable reaches to byte {start + 8 + length}"
                     )
-                if kind == _COMPRESSED:
-                    flow = _Flow(handle, length, self, packed=True)
-                    inner, inside = struct.unpack(self.order + "II", flow.read(8))
-                    if inner != _MATRIX:
-                        raise _MalformedError(f"holds a variable of type {inner}")
-                    self._matrix(flow, inside, 0)
-                elif kind == _MATRIX:
-                    self._matrix(_Flow(handle, length, self, packed=False), length, 0)
-                else:
+                if kind not in (_COMPRESSED, _MATRIX):
                     raise _MalformedError(f"holds an element of type {kind} at byte {start}")
-                handle.seek(start + 8 + length)
+                flow = _Flow(handle, length, self, packed=kind == _COMPRESSED)
+                if kind == _COMPRESSED:
+                    kind, length = struct.unpack(self.order + "II", flow.read(8))
+                    if kind != _MATRIX:
+                        raise _MalformedError(f"holds a variable of type {kind}")
+                name, value = self._matrix(flow, length, 0)
+                # without a name: what MATLAB keeps for its objects
+                if name:
+                    tree[name] = value
+                handle.seek(start + 8 + struct.unpack(self.order + "I", tag[4:])[0])
+        return tree
 
-    def _matrix(self, flow: _Flow, size: int, depth: int) -> None:
-        """Walk one matrix of `size` bytes and those inside it."""
+    def _matrix(self, flow: _Flow, size: int, depth: int) -> tuple[str, Any]:
+        """Return name and value of one matrix, `size` bytes long."""
         self.items += 1
         if self.items > MAX_ITEMS:
             raise _too_large(self.path.name, "variables, fields or cells", self.items, MAX_ITEMS)
@@ -210,180 +223,199 @@ class _Five:
                 f"'{self.path.name}' nests structs deeper than {MAX_DEPTH}: save its columns flat."
             )
         if size == 0:
-            return
-        position = place = 0
-        kind, numel = _OPAQUE, 0
-        while position < size:
-            code, length, head = self._tag(flow, size - position)
-            position += head
-            if code == _MATRIX:
-                self._matrix(flow, length, depth + 1)
-                position += length
-                place += 1
-                continue
-            padded = length + (-length % 8 if head == 8 else 0)
-            # MATLAB leaves out the padding where nothing follows
-            padded = min(padded, size - position)
-            if place == 0:
-                if length < 8:
-                    raise _MalformedError("holds a variable without flags")
-                content = flow.read(padded)
-                kind = content[0] if self.order == "<" else content[3]
-            elif place == 1 and kind != _OPAQUE:
-                if length > 4 * 64:
-                    raise _MalformedError(f"holds a variable of {length // 4} dimensions")
-                content = flow.read(padded)
-                lengths = struct.unpack(f"{self.order}{length // 4}i", content[: length // 4 * 4])
-                numel = self._extent(kind, lengths, size)
-            else:
-                if place == 3 and kind == _CHAR and numel > length:
-                    raise _MalformedError(f"states a text of {numel} characters in {length} bytes")
-                flow.skip(padded)
-            position += padded
-            place += 1
+            return "", np.empty((0, 0))
+        end = flow.used + size
+        _, flags = self._element(flow, end)
+        if len(flags) != 8:
+            raise _MalformedError("holds a variable without flags")
+        (word,) = struct.unpack(self.order + "I", flags[:4])
+        kind, marks = word & 0xFF, word >> 8 & 0xFF
+        if kind == _OPAQUE:
+            name, _, made = (self._text(flow, end) for _ in range(3))
+            value: Any = _opaque(made)
+        else:
+            _, raw = self._element(flow, end, 4 * 64)
+            lengths = struct.unpack(f"{self.order}{len(raw) // 4}i", raw[: len(raw) // 4 * 4])
+            if len(lengths) < 2 or min(lengths) < 0:
+                raise _MalformedError(f"holds a variable of size {lengths}")
+            name = self._text(flow, end)
+            value = self._value(flow, end, kind, marks, lengths, depth)
+        if flow.used > end:
+            raise _MalformedError("holds a variable that is longer than it states")
+        flow.skip(end - flow.used)
+        return name, value
 
-    def _tag(self, flow: _Flow, left: int) -> tuple[int, int, int]:
-        """Return type, bytes of data and bytes of the tag; a small element's data are skipped."""
-        if left < 8:
-            raise _MalformedError("holds a variable that ends inside a tag")
-        first = struct.unpack(self.order + "I", flow.read(4))[0]
-        if first >> 16:
-            return self._small(first)
-        (length,) = struct.unpack(self.order + "I", flow.read(4))
-        if length > left - 8:
-            raise _MalformedError(f"holds an element of {length} bytes where {left - 8} are left")
-        return int(first), int(length), 8
-
-    def _small(self, first: int) -> tuple[int, int, int]:
-        if first >> 16 > 4:
-            raise _MalformedError(f"holds a small element of {first >> 16} bytes")
-        # its data fill the second half of the tag, whatever their length
-        return int(first & 0xFFFF), 4, 4
-
-    def _extent(self, kind: int, lengths: tuple[int, ...], size: int) -> int:
-        if any(n < 0 for n in lengths):
-            raise _MalformedError(f"holds a variable of size {lengths}")
+    def _value(
+        self, flow: _Flow, end: int, kind: int, marks: int, lengths: tuple[int, ...], depth: int
+    ) -> Any:
         numel = math.prod(lengths)
-        if kind in (_CELL, _STRUCT, _OBJECT) and numel > size // 8:
-            raise _MalformedError(f"states {numel} cells or structs in {size} bytes")
-        if _FIRST_NUMERIC <= kind <= _LAST_NUMERIC:
-            if numel > size:
-                raise _MalformedError(f"states {numel} numbers in {size} bytes")
-            self.values += numel
-            if self.values > MAX_VALUES:
-                raise _too_large(self.path.name, "numbers", self.values, MAX_VALUES)
-        return numel
+        if kind in _CLASSES:
+            if marks & _COMPLEX:
+                return Unreadable("it is complex: save its real and imaginary parts")
+            numbers = self._numbers(flow, end, numel)
+            return numbers.astype(_CLASSES[kind], copy=False).reshape(lengths, order="F")
+        if kind == _CHAR:
+            return self._characters(flow, end, numel, lengths[0])
+        if kind == _CELL:
+            self._check_cells(numel, end - flow.used)
+            return [self._inner(flow, end, depth) for _ in range(numel)]
+        if kind == _STRUCT:
+            return self._structs(flow, end, numel, depth)
+        if kind == _SPARSE:
+            return self._sparse(flow, end, marks, lengths)
+        if kind == _OBJECT:
+            return _opaque(self._text(flow, end))
+        return Unreadable("it is a function" if kind == _FUNCTION else f"its class is {kind}")
+
+    def _element(self, flow: _Flow, end: int, most: int = MAX_BYTES) -> tuple[int, bytes]:
+        """Return type and data of the next element."""
+        if end - flow.used < 8:
+            raise _MalformedError("holds a variable that ends inside a tag")
+        (first,) = struct.unpack(self.order + "I", flow.read(4))
+        if first >> 16:
+            # a small element: its data stand in the tag itself
+            data = flow.read(4)
+            if first >> 16 > 4:
+                raise _MalformedError(f"holds a small element of {first >> 16} bytes")
+            return first & 0xFFFF, data[: first >> 16]
+        (length,) = struct.unpack(self.order + "I", flow.read(4))
+        if length > min(end - flow.used, most):
+            raise _MalformedError(
+                f"holds an element of {length} bytes where {min(end - flow.used, most)} are left"
+            )
+        data = flow.read(length)
+        # some writers leave out the padding where nothing follows
+        flow.skip(min(-length % 8, end - flow.used))
+        return first, data
+
+    def _text(self, flow: _Flow, end: int) -> str:
+        _, data = self._element(flow, end, 4096)
+        return data.rstrip(b"\0").decode("ascii", "replace")
+
+    def _numbers(self, flow: _Flow, end: int, numel: int) -> Any:
+        self.values += numel
+        if self.values > MAX_VALUES:
+            raise _too_large(self.path.name, "numbers", self.values, MAX_VALUES)
+        kind, data = self._element(flow, end)
+        if kind not in _STORED:
+            raise _MalformedError(f"holds numbers of type {kind}")
+        stored = np.dtype(self.order + _STORED[kind])
+        if len(data) != numel * stored.itemsize:
+            raise _MalformedError(f"states {numel} numbers in {len(data)} bytes")
+        return np.frombuffer(data, stored).astype(stored.newbyteorder("="))
+
+    def _characters(self, flow: _Flow, end: int, numel: int, rows: int) -> Any:
+        kind, data = self._element(flow, end)
+        if kind in _ENCODED:
+            order = {"utf-8": ""}.get(_ENCODED[kind], "-le" if self.order == "<" else "-be")
+            letters = data.decode(_ENCODED[kind] + order, "replace")
+        elif kind in (1, 2):
+            letters = data.decode("latin-1")
+        elif kind in (3, 4):
+            letters = data.decode("utf-16-le" if self.order == "<" else "utf-16-be", "replace")
+        else:
+            raise _MalformedError(f"holds text of type {kind}")
+        if numel > max(len(letters), len(data)):
+            raise _MalformedError(f"states a text of {numel} characters in {len(data)} bytes")
+        if rows <= 1:
+            return letters.rstrip()
+        # columns first
+        return [letters[k::rows].rstrip() for k in range(min(rows, len(letters)))]
+
+    def _check_cells(self, count: int, left: int) -> None:
+        # each takes at least a tag
+        if count > left // 8:
+            raise _MalformedError(f"states {count} cells or structs in {left} bytes")
+
+    def _inner(self, flow: _Flow, end: int, depth: int) -> Any:
+        if end - flow.used < 8:
+            raise _MalformedError("holds fewer cells or fields than it states")
+        kind, length = struct.unpack(self.order + "II", flow.read(8))
+        if kind != _MATRIX or length > end - flow.used:
+            raise _MalformedError(f"holds a cell or field of type {kind}")
+        return self._matrix(flow, length, depth + 1)[1]
+
+    def _structs(self, flow: _Flow, end: int, numel: int, depth: int) -> Any:
+        _, raw = self._element(flow, end, 8)
+        if len(raw) != 4:
+            raise _MalformedError("holds a struct without the length of its names")
+        (width,) = struct.unpack(self.order + "i", raw)
+        _, data = self._element(flow, end)
+        if not 0 < width <= 4096:
+            raise _MalformedError(f"holds a struct with names of {width} characters")
+        names = [
+            data[k : k + width].split(b"\0")[0].decode("utf-8", "replace")
+            for k in range(0, len(data) - width + 1, width)
+        ]
+        if not names:
+            return {}
+        self._check_cells(numel * len(names), end - flow.used)
+        items = [{n: self._inner(flow, end, depth) for n in names} for _ in range(numel)]
+        return items[0] if len(items) == 1 else items
+
+    def _sparse(self, flow: _Flow, end: int, marks: int, lengths: tuple[int, ...]) -> Any:
+        numel = math.prod(lengths)
+        if marks & _COMPLEX or len(lengths) != 2 or numel > MAX_DENSE:
+            return Unreadable(f"it is a sparse matrix of {numel} elements: save full(x)")
+        rows, starts = (self._integers(flow, end) for _ in range(2))
+        _, data = self._element(flow, end)
+        values = np.frombuffer(data[: len(data) // 8 * 8], self.order + "f8")
+        used = int(starts[-1]) if len(starts) == lengths[1] + 1 else -1
+        rows, values = rows[: max(used, 0)], values[: max(used, 0)]
+        if (
+            not len(rows) == len(values) == used
+            or np.any(np.diff(starts) < 0)
+            or np.any((rows < 0) | (rows >= lengths[0]))
+        ):
+            return Unreadable("it is sparse and its indices make no sense: save full(x)")
+        dense = np.zeros(lengths)
+        dense[rows, np.repeat(np.arange(lengths[1]), np.diff(starts))] = values
+        return dense
+
+    def _integers(self, flow: _Flow, end: int) -> Any:
+        _, data = self._element(flow, end)
+        return np.frombuffer(data[: len(data) // 4 * 4], self.order + "i4").astype(np.int64)
 
 
 # version 4: a header of five integers before each matrix
 
-_FOUR_SIZES = {0: 8, 1: 4, 2: 4, 3: 2, 4: 2, 5: 1}
+_FOUR_TYPES = {0: "f8", 1: "f4", 2: "i4", 3: "i2", 4: "u2", 5: "u1"}
 
 
-def _measure_four(path: Path) -> None:
+def _load_four(path: Path) -> Tree:
     size = path.stat().st_size
-    position = 0
+    tree: Tree = {}
     with open(path, "rb") as handle:
-        while position < size:
-            handle.seek(position)
+        while (position := handle.tell()) < size:
             head = handle.read(20)
             if len(head) < 20:
                 raise _MalformedError(f"ends at byte {size} inside a header")
             order = "<" if 0 <= struct.unpack("<i", head[:4])[0] <= 5000 else ">"
             kind, rows, columns, imaginary, named = struct.unpack(order + "5i", head)
-            width = _FOUR_SIZES.get(kind // 10 % 10)
-            known = 0 <= kind < 5000 and kind // 100 % 10 == 0 and kind % 10 <= 2
-            if not known or width is None or min(rows, columns) < 0 or not 0 < named <= 1024:
+            stored = _FOUR_TYPES.get(kind // 10 % 10)
+            known = kind in range(2000) and kind // 100 % 10 == 0 and kind % 10 <= 2
+            if not known or stored is None or min(rows, columns) < 0 or not 0 < named <= 1024:
                 raise _MalformedError(f"holds no header of a variable at byte {position}")
-            held = rows * columns * width * (2 if imaginary else 1)
+            parts = 2 if imaginary else 1
+            held = rows * columns * np.dtype(stored).itemsize * parts
             if held > MAX_BYTES:
                 raise _too_large(path.name, "bytes in one variable", held, MAX_BYTES)
-            position += 20 + named + held
-            if position > size:
+            if position + 20 + named + held > size:
                 raise _MalformedError(
-                    f"ends at byte {size}, but a variable reaches to byte {position}"
+                    f"ends at byte {size}, but a variable reaches to byte "
+                    f"{position + 20 + named + held}"
                 )
-
-
-def _load_scipy(path: Path) -> Tree:
-    from scipy.io import loadmat
-    from scipy.io.matlab import MatReadWarning
-
-    try:
-        with warnings.catch_warnings():
-            # duplicate names and old functions: neither is a signal
-            warnings.simplefilter("ignore", MatReadWarning)
-            warnings.simplefilter("ignore", UserWarning)
-            found = loadmat(path, mat_dtype=False, squeeze_me=False, chars_as_strings=True)
-    except (LogError, MemoryError, RecursionError):
-        raise
-    # SciPy fails in many ways on a damaged file
-    except Exception as error:
-        raise _MalformedError(f"cannot be read ({type(error).__name__}: {error})") from None
-    tree: Tree = {}
-    for name, value in found.items():
-        if name.startswith("__"):
-            continue
-        plain = _plain(value, 0)
-        if name == "None" and isinstance(plain, Unreadable):
-            name = _opaque_name(value)
-        tree[name] = plain
+            name = handle.read(named).rstrip(b"\0").decode("ascii", "replace")
+            values = np.frombuffer(handle.read(held), np.dtype(order + stored))
+            if imaginary:
+                tree[name] = Unreadable("it is complex: save its real and imaginary parts")
+            elif kind % 10 == 2:
+                tree[name] = Unreadable("it is sparse: save full(x)")
+            else:
+                table = values.astype(values.dtype.newbyteorder("="))
+                table = table.reshape((rows, columns), order="F")
+                tree[name] = _characters(table) if kind % 10 == 1 else table
     return tree
-
-
-def _opaque_name(value: Any) -> str:
-    try:
-        return bytes(value[0]["s0"]).decode("ascii", "replace") or "None"
-    except (IndexError, KeyError, ValueError, TypeError):
-        return "None"
-
-
-def _plain(value: Any, depth: int) -> Any:
-    """Return SciPy's value as a tree."""
-    from scipy import sparse
-    from scipy.io.matlab import MatlabFunction, MatlabObject, MatlabOpaque
-
-    if depth > 2 * MAX_DEPTH:
-        return Unreadable("it is nested too deep")
-    if isinstance(value, MatlabOpaque):
-        return _opaque(_class_name(value))
-    if isinstance(value, MatlabFunction):
-        return Unreadable("it is a function")
-    if isinstance(value, MatlabObject):
-        return _opaque(str(value.classname))
-    if sparse.issparse(value):
-        if math.prod(value.shape) > MAX_DENSE:
-            return Unreadable(f"it is a sparse matrix of {math.prod(value.shape)} elements")
-        return _numeric(value.toarray())
-    if not isinstance(value, np.ndarray):
-        return Unreadable(f"it is a {type(value).__name__}")
-    if value.dtype.names is not None:
-        items = [
-            {n: _plain(item[n], depth + 1) for n in value.dtype.names}
-            for item in value.ravel(order="F")
-        ]
-        return items[0] if len(items) == 1 else items
-    if value.dtype == object:
-        return [_plain(item, depth + 1) for item in value.ravel(order="F")]
-    if value.dtype.kind in "US":
-        texts = [str(s).rstrip() for s in value.ravel()]
-        return texts[0] if len(texts) == 1 else (texts or "")
-    return _numeric(value)
-
-
-def _numeric(value: Any) -> Any:
-    if value.dtype.kind == "c":
-        return Unreadable("it is complex: save its real and imaginary parts")
-    if value.dtype.kind not in "fiub":
-        return Unreadable(f"its type is {value.dtype}")
-    return value
-
-
-def _class_name(value: Any) -> str:
-    try:
-        return bytes(value[0]["s2"]).decode("ascii", "replace")
-    except (IndexError, KeyError, ValueError, TypeError):
-        return "object"
 
 
 def _opaque(name: str) -> Unreadable:
@@ -531,8 +563,6 @@ def _struct_array(fields: Tree) -> Any:
 
 def _characters(value: Any) -> Any:
     """Return codes of characters, one text a row."""
-    if value.dtype.kind not in "iu":
-        return Unreadable("its characters are no integers")
     rows = np.atleast_2d(value)
     rows = rows.reshape(len(rows), -1).astype(np.uint16)
     texts = [r.astype("<u2").tobytes().decode("utf-16-le", "replace").rstrip() for r in rows]
