@@ -284,15 +284,20 @@ def _counted(
 
 
 def _zstd(data: bytes, limit: int) -> bytes:
-    """Return at most `limit` bytes; nothing where the data are damaged."""
+    """Return at most `limit` bytes; what comes before the damage where there is some."""
     import zstandard
 
+    inflater = zstandard.ZstdDecompressor(max_window_size=_ZSTD_WINDOW)
+    parts: list[bytes] = []
     try:
-        inflater = zstandard.ZstdDecompressor(max_window_size=_ZSTD_WINDOW)
         with inflater.stream_reader(data, read_across_frames=True) as stream:
-            return bytes(stream.read(limit))
+            # in blocks, for what is asked for is allocated whether it comes or not
+            while limit and (part := stream.read(min(limit, _BLOCK))):
+                parts.append(part)
+                limit -= len(part)
     except zstandard.ZstdError:
-        return b""
+        pass
+    return b"".join(parts)
 
 
 def _inflate_file(source: IO[bytes], target: Path, budget: Budget) -> None:
