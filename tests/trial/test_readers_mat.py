@@ -433,6 +433,15 @@ def test_flipped_bytes_never_raise_anything_else(tmp_path, kind):
         assert recording is not None or len(message) > 20
 
 
+def test_a_wrong_checksum_is_damage(tmp_path):
+    path = packed(tmp_path / "a.mat", {"t": column(T)})
+    data = bytearray(path.read_bytes())
+    data[-1] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(LogError, match=r"damaged compressed data .*incorrect data check"):
+        read_mat(path)
+
+
 @pytest.mark.parametrize("content", [b"", b"MATLAB", b"garbage " * 100, bytes(2000), b"\xff" * 300])
 def test_garbage_is_refused(tmp_path, content):
     path = tmp_path / "a.mat"
@@ -506,6 +515,7 @@ def test_trees_agree_with_scipy(tmp_path, compressed):
         numbers
         | {
             "thin": thin,
+            "thin_on": thin.astype(bool),
             "on": np.array([[True, False]]),
             "rows": np.array(["ab", "cde"]),
             "greek": "\u03b1\u03b2",
@@ -519,7 +529,8 @@ def test_trees_agree_with_scipy(tmp_path, compressed):
     for name in [*kinds, "on", "nothing"]:
         assert tree[name].dtype == reference[name].dtype
         np.testing.assert_array_equal(tree[name], reference[name])
-    np.testing.assert_array_equal(tree["thin"], reference["thin"].toarray())
+    for name in ("thin", "thin_on"):
+        np.testing.assert_array_equal(tree[name], reference[name].toarray())
     assert tree["rows"] == ["ab", "cde"]
     assert tree["greek"] == "\u03b1\u03b2"
     assert [type(v).__name__ for v in tree["cell"]] == ["ndarray", "dict", "str", "ndarray"]

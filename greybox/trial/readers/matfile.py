@@ -31,6 +31,7 @@ MAX_DEPTH = 16
 # a sparse matrix is made dense up to this many elements
 MAX_DENSE = 1_000_000
 _BLOCK = 2**20
+_PADDED = 4096
 
 _HOW = (
     "in MATLAB save plain columns instead, as in "
@@ -130,6 +131,7 @@ class _Flow:
         self.inflater = zlib.decompressobj() if packed else None
         self.pending = b""
         self.used = 0
+        self.finishing = False
 
     def read(self, count: int) -> bytes:
         """Return exactly `count` bytes."""
@@ -145,6 +147,12 @@ class _Flow:
         while count:
             count -= len(self._some(min(count, _BLOCK)))
 
+    def finish(self) -> None:
+        """Inflate what is left, for the checksum stands behind it."""
+        self.finishing = True
+        while self.inflater is not None and not self.inflater.eof:
+            self._some(_BLOCK)
+
     def _some(self, limit: int) -> bytes:
         part = self._raw(limit) if self.inflater is None else self._inflated(limit)
         self.used += len(part)
@@ -156,6 +164,8 @@ class _Flow:
         part = b""
         while not part:
             if self.inflater.eof:
+                if self.finishing:
+                    break
                 raise _MalformedError("holds a variable that ends too early")
             feed = self.pending or self._raw(_BLOCK)
             try:
@@ -207,6 +217,7 @@ class _Five:
                     if kind != _MATRIX:
                         raise _MalformedError(f"holds a variable of type {kind}")
                 name, value = self._matrix(flow, length, 0)
+                flow.finish()
                 # without a name: what MATLAB keeps for its objects
                 if name:
                     tree[name] = value
@@ -315,7 +326,10 @@ class _Five:
             letters = data.decode("utf-16-le" if self.order == "<" else "utf-16-be", "replace")
         else:
             raise _MalformedError(f"holds text of type {kind}")
-        if numel > max(len(letters), len(data)):
+        if len(letters) < numel <= _PADDED:
+            # MATLAB itself writes texts of blanks without their bytes
+            letters = letters.ljust(numel)
+        elif numel > max(len(letters), len(data)):
             raise _MalformedError(f"states a text of {numel} characters in {len(data)} bytes")
         if rows <= 1:
             return letters.rstrip()
@@ -358,8 +372,9 @@ class _Five:
         if marks & _COMPLEX or len(lengths) != 2 or numel > MAX_DENSE:
             return Unreadable(f"it is a sparse matrix of {numel} elements: save full(x)")
         rows, starts = (self._integers(flow, end) for _ in range(2))
-        _, data = self._element(flow, end)
-        values = np.frombuffer(data[: len(data) // 8 * 8], self.order + "f8")
+        kind, data = self._element(flow, end)
+        stored = np.dtype(self.order + _STORED.get(kind, "f8"))
+        values = np.frombuffer(data[: len(data) // stored.itemsize * stored.itemsize], stored)
         used = int(starts[-1]) if len(starts) == lengths[1] + 1 else -1
         rows, values = rows[: max(used, 0)], values[: max(used, 0)]
         if (
