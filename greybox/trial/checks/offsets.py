@@ -133,11 +133,12 @@ class Tie:
         late = state.late.get(name, 0.0)
         if late == 0.0:
             return values[name]
-        # what is true now is recorded `late` seconds later
-        out = np.empty_like(values[name])
+        # what is true now is recorded `late` seconds later; only the smooth part is moved,
+        # since interpolation between samples would shrink the noise and so seem to explain it
+        out = values[name].copy()
         for a, b in self.motion.stretches:
-            t = self.motion.t[a:b]
-            out[a:b] = np.interp(t + late, t, values[name][a:b])
+            t, slow = self.motion.t[a:b], self.smooth[name][a:b]
+            out[a:b] += np.interp(t + late, t, slow) - slow
         return out
 
     def walked(self, state: State, values: dict[str, Array]) -> Array:
@@ -209,16 +210,20 @@ class Gain:
     loglik: float
 
 
-def _gain(tie: Tie, state: State, gains: Array = GAINS) -> Gain:
+def _gain(tie: Tie, state: State, near: Gain | None = None) -> Gain:
+    """Estimate the gains; around known ones where they are known."""
     pos, head = tie.nuisance(state)
+    around = np.array([0.6, 1.0, 1.7])
     total = 0.0
     p = h = (1.0, 1.0)
     values = tie.motion.values
     if tie.positioned:
+        gains = GAINS if near is None else np.minimum(around * near.position[0], 1.0)
         found = profile(tie.position(state, values), pos, tie.motion, gains)
         total += found.loglik
         p = (found.gain, found.std)
     if tie.turned:
+        gains = GAINS if near is None else np.minimum(around * near.heading[0], 1.0)
         found = profile(tie.heading(state, values), head, tie.motion, gains)
         total += found.loglik
         h = (found.gain, found.std)
@@ -305,7 +310,7 @@ def fit(tie: Tie, candidates: tuple[Candidate, ...], start: State, rounds: int =
         for c, a, b in zip(candidates, edges[:-1], edges[1:], strict=True):
             state = state.moved(c, step[a:b])
         total += step
-        gain = _gain(tie, state)
+        gain = _gain(tie, state, gain)
         if np.all(np.abs(step) < 1e-3):
             break
     covariance = _robust(x, rest, int(edges[-1]), tie)
@@ -407,7 +412,7 @@ def _scan(tie: Tie, candidate: Candidate, state: State) -> State:
     """Return a start near the best of a coarse scan, so that large offsets are found."""
     if candidate.id == "lever_arm":
         return state
-    gain = _gain(tie, state, GAINS[2::3])
+    gain = _gain(tie, state)
     steps = (
         np.array(_SCAN)
         if candidate.id == "clock_offset"

@@ -180,8 +180,14 @@ def _spikes(value: Array) -> tuple[NDArray[np.int64], float, Array]:
     """Return indices, robust scatter, and each sample's distance from its neighbours."""
     from scipy.ndimage import median_filter
 
-    width = 2 * _SPIKE_WIDTH + 3
-    gap = value - median_filter(value, size=width, mode="nearest")
+    # each pair of distances predicts a sample from its neighbours to third order; of the
+    # five predictions three do not touch a spike of up to three samples
+    padded = np.pad(value, 4, mode="reflect", reflect_type="odd")
+    n = len(value)
+    mean = {k: 0.5 * (padded[4 - k : 4 - k + n] + padded[4 + k : 4 + k + n]) for k in (1, 2, 3, 4)}
+    pairs = ((1, 2), (1, 3), (2, 3), (2, 4), (3, 4))
+    predicted = [(b * b * mean[a] - a * a * mean[b]) / (b * b - a * a) for a, b in pairs]
+    gap = value - np.median(predicted, axis=0)
     scale = 1.4826 * float(np.median(np.abs(gap)))
     step = _quantum(value)
     scale = max(scale, step / np.sqrt(12), 1e-12 * max(float(np.abs(value).max()), 1e-300))
