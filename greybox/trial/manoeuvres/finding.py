@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,8 +74,7 @@ class _Signals:
         k = np.flatnonzero(np.abs(self.t - time) <= half)
         if len(k) < 3:
             return float(np.interp(time, self.t, self.psi))
-        slope, offset = np.polyfit(self.t[k] - time, self.psi[k], 1)
-        return float(offset)
+        return float(np.polyfit(self.t[k] - time, self.psi[k], 1)[1])
 
 
 def find_manoeuvres(log: TrialLog, *, scale: float = 1.0) -> tuple[Manoeuvre, ...]:
@@ -237,8 +237,8 @@ def _zigzag(
     begun_straight = abs(headings[0] - base) <= max(_HEADING_SLACK, 0.35 * mean)
     if mean < math.radians(2) or not begun_straight or np.abs(own).max() > slack:
         return None
-    seen = np.any(signals.t < executes[0] - signals.ship_time / 4)
-    # two equal headings may be chance; they are not where a straight approach came before
+    seen = int((signals.t < executes[0] - signals.start_std).sum()) >= 3
+    # two equal headings may be chance; less so where a helm amidships came before
     if len(run) < (3 if seen else 4):
         return None
     level = float(np.median([abs(h.level) for h in run]))
@@ -412,7 +412,7 @@ def _stops(log: TrialLog, signals: _Signals) -> Iterator[Stopping]:
     shortest = _HELD_LENGTHS * signals.ship_time
     tolerance = max(0.05 * largest, 4 * noise_std(t, thrust))
     held = held_angles(t, thrust, shortest, tolerance=tolerance)
-    for ahead, astern in zip(held, held[1:], strict=False):
+    for ahead, astern in pairwise(held):
         usual = ahead.level
         if usual < 0.2 * largest or astern.level > _THRUST_OFF * usual:
             continue
@@ -428,7 +428,8 @@ def _stops(log: TrialLog, signals: _Signals) -> Iterator[Stopping]:
             continue
         if straight > math.radians(10) or t[ahead.last] - t[ahead.first] < signals.ship_time:
             continue
-        end = _thrust_stays_off(t, thrust, start, _THRUST_OFF * usual)
+        # one order until the ship stands: whoever manoeuvres gives several
+        end = float(t[astern.last])
         after = np.flatnonzero((t >= start) & (t <= end))
         if len(after) < 10:
             continue
@@ -445,12 +446,3 @@ def _stops(log: TrialLog, signals: _Signals) -> Iterator[Stopping]:
             position_std=signals.position_std,
             start_std=signals.start_std,
         )
-
-
-def _thrust_stays_off(t: Array, thrust: Array, start: float, limit: float) -> float:
-    after = np.flatnonzero(t > start)
-    low = after[thrust[after] <= limit]
-    if len(low) == 0:
-        return start
-    back = after[(after > low[0]) & (thrust[after] > limit)]
-    return float(t[back[0] - 1]) if len(back) else float(t[-1])

@@ -21,7 +21,7 @@ Side = Literal["both", "before", "after"]
 # half width of the first window, and its greatest, as shares of the time scale
 _NARROW, _WIDE, _GROWTH = 0.1, 0.4, 1.4
 # probability below which the quartic is needed and the window too wide
-_LACK_OF_FIT = 0.2
+_LACK_OF_FIT = 0.1
 _FEWEST = 9
 # samples of white noise that a coloured residual is worth, at least
 _FEWEST_WORTH = 8.0
@@ -206,7 +206,9 @@ def fit_at(
     degree = min(3 if side != "both" else 4, max(0, len(best) - 3))
     design = np.vander(x, degree + 1, increasing=True)
     coefficients, covariance, dof, noise = regress(design, z, std)
-    return LocalFit(at, coefficients, covariance, (float(t[best[0]]), float(t[best[-1]])), dof, noise)
+    return LocalFit(
+        at, coefficients, covariance, (float(t[best[0]]), float(t[best[-1]])), dof, noise
+    )
 
 
 def _needs_quartic(x: Array, y: Array) -> bool:

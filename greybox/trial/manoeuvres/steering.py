@@ -56,7 +56,9 @@ def steering_angle(log: TrialLog) -> tuple[Array, float | None] | None:
     vessel = log.vessel
     rudders = dict.fromkeys(t.rudder for t in vessel.thrusters if t.rudder is not None)
     if rudders and all(name in log for name in rudders):
-        limits = [x for n in rudders if (x := _greatest(vessel.limits[n].lower, n, log)) is not None]
+        limits = [
+            x for n in rudders if (x := _greatest(vessel.limits[n].lower, n, log)) is not None
+        ]
         return np.mean([log[n] for n in rudders], axis=0), min(limits, default=None)
     azimuths = {
         t.angle: (-1.0 if t.x <= 0 else 1.0) for t in vessel.thrusters if isinstance(t.angle, str)
@@ -96,7 +98,7 @@ def held_angles(
     if tolerance is None:
         largest = float(np.abs(smooth).max())
         tolerance = max(_TOLERANCE, 4 * noise_std(t, angle), 0.03 * largest)
-    made = []
+    made: list[Held] = []
     i, n = 0, len(t)
     while i < n:
         j = _reach(smooth, i, 2 * tolerance)
@@ -107,8 +109,10 @@ def held_angles(
         close = np.flatnonzero(np.abs(smooth[i : j + 1] - level) <= tolerance)
         first, last = i + int(close[0]), i + int(close[-1])
         before = made[-1] if made else None
-        if before is not None and abs(before.level - level) <= 2 * tolerance and (
-            _stays(smooth[before.last : first + 1], level, 3 * tolerance)
+        if (
+            before is not None
+            and abs(before.level - level) <= 2 * tolerance
+            and (_stays(smooth[before.last : first + 1], level, 3 * tolerance))
         ):
             made[-1] = Held(before.level, before.first, last, before.execute)
         else:

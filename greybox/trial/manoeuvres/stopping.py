@@ -179,16 +179,10 @@ def measure_stopping(
                 min(one.dof, two.dof),
             )
         (a, var_a, dof_a), (b, var_b, dof_b) = ends["along"], ends["across"]
-        head = Quantity(
-            a, math.sqrt(var_a + (b * psi0.std) ** 2), "m", min(dof_a, psi0.dof)
-        )
-        lateral = Quantity(
-            b, math.sqrt(var_b + (a * psi0.std) ** 2), "m", min(dof_b, psi0.dof)
-        )
+        head = Quantity(a, math.sqrt(var_a + (b * psi0.std) ** 2), "m", min(dof_a, psi0.dof))
+        lateral = Quantity(b, math.sqrt(var_b + (a * psi0.std) ** 2), "m", min(dof_b, psi0.dof))
         own = fit_at(t, psi, when, scale, std=heading_std)
-        error = math.sqrt(
-            own.std(when) ** 2 + psi0.std**2 + (own.value(when, 1) * slow) ** 2
-        )
+        error = math.sqrt(own.std(when) ** 2 + psi0.std**2 + (own.value(when, 1) * slow) ** 2)
         turned = Quantity(own.value(when) - psi0.value, error, "rad", min(own.dof, psi0.dof))
         stop = when
     if reversed_thrust:

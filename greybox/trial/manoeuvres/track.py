@@ -133,8 +133,8 @@ def path_length(track: Track, start: float, stop: float, scale: float) -> Quanti
     speed = np.maximum(np.hypot(north, east), 1e-12)
     variance = 0.0
     across = np.zeros_like(speed)
-    for way, other, (_, covariance, _, _) in zip((north, east), (east, north), fits, strict=True):
-        gradient = (weights * way / speed) @ rate
+    for own, other, (_, covariance, _, _) in zip((north, east), (east, north), fits, strict=True):
+        gradient = (weights * own / speed) @ rate
         variance += float(gradient @ covariance @ gradient)
         across += (other / speed) ** 2 * np.einsum("gi,ij,gj->g", rate, covariance, rate)
     # where the ship nearly stands the first-order correction would exceed the speed itself

@@ -193,9 +193,7 @@ def measure_turning_circle(
         `start` is outside the log, or the heading does not change.
     """
     approach = measure_approach(t, psi, u, v, start, length, heading_std=heading_std)
-    track = make_track(
-        t, x_n, y_n, psi, u, v, position_std=position_std, heading_std=heading_std
-    )
+    track = make_track(t, x_n, y_n, psi, u, v, position_std=position_std, heading_std=heading_std)
     stop = float(t[-1]) if stop is None else stop
     inside = (t >= start) & (t <= stop)
     if inside.sum() < 2:
@@ -221,7 +219,7 @@ def measure_turning_circle(
         advance, transfer, time_90 = _at(frame, approach, quarter, scale, start_std)
     if half is not None:
         _, tactical, time_180 = _at(frame, approach, half, scale, start_std)
-    steady = _steady(t, psi, own, track, start, stop, direction, heading_std)
+    steady = _steady(t, psi, own, u, v, track, start, stop, direction, heading_std)
     loss = None
     if steady is not None:
         notes += steady.notes
@@ -347,6 +345,8 @@ def _steady(
     t: Array,
     psi: Array,
     own: Array,
+    surge: Array,
+    sway: Array,
     track: Track,
     start: float,
     stop: float,
@@ -370,7 +370,9 @@ def _steady(
     ones = np.ones_like(x)
     slope, covariance, dof, _ = regress(np.column_stack([ones, x]), psi[k], heading_std)
     rate = Quantity(float(slope[1]), math.sqrt(float(covariance[1, 1])), "rad/s", dof)
-    halves = [np.polyfit(x[part], psi[k][part], 1)[0] for part in np.array_split(np.arange(len(x)), 2)]
+    halves = [
+        np.polyfit(x[part], psi[k][part], 1)[0] for part in np.array_split(np.arange(len(x)), 2)
+    ]
     change = abs(halves[1] - halves[0]) / abs(rate.value)
     spread = float(own[k[-1]] - own[k[0]])
     if spread < _DRIFT_RANGE:
@@ -391,7 +393,7 @@ def _steady(
     if spread >= _DRIFT_RANGE:
         north += [x, zero]
         east += [zero, x]
-    # north and east side by side, so that a residual's neighbour in the row is its neighbour in time
+    # north after east, not sample by sample: neighbours in the residual are neighbours in time
     design = np.concatenate([np.column_stack(north), np.column_stack(east)])
     place = np.concatenate([track.x_n[k], track.y_n[k]])
     found, spread_of, free, _ = regress(design, place, track.std)
@@ -402,8 +404,7 @@ def _steady(
     radius = math.hypot(*arm)
     toward = arm / max(radius, 1e-12)
     radius_std = math.sqrt(max(0.0, float(toward @ part @ toward)))
-    walk = track.walk * (t[k[-1]] - t[k[0]]) / 3
-    diameter = Quantity(2 * radius, 2 * math.sqrt(radius_std**2 + walk), "m", free)
+    diameter = Quantity(2 * radius, 2 * radius_std, "m", free)
     speed = abs(rate.value) * radius
     speed_std = math.hypot(rate.value * radius_std, radius * rate.std)
     # velocity of the body is r × w: u = −r w₂, v = r w₁
@@ -412,18 +413,40 @@ def _steady(
     angle_std = math.sqrt(max(0.0, float(around @ part @ around))) / max(radius, 1e-12)
     angle_std = math.hypot(angle_std, math.sqrt(covariance[0, 0]))
     drift = Quantity(math.atan2(-v, u), angle_std, "rad", min(free, dof))
+    way = Quantity(speed, speed_std, "m/s", min(free, dof))
+    if track.integrated:
+        # the track was made of the velocities, and its errors add up: their means do not
+        way, drift = _mean_velocity(surge[k], sway[k])
+        error = 2 * math.hypot(way.std, way.value * rate.std / abs(rate.value)) / abs(rate.value)
+        diameter = Quantity(2 * way.value / abs(rate.value), error, "m", min(way.dof, dof))
     sets: list[Quantity | None] = [None, None]
     if spread >= _DRIFT_RANGE:
+        walk = track.walk / float(t[k[-1]] - t[k[0]])
         sets = [
-            Quantity(float(found[i]), math.sqrt(float(spread_of[i, i])), "m/s", free)
+            Quantity(float(found[i]), math.sqrt(float(spread_of[i, i]) + walk), "m/s", free)
             for i in (4, 5)
         ]
     return _SteadyTurn(
         rate,
         diameter,
-        Quantity(speed, speed_std, "m/s", min(free, dof)),
+        way,
         drift,
         sets[0],
         sets[1],
         tuple(notes),
+    )
+
+
+def _mean_velocity(surge: Array, sway: Array) -> tuple[Quantity, Quantity]:
+    """Return speed and drift angle of the mean velocity over a whole turn."""
+    ones = np.ones((len(surge), 1))
+    (u, var_u, dof_u, _), (v, var_v, dof_v, _) = (regress(ones, y) for y in (surge, sway))
+    along, across = float(u[0]), float(v[0])
+    speed, dof = math.hypot(along, across), min(dof_u, dof_v)
+    a, b = float(var_u[0, 0]), float(var_v[0, 0])
+    std = math.sqrt(along**2 * a + across**2 * b) / speed
+    angle = math.sqrt(across**2 * a + along**2 * b) / speed**2
+    return (
+        Quantity(speed, std, "m/s", dof),
+        Quantity(math.atan2(-across, along), angle, "rad", dof),
     )

@@ -198,10 +198,12 @@ def measure_zigzag(
     away = float(np.interp(executes[1], t, psi)) - psi0.value
     direction = 1 if away >= 0 else -1
 
-    switch, overshoots, checks = [], [], []
+    switch: list[Quantity] = []
+    overshoots: list[Quantity] = []
+    checks: list[Quantity] = []
     for i, time in enumerate(ends[:-1]):
         sign = direction if i % 2 == 0 else -direction
-        before = time - (executes[i])
+        before = time - executes[i]
         quarter = before / 2
         own = sign * (psi - psi0.value)
         here = fit_at(
@@ -219,8 +221,9 @@ def measure_zigzag(
         )
         if len(overshoots) < i:
             continue
-        # the window reaches little beyond the execute, where the heading has a kink
-        top = peak(t, own, time, ends[i + 1], (ends[i + 1] - time) / 2, std=heading_std)
+        # the last rudder angle may be held long after its peak
+        swing = 0.75 * min(ends[i + 1] - time, 2 * before)
+        top = peak(t, own, time, ends[i + 1], swing, std=heading_std)
         if top is None:
             continue
         when, fit = top
