@@ -28,6 +28,8 @@ _SMALLEST = math.radians(3)
 _HELD_LENGTHS = 0.3
 # shares of the manoeuvre's own rudder angle and yaw rate that an approach may have
 _APPROACH_RUDDER, _APPROACH_RATE = 0.35, 0.25
+# ship lengths of the approach, where the log holds them, and the heading swept in them [rad]
+_APPROACH_LENGTHS, _APPROACH_SWEEP = 2.0, math.radians(10)
 # how much rudder angles, and headings at executes, may differ within one zig-zag
 _RUDDER_SPREAD, _HEADING_SPREAD = 0.12, 0.3
 _RUDDER_SLACK, _HEADING_SLACK = math.radians(1.0), math.radians(1.5)
@@ -177,7 +179,10 @@ def _approach_is_straight(
         return abs(signals.rate(execute, ahead)) <= 2 * _APPROACH_RATE * abs(rate)
     amidships = abs(float(angle[before].mean())) <= _APPROACH_RUDDER * abs(level)
     straight = abs(signals.rate(execute - signals.ship_time, execute)) <= _APPROACH_RATE * abs(rate)
-    return amidships and straight
+    # among random orders the ship goes straight for a moment, but not for ship lengths
+    run = (signals.t >= execute - _APPROACH_LENGTHS * signals.ship_time) & (signals.t < execute)
+    sweep = float(np.ptp(signals.psi[run])) <= _APPROACH_SWEEP + 6 * signals.heading_std
+    return amidships and straight and sweep
 
 
 def _zigzags(

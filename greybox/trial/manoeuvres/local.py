@@ -304,6 +304,17 @@ def peak(
         Its time [s] and the fit there; None where the signal still rises or
         already falls at an end of the interval, so that no peak was seen.
     """
+    # in a window too narrow for the noise the polynomial may have no top
+    for wider in (1.0, 1.6, 2.5):
+        found = _peak(t, y, start, stop, wider * scale, std)
+        if found is not None:
+            return found
+    return None
+
+
+def _peak(
+    t: Array, y: Array, start: float, stop: float, scale: float, std: float | None
+) -> tuple[float, LocalFit] | None:
     k = np.flatnonzero((t >= start) & (t <= stop))
     if len(k) < 5:
         return None

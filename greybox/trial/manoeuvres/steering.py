@@ -175,6 +175,8 @@ def execute_time(t: Array, y: Array, first: int, level: float, tolerance: float)
             rest += 1
             if rest >= 5 and sign * level - lowest > 2 * tolerance:
                 break
+    before = z[i : low + 1]
+    lowest = float(np.median(before[before <= lowest + tolerance / 4]))
     step = sign * level - lowest
     if step <= 2 * tolerance:
         return float(t[first])

@@ -204,10 +204,9 @@ def measure_zigzag(
     for i, time in enumerate(ends[:-1]):
         sign = direction if i % 2 == 0 else -direction
         before = time - executes[i]
-        quarter = before / 2
         own = sign * (psi - psi0.value)
         here = fit_at(
-            t, own, time, quarter, std=heading_std, side="before", bounds=(executes[i], time)
+            t, own, time, before, std=heading_std, side="before", bounds=(executes[i], time)
         )
         rate = here.value(time, 1)
         moved = rate * start_std
@@ -222,7 +221,7 @@ def measure_zigzag(
         if len(overshoots) < i:
             continue
         # the last rudder angle may be held long after its peak
-        swing = 0.75 * min(ends[i + 1] - time, 2 * before)
+        swing = min(ends[i + 1] - time, 2 * before)
         top = peak(t, own, time, ends[i + 1], swing, std=heading_std)
         if top is None:
             continue
@@ -231,7 +230,10 @@ def measure_zigzag(
         overshoots.append(
             Quantity(fit.value(when) - here.value(time), error, "rad", min(fit.dof, here.dof))
         )
-        slow = math.hypot(fit.std(when, 1) / abs(fit.value(when, 2)), start_std)
+        # the slope there is about zero, so the curvature's error enters in second order
+        bend = fit.value(when, 2)
+        share = math.sqrt(1 + 3 * (fit.std(when, 2) / bend) ** 2)
+        slow = math.hypot(share * fit.std(when, 1) / abs(bend), start_std)
         checks.append(Quantity(when - time, slow, "s", fit.dof))
 
     nominal = _nominal_rudder(rudder)
