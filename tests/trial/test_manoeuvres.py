@@ -19,6 +19,7 @@ from greybox.trial.manoeuvres import (
     Verdict,
     ZigZag,
     find_manoeuvres,
+    held_angles,
     measure_stopping,
     measure_turning_circle,
     measure_zigzag,
@@ -503,6 +504,16 @@ def test_random_pulses_hold_no_manoeuvre(seed):
 def test_the_virtual_trials_hold_no_manoeuvre():
     for seed in range(3):
         assert find_manoeuvres(virtual_log(seed, 1500)) == ()
+
+
+def test_noisy_orders_have_a_time():
+    """A held level may begin at the edge of its tolerance, with no sample beyond the ramp."""
+    rng = np.random.default_rng(0)
+    t = np.arange(400) * 1.0
+    for _ in range(50):
+        steps = np.repeat(rng.uniform(-1, 1, 10), 40) + 0.1 * rng.standard_normal(400)
+        for held in held_angles(t, steps, 5.0, tolerance=0.2):
+            assert t[0] <= held.execute <= t[held.first]
 
 
 # standards and misuse

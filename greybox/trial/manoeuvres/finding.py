@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from greybox.errors import LogError
 from greybox.trial.log import TrialLog
 from greybox.trial.manoeuvres.local import noise_std
-from greybox.trial.manoeuvres.steering import Held, held_angles, steering_angle
+from greybox.trial.manoeuvres.steering import Held, held_angles, sideways, steering_angle
 from greybox.trial.manoeuvres.stopping import Stopping, measure_stopping
 from greybox.trial.manoeuvres.track import without_antenna
 from greybox.trial.manoeuvres.turning_circle import TurningCircle, measure_turning_circle
@@ -33,7 +33,7 @@ _APPROACH_LENGTHS, _APPROACH_SWEEP = 2.0, math.radians(10)
 # how much rudder angles, and headings at executes, may differ within one zig-zag
 _RUDDER_SPREAD, _HEADING_SPREAD = 0.12, 0.3
 _RUDDER_SLACK, _HEADING_SLACK = math.radians(1.0), math.radians(1.5)
-# heading change of a turning circle, and of one that only the yaw rate shows [rad]
+# heading change of a turning circle, and of one without a logged order or approach [rad]
 _TURN, _TURN_UNSEEN = math.pi, 1.9 * math.pi
 # share of the approach thrust that a stop leaves, and by which thrust may vary otherwise
 _THRUST_OFF, _THRUST_VARIES = 0.1, 0.3
@@ -122,7 +122,14 @@ def find_manoeuvres(log: TrialLog, *, scale: float = 1.0) -> tuple[Manoeuvre, ..
         found += _turns_by_yaw_rate(log, signals)
     else:
         angle, greatest = steering
-        held = held_angles(log.t, angle, _HELD_LENGTHS * signals.ship_time)
+        opposed = sideways(log)
+        held = tuple(
+            h
+            for h in held_angles(log.t, angle, _HELD_LENGTHS * signals.ship_time)
+            if not opposed[h.first : h.last + 1].any()
+        )
+        # thrusters that oppose one another are not amidships, whatever their mean
+        angle = np.where(opposed, math.pi / 2, angle)
         rudder = any(t.rudder is not None for t in log.vessel.thrusters)
         zigzags = list(_zigzags(signals, angle, held, scale, rudder))
         found += zigzags
@@ -299,6 +306,12 @@ def _turns(
             continue
         change = signals.heading(stop) - signals.heading(start)
         if abs(change) < _TURN + math.radians(5):
+            continue
+        # without an approach in the log a held angle proves less, at its first sample nothing
+        if int((signals.t < start - signals.start_std).sum()) < 3:
+            continue
+        seen = float(signals.t[0]) <= start - signals.ship_time
+        if not seen and abs(change) < _TURN_UNSEEN:
             continue
         rate = change / (stop - start)
         if not _approach_is_straight(signals, angle, start, order.level, rate):

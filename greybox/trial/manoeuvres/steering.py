@@ -15,6 +15,8 @@ from greybox.trial.manoeuvres.local import noise_std
 Array = NDArray[np.float64]
 
 _TOLERANCE = math.radians(1.0)
+# angle between azimuth thrusters above which they push against one another [rad]
+_OPPOSED = math.radians(20)
 # share of a step within which its ramp is fitted
 _RAMP_LOW, _RAMP_HIGH = 0.2, 0.8
 
@@ -70,6 +72,31 @@ def steering_angle(log: TrialLog) -> tuple[Array, float | None] | None:
         ]
         return np.mean(parts, axis=0), None
     return None
+
+
+def sideways(log: TrialLog) -> NDArray[np.bool_]:
+    """Return where azimuth thrusters push against one another.
+
+    Their mean then is no steering angle: two at 45 degrees, one ahead and one
+    aft, have a mean of zero and move the ship sideways.
+
+    Returns
+    -------
+    ndarray of bool
+        (N,); never for a vessel with rudders, or with one azimuth thruster.
+    """
+    columns = {t.angle: t.x for t in log.vessel.thrusters if isinstance(t.angle, str)}
+    if any(t.rudder is not None for t in log.vessel.thrusters) or len(columns) < 2:
+        return np.zeros(len(log), bool)
+    parts = [
+        (-1.0 if x <= 0 else 1.0) * ((log[n] + math.pi / 2) % math.pi - math.pi / 2)
+        for n, x in columns.items()
+    ]
+    apart = np.max(parts, axis=0) - np.min(parts, axis=0)
+    largest = np.abs(parts).max(axis=0)
+    # some stay straight while others steer: these do not oppose one another
+    opposed = np.min(parts, axis=0) * np.max(parts, axis=0) < 0
+    return np.asarray(opposed & (apart > _OPPOSED) & (apart > largest))
 
 
 def _greatest(lower: float | None, name: str, log: TrialLog) -> float | None:
@@ -191,4 +218,5 @@ def execute_time(t: Array, y: Array, first: int, level: float, tolerance: float)
     if len(ramp) == 1:
         return float(t[max(0, ramp[0] - 1)])
     # no sample on the way: a command that is held between samples took effect at this one
-    return float(t[inside[share >= _RAMP_HIGH][0]])
+    there = inside[share >= _RAMP_HIGH]
+    return float(t[there[0] if len(there) else first])
