@@ -1,0 +1,190 @@
+"""Segments of a log: by the signs of its states, by its gaps, by its manoeuvres."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.errors import LogError
+from greybox.trial.log import TrialLog
+from greybox.trial.manoeuvres import find_manoeuvres
+
+Array = NDArray[np.float64]
+SegmentKind = Literal["sign", "piece", "manoeuvre"]
+
+# a step longer than this many sample times is a gap
+_GAP = 1.5
+# standard errors by which a smoothed state must be inside its margin's width
+_SURE = 3.0
+# samples over which a state is averaged at most, where its noise is large beside the margin
+_LONGEST_AVERAGE = 101
+
+
+@dataclass(frozen=True)
+class Segment:
+    """Samples ``start:stop`` of a log.
+
+    Parameters
+    ----------
+    start, stop : int
+        First sample, and the one after the last.
+    kind : {"sign", "piece", "manoeuvre"}
+    label : str
+        The regime (``u+v+``), the number of the piece, or the manoeuvre in words.
+    t_start, t_stop : float
+        Time of the first and of the last sample [s].
+    """
+
+    start: int
+    stop: int
+    kind: SegmentKind
+    label: str
+    t_start: float
+    t_stop: float
+
+    def __len__(self) -> int:
+        return self.stop - self.start
+
+    def summary(self) -> str:
+        """Return one line: what, when, how many samples."""
+        return f"{self.label}: {self.t_start:.1f} to {self.t_stop:.1f} s, {len(self)} samples"
+
+    def cut(self, log: TrialLog) -> TrialLog:
+        """Return the samples of this segment as a log of their own."""
+        return log.window(self.start, self.stop, f"{log.name}[{self.label}]")
+
+
+def by_sign(
+    log: TrialLog, margins: Mapping[str, float], *, shortest: float = 0.0
+) -> tuple[Segment, ...]:
+    """Return the runs of samples in which states keep their signs with a margin.
+
+    Where the vessel file gives the noise of a state, the decision is taken on a
+    running mean, just long enough that its standard error is a third of the
+    margin, so that noise does not break a run.
+
+    Parameters
+    ----------
+    log : TrialLog
+    margins : mapping of str to float
+        For each state that matters, such as u and v, how far it stays from zero
+        [m/s], [rad/s]; not negative.
+    shortest : float
+        Runs of less time are dropped [s].
+
+    Returns
+    -------
+    tuple of Segment
+        In time order, each labelled with its regime, such as ``u+v-``. None
+        reaches over a gap of the log.
+
+    Raises
+    ------
+    LogError
+        A margin is negative, none is given, or the log lacks the state.
+
+    References
+    ----------
+    Ljungberg (2020), assumption A10.
+    """
+    if not margins:
+        raise LogError("no state was named: give margins such as {'u': 0.2, 'v': 0.1}.")
+    for name, margin in margins.items():
+        if margin < 0 or not math.isfinite(margin):
+            raise LogError(f"the margin of {name} is {margin:g}, it cannot be negative.")
+    pieces = split_at_gaps(log.t, log.sample_time)
+    made = []
+    for first, last in pieces:
+        signs = np.stack(
+            [
+                _sign(log[name][first:last], margin, log.vessel.std(name))
+                for name, margin in margins.items()
+            ]
+        )
+        inside = (signs != 0).all(axis=0)
+        changes = np.flatnonzero((np.diff(signs, axis=1) != 0).any(axis=0)) + 1
+        edges = [0, *changes.tolist(), last - first]
+        for a, b in pairwise(edges):
+            if not inside[a]:
+                continue
+            start, stop = first + a, first + b
+            duration = float(log.t[stop - 1] - log.t[start]) + log.sample_time
+            if duration < shortest:
+                continue
+            label = "".join(
+                f"{n}{'+' if s > 0 else '-'}" for n, s in zip(margins, signs[:, a], strict=True)
+            )
+            made.append(_segment(log, start, stop, "sign", label))
+    return tuple(made)
+
+
+def split_at_gaps(t: Array, sample_time: float) -> list[tuple[int, int]]:
+    """Return the pieces between steps that exceed 1.5 sample times.
+
+    Parameters
+    ----------
+    t : ndarray
+        (N,) [s]
+    sample_time : float
+        [s]
+
+    Returns
+    -------
+    list of (int, int)
+        First sample of each piece, and the one after its last.
+    """
+    if len(t) == 0:
+        return []
+    gaps = np.flatnonzero(np.diff(t) > _GAP * sample_time) + 1
+    edges = [0, *gaps.tolist(), len(t)]
+    return list(pairwise(edges))
+
+
+def by_gaps(log: TrialLog) -> tuple[Segment, ...]:
+    """Return the pieces of a log between its gaps."""
+    pieces = split_at_gaps(log.t, log.sample_time)
+    return tuple(_segment(log, a, b, "piece", f"piece {i + 1}") for i, (a, b) in enumerate(pieces))
+
+
+def by_manoeuvre(log: TrialLog) -> tuple[Segment, ...]:
+    """Return the samples of each standard manoeuvre, from its order to its end.
+
+    Raises
+    ------
+    LogError
+        As `find_manoeuvres`.
+    """
+    made = []
+    for found in find_manoeuvres(log):
+        a = int(np.searchsorted(log.t, found.start))
+        b = int(np.searchsorted(log.t, found.stop, "right"))
+        made.append(_segment(log, a, b, "manoeuvre", found.label))
+    return tuple(made)
+
+
+def _segment(log: TrialLog, start: int, stop: int, kind: SegmentKind, label: str) -> Segment:
+    return Segment(start, stop, kind, label, float(log.t[start]), float(log.t[stop - 1]))
+
+
+def _sign(value: Array, margin: float, std: float | None) -> NDArray[np.int64]:
+    """Return 1, −1, or 0 where the state is within its margin, a sample each."""
+    size = 1
+    if std and margin > 0:
+        size = min(math.ceil((_SURE * std / margin) ** 2), _LONGEST_AVERAGE)
+    elif std:
+        size = _LONGEST_AVERAGE
+    half = min(size // 2, (len(value) - 1) // 2)
+    if half > 0:
+        total = np.concatenate([[0.0], np.cumsum(value)])
+        k = np.arange(len(value))
+        # windows shrink at the ends instead of leaning to one side
+        own = np.minimum(half, np.minimum(k, len(value) - 1 - k))
+        value = (total[k + own + 1] - total[k - own]) / (2 * own + 1)
+    clear = (np.abs(value) >= margin) & (value != 0)
+    return np.where(clear, np.sign(value), 0.0).astype(np.int64)
