@@ -79,7 +79,8 @@ def recorded(
     """
     structure, vessel = get_structure("thesis"), load_vessel("thesis")
     rng = np.random.default_rng([200, seed])
-    fine = 1 / max(rate, 10.0) if (10 % rate == 0 or rate > 10) else 1 / (rate * 5)
+    # fine enough that Euler's half step is no latency
+    fine = 1 / rate / np.ceil(50 / rate)
     stride = round(1 / rate / fine)
     pad = round(10 / fine)
     samples = round(seconds / fine) + 2 * pad + 1

@@ -38,11 +38,11 @@ def read_logs(
     sample_time: float | None = None,
     states: tuple[str, ...] = (),
 ) -> list[TrialLog]:
-    """Read log files, and decimate them where a sample time is asked for."""
+    """Read log files as the segments between gaps, decimated where a sample time is asked for."""
     from greybox.trial.conditioning import decimate
-    from greybox.trial.reading import read_log
+    from greybox.trial.reading import read_segments
 
-    logs = [read_log(path, vessel, states=states) for path in paths]
+    logs = [s for path in paths for s in read_segments(path, vessel, states=states)]
     return logs if sample_time is None else [decimate(log, sample_time) for log in logs]
 
 

@@ -104,7 +104,11 @@ def check_recording(
     findings += wind_findings(steady, findings)
     findings += response_findings(steady, vessel, findings)
     return CheckReport(
-        recording.name, tuple(findings), _outcomes(findings, outcomes), recording.notes
+        recording.name,
+        tuple(findings),
+        _outcomes(findings, outcomes),
+        recording.notes,
+        recording,
     )
 
 

@@ -110,7 +110,7 @@ def _pushed(recording: Recording, vessel: Vessel, angle: float) -> bool:
     commands = {c: recording[c].value[np.isfinite(recording[c].value)] for c in vessel.commands}
     size = min(len(v) for v in commands.values())
     made = generalised_force(vessel, {c: v[:size] for c, v in commands.items()})
-    across = float(np.mean(made.get("Y", np.zeros(1))))
+    across = float(np.mean(made.get("tauy", np.zeros(1))))
     total = sum(float(np.mean(np.abs(v))) for v in made.values()) or 1.0
     return across * np.sin(angle) > 0.05 * total
 

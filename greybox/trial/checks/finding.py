@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from greybox.trial.recording import Recording
+
 IDS = (
     "gap", "duplicate_time", "nan", "outlier", "stuck", "quantised", "unit", "frame", "sign",
     "clock_offset", "lever_arm", "heading_bias",
@@ -117,12 +119,15 @@ class CheckReport:
     outcomes : tuple of Outcome
     notes : tuple of str
         What was guessed or skipped while reading.
+    recording : Recording, optional
+        What was checked, for pictures.
     """
 
     name: str
     findings: tuple[Finding, ...]
     outcomes: tuple[Outcome, ...]
     notes: tuple[str, ...] = ()
+    recording: Recording | None = None
 
     def summary(self) -> str:
         """Return the findings as text."""

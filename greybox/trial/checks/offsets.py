@@ -17,10 +17,10 @@ from greybox.trial.checks.finding import Finding, Outcome, Repair
 from greybox.trial.checks.motion import (
     GAINS,
     Motion,
+    denoise,
     integrate,
     levels,
     profile,
-    smooth,
     solve,
     turn,
     whiten,
@@ -34,13 +34,12 @@ _CLOCKS = ("x_n", "y_n", "psi", "u", "v", "r")
 _LEAST_CLOCK = 0.1
 _LEAST_HEADING = np.radians(0.75)
 _LEAST_ARM = (0.1, 0.02)
-_SIGMAS = 4.5
-_LEAST_GAIN = 12.0
+_SIGMAS = 3.3
+_LEAST_GAIN = 5.5
 # wide enough to see a whole turn, which tells a late compass from a lever arm
 _SCAN = (-8.0, -6.0, -4.5, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 4.5, 6.0, 8.0)
-_ROUNDS = 4
+_ROUNDS = 12
 _MOST = 3
-_SMOOTH = 0.8
 # beyond these nothing can be said
 _VAGUE_HEADING = np.radians(1.0)
 _VAGUE_CLOCK = 0.3
@@ -70,8 +69,8 @@ _CANDIDATES = (
     Candidate("clock_offset", ("r",)),
     Candidate("clock_offset", ("x_n", "y_n")),
     Candidate("clock_offset", ("u", "v")),
-    Candidate("clock_offset", ("psi", "r"), 1.0),
-    Candidate("clock_offset", ("u", "v", "r"), 1.0),
+    Candidate("clock_offset", ("psi", "r"), 4.0),
+    Candidate("clock_offset", ("u", "v", "r"), 4.0),
     Candidate("clock_offset", ("u",), 3.0),
     Candidate("clock_offset", ("v",), 3.0),
     Candidate("clock_offset", ("x_n",), 3.0),
@@ -99,6 +98,12 @@ class State:
     bias: float = 0.0
     arm: tuple[float, float] = (0.0, 0.0)
 
+    @property
+    def common(self) -> float:
+        """Lateness of both positions: the same as all others being early, and easier to move."""
+        x, y = self.late.get("x_n", 0.0), self.late.get("y_n", 0.0)
+        return x if x == y else 0.0
+
     def moved(self, candidate: Candidate, step: Array) -> State:
         """Return the state with a candidate's parameters moved."""
         if candidate.id == "clock_offset":
@@ -121,7 +126,7 @@ class Tie:
 
     def __init__(self, motion: Motion) -> None:
         self.motion = motion
-        self.smooth = {n: smooth(v, motion, _SMOOTH) for n, v in motion.values.items()}
+        self.smooth = {n: denoise(v, motion) for n, v in motion.values.items()}
         self.level = levels(motion)
         n, s = self.level.shape
         self.drift = (motion.t - motion.t[0]) / max(float(np.ptp(motion.t)), 1e-9)
@@ -130,7 +135,7 @@ class Tie:
         self.samples = (2 * n if self.positioned else 0) + (n if self.turned else 0)
 
     def _at(self, name: str, state: State, values: dict[str, Array]) -> Array:
-        late = state.late.get(name, 0.0)
+        late = state.late.get(name, 0.0) - state.common
         if late == 0.0:
             return values[name]
         # what is true now is recorded `late` seconds later; only the smooth part is moved,
@@ -138,7 +143,7 @@ class Tie:
         out = values[name].copy()
         for a, b in self.motion.stretches:
             t, slow = self.motion.t[a:b], self.smooth[name][a:b]
-            out[a:b] += np.interp(t + late, t, slow) - slow
+            out[a:b] += _beyond(t + late, t, slow) - slow
         return out
 
     def walked(self, state: State, values: dict[str, Array]) -> Array:
@@ -201,6 +206,16 @@ class Tie:
         return pos, head
 
 
+def _beyond(at: Array, t: Array, value: Array) -> Array:
+    """Interpolate, and go on straight beyond the ends."""
+    out = np.interp(at, t, value)
+    reach = min(5, len(t) - 1)
+    for inside, k, j in ((at < t[0], 0, reach), (at > t[-1], -1, -1 - reach)):
+        slope = (value[k] - value[j]) / (t[k] - t[j])
+        out[inside] = value[k] + slope * (at[inside] - t[k])
+    return np.asarray(out)
+
+
 @dataclass(frozen=True)
 class Gain:
     """Gains and innovations of both residuals at some parameters."""
@@ -213,7 +228,7 @@ class Gain:
 def _gain(tie: Tie, state: State, near: Gain | None = None) -> Gain:
     """Estimate the gains; around known ones where they are known."""
     pos, head = tie.nuisance(state)
-    around = np.array([0.6, 1.0, 1.7])
+    around = np.array([0.4, 0.7, 1.0, 1.5])
     total = 0.0
     p = h = (1.0, 1.0)
     values = tie.motion.values
@@ -311,7 +326,7 @@ def fit(tie: Tie, candidates: tuple[Candidate, ...], start: State, rounds: int =
             state = state.moved(c, step[a:b])
         total += step
         gain = _gain(tie, state, gain)
-        if np.all(np.abs(step) < 1e-3):
+        if np.all(np.abs(step) < 2e-3):
             break
     covariance = _robust(x, rest, int(edges[-1]), tie)
     return Fit(state, candidates, covariance, gain.loglik, total)
@@ -369,7 +384,8 @@ def find_offsets(motion: Motion, vessel: Vessel) -> tuple[list[Finding], list[Ou
     usable = [c for c in _CANDIDATES if _usable(c, motion)]
     chosen: tuple[Candidate, ...] = ()
     start = State(arm=(antenna[0], antenna[1]))
-    best = Fit(start, (), np.zeros((0, 0)), _gain(tie, start).loglik, np.zeros(0))
+    plain = _gain(tie, start, _gain(tie, start))
+    best = Fit(start, (), np.zeros((0, 0)), plain.loglik, np.zeros(0))
     inflation = max(1.0, 0.1 / motion.step)
     for _ in range(_MOST):
         trials = []
@@ -416,9 +432,12 @@ def _scan(tie: Tie, candidate: Candidate, state: State) -> State:
     steps = (
         np.array(_SCAN)
         if candidate.id == "clock_offset"
-        else np.radians([-90, -60, -40, -25, -12, 0, 12, 25, 40, 60, 90, 180])
+        else np.radians([-150, -120, -90, -60, -40, -25, -12, 0, 12, 25, 40, 60, 90, 120, 150, 180])
     )
     nuisance = _columns(tie, state, gain)
+    if candidate.id == "heading_bias":
+        # a free scale may be negative, and then half a turn changes nothing
+        nuisance = np.delete(nuisance, tie.columns - 1, axis=1)
     scores = []
     for step in steps:
         y = _residual(tie, state.moved(candidate, np.array([step])), gain)

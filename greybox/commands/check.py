@@ -1,0 +1,54 @@
+"""`greybox check`: what is wrong with a log, before any force model."""
+
+from __future__ import annotations
+
+import argparse
+
+from greybox.commands.common import provenance, say
+
+HELP = "find what is wrong with logs by kinematics: gaps, frames, signs, units, clocks, lever arm"
+EXAMPLES = """examples:
+  greybox check trial.csv --vessel ship.toml
+  greybox check raw.nmea --vessel ship.toml --json findings.json
+  greybox check *.csv --vessel ship.toml --report check.html
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("logs", nargs="+", metavar="LOG", help="logs, or raw files of any format")
+    parser.add_argument("--vessel", required=True, metavar="V", help="vessel file (TOML)")
+    parser.add_argument("--json", metavar="F", help="write the findings as JSON; - is stdout")
+    parser.add_argument("--report", metavar="HTML", help="write a page with a picture per finding")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Read, check, tell."""
+    from pathlib import Path
+
+    from greybox.files import check_targets, write_json
+    from greybox.trial.checks.check import check_files
+    from greybox.vessel.toml import load_vessel
+
+    check_targets(options.json, options.report)
+    vessel = load_vessel(options.vessel)
+    reports = check_files([Path(p) for p in options.logs], vessel)
+    if options.json:
+        found = [r.to_dict() for r in reports]
+        if len(found) == 1:
+            result = found[0]
+        else:
+            result = {
+                "findings": [{**f, "log": r["log"]} for r in found for f in r["findings"]],
+                "logs": found,
+            }
+        write_json({**result, "provenance": provenance(options)}, options.json)
+    if options.report:
+        from greybox.report.checks import check_page
+
+        check_page(reports, [Path(p) for p in options.logs], vessel, options.report)
+    if options.json != "-":
+        for report in reports:
+            say(report.summary())
+        if options.report:
+            say(f"\nwrote {options.report}")
