@@ -242,7 +242,8 @@ def merge(recordings: list[Recording], say: Callable[[str], None] | None = None)
             found.setdefault(s.name, []).append((r.name, replace(s, t=s.t + shift)))
         for name, (t, words) in r.text.items():
             before = text.get(name, (np.empty(0), np.empty(0, dtype=str)))
-            text[name] = (np.concatenate([before[0], t + shift]), np.concatenate([before[1], words]))
+            joined = np.concatenate([before[1], words])
+            text[name] = (np.concatenate([before[0], t + shift]), joined)
     signals = []
     for name, parts in found.items():
         kept = [parts[0]]

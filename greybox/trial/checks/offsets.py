@@ -21,6 +21,7 @@ from greybox.trial.checks.motion import (
     integrate,
     levels,
     profile,
+    smooth,
     solve,
     turn,
     whiten,
@@ -40,6 +41,8 @@ _LEAST_GAIN = 5.5
 _SCAN = (-8.0, -6.0, -4.5, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 4.5, 6.0, 8.0)
 _ROUNDS = 12
 _MOST = 3
+# beyond this time the heading's own noise is averaged out
+_HEADING_WINDOW = 5.0
 # beyond these nothing can be said
 _VAGUE_HEADING = np.radians(1.0)
 _VAGUE_CLOCK = 0.3
@@ -73,8 +76,8 @@ _CANDIDATES = (
     Candidate("clock_offset", ("u", "v", "r"), 4.0),
     Candidate("clock_offset", ("u",), 3.0),
     Candidate("clock_offset", ("v",), 3.0),
-    Candidate("clock_offset", ("x_n",), 3.0),
-    Candidate("clock_offset", ("y_n",), 3.0),
+    Candidate("clock_offset", ("x_n",), 8.0),
+    Candidate("clock_offset", ("y_n",), 8.0),
     Candidate("lever_arm", ("x_n", "y_n"), 1.0),
     Candidate("heading_bias", ("psi",)),
 )
@@ -126,12 +129,24 @@ class Tie:
 
     def __init__(self, motion: Motion) -> None:
         self.motion = motion
-        self.smooth = {n: denoise(v, motion) for n, v in motion.values.items()}
+        self.smooth = {
+            n: denoise(v, motion) for n, v in motion.values.items() if n not in ("x_n", "y_n")
+        }
         self.level = levels(motion)
         n, s = self.level.shape
         self.drift = (motion.t - motion.t[0]) / max(float(np.ptp(motion.t)), 1e-9)
         self.columns = 2 * s + 3
         self.positioned, self.turned = motion.positioned, motion.turned
+        if self.turned:
+            # as for the positions below: what is fast in the heading comes from the rate
+            swept = integrate(self.smooth["r"], motion)
+            slow = smooth(motion["psi"] - swept, motion, max(_HEADING_WINDOW, 5 * motion.step))
+            self.smooth["psi"] = swept + slow
+        if self.positioned:
+            # what is moved in time must not know the positions' own noise, or moving it would
+            # seem to explain that noise: the way by the other sensors stands in for them
+            way = self.walked(State(), self.smooth)
+            self.smooth["x_n"], self.smooth["y_n"] = way[:, 0], way[:, 1]
         self.samples = (2 * n if self.positioned else 0) + (n if self.turned else 0)
 
     def _at(self, name: str, state: State, values: dict[str, Array]) -> Array:
@@ -354,8 +369,10 @@ def _robust(x: Array, rest: Array, wanted: int, tie: Tie) -> Array:
     full = bread @ meat @ bread
     plain = bread * float(np.mean(rest**2))
     # the robust one has few degrees of freedom: never below what white noise would give
-    factor = np.sqrt(np.maximum(np.diag(full), np.diag(plain)) / np.maximum(np.diag(full), 1e-300))
+    have, least = np.maximum(np.diag(full), 0.0), np.maximum(np.diag(plain), 1e-300)
+    factor = np.sqrt(np.maximum(have, least) / np.maximum(have, 1e-6 * least))
     full = full * np.outer(factor, factor)
+    full[np.diag_indices_from(full)] = np.maximum(have, least)
     out = full[:wanted, :wanted] / np.outer(scale[:wanted], scale[:wanted])
     return np.asarray(out)
 
@@ -400,8 +417,51 @@ def find_offsets(motion: Motion, vessel: Vessel) -> tuple[list[Finding], list[Ou
         if worth - best.loglik < _LEAST_GAIN * inflation:
             break
         best, chosen = trial, trial.candidates
-    final = fit(tie, chosen, best.state) if chosen else best
+    final = _pruned(tie, best, start, vessel, antenna)
     return _findings(final, motion, vessel, antenna), _outcomes(tie, final, usable)
+
+
+def _pruned(tie: Tie, found: Fit, start: State, vessel: Vessel, antenna: tuple[float, ...]) -> Fit:
+    """Drop what is too small or too uncertain, least certain first, and fit the rest anew."""
+    while found.candidates:
+        worth = [_worth(found, k, vessel, antenna) for k in range(len(found.candidates))]
+        weakest = int(np.argmin(worth))
+        if worth[weakest] >= 1.0:
+            break
+        kept = tuple(c for k, c in enumerate(found.candidates) if k != weakest)
+        state = _restored(found.state, found.candidates[weakest], start)
+        found = fit(tie, kept, state) if kept else Fit(
+            start, (), np.zeros((0, 0)), found.loglik, np.zeros(0)
+        )
+    return found
+
+
+def _restored(state: State, candidate: Candidate, start: State) -> State:
+    if candidate.id == "clock_offset":
+        return replace(
+            state, late={k: v for k, v in state.late.items() if k not in candidate.channels}
+        )
+    if candidate.id == "heading_bias":
+        return replace(state, bias=start.bias)
+    return replace(state, arm=start.arm)
+
+
+def _worth(found: Fit, k: int, vessel: Vessel, antenna: tuple[float, ...]) -> float:
+    """Return how far a candidate passes both thresholds; below one it is no finding."""
+    c = found.candidates[k]
+    at = sum(size(o) for o in found.candidates[:k])
+    cov = found.covariance[at : at + size(c), at : at + size(c)]
+    if c.id == "lever_arm":
+        off = np.array(found.state.arm) - np.array(antenna)
+        least = _LEAST_ARM[0] + _LEAST_ARM[1] * vessel.length
+        wald = float(off @ np.linalg.solve(cov + 1e-12 * np.eye(2), off))
+        return float(min(np.hypot(*off) / least, np.sqrt(wald / (_SIGMAS**2 + 4))))
+    std = float(np.sqrt(cov[0, 0]))
+    if c.id == "clock_offset":
+        value, least = found.state.late.get(c.channels[0], 0.0), _LEAST_CLOCK
+    else:
+        value, least = float(np.angle(np.exp(1j * found.state.bias))), float(_LEAST_HEADING)
+    return min(abs(value) / least, abs(value) / (_SIGMAS * std))
 
 
 _IDS = ("clock_offset", "lever_arm", "heading_bias")
@@ -453,49 +513,39 @@ def _findings(
     at = 0
     for c in found.candidates:
         k = size(c)
-        cov = found.covariance[at : at + k, at : at + k]
+        std = np.sqrt(np.diag(found.covariance[at : at + k, at : at + k]))
         at += k
-        std = np.sqrt(np.diag(cov))
         if c.id == "clock_offset":
-            value = found.state.late.get(c.channels[0], 0.0)
-            others = [o for o in found.candidates if o is not c and o.id == c.id]
-            del others
-            least = _LEAST_CLOCK
-            if abs(value) < least or abs(value) < _SIGMAS * std[0]:
-                continue
-            findings.append(_clock_finding(c, value, float(std[0]), motion))
+            late = found.state.late.get(c.channels[0], 0.0)
+            findings.append(_clock_finding(c, late, float(std[0]), motion))
         elif c.id == "heading_bias":
-            value = float(np.angle(np.exp(1j * found.state.bias)))
-            if abs(value) < _LEAST_HEADING or abs(value) < _SIGMAS * std[0]:
-                continue
-            findings.append(_heading_finding(value, float(std[0])))
+            bias = float(np.angle(np.exp(1j * found.state.bias)))
+            findings.append(_heading_finding(bias, float(std[0])))
         else:
-            arm = np.array(found.state.arm)
-            off = arm - np.array(antenna)
-            least = _LEAST_ARM[0] + _LEAST_ARM[1] * vessel.length
-            wald = float(off @ np.linalg.solve(cov + 1e-12 * np.eye(2), off))
-            if np.hypot(*off) < least or wald < _SIGMAS**2 + 4:
-                continue
-            findings.append(_arm_finding(arm, std, antenna))
+            findings.append(_arm_finding(np.array(found.state.arm), std, antenna))
     return findings
 
 
 def _clock_finding(c: Candidate, value: float, std: float, motion: Motion) -> Finding:
-    names = " and ".join(c.channels)
+    channels = c.channels
+    if channels == ("x_n", "y_n") and value < 0:
+        # a sensor can be late, not early: then all the others are
+        channels, value = tuple(n for n in ("u", "v", "psi", "r") if n in motion), -value
+    names = ", ".join(channels[:-1]) + " and " + channels[-1] if len(channels) > 1 else channels[0]
     late = "late" if value > 0 else "early"
-    against = [n for n in ("x_n", "psi", "u", "r") if n in motion and n not in c.channels]
+    against = [n for n in ("x_n", "psi", "u", "r") if n in motion and n not in channels]
     return Finding(
         "clock_offset",
-        c.channels[0],
+        channels[0],
         value,
         (value - 1.96 * std, value + 1.96 * std),
         "s",
-        f"{names} {'comes' if len(c.channels) == 1 else 'come'} {abs(value):.2f} s {late} against "
+        f"{names} {'comes' if len(channels) == 1 else 'come'} {abs(value):.2f} s {late} against "
         f"{_words(against)}: shifted so, positions, velocities and heading agree",
         f"shift {names} by {-value:+.2f} s (import --fix does), and look for the delay in the "
         f"logger or a filter",
-        c.channels,
-        (Repair("shift", c.channels, (value,)),),
+        channels,
+        (Repair("shift", channels, (value,)),),
         True,
     )
 

@@ -70,7 +70,13 @@ def _gaps(names: tuple[str, ...], t: Array) -> list[Finding]:
         return []
     usual = clock(t).period
     steps = np.diff(t)
-    wide = np.flatnonzero(steps > HOLE * usual)
+    limit = np.full(len(steps), HOLE * usual)
+    digits = _digits(t)
+    if digits:
+        # between times that were rounded there may have been others
+        grid = 10.0 ** (np.floor(np.log10(np.maximum(t[1:], 1e-9))) + 1 - digits)
+        limit = np.maximum(limit, 1.5 * grid)
+    wide = np.flatnonzero(steps > limit)
     if not len(wide):
         return []
     longest = int(wide[np.argmax(steps[wide])])
@@ -147,9 +153,10 @@ def spike_findings(recording: Recording) -> list[Finding]:
     found = []
     for s in _motion(recording):
         t, value = _clean(s)
-        if len(value) < 30:
+        if len(value) < 30 or _digits(_wrapped(s)):
             continue
         spikes, scale, gap = _spikes(value)
+        spikes = spikes[np.abs(gap[spikes]) > _worth(s.name, value)]
         if not len(spikes):
             continue
         worst = spikes[np.argmax(np.abs(gap[spikes]))]
@@ -176,6 +183,18 @@ def spike_findings(recording: Recording) -> list[Finding]:
     return found
 
 
+def _worth(name: str, value: Array) -> float:
+    """Return the size below which a spike does no harm."""
+    if name in ("x_n", "y_n"):
+        # half of what the ship moves from sample to sample
+        return max(0.5 * float(np.quantile(np.abs(np.diff(value)), 0.9)), 0.02)
+    spread = float(np.subtract(*np.quantile(value, [0.95, 0.05])))
+    if name in ("u_q", "v_q"):
+        # gusts have heavy tails
+        return 0.5 * spread
+    return 0.005 if name == "psi" else 0.03 * spread
+
+
 def _spikes(value: Array) -> tuple[NDArray[np.int64], float, Array]:
     """Return indices, robust scatter, and each sample's distance from its neighbours."""
     from scipy.ndimage import median_filter
@@ -198,11 +217,53 @@ def _spikes(value: Array) -> tuple[NDArray[np.int64], float, Array]:
     return np.array(wide, dtype=np.int64), scale, gap
 
 
+def _digits(value: Array) -> int:
+    """Return the significant digits, at most four, that a signal was rounded to; else 0."""
+    part = np.abs(value[value != 0][:20000])
+    # one decade alone cannot tell significant digits from decimals
+    if len(part) < 50 or part.max() < 30 * np.quantile(part, 0.01):
+        return 0
+    scale = 10.0 ** np.floor(np.log10(part))
+    for digits in (2, 3, 4):
+        grid = scale * 10.0 ** (1 - digits)
+        if np.mean(np.abs(part / grid - np.round(part / grid)) < 1e-6) > 0.995:
+            return digits
+    return 0
+
+
+def _rounded_finding(name: str, t: Array, value: Array, unit: str, digits: int) -> Finding:
+    largest = float(np.abs(value).max())
+    step = float(10.0 ** (np.floor(np.log10(largest)) + 1 - digits))
+    return Finding(
+        "quantised",
+        name,
+        step,
+        (step, step),
+        unit,
+        f"{name} was written with {digits} significant digits: at {largest:.4g} {unit} it moves in "
+        f"steps of {step:g} {unit}",
+        "export it again with all its digits; what depends on fine differences of it is lost",
+        (name,),
+        (),
+        False,
+        {"t": t, "value": value},
+    )
+
+
 def coarse_findings(recording: Recording) -> list[Finding]:
-    """Find signals that move in steps coarser than what they measure."""
+    """Find signals, and times, that move in steps coarser than what they measure."""
     found = []
+    for _, t in _clocks(recording):
+        times = t[np.isfinite(t)]
+        digits = _digits(times)
+        if digits:
+            found.append(_rounded_finding("t", times, times, "s", digits))
     for s in _motion(recording):
         t, value = _clean(s)
+        digits = _digits(_wrapped(s))
+        if digits and np.mean(np.diff(value) == 0) > 0.3:
+            found.append(_rounded_finding(s.name, t, value, s.unit or "1", digits))
+            continue
         step = _quantum(value)
         if step <= 0 or len(value) < 50:
             continue
@@ -233,6 +294,15 @@ def coarse_findings(recording: Recording) -> list[Finding]:
             )
         )
     return found
+
+
+def _wrapped(s: Signal) -> Array:
+    """Return the values as they were written: digits count in degrees, not in radians."""
+    value = s.value[np.isfinite(s.value) & np.isfinite(s.t)]
+    degrees = np.degrees(value)
+    if s.name in ANGLES | {"r"} and _digits(degrees):
+        return np.asarray(degrees)
+    return value
 
 
 def _quantum(value: Array) -> float:
@@ -267,6 +337,8 @@ def stuck_findings(recording: Recording, vessel: Vessel) -> list[Finding]:
         longest = int(np.argmax(lengths))
         a, b = stretches[longest]
         span = float(t[b - 1] - t[a])
+        if _digits(_wrapped(s)):
+            continue
         # runs of a held or coarse signal are its habit; a stuck one is far longer
         usual = float(np.quantile(lengths, 0.9)) if len(lengths) > 5 else 1.0
         enough = max(_STUCK_SECONDS, 5 * usual * period)
