@@ -25,9 +25,9 @@ Array = NDArray[np.float64]
 _EPOCH = 1e8
 
 
-def read_recording(path: str | Path, vessel: Vessel, *, guess: bool = True, **options: Any) -> (
-    Recording
-):
+def read_recording(
+    path: str | Path, vessel: Vessel, *, guess: bool = True, **options: Any
+) -> Recording:
     """Read one raw file into canonical signals.
 
     Parameters

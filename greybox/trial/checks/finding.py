@@ -157,9 +157,7 @@ class CheckReport:
 
 def _size(f: Finding) -> str:
     if isinstance(f.value, tuple):
-        parts = [
-            f"{v:.3g} ({c[0]:.3g} to {c[1]:.3g})" for v, c in zip(f.value, f.ci, strict=True)
-        ]
+        parts = [f"{v:.3g} ({c[0]:.3g} to {c[1]:.3g})" for v, c in zip(f.value, f.ci, strict=True)]
         return f"{', '.join(parts)} {f.unit}"
     unit = "" if f.unit == "1" else f" {f.unit}"
     if f.ci[0] == f.ci[1]:

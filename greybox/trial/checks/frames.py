@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from greybox.trial.checks.finding import Finding, Outcome, Repair
 from greybox.trial.checks.motion import Motion, integrate, levels, profile, turn
-from greybox.trial.checks.rows import continuous
+from greybox.trial.deriving import continuous
 
 Array = NDArray[np.float64]
 Values = dict[str, Array]
@@ -207,7 +207,7 @@ def find_reading(motion: Motion) -> Reading:
     scorer = _Scorer(motion)
     usable = [c for c in (*_PSI, *_RATE, *_VELOCITY, *_POSITION, *_ACROSS) if scorer.applies(c)]
     base = scorer.score(())
-    ranked = [((), base, 0.0)]
+    ranked: list[tuple[tuple[Change, ...], float, float]] = [((), base, 0.0)]
     ranked += [((c,), scorer.score((c,)), c.cost) for c in usable]
     for a, b in combinations(usable, 2):
         if a.group == b.group or set(a.channels) & set(b.channels):
@@ -236,8 +236,11 @@ def reading_findings(reading: Reading) -> list[Finding]:
     """Return one finding for each change of a reading."""
     found = []
     for c in reading.changes:
-        tied = "positions and velocities" if c.group in ("velocity", "speed", "position", "length")\
+        tied = (
+            "positions and velocities"
+            if c.group in ("velocity", "speed", "position", "length")
             else "heading and the other channels"
+        )
         found.append(
             Finding(
                 c.id,
@@ -245,8 +248,7 @@ def reading_findings(reading: Reading) -> list[Finding]:
                 c.value,
                 (c.value, c.value),
                 c.unit,
-                f"{c.words}: only so do {tied} agree (log-likelihood higher by "
-                f"{reading.gain:.0f})",
+                f"{c.words}: only so do {tied} agree (log-likelihood higher by {reading.gain:.0f})",
                 c.fix,
                 c.channels,
                 c.repair,

@@ -8,6 +8,7 @@ unless the motion cannot tell them apart.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -20,6 +21,7 @@ from greybox.trial.checks.motion import (
     denoise,
     integrate,
     levels,
+    outlier_weights,
     profile,
     smooth,
     solve,
@@ -76,8 +78,8 @@ _CANDIDATES = (
     Candidate("clock_offset", ("u", "v", "r"), 4.0),
     Candidate("clock_offset", ("u",), 3.0),
     Candidate("clock_offset", ("v",), 3.0),
-    Candidate("clock_offset", ("x_n",), 8.0),
-    Candidate("clock_offset", ("y_n",), 8.0),
+    Candidate("clock_offset", ("x_n",), 30.0),
+    Candidate("clock_offset", ("y_n",), 30.0),
     Candidate("lever_arm", ("x_n", "y_n"), 1.0),
     Candidate("heading_bias", ("psi",)),
 )
@@ -127,8 +129,10 @@ def size(candidate: Candidate) -> int:
 class Tie:
     """Residuals of positions and heading for given parameters, and their derivatives."""
 
-    def __init__(self, motion: Motion) -> None:
+    def __init__(self, motion: Motion, start: State | None = None) -> None:
         self.motion = motion
+        self.start = start or State()
+        self._weights: dict[tuple[str, int], Array] = {}
         self.smooth = {
             n: denoise(v, motion) for n, v in motion.values.items() if n not in ("x_n", "y_n")
         }
@@ -149,6 +153,27 @@ class Tie:
             self.smooth["x_n"], self.smooth["y_n"] = way[:, 0], way[:, 1]
         self.samples = (2 * n if self.positioned else 0) + (n if self.turned else 0)
 
+    def weigh(self, what: str) -> Callable[[float], Array]:
+        """Return gain -> weights of the innovations of ``position`` or ``heading``.
+
+        They are taken once, from the log as it is: were they to change from one
+        candidate to the next, their likelihoods could not be compared.
+        """
+
+        def weight(gain: float) -> Array:
+            key = (what, round(10 * float(np.log(gain))))
+            if key not in self._weights:
+                pos, head = self.nuisance(self.start)
+                values = self.motion.values
+                if what == "position":
+                    z, x = self.position(self.start, values), pos
+                else:
+                    z, x = self.heading(self.start, values), head
+                self._weights[key] = outlier_weights(z, x, gain, self.motion)
+            return self._weights[key]
+
+        return weight
+
     def _at(self, name: str, state: State, values: dict[str, Array]) -> Array:
         late = state.late.get(name, 0.0) - state.common
         if late == 0.0:
@@ -168,24 +193,20 @@ class Tie:
             turn(psi, self._at("u", state, values), self._at("v", state, values)), self.motion
         )
 
-    def position(self, state: State, values: dict[str, Array], walked: Array | None = None) -> (
-        Array
-    ):
+    def position(
+        self, state: State, values: dict[str, Array], walked: Array | None = None
+    ) -> Array:
         """Return measured position minus that of velocity, heading and lever arm (N, 2) [m]."""
         if walked is None:
             walked = self.walked(state, values)
         psi = self._at("psi", state, values) - state.bias
         arm = turn(psi, np.full(len(psi), state.arm[0]), np.full(len(psi), state.arm[1]))
-        measured = np.column_stack(
-            [self._at("x_n", state, values), self._at("y_n", state, values)]
-        )
+        measured = np.column_stack([self._at("x_n", state, values), self._at("y_n", state, values)])
         return measured - walked - arm
 
     def heading(self, state: State, values: dict[str, Array]) -> Array:
         """Return measured heading minus that of the yaw rate (N,) [rad]."""
-        return self._at("psi", state, values) - integrate(
-            self._at("r", state, values), self.motion
-        )
+        return self._at("psi", state, values) - integrate(self._at("r", state, values), self.motion)
 
     def nuisance(self, state: State) -> tuple[Array, Array]:
         """Return the columns for starts, a constant velocity, and scales, (N, 2, q) and (N, q)."""
@@ -249,12 +270,14 @@ def _gain(tie: Tie, state: State, near: Gain | None = None) -> Gain:
     values = tie.motion.values
     if tie.positioned:
         gains = GAINS if near is None else np.minimum(around * near.position[0], 1.0)
-        found = profile(tie.position(state, values), pos, tie.motion, gains)
+        z = tie.position(state, values)
+        found = profile(z, pos, tie.motion, gains, tie.weigh("position"))
         total += found.loglik
         p = (found.gain, found.std)
     if tie.turned:
         gains = GAINS if near is None else np.minimum(around * near.heading[0], 1.0)
-        found = profile(tie.heading(state, values), head, tie.motion, gains)
+        z = tie.heading(state, values)
+        found = profile(z, head, tie.motion, gains, tie.weigh("heading"))
         total += found.loglik
         h = (found.gain, found.std)
     return Gain(p, h, total)
@@ -264,10 +287,14 @@ def _stack(tie: Tie, gain: Gain, pos: Array, head: Array) -> Array:
     """Whiten both blocks and stack them to rows, (3 N or less, q)."""
     rows = []
     if tie.positioned:
-        white = whiten(pos, gain.position[0], tie.motion) / gain.position[1]
+        k, std = gain.position
+        white = whiten(pos, k, tie.motion) / std
+        white = white * tie.weigh("position")(k).reshape(-1, *[1] * (white.ndim - 1))
         rows.append(white.reshape(-1, *white.shape[2:]))
     if tie.turned:
-        rows.append(whiten(head, gain.heading[0], tie.motion) / gain.heading[1])
+        k, std = gain.heading
+        white = whiten(head, k, tie.motion) / std
+        rows.append(white * tie.weigh("heading")(k).reshape(-1, *[1] * (white.ndim - 1)))
     return np.concatenate(rows)
 
 
@@ -397,7 +424,7 @@ def find_offsets(motion: Motion, vessel: Vessel) -> tuple[list[Finding], list[Ou
     if not (motion.positioned or motion.turned):
         why = "needs heading and yaw rate, or positions, heading and velocities of their own sensor"
         return [], [Outcome(i, "cannot tell", why) for i in _IDS]
-    tie = Tie(motion)
+    tie = Tie(motion, State(arm=(antenna[0], antenna[1])))
     usable = [c for c in _CANDIDATES if _usable(c, motion)]
     chosen: tuple[Candidate, ...] = ()
     start = State(arm=(antenna[0], antenna[1]))
@@ -430,8 +457,10 @@ def _pruned(tie: Tie, found: Fit, start: State, vessel: Vessel, antenna: tuple[f
             break
         kept = tuple(c for k, c in enumerate(found.candidates) if k != weakest)
         state = _restored(found.state, found.candidates[weakest], start)
-        found = fit(tie, kept, state) if kept else Fit(
-            start, (), np.zeros((0, 0)), found.loglik, np.zeros(0)
+        found = (
+            fit(tie, kept, state)
+            if kept
+            else Fit(start, (), np.zeros((0, 0)), found.loglik, np.zeros(0))
         )
     return found
 
@@ -589,7 +618,13 @@ def _arm_finding(arm: Array, std: Array, antenna: tuple[float, ...]) -> Finding:
         f"write antenna = [{arm[0]:.2f}, {arm[1]:.2f}] in [sensors], or import --fix, which moves "
         f"the positions to where the vessel file has them",
         ("x_n", "y_n"),
-        (Repair("lever", ("x_n", "y_n"), (float(arm[0] - antenna[0]), float(arm[1] - antenna[1]))),),
+        (
+            Repair(
+                "lever",
+                ("x_n", "y_n"),
+                tuple(float(a - d) for a, d in zip(arm, antenna, strict=True)),
+            ),
+        ),
         True,
     )
 
@@ -639,8 +674,9 @@ def _outcomes(tie: Tie, found: Fit, usable: list[Candidate]) -> list[Outcome]:
             )  # fmt: skip
         else:
             error = (
-                f"{np.degrees(std[0]):.2f} deg" if kind == "heading_bias" else
-                f"{std[0]:.2g} and {std[1]:.2g} m"
+                f"{np.degrees(std[0]):.2f} deg"
+                if kind == "heading_bias"
+                else f"{std[0]:.2g} and {std[1]:.2g} m"
             )
             outcomes.append(Outcome(kind, "clean", f"standard error {error}"))
     return outcomes

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from greybox.channels import ANGLES
 from greybox.trial.checks.finding import Finding, Repair
+from greybox.trial.deriving import continuous
 from greybox.trial.recording import Recording, Signal
 from greybox.trial.resampling import HOLE, clock, runs
 from greybox.vessel.vessel import Vessel
@@ -115,9 +116,14 @@ def missing_findings(recording: Recording) -> list[Finding]:
         names = tuple(s.name for s in members)
         t, n = members[0].t, len(bad)
         start = t[stretches[0][0]]
-        where = "at the end" if len(stretches) == 1 and stretches[0][1] == n else (
-            f"first at t = {start:.6g} s" if np.isfinite(start) else
-            f"first in row {stretches[0][0] + 1}"
+        where = (
+            "at the end"
+            if len(stretches) == 1 and stretches[0][1] == n
+            else (
+                f"first at t = {start:.6g} s"
+                if np.isfinite(start)
+                else f"first in row {stretches[0][0] + 1}"
+            )
         )
         count = float(bad.sum())
         found.append(
@@ -213,8 +219,28 @@ def _spikes(value: Array) -> tuple[NDArray[np.int64], float, Array]:
     local = 1.4826 * median_filter(np.abs(gap), size=51, mode="nearest")
     limit = np.maximum(_SPIKE * scale, _LOCAL_SPIKE * local) + 2 * step
     out = np.abs(gap) > limit
-    wide = [k for a, b in runs(out) if b - a <= _SPIKE_WIDTH for k in range(a, b)]
+    wide = [
+        k
+        for a, b in runs(out)
+        if b - a <= _SPIKE_WIDTH and _comes_back(value, a, b)
+        for k in range(a, b)
+    ]
     return np.array(wide, dtype=np.int64), scale, gap
+
+
+def _comes_back(value: Array, a: int, b: int) -> bool:
+    """Whether samples a to b leave their neighbours by far more than these differ.
+
+    A sharp turn at a coarse sample time bends too, but its neighbours move alike.
+    """
+    before, after = value[max(a - 3, 0) : a], value[b : b + 3]
+    beside = np.concatenate([before, after])
+    if len(beside) < 4:
+        return False
+    part = value[a:b]
+    excess = float(max((part - beside.max()).max(), (beside.min() - part).max()))
+    steps = max(float(np.abs(np.diff(side)).max()) for side in (before, after) if len(side) > 1)
+    return excess > 3 * max(steps, float(abs(value[min(b, len(value) - 1)] - value[a - 1])))
 
 
 def _digits(value: Array) -> int:
@@ -256,7 +282,8 @@ def coarse_findings(recording: Recording) -> list[Finding]:
     for _, t in _clocks(recording):
         times = t[np.isfinite(t)]
         digits = _digits(times)
-        if digits:
+        steps = np.diff(np.unique(times))
+        if digits and steps.max() > 5 * np.quantile(steps, 0.1):
             found.append(_rounded_finding("t", times, times, "s", digits))
     for s in _motion(recording):
         t, value = _clean(s)
@@ -367,6 +394,7 @@ def stuck_findings(recording: Recording, vessel: Vessel) -> list[Finding]:
 
 def _moves(name: str, start: float, stop: float, signals: list[Signal], step: float) -> bool:
     """Whether the rest of the log says that this channel should have changed."""
+
     def part(other: str) -> Array | None:
         for s in signals:
             if s.name == other:
@@ -425,7 +453,7 @@ def angle_unit_findings(recording: Recording, vessel: Vessel) -> list[Finding]:
                     f"{s.name} reaches {largest:.4g}, which cannot be radians: degrees under a "
                     f"radian name",
                     f"multiply {s.name} by pi/180 (import --fix does), or map it with "
-                    f"unit = \"deg\" in [columns]",
+                    f'unit = "deg" in [columns]',
                     (s.name,),
                     (Repair("scale", (s.name,), (factor,)),),
                     True,
@@ -445,14 +473,6 @@ def _clean(s: Signal) -> tuple[Array, Array]:
     if s.name == "psi":
         value = continuous(value)
     return t, value
-
-
-def continuous(angle: Array) -> Array:
-    """Return an angle without its wraps, be they of 2π or of 360."""
-    jumps = np.abs(np.diff(angle))
-    if np.any((jumps > 300) & (jumps < 361)):
-        return np.asarray(np.unwrap(angle, period=360.0))
-    return np.asarray(np.unwrap(angle))
 
 
 def _clocks(recording: Recording) -> list[tuple[tuple[str, ...], Array]]:

@@ -1,4 +1,4 @@
-"""Convention of the measured wind: the right one makes the true wind steady while the ship turns."""
+"""Convention of the measured wind: the right one keeps the true wind steady in turns."""
 
 from __future__ import annotations
 
