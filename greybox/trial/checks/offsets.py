@@ -563,6 +563,9 @@ def _clock_finding(c: Candidate, value: float, std: float, motion: Motion) -> Fi
     names = ", ".join(channels[:-1]) + " and " + channels[-1] if len(channels) > 1 else channels[0]
     late = "late" if value > 0 else "early"
     against = [n for n in ("x_n", "psi", "u", "r") if n in motion and n not in channels]
+    half = ""
+    if "x_n" in channels and abs(value - 0.5 * motion.step) < max(2.5 * std, 0.02):
+        half = " (half a sample: a simulation by Euler's rule at this step looks the same)"
     return Finding(
         "clock_offset",
         channels[0],
@@ -570,7 +573,7 @@ def _clock_finding(c: Candidate, value: float, std: float, motion: Motion) -> Fi
         (value - 1.96 * std, value + 1.96 * std),
         "s",
         f"{names} {'comes' if len(channels) == 1 else 'come'} {abs(value):.2f} s {late} against "
-        f"{_words(against)}: shifted so, positions, velocities and heading agree",
+        f"{_words(against)}: shifted so, positions, velocities and heading agree{half}",
         f"shift {names} by {-value:+.2f} s (import --fix does), and look for the delay in the "
         f"logger or a filter",
         channels,
