@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,6 +101,7 @@ def response_findings(
             a.channels,
             a.repair,
             False,
+            problem.picture(vessel, inputs, _as_read(inputs, a)),
         )
     ]
 
@@ -135,7 +137,7 @@ class _Problem:
     def __init__(
         self, motion: Motion, states: list[str], rows: NDArray[np.int64], step: int
     ) -> None:
-        self.states, self.rows, self.step = states, rows, step
+        self.motion, self.states, self.rows, self.step = motion, states, rows, step
         means = {s: self._mean(motion[s], rows) for s in states}
         after = {s: self._mean(motion[s], rows + step) for s in states}
         self.change = {s: after[s] - means[s] for s in states}
@@ -149,6 +151,38 @@ class _Problem:
     def _mean(self, value: Array, rows: NDArray[np.int64]) -> Array:
         total = np.concatenate([[0.0], np.cumsum(value)])
         return np.asarray((total[rows + self.step] - total[rows]) / self.step)
+
+    def picture(
+        self, vessel: Vessel, inputs: dict[str, Array], as_read: dict[str, Array]
+    ) -> dict[str, Any]:
+        """Return acceleration beyond damping and the thrusters' push, of the clearest state."""
+        shown: dict[str, Any] = {}
+        seconds = self.step * self.motion.step
+        for s in self.states:
+            logged, read = (self._pushed(vessel, x, s) for x in (inputs, as_read))
+            if logged is None or read is None:
+                continue
+            rest = self._beside(self.change[s])
+            pushes = [self._beside(logged), self._beside(read)]
+            size = float(np.linalg.norm(rest)) or 1.0
+            match = [float(p @ rest) / (size * (float(np.linalg.norm(p)) or 1.0)) for p in pushes]
+            if not shown or match[1] > shown["match"][1]:
+                shown = {
+                    "state": s, "t": self.motion.t[self.rows] + seconds,
+                    "acceleration": rest / seconds, "push": pushes[0], "push_read": pushes[1],
+                    "match": tuple(match),
+                }  # fmt: skip
+        return shown
+
+    def _pushed(self, vessel: Vessel, inputs: dict[str, Array], state: str) -> Array | None:
+        force = _force_of(generalised_force(vessel, inputs), state)
+        return None if force is None else self._mean(force, self.rows + self.step // 2)
+
+    def _beside(self, value: Array) -> Array:
+        """Return what velocities do not explain of a column."""
+        return np.asarray(
+            value - self.damping @ np.linalg.lstsq(self.damping, value, rcond=None)[0]
+        )
 
     def loglik(self, vessel: Vessel, inputs: dict[str, Array]) -> float | None:
         """Return the likelihood with gains that push the right way; None without force."""
