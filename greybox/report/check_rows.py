@@ -50,8 +50,9 @@ def gap_figure(finding: Finding, recording: Recording) -> Figure:
     _draw(whole, t, value)
     _shade(whole, gaps)
     start, stop = max(gaps, key=_length)
-    _draw_part(zoom, t, value, *_around(t, start, stop))
-    _shade(zoom, [(start, stop)], "")
+    low, high = _around(t, start, stop)
+    _draw_part(zoom, t, value, low, high)
+    _shade(zoom, [x for x in gaps if x[1] > low and x[0] < high], "")
     zoom.set_title(f"the longest: {stop - start:.4g} s", fontsize=9)
     steps = np.diff(times)
     third.semilogy(*_dots(times[:-1], steps, 600), ".", color=BLUE, markersize=2.5)
@@ -103,7 +104,7 @@ def missing_figure(finding: Finding, recording: Recording) -> Figure:
     bad: NDArray[np.bool_] = finding.picture["bad"]
     timed = np.isfinite(t)
     t, bad = t[timed], bad[timed]
-    s = recording[finding.channel]
+    s = _telling(recording, finding.channels)
     good_t, value = _orderly(s)
     period = clock(np.unique(t)).period if len(t) > 1 else 1.0
     # a lone missing sample is as wide as its step
@@ -120,7 +121,8 @@ def missing_figure(finding: Finding, recording: Recording) -> Figure:
         _draw_part(zoom, good_t, value, low, high, breaks=spans)
         inside = [x for x in spans if x[1] > low and x[0] < high]
         _shade(zoom, inside, "")
-        zoom.set_title(f"the longest: {max(b - a for a, b in found)} samples", fontsize=9)
+        count = max(b - a for a, b in found)
+        zoom.set_title(f"the longest: {count} sample{'s' * (count > 1)}", fontsize=9)
     _name(s, whole, zoom)
     return figure
 

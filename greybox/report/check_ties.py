@@ -40,6 +40,8 @@ _DOTS = 700
 _LAGS = 41
 _CURVE_SAMPLES = 12_000
 # what a mended pair must change by to be worth a column, in shares of the largest change
+# logarithm of the disagreement's change below which a repair is no help
+_LEAST_HELP = -0.01
 _LEAST_CHANGE = 0.03
 # smoothing goes on until the disagreement that is left is this share of that before
 _CLEAR = 0.35
@@ -77,6 +79,12 @@ class Tie:
     drift: tuple[float, float]
     antenna: tuple[float, float]
     others: bool
+
+    @property
+    def helps(self) -> bool:
+        """Whether the repair brings the velocities closer, all in all."""
+        ratio = [self.after.rms(n) / max(self.before.rms(n), 1e-12) for n in self.names]
+        return float(np.mean(np.log(np.maximum(ratio, 1e-12)))) < _LEAST_HELP
 
 
 def make_tie(finding: Finding, report: CheckReport, vessel: Vessel) -> Tie | None:
@@ -232,7 +240,11 @@ def signed(text: str) -> str:
 
 
 def _two_clearest(tie: Tie) -> tuple[str, ...]:
-    gain = {n: tie.before.rms(n) / max(tie.after.rms(n), 1e-12) for n in tie.names}
+    # a repair that makes a pair worse must show as well
+    gain = {
+        n: abs(np.log(max(tie.before.rms(n), 1e-12) / max(tie.after.rms(n), 1e-12)))
+        for n in tie.names
+    }
     kept = sorted(gain, key=lambda n: -gain[n])[:2]
     return tuple(n for n in tie.names if n in kept)
 

@@ -61,6 +61,9 @@ _TIE = (
     "Velocities as logged and from positions and heading where they differ most, above as logged "
     "and below mended, with their root mean square disagreement over the log."
 )
+_DOUBT = (
+    " The velocities of the whole log come no closer by this repair: judge it before you apply it."
+)
 
 
 def check_page(
@@ -139,6 +142,11 @@ def finding_figure(finding: Finding, report: CheckReport, vessel: Vessel) -> Fig
     UsageError
         The report holds no recording.
     """
+    return _drawn(finding, report, vessel)[0]
+
+
+def _drawn(finding: Finding, report: CheckReport, vessel: Vessel) -> tuple[Figure, str]:
+    """Return the picture, and a doubt where it does not bear the finding out."""
     recording = report.recording
     if recording is None:
         raise UsageError(
@@ -147,27 +155,29 @@ def finding_figure(finding: Finding, report: CheckReport, vessel: Vessel) -> Fig
         )
     picture = finding.picture
     if finding.id == "gap":
-        return gap_figure(finding, recording)
+        return gap_figure(finding, recording), ""
     if finding.id == "duplicate_time":
-        return order_figure(finding)
+        return order_figure(finding), ""
     if finding.id == "nan":
-        return missing_figure(finding, recording)
+        return missing_figure(finding, recording), ""
     if finding.id == "outlier":
-        return spike_figure(finding)
+        return spike_figure(finding), ""
     if finding.id == "stuck":
-        return stuck_figure(finding, recording)
+        return stuck_figure(finding, recording), ""
     if finding.id == "quantised":
-        return coarse_figure(finding)
+        return coarse_figure(finding), ""
     if "limit" in picture:
-        return range_figure(finding)
+        return range_figure(finding), ""
     if "air" in picture:
-        return wind_figure(finding)
+        return wind_figure(finding), ""
     if "push" in picture:
-        return answer_figure(finding)
+        return answer_figure(finding), ""
     if "drift" in picture:
-        return course_figure(finding)
+        return course_figure(finding), ""
     tie = make_tie(finding, report, vessel)
-    return signals_figure(finding, recording, vessel) if tie is None else tie_figure(finding, tie)
+    if tie is None:
+        return signals_figure(finding, recording, vessel), ""
+    return tie_figure(finding, tie), "" if tie.helps else _DOUBT
 
 
 def _rank(item: tuple[Finding, CheckReport]) -> int:
@@ -184,8 +194,9 @@ def _section(number: int, report: CheckReport, vessel: Vessel) -> Section:
         if report.recording is None:
             sentences.append(said)
             continue
-        figure = finding_figure(f, report, vessel)
-        pictures.append(Picture(to_svg(figure, f"log{number}finding{k}"), said, alternative(f)))
+        figure, doubt = _drawn(f, report, vessel)
+        svg = to_svg(figure, f"log{number}finding{k}")
+        pictures.append(Picture(svg, f"{said}{doubt}", f"{alternative(f)}{doubt}"))
     if report.recording is not None:
         try:
             log = _whole(report.recording, vessel)

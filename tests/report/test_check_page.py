@@ -206,6 +206,19 @@ def test_a_reading_explains_nearly_all(name):
     assert all(tie.before.rms(n) > 5 * tie.after.rms(n) for n in tie.names)
 
 
+def test_a_repair_that_does_not_help_is_doubted(tmp_path):
+    report = tie_case("clock of u, v")
+    path = tmp_path / "check.html"
+    check_page([report], [Path("a.csv")], SHIP, path)
+    assert "judge it before you apply it" not in path.read_text()
+    wrong = replace(
+        report.findings[0], value=-1.0, ci=(-1.1, -0.9),
+        repair=(Repair("shift", ("u", "v"), (-1.0,)),),
+    )  # fmt: skip
+    check_page([replace(report, findings=(wrong,))], [Path("a.csv")], SHIP, path)
+    assert "judge it before you apply it" in path.read_text()
+
+
 def test_disagreement_is_least_at_the_offset():
     report = tie_case("clock of u, v")
     motion = make_motion(report.recording)
