@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +40,8 @@ _LEAST_RATIO = 1.5
 # one equation may prefer the columns as they are by chance, never by much
 _MOST_LOSS = 0.3
 _MIN_SAMPLES = 60
+# spans over which accelerations are shown [s]
+_PICTURE_SECONDS = 2.0
 _STATES = ("u", "v", "r")
 _INPUT_OF = {"u": "taux", "v": "tauy", "r": "taun"}
 
@@ -111,8 +114,60 @@ def response_findings(
             a.channels,
             a.repair,
             False,
+            _picture(motion, vessel, inputs, _as_read(inputs, a)),
         )
     ]
+
+
+def _picture(
+    motion: Motion, vessel: Vessel, inputs: dict[str, Array], as_read: dict[str, Array]
+) -> dict[str, Any]:
+    """Return acceleration beyond damping and the thrusters' push, of the clearest state.
+
+    Differences over two seconds: plainer to look at than the integrals that decide.
+    """
+    step = max(1, round(_PICTURE_SECONDS / motion.step))
+    rows = np.concatenate([np.arange(a, b - 2 * step, step) for a, b in motion.stretches])
+    seconds = step * motion.step
+
+    def mean(value: Array, at: NDArray[np.int64]) -> Array:
+        total = np.concatenate([[0.0], np.cumsum(value)])
+        return np.asarray((total[at + step] - total[at]) / step)
+
+    states = [s for s in _STATES if s in motion]
+    before = {s: mean(motion[s], rows) for s in states}
+    after = {s: mean(motion[s], rows + step) for s in states}
+    middle = {s: 0.5 * (before[s] + after[s]) for s in states}
+    damping = np.column_stack(
+        [
+            np.ones(len(rows)),
+            *[middle[s] for s in states],
+            *[middle[s] * np.abs(middle[s]) for s in states],
+        ]
+    )
+
+    def beside(value: Array) -> Array:
+        return np.asarray(value - damping @ np.linalg.lstsq(damping, value, rcond=None)[0])
+
+    shown: dict[str, Any] = {}
+    for s in states:
+        forces = [_force_of(generalised_force(vessel, x), s) for x in (inputs, as_read)]
+        if any(f is None for f in forces):
+            continue
+        rest = beside(after[s] - before[s])
+        pushes = [beside(mean(f, rows + step // 2)) for f in forces if f is not None]
+        size = float(np.linalg.norm(rest)) or 1.0
+        match = [float(p @ rest) / (size * (float(np.linalg.norm(p)) or 1.0)) for p in pushes]
+        if not shown or match[1] > shown["match"][1]:
+            shown = {
+                "state": s,
+                "t": motion.t[rows] + seconds,
+                "acceleration": rest / seconds,
+                "push": pushes[0],
+                "push_read": pushes[1],
+                "match": tuple(match),
+            }
+    return shown
 
 
 def _held(recording: Recording, name: str, t: Array) -> Array:

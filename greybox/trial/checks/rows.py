@@ -59,7 +59,7 @@ def time_findings(recording: Recording) -> list[Finding]:
                     ("t",),
                     (Repair("order", names),),
                     True,
-                    {"t": finite, "steps": steps},
+                    {"t": finite, "steps": steps, "names": names},
                 )
             )
         found += _gaps(names, np.unique(finite))
@@ -96,7 +96,8 @@ def _gaps(names: tuple[str, ...], t: Array) -> list[Finding]:
             ("t",),
             (),
             False,
-            {"t": t, "gaps": [(float(t[k]), float(t[k + 1])) for k in wide[:200]]},
+            {"t": t, "gaps": [(float(t[k]), float(t[k + 1])) for k in wide[:200]],
+             "names": names, "limit": HOLE * usual},
         )
     ]
 
@@ -183,7 +184,8 @@ def spike_findings(recording: Recording) -> list[Finding]:
                 (s.name,),
                 (Repair("drop", (s.name,), tuple(float(x) for x in t[spikes])),),
                 True,
-                {"t": t, "value": value, "spikes": spikes},
+                {"t": t, "value": value, "spikes": spikes, "worst": int(worst),
+                 "distance": gap},
             )
         )
     return found
@@ -317,7 +319,7 @@ def coarse_findings(recording: Recording) -> list[Finding]:
                 (s.name,),
                 (),
                 False,
-                {"t": t, "value": value},
+                {"t": t, "value": value, "step": step},
             )
         )
     return found
@@ -457,7 +459,7 @@ def angle_unit_findings(recording: Recording, vessel: Vessel) -> list[Finding]:
                     (s.name,),
                     (Repair("scale", (s.name,), (factor,)),),
                     True,
-                    {"t": s.t, "value": s.value},
+                    {"t": s.t, "value": s.value, "limit": float(limit)},
                 )
             )
     return found
