@@ -111,4 +111,3 @@ def _pushed(recording: Recording, vessel: Vessel, angle: float) -> bool:
     across = float(np.mean(made.get("tauy", np.zeros(1))))
     total = sum(float(np.mean(np.abs(v))) for v in made.values()) or 1.0
     return bool(across * np.sin(angle) > 0.05 * total)
-

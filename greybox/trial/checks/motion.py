@@ -28,6 +28,9 @@ _MAX_SAMPLES = 40_000
 _MAX_STRETCHES = 30
 _MIN_STRETCH = 20
 _ROBUST = 4.0
+# reach of the kernels that are tried against noise, and samples left out beside each
+_MOST_TAPS = 90
+_LEFT_OUT = 2
 # gains of the local-level filter; 1 is a pure random walk
 GAINS = np.geomspace(0.003, 1.0, 9)
 
@@ -281,15 +284,21 @@ def denoise(value: Array, motion: Motion) -> Array:
     noisy rate gyro on a slow ship, narrow for a clean signal.
     """
     best, chosen = np.inf, value
-    for seconds in motion.step * np.array([0.7, 1.0, 1.5, 2, 3, 4.5, 7, 10, 15, 22, 32, 45]):
-        slow = smooth(value, motion, float(seconds))
-        width = seconds / motion.step
-        taps = np.arange(-int(3 * width + 0.5), int(3 * width + 0.5) + 1)
-        weight = np.exp(-0.5 * (taps / width) ** 2)
-        centre = 1.0 / float(weight.sum())
-        error = float(np.mean(((value - slow) / (1.0 - centre)) ** 2))
-        if error < best:
-            best, chosen = error, slow
+    taps = np.arange(-_MOST_TAPS, _MOST_TAPS + 1)
+    for width in (1.5, 2.0, 3.0, 4.5, 7.0, 10.0, 15.0, 22.0, 32.0, 45.0):
+        # neighbours are left out too: their noise may go along with that of the sample
+        weight = np.where(np.abs(taps) > _LEFT_OUT, np.exp(-0.5 * (taps / width) ** 2), 0.0)
+        error, count = 0.0, 0
+        for a, b in motion.stretches:
+            if b - a > 2 * _MOST_TAPS:
+                said = np.convolve(value[a:b], weight / weight.sum(), "valid")
+                error += float(np.sum((value[a + _MOST_TAPS : b - _MOST_TAPS] - said) ** 2))
+                count += len(said)
+        if not count:
+            return smooth(value, motion, 2.0 * motion.step)
+        if error / count < best:
+            best = error / count
+            chosen = smooth(value, motion, width * motion.step)
     return chosen
 
 

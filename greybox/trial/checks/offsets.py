@@ -41,6 +41,8 @@ _SIGMAS = 3.3
 _LEAST_GAIN = 5.5
 # wide enough to see a whole turn, which tells a late compass from a lever arm
 _SCAN = (-8.0, -6.0, -4.5, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 4.5, 6.0, 8.0)
+_MOST_LATE = 9.0
+_FAR_COST = 6.0
 _ROUNDS = 12
 _MOST = 3
 # beyond this time the heading's own noise is averaged out
@@ -437,7 +439,12 @@ def find_offsets(motion: Motion, vessel: Vessel) -> tuple[list[Finding], list[Ou
             if any(c.id == k.id and set(c.channels) & set(k.channels) for k in chosen):
                 continue
             trial = fit(tie, (*chosen, c), _scan(tie, c, best.state))
-            trials.append((trial.loglik - c.cost * inflation, trial))
+            if max(map(abs, trial.state.late.values()), default=0.0) > _MOST_LATE:
+                continue
+            # a scan over many seconds finds more by chance than a search around zero
+            far = c.id == "clock_offset" and abs(trial.state.late[c.channels[0]]) > 2.0
+            cost = (c.cost + (_FAR_COST if far else 0.0)) * inflation
+            trials.append((trial.loglik - cost, trial))
         if not trials:
             break
         worth, trial = max(trials, key=_first)

@@ -96,8 +96,12 @@ def _gaps(names: tuple[str, ...], t: Array) -> list[Finding]:
             ("t",),
             (),
             False,
-            {"t": t, "gaps": [(float(t[k]), float(t[k + 1])) for k in wide[:200]],
-             "names": names, "limit": HOLE * usual},
+            {
+                "t": t,
+                "gaps": [(float(t[k]), float(t[k + 1])) for k in wide[:200]],
+                "names": names,
+                "limit": HOLE * usual,
+            },
         )
     ]
 
@@ -184,8 +188,7 @@ def spike_findings(recording: Recording) -> list[Finding]:
                 (s.name,),
                 (Repair("drop", (s.name,), tuple(float(x) for x in t[spikes])),),
                 True,
-                {"t": t, "value": value, "spikes": spikes, "worst": int(worst),
-                 "distance": gap},
+                {"t": t, "value": value, "spikes": spikes, "worst": int(worst), "distance": gap},
             )
         )
     return found
@@ -285,15 +288,17 @@ def coarse_findings(recording: Recording) -> list[Finding]:
         times = t[np.isfinite(t)]
         digits = _digits(times)
         steps = np.diff(np.unique(times))
-        if digits and steps.max() > 5 * np.quantile(steps, 0.1):
+        # an even clock looks rounded too, when its step is
+        uneven = np.mean(np.abs(steps - np.median(steps)) > 0.3 * np.median(steps))
+        if digits and uneven > 0.2:
             found.append(_rounded_finding("t", times, times, "s", digits))
     for s in _motion(recording):
         t, value = _clean(s)
-        digits = _digits(_wrapped(s))
-        if digits and np.mean(np.diff(value) == 0) > 0.3:
+        step = _quantum(value)
+        digits = _digits(_wrapped(s)) if step <= 0 else 0
+        if digits and (digits < 4 or np.mean(np.diff(value) == 0) > 0.3):
             found.append(_rounded_finding(s.name, t, value, s.unit or "1", digits))
             continue
-        step = _quantum(value)
         if step <= 0 or len(value) < 50:
             continue
         change = np.abs(np.diff(value))
@@ -414,11 +419,11 @@ def _moves(name: str, start: float, stop: float, signals: list[Signal], step: fl
         if u is not None and v is not None and psi is not None and len(u) == len(v) == len(psi):
             c, s = np.cos(psi), np.sin(psi)
             rate = c * u - s * v if name == "x_n" else s * u + c * v
-            return bool(abs(rate.mean()) * span > max(0.3, 3 * step))
+            return bool(np.ptp(np.cumsum(rate)) * span / len(rate) > max(0.3, 3 * step))
     if name == "psi":
         r = part("r")
         if r is not None:
-            return bool(abs(r.mean()) * span > max(0.03, 3 * step))
+            return bool(np.ptp(np.cumsum(r)) * span / len(r) > max(0.05, 3 * step))
     # a velocity repeats exactly only where everything stands still, or it is stuck
     for other in signals:
         inside = part(other.name)

@@ -99,7 +99,9 @@ def wind_findings(recording: Recording, findings: list[Finding]) -> list[Finding
             steps,
             bool(steps),
             {
-                "t": motion.t, "psi": psi, "air": turn(psi, u - u_q, v - v_q),
+                "t": motion.t,
+                "psi": psi,
+                "air": turn(psi, u - u_q, v - v_q),
                 "air_mended": turn(psi, u - through.real, v - through.imag),
             },
         )
