@@ -73,7 +73,8 @@ class Candidate:
 
 _CANDIDATES = (
     Candidate("clock_offset", ("psi",)),
-    Candidate("clock_offset", ("r",)),
+    # a rate gyro is noisy against what a slow ship turns: the least certain of all
+    Candidate("clock_offset", ("r",), 2.5),
     Candidate("clock_offset", ("x_n", "y_n")),
     Candidate("clock_offset", ("u", "v")),
     Candidate("clock_offset", ("psi", "r"), 4.0),
