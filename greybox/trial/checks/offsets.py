@@ -143,6 +143,7 @@ class Tie:
         n, s = self.level.shape
         self.drift = (motion.t - motion.t[0]) / max(float(np.ptp(motion.t)), 1e-9)
         self.columns = 2 * s + 3
+        self.calm = self.smooth.get("psi", np.zeros(len(motion)))
         self.positioned, self.turned = motion.positioned, motion.turned
         if self.turned:
             # as for the positions below: what is fast in the heading comes from the rate
@@ -189,6 +190,17 @@ class Tie:
             out[a:b] += _beyond(t + late, t, slow) - slow
         return out
 
+    def _late(self, value: Array, name: str, state: State) -> Array:
+        """Return a noise-free channel as it would be were it not late."""
+        late = state.late.get(name, 0.0) - state.common
+        if late == 0.0:
+            return value
+        out = np.empty_like(value)
+        for a, b in self.motion.stretches:
+            t = self.motion.t[a:b]
+            out[a:b] = _beyond(t + late, t, value[a:b])
+        return out
+
     def walked(self, state: State, values: dict[str, Array]) -> Array:
         """Return the way made by velocities and heading (N, 2) [m]."""
         psi = self._at("psi", state, values) - state.bias
@@ -202,7 +214,8 @@ class Tie:
         """Return measured position minus that of velocity, heading and lever arm (N, 2) [m]."""
         if walked is None:
             walked = self.walked(state, values)
-        psi = self._at("psi", state, values) - state.bias
+        # the heading's noise, a lever long, would count as noise of the positions
+        psi = self._late(self.calm, "psi", state) - state.bias
         arm = turn(psi, np.full(len(psi), state.arm[0]), np.full(len(psi), state.arm[1]))
         measured = np.column_stack([self._at("x_n", state, values), self._at("y_n", state, values)])
         return measured - walked - arm
@@ -452,8 +465,35 @@ def find_offsets(motion: Motion, vessel: Vessel) -> tuple[list[Finding], list[Ou
         if worth - best.loglik < _LEAST_GAIN * inflation:
             break
         best, chosen = trial, trial.candidates
+    best = _exchanged(tie, best, usable, inflation)
     final = _pruned(tie, best, start, vessel, antenna)
     return _findings(final, motion, vessel, antenna), _outcomes(tie, final, usable)
+
+
+def _exchanged(tie: Tie, found: Fit, usable: list[Candidate], inflation: float) -> Fit:
+    """Exchange one late channel for another where that explains more beside the rest.
+
+    What was taken first was taken alone, and may stand for two defects together.
+    """
+    if len(found.candidates) < 2:
+        return found
+    best, worth = found, _net(found, inflation)
+    for k, old in enumerate(found.candidates):
+        if old.id != "clock_offset":
+            continue
+        for new in usable:
+            if new.id != "clock_offset" or new in found.candidates:
+                continue
+            others = tuple(c for j, c in enumerate(found.candidates) if j != k)
+            state = _restored(found.state, old, found.state)
+            trial = fit(tie, (*others, new), state)
+            if _net(trial, inflation) > worth + 2.0 * inflation:
+                best, worth = trial, _net(trial, inflation)
+    return best
+
+
+def _net(found: Fit, inflation: float) -> float:
+    return found.loglik - inflation * sum(c.cost for c in found.candidates)
 
 
 def _pruned(tie: Tie, found: Fit, start: State, vessel: Vessel, antenna: tuple[float, ...]) -> Fit:
