@@ -83,7 +83,7 @@ _CANDIDATES = (
     Candidate("clock_offset", ("v",), 3.0),
     Candidate("clock_offset", ("x_n",), 30.0),
     Candidate("clock_offset", ("y_n",), 30.0),
-    Candidate("lever_arm", ("x_n", "y_n"), 1.0),
+    Candidate("lever_arm", ("x_n", "y_n"), 3.0),
     Candidate("heading_bias", ("psi",)),
 )
 
@@ -146,16 +146,28 @@ class Tie:
         self.calm = self.smooth.get("psi", np.zeros(len(motion)))
         self.positioned, self.turned = motion.positioned, motion.turned
         if self.turned:
-            # as for the positions below: what is fast in the heading comes from the rate
-            swept = integrate(self.smooth["r"], motion)
-            slow = smooth(motion["psi"] - swept, motion, max(_HEADING_WINDOW, 5 * motion.step))
-            self.smooth["psi"] = swept + slow
+            self.align(self.start)
         if self.positioned:
             # what is moved in time must not know the positions' own noise, or moving it would
             # seem to explain that noise: the way by the other sensors stands in for them
             way = self.walked(State(), self.smooth)
             self.smooth["x_n"], self.smooth["y_n"] = way[:, 0], way[:, 1]
         self.samples = (2 * n if self.positioned else 0) + (n if self.turned else 0)
+
+    def align(self, state: State) -> None:
+        """Take the fast part of the noise-free heading from the rate, as late as the heading is.
+
+        As for the positions: what is moved in time must not know its own noise.
+        """
+        if not self.turned:
+            return
+        behind = state.late.get("psi", 0.0) - state.late.get("r", 0.0)
+        swept = integrate(self.smooth["r"], self.motion)
+        for a, b in self.motion.stretches:
+            t = self.motion.t[a:b]
+            swept[a:b] = _beyond(t - behind, t, swept[a:b])
+        seconds = max(_HEADING_WINDOW, 5 * self.motion.step)
+        self.smooth["psi"] = swept + smooth(self.motion["psi"] - swept, self.motion, seconds)
 
     def weigh(self, what: str) -> Callable[[float], Array]:
         """Return gain -> weights of the innovations of ``position`` or ``heading``.
@@ -464,8 +476,10 @@ def find_offsets(motion: Motion, vessel: Vessel) -> tuple[list[Finding], list[Ou
         worth, trial = max(trials, key=_first)
         if worth - best.loglik < _LEAST_GAIN * inflation:
             break
-        best, chosen = trial, trial.candidates
-    best = _exchanged(tie, best, usable, inflation)
+        chosen = trial.candidates
+        tie.align(trial.state)
+        best = fit(tie, chosen, trial.state)
+    best = _exchanged(tie, _without_one(tie, best, start, inflation), usable, inflation)
     final = _pruned(tie, best, start, vessel, antenna)
     return _findings(final, motion, vessel, antenna), _outcomes(tie, final, usable)
 
@@ -490,6 +504,21 @@ def _exchanged(tie: Tie, found: Fit, usable: list[Candidate], inflation: float) 
             if _net(trial, inflation) > worth + 2.0 * inflation:
                 best, worth = trial, _net(trial, inflation)
     return best
+
+
+def _without_one(tie: Tie, found: Fit, start: State, inflation: float) -> Fit:
+    """Drop a candidate that another, looked for anew, makes needless."""
+    for old in found.candidates if len(found.candidates) > 1 else ():
+        others = tuple(c for c in found.candidates if c is not old)
+        state = _restored(found.state, old, start)
+        begins = [state]
+        if len(others) == 1:
+            begins.append(_scan(tie, others[0], start))
+        for begin in begins:
+            trial = fit(tie, others, begin)
+            if _net(trial, inflation) > _net(found, inflation) - _LEAST_GAIN * inflation:
+                return _without_one(tie, trial, start, inflation)
+    return found
 
 
 def _net(found: Fit, inflation: float) -> float:
