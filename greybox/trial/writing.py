@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from itertools import chain
 from pathlib import Path
@@ -25,7 +25,11 @@ def record_path(path: str | Path) -> Path:
 
 
 def write_log(
-    segments: Iterable[TrialLog], path: str | Path, *, extra: Mapping[str, Any] | None = None
+    segments: Iterable[TrialLog],
+    path: str | Path,
+    *,
+    extra: Mapping[str, Any] | None = None,
+    provenance: Callable[[], Provenance] | None = None,
 ) -> None:
     """Write the segments of a log as one table, and its record beside it.
 
@@ -41,6 +45,8 @@ def write_log(
         CSV, or Parquet where it ends so.
     extra : mapping, optional
         More entries of the record.
+    provenance : callable, optional
+        Asked after the last segment; that of the first segment by default.
 
     Raises
     ------
@@ -94,7 +100,7 @@ def write_log(
         "sample_time": first.sample_time,
         "units": _units(first, names),
         "segments": _merged(spans, first.sample_time)[:1000],
-        **asdict(first.provenance),
+        **asdict(first.provenance if provenance is None else provenance()),
         **(extra or {}),
     }
     write_json(record, record_path(path))
