@@ -31,9 +31,9 @@ _HEAD = 10_000
 _OVERLAP = 0.05
 
 
-def read_recording(path: str | Path, vessel: Vessel, *, guess: bool = True, **options: Any) -> (
-    Recording
-):
+def read_recording(
+    path: str | Path, vessel: Vessel, *, guess: bool = True, **options: Any
+) -> Recording:
     """Read one raw file into canonical signals.
 
     Parameters
@@ -333,7 +333,10 @@ def merge(recordings: list[Recording]) -> Recording:
             found.setdefault(s.name, []).append((r.name, replace(s, t=t)))
         for name, (t, words) in r.text.items():
             before = text.get(name, (np.empty(0), np.empty(0, dtype=str)))
-            text[name] = (np.concatenate([before[0], t + shift]), np.concatenate([before[1], words]))
+            text[name] = (
+                np.concatenate([before[0], t + shift]),
+                np.concatenate([before[1], words]),
+            )
     signals = []
     clocks: dict[tuple[int, ...], Array] = {}
     for name, parts in found.items():

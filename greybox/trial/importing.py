@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -134,9 +135,8 @@ def import_recording(
     plan = plan_import(extents, vessel, options, recording.name)
     span = (0, plan.count)
     segments, derived, short = cut_segments(signals, recording.text, plan, span, vessel, options)
-    segments = [replace(s, name=f"{s.name}[{k + 1}]") for k, s in enumerate(segments)] if (
-        len(segments) > 1
-    ) else segments
+    if len(segments) > 1:
+        segments = [replace(s, name=f"{s.name}[{k + 1}]") for k, s in enumerate(segments)]
     notes += [*plan.notes, *gap_notes([(float(s.t[0]), float(s.t[-1])) for s in segments], short)]
     if not segments:
         raise too_short(plan)
@@ -322,8 +322,8 @@ def _refuse_two_runs(t: Array, back: NDArray[np.int64], signal: str, name: str) 
     edges = np.concatenate([[0], far + 1, [len(t)]])
     if len(far) > _MAX_RUNS:
         return
-    spans = sorted((t[a:b].min(), t[a:b].max()) for a, b in zip(edges, edges[1:], strict=False))
-    for (_, stop), (start, end) in zip(spans, spans[1:], strict=False):
+    spans = sorted((t[a:b].min(), t[a:b].max()) for a, b in pairwise(edges))
+    for (_, stop), (start, end) in pairwise(spans):
         if min(stop, end) - start > _FAR * usual:
             k = int(far[0])
             raise LogError(
@@ -499,7 +499,7 @@ def gap_notes(spans: Sequence[tuple[float, float]], short: int) -> list[str]:
             f"{short} stretch{'es' if short > 1 else ''} of fewer than {_MIN_SEGMENT} samples "
             f"left out"
         )
-    gaps = [(a[1], b[0]) for a, b in zip(spans[:-1], spans[1:], strict=True)]
+    gaps = [(a[1], b[0]) for a, b in pairwise(spans)]
     if gaps:
         longest = max(gaps, key=_length)
         notes.append(

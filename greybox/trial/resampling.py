@@ -52,11 +52,11 @@ class Clock:
 
     @property
     def irregular(self) -> int:
-        """How many steps within stretches differ by more than half from the usual one."""
+        """How many steps within stretches differ by more than a third from the usual one."""
         steps = np.diff(self.t)
         within = np.ones(len(steps), bool)
         within[self.starts[1:] - 1] = False
-        return int(np.sum(within & (np.abs(steps - self.period) > 0.5 * self.period)))
+        return int(np.sum(within & (np.abs(steps - self.period) > 0.33 * self.period)))
 
 
 def usual_step(t: Array) -> float:
@@ -142,8 +142,8 @@ def _low_pass(t: Array, value: Array, grid: Array, period: float, sample_time: f
 
     ratio = sample_time / period
     # an odd number of taps keeps the filter without delay
-    taps = 2 * int(np.ceil(_TAPS_PER_RATIO * ratio / 2)) + 1
-    count = max(int(np.floor((t[-1] - t[0]) / period + 1e-9)) + 1, 2)
+    taps = 2 * int(np.ceil(_TAPS_PER_RATIO * ratio / 2 - 1e-6)) + 1
+    count = max(int(np.floor((t[-1] - t[0]) / period + 1e-6)) + 1, 2)
     fine = t[0] + period * np.arange(count)
     even = np.interp(fine, t, value)
     kernel = firwin(taps, _CUT_OFF / ratio)
@@ -155,7 +155,7 @@ def _low_pass(t: Array, value: Array, grid: Array, period: float, sample_time: f
     before = 2 * even[0] - even[half:0:-1]
     after = 2 * even[-1] - even[-2 : -half - 2 : -1]
     smooth = oaconvolve(np.concatenate([before, even, after]), kernel, mode="valid")
-    return np.interp(grid, fine, smooth)
+    return np.asarray(np.interp(grid, fine, smooth))
 
 
 def hold(of: Clock, value: Array, grid: Array) -> Array:

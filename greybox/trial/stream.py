@@ -159,7 +159,6 @@ class _Stream:
         self.samples = 0
         self.spans: list[tuple[float, float]] = []
         self.derived: dict[str, None] = {}
-        self.short = 0
         self.done = 0
         self.anchors: dict[str, float] = {}
         self.file = SourceFile(table.path.name, sha256(table.path), table.format)
@@ -173,9 +172,7 @@ class _Stream:
 
     def provenance(self) -> Provenance:
         """Return where the log came from, with all that is known by now."""
-        notes = dict.fromkeys(
-            [*self.table.notes, *self.survey.notes, *gap_notes(self.spans, self.short)]
-        )
+        notes = dict.fromkeys([*self.table.notes, *self.survey.notes, *gap_notes(self.spans, 0)])
         whole = Recording(
             self.table.path.stem, (), epoch=self.survey.scale.epoch, files=(self.file,)
         )
@@ -192,7 +189,7 @@ class _Stream:
         survey, plan = self.survey, self.survey.plan
         columns = [a.raw for a in survey.assigned.values()]
         held: dict[str, list[NDArray[Any]]] = {c: [] for c in columns}
-        rows, fresh = 0, 0
+        fresh = 0
         for batch in chain(self.table.batches(columns), [None]):
             if batch is not None:
                 for c in columns:
@@ -201,11 +198,11 @@ class _Stream:
                 if fresh < _BLOCK_ROWS:
                     continue
             block = {c: np.concatenate(held[c]) if held[c] else np.empty(0) for c in columns}
-            del held
             start, pieces = self._block(block, last=batch is None)
+            # a copy, so that the whole block is not kept for its end
+            held = {c: [block[c][start:].copy()] for c in columns}
+            del block
             yield from pieces
-            held = {c: [block[c][start:]] for c in columns}
-            rows += fresh
             fresh = 0
         if self.first is None:
             raise too_short(plan)
@@ -243,7 +240,7 @@ class _Stream:
         # samples beside those wanted, so that stretches do not end where the block does
         margin = _MARGIN
         span = (max(self.done - margin, 0), min(stop + margin, plan.count))
-        found, derived, short = cut_segments(
+        found, derived, _ = cut_segments(
             signals, recording.text, plan, span, self.vessel, self.options
         )
         self.derived.update(dict.fromkeys(derived))
@@ -282,7 +279,9 @@ class _Stream:
                         value += 2 * np.pi * turns
                     following = rows[rows >= start]
                     # the same row comes first in the next block; else the last is nearest
-                    self.anchors[s.name] = float(value[following[0] if len(following) else rows[-1]])
+                    self.anchors[s.name] = float(
+                        value[following[0] if len(following) else rows[-1]]
+                    )
                     s = s.with_value(value)
             out.append(s)
         return recording.with_signals(out)

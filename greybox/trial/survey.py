@@ -108,9 +108,7 @@ def survey_table(table: TableFile, vessel: Vessel, options: ImportOptions) -> Su
             f"{found.repeated} row{'s' if found.repeated > 1 else ''} repeat a time: "
             f"the first is kept"
         )
-    return Survey(
-        decided, found.scale, found.origin, found.back, plan, (*notes, *plan.notes)
-    )
+    return Survey(decided, found.scale, found.origin, found.back, plan, (*notes, *plan.notes))
 
 
 class _Parts:
@@ -129,9 +127,7 @@ class _Parts:
             t = np.unique(t)
         if len(t) > 1:
             part = extent(clock(t, self.hole))
-            self.extents.append(
-                part if self.last is None else replace(part, count=part.count - 1)
-            )
+            self.extents.append(part if self.last is None else replace(part, count=part.count - 1))
             self.last = part.last
         elif len(t) and self.last is None:
             self.last = float(t[0])

@@ -169,7 +169,7 @@ class DayClock:
 
         words = pd.Series(text(column)).str.strip().str.replace(",", ".", regex=False)
         parts = words.str.extract(r"^(\d\d?):(\d\d):(\d\d(?:\.\d+)?)$").astype(float).to_numpy()
-        value = parts @ np.array([3600.0, 60.0, 1.0])
+        value: NDArray[np.float64] = parts @ np.array([3600.0, 60.0, 1.0])
         good = np.flatnonzero(np.isfinite(value))
         if not len(good):
             return value

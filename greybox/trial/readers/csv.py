@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from greybox.errors import LogError
-from greybox.trial.readers import cells
+from greybox.trial.readers import cells as cell_text
 from greybox.trial.readers.layout import find_layout
 from greybox.trial.readers.table import Batch
 
@@ -61,7 +61,7 @@ class CsvFile:
             return "skip"
 
         words: Counter[str] = Counter()
-        days = {c: cells.DayClock() for c in columns if c in self.clocks}
+        days = {c: cell_text.DayClock() for c in columns if c in self.clocks}
         rows = 0
         blanks, wide = self.delimiter == " ", self.encoding.startswith("utf-16")
         try:
@@ -80,7 +80,7 @@ class CsvFile:
                 convert_options=arrow.ConvertOptions(
                     include_columns=list(columns),
                     column_types={c: pa.string() for c in columns},
-                    null_values=cells.NULLS,
+                    null_values=cell_text.NULLS,
                     strings_can_be_null=True,
                     check_utf8=False,
                 ),
@@ -120,15 +120,15 @@ class CsvFile:
             self.notes.append(note)
 
     def _values(
-        self, column: Any, name: str, words: Counter[str], days: dict[str, cells.DayClock]
+        self, column: Any, name: str, words: Counter[str], days: dict[str, cell_text.DayClock]
     ) -> Any:
         if name in self.text:
-            return cells.text(column, "cp1252" if self.encoding == "cp1252" else "utf-8")
+            return cell_text.text(column, "cp1252" if self.encoding == "cp1252" else "utf-8")
         if name in self.dates:
-            return cells.dates(column)
+            return cell_text.dates(column)
         if name in days:
             return days[name].seconds(column)
-        return cells.numbers(column, self.decimal, name, words)
+        return cell_text.numbers(column, self.decimal, name, words)
 
 
 def open_csv(path: Path) -> CsvFile:

@@ -101,9 +101,7 @@ def _kind(path: Path) -> str:
         beside = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise LogError(
-            f"cannot read '{str(path)[:80]}': {reason}. Name an existing log."
-        ) from None
+        raise LogError(f"cannot read '{str(path)[:80]}': {reason}. Name an existing log.") from None
     if not there:
         raise LogError(
             f"there is no file '{path}'.{suggestion(path.name, beside)} Name an existing log."

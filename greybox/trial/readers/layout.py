@@ -79,7 +79,7 @@ class _Split:
         """First line that may hold names, above the first row."""
         likely = [k for k in range(self.first_row) if self.header_like(k) and self._named(k)]
         full = [k for k in likely if not any(cells.is_blank(c) for c in _bare(self.rows[k]))]
-        return (full or likely or [None])[0]
+        return next(iter(full or likely), None)
 
     def _named(self, k: int) -> bool:
         # rows may end in a delimiter that the header lacks
@@ -297,8 +297,7 @@ def _no_header(path: Path, split: _Split) -> LogError:
 def _unique(names: list[str], notes: list[str]) -> tuple[str, ...]:
     if len(names) > _MAX_COLUMNS:
         raise LogError(
-            f"the header names {len(names)} columns, at most {_MAX_COLUMNS} are read: "
-            f"export fewer."
+            f"the header names {len(names)} columns, at most {_MAX_COLUMNS} are read: export fewer."
         )
     taken: set[str] = set()
     found, renamed = [], []
@@ -318,9 +317,7 @@ def _unique(names: list[str], notes: list[str]) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _units(
-    columns: tuple[str, ...], below: list[list[str]], notes: list[str]
-) -> dict[str, str]:
+def _units(columns: tuple[str, ...], below: list[list[str]], notes: list[str]) -> dict[str, str]:
     units: dict[str, str] = {}
     for row in below:
         found = {}

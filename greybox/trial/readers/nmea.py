@@ -91,7 +91,8 @@ class _Stream:
 
     def place(self, lat: Fields, lon: Fields) -> None:
         """Give a position of value and hemisphere each; both or none."""
-        north, east = _degrees(*lat, b"NS", 90), _degrees(*lon, b"EW", 180)
+        north = _degrees(lat[0], lat[1], b"NS", 90)
+        east = _degrees(lon[0], lon[1], b"EW", 180)
         self.give("lat", north)
         self.give("lon", east)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from greybox.errors import LogError
-from greybox.trial.readers import cells
+from greybox.trial.readers import cells as cell_text
 from greybox.trial.readers.table import Batch
 
 _BATCH_ROWS = 1 << 17
@@ -75,13 +75,13 @@ class ParquetFile:
         if pa.types.is_dictionary(column.type):
             column = column.dictionary_decode()
         if name in self.parsed:
-            return cells.dates(column.cast(pa.string()))
+            return cell_text.dates(column.cast(pa.string()))
         if name in self.text:
-            return cells.text(column)
+            return cell_text.text(column)
         if name in self.dates:
             if pa.types.is_date(column.type):
                 column = column.cast(pa.timestamp("s"))
-            return cells.unix_seconds(column.cast(pa.timestamp("ns", column.type.tz)))
+            return cell_text.unix_seconds(column.cast(pa.timestamp("ns", column.type.tz)))
         if pa.types.is_duration(column.type):
             column = column.cast(pa.int64())
         elif pa.types.is_boolean(column.type):
@@ -192,7 +192,7 @@ def _written_dates(path: Path, text: Sequence[str]) -> frozenset[str]:
         raise _unreadable(path, error) from None
     except pa.ArrowException as error:
         raise _unreadable(path, error) from None
-    return frozenset(c for c in text if cells.kind(first[c], comma=False) == "date")
+    return frozenset(c for c in text if cell_text.kind(first[c], comma=False) == "date")
 
 
 def _refuse_bombs(path: Path, metadata: Any, columns: Sequence[str]) -> None:
