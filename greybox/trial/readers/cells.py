@@ -117,12 +117,12 @@ def _ascii(cell: str) -> str | None:
     return cell.replace("\u2212", "-").strip() or None
 
 
-def text(column: Any, encoding: str = "utf-8") -> NDArray[Any]:
+def text(column: Any) -> NDArray[Any]:
     """Return a column of text as an array of str, (n,) object."""
     import pyarrow as pa
 
     raw = column.cast(pa.binary()).to_pylist()
-    return np.array(["" if c is None else c.decode(encoding, "replace") for c in raw], object)
+    return np.array(["" if c is None else c.decode("utf-8", "replace") for c in raw], object)
 
 
 def dates(column: Any) -> NDArray[np.float64]:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import codecs
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from io import RawIOBase
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from greybox.errors import LogError
 from greybox.trial.readers import cells as cell_text
@@ -63,16 +64,13 @@ class CsvFile:
         words: Counter[str] = Counter()
         days = {c: cell_text.DayClock() for c in columns if c in self.clocks}
         rows = 0
-        blanks, wide = self.delimiter == " ", self.encoding.startswith("utf-16")
         try:
             reader = arrow.open_csv(
-                _Blanks(self.path, self.encoding) if blanks else self.path,
+                _Clean(self.path, self.encoding, blanks=self.delimiter == " "),
                 read_options=arrow.ReadOptions(
                     block_size=_BLOCK_BYTES,
                     column_names=list(self.columns),
                     skip_rows=self.skip,
-                    # one-byte encodings differ in words only: transcoding them is slow
-                    encoding=self.encoding if wide and not blanks else "utf8",
                 ),
                 parse_options=arrow.ParseOptions(
                     delimiter=self.delimiter, invalid_row_handler=skip_row
@@ -123,7 +121,7 @@ class CsvFile:
         self, column: Any, name: str, words: Counter[str], days: dict[str, cell_text.DayClock]
     ) -> Any:
         if name in self.text:
-            return cell_text.text(column, "cp1252" if self.encoding == "cp1252" else "utf-8")
+            return cell_text.text(column)
         if name in self.dates:
             return cell_text.dates(column)
         if name in days:
@@ -168,18 +166,20 @@ def open_csv(path: Path) -> CsvFile:
     )
 
 
-class _Blanks(RawIOBase):
-    """A file whose runs of blanks and tabs are one blank each, and none at the ends of lines."""
+class _Clean(RawIOBase):
+    """A text file as valid UTF-8, line by line.
 
-    def __init__(self, path: Path, encoding: str) -> None:
-        self._text = encoding if encoding.startswith("utf-16") else None
-        mode = "r" if self._text else "rb"
-        newline = "" if self._text else None
-        self._file: IO[Any] = open(  # noqa: SIM115 - closed with the stream
-            path, mode, encoding=self._text, newline=newline
-        )
+    Arrow hands rows that it cannot split to Python as text: one damaged byte
+    would end there. Runs of blanks become one blank where blanks part the fields.
+    """
+
+    def __init__(self, path: Path, encoding: str, *, blanks: bool) -> None:
+        self._file = open(path, "rb")  # noqa: SIM115 - closed with the stream
+        wide = encoding.startswith("utf-16")
+        self._decode = codecs.getincrementaldecoder(encoding)("replace").decode if wide else None
+        self._encoding, self._blanks = encoding, blanks
         self._rest = b""
-        self._ready = b""
+        self._ready = memoryview(b"")
 
     def readable(self) -> bool:
         """Whether it can be read, as Arrow asks."""
@@ -191,22 +191,32 @@ class _Blanks(RawIOBase):
         super().close()
 
     def read(self, size: int = -1) -> bytes:
-        """Return up to `size` bytes, fewer at the end only."""
-        while len(self._ready) < max(size, 1):
-            block = self._file.read(_BLOCK_BYTES)
-            block = block.encode() if self._text else block
-            whole = self._rest + block
-            cut = max(whole.rfind(b"\n"), whole.rfind(b"\r")) + 1 if block else len(whole)
-            if not whole or (cut == 0 and len(whole) > 2 * _BLOCK_BYTES):
-                # a line that long fails in the parser, without being held here
-                cut = len(whole)
-            self._rest = whole[cut:]
-            lines = _BLANKS.sub(b" ", whole[:cut])
+        """Return up to `size` bytes, none at the end only."""
+        while not len(self._ready):
+            raw = self._file.read(_BLOCK_BYTES)
+            block = raw if self._decode is None else self._decode(raw, not raw).encode()
+            if not raw and not self._rest and not block:
+                return b""
+            cut = max(block.rfind(b"\n"), block.rfind(b"\r")) + 1 if raw else len(block)
+            if cut == 0 and len(self._rest) + len(block) < 2 * _BLOCK_BYTES and raw:
+                self._rest += block
+                continue
+            # a line that long fails in the parser, without being held here
+            cut = cut or len(block)
+            self._ready = memoryview(self._cleaned(self._rest + block[:cut]))
+            self._rest = block[cut:]
+        taken = self._ready if size < 0 else self._ready[:size]
+        self._ready = self._ready[len(taken) :]
+        return bytes(taken)
+
+    def _cleaned(self, lines: bytes) -> bytes:
+        if not lines.isascii():
+            try:
+                lines.decode("utf-8")
+            except UnicodeDecodeError:
+                known = "cp1252" if self._encoding == "cp1252" else "utf-8"
+                lines = lines.decode(known, "replace").encode()
+        if self._blanks:
+            lines = _BLANKS.sub(b" ", lines).removeprefix(b" ")
             lines = lines.replace(b"\n ", b"\n").replace(b" \n", b"\n").replace(b" \r", b"\r")
-            self._ready += lines.removeprefix(b" ")
-            if not block:
-                break
-        if size < 0:
-            size = len(self._ready)
-        out, self._ready = self._ready[:size], self._ready[size:]
-        return out
+        return lines

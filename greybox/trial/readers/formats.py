@@ -59,7 +59,7 @@ _REFUSED_ENDINGS = {
 
 
 # protocols 0 and 1 are text: a mark and a list, a dictionary, or a name to import
-_OLD_PICKLE = re.compile(rb"\((dp|lp|i|c)\w|c[\w.]+\n[\w.]+\n")
+_OLD_PICKLE = re.compile(rb"\((dp|lp|i|c)\w|[\]}]q\0|c[\w.]+\n[\w.]+\n")
 
 
 def open_raw(path: str | Path, **options: Any) -> Recording | TableFile:

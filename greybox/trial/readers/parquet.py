@@ -83,8 +83,10 @@ class ParquetFile:
                 column = column.cast(pa.timestamp("s"))
             return cell_text.unix_seconds(column.cast(pa.timestamp("ns", column.type.tz)))
         if pa.types.is_duration(column.type):
-            column = column.cast(pa.int64())
-        elif pa.types.is_boolean(column.type):
+            parts = {"s": 1, "ms": 1_000, "us": 1_000_000, "ns": 1_000_000_000}
+            count = column.cast(pa.int64()).cast(pa.float64(), safe=False)
+            return count.to_numpy(zero_copy_only=False) / parts[column.type.unit]
+        if pa.types.is_boolean(column.type):
             column = column.cast(pa.int8())
         return column.cast(pa.float64(), safe=False).to_numpy(zero_copy_only=False)
 
@@ -131,7 +133,7 @@ def open_parquet(path: Path) -> ParquetFile:
             continue
         kinds[item.name] = kind
         if kind == "duration":
-            units[item.name] = item.type.unit
+            units[item.name] = "s"
     twice = sorted(n for n, c in Counter(schema.names).items() if c > 1)
     if twice:
         raise LogError(
