@@ -115,6 +115,11 @@ def table_columns(table: TableFile, vessel: Vessel, *, guess: bool = True) -> di
             f"write seconds, UNIX time or ISO 8601 (2024-05-01T12:00:00Z), or map another column "
             f"to 't' in [columns]."
         )
+    if len(assigned) == 1:
+        raise LogError(
+            f"no column of '{table.path.name}' but its time '{time}' is known: map them in the "
+            f"vessel file's [columns]. Its columns: {', '.join(table.columns[:30])}."
+        )
     return assigned
 
 
@@ -237,7 +242,8 @@ def canonical(
         target = CHANNELS[name].unit if name in CHANNELS else None
         source = signal.source if a.raw == name else (signal.source or f"'{a.raw}'")
         signals.append(Signal(name, signal.t, value, target, source, True))
-    return raw.with_signals(signals, *notes)
+    guessed = frozenset(n for n, a in assigned.items() if a.how == "guessed")
+    return replace(raw.with_signals(signals, *notes), guessed=guessed)
 
 
 def _factor(
@@ -322,6 +328,7 @@ def merge(recordings: list[Recording]) -> Recording:
         )
     epoch = min(r.epoch for r in absolute if r.epoch is not None) if absolute else None
     found: dict[str, list[tuple[str, Signal]]] = {}
+    stated: dict[str, int] = {}
     text: dict[str, tuple[Array, NDArray[Any]]] = {}
     notes: list[str] = []
     for r in recordings:
@@ -330,7 +337,11 @@ def merge(recordings: list[Recording]) -> Recording:
         moved: dict[int, Array] = {}
         for s in r.signals:
             t = moved.setdefault(id(s.t), s.t + shift)
-            found.setdefault(s.name, []).append((r.name, replace(s, t=t)))
+            parts = found.setdefault(s.name, [])
+            # what a file states is preferred to what was guessed of another
+            at = len(parts) if s.name in r.guessed else stated.get(s.name, 0)
+            parts.insert(at, (r.name, replace(s, t=t)))
+            stated[s.name] = stated.get(s.name, 0) + (s.name not in r.guessed)
         for name, (t, words) in r.text.items():
             before = text.get(name, (np.empty(0), np.empty(0, dtype=str)))
             text[name] = (

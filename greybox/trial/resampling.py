@@ -13,7 +13,7 @@ Mask = NDArray[np.bool_]
 # a step of more than this many usual steps is a hole
 HOLE = 2.5
 # share of steps past a hole's length that makes a clock bursty
-_BURSTY = 0.1
+_BURSTY = 0.15
 # low-pass of the signals that are faster than the log: cut-off as a share of its Nyquist rate
 _CUT_OFF = 0.8
 _TAPS_PER_RATIO = 8
@@ -86,7 +86,10 @@ def clock(t: Array, hole: float | None = None, period: float | None = None) -> C
     """
     steps = np.diff(t)
     period = usual_step(t) if period is None else period
-    limit = HOLE * period if hole is None else max(hole, 1.01 * period)
+    limit = HOLE * period
+    if hole is not None:
+        # what the user calls a hole is one, but not every step
+        limit = max(hole, 1.01 * min(period, float(np.median(steps)) if len(steps) else period))
     breaks = np.flatnonzero(steps > limit) + 1
     starts = np.concatenate([[0], breaks]).astype(np.int64)
     stops = np.concatenate([breaks, [len(t)]]).astype(np.int64)
@@ -143,8 +146,9 @@ def _low_pass(t: Array, value: Array, grid: Array, period: float, sample_time: f
     ratio = sample_time / period
     # an odd number of taps keeps the filter without delay
     taps = 2 * int(np.ceil(_TAPS_PER_RATIO * ratio / 2 - 1e-6)) + 1
-    count = max(int(np.floor((t[-1] - t[0]) / period + 1e-6)) + 1, 2)
-    fine = t[0] + period * np.arange(count)
+    # the mean step of this stretch: that of all of them would drift away from its times
+    count = max(round((t[-1] - t[0]) / period) + 1, 2)
+    fine = np.linspace(t[0], t[-1], count)
     even = np.interp(fine, t, value)
     kernel = firwin(taps, _CUT_OFF / ratio)
     half = taps // 2

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.errors import LogError
 from greybox.files import sha256
 from greybox.trial.canonical import (
     batch_recording,
@@ -35,7 +36,7 @@ from greybox.trial.readers.table import Batch, TableFile
 from greybox.trial.recording import Recording, SourceFile
 from greybox.trial.repair import repair
 from greybox.trial.survey import Survey, survey_table
-from greybox.trial.writing import write_log
+from greybox.trial.writing import record_path, write_log
 from greybox.vessel.vessel import Vessel
 
 # tables that may hold more numbers are imported in blocks
@@ -86,6 +87,7 @@ def import_files(
         A file cannot be read, or no log can be made of them.
     """
     options = options or ImportOptions()
+    _keep_sources(paths, out)
     if len(paths) == 1 and not fix and not fix_also and Path(paths[0]).is_file():
         table = open_raw(paths[0], **(reader or {}))
         if not isinstance(table, Recording) and table.cells > _LARGE_CELLS:
@@ -112,6 +114,16 @@ def import_files(
         + [f"mended: {n}" for n in fixed]
         + [f"left as it is: {n}" for n in left],
     )
+
+
+def _keep_sources(paths: Sequence[str | Path], out: str | Path) -> None:
+    """Refuse to write the log over a raw file: it could not be imported again."""
+    targets = {Path(out).resolve(), record_path(out).resolve()}
+    for path in paths:
+        if Path(path).resolve() in targets:
+            raise LogError(
+                f"'{Path(path).name}' is also the log to write: name another file for the log."
+            )
 
 
 def _summary(
@@ -238,7 +250,7 @@ class _Stream:
         notes: list[str] = []
         signals = clean_signals(recording, survey.origin, notes)
         # samples beside those wanted, so that stretches do not end where the block does
-        margin = _MARGIN
+        margin = _MARGIN + int(np.ceil(self.options.window / plan.sample_time))
         span = (max(self.done - margin, 0), min(stop + margin, plan.count))
         found, derived, _ = cut_segments(
             signals, recording.text, plan, span, self.vessel, self.options

@@ -87,7 +87,9 @@ def test_aligned_columns_with_decimal_commas(tmp_path):
 def test_names_in_a_comment_as_numpy_writes_them(tmp_path):
     wanted = frame()
     path = tmp_path / "x.csv"
-    np.savetxt(path, wanted, delimiter=",", header="made by numpy\n" + ",".join(wanted), fmt="%.17g")
+    np.savetxt(
+        path, wanted, delimiter=",", header="made by numpy\n" + ",".join(wanted), fmt="%.17g"
+    )
     found, table = read(path)
     pd.testing.assert_frame_equal(found, wanted, check_exact=True)
     assert "names of the columns read from a comment" in table.notes
@@ -236,7 +238,9 @@ def test_columns_may_stand_in_any_order(tmp_path):
 def test_units_of_the_vessel_file_rescale(tmp_path):
     wanted = frame()
     wanted.to_csv(tmp_path / "a.csv", index=False)
-    other = wanted.assign(u=wanted["u"] * 3600 / 1852, psi=np.degrees(wanted["psi"]), v=-wanted["v"])
+    other = wanted.assign(
+        u=wanted["u"] * 3600 / 1852, psi=np.degrees(wanted["psi"]), v=-wanted["v"]
+    )
     other = other.rename(columns={"u": "STW", "psi": "Hd", "v": "Drift"})
     other.to_csv(tmp_path / "b.csv", index=False)
     mapped = vessel_from_dict(

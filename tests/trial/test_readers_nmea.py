@@ -159,7 +159,9 @@ def test_midnight(tmp_path):
 
 
 def test_two_days_in_one_file(tmp_path):
-    lines = [rmc(36000 + k, "010624") for k in range(9)] + [rmc(30000 + k, "030624") for k in range(9)]
+    lines = [rmc(36000 + k, "010624") for k in range(9)] + [
+        rmc(30000 + k, "030624") for k in range(9)
+    ]
     t = read(tmp_path, *lines)["lat"].t
     assert t[9] - t[8] == 2 * 86400 - 6000 - 8
 
