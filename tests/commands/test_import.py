@@ -150,7 +150,8 @@ BAD = {
     "random.bin": os.urandom(300), "sparse.csv": sparse, "sparse.nmea": sparse,
     "sparse.parquet": sparse, "zip.csv": b"PK\x03\x04" + bytes(100),
     "pickle.csv": pickle.dumps({"t": 1}), "header.csv": b"t,u,v\n", "text.nmea": b"hello\n" * 99,
-    "text.parquet": b"t,u\n1,2\n", "csv.xlsx": b"t,u\n1,2\n", "still.csv": b"t,foo\n" + b"1,2\n" * 9,
+    "text.parquet": b"t,u\n1,2\n", "csv.xlsx": b"t,u\n1,2\n",
+    "still.csv": b"t,foo\n" + b"1,2\n" * 9,
 }  # fmt: skip
 
 

@@ -210,7 +210,7 @@ def test_rows_out_of_order_and_twice():
 def test_two_runs_in_one_file_are_not_shuffled():
     data = columns()
     twice = {k: np.concatenate([v, v[100:300] + (0 if k == "t" else 1)]) for k, v in data.items()}
-    with pytest.raises(LogError, match="goes back from 199.5 to 50 s, over .* are there twice"):
+    with pytest.raises(LogError, match=r"goes back from 199.5 to 50 s, over .* are there twice"):
         imported(twice)
 
 
@@ -302,7 +302,7 @@ def test_a_large_file_whose_time_starts_again(tmp_path, monkeypatch):
     pd.concat([table, table]).to_csv(tmp_path / "raw.csv", index=False)
     monkeypatch.setattr(stream, "_LARGE_CELLS", 0)
     monkeypatch.setattr("greybox.trial.survey._MAX_BACK_ROWS", 1000)
-    with pytest.raises(LogError, match="goes back by 899.9 s, at most 100 s"):
+    with pytest.raises(LogError, match=r"goes back by 899.9 s, at most 100 s"):
         stream.import_files([tmp_path / "raw.csv"], VESSEL, tmp_path / "a.csv")
     assert not (tmp_path / "a.csv").exists()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import pickle
 import zipfile
@@ -367,16 +368,27 @@ def test_parquet_bombs(tmp_path):
         zeros = pa.table({"t": np.zeros(1 << 21)})
         for _ in range(2):
             writer.write_table(zeros)
-    with pytest.raises(LogError, match="states 4194304 rows in .* at most 8 a byte"):
+    with pytest.raises(LogError, match=r"states 4194304 rows in .* at most 8 a byte"):
         open_parquet(path)
 
 
-def test_a_parquet_column_that_unpacks_too_far(tmp_path, monkeypatch):
-    monkeypatch.setattr("greybox.trial.readers.parquet._MAX_CHUNK_BYTES", 1 << 16)
+def test_a_parquet_row_group_that_unpacks_too_far(tmp_path, monkeypatch):
+    monkeypatch.setattr("greybox.trial.readers.parquet._MAX_GROUP_BYTES", 1 << 16)
     table = pa.table({"t": np.arange(1 << 16) // 100 * 1.0})
     parquet.write_table(table, tmp_path / "x.parquet", compression="zstd", use_dictionary=False)
-    with pytest.raises(LogError, match="unpacks from .* in one row group"):
+    with pytest.raises(LogError, match=r"a row group of .* unpacks to \d+ bytes, at most 65536"):
         read(tmp_path / "x.parquet")
+
+
+def test_a_damaged_footer_does_not_end_the_process(tmp_path):
+    """pyarrow throws through C++ where it is asked for the chunks of such files."""
+    frame().to_parquet(tmp_path / "x.parquet")
+    whole = bytearray((tmp_path / "x.parquet").read_bytes())
+    for at in range(len(whole) - 1500, len(whole) - 8, 7):
+        damaged = whole.copy()
+        damaged[at] ^= 0x11
+        with contextlib.suppress(LogError):
+            read(written(tmp_path / "y.parquet", bytes(damaged)))
 
 
 def test_bad_parquet(tmp_path):

@@ -13,8 +13,9 @@ from greybox.trial.readers import cells as cell_text
 from greybox.trial.readers.table import Batch
 
 _BATCH_ROWS = 1 << 17
-# a page is decoded as a whole, and one column chunk may be one page
-_MAX_CHUNK_BYTES = 1 << 29
+# a page is decoded as a whole, and a row group may be one page a column
+_MAX_GROUP_BYTES = 1 << 29
+_MAX_RATIO = 4
 # times are never repeated: even delta coding needs a bit or two for each row
 _MAX_ROWS_PER_BYTE = 8
 _HONEST_ROWS = 1_000_000
@@ -49,7 +50,7 @@ class ParquetFile:
         Raises
         ------
         LogError
-            A page is damaged, or a column chunk is larger than memory allows.
+            A page is damaged, or a row group is larger than memory allows.
         """
         import pyarrow as pa
         from pyarrow import parquet
@@ -59,7 +60,7 @@ class ParquetFile:
             with parquet.ParquetFile(
                 self.path, memory_map=False, pre_buffer=False, buffer_size=_READ_BYTES
             ) as file:
-                _refuse_bombs(self.path, file.metadata, columns)
+                _refuse_bombs(self.path, file.metadata)
                 for batch in file.iter_batches(
                     batch_size=_BATCH_ROWS, columns=list(columns), use_threads=True
                 ):
@@ -187,7 +188,7 @@ def _written_dates(path: Path, text: Sequence[str]) -> frozenset[str]:
         return frozenset()
     try:
         with parquet.ParquetFile(path, memory_map=False, buffer_size=_READ_BYTES) as file:
-            _refuse_bombs(path, file.metadata, text)
+            _refuse_bombs(path, file.metadata)
             batch = next(file.iter_batches(batch_size=64, columns=list(text)))
             first = {c: [str(v or "") for v in batch.column(c).to_pylist()] for c in text}
     except _ERRORS as error:
@@ -197,21 +198,18 @@ def _written_dates(path: Path, text: Sequence[str]) -> frozenset[str]:
     return frozenset(c for c in text if cell_text.kind(first[c], comma=False) == "date")
 
 
-def _refuse_bombs(path: Path, metadata: Any, columns: Sequence[str]) -> None:
-    wanted = set(columns)
+def _refuse_bombs(path: Path, metadata: Any) -> None:
+    # groups only: asking pyarrow for a damaged column chunk ends the process (26.0)
+    size = path.stat().st_size
     for k in range(metadata.num_row_groups):
-        group = metadata.row_group(k)
-        for j in range(group.num_columns):
-            chunk = group.column(j)
-            packed, size = chunk.total_compressed_size, chunk.total_uncompressed_size
-            # what hardly shrank is as large as its file, and is cut into pages of a megabyte
-            bomb = size > _MAX_CHUNK_BYTES and size > 4 * packed
-            if chunk.path_in_schema in wanted and bomb:
-                raise LogError(
-                    f"column '{chunk.path_in_schema}' of '{path.name}' unpacks from {packed} to "
-                    f"{size} bytes in one row group, at most {_MAX_CHUNK_BYTES} are read at "
-                    f"once: write it with smaller row groups."
-                )
+        unpacked = metadata.row_group(k).total_byte_size
+        # what hardly shrank is as large as its file, and is cut into pages of a megabyte
+        if unpacked > max(_MAX_GROUP_BYTES, _MAX_RATIO * size):
+            raise LogError(
+                f"a row group of '{path.name}' ({size} bytes) unpacks to {unpacked} bytes, at most "
+                f"{max(_MAX_GROUP_BYTES, _MAX_RATIO * size)} are read at once: write it with "
+                f"smaller row groups."
+            )
 
 
 def _unreadable(path: Path, error: Exception) -> LogError:
