@@ -192,6 +192,24 @@ def test_a_file_is_not_written_over_itself(tmp_path, capsys):
     assert raw.read_bytes() == before
 
 
+def test_devices_and_full_disks(tmp_path, capsys, monkeypatch):
+    raw = tmp_path / "raw.csv"
+    data().to_csv(raw, index=False)
+    status, _, err = run(capsys, "import", raw, "--vessel", "thesis", "--out", "/dev/null")
+    assert status == 1
+    assert "a device or a pipe" in err
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("greybox.trial.writing._write_tables", full)
+    out = tmp_path / "log.csv"
+    status, _, err = run(capsys, "import", raw, "--vessel", "thesis", "--out", out)
+    assert status == 1
+    assert "No space left on device. Nothing was written" in err
+    assert os.listdir(tmp_path) == ["raw.csv"]
+
+
 def mutated(rng, content):
     out = bytearray(content)
     for _ in range(rng.choice([1, 3, 30])):
