@@ -477,7 +477,7 @@ def cut_segments(
     segments = []
     derived: tuple[str, ...] = ()
     for start, stop in stretches:
-        part = {n: v[start:stop].copy() for n, v in channels.items()}
+        part = {n: v[start:stop] for n, v in channels.items()}
         part, made, trim = _derive(part, vessel, plan.sample_time, options)
         derived = tuple(made)
         closed, known = _loop(held, vessel, grid[start:stop])
