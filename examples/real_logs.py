@@ -72,7 +72,7 @@ def show(vessel, path, out):
     print(gb.import_files([path], vessel, out, fix=True))
     (after,) = gb.check_files([out], vessel)
     print(f"after the safe fixes: {', '.join(f.id for f in after.findings) or 'clean'}")
-    print(gb.survey_recording(after.recording, vessel).summary() + "\n")
+    print(gb.describe_recording(after.recording, vessel).summary() + "\n")
 
 
 for folder in sys.argv[1:] or TRIALS:

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from greybox.trial.checks.check import check_files, check_recording
     from greybox.trial.checks.finding import CheckReport, Finding
     from greybox.trial.conditioning import decimate
+    from greybox.trial.contents import describe_recording
     from greybox.trial.importing import ImportOptions, import_recording
     from greybox.trial.log import TrialLog, make_log
     from greybox.trial.manoeuvres import find_manoeuvres
@@ -34,7 +35,6 @@ if TYPE_CHECKING:
     from greybox.trial.recording import Recording
     from greybox.trial.repair import repair
     from greybox.trial.stream import import_files
-    from greybox.trial.survey import survey_recording
     from greybox.trial.writing import write_log
     from greybox.validation.choose import Request, estimate_model
     from greybox.validation.comparison import compare_models
@@ -78,7 +78,7 @@ _WHERE = {
     "simulate": "greybox.model.simulation",
     "stationary_disturbance": "greybox.model.simulation",
     "structure_names": "greybox.model.catalogue",
-    "survey_recording": "greybox.trial.survey",
+    "describe_recording": "greybox.trial.contents",
     "vessel_from_dict": "greybox.vessel.toml",
     "write_log": "greybox.trial.writing",
 }
@@ -100,6 +100,7 @@ __all__ = [
     "check_recording",
     "compare_models",
     "decimate",
+    "describe_recording",
     "estimate_iv",
     "estimate_ls",
     "estimate_model",
@@ -119,7 +120,6 @@ __all__ = [
     "simulate",
     "stationary_disturbance",
     "structure_names",
-    "survey_recording",
     "vessel_from_dict",
     "write_log",
 ]

@@ -29,21 +29,21 @@ def run(options: argparse.Namespace) -> None:
 
     from greybox.files import check_targets, write_json
     from greybox.trial.checks.check import check_files
+    from greybox.trial.contents import Contents, describe_recording
     from greybox.trial.repair import apply_repairs
-    from greybox.trial.survey import Survey, survey_recording
     from greybox.vessel.toml import load_vessel
 
     check_targets(options.json, options.report)
     vessel = load_vessel(options.vessel)
     reports = check_files([Path(p) for p in options.logs], vessel)
-    surveys = [
-        survey_recording(apply_repairs(r.recording, [f for f in r.findings if f.safe]), vessel)
+    contents = [
+        describe_recording(apply_repairs(r.recording, [f for f in r.findings if f.safe]), vessel)
         if r.recording is not None
-        else Survey()
+        else Contents()
         for r in reports
     ]
     if options.json:
-        found = [r.to_dict() | s.to_dict() for r, s in zip(reports, surveys, strict=True)]
+        found = [r.to_dict() | s.to_dict() for r, s in zip(reports, contents, strict=True)]
         if len(found) == 1:
             result = found[0]
         else:
@@ -57,9 +57,9 @@ def run(options: argparse.Namespace) -> None:
 
         check_page(reports, [Path(p) for p in options.logs], vessel, options.report)
     if options.json != "-":
-        for report, survey in zip(reports, surveys, strict=True):
+        for report, holds in zip(reports, contents, strict=True):
             say(report.summary())
-            if survey.summary():
-                say(indent(survey.summary(), "  "))
+            if holds.summary():
+                say(indent(holds.summary(), "  "))
         if options.report:
             say(f"\nwrote {options.report}")

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from greybox.report.figures import BLACK, BLUE, GREEN, LABELS, VERMILION, new_figure, tidy
 from greybox.report.thinning import find_gaps, pick, thin
 from greybox.trial.checks.finding import Finding
-from greybox.trial.checks.rows import MOTION, continuous
+from greybox.trial.checks.rows import MOTION
+from greybox.trial.deriving import continuous
 from greybox.trial.recording import Recording, Signal
 from greybox.trial.resampling import clock, runs
 from greybox.vessel.vessel import Vessel

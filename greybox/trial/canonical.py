@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +17,18 @@ from greybox.trial.names import Assigned, assign
 from greybox.trial.readers.formats import open_raw
 from greybox.trial.readers.table import Batch, TableFile, read_columns
 from greybox.trial.recording import Recording, Signal, SourceFile
+from greybox.trial.writing import read_record, recorded_provenance
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
 
 # UNIX time is past 1e8 s since 1973, a log's own clock hardly ever is
 _EPOCH = 1e8
+# seconds past it are the year 5138: it is in milliseconds
+_LATEST = 1e11
+_HEAD = 10_000
+# files that overlap for less than this share of the shorter one follow one another
+_OVERLAP = 0.05
 
 
 def read_recording(
@@ -54,7 +60,13 @@ def read_recording(
     """
     raw = open_raw(path, **options)
     if not isinstance(raw, Recording):
+        record = read_record(Path(path))
+        if record is not None:
+            # what greybox wrote is canonical: a mapping would convert it twice
+            vessel, guess = replace(vessel, columns={}), False
         raw, assigned = table_recording(raw, vessel, guess=guess)
+        if record is not None and raw.epoch is None:
+            raw = replace(raw, epoch=recorded_provenance(record).epoch)
     else:
         assigned = assign(
             raw.names,
@@ -73,18 +85,21 @@ def table_recording(
     """Read the columns of a table that mean something into a recording."""
     assigned = table_columns(table, vessel, guess=guess)
     batch = read_columns(table, [a.raw for a in assigned.values()])
-    recording = batch_recording(table, batch, assigned, vessel)
+    time = assigned["t"]
+    scale = time_scale(batch[time.raw], time, table)
+    recording = batch_recording(table, batch, assigned, scale, vessel)
     files = (SourceFile(table.path.name, sha256(table.path), table.format),)
-    return replace(recording, files=files, notes=(*table.notes, *recording.notes)), assigned
+    notes = (*table.notes, *scale.notes, *recording.notes)
+    return replace(recording, files=files, notes=notes), assigned
 
 
-def table_columns(table: TableFile, vessel: Vessel, *, guess: bool) -> dict[str, Assigned]:
+def table_columns(table: TableFile, vessel: Vessel, *, guess: bool = True) -> dict[str, Assigned]:
     """Say which columns of a table to read.
 
     Raises
     ------
     LogError
-        There is no time among them.
+        There is no time among them, or it is written in words.
     """
     assigned = assign(table.columns, vessel, units=table.units, guess=guess)
     if "t" not in assigned:
@@ -93,63 +108,121 @@ def table_columns(table: TableFile, vessel: Vessel, *, guess: bool) -> dict[str,
             f"Map the time column in the vessel file's [columns] with its unit. "
             f"Its columns: {', '.join(table.columns[:30])}."
         )
+    time = assigned["t"].raw
+    if time in table.text:
+        raise LogError(
+            f"column '{time}' of '{table.path.name}' holds words where the time should be: "
+            f"write seconds, UNIX time or ISO 8601 (2024-05-01T12:00:00Z), or map another column "
+            f"to 't' in [columns]."
+        )
+    if len(assigned) == 1:
+        raise LogError(
+            f"no column of '{table.path.name}' but its time '{time}' is known: map them in the "
+            f"vessel file's [columns]. Its columns: {', '.join(table.columns[:30])}."
+        )
     return assigned
 
 
+@dataclass(frozen=True)
+class TimeScale:
+    """How a time column becomes relative seconds.
+
+    Parameters
+    ----------
+    factor : float
+        To seconds.
+    zero : float
+        Value of the column where the time is zero.
+    epoch : float, optional
+        UNIX time [s] of zero, None where the column counts from a moment of its own.
+    notes : tuple of str
+    """
+
+    factor: float
+    zero: float
+    epoch: float | None
+    notes: tuple[str, ...] = ()
+
+    def seconds(self, raw: Array) -> Array:
+        """Return relative times [s], (N,)."""
+        # the difference first: UNIX nanoseconds do not fit a double
+        return (raw - self.zero) * self.factor if self.zero else raw * self.factor
+
+
+def time_scale(raw: Array, time: Assigned, table: TableFile) -> TimeScale:
+    """Find out from its first values in what unit a time column is.
+
+    Raises
+    ------
+    LogError
+        It holds no number.
+    """
+    finite = raw[np.isfinite(raw)]
+    if not len(finite):
+        raise LogError(
+            f"column '{time.raw}' of '{table.path.name}' holds no number among its {len(raw)} "
+            f"rows, it cannot be the time: map another column to 't' in [columns]."
+        )
+    head = finite[:_HEAD]
+    # one damaged value must not decide
+    size = float(np.median(np.abs(head)))
+    date, unit = time.raw in table.dates, time.unit
+    notes: list[str] = []
+    stated = unit is not None and not (unit == "s" and time.how == "exact" and size > _LATEST)
+    if not stated and not date:
+        for limit, spelled in ((1e17, "ns"), (1e14, "us"), (_LATEST, "ms")):
+            if size > limit:
+                unit = spelled
+                break
+        else:
+            steps = np.diff(head)
+            # nobody logs a manoeuvre every ten seconds, milliseconds are common
+            unit = "ms" if len(steps) and np.median(np.abs(steps)) >= 10 else "s"
+    if time.how == "guessed" or not stated:
+        notes.append(f"column '{time.raw}' taken for time in {unit or 's'}")
+    if date or time.raw in table.clocks:
+        unit = "s"
+    factor = unit_factor(unit or "s", "s", time.raw)
+    first = float(finite[0])
+    if size * factor < _EPOCH and not date:
+        return TimeScale(factor, 0.0, None, tuple(notes))
+    return TimeScale(factor, first, first * factor, tuple(notes))
+
+
 def batch_recording(
-    table: TableFile, batch: Batch, assigned: dict[str, Assigned], vessel: Vessel
+    table: TableFile,
+    batch: Batch,
+    assigned: dict[str, Assigned],
+    scale: TimeScale,
+    vessel: Vessel,
 ) -> Recording:
     """Return columns of a table as a recording, names as in the source."""
-    time = assigned["t"]
-    t, epoch, notes = _seconds(batch[time.raw], time, time.raw in table.dates)
-    signals, text = [], {}
+    t = scale.seconds(batch[assigned["t"].raw])
+    signals, text, notes = [], {}, []
     loop = vessel.closed_loop[0] if vessel.closed_loop else None
     for name, a in assigned.items():
         if name == "t":
             continue
         if name == loop:
             text[loop] = (t, np.asarray(batch[a.raw]).astype(str))
-        elif a.raw in table.text:
-            notes.append(f"column '{a.raw}' holds words, not numbers: left out")
+        elif a.raw in table.text or a.raw in table.dates:
+            notes.append(f"column '{a.raw}' holds words or dates, not numbers: left out")
         else:
             signals.append(Signal(a.raw, t, batch[a.raw], a.unit, f"column '{a.raw}'"))
-    return Recording(table.path.stem, tuple(signals), text, epoch, notes=tuple(notes))
+    return Recording(table.path.stem, tuple(signals), text, scale.epoch, notes=tuple(notes))
 
 
-def _seconds(raw: Array, time: Assigned, date: bool) -> tuple[Array, float | None, list[str]]:
-    """Return relative seconds, the UNIX time of zero, and notes."""
-    notes: list[str] = []
-    factor = 1.0
-    unit = time.unit
-    finite = raw[np.isfinite(raw)]
-    if not len(finite):
-        raise LogError(
-            f"column '{time.raw}' holds no number among its {len(raw)} rows, it cannot be the "
-            f"time: map another column to 't' in [columns]."
-        )
-    size = float(np.max(np.abs(finite)))
-    if unit is None and not date:
-        for limit, spelled in ((1e17, "ns"), (1e14, "us"), (1e11, "ms")):
-            if size > limit:
-                unit = spelled
-                break
-        else:
-            steps = np.diff(finite[:10000])
-            # nobody logs a manoeuvre every ten seconds, milliseconds are common
-            unit = "ms" if len(steps) and np.median(np.abs(steps)) >= 10 else "s"
-    if time.how == "guessed" or time.unit is None:
-        notes.append(f"column '{time.raw}' taken for time in {unit or 's'}")
-    if unit is not None:
-        factor = unit_factor(unit, "s", time.raw)
-    if size * factor < _EPOCH and not date:
-        return raw * factor, None, notes
-    first = float(finite[0])
-    # the difference first: UNIX nanoseconds do not fit a double
-    return (raw - first) * factor, first * factor, notes
+def canonical(
+    raw: Recording,
+    assigned: dict[str, Assigned],
+    vessel: Vessel,
+    reach: Mapping[str, tuple[float, float]] | None = None,
+) -> Recording:
+    """Rename and convert the signals of a recording; state every guess.
 
-
-def canonical(raw: Recording, assigned: dict[str, Assigned], vessel: Vessel) -> Recording:
-    """Rename and convert the signals of a recording; state every guess."""
+    `reach` gives largest value and step of angles whose unit is to be guessed,
+    where the recording is only a part of what there is.
+    """
     by_name = {s.name: s for s in raw.signals}
     signals, notes = [], []
     for name, a in assigned.items():
@@ -158,7 +231,7 @@ def canonical(raw: Recording, assigned: dict[str, Assigned], vessel: Vessel) -> 
             continue
         if a.how != "guessed" and signal.unit is not None and a.how != "mapped":
             a = replace(a, unit=signal.unit)
-        unit, factor, why = _factor(a, signal, vessel)
+        unit, factor, why = _factor(a, signal, vessel, (reach or {}).get(name))
         if a.how == "guessed":
             size = f" in {unit}" if unit else ""
             notes.append(f"{a.raw} taken for {name}{size}{why}")
@@ -169,10 +242,13 @@ def canonical(raw: Recording, assigned: dict[str, Assigned], vessel: Vessel) -> 
         target = CHANNELS[name].unit if name in CHANNELS else None
         source = signal.source if a.raw == name else (signal.source or f"'{a.raw}'")
         signals.append(Signal(name, signal.t, value, target, source, True))
-    return raw.with_signals(signals, *notes)
+    guessed = frozenset(n for n, a in assigned.items() if a.how == "guessed")
+    return replace(raw.with_signals(signals, *notes), guessed=guessed)
 
 
-def _factor(a: Assigned, signal: Signal, vessel: Vessel) -> tuple[str | None, float, str]:
+def _factor(
+    a: Assigned, signal: Signal, vessel: Vessel, known: tuple[float, float] | None = None
+) -> tuple[str | None, float, str]:
     """Return unit, factor to SI and, where the unit was guessed, why."""
     target = CHANNELS[a.name].unit if a.name in CHANNELS else None
     if a.name in vessel.angle_commands:
@@ -182,33 +258,52 @@ def _factor(a: Assigned, signal: Signal, vessel: Vessel) -> tuple[str | None, fl
     if target is None or a.how == "exact":
         return target, 1.0, ""
     if target == "rad":
-        finite = signal.value[np.isfinite(signal.value)]
-        largest = float(np.max(np.abs(finite))) if len(finite) else 0.0
-        # wrapped radians end at 2π; what turns further was unwrapped, and then has no jumps
-        steps = float(np.max(np.abs(np.diff(finite)))) if len(finite) > 1 else 0.0
-        if largest > 50 or steps > 100:
-            return "deg", np.pi / 180, f", since it reaches {largest:.0f}"
-        return "rad", 1.0, f", since it stays below {largest:.2f}"
+        reach = known or angle_reach(signal.value)
+        if angle_unit(reach) == "deg":
+            return "deg", np.pi / 180, f", since it reaches {reach[0]:.0f}"
+        return "rad", 1.0, f", since it stays below {reach[0]:.2f}"
     return target, 1.0, ", no unit being stated"
+
+
+def angle_reach(value: Array) -> tuple[float, float]:
+    """Return the largest size and the largest step of an angle whose unit is to be guessed."""
+    finite = value[np.isfinite(value)]
+    largest = float(np.max(np.abs(finite))) if len(finite) else 0.0
+    steps = float(np.max(np.abs(np.diff(finite)))) if len(finite) > 1 else 0.0
+    return largest, steps
+
+
+def angle_unit(reach: tuple[float, float]) -> str:
+    """Return the unit of an angle, from `angle_reach`."""
+    # wrapped radians end at 2π; what turns further was unwrapped, and then has no jumps
+    return "deg" if reach[0] > 50 or reach[1] > 100 else "rad"
 
 
 def _guess_commands(raw: Recording, assigned: dict[str, Assigned], vessel: Vessel) -> None:
     """Give rudders and shafts of NMEA 0183 to the vessel's columns where only one fit exists."""
     missing = [c for c in vessel.commands if c not in assigned]
-    rudders = [c for c in missing if c in vessel.angle_commands]
+    # azimuths are not what RSA tells of: their sign and range differ from a rudder's
+    rudders = [c for c in missing if c in {t.rudder for t in vessel.thrusters}]
     speeds = [c for c in missing if c not in vessel.angle_commands]
+    shafts = sorted((n for n in raw.names if n.startswith("rpm_")), key=_shaft)
+    of_kind = [n for n in shafts if n.startswith("rpm_shaft")]
+    # an engine and its shaft turn together: one of each kind is enough
+    offered_speeds = of_kind if len(of_kind) >= len(speeds) else shafts
     for wanted, offered in (
         (rudders, [n for n in ("rudder_starboard", "rudder_port") if n in raw]),
-        (speeds, [n for n in raw.names if n.startswith("rpm_")]),
+        (speeds, offered_speeds),
     ):
-        if wanted and len(wanted) <= len(offered) and (len(wanted) > 1 or len(offered) >= 1):
-            pairs = zip(wanted, offered, strict=False)
-            if len(wanted) == 1 or len(wanted) == len(offered):
-                for name, source in pairs:
-                    assigned[name] = Assigned(source, name, raw[source].unit, 1, "guessed")
+        if len(wanted) == 1 or len(wanted) == len(offered):
+            for name, source in zip(wanted, offered, strict=False):
+                assigned[name] = Assigned(source, name, raw[source].unit, 1, "guessed")
 
 
-def merge(recordings: list[Recording], say: Callable[[str], None] | None = None) -> Recording:
+def _shaft(name: str) -> tuple[str, int]:
+    stem = name.rstrip("0123456789")
+    return stem, int(name[len(stem) :] or 0)
+
+
+def merge(recordings: list[Recording]) -> Recording:
     """Merge the files of one trial on their clocks.
 
     Parameters
@@ -233,37 +328,46 @@ def merge(recordings: list[Recording], say: Callable[[str], None] | None = None)
         )
     epoch = min(r.epoch for r in absolute if r.epoch is not None) if absolute else None
     found: dict[str, list[tuple[str, Signal]]] = {}
+    stated: dict[str, int] = {}
     text: dict[str, tuple[Array, NDArray[Any]]] = {}
     notes: list[str] = []
     for r in recordings:
         shift = r.epoch - epoch if epoch is not None and r.epoch is not None else 0.0
         notes += [f"{r.name}: {n}" for n in r.notes]
+        moved: dict[int, Array] = {}
         for s in r.signals:
-            found.setdefault(s.name, []).append((r.name, replace(s, t=s.t + shift)))
+            t = moved.setdefault(id(s.t), s.t + shift)
+            parts = found.setdefault(s.name, [])
+            # what a file states is preferred to what was guessed of another
+            at = len(parts) if s.name in r.guessed else stated.get(s.name, 0)
+            parts.insert(at, (r.name, replace(s, t=t)))
+            stated[s.name] = stated.get(s.name, 0) + (s.name not in r.guessed)
         for name, (t, words) in r.text.items():
             before = text.get(name, (np.empty(0), np.empty(0, dtype=str)))
-            joined = np.concatenate([before[1], words])
-            text[name] = (np.concatenate([before[0], t + shift]), joined)
+            text[name] = (
+                np.concatenate([before[0], t + shift]),
+                np.concatenate([before[1], words]),
+            )
     signals = []
+    clocks: dict[tuple[int, ...], Array] = {}
     for name, parts in found.items():
         kept = [parts[0]]
         for part in parts[1:]:
-            if any(_overlap(part[1], k[1]) for k in kept):
+            same = next((k[0] for k in kept if _overlap(part[1], k[1])), None)
+            if same is not None:
                 notes.append(
-                    f"{name} stands in '{kept[0][0]}' and '{part[0]}' at the same times: "
-                    f"that of '{kept[0][0]}' is used"
+                    f"{name} stands in '{same}' and '{part[0]}' at the same times: "
+                    f"that of '{same}' is used"
                 )
             else:
                 kept.append(part)
-        kept.sort(key=lambda p: float(p[1].t[0]) if len(p[1]) else 0.0)
-        first = kept[0][1]
-        signals.append(
-            replace(
-                first,
-                t=np.concatenate([p[1].t for p in kept]),
-                value=np.concatenate([p[1].value for p in kept]),
-            )
-        )
+        kept.sort(key=lambda p: _span(p[1])[0])
+        # columns of one table go on sharing their clock
+        key = tuple(id(p[1].t) for p in kept)
+        if key not in clocks:
+            clocks[key] = np.concatenate([p[1].t for p in kept])
+        value = np.concatenate([p[1].value for p in kept])
+        signals.append(replace(kept[0][1], t=clocks[key], value=value))
     return Recording(
         recordings[0].name,
         tuple(signals),
@@ -274,7 +378,24 @@ def merge(recordings: list[Recording], say: Callable[[str], None] | None = None)
     )
 
 
+def _span(signal: Signal) -> tuple[float, float]:
+    finite = signal.t[np.isfinite(signal.t)]
+    return (float(finite.min()), float(finite.max())) if len(finite) else (np.inf, -np.inf)
+
+
 def _overlap(a: Signal, b: Signal) -> bool:
-    if not len(a) or not len(b):
-        return False
-    return bool(np.nanmin(a.t) <= np.nanmax(b.t) and np.nanmin(b.t) <= np.nanmax(a.t))
+    """Whether two signals tell of the same times, beyond the seam between two files."""
+    (a0, a1), (b0, b1) = _span(a), _span(b)
+    common = min(a1, b1) - max(a0, b0)
+    return common > _OVERLAP * min(a1 - a0, b1 - b0)
+
+
+def unused_mappings(recordings: Iterable[Recording], vessel: Vessel) -> list[str]:
+    """Say which columns the vessel file maps and no file has."""
+    used = {s.source for r in recordings for s in r.signals}
+    names = {s.name for r in recordings for s in r.signals}
+    return [
+        f"[columns] maps '{raw}' to '{m.name}', which no file has"
+        for raw, m in vessel.columns.items()
+        if m.name not in names and m.name != "t" and f"column '{raw}'" not in used
+    ]

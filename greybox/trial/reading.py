@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -194,8 +195,8 @@ def _canonical(
         not np.isfinite(_floats(batch, assigned[n])).all() for n in positions
     ):
         # positions are not needed where velocities were logged: they may have holes
-        for name in positions:
-            assigned.pop(name)
+        for place in positions:
+            assigned.pop(place)
     for name, a in assigned.items():
         target = CHANNELS[name].unit if name in CHANNELS else None
         if name in vessel.angle_commands:
@@ -255,7 +256,7 @@ def _stretches(t: Array, name: str) -> tuple[list[tuple[int, int]], float]:
             f"Resample it to one with greybox import."
         )
     edges = [0, *(np.flatnonzero(gaps) + 1).tolist(), len(t)]
-    found = [(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True) if b - a >= _MIN_SAMPLES]
+    found = [(a, b) for a, b in pairwise(edges) if b - a >= _MIN_SAMPLES]
     if not found:
         raise LogError(
             f"'{name}' has no {_MIN_SAMPLES} samples between two gaps: use a log with fewer."

@@ -77,6 +77,8 @@ class Recording:
     files : tuple of SourceFile
     notes : tuple of str
         What was guessed, skipped or recovered while reading, one sentence each.
+    guessed : frozenset of str
+        Signals whose meaning was guessed: another file that states it is preferred.
     """
 
     name: str
@@ -85,6 +87,7 @@ class Recording:
     epoch: float | None = None
     files: tuple[SourceFile, ...] = ()
     notes: tuple[str, ...] = ()
+    guessed: frozenset[str] = frozenset()
 
     def __contains__(self, name: object) -> bool:
         return any(s.name == name for s in self.signals)

@@ -12,6 +12,8 @@ Mask = NDArray[np.bool_]
 
 # a step of more than this many usual steps is a hole
 HOLE = 2.5
+# share of steps past a hole's length that makes a clock bursty
+_BURSTY = 0.15
 # low-pass of the signals that are faster than the log: cut-off as a share of its Nyquist rate
 _CUT_OFF = 0.8
 _TAPS_PER_RATIO = 8
@@ -36,8 +38,41 @@ class Clock:
     starts: NDArray[np.int64]
     stops: NDArray[np.int64]
 
+    @property
+    def covered(self) -> float:
+        """Time within stretches [s]."""
+        return float(np.sum(self.t[self.stops - 1] - self.t[self.starts]))
 
-def clock(t: Array, hole: float | None = None) -> Clock:
+    @property
+    def mean(self) -> float:
+        """Mean step within the stretch of most samples [s]: it does not depend on jitter."""
+        k = int(np.argmax(self.stops - self.starts))
+        start, stop = self.starts[k], self.stops[k] - 1
+        return float((self.t[stop] - self.t[start]) / (stop - start)) if stop > start else 0.0
+
+    @property
+    def irregular(self) -> int:
+        """How many steps within stretches differ by more than a third from the usual one."""
+        steps = np.diff(self.t)
+        within = np.ones(len(steps), bool)
+        within[self.starts[1:] - 1] = False
+        return int(np.sum(within & (np.abs(steps - self.period) > 0.33 * self.period)))
+
+
+def usual_step(t: Array) -> float:
+    """Return the usual step of increasing times [s], 0 where there is none."""
+    steps = np.diff(t)
+    period = float(np.median(steps)) if len(steps) else 0.0
+    # merged or bursty clocks have many short steps: the usual one carries half of the time;
+    # holes are few, however long
+    if len(steps) and float(np.mean(steps > HOLE * period)) > _BURSTY:
+        order = np.sort(steps)
+        share = np.cumsum(order)
+        period = float(order[np.searchsorted(share, share[-1] / 2)])
+    return period
+
+
+def clock(t: Array, hole: float | None = None, period: float | None = None) -> Clock:
     """Return the usual step of times and the stretches without a hole.
 
     Parameters
@@ -46,15 +81,15 @@ def clock(t: Array, hole: float | None = None) -> Clock:
         (N,) [s], increasing, N >= 1.
     hole : float, optional
         Shortest step that counts as a hole [s]; 2.5 usual steps by default.
+    period : float, optional
+        Usual step [s], where it is known from more than these times.
     """
     steps = np.diff(t)
-    period = float(np.median(steps)) if len(steps) else 0.0
-    # merged or bursty clocks have many short steps: the usual one carries half of the time
-    if len(steps) and float(np.mean(steps)) > 1.5 * period:
-        order = np.sort(steps)
-        covered = np.cumsum(order)
-        period = float(order[np.searchsorted(covered, covered[-1] / 2)])
-    limit = HOLE * period if hole is None else max(hole, 1.01 * period)
+    period = usual_step(t) if period is None else period
+    limit = HOLE * period
+    if hole is not None:
+        # what the user calls a hole is one, but not every step
+        limit = max(hole, 1.01 * min(period, float(np.median(steps)) if len(steps) else period))
     breaks = np.flatnonzero(steps > limit) + 1
     starts = np.concatenate([[0], breaks]).astype(np.int64)
     stops = np.concatenate([breaks, [len(t)]]).astype(np.int64)
@@ -110,9 +145,10 @@ def _low_pass(t: Array, value: Array, grid: Array, period: float, sample_time: f
 
     ratio = sample_time / period
     # an odd number of taps keeps the filter without delay
-    taps = 2 * int(np.ceil(_TAPS_PER_RATIO * ratio / 2)) + 1
-    count = max(int(np.floor((t[-1] - t[0]) / period + 1e-9)) + 1, 2)
-    fine = t[0] + period * np.arange(count)
+    taps = 2 * int(np.ceil(_TAPS_PER_RATIO * ratio / 2 - 1e-6)) + 1
+    # the mean step of this stretch: that of all of them would drift away from its times
+    count = max(round((t[-1] - t[0]) / period) + 1, 2)
+    fine = np.linspace(t[0], t[-1], count)
     even = np.interp(fine, t, value)
     kernel = firwin(taps, _CUT_OFF / ratio)
     half = taps // 2
@@ -123,7 +159,7 @@ def _low_pass(t: Array, value: Array, grid: Array, period: float, sample_time: f
     before = 2 * even[0] - even[half:0:-1]
     after = 2 * even[-1] - even[-2 : -half - 2 : -1]
     smooth = oaconvolve(np.concatenate([before, even, after]), kernel, mode="valid")
-    return np.interp(grid, fine, smooth)
+    return np.asarray(np.interp(grid, fine, smooth))
 
 
 def hold(of: Clock, value: Array, grid: Array) -> Array:

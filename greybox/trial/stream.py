@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -17,27 +18,32 @@ from greybox.trial.canonical import (
     canonical,
     merge,
     read_recording,
-    table_columns,
+    unused_mappings,
 )
 from greybox.trial.checks.check import check_recording
-from greybox.trial.importing import Imported, ImportOptions, import_recording
-from greybox.trial.log import TrialLog
-from greybox.trial.names import Assigned
+from greybox.trial.importing import (
+    ImportOptions,
+    clean_signals,
+    cut_segments,
+    gap_notes,
+    import_recording,
+    make_provenance,
+    too_short,
+)
+from greybox.trial.log import Provenance, TrialLog
 from greybox.trial.readers.formats import open_raw
 from greybox.trial.readers.table import Batch, TableFile
 from greybox.trial.recording import Recording, SourceFile
 from greybox.trial.repair import repair
-from greybox.trial.resampling import nice_period
-from greybox.trial.writing import write_log
+from greybox.trial.survey import Survey, survey_table
+from greybox.trial.writing import record_path, write_log
 from greybox.vessel.vessel import Vessel
 
-Array = NDArray[np.float64]
-
-# tables above this size are imported in blocks [bytes]
-_LARGE = 200_000_000
-_BLOCK_ROWS = 400_000
-# rows that neighbouring blocks share, so that no filter sees a block's end
-_HALO_ROWS = 2_000
+# tables that may hold more numbers are imported in blocks
+_LARGE_CELLS = 20_000_000
+_BLOCK_ROWS = 300_000
+# samples on both sides of a block that are made with it and not kept
+_MARGIN = 4
 
 
 def import_files(
@@ -81,12 +87,16 @@ def import_files(
         A file cannot be read, or no log can be made of them.
     """
     options = options or ImportOptions()
-    large = [p for p in map(Path, paths) if p.is_file() and p.stat().st_size > _LARGE]
-    if large and len(paths) == 1 and not fix and not fix_also:
-        table = open_raw(large[0])
-        if not isinstance(table, Recording):
+    _keep_sources(paths, out)
+    if len(paths) == 1 and not fix and not fix_also and Path(paths[0]).is_file():
+        table = open_raw(paths[0], **(reader or {}))
+        if not isinstance(table, Recording) and table.cells > _LARGE_CELLS:
             return _in_blocks(table, vessel, out, options, extra)
-    recording = merge([read_recording(p, vessel, **(reader or {})) for p in paths])
+    recordings = [read_recording(p, vessel, **(reader or {})) for p in paths]
+    unused = unused_mappings(recordings, vessel)
+    recording = merge(recordings)
+    recording = recording.with_signals(recording.signals, *unused)
+    del recordings
     fixed: tuple[str, ...] = ()
     left: list[str] = []
     if fix or fix_also:
@@ -94,22 +104,39 @@ def import_files(
         recording, fixed, left = repair(recording, vessel, report, also=fix_also)
     imported = import_recording(recording, vessel, options, fixed=fixed)
     write_log(imported.segments, out, extra=extra)
-    return _summary(imported, fixed, left)
-
-
-def _summary(imported: Imported, fixed: Sequence[str], left: Sequence[str]) -> str:
     first, last = imported.segments[0], imported.segments[-1]
-    samples = sum(len(s) for s in imported.segments)
-    lines = [
-        f"{first.provenance.source}: {samples} samples of {first.sample_time:g} s, "
-        f"{last.t[-1] - first.t[0]:.6g} s, {len(imported.segments)} segment"
-        f"{'s' if len(imported.segments) > 1 else ''}",
-        f"channels: {', '.join(first.channels)}",
-    ]
-    lines += [f"note: {n}" for n in imported.notes]
-    lines += [f"mended: {n}" for n in fixed]
-    lines += [f"left as it is: {n}" for n in left]
-    return "\n".join(lines)
+    return _summary(
+        first,
+        sum(len(s) for s in imported.segments),
+        float(last.t[-1] - first.t[0]),
+        len(imported.segments),
+        [f"note: {n}" for n in imported.notes]
+        + [f"mended: {n}" for n in fixed]
+        + [f"left as it is: {n}" for n in left],
+    )
+
+
+def _keep_sources(paths: Sequence[str | Path], out: str | Path) -> None:
+    """Refuse to write the log over a raw file: it could not be imported again."""
+    targets = {Path(out).resolve(), record_path(out).resolve()}
+    for path in paths:
+        if Path(path).resolve() in targets:
+            raise LogError(
+                f"'{Path(path).name}' is also the log to write: name another file for the log."
+            )
+
+
+def _summary(
+    first: TrialLog, samples: int, seconds: float, segments: int, lines: Sequence[str]
+) -> str:
+    return "\n".join(
+        [
+            f"{first.provenance.source}: {samples} samples of {first.sample_time:g} s, "
+            f"{seconds:.6g} s, {segments} segment{'s' if segments > 1 else ''}",
+            f"channels: {', '.join(first.channels)}",
+            *lines,
+        ]
+    )
 
 
 def _in_blocks(
@@ -119,114 +146,154 @@ def _in_blocks(
     options: ImportOptions,
     extra: Mapping[str, Any] | None,
 ) -> str:
-    assigned = table_columns(table, vessel, guess=True)
-    state = _State(options)
-    files = (SourceFile(table.path.name, sha256(table.path), table.format),)
-
-    def segments() -> Iterator[TrialLog]:
-        for batch, before, last in _blocks(table, [a.raw for a in assigned.values()]):
-            yield from state.block(table, batch, before, last, assigned, vessel, files)
-
-    write_log(segments(), out, extra=extra)
-    notes = list(dict.fromkeys([*table.notes, *state.notes]))
-    lines = [
-        f"{table.path.name}: {state.samples} samples of {state.sample_time:g} s, imported in blocks"
-    ]
-    return "\n".join(lines + [f"note: {n}" for n in notes])
+    survey = survey_table(table, vessel, options)
+    stream = _Stream(table, vessel, options, survey)
+    write_log(stream.segments(), out, extra=extra, provenance=stream.provenance)
+    assert stream.first is not None
+    notes = [*stream.provenance().read, *stream.provenance().derived]
+    return _summary(
+        stream.first,
+        stream.samples,
+        stream.spans[-1][1] - stream.spans[0][0],
+        len(stream.spans),
+        [f"note: {n}" for n in notes],
+    )
 
 
-def _blocks(table: TableFile, columns: Sequence[str]) -> Iterator[tuple[Batch, int, bool]]:
-    """Yield blocks of rows with the halo of the one before, and whether it is the last.
+class _Stream:
+    """The second pass over a table: what one block leaves to the next."""
 
-    The second item is the number of rows at the front that were there before.
-    """
-    held: dict[str, list[NDArray[Any]]] = {c: [] for c in columns}
-    rows, before = 0, 0
-    for batch in table.batches(columns):
-        for c in columns:
-            held[c].append(batch[c])
-        rows += len(batch[columns[0]])
-        if rows >= _BLOCK_ROWS + before:
-            block = {c: np.concatenate(held[c]) for c in columns}
-            yield block, before, False
-            before = 2 * _HALO_ROWS
-            held = {c: [block[c][-before:]] for c in columns}
-            rows = before
-    if rows > before or before == 0:
-        yield {c: np.concatenate(held[c]) for c in columns if held[c]}, before, True
-    elif before:
-        yield {c: np.concatenate(held[c]) for c in columns}, before, True
-
-
-class _State:
-    """What one block leaves to the next: the grid's origin and the turns of the angles."""
-
-    def __init__(self, options: ImportOptions) -> None:
-        self.options = options
-        self.sample_time = 0.0
-        self.start: float | None = None
-        self.epoch: float | None = None
-        self.last = -np.inf
-        self.turns: dict[str, tuple[float, float]] = {}
+    def __init__(
+        self, table: TableFile, vessel: Vessel, options: ImportOptions, survey: Survey
+    ) -> None:
+        self.table, self.vessel, self.options, self.survey = table, vessel, options, survey
+        self.first: TrialLog | None = None
         self.samples = 0
-        self.notes: list[str] = []
+        self.spans: list[tuple[float, float]] = []
+        self.derived: dict[str, None] = {}
+        self.done = 0
+        self.anchors: dict[str, float] = {}
+        self.file = SourceFile(table.path.name, sha256(table.path), table.format)
 
-    def block(
-        self,
-        table: TableFile,
-        batch: Batch,
-        before: int,
-        last: bool,
-        assigned: dict[str, Assigned],
-        vessel: Vessel,
-        files: tuple[SourceFile, ...],
-    ) -> Iterator[TrialLog]:
-        """Yield the segments of one block, its halo cut off, angles continued."""
-        recording = canonical(batch_recording(table, batch, assigned, vessel), assigned, vessel)
-        t = recording.signals[0].t
-        if self.epoch is None:
-            self.epoch = recording.epoch
-        elif recording.epoch is not None and self.epoch is not None:
-            shift = recording.epoch - self.epoch
-            recording = recording.with_signals(
-                replace(s, t=s.t + shift) for s in recording.signals
-            )
-            t = recording.signals[0].t
-        if self.start is None:
-            self.start = float(t[0])
-            self.sample_time = self.options.sample_time or nice_period(float(np.median(np.diff(t))))
-        elif (np.diff(t) <= 0).all():
-            raise LogError(
-                f"time in '{table.path.name}' runs backwards in a file too large to sort: "
-                f"sort it first."
-            )
-        options = replace(self.options, sample_time=self.sample_time)
-        recording = replace(recording, files=files)
-        # a grid point before the block's first row, so that all blocks share one grid
-        offset = np.ceil((float(np.nanmin(t)) - self.start) / self.sample_time - 1e-6)
-        zero = self.start + offset * self.sample_time
-        imported = import_recording(recording, vessel, options, zero=zero)
-        self.notes += [n for n in imported.notes if n not in self.notes]
-        # half of the halo belongs to the block before, half to the next
-        stop = np.inf if last else float(t[-_HALO_ROWS])
-        for log in imported.segments:
-            inside = (log.t > self.last + 0.5 * self.sample_time) & (log.t < stop)
-            k = np.flatnonzero(inside)
-            if not len(k):
+    @property
+    def halo(self) -> float:
+        """Time that blocks share, so that no filter sees a block's end [s]."""
+        plan = self.survey.plan
+        slowest = max(plan.periods.values())
+        return 8 * (plan.sample_time + slowest) + 2 * self.options.window + self.survey.back
+
+    def provenance(self) -> Provenance:
+        """Return where the log came from, with all that is known by now."""
+        notes = dict.fromkeys([*self.table.notes, *self.survey.notes, *gap_notes(self.spans, 0)])
+        whole = Recording(
+            self.table.path.stem, (), epoch=self.survey.scale.epoch, files=(self.file,)
+        )
+        return make_provenance(whole, self.options, list(notes), list(self.derived))
+
+    def segments(self) -> Iterator[TrialLog]:
+        """Yield the pieces of the log in order of time.
+
+        Raises
+        ------
+        LogError
+            A row cannot be read, or there is no piece.
+        """
+        survey, plan = self.survey, self.survey.plan
+        columns = [a.raw for a in survey.assigned.values()]
+        held: dict[str, list[NDArray[Any]]] = {c: [] for c in columns}
+        fresh = 0
+        for batch in chain(self.table.batches(columns), [None]):
+            if batch is not None:
+                for c in columns:
+                    held[c].append(batch[c])
+                fresh += len(batch[columns[0]])
+                if fresh < _BLOCK_ROWS:
+                    continue
+            block = {c: np.concatenate(held[c]) if held[c] else np.empty(0) for c in columns}
+            start, pieces = self._block(block, last=batch is None)
+            # a copy, so that the whole block is not kept for its end
+            held = {c: [block[c][start:].copy()] for c in columns}
+            del block
+            yield from pieces
+            fresh = 0
+        if self.first is None:
+            raise too_short(plan)
+
+    def _block(self, block: Batch, *, last: bool) -> tuple[int, list[TrialLog]]:
+        """Return the first row that the next block needs, and the pieces of this one."""
+        survey, plan = self.survey, self.survey.plan
+        raw = batch_recording(self.table, block, survey.assigned, survey.scale, self.vessel)
+        recording = canonical(raw, survey.assigned, self.vessel)
+        t = survey.scale.seconds(block[survey.assigned["t"].raw])
+        finite = t[np.isfinite(t)]
+        if not len(finite):
+            return len(t), []
+        newest = float(finite.max())
+        stop = plan.count
+        if not last:
+            until = (newest - self.halo - plan.start) / plan.sample_time
+            stop = int(np.clip(np.floor(until), self.done, plan.count))
+        # the samples of the next block, and before them what its filters see
+        needed = plan.start + stop * plan.sample_time - self.halo
+        # the first row from which on nothing older comes: rows may be out of order
+        older = np.flatnonzero(t < needed)
+        start = int(older[-1]) + 1 if len(older) else 0
+        recording = self._turned(recording, start)
+        pieces = self._pieces(recording, stop)
+        self.done = stop
+        return start, pieces
+
+    def _pieces(self, recording: Recording, stop: int) -> list[TrialLog]:
+        survey, plan = self.survey, self.survey.plan
+        if stop <= self.done:
+            return []
+        notes: list[str] = []
+        signals = clean_signals(recording, survey.origin, notes)
+        # samples beside those wanted, so that stretches do not end where the block does
+        margin = _MARGIN + int(np.ceil(self.options.window / plan.sample_time))
+        span = (max(self.done - margin, 0), min(stop + margin, plan.count))
+        found, derived, _ = cut_segments(
+            signals, recording.text, plan, span, self.vessel, self.options
+        )
+        self.derived.update(dict.fromkeys(derived))
+        low, high = plan.grid(self.done, self.done + 1)[0], plan.grid(stop, stop + 1)[0]
+        half = 0.5 * plan.sample_time
+        pieces = []
+        for log in found:
+            inside = np.flatnonzero((log.t > low - half) & (log.t < high - half))
+            if not len(inside):
                 continue
-            part = log.window(int(k[0]), int(k[-1]) + 1, log.name)
-            part = self._continue(part, vessel)
-            self.last = float(part.t[-1])
-            self.samples += len(part)
-            yield part
+            piece = log.window(int(inside[0]), int(inside[-1]) + 1, log.name)
+            if self.first is None:
+                piece = replace(piece, provenance=self.provenance())
+                self.first = piece
+            begin, end = float(piece.t[0]), float(piece.t[-1])
+            if self.spans and begin - self.spans[-1][1] < 1.5 * plan.sample_time:
+                self.spans[-1] = (self.spans[-1][0], end)
+            else:
+                self.spans.append((begin, end))
+            self.samples += len(piece)
+            pieces.append(piece)
+        return pieces
 
-    def _continue(self, log: TrialLog, vessel: Vessel) -> TrialLog:
-        channels = dict(log.channels)
-        for name in {"psi", *vessel.angle_commands} & channels.keys():
-            value = channels[name]
-            if name in self.turns:
-                jump = np.round((value[0] - self.turns[name][1]) / (2 * np.pi))
-                value = value - 2 * np.pi * jump
-                channels[name] = value
-            self.turns[name] = (float(log.t[-1]), float(value[-1]))
-        return replace(log, channels=channels)
+    def _turned(self, recording: Recording, start: int) -> Recording:
+        """Unwrap angles as if the blocks before were there; `start` is where the next begins."""
+        out = []
+        for s in recording.signals:
+            if s.name in {"psi", *self.vessel.angle_commands}:
+                order = np.argsort(s.t, kind="stable")
+                rows = order[np.isfinite(s.value[order]) & np.isfinite(s.t[order])]
+                if len(rows):
+                    value = s.value.copy()
+                    value[rows] = np.unwrap(value[rows])
+                    if s.name in self.anchors:
+                        turns = np.round((self.anchors[s.name] - value[rows[0]]) / (2 * np.pi))
+                        value += 2 * np.pi * turns
+                    following = rows[rows >= start]
+                    # the same row comes first in the next block; else the last is nearest
+                    self.anchors[s.name] = float(
+                        value[following[0] if len(following) else rows[-1]]
+                    )
+                    s = s.with_value(value)
+            out.append(s)
+        return recording.with_signals(out)

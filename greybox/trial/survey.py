@@ -1,121 +1,235 @@
-"""What a log holds: standard manoeuvres, and how long each sign regime lasts."""
+"""The first pass over a table that does not fit in memory: its clocks, units and origin."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass, replace
 
-from greybox.errors import GreyboxError
-from greybox.trial.importing import import_recording
-from greybox.trial.log import TrialLog
-from greybox.trial.manoeuvres import Criterion, Manoeuvre, Quantity, Verdict, find_manoeuvres
-from greybox.trial.recording import Recording
-from greybox.trial.segments import by_sign
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.channels import CHANNELS
+from greybox.errors import LogError
+from greybox.trial.canonical import (
+    TimeScale,
+    angle_reach,
+    angle_unit,
+    batch_recording,
+    canonical,
+    table_columns,
+    time_scale,
+    unused_mappings,
+)
+from greybox.trial.deriving import derive_signals
+from greybox.trial.importing import Extent, ImportOptions, Plan, extent, plan_import
+from greybox.trial.names import Assigned
+from greybox.trial.readers.table import Batch, TableFile
+from greybox.trial.recording import Recording, Signal
+from greybox.trial.resampling import clock
+from greybox.trial.writing import read_record, recorded_provenance
 from greybox.vessel.vessel import Vessel
 
-# regimes shorter than this tell nothing about a trial [s]
-_SHORTEST = 5.0
-# a state keeps its sign with a margin of this share of its usual size
-_MARGIN = 0.1
+Array = NDArray[np.float64]
+
+# time may go back by this share of what a block spans: more cannot be sorted in blocks
+_MAX_BACK_ROWS = 10_000
 
 
 @dataclass(frozen=True)
 class Survey:
-    """What the segments of one trial hold.
+    """What must be known of a table before its first block can be imported.
 
     Parameters
     ----------
-    manoeuvres : tuple of Manoeuvre
-        In order of time.
-    regimes : mapping of str to float
-        Seconds by sign regime of surge and sway, such as ``u+v-``.
-    seconds : float
-        Length of all segments.
-    note : str
-        Why there is no survey; empty where there is one.
+    assigned : dict of str to Assigned
+        Which column is which signal, units decided.
+    scale : TimeScale
+    origin : tuple of float, optional
+        Latitude and longitude [deg] of the first position.
+    back : float
+        By how much time goes back at most [s].
+    plan : Plan
+    notes : tuple of str
     """
 
-    manoeuvres: tuple[Manoeuvre, ...] = ()
-    regimes: Mapping[str, float] | None = None
-    seconds: float = 0.0
-    note: str = ""
+    assigned: dict[str, Assigned]
+    scale: TimeScale
+    origin: tuple[float, float] | None
+    back: float
+    plan: Plan
+    notes: tuple[str, ...]
 
-    def summary(self) -> str:
-        """Return manoeuvres and regimes as text; empty where there is nothing to tell."""
-        parts = [m.summary() for m in self.manoeuvres]
-        if self.regimes and self.seconds > 0:
-            said = ", ".join(
-                f"{name} {100 * s / self.seconds:.0f} %"
-                for name, s in sorted(self.regimes.items(), key=_longest)
+
+def survey_table(table: TableFile, vessel: Vessel, options: ImportOptions) -> Survey:
+    """Read a table once and decide on the samples of its log.
+
+    Raises
+    ------
+    LogError
+        As `plan_import`; or time goes back too far to be sorted in blocks.
+    """
+    record = read_record(table.path)
+    if record is not None:
+        # what greybox wrote is canonical: a mapping would convert it twice
+        vessel = replace(vessel, columns={})
+    assigned = table_columns(table, vessel, guess=record is None)
+    found = _Found(table, vessel, options, assigned)
+    for batch in table.batches([a.raw for a in assigned.values()]):
+        found.add(batch)
+    if found.scale is None:
+        # nothing to measure: the message is that of an empty time column
+        time_scale(np.empty(0), assigned["t"], table)
+        raise AssertionError
+    if record is not None and found.scale.epoch is None:
+        found.scale = replace(found.scale, epoch=recorded_provenance(record).epoch)
+    if found.back > _MAX_BACK_ROWS * found.usual:
+        raise LogError(
+            f"time in '{table.path.name}' goes back by {found.back:.6g} s, at most "
+            f"{_MAX_BACK_ROWS * found.usual:.6g} s can be put in order in a file of that size: "
+            f"sort it, or cut it where time goes back."
+        )
+    units = {n: angle_unit(reach) for n, reach in found.reach.items()}
+    whole = canonical(found.sample, assigned, vessel, found.reach)
+    derived = derive_signals(whole, found.origin)
+    decided = {n: replace(a, unit=units[n]) if n in units else a for n, a in assigned.items()}
+    extents = {n: parts.extent() for n, parts in found.parts.items()}
+    plan = plan_import(extents, vessel, options, table.path.stem)
+    notes = [
+        *found.scale.notes,
+        *derived.notes,
+        *unused_mappings([found.raw], vessel),
+    ]
+    if found.backward:
+        notes.append(
+            f"time goes back {found.backward} time{'s' if found.backward > 1 else ''}, by "
+            f"{found.back:.6g} s at most: put in order"
+        )
+    if found.repeated:
+        notes.append(
+            f"{found.repeated} row{'s' if found.repeated > 1 else ''} repeat a time: "
+            f"the first is kept"
+        )
+    return Survey(decided, found.scale, found.origin, found.back, plan, (*notes, *plan.notes))
+
+
+class _Parts:
+    """The clock of one signal, from batch to batch."""
+
+    def __init__(self, hole: float | None) -> None:
+        self.hole = hole
+        self.last: float | None = None
+        self.extents: list[Extent] = []
+
+    def add(self, t: Array) -> None:
+        """Add the times of a batch; they begin with the last time of the one before."""
+        if self.last is not None:
+            t = np.concatenate([[self.last], t])
+        if len(t) > 1 and not (np.diff(t) > 0).all():
+            t = np.unique(t)
+        if len(t) > 1:
+            part = extent(clock(t, self.hole))
+            self.extents.append(part if self.last is None else replace(part, count=part.count - 1))
+            self.last = part.last
+        elif len(t) and self.last is None:
+            self.last = float(t[0])
+            self.extents.append(extent(clock(t, self.hole)))
+
+    def extent(self) -> Extent:
+        """Return the whole: the usual step is the median over batches, by their counts."""
+        parts = [e for e in self.extents if e.period > 0] or self.extents
+        order = sorted(parts, key=lambda e: e.period)
+        share = np.cumsum([e.count for e in order])
+        middle = order[int(np.searchsorted(share, share[-1] / 2))]
+        near = [e for e in parts if abs(e.period - middle.period) <= 0.01 * middle.period]
+        return Extent(
+            min(e.first for e in self.extents),
+            max(e.last for e in self.extents),
+            sum(e.count for e in self.extents),
+            middle.period,
+            max(near, key=lambda e: e.covered).mean,
+            sum(e.covered for e in self.extents),
+            sum(e.irregular for e in self.extents),
+        )
+
+
+class _Found:
+    """What has been seen so far of a table."""
+
+    def __init__(
+        self,
+        table: TableFile,
+        vessel: Vessel,
+        options: ImportOptions,
+        assigned: dict[str, Assigned],
+    ) -> None:
+        self.table, self.vessel, self.options, self.assigned = table, vessel, options, assigned
+        self.scale: TimeScale | None = None
+        self.origin = options.origin
+        self.back, self.backward, self.repeated = 0.0, 0, 0
+        self.usual = 0.0
+        self.newest = -np.inf
+        self.parts: dict[str, _Parts] = {}
+        self.reach: dict[str, tuple[float, float]] = {}
+        self.raw = self.sample = Recording("", ())
+
+    def add(self, batch: Batch) -> None:
+        """Take in one batch."""
+        time = self.assigned["t"]
+        column = batch[time.raw]
+        if self.scale is None:
+            if not np.isfinite(column).any():
+                return
+            self.scale = time_scale(column, time, self.table)
+        raw = batch_recording(self.table, batch, self.assigned, self.scale, self.vessel)
+        t = self.scale.seconds(column)
+        good = np.isfinite(t)
+        self._order(t[good])
+        self._reach(raw)
+        recording = canonical(raw, self.assigned, self.vessel)
+        if not self.sample.signals:
+            self.sample, self.raw = _head(raw), recording
+        if self.origin is None:
+            self.origin = _first_position(recording)
+        keeps: dict[tuple[int, bytes], Array] = {}
+        for s in derive_signals(recording, self.origin).signals:
+            keep = np.isfinite(s.t) & np.isfinite(s.value)
+            t = keeps.setdefault((id(s.t), np.packbits(keep).tobytes()), s.t[keep])
+            self.parts.setdefault(s.name, _Parts(self.options.hole)).add(t)
+
+    def _order(self, t: Array) -> None:
+        if not len(t):
+            return
+        steps = np.diff(t)
+        if len(steps) and not self.usual:
+            self.usual = float(np.median(np.abs(steps)))
+        before = np.maximum.accumulate(np.concatenate([[self.newest], t]))
+        fall = before[:-1] - t
+        fall = fall[np.isfinite(fall)]
+        self.backward += int(np.sum(steps < 0))
+        self.repeated += int(np.sum(steps == 0))
+        self.back = max(self.back, float(fall.max(initial=0.0)))
+        self.newest = float(before[-1])
+
+    def _reach(self, raw: Recording) -> None:
+        for name, a in self.assigned.items():
+            angle = name in self.vessel.angle_commands or (
+                name in CHANNELS and CHANNELS[name].unit == "rad"
             )
-            parts.append(f"sign regimes kept for {_SHORTEST:g} s or more: {said}")
-        return "\n".join(parts)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the survey as plain values, angles in radians."""
-        return {
-            "manoeuvres": [manoeuvre_to_dict(m) for m in self.manoeuvres],
-            "regimes": dict(self.regimes or {}),
-        }
+            if angle and a.unit is None and a.how != "exact" and a.raw in raw:
+                new, old = angle_reach(raw[a.raw].value), self.reach.get(name, (0.0, 0.0))
+                self.reach[name] = (max(new[0], old[0]), max(new[1], old[1]))
 
 
-def _longest(item: tuple[str, float]) -> float:
-    return -item[1]
+def _head(recording: Recording) -> Recording:
+    """Return the first values of a recording, enough to name what is derived of them."""
+    return recording.with_signals(
+        Signal(s.name, s.t[:100], s.value[:100], s.unit, s.source, s.canonical)
+        for s in recording.signals
+    )
 
 
-def survey_logs(segments: Sequence[TrialLog]) -> Survey:
-    """Find the manoeuvres and sign regimes of the segments of one trial.
-
-    Parameters
-    ----------
-    segments : sequence of TrialLog
-        Without gaps, in order of time.
-    """
-    manoeuvres: list[Manoeuvre] = []
-    regimes: dict[str, float] = {}
-    seconds = 0.0
-    for log in segments:
-        seconds += len(log) * log.sample_time
-        states = [n for n in ("u", "v") if n in log]
-        if "psi" in log and "u" in log and len(log) * log.sample_time > _SHORTEST:
-            manoeuvres += find_manoeuvres(log)
-        if states:
-            margins = {n: _MARGIN * float(abs(log[n]).mean()) for n in states}
-            for s in by_sign(log, margins, shortest=_SHORTEST):
-                regimes[s.label] = regimes.get(s.label, 0.0) + s.t_stop - s.t_start
-    return Survey(tuple(manoeuvres), regimes, seconds)
-
-
-def survey_recording(recording: Recording, vessel: Vessel) -> Survey:
-    """Make a log of a mended recording and survey it; say why where none can be made."""
-    try:
-        return survey_logs(import_recording(recording, vessel).segments)
-    except GreyboxError as error:
-        return Survey(note=str(error))
-
-
-def manoeuvre_to_dict(manoeuvre: Manoeuvre) -> dict[str, Any]:
-    """Return a manoeuvre as plain values; quantities with standard error and interval."""
-    kind = {"TurningCircle": "turning_circle", "ZigZag": "zigzag", "Stopping": "stopping"}
-    found: dict[str, Any] = {"kind": kind[type(manoeuvre).__name__]}
-    for field in fields(manoeuvre):
-        found[field.name] = _plain(getattr(manoeuvre, field.name))
-    return found
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Quantity):
-        return {
-            "value": value.value,
-            "std": value.std,
-            "unit": value.unit,
-            "ci": list(value.interval),
-        }
-    if isinstance(value, Criterion):
-        return {f.name: _plain(getattr(value, f.name)) for f in fields(value)}
-    if isinstance(value, Verdict):
-        return value.value
-    if isinstance(value, tuple | list):
-        return [_plain(v) for v in value]
-    return value
+def _first_position(recording: Recording) -> tuple[float, float] | None:
+    if "lat" not in recording or "lon" not in recording:
+        return None
+    lat, lon = recording["lat"].value, recording["lon"].value
+    good = np.flatnonzero(np.isfinite(lat) & np.isfinite(lon))
+    return (float(lat[good[0]]), float(lon[good[0]])) if len(good) else None

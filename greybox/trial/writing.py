@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import asdict
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
@@ -17,6 +19,7 @@ from greybox.files import check_targets, replacing, sha256, write_json
 from greybox.trial.log import Provenance, TrialLog
 
 _MAX_RECORD = 4_000_000
+_ROWS = 1 << 17
 
 
 def record_path(path: str | Path) -> Path:
@@ -25,7 +28,11 @@ def record_path(path: str | Path) -> Path:
 
 
 def write_log(
-    segments: Iterable[TrialLog], path: str | Path, *, extra: Mapping[str, Any] | None = None
+    segments: Iterable[TrialLog],
+    path: str | Path,
+    *,
+    extra: Mapping[str, Any] | None = None,
+    provenance: Callable[[], Provenance] | None = None,
 ) -> None:
     """Write the segments of a log as one table, and its record beside it.
 
@@ -41,6 +48,8 @@ def write_log(
         CSV, or Parquet where it ends so.
     extra : mapping, optional
         More entries of the record.
+    provenance : callable, optional
+        Asked after the last segment; that of the first segment by default.
 
     Raises
     ------
@@ -49,12 +58,45 @@ def write_log(
     """
     path = Path(path)
     check_targets(path, record_path(path))
+    if path.exists() and not path.is_file():
+        raise LogError(
+            f"cannot write a log to '{path}', a device or a pipe: its record stands beside it and "
+            f"holds its hash. Name a file."
+        )
     iterator = iter(segments)
     first = next(iterator, None)
     if first is None:
         raise LogError("there is no segment to write: import at least one.")
     names = _columns(first)
-    rows, spans = 0, []
+    spans: list[list[float]] = []
+    tables = _tables(chain([first], iterator), first, names, spans)
+    try:
+        with replacing(path, "wb") as handle:
+            _write_tables(tables, path, handle)
+    except OSError as error:
+        raise LogError(
+            f"cannot write '{path}': {error.strerror or error}. Nothing was written: make room, or "
+            f"name a file elsewhere."
+        ) from None
+    record = {
+        "format": "greybox-log",
+        "version": 1,
+        "log": path.name,
+        "log_sha256": sha256(path),
+        "rows": int(sum(s[2] for s in spans)),
+        "sample_time": first.sample_time,
+        "units": _units(first, names),
+        "segments": _merged(spans, first.sample_time)[:1000],
+        **asdict(first.provenance if provenance is None else provenance()),
+        **(extra or {}),
+    }
+    write_json(record, record_path(path))
+
+
+def _tables(
+    segments: Iterable[TrialLog], first: TrialLog, names: Sequence[str], spans: list[list[float]]
+) -> Iterator[Any]:
+    """Yield the rows of the log as Arrow tables, and note the spans of its segments."""
     import pyarrow as pa
 
     loop = first.vessel.closed_loop if first.loop_known else None
@@ -62,42 +104,44 @@ def write_log(
     if loop is not None:
         fields.append((loop[0], pa.string()))
     schema = pa.schema(fields)
-    with replacing(path, "wb") as handle:
-        if path.suffix.lower() in (".parquet", ".pq"):
-            from pyarrow import parquet
+    for log in segments:
+        spans.append([float(log.t[0]), float(log.t[-1]), len(log)])
+        for start in range(0, len(log), _ROWS):
+            part = slice(start, start + _ROWS)
+            arrays = [pa.array((log.t if n == "t" else log[n])[part]) for n in names]
+            if loop is not None:
+                words = np.where(log.closed_loop[part], loop[1][0], "open")
+                arrays.append(pa.array(words.astype(str)))
+            yield pa.Table.from_arrays(arrays, schema=schema)
 
-            writer: Any = parquet.ParquetWriter(handle, schema)
-        else:
-            from pyarrow import csv
 
-            options = csv.WriteOptions(quoting_style="needed")
-            writer = csv.CSVWriter(handle, schema, write_options=options)
+def _write_tables(tables: Iterator[Any], path: Path, handle: IO[bytes]) -> None:
+    """Write tables while the next one is made."""
+    table = next(tables)
+    if path.suffix.lower() in (".parquet", ".pq"):
+        from pyarrow import parquet
+
+        # measured values hardly repeat: dictionaries of them only cost time
+        writer: Any = parquet.ParquetWriter(handle, table.schema, use_dictionary=False)
+    else:
+        from pyarrow import csv
+
+        options = csv.WriteOptions(quoting_style="needed")
+        writer = csv.CSVWriter(handle, table.schema, write_options=options)
+    with ThreadPoolExecutor(max_workers=1) as pool:
         try:
-            for log in chain([first], iterator):
-                rows += len(log)
-                spans.append([float(log.t[0]), float(log.t[-1]), len(log)])
-                for start in range(0, len(log), 1 << 17):
-                    part = slice(start, start + (1 << 17))
-                    arrays = [pa.array((log.t if n == "t" else log[n])[part]) for n in names]
-                    if loop is not None:
-                        words = np.where(log.closed_loop[part], loop[1][0], "open")
-                        arrays.append(pa.array(words.astype(str)))
-                    writer.write_table(pa.Table.from_arrays(arrays, schema=schema))
-        finally:
-            writer.close()
-    record = {
-        "format": "greybox-log",
-        "version": 1,
-        "log": path.name,
-        "log_sha256": sha256(path),
-        "rows": rows,
-        "sample_time": first.sample_time,
-        "units": _units(first, names),
-        "segments": _merged(spans, first.sample_time)[:1000],
-        **asdict(first.provenance),
-        **(extra or {}),
-    }
-    write_json(record, record_path(path))
+            written = pool.submit(writer.write_table, table)
+            for table in tables:
+                written.result()
+                written = pool.submit(writer.write_table, table)
+            written.result()
+        except BaseException:
+            # the writer may be at work still: it is the file's end that must not be written
+            pool.shutdown(wait=True)
+            with suppress(Exception):
+                writer.close()
+            raise
+        writer.close()
 
 
 def read_record(path: Path) -> dict[str, Any] | None:

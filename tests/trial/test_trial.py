@@ -143,7 +143,10 @@ def test_decimation_averages_what_the_ship_feels(ship):
         (lambda f: f.drop(columns=["t"]), "no column 't'"),
         (lambda f: f.drop(columns=["u", "x_n"]), "no 'u' and it cannot be derived"),
         (lambda f: f.drop(columns=["psi"]), "no heading 'psi'"),
-        (lambda f: f.assign(u=f["u"].where(f.index != 4)), "holds 'nan' in row 6 and 1 of 20"),
+        (
+            lambda f: f.assign(u=f["u"].where(f.index != 4)),
+            "holds no finite number in row 6 and in 1 of 20",
+        ),
         (lambda f: f.assign(v="x"), "no finite number"),
         (lambda f: f.assign(t=f["t"][::-1].to_numpy()), "must increase"),
         (lambda f: f.assign(t=np.r_[np.arange(10), 10 + 2 * np.arange(10)]), "two sample times"),
@@ -164,13 +167,13 @@ def test_bad_files(tmp_path):
     with pytest.raises(LogError, match="there is no file"):
         read_log(tmp_path / "none.csv", ship)
     (tmp_path / "log.xlsx").write_text("t")
-    with pytest.raises(LogError, match=r"logs are CSV \(.csv\) or Parquet"):
+    with pytest.raises(LogError, match="is a spreadsheet, not a log"):
         read_log(tmp_path / "log.xlsx", ship)
     (tmp_path / "log.parquet").write_text("not parquet")
     with pytest.raises(LogError, match="as Parquet"):
         read_log(tmp_path / "log.parquet", ship)
     (tmp_path / "empty.csv").write_text("")
-    with pytest.raises(LogError, match="as CSV"):
+    with pytest.raises(LogError, match="is empty"):
         read_log(tmp_path / "empty.csv", ship)
 
 

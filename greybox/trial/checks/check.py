@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from greybox.trial.canonical import merge, read_recording
+from greybox.trial.canonical import read_recording
 from greybox.trial.checks.course import course_findings
 from greybox.trial.checks.finding import IDS, CheckReport, Finding, Outcome
 from greybox.trial.checks.frames import find_reading, frame_outcomes, read, reading_findings
@@ -49,15 +49,10 @@ def check_files(paths: Sequence[str | Path], vessel: Vessel) -> list[CheckReport
 
 
 def _read(path: Path, vessel: Vessel) -> tuple[Recording, tuple[str, ...]]:
-    from dataclasses import replace
-
     record = read_record(path) if path.is_file() else None
-    if record is None:
-        return merge([read_recording(path, vessel)]), ()
-    # what greybox wrote is canonical; what it derived is no sensor of its own
-    derived = tuple(str(d) for d in record.get("derived") or ())
-    plain = replace(vessel, columns={})
-    return merge([read_recording(path, plain, guess=False)]), derived
+    # what greybox derived is no sensor of its own
+    derived = tuple(str(d) for d in (record or {}).get("derived") or ())
+    return read_recording(path, vessel), derived
 
 
 def check_recording(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import stat
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -34,14 +35,31 @@ _MAGIC = (
     (b"\x89HDF\r\n\x1a\n", "mat", "a MATLAB 7.3 file"),
     (b"SQLite format 3", "ros", "a ROS 2 database"),
 )
+_ZSTD = b"\x28\xb5\x2f\xfd"
 _REFUSED = (
     (b"PK\x03\x04", "a zip archive (a spreadsheet?)"),
+    (b"PK\x05\x06", "an empty zip archive"),
     (b"\x1f\x8b", "compressed by gzip"),
-    (b"\x80\x04\x95", "a Python pickle"),
-    (b"\x80\x05\x95", "a Python pickle"),
-    (b"\x80\x03", "a Python pickle"),
+    (b"BZh", "compressed by bzip2"),
+    (b"\xfd7zXZ", "compressed by xz"),
+    (_ZSTD, "compressed by zstd"),
+    (b"7z\xbc\xaf", "a 7z archive"),
+    (b"Rar!", "a RAR archive"),
+    (b"\xd0\xcf\x11\xe0", "an old spreadsheet or document"),
+    (b"\x93NUMPY", "a NumPy array"),
     (b"%PDF", "a PDF"),
 )
+# what may run code when it is opened, or holds none of the formats whatever its first bytes
+_REFUSED_ENDINGS = {
+    ".pkl": "a Python pickle", ".pickle": "a Python pickle", ".p": "a Python pickle",
+    ".joblib": "a Python pickle", ".npy": "a NumPy array", ".npz": "a NumPy archive",
+    ".xls": "a spreadsheet", ".xlsx": "a spreadsheet", ".ods": "a spreadsheet",
+    ".zip": "a zip archive", ".gz": "compressed by gzip",
+}  # fmt: skip
+
+
+# protocols 0 and 1 are text: a mark and a list, a dictionary, or a name to import
+_OLD_PICKLE = re.compile(rb"\((dp|lp|i|c)\w|[\]}]q\0|c[\w.]+\n[\w.]+\n")
 
 
 def open_raw(path: str | Path, **options: Any) -> Recording | TableFile:
@@ -78,8 +96,13 @@ def open_raw(path: str | Path, **options: Any) -> Recording | TableFile:
 
 
 def _kind(path: Path) -> str:
-    if not path.exists():
+    try:
+        there = path.exists()
         beside = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise LogError(f"cannot read '{str(path)[:80]}': {reason}. Name an existing log.") from None
+    if not there:
         raise LogError(
             f"there is no file '{path}'.{suggestion(path.name, beside)} Name an existing log."
         )
@@ -102,12 +125,17 @@ def _kind(path: Path) -> str:
     for magic, kind, _ in _MAGIC:
         if head.startswith(magic):
             return kind
-    for magic, what in _REFUSED:
-        if head.startswith(magic):
-            raise LogError(
-                f"'{path.name}' is {what}, not a log: unpack or export it as CSV, Parquet, MAT, "
-                f"NMEA 0183, a ROS bag or MCAP."
-            )
+    if head.startswith(_ZSTD) and {".db3", ".mcap"} & set(path.suffixes):
+        return "ros"
+    refused = next((what for magic, what in _REFUSED if head.startswith(magic)), None)
+    if refused is None and _is_pickle(head):
+        refused = "a Python pickle"
+    refused = refused or _REFUSED_ENDINGS.get(suffix)
+    if refused is not None:
+        raise LogError(
+            f"'{path.name}' is {refused}, not a log: unpack or export it as CSV, Parquet, MAT, "
+            f"NMEA 0183, a ROS bag or MCAP."
+        )
     from greybox.trial.readers.nmea import looks_like_nmea
 
     if looks_like_nmea(head):
@@ -125,3 +153,9 @@ def _kind(path: Path) -> str:
             f"use one of {', '.join(known)}."
         )
     return kind
+
+
+def _is_pickle(head: bytes) -> bool:
+    return (head[0] == 0x80 and head[1:2] in (b"\2", b"\3", b"\4", b"\5")) or bool(
+        _OLD_PICKLE.match(head)
+    )

@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from greybox.errors import LogError
+from greybox.trial.readers import cells as cell_text
 from greybox.trial.readers.table import Batch
 
 _BATCH_ROWS = 1 << 17
-# a page is decoded as a whole: refuse groups that would not fit beside the rest
-_MAX_GROUP_BYTES = 3 << 29
+# a page is decoded as a whole, and a row group may be one page a column
+_MAX_GROUP_BYTES = 1 << 29
+_MAX_RATIO = 4
+# times are never repeated: even delta coding needs a bit or two for each row
+_MAX_ROWS_PER_BYTE = 8
+_HONEST_ROWS = 1_000_000
+_READ_BYTES = 1 << 20
+# damaged footers and pages surface as any of these, beside Arrow's own
+_ERRORS = (OSError, ValueError, KeyError, MemoryError, StopIteration, OverflowError)
 
 
 @dataclass
@@ -27,8 +34,15 @@ class ParquetFile:
     text: frozenset[str] = frozenset()
     dates: frozenset[str] = frozenset()
     notes: list[str] = field(default_factory=list)
-    metadata: dict[str, str] = field(default_factory=dict)
+    parsed: frozenset[str] = frozenset()
+    clocks: frozenset[str] = frozenset()
+    rows: int = 0
     format: str = "Parquet"
+
+    @property
+    def cells(self) -> int:
+        """How many numbers the file holds."""
+        return self.rows * len(self.columns)
 
     def batches(self, columns: Sequence[str]) -> Iterator[Batch]:
         """Yield the named columns, 131072 rows at a time.
@@ -42,23 +56,39 @@ class ParquetFile:
         from pyarrow import parquet
 
         try:
-            with parquet.ParquetFile(self.path, memory_map=False, pre_buffer=False) as file:
-                _refuse_bombs(self.path, file.metadata, columns)
+            # read in pieces: else whole row groups are held, however large they were written
+            with parquet.ParquetFile(
+                self.path, memory_map=False, pre_buffer=False, buffer_size=_READ_BYTES
+            ) as file:
+                _refuse_bombs(self.path, file.metadata)
                 for batch in file.iter_batches(
                     batch_size=_BATCH_ROWS, columns=list(columns), use_threads=True
                 ):
                     yield {c: self._values(batch.column(c), c) for c in columns}
-        except (pa.ArrowException, OSError, ValueError, KeyError) as error:
+        except _ERRORS as error:
+            raise _unreadable(self.path, error) from None
+        except pa.ArrowException as error:
             raise _unreadable(self.path, error) from None
 
     def _values(self, column: Any, name: str) -> Any:
         import pyarrow as pa
 
+        if pa.types.is_dictionary(column.type):
+            column = column.dictionary_decode()
+        if name in self.parsed:
+            return cell_text.dates(column.cast(pa.string()))
         if name in self.text:
-            return np.array([str(v or "") for v in column.to_pylist()], dtype=object)
+            return cell_text.text(column)
         if name in self.dates:
-            ns = column.cast(pa.timestamp("ns")).cast(pa.int64())
-            return ns.cast(pa.float64(), safe=False).to_numpy(zero_copy_only=False) * 1e-9
+            if pa.types.is_date(column.type):
+                column = column.cast(pa.timestamp("s"))
+            return cell_text.unix_seconds(column.cast(pa.timestamp("ns", column.type.tz)))
+        if pa.types.is_duration(column.type):
+            parts = {"s": 1, "ms": 1_000, "us": 1_000_000, "ns": 1_000_000_000}
+            count = column.cast(pa.int64()).cast(pa.float64(), safe=False)
+            return count.to_numpy(zero_copy_only=False) / parts[column.type.unit]
+        if pa.types.is_boolean(column.type):
+            column = column.cast(pa.int8())
         return column.cast(pa.float64(), safe=False).to_numpy(zero_copy_only=False)
 
 
@@ -82,53 +112,103 @@ def open_parquet(path: Path) -> ParquetFile:
     from pyarrow import parquet
 
     try:
-        schema = parquet.read_schema(path, memory_map=False)
-    except (pa.ArrowException, OSError, ValueError) as error:
+        with parquet.ParquetFile(path, memory_map=False) as file:
+            schema, rows = file.schema_arrow, file.metadata.num_rows
+    except _ERRORS as error:
         raise _unreadable(path, error) from None
-    columns, text, dates, dropped = [], set(), set(), []
+    except pa.ArrowException as error:
+        raise _unreadable(path, error) from None
+    size = path.stat().st_size
+    if rows > max(_HONEST_ROWS, _MAX_ROWS_PER_BYTE * size):
+        raise LogError(
+            f"'{path.name}' states {rows} rows in {size} bytes, at most {_MAX_ROWS_PER_BYTE} a "
+            f"byte are believed: export it again from the recorder."
+        )
+    kinds: dict[str, str] = {}
+    units: dict[str, str] = {}
+    dropped: list[str] = []
     for item in schema:
-        kind = item.type
-        if pa.types.is_dictionary(kind):
-            kind = kind.value_type
-        if pa.types.is_timestamp(kind) or pa.types.is_date(kind):
-            dates.add(item.name)
-        elif pa.types.is_string(kind) or pa.types.is_large_string(kind):
-            text.add(item.name)
-        elif not (
-            pa.types.is_floating(kind) or pa.types.is_integer(kind) or pa.types.is_boolean(kind)
-        ):
+        kind = _kind(item.type)
+        if kind is None or item.name in kinds:
             dropped.append(item.name)
             continue
-        columns.append(item.name)
+        kinds[item.name] = kind
+        if kind == "duration":
+            units[item.name] = "s"
+    twice = sorted(n for n, c in Counter(schema.names).items() if c > 1)
+    if twice:
+        raise LogError(
+            f"'{path.name}' has {schema.names.count(twice[0])} columns called '{twice[0]}': "
+            f"export it with a name for each."
+        )
+    if not kinds or not rows:
+        raise LogError(
+            f"'{path.name}' holds {rows} rows and {len(kinds)} columns of numbers, times or text: "
+            f"name a log with samples."
+        )
     notes = [f"column '{n}' is neither number, time nor text: left out" for n in dropped[:5]]
-    metadata = {
-        k.decode("utf-8", "replace"): v.decode("utf-8", "replace")
-        for k, v in (schema.metadata or {}).items()
-        if k == b"greybox"
-    }
+    if len(dropped) > 5:
+        notes.append(f"{len(dropped) - 5} more columns that are neither left out")
+    text = [n for n, k in kinds.items() if k == "text"]
+    parsed = _written_dates(path, text)
     return ParquetFile(
         path,
-        tuple(columns),
-        text=frozenset(text),
-        dates=frozenset(dates),
-        notes=notes,
-        metadata=metadata,
+        tuple(kinds),
+        units,
+        frozenset(text) - parsed,
+        frozenset(n for n, k in kinds.items() if k == "date") | parsed,
+        notes,
+        parsed,
+        rows=rows,
     )
 
 
-def _refuse_bombs(path: Path, metadata: Any, columns: Sequence[str]) -> None:
-    wanted = set(columns)
+def _kind(found: Any) -> str | None:
+    import pyarrow as pa
+
+    is_a = pa.types
+    if is_a.is_dictionary(found):
+        found = found.value_type
+    if is_a.is_timestamp(found) or is_a.is_date(found):
+        return "date"
+    if is_a.is_string(found) or is_a.is_large_string(found):
+        return "text"
+    if is_a.is_duration(found):
+        return "duration"
+    numeric = (is_a.is_floating, is_a.is_integer, is_a.is_boolean, is_a.is_decimal)
+    return "number" if any(test(found) for test in numeric) else None
+
+
+def _written_dates(path: Path, text: Sequence[str]) -> frozenset[str]:
+    """Return those columns of text whose first rows are dates."""
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    if not text:
+        return frozenset()
+    try:
+        with parquet.ParquetFile(path, memory_map=False, buffer_size=_READ_BYTES) as file:
+            _refuse_bombs(path, file.metadata)
+            batch = next(file.iter_batches(batch_size=64, columns=list(text)))
+            first = {c: [str(v or "") for v in batch.column(c).to_pylist()] for c in text}
+    except _ERRORS as error:
+        raise _unreadable(path, error) from None
+    except pa.ArrowException as error:
+        raise _unreadable(path, error) from None
+    return frozenset(c for c in text if cell_text.kind(first[c], comma=False) == "date")
+
+
+def _refuse_bombs(path: Path, metadata: Any) -> None:
+    # groups only: asking pyarrow for a damaged column chunk ends the process (26.0)
+    size = path.stat().st_size
     for k in range(metadata.num_row_groups):
-        group = metadata.row_group(k)
-        size = sum(
-            group.column(j).total_uncompressed_size
-            for j in range(group.num_columns)
-            if group.column(j).path_in_schema in wanted
-        )
-        if size > _MAX_GROUP_BYTES:
+        unpacked = metadata.row_group(k).total_byte_size
+        # what hardly shrank is as large as its file, and is cut into pages of a megabyte
+        if unpacked > max(_MAX_GROUP_BYTES, _MAX_RATIO * size):
             raise LogError(
-                f"'{path.name}' has a row group of {size / 2**30:.1f} GiB when unpacked, at most "
-                f"{_MAX_GROUP_BYTES / 2**30:.1f} GiB are read at once: write it with smaller ones."
+                f"a row group of '{path.name}' ({size} bytes) unpacks to {unpacked} bytes, at most "
+                f"{max(_MAX_GROUP_BYTES, _MAX_RATIO * size)} are read at once: write it with "
+                f"smaller row groups."
             )
 
 

@@ -20,8 +20,13 @@ class TableFile(Protocol):
     units: dict[str, str]
     text: frozenset[str]
     dates: frozenset[str]
+    clocks: frozenset[str]
     notes: list[str]
     format: str
+
+    @property
+    def cells(self) -> int:
+        """How many numbers the table holds at most."""
 
     def batches(self, columns: Sequence[str]) -> Iterator[Batch]:
         """Yield the named columns: (n,) float each, str where in `text`, UNIX s where in `dates`.

@@ -1,0 +1,182 @@
+"""From the text of cells to numbers, words and times; what cannot be read is counted."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+NULLS = ["", "NaN", "nan", "NAN", "NA", "N/A", "n/a", "null", "NULL", "None", "none", "-", "--"]
+NULLS += ["#N/A", "NaT"]
+DAY = 86400.0
+
+_NOTHING = {n.lower() for n in NULLS} | {"inf", "-inf", "+inf"}
+# a dash is how people fill a cell of any row, also of a row of units
+_BLANK = {"", "-", "--"}
+_POINT = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?")
+_COMMA = re.compile(r"[+-]?(\d+,\d*|,\d+)([eEdD][+-]?\d+)?")
+_DATE = re.compile(r"\d{4}([-/])\d\d\1\d\d[T ]\d\d:\d\d|\d\d\.\d\d\.\d{4}[T ]\d\d:\d\d")
+_CLOCK = re.compile(r"\d\d?:\d\d:\d\d([.,]\d+)?")
+# RE2, on bytes
+_PLAIN = r"^-?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?$"
+
+
+def is_blank(cell: str) -> bool:
+    """Whether a cell of a first line says nothing."""
+    return cell.strip() in _BLANK
+
+
+def is_date(cell: str) -> bool:
+    """Whether a cell is a date with a time of day that can be read in one way only."""
+    return bool(_DATE.match(cell.strip()))
+
+
+def is_clock(cell: str) -> bool:
+    """Whether a cell is a time of day."""
+    return bool(_CLOCK.fullmatch(cell.strip()))
+
+
+def is_number(cell: str, *, comma: bool) -> bool:
+    """Whether a cell is a number or stands for a missing one; `comma` allows 1,5."""
+    bare = cell.strip()
+    return (
+        bool(_POINT.fullmatch(bare))
+        or (comma and has_comma(bare))
+        or (bare.lower() in _NOTHING and bool(bare))
+    )
+
+
+def has_comma(cell: str) -> bool:
+    """Whether a cell is a number with a decimal comma."""
+    return bool(_COMMA.fullmatch(cell.strip()))
+
+
+def kind(cells: Iterable[str], *, comma: bool) -> str:
+    """Return what most cells of a column hold: number, date, clock or text."""
+    filled = [c.strip() for c in cells]
+    filled = [c for c in filled if c.lower() not in _NOTHING]
+    for name, test in (("date", is_date), ("clock", is_clock)):
+        if filled and sum(map(test, filled)) > 0.5 * len(filled):
+            return name
+    if filled and sum(is_number(c, comma=comma) for c in filled) < 0.5 * len(filled):
+        return "text"
+    return "number"
+
+
+def numbers(column: Any, decimal: str, name: str, words: Counter[str]) -> NDArray[np.float64]:
+    """Return a column of text as numbers, NaN where it holds words.
+
+    Parameters
+    ----------
+    column : pyarrow.Array
+        (n,) of strings, None where missing.
+    decimal : str
+        Decimal mark.
+    name : str
+        Column, for the count.
+    words : Counter
+        Receives how many cells hold words.
+
+    Returns
+    -------
+    ndarray
+        (n,)
+    """
+    import pyarrow as pa
+    from pyarrow import compute
+
+    if decimal == ",":
+        column = compute.replace_substring(column, ",", ".")
+    try:
+        return np.asarray(column.cast(pa.float64()).to_numpy(zero_copy_only=False))
+    except pa.ArrowInvalid:
+        pass
+    # RE2 refuses text with damaged characters: one such cell must not cost the others
+    ascii_only = compute.all(compute.string_is_ascii(column), min_count=0).as_py()
+    raw = column if ascii_only else pa.array([_ascii(w) for w in text(column)], pa.string())
+    raw = compute.ascii_trim_whitespace(raw)
+    raw = compute.replace_substring_regex(raw, r"^\+", "")
+    raw = compute.replace_substring_regex(raw, r"^([-\d.]+),(\d*([eE][+-]?\d+)?)$", r"\1.\2")
+    raw = compute.replace_substring_regex(raw, r"^(.*\d\.?)[dD]([+-]?\d+)$", r"\1E\2")
+    plain = compute.match_substring_regex(raw, _PLAIN)
+    missing = compute.is_in(compute.ascii_lower(raw), pa.array(sorted(_NOTHING)))
+    lost = compute.and_not(compute.is_valid(raw), compute.or_(plain, missing))
+    count = int(compute.sum(lost.cast(pa.int64())).as_py() or 0)
+    if count:
+        words[name] += count
+    kept = compute.if_else(plain, raw, pa.scalar(None, pa.string()))
+    return np.asarray(kept.cast(pa.float64()).to_numpy(zero_copy_only=False))
+
+
+def _ascii(cell: str) -> str | None:
+    # the minus sign of typesetting, and blanks that are no ASCII
+    return cell.replace("\u2212", "-").strip() or None
+
+
+def text(column: Any) -> NDArray[Any]:
+    """Return a column of text as an array of str, (n,) object."""
+    import pyarrow as pa
+
+    raw = column.cast(pa.binary()).to_pylist()
+    return np.array(["" if c is None else c.decode("utf-8", "replace") for c in raw], object)
+
+
+def dates(column: Any) -> NDArray[np.float64]:
+    """Return dates as UNIX time [s], (n,); those without a zone are taken for UTC."""
+    import pandas as pd
+    import pyarrow as pa
+
+    for zone in (None, "UTC"):
+        try:
+            stamps = column.cast(pa.timestamp("ns", zone))
+            return unix_seconds(stamps)
+        except pa.ArrowInvalid:
+            continue
+    words = pd.Series(text(column)).str.strip()
+    words = words.str.replace(r"^(\d\d)\.(\d\d)\.(\d{4})", r"\3-\2-\1", regex=True)
+    words = words.str.replace(r"^(\d{4})/(\d\d)/", r"\1-\2-", regex=True)
+    words = words.str.replace(",", ".", regex=False)
+    parsed = pd.to_datetime(words, utc=True, errors="coerce", format="ISO8601")
+    ns = parsed.astype("datetime64[ns, UTC]").astype("int64").to_numpy().astype(float)
+    return np.where(parsed.isna().to_numpy(), np.nan, ns * 1e-9)
+
+
+def unix_seconds(stamps: Any) -> NDArray[np.float64]:
+    """Return time stamps of Arrow as UNIX time [s], (n,), NaN where missing."""
+    import pyarrow as pa
+
+    # whole seconds apart from the rest: UNIX nanoseconds do not fit a double
+    ns = stamps.cast(pa.int64()).fill_null(np.iinfo(np.int64).min).to_numpy(zero_copy_only=False)
+    seconds = ns // 1_000_000_000
+    value = seconds + (ns - seconds * 1_000_000_000) * 1e-9
+    return np.where(ns == np.iinfo(np.int64).min, np.nan, value)
+
+
+class DayClock:
+    """Times of day as seconds that go on past midnight, from one block to the next."""
+
+    def __init__(self) -> None:
+        self.day = 0
+        self.last: float | None = None
+
+    def seconds(self, column: Any) -> NDArray[np.float64]:
+        """Return times of day as seconds since the first midnight, (n,)."""
+        import pandas as pd
+
+        words = pd.Series(text(column)).str.strip().str.replace(",", ".", regex=False)
+        parts = words.str.extract(r"^(\d\d?):(\d\d):(\d\d(?:\.\d+)?)$").astype(float).to_numpy()
+        value: NDArray[np.float64] = parts @ np.array([3600.0, 60.0, 1.0])
+        good = np.flatnonzero(np.isfinite(value))
+        if not len(good):
+            return value
+        before = value[good[0]] if self.last is None else self.last
+        steps = np.diff(np.concatenate([[before], value[good]]))
+        turns = (steps < -DAY / 2).astype(int) - (steps > DAY / 2).astype(int)
+        days = self.day + np.cumsum(turns)
+        self.day, self.last = int(days[-1]), float(value[good[-1]])
+        value[good] += DAY * days
+        return value

@@ -1,0 +1,253 @@
+"""`greybox import` from the outside: logs that estimate, bad input, nothing half-written."""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import random
+
+import numpy as np
+import pandas as pd
+import pytest
+from virtual import recorded, virtual_log, write_csv
+
+from greybox.commands.main import main
+
+
+def data(n=60):
+    t = np.arange(n) * 0.5
+    return pd.DataFrame(
+        {
+            "t": t, "x_n": 2 * t, "y_n": np.sin(t), "psi": 0.1 * np.sin(t / 5), "u": 2 + 0 * t,
+            "v": 0.1 * np.sin(t), "r": 0.02 * np.cos(t / 5), "u_q": 3 + 0 * t, "v_q": 0 * t,
+            "n": 15 + 0.01 * t, "alpha1": 0.8 + 0 * t, "alpha2": 0.8 + 0 * t,
+        }
+    )  # fmt: skip
+
+
+def nmea(seconds=60):
+    lines = []
+    for k in range(seconds):
+        for body in (
+            f"GPGGA,2359{k % 60:02}.00,6325.{k:06},N,01024.{k:06},E,1,9,1,5,M,4,M,,",
+            f"GPRMC,2359{k % 60:02}.00,A,6325.{k:06},N,01024.{k:06},E,5.1,45.0,010623,,,A",
+            f"HEHDT,{k}.5,T", "WIMWV,20,R,5,N,A", "IIRPM,S,1,100,20,A", "TIROT,2,A",
+        ):  # fmt: skip
+            check = 0
+            for c in body.encode():
+                check ^= c
+            lines.append(f"${body}*{check:02X}\r\n")
+    return "".join(lines).encode()
+
+
+def run(capsys, *arguments):
+    status = main([str(a) for a in arguments])
+    return status, *capsys.readouterr()
+
+
+def test_a_log_with_a_gap_is_estimated_by_segments(tmp_path, capsys):
+    log = virtual_log(1, 1500)
+    raw = write_csv(log, tmp_path / "raw.csv")
+    lines = raw.read_text().splitlines(keepends=True)
+    raw.write_text("".join(lines[:701] + lines[731:]))
+    status, out, _ = run(
+        capsys, "import", raw, "--vessel", "thesis", "--out", tmp_path / "log.csv",
+        "--note", "draught=1.2 m",
+    )  # fmt: skip
+    assert status == 0
+    assert "1470 samples of 1 s, 1499 s, 2 segments" in out
+    assert "1 gap kept as such, the longest of 31 s at t = 699 s" in out
+    record = json.loads((tmp_path / "log.csv.json").read_text())
+    assert record["segments"] == [[0, 699, 700], [730, 1499, 770]]
+    assert record["notes"] == {"draught": "1.2 m"}
+    model = tmp_path / "model.json"
+    status, out, err = run(
+        capsys, "estimate", tmp_path / "log.csv", "--vessel", "thesis", "--out", model
+    )
+    assert status == 0, err
+    with_gap = json.loads(model.read_text())["theta"]
+    whole = write_csv(log, tmp_path / "whole.csv")
+    assert run(capsys, "estimate", whole, "--vessel", "thesis", "--out", model)[0] == 0
+    fitted = json.loads(model.read_text())
+    both = [np.array(list(x.values()) if isinstance(x, dict) else x)
+            for x in (with_gap, fitted["theta"])]  # fmt: skip
+    spread = fitted["std"]
+    spread = np.array(list(spread.values()) if isinstance(spread, dict) else spread)
+    # two estimates that share 98 % of their data
+    assert np.all(np.abs(both[0] - both[1]) < 2 * spread)
+
+
+@pytest.mark.parametrize("ending", ["csv", "parquet"])
+def test_nmea_and_thrusters_merge(tmp_path, capsys, ending):
+    (tmp_path / "bridge.nmea").write_bytes(nmea())
+    start = pd.Timestamp("2023-06-01T23:59:00Z").timestamp()
+    data().assign(t=start + np.arange(60))[["t", "n", "alpha1", "alpha2"]].to_csv(
+        tmp_path / "thrusters.csv", index=False
+    )
+    out = tmp_path / f"log.{ending}"
+    status, said, _ = run(
+        capsys, "import", tmp_path / "bridge.nmea", tmp_path / "thrusters.csv",
+        "--vessel", "thesis", "--out", out, "--json", "-",
+    )  # fmt: skip
+    assert status == 0
+    record = json.loads(said)
+    assert [f["format"] if isinstance(f, dict) else f[2] for f in record["files"]] == [
+        "NMEA 0183", "CSV",
+    ]  # fmt: skip
+    assert record["epoch"] == pytest.approx(start)
+    log = pd.read_csv(out) if ending == "csv" else pd.read_parquet(out)
+    assert {"t", "x_n", "y_n", "psi", "u", "v", "r", "u_q", "v_q", "n"} <= set(log)
+    assert np.diff(log["t"]).max() == pytest.approx(1)
+    assert log["n"].iloc[0] == pytest.approx(15)
+
+
+def test_guesses_are_stated(tmp_path, capsys):
+    columns = recorded(0, seconds=60)
+    table = pd.DataFrame(columns).rename(
+        columns={"t": "Time [ms]", "psi": "True Heading", "x_n": "North", "u": "Surge (kn)"}
+    )
+    table["Time [ms]"] *= 1000
+    table["True Heading"] = np.degrees(table["True Heading"]) % 360
+    table["Surge (kn)"] *= 3600 / 1852
+    table.to_csv(tmp_path / "raw.csv", index=False)
+    status, out, _ = run(
+        capsys, "import", tmp_path / "raw.csv", "--vessel", "thesis", "--out", tmp_path / "o.csv"
+    )
+    assert status == 0
+    for note in (
+        "column 'Time [ms]' taken for time in ms", "True Heading taken for psi in deg, since",
+        "North taken for x_n in m", "Surge (kn) taken for u in kn",
+    ):  # fmt: skip
+        assert note in out
+    log = pd.read_csv(tmp_path / "o.csv")
+    np.testing.assert_allclose(log["u"], columns["u"], rtol=1e-9)
+    np.testing.assert_allclose(np.exp(1j * log["psi"]), np.exp(1j * columns["psi"]), atol=1e-9)
+
+
+def test_a_mapping_that_no_file_has_is_told(tmp_path, capsys):
+    ship = tmp_path / "ship.toml"
+    ship.write_text(
+        'name = "S"\nlength = 5\n[[thruster]]\ntype = "azimuth"\nspeed = "n"\nangle = "alpha1"\n'
+        '[columns]\n"Wind U" = { name = "u_q", unit = "m/s" }\n'
+    )
+    data().drop(columns=["u_q", "v_q"]).to_csv(tmp_path / "raw.csv", index=False)
+    status, out, _ = run(
+        capsys, "import", tmp_path / "raw.csv", "--vessel", ship, "--out", tmp_path / "o.csv"
+    )
+    assert status == 0
+    assert "[columns] maps 'Wind U' to 'u_q', which no file has" in out
+
+
+def sparse(path):
+    with open(path, "wb") as handle:
+        handle.truncate(10 * 2**30)
+
+
+BAD = {
+    "empty.csv": b"", "empty.parquet": b"", "empty.nmea": b"", "random.csv": os.urandom(3000),
+    "random.parquet": os.urandom(3000), "random.nmea": os.urandom(3000),
+    "random.bin": os.urandom(300), "sparse.csv": sparse, "sparse.nmea": sparse,
+    "sparse.parquet": sparse, "zip.csv": b"PK\x03\x04" + bytes(100),
+    "pickle.csv": pickle.dumps({"t": 1}), "header.csv": b"t,u,v\n", "text.nmea": b"hello\n" * 99,
+    "text.parquet": b"t,u\n1,2\n", "csv.xlsx": b"t,u\n1,2\n",
+    "still.csv": b"t,foo\n" + b"1,2\n" * 9,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_files_end_in_one_message_and_leave_nothing(tmp_path, capsys, name):
+    raw = tmp_path / name
+    BAD[name](raw) if callable(BAD[name]) else raw.write_bytes(BAD[name])
+    status, out, err = run(
+        capsys, "import", raw, "--vessel", "thesis", "--out", tmp_path / "log.csv"
+    )
+    assert status == 1
+    assert out == ""
+    assert err.startswith("greybox import: ")
+    assert err.count("\n") == 1
+    assert name in err
+    assert os.listdir(tmp_path) == [name]
+
+
+def test_a_log_that_was_there_survives_a_failure(tmp_path, capsys):
+    (tmp_path / "log.csv").write_text("kept")
+    (tmp_path / "log.csv.json").write_text("kept too")
+    (tmp_path / "raw.csv").write_text("t,u\n" + "1,2\n" * 2)
+    status, _, _ = run(
+        capsys, "import", tmp_path / "raw.csv", "--vessel", "thesis", "--out", tmp_path / "log.csv"
+    )
+    assert status == 1
+    assert (tmp_path / "log.csv").read_text() == "kept"
+    assert (tmp_path / "log.csv.json").read_text() == "kept too"
+
+
+def test_a_file_is_not_written_over_itself(tmp_path, capsys):
+    raw = tmp_path / "raw.csv"
+    data().to_csv(raw, index=False)
+    before = raw.read_bytes()
+    status, _, err = run(capsys, "import", raw, "--vessel", "thesis", "--out", raw)
+    assert status == 1
+    assert "raw.csv' is also the log to write" in err
+    assert raw.read_bytes() == before
+
+
+def test_devices_and_full_disks(tmp_path, capsys, monkeypatch):
+    raw = tmp_path / "raw.csv"
+    data().to_csv(raw, index=False)
+    status, _, err = run(capsys, "import", raw, "--vessel", "thesis", "--out", "/dev/null")
+    assert status == 1
+    assert "a device or a pipe" in err
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("greybox.trial.writing._write_tables", full)
+    out = tmp_path / "log.csv"
+    status, _, err = run(capsys, "import", raw, "--vessel", "thesis", "--out", out)
+    assert status == 1
+    assert "No space left on device. Nothing was written" in err
+    assert os.listdir(tmp_path) == ["raw.csv"]
+
+
+def mutated(rng, content):
+    out = bytearray(content)
+    for _ in range(rng.choice([1, 3, 30])):
+        at, kind = rng.randrange(len(out)), rng.random()
+        if kind < 0.4:
+            out[at] = rng.randrange(256)
+        elif kind < 0.7:
+            out[at:at] = rng.choice(
+                [b",", b"\n", b'"', b"\0", b"nan", b"1e999", b"\xff", b"$", b";"]
+            )
+        else:
+            del out[at : at + rng.choice([1, 10, 200])]
+        out = out or bytearray(b"x")
+    return bytes(out)
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_damaged_files_give_a_log_or_a_message(tmp_path, capsys, seed):
+    rng = random.Random(seed)
+    ending = rng.choice([".csv", ".parquet", ".nmea"])
+    whole = tmp_path / "whole"
+    if ending == ".nmea":
+        content = nmea()
+    elif ending == ".csv":
+        content = data().to_csv(index=False, sep=rng.choice(",;\t ")).encode()
+    else:
+        data().to_parquet(whole)
+        content = whole.read_bytes()
+    (tmp_path / f"raw{ending}").write_bytes(mutated(rng, content))
+    whole.unlink(missing_ok=True)
+    status, _, err = run(
+        capsys, "import", tmp_path / f"raw{ending}", "--vessel", "thesis",
+        "--out", tmp_path / "log.csv",
+    )  # fmt: skip
+    left = sorted(os.listdir(tmp_path))
+    if status == 0:
+        assert left == sorted(["log.csv", "log.csv.json", f"raw{ending}"])
+    else:
+        assert status == 1
+        assert err.count("\n") == 1
+        assert left == [f"raw{ending}"]

@@ -1,0 +1,335 @@
+"""From recordings to logs: gaps, merging, frames, and files larger than memory."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pymap3d
+import pytest
+from virtual import as_recording, recorded
+
+from greybox.errors import LogError
+from greybox.trial import stream
+from greybox.trial.canonical import merge, read_recording
+from greybox.trial.importing import ImportOptions, import_recording
+from greybox.trial.readers import csv as csv_reader
+from greybox.trial.reading import read_segments
+from greybox.trial.recording import Recording, Signal
+from greybox.vessel.toml import load_vessel, vessel_from_dict
+
+VESSEL = load_vessel("thesis")
+
+
+def columns(n=400, dt=0.5):
+    t = np.round(np.arange(n) * dt, 6)
+    return {
+        "t": t, "x_n": 2 * t, "y_n": np.sin(t / 9), "psi": 0.1 * np.sin(t / 5), "u": 2 + 0 * t,
+        "v": 0.1 * np.sin(t / 4), "r": 0.02 * np.cos(t / 5), "u_q": 3 + 0 * t, "v_q": 0 * t,
+        "n": 15 + np.sin(t / 3), "alpha1": 0.8 + 0 * t, "alpha2": 0.9 + 0 * t,
+    }  # fmt: skip
+
+
+def imported(data, **options):
+    return import_recording(as_recording(data), VESSEL, ImportOptions(**options))
+
+
+def without(data, rows):
+    return {k: np.delete(v, rows) for k, v in data.items()}
+
+
+def to_csv(data, path):
+    pd.DataFrame(data).to_csv(path, index=False)
+    return path
+
+
+def test_a_clean_log_comes_out_as_it_went_in():
+    data = columns()
+    (log,) = imported(data).segments
+    assert log.sample_time == 0.5
+    for name, value in data.items():
+        np.testing.assert_array_equal(log.t if name == "t" else log[name], value)
+
+
+def test_gaps_are_gaps_for_every_channel():
+    data = columns()
+    for name in ("psi", "n", "u_q"):
+        broken = {k: v.copy() for k, v in data.items()}
+        broken[name][100:130] = np.nan
+        result = imported(broken)
+        one, two = result.segments
+        assert one.t[-1] == data["t"][99]
+        assert two.t[0] == data["t"][130]
+        assert any("1 gap kept as such, the longest of 15.5 s at t = 49.5 s" in n
+                   for n in result.notes)  # fmt: skip
+    one, two = imported(without(data, slice(100, 130))).segments
+    np.testing.assert_array_equal(two["v"], data["v"][130:])
+
+
+def test_gaps_that_hold_most_of_the_time():
+    data = columns(300)
+    data["t"] = data["t"] + 500 * (np.arange(300) // 60)
+    assert [len(s) for s in imported(data).segments] == [60] * 5
+
+
+def test_a_command_that_is_logged_when_it_changes_is_held():
+    data = columns()
+    full = as_recording(data)
+    at = np.array([0.0, 3, 50, 51, 120, 199])
+    change = Signal("n", at, np.arange(6.0), None, "n", True)
+    recording = full.with_signals([*(s for s in full.signals if s.name != "n"), change])
+    (log,) = import_recording(recording, VESSEL).segments
+    assert len(log) == 400
+    np.testing.assert_array_equal(log["n"], np.searchsorted(at, log.t, side="right") - 1)
+
+
+def test_a_sensor_that_died_does_not_take_the_trial_with_it():
+    data = columns()
+    data["u_q"][50:] = np.nan
+    result = imported(data)
+    assert len(result.segments[0]) == 400
+    assert "u_q" not in result.segments[0]
+    assert any(n.startswith("u_q covers 24.5 of 199.5 s: left out") for n in result.notes)
+
+
+def test_mixed_rates_meet_on_the_slowest_motion_sensor():
+    rng = np.random.default_rng(0)
+    fast, slow = np.arange(0, 200, 0.1), np.arange(0, 200, 1.0)
+    noise = rng.normal(0, 0.1, len(fast))
+    signals = [
+        Signal("psi", fast, 0.01 * fast + noise, "rad", "psi", True),
+        *(Signal(n, slow, 0 * slow + 1, None, n, True) for n in ("x_n", "y_n", "u", "v", "r")),
+        *(Signal(n, fast, np.floor(fast / 7), None, n, True) for n in VESSEL.commands),
+    ]
+    (log,) = import_recording(Recording("x", tuple(signals)), VESSEL).segments
+    assert log.sample_time == 1
+    error = log["psi"] - 0.01 * log.t
+    # the low-pass keeps about 0.08 of the band
+    assert abs(error.std() / (0.1 * np.sqrt(0.08)) - 1) < 4 / np.sqrt(2 * len(log))
+    np.testing.assert_allclose(log["n"][:-1], np.floor(log.t[:-1] / 7), atol=1e-9)
+
+
+def test_positions_against_pymap3d():
+    t = np.arange(100.0)
+    lat, lon = 63.4 + 1e-5 * t, 10.4 - 2e-5 * t
+    signals = [
+        Signal("lat", t, lat, "deg", "lat", True), Signal("lon", t, lon, "deg", "lon", True),
+        Signal("psi", t, 0 * t, "rad", "psi", True),
+    ]  # fmt: skip
+    # heading noise would be divided out of the velocities (3.64)
+    calm = replace(VESSEL, sensors={})
+    (log,) = import_recording(Recording("x", tuple(signals)), calm).segments
+    north, east, _ = pymap3d.geodetic2ned(lat, lon, 0, lat[0], lon[0], 0)
+    np.testing.assert_allclose(log["x_n"], north[1:-1], atol=1e-9)
+    np.testing.assert_allclose(log["y_n"], east[1:-1], atol=1e-9)
+    np.testing.assert_allclose(log["u"], np.gradient(north)[1:-1], atol=1e-6)
+    (moved,) = import_recording(
+        Recording("x", tuple(signals)), VESSEL, ImportOptions(origin=(63.4, 10.3))
+    ).segments
+    assert moved["y_n"][0] == pytest.approx(
+        pymap3d.geodetic2ned(lat[1], lon[1], 0, 63.4, 10.3, 0)[1]
+    )
+
+
+def test_true_wind_becomes_velocity_through_the_air():
+    """Ship eastward at 3 m/s, wind of 5 m/s from the north: it comes from port."""
+    t = np.arange(50.0)
+    base = {"psi": np.pi / 2 + 0 * t, "u": 3 + 0 * t, "v": 0 * t, "r": 0 * t}
+    for extra in (
+        {"V_w": 5 + 0 * t, "dir_w": 0 * t},
+        {"V_w": 5 + 0 * t, "dir_t": -np.pi / 2 + 0 * t},
+        {"V_q": np.hypot(3, 5) + 0 * t, "dir_q": np.arctan2(-5, 3) + 0 * t},
+    ):
+        (log,) = imported({"t": t, **base, **extra}).segments
+        np.testing.assert_allclose(log["u_q"], 3, atol=1e-12)
+        np.testing.assert_allclose(log["v_q"], -5, atol=1e-12)
+
+
+@pytest.mark.parametrize("epoch", [None, 1717236000.0])
+@pytest.mark.parametrize("cut", [1, 137, 399])
+def test_two_halves_merge_to_the_whole(tmp_path, cut, epoch):
+    data = columns()
+    if epoch is not None:
+        data["t"] = data["t"] + epoch
+    table = pd.DataFrame(data)
+    table.to_csv(tmp_path / "all.csv", index=False)
+    table[:cut].to_csv(tmp_path / "a.csv", index=False)
+    # the row at the seam may stand in both
+    table[cut - 1 :].to_csv(tmp_path / "b.csv", index=False)
+    whole = import_recording(read_recording(tmp_path / "all.csv", VESSEL), VESSEL)
+    for order in ("ab", "ba"):
+        parts = merge([read_recording(tmp_path / f"{x}.csv", VESSEL) for x in order])
+        result = import_recording(parts, VESSEL)
+        assert len(result.segments) == 1
+        assert result.segments[0].provenance.epoch == epoch
+        for name in whole.segments[0].channels:
+            np.testing.assert_allclose(result.segments[0][name], whole.segments[0][name], atol=1e-6)
+
+
+def test_columns_of_two_files_merge(tmp_path):
+    data = columns()
+    motion = {k: v for k, v in data.items() if k not in VESSEL.commands}
+    inputs = {k: data[k] for k in ("t", *VESSEL.commands)}
+    files = [to_csv(motion, tmp_path / "a.csv"), to_csv(inputs, tmp_path / "b.csv")]
+    recording = merge([read_recording(p, VESSEL) for p in files])
+    (log,) = import_recording(recording, VESSEL).segments
+    for name in data.keys() - {"t"}:
+        np.testing.assert_allclose(log[name], data[name], atol=1e-12)
+    both = merge([read_recording(files[0], VESSEL)] * 2)
+    assert any("psi stands in 'a' and 'a' at the same times" in n for n in both.notes)
+
+
+def test_clocks_that_cannot_meet(tmp_path):
+    data = columns()
+    one = read_recording(to_csv(data, tmp_path / "a.csv"), VESSEL)
+    late = data | {"t": data["t"] + 1.7e9}
+    two = read_recording(to_csv(late, tmp_path / "b.csv"), VESSEL)
+    with pytest.raises(LogError, match="'b' has the time of day and 'a' only seconds"):
+        merge([one, two])
+    apart = {k: data[k] for k in ("t", *VESSEL.commands)} | {"t": data["t"] + 5000}
+    motion = {k: v for k, v in data.items() if k not in VESSEL.commands}
+    parts = merge([as_recording(motion), as_recording(apart)])
+    with pytest.raises(LogError, match=r"overlap from 5000 s \(n\) to 199.5 s"):
+        import_recording(parts, VESSEL)
+
+
+def test_rows_out_of_order_and_twice():
+    data = columns()
+    rows = np.arange(400)
+    rows[[10, 11]] = rows[[11, 10]]
+    rows = np.insert(rows, 50, [50, 50])
+    result = imported({k: v[rows] for k, v in data.items()})
+    (log,) = result.segments
+    np.testing.assert_array_equal(log["v"], data["v"])
+    assert any("goes back 1 time, first from 5.5 to 5 s: put in order" in n for n in result.notes)
+    assert any("2 values of x_n repeat a time: the first is kept" in n for n in result.notes)
+
+
+def test_two_runs_in_one_file_are_not_shuffled():
+    data = columns()
+    twice = {k: np.concatenate([v, v[100:300] + (0 if k == "t" else 1)]) for k, v in data.items()}
+    with pytest.raises(LogError, match=r"goes back from 199.5 to 50 s, over .* are there twice"):
+        imported(twice)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: {"t": d["t"]}, "no position, heading, velocity or thruster column"),
+        (lambda d: {k: v[:2] for k, v in d.items()}, "no position, heading"),
+        (lambda d: d | {"t": np.append(d["t"][:-1], 1e12)}, "1e.12 s, 2e.12 samples of 0.5 s, but"),
+    ],
+)
+def test_recordings_that_make_no_log(change, message):
+    with pytest.raises(LogError, match=message):
+        imported(change(columns()))
+
+
+def test_stretches_that_are_too_short():
+    data = columns()
+    data["psi"] = np.where(np.arange(400) % 10 < 2, data["psi"], np.nan)
+    with pytest.raises(LogError, match="no 3 that follow each other in which x_n, y_n, psi"):
+        imported(data, hole=1.0)
+
+
+def large(case, n=9000):
+    rng = np.random.default_rng(3)
+    data = columns(n, 0.1)
+    data["psi"] = np.cumsum(rng.normal(0.003, 0.02, n))
+    for name in ("u", "v", "u_q", "v_q", "alpha1"):
+        data[name] = data[name] + rng.normal(0, 0.1, n)
+    data["alpha2"] = np.cumsum(rng.normal(0, 0.05, n))
+    table = pd.DataFrame(data)
+    table["alpha2"] = (table["alpha2"] + np.pi) % (2 * np.pi) - np.pi
+    table["Heading"] = np.degrees(table.pop("psi")) % 360
+    if case == "gaps":
+        table.loc[2500:2560, "n"] = np.nan
+        table = table.drop(index=[*range(1990, 2010), *range(3000, 5100), 6000])
+    elif case == "geographic":
+        table["lat"], table["lon"] = 63 + 1e-6 * table["x_n"], 10 + 1e-6 * table["y_n"]
+        table = table.drop(columns=["u", "v", "r", "x_n", "y_n"])
+        table.loc[table.index % 4 > 0, ["u_q", "v_q"]] = np.nan
+        table["t"] += 1.7e9
+    elif case == "disorder":
+        order = np.arange(n)
+        order[[2000, 2003]] = order[[2003, 2000]]
+        order[[5000, 5001]] = order[[5001, 5000]]
+        table = table.iloc[np.insert(order, 7000, 6999)]
+    elif case == "modes":
+        table["mode"] = np.where(np.arange(n) // 700 % 2, "dp", "manual")
+    return table
+
+
+@pytest.mark.parametrize("case", ["plain", "gaps", "geographic", "disorder", "modes"])
+@pytest.mark.parametrize("options", [{}, {"sample_time": 1.0}, {"velocities": "savgol"}])
+@pytest.mark.parametrize("ending", ["csv", "parquet"])
+def test_blocks_give_the_log_that_memory_gives(tmp_path, monkeypatch, case, options, ending):
+    loop = {"closed_loop": {"column": "mode", "values": ["dp"]}}
+    thrusters = [
+        {"type": "azimuth", "x": x, "speed": "n", "angle": a}
+        for x, a in ((9, "alpha1"), (-9, "alpha2"))
+    ]
+    vessel = vessel_from_dict({"name": "S", "length": 30, "thruster": thrusters} | loop)
+    raw = tmp_path / f"raw.{ending}"
+    table = large(case)
+    if ending == "csv":
+        table.to_csv(raw, index=False)
+    else:
+        table.to_parquet(raw, index=False, row_group_size=1000)
+    chosen = ImportOptions(**options)
+    first = stream.import_files([raw], vessel, tmp_path / "a.csv", chosen)
+    monkeypatch.setattr(stream, "_LARGE_CELLS", 0)
+    monkeypatch.setattr(stream, "_BLOCK_ROWS", 700)
+    monkeypatch.setattr(csv_reader, "_BLOCK_BYTES", 1 << 15)
+    monkeypatch.setattr("greybox.trial.readers.parquet._BATCH_ROWS", 450)
+    second = stream.import_files([raw], vessel, tmp_path / "b.csv", chosen)
+    one, two = (pd.read_csv(tmp_path / f"{x}.csv") for x in "ab")
+    # UNIX times are known to 0.2 µs, and filters begin where a block does
+    near = 1e-5 if case == "geographic" else 1e-8
+    pd.testing.assert_frame_equal(one, two, rtol=near, atol=near)
+    assert first.splitlines()[:2] == second.splitlines()[:2]
+    a, b = (json.loads((tmp_path / f"{x}.csv.json").read_text()) for x in "ab")
+    for key in ("rows", "sample_time", "segments", "derived", "epoch", "files", "units"):
+        assert a[key] == b[key]
+    if case != "disorder":
+        assert sorted(a["read"]) == sorted(b["read"])
+
+
+def test_a_large_file_whose_time_starts_again(tmp_path, monkeypatch):
+    table = large("plain")
+    pd.concat([table, table]).to_csv(tmp_path / "raw.csv", index=False)
+    monkeypatch.setattr(stream, "_LARGE_CELLS", 0)
+    monkeypatch.setattr("greybox.trial.survey._MAX_BACK_ROWS", 1000)
+    with pytest.raises(LogError, match=r"goes back by 899.9 s, at most 100 s"):
+        stream.import_files([tmp_path / "raw.csv"], VESSEL, tmp_path / "a.csv")
+    assert not (tmp_path / "a.csv").exists()
+
+
+@pytest.mark.parametrize("ending", ["csv", "parquet"])
+def test_a_log_is_read_again_as_it_was_written(tmp_path, ending):
+    data = recorded(0, rate=2.0, seconds=120)
+    raw = to_csv(without(data, slice(100, 130)), tmp_path / "raw.csv")
+    mapped = vessel_from_dict(
+        {
+            "name": "T", "length": 30,
+            "thruster": [{"type": "azimuth", "speed": "n", "angle": "alpha1"}],
+            "columns": {"v": {"name": "v", "unit": "kn", "sign": -1}},
+        }
+    )  # fmt: skip
+    log = tmp_path / f"log.{ending}"
+    stream.import_files([raw], mapped, log)
+    segments = read_segments(log, mapped)
+    assert [s.provenance.source for s in segments] == ["raw.csv"] * 2
+    np.testing.assert_allclose(segments[0]["v"], -data["v"][:100] * 1852 / 3600)
+    # imported again it is the same: its columns are not converted twice
+    again = tmp_path / f"again.{ending}"
+    stream.import_files([log], mapped, again)
+    for one, two in zip(segments, read_segments(again, mapped), strict=True):
+        for name in one.channels:
+            np.testing.assert_allclose(one[name], two[name], rtol=1e-12, atol=1e-12)
+    # a log that was edited since is read by the vessel file's columns
+    record = tmp_path / f"log.{ending}.json"
+    record.write_text("{" * 10000)
+    assert read_segments(log, mapped)[0]["v"][0] != segments[0]["v"][0]

@@ -1,0 +1,408 @@
+"""CSV and Parquet as people and programs write them."""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import pickle
+import zipfile
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pytest
+from pyarrow import parquet
+
+from greybox.errors import LogError
+from greybox.trial.canonical import read_recording
+from greybox.trial.readers.csv import open_csv
+from greybox.trial.readers.formats import open_raw
+from greybox.trial.readers.parquet import open_parquet
+from greybox.trial.readers.table import read_columns
+from greybox.vessel.toml import vessel_from_dict
+
+SHIP = {
+    "name": "S",
+    "length": 5,
+    "thruster": [{"type": "azimuth", "speed": "n", "angle": "a"}],
+}
+VESSEL = vessel_from_dict(SHIP)
+
+
+def frame(n=50, seed=0):
+    rng = np.random.default_rng(seed)
+    t = np.round(np.arange(n) * 0.1, 1)
+    names = ("x_n", "y_n", "psi", "u", "v", "r", "n", "a")
+    return pd.DataFrame({"t": t} | {k: rng.normal(size=n) for k in names})
+
+
+def read(path):
+    table = open_raw(path)
+    return pd.DataFrame(read_columns(table, table.columns)), table
+
+
+def written(path, content):
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
+
+
+LAYOUTS = {
+    "plain": {},
+    "semicolon and comma": {"sep": ";", "decimal": ","},
+    "tab and comma": {"sep": "\t", "decimal": ","},
+    "bar": {"sep": "|"},
+    "crlf": {"lineterminator": "\r\n"},
+    "cr": {"lineterminator": "\r"},
+    "quoted": {"quoting": 1},
+    "bom": {"encoding": "utf-8-sig"},
+    "utf-16": {"encoding": "utf-16"},
+    "blank": {"sep": " "},
+    "exponent": {"float_format": "%.17e"},
+}
+
+
+@pytest.mark.parametrize("how", LAYOUTS)
+def test_layouts_give_what_pandas_wrote(tmp_path, how):
+    wanted = frame()
+    wanted.to_csv(tmp_path / "x.csv", index=False, **LAYOUTS[how])
+    found, _ = read(tmp_path / "x.csv")
+    pd.testing.assert_frame_equal(found, wanted, check_exact=True)
+
+
+@pytest.mark.parametrize("rows", [3, 59, 60, 61, 5000])
+def test_rows_are_neither_lost_nor_doubled(tmp_path, rows):
+    wanted = frame(rows)
+    text = "\n\n# by a logger\nGroup A\n" + wanted.to_csv(index=False).replace("\n", "\n\n", 1)
+    found, table = read(written(tmp_path / "x.csv", text))
+    pd.testing.assert_frame_equal(found, wanted, check_exact=True)
+    assert table.notes == ["2 lines before the header skipped"]
+
+
+def test_aligned_columns_with_decimal_commas(tmp_path):
+    wanted = frame().round(4)
+    text = wanted.to_string(index=False, decimal=",").replace("\n", " \n")
+    found, _ = read(written(tmp_path / "x.txt", text))
+    np.testing.assert_allclose(found, wanted, atol=1e-4)
+
+
+def test_names_in_a_comment_as_numpy_writes_them(tmp_path):
+    wanted = frame()
+    path = tmp_path / "x.csv"
+    np.savetxt(
+        path, wanted, delimiter=",", header="made by numpy\n" + ",".join(wanted), fmt="%.17g"
+    )
+    found, table = read(path)
+    pd.testing.assert_frame_equal(found, wanted, check_exact=True)
+    assert "names of the columns read from a comment" in table.notes
+
+
+@pytest.mark.parametrize("units", ["s,m,m,deg,kn,kn,deg/s,rpm,deg", "[s],[m],,[deg],[kn],[kn],,,"])
+def test_second_header_line_of_units(tmp_path, units):
+    text = frame().to_csv(index=False).split("\n", 1)
+    found, table = read(written(tmp_path / "x.csv", f"{text[0]}\n{units}\n{text[1]}"))
+    assert len(found) == 50
+    assert table.units["psi"] == "deg"
+    assert "second header line read as units" in table.notes
+
+
+def test_second_header_line_of_words(tmp_path):
+    text = frame().to_csv(index=False).split("\n", 1)
+    words = "time,north,east,bow,ahead,aside,turn,prop,pod"
+    found, table = read(written(tmp_path / "x.csv", f"{text[0]}\n{words}\n{text[1]}"))
+    assert len(found) == 50
+    assert "second header line skipped" in table.notes
+
+
+def test_delimiters_at_the_ends_of_rows(tmp_path):
+    wanted = frame()
+    text = wanted.to_csv(index=False)
+    for change in (lambda s: s.replace("\n", ",\n"), lambda s: s.replace("\n", ",\n").replace(
+        ",\n", "\n", 1
+    )):  # fmt: skip
+        found, _ = read(written(tmp_path / "x.csv", change(text)))
+        pd.testing.assert_frame_equal(found[list(wanted)], wanted, check_exact=True)
+
+
+def test_damaged_cells_and_rows_are_counted(tmp_path):
+    lines = frame().to_csv(index=False).splitlines()
+    lines[5] = lines[5].replace(lines[5].split(",")[4], "12 m/s")
+    lines[9] = lines[9] + ",1"
+    lines[20] = "# stopped for lunch"
+    text = "\n".join(lines).encode() + b"\n5.0,1,2,3"
+    text = text.replace(lines[30].encode(), b"\xff\xfe," + lines[30].encode())
+    found, table = read(written(tmp_path / "x.csv", text))
+    assert len(found) == 47
+    assert np.isnan(found["u"][4])
+    assert "4 rows with another number of fields than the 9 of the header left out" in table.notes
+    assert "column 'u' holds words in 1 row: read as missing" in table.notes
+
+
+def test_numbers_as_people_write_them(tmp_path):
+    cells = ["+1.5", " 2.5 ", "1.0D+02", "\u22123.5", "1e-3", ".5", "5.", "NaN", "-", "", "inf"]
+    text = "t,u,n,a\n" + "".join(f"{k},{c},0,0\n" for k, c in enumerate(cells))
+    found, table = read(written(tmp_path / "x.csv", text))
+    wanted = [1.5, 2.5, 100, -3.5, 1e-3, 0.5, 5, *[np.nan] * 4]
+    np.testing.assert_array_equal(found["u"], wanted)
+    assert table.notes == []
+
+
+def test_a_decimal_comma_that_comes_late(tmp_path):
+    text = "t;u\n" + "".join(f"{k};1\n" for k in range(200)) + "200;1,5\n"
+    found, _ = read(written(tmp_path / "x.csv", text))
+    assert found["u"].iloc[-1] == 1.5
+
+
+def test_one_byte_encodings_and_their_mixture(tmp_path):
+    text = ("t,Geschwindigkeit (m/s),Größe [°]\n" + "1.0,2.0,3.0\n" * 9).encode("cp1252")
+    found, table = read(written(tmp_path / "x.csv", text))
+    assert table.columns[2] == "Größe [°]"
+    assert "text in cp1252" in table.notes
+    assert found.shape == (9, 3)
+    rows = b"t,u,note\n" + b"1,2,sm\xc3\xb8rbr\xc3\xb8d\n" * 20000 + b"1,2,K\xf8benhavn\n"
+    found, _ = read(written(tmp_path / "y.csv", rows))
+    assert found["note"].iloc[0] == "smørbrød"
+    assert len(found) == 20001
+
+
+STAMPS = {
+    "2024-05-01T12:00:00": 1714564800,
+    "2024-05-01 12:00:00.25": 1714564800.25,
+    "2024-05-01T12:00:00Z": 1714564800,
+    "2024-05-01T12:00:00.5+02:00": 1714557600.5,
+    "2024/05/01 12:00:00": 1714564800,
+    "01.05.2024 12:00:00": 1714564800,
+    "2024-05-01 12:00:00,25": 1714564800.25,
+}
+
+
+@pytest.mark.parametrize("stamp", STAMPS)
+def test_dates(tmp_path, stamp):
+    text = "time;u\n" + f"{stamp};1\n" * 3
+    found, table = read(written(tmp_path / "x.csv", text))
+    assert table.dates == {"time"}
+    np.testing.assert_allclose(found["time"], STAMPS[stamp], rtol=0, atol=2e-7)
+
+
+def test_times_of_day_go_on_past_midnight(tmp_path):
+    text = "time,u\n" + "".join(f"{k // 3600 % 24:02}:{k // 60 % 60:02}:{k % 60:02}.5,1\n"
+                                for k in range(86380, 86420))  # fmt: skip
+    recording = read_recording(written(tmp_path / "x.csv", text), VESSEL)
+    np.testing.assert_allclose(np.diff(recording["u"].t), 1)
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("s", 1), ("ms", 1e3), ("us", 1e6), ("ns", 1e9)])
+@pytest.mark.parametrize("name", ["t", "timestamp"])
+def test_unix_times(tmp_path, unit, factor, name):
+    table = frame().rename(columns={"t": name})
+    table[name] = ((1714564800 + np.arange(50) * 0.1) * factor).round(2)
+    table.to_csv(tmp_path / "x.csv", index=False, float_format="%.2f")
+    recording = read_recording(tmp_path / "x.csv", VESSEL)
+    assert recording.epoch == pytest.approx(1714564800)
+    np.testing.assert_allclose(recording["u"].t, np.arange(50) * 0.1, atol=1e-6)
+    if name == "timestamp" or unit != "s":
+        assert f"column '{name}' taken for time in {unit}" in recording.notes
+
+
+def test_one_damaged_time_does_not_change_the_unit(tmp_path):
+    table = frame()
+    table.loc[7, "t"] = 1.7e18
+    table.rename(columns={"t": "time"}).to_csv(tmp_path / "x.csv", index=False)
+    recording = read_recording(tmp_path / "x.csv", VESSEL)
+    assert recording["u"].t[8] == pytest.approx(0.8)
+
+
+def test_thousands_of_columns(tmp_path):
+    names = ["t", *(f"c{k}" for k in range(4000))]
+    text = ",".join(names) + "\n" + (",".join(["0.123456789012345678"] * 4001) + "\n") * 5
+    found, _ = read(written(tmp_path / "x.csv", text))
+    assert found.shape == (5, 4001)
+    wide = ",".join(f"c{k}" for k in range(5000)) + "\n" + "1," * 4999 + "1\n"
+    with pytest.raises(LogError, match="names 5000 columns, at most 4096"):
+        open_csv(written(tmp_path / "wide.csv", wide))
+
+
+def test_columns_of_one_name(tmp_path):
+    _, table = read(written(tmp_path / "x.csv", "t,u,u,u,u.2\n1,2,3,4,5\n2,3,4,5,6\n"))
+    assert len(set(table.columns)) == 5
+    assert "column 'u' stands 3 times: it is called 'u.3' there" in table.notes
+
+
+def test_columns_may_stand_in_any_order(tmp_path):
+    wanted = frame()
+    wanted.to_csv(tmp_path / "a.csv", index=False)
+    wanted[sorted(wanted, reverse=True)].to_csv(tmp_path / "b.csv", index=False)
+    one, two = (read_recording(tmp_path / f"{x}.csv", VESSEL) for x in "ab")
+    for name in one.names:
+        np.testing.assert_array_equal(one[name].value, two[name].value)
+
+
+def test_units_of_the_vessel_file_rescale(tmp_path):
+    wanted = frame()
+    wanted.to_csv(tmp_path / "a.csv", index=False)
+    other = wanted.assign(
+        u=wanted["u"] * 3600 / 1852, psi=np.degrees(wanted["psi"]), v=-wanted["v"]
+    )
+    other = other.rename(columns={"u": "STW", "psi": "Hd", "v": "Drift"})
+    other.to_csv(tmp_path / "b.csv", index=False)
+    mapped = vessel_from_dict(
+        SHIP
+        | {
+            "columns": {
+                "STW": {"name": "u", "unit": "kn"},
+                "Hd": {"name": "psi", "unit": "deg"},
+                "Drift": {"name": "v", "unit": "m/s", "sign": -1},
+            }
+        }
+    )
+    one = read_recording(tmp_path / "a.csv", VESSEL)
+    two = read_recording(tmp_path / "b.csv", mapped)
+    for name in ("u", "psi", "v"):
+        np.testing.assert_allclose(one[name].value, two[name].value, rtol=1e-12)
+
+
+def bad_csv():
+    yield "empty", b"", "is empty"
+    yield "blank", b"\n \n\n", "is empty"
+    yield "comments", b"# a\n# b\n", "holds no rows"
+    yield "header only", b"t,u,v\n", "header line of 3 names but no rows"
+    yield "numbers only", b"1,2,3\n4,5,6\n", r"begins with numbers \(1, 2, 3\)"
+    yield "binary", bytes(range(256)) * 20, "holds binary data"
+    yield "control", b"\x01\x02\x03\x04abc\n" * 50, "control characters"
+    yield "ambiguous", b"t,u\n" + b"1,5,2,5\n" * 9, "2 names in its header and 4 fields"
+    yield "words", b"t,u\n" + b"one,two\n" * 9, "no rows|holds words"
+    yield "dates", b"time,u\n" + b"5/1/24 3:00 PM,2\n" * 9, "holds words where the time"
+    yield "no time", b"u,v\n" + b"1,2\n" * 9, "no column 't'"
+    yield "long line", b"t,u\n1,2\n" + b"7" * (1 << 23) * 3, "no column|cannot read|hold"
+    yield "narrow", b"t,u,v\n1,2,3\n" + b"1,2,3\n" * 80 + b"1,2\n" * 500, "500 of 581 rows"
+
+
+@pytest.mark.parametrize(("content", "message"), [c[1:] for c in bad_csv()],
+                         ids=[c[0] for c in bad_csv()])  # fmt: skip
+def test_bad_csv(tmp_path, content, message):
+    with pytest.raises(LogError, match=message):
+        read_recording(written(tmp_path / "x.csv", content), VESSEL)
+
+
+def test_one_line_of_ten_gigabytes(tmp_path):
+    path = tmp_path / "x.csv"
+    with open(path, "wb") as handle:
+        handle.write(b"t,u\n1,2\n")
+        handle.truncate(10 * 2**30)
+    with pytest.raises(LogError, match="binary data"):
+        read_recording(path, VESSEL)
+
+
+def refused(folder):
+    with zipfile.ZipFile(folder / "bomb.csv", "w", zipfile.ZIP_DEFLATED) as bomb:
+        bomb.writestr("x.csv", b"0" * 10**7)
+    (folder / "x.xlsx").write_bytes((folder / "bomb.csv").read_bytes())
+    for protocol in range(6):
+        (folder / f"p{protocol}.csv").write_bytes(pickle.dumps({"t": [1, 2]}, protocol))
+    (folder / "c.csv").write_bytes(b"cos\nsystem\n(S'true'\ntR.")
+    (folder / "x.csv").write_bytes(b"\x1f\x8b\x08" + bytes(50))
+    (folder / "x.pkl").write_bytes(b"t,u\n1,2\n")
+    return ["bomb.csv", "x.xlsx", *(f"p{k}.csv" for k in range(6)), "c.csv", "x.csv", "x.pkl"]
+
+
+def test_archives_and_pickles_are_refused(tmp_path):
+    for name in refused(tmp_path):
+        with pytest.raises(LogError, match=r"is (a|compressed).*, not a log: unpack or export"):
+            open_raw(tmp_path / name)
+
+
+def test_paths_that_are_no_files(tmp_path):
+    (tmp_path / "log.csv").write_text("t\n1\n")
+    with pytest.raises(LogError, match=r"there is no file .* Did you mean 'log.csv'\?"):
+        open_raw(tmp_path / "lg.csv")
+    with pytest.raises(LogError, match="a folder without a ROS 2 bag"):
+        open_raw(tmp_path)
+    with pytest.raises(LogError, match="device or a pipe"):
+        open_raw("/dev/null")
+    with pytest.raises(LogError, match="cannot read"):
+        open_raw(tmp_path / ("n" * 300 + ".csv"))
+    (tmp_path / "log.xyz").write_text("t,u\n1,2\n")
+    with pytest.raises(LogError, match="no known format"):
+        open_raw(tmp_path / "log.xyz")
+
+
+def test_parquet_types(tmp_path):
+    table = frame()
+    stamps = pd.Timestamp("2024-05-01T12:00:00.123456789Z") + pd.to_timedelta(table["t"], unit="s")
+    full = table.assign(
+        stamp=stamps,
+        naive=stamps.dt.tz_localize(None),
+        text=stamps.astype(str),
+        day=datetime.date(2024, 5, 1),
+        span=pd.to_timedelta(table["t"], unit="s"),
+        flag=table["u"] > 0,
+        small=table["u"].astype("float32"),
+        count=np.arange(50, dtype="uint8"),
+        mode=pd.Categorical(["dp", "manual"] * 25),
+        code=pd.Categorical(np.repeat([1.5, 2.5], 25)),
+        nested=[[1.0, 2.0]] * 50,
+    )
+    full["gap"] = pd.array([1, None] * 25, dtype="Int64")
+    full.to_parquet(tmp_path / "x.parquet")
+    found, opened = read(tmp_path / "x.parquet")
+    for name in ("stamp", "naive", "text"):
+        np.testing.assert_allclose(found[name] - found[name][0], table["t"], atol=3e-7)
+        assert found[name][0] == pytest.approx(1714564800.123456789, abs=1e-6)
+    assert found["day"][0] == 1714521600
+    np.testing.assert_array_equal(found["flag"], full["flag"])
+    np.testing.assert_array_equal(found["small"], full["small"])
+    np.testing.assert_array_equal(found["code"], full["code"].astype(float))
+    assert list(found["mode"]) == list(full["mode"])
+    assert opened.units["span"] == "s"
+    assert np.isnan(found["gap"][1])
+    assert "column 'nested' is neither number, time nor text: left out" in opened.notes
+    for time in ("stamp", "naive", "text", "span"):
+        ship = vessel_from_dict(SHIP | {"columns": {time: {"name": "t", "unit": "s"}}})
+        recording = read_recording(tmp_path / "x.parquet", ship)
+        np.testing.assert_allclose(recording["u"].t, table["t"], atol=3e-7)
+
+
+def test_parquet_bombs(tmp_path):
+    path = tmp_path / "x.parquet"
+    schema = pa.schema([("t", pa.float64())])
+    with parquet.ParquetWriter(path, schema, compression="zstd") as writer:
+        zeros = pa.table({"t": np.zeros(1 << 21)})
+        for _ in range(2):
+            writer.write_table(zeros)
+    with pytest.raises(LogError, match=r"states 4194304 rows in .* at most 8 a byte"):
+        open_parquet(path)
+
+
+def test_a_parquet_row_group_that_unpacks_too_far(tmp_path, monkeypatch):
+    monkeypatch.setattr("greybox.trial.readers.parquet._MAX_GROUP_BYTES", 1 << 16)
+    table = pa.table({"t": np.arange(1 << 16) // 100 * 1.0})
+    parquet.write_table(table, tmp_path / "x.parquet", compression="zstd", use_dictionary=False)
+    with pytest.raises(LogError, match=r"a row group of .* unpacks to \d+ bytes, at most 65536"):
+        read(tmp_path / "x.parquet")
+
+
+def test_a_damaged_footer_does_not_end_the_process(tmp_path):
+    """pyarrow throws through C++ where it is asked for the chunks of such files."""
+    frame().to_parquet(tmp_path / "x.parquet")
+    whole = bytearray((tmp_path / "x.parquet").read_bytes())
+    for at in range(len(whole) - 1500, len(whole) - 8, 7):
+        damaged = whole.copy()
+        damaged[at] ^= 0x11
+        with contextlib.suppress(LogError):
+            read(written(tmp_path / "y.parquet", bytes(damaged)))
+
+
+def test_bad_parquet(tmp_path):
+    frame().to_parquet(tmp_path / "x.parquet")
+    whole = (tmp_path / "x.parquet").read_bytes()
+    for content in (whole[:-20], whole[: len(whole) // 2], b"PAR1", b"t,u\n1,2\n", whole[:4] * 9):
+        with pytest.raises(LogError, match="as Parquet"):
+            read(written(tmp_path / "y.parquet", content))
+    with pytest.raises(LogError, match="is empty"):
+        read(written(tmp_path / "y.parquet", b""))
+    frame(50).head(0).to_parquet(tmp_path / "z.parquet")
+    with pytest.raises(LogError, match="holds 0 rows"):
+        read(tmp_path / "z.parquet")
+    twice = pa.Table.from_arrays([pa.array([1.0]), pa.array([2.0])], names=["t", "t"])
+    parquet.write_table(twice, tmp_path / "t.parquet")
+    with pytest.raises(LogError, match="2 columns called 't'"):
+        read(tmp_path / "t.parquet")
