@@ -175,7 +175,7 @@ def _only(lines: Mapping[str, Array]) -> str:
     # a unit within the column's name would stand beside the axis's own
     name = re.sub(r"\s*[\[(][^\])]*[\])]\s*$", "", next(iter(lines)))
     name = name if len(name) <= _LONG_NAME else f"{name[: _LONG_NAME - 1]}…"
-    return f" {name}" if len(name) <= 4 else f"\n{name}"
+    return f" {name}" if len(name) <= 5 else f"\n{name}"
 
 
 def _controlled(log: TrialLog, clock: _Clock) -> list[tuple[float, float]]:
