@@ -23,65 +23,105 @@ if TYPE_CHECKING:
     from greybox.model.predictor import Predictor, build_predictor
     from greybox.model.simulation import simulate, stationary_disturbance
     from greybox.model.structure import Structure
+    from greybox.trial.canonical import read_recording
+    from greybox.trial.checks.check import check_files, check_recording
+    from greybox.trial.checks.finding import CheckReport, Finding
     from greybox.trial.conditioning import decimate
+    from greybox.trial.importing import ImportOptions, import_recording
     from greybox.trial.log import TrialLog, make_log
-    from greybox.trial.reading import read_log
+    from greybox.trial.manoeuvres import find_manoeuvres
+    from greybox.trial.reading import read_log, read_segments
+    from greybox.trial.recording import Recording
+    from greybox.trial.repair import repair
+    from greybox.trial.stream import import_files
+    from greybox.trial.survey import survey_recording
+    from greybox.trial.writing import write_log
     from greybox.validation.choose import Request, estimate_model
     from greybox.validation.comparison import compare_models
     from greybox.validation.fit import fit_percent, run_model
-    from greybox.vessel.toml import load_vessel
+    from greybox.vessel.toml import load_vessel, vessel_from_dict
     from greybox.vessel.vessel import Vessel
 
 _WHERE = {
+    "CheckReport": "greybox.trial.checks.finding",
     "Estimate": "greybox.estimation.result",
+    "Finding": "greybox.trial.checks.finding",
+    "ImportOptions": "greybox.trial.importing",
     "ManoeuvringModel": "greybox.model.model",
     "Predictor": "greybox.model.predictor",
+    "Recording": "greybox.trial.recording",
     "Request": "greybox.validation.choose",
     "Structure": "greybox.model.structure",
     "TrialLog": "greybox.trial.log",
     "Vessel": "greybox.vessel.vessel",
     "build_predictor": "greybox.model.predictor",
+    "check_files": "greybox.trial.checks.check",
+    "check_recording": "greybox.trial.checks.check",
     "compare_models": "greybox.validation.comparison",
     "decimate": "greybox.trial.conditioning",
     "estimate_iv": "greybox.estimation.estimate",
     "estimate_ls": "greybox.estimation.estimate",
     "estimate_model": "greybox.validation.choose",
+    "find_manoeuvres": "greybox.trial.manoeuvres",
     "fit_percent": "greybox.validation.fit",
     "get_structure": "greybox.model.catalogue",
+    "import_files": "greybox.trial.stream",
+    "import_recording": "greybox.trial.importing",
     "load_model": "greybox.model.model",
     "load_vessel": "greybox.vessel.toml",
     "make_log": "greybox.trial.log",
     "read_log": "greybox.trial.reading",
+    "read_recording": "greybox.trial.canonical",
+    "read_segments": "greybox.trial.reading",
+    "repair": "greybox.trial.repair",
     "run_model": "greybox.validation.fit",
     "simulate": "greybox.model.simulation",
     "stationary_disturbance": "greybox.model.simulation",
     "structure_names": "greybox.model.catalogue",
+    "survey_recording": "greybox.trial.survey",
+    "vessel_from_dict": "greybox.vessel.toml",
+    "write_log": "greybox.trial.writing",
 }
 
 __all__ = [
+    "CheckReport",
     "Estimate",
+    "Finding",
+    "ImportOptions",
     "ManoeuvringModel",
     "Predictor",
+    "Recording",
     "Request",
     "Structure",
     "TrialLog",
     "Vessel",
     "build_predictor",
+    "check_files",
+    "check_recording",
     "compare_models",
     "decimate",
     "estimate_iv",
     "estimate_ls",
     "estimate_model",
+    "find_manoeuvres",
     "fit_percent",
     "get_structure",
+    "import_files",
+    "import_recording",
     "load_model",
     "load_vessel",
     "make_log",
     "read_log",
+    "read_recording",
+    "read_segments",
+    "repair",
     "run_model",
     "simulate",
     "stationary_disturbance",
     "structure_names",
+    "survey_recording",
+    "vessel_from_dict",
+    "write_log",
 ]
 
 

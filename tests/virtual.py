@@ -101,9 +101,7 @@ def recorded(
     )  # fmt: skip
     theta = np.array([TRUE[n] for n in PARAMETERS]) * fine
     start = rng.uniform(-np.pi, np.pi)
-    run = simulate(
-        structure, theta, np.array([1.5, 1.2, 0.0]), tau[:-1], fine, d=d, psi0=start
-    )
+    run = simulate(structure, theta, np.array([1.5, 1.2, 0.0]), tau[:-1], fine, d=d, psi0=start)
     x, psi = run.x[0], run.psi[0]
     c, s = np.cos(psi), np.sin(psi)
     velocity = np.column_stack([c * x[:, 0] - s * x[:, 1], s * x[:, 0] + c * x[:, 1]])

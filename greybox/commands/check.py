@@ -25,16 +25,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Read, check, tell."""
     from pathlib import Path
+    from textwrap import indent
 
     from greybox.files import check_targets, write_json
     from greybox.trial.checks.check import check_files
+    from greybox.trial.repair import apply_repairs
+    from greybox.trial.survey import Survey, survey_recording
     from greybox.vessel.toml import load_vessel
 
     check_targets(options.json, options.report)
     vessel = load_vessel(options.vessel)
     reports = check_files([Path(p) for p in options.logs], vessel)
+    surveys = [
+        survey_recording(apply_repairs(r.recording, [f for f in r.findings if f.safe]), vessel)
+        if r.recording is not None
+        else Survey()
+        for r in reports
+    ]
     if options.json:
-        found = [r.to_dict() for r in reports]
+        found = [r.to_dict() | s.to_dict() for r, s in zip(reports, surveys, strict=True)]
         if len(found) == 1:
             result = found[0]
         else:
@@ -48,7 +57,9 @@ def run(options: argparse.Namespace) -> None:
 
         check_page(reports, [Path(p) for p in options.logs], vessel, options.report)
     if options.json != "-":
-        for report in reports:
+        for report, survey in zip(reports, surveys, strict=True):
             say(report.summary())
+            if survey.summary():
+                say(indent(survey.summary(), "  "))
         if options.report:
             say(f"\nwrote {options.report}")

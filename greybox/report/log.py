@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from textwrap import fill
@@ -23,6 +24,7 @@ Array = NDArray[np.float64]
 # of gaps and of spans under a controller: more would be one grey block anyway
 _MOST_SPANS = 300
 _HOURS_FROM = 3 * 3600.0
+_LONG_NAME = 18
 _DOTS = 1500
 _GREY = "0.82"
 _DEGREES = (1, 2, 5, 10, 15, 30, 45, 90, 180, 360, 720, 1440, 3600, 7200, 36000)
@@ -167,8 +169,13 @@ def _inputs(log: TrialLog, clock: _Clock) -> Iterator[_Panel]:
 
 
 def _only(lines: Mapping[str, Array]) -> str:
-    """Return the name of a single line, which needs no legend."""
-    return f" {next(iter(lines))}" if len(lines) == 1 else ""
+    """Return the name of a single line, which needs no legend; on a line of its own if long."""
+    if len(lines) != 1:
+        return ""
+    # a unit within the column's name would stand beside the axis's own
+    name = re.sub(r"\s*[\[(][^\])]*[\])]\s*$", "", next(iter(lines)))
+    name = name if len(name) <= _LONG_NAME else f"{name[: _LONG_NAME - 1]}…"
+    return f" {name}" if len(name) <= 4 else f"\n{name}"
 
 
 def _controlled(log: TrialLog, clock: _Clock) -> list[tuple[float, float]]:

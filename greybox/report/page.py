@@ -12,19 +12,32 @@ from greybox.files import write_text
 
 @dataclass(frozen=True)
 class Picture:
-    """An SVG with the text that stands for it."""
+    """An SVG with the text below it, and the one that stands for it (the caption by default)."""
 
     svg: str
     caption: str
+    alternative: str = ""
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table of already formatted cells."""
+    """A table of already formatted cells; one of sentences wraps them."""
 
     caption: str
     header: Sequence[str]
     rows: Sequence[Sequence[str]]
+    sentences: bool = False
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of a page under a heading of its own, such as one log of several."""
+
+    title: str
+    sentences: Sequence[str] = ()
+    pictures: Sequence[Picture] = ()
+    tables: Sequence[Table] = ()
+    texts: Sequence[tuple[str, str]] = ()
 
 
 @dataclass(frozen=True)
@@ -38,9 +51,27 @@ class Page:
     tables: Sequence[Table] = ()
     texts: Sequence[tuple[str, str]] = ()
     computed: dict[str, Any] = field(default_factory=dict)
+    sections: Sequence[Section] = ()
 
 
-_TEMPLATE = """<!doctype html>
+_TEMPLATE = """{% macro parts(of, level) %}
+{% for sentence in of.sentences %}<p>{{ sentence }}</p>
+{% endfor %}
+{% for picture in of.pictures %}<figure role="group"
+ aria-label="{{ picture.alternative or picture.caption }}">
+{{ picture.svg | safe }}
+<figcaption>{{ picture.caption }}</figcaption></figure>
+{% endfor %}
+{% for table in of.tables %}<div class="wide"><table
+{%- if table.sentences %} class="sentences"{% endif %}><caption>{{ table.caption }}</caption>
+<thead><tr>{% for cell in table.header %}<th scope="col">{{ cell }}</th>{% endfor %}</tr></thead>
+<tbody>{% for row in table.rows %}<tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}</tr>
+{% endfor %}</tbody></table></div>
+{% endfor %}
+{% for heading, text in of.texts %}<{{ level }}>{{ heading }}</{{ level }}><pre>{{ text }}</pre>
+{% endfor %}
+{% endmacro %}
+<!doctype html>
 <html lang="en">
 <head>
 <meta charset="utf-8">
@@ -51,6 +82,8 @@ _TEMPLATE = """<!doctype html>
 body { font: 16px/1.5 system-ui, sans-serif; margin: 0 auto; padding: 1rem; max-width: 70rem;
        color: #1a1a1a; background: #fff; }
 h1 { font-size: 1.5rem; line-height: 1.25; margin: 0.5rem 0; }
+section { border-top: 2px solid #ddd; margin-top: 2rem; }
+h3 { font-size: 1rem; margin: 1.2rem 0 0.3rem; }
 h2 { font-size: 1.15rem; margin: 1.6rem 0 0.4rem; }
 .headline { font-size: 1.15rem; border-left: 4px solid #0072B2; padding-left: 0.8rem; }
 figure { margin: 1rem 0; }
@@ -61,6 +94,9 @@ table { border-collapse: collapse; font-size: 0.9rem; font-variant-numeric: tabu
 th, td { padding: 0.2rem 0.6rem; border-bottom: 1px solid #ddd; text-align: right;
          white-space: nowrap; }
 th:first-child, td:first-child { text-align: left; }
+table.sentences th, table.sentences td { text-align: left; white-space: normal;
+         vertical-align: top; overflow-wrap: anywhere; }
+table.sentences td:first-child { overflow-wrap: normal; }
 caption { text-align: left; font-weight: 600; padding: 0.3rem 0; }
 pre { font-size: 0.8rem; overflow-x: auto; background: #f6f6f6; padding: 0.6rem; }
 @media print { body { max-width: none; font-size: 11px; } figure { break-inside: avoid; } }
@@ -69,21 +105,14 @@ pre { font-size: 0.8rem; overflow-x: auto; background: #f6f6f6; padding: 0.6rem;
 <body>
 <h1>{{ page.title }}</h1>
 <p class="headline">{{ page.headline }}</p>
-{% for sentence in page.sentences %}<p>{{ sentence }}</p>
-{% endfor %}
-{% for picture in page.pictures %}<figure role="group" aria-label="{{ picture.caption }}">
-{{ picture.svg | safe }}
-<figcaption>{{ picture.caption }}</figcaption></figure>
-{% endfor %}
-{% for table in page.tables %}<div class="wide"><table><caption>{{ table.caption }}</caption>
-<thead><tr>{% for cell in table.header %}<th scope="col">{{ cell }}</th>{% endfor %}</tr></thead>
-<tbody>{% for row in table.rows %}<tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}</tr>
-{% endfor %}</tbody></table></div>
-{% endfor %}
-{% for heading, text in page.texts %}<h2>{{ heading }}</h2><pre>{{ text }}</pre>
+{{ parts(page, "h2") }}
+{% for section in page.sections %}<section>
+<h2>{{ section.title }}</h2>
+{{ parts(section, "h3") }}
+</section>
 {% endfor %}
 <h2>How this was computed</h2>
-<div class="wide"><table><tbody>
+<div class="wide"><table class="sentences"><tbody>
 {% for key, value in page.computed.items() %}<tr><td>{{ key }}</td><td>{{ value }}</td></tr>
 {% endfor %}</tbody></table></div>
 </body>

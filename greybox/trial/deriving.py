@@ -97,11 +97,27 @@ def local_positions(
 
 
 def unwrapped(signal: Signal) -> Signal:
-    """Return an angle [rad] without its jumps of 2π; values that are no number stay."""
+    """Return an angle without its wraps; values that are no number stay."""
     value = signal.value.copy()
     finite = np.isfinite(value)
-    value[finite] = np.unwrap(value[finite])
+    value[finite] = continuous(value[finite])
     return replace(signal, value=value)
+
+
+def continuous(angle: Array) -> Array:
+    """Return an angle without its wraps, be they of 2π or, under a wrong name, of 360.
+
+    What is beyond a turn already has been unwrapped before, or holds degrees:
+    it is left as it is.
+    """
+    if not len(angle):
+        return angle
+    jumps = np.abs(np.diff(angle))
+    if np.any((jumps > 300) & (jumps < 361)):
+        return np.asarray(np.unwrap(angle, period=360.0))
+    if np.abs(angle).max() > 2 * np.pi + 0.5:
+        return angle
+    return np.asarray(np.unwrap(angle))
 
 
 def _paired(a: Signal, b: Signal) -> tuple[Array, Array, Array]:

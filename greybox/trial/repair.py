@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from greybox.errors import UsageError, suggestion
 from greybox.trial.checks.finding import IDS, CheckReport, Finding, Repair
-from greybox.trial.deriving import derive_signals
+from greybox.trial.deriving import continuous, derive_signals
 from greybox.trial.recording import Recording, Signal
 from greybox.vessel.vessel import Vessel
 
@@ -172,7 +172,7 @@ def _lever(recording: Recording, step: Repair) -> Recording:
 def _heading_at(recording: Recording, t: Array) -> Array:
     psi = recording["psi"]
     keep = np.isfinite(psi.value) & np.isfinite(psi.t)
-    return np.interp(t, psi.t[keep], np.unwrap(psi.value[keep]))
+    return np.interp(t, psi.t[keep], continuous(psi.value[keep]))
 
 
 _ACTIONS = {

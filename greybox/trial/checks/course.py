@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.trial.checks.finding import Finding, Outcome, Repair
-from greybox.trial.checks.motion import make_motion, turn
+from greybox.trial.checks.motion import make_motion
 from greybox.trial.recording import Recording
 from greybox.vessel.vessel import Vessel
 
@@ -63,10 +63,8 @@ def course_findings(recording: Recording, vessel: Vessel) -> tuple[list[Finding]
     design = np.column_stack([turned, np.ones(len(rows))])
     estimate = np.linalg.lstsq(design, track[rows], rcond=None)[0]
     bias = -float(np.angle(estimate[0]))
-    rest = track[rows] - design @ estimate
     blocks = np.array_split(np.arange(len(rows)), 12)
     error = float(np.std([np.angle(np.mean(unit[b])) for b in blocks])) / np.sqrt(len(blocks))
-    del rest
     # what a drifting hull may add is unknown: the interval allows for a plausible drift angle
     half = float(np.hypot(1.96 * error, _PLAUSIBLE / 2))
     finding = Finding(
@@ -112,7 +110,4 @@ def _pushed(recording: Recording, vessel: Vessel, angle: float) -> bool:
     made = generalised_force(vessel, {c: v[:size] for c, v in commands.items()})
     across = float(np.mean(made.get("tauy", np.zeros(1))))
     total = sum(float(np.mean(np.abs(v))) for v in made.values()) or 1.0
-    return across * np.sin(angle) > 0.05 * total
-
-
-__all__ = ["course_findings", "turn"]
+    return bool(across * np.sin(angle) > 0.05 * total)

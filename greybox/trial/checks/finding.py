@@ -136,7 +136,7 @@ class CheckReport:
             f"{self.name}: " + (f"{count} finding{'s' if count > 1 else ''}" if count else "clean")
         ]
         for f in self.findings:
-            lines.append(f"  {f.id} ({', '.join(f.channels or (f.channel,))}): {_size(f)}")
+            lines.append(f"  {f.id} ({', '.join(f.channels or (f.channel,))}): {size_in_words(f)}")
             lines.append(f"    {f.evidence}")
             lines.append(f"    fix: {f.fix}")
         lines += [f"  {o.id}: {o.sentence}" for o in self.outcomes if o.status == "cannot tell"]
@@ -155,11 +155,10 @@ class CheckReport:
         }
 
 
-def _size(f: Finding) -> str:
+def size_in_words(f: Finding) -> str:
+    """Return the value of a finding with its interval and unit."""
     if isinstance(f.value, tuple):
-        parts = [
-            f"{v:.3g} ({c[0]:.3g} to {c[1]:.3g})" for v, c in zip(f.value, f.ci, strict=True)
-        ]
+        parts = [f"{v:.3g} ({c[0]:.3g} to {c[1]:.3g})" for v, c in zip(f.value, f.ci, strict=True)]
         return f"{', '.join(parts)} {f.unit}"
     unit = "" if f.unit == "1" else f" {f.unit}"
     if f.ci[0] == f.ci[1]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from greybox.trial.checks.finding import Finding, Outcome, Repair
 from greybox.trial.checks.motion import Motion, integrate, levels, profile, turn
-from greybox.trial.checks.rows import continuous
+from greybox.trial.deriving import continuous
 
 Array = NDArray[np.float64]
 Values = dict[str, Array]
@@ -24,6 +24,8 @@ Values = dict[str, Array]
 # what one more change must gain in log-likelihood, and in share of the residual
 _LEAST_GAIN = 15.0
 _LEAST_SHARE = 0.15
+# the way made in this time shows where the velocity points
+_TURN_SECONDS = 10.0
 # a gross error shows in a part of a long log
 _EXCERPT = 8000
 _DEG = np.pi / 180
@@ -149,7 +151,7 @@ _RATE = (
 _VELOCITY = (
     _sign("u", group="velocity"),
     _sign("v", group="velocity"),
-    _sign("u", "v", group="velocity", cost=1.2),
+    _sign("u", "v", group="velocity", cost=1.05),
     _swap("u", "v", group="velocity"),
     _unit(("u", "v"), "speed", _KNOT, "m/s", "kn"),
     _unit(("u", "v"), "speed", 1 / 3.6, "m/s", "km/h"),
@@ -207,8 +209,11 @@ def find_reading(motion: Motion) -> Reading:
     scorer = _Scorer(motion)
     usable = [c for c in (*_PSI, *_RATE, *_VELOCITY, *_POSITION, *_ACROSS) if scorer.applies(c)]
     base = scorer.score(())
-    ranked = [((), base, 0.0)]
+    ranked: list[tuple[tuple[Change, ...], float, float]] = [((), base, 0.0)]
     ranked += [((c,), scorer.score((c,)), c.cost) for c in usable]
+    turned = _turned(motion)
+    if motion.positioned:
+        ranked.append(((turned,), scorer.score((turned,)), turned.cost))
     for a, b in combinations(usable, 2):
         if a.group == b.group or set(a.channels) & set(b.channels):
             continue
@@ -220,6 +225,13 @@ def find_reading(motion: Motion) -> Reading:
     samples = scorer.samples
     share = 1.0 - np.exp(-2 * gain / samples) if samples else 0.0
     if not changes or share < _LEAST_SHARE * cost:
+        return Reading((), motion, 0.0)
+    if changes == (turned,):
+        # no frame, sign or unit is at fault but the compass: its bias is estimated later
+        return Reading((), motion, 0.0)
+    silent = _silent(changes)
+    if silent.channels and score - scorer.score((*changes, silent)) < _LEAST_GAIN:
+        # whatever shrinks a channel shrinks its noise: it must explain more than nothing would
         return Reading((), motion, 0.0)
     return Reading(changes, read(motion, changes), float(gain))
 
@@ -236,8 +248,11 @@ def reading_findings(reading: Reading) -> list[Finding]:
     """Return one finding for each change of a reading."""
     found = []
     for c in reading.changes:
-        tied = "positions and velocities" if c.group in ("velocity", "speed", "position", "length")\
+        tied = (
+            "positions and velocities"
+            if c.group in ("velocity", "speed", "position", "length")
             else "heading and the other channels"
+        )
         found.append(
             Finding(
                 c.id,
@@ -245,8 +260,7 @@ def reading_findings(reading: Reading) -> list[Finding]:
                 c.value,
                 (c.value, c.value),
                 c.unit,
-                f"{c.words}: only so do {tied} agree (log-likelihood higher by "
-                f"{reading.gain:.0f})",
+                f"{c.words}: only so do {tied} agree (log-likelihood higher by {reading.gain:.0f})",
                 c.fix,
                 c.channels,
                 c.repair,
@@ -268,6 +282,31 @@ def frame_outcomes(motion: Motion | None) -> list[Outcome]:
     if motion.turned:
         seen.append("heading against yaw rate")
     return [Outcome(i, "clean", " and ".join(seen)) for i in ("unit", "frame", "sign")]
+
+
+def _turned(m: Motion) -> Change:
+    """Return the change that turns the heading by the angle that fits best."""
+    angle = 0.0
+    if m.positioned:
+        span = max(1, round(_TURN_SECONDS / m.step))
+        walked = integrate(turn(m["psi"], m["u"], m["v"]), m)
+        way = (m["x_n"] + 1j * m["y_n"])[span:] - (m["x_n"] + 1j * m["y_n"])[:-span]
+        by = (walked[:, 0] + 1j * walked[:, 1])[span:] - (walked[:, 0] + 1j * walked[:, 1])[:-span]
+        for a, _ in m.stretches[1:]:
+            way[max(a - span, 0) : a] = 0
+        angle = float(np.angle(np.vdot(by, way)))
+    return Change(
+        "sign", "turned", ("psi",), lambda x: {**x, "psi": x["psi"] + angle}, (),
+        f"turned by {angle:.6f}", "", angle, "rad", cost=1.3,
+    )  # fmt: skip
+
+
+def _silent(changes: tuple[Change, ...]) -> Change:
+    names = tuple(n for c in changes for n in c.channels if n in ("u", "v", "r"))
+    return Change(
+        "sign", "silent", names, _scaled(names, 0.0), (),
+        f"without {', '.join(names)}", "",
+    )  # fmt: skip
 
 
 class _Scorer:
@@ -310,6 +349,8 @@ class _Scorer:
 
 def _order(change: Change) -> int:
     # the heading must be right before velocities are turned by it
+    if change.group in ("turned", "silent"):
+        return 2
     return 1 if change.id == "frame" and change.group == "velocity" else 0
 
 

@@ -10,12 +10,14 @@ disagreement as the noises demand; K is estimated by maximum likelihood.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.trial.checks.rows import continuous
+from greybox.trial.deriving import continuous
 from greybox.trial.recording import Recording, Signal
 from greybox.trial.resampling import clock, covered, runs
 
@@ -25,6 +27,10 @@ NAMES = ("x_n", "y_n", "psi", "u", "v", "r")
 _MAX_SAMPLES = 40_000
 _MAX_STRETCHES = 30
 _MIN_STRETCH = 20
+_ROBUST = 4.0
+# reach of the kernels that are tried against noise, and samples left out beside each
+_MOST_TAPS = 90
+_LEFT_OUT = 2
 # gains of the local-level filter; 1 is a pure random walk
 GAINS = np.geomspace(0.003, 1.0, 9)
 
@@ -66,9 +72,7 @@ class Motion:
         rows, stretches, at = [], [], 0
         for k in range(pieces):
             start = round(k * (len(self) - size) / (pieces - 1))
-            a, b = next(
-                (s for s in self.stretches if s[0] <= start < s[1]), self.stretches[-1]
-            )
+            a, b = next((s for s in self.stretches if s[0] <= start < s[1]), self.stretches[-1])
             part = np.arange(max(start, a), min(start + size, b))
             if len(part) >= _MIN_STRETCH:
                 rows.append(part)
@@ -110,7 +114,7 @@ def make_motion(recording: Recording, names: tuple[str, ...] = NAMES) -> Motion 
     if step <= 0 or stop - start < _MIN_STRETCH * step:
         return None
     count = min(int((stop - start) / step + 1e-6) + 1, _MAX_SAMPLES)
-    grid = start + step * np.arange(count)
+    grid = start + step * np.arange(count, dtype=np.float64)
     keep = np.ones(count, bool)
     for c in clocks.values():
         keep &= covered(grid, c)
@@ -121,7 +125,7 @@ def make_motion(recording: Recording, names: tuple[str, ...] = NAMES) -> Motion 
     rows = np.concatenate([np.arange(a, b) for a, b in kept])
     values = {n: np.interp(grid[rows], s.t, s.value) for n, s in signals.items()}
     edges = np.concatenate([[0], np.cumsum([b - a for a, b in kept])])
-    stretches = tuple((int(a), int(b)) for a, b in zip(edges[:-1], edges[1:], strict=True))
+    stretches = tuple((int(a), int(b)) for a, b in pairwise(edges))
     return Motion(grid[rows], step, values, stretches)
 
 
@@ -192,7 +196,13 @@ class Profile:
     std: float
 
 
-def profile(z: Array, nuisance: Array, motion: Motion, gains: Array = GAINS) -> Profile:
+def profile(
+    z: Array,
+    nuisance: Array,
+    motion: Motion,
+    gains: Array = GAINS,
+    weigh: Callable[[float], Array] | None = None,
+) -> Profile:
     """Return the likelihood of a residual, its nuisance fitted, over the gains.
 
     Parameters
@@ -201,12 +211,18 @@ def profile(z: Array, nuisance: Array, motion: Motion, gains: Array = GAINS) -> 
         (N,) or (N, m) residual, m components that share the nuisance's columns.
     nuisance : ndarray
         (N, q), or (N, m, q) where the columns join the components.
+    weigh : callable, optional
+        Gain -> weights (N,) of the innovations.
     """
     best: Profile | None = None
     joint = nuisance.ndim == 3
     for gain in gains:
         e = whiten(z, float(gain), motion)
         x = whiten(nuisance, float(gain), motion)
+        if weigh is not None:
+            weight = weigh(float(gain))
+            e = e * weight.reshape(-1, *[1] * (e.ndim - 1))
+            x = x * weight.reshape(-1, *[1] * (x.ndim - 1))
         if joint:
             e, x = e.reshape(-1), x.reshape(-1, x.shape[-1])
         rest = e - x @ solve(x, e)
@@ -216,6 +232,25 @@ def profile(z: Array, nuisance: Array, motion: Motion, gains: Array = GAINS) -> 
             best = Profile(loglik, float(gain), float(np.sqrt(variance)))
     assert best is not None
     return best
+
+
+def outlier_weights(z: Array, nuisance: Array, gain: float, motion: Motion) -> Array:
+    """Return weights (N,) that let no innovation count for more than four robust deviations.
+
+    Satellite positions jump now and then; one jump would outweigh minutes.
+    """
+    e = whiten(z, gain, motion)
+    x = whiten(nuisance, gain, motion)
+    if nuisance.ndim == 3:
+        flat = x.reshape(-1, x.shape[-1])
+        rest = e - (flat @ solve(flat, e.reshape(-1))).reshape(e.shape)
+    else:
+        rest = e - x @ solve(x, e)
+    size = np.abs(rest) if rest.ndim == 1 else np.abs(rest).max(axis=1)
+    scale = float(np.median(np.abs(rest))) * 1.4826
+    if scale <= 0:
+        return np.ones(len(size))
+    return np.asarray(np.minimum(1.0, _ROBUST * scale / np.maximum(size, 1e-300)))
 
 
 def solve(x: Array, y: Array) -> Array:
@@ -249,15 +284,21 @@ def denoise(value: Array, motion: Motion) -> Array:
     noisy rate gyro on a slow ship, narrow for a clean signal.
     """
     best, chosen = np.inf, value
-    for seconds in motion.step * np.array([0.7, 1.0, 1.5, 2, 3, 4.5, 7, 10, 15, 22, 32, 45]):
-        slow = smooth(value, motion, float(seconds))
-        width = seconds / motion.step
-        taps = np.arange(-int(3 * width + 0.5), int(3 * width + 0.5) + 1)
-        weight = np.exp(-0.5 * (taps / width) ** 2)
-        centre = 1.0 / float(weight.sum())
-        error = float(np.mean(((value - slow) / (1.0 - centre)) ** 2))
-        if error < best:
-            best, chosen = error, slow
+    taps = np.arange(-_MOST_TAPS, _MOST_TAPS + 1)
+    for width in (1.5, 2.0, 3.0, 4.5, 7.0, 10.0, 15.0, 22.0, 32.0, 45.0):
+        # neighbours are left out too: their noise may go along with that of the sample
+        weight = np.where(np.abs(taps) > _LEFT_OUT, np.exp(-0.5 * (taps / width) ** 2), 0.0)
+        error, count = 0.0, 0
+        for a, b in motion.stretches:
+            if b - a > 2 * _MOST_TAPS:
+                said = np.convolve(value[a:b], weight / weight.sum(), "valid")
+                error += float(np.sum((value[a + _MOST_TAPS : b - _MOST_TAPS] - said) ** 2))
+                count += len(said)
+        if not count:
+            return smooth(value, motion, 2.0 * motion.step)
+        if error / count < best:
+            best = error / count
+            chosen = smooth(value, motion, width * motion.step)
     return chosen
 
 

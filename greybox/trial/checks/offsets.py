@@ -8,6 +8,7 @@ unless the motion cannot tell them apart.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -20,7 +21,9 @@ from greybox.trial.checks.motion import (
     denoise,
     integrate,
     levels,
+    outlier_weights,
     profile,
+    smooth,
     solve,
     turn,
     whiten,
@@ -38,8 +41,12 @@ _SIGMAS = 3.3
 _LEAST_GAIN = 5.5
 # wide enough to see a whole turn, which tells a late compass from a lever arm
 _SCAN = (-8.0, -6.0, -4.5, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 4.5, 6.0, 8.0)
+_MOST_LATE = 9.0
+_FAR_COST = 6.0
 _ROUNDS = 12
 _MOST = 3
+# beyond this time the heading's own noise is averaged out
+_HEADING_WINDOW = 5.0
 # beyond these nothing can be said
 _VAGUE_HEADING = np.radians(1.0)
 _VAGUE_CLOCK = 0.3
@@ -66,15 +73,16 @@ class Candidate:
 
 _CANDIDATES = (
     Candidate("clock_offset", ("psi",)),
-    Candidate("clock_offset", ("r",)),
+    # a rate gyro is noisy against what a slow ship turns: the least certain of all
+    Candidate("clock_offset", ("r",), 2.5),
     Candidate("clock_offset", ("x_n", "y_n")),
     Candidate("clock_offset", ("u", "v")),
     Candidate("clock_offset", ("psi", "r"), 4.0),
     Candidate("clock_offset", ("u", "v", "r"), 4.0),
     Candidate("clock_offset", ("u",), 3.0),
     Candidate("clock_offset", ("v",), 3.0),
-    Candidate("clock_offset", ("x_n",), 3.0),
-    Candidate("clock_offset", ("y_n",), 3.0),
+    Candidate("clock_offset", ("x_n",), 30.0),
+    Candidate("clock_offset", ("y_n",), 30.0),
     Candidate("lever_arm", ("x_n", "y_n"), 1.0),
     Candidate("heading_bias", ("psi",)),
 )
@@ -124,15 +132,51 @@ def size(candidate: Candidate) -> int:
 class Tie:
     """Residuals of positions and heading for given parameters, and their derivatives."""
 
-    def __init__(self, motion: Motion) -> None:
+    def __init__(self, motion: Motion, start: State | None = None) -> None:
         self.motion = motion
-        self.smooth = {n: denoise(v, motion) for n, v in motion.values.items()}
+        self.start = start or State()
+        self._weights: dict[tuple[str, int], Array] = {}
+        self.smooth = {
+            n: denoise(v, motion) for n, v in motion.values.items() if n not in ("x_n", "y_n")
+        }
         self.level = levels(motion)
         n, s = self.level.shape
         self.drift = (motion.t - motion.t[0]) / max(float(np.ptp(motion.t)), 1e-9)
         self.columns = 2 * s + 3
+        self.calm = self.smooth.get("psi", np.zeros(len(motion)))
         self.positioned, self.turned = motion.positioned, motion.turned
+        if self.turned:
+            # as for the positions below: what is fast in the heading comes from the rate
+            swept = integrate(self.smooth["r"], motion)
+            slow = smooth(motion["psi"] - swept, motion, max(_HEADING_WINDOW, 5 * motion.step))
+            self.smooth["psi"] = swept + slow
+        if self.positioned:
+            # what is moved in time must not know the positions' own noise, or moving it would
+            # seem to explain that noise: the way by the other sensors stands in for them
+            way = self.walked(State(), self.smooth)
+            self.smooth["x_n"], self.smooth["y_n"] = way[:, 0], way[:, 1]
         self.samples = (2 * n if self.positioned else 0) + (n if self.turned else 0)
+
+    def weigh(self, what: str) -> Callable[[float], Array]:
+        """Return gain -> weights of the innovations of ``position`` or ``heading``.
+
+        They are taken once, from the log as it is: were they to change from one
+        candidate to the next, their likelihoods could not be compared.
+        """
+
+        def weight(gain: float) -> Array:
+            key = (what, round(10 * float(np.log(gain))))
+            if key not in self._weights:
+                pos, head = self.nuisance(self.start)
+                values = self.motion.values
+                if what == "position":
+                    z, x = self.position(self.start, values), pos
+                else:
+                    z, x = self.heading(self.start, values), head
+                self._weights[key] = outlier_weights(z, x, gain, self.motion)
+            return self._weights[key]
+
+        return weight
 
     def _at(self, name: str, state: State, values: dict[str, Array]) -> Array:
         late = state.late.get(name, 0.0) - state.common
@@ -146,6 +190,17 @@ class Tie:
             out[a:b] += _beyond(t + late, t, slow) - slow
         return out
 
+    def _late(self, value: Array, name: str, state: State) -> Array:
+        """Return a noise-free channel as it would be were it not late."""
+        late = state.late.get(name, 0.0) - state.common
+        if late == 0.0:
+            return value
+        out = np.empty_like(value)
+        for a, b in self.motion.stretches:
+            t = self.motion.t[a:b]
+            out[a:b] = _beyond(t + late, t, value[a:b])
+        return out
+
     def walked(self, state: State, values: dict[str, Array]) -> Array:
         """Return the way made by velocities and heading (N, 2) [m]."""
         psi = self._at("psi", state, values) - state.bias
@@ -153,24 +208,21 @@ class Tie:
             turn(psi, self._at("u", state, values), self._at("v", state, values)), self.motion
         )
 
-    def position(self, state: State, values: dict[str, Array], walked: Array | None = None) -> (
-        Array
-    ):
+    def position(
+        self, state: State, values: dict[str, Array], walked: Array | None = None
+    ) -> Array:
         """Return measured position minus that of velocity, heading and lever arm (N, 2) [m]."""
         if walked is None:
             walked = self.walked(state, values)
-        psi = self._at("psi", state, values) - state.bias
+        # the heading's noise, a lever long, would count as noise of the positions
+        psi = self._late(self.calm, "psi", state) - state.bias
         arm = turn(psi, np.full(len(psi), state.arm[0]), np.full(len(psi), state.arm[1]))
-        measured = np.column_stack(
-            [self._at("x_n", state, values), self._at("y_n", state, values)]
-        )
+        measured = np.column_stack([self._at("x_n", state, values), self._at("y_n", state, values)])
         return measured - walked - arm
 
     def heading(self, state: State, values: dict[str, Array]) -> Array:
         """Return measured heading minus that of the yaw rate (N,) [rad]."""
-        return self._at("psi", state, values) - integrate(
-            self._at("r", state, values), self.motion
-        )
+        return self._at("psi", state, values) - integrate(self._at("r", state, values), self.motion)
 
     def nuisance(self, state: State) -> tuple[Array, Array]:
         """Return the columns for starts, a constant velocity, and scales, (N, 2, q) and (N, q)."""
@@ -234,12 +286,14 @@ def _gain(tie: Tie, state: State, near: Gain | None = None) -> Gain:
     values = tie.motion.values
     if tie.positioned:
         gains = GAINS if near is None else np.minimum(around * near.position[0], 1.0)
-        found = profile(tie.position(state, values), pos, tie.motion, gains)
+        z = tie.position(state, values)
+        found = profile(z, pos, tie.motion, gains, tie.weigh("position"))
         total += found.loglik
         p = (found.gain, found.std)
     if tie.turned:
         gains = GAINS if near is None else np.minimum(around * near.heading[0], 1.0)
-        found = profile(tie.heading(state, values), head, tie.motion, gains)
+        z = tie.heading(state, values)
+        found = profile(z, head, tie.motion, gains, tie.weigh("heading"))
         total += found.loglik
         h = (found.gain, found.std)
     return Gain(p, h, total)
@@ -249,10 +303,14 @@ def _stack(tie: Tie, gain: Gain, pos: Array, head: Array) -> Array:
     """Whiten both blocks and stack them to rows, (3 N or less, q)."""
     rows = []
     if tie.positioned:
-        white = whiten(pos, gain.position[0], tie.motion) / gain.position[1]
+        k, std = gain.position
+        white = whiten(pos, k, tie.motion) / std
+        white = white * tie.weigh("position")(k).reshape(-1, *[1] * (white.ndim - 1))
         rows.append(white.reshape(-1, *white.shape[2:]))
     if tie.turned:
-        rows.append(whiten(head, gain.heading[0], tie.motion) / gain.heading[1])
+        k, std = gain.heading
+        white = whiten(head, k, tie.motion) / std
+        rows.append(white * tie.weigh("heading")(k).reshape(-1, *[1] * (white.ndim - 1)))
     return np.concatenate(rows)
 
 
@@ -354,8 +412,10 @@ def _robust(x: Array, rest: Array, wanted: int, tie: Tie) -> Array:
     full = bread @ meat @ bread
     plain = bread * float(np.mean(rest**2))
     # the robust one has few degrees of freedom: never below what white noise would give
-    factor = np.sqrt(np.maximum(np.diag(full), np.diag(plain)) / np.maximum(np.diag(full), 1e-300))
+    have, least = np.maximum(np.diag(full), 0.0), np.maximum(np.diag(plain), 1e-300)
+    factor = np.sqrt(np.maximum(have, least) / np.maximum(have, 1e-6 * least))
     full = full * np.outer(factor, factor)
+    full[np.diag_indices_from(full)] = np.maximum(have, least)
     out = full[:wanted, :wanted] / np.outer(scale[:wanted], scale[:wanted])
     return np.asarray(out)
 
@@ -380,7 +440,7 @@ def find_offsets(motion: Motion, vessel: Vessel) -> tuple[list[Finding], list[Ou
     if not (motion.positioned or motion.turned):
         why = "needs heading and yaw rate, or positions, heading and velocities of their own sensor"
         return [], [Outcome(i, "cannot tell", why) for i in _IDS]
-    tie = Tie(motion)
+    tie = Tie(motion, State(arm=(antenna[0], antenna[1])))
     usable = [c for c in _CANDIDATES if _usable(c, motion)]
     chosen: tuple[Candidate, ...] = ()
     start = State(arm=(antenna[0], antenna[1]))
@@ -393,15 +453,92 @@ def find_offsets(motion: Motion, vessel: Vessel) -> tuple[list[Finding], list[Ou
             if any(c.id == k.id and set(c.channels) & set(k.channels) for k in chosen):
                 continue
             trial = fit(tie, (*chosen, c), _scan(tie, c, best.state))
-            trials.append((trial.loglik - c.cost * inflation, trial))
+            if max(map(abs, trial.state.late.values()), default=0.0) > _MOST_LATE:
+                continue
+            # a scan over many seconds finds more by chance than a search around zero
+            far = c.id == "clock_offset" and abs(trial.state.late[c.channels[0]]) > 2.0
+            cost = (c.cost + (_FAR_COST if far else 0.0)) * inflation
+            trials.append((trial.loglik - cost, trial))
         if not trials:
             break
         worth, trial = max(trials, key=_first)
         if worth - best.loglik < _LEAST_GAIN * inflation:
             break
         best, chosen = trial, trial.candidates
-    final = fit(tie, chosen, best.state) if chosen else best
+    best = _exchanged(tie, best, usable, inflation)
+    final = _pruned(tie, best, start, vessel, antenna)
     return _findings(final, motion, vessel, antenna), _outcomes(tie, final, usable)
+
+
+def _exchanged(tie: Tie, found: Fit, usable: list[Candidate], inflation: float) -> Fit:
+    """Exchange one late channel for another where that explains more beside the rest.
+
+    What was taken first was taken alone, and may stand for two defects together.
+    """
+    if len(found.candidates) < 2:
+        return found
+    best, worth = found, _net(found, inflation)
+    for k, old in enumerate(found.candidates):
+        if old.id != "clock_offset":
+            continue
+        for new in usable:
+            if new.id != "clock_offset" or new in found.candidates:
+                continue
+            others = tuple(c for j, c in enumerate(found.candidates) if j != k)
+            state = _restored(found.state, old, found.state)
+            trial = fit(tie, (*others, new), state)
+            if _net(trial, inflation) > worth + 2.0 * inflation:
+                best, worth = trial, _net(trial, inflation)
+    return best
+
+
+def _net(found: Fit, inflation: float) -> float:
+    return found.loglik - inflation * sum(c.cost for c in found.candidates)
+
+
+def _pruned(tie: Tie, found: Fit, start: State, vessel: Vessel, antenna: tuple[float, ...]) -> Fit:
+    """Drop what is too small or too uncertain, least certain first, and fit the rest anew."""
+    while found.candidates:
+        worth = [_worth(found, k, vessel, antenna) for k in range(len(found.candidates))]
+        weakest = int(np.argmin(worth))
+        if worth[weakest] >= 1.0:
+            break
+        kept = tuple(c for k, c in enumerate(found.candidates) if k != weakest)
+        state = _restored(found.state, found.candidates[weakest], start)
+        found = (
+            fit(tie, kept, state)
+            if kept
+            else Fit(start, (), np.zeros((0, 0)), found.loglik, np.zeros(0))
+        )
+    return found
+
+
+def _restored(state: State, candidate: Candidate, start: State) -> State:
+    if candidate.id == "clock_offset":
+        return replace(
+            state, late={k: v for k, v in state.late.items() if k not in candidate.channels}
+        )
+    if candidate.id == "heading_bias":
+        return replace(state, bias=start.bias)
+    return replace(state, arm=start.arm)
+
+
+def _worth(found: Fit, k: int, vessel: Vessel, antenna: tuple[float, ...]) -> float:
+    """Return how far a candidate passes both thresholds; below one it is no finding."""
+    c = found.candidates[k]
+    at = sum(size(o) for o in found.candidates[:k])
+    cov = found.covariance[at : at + size(c), at : at + size(c)]
+    if c.id == "lever_arm":
+        off = np.array(found.state.arm) - np.array(antenna)
+        least = _LEAST_ARM[0] + _LEAST_ARM[1] * vessel.length
+        wald = float(off @ np.linalg.solve(cov + 1e-12 * np.eye(2), off))
+        return float(min(np.hypot(*off) / least, np.sqrt(wald / (_SIGMAS**2 + 4))))
+    std = float(np.sqrt(cov[0, 0]))
+    if c.id == "clock_offset":
+        value, least = found.state.late.get(c.channels[0], 0.0), _LEAST_CLOCK
+    else:
+        value, least = float(np.angle(np.exp(1j * found.state.bias))), float(_LEAST_HEADING)
+    return min(abs(value) / least, abs(value) / (_SIGMAS * std))
 
 
 _IDS = ("clock_offset", "lever_arm", "heading_bias")
@@ -453,49 +590,42 @@ def _findings(
     at = 0
     for c in found.candidates:
         k = size(c)
-        cov = found.covariance[at : at + k, at : at + k]
+        std = np.sqrt(np.diag(found.covariance[at : at + k, at : at + k]))
         at += k
-        std = np.sqrt(np.diag(cov))
         if c.id == "clock_offset":
-            value = found.state.late.get(c.channels[0], 0.0)
-            others = [o for o in found.candidates if o is not c and o.id == c.id]
-            del others
-            least = _LEAST_CLOCK
-            if abs(value) < least or abs(value) < _SIGMAS * std[0]:
-                continue
-            findings.append(_clock_finding(c, value, float(std[0]), motion))
+            late = found.state.late.get(c.channels[0], 0.0)
+            findings.append(_clock_finding(c, late, float(std[0]), motion))
         elif c.id == "heading_bias":
-            value = float(np.angle(np.exp(1j * found.state.bias)))
-            if abs(value) < _LEAST_HEADING or abs(value) < _SIGMAS * std[0]:
-                continue
-            findings.append(_heading_finding(value, float(std[0])))
+            bias = float(np.angle(np.exp(1j * found.state.bias)))
+            findings.append(_heading_finding(bias, float(std[0])))
         else:
-            arm = np.array(found.state.arm)
-            off = arm - np.array(antenna)
-            least = _LEAST_ARM[0] + _LEAST_ARM[1] * vessel.length
-            wald = float(off @ np.linalg.solve(cov + 1e-12 * np.eye(2), off))
-            if np.hypot(*off) < least or wald < _SIGMAS**2 + 4:
-                continue
-            findings.append(_arm_finding(arm, std, antenna))
+            findings.append(_arm_finding(np.array(found.state.arm), std, antenna))
     return findings
 
 
 def _clock_finding(c: Candidate, value: float, std: float, motion: Motion) -> Finding:
-    names = " and ".join(c.channels)
+    channels = c.channels
+    if channels == ("x_n", "y_n") and value < 0:
+        # a sensor can be late, not early: then all the others are
+        channels, value = tuple(n for n in ("u", "v", "psi", "r") if n in motion), -value
+    names = ", ".join(channels[:-1]) + " and " + channels[-1] if len(channels) > 1 else channels[0]
     late = "late" if value > 0 else "early"
-    against = [n for n in ("x_n", "psi", "u", "r") if n in motion and n not in c.channels]
+    against = [n for n in ("x_n", "psi", "u", "r") if n in motion and n not in channels]
+    half = ""
+    if "x_n" in channels and abs(value - 0.5 * motion.step) < max(2.5 * std, 0.02):
+        half = " (half a sample: a simulation by Euler's rule at this step looks the same)"
     return Finding(
         "clock_offset",
-        c.channels[0],
+        channels[0],
         value,
         (value - 1.96 * std, value + 1.96 * std),
         "s",
-        f"{names} {'comes' if len(c.channels) == 1 else 'come'} {abs(value):.2f} s {late} against "
-        f"{_words(against)}: shifted so, positions, velocities and heading agree",
+        f"{names} {'comes' if len(channels) == 1 else 'come'} {abs(value):.2f} s {late} against "
+        f"{_words(against)}: shifted so, positions, velocities and heading agree{half}",
         f"shift {names} by {-value:+.2f} s (import --fix does), and look for the delay in the "
         f"logger or a filter",
-        c.channels,
-        (Repair("shift", c.channels, (value,)),),
+        channels,
+        (Repair("shift", channels, (value,)),),
         True,
     )
 
@@ -539,7 +669,13 @@ def _arm_finding(arm: Array, std: Array, antenna: tuple[float, ...]) -> Finding:
         f"write antenna = [{arm[0]:.2f}, {arm[1]:.2f}] in [sensors], or import --fix, which moves "
         f"the positions to where the vessel file has them",
         ("x_n", "y_n"),
-        (Repair("lever", ("x_n", "y_n"), (float(arm[0] - antenna[0]), float(arm[1] - antenna[1]))),),
+        (
+            Repair(
+                "lever",
+                ("x_n", "y_n"),
+                tuple(float(a - d) for a, d in zip(arm, antenna, strict=True)),
+            ),
+        ),
         True,
     )
 
@@ -589,8 +725,9 @@ def _outcomes(tie: Tie, found: Fit, usable: list[Candidate]) -> list[Outcome]:
             )  # fmt: skip
         else:
             error = (
-                f"{np.degrees(std[0]):.2f} deg" if kind == "heading_bias" else
-                f"{std[0]:.2g} and {std[1]:.2g} m"
+                f"{np.degrees(std[0]):.2f} deg"
+                if kind == "heading_bias"
+                else f"{std[0]:.2g} and {std[1]:.2g} m"
             )
             outcomes.append(Outcome(kind, "clean", f"standard error {error}"))
     return outcomes

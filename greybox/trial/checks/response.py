@@ -9,25 +9,39 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from greybox.trial.checks.finding import Finding, Repair
-from greybox.trial.checks.motion import Motion, make_motion
+from greybox.trial.checks.motion import (
+    Motion,
+    Profile,
+    denoise,
+    integrate,
+    levels,
+    make_motion,
+    profile,
+    solve,
+    whiten,
+)
 from greybox.trial.recording import Recording
-from greybox.trial.resampling import hold
 from greybox.trial.resampling import clock as make_clock
+from greybox.trial.resampling import hold, runs
 from greybox.vessel.force import generalised_force
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
 
-# accelerations are taken over this time: shorter is noise, longer is drag
-_SPAN = 2.0
-_LEAST_GAIN = 25.0
-_LEAST_SHARE = 0.03
-_MIN_ROWS = 60
+# what an alternative must gain in log-likelihood, and how much more than the columns as they are
+_LEAST_GAIN = 20.0
+_LEAST_RATIO = 1.5
+# one equation may prefer the columns as they are by chance, never by much
+_MOST_LOSS = 0.3
+_MIN_SAMPLES = 60
+# spans over which accelerations are shown [s]
+_PICTURE_SECONDS = 2.0
 _STATES = ("u", "v", "r")
 _INPUT_OF = {"u": "taux", "v": "tauy", "r": "taun"}
 
@@ -45,9 +59,10 @@ def response_findings(
 ) -> list[Finding]:
     """Find thruster columns that are swapped or reversed.
 
-    Accelerations over two seconds are regressed on velocities, their moduli and
-    the generalised force, with gains that must be positive; each alternative
-    reading of the columns is compared by the likelihood.
+    Each velocity is the integral of damping and force, with a force gain that
+    must be positive; what remains is measurement noise on a random walk (see
+    `motion`). The readings of the columns are compared by what the force then
+    explains, equation by equation.
 
     Parameters
     ----------
@@ -65,43 +80,94 @@ def response_findings(
     motion = make_motion(recording, _STATES)
     if motion is None:
         return []
-    states = [s for s in _STATES if s in motion]
     inputs = {c: _held(recording, c, motion.t) for c in commands}
-    loop = _open_rows(recording, vessel, motion.t)
-    rows, step = _rows(motion, loop)
-    if len(rows) < _MIN_ROWS:
+    motion, inputs = _open_loop(recording, vessel, motion, inputs)
+    if len(motion) < _MIN_SAMPLES:
         return []
-    problem = _Problem(motion, states, rows, step)
-    base = problem.loglik(vessel, inputs)
-    if base is None:
-        return []
+    problem = _Problem(motion)
+    base = problem.explained(vessel, inputs)
     best: tuple[float, _Alternative] | None = None
     for alternative in _alternatives(vessel, commands):
-        score = problem.loglik(vessel, _as_read(inputs, alternative))
-        if score is not None and (best is None or score > best[0]):
-            best = (score, alternative)
-    if best is None:
+        found = problem.explained(vessel, _as_read(inputs, alternative))
+        changes = [found[s] - base[s] for s in found]
+        gain = float(sum(changes))
+        won, lost = sum(c for c in changes if c > 0), -sum(c for c in changes if c < 0)
+        clear = any(found[s] > _LEAST_RATIO * base[s] + _LEAST_GAIN / 2 for s in found)
+        if clear and lost < _MOST_LOSS * won and (best is None or gain > best[0]):
+            best = (gain, alternative)
+    inflation = max(1.0, 0.2 / motion.step)
+    if best is None or best[0] < _LEAST_GAIN * inflation:
         return []
-    gain = best[0] - base
-    share = 1 - np.exp(-2 * gain / (len(rows) * len(states)))
-    if gain < _LEAST_GAIN or share < _LEAST_SHARE:
-        return []
-    a = best[1]
+    gain, a = best
+    single = len(a.repair[0].channels) == 1
+    value = -1.0 if single else 0.0
     return [
         Finding(
             "sign",
             a.channels[0],
-            -1.0 if len(a.repair[0].channels) == 1 else 0.0,
-            (-1.0, -1.0) if len(a.repair[0].channels) == 1 else (0.0, 0.0),
+            value,
+            (value, value),
             "1",
-            f"the ship answers as if {a.words}: so read, the thrusters explain its accelerations "
-            f"better by {100 * share:.0f} % of the variance (log-likelihood higher by {gain:.0f})",
+            f"the ship answers as if {a.words}: read so, the force explains its motion far better "
+            f"(log-likelihood higher by {gain:.0f}); a check of response, not of kinematics",
             a.fix,
             a.channels,
             a.repair,
             False,
+            _picture(motion, vessel, inputs, _as_read(inputs, a)),
         )
     ]
+
+
+def _picture(
+    motion: Motion, vessel: Vessel, inputs: dict[str, Array], as_read: dict[str, Array]
+) -> dict[str, Any]:
+    """Return acceleration beyond damping and the thrusters' push, of the clearest state.
+
+    Differences over two seconds: plainer to look at than the integrals that decide.
+    """
+    step = max(1, round(_PICTURE_SECONDS / motion.step))
+    rows = np.concatenate([np.arange(a, b - 2 * step, step) for a, b in motion.stretches])
+    seconds = step * motion.step
+
+    def mean(value: Array, at: NDArray[np.int64]) -> Array:
+        total = np.concatenate([[0.0], np.cumsum(value)])
+        return np.asarray((total[at + step] - total[at]) / step)
+
+    states = [s for s in _STATES if s in motion]
+    before = {s: mean(motion[s], rows) for s in states}
+    after = {s: mean(motion[s], rows + step) for s in states}
+    middle = {s: 0.5 * (before[s] + after[s]) for s in states}
+    damping = np.column_stack(
+        [
+            np.ones(len(rows)),
+            *[middle[s] for s in states],
+            *[middle[s] * np.abs(middle[s]) for s in states],
+        ]
+    )
+
+    def beside(value: Array) -> Array:
+        return np.asarray(value - damping @ np.linalg.lstsq(damping, value, rcond=None)[0])
+
+    shown: dict[str, Any] = {}
+    for s in states:
+        forces = [_force_of(generalised_force(vessel, x), s) for x in (inputs, as_read)]
+        if any(f is None for f in forces):
+            continue
+        rest = beside(after[s] - before[s])
+        pushes = [beside(mean(f, rows + step // 2)) for f in forces if f is not None]
+        size = float(np.linalg.norm(rest)) or 1.0
+        match = [float(p @ rest) / (size * (float(np.linalg.norm(p)) or 1.0)) for p in pushes]
+        if not shown or match[1] > shown["match"][1]:
+            shown = {
+                "state": s,
+                "t": motion.t[rows] + seconds,
+                "acceleration": rest / seconds,
+                "push": pushes[0],
+                "push_read": pushes[1],
+                "match": tuple(match),
+            }
+    return shown
 
 
 def _held(recording: Recording, name: str, t: Array) -> Array:
@@ -111,67 +177,75 @@ def _held(recording: Recording, name: str, t: Array) -> Array:
     return hold(make_clock(s.t[keep][order]), s.value[keep][order], t)
 
 
-def _open_rows(recording: Recording, vessel: Vessel, t: Array) -> NDArray[np.bool_]:
-    """Whether no controller moves the thrusters: feedback turns cause and answer round."""
+def _open_loop(
+    recording: Recording, vessel: Vessel, motion: Motion, inputs: dict[str, Array]
+) -> tuple[Motion, dict[str, Array]]:
+    """Keep what no controller moved: feedback turns cause and answer round."""
     if vessel.closed_loop is None or vessel.closed_loop[0] not in recording.text:
-        return np.ones(len(t), bool)
+        return motion, inputs
     at, words = recording.text[vessel.closed_loop[0]]
-    k = np.clip(np.searchsorted(at, t, side="right") - 1, 0, len(words) - 1)
-    return ~np.isin(words[k], vessel.closed_loop[1])
-
-
-def _rows(motion: Motion, keep: NDArray[np.bool_]) -> tuple[NDArray[np.int64], int]:
-    step = max(1, round(_SPAN / motion.step))
-    rows = []
+    k = np.clip(np.searchsorted(at, motion.t, side="right") - 1, 0, len(words) - 1)
+    free = ~np.isin(words[k], vessel.closed_loop[1])
+    rows, stretches, count = [], [], 0
     for a, b in motion.stretches:
-        start = np.arange(a, b - 2 * step, step)
-        rows.append(start[[bool(keep[k : k + step].all()) for k in start]])
-    return np.concatenate(rows).astype(np.int64), step
+        for start, stop in runs(free[a:b]):
+            if stop - start >= _MIN_SAMPLES:
+                rows.append(np.arange(a + start, a + stop))
+                stretches.append((count, count + stop - start))
+                count += stop - start
+    index = np.concatenate(rows) if rows else np.empty(0, dtype=np.int64)
+    values = {n: v[index] for n, v in motion.values.items()}
+    kept = Motion(motion.t[index], motion.step, values, tuple(stretches))
+    return kept, {n: v[index] for n, v in inputs.items()}
 
 
 class _Problem:
-    """Accelerations between the means of neighbouring spans, and what damps them."""
+    """Velocities as integrals of what damps them and of the force."""
 
-    def __init__(
-        self, motion: Motion, states: list[str], rows: NDArray[np.int64], step: int
-    ) -> None:
-        self.states, self.rows, self.step = states, rows, step
-        means = {s: self._mean(motion[s], rows) for s in states}
-        after = {s: self._mean(motion[s], rows + step) for s in states}
-        self.change = {s: after[s] - means[s] for s in states}
-        middle = {s: 0.5 * (after[s] + means[s]) for s in states}
-        columns = [np.ones(len(rows))]
-        columns += [middle[s] for s in states]
-        columns += [middle[s] * np.abs(middle[s]) for s in states]
-        columns += [middle[a] * middle[b] for a, b in combinations(states, 2)]
-        self.damping = np.column_stack(columns)
-
-    def _mean(self, value: Array, rows: NDArray[np.int64]) -> Array:
-        total = np.concatenate([[0.0], np.cumsum(value)])
-        return np.asarray((total[rows + self.step] - total[rows]) / self.step)
-
-    def loglik(self, vessel: Vessel, inputs: dict[str, Array]) -> float | None:
-        """Return the likelihood with gains that push the right way; None without force."""
-        force = generalised_force(vessel, inputs)
-        total, used = 0.0, False
-        rows = self.rows + self.step // 2
+    def __init__(self, motion: Motion) -> None:
+        self.motion = motion
+        self.states = [s for s in _STATES if s in motion]
+        x = {s: denoise(motion[s], motion) for s in self.states}
+        rates = [np.ones(len(motion))]
+        rates += [x[s] for s in self.states]
+        rates += [x[s] * np.abs(x[s]) for s in self.states]
+        rates += [x[a] * x[b] for a, b in combinations(self.states, 2)]
+        columns = np.hstack([levels(motion), integrate(np.column_stack(rates), motion)])
+        size = np.sqrt(np.mean(columns**2, axis=0))
+        self.columns = columns / np.where(size > 0, size, 1.0)
+        self.without: dict[str, Profile] = {}
+        self.kept: dict[tuple[str, bytes], float] = {}
         for s in self.states:
-            columns = self.damping
+            coarse = profile(motion[s], self.columns, motion)
+            near = np.minimum(coarse.gain * np.array([0.6, 1.0, 1.6]), 1.0)
+            self.without[s] = profile(motion[s], self.columns, motion, near)
+
+    def explained(self, vessel: Vessel, inputs: dict[str, Array]) -> dict[str, float]:
+        """Return by state the log-likelihood that the force adds; no less than zero."""
+        force = generalised_force(vessel, inputs)
+        found: dict[str, float] = {}
+        for s in self.states:
             f = _force_of(force, s)
-            y = self.change[s]
-            rest = y - columns @ np.linalg.lstsq(columns, y, rcond=None)[0]
-            variance = float(np.mean(rest**2))
-            if f is not None and np.std(f) > 0:
-                used = True
-                pushed = self._mean(f, rows)
-                other = pushed - columns @ np.linalg.lstsq(columns, pushed, rcond=None)[0]
-                power = float(other @ other)
-                gain = float(other @ rest) / power if power > 0 else 0.0
-                # a negative gain is no gain: the thruster cannot pull
-                if gain > 0:
-                    variance = float(np.mean((rest - gain * other) ** 2))
-            total -= 0.5 * len(y) * np.log(max(variance, 1e-300))
-        return total if used else None
+            if f is None or np.std(f) == 0:
+                continue
+            key = (s, f.tobytes())
+            if key not in self.kept:
+                self.kept[key] = self._added(s, f)
+            found[s] = self.kept[key]
+        return found
+
+    def _added(self, state: str, force: Array) -> float:
+        pushed = integrate(force / np.std(force), self.motion)
+        alone = self.without[state]
+        e = whiten(self.motion[state], alone.gain, self.motion)
+        x = whiten(np.column_stack([self.columns, pushed]), alone.gain, self.motion)
+        # a negative gain is no gain: a thruster that pulls is the other reading
+        if float(solve(x, e)[-1]) <= 0:
+            return 0.0
+        near = np.minimum(alone.gain * np.array([0.1, 0.25, 0.5, 1.0]), 1.0)
+        joint = np.column_stack([self.columns, pushed])
+        with_it = profile(self.motion[state], joint, self.motion, near)
+        return max(with_it.loglik - alone.loglik, 0.0)
 
 
 def _force_of(force: dict[str, Array], state: str) -> Array | None:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from greybox.channels import ANGLES
 from greybox.trial.checks.finding import Finding, Repair
+from greybox.trial.deriving import continuous
 from greybox.trial.recording import Recording, Signal
 from greybox.trial.resampling import HOLE, clock, runs
 from greybox.vessel.vessel import Vessel
@@ -58,7 +59,7 @@ def time_findings(recording: Recording) -> list[Finding]:
                     ("t",),
                     (Repair("order", names),),
                     True,
-                    {"t": finite, "steps": steps},
+                    {"t": finite, "steps": steps, "names": names},
                 )
             )
         found += _gaps(names, np.unique(finite))
@@ -70,7 +71,13 @@ def _gaps(names: tuple[str, ...], t: Array) -> list[Finding]:
         return []
     usual = clock(t).period
     steps = np.diff(t)
-    wide = np.flatnonzero(steps > HOLE * usual)
+    limit = np.full(len(steps), HOLE * usual)
+    digits = _digits(t)
+    if digits:
+        # between times that were rounded there may have been others
+        grid = 10.0 ** (np.floor(np.log10(np.maximum(t[1:], 1e-9))) + 1 - digits)
+        limit = np.maximum(limit, 1.5 * grid)
+    wide = np.flatnonzero(steps > limit)
     if not len(wide):
         return []
     longest = int(wide[np.argmax(steps[wide])])
@@ -89,7 +96,12 @@ def _gaps(names: tuple[str, ...], t: Array) -> list[Finding]:
             ("t",),
             (),
             False,
-            {"t": t, "gaps": [(float(t[k]), float(t[k + 1])) for k in wide[:200]]},
+            {
+                "t": t,
+                "gaps": [(float(t[k]), float(t[k + 1])) for k in wide[:200]],
+                "names": names,
+                "limit": HOLE * usual,
+            },
         )
     ]
 
@@ -109,9 +121,14 @@ def missing_findings(recording: Recording) -> list[Finding]:
         names = tuple(s.name for s in members)
         t, n = members[0].t, len(bad)
         start = t[stretches[0][0]]
-        where = "at the end" if len(stretches) == 1 and stretches[0][1] == n else (
-            f"first at t = {start:.6g} s" if np.isfinite(start) else
-            f"first in row {stretches[0][0] + 1}"
+        where = (
+            "at the end"
+            if len(stretches) == 1 and stretches[0][1] == n
+            else (
+                f"first at t = {start:.6g} s"
+                if np.isfinite(start)
+                else f"first in row {stretches[0][0] + 1}"
+            )
         )
         count = float(bad.sum())
         found.append(
@@ -147,9 +164,10 @@ def spike_findings(recording: Recording) -> list[Finding]:
     found = []
     for s in _motion(recording):
         t, value = _clean(s)
-        if len(value) < 30:
+        if len(value) < 30 or _digits(_wrapped(s)):
             continue
         spikes, scale, gap = _spikes(value)
+        spikes = spikes[np.abs(gap[spikes]) > _worth(s.name, value)]
         if not len(spikes):
             continue
         worst = spikes[np.argmax(np.abs(gap[spikes]))]
@@ -170,10 +188,22 @@ def spike_findings(recording: Recording) -> list[Finding]:
                 (s.name,),
                 (Repair("drop", (s.name,), tuple(float(x) for x in t[spikes])),),
                 True,
-                {"t": t, "value": value, "spikes": spikes},
+                {"t": t, "value": value, "spikes": spikes, "worst": int(worst), "distance": gap},
             )
         )
     return found
+
+
+def _worth(name: str, value: Array) -> float:
+    """Return the size below which a spike does no harm."""
+    if name in ("x_n", "y_n"):
+        # half of what the ship moves from sample to sample
+        return max(0.5 * float(np.quantile(np.abs(np.diff(value)), 0.9)), 0.02)
+    spread = float(np.subtract(*np.quantile(value, [0.95, 0.05])))
+    if name in ("u_q", "v_q"):
+        # gusts have heavy tails
+        return 0.5 * spread
+    return 0.005 if name == "psi" else 0.03 * spread
 
 
 def _spikes(value: Array) -> tuple[NDArray[np.int64], float, Array]:
@@ -194,16 +224,81 @@ def _spikes(value: Array) -> tuple[NDArray[np.int64], float, Array]:
     local = 1.4826 * median_filter(np.abs(gap), size=51, mode="nearest")
     limit = np.maximum(_SPIKE * scale, _LOCAL_SPIKE * local) + 2 * step
     out = np.abs(gap) > limit
-    wide = [k for a, b in runs(out) if b - a <= _SPIKE_WIDTH for k in range(a, b)]
+    wide = [
+        k
+        for a, b in runs(out)
+        if b - a <= _SPIKE_WIDTH and _comes_back(value, a, b)
+        for k in range(a, b)
+    ]
     return np.array(wide, dtype=np.int64), scale, gap
 
 
+def _comes_back(value: Array, a: int, b: int) -> bool:
+    """Whether samples a to b leave their neighbours by far more than these differ.
+
+    A sharp turn at a coarse sample time bends too, but its neighbours move alike.
+    """
+    before, after = value[max(a - 3, 0) : a], value[b : b + 3]
+    beside = np.concatenate([before, after])
+    if len(beside) < 4:
+        return False
+    part = value[a:b]
+    excess = float(max((part - beside.max()).max(), (beside.min() - part).max()))
+    steps = max(float(np.abs(np.diff(side)).max()) for side in (before, after) if len(side) > 1)
+    return excess > 3 * max(steps, float(abs(value[min(b, len(value) - 1)] - value[a - 1])))
+
+
+def _digits(value: Array) -> int:
+    """Return the significant digits, at most four, that a signal was rounded to; else 0."""
+    part = np.abs(value[value != 0][:20000])
+    # one decade alone cannot tell significant digits from decimals
+    if len(part) < 50 or part.max() < 30 * np.quantile(part, 0.01):
+        return 0
+    scale = 10.0 ** np.floor(np.log10(part))
+    for digits in (2, 3, 4):
+        grid = scale * 10.0 ** (1 - digits)
+        if np.mean(np.abs(part / grid - np.round(part / grid)) < 1e-6) > 0.995:
+            return digits
+    return 0
+
+
+def _rounded_finding(name: str, t: Array, value: Array, unit: str, digits: int) -> Finding:
+    largest = float(np.abs(value).max())
+    step = float(10.0 ** (np.floor(np.log10(largest)) + 1 - digits))
+    return Finding(
+        "quantised",
+        name,
+        step,
+        (step, step),
+        unit,
+        f"{name} was written with {digits} significant digits: at {largest:.4g} {unit} it moves in "
+        f"steps of {step:g} {unit}",
+        "export it again with all its digits; what depends on fine differences of it is lost",
+        (name,),
+        (),
+        False,
+        {"t": t, "value": value},
+    )
+
+
 def coarse_findings(recording: Recording) -> list[Finding]:
-    """Find signals that move in steps coarser than what they measure."""
+    """Find signals, and times, that move in steps coarser than what they measure."""
     found = []
+    for _, t in _clocks(recording):
+        times = t[np.isfinite(t)]
+        digits = _digits(times)
+        steps = np.diff(np.unique(times))
+        # an even clock looks rounded too, when its step is
+        uneven = np.mean(np.abs(steps - np.median(steps)) > 0.3 * np.median(steps))
+        if digits and uneven > 0.2:
+            found.append(_rounded_finding("t", times, times, "s", digits))
     for s in _motion(recording):
         t, value = _clean(s)
         step = _quantum(value)
+        digits = _digits(_wrapped(s)) if step <= 0 else 0
+        if digits and (digits < 4 or np.mean(np.diff(value) == 0) > 0.3):
+            found.append(_rounded_finding(s.name, t, value, s.unit or "1", digits))
+            continue
         if step <= 0 or len(value) < 50:
             continue
         change = np.abs(np.diff(value))
@@ -229,10 +324,19 @@ def coarse_findings(recording: Recording) -> list[Finding]:
                 (s.name,),
                 (),
                 False,
-                {"t": t, "value": value},
+                {"t": t, "value": value, "step": step},
             )
         )
     return found
+
+
+def _wrapped(s: Signal) -> Array:
+    """Return the values as they were written: digits count in degrees, not in radians."""
+    value = s.value[np.isfinite(s.value) & np.isfinite(s.t)]
+    degrees = np.degrees(value)
+    if s.name in ANGLES | {"r"} and _digits(degrees):
+        return np.asarray(degrees)
+    return value
 
 
 def _quantum(value: Array) -> float:
@@ -267,6 +371,8 @@ def stuck_findings(recording: Recording, vessel: Vessel) -> list[Finding]:
         longest = int(np.argmax(lengths))
         a, b = stretches[longest]
         span = float(t[b - 1] - t[a])
+        if _digits(_wrapped(s)):
+            continue
         # runs of a held or coarse signal are its habit; a stuck one is far longer
         usual = float(np.quantile(lengths, 0.9)) if len(lengths) > 5 else 1.0
         enough = max(_STUCK_SECONDS, 5 * usual * period)
@@ -295,6 +401,7 @@ def stuck_findings(recording: Recording, vessel: Vessel) -> list[Finding]:
 
 def _moves(name: str, start: float, stop: float, signals: list[Signal], step: float) -> bool:
     """Whether the rest of the log says that this channel should have changed."""
+
     def part(other: str) -> Array | None:
         for s in signals:
             if s.name == other:
@@ -312,11 +419,11 @@ def _moves(name: str, start: float, stop: float, signals: list[Signal], step: fl
         if u is not None and v is not None and psi is not None and len(u) == len(v) == len(psi):
             c, s = np.cos(psi), np.sin(psi)
             rate = c * u - s * v if name == "x_n" else s * u + c * v
-            return bool(abs(rate.mean()) * span > max(0.3, 3 * step))
+            return bool(np.ptp(np.cumsum(rate)) * span / len(rate) > max(0.3, 3 * step))
     if name == "psi":
         r = part("r")
         if r is not None:
-            return bool(abs(r.mean()) * span > max(0.03, 3 * step))
+            return bool(np.ptp(np.cumsum(r)) * span / len(r) > max(0.05, 3 * step))
     # a velocity repeats exactly only where everything stands still, or it is stuck
     for other in signals:
         inside = part(other.name)
@@ -353,11 +460,11 @@ def angle_unit_findings(recording: Recording, vessel: Vessel) -> list[Finding]:
                     f"{s.name} reaches {largest:.4g}, which cannot be radians: degrees under a "
                     f"radian name",
                     f"multiply {s.name} by pi/180 (import --fix does), or map it with "
-                    f"unit = \"deg\" in [columns]",
+                    f'unit = "deg" in [columns]',
                     (s.name,),
                     (Repair("scale", (s.name,), (factor,)),),
                     True,
-                    {"t": s.t, "value": s.value},
+                    {"t": s.t, "value": s.value, "limit": float(limit)},
                 )
             )
     return found
@@ -373,14 +480,6 @@ def _clean(s: Signal) -> tuple[Array, Array]:
     if s.name == "psi":
         value = continuous(value)
     return t, value
-
-
-def continuous(angle: Array) -> Array:
-    """Return an angle without its wraps, be they of 2π or of 360."""
-    jumps = np.abs(np.diff(angle))
-    if np.any((jumps > 300) & (jumps < 361)):
-        return np.asarray(np.unwrap(angle, period=360.0))
-    return np.asarray(np.unwrap(angle))
 
 
 def _clocks(recording: Recording) -> list[tuple[tuple[str, ...], Array]]:

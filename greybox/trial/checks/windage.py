@@ -1,4 +1,4 @@
-"""Convention of the measured wind: the right one makes the true wind steady while the ship turns."""
+"""Convention of the measured wind: the right one keeps the true wind steady in turns."""
 
 from __future__ import annotations
 
@@ -82,7 +82,8 @@ def wind_findings(recording: Recording, findings: list[Finding]) -> list[Finding
     blocks = max(int(np.ptp(motion.t) / _BLOCK_SECONDS), 1)
     if best * _RATIO > as_named or blocks < 5:
         return []
-    kind, words, fix, steps, _ = _CONVENTIONS[k]
+    kind, words, fix, steps, meant = _CONVENTIONS[k]
+    through = meant(u_q, v_q, psi)
     ratio = float(np.sqrt(as_named / max(best, 1e-12)))
     return [
         Finding(
@@ -97,5 +98,11 @@ def wind_findings(recording: Recording, findings: list[Finding]) -> list[Finding
             ("u_q", "v_q") if k != 1 else ("v_q",),
             steps,
             bool(steps),
+            {
+                "t": motion.t,
+                "psi": psi,
+                "air": turn(psi, u - u_q, v - v_q),
+                "air_mended": turn(psi, u - through.real, v - through.imag),
+            },
         )
     ]

@@ -1,0 +1,410 @@
+"""Pictures of defects of single signals: times, holes, spikes, stuck and coarse values."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from greybox.report.figures import BLACK, BLUE, GREEN, LABELS, VERMILION, new_figure, tidy
+from greybox.report.thinning import find_gaps, pick, thin
+from greybox.trial.checks.finding import Finding
+from greybox.trial.checks.rows import MOTION, continuous
+from greybox.trial.recording import Recording, Signal
+from greybox.trial.resampling import clock, runs
+from greybox.vessel.vessel import Vessel
+
+Array = NDArray[np.float64]
+
+# of one kind in one picture: more would be one block of colour
+_MOST_MARKS = 300
+# a zoom shows this much beside what it zooms on, in its lengths and in samples
+_BESIDE = 1.0
+_BESIDE_SAMPLES = 25
+_ROWS = 8
+_NAMED = {
+    "x_n": "position north x_n [m]", "y_n": "position east y_n [m]",
+    "v_n": "velocity north v_n [m/s]", "v_e": "velocity east v_e [m/s]",
+    "u_q": "wind along the bow u_q [m/s]", "v_q": "wind across v_q [m/s]",
+}  # fmt: skip
+
+
+def label_of(name: str, unit: str | None) -> str:
+    """Return the label of an axis with its unit."""
+    if name in _NAMED or name in LABELS:
+        return _NAMED.get(name) or LABELS[name]
+    return f"{name} [{unit if unit and unit != '1' else 'unit of the log'}]"
+
+
+def gap_figure(finding: Finding, recording: Recording) -> Figure:
+    """Draw a signal with its holes, the longest one closer, and the steps of its clock."""
+    names: tuple[str, ...] = finding.picture["names"]
+    gaps: list[tuple[float, float]] = finding.picture["gaps"]
+    times: Array = finding.picture["t"]
+    s = _telling(recording, names)
+    t, value = _orderly(s)
+    figure, whole, zoom, third = _axes("Holes in the times", True)
+    _draw(whole, t, value)
+    _shade(whole, gaps)
+    start, stop = max(gaps, key=_length)
+    low, high = _around(t, start, stop)
+    _draw_part(zoom, t, value, low, high)
+    _shade(zoom, [x for x in gaps if x[1] > low and x[0] < high], "")
+    zoom.set_title(f"the longest: {stop - start:.4g} s", fontsize=9)
+    steps = np.diff(times)
+    third.semilogy(*_dots(times[:-1], steps, 600), ".", color=BLUE, markersize=2.5)
+    wide = steps > finding.picture["limit"]
+    third.semilogy(times[:-1][wide], steps[wide], "v", color=VERMILION, markersize=5)
+    third.axhline(finding.picture["limit"], color=BLACK, linewidth=0.8, linestyle="--")
+    third.set_title("time to the next sample; above the dashed line it is a gap", fontsize=9)
+    third.set_ylabel("step [s]", fontsize=9)
+    third.set_xlabel("time [s]", fontsize=9)
+    _name(s, whole, zoom)
+    return figure
+
+
+def order_figure(finding: Finding) -> Figure:
+    """Draw the times by row, with those that repeat or go back."""
+    t: Array = finding.picture["t"]
+    rows = np.arange(1, len(t) + 1, dtype=float)
+    wrong = np.flatnonzero(np.diff(t) <= 0) + 1
+    figure, whole, zoom, third = _axes("Times that repeat or go back", True)
+    low = max(int(wrong[0]) - _ROWS, 0)
+    high = min(int(wrong[0]) + _ROWS, len(t))
+    for ax, part in ((whole, slice(None)), (zoom, slice(low, high))):
+        inside = wrong[(rows[wrong] >= rows[part][0]) & (rows[wrong] <= rows[part][-1])]
+        index = thin(np.array([], np.intp), t[part])
+        ax.plot(pick(rows[part], index), pick(t[part], index), color=BLUE, linewidth=1.0)
+        if ax is zoom:
+            ax.plot(rows[part], t[part], ".", color=BLUE, markersize=4)
+        inside = inside[:_MOST_MARKS]
+        ax.plot(rows[inside], t[inside], "v", color=VERMILION, markersize=6, label="wrong time")
+        ax.set_ylabel("time [s]", fontsize=9)
+        ax.set_xlabel("row of the file", fontsize=9)
+    zoom.set_title(f"around the first, row {wrong[0] + 1}", fontsize=9)
+    steps = np.diff(t)
+    usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0
+    third.plot(*_dots(rows[1:], steps, 600), ".", color=BLUE, markersize=2.5)
+    third.plot(rows[wrong], steps[wrong - 1], "v", color=VERMILION, markersize=5)
+    third.axhline(0, color=BLACK, linewidth=0.8, linestyle="--")
+    third.set_yscale("symlog", linthresh=usual)
+    third.set_title("time since the row before; it must be above zero", fontsize=9)
+    third.set_ylabel("step [s]", fontsize=9)
+    third.set_xlabel("row of the file", fontsize=9)
+    _legend(whole)
+    return figure
+
+
+def missing_figure(finding: Finding, recording: Recording) -> Figure:
+    """Draw a signal with the stretches that hold no number, and the longest one closer."""
+    t: Array = finding.picture["t"]
+    bad: NDArray[np.bool_] = finding.picture["bad"]
+    timed = np.isfinite(t)
+    t, bad = t[timed], bad[timed]
+    s = _telling(recording, finding.channels)
+    good_t, value = _orderly(s)
+    period = clock(np.unique(t)).period if len(t) > 1 else 1.0
+    # a lone missing sample is as wide as its step
+    found = runs(bad)
+    spans = [(t[a] - period / 2, t[b - 1] + period / 2) for a, b in found]
+    figure, whole, zoom, _ = _axes(f"Samples without a number: {', '.join(finding.channels)}")
+    if spans:
+        ends = (float(t.min()), float(t.max()))
+        _draw(whole, good_t, value, breaks=spans)
+        whole.set_xlim(*_margin(*ends))
+        _shade(whole, spans, "no number")
+        start, stop = max(spans, key=_length)
+        low, high = _around(t, start, stop)
+        _draw_part(zoom, good_t, value, low, high, breaks=spans)
+        inside = [x for x in spans if x[1] > low and x[0] < high]
+        _shade(zoom, inside, "")
+        count = max(b - a for a, b in found)
+        zoom.set_title(f"the longest: {count} sample{'s' * (count > 1)}", fontsize=9)
+    _name(s, whole, zoom)
+    return figure
+
+
+def spike_figure(finding: Finding) -> Figure:
+    """Draw the whole signal with its spikes marked, and the largest one closer."""
+    t: Array = finding.picture["t"]
+    value: Array = finding.picture["value"]
+    spikes: NDArray[np.int64] = finding.picture["spikes"]
+    size = abs(float(np.asarray(finding.value)))
+    distance: Array = finding.picture["distance"]
+    figure, whole, zoom, third = _axes(f"Outliers of {finding.channel}", True)
+    _draw(whole, t, value)
+    k = int(finding.picture["worst"])
+    low, high = max(k - _BESIDE_SAMPLES, 0), min(k + _BESIDE_SAMPLES + 1, len(t))
+    part = slice(low, high)
+    zoom.plot(t[part], value[part], color=BLUE, linewidth=1.0)
+    zoom.plot(t[part], value[part], ".", color=BLUE, markersize=4)
+    near = spikes[(spikes >= low) & (spikes < high)]
+    for ax, marked in ((whole, spikes[:_MOST_MARKS]), (zoom, near)):
+        ax.plot(
+            t[marked], value[marked], "o", markersize=8, markerfacecolor="none",
+            markeredgecolor=VERMILION, markeredgewidth=1.4, label="outlier",
+        )  # fmt: skip
+    zoom.set_title(f"the largest: {size:.3g} {finding.unit} from its neighbours", fontsize=9)
+    # on a slope an outlier shows only against what its neighbours predict
+    third.plot(t[part], distance[part], ".-", color=BLUE, linewidth=0.8, markersize=4)
+    third.plot(
+        t[near], distance[near], "o", markersize=8, markerfacecolor="none",
+        markeredgecolor=VERMILION, markeredgewidth=1.4,
+    )  # fmt: skip
+    third.set_title("distance from what the neighbours predict", fontsize=9)
+    third.set_ylabel(f"distance [{finding.unit}]", fontsize=9)
+    third.set_xlabel("time [s]", fontsize=9)
+    _label(whole, finding)
+    _label(zoom, finding)
+    _legend(whole)
+    return figure
+
+
+def stuck_figure(finding: Finding, recording: Recording) -> Figure:
+    """Draw the plateau in the whole signal and closer, beside a channel that moves on."""
+    t: Array = finding.picture["t"]
+    value: Array = finding.picture["value"]
+    start, stop = finding.picture["stretch"]
+    other = _mover(recording, finding.channel, start, stop)
+    figure, whole, zoom, third = _axes(f"{finding.channel} is stuck", other is not None)
+    low, high = _around(t, start, stop)
+    _draw(whole, t, value)
+    _draw_part(zoom, t, value, low, high)
+    zoom.set_title(f"it repeats one value for {stop - start:.4g} s", fontsize=9)
+    axes = [whole, zoom]
+    if other is not None:
+        _draw_part(third, *_orderly(other), low, high)
+        third.set_xlim(zoom.get_xlim())
+        third.set_ylabel(label_of(other.name, other.unit), fontsize=9)
+        third.set_xlabel("time [s]", fontsize=9)
+        third.set_title(f"meanwhile {other.name} moves", fontsize=9)
+        axes.append(third)
+    for ax in axes:
+        _shade(ax, [(start, stop)], "stuck" if ax is whole else "")
+    _label(whole, finding)
+    _label(zoom, finding)
+    return figure
+
+
+def coarse_figure(finding: Finding) -> Figure:
+    """Draw the steps of a signal closer, and how large its changes are."""
+    t: Array = finding.picture["t"]
+    value: Array = finding.picture["value"]
+    step = float(finding.picture["step"])
+    figure, whole, zoom, third = _axes(f"{finding.channel} moves in coarse steps", True)
+    _draw(whole, t, value)
+    # where it changes most often the steps show best
+    width = min(60, len(t))
+    busy = np.convolve(np.r_[np.diff(value) != 0, False], np.ones(width), mode="valid")
+    k = int(np.argmax(busy))
+    part = slice(k, k + width)
+    zoom.step(t[part], value[part], where="post", color=BLUE, linewidth=0.8)
+    zoom.plot(t[part], value[part], ".", color=BLUE, markersize=4)
+    inside = value[part]
+    if np.ptp(inside) < 25 * step:
+        origin = float(inside.min())
+        for level in origin + step * np.arange(round(float(np.ptp(inside)) / step) + 1):
+            zoom.axhline(float(level), color=VERMILION, linewidth=0.5, alpha=0.7)
+    zoom.set_title(f"closer, with the steps of {step:.4g} {finding.unit}", fontsize=9)
+    change = np.round(np.abs(np.diff(value)) / step)
+    sizes = np.arange(0, min(max(float(change.max()), 3), 8) + 1)
+    share = [100 * float(np.mean(change == k)) for k in sizes]
+    third.bar(sizes, share, color=[VERMILION, *[BLUE] * (len(sizes) - 1)], width=0.7)
+    third.set_xticks(sizes)
+    third.set_xlabel(f"change between samples [steps of {step:.4g} {finding.unit}]", fontsize=9)
+    third.set_ylabel("share of samples [%]", fontsize=9)
+    third.set_title(f"{share[0]:.0f} % of the samples repeat the one before", fontsize=9)
+    _label(whole, finding)
+    _label(zoom, finding)
+    return figure
+
+
+def range_figure(finding: Finding) -> Figure:
+    """Draw an angle against the range that its name allows, as logged and mended."""
+    t: Array = finding.picture["t"]
+    value: Array = finding.picture["value"]
+    limit = float(finding.picture["limit"])
+    keep = np.isfinite(t) & np.isfinite(value)
+    factor = finding.repair[0].values[0] if finding.repair else 1.0
+    figure = new_figure(10, 4.6)
+    above, below = figure.subplots(2, 1, sharex=True)
+    for ax, x, title in (
+        (above, value, "as logged"),
+        (below, value * factor, f"multiplied by {factor:.5g}"),
+    ):
+        ax.axhspan(
+            -limit,
+            limit,
+            color=GREEN,
+            alpha=0.15,
+            linewidth=0,
+            label=f"possible in rad (within {limit:.3g})",
+        )
+        _draw(ax, t[keep], x[keep])
+        ax.set_title(title, fontsize=9, loc="left")
+        ax.set_ylabel(f"{finding.channel} [rad]", fontsize=9)
+    low, high = float(np.min(value[keep] * factor)), float(np.max(value[keep] * factor))
+    room = 0.15 * max(high - low, 0.1)
+    below.set_ylim(low - room, high + room)
+    above.set_xlabel("")
+    above.tick_params(labelbottom=False)
+    above.legend(
+        fontsize=8, loc="lower right", bbox_to_anchor=(1.0, 1.0), frameon=False, borderaxespad=0.2
+    )
+    figure.suptitle(f"Unit of {finding.channel}", fontsize=11)
+    return figure
+
+
+def signals_figure(finding: Finding, recording: Recording, vessel: Vessel) -> Figure:
+    """Draw the channels at fault as they are, where nothing better can be drawn."""
+    names = [n for n in (finding.channels or (finding.channel,)) if n in recording][:4]
+    names = names or [n for n in (*MOTION, *vessel.commands) if n in recording][:1]
+    names = names or [s.name for s in recording.signals[:1]]
+    figure = new_figure(10, 1.9 * max(len(names), 1) + 0.7)
+    axes = figure.subplots(max(len(names), 1), 1, sharex=True, squeeze=False)[:, 0]
+    for ax, name in zip(axes, names, strict=False):
+        s = recording[name]
+        _draw(ax, *_orderly(s))
+        ax.set_ylabel(label_of(name, s.unit), fontsize=9)
+        if ax is not axes[-1]:
+            ax.set_xlabel("")
+    figure.suptitle(f"{finding.id}: {', '.join(finding.channels or (finding.channel,))}")
+    return figure
+
+
+def _axes(title: str, three: bool = False) -> tuple[Figure, Any, Any, Any]:
+    """Return the whole signal above, closer below, and a third pair of axes beside."""
+    figure = new_figure(10, 5.0)
+    grid = figure.add_gridspec(2, 2, height_ratios=[1, 1.15])
+    whole = figure.add_subplot(grid[0, :])
+    zoom = figure.add_subplot(grid[1, 0] if three else grid[1, :])
+    third = figure.add_subplot(grid[1, 1]) if three else None
+    for ax in (whole, zoom, third):
+        if ax is not None:
+            tidy(ax)
+            ax.tick_params(labelsize=8)
+    figure.suptitle(title, fontsize=11)
+    return figure, whole, zoom, third
+
+
+def _orderly(s: Signal) -> tuple[Array, Array]:
+    """Return times and values that are numbers, in order of time."""
+    keep = np.isfinite(s.t) & np.isfinite(s.value)
+    order = np.argsort(s.t[keep], kind="stable")
+    t, value = s.t[keep][order], s.value[keep][order]
+    return t, continuous(value) if s.name == "psi" and len(value) > 1 else value
+
+
+def _draw(ax: Any, t: Array, value: Array, breaks: Sequence[tuple[float, float]] = ()) -> None:
+    """Draw a line that is interrupted at holes, thinned without losing a peak."""
+    if len(t) > 1:
+        order = np.argsort(t, kind="stable")
+        t, value = t[order], value[order]
+        usual = clock(t).period
+        gaps = find_gaps(t, max(usual, 1e-12) * 1.6)
+        if breaks:
+            starts = np.searchsorted(t, [b[0] for b in breaks]) - 1
+            gaps = np.unique(np.r_[gaps, starts[(starts >= 0) & (starts < len(t) - 1)]])
+        index = thin(gaps, value, points=1600)
+        t, value = pick(t, index), pick(value, index)
+    ax.plot(t, value, color=BLUE, linewidth=0.9)
+    ax.set_xlabel("time [s]", fontsize=9)
+    tidy(ax)
+
+
+def _draw_part(
+    ax: Any,
+    t: Array,
+    value: Array,
+    low: float,
+    high: float,
+    breaks: Sequence[tuple[float, float]] = (),
+) -> None:
+    inside = (t >= low) & (t <= high)
+    _draw(ax, t[inside], value[inside], breaks)
+    if inside.sum() < 200:
+        ax.plot(t[inside], value[inside], ".", color=BLUE, markersize=4)
+    ax.set_xlim(low, high)
+
+
+def _around(t: Array, start: float, stop: float) -> tuple[float, float]:
+    """Return a span with room on both sides of what it shows, within the log."""
+    period = clock(np.unique(t)).period if len(t) > 1 else 1.0
+    beside = max(_BESIDE * (stop - start), _BESIDE_SAMPLES * period)
+    return (
+        max(start - beside, min(float(t.min()), start) - period),
+        min(stop + beside, max(float(t.max()), stop) + period),
+    )
+
+
+def _margin(low: float, high: float) -> tuple[float, float]:
+    room = 0.02 * max(high - low, 1e-9)
+    return low - room, high + room
+
+
+def _shade(ax: Any, spans: Iterable[tuple[float, float]], label: str = "gap") -> None:
+    """Shade spans over the whole height; those too narrow for the page still show as lines."""
+    shown = sorted(spans, key=_length)[-_MOST_MARKS:]
+    ax.broken_barh(
+        [(a, b - a) for a, b in shown], (0, 1), transform=ax.get_xaxis_transform(),
+        facecolor=VERMILION, edgecolor=VERMILION, linewidth=0.8, alpha=0.3, zorder=0,
+        label=label or None,
+    )  # fmt: skip
+    if label:
+        _legend(ax)
+
+
+def _legend(ax: Any) -> None:
+    ax.legend(
+        fontsize=8, loc="lower right", bbox_to_anchor=(1.0, 1.0), frameon=False,
+        borderaxespad=0.2, ncols=3,
+    )  # fmt: skip
+
+
+def _name(s: Signal, *axes: Any) -> None:
+    for ax in axes:
+        ax.set_ylabel(label_of(s.name, s.unit), fontsize=9)
+        ax.set_xlabel("time [s]", fontsize=9)
+
+
+def _label(ax: Any, finding: Finding) -> None:
+    ax.set_ylabel(label_of(finding.channel, finding.unit), fontsize=9)
+    ax.set_xlabel("time [s]", fontsize=9)
+
+
+def _telling(recording: Recording, names: Sequence[str]) -> Signal:
+    """Return the signal of some that shows a hole best: a moving one, not a command."""
+    ranked = [n for n in ("psi", "r", "u", "v", *MOTION) if n in names and n in recording]
+    ranked += [n for n in names if n in recording]
+    return recording[ranked[0]] if ranked else recording.signals[0]
+
+
+def _mover(recording: Recording, channel: str, start: float, stop: float) -> Signal | None:
+    """Return the channel that moves most, for its own habit, while another is stuck."""
+    best: tuple[float, Signal] | None = None
+    for s in recording.signals:
+        if s.name == channel or s.name not in MOTION:
+            continue
+        t, value = _orderly(s)
+        inside = value[(t >= start) & (t <= stop)]
+        spread = float(np.std(value)) if len(value) else 0.0
+        if len(inside) < 4 or spread == 0:
+            continue
+        # the channel that is tied to the stuck one says most
+        tied = 3.0 if {s.name, channel} in ({"psi", "r"}, {"x_n", "u"}, {"y_n", "u"}) else 1.0
+        moved = tied * float(np.ptp(inside)) / spread
+        if best is None or moved > best[0]:
+            best = (moved, s)
+    return None if best is None else best[1]
+
+
+def _dots(x: Array, y: Array, most: int) -> tuple[Array, Array]:
+    every = max(1, -(-len(x) // most))
+    return x[::every], y[::every]
+
+
+def _length(span: tuple[float, float]) -> float:
+    return span[1] - span[0]

@@ -1,0 +1,260 @@
+"""The page of `greybox check`: every finding shown, each log as a whole, what was looked at."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from greybox.errors import GreyboxError, UsageError
+from greybox.report.check_answers import answer_figure, course_figure, wind_figure
+from greybox.report.check_rows import (
+    coarse_figure,
+    gap_figure,
+    missing_figure,
+    order_figure,
+    range_figure,
+    signals_figure,
+    spike_figure,
+    stuck_figure,
+)
+from greybox.report.check_ties import make_tie, tie_figure
+from greybox.report.figures import to_svg
+from greybox.report.log import log_figure
+from greybox.report.page import Page, Picture, Section, Table, write_page
+from greybox.trial.checks.finding import CheckReport, Finding, size_in_words
+from greybox.trial.importing import import_recording
+from greybox.trial.log import TrialLog
+from greybox.trial.recording import Recording
+from greybox.vessel.vessel import Vessel
+
+# what makes a force model wrong before what it only has to do without
+_SERIOUS = (
+    "frame", "sign", "unit", "clock_offset", "heading_bias", "lever_arm", "duplicate_time",
+    "stuck", "nan", "outlier", "gap", "quantised",
+)  # fmt: skip
+_SHOWN = {
+    "gap": "The signal with its holes shaded, the longest hole closer, and the time from each "
+    "sample to the next.",
+    "duplicate_time": "Times by row with the wrong ones marked, closer around the first, and "
+    "the time since the row before.",
+    "nan": "The signal with the samples that hold no number shaded, and the longest stretch "
+    "closer.",
+    "outlier": "The whole signal with its outliers circled, and the largest one closer.",
+    "stuck": "The whole signal, the time in which it repeats one value closer, and a channel "
+    "that moves meanwhile.",
+    "quantised": "The whole signal, its steps closer, and how many steps it changes by from "
+    "sample to sample.",
+    "clock_offset": "Velocities as logged and from positions and heading where they differ "
+    "most, above as logged and below shifted; beside them their disagreement against the "
+    "shift, with the estimate and its interval.",
+    "lever_arm": "Velocities as logged and from positions and heading, above as logged and "
+    "below with the positions moved; beside them their disagreement against the rate of turn, "
+    "with the slope that the arm makes.",
+    "heading_bias": "Velocities as logged and from positions and heading, above as logged and "
+    "below with the heading turned; beside them the angle between both against the heading.",
+}
+_TIE = (
+    "Velocities as logged and from positions and heading where they differ most, above as logged "
+    "and below mended, with their root mean square disagreement over the log."
+)
+_DOUBT = (
+    " The velocities of the whole log come no closer by this repair: judge it before you apply it."
+)
+
+
+def check_page(
+    reports: Sequence[CheckReport], paths: Sequence[Path], vessel: Vessel, target: str | Path
+) -> None:
+    """Write one page on what is wrong with some logs.
+
+    Parameters
+    ----------
+    reports : sequence of CheckReport
+        One a log.
+    paths : sequence of Path
+        Of the logs, in the same order.
+    vessel : Vessel
+    target : str or Path
+        HTML file, replaced in one step.
+    """
+    sections = [_section(k, r, vessel) for k, r in enumerate(reports)]
+    computed = {"program": f"greybox-marine {version('greybox-marine')}", "vessel": vessel.name}
+    for report, path in zip(reports, paths, strict=True):
+        files = report.recording.files if report.recording else ()
+        hashes = ", ".join(f"{f.format}, SHA-256 {f.sha256}" for f in files)
+        computed[f"log {report.name}"] = f"{path} ({hashes})" if hashes else str(path)
+    computed["method"] = (
+        "kinematics before any force model: single signals first, then which reading of the "
+        "columns makes positions, heading, velocities and yaw rate agree (likelihood of a "
+        "random walk with sensor noise), then clocks, antenna and heading together"
+    )
+    computed["pictures"] = (
+        "velocities from positions are derivatives after a Gaussian smoothing that the logged "
+        "ones are given too; what else was found is mended in both rows; a constant velocity of "
+        "the water is allowed for"
+    )
+    page = Page(
+        title="What is wrong with the log" if len(reports) == 1 else "What is wrong with the logs",
+        headline=headline(reports),
+        sections=sections,
+        computed=computed,
+    )
+    write_page(page, target)
+
+
+def headline(reports: Sequence[CheckReport]) -> str:
+    """Return how much was found, and the most serious of it in words."""
+    found = [(f, r) for r in reports for f in r.findings]
+    logs = f"{len(reports)} log" + "s" * (len(reports) != 1)
+    if not found:
+        open_ids = sorted({o.id for r in reports for o in r.outcomes if o.status == "cannot tell"})
+        vague = f"; nothing can be said of {', '.join(open_ids)}" if open_ids else ""
+        return f"No findings in {logs}{vague}."
+    finding, report = min(found, key=_rank)
+    count = f"{len(found)} finding" + "s" * (len(found) != 1)
+    where = f" ({report.name})" if len(reports) > 1 else ""
+    lead = "the most serious" if len(found) > 1 else "namely"
+    return f"{count} in {logs}; {lead}{where}: {finding.evidence}."
+
+
+def finding_figure(finding: Finding, report: CheckReport, vessel: Vessel) -> Figure:
+    """Draw one finding so that it shows.
+
+    Parameters
+    ----------
+    finding : Finding
+    report : CheckReport
+        That has it; its recording is drawn.
+    vessel : Vessel
+
+    Returns
+    -------
+    Figure
+        Defects of one signal: the signal with what is wrong marked, and closer.
+        Others: before and after the finding's repair.
+
+    Raises
+    ------
+    UsageError
+        The report holds no recording.
+    """
+    return _drawn(finding, report, vessel)[0]
+
+
+def _drawn(finding: Finding, report: CheckReport, vessel: Vessel) -> tuple[Figure, str]:
+    """Return the picture, and a doubt where it does not bear the finding out."""
+    recording = report.recording
+    if recording is None:
+        raise UsageError(
+            f"the report of '{report.name}' holds no recording to draw: make it with "
+            f"check_recording or check_files."
+        )
+    picture = finding.picture
+    if finding.id == "gap":
+        return gap_figure(finding, recording), ""
+    if finding.id == "duplicate_time":
+        return order_figure(finding), ""
+    if finding.id == "nan":
+        return missing_figure(finding, recording), ""
+    if finding.id == "outlier":
+        return spike_figure(finding), ""
+    if finding.id == "stuck":
+        return stuck_figure(finding, recording), ""
+    if finding.id == "quantised":
+        return coarse_figure(finding), ""
+    if "limit" in picture:
+        return range_figure(finding), ""
+    if "air" in picture:
+        return wind_figure(finding), ""
+    if "push" in picture:
+        return answer_figure(finding), ""
+    if "drift" in picture:
+        return course_figure(finding), ""
+    tie = make_tie(finding, report, vessel)
+    if tie is None:
+        return signals_figure(finding, recording, vessel), ""
+    return tie_figure(finding, tie), "" if tie.helps else _DOUBT
+
+
+def _rank(item: tuple[Finding, CheckReport]) -> int:
+    return _SERIOUS.index(item[0].id) if item[0].id in _SERIOUS else len(_SERIOUS)
+
+
+def _section(number: int, report: CheckReport, vessel: Vessel) -> Section:
+    pictures: list[Picture] = []
+    sentences: list[str] = []
+    if not report.findings:
+        sentences.append("Nothing was found.")
+    for k, f in enumerate(sorted(report.findings, key=_seriousness)):
+        said = caption(f)
+        if report.recording is None:
+            sentences.append(said)
+            continue
+        figure, doubt = _drawn(f, report, vessel)
+        svg = to_svg(figure, f"log{number}finding{k}")
+        pictures.append(Picture(svg, f"{said}{doubt}", f"{alternative(f)}{doubt}"))
+    if report.recording is not None:
+        try:
+            log = _whole(report.recording, vessel)
+        except GreyboxError as error:
+            sentences.append(f"The log as a whole cannot be drawn: {error}")
+        else:
+            text = f"The log {report.name} as a whole, as it would be imported, nothing mended."
+            pictures.append(Picture(to_svg(log_figure(log), f"log{number}whole"), text))
+    table = Table(
+        "All checks",
+        ["check", "outcome", "what was seen"],
+        [[o.id, o.status, o.sentence] for o in report.outcomes],
+        sentences=True,
+    )
+    texts = [("Notes from reading", "\n".join(report.notes))] if report.notes else []
+    return Section(report.name, sentences, pictures, [table], texts)
+
+
+def _seriousness(finding: Finding) -> int:
+    return _SERIOUS.index(finding.id) if finding.id in _SERIOUS else len(_SERIOUS)
+
+
+def caption(finding: Finding) -> str:
+    """Return what was found, the evidence and the fix."""
+    names = ", ".join(finding.channels or (finding.channel,))
+    return (
+        f"{finding.id} ({names}), {size_in_words(finding)}: {finding.evidence}. Fix: {finding.fix}."
+    )
+
+
+def alternative(finding: Finding) -> str:
+    """Return the text that stands for the picture of a finding."""
+    if finding.id == "unit" and "limit" in finding.picture:
+        shown = "The angle against the range that radians allow, as logged and mended."
+    elif "air" in finding.picture:
+        shown = "The true wind against heading and as a map, as logged and read otherwise."
+    elif "push" in finding.picture:
+        shown = (
+            "The ship's acceleration and what the thrusters push, against time and against each "
+            "other, as logged and read otherwise."
+        )
+    elif "drift" in finding.picture:
+        shown = "Course minus heading against time and around the bow, as logged and mended."
+    else:
+        shown = _SHOWN.get(finding.id, _TIE)
+    return f"{shown} {finding.evidence}."
+
+
+def _whole(recording: Recording, vessel: Vessel) -> TrialLog:
+    """Return all segments of a recording as one log with gaps."""
+    from dataclasses import replace
+
+    parts = import_recording(recording, vessel).segments
+    names = [n for n in parts[0].channels if all(n in p for p in parts)]
+    return replace(
+        parts[0],
+        name=recording.name,
+        t=np.concatenate([p.t for p in parts]),
+        channels={n: np.concatenate([p[n] for p in parts]) for n in names},
+        closed_loop=np.concatenate([p.closed_loop for p in parts]),
+    )

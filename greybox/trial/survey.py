@@ -1,0 +1,121 @@
+"""What a log holds: standard manoeuvres, and how long each sign regime lasts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+from greybox.errors import GreyboxError
+from greybox.trial.importing import import_recording
+from greybox.trial.log import TrialLog
+from greybox.trial.manoeuvres import Criterion, Manoeuvre, Quantity, Verdict, find_manoeuvres
+from greybox.trial.recording import Recording
+from greybox.trial.segments import by_sign
+from greybox.vessel.vessel import Vessel
+
+# regimes shorter than this tell nothing about a trial [s]
+_SHORTEST = 5.0
+# a state keeps its sign with a margin of this share of its usual size
+_MARGIN = 0.1
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What the segments of one trial hold.
+
+    Parameters
+    ----------
+    manoeuvres : tuple of Manoeuvre
+        In order of time.
+    regimes : mapping of str to float
+        Seconds by sign regime of surge and sway, such as ``u+v-``.
+    seconds : float
+        Length of all segments.
+    note : str
+        Why there is no survey; empty where there is one.
+    """
+
+    manoeuvres: tuple[Manoeuvre, ...] = ()
+    regimes: Mapping[str, float] | None = None
+    seconds: float = 0.0
+    note: str = ""
+
+    def summary(self) -> str:
+        """Return manoeuvres and regimes as text; empty where there is nothing to tell."""
+        parts = [m.summary() for m in self.manoeuvres]
+        if self.regimes and self.seconds > 0:
+            said = ", ".join(
+                f"{name} {100 * s / self.seconds:.0f} %"
+                for name, s in sorted(self.regimes.items(), key=_longest)
+            )
+            parts.append(f"sign regimes kept for {_SHORTEST:g} s or more: {said}")
+        return "\n".join(parts)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the survey as plain values, angles in radians."""
+        return {
+            "manoeuvres": [manoeuvre_to_dict(m) for m in self.manoeuvres],
+            "regimes": dict(self.regimes or {}),
+        }
+
+
+def _longest(item: tuple[str, float]) -> float:
+    return -item[1]
+
+
+def survey_logs(segments: Sequence[TrialLog]) -> Survey:
+    """Find the manoeuvres and sign regimes of the segments of one trial.
+
+    Parameters
+    ----------
+    segments : sequence of TrialLog
+        Without gaps, in order of time.
+    """
+    manoeuvres: list[Manoeuvre] = []
+    regimes: dict[str, float] = {}
+    seconds = 0.0
+    for log in segments:
+        seconds += len(log) * log.sample_time
+        states = [n for n in ("u", "v") if n in log]
+        if "psi" in log and "u" in log and len(log) * log.sample_time > _SHORTEST:
+            manoeuvres += find_manoeuvres(log)
+        if states:
+            margins = {n: _MARGIN * float(abs(log[n]).mean()) for n in states}
+            for s in by_sign(log, margins, shortest=_SHORTEST):
+                regimes[s.label] = regimes.get(s.label, 0.0) + s.t_stop - s.t_start
+    return Survey(tuple(manoeuvres), regimes, seconds)
+
+
+def survey_recording(recording: Recording, vessel: Vessel) -> Survey:
+    """Make a log of a mended recording and survey it; say why where none can be made."""
+    try:
+        return survey_logs(import_recording(recording, vessel).segments)
+    except GreyboxError as error:
+        return Survey(note=str(error))
+
+
+def manoeuvre_to_dict(manoeuvre: Manoeuvre) -> dict[str, Any]:
+    """Return a manoeuvre as plain values; quantities with standard error and interval."""
+    kind = {"TurningCircle": "turning_circle", "ZigZag": "zigzag", "Stopping": "stopping"}
+    found: dict[str, Any] = {"kind": kind[type(manoeuvre).__name__]}
+    for field in fields(manoeuvre):
+        found[field.name] = _plain(getattr(manoeuvre, field.name))
+    return found
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Quantity):
+        return {
+            "value": value.value,
+            "std": value.std,
+            "unit": value.unit,
+            "ci": list(value.interval),
+        }
+    if isinstance(value, Criterion):
+        return {f.name: _plain(getattr(value, f.name)) for f in fields(value)}
+    if isinstance(value, Verdict):
+        return value.value
+    if isinstance(value, tuple | list):
+        return [_plain(v) for v in value]
+    return value

@@ -1,0 +1,332 @@
+"""Checks: planted defects are found and named, clean logs give none, repairs undo them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from virtual import as_recording, recorded
+
+from greybox.errors import UsageError
+from greybox.trial.checks.check import check_files, check_recording
+from greybox.trial.checks.finding import IDS
+from greybox.trial.recording import Recording, Signal
+from greybox.trial.repair import apply_repairs, repair
+from greybox.vessel.toml import load_vessel, vessel_from_dict
+
+KNOT = 1852 / 3600
+
+
+def earth(d, east_first=False):
+    c, s = np.cos(d["psi"]), np.sin(d["psi"])
+    n, e = c * d["u"] - s * d["v"], s * d["u"] + c * d["v"]
+    return {**d, "u": e if east_first else n, "v": n if east_first else e}
+
+
+def swap(d, a, b):
+    return {**d, a: d[b], b: d[a]}
+
+
+def negate(d, *names):
+    return {**d, **{n: -d[n] for n in names}}
+
+
+PLANTED = {
+    "earth-fixed": (earth, "frame", {"u", "v"}),
+    "east before north": (lambda d: earth(d, True), "frame", {"u", "v"}),
+    "heading in degrees, wrapped": (
+        lambda d: {**d, "psi": np.degrees(d["psi"]) % 360}, "unit", {"psi"},
+    ),
+    "rate in degrees": (lambda d: {**d, "r": np.degrees(d["r"])}, "unit", {"r"}),
+    "knots": (lambda d: {**d, "u": d["u"] / KNOT, "v": d["v"] / KNOT}, "unit", {"u", "v"}),
+    "surge in knots": (lambda d: {**d, "u": d["u"] / KNOT}, "unit", {"u"}),
+    "azimuth in degrees": (
+        lambda d: {**d, "alpha1": np.degrees(d["alpha1"])}, "unit", {"alpha1"},
+    ),
+    "sway reversed": (lambda d: negate(d, "v"), "sign", {"v"}),
+    "surge reversed": (lambda d: negate(d, "u"), "sign", {"u"}),
+    "rate reversed": (lambda d: negate(d, "r"), "sign", {"r"}),
+    "heading anticlockwise": (lambda d: negate(d, "psi"), "sign", {"psi"}),
+    "west for east": (lambda d: negate(d, "y_n"), "sign", {"y_n"}),
+    "surge and sway swapped": (lambda d: swap(d, "u", "v"), "sign", {"u", "v"}),
+    "north and east swapped": (lambda d: swap(d, "x_n", "y_n"), "sign", {"x_n", "y_n"}),
+    "heading and rate swapped": (lambda d: swap(d, "psi", "r"), "sign", {"psi", "r"}),
+    "heading from east": (lambda d: {**d, "psi": np.pi / 2 - d["psi"]}, "frame", {"psi"}),
+    "azimuths swapped": (lambda d: swap(d, "alpha1", "alpha2"), "sign", {"alpha1", "alpha2"}),
+    "azimuth reversed": (lambda d: negate(d, "alpha1"), "sign", {"alpha1"}),
+    "wind, not velocity through it": (lambda d: negate(d, "u_q", "v_q"), "sign", {"u_q", "v_q"}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", PLANTED)
+def test_a_planted_defect_is_found_alone(name, ship):
+    plant, kind, channels = PLANTED[name]
+    log = as_recording(plant(recorded(list(PLANTED).index(name), 2.0)))
+    report = check_recording(log, ship)
+    assert [(f.id, set(f.channels)) for f in report.findings] == [(kind, channels)]
+    finding = report.findings[0]
+    mended = apply_repairs(log, [finding])
+    assert not check_recording(mended, ship).findings
+
+
+@pytest.mark.parametrize("rate", [1.0, 2.0, 5.0, 10.0])
+def test_a_clean_log_gives_no_finding(rate, ship):
+    report = check_recording(as_recording(recorded(40 + int(rate), rate)), ship)
+    assert not report.findings
+    assert [o.id for o in report.outcomes] == list(IDS)
+    assert all(o.status == "clean" for o in report.outcomes)
+
+
+@pytest.mark.parametrize(
+    ("channels", "late", "rate"),
+    [
+        (("psi",), 0.3, 2.0),
+        (("u", "v"), 0.6, 5.0),
+        (("x_n", "y_n"), 0.8, 1.0),
+        (("u",), 0.5, 5.0),
+        (("r",), 1.2, 5.0),
+        (("psi",), 3.0, 1.0),
+    ],
+)
+def test_latency_is_found_to_a_tenth_of_a_second(channels, late, rate, ship):
+    log = as_recording(recorded(60, rate, late=dict.fromkeys(channels, late)))
+    findings = check_recording(log, ship).findings
+    assert [(f.id, f.channels) for f in findings] == [("clock_offset", channels)]
+    found = findings[0]
+    assert abs(found.value - late) < (0.3 if channels == ("r",) else 0.1)
+    assert found.ci[0] < found.value < found.ci[1]
+    again = check_recording(apply_repairs(log, findings), ship)
+    assert not again.findings
+
+
+@pytest.mark.parametrize("arm", [(1.0, 0.0), (-0.7, 0.8), (4.0, -2.0)])
+def test_lever_arm(arm, ship):
+    log = as_recording(recorded(70, 2.0, arm=arm))
+    (found,) = check_recording(log, ship).findings
+    assert found.id == "lever_arm"
+    np.testing.assert_allclose(found.value, arm, atol=0.2)
+    told = vessel_from_dict(
+        {
+            "name": "told", "length": 30,
+            "thruster": [
+                {"type": "azimuth", "x": x, "speed": "n", "angle": a}
+                for x, a in ((9.0, "alpha1"), (-9.0, "alpha2"))
+            ],
+            "sensors": {"antenna": list(arm)},
+        }
+    )  # fmt: skip
+    assert not check_recording(log, told).findings
+    assert not check_recording(apply_repairs(log, [found]), ship).findings
+
+
+@pytest.mark.parametrize("degrees", [2.0, -5.0, 70.0])
+def test_heading_bias_is_not_taken_for_the_current(degrees, ship):
+    log = as_recording(recorded(80, 2.0, heading_bias=np.radians(degrees)))
+    (found,) = check_recording(log, ship).findings
+    assert found.id == "heading_bias"
+    assert not found.safe
+    assert abs(np.degrees(found.value) - degrees) < 0.5
+
+
+def test_two_defects_at_once(ship):
+    log = recorded(90, 5.0, late={"u": 0.7, "v": 0.7}, heading_bias=0.1)
+    found = {f.id: f for f in check_recording(as_recording(negate(log, "r")), ship).findings}
+    assert set(found) == {"sign", "clock_offset", "heading_bias"}
+    assert abs(found["clock_offset"].value - 0.7) < 0.1
+    assert abs(found["heading_bias"].value - 0.1) < 0.01
+
+
+def test_intervals_cover(ship):
+    """Twenty logs: of a 95 % interval at least fifteen cover (binomial chance below 1e-3)."""
+    late = 0.5
+    hits = 0
+    for seed in range(20):
+        log = as_recording(recorded(300 + seed, 1.0, late={"u": late, "v": late}, seconds=400))
+        f = next(f for f in check_recording(log, ship).findings if f.id == "clock_offset")
+        assert f.channels == ("u", "v")
+        hits += f.ci[0] <= late <= f.ci[1]
+    assert hits >= 15
+
+
+def test_without_a_velocity_sensor_a_bias_cannot_be_told(ship):
+    d = recorded(3, 2.0, heading_bias=0.05)
+    for name in ("u", "v", "r"):
+        del d[name]
+    report = check_recording(as_recording(d), ship)
+    assert not report.findings
+    said = {o.id: o for o in report.outcomes}
+    assert said["heading_bias"].status == "cannot tell"
+    assert "no velocity sensor of its own" in said["heading_bias"].sentence
+
+
+def test_on_one_course_a_bias_cannot_be_told_from_a_current():
+    rng = np.random.default_rng(5)
+    t = np.arange(0, 300, 0.5)
+    n = len(t)
+    columns = {
+        "t": t, "x_n": 2 * t + 0.05 * rng.standard_normal(n),
+        "y_n": 0.3 * t + 0.05 * rng.standard_normal(n), "psi": 0.002 * rng.standard_normal(n),
+        "u": 2 + 0.01 * rng.standard_normal(n), "v": 0.01 * rng.standard_normal(n),
+        "r": 0.002 * rng.standard_normal(n),
+    }  # fmt: skip
+    report = check_recording(as_recording(columns), load_vessel("thesis"))
+    assert not report.findings
+    said = {o.id: o.sentence for o in report.outcomes if o.status == "cannot tell"}
+    assert "cannot be told from a current" in said["heading_bias"]
+    assert "turns too little" in said["lever_arm"]
+
+
+def found_in(columns, ship):
+    return {f.id: f for f in check_recording(as_recording(columns), ship).findings}
+
+
+def test_times_that_repeat_and_go_back(ship):
+    d = recorded(1, 5.0)
+    d["t"] = d["t"].copy()
+    d["t"][100] = d["t"][99]
+    d["t"][[500, 501]] = d["t"][[501, 500]]
+    f = found_in(d, ship)
+    assert set(f) == {"duplicate_time"}
+    assert f["duplicate_time"].value == 2
+    assert "1 repeat the one before and 1 go back" in f["duplicate_time"].evidence
+
+
+def test_gap_nan_spike_stuck(ship):
+    d = recorded(2, 5.0)
+    keep = np.r_[0:1000, 1100:2000, 2050 : len(d["t"])]
+    d = {k: v[keep].copy() for k, v in d.items()}
+    d["u"][300] += 1.0
+    d["psi"][700:712] = np.nan
+    d["x_n"][1500:1600] = d["x_n"][1500]
+    f = found_in(d, ship)
+    assert set(f) == {"gap", "outlier", "nan", "stuck"}
+    assert f["gap"].value == pytest.approx(20.2)
+    assert "2 times" in f["gap"].evidence
+    assert (f["outlier"].channel, f["outlier"].value) == ("u", pytest.approx(1.0, abs=0.06))
+    assert (f["nan"].channel, f["nan"].value) == ("psi", 12)
+    assert (f["stuck"].channel, f["stuck"].value) == ("x_n", pytest.approx(19.8))
+    mended, fixed, left = repair(as_recording(d), ship, check_recording(as_recording(d), ship))
+    assert len(fixed) == 3
+    assert not left
+    assert set(found_ids(mended, ship)) == {"gap"}
+
+
+def found_ids(recording: Recording, ship):
+    return [f.id for f in check_recording(recording, ship).findings]
+
+
+def test_coarse_values(ship):
+    d = recorded(4, 10.0)
+    d["psi"] = np.radians(np.round(np.degrees(d["psi"]) / 5) * 5)
+    f = found_in(d, ship)
+    assert f["quantised"].channel == "psi"
+    assert f["quantised"].value == pytest.approx(np.radians(5))
+    d = recorded(4, 10.0)
+    scale = 10 ** np.floor(np.log10(np.abs(d["x_n"])))
+    d["x_n"] = np.round(d["x_n"] / scale, 2) * scale
+    d["x_n"] *= 1.0
+    report = check_recording(as_recording(d), ship)
+    assert all(f.channel == "x_n" for f in report.findings)
+
+
+def test_fixes_that_need_judgement_are_left(ship):
+    log = as_recording(recorded(80, 2.0, heading_bias=0.1))
+    report = check_recording(log, ship)
+    same, fixed, left = repair(log, ship, report)
+    assert not fixed
+    assert left[0].startswith("heading_bias (psi): subtract")
+    np.testing.assert_array_equal(same["psi"].value, log["psi"].value)
+    mended, fixed, _ = repair(log, ship, report, also=("heading_bias",))
+    assert len(fixed) == 1
+    assert not check_recording(mended, ship).findings
+    with pytest.raises(UsageError, match=r"no check .heading_bais.\. Did you mean .heading_bias."):
+        repair(log, ship, report, also=("heading_bais",))
+
+
+def test_signals_on_their_own_clocks(ship):
+    """Positions at 1 Hz, heading and rate at 10 Hz, velocities at 5 Hz, 0.4 s late."""
+    fast = recorded(6, 10.0, late={"u": 0.4, "v": 0.4})
+    every = {"x_n": 10, "y_n": 10, "u": 2, "v": 2, "psi": 1, "r": 1}
+    signals = tuple(
+        Signal(n, fast["t"][::k].copy(), fast[n][::k], None, n, True) for n, k in every.items()
+    )
+    (found,) = check_recording(Recording("mixed", signals), ship).findings
+    assert (found.id, found.channels) == ("clock_offset", ("u", "v"))
+    assert abs(found.value - 0.4) < 0.1
+
+
+ESSO = {
+    "name": "Esso Osaka model", "length": 3.0,
+    "thruster": [
+        {"type": "propeller_rudder", "x": -1.5, "speed": "n_prop [rps]",
+         "rudder": "delta_rudder [rad]"}
+    ],
+    "columns": {
+        "wind_velo_relative_mid [m/s]": {"name": "V_q", "unit": "m/s"},
+        "wind_dir_relative_mid [rad]": {"name": "dir_q", "unit": "rad"},
+    },
+}  # fmt: skip
+BLUEBOAT = {
+    "name": "BlueBoat", "length": 1.2,
+    "thruster": [
+        {"type": "fixed", "y": y, "speed": f"{side}_force"}
+        for side, y in (("left", -0.285), ("right", 0.285))
+    ],
+}  # fmt: skip
+TANKER = {
+    "name": "KVLCC2", "length": 7.0,
+    "thruster": [
+        {"type": "propeller_rudder", "x": -3.5, "speed": "n_rps", "rudder": "delta_deg"}
+    ],
+    "columns": {"delta_deg": {"name": "delta_deg", "unit": "deg"}},
+}  # fmt: skip
+
+
+def real(folder, vessel, name):
+    (report,) = check_files([folder / name], vessel_from_dict(vessel))
+    return report
+
+
+def test_velocities_of_the_tanker_model_are_late(data_folder):
+    report = real(data_folder, ESSO, "esso_osaka/turn_14-Sep-2020_14_16_04.csv")
+    late = next(f for f in report.findings if f.id == "clock_offset")
+    assert {"u", "v"} <= set(late.channels)
+    assert 0.5 < late.value < 1.3
+
+
+def test_velocities_of_the_benchmark_are_earth_fixed(data_folder):
+    for name in ("hsva_Z_10_05", "hsva_Z_20_10_P"):
+        report = real(data_folder, TANKER, f"kvlcc2/{name}.csv")
+        found = {f.id: f.channels for f in report.findings}
+        assert found == {"frame": ("u", "v"), "sign": ("delta_deg",)}
+    report = real(data_folder, TANKER, "kvlcc2/marin_tc_35.csv")
+    assert {"t", "x_n"} <= {f.channel for f in report.findings if f.id == "quantised"}
+
+
+def test_thrusters_of_the_catamaran_are_swapped(data_folder):
+    for number in (220, 230, 235):
+        report = real(data_folder, BLUEBOAT, f"blueboat/fixed_00000{number}.csv")
+        swapped = [f for f in report.findings if f.id == "sign"]
+        assert [f.channels for f in swapped] == [("left_force", "right_force")]
+        assert any("deg, since it reaches" in n for n in report.notes)
+
+
+def test_antenna_pair_of_the_drone_is_turned(data_folder):
+    for name in ("usv_202412051751", "usv_202412071021"):
+        report = real(data_folder, BLUEBOAT, f"nmea/{name}.nmea")
+        (bias,) = (f for f in report.findings if f.id == "heading_bias")
+        assert -80 < np.degrees(bias.value) < -65
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("wide", [False, True])
+def test_false_findings_are_rare(wide, ship):
+    """At most 2 % false findings per check, plus the binomial error of 120 logs."""
+    count: dict[str, int] = {}
+    logs = 120
+    for seed in range(logs):
+        rate = (1.0, 2.0, 5.0, 10.0)[seed % 4]
+        report = check_recording(as_recording(recorded(1000 + seed, rate, wide=wide)), ship)
+        for kind in {f.id for f in report.findings}:
+            count[kind] = count.get(kind, 0) + 1
+    limit = 0.02 * logs + 2 * np.sqrt(0.02 * 0.98 * logs)
+    assert all(c <= limit for c in count.values()), count
