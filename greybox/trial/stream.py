@@ -35,7 +35,7 @@ from greybox.trial.readers.formats import open_raw
 from greybox.trial.readers.table import Batch, TableFile
 from greybox.trial.recording import Recording, SourceFile
 from greybox.trial.repair import repair
-from greybox.trial.survey import Survey, survey_table
+from greybox.trial.scan import Scan, scan_table
 from greybox.trial.writing import record_path, write_log
 from greybox.vessel.vessel import Vessel
 
@@ -146,8 +146,8 @@ def _in_blocks(
     options: ImportOptions,
     extra: Mapping[str, Any] | None,
 ) -> str:
-    survey = survey_table(table, vessel, options)
-    stream = _Stream(table, vessel, options, survey)
+    scan = scan_table(table, vessel, options)
+    stream = _Stream(table, vessel, options, scan)
     write_log(stream.segments(), out, extra=extra, provenance=stream.provenance)
     assert stream.first is not None
     notes = [*stream.provenance().read, *stream.provenance().derived]
@@ -164,9 +164,9 @@ class _Stream:
     """The second pass over a table: what one block leaves to the next."""
 
     def __init__(
-        self, table: TableFile, vessel: Vessel, options: ImportOptions, survey: Survey
+        self, table: TableFile, vessel: Vessel, options: ImportOptions, scan: Scan
     ) -> None:
-        self.table, self.vessel, self.options, self.survey = table, vessel, options, survey
+        self.table, self.vessel, self.options, self.scan = table, vessel, options, scan
         self.first: TrialLog | None = None
         self.samples = 0
         self.spans: list[tuple[float, float]] = []
@@ -178,16 +178,14 @@ class _Stream:
     @property
     def halo(self) -> float:
         """Time that blocks share, so that no filter sees a block's end [s]."""
-        plan = self.survey.plan
+        plan = self.scan.plan
         slowest = max(plan.periods.values())
-        return 8 * (plan.sample_time + slowest) + 2 * self.options.window + self.survey.back
+        return 8 * (plan.sample_time + slowest) + 2 * self.options.window + self.scan.back
 
     def provenance(self) -> Provenance:
         """Return where the log came from, with all that is known by now."""
-        notes = dict.fromkeys([*self.table.notes, *self.survey.notes, *gap_notes(self.spans, 0)])
-        whole = Recording(
-            self.table.path.stem, (), epoch=self.survey.scale.epoch, files=(self.file,)
-        )
+        notes = dict.fromkeys([*self.table.notes, *self.scan.notes, *gap_notes(self.spans, 0)])
+        whole = Recording(self.table.path.stem, (), epoch=self.scan.scale.epoch, files=(self.file,))
         return make_provenance(whole, self.options, list(notes), list(self.derived))
 
     def segments(self) -> Iterator[TrialLog]:
@@ -198,8 +196,8 @@ class _Stream:
         LogError
             A row cannot be read, or there is no piece.
         """
-        survey, plan = self.survey, self.survey.plan
-        columns = [a.raw for a in survey.assigned.values()]
+        scan, plan = self.scan, self.scan.plan
+        columns = [a.raw for a in scan.assigned.values()]
         held: dict[str, list[NDArray[Any]]] = {c: [] for c in columns}
         fresh = 0
         for batch in chain(self.table.batches(columns), [None]):
@@ -221,10 +219,10 @@ class _Stream:
 
     def _block(self, block: Batch, *, last: bool) -> tuple[int, list[TrialLog]]:
         """Return the first row that the next block needs, and the pieces of this one."""
-        survey, plan = self.survey, self.survey.plan
-        raw = batch_recording(self.table, block, survey.assigned, survey.scale, self.vessel)
-        recording = canonical(raw, survey.assigned, self.vessel)
-        t = survey.scale.seconds(block[survey.assigned["t"].raw])
+        scan, plan = self.scan, self.scan.plan
+        raw = batch_recording(self.table, block, scan.assigned, scan.scale, self.vessel)
+        recording = canonical(raw, scan.assigned, self.vessel)
+        t = scan.scale.seconds(block[scan.assigned["t"].raw])
         finite = t[np.isfinite(t)]
         if not len(finite):
             return len(t), []
@@ -244,11 +242,11 @@ class _Stream:
         return start, pieces
 
     def _pieces(self, recording: Recording, stop: int) -> list[TrialLog]:
-        survey, plan = self.survey, self.survey.plan
+        scan, plan = self.scan, self.scan.plan
         if stop <= self.done:
             return []
         notes: list[str] = []
-        signals = clean_signals(recording, survey.origin, notes)
+        signals = clean_signals(recording, scan.origin, notes)
         # samples beside those wanted, so that stretches do not end where the block does
         margin = _MARGIN + int(np.ceil(self.options.window / plan.sample_time))
         span = (max(self.done - margin, 0), min(stop + margin, plan.count))

@@ -301,7 +301,7 @@ def test_a_large_file_whose_time_starts_again(tmp_path, monkeypatch):
     table = large("plain")
     pd.concat([table, table]).to_csv(tmp_path / "raw.csv", index=False)
     monkeypatch.setattr(stream, "_LARGE_CELLS", 0)
-    monkeypatch.setattr("greybox.trial.survey._MAX_BACK_ROWS", 1000)
+    monkeypatch.setattr("greybox.trial.scan._MAX_BACK_ROWS", 1000)
     with pytest.raises(LogError, match=r"goes back by 899.9 s, at most 100 s"):
         stream.import_files([tmp_path / "raw.csv"], VESSEL, tmp_path / "a.csv")
     assert not (tmp_path / "a.csv").exists()

@@ -35,7 +35,7 @@ _MAX_BACK_ROWS = 10_000
 
 
 @dataclass(frozen=True)
-class Survey:
+class Scan:
     """What must be known of a table before its first block can be imported.
 
     Parameters
@@ -59,7 +59,7 @@ class Survey:
     notes: tuple[str, ...]
 
 
-def survey_table(table: TableFile, vessel: Vessel, options: ImportOptions) -> Survey:
+def scan_table(table: TableFile, vessel: Vessel, options: ImportOptions) -> Scan:
     """Read a table once and decide on the samples of its log.
 
     Raises
@@ -108,7 +108,7 @@ def survey_table(table: TableFile, vessel: Vessel, options: ImportOptions) -> Su
             f"{found.repeated} row{'s' if found.repeated > 1 else ''} repeat a time: "
             f"the first is kept"
         )
-    return Survey(decided, found.scale, found.origin, found.back, plan, (*notes, *plan.notes))
+    return Scan(decided, found.scale, found.origin, found.back, plan, (*notes, *plan.notes))
 
 
 class _Parts:
