@@ -77,8 +77,8 @@ _CANDIDATES = (
     Candidate("clock_offset", ("r",), 2.5),
     Candidate("clock_offset", ("x_n", "y_n")),
     Candidate("clock_offset", ("u", "v")),
-    Candidate("clock_offset", ("psi", "r"), 4.0),
-    Candidate("clock_offset", ("u", "v", "r"), 4.0),
+    Candidate("clock_offset", ("psi", "r"), 8.0),
+    Candidate("clock_offset", ("u", "v", "r"), 6.0),
     Candidate("clock_offset", ("u",), 3.0),
     Candidate("clock_offset", ("v",), 3.0),
     Candidate("clock_offset", ("x_n",), 30.0),
@@ -168,6 +168,7 @@ class Tie:
             swept[a:b] = _beyond(t - behind, t, swept[a:b])
         seconds = max(_HEADING_WINDOW, 5 * self.motion.step)
         self.smooth["psi"] = swept + smooth(self.motion["psi"] - swept, self.motion, seconds)
+        self.calm = self.smooth["psi"]
 
     def weigh(self, what: str) -> Callable[[float], Array]:
         """Return gain -> weights of the innovations of ``position`` or ``heading``.
