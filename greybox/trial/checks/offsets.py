@@ -42,6 +42,8 @@ _LEAST_GAIN = 5.5
 # wide enough to see a whole turn, which tells a late compass from a lever arm
 _SCAN = (-8.0, -6.0, -4.5, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 4.5, 6.0, 8.0)
 _MOST_LATE = 9.0
+# in log-likelihood: what differs by less explains alike
+_NEARLY = 10.0
 _FAR_COST = 6.0
 _ROUNDS = 12
 _MOST = 3
@@ -460,8 +462,9 @@ def find_offsets(motion: Motion, vessel: Vessel) -> tuple[list[Finding], list[Ou
     plain = _gain(tie, start, _gain(tie, start))
     best = Fit(start, (), np.zeros((0, 0)), plain.loglik, np.zeros(0))
     inflation = max(1.0, 0.1 / motion.step)
+    first: list[tuple[float, Fit]] = []
     for _ in range(_MOST):
-        trials = []
+        trials: list[tuple[float, Fit]] = []
         for c in usable:
             if any(c.id == k.id and set(c.channels) & set(k.channels) for k in chosen):
                 continue
@@ -474,15 +477,67 @@ def find_offsets(motion: Motion, vessel: Vessel) -> tuple[list[Finding], list[Ou
             trials.append((trial.loglik - cost, trial))
         if not trials:
             break
-        worth, trial = max(trials, key=_first)
+        first = first or trials
+        worth, trial = _preferred(trials, vessel, antenna, inflation)
         if worth - best.loglik < _LEAST_GAIN * inflation:
             break
         chosen = trial.candidates
         tie.align(trial.state)
         best = fit(tie, chosen, trial.state)
-    best = _exchanged(tie, _without_one(tie, best, start, inflation), usable, inflation)
+    best = _without_one(tie, _pruned(tie, best, start, vessel, antenna), start, inflation)
+    best = _exchanged(tie, best, usable, inflation)
+    best = _simplest(tie, best, usable, start, inflation)
     final = _pruned(tie, best, start, vessel, antenna)
-    return _findings(final, motion, vessel, antenna), _outcomes(tie, final, usable)
+    rivals = _rivals(first, final, vessel, antenna, inflation)
+    findings = _findings(final, motion, vessel, antenna)
+    if rivals:
+        findings = [replace(f, evidence=f"{f.evidence}; {rivals}") for f in findings]
+    return findings, _outcomes(tie, final, usable)
+
+
+def _preferred(
+    trials: list[tuple[float, Fit]], vessel: Vessel, antenna: tuple[float, ...], inflation: float
+) -> tuple[float, Fit]:
+    """Return the best trial; of those nearly as good, one that is large enough to report."""
+    best = max(trials, key=_first)
+    large = [
+        t
+        for t in trials
+        if _worth(t[1], len(t[1].candidates) - 1, vessel, antenna) >= 1.0
+        and t[0] > best[0] - _NEARLY * inflation
+    ]
+    return max(large, key=_first) if large else best
+
+
+def _rivals(
+    first: list[tuple[float, Fit]],
+    found: Fit,
+    vessel: Vessel,
+    antenna: tuple[float, ...],
+    inflation: float,
+) -> str:
+    """Say what else would explain as much, where one defect was found."""
+    if len(found.candidates) != 1:
+        return ""
+    mine = _net(found, inflation)
+    said = []
+    for worth, trial in sorted(first, key=_first, reverse=True):
+        c = trial.candidates[0]
+        alike = set(c.channels) & set(found.candidates[0].channels) and c.id == "clock_offset"
+        if c == found.candidates[0] or (alike and found.candidates[0].id == c.id):
+            continue
+        if worth < mine - _NEARLY * inflation or _worth(trial, 0, vessel, antenna) < 1.0:
+            continue
+        if c.id == "clock_offset":
+            late = trial.state.late[c.channels[0]]
+            said.append(f"{' and '.join(c.channels)} {late:+.2f} s late")
+        elif c.id == "lever_arm":
+            said.append(f"an antenna at ({trial.state.arm[0]:.2f}, {trial.state.arm[1]:.2f}) m")
+        else:
+            said.append(f"a heading bias of {np.degrees(trial.state.bias):.1f} deg")
+    if not said:
+        return ""
+    return f"{' or '.join(said[:2])} would explain nearly as much of this motion"
 
 
 def _exchanged(tie: Tie, found: Fit, usable: list[Candidate], inflation: float) -> Fit:
@@ -503,6 +558,20 @@ def _exchanged(tie: Tie, found: Fit, usable: list[Candidate], inflation: float) 
             state = _restored(found.state, old, found.state)
             trial = fit(tie, (*others, new), state)
             if _net(trial, inflation) > worth + 2.0 * inflation:
+                best, worth = trial, _net(trial, inflation)
+    return best
+
+
+def _simplest(tie: Tie, found: Fit, usable: list[Candidate], start: State, inflation: float) -> Fit:
+    """Return one late sensor in place of several defects where it explains nearly as much."""
+    extra = len(found.candidates) - 1
+    if extra < 1:
+        return found
+    best, worth = found, _net(found, inflation) - extra * _NEARLY * inflation
+    for c in usable:
+        if c.id == "clock_offset":
+            trial = fit(tie, (c,), _scan(tie, c, start))
+            if _net(trial, inflation) > worth:
                 best, worth = trial, _net(trial, inflation)
     return best
 
