@@ -78,7 +78,12 @@ def check_recording(
     findings += missing_findings(recording)
     findings += angle_unit_findings(recording, vessel)
     whole = derive_signals(apply_repairs(recording, findings))
-    rows = [*stuck_findings(whole, vessel), *spike_findings(whole), *coarse_findings(whole)]
+    measured = _independent(whole, derived)
+    rows = [
+        *stuck_findings(measured, vessel),
+        *spike_findings(measured),
+        *coarse_findings(measured),
+    ]
     findings += rows
     steady = apply_repairs(whole, [f for f in rows if f.safe])
     independent = _independent(steady, derived)

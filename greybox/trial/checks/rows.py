@@ -255,7 +255,12 @@ def _digits(value: Array) -> int:
     if len(part) < 50 or part.max() < 30 * np.quantile(part, 0.01):
         return 0
     scale = 10.0 ** np.floor(np.log10(part))
+    small = part[part < 0.1 * part.max()]
     for digits in (2, 3, 4):
+        top = 10.0 ** (np.floor(np.log10(part.max())) + 1 - digits)
+        # steps that are the same for small values are decimals, not digits
+        if not len(small) or np.mean(np.abs(small / top - np.round(small / top)) < 1e-6) > 0.5:
+            continue
         grid = scale * 10.0 ** (1 - digits)
         if np.mean(np.abs(part / grid - np.round(part / grid)) < 1e-6) > 0.995:
             return digits
