@@ -22,6 +22,8 @@ MOTION = ("x_n", "y_n", "psi", "u", "v", "r", "v_n", "v_e", "u_q", "v_q")
 _SPIKE = 10.0
 _LOCAL_SPIKE = 7.0
 _SPIKE_WIDTH = 3
+# steps of rounded values that matter, as a share of the signal's spread
+_COARSE = 0.004
 # a sensor that is stuck repeats itself this long
 _STUCK_SECONDS = 3.0
 _STUCK_SAMPLES = 8
@@ -267,9 +269,12 @@ def _digits(value: Array) -> int:
     return 0
 
 
-def _rounded_finding(name: str, t: Array, value: Array, unit: str, digits: int) -> Finding:
+def _rounded_finding(
+    name: str, t: Array, value: Array, unit: str, digits: int, per: float = 1.0
+) -> Finding:
+    """Return the finding; `per` is the unit in which the digits were counted."""
     largest = float(np.abs(value).max())
-    step = float(10.0 ** (np.floor(np.log10(largest)) + 1 - digits))
+    step = per * float(10.0 ** (np.floor(np.log10(largest / per)) + 1 - digits))
     return Finding(
         "quantised",
         name,
@@ -277,7 +282,7 @@ def _rounded_finding(name: str, t: Array, value: Array, unit: str, digits: int) 
         (step, step),
         unit,
         f"{name} was written with {digits} significant digits: at {largest:.4g} {unit} it moves in "
-        f"steps of {step:g} {unit}",
+        f"steps of {step:.3g} {unit}",
         "export it again with all its digits; what depends on fine differences of it is lost",
         (name,),
         (),
@@ -302,7 +307,11 @@ def coarse_findings(recording: Recording) -> list[Finding]:
         step = _quantum(value)
         digits = _digits(_wrapped(s)) if step <= 0 else 0
         if digits and (digits < 4 or np.mean(np.diff(value) == 0) > 0.3):
-            found.append(_rounded_finding(s.name, t, value, s.unit or "1", digits))
+            degrees = s.name in ANGLES | {"r"} and not _digits(s.value[np.isfinite(s.value)])
+            per = np.pi / 180 if degrees else 1.0
+            coarse = _rounded_finding(s.name, t, value, s.unit or "1", digits, per)
+            if isinstance(coarse.value, float) and coarse.value > _COARSE * np.std(value):
+                found.append(coarse)
             continue
         if step <= 0 or len(value) < 50:
             continue
