@@ -93,11 +93,17 @@ def run(options: argparse.Namespace) -> None:
     """Read, merge, mend, resample, write."""
     from pathlib import Path
 
+    from greybox.errors import UsageError
     from greybox.files import check_targets, write_json
     from greybox.trial.stream import import_files
     from greybox.trial.writing import read_record, record_path
     from greybox.vessel.toml import load_vessel
 
+    if Path(options.out).suffix.lower() not in ("", ".csv", ".parquet", ".pq"):
+        raise UsageError(
+            f"--out {options.out} ends in '{Path(options.out).suffix}': name a log that ends in "
+            f".csv or .parquet."
+        )
     check_targets(options.out, record_path(options.out), options.json)
     vessel = load_vessel(options.vessel)
     summary = import_files(

@@ -22,6 +22,8 @@ from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
 
+MOTION = frozenset({"x_n", "y_n", "psi", "u", "v", "r", "v_n", "v_e", "lat", "lon", "sog"})
+
 # UNIX time is past 1e8 s since 1973, a log's own clock hardly ever is
 _EPOCH = 1e8
 # seconds past it are the year 5138: it is in milliseconds
@@ -209,6 +211,15 @@ def batch_recording(
             notes.append(f"column '{a.raw}' holds words or dates, not numbers: left out")
         else:
             signals.append(Signal(a.raw, t, batch[a.raw], a.unit, f"column '{a.raw}'"))
+    used = {a.raw for a in assigned.values()}
+    ignored = [c for c in table.columns if c not in used]
+    if ignored:
+        more = f" and {len(ignored) - 12} more" if len(ignored) > 12 else ""
+        notes.append(f"columns not used: {', '.join(ignored[:12])}{more}")
+    if not set(assigned) & MOTION:
+        notes.append(
+            "no position, heading or velocity was recognised: map their columns in [columns]"
+        )
     return Recording(table.path.stem, tuple(signals), text, scale.epoch, notes=tuple(notes))
 
 

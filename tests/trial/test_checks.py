@@ -175,6 +175,57 @@ def test_on_one_course_a_bias_cannot_be_told_from_a_current():
     assert "turns too little" in said["lever_arm"]
 
 
+@pytest.mark.parametrize("course", [45, 135, 225, 315])
+def test_no_course_makes_a_clean_log_wrong(course, ship):
+    """Both positions grow alike on a course north-east or south-west."""
+    d = recorded(8, 2.0)
+    keep = slice(0, 400)
+    psi = np.radians(course) + 0.3 * np.sin(d["t"][keep] / 20)
+    r = np.gradient(psi, d["t"][keep])
+    u, v = 2 + 0.2 * np.sin(d["t"][keep] / 13), 0.1 * np.cos(d["t"][keep] / 17)
+    north = np.cos(psi) * u - np.sin(psi) * v
+    east = np.sin(psi) * u + np.cos(psi) * v
+    rng = np.random.default_rng(course)
+
+    def way(rate):
+        return np.concatenate([[0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * 0.5)])
+
+    columns = {"t": d["t"][keep], "x_n": way(north), "y_n": way(east), "psi": psi, "u": u, "v": v,
+               "r": r}  # fmt: skip
+    std = {"x_n": 0.05, "y_n": 0.05, "psi": 0.01, "u": 0.014, "v": 0.014, "r": 0.014}
+    noisy = {k: x + std.get(k, 0.0) * rng.standard_normal(len(x)) for k, x in columns.items()}
+    assert not check_recording(as_recording(noisy), ship).findings
+
+
+def test_a_reversed_propeller_before_a_rudder_is_no_crash():
+    d = recorded(9, 2.0)
+    ship = vessel_from_dict(
+        {"name": "s", "length": 30,
+         "thruster": [{"type": "propeller_rudder", "x": -14.0, "speed": "n", "rudder": "delta"}]}
+    )  # fmt: skip
+    columns = {k: x for k, x in d.items() if not k.startswith("alpha")}
+    columns |= {"n": -d["n"], "delta": d["alpha1"] - 0.85}
+    report = check_recording(as_recording(columns), ship)
+    assert all(f.id == "sign" for f in report.findings)
+
+
+def test_whole_degrees_are_coarse(ship):
+    d = recorded(4, 1.0)
+    d["psi"] = np.radians(np.round(np.degrees(d["psi"])))
+    (found,) = check_recording(as_recording(d), ship).findings
+    assert (found.id, found.channel) == ("quantised", "psi")
+    assert found.value == pytest.approx(np.radians(1.0))
+
+
+def test_a_spike_of_the_position_under_way(ship):
+    d = recorded(12, 1.0)
+    d["x_n"] = d["x_n"].copy()
+    d["x_n"][[100, 300]] += 5.0
+    (found,) = check_recording(as_recording(d), ship).findings
+    assert (found.id, found.channel) == ("outlier", "x_n")
+    assert found.value == pytest.approx(5.0, abs=0.4)
+
+
 def found_in(columns, ship):
     return {f.id: f for f in check_recording(as_recording(columns), ship).findings}
 

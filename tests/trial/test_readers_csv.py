@@ -80,7 +80,7 @@ def test_rows_are_neither_lost_nor_doubled(tmp_path, rows):
 
 def test_aligned_columns_with_decimal_commas(tmp_path):
     wanted = frame().round(4)
-    text = wanted.to_string(index=False, decimal=",").replace("\n", " \n")
+    text = wanted.to_string(index=False, decimal=",").replace("\n", " \n") + "\n"
     found, _ = read(written(tmp_path / "x.txt", text))
     np.testing.assert_allclose(found, wanted, atol=1e-4)
 
@@ -133,8 +133,16 @@ def test_damaged_cells_and_rows_are_counted(tmp_path):
     found, table = read(written(tmp_path / "x.csv", text))
     assert len(found) == 47
     assert np.isnan(found["u"][4])
-    assert "4 rows with another number of fields than the 9 of the header left out" in table.notes
+    assert "3 rows with another number of fields than the 9 of the header left out" in table.notes
+    assert "the last line has no end: left out, since it may be cut" in table.notes
     assert "column 'u' holds words in 1 row: read as missing" in table.notes
+
+
+def test_half_a_number_at_the_end_is_no_number(tmp_path):
+    whole = frame().to_csv(index=False)
+    found, table = read(written(tmp_path / "x.csv", whole[:-5].encode()))
+    assert len(found) == len(frame()) - 1
+    assert table.notes == ["the last line has no end: left out, since it may be cut"]
 
 
 def test_numbers_as_people_write_them(tmp_path):

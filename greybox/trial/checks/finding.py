@@ -132,9 +132,11 @@ class CheckReport:
     def summary(self) -> str:
         """Return the findings as text."""
         count = len(self.findings)
-        lines = [
-            f"{self.name}: " + (f"{count} finding{'s' if count > 1 else ''}" if count else "clean")
-        ]
+        untold = sum(o.status == "cannot tell" for o in self.outcomes)
+        verdict = f"{count} finding{'s' if count > 1 else ''}" if count else "clean"
+        if untold and not count:
+            verdict = f"nothing found, but {untold} of {len(self.outcomes)} checks cannot tell"
+        lines = [f"{self.name}: {verdict}"]
         for f in self.findings:
             lines.append(f"  {f.id} ({', '.join(f.channels or (f.channel,))}): {size_in_words(f)}")
             lines.append(f"    {f.evidence}")

@@ -214,6 +214,7 @@ def find_reading(motion: Motion) -> Reading:
     turned = _turned(motion)
     if motion.positioned:
         ranked.append(((turned,), scorer.score((turned,)), turned.cost))
+        ranked += [((c,), scorer.score((c,)), c.cost) for c in _late(motion)]
     for a, b in combinations(usable, 2):
         if a.group == b.group or set(a.channels) & set(b.channels):
             continue
@@ -229,9 +230,18 @@ def find_reading(motion: Motion) -> Reading:
     if changes == (turned,):
         # no frame, sign or unit is at fault but the compass: its bias is estimated later
         return Reading((), motion, 0.0)
-    silent = _silent(changes)
-    if silent.channels and score - scorer.score((*changes, silent)) < _LEAST_GAIN:
+    if changes[0].group == "late":
+        # a late sensor, which is estimated later
+        return Reading((), motion, 0.0)
+    kept = []
+    for change in changes:
+        silent = _silent((change,))
         # whatever shrinks a channel shrinks its noise: it must explain more than nothing would
+        if not silent.channels or score - scorer.score((*changes, silent)) >= _LEAST_GAIN:
+            kept.append(change)
+    changes = tuple(kept)
+    gain = scorer.score(changes) - base
+    if not changes:
         return Reading((), motion, 0.0)
     return Reading(changes, read(motion, changes), float(gain))
 
@@ -301,6 +311,33 @@ def _turned(m: Motion) -> Change:
     )  # fmt: skip
 
 
+def _late(motion: Motion) -> list[Change]:
+    """Return readings with some channels moved in time, so that lateness is no frame or unit."""
+
+    def shifted(names: tuple[str, ...], late: float) -> Callable[[Values], Values]:
+        def apply(x: Values) -> Values:
+            moved = dict(x)
+            for n in names:
+                moved[n] = x[n].copy()
+                for a, b in motion.stretches:
+                    t = motion.t[a:b]
+                    moved[n][a:b] = np.interp(t + late, t, x[n][a:b])
+            return moved
+
+        return apply
+
+    found = []
+    for names in (("psi",), ("u", "v"), ("x_n", "y_n")):
+        for late in (-3.0, -2.0, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0, 3.0, 4.5):
+            words = f"{' and '.join(names)} {late:g} s late"
+            found.append(
+                Change(
+                    "sign", "late", names, shifted(names, late), (), words, "", late, "s", cost=1.3
+                )
+            )
+    return found
+
+
 def _silent(changes: tuple[Change, ...]) -> Change:
     names = tuple(n for c in changes for n in c.channels if n in ("u", "v", "r"))
     return Change(
@@ -349,7 +386,7 @@ class _Scorer:
 
 def _order(change: Change) -> int:
     # the heading must be right before velocities are turned by it
-    if change.group in ("turned", "silent"):
+    if change.group in ("turned", "silent", "late"):
         return 2
     return 1 if change.id == "frame" and change.group == "velocity" else 0
 
@@ -359,13 +396,14 @@ def _position_score(m: Motion, level: Array) -> float:
     position = np.column_stack([m["x_n"], m["y_n"]])
     drift = (m.t - m.t[0])[:, None]
     # a reading is judged per metre, so that one in kilometres has no advantage
-    scale = float(np.std(np.diff(position, axis=0))) or 1.0
+    # the size of all steps together stays the same whatever is reversed or exchanged
+    scale = float(np.sqrt(np.mean(np.diff(position, axis=0) ** 2))) or 1.0
     found = profile((position - walked) / scale, np.hstack([level, drift]), m)
     return found.loglik
 
 
 def _heading_score(m: Motion, level: Array) -> float:
-    scale = float(np.std(np.diff(m["psi"]))) or 1.0
+    scale = float(np.sqrt(np.mean(np.diff(m["psi"]) ** 2))) or 1.0
     drift = (m.t - m.t[0])[:, None]
     rest = (m["psi"] - integrate(m["r"], m)) / scale
     return profile(rest, np.hstack([level, drift]), m).loglik

@@ -44,7 +44,10 @@ _SCAN = (-8.0, -6.0, -4.5, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 4.5, 6.0, 8.0)
 _MOST_LATE = 9.0
 # in log-likelihood: what differs by less explains alike
 _NEARLY = 10.0
-_FAR_COST = 6.0
+_FAR_COST = 12.0
+_EARLY_COST = 3.0
+# an antenna stands on the ship, or hardly beyond it [ship lengths]
+_MOST_ARM = 0.8
 _ROUNDS = 12
 _MOST = 3
 # beyond this time the heading's own noise is averaged out
@@ -52,6 +55,7 @@ _HEADING_WINDOW = 5.0
 # beyond these nothing can be said
 _VAGUE_HEADING = np.radians(1.0)
 _VAGUE_CLOCK = 0.3
+_OWN_CLOCKS = (("psi",), ("r",), ("x_n", "y_n"), ("u", "v"))
 
 
 @dataclass(frozen=True)
@@ -472,8 +476,13 @@ def find_offsets(motion: Motion, vessel: Vessel) -> tuple[list[Finding], list[Ou
             if max(map(abs, trial.state.late.values()), default=0.0) > _MOST_LATE:
                 continue
             # a scan over many seconds finds more by chance than a search around zero
-            far = c.id == "clock_offset" and abs(trial.state.late[c.channels[0]]) > 2.0
-            cost = (c.cost + (_FAR_COST if far else 0.0)) * inflation
+            late = trial.state.late[c.channels[0]] if c.id == "clock_offset" else 0.0
+            if c.id == "lever_arm" and np.hypot(*trial.state.arm) > _MOST_ARM * vessel.length:
+                continue
+            cost = c.cost + (_FAR_COST if abs(late) > 2.0 else 0.0)
+            # a sensor is late, not early; only all the others can be, and then the positions are
+            cost = cost + (_EARLY_COST if late < 0 and "x_n" not in c.channels else 0.0)
+            cost *= inflation
             trials.append((trial.loglik - cost, trial))
         if not trials:
             break
@@ -798,7 +807,10 @@ def _outcomes(tie: Tie, found: Fit, usable: list[Candidate]) -> list[Outcome]:
                 Outcome(kind, "clean", "heading against yaw rate; no positions to tell which")
             )
             continue
-        if not members or kind == "clock_offset":
+        if kind == "clock_offset":
+            outcomes.append(_clock_outcome(tie, found, usable))
+            continue
+        if not members:
             outcomes.append(Outcome(kind, "clean", "positions, velocities and heading compared"))
             continue
         with_it = fit(tie, (*found.candidates, members[0]), found.state, rounds=1)
@@ -830,3 +842,23 @@ def _outcomes(tie: Tie, found: Fit, usable: list[Candidate]) -> list[Outcome]:
             )
             outcomes.append(Outcome(kind, "clean", f"standard error {error}"))
     return outcomes
+
+
+def _clock_outcome(tie: Tie, found: Fit, usable: list[Candidate]) -> Outcome:
+    """Say how well each clock is known, and which cannot be told."""
+    known: list[str] = []
+    vague: list[str] = []
+    for c in usable:
+        if c.id != "clock_offset" or c.channels not in _OWN_CLOCKS or c in found.candidates:
+            continue
+        fitted = fit(tie, (*found.candidates, c), found.state, rounds=1)
+        std = float(np.sqrt(fitted.covariance[-1, -1]))
+        words = f"{', '.join(c.channels)} {std:.2g} s"
+        (vague if std > _VAGUE_CLOCK else known).append(words)
+    if not known:
+        said = f"this motion tells no clock apart (standard errors: {'; '.join(vague)})"
+        return Outcome("clock_offset", "cannot tell", said)
+    said = f"standard errors: {'; '.join(known)}"
+    if vague:
+        said += f"; cannot tell: {'; '.join(vague)}"
+    return Outcome("clock_offset", "clean", said)

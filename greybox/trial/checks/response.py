@@ -89,10 +89,14 @@ def response_findings(
     best: tuple[float, _Alternative] | None = None
     for alternative in _alternatives(vessel, commands):
         found = problem.explained(vessel, _as_read(inputs, alternative))
-        changes = [found[s] - base[s] for s in found]
+        # a state that no force moves under one reading gains nothing by it
+        both = found.keys() | base.keys()
+        changes = [found.get(s, 0.0) - base.get(s, 0.0) for s in sorted(both)]
         gain = float(sum(changes))
         won, lost = sum(c for c in changes if c > 0), -sum(c for c in changes if c < 0)
-        clear = any(found[s] > _LEAST_RATIO * base[s] + _LEAST_GAIN / 2 for s in found)
+        clear = any(
+            found.get(s, 0.0) > _LEAST_RATIO * base.get(s, 0.0) + _LEAST_GAIN / 2 for s in both
+        )
         if clear and lost < _MOST_LOSS * won and (best is None or gain > best[0]):
             best = (gain, alternative)
     inflation = max(1.0, 0.2 / motion.step)

@@ -22,6 +22,12 @@ MOTION = ("x_n", "y_n", "psi", "u", "v", "r", "v_n", "v_e", "u_q", "v_q")
 _SPIKE = 10.0
 _LOCAL_SPIKE = 7.0
 _SPIKE_WIDTH = 3
+# a coarse signal has steps larger than its noise, and large enough to matter
+_LEAST_STEP = 1.2
+_MATERIAL = {
+    "psi": 0.0035, "r": 0.0035, "x_n": 0.1, "y_n": 0.1, "u": 0.02, "v": 0.02, "v_n": 0.02,
+    "v_e": 0.02,
+}  # fmt: skip
 # steps of rounded values that matter, as a share of the signal's spread
 _COARSE = 0.004
 # a sensor that is stuck repeats itself this long
@@ -182,8 +188,9 @@ def spike_findings(recording: Recording) -> list[Finding]:
                 size,
                 (size - half, size + half),
                 s.unit or "1",
-                f"{len(spikes)} sample{'s' if len(spikes) > 1 else ''} of {s.name} stand out of "
-                f"their neighbours, the largest by {size:.3g} {s.unit} at t = {t[worst]:.6g} s, "
+                f"{len(spikes)} sample{'s' if len(spikes) > 1 else ''} of {s.name} "
+                f"stand{'' if len(spikes) > 1 else 's'} out of the neighbours, the "
+                f"largest by {size:.3g} {s.unit} at t = {t[worst]:.6g} s, "
                 f"where the neighbours scatter by {scale:.2g}",
                 "leave those samples out (import --fix does; what is missing is bridged where "
                 "one sample is, else a gap)",
@@ -240,14 +247,22 @@ def _comes_back(value: Array, a: int, b: int) -> bool:
 
     A sharp turn at a coarse sample time bends too, but its neighbours move alike.
     """
-    before, after = value[max(a - 3, 0) : a], value[b : b + 3]
-    beside = np.concatenate([before, after])
-    if len(beside) < 4:
+    rows = np.concatenate([np.arange(max(a - 3, 0), a), np.arange(b, min(b + 3, len(value)))])
+    if len(rows) < 4:
         return False
-    part = value[a:b]
+    # a steady course is a slope: what counts is what stands out of it
+    slope, level = np.polyfit(rows - a, value[rows], 1)
+    flat = (
+        value[max(a - 3, 0) : b + 3]
+        - slope * (np.arange(max(a - 3, 0) - a, b + 3 - a))[: len(value[max(a - 3, 0) : b + 3])]
+        - level
+    )
+    first = a - max(a - 3, 0)
+    before, part, after = flat[:first], flat[first : first + b - a], flat[first + b - a :]
+    beside = np.concatenate([before, after])
     excess = float(max((part - beside.max()).max(), (beside.min() - part).max()))
     steps = max(float(np.abs(np.diff(side)).max()) for side in (before, after) if len(side) > 1)
-    return excess > 3 * max(steps, float(abs(value[min(b, len(value) - 1)] - value[a - 1])))
+    return excess > 3 * max(steps, float(abs(after[0] - before[-1])) if len(after) else 0.0)
 
 
 def _digits(value: Array) -> int:
@@ -322,7 +337,9 @@ def coarse_findings(recording: Recording) -> list[Finding]:
         # held samples of a slow sensor repeat too, but then jump by many steps
         still = 1.0 - moving.mean()
         single = float(np.mean(change[moving] < 1.5 * step))
-        if still < 0.5 or single < 0.5:
+        noise = _spikes(value)[1]
+        coarse = step > _LEAST_STEP * noise and step >= _MATERIAL.get(s.name, np.inf)
+        if not coarse and (still < 0.5 or single < 0.5):
             continue
         found.append(
             Finding(
@@ -331,8 +348,8 @@ def coarse_findings(recording: Recording) -> list[Finding]:
                 step,
                 (step, step),
                 s.unit or "1",
-                f"{s.name} moves in steps of {step:.4g} {s.unit} and repeats itself in "
-                f"{100 * still:.0f} % of the samples: its changes are finer than its steps",
+                f"{s.name} moves in steps of {step:.4g} {s.unit}, where its own noise is "
+                f"{noise:.2g} {s.unit}, and repeats itself in {100 * still:.0f} % of the samples",
                 "record it with more digits; until then use a longer sample time, and expect "
                 f"an error of {step / np.sqrt(12):.2g} {s.unit} (standard deviation)",
                 (s.name,),
@@ -357,7 +374,7 @@ def _quantum(value: Array) -> float:
     """Return the step of which all values are multiples; 0 where there is none."""
     part = value[: min(len(value), 20000)]
     unique = np.unique(part)
-    if not 3 <= len(unique) <= 0.3 * len(part) + 3:
+    if len(unique) < 3:
         return 0.0
     steps = np.diff(unique)
     fine = float(np.quantile(steps, 0.1))

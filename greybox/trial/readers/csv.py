@@ -65,8 +65,9 @@ class CsvFile:
         days = {c: cell_text.DayClock() for c in columns if c in self.clocks}
         rows = 0
         try:
+            clean = _Clean(self.path, self.encoding, blanks=self.delimiter == " ")
             reader = arrow.open_csv(
-                _Clean(self.path, self.encoding, blanks=self.delimiter == " "),
+                clean,
                 read_options=arrow.ReadOptions(
                     block_size=_BLOCK_BYTES,
                     column_names=list(self.columns),
@@ -94,6 +95,8 @@ class CsvFile:
                 f"cannot read '{self.path.name}' as CSV after {rows} rows: {reason}. "
                 f"Cut the file before that place, or export it again."
             ) from None
+        if clean.unfinished:
+            self._note("the last line has no end: left out, since it may be cut")
         count = broken["rows"]
         if count > rows:
             raise LogError(
@@ -180,6 +183,7 @@ class _Clean(RawIOBase):
         self._encoding, self._blanks = encoding, blanks
         self._rest = b""
         self._ready = memoryview(b"")
+        self.unfinished = False
 
     def readable(self) -> bool:
         """Whether it can be read, as Arrow asks."""
@@ -195,9 +199,11 @@ class _Clean(RawIOBase):
         while not len(self._ready):
             raw = self._file.read(_BLOCK_BYTES)
             block = raw if self._decode is None else self._decode(raw, not raw).encode()
-            if not raw and not self._rest and not block:
+            if not raw and not block:
+                # what has no end may be half a line, and half a number looks like a number
+                self.unfinished = bool(self._rest.strip())
                 return b""
-            cut = max(block.rfind(b"\n"), block.rfind(b"\r")) + 1 if raw else len(block)
+            cut = max(block.rfind(b"\n"), block.rfind(b"\r")) + 1
             if cut == 0 and len(self._rest) + len(block) < 2 * _BLOCK_BYTES and raw:
                 self._rest += block
                 continue

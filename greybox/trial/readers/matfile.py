@@ -21,9 +21,9 @@ import numpy as np
 from greybox.errors import LogError
 
 GIB = 2**30
-# bytes after decompression, over all variables
-MAX_BYTES = 2 * GIB
-# numbers over all variables: as float64 they fill the same 2 GiB
+# bytes after decompression, over all variables: three copies of them must fit beside the rest
+MAX_BYTES = GIB // 2
+# numbers over all variables: as float64 they fill the same space
 MAX_VALUES = MAX_BYTES // 8
 # variables, fields and cells: each costs far more memory than bytes in the file
 MAX_ITEMS = 500_000
