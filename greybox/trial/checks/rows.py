@@ -338,8 +338,8 @@ def coarse_findings(recording: Recording) -> list[Finding]:
         still = 1.0 - moving.mean()
         single = float(np.mean(change[moving] < 1.5 * step))
         noise = _spikes(value)[1]
-        coarse = step > _LEAST_STEP * noise and step >= _MATERIAL.get(s.name, np.inf)
-        if not coarse and (still < 0.5 or single < 0.5):
+        matters = step > _LEAST_STEP * noise and step >= _MATERIAL.get(s.name, np.inf)
+        if not matters and (still < 0.5 or single < 0.5):
             continue
         found.append(
             Finding(
