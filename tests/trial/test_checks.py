@@ -371,9 +371,9 @@ def test_antenna_pair_of_the_drone_is_turned(data_folder):
 @pytest.mark.long
 @pytest.mark.parametrize("wide", [False, True])
 def test_false_findings_are_rare(wide, ship):
-    """At most 2 % false findings per check, plus the binomial error of 120 logs."""
+    """At most 2 % false findings per check, plus the binomial error of 48 logs."""
     count: dict[str, int] = {}
-    logs = 120
+    logs = 48
     for seed in range(logs):
         rate = (1.0, 2.0, 5.0, 10.0)[seed % 4]
         report = check_recording(as_recording(recorded(1000 + seed, rate, wide=wide)), ship)
@@ -385,14 +385,14 @@ def test_false_findings_are_rare(wide, ship):
 
 @pytest.mark.long
 def test_planted_offsets_are_found(ship):
-    """At least 95 % found within 0.1 s, 0.2 m, 0.5 deg, less two binomial errors of 48 logs.
+    """At least 95 % found within 0.1 s, 0.2 m, 0.5 deg, less two binomial errors of 24 logs.
 
     A late yaw rate is left out: with the noise of (6.2) its clock has a standard
     error of 0.1 to 0.3 s on this ship, whatever the method.
     """
     channels = [("psi",), ("x_n", "y_n"), ("u", "v"), ("u",), ("v",)]
     found = {"clock_offset": 0, "lever_arm": 0, "heading_bias": 0}
-    logs = 48
+    logs = 24
     for k in range(logs):
         rng = np.random.default_rng([7, k])
         rate = (1.0, 2.0, 5.0, 10.0)[k % 4]

@@ -223,7 +223,7 @@ def find_reading(motion: Motion) -> Reading:
     worth = [score - penalty * cost for _, score, cost in ranked]
     changes, score, cost = ranked[int(np.argmax(worth))]
     gain = score - base
-    samples = scorer.samples
+    samples = scorer.judging(changes)
     share = 1.0 - np.exp(-2 * gain / samples) if samples else 0.0
     if not changes or share < _LEAST_SHARE * cost:
         return Reading((), motion, 0.0)
@@ -314,25 +314,28 @@ def _turned(m: Motion) -> Change:
 def _late(motion: Motion) -> list[Change]:
     """Return readings with some channels moved in time, so that lateness is no frame or unit."""
 
-    def shifted(names: tuple[str, ...], late: float) -> Callable[[Values], Values]:
+    # by whole samples: between samples the noise would be averaged, which looks like agreement
+    def shifted(names: tuple[str, ...], steps: int) -> Callable[[Values], Values]:
         def apply(x: Values) -> Values:
             moved = dict(x)
             for n in names:
                 moved[n] = x[n].copy()
                 for a, b in motion.stretches:
-                    t = motion.t[a:b]
-                    moved[n][a:b] = np.interp(t + late, t, x[n][a:b])
+                    rows = np.clip(np.arange(a, b) + steps, a, b - 1)
+                    moved[n][a:b] = x[n][rows]
             return moved
 
         return apply
 
     found = []
     for names in (("psi",), ("u", "v"), ("x_n", "y_n")):
-        for late in (-3.0, -2.0, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0, 3.0, 4.5):
+        delays = (-3.0, -2.0, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0, 3.0, 4.5)
+        for steps in sorted({round(late / motion.step) for late in delays} - {0}):
+            late = steps * motion.step
             words = f"{' and '.join(names)} {late:g} s late"
             found.append(
                 Change(
-                    "sign", "late", names, shifted(names, late), (), words, "", late, "s", cost=1.3
+                    "sign", "late", names, shifted(names, steps), (), words, "", late, "s", cost=1.3
                 )
             )
     return found
@@ -354,10 +357,16 @@ class _Scorer:
         motion = self.motion
         self.cache: dict[tuple[str, tuple[str, ...]], float] = {}
         self.level = levels(motion)
-        n = len(motion)
-        self.samples = (2 * n if motion.positioned else 0) + (n if motion.turned else 0)
         # neighbouring samples of a fast log say the same: its likelihood counts them all
         self.inflation = max(1.0, 0.5 / motion.step / 5)
+
+    def judging(self, changes: tuple[Change, ...]) -> int:
+        """Return how many residuals can tell about these changes."""
+        channels = {c for change in changes for c in change.channels}
+        n = len(self.motion)
+        position = self.motion.positioned and bool(channels & {"x_n", "y_n", "u", "v", "psi"})
+        heading = self.motion.turned and bool(channels & {"psi", "r"})
+        return 2 * n * position + n * heading
 
     def applies(self, change: Change) -> bool:
         if not all(c in self.motion for c in change.channels):
