@@ -1,0 +1,300 @@
+"""What a trial must keep: margins from the origin, sea room, caps, end state, energy, headings.
+
+Each limit is one number h at each sample or one a trial, negative where kept.
+Path limits are symbolic in the state, so that the search, IPOPT and the checks
+read the same expression.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from experiment_design.rollout import Motion, Rollout
+from experiment_design.schedule import Schedule
+from greybox.errors import UsageError
+from greybox.model.disturbances import rotate_to_body
+from greybox.vectorised import Vectorised
+
+Array = NDArray[np.float64]
+
+# how much of each quantity counts as one in the solvers
+_SCALE = {"m/s": 0.1, "rad/s": 0.01, "m": 10.0, "rad": 0.1, "": 0.01}
+# what a plan may miss a limit by, in its unit, and still count as keeping it
+TOLERANCE = 1e-4
+_NAMES = {"u": "surge", "v": "sway", "r": "yaw rate"}
+
+
+@dataclass(frozen=True)
+class Circle:
+    """A round sea room: centre north and east, and radius [m]."""
+
+    north: float
+    east: float
+    radius: float
+
+
+@dataclass(frozen=True)
+class TrialLimits:
+    """What the captain and the method ask of a trial; None where nothing is asked.
+
+    Parameters
+    ----------
+    signs : mapping of str to int
+        Sign that each named state keeps, such as ``{"u": 1, "v": 1}``.
+    margins : mapping of str to float
+        Least magnitude of each of them [m/s] (A10).
+    area : ndarray or Circle, optional
+        (m, 2) corners of the sea room, north and east [m], or a circle.
+    position : (float, float)
+        Where the trial starts, north and east [m].
+    clearance : float
+        Kept from the edge of the sea room [m].
+    speed_cap, yaw_cap : float, optional
+        Largest speed over ground [m/s] and rate of turn [rad/s].
+    end : mapping of str to (float, float)
+        Wanted final value and tolerance of ``u, v, r, psi, x_n, y_n``.
+    energy : float, optional
+        Largest mean of the cube of the propeller speeds over that of full speed.
+    headings : float, optional
+        Least range of headings that the trial covers [rad].
+    """
+
+    signs: Mapping[str, int] = field(default_factory=dict)
+    margins: Mapping[str, float] = field(default_factory=dict)
+    area: Array | Circle | None = None
+    position: tuple[float, float] = (0.0, 0.0)
+    clearance: float = 0.0
+    speed_cap: float | None = None
+    yaw_cap: float | None = None
+    end: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    energy: float | None = None
+    headings: float | None = None
+
+    def __post_init__(self) -> None:
+        for name, value in self.margins.items():
+            if not 0 <= value < np.inf:
+                raise UsageError(f"the margin of {name} is {value:g} m/s, it must be 0 or more.")
+        for what, cap in (("speed", self.speed_cap), ("yaw-rate", self.yaw_cap)):
+            if cap is not None and not 0 < cap < np.inf:
+                raise UsageError(f"the {what} cap is {cap:g}, it must be positive.")
+        if self.energy is not None and not self.energy > 0:
+            raise UsageError(f"the energy share is {self.energy:g}, it must be positive.")
+        if self.headings is not None and not self.headings > 0:
+            raise UsageError(f"the heading coverage is {self.headings:g} rad, must be positive.")
+        kept = [self.margins.get(s, 0.0) for s in ("u", "v") if s in self.signs]
+        floor = float(np.linalg.norm(kept))
+        if self.speed_cap is not None and self.speed_cap <= floor:
+            raise UsageError(
+                f"the limits contradict: margins of {self.margins.get('u', 0.0):g} and "
+                f"{self.margins.get('v', 0.0):g} m/s in surge and sway need a speed of at least "
+                f"{floor:.3g} m/s, the cap is {self.speed_cap:g} m/s. Raise the cap above "
+                f"{floor:.3g}, or lower the margins."
+            )
+
+
+@dataclass(frozen=True)
+class LimitName:
+    """One limit in words: what it is, its bound and unit, and the option that sets it."""
+
+    name: str
+    bound: float
+    unit: str
+    option: str
+
+
+def _polygon_distance(corners: Array, north: ca.SX, east: ca.SX) -> ca.SX:
+    """Return the signed distance to a polygon, positive outside [m]."""
+    nearest = ca.SX(1e300)
+    parity = ca.SX(1)
+    for (n0, e0), (n1, e1) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        dn, de = n1 - n0, e1 - e0
+        t = ca.fmin(1, ca.fmax(0, ((north - n0) * dn + (east - e0) * de) / (dn**2 + de**2)))
+        square = (north - n0 - t * dn) ** 2 + (east - e0 - t * de) ** 2
+        nearest = ca.fmin(nearest, square)
+        if e0 != e1:
+            # a ray to the north crosses this edge once for a point inside
+            between = ca.logic_and(ca.fmin(e0, e1) <= east, east < ca.fmax(e0, e1))
+            above = n0 + (east - e0) * dn / de > north
+            parity = parity * (1 - 2 * ca.logic_and(between, above))
+    return parity * ca.sqrt(nearest + 1e-12)
+
+
+class LimitProgram:
+    """Compiled limits of one trial under one prior model.
+
+    Parameters
+    ----------
+    rollout : Rollout
+    schedule : Schedule
+    limits : TrialLimits
+    predictor_wind : bool
+        Whether the wind is measured, so that its sign may be anything (5.50).
+    """
+
+    def __init__(
+        self,
+        rollout: Rollout,
+        schedule: Schedule,
+        limits: TrialLimits,
+        *,
+        wind_matters: bool = False,
+    ) -> None:
+        self.limits = limits
+        self.schedule = schedule
+        self.nx = rollout.nx
+        self._states = rollout.structure.states
+        state = rollout.symbols[0]
+        x, psi = state[: self.nx], state[self.nx]
+        where = {n: x[i] for i, n in enumerate(self._states)}
+        names: list[LimitName] = []
+        rows: list[ca.SX] = []
+        d = rollout.d
+        for name, sign in limits.signs.items():
+            margin = limits.margins.get(name, 0.0)
+            seen = [where[name]]
+            if name in ("u", "v"):
+                for pair, matters in ((d[:2], True), (d[2:], wind_matters)):
+                    if matters and np.any(pair):
+                        moved = rotate_to_body(psi, ca.SX(pair[0]), ca.SX(pair[1]))
+                        seen.append(where[name] - moved[name == "v"])
+            least = seen[0] * sign
+            for other in seen[1:]:
+                least = ca.fmin(least, other * sign)
+            names.append(
+                LimitName(f"margin of {_NAMES.get(name, name)}", margin,
+                          "rad/s" if name == "r" else "m/s", f"--margin-{name}")
+            )  # fmt: skip
+            rows.append(margin - least)
+        u, v = where["u"], where.get("v", ca.SX(0))
+        if limits.speed_cap is not None:
+            names.append(LimitName("speed cap", limits.speed_cap, "m/s", "--speed-cap"))
+            rows.append(ca.sqrt(u**2 + v**2 + 1e-12) - limits.speed_cap)
+        if limits.yaw_cap is not None and "r" in where:
+            names.append(LimitName("yaw-rate cap", limits.yaw_cap, "rad/s", "--yaw-cap"))
+            rows.append(ca.fabs(where["r"]) - limits.yaw_cap)
+        if limits.area is not None:
+            north = state[self.nx + 1] + limits.position[0]
+            east = state[self.nx + 2] + limits.position[1]
+            names.append(LimitName("sea room", limits.clearance, "m", "--area"))
+            if isinstance(limits.area, Circle):
+                circle = limits.area
+                distance = (
+                    ca.sqrt((north - circle.north) ** 2 + (east - circle.east) ** 2 + 1e-12)
+                    - circle.radius
+                )
+            else:
+                distance = _polygon_distance(np.asarray(limits.area, float), north, east)
+            rows.append(distance + limits.clearance)
+        self.path_names = tuple(names)
+        self.path = ca.vertcat(*rows) if rows else ca.SX(0, 1)
+        self.path_scale = np.array([_SCALE[n.unit] for n in names])
+        self.end_names, self._ends = self._end_limits(limits)
+        self.whole_names = tuple(self._whole_names(limits))
+        self.whole_scale = np.array([_SCALE[n.unit] for n in self.whole_names])
+        scalars = ca.vertsplit(state)
+        if rows:
+            self._path = Vectorised(ca.vertsplit(self.path), scalars)
+            w = ca.SX.sym("w", len(rows))
+            back = ca.jtimes(self.path, state, w, True)
+            self._path_back = Vectorised(ca.vertsplit(back), [*scalars, *ca.vertsplit(w)])
+        self._full = np.maximum(np.abs(schedule.lower), np.abs(schedule.upper))
+        speeds = {t.speed for t in rollout.vessel.thrusters}
+        self._speeds = [i for i, n in enumerate(schedule.commands) if n in speeds]
+
+    @property
+    def names(self) -> tuple[LimitName, ...]:
+        """Every limit, path limits first."""
+        return (*self.path_names, *self.whole_names)
+
+    def _end_limits(self, limits: TrialLimits) -> tuple[list[LimitName], list[tuple[int, float]]]:
+        place = {n: i for i, n in enumerate(self._states)}
+        place |= {"psi": self.nx, "x_n": self.nx + 1, "y_n": self.nx + 2}
+        units = {"u": "m/s", "v": "m/s", "r": "rad/s", "psi": "rad", "x_n": "m", "y_n": "m"}
+        names, ends = [], []
+        for name, (value, tolerance) in limits.end.items():
+            if name not in place:
+                raise UsageError(f"the end state names '{name}': it can name {', '.join(place)}.")
+            names.append(LimitName(f"end state of {name}", tolerance, units[name], "--end"))
+            shift = {"x_n": limits.position[0], "y_n": limits.position[1]}.get(name, 0.0)
+            ends.append((place[name], value - shift))
+        return names, ends
+
+    def _whole_names(self, limits: TrialLimits) -> list[LimitName]:
+        names = list(self.end_names)
+        if limits.energy is not None:
+            names.append(LimitName("energy", limits.energy, "", "--energy"))
+        if limits.headings is not None:
+            names.append(LimitName("heading coverage", limits.headings, "rad", "--headings"))
+        return names
+
+    def path_values(self, state: Array) -> Array:
+        """Return the path limits (m, ...) of states (..., n)."""
+        shape = state.shape[:-1]
+        if not self.path_names:
+            return np.empty((0, *shape))
+        columns = [np.ascontiguousarray(state[..., i]) for i in range(state.shape[-1])]
+        return self._path(columns, np.empty((len(self.path_names), *shape)))
+
+    def path_pull(self, state: Array, weights: Array) -> Array:
+        """Carry weights (m, N+1) on the path limits back to states (N+1, n)."""
+        if not self.path_names:
+            return np.zeros_like(state)
+        out = np.empty((state.shape[1], len(state)))
+        self._path_back([*np.ascontiguousarray(state.T), *weights], out)
+        return out.T
+
+    def whole_values(self, motion: Motion) -> Array:
+        """Return the limits on the whole trial, (m, R)."""
+        rows: list[Array] = []
+        limits = self.limits
+        for (place, value), name in zip(self._ends, self.end_names, strict=True):
+            rows.append(np.abs(motion.state[:, -1, place] - value) - name.bound)
+        if limits.energy is not None:
+            share = np.abs(motion.commands[..., self._speeds] / self._full[self._speeds]) ** 3
+            rows.append(share.mean(axis=(1, 2)) - limits.energy)
+        if limits.headings is not None:
+            psi = motion.state[..., self.nx]
+            rows.append(limits.headings - (psi.max(axis=1) - psi.min(axis=1)))
+        return np.array(rows).reshape(len(rows), len(motion.state))
+
+    def whole_pull(self, motion: Motion, weights: Array) -> tuple[Array, Array]:
+        """Carry weights (m,) on the whole-trial limits back to states and commands."""
+        state, commands = motion.state[0], motion.commands[0]
+        d_state, d_commands = np.zeros_like(state), np.zeros_like(commands)
+        k = 0
+        for place, value in self._ends:
+            d_state[-1, place] += weights[k] * np.sign(state[-1, place] - value)
+            k += 1
+        if self.limits.energy is not None:
+            part = commands[:, self._speeds] / self._full[self._speeds]
+            slope = 3 * part * np.abs(part) / self._full[self._speeds] / part.size
+            d_commands[:, self._speeds] += weights[k] * slope
+            k += 1
+        if self.limits.headings is not None:
+            psi = state[:, self.nx]
+            d_state[int(psi.argmax()), self.nx] -= weights[k]
+            d_state[int(psi.argmin()), self.nx] += weights[k]
+        return d_state, d_commands
+
+    def violations(self, motion: Motion) -> Array:
+        """Return by how much each limit is missed at worst, (m, R), 0 where kept.
+
+        A run that is unstable misses every limit without bound.
+        """
+        worst = [
+            self.path_values(motion.state[:, 1:]).max(axis=-1),
+            self.whole_values(motion),
+        ]
+        out = np.maximum(np.concatenate(worst), 0.0)
+        out[:, ~motion.stable] = np.inf
+        return np.asarray(out)
+
+    def keeps(self, motion: Motion) -> NDArray[np.bool_]:
+        """Return which runs keep every limit, (R,)."""
+        missed = self.violations(motion)
+        return np.asarray((missed <= TOLERANCE).all(axis=0) & motion.stable)

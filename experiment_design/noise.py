@@ -1,0 +1,123 @@
+"""How noisy the next trial's measurements and its motion will be."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.errors import UsageError
+from greybox.model.functions import jacobians
+from greybox.model.model import ManoeuvringModel
+from greybox.vessel.vessel import Vessel
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class NoiseLevels:
+    """Standard deviations that a predicted precision rests on.
+
+    Parameters
+    ----------
+    states : tuple of str
+    measurement : ndarray
+        (nx,) of the measured states [m/s, rad/s].
+    process : ndarray
+        (nx,) of what moves the states beside the model, per sample [m/s, rad/s].
+    heading : float
+        Of the measured heading [rad].
+    wind : float
+        Of each component of the measured velocity through the air [m/s].
+    source : str
+        Where the figures came from, one sentence.
+    """
+
+    states: tuple[str, ...]
+    measurement: Array
+    process: Array
+    heading: float = 0.0
+    wind: float = 0.0
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        total = self.measurement**2 + self.process**2
+        if not (np.isfinite(total).all() and (total > 0).all()):
+            worst = self.states[int(np.argmin(np.where(np.isfinite(total), total, -1.0)))]
+            raise UsageError(
+                f"the noise of {worst} is 0, so any trial would give its equation without error: "
+                f"state {worst}_std under [sensors] in the vessel file."
+            )
+
+
+def noise_levels(
+    model: ManoeuvringModel,
+    vessel: Vessel,
+    process: Array | None = None,
+) -> NoiseLevels:
+    """Return the noises that the vessel file and a previous estimate tell of.
+
+    The one-step residual of (4.3) holds the measurement noise twice,
+    var ε = σ² + Σ aⱼ² σⱼ² + w²; what its standard deviation leaves beyond the
+    sensors' noise is process noise.
+
+    Parameters
+    ----------
+    model : ManoeuvringModel
+        Its ``residual_std`` is used where `process` is not given.
+    vessel : Vessel
+        Its sensors' standard deviations.
+    process : ndarray, optional
+        (nx,) process noise per sample.
+
+    Raises
+    ------
+    UsageError
+        Neither tells how noisy a state is.
+    """
+    states = model.structure.states
+    residual = np.asarray(model.residual_std, float)
+    has_residual = residual.shape == (len(states),) and bool((residual > 0).all())
+    stated = [vessel.std(s) for s in states]
+    a = np.asarray(
+        jacobians(model.structure)(
+            [1.0] * len(states), 0.0, [0.0] * len(model.structure.inputs),
+            model.d, [1.0, 1.0], model.theta,
+        )[0]
+    )  # fmt: skip
+    missing = [s for s, v in zip(states, stated, strict=True) if v is None]
+    if missing and not has_residual:
+        raise UsageError(
+            f"nothing tells how noisy {', '.join(missing)} "
+            f"{'is' if len(missing) == 1 else 'are'}: state {missing[0]}_std under [sensors] in "
+            f"the vessel file, or design with a model that was estimated."
+        )
+    # without a stated sensor, half of the residual is taken as the sensor's
+    measurement = np.array(
+        [residual[i] / np.sqrt(2.0) if v is None else v for i, v in enumerate(stated)]
+    )
+    told = ["sensors of the vessel file" if not missing else "residuals of the model"]
+    if process is None and has_residual:
+        beyond = residual**2 - measurement**2 - a**2 @ measurement**2
+        process = np.sqrt(np.maximum(beyond, 0.0))
+        told.append("process noise from the model's residuals")
+    elif process is None:
+        process = np.zeros(len(states))
+        told.append("no process noise, because the model has no residuals")
+    else:
+        process = np.asarray(process, float)
+        if process.shape != (len(states),) or not (process >= 0).all():
+            raise UsageError(
+                f"the process noise has {process.size} values, one that is not negative is "
+                f"needed for each of {', '.join(states)}."
+            )
+        told.append("process noise as given")
+    return NoiseLevels(
+        states,
+        measurement,
+        process,
+        vessel.std("psi") or 0.0,
+        vessel.std("wind") or 0.0,
+        "; ".join(told),
+    )

@@ -1,0 +1,218 @@
+"""The motion that a sequence gives under one prior model, and derivatives carried back to it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_banded
+
+from greybox.errors import StructureError
+from greybox.model.simulation import positions, simulate
+from greybox.model.structure import Structure
+from greybox.vectorised import Vectorised
+from greybox.vessel.force import force_expressions, generalised_force
+from greybox.vessel.vessel import Vessel
+
+Array = NDArray[np.float64]
+
+# speeds [m/s] and rates [rad/s] past which a free run counts as unstable
+_BOUND = {"u": 100.0, "v": 100.0, "r": 10.0}
+
+
+@dataclass(frozen=True)
+class Motion:
+    """R runs of N steps.
+
+    Parameters
+    ----------
+    state : ndarray
+        (R, N+1, nx+3) states [m/s, rad/s], heading [rad], north and east [m].
+    tau : ndarray
+        (R, N, nu) generalised inputs.
+    commands : ndarray
+        (R, N, nc)
+    stable : ndarray of bool
+        (R,) whether the run stayed within every plausible bound.
+    """
+
+    state: Array
+    tau: Array
+    commands: Array
+    stable: NDArray[np.bool_]
+
+
+class Rollout:
+    """A prior model on its way through a trial.
+
+    Parameters
+    ----------
+    vessel : Vessel
+    structure : Structure
+        Marine, with surge among its states.
+    theta : ndarray
+        (p,) parameters.
+    d : ndarray
+        (nd,) disturbance means [m/s].
+    start : ndarray
+        (nx + 1,) initial states [m/s, rad/s] and heading [rad].
+    sample_time : float
+        [s]
+
+    Raises
+    ------
+    StructureError
+        The structure is no ship.
+    """
+
+    def __init__(
+        self,
+        vessel: Vessel,
+        structure: Structure,
+        theta: Array,
+        d: Array,
+        start: Array,
+        sample_time: float,
+    ) -> None:
+        if structure.disturbance != "marine" or "u" not in structure.states:
+            raise StructureError(
+                f"structure '{structure.name}' has no surge speed u, so no trial can be designed "
+                f"for it: use a manoeuvring structure such as 'thesis' or 'surge'."
+            )
+        self.vessel = vessel
+        self.structure = structure
+        self.theta = np.asarray(theta, float)
+        self.d = np.asarray(d, float)
+        self.start = np.asarray(start, float)
+        self.sample_time = sample_time
+        self.nx = len(structure.states)
+        self.symbols, self.step = step_expression(
+            vessel, structure, self.theta, self.d, sample_time
+        )
+        state, commands = self.symbols
+        s = structure.symbols
+        tau = force_vector(vessel, structure, commands)
+        parts = [
+            ca.jacobian(self.step, state),
+            ca.jacobian(self.step, commands),
+            ca.jacobian(tau, commands),
+        ]
+        self._shapes = [p.shape for p in parts]
+        self._slopes = Vectorised(
+            ca.vertsplit(ca.vertcat(*[ca.vec(p.T) for p in parts])),
+            [*ca.vertsplit(state), *ca.vertsplit(commands)],
+        )
+        self._names = s.x.numel()
+
+    def run(self, commands: Array) -> Motion:
+        """Run freely on commands (R, N, nc)."""
+        structure = self.structure
+        made = generalised_force(
+            self.vessel,
+            {n: commands[..., i] for i, n in enumerate(self.vessel.commands)},
+        )
+        tau = np.stack(
+            [made.get(n, np.zeros(commands.shape[:2])) for n in structure.inputs], axis=-1
+        )
+        samples = commands.shape[1]
+        heading = None if "r" in structure.states else np.full(samples + 1, self.start[-1])
+        bound = np.array([_BOUND.get(n, 1e6) for n in structure.states])
+        free = simulate(
+            structure, self.theta, self.start[:-1], tau, self.sample_time,
+            psi=heading, psi0=float(self.start[-1]),
+            d=np.broadcast_to(self.d, (samples, self.d.size)) if self.d.any() else None,
+            bound=bound,
+        )  # fmt: skip
+        stable = free.diverged < 0
+        state = np.zeros((len(tau), samples + 1, self.nx + 3))
+        with np.errstate(invalid="ignore", over="ignore"):
+            state[..., : self.nx] = free.x
+            state[..., self.nx] = free.psi
+            pair = np.zeros((*free.x.shape[:2], 2))
+            pair[..., 0] = free.x[..., structure.states.index("u")]
+            if "v" in structure.states:
+                pair[..., 1] = free.x[..., structure.states.index("v")]
+            state[..., self.nx + 1 :] = positions(pair, free.psi, self.sample_time)
+        state[~stable] = 0.0
+        return Motion(state, tau, commands, stable)
+
+    def pull(self, motion: Motion, d_state: Array, d_tau: Array, d_commands: Array) -> Array:
+        """Carry the derivatives of a scalar along one run back to its commands.
+
+        Parameters
+        ----------
+        motion : Motion
+            Of one run.
+        d_state : ndarray
+            (N+1, nx+3)
+        d_tau : ndarray
+            (N, nu)
+        d_commands : ndarray
+            (N, nc)
+
+        Returns
+        -------
+        ndarray
+            (N, nc) total derivative.
+        """
+        state, commands = motion.state[0], motion.commands[0]
+        samples, n = len(commands), state.shape[1]
+        out = np.empty((self._slopes.size, samples))
+        self._slopes([*state[:-1].T, *commands.T], out)
+        blocks, first = [], 0
+        for rows, columns in self._shapes:
+            blocks.append(out[first : first + rows * columns].reshape(rows, columns, samples))
+            first += rows * columns
+        in_state, in_command, force = blocks
+        # costates p(k) = g(k) + Fᵀ(k) p(k+1): one upper banded system
+        band = np.zeros((2 * n, n * (samples + 1)))
+        band[-1] = 1.0
+        for a in range(n):
+            for b in range(n):
+                band[n - 1 + a - b, n + b :: n] = -in_state[b, a]
+        costate = solve_banded(
+            (0, 2 * n - 1), band, d_state.ravel(), check_finite=False, overwrite_ab=True
+        ).reshape(samples + 1, n)
+        return np.asarray(
+            d_commands
+            + np.einsum("ian,ni->na", force, d_tau)
+            + np.einsum("ian,ni->na", in_command, costate[1:])
+        )
+
+
+def force_vector(vessel: Vessel, structure: Structure, commands: ca.SX) -> ca.SX:
+    """Return the structure's inputs as expressions of the commands (nc,)."""
+    made = force_expressions(vessel, commands)
+    return ca.vertcat(*[made.get(n, ca.SX(0)) for n in structure.inputs])
+
+
+def step_expression(
+    vessel: Vessel, structure: Structure, theta: Array, d: Array, sample_time: float
+) -> tuple[tuple[ca.SX, ca.SX], ca.SX]:
+    """Return symbols (state (nx+3,), commands (nc,)) and the next state, by Euler (3.51).
+
+    The state holds the structure's states, the heading, and north and east.
+    """
+    s = structure.symbols
+    commands = ca.vertcat(*[ca.SX.sym(c) for c in vessel.commands])
+    place = ca.vertcat(ca.SX.sym("north"), ca.SX.sym("east"))
+    f = structure.increment_expression(air_measured=False)
+    x_next = s.x + f if structure.increment else f
+    fixed = ca.substitute(
+        x_next, ca.vertcat(s.d, s.theta), ca.DM(np.concatenate([np.asarray(d), np.asarray(theta)]))
+    )
+    fixed = ca.substitute(fixed, s.tau, force_vector(vessel, structure, commands))
+    states = structure.states
+    u = s.x[states.index("u")]
+    v = s.x[states.index("v")] if "v" in states else ca.SX(0)
+    turn = sample_time * s.x[states.index("r")] if "r" in states else ca.SX(0)
+    c, sn = ca.cos(s.psi), ca.sin(s.psi)
+    after = ca.vertcat(
+        fixed,
+        s.psi + turn,
+        place[0] + sample_time * (c * u - sn * v),
+        place[1] + sample_time * (sn * u + c * v),
+    )
+    return (ca.vertcat(s.x, s.psi, place), commands), after

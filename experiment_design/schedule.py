@@ -1,0 +1,149 @@
+"""From the levels of each hold to the command at each sample: held, or ramped at a fixed pace.
+
+The map is linear in the levels, so a gradient in the commands is carried back
+by its transpose, and a rate limit is a limit on the step between two levels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.errors import UsageError, VesselError
+from greybox.vessel.vessel import Vessel
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """When commands change, how far and how fast.
+
+    Parameters
+    ----------
+    commands : tuple of str
+    sample_time : float
+        [s]
+    samples, hold : int
+        N, and samples between changes.
+    lower, upper : ndarray
+        (nc,) limits of each command.
+    ramp : tuple of int
+        Samples over which each command moves to a new level; 1 is a step.
+    reach : ndarray
+        (nc,) largest step between neighbouring levels, inf where any is allowed.
+    """
+
+    commands: tuple[str, ...]
+    sample_time: float
+    samples: int
+    hold: int
+    lower: Array
+    upper: Array
+    ramp: tuple[int, ...]
+    reach: Array
+
+    @property
+    def holds(self) -> int:
+        """Number of levels a command, K."""
+        return -(-self.samples // self.hold)
+
+    @property
+    def limited(self) -> bool:
+        """Whether some rate stops a command from crossing its range in one hold."""
+        return bool((self.reach < self.upper - self.lower).any())
+
+    def expand(self, levels: Array) -> Array:
+        """Return the commands (..., N, nc) of levels (..., K, nc)."""
+        out = np.repeat(levels, self.hold, axis=-2)[..., : self.samples, :]
+        if max(self.ramp) == 1:
+            return out
+        before = np.concatenate([levels[..., :1, :], levels[..., :-1, :]], axis=-2)
+        held = np.repeat(before, self.hold, axis=-2)[..., : self.samples, :]
+        share = self._share()
+        return np.asarray(held + share * (out - held))
+
+    def gather(self, gradient: Array) -> Array:
+        """Carry a derivative in the commands (N, nc) to the levels (K, nc)."""
+        starts = np.arange(0, self.samples, self.hold)
+        if max(self.ramp) == 1:
+            return np.asarray(np.add.reduceat(gradient, starts, axis=0))
+        share = self._share()
+        out = np.add.reduceat(gradient * share, starts, axis=0)
+        before = np.add.reduceat(gradient * (1 - share), starts, axis=0)
+        out[:-1] += before[1:]
+        out[0] += before[0]
+        return np.asarray(out)
+
+    def _share(self) -> Array:
+        k = np.arange(self.samples) % self.hold + 1
+        return np.asarray(np.minimum(1.0, k[:, None] / np.array(self.ramp)))
+
+    def within_reach(self, levels: Array) -> Array:
+        """Return levels (..., K, nc) clipped to the limits and to the rates, first to last."""
+        out = np.clip(levels, self.lower, self.upper)
+        if self.limited:
+            for k in range(1, out.shape[-2]):
+                before = out[..., k - 1, :]
+                out[..., k, :] = np.clip(out[..., k, :], before - self.reach, before + self.reach)
+        return out
+
+
+def make_schedule(vessel: Vessel, duration: float, hold: float, sample_time: float) -> Schedule:
+    """Return the schedule that a vessel's limits and rates allow.
+
+    Parameters
+    ----------
+    vessel : Vessel
+        With limits for every command; where it states a rate, changes are ramps.
+    duration, hold : float
+        [s]
+    sample_time : float
+        [s]
+
+    Raises
+    ------
+    VesselError
+        A command has no limits, or limits without room.
+    UsageError
+        The hold is no multiple of the sample time or longer than the trial.
+    """
+    samples, held = round(duration / sample_time), round(hold / sample_time)
+    if held < 1 or abs(held * sample_time - hold) > 1e-6 * hold:
+        raise UsageError(
+            f"commands cannot change every {hold:g} s when the model's sample time is "
+            f"{sample_time:g} s: use a multiple, such as --hold {max(1, held) * sample_time:g}."
+        )
+    if samples < 2 * held:
+        raise UsageError(
+            f"a trial of {duration:g} s has no change of command when each is held {hold:g} s: "
+            f"use --duration {2 * hold:g} or more, or a shorter --hold."
+        )
+    lower, upper, ramp, reach = [], [], [], []
+    for name, limits in vessel.limits.items():
+        if limits.lower is None or limits.upper is None:
+            raise VesselError(
+                f"'{name}' has no limits, and a sequence must stay within some: add "
+                f"speed_limits, angle_limits or rudder_limits to its thruster in the vessel file."
+            )
+        if limits.upper < limits.lower:
+            raise VesselError(
+                f"the limits of '{name}' contradict: the lower one is {limits.lower:g}, the upper "
+                f"one {limits.upper:g}. Widen one of the thrusters that share the column."
+            )
+        lower.append(limits.lower)
+        upper.append(limits.upper)
+        span = limits.upper - limits.lower
+        if limits.rate is None or limits.rate <= 0 or span == 0:
+            ramp.append(1)
+            reach.append(np.inf)
+            continue
+        needed = max(1, int(np.ceil(span / (limits.rate * sample_time) - 1e-9)))
+        ramp.append(min(needed, held))
+        reach.append(np.inf if needed <= held else limits.rate * held * sample_time)
+    return Schedule(
+        tuple(vessel.limits), sample_time, samples, held, np.array(lower), np.array(upper),
+        tuple(ramp), np.array(reach),
+    )  # fmt: skip
