@@ -108,6 +108,13 @@ class Rollout:
 
     def run(self, commands: Array) -> Motion:
         """Run freely on commands (R, N, nc)."""
+        return self._run(self.theta, commands)
+
+    def run_models(self, thetas: Array, commands: Array) -> Motion:
+        """Run other parameters (R, p) on the same commands (N, nc)."""
+        return self._run(thetas, np.broadcast_to(commands, (len(thetas), *commands.shape)))
+
+    def _run(self, theta: Array, commands: Array) -> Motion:
         structure = self.structure
         made = generalised_force(
             self.vessel,
@@ -120,7 +127,7 @@ class Rollout:
         heading = None if "r" in structure.states else np.full(samples + 1, self.start[-1])
         bound = np.array([_BOUND.get(n, 1e6) for n in structure.states])
         free = simulate(
-            structure, self.theta, self.start[:-1], tau, self.sample_time,
+            structure, theta, self.start[:-1], tau, self.sample_time,
             psi=heading, psi0=float(self.start[-1]),
             d=np.broadcast_to(self.d, (samples, self.d.size)) if self.d.any() else None,
             bound=bound,
