@@ -75,7 +75,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--target",
         nargs="+",
         metavar="NAME=STD",
-        help="find the least duration that reaches these standard errors",
+        help="least trial time for these standard errors, --duration at most",
     )
     goal.add_argument("--predictor", choices=("basic", "augmented", "wind", "basic+wind"))
     goal.add_argument(
@@ -162,6 +162,7 @@ def run(options: argparse.Namespace) -> None:
     from experiment_design.design import design_trial
     from experiment_design.plan import write_plan
     from experiment_design.prepare import prepare_request
+    from experiment_design.timing import least_duration
     from greybox.errors import UsageError
     from greybox.files import check_targets, write_json
     from greybox.model.model import load_model
@@ -174,8 +175,16 @@ def run(options: argparse.Namespace) -> None:
         raise UsageError("--duration is missing: say how long the trial may last, in seconds.")
     wishes = _wishes(options, model)
     prepared = prepare_request(model, wishes, vessel)
+    request = prepared.request
+    if options.target:
+        request = least_duration(
+            request,
+            dict(_target(text) for text in options.target),
+            progress=progress("duration"),
+            workers=options.workers,
+        )
     design = design_trial(
-        prepared.request,
+        request,
         best_effort=options.best_effort,
         progress=progress("design"),
         workers=options.workers,
@@ -263,6 +272,18 @@ def _end(text: str) -> tuple[str, tuple[float, float]]:
     except ValueError as error:
         raise UsageError(
             f"--end '{text}' cannot be read: write NAME=VALUE:TOLERANCE, such as x_n=0:20."
+        ) from error
+
+
+def _target(text: str) -> tuple[str, float]:
+    from greybox.errors import UsageError
+
+    name, _, value = text.partition("=")
+    try:
+        return name, float(value)
+    except ValueError as error:
+        raise UsageError(
+            f"--target '{text}' cannot be read: write NAME=STD, such as Yvv=0.01."
         ) from error
 
 

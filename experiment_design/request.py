@@ -59,6 +59,8 @@ class DesignRequest:
         Parameters that count; empty for all of the undisturbed model.
     combination : mapping of str to float
         Gradient of the function of the parameters for ``c``.
+    targets : tuple of float
+        Wanted standard errors of `wanted`, the scale of A and E in place of prior values.
     d : ndarray
         (nd,) expected current and wind [m/s].
     prior : (tuple of str, ndarray), optional
@@ -93,6 +95,7 @@ class DesignRequest:
     criterion: CriterionKind = "D"
     wanted: tuple[str, ...] = ()
     combination: Mapping[str, float] = field(default_factory=dict)
+    targets: tuple[float, ...] = ()
     d: Array = field(default_factory=lambda: np.zeros(4))
     prior: tuple[tuple[str, ...], Array] | None = None
     covariance: Array | None = None
@@ -210,6 +213,8 @@ def build_criterion(request: DesignRequest, predictor: Predictor) -> Criterion:
     )
     # a parameter that is zero a priori is measured by what the others of its equation are
     scale = np.where(scale > 0, scale, scale[scale > 0].min(initial=1.0))
+    if request.targets:
+        scale = np.array(request.targets, float)
     combination = np.zeros(len(names))
     for name, slope in request.combination.items():
         combination[wanted.index(wanted_columns(predictor, (name,))[0])] += slope
