@@ -58,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
     add("--vessel", required=True, metavar="V", help="vessel file (TOML) with limits")
-    add("--model", required=True, metavar="MODEL", help="prior model of greybox estimate")
+    add("--model", metavar="MODEL", help="prior model of greybox estimate")
     add("--duration", type=positive, metavar="S", help="length of each trial [s]")
     add("--out", required=True, metavar="PLAN", help="where to write the commands (CSV)")
     add("--json", metavar="F", help="write the design as JSON; - is stdout")
@@ -169,13 +169,18 @@ def run(options: argparse.Namespace) -> None:
     from greybox.vessel.toml import load_vessel
 
     check_targets(options.out, options.json, options.sheet)
-    model = load_model(options.model)
+    if options.between is None and options.model is None:
+        raise UsageError("--model is missing: name a prior model, or two with --between A B.")
+    model = load_model(options.between[0] if options.between else options.model)
     vessel = load_vessel(options.vessel)
     if options.duration is None:
         raise UsageError("--duration is missing: say how long the trial may last, in seconds.")
     wishes = _wishes(options, model)
     prepared = prepare_request(model, wishes, vessel)
     request = prepared.request
+    if options.between:
+        _run_between(options, request, prepared.notes)
+        return
     if options.target:
         request = least_duration(
             request,
@@ -198,6 +203,45 @@ def run(options: argparse.Namespace) -> None:
     if options.json != "-":
         say(design.summary())
         for note in prepared.notes:
+            say(f"Note: {note}")
+        say(f"wrote {options.out}")
+
+
+def _run_between(options: argparse.Namespace, request: Any, notes: tuple[str, ...]) -> None:
+    """Design the trial between two models and write it."""
+    from experiment_design.discriminate import design_between
+    from experiment_design.plan import write_plan
+    from experiment_design.request import Rival, full_structure
+    from greybox.errors import UsageError
+    from greybox.files import write_json
+    from greybox.model.model import load_model
+
+    first, second = (Path(p).stem for p in options.between)
+    if first == second:
+        first, second = options.between
+    other = load_model(options.between[1])
+    if other.sample_time != request.sample_time:
+        raise UsageError(
+            f"'{first}' has the sample time {request.sample_time:g} s and '{second}' "
+            f"{other.sample_time:g} s: estimate both at one."
+        )
+    structure, theta = full_structure(other)
+    found = design_between(
+        request,
+        Rival(second, structure, theta, other.d),
+        (first, second),
+        best_effort=options.best_effort,
+        progress=progress("design"),
+        workers=options.workers,
+    )
+    write_plan(found.design, options.out)
+    if options.json:
+        data = found.to_dict()
+        data["notes"] = [*notes, *data["notes"]]
+        write_json(data | {"provenance": provenance(options)}, options.json)
+    if options.json != "-":
+        say(found.summary())
+        for note in notes:
             say(f"Note: {note}")
         say(f"wrote {options.out}")
 

@@ -77,8 +77,10 @@ class Design:
     efficiency_vs_random : float or None
         Against the best of 200 random two-level sequences that keep the limits;
         None where none of them does.
+    random_value : float
+        Criterion of that one, nan where there is none.
     random_kept : int
-        How many were found that do.
+        How many were found that keep the limits.
     certificate : Certificate
     margins : dict of str to float
         Least |u_r| and |v_r| (or |r|) over all trials.
@@ -103,6 +105,7 @@ class Design:
     covariance: Array
     criterion_value: float
     efficiency_vs_random: float | None
+    random_value: float
     random_kept: int
     certificate: Certificate
     margins: dict[str, float]
@@ -296,7 +299,14 @@ def design_trial(
             np.clip((v - p.schedule.lower) / _span(p), 0, 1)
             for v, p in zip(first, problems, strict=True)
         ]
-    found = search_campaign(request, problems, initial, progress=progress, workers=workers)
+    found = search_campaign(
+        request,
+        problems,
+        initial,
+        effort=request.effort,
+        progress=progress,
+        workers=workers,
+    )
     candidates, evaluations = list(found.candidates), found.evaluations
     notes: list[str] = []
     status = "solved: local optimum of many ascents"
@@ -328,18 +338,21 @@ def design_trial(
     criterion = problems[0].criterion
     sums = add_up([own_moments(p, u) for p, u in zip(problems, units, strict=True)])
     covariance = criterion.covariance(sums[0])[0]
-    if not np.isfinite(covariance).all():
+    if not np.isfinite(covariance).all() and not request.rivals:
         raise InfeasibleError(_unexcited(problems, units, request))
     predictor = request.build_predictor()
     names = tuple(predictor.columns[i].name for i in criterion.wanted)
     notes += _require_informative(request, problems, units)
-    versus = None
+    versus, random_value = None, float("nan")
     if reference is not None:
         other = add_up([own_moments(p, u) for p, u in zip(problems, reference, strict=True)])
         gain = logdet_information(covariance) - logdet_information(
             criterion.covariance(other[0])[0]
         )
         versus = float(np.exp(gain / len(covariance)))
+        random_value = float(criterion.value(other[0])[0])
+        if request.rivals:
+            random_value = float(problems[0].evaluate(reference[0][None]).value[0])
     certificate = certify(problems, units)
     values = np.array(
         [
@@ -371,6 +384,7 @@ def design_trial(
         covariance,
         float(criterion.of_covariance(covariance[None])[0]),
         versus,
+        random_value,
         kept,
         certificate,
         _margins(problems, motions),
@@ -412,7 +426,7 @@ def _require_informative(
 
     `hopeless` is how many times vaguer random sequences may be than the design.
     """
-    if request.targets or request.criterion == "c":
+    if request.targets or request.rivals or request.criterion == "c":
         return []
     criterion = problems[0].criterion
     predictor = request.build_predictor()
@@ -569,7 +583,11 @@ def _tighten(
         tighter = replace(current, backoff=tuple(backoff + 1.05 * kept.shortfall))
         again = [build_problem(tighter, t) for t in range(request.trials)]
         found = search_campaign(
-            tighter, again, [c.unit for c in previous], effort=_AGAIN, workers=workers
+            tighter,
+            again,
+            [c.unit for c in previous],
+            effort=_AGAIN * request.effort,
+            workers=workers,
         )
         spent += found.evaluations
         now = keep_probability(plain, [c.unit for c in found.candidates])

@@ -101,7 +101,9 @@ def least_duration(
         trial = replace(wanted, duration=duration)
         problems = [build_problem(trial, t) for t in range(trial.trials)]
         start, _ = random_campaign(problems, trial.seed)
-        found = search_campaign(trial, problems, start, effort=_QUICK, workers=workers)
+        found = search_campaign(
+            trial, problems, start, effort=_QUICK * request.effort, workers=workers
+        )
         tried[0] += 1
         if progress is not None:
             progress(min(tried[0], 14), 15)
