@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from greybox.commands.common import positive, provenance, say
 
 if TYPE_CHECKING:
-    from greybox.trial.importing import ImportOptions
+    from greybox.trial.options import ImportOptions
 
 HELP = "make a log of raw files: CSV, Parquet, NMEA 0183, MATLAB, ROS bags, MCAP"
 EXAMPLES = """examples:
@@ -126,7 +126,7 @@ def run(options: argparse.Namespace) -> None:
 
 def import_options(options: argparse.Namespace) -> ImportOptions:
     """Return the options of the import, checked."""
-    from greybox.trial.importing import ImportOptions
+    from greybox.trial.options import ImportOptions
 
     return ImportOptions(
         sample_time=options.sample_time,

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.channels import LOGGED
 from greybox.errors import LogError
-from greybox.trial.conditioning import velocities_from_positions
-from greybox.trial.deriving import derive_signals, earth_to_body
+from greybox.trial.completing import complete_channels
+from greybox.trial.deriving import derive_signals
 from greybox.trial.log import Provenance, TrialLog
+from greybox.trial.options import ImportOptions
 from greybox.trial.recording import Recording, Signal
 from greybox.trial.resampling import (
     Clock,
@@ -49,38 +49,6 @@ _ENOUGH = 0.5
 # usual steps by which time may go back without there being two runs in a file
 _FAR = 50.0
 _MAX_RUNS = 1000
-
-
-@dataclass(frozen=True)
-class ImportOptions:
-    """What the user may decide about an import.
-
-    Parameters
-    ----------
-    sample_time : float, optional
-        Ts of the log [s]; that of the slowest motion sensor by default.
-    hole : float, optional
-        Shortest step that counts as a gap [s]; 2.5 usual steps of the sensor
-        by default.
-    velocities : {"central", "savgol"}
-        How u, v, r are made from positions where nothing measured them.
-    window : float
-        Window of the Savitzky-Golay filter [s].
-    reference_height : float, optional
-        Height [m] to which the wind is brought; as measured by default.
-    origin : tuple of float, optional
-        Latitude and longitude [deg] of ``x_n = y_n = 0``.
-    notes : mapping of str to str
-        Draught, loading, depth, sea state and what else was noted of the trial.
-    """
-
-    sample_time: float | None = None
-    hole: float | None = None
-    velocities: str = "central"
-    window: float = 2.0
-    reference_height: float | None = None
-    origin: tuple[float, float] | None = None
-    notes: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -134,7 +102,9 @@ def import_recording(
     extents = {n: extent(clocks[n]) for n in signals}
     plan = plan_import(extents, vessel, options, recording.name)
     span = (0, plan.count)
-    segments, derived, short = cut_segments(signals, recording.text, plan, span, vessel, options)
+    segments, derived, short = cut_segments(
+        signals, recording.text, plan, span, vessel, options, recording.derived
+    )
     if len(segments) > 1:
         segments = [replace(s, name=f"{s.name}[{k + 1}]") for k, s in enumerate(segments)]
     notes += [*plan.notes, *gap_notes([(float(s.t[0]), float(s.t[-1])) for s in segments], short)]
@@ -150,12 +120,12 @@ def import_recording(
 def make_provenance(
     recording: Recording, options: ImportOptions, notes: Sequence[str], derived: Sequence[str]
 ) -> Provenance:
-    """Return where a log came from."""
+    """Return where a log came from; what was derived before is kept."""
     first = recording.files[0] if recording.files else None
     return Provenance(
         source=", ".join(f.name for f in recording.files) or recording.name,
         sha256=first.sha256 if first and len(recording.files) == 1 else "",
-        derived=tuple(derived),
+        derived=(*recording.derived, *derived),
         files=tuple((f.name, f.sha256, f.format) for f in recording.files),
         read=tuple(notes),
         epoch=recording.epoch,
@@ -450,8 +420,11 @@ def cut_segments(
     span: tuple[int, int],
     vessel: Vessel,
     options: ImportOptions,
+    earlier: Sequence[str] = (),
 ) -> tuple[list[TrialLog], tuple[str, ...], int]:
     """Make the segments among samples `span` of a plan.
+
+    `earlier` is what was derived before, where the source is a log that greybox wrote.
 
     Returns
     -------
@@ -478,7 +451,7 @@ def cut_segments(
     derived: tuple[str, ...] = ()
     for start, stop in stretches:
         part = {n: v[start:stop] for n, v in channels.items()}
-        part, made, trim = _derive(part, vessel, plan.sample_time, options)
+        part, made, trim = complete_channels(part, vessel, plan.sample_time, options, earlier)
         derived = tuple(made)
         closed, known = _loop(held, vessel, grid[start:stop])
         log = TrialLog(
@@ -542,87 +515,6 @@ def _resample(
         else:
             channels[name] = interpolate(of, value, grid, sample_time)
     return channels
-
-
-def _derive(
-    part: dict[str, Array], vessel: Vessel, sample_time: float, options: ImportOptions
-) -> tuple[dict[str, Array], list[str], bool]:
-    """Return the channels of the log, what was derived, and whether the ends must go."""
-    derived: list[str] = []
-    antenna = vessel.sensors.get("antenna", (0.0, 0.0))
-    trim = False
-    psi = part.get("psi")
-    if psi is not None and "r" not in part and len(psi) > 2:
-        part["r"] = np.gradient(psi, sample_time)
-        derived.append("r from heading by central differences (3.57)")
-        trim = True
-    if psi is not None and "u" not in part and "v_n" in part and "v_e" in part:
-        # speed and course are the antenna's, u and v the body origin's
-        u, v = earth_to_body(part["v_n"], part["v_e"], psi)
-        r = part.get("r", np.zeros_like(u))
-        part["u"] = u + r * antenna[1]
-        part.setdefault("v", v - r * antenna[0])
-        derived.append("u, v from the velocity over ground and the heading")
-    if psi is not None and "u" not in part and {"x_n", "y_n"} <= part.keys() and len(psi) > 2:
-        if options.velocities == "savgol":
-            from greybox.trial.smoothing import savgol_velocities
-
-            u, v, r = savgol_velocities(
-                part["x_n"], part["y_n"], psi, sample_time, window_s=options.window, order=3,
-                heading_std=vessel.std("psi") or 0.0, antenna=antenna,
-            )  # fmt: skip
-            how = f"Savitzky-Golay over {options.window:g} s"
-        else:
-            u, v, r = velocities_from_positions(
-                part["x_n"], part["y_n"], psi, sample_time,
-                heading_std=vessel.std("psi") or 0.0, antenna=antenna,
-            )  # fmt: skip
-            how = "central differences (3.57)"
-        part["u"] = u
-        part.setdefault("v", v)
-        if any(d.startswith("r from") for d in derived):
-            part["r"] = r
-        derived.append(f"u, v from positions and heading by {how}")
-        trim = True
-    _derive_wind(part, vessel, options, derived)
-    keep = [n for n in (*LOGGED, *vessel.commands) if n in part]
-    return {n: part[n] for n in keep}, derived, trim
-
-
-def _derive_wind(
-    part: dict[str, Array], vessel: Vessel, options: ImportOptions, derived: list[str]
-) -> None:
-    from greybox.trial.wind import move_anemometer, wind_at_height
-
-    psi, u, v = part.get("psi"), part.get("u"), part.get("v")
-    height = vessel.sensors.get("anemometer", (0.0, 0.0, 0.0))[2]
-    if "u_q" not in part and psi is not None and u is not None and v is not None:
-        if "w_n" in part:
-            # components of where it comes from: the air moves the other way
-            from_x, from_y = earth_to_body(part["w_n"], part["w_e"], psi)
-        elif "w_x" in part:
-            from_x, from_y = part["w_x"], part["w_y"]
-        else:
-            return
-        part["u_q"], part["v_q"] = u + from_x, v + from_y
-        derived.append("u_q, v_q from the true wind, the heading and the velocity over ground")
-    elif "u_q" in part and "anemometer" in vessel.sensors and "r" in part:
-        x, y, _ = vessel.sensors["anemometer"]
-        part["u_q"], part["v_q"] = move_anemometer(part["u_q"], part["v_q"], part["r"], x, y)
-        if x or y:
-            derived.append(f"u_q, v_q moved from the anemometer at ({x:g}, {y:g}) m to the origin")
-    if options.reference_height is not None and "u_q" in part and u is not None and v is not None:
-        if "anemometer" not in vessel.sensors:
-            raise LogError(
-                f"the wind cannot be brought to {options.reference_height:g} m without the height "
-                f"of the anemometer: add anemometer = [x, y, height] to [sensors]."
-            )
-        part["u_q"], part["v_q"] = wind_at_height(
-            part["u_q"], part["v_q"], u, v, height, reference_height=options.reference_height
-        )
-        derived.append(
-            f"true wind brought from {height:g} to {options.reference_height:g} m (1/7 power law)"
-        )
 
 
 def _loop(

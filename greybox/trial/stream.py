@@ -22,7 +22,6 @@ from greybox.trial.canonical import (
 )
 from greybox.trial.checks.check import check_recording
 from greybox.trial.importing import (
-    ImportOptions,
     clean_signals,
     cut_segments,
     gap_notes,
@@ -31,6 +30,7 @@ from greybox.trial.importing import (
     too_short,
 )
 from greybox.trial.log import Provenance, TrialLog
+from greybox.trial.options import ImportOptions
 from greybox.trial.readers.formats import open_raw
 from greybox.trial.readers.table import Batch, TableFile
 from greybox.trial.recording import Recording, SourceFile
@@ -150,7 +150,7 @@ def _in_blocks(
     stream = _Stream(table, vessel, options, scan)
     write_log(stream.segments(), out, extra=extra, provenance=stream.provenance)
     assert stream.first is not None
-    notes = [*stream.provenance().read, *stream.provenance().derived]
+    notes = [*stream.provenance().read, *stream.derived]
     return _summary(
         stream.first,
         stream.samples,
@@ -185,7 +185,10 @@ class _Stream:
     def provenance(self) -> Provenance:
         """Return where the log came from, with all that is known by now."""
         notes = dict.fromkeys([*self.table.notes, *self.scan.notes, *gap_notes(self.spans, 0)])
-        whole = Recording(self.table.path.stem, (), epoch=self.scan.scale.epoch, files=(self.file,))
+        whole = Recording(
+            self.table.path.stem, (), epoch=self.scan.scale.epoch, files=(self.file,),
+            derived=self.scan.derived,
+        )  # fmt: skip
         return make_provenance(whole, self.options, list(notes), list(self.derived))
 
     def segments(self) -> Iterator[TrialLog]:
@@ -251,7 +254,7 @@ class _Stream:
         margin = _MARGIN + int(np.ceil(self.options.window / plan.sample_time))
         span = (max(self.done - margin, 0), min(stop + margin, plan.count))
         found, derived, _ = cut_segments(
-            signals, recording.text, plan, span, self.vessel, self.options
+            signals, recording.text, plan, span, self.vessel, self.options, scan.derived
         )
         self.derived.update(dict.fromkeys(derived))
         low, high = plan.grid(self.done, self.done + 1)[0], plan.grid(stop, stop + 1)[0]

@@ -251,3 +251,120 @@ def test_damaged_files_give_a_log_or_a_message(tmp_path, capsys, seed):
         assert status == 1
         assert err.count("\n") == 1
         assert left == [f"raw{ending}"]
+
+
+MAST = (4.0, -1.5, 5.0)
+MAST_SHIP = f"""name = "S"
+length = 30
+[[thruster]]
+type = "azimuth"
+speed = "n"
+angle = "alpha1"
+[sensors]
+anemometer = [{MAST[0]}, {MAST[1]}, {MAST[2]}]
+"""
+
+
+def turning(seconds=90):
+    """NMEA of a ship in a steady turn, and ν_q of its origin in the wind at 10 m.
+
+    Complex numbers, north + i east: the mast's velocity is the derivative of its path.
+    """
+    rate, heading = 0.04, 0.3
+    psi = heading + rate * np.arange(seconds)
+    bow = np.exp(1j * psi)
+    ground = (2.0 + 0.2j) * bow
+    mast = ground + 1j * rate * complex(*MAST[:2]) * bow
+    wind = 4.0 - 3.0j
+    felt = (wind - mast) / bow
+    towards = np.angle(-felt)
+    lines = []
+    for k in range(seconds):
+        course = np.degrees(np.angle(ground[k])) % 360
+        for body in (
+            f"GPRMC,10{k // 60:02}{k % 60:02}.00,A,6325.0,N,01024.0,E,"
+            f"{abs(ground[k]) * 3600 / 1852:.9f},{course:.9f},010623,,,A",
+            f"HEHDT,{np.degrees(psi[k]) % 360:.9f},T", f"TIROT,{np.degrees(rate) * 60:.9f},A",
+            f"WIMWV,{np.degrees(towards[k]) % 360:.9f},R,{abs(felt[k]):.9f},M,A",
+        ):  # fmt: skip
+            check = 0
+            for c in body.encode():
+                check ^= c
+            lines.append(f"${body}*{check:02X}\r\n")
+    through = (ground - wind * 2 ** (1 / 7)) / bow
+    return "".join(lines).encode(), through
+
+
+def test_wind_is_moved_from_the_mast_and_brought_to_a_height(tmp_path, capsys):
+    ship, out = tmp_path / "ship.toml", tmp_path / "log.csv"
+    ship.write_text(MAST_SHIP)
+    sentences, through = turning()
+    (tmp_path / "all.nmea").write_bytes(sentences)
+    arguments = ("--vessel", ship, "--reference-height", 10, "--out", out)
+    status, said, _ = run(capsys, "import", tmp_path / "all.nmea", *arguments)
+    assert status == 0
+    assert "u_q, v_q moved from the anemometer at (4, -1.5) m to the origin" in said
+    assert "true wind brought from 5 to 10 m (1/7 power law)" in said
+    log = pd.read_csv(out)
+    first = round(float(log["t"].iloc[0]))
+    np.testing.assert_allclose(
+        log["u_q"] + 1j * log["v_q"], through[first : first + len(log)], atol=1e-7
+    )
+    # no height of the anemometer is known
+    ship.write_text(MAST_SHIP.partition("[sensors]")[0])
+    status, _, err = run(capsys, "import", tmp_path / "all.nmea", *arguments)
+    assert status == 1
+    assert "cannot be brought to 10 m without the height of the anemometer" in err
+
+
+@pytest.mark.parametrize("cells", [None, 0], ids=["memory", "blocks"])
+def test_a_log_that_is_imported_again_is_the_same(tmp_path, capsys, monkeypatch, cells):
+    ship = tmp_path / "ship.toml"
+    ship.write_text(MAST_SHIP)
+    (tmp_path / "all.nmea").write_bytes(turning()[0])
+    if cells is not None:
+        monkeypatch.setattr("greybox.trial.stream._LARGE_CELLS", cells)
+    source = "all.nmea"
+    records = []
+    for name in ("a.csv", "b.csv", "c.csv"):
+        assert run(
+            capsys, "import", tmp_path / source, "--vessel", ship, "--reference-height", 10,
+            "--out", tmp_path / name,
+        )[0] == 0  # fmt: skip
+        records.append(json.loads((tmp_path / f"{name}.json").read_text()))
+        source = name
+    assert (tmp_path / "b.csv").read_bytes() == (tmp_path / "a.csv").read_bytes()
+    assert (tmp_path / "c.csv").read_bytes() == (tmp_path / "a.csv").read_bytes()
+    assert records[0]["derived"] == records[1]["derived"] == records[2]["derived"]
+
+
+def test_a_height_is_changed_from_that_of_the_log(tmp_path, capsys):
+    ship = tmp_path / "ship.toml"
+    ship.write_text(MAST_SHIP)
+    (tmp_path / "all.nmea").write_bytes(turning()[0])
+    for source, height, name in (
+        ("all.nmea", 10, "ten"), ("ten.csv", 20, "by_ten"), ("all.nmea", 20, "direct"),
+    ):  # fmt: skip
+        assert run(
+            capsys, "import", tmp_path / source, "--vessel", ship, "--reference-height", height,
+            "--out", tmp_path / f"{name}.csv",
+        )[0] == 0  # fmt: skip
+    one, two = pd.read_csv(tmp_path / "by_ten.csv"), pd.read_csv(tmp_path / "direct.csv")
+    pd.testing.assert_frame_equal(one, two, rtol=1e-12)
+
+
+def test_winds_in_two_states_are_not_merged(tmp_path, capsys):
+    ship = tmp_path / "ship.toml"
+    ship.write_text(MAST_SHIP)
+    (tmp_path / "all.nmea").write_bytes(turning()[0])
+    command = ("--vessel", ship, "--out")
+    assert run(capsys, "import", tmp_path / "all.nmea", *command, tmp_path / "a.csv")[0] == 0
+    later = pd.read_csv(tmp_path / "a.csv")
+    later["t"] += json.loads((tmp_path / "a.csv.json").read_text())["epoch"] + 90
+    later.to_csv(tmp_path / "later.csv", index=False)
+    status, _, err = run(
+        capsys, "import", tmp_path / "a.csv", tmp_path / "later.csv", *command, tmp_path / "b.csv"
+    )
+    assert status == 1
+    assert "the wind of 'a' is moved to the origin and at the height of its sensor, that of" in err
+    assert "'later' is not moved" in err

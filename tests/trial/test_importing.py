@@ -14,7 +14,8 @@ from virtual import as_recording, recorded
 from greybox.errors import LogError
 from greybox.trial import stream
 from greybox.trial.canonical import merge, read_recording
-from greybox.trial.importing import ImportOptions, import_recording
+from greybox.trial.importing import import_recording
+from greybox.trial.options import ImportOptions
 from greybox.trial.readers import csv as csv_reader
 from greybox.trial.reading import read_segments
 from greybox.trial.recording import Recording, Signal
