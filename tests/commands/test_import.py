@@ -10,6 +10,7 @@ import random
 import numpy as np
 import pandas as pd
 import pytest
+from mcap.writer import Writer
 from virtual import recorded, virtual_log, write_csv
 
 from greybox.commands.main import main
@@ -368,3 +369,41 @@ def test_winds_in_two_states_are_not_merged(tmp_path, capsys):
     assert status == 1
     assert "the wind of 'a' is moved to the origin and at the height of its sensor, that of" in err
     assert "'later' is not moved" in err
+
+
+def test_topics_of_a_bag_are_chosen_and_named(tmp_path, capsys):
+    bag = tmp_path / "trial.mcap"
+    t = 0.5 * np.arange(60)
+    said = {
+        "/nav": [{"heading": 0.1 * s, "over_ground": {"ahead": 2.0 + s / 9}} for s in t],
+        "/engine": [{"speed": 100.0 + s} for s in t],
+        "/other": [{"psi": 9.0, "u": 9.0} for _ in t],
+    }
+    with open(bag, "wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        for topic, messages in said.items():
+            channel = writer.register_channel(topic, "json", 0)
+            for s, message in zip(t, messages, strict=True):
+                nanos = 1_714_550_400 * 10**9 + int(1e9 * s)
+                writer.add_message(channel, nanos, json.dumps(message).encode(), nanos)
+        writer.finish()
+    arguments = ("import", bag, "--vessel", "thesis", "--out", tmp_path / "log.csv")
+    status, _, _ = run(
+        capsys, *arguments, "--topic", "/nav=heading=psi,over_ground.ahead=u",
+        "--topic", "/engine=n",
+    )  # fmt: skip
+    assert status == 0
+    log = pd.read_csv(tmp_path / "log.csv")
+    np.testing.assert_allclose(log["psi"], 0.1 * log["t"])
+    np.testing.assert_allclose(log["u"], 2 + log["t"] / 9)
+    # a command is held: the mean over the sample that follows
+    np.testing.assert_allclose(log["n"], 100 + log["t"])
+    for given, words in (
+        ("/nva=psi", "no topic '/nva'. Did you mean '/nav'"),
+        ("/nav=headin=psi", "no numeric field 'headin'"),
+        ("=psi", "--topic =psi has no value"),
+    ):
+        status, _, err = run(capsys, *arguments, "--topic", given)
+        assert status == 1
+        assert words in err
