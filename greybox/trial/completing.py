@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.channels import LOGGED
-from greybox.errors import LogError
+from greybox.errors import LogError, suggestion
 from greybox.trial.conditioning import velocities_from_positions
 from greybox.trial.deriving import earth_to_body
 from greybox.trial.options import ImportOptions
@@ -103,9 +103,13 @@ def complete_channels(
     Raises
     ------
     LogError
-        The wind is to be brought to a height and that of the anemometer is not known.
+        The wind is to be brought to a height and that of the anemometer is not known;
+        a channel that the log has not is to be smoothed.
     """
     derived: list[str] = []
+    logged = (*LOGGED, *vessel.commands)
+    measured = [n for n in options.smooth if n in part and n in logged]
+    _smooth(part, measured, sample_time, options, derived)
     antenna = vessel.sensors.get("antenna", (0.0, 0.0))
     trim = False
     psi = part.get("psi")
@@ -142,8 +146,31 @@ def complete_channels(
         derived.append(f"u, v from positions and heading by {how}")
         trim = True
     _complete_wind(part, vessel, options, derived, wind_state(earlier))
-    keep = [n for n in (*LOGGED, *vessel.commands) if n in part]
-    return {n: part[n] for n in keep}, derived, trim
+    channels = {n: part[n] for n in logged if n in part}
+    _smooth(
+        channels, [n for n in options.smooth if n not in measured], sample_time, options, derived
+    )
+    return channels, derived, trim
+
+
+def _smooth(
+    channels: dict[str, Array],
+    names: Sequence[str],
+    sample_time: float,
+    options: ImportOptions,
+    derived: list[str],
+) -> None:
+    from greybox.trial.smoothing import smooth
+
+    for name in names:
+        if name not in channels:
+            raise LogError(
+                f"'{name}' is to be smoothed and the log has no such channel."
+                f"{suggestion(name, channels)} It has: {', '.join(channels)}."
+            )
+        window = options.smooth[name]
+        channels[name] = smooth(channels[name], sample_time, window)
+        derived.append(f"{name} smoothed over {window:g} s (local polynomials of order 2)")
 
 
 def _complete_wind(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -107,7 +107,8 @@ def import_recording(
     )
     if len(segments) > 1:
         segments = [replace(s, name=f"{s.name}[{k + 1}]") for k, s in enumerate(segments)]
-    notes += [*plan.notes, *gap_notes([(float(s.t[0]), float(s.t[-1])) for s in segments], short)]
+    spans = [(float(s.t[0]), float(s.t[-1])) for s in segments]
+    notes += [*plan.notes, *gap_notes(spans, short, plan.least)]
     if not segments:
         raise too_short(plan)
     origin_notes = [n for n in notes if n not in recording.notes]
@@ -188,6 +189,8 @@ class Plan:
     leading : tuple of str
         Signals whose holes are gaps.
     notes : tuple of str
+    least : int
+        Samples of the shortest stretch that is kept.
     """
 
     name: str
@@ -197,6 +200,7 @@ class Plan:
     periods: Mapping[str, float]
     leading: tuple[str, ...]
     notes: tuple[str, ...]
+    least: int
 
     def grid(self, first: int, stop: int) -> Array:
         """Return the times of some samples [s]."""
@@ -330,7 +334,8 @@ def plan_import(
     Raises
     ------
     LogError
-        Nothing moves in the recording, or its signals do not overlap.
+        Nothing moves in the recording, or its signals do not overlap; a window
+        of smoothing is too short or too long.
     """
     notes = [
         f"{n} has {e.count} value{'s' if e.count != 1 else ''}: left out"
@@ -394,15 +399,28 @@ def plan_import(
             f"of {longest:.4g} s, {start:.6g} s ({one} begins) to {stop:.6g} s ({two} ends) are "
             f"covered by every signal"
         )
+    count = int(np.floor((stop - start) / sample_time + 1e-6)) + 1
     return Plan(
         name,
         sample_time,
         start,
-        int(np.floor((stop - start) / sample_time + 1e-6)) + 1,
+        count,
         {n: e.period for n, e in used.items()},
         tuple(leading),
         tuple(notes),
+        max([_MIN_SEGMENT, *_windows(options, count, sample_time)]),
     )
+
+
+def _windows(options: ImportOptions, count: int, sample_time: float) -> Iterator[int]:
+    """Yield the samples of each window of smoothing."""
+    if options.smooth:
+        from greybox.trial.smoothing import window_samples
+    for name, seconds in options.smooth.items():
+        try:
+            yield window_samples(count, sample_time, seconds)
+        except LogError as error:
+            raise LogError(f"{name} cannot be smoothed: {error}") from None
 
 
 def _sample_time(extents: list[Extent]) -> float:
@@ -445,7 +463,7 @@ def cut_segments(
         keep &= covered(grid, c)
     channels = _resample(signals, clocks, vessel, grid, plan.sample_time)
     everything = runs(keep)
-    stretches = [r for r in everything if r[1] - r[0] >= _MIN_SEGMENT]
+    stretches = [r for r in everything if r[1] - r[0] >= plan.least]
     held = {n: (clock(t), words) for n, (t, words) in text.items() if len(t)}
     segments = []
     derived: tuple[str, ...] = ()
@@ -464,13 +482,13 @@ def cut_segments(
     return segments, derived, len(everything) - len(segments)
 
 
-def gap_notes(spans: Sequence[tuple[float, float]], short: int) -> list[str]:
+def gap_notes(spans: Sequence[tuple[float, float]], short: int, least: int) -> list[str]:
     """Say how many gaps there are between spans [s], and what was too short to keep."""
     notes = []
     if short:
         notes.append(
-            f"{short} stretch{'es' if short > 1 else ''} of fewer than {_MIN_SEGMENT} samples "
-            f"left out"
+            f"{short} stretch{'es' if short > 1 else ''} of fewer than {least} samples left out"
+            f"{', since none can be smoothed' if least > _MIN_SEGMENT else ''}"
         )
     gaps = [(a[1], b[0]) for a, b in pairwise(spans)]
     if gaps:
@@ -484,10 +502,12 @@ def gap_notes(spans: Sequence[tuple[float, float]], short: int) -> list[str]:
 
 def too_short(plan: Plan) -> LogError:
     """Return the error of a plan without a segment."""
+    other = " or a shorter window of smoothing" if plan.least > _MIN_SEGMENT else ""
     return LogError(
         f"'{plan.name}' has {plan.count} samples of {plan.sample_time:g} s but no "
-        f"{_MIN_SEGMENT} that follow each other in which {', '.join(plan.leading)} all have "
-        f"values (two more where velocities are derived): choose another sample time or hole."
+        f"{plan.least} that follow each other in which {', '.join(plan.leading)} all have "
+        f"values (two more where velocities are derived): choose another sample time or "
+        f"hole{other}."
     )
 
 

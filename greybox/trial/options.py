@@ -27,6 +27,9 @@ class ImportOptions:
         Latitude and longitude [deg] of ``x_n = y_n = 0``.
     notes : mapping of str to str
         Draught, loading, depth, sea state and what else was noted of the trial.
+    smooth : mapping of str to float
+        Window [s] of the local polynomials for each channel of the log that is to be
+        smoothed; none by default.
     """
 
     sample_time: float | None = None
@@ -36,3 +39,9 @@ class ImportOptions:
     reference_height: float | None = None
     origin: tuple[float, float] | None = None
     notes: Mapping[str, str] = field(default_factory=dict)
+    smooth: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def reach(self) -> float:
+        """Time over which filters see their neighbours, at most [s]."""
+        return self.window + max(self.smooth.values(), default=0.0)

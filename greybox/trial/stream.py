@@ -180,11 +180,13 @@ class _Stream:
         """Time that blocks share, so that no filter sees a block's end [s]."""
         plan = self.scan.plan
         slowest = max(plan.periods.values())
-        return 8 * (plan.sample_time + slowest) + 2 * self.options.window + self.scan.back
+        return 8 * (plan.sample_time + slowest) + 2 * self.options.reach + self.scan.back
 
     def provenance(self) -> Provenance:
         """Return where the log came from, with all that is known by now."""
-        notes = dict.fromkeys([*self.table.notes, *self.scan.notes, *gap_notes(self.spans, 0)])
+        notes = dict.fromkeys(
+            [*self.table.notes, *self.scan.notes, *gap_notes(self.spans, 0, self.scan.plan.least)]
+        )
         whole = Recording(
             self.table.path.stem, (), epoch=self.scan.scale.epoch, files=(self.file,),
             derived=self.scan.derived,
@@ -251,7 +253,7 @@ class _Stream:
         notes: list[str] = []
         signals = clean_signals(recording, scan.origin, notes)
         # samples beside those wanted, so that stretches do not end where the block does
-        margin = _MARGIN + int(np.ceil(self.options.window / plan.sample_time))
+        margin = _MARGIN + int(np.ceil(self.options.reach / plan.sample_time))
         span = (max(self.done - margin, 0), min(stop + margin, plan.count))
         found, derived, _ = cut_segments(
             signals, recording.text, plan, span, self.vessel, self.options, scan.derived

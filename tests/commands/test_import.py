@@ -407,3 +407,78 @@ def test_topics_of_a_bag_are_chosen_and_named(tmp_path, capsys):
         status, _, err = run(capsys, *arguments, "--topic", given)
         assert status == 1
         assert words in err
+
+
+@pytest.mark.parametrize("cells", [None, 0], ids=["memory", "blocks"])
+def test_channels_are_smoothed_where_asked(tmp_path, capsys, monkeypatch, cells):
+    if cells is not None:
+        monkeypatch.setattr("greybox.trial.stream._LARGE_CELLS", cells)
+        monkeypatch.setattr("greybox.trial.stream._BLOCK_ROWS", 50)
+        monkeypatch.setattr("greybox.trial.readers.csv._BLOCK_BYTES", 1 << 12)
+    rng = np.random.default_rng(5)
+    table = data(300).drop(columns=["r"])
+    table["psi"] = 0.3 + 0.01 * table["t"]
+    table["v"] = 0.1 * rng.standard_normal(300)
+    table["u"] = rng.standard_normal(300)
+    table = table.drop(index=[*range(100, 110), *range(114, 120)])
+    table.to_csv(tmp_path / "raw.csv", index=False)
+    out = tmp_path / "log.csv"
+    arguments = ("import", tmp_path / "raw.csv", "--vessel", "thesis", "--out", out)
+    status, said, _ = run(
+        capsys, *arguments, "--smooth", "u=4", "--smooth", "r=2.9", "--smooth", "psi=2"
+    )
+    assert status == 0
+    record = json.loads((tmp_path / "log.csv.json").read_text())
+    assert record["derived"] == [
+        "u smoothed over 4 s (local polynomials of order 2)",
+        "psi smoothed over 2 s (local polynomials of order 2)",
+        "r from heading by central differences (3.57)",
+        "r smoothed over 2.9 s (local polynomials of order 2)",
+    ]
+    assert record["command"]["smooth"] == ["u=4", "r=2.9", "psi=2"]
+    assert "u smoothed over 4 s" in said
+    # the four samples between two gaps are fewer than a window
+    assert [s[2] for s in record["segments"]] == [98, 178]
+    log = pd.read_csv(out).set_index("t")
+    np.testing.assert_allclose(log["r"], 0.01, atol=1e-12)
+    raw = table.set_index("t")
+    np.testing.assert_array_equal(log["v"], raw["v"][log.index])
+    for at in (0.5, 20.0, 49.0, 60.5, 100.0, 149.0):
+        # the parabola through the nine samples around, of the outermost at the ends
+        stretch = raw["u"].loc[:49.5] if at < 50 else raw["u"].loc[60.0:]
+        k = int(np.clip(stretch.index.get_loc(at), 4, len(stretch) - 5))
+        near = stretch.iloc[k - 4 : k + 5]
+        fitted = np.polyval(np.polyfit(near.index - at, near, 2), 0.0)
+        assert log["u"][at] == pytest.approx(fitted, abs=1e-9)
+
+
+@pytest.mark.parametrize("cells", [None, 0], ids=["memory", "blocks"])
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ("r", "--smooth r has no value"),
+        ("r=0", "--smooth r has a window of '0', it must be a positive number of seconds"),
+        ("r=-1", "'-1', it must be a positive number"), ("r=nan", "'nan', it must be a positive"),
+        ("r=x", "'x', it must be a positive"), ("r=1e999", "'1e999', it must be a positive"),
+        ("psy=4", "'psy' is to be smoothed and the log has no such channel. Did you mean 'psi'?"),
+        ("t=4", "'t' is to be smoothed and the log has no such channel"),
+        ("r=1", "r cannot be smoothed: a window of 1 s holds 3 samples of 0.5 s, order 2 needs 4"),
+        ("r=50", "a window of 50 s holds 101 samples, the log has 60: use a window of at most 29"),
+        ("r=25", "no 51 that follow each other"),
+    ],
+)  # fmt: skip
+def test_windows_that_cannot_be(tmp_path, capsys, monkeypatch, cells, given, words):
+    if cells is not None:
+        monkeypatch.setattr("greybox.trial.stream._LARGE_CELLS", cells)
+    table = data()
+    (table.drop(index=range(30, 36)) if given == "r=25" else table).to_csv(
+        tmp_path / "raw.csv", index=False
+    )
+    status, _, err = run(
+        capsys, "import", tmp_path / "raw.csv", "--vessel", "thesis",
+        "--out", tmp_path / "log.csv", "--smooth", given,
+    )  # fmt: skip
+    assert status == 1
+    assert words in err
+    assert err.count("\n") == 1
+    assert os.listdir(tmp_path) == ["raw.csv"]
