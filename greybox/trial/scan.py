@@ -20,9 +20,9 @@ from greybox.trial.canonical import (
     unused_mappings,
 )
 from greybox.trial.deriving import derive_signals
-from greybox.trial.importing import Extent, Plan, extent, plan_import
 from greybox.trial.names import Assigned
 from greybox.trial.options import ImportOptions
+from greybox.trial.planning import Extent, Plan, extent, plan_import
 from greybox.trial.readers.table import Batch, TableFile
 from greybox.trial.recording import Recording, Signal
 from greybox.trial.resampling import clock

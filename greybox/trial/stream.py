@@ -21,16 +21,11 @@ from greybox.trial.canonical import (
     unused_mappings,
 )
 from greybox.trial.checks.check import check_recording
-from greybox.trial.importing import (
-    clean_signals,
-    cut_segments,
-    gap_notes,
-    import_recording,
-    make_provenance,
-    too_short,
-)
+from greybox.trial.importing import cut_segments, import_recording, make_provenance
 from greybox.trial.log import Provenance, TrialLog
 from greybox.trial.options import ImportOptions
+from greybox.trial.ordering import clean_signals
+from greybox.trial.planning import gap_notes, too_short
 from greybox.trial.readers.formats import open_raw
 from greybox.trial.readers.table import Batch, TableFile
 from greybox.trial.recording import Recording, SourceFile
