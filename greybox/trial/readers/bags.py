@@ -87,14 +87,19 @@ def _digits(name: str) -> list[str]:
 
 def _metadata(path: Path) -> dict[str, Any]:
     from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
 
     if path.stat().st_size > _MAX_METADATA:
         return {}
     try:
         tree = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
         information = tree["rosbag2_bagfile_information"]
+    # values that their tags or spelling promise and that do not convert raise Python's own;
     # whatever is wrong with it, the files can be found without it
-    except Exception:
+    except (
+        YAMLError, OSError, ValueError, LookupError, TypeError, ArithmeticError, AssertionError,
+        RecursionError,
+    ):  # fmt: skip
         return {}
     return information if isinstance(information, dict) else {}
 
