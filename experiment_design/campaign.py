@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from experiment_design.inputs import prbs
 from experiment_design.moments import Moments
 from experiment_design.problem import TrialProblem
 from experiment_design.request import DesignRequest, build_problem
@@ -19,9 +20,9 @@ from experiment_design.search import (
     assess,
     best_random,
     climb,
-    draw_prbs,
     draw_two_level,
     limit_scale,
+    within_reach,
 )
 from greybox.study.parallel import map_pieces, processors
 
@@ -198,7 +199,12 @@ def search_campaign(
 
 def _chain_starts(problem: TrialProblem, best: Candidate, rng: np.random.Generator) -> list[Array]:
     """Return the starts of each chain: the best two-level and PRBS sequences, shared out."""
-    drawn = np.concatenate([draw_two_level(problem, rng, REFERENCE), draw_prbs(problem, 7)])
+    drawn = np.concatenate(
+        [
+            draw_two_level(problem, rng, REFERENCE),
+            within_reach(problem, prbs(*problem.shape)),
+        ]
+    )
     found = assess(problem, drawn)
     scale = limit_scale(problem)
     # feasible first; else those that miss least

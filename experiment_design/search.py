@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
-from scipy.signal import max_len_seq
 
+from experiment_design.inputs import random_two_level
 from experiment_design.limits import TOLERANCE
 from experiment_design.problem import TrialProblem
 
@@ -93,25 +93,14 @@ def to_unit(problem: TrialProblem, levels: Array) -> Array:
     return np.asarray((levels - s.lower) / span)
 
 
+def within_reach(problem: TrialProblem, unit: Array) -> Array:
+    """Return unit coordinates (..., K, nc) clipped to what limits and rates allow."""
+    return to_unit(problem, problem.schedule.within_reach(problem.levels(unit)))
+
+
 def draw_two_level(problem: TrialProblem, rng: np.random.Generator, count: int) -> Array:
     """Draw sequences (count, K, nc) with each command at one of its limits, as rates allow."""
-    unit = (rng.random((count, *problem.shape)) < 0.5).astype(float)
-    return to_unit(problem, problem.schedule.within_reach(problem.levels(unit)))
-
-
-def draw_prbs(problem: TrialProblem, count: int) -> Array:
-    """Return maximum-length sequences (≤ count, K, nc), each command shifted."""
-    holds, commands = problem.shape
-    found = []
-    for bits in range(4, 11):
-        sequence = max_len_seq(bits)[0].astype(float)
-        columns = [
-            np.resize(np.roll(sequence, i * len(sequence) // commands), holds)
-            for i in range(commands)
-        ]
-        found.append(np.column_stack(columns))
-    unit = np.array(found[:count])
-    return to_unit(problem, problem.schedule.within_reach(problem.levels(unit)))
+    return within_reach(problem, random_two_level(*problem.shape, count, rng))
 
 
 def best_random(
@@ -180,7 +169,7 @@ def ascend(problem: TrialProblem, unit: Array, budget: int) -> Candidate:
         spent += int(result.nfev)
         current = np.asarray(result.x).reshape(shape)
         if problem.schedule.limited:
-            current = to_unit(problem, problem.schedule.within_reach(problem.levels(current)))
+            current = within_reach(problem, current)
         candidate = assess(problem, current[None])[0]
         if candidate.beats(best, scale):
             best = candidate
@@ -221,7 +210,7 @@ def exchange(problem: TrialProblem, unit: Array, passes: int) -> Candidate:
         trials = np.repeat(best.unit[None], len(places), axis=0)
         where = places[:, :2].astype(int)
         trials[np.arange(len(places)), where[:, 0], where[:, 1]] = places[:, 2]
-        trials = to_unit(problem, problem.schedule.within_reach(problem.levels(trials)))
+        trials = within_reach(problem, trials)
         found = assess(problem, trials)
         spent += len(found)
         good = [i for i, c in enumerate(found) if c.beats(best, scale)]
@@ -234,7 +223,7 @@ def exchange(problem: TrialProblem, unit: Array, passes: int) -> Candidate:
             current = current.copy()
             current[where[i, 0], where[i, 1]] = places[i, 2]
             stacked.append(current)
-        several = to_unit(problem, problem.schedule.within_reach(problem.levels(np.array(stacked))))
+        several = within_reach(problem, np.array(stacked))
         candidates = [found[good[0]], *assess(problem, several)]
         spent += len(several)
         before = best
