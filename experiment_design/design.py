@@ -342,7 +342,8 @@ def design_trial(
         raise InfeasibleError(_unexcited(problems, units, request))
     predictor = request.build_predictor()
     names = tuple(predictor.columns[i].name for i in criterion.wanted)
-    notes += _require_informative(request, problems, units)
+    if not missing or not best_effort:
+        notes += _require_informative(request, problems, units)
     versus, random_value = None, float("nan")
     if reference is not None:
         other = add_up([own_moments(p, u) for p, u in zip(problems, reference, strict=True)])

@@ -24,8 +24,10 @@ Array = NDArray[np.float64]
 # random sequences that `efficiency_vs_random` is measured against
 REFERENCE = 200
 _DRAWS = 4000
-_OUTER = 7
+_OUTER = 10
 _ITERATIONS = 150
+# fewer where limits matter: multipliers are better renewed than a penalty followed to its end
+_LIMITED_ITERATIONS = 50
 # a criterion a parameter that is gained for each scaled unit of a limit, at first
 _PENALTY = 3.0
 
@@ -146,7 +148,8 @@ def ascend(problem: TrialProblem, unit: Array, budget: int) -> Candidate:
     multipliers: Array | None = None
     penalty = _PENALTY
     current = np.asarray(unit, float)
-    for _ in range(_OUTER):
+    iterations = _ITERATIONS
+    for outer in range(_OUTER):
         held = multipliers
 
         def cost(
@@ -157,14 +160,14 @@ def ascend(problem: TrialProblem, unit: Array, budget: int) -> Candidate:
                 return 1e6, np.zeros(flat.size)
             return -value, -slope.ravel()
 
-        most = max(2, min(2 * _ITERATIONS, budget - spent))
+        most = max(2, min(2 * iterations, budget - spent))
         result = minimize(
             cost,
             current.ravel(),
             jac=True,
             method="L-BFGS-B",
             bounds=[(0.0, 1.0)] * current.size,
-            options={"maxiter": _ITERATIONS, "maxfun": most},
+            options={"maxiter": iterations, "maxfun": most},
         )
         spent += int(result.nfev)
         current = np.asarray(result.x).reshape(shape)
@@ -179,11 +182,12 @@ def ascend(problem: TrialProblem, unit: Array, budget: int) -> Candidate:
             break
         known = np.zeros_like(h) if multipliers is None else multipliers
         updated = np.maximum(0.0, known + penalty * h)
-        if h.max() <= 1e-3 and np.abs(updated - known).max() <= 1e-3 * max(1.0, updated.max()):
+        if h.max() <= 1e-3 and (outer > 1 or not updated.any()):
             break
+        iterations = _LIMITED_ITERATIONS
+        if multipliers is not None and h.max() > 1e-3:
+            penalty *= 2.0
         multipliers = updated
-        if h.max() > 0.02:
-            penalty *= 4.0
     assert best is not None
     return Candidate(best.unit, best.value, best.missed, spent)
 
