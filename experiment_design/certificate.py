@@ -18,6 +18,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +43,9 @@ _SECONDS = 3.5
 _COST = (6e-4, 1.8e-7)
 # scenarios of an uncertain prior model that are certified one by one
 _SCENARIOS = 8
+# wanted parameters up to which the information of all columns is mixed: a matrix of
+# few entries would leave no room for what the ascents miss
+_FEW = 3
 # exponent of the norm that the gradient of E stands on
 _SHARP = 8
 # smallest eigenvalue of a correlation-scaled score matrix that is inverted
@@ -53,9 +57,9 @@ _HULL = (
     "functional is maximised over sequences by {count} ascents from perturbed and random starts."
 )
 _HULL_CHECKED = (
-    "Numerical: an ascent may miss a better sequence, so the largest bound of the last third of the "
-    "search is taken, and what that third still raised is added; compared with exhaustive search "
-    "on short trials in the tests."
+    "Numerical: an ascent may miss a better sequence, so the largest bound of the last third of "
+    "the search is taken, and what that third still raised is added; compared with exhaustive "
+    "search on short trials in the tests."
 )
 _SURGE = (
     "Mixtures of the summed moments of all sequences, improved from {starts} starts; each step "
@@ -75,9 +79,9 @@ class Certificate:
 
     Parameters
     ----------
-    efficiency_lower_bound : float
+    efficiency_lower_bound : float or None
         (det C_bound / det C)^(1/p) for D, the ratio of the criterion's variances
-        for A, E and c; NaN where not available.
+        for A, E and c; None where not available.
     value, bound : float
         Criterion of the design, and what no admissible input exceeds.
     gap : float
@@ -96,7 +100,7 @@ class Certificate:
         [s]
     """
 
-    efficiency_lower_bound: float
+    efficiency_lower_bound: float | None
     value: float
     bound: float
     gap: float
@@ -113,16 +117,38 @@ class Certificate:
         """Whether there is a bound."""
         return not self.reason
 
-    def summary(self) -> str:
-        """Return the certificate as text."""
-        if not self.available:
+    def sentence(self) -> str:
+        """Return one sentence for the summary of a design."""
+        if self.efficiency_lower_bound is None:
             return f"certificate: not available because {self.reason}"
-        kind = "proven" if self.rigorous else "numerical"
-        return (
-            f"certificate: at least {100 * self.efficiency_lower_bound:.0f} % of the best possible "
-            f"({kind} bound {self.bound:.3f}, design {self.value:.3f})\n"
-            f"  {self.method}\n  {self.checked}"
-        )
+        kind = "proven" if self.rigorous else "numerical bound"
+        percent = int(100 * self.efficiency_lower_bound)
+        return f"certificate: at least {percent} % of the best that any input could reach ({kind})"
+
+    def summary(self) -> str:
+        """Return the sentence with how the bound was found and checked."""
+        parts = [self.sentence(), self.method, self.checked]
+        return "\n  ".join(p for p in parts if p)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fields for JSON, without the wall time; not finite numbers as None."""
+        out = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "wall_s"}
+        return {
+            k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in out.items()
+        }
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Bound under one scenario, fields as `Certificate`."""
+
+    value: float
+    bound: float
+    gap: float
+    mixture: int
+    evaluations: int
+    method: str
+    checked: str
 
 
 @dataclass(frozen=True)
@@ -164,7 +190,7 @@ class _Tangent(Criterion):
 
 def _pseudo_inverse(score: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Return the inverse (R, p, p) on what is excited, and whether the sums are finite."""
-    good = np.isfinite(score).all(axis=(1, 2))
+    good = np.asarray(np.isfinite(score).all(axis=(1, 2)))
     score = np.where(good[:, None, None], score, 0.0)
     size = np.sqrt(np.maximum(np.diagonal(score, axis1=1, axis2=2), 0.0))
     size = np.where(size > 0, size, 1.0)
@@ -178,9 +204,10 @@ def _information(criterion: Criterion, moments: Moments, whole: bool) -> Array:
         inverse, good = _pseudo_inverse(moments.score)
         info = np.asarray(moments.gram @ inverse @ moments.gram)
     else:
-        c, _, _, good = criterion._solve(moments)
+        c, _, _, fit = criterion._solve(moments)
+        good = fit > 0
         c[~good] = np.eye(c.shape[1])
-        info = np.linalg.inv(c)
+        info = np.asarray(np.linalg.inv(c))
     info = (info + info.transpose(0, 2, 1)) / 2
     info[~good] = np.inf
     return info
@@ -220,16 +247,12 @@ class _Pool:
         self.info = np.concatenate([self.info, info[good]])
 
 
-def _mixture(pools: list[_Pool], weights: list[Array], constant: Array) -> Array:
-    total = constant.copy()
-    for pool, w in zip(pools, weights, strict=True):
-        total += np.tensordot(w, pool.info, 1)
-    return total
+def _mixture(pools: list[_Pool], weights: list[Array]) -> Array:
+    parts = [np.tensordot(w, p.info, 1) for p, w in zip(pools, weights, strict=True)]
+    return np.asarray(sum(parts[1:], parts[0]))
 
 
-def _best_weights(
-    outer: Criterion, pools: list[_Pool], weights: list[Array], constant: Array
-) -> list[Array]:
+def _best_weights(outer: Criterion, pools: list[_Pool], weights: list[Array]) -> list[Array]:
     """Return the weights that maximise the criterion of the mixture, each trial's sum one."""
     ends = np.cumsum([len(w) for w in weights])[:-1]
 
@@ -239,7 +262,7 @@ def _best_weights(
 
     def cost(flat: Array) -> tuple[float, Array]:
         parts = shares(flat)
-        value, slope = _concave(outer, _mixture(pools, parts, constant))
+        value, slope = _concave(outer, _mixture(pools, parts))
         if not np.isfinite(value):
             return 1e6, np.zeros_like(flat)
         gradient = []
@@ -258,11 +281,10 @@ def _bound_hull(
     units: Sequence[Array],
     seed: int,
     budget: int,
-    constant: Array | None = None,
 ) -> tuple[float, float, int, int, int]:
     """Return the bound, its gap, the mixture's size, evaluations and ascents."""
-    whole = len(problems) > 1
     criterion = problems[0].criterion
+    whole = len(problems) > 1 or len(criterion.wanted) <= _FEW
     outer = criterion if whole else _wanted_only(criterion)
     rng = np.random.default_rng([13, seed])
     pools = [_Pool(p, u, whole) for p, u in zip(problems, units, strict=True)]
@@ -275,16 +297,14 @@ def _bound_hull(
         if best.size:
             pool.add(draws[best])
         weights.append(np.full(len(pool.units), 1.0 / len(pool.units)))
-    size = pools[0].info.shape[1]
-    fixed = np.zeros((size, size)) if constant is None else constant
     history: list[tuple[int, float, float]] = []
     turn = 0
     while spent < budget:
-        weights = _best_weights(outer, pools, weights, fixed)
-        mixed = _mixture(pools, weights, fixed)
+        weights = _best_weights(outer, pools, weights)
+        mixed = _mixture(pools, weights)
         value, slope = _concave(outer, mixed)
         at = spent
-        gap = -float((slope * (mixed - fixed)).sum())
+        gap = -float((slope * mixed).sum())
         for t, pool in enumerate(pools):
             own = {f.name: getattr(criterion, f.name) for f in fields(criterion)}
             tangent = _Tangent(**own, weights=slope, whole=whole)
@@ -330,143 +350,117 @@ def default_budget(problem: TrialProblem) -> int:
 
 
 def certify(
-    problem: TrialProblem, unit: Array, seed: int = 0, budget: int | None = None
+    problems: Sequence[TrialProblem],
+    units: Sequence[Array],
+    seed: int = 0,
+    budget: int | None = None,
 ) -> Certificate:
-    """Bound what any admissible input could reach, and compare a design with it.
+    """Bound what any admissible inputs of one or several trials could reach.
+
+    In a campaign the covariance of the summed moments is no smaller than that of
+    the summed information G M⁻¹ G, to which each trial adds its own part.
 
     Parameters
     ----------
-    problem : TrialProblem
-        One trial; sums of other trials in ``known`` count as fixed.
-    unit : ndarray
-        (K, nc) unit coordinates of the design.
+    problems : sequence of TrialProblem
+        One a trial. Sums of earlier trials in ``known`` count for a single trial;
+        in a campaign they are left out.
+    units : sequence of ndarray
+        (K, nc) unit coordinates of each trial's design.
     seed : int
     budget : int, optional
         Evaluations to spend; a few seconds by default.
+
+    Returns
+    -------
+    Certificate
 
     References
     ----------
     Kiefer and Wolfowitz (1960), the equivalence theorem.
     """
     began = time.perf_counter()
-    result = problem.evaluate(unit[None])
-    value = float(result.value[0])
-    if not np.isfinite(value):
-        return _absent(value, "the design leaves some direction without excitation", began)
-    if len(problem.scenarios) > 1:
-        return _over_scenarios(problem, unit, value, seed, budget, began)
-    if not why_not_surge(problem):
-        found = bound_surge(problem, unit, seed)
-        bound = max(found.bound + _slack(problem.criterion), value)
-        return _made(
-            problem.criterion, value, bound, found.gap, found.mixture, found.evaluations,
-            _SURGE.format(starts=found.starts),
-            _SURGE_CHECKED.format(spread=found.spread, grid=found.grid), began,
-        )  # fmt: skip
-    spend = default_budget(problem) if budget is None else budget
-    bound, gap, members, spent, ascents = _bound_hull([problem], [unit], seed, spend)
-    return _made(
-        problem.criterion, value, max(bound, value), gap, members, spent,
-        _HULL.format(count=ascents), _HULL_CHECKED, began,
-    )  # fmt: skip
-
-
-def certify_campaign(
-    problems: Sequence[TrialProblem],
-    units: Sequence[Array],
-    seed: int = 0,
-    budget: int | None = None,
-    known: Moments | None = None,
-) -> Certificate:
-    """Bound what any admissible inputs of several trials together could reach.
-
-    The covariance of sums is no smaller than that of the summed information
-    G M⁻¹ G of the trials, which is a sum of one part a trial.
-
-    Parameters
-    ----------
-    problems : sequence of TrialProblem
-        One a trial; their ``known`` is left out.
-    units : sequence of ndarray
-        (K, nc) each, the designs.
-    seed : int
-    budget : int, optional
-        Evaluations to spend over all trials.
-    known : Moments, optional
-        Sums of earlier trials, (1, p, p).
-    """
-    began = time.perf_counter()
-    alone = [p.with_known(()) for p in problems]
-    if len(alone) == 1:
-        one = alone[0].with_known(() if known is None else (known,) * len(alone[0].scenarios))
-        return certify(one, units[0], seed, budget)
-    if any(len(p.scenarios) > 1 for p in alone):
-        return _absent(np.nan, "a campaign over an uncertain prior model has no bound yet", began)
-    total = known
-    for p, u in zip(alone, units, strict=True):
-        motion = p.scenarios[0].rollout.run(p.schedule.expand(p.levels(u[None])))
-        own = p.moments(motion, 0)
-        total = own if total is None else total + own
-    assert total is not None
-    criterion = alone[0].criterion
-    value = float(criterion.value(total)[0])
-    if not np.isfinite(value):
-        return _absent(value, "the designs leave some direction without excitation", began)
-    constant = None if known is None else _information(criterion, known, True)[0]
-    spend = default_budget(alone[0]) if budget is None else budget
-    bound, gap, members, spent, ascents = _bound_hull(alone, units, seed, spend, constant)
-    return _made(
-        criterion, value, max(bound, value), gap, members, spent,
-        _HULL.format(count=ascents), _HULL_CHECKED, began,
-    )  # fmt: skip
-
-
-def _over_scenarios(
-    problem: TrialProblem, unit: Array, value: float, seed: int, budget: int | None, began: float
-) -> Certificate:
-    """Certify each scenario by itself: the expectation of bounds, or the least of them."""
-    count = len(problem.scenarios)
+    first = problems[0]
+    if any(p.contrast is not None for p in problems):
+        return _absent("discrimination between models maximises no information matrix", began)
+    count = len(first.scenarios)
     if count > _SCENARIOS:
         return _absent(
-            value, f"{count} scenarios would need {count} bounds; at most {_SCENARIOS} are made", began
+            f"{count} scenarios of the prior model would need as many bounds, and at most "
+            f"{_SCENARIOS} are made",
+            began,
         )
-    spend = max(2 * _ASCENT, (default_budget(problem) if budget is None else budget) // count)
-    parts = []
-    for i, scenario in enumerate(problem.scenarios):
-        known = problem.known[i : i + 1]
-        parts.append(certify(replace(problem, scenarios=(scenario,), known=known), unit, seed, spend))
-    for part in parts:
-        if not part.available:
-            return _absent(value, part.reason, began)
+    spend = default_budget(first) if budget is None else budget
+    spend = max(4 * _ASCENT, spend // count)
+    parts: list[_Part] = []
+    for i in range(count):
+        alone = [_single(p, i, len(problems) == 1) for p in problems]
+        total = [
+            p.moments(p.scenarios[0].rollout.run(_expand(p, u[None])), 0)
+            for p, u in zip(alone, units, strict=True)
+        ]
+        value = float(first.criterion.value(sum(total[1:], total[0]))[0])
+        if not np.isfinite(value):
+            return _absent("the design leaves some direction without excitation", began)
+        parts.append(_bound(alone, units, value, seed, spend))
+    share = np.array([s.weight for s in first.scenarios])
+    values = np.array([p.value for p in parts])
     bounds = np.array([p.bound for p in parts])
-    share = np.array([s.weight for s in problem.scenarios])
-    bound = float(bounds.min() if problem.worst_case else bounds @ share / share.sum())
-    return _made(
-        problem.criterion, value, max(bound, value), max(p.gap for p in parts),
-        sum(p.mixture for p in parts), sum(p.evaluations for p in parts),
-        f"Each of {count} scenarios by itself. {parts[0].method}", parts[0].checked, began,
-    )  # fmt: skip
-
-
-def _made(
-    criterion: Criterion,
-    value: float,
-    bound: float,
-    gap: float,
-    mixture: int,
-    evaluations: int,
-    method: str,
-    checked: str,
-    began: float,
-) -> Certificate:
-    size = len(criterion.wanted) if criterion.kind == "D" else 1
+    value = float(values.min() if first.worst_case else values @ share / share.sum())
+    bound = float(bounds.min() if first.worst_case else bounds @ share / share.sum())
+    size = len(first.criterion.wanted) if first.criterion.kind == "D" else 1
+    several = f"Each of {count} scenarios by itself. " if count > 1 else ""
     return Certificate(
-        float(np.exp((value - bound) / size)), value, bound, gap, mixture, evaluations, False,
-        method, checked, "", time.perf_counter() - began,
-    )  # fmt: skip
+        float(np.exp(min(value - bound, 0.0) / size)),
+        value,
+        bound,
+        max(p.gap for p in parts),
+        sum(p.mixture for p in parts),
+        sum(p.evaluations for p in parts),
+        False,
+        several + parts[0].method,
+        parts[0].checked,
+        "",
+        time.perf_counter() - began,
+    )
 
 
-def _absent(value: float, reason: str, began: float) -> Certificate:
+def _expand(problem: TrialProblem, units: Array) -> Array:
+    return problem.schedule.expand(problem.levels(units))
+
+
+def _single(problem: TrialProblem, scenario: int, known: bool) -> TrialProblem:
+    """Return the problem under one scenario, with the sums of other trials where wanted."""
+    return replace(
+        problem,
+        scenarios=(problem.scenarios[scenario],),
+        known=problem.known[scenario : scenario + 1] if known else (),
+    )
+
+
+def _bound(
+    problems: list[TrialProblem], units: Sequence[Array], value: float, seed: int, budget: int
+) -> _Part:
+    """Bound one scenario."""
+    criterion = problems[0].criterion
+    if len(problems) == 1 and not why_not_surge(problems[0]):
+        found = bound_surge(problems[0], units[0], seed)
+        return _Part(
+            value,
+            max(found.bound + _slack(criterion), value),
+            found.gap,
+            found.mixture,
+            found.evaluations,
+            _SURGE.format(starts=found.starts),
+            _SURGE_CHECKED.format(spread=found.spread, grid=found.grid),
+        )
+    bound, gap, members, spent, ascents = _bound_hull(problems, units, seed, budget)
+    return _Part(
+        value, max(bound, value), gap, members, spent, _HULL.format(count=ascents), _HULL_CHECKED
+    )
+
+
+def _absent(reason: str, began: float) -> Certificate:
     return Certificate(
-        np.nan, value, np.nan, np.nan, 0, 0, False, "", "", reason, time.perf_counter() - began
+        None, np.nan, np.nan, np.nan, 0, 0, False, "", "", reason, time.perf_counter() - began
     )

@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 CriterionKind = Literal["D", "A", "E", "c"]
 CRITERIA: tuple[CriterionKind, ...] = ("D", "A", "E", "c")
 # smallest eigenvalue of a correlation-scaled Gram matrix that counts as excited
-_FLOOR = 1e-13
+_FLOOR = 1e-12
 # exponent of the norm that stands for the largest eigenvalue while climbing
 _SHARP = 8
 
@@ -38,12 +38,15 @@ class Criterion:
         (p_w,) unit of each wanted parameter in A and E, its prior magnitude.
     combination : ndarray
         (p_w,) gradient of the function of the parameters that ``c`` looks at.
+    prior : ndarray, optional
+        (p_w, p_w) information on the wanted parameters from earlier trials.
     """
 
     kind: CriterionKind
     wanted: tuple[int, ...]
     scale: Array
     combination: Array
+    prior: Array | None = None
 
     def __post_init__(self) -> None:
         if self.kind not in CRITERIA:
@@ -52,8 +55,21 @@ class Criterion:
             )
 
     def covariance(self, moments: Moments) -> Array:
-        """Return C, (R, p_w, p_w); infinite where a direction is not excited."""
-        return self._solve(moments)[0]
+        """Return C, (R, p_w, p_w), prior included; infinite where a direction is not excited."""
+        c, _, _, good = self._solve(moments)
+        if good.any():
+            c[good] = self._posterior(c[good])
+        return c
+
+    def _posterior(self, c: Array) -> Array:
+        """Return (C⁻¹ + prior)⁻¹, as C (I + prior C)⁻¹."""
+        if self.prior is None:
+            return c
+        d = np.sqrt(np.diagonal(c, axis1=1, axis2=2))
+        outer = d[:, :, None] * d[:, None, :]
+        unit, known = c / outer, self.prior * outer
+        both = unit @ np.linalg.inv(np.eye(c.shape[1]) + known @ unit)
+        return np.asarray((both + both.transpose(0, 2, 1)) / 2 * outer)
 
     def _solve(self, moments: Moments) -> tuple[Array, Array, Array, Array]:
         """Return C, the wanted rows W of G⁻¹, G⁻¹, and whether G could be inverted."""
@@ -78,7 +94,7 @@ class Criterion:
         c, _, _, good = self._solve(moments)
         out = np.full(len(c), -np.inf)
         if good.any():
-            out[good] = self.of_covariance(c[good])
+            out[good] = self.of_covariance(self._posterior(c[good]))
         return out
 
     def of_covariance(self, c: Array) -> Array:
@@ -106,8 +122,9 @@ class Criterion:
         p = moments.gram.shape[1]
         if not good[0]:
             return -np.inf, np.zeros((p, p)), np.zeros((p, p))
-        cov, w, g = c[0], rows[0], inverse[0]
-        value = float(self.of_covariance(c)[0])
+        own, w, g = c[0], rows[0], inverse[0]
+        cov = self._posterior(c)[0]
+        value = float(self.of_covariance(cov[None])[0])
         if self.kind == "D":
             d = np.sqrt(np.diag(cov))
             gamma = -np.linalg.inv(cov / np.outer(d, d)) / np.outer(d, d)
@@ -124,6 +141,10 @@ class Criterion:
                 power = share ** (_SHARP - 1) / (share**_SHARP).sum() / values[-1]
                 gamma = -(vectors * power) @ vectors.T / outer
                 value = float(-np.log(values[-1]) - np.log((share**_SHARP).sum()) / _SHARP)
+        if self.prior is not None:
+            # d C_post = T dC Tᵀ with T = C_post C⁻¹ = (I + C prior)⁻¹
+            carried = np.linalg.inv(np.eye(len(own)) + own @ self.prior)
+            gamma = carried.T @ gamma @ carried
         d_score = w.T @ gamma @ w
         side = d_score @ moments.score[0] @ g
         return value, -(side + side.T), d_score

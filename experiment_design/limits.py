@@ -7,7 +7,7 @@ read the same expression.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import casadi as ca
@@ -132,8 +132,12 @@ class LimitProgram:
     rollout : Rollout
     schedule : Schedule
     limits : TrialLimits
-    predictor_wind : bool
-        Whether the wind is measured, so that its sign may be anything (5.50).
+    wind_matters : bool
+        Whether the velocity through the air must keep its sign too (5.7), as it
+        must where the wind is not measured.
+    backoff : sequence of float
+        By how much each path limit is tightened, in its unit, for models that
+        are not known exactly.
     """
 
     def __init__(
@@ -143,6 +147,7 @@ class LimitProgram:
         limits: TrialLimits,
         *,
         wind_matters: bool = False,
+        backoff: Sequence[float] = (),
     ) -> None:
         self.limits = limits
         self.schedule = schedule
@@ -191,6 +196,9 @@ class LimitProgram:
                 distance = _polygon_distance(np.asarray(limits.area, float), north, east)
             rows.append(distance + limits.clearance)
         self.path_names = tuple(names)
+        self.backoff = np.zeros(len(rows))
+        self.backoff[: len(backoff)] = backoff
+        rows = [row + more for row, more in zip(rows, self.backoff.tolist(), strict=True)]
         self.path = ca.vertcat(*rows) if rows else ca.SX(0, 1)
         self.path_scale = np.array([_SCALE[n.unit] for n in names])
         self.end_names, self._ends = self._end_limits(limits)

@@ -108,6 +108,13 @@ class Rollout:
 
     def run(self, commands: Array) -> Motion:
         """Run freely on commands (R, N, nc)."""
+        return self._run(self.theta, commands)
+
+    def run_models(self, thetas: Array, commands: Array) -> Motion:
+        """Run other parameters (R, p) on the same commands (N, nc)."""
+        return self._run(thetas, np.broadcast_to(commands, (len(thetas), *commands.shape)))
+
+    def _run(self, theta: Array, commands: Array) -> Motion:
         structure = self.structure
         made = generalised_force(
             self.vessel,
@@ -120,7 +127,7 @@ class Rollout:
         heading = None if "r" in structure.states else np.full(samples + 1, self.start[-1])
         bound = np.array([_BOUND.get(n, 1e6) for n in structure.states])
         free = simulate(
-            structure, self.theta, self.start[:-1], tau, self.sample_time,
+            structure, theta, self.start[:-1], tau, self.sample_time,
             psi=heading, psi0=float(self.start[-1]),
             d=np.broadcast_to(self.d, (samples, self.d.size)) if self.d.any() else None,
             bound=bound,
@@ -189,7 +196,11 @@ def force_vector(vessel: Vessel, structure: Structure, commands: ca.SX) -> ca.SX
 
 
 def step_expression(
-    vessel: Vessel, structure: Structure, theta: Array, d: Array, sample_time: float
+    vessel: Vessel,
+    structure: Structure,
+    theta: Array | ca.SX,
+    d: Array | ca.SX,
+    sample_time: float,
 ) -> tuple[tuple[ca.SX, ca.SX], ca.SX]:
     """Return symbols (state (nx+3,), commands (nc,)) and the next state, by Euler (3.51).
 
@@ -200,9 +211,7 @@ def step_expression(
     place = ca.vertcat(ca.SX.sym("north"), ca.SX.sym("east"))
     f = structure.increment_expression(air_measured=False)
     x_next = s.x + f if structure.increment else f
-    fixed = ca.substitute(
-        x_next, ca.vertcat(s.d, s.theta), ca.DM(np.concatenate([np.asarray(d), np.asarray(theta)]))
-    )
+    fixed = ca.substitute(x_next, ca.vertcat(s.d, s.theta), ca.vertcat(ca.SX(d), ca.SX(theta)))
     fixed = ca.substitute(fixed, s.tau, force_vector(vessel, structure, commands))
     states = structure.states
     u = s.x[states.index("u")]

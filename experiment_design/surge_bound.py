@@ -244,7 +244,7 @@ class _Programme:
         self.before = trial.extended(before, np.broadcast_to(self.tau, before.shape))[0]
 
     def maximise(self, slope: _Sums) -> tuple[float, Array]:
-        """Return the largest ⟨slope, sums⟩ over all sequences, and the forces (K,) that reach it."""
+        """Return the largest ⟨slope, sums⟩ over all sequences, and its forces (K,)."""
         trial = self.trial
         score = trial.variance[0] * slope.score
         plain = slope.gram + trial.process * slope.score
@@ -263,7 +263,7 @@ class _Programme:
         cross = -2.0 * (self.before @ score) @ first.transpose(0, 2, 1)
         column = np.arange(self.tau.size)[None, :]
         future = np.zeros(whole.shape)
-        ahead = []
+        ahead: list[Array] = []
         for k in range(trial.problem.schedule.holds - 1, -1, -1):
             own = whole if ahead else part
             now = own + (1 - self.share) * future[self.cell, column]
@@ -330,9 +330,7 @@ def _weights(trial: _Trial, gram: Array, score: Array, weights: Array) -> Array:
 
     def cost(flat: Array) -> tuple[float, Array]:
         w = shares(flat)
-        value, slope = trial.value(
-            _Sums(np.tensordot(w, gram, 1), np.tensordot(w, score, 1))
-        )
+        value, slope = trial.value(_Sums(np.tensordot(w, gram, 1), np.tensordot(w, score, 1)))
         if not np.isfinite(value):
             return 1e6, np.zeros_like(flat)
         g = np.einsum("ij,rij->r", slope.gram, gram) + np.einsum("ij,rij->r", slope.score, score)

@@ -39,6 +39,10 @@ class ModelFileError(GreyboxError, ValueError):
     """The file is not a model of this package, or of a version it cannot read."""
 
 
+class InfeasibleError(GreyboxError, ValueError):
+    """What is asked of a trial cannot be met; the message names the limit and the least change."""
+
+
 class UsageError(GreyboxError, ValueError):
     """Options that exclude one another, or that need another one beside them."""
 

@@ -1,0 +1,379 @@
+"""`greybox design`: thruster sequences for the next trial."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from pathlib import Path
+from typing import Any
+
+from greybox.commands.common import add_seed, positive, progress, provenance, say
+
+HELP = "design the thruster sequences of the next trial"
+EXAMPLES = """examples:
+  greybox design --vessel ship.toml --model model.json --duration 600 --out plan.csv
+  greybox design --vessel ship.toml --model model.json --duration 300 --regime u+v+ \\
+      --margin-u 0.5 --margin-v 0.4 --start 1.5,1.2,0,0 --out plan.csv --json design.json
+  greybox design --vessel ship.toml --model model.json --duration 900 --area room.csv \\
+      --speed-cap 3 --yaw-cap 0.1 --sheet sheet.html --out plan.csv
+  greybox design --vessel ship.toml --model model.json --duration 600 --trials 2 --out plan.csv
+  greybox design --vessel ship.toml --model model.json --duration 600 \\
+      --between plain.json current.json --out plan.csv
+"""
+
+
+def _pair(text: str) -> tuple[float, float]:
+    first, second = (float(v) for v in text.split(","))
+    return first, second
+
+
+def _not_negative(text: str) -> float:
+    value = float(text)
+    if not 0 <= value < float("inf"):
+        raise ValueError(text)
+    return value
+
+
+def _share(text: str) -> float:
+    value = float(text)
+    if not 0 < value < 1:
+        raise ValueError(text)
+    return value
+
+
+def _floats(text: str) -> list[float]:
+    return [float(v) for v in text.split(",")]
+
+
+for _type, _name in (
+    (_pair, "two numbers A,B"),
+    (_not_negative, "number of at least 0"),
+    (_share, "number between 0 and 1"),
+    (_floats, "numbers separated by commas"),
+):
+    _type.__name__ = _name
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add = parser.add_argument
+    add("--vessel", required=True, metavar="V", help="vessel file (TOML) with limits")
+    add("--model", metavar="MODEL", help="prior model of greybox estimate")
+    add("--duration", type=positive, metavar="S", help="length of each trial [s]")
+    add("--out", required=True, metavar="PLAN", help="where to write the commands (CSV)")
+    add("--json", metavar="F", help="write the design as JSON; - is stdout")
+    add("--sheet", metavar="HTML", help="write the sheet to take on board")
+    goal = parser.add_argument_group("what is to be learnt")
+    goal.add_argument("--criterion", choices=("D", "A", "E", "c"), default="D")
+    goal.add_argument(
+        "--want", nargs="+", default=[], metavar="NAME", help="parameters that count (all)"
+    )
+    goal.add_argument(
+        "--of", metavar="EXPR", help="function of the parameters for criterion c, such as Xuu/Xmu"
+    )
+    goal.add_argument(
+        "--target",
+        nargs="+",
+        metavar="NAME=STD",
+        help="least trial time for these standard errors, --duration at most",
+    )
+    goal.add_argument("--predictor", choices=("basic", "augmented", "wind", "basic+wind"))
+    goal.add_argument(
+        "--estimator",
+        choices=("iv", "iv-white", "oe"),
+        default="iv",
+        help="zero-mean IV, the same with white residuals, or output error (iv)",
+    )
+    goal.add_argument("--prior", metavar="MODEL", help="model of earlier trials, its information")
+    goal.add_argument(
+        "--between", nargs=2, metavar=("A", "B"), help="tell two explanations apart instead"
+    )
+    motion = parser.add_argument_group("what the trial must keep")
+    motion.add_argument("--regime", default="auto", metavar="u+v+", help="signs to keep (auto)")
+    motion.add_argument("--margin-u", type=_not_negative, metavar="M", help="least |u_r| [m/s]")
+    motion.add_argument("--margin-v", type=_not_negative, metavar="M", help="least |v_r| [m/s]")
+    motion.add_argument(
+        "--hold", type=positive, default=10.0, metavar="S", help="commands change every S s (10)"
+    )
+    motion.add_argument("--start", type=_floats, metavar="u,v,r,psi", help="state at the start")
+    motion.add_argument("--trials", type=int, default=1, metavar="K", help="trials of a campaign")
+    motion.add_argument("--area", metavar="CSV", help="sea room, a polygon of x_n, y_n [m]")
+    motion.add_argument(
+        "--circle", type=_floats, metavar="N,E,R", help="round sea room: centre and radius [m]"
+    )
+    motion.add_argument(
+        "--position", type=_pair, default=(0.0, 0.0), metavar="N,E", help="place of the start [m]"
+    )
+    motion.add_argument(
+        "--clearance", type=_not_negative, default=0.0, metavar="M", help="kept from the edge [m]"
+    )
+    motion.add_argument("--speed-cap", type=positive, metavar="M", help="largest speed [m/s]")
+    motion.add_argument("--yaw-cap", type=positive, metavar="R", help="largest yaw rate [rad/s]")
+    motion.add_argument(
+        "--end",
+        nargs="+",
+        default=[],
+        metavar="NAME=VALUE:TOL",
+        help="final u, v, r, psi, x_n or y_n with tolerance",
+    )
+    motion.add_argument(
+        "--energy", type=positive, metavar="E", help="mean (n/n_max)^3 at most, such as 0.5"
+    )
+    motion.add_argument(
+        "--headings", type=positive, metavar="RAD", help="range of headings to cover [rad]"
+    )
+    belief = parser.add_argument_group("what is believed beforehand")
+    belief.add_argument("--current", type=_pair, metavar="N,E", help="expected current [m/s]")
+    belief.add_argument("--wind", type=_pair, metavar="N,E", help="expected wind [m/s]")
+    belief.add_argument(
+        "--process-noise", type=_floats, metavar="U,V,R", help="per sample, beside the model"
+    )
+    belief.add_argument(
+        "--robust",
+        type=int,
+        default=0,
+        metavar="S",
+        help="expect the criterion over S models drawn from the prior's covariance",
+    )
+    belief.add_argument(
+        "--worst-case", action="store_true", help="look at the worst of them instead"
+    )
+    belief.add_argument(
+        "--probability",
+        type=_share,
+        default=0.9,
+        metavar="P",
+        help="with which limits are kept under the prior's uncertainty (0.9)",
+    )
+    work = parser.add_argument_group("how")
+    work.add_argument(
+        "--best-effort", action="store_true", help="write the closest plan if limits stop it"
+    )
+    work.add_argument("--effort", type=positive, default=1.0, help="times the usual search (1)")
+    work.add_argument("--workers", type=int, metavar="N", help="processes (as needed)")
+    add_seed(work)  # type: ignore[arg-type]
+
+
+def run(options: argparse.Namespace) -> None:
+    """Read, design, write."""
+    # many small matrix products: threads of BLAS only get in each other's way
+    for name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+    from experiment_design.design import design_trial
+    from experiment_design.plan import write_plan
+    from experiment_design.prepare import prepare_request
+    from experiment_design.timing import least_duration
+    from greybox.errors import UsageError
+    from greybox.files import check_targets, write_json
+    from greybox.model.model import load_model
+    from greybox.vessel.toml import load_vessel
+
+    check_targets(options.out, options.json, options.sheet)
+    if options.between is None and options.model is None:
+        raise UsageError("--model is missing: name a prior model, or two with --between A B.")
+    model = load_model(options.between[0] if options.between else options.model)
+    vessel = load_vessel(options.vessel)
+    if options.duration is None:
+        raise UsageError("--duration is missing: say how long the trial may last, in seconds.")
+    wishes = _wishes(options, model)
+    prepared = prepare_request(model, wishes, vessel)
+    request = prepared.request
+    if options.between:
+        _run_between(options, request, prepared.notes)
+        return
+    if options.target:
+        request = least_duration(
+            request,
+            dict(_target(text) for text in options.target),
+            progress=progress("duration"),
+            workers=options.workers,
+        )
+    design = design_trial(
+        request,
+        best_effort=options.best_effort,
+        progress=progress("design"),
+        workers=options.workers,
+    )
+    write_plan(design, options.out)
+    record = provenance(options)
+    if options.json:
+        data: dict[str, Any] = design.to_dict()
+        data["notes"] = [*prepared.notes, *data["notes"]]
+        write_json(data | {"provenance": record}, options.json)
+    if options.json != "-":
+        say(design.summary())
+        for note in prepared.notes:
+            say(f"Note: {note}")
+        say(f"wrote {options.out}")
+
+
+def _run_between(options: argparse.Namespace, request: Any, notes: tuple[str, ...]) -> None:
+    """Design the trial between two models and write it."""
+    from experiment_design.discriminate import design_between
+    from experiment_design.plan import write_plan
+    from experiment_design.request import Rival, full_structure
+    from greybox.errors import UsageError
+    from greybox.files import write_json
+    from greybox.model.model import load_model
+
+    first, second = (Path(p).stem for p in options.between)
+    if first == second:
+        first, second = options.between
+    other = load_model(options.between[1])
+    if other.sample_time != request.sample_time:
+        raise UsageError(
+            f"'{first}' has the sample time {request.sample_time:g} s and '{second}' "
+            f"{other.sample_time:g} s: estimate both at one."
+        )
+    structure, theta = full_structure(other)
+    found = design_between(
+        request,
+        Rival(second, structure, theta, other.d),
+        (first, second),
+        best_effort=options.best_effort,
+        progress=progress("design"),
+        workers=options.workers,
+    )
+    write_plan(found.design, options.out)
+    if options.json:
+        data = found.to_dict()
+        data["notes"] = [*notes, *data["notes"]]
+        write_json(data | {"provenance": provenance(options)}, options.json)
+    if options.json != "-":
+        say(found.summary())
+        for note in notes:
+            say(f"Note: {note}")
+        say(f"wrote {options.out}")
+
+
+def _wishes(options: argparse.Namespace, model: Any) -> Any:
+    import numpy as np
+
+    from experiment_design.expressions import gradient_of
+    from experiment_design.limits import Circle, TrialLimits
+    from experiment_design.prepare import Wishes
+    from greybox.errors import UsageError
+    from greybox.model.model import load_model
+
+    if options.area and options.circle:
+        raise UsageError("--area and --circle exclude one another: give one sea room.")
+    area: Any = None
+    if options.area:
+        area = read_area(options.area)
+    if options.circle:
+        if len(options.circle) != 3 or not options.circle[2] > 0:
+            raise UsageError("--circle needs three numbers: north, east and a positive radius.")
+        area = Circle(*options.circle)
+    limits = TrialLimits(
+        area=area,
+        position=options.position,
+        clearance=options.clearance,
+        speed_cap=options.speed_cap,
+        yaw_cap=options.yaw_cap,
+        end=dict(_end(text) for text in options.end),
+        energy=options.energy,
+        headings=options.headings,
+    )
+    combination = {}
+    if options.of:
+        values = dict(zip(model.names, model.theta, strict=True))
+        combination = gradient_of(options.of, values)
+    criterion: Any = "c" if options.of and options.criterion == "D" else options.criterion
+    process = None if options.process_noise is None else np.array(options.process_noise)
+    return Wishes(
+        duration=options.duration,
+        hold=options.hold,
+        regime=options.regime,
+        margin_u=options.margin_u,
+        margin_v=options.margin_v,
+        start=options.start,
+        trials=options.trials,
+        predictor=options.predictor,
+        estimator=options.estimator,
+        criterion=criterion,
+        wanted=tuple(options.want),
+        combination=combination,
+        current=options.current,
+        wind=options.wind,
+        process_noise=process,
+        limits=limits,
+        prior=None if options.prior is None else load_model(options.prior),
+        robust=options.robust,
+        worst_case=options.worst_case,
+        probability=options.probability,
+        seed=options.seed,
+        effort=options.effort,
+    )
+
+
+def _end(text: str) -> tuple[str, tuple[float, float]]:
+    from greybox.errors import UsageError
+
+    name, _, rest = text.partition("=")
+    value, _, tolerance = rest.partition(":")
+    try:
+        return name, (float(value), float(tolerance or 0.05))
+    except ValueError as error:
+        raise UsageError(
+            f"--end '{text}' cannot be read: write NAME=VALUE:TOLERANCE, such as x_n=0:20."
+        ) from error
+
+
+def _target(text: str) -> tuple[str, float]:
+    from greybox.errors import UsageError
+
+    name, _, value = text.partition("=")
+    try:
+        return name, float(value)
+    except ValueError as error:
+        raise UsageError(
+            f"--target '{text}' cannot be read: write NAME=STD, such as Yvv=0.01."
+        ) from error
+
+
+def read_area(path: str | Path) -> Any:
+    """Read a sea room: a CSV polygon of ``x_n, y_n`` [m].
+
+    Returns
+    -------
+    ndarray
+        (m, 2) corners, north and east.
+
+    Raises
+    ------
+    LogError
+        The file cannot be read, or is no polygon.
+    """
+    import csv
+
+    import numpy as np
+
+    from greybox.errors import LogError
+
+    path = Path(path)
+    try:
+        if path.stat().st_size > 1_000_000:
+            raise LogError(f"'{path.name}' is larger than any sea room: is it a log?")
+        with open(path, encoding="utf-8-sig", newline="") as handle:
+            rows = [r for r in csv.reader(handle) if any(c.strip() for c in r)]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise LogError(f"cannot read the sea room '{path}': {error}.") from error
+    header = [c.strip() for c in rows[0]] if rows else []
+    if "x_n" not in header or "y_n" not in header:
+        raise LogError(
+            f"the sea room '{path.name}' needs columns x_n and y_n [m] in its first line: it has "
+            f"{', '.join(header) or 'none'}."
+        )
+    places = [header.index("x_n"), header.index("y_n")]
+    try:
+        corners = np.array([[float(r[p]) for p in places] for r in rows[1:]])
+    except (ValueError, IndexError) as error:
+        raise LogError(f"the sea room '{path.name}' holds a corner that is no number.") from error
+    if len(corners) > 1 and np.allclose(corners[0], corners[-1]):
+        corners = corners[:-1]
+    if len(corners) < 3 or not np.isfinite(corners).all() or len(corners) > 500:
+        raise LogError(
+            f"the sea room '{path.name}' has {len(corners)} corners, 3 to 500 finite ones are "
+            f"needed."
+        )
+    return corners

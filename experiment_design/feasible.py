@@ -1,0 +1,119 @@
+"""When limits cannot be met: which one stops the trial, and by how much."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from experiment_design.limits import TOLERANCE, LimitName
+from experiment_design.problem import TrialProblem
+from experiment_design.search import Candidate, assess, draw_two_level, limit_scale, to_unit
+
+Array = NDArray[np.float64]
+
+_STARTS = 6
+_ITERATIONS = 200
+# penalties of the squared shortfall; the last one weighs the worst sample most
+_PENALTIES = (1.0, 100.0)
+
+
+def closest(problem: TrialProblem, starts: Array, seed: int) -> Candidate:
+    """Return the sequence that misses the limits least, all information aside.
+
+    Parameters
+    ----------
+    problem : TrialProblem
+    starts : ndarray
+        (S, K, nc) sequences to start from, beside constant ones.
+    seed : int
+    """
+    rng = np.random.default_rng([23, seed])
+    holds, commands = problem.shape
+    constant = rng.random((400, commands))
+    pool = np.concatenate(
+        [starts, np.repeat(constant[:, None], holds, axis=1), draw_two_level(problem, rng, 100)]
+    )
+    scale = limit_scale(problem)
+    found = assess(problem, pool)
+    order = sorted(range(len(pool)), key=lambda i: _short(found[i], scale))
+    best = found[order[0]]
+    for i in order[:_STARTS]:
+        unit = pool[i]
+        for penalty in _PENALTIES:
+            result = minimize(
+                _shortfall,
+                unit.ravel(),
+                args=(problem, penalty),
+                jac=True,
+                method="L-BFGS-B",
+                bounds=[(0.0, 1.0)] * unit.size,
+                options={"maxiter": _ITERATIONS},
+            )
+            unit = np.asarray(result.x).reshape(problem.shape)
+            unit = to_unit(problem, problem.schedule.within_reach(problem.levels(unit)))
+            candidate = assess(problem, unit[None])[0]
+            if _short(candidate, scale) < _short(best, scale):
+                best = candidate
+        if _short(best, scale) == 0.0:
+            break
+    return best
+
+
+def _short(candidate: Candidate, scale: Array) -> float:
+    over = np.where(candidate.missed > TOLERANCE, candidate.missed, 0.0) / scale
+    return float(over.max(initial=0.0))
+
+
+def _shortfall(flat: Array, problem: TrialProblem, penalty: float) -> tuple[float, Array]:
+    """Return the penalty terms alone, with their gradient."""
+    unit = flat.reshape(problem.shape)
+    with_penalty = problem.gradient(unit, None, penalty)
+    without = problem.gradient(unit, None, 0.0)
+    if not np.isfinite(with_penalty[1]):
+        return 1e9, np.zeros(flat.size)
+    cost = without[1] - with_penalty[1]
+    return cost, (without[2] - with_penalty[2]).ravel()
+
+
+def least_change(problem: TrialProblem, best: Candidate) -> list[tuple[LimitName, float]]:
+    """Return each limit that a sequence misses with the amount, the worst first."""
+    names = problem.scenarios[0].limits.names
+    scale = limit_scale(problem)
+    missed = [(name, float(m)) for name, m in zip(names, best.missed, strict=True) if m > TOLERANCE]
+    order = {n.name: s for n, s in zip(names, scale, strict=True)}
+    return sorted(missed, key=lambda item: -item[1] / order[item[0].name])
+
+
+def in_words(name: LimitName, amount: float, what: str = "") -> str:
+    """Return one sentence: what stops the trial, and the least change that was found to help."""
+    a = float(np.ceil(amount * 1e3) / 1e3)
+    unit = f" {name.unit}" if name.unit else ""
+    if name.name.startswith("margin of"):
+        reached = name.bound - a
+        if reached >= 0:
+            return (
+                f"the {name.name}, {name.bound:g}{unit}, cannot be kept: {reached:.3f}{unit} is "
+                f"the most that was reached. Lower {name.option} to {reached:.3f}, widen the "
+                f"limits of the thrusters, or choose another --regime.{what}"
+            )
+        return (
+            f"the {name.name}, {name.bound:g}{unit}, cannot be kept: the sign changes by "
+            f"{-reached:.3f}{unit} in every sequence that was tried. Choose another --regime or "
+            f"widen the limits of the thrusters.{what}"
+        )
+    if name.name == "sea room":
+        return (
+            f"the sea room is too small: the best sequence leaves it by {amount:.1f} m. Enlarge "
+            f"it by {np.ceil(amount):.0f} m on every side, or shorten the trial.{what}"
+        )
+    if name.name == "heading coverage":
+        return (
+            f"headings cannot cover {name.bound:.3g} rad: {name.bound - amount:.3g} rad is the "
+            f"most that was reached. Lower --headings to {name.bound - a:.3g} or lengthen the "
+            f"trial.{what}"
+        )
+    return (
+        f"the {name.name} of {name.bound:g}{unit} cannot be kept: it is missed by "
+        f"{amount:.3g}{unit} at best. Raise {name.option} to {name.bound + a:.4g}{unit}.{what}"
+    )

@@ -1,0 +1,359 @@
+"""From what a user gives to a complete request: noises, margins, regimes and starts chosen."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from experiment_design.campaign import random_campaign
+from experiment_design.criteria import CriterionKind
+from experiment_design.limits import TrialLimits
+from experiment_design.noise import noise_levels
+from experiment_design.regimes import (
+    Signs,
+    Steady,
+    candidate_regimes,
+    parse_regime,
+    spell_regime,
+    steady_motions,
+    steady_start,
+)
+from experiment_design.request import DesignRequest, EstimatorKind, build_problem, full_structure
+from experiment_design.schedule import make_schedule
+from greybox.errors import InfeasibleError, StructureError, UsageError
+from greybox.model.model import ManoeuvringModel
+from greybox.model.predictor import PREDICTORS
+from greybox.model.structure import Structure
+from greybox.vessel.vessel import Vessel
+
+Array = NDArray[np.float64]
+
+# a disturbance bound of A10 where nothing is known of currents and wind [m/s]
+_DISTURBANCE = 0.1
+
+
+@dataclass(frozen=True)
+class Wishes:
+    """What a user may ask of a design; None where the product is to choose.
+
+    Parameters
+    ----------
+    duration, hold : float
+        [s]
+    regime : str
+        ``auto``, one regime such as ``u+v-``, or one a trial separated by commas.
+    margin_u, margin_v : float, optional
+        [m/s]
+    start : sequence of float, optional
+        Initial states and heading.
+    trials : int
+    predictor : str, optional
+    current, wind : (float, float), optional
+        Expected means, north and east [m/s].
+    process_noise : ndarray, optional
+        (nx,) per sample.
+    limits : TrialLimits
+        Sea room, caps, end state, energy, headings.
+    prior : ManoeuvringModel, optional
+        Whose information is added.
+    robust : int
+        Prior models drawn from the model's covariance that the criterion is expected over.
+    """
+
+    duration: float
+    hold: float = 10.0
+    regime: str = "auto"
+    margin_u: float | None = None
+    margin_v: float | None = None
+    start: Sequence[float] | None = None
+    trials: int = 1
+    predictor: str | None = None
+    estimator: EstimatorKind = "iv"
+    criterion: CriterionKind = "D"
+    wanted: tuple[str, ...] = ()
+    combination: Mapping[str, float] = field(default_factory=dict)
+    current: tuple[float, float] | None = None
+    wind: tuple[float, float] | None = None
+    process_noise: Array | None = None
+    limits: TrialLimits = field(default_factory=TrialLimits)
+    prior: ManoeuvringModel | None = None
+    robust: int = 0
+    worst_case: bool = False
+    probability: float = 0.9
+    seed: int = 0
+    effort: float = 1.0
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A request, and a sentence for each choice that was made for the user."""
+
+    request: DesignRequest
+    notes: tuple[str, ...]
+
+
+def prepare_request(
+    model: ManoeuvringModel, wishes: Wishes, vessel: Vessel | None = None
+) -> Prepared:
+    """Complete what a user asked for.
+
+    Parameters
+    ----------
+    model : ManoeuvringModel
+        The prior: parameters, their covariance, residuals, known current.
+    wishes : Wishes
+    vessel : Vessel, optional
+        With limits and sensors; by default the model's own.
+
+    Raises
+    ------
+    UsageError
+        Wishes that exclude one another.
+    InfeasibleError
+        No motion within the limits keeps the wanted signs.
+    """
+    vessel = model.vessel if vessel is None else vessel
+    structure, theta = full_structure(model)
+    if structure.disturbance != "marine" or "u" not in structure.states:
+        raise StructureError(
+            f"structure '{structure.name}' has no surge speed u, so no trial can be designed for "
+            f"it: use a manoeuvring structure such as 'thesis' or 'surge'."
+        )
+    notes: list[str] = []
+    if wishes.trials < 1:
+        raise UsageError(f"--trials is {wishes.trials}, it must be 1 or more.")
+    schedule = make_schedule(vessel, wishes.duration, wishes.hold, model.sample_time)
+    noise = noise_levels(model, vessel, wishes.process_noise)
+    notes.append(f"noise: {noise.source}")
+    predictor = _predictor(model, structure, wishes, notes)
+    d = np.array(model.d, float)
+    if wishes.current is not None:
+        d[:2] = wishes.current
+    if wishes.wind is not None:
+        d[2:] = wishes.wind
+    if predictor in ("wind", "basic+wind") and not d[2:].any():
+        raise UsageError(
+            f"predictor '{predictor}' measures the wind, and in still air its terms are those of "
+            f"the water: give the wind to expect, such as --wind 5,0 (north, east, m/s)."
+        )
+    margins = _margins(model, structure, noise.measurement, wishes, notes)
+    covariance = np.zeros((theta.size, theta.size))
+    size = model.covariance.shape[0]
+    covariance[:size, :size] = model.covariance
+    base = DesignRequest(
+        vessel=vessel,
+        structure=structure,
+        theta=theta,
+        sample_time=model.sample_time,
+        noise=noise,
+        duration=wishes.duration,
+        hold=wishes.hold,
+        regimes=((),),
+        starts=(np.zeros(len(structure.states) + 1),),
+        limits=replace(wishes.limits, margins=margins),
+        predictor=predictor,
+        estimator=wishes.estimator,
+        criterion=wishes.criterion,
+        wanted=wishes.wanted,
+        combination=wishes.combination,
+        d=d,
+        prior=_prior(wishes.prior),
+        covariance=covariance if covariance.any() else None,
+        scenarios=wishes.robust,
+        worst_case=wishes.worst_case,
+        probability=wishes.probability,
+        seed=wishes.seed,
+        effort=wishes.effort,
+    )
+    steady = steady_motions(vessel, structure, theta, d, schedule)
+    if not len(steady.x):
+        raise InfeasibleError(
+            f"the prior model is unstable in free run: under each of {steady.unstable} constant "
+            f"commands a state passes 100 m/s or 10 rad/s within 400 s. Design with a stable "
+            f"model: estimate it with fewer terms (--structure linear), or on more data."
+        )
+    start = _start(wishes, structure)
+    if wishes.regime.strip().lower() == "auto":
+        regimes = _choose_regimes(base, steady, start, wishes, notes)
+    else:
+        parts = [parse_regime(p, structure.states) for p in wishes.regime.split(",")]
+        if len(parts) not in (1, wishes.trials):
+            raise UsageError(
+                f"--regime names {len(parts)} regimes for {wishes.trials} "
+                f"trial{'s' if wishes.trials > 1 else ''}: give one, or one a trial."
+            )
+        regimes = tuple(parts * wishes.trials if len(parts) == 1 else parts)
+    starts = tuple(_start_of(signs, start, steady, structure, margins) for signs in regimes)
+    if start is None:
+        shown = ", ".join(
+            f"{n} {v:.2f}" for n, v in zip((*structure.states, "psi"), starts[0], strict=True)
+        )
+        notes.append(f"the first trial starts from a steady motion: {shown} (--start to change)")
+    return Prepared(replace(base, regimes=regimes, starts=starts), tuple(notes))
+
+
+def _predictor(
+    model: ManoeuvringModel, structure: Structure, wishes: Wishes, notes: list[str]
+) -> str:
+    if wishes.predictor is not None:
+        if wishes.predictor not in PREDICTORS:
+            raise UsageError(
+                f"there is no predictor '{wishes.predictor}': use {', '.join(PREDICTORS)}."
+            )
+        return wishes.predictor
+    if "r" not in structure.states:
+        notes.append(
+            "basic predictor: without a yaw rate the heading stays, and a current looks like the "
+            "model's own terms"
+        )
+        return "basic"
+    notes.append("augmented predictor: current and wind are captured, not measured")
+    return "augmented"
+
+
+def _margins(
+    model: ManoeuvringModel,
+    structure: Structure,
+    measurement: Array,
+    wishes: Wishes,
+    notes: list[str],
+) -> dict[str, float]:
+    """Return the margins asked for; else three noise deviations plus a disturbance bound (A10)."""
+    given = {"u": wishes.margin_u, "v": wishes.margin_v}
+    known = [e for _, e in model.disturbances.values()]
+    bound = 2 * max(known) if known and max(known) > 0 else _DISTURBANCE
+    margins = {}
+    for i, state in enumerate(structure.states):
+        if state not in ("u", "v"):
+            continue
+        value = given[state]
+        if value is None:
+            value = 3.0 * float(measurement[i]) + bound
+            notes.append(
+                f"margin of {state}: {value:.3f} m/s, three standard deviations of its noise and "
+                f"{bound:.3g} m/s for disturbances (A10)"
+            )
+        margins[state] = float(value)
+    return margins
+
+
+def _prior(model: ManoeuvringModel | None) -> tuple[tuple[str, ...], Array] | None:
+    if model is None:
+        return None
+    d = model.std
+    if not (d > 0).all():
+        name = model.names[int(np.argmin(d))]
+        raise UsageError(
+            f"the prior model gives {name} a standard error of 0, so nothing could be learnt of "
+            f"it: use a model that was estimated."
+        )
+    unit = model.covariance / np.outer(d, d)
+    return model.names, np.linalg.inv(unit) / np.outer(d, d)
+
+
+def _start(wishes: Wishes, structure: Structure) -> Array | None:
+    if wishes.start is None:
+        return None
+    given = np.asarray(wishes.start, float)
+    expected = len(structure.states) + 1
+    if given.size == 4 and expected < 4:
+        # u,v,r,psi for a model of fewer states
+        names = ("u", "v", "r")
+        given = np.array([given[names.index(s)] for s in structure.states] + [given[3]])
+    if given.size != expected or not np.isfinite(given).all():
+        raise UsageError(
+            f"--start has {given.size} numbers, {expected} are needed: "
+            f"{','.join(structure.states)},psi."
+        )
+    return given
+
+
+def _start_of(
+    signs: Signs,
+    start: Array | None,
+    steady: Steady,
+    structure: Structure,
+    margins: dict[str, float],
+) -> Array:
+    if start is not None and all(start[structure.states.index(s)] * v >= 0 for s, v in signs):
+        return start
+    found = steady_start(steady, structure.states, signs, margins)
+    if found is None:
+        reached = [
+            spell_regime(c)
+            for c in candidate_regimes(structure.states)
+            if steady_start(steady, structure.states, c, margins) is not None
+        ]
+        raise InfeasibleError(
+            f"no constant command within the limits of the thrusters holds the regime "
+            f"{spell_regime(signs)}: reached are {', '.join(reached) or 'none'}. Choose one of "
+            f"them with --regime, or widen the limits."
+        )
+    return found
+
+
+def _choose_regimes(
+    base: DesignRequest, steady: Steady, start: Array | None, wishes: Wishes, notes: list[str]
+) -> tuple[Signs, ...]:
+    """Return the regimes that can be held and tell most, one a trial."""
+    states = base.structure.states
+    margins = dict(base.limits.margins)
+    worth: list[tuple[float, Signs]] = []
+    for signs in candidate_regimes(states):
+        begin = steady_start(steady, states, signs, margins)
+        if begin is None:
+            continue
+        own = begin
+        if start is not None:
+            if all(start[states.index(s)] * v >= 0 for s, v in signs):
+                own = start
+            elif wishes.trials == 1:
+                continue
+        depth = min(abs(float(own[states.index(s)])) - margins.get(s, 0.0) for s, _ in signs)
+        if depth < -1e-6 and own is not start:
+            continue
+        try:
+            request = replace(base, regimes=(signs,), starts=(own,))
+            problem = build_problem(request)
+        except StructureError as error:
+            if wishes.trials == 1:
+                raise
+            del error
+            worth.append((0.0, signs))
+            continue
+        units, kept = random_campaign([problem], base.seed)
+        value = -np.inf
+        if units is not None and kept:
+            value = float(problem.evaluate(np.array(units)).value[0])
+        worth.append((value, signs))
+    if not worth:
+        shown = ", ".join(f"{k} {v:.3g}" for k, v in margins.items())
+        most = {
+            s: float(np.abs(steady.x[:, states.index(s)]).max()) for s in margins if s in states
+        }
+        best = ", ".join(f"{k} {v:.3g}" for k, v in most.items())
+        raise InfeasibleError(
+            f"no steady motion keeps the margins {shown} m/s: the limits of the thrusters reach "
+            f"at most {best} m/s. Lower --margin-u and --margin-v below these, or widen the limits."
+        )
+    worth.sort(key=lambda item: -item[0])
+    chosen = [signs for _, signs in worth]
+    if wishes.trials == 1:
+        notes.append(
+            f"regime {spell_regime(chosen[0])} chosen of "
+            f"{', '.join(spell_regime(c) for c in chosen)}, where random sequences tell most"
+        )
+        return (chosen[0],)
+    picked = tuple(chosen[i % len(chosen)] for i in range(wishes.trials))
+    shown = ", ".join(spell_regime(c) for c in picked)
+    if len(chosen) > 1:
+        notes.append(
+            f"regimes {shown}: trials of different signs determine together what one alone "
+            f"cannot (Remark 4.1)"
+        )
+    else:
+        notes.append(f"regimes {shown}: no other one can be held within the thrusters' limits")
+    return picked

@@ -1,0 +1,326 @@
+"""What is asked of a design, as plain data, and the problem that follows from it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from experiment_design.contrast import Contrast
+from experiment_design.criteria import Criterion, CriterionKind
+from experiment_design.limits import LimitProgram, TrialLimits
+from experiment_design.moments import MomentProgram, Moments
+from experiment_design.noise import NoiseLevels
+from experiment_design.problem import Scenario, TrialProblem, Yardstick
+from experiment_design.rollout import Rollout
+from experiment_design.schedule import Schedule, make_schedule
+from greybox.errors import UsageError, suggestion
+from greybox.model.model import ManoeuvringModel
+from greybox.model.predictor import Predictor, Regime, build_predictor
+from greybox.model.structure import Structure
+from greybox.vessel.vessel import Vessel
+
+Array = NDArray[np.float64]
+EstimatorKind = Literal["iv", "iv-white", "oe"]
+ESTIMATORS: tuple[EstimatorKind, ...] = ("iv", "iv-white", "oe")
+Signs = tuple[tuple[str, int], ...]
+
+
+@dataclass(frozen=True)
+class Rival:
+    """Another explanation of the same ship: its structure, parameters and disturbances."""
+
+    name: str
+    structure: Structure
+    theta: Array
+    d: Array
+
+
+@dataclass(frozen=True)
+class DesignRequest:
+    """Everything that a design depends on; equal requests give equal designs.
+
+    Parameters
+    ----------
+    vessel : Vessel
+    structure : Structure
+    theta : ndarray
+        (p,) prior parameters at `sample_time`.
+    sample_time : float
+        [s]
+    noise : NoiseLevels
+    duration, hold : float
+        Of each trial, and between changes of command [s].
+    regimes : tuple of Signs
+        Signs that the states keep, one entry a trial, such as ``(("u", 1), ("v", 1))``.
+    starts : tuple of ndarray
+        (nx + 1,) initial states and heading a trial [m/s, rad/s, rad].
+    limits : TrialLimits
+        Those that all trials share; its signs are replaced by each trial's.
+    predictor : str
+        ``basic``, ``augmented``, ``wind`` or ``basic+wind``.
+    estimator : {"iv", "iv-white", "oe"}
+        Zero-mean IV with its moving-average or white equation error, or the
+        Cramér-Rao information of an output-error fit.
+    criterion : {"D", "A", "E", "c"}
+    wanted : tuple of str
+        Parameters that count; empty for all of the undisturbed model.
+    combination : mapping of str to float
+        Gradient of the function of the parameters for ``c``.
+    targets : tuple of float
+        Wanted standard errors of `wanted`, the scale of A and E in place of prior values.
+    d : ndarray
+        (nd,) expected current and wind [m/s].
+    prior : (tuple of str, ndarray), optional
+        Names and information matrix of earlier trials.
+    covariance : ndarray, optional
+        (p, p) uncertainty of `theta`; None or zero: known exactly.
+    scenarios : int
+        Further prior models drawn from it that the criterion is expected over.
+    worst_case : bool
+        Look at the worst scenario instead of the expectation.
+    probability : float
+        With which the path limits are to be kept under models drawn from it.
+    backoff : tuple of float
+        By how much each path limit is tightened for that, in its unit.
+    rivals : tuple of Rival
+        Other explanations; the trial is then to tell the prior model from them.
+    seed : int
+    effort : float
+        Evaluations of the search, 1 being the usual number.
+    """
+
+    vessel: Vessel
+    structure: Structure
+    theta: Array
+    sample_time: float
+    noise: NoiseLevels
+    duration: float
+    hold: float
+    regimes: tuple[Signs, ...]
+    starts: tuple[Array, ...]
+    limits: TrialLimits = field(default_factory=TrialLimits)
+    predictor: str = "augmented"
+    estimator: EstimatorKind = "iv"
+    criterion: CriterionKind = "D"
+    wanted: tuple[str, ...] = ()
+    combination: Mapping[str, float] = field(default_factory=dict)
+    targets: tuple[float, ...] = ()
+    d: Array = field(default_factory=lambda: np.zeros(4))
+    prior: tuple[tuple[str, ...], Array] | None = None
+    covariance: Array | None = None
+    scenarios: int = 0
+    worst_case: bool = False
+    probability: float = 0.9
+    backoff: tuple[float, ...] = ()
+    rivals: tuple[Rival, ...] = ()
+    seed: int = 0
+    effort: float = 1.0
+
+    @property
+    def trials(self) -> int:
+        """Number of trials of the campaign."""
+        return len(self.regimes)
+
+    @property
+    def schedule(self) -> Schedule:
+        """When and how far commands change."""
+        return make_schedule(self.vessel, self.duration, self.hold, self.sample_time)
+
+    def build_predictor(self) -> Predictor:
+        """Return the predictor over the signs that the trials together take."""
+        signs: dict[str, tuple[int, ...]] = {}
+        for state in self.structure.states:
+            taken = {dict(r).get(state, 0) for r in self.regimes}
+            signs[state] = (1, -1) if 0 in taken or len(taken) > 1 else (taken.pop(),)
+        regime: Regime = tuple(signs.items())
+        return build_predictor(self.structure, self.predictor, regime)
+
+    def trial_limits(self, trial: int) -> TrialLimits:
+        """Return the limits of one trial."""
+        return replace(self.limits, signs=dict(self.regimes[trial]))
+
+    def draw_models(self, count: int, seed: int) -> Array:
+        """Draw prior models (count, p) from the covariance."""
+        rng = np.random.default_rng([13, self.seed, seed])
+        theta = np.asarray(self.theta, float)
+        if self.covariance is None:
+            return np.repeat(theta[None], count, axis=0)
+        scale = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+        safe = np.where(scale > 0, scale, 1.0)
+        values, vectors = np.linalg.eigh(self.covariance / np.outer(safe, safe))
+        root = vectors * np.sqrt(np.maximum(values, 0.0)) * 1.0
+        half = rng.standard_normal((-(-count // 2), theta.size))
+        # pairs around the nominal model, so that few draws have its mean
+        both = np.stack([half, -half], axis=1).reshape(-1, theta.size)[:count]
+        return np.asarray(theta + both @ root.T * scale)
+
+    @property
+    def uncertain(self) -> bool:
+        """Whether the prior model has a covariance."""
+        return self.covariance is not None and bool(np.diag(self.covariance).max(initial=0.0) > 0)
+
+    def thetas(self) -> Array:
+        """Return the prior models (S+1, p), the nominal one first."""
+        nominal = np.asarray(self.theta, float)[None]
+        if not self.scenarios or not self.uncertain:
+            return nominal
+        return np.vstack([nominal, self.draw_models(self.scenarios, 0)])
+
+
+def full_structure(model: ManoeuvringModel) -> tuple[Structure, Array]:
+    """Return a model's structure with the terms that its sums absorbed, and its parameters.
+
+    An estimate without wind measurement keeps Xuu for Xuu + Wuu; the disturbed
+    trial needs both terms. The absorbed ones are put back with the value zero.
+    """
+    absorbed = [n for names in model.sums.values() for n in names if n not in model.names]
+    if not absorbed:
+        return model.structure, np.asarray(model.theta, float)
+    structure = model.structure.with_terms(*absorbed)
+    return structure, np.concatenate([model.theta, np.zeros(len(absorbed))])
+
+
+def wanted_columns(predictor: Predictor, names: tuple[str, ...]) -> tuple[int, ...]:
+    """Return the positions of the wanted parameters, all of them where none is named.
+
+    Raises
+    ------
+    UsageError
+        A name is no parameter of the predictor; the nearest is suggested.
+    """
+    known = {c.name: i for i, c in enumerate(predictor.columns) if not c.is_bias}
+    for i, column in enumerate(predictor.columns):
+        known |= {t: i for t in column.terms if t not in known}
+        if column.terms:
+            known.setdefault(column.label, i)
+    if not names:
+        return tuple(i for i in predictor.parameter_columns if i not in predictor.constants)
+    for name in names:
+        if name not in known:
+            raise UsageError(
+                f"'{name}' is no parameter of this model.{suggestion(name, known)} "
+                f"It has: {', '.join(predictor.parameter_names)}."
+            )
+    return tuple(dict.fromkeys(known[n] for n in names))
+
+
+def build_criterion(request: DesignRequest, predictor: Predictor) -> Criterion:
+    """Return the criterion over the predictor's columns.
+
+    Raises
+    ------
+    UsageError
+        A name is unknown, or ``c`` has no function to look at.
+    """
+    wanted = wanted_columns(predictor, request.wanted or tuple(request.combination))
+    names = [predictor.columns[i].name for i in wanted]
+    structure = request.structure
+    scale = np.array(
+        [
+            abs(sum(float(request.theta[structure.index(t)]) for t in predictor.columns[i].terms))
+            for i in wanted
+        ]
+    )
+    # a parameter that is zero a priori is measured by what the others of its equation are
+    scale = np.where(scale > 0, scale, scale[scale > 0].min(initial=1.0))
+    if request.targets:
+        scale = np.array(request.targets, float)
+    combination = np.zeros(len(names))
+    for name, slope in request.combination.items():
+        combination[wanted.index(wanted_columns(predictor, (name,))[0])] += slope
+    if request.criterion == "c" and not combination.any():
+        raise UsageError(
+            "criterion c looks at one coefficient or one function of the parameters: name it, "
+            "such as --of Yvv or --of 'Xuu/Xmu'."
+        )
+    prior = None
+    if request.prior is not None:
+        prior = _prior_information(names, *request.prior)
+    return Criterion(request.criterion, wanted, scale, combination, prior)
+
+
+def _prior_information(names: list[str], known: tuple[str, ...], information: Array) -> Array:
+    """Return the information on `names`, the other parameters unknown."""
+    shared = [n for n in names if n in known]
+    if not shared:
+        raise UsageError(
+            f"the prior model knows none of the wanted parameters {', '.join(names)}: it has "
+            f"{', '.join(known)}."
+        )
+    keep = [known.index(n) for n in shared]
+    rest = [i for i in range(len(known)) if i not in keep]
+    part = information[np.ix_(keep, keep)]
+    if rest:
+        cross = information[np.ix_(keep, rest)]
+        part = part - cross @ np.linalg.pinv(information[np.ix_(rest, rest)]) @ cross.T
+    out = np.zeros((len(names), len(names)))
+    where = [names.index(n) for n in shared]
+    out[np.ix_(where, where)] = (part + part.T) / 2
+    return out
+
+
+def build_problem(
+    request: DesignRequest, trial: int = 0, known: tuple[Moments, ...] = ()
+) -> TrialProblem:
+    """Return the problem of one trial of a request.
+
+    Parameters
+    ----------
+    request : DesignRequest
+    trial : int
+    known : tuple of Moments
+        Sums of the other trials, one a scenario.
+    """
+    predictor = request.build_predictor()
+    criterion = build_criterion(request, predictor)
+    schedule = request.schedule
+    limits = request.trial_limits(trial)
+    scenarios = []
+    for k, theta in enumerate(request.thetas()):
+        rollout = Rollout(
+            request.vessel, request.structure, theta, request.d, request.starts[trial],
+            request.sample_time,
+        )  # fmt: skip
+        program = LimitProgram(
+            rollout,
+            schedule,
+            limits,
+            wind_matters=predictor.augmented and predictor.kind != "wind",
+            backoff=request.backoff,
+        )
+        scenarios.append(
+            Scenario(rollout, _yardstick(request, predictor, theta), program, 1.0 if k else 2.0)
+        )
+    contrast = None
+    if request.rivals:
+        for rival in request.rivals:
+            rollout = Rollout(
+                request.vessel,
+                rival.structure,
+                rival.theta,
+                rival.d,
+                rival_start(request, rival, trial),
+                request.sample_time,
+            )
+            program = LimitProgram(rollout, schedule, limits, backoff=request.backoff)
+            scenarios.append(Scenario(rollout, scenarios[0].yardstick, program, 0.0))
+        contrast = Contrast(
+            scenarios[0].rollout, [s.rollout for s in scenarios[1:]], request.noise, schedule
+        )
+    return TrialProblem(schedule, tuple(scenarios), criterion, known, request.worst_case, contrast)
+
+
+def rival_start(request: DesignRequest, rival: Rival, trial: int) -> Array:
+    """Return a rival's initial states and heading, those that it lacks left out."""
+    start = dict(zip((*request.structure.states, "psi"), request.starts[trial], strict=True))
+    return np.array([start.get(s, 0.0) for s in (*rival.structure.states, "psi")])
+
+
+def _yardstick(request: DesignRequest, predictor: Predictor, theta: Array) -> Yardstick:
+    return MomentProgram(
+        predictor, theta, request.d, request.noise, white=request.estimator == "iv-white"
+    )
