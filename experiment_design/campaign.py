@@ -10,6 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from experiment_design.inputs import prbs
+from experiment_design.limits import TOLERANCE
 from experiment_design.moments import Moments
 from experiment_design.problem import TrialProblem
 from experiment_design.request import DesignRequest, build_problem
@@ -19,9 +21,9 @@ from experiment_design.search import (
     assess,
     best_random,
     climb,
-    draw_prbs,
     draw_two_level,
     limit_scale,
+    within_reach,
 )
 from greybox.study.parallel import map_pieces, processors
 
@@ -34,6 +36,8 @@ _CHAINS = 4
 _ROUNDS = 3
 # passes over the trials of a campaign
 _PASSES = 2
+# times the evaluations where few sequences keep the limits, and the least that a chain needs then
+_LIMITED, _LEAST = 2, 400
 # seconds of work from which processes are worth starting
 _PARALLEL = 3.0
 
@@ -110,7 +114,7 @@ def random_campaign(problems: list[TrialProblem], seed: int) -> tuple[list[Array
             unit = draw_two_level(problem, rng, REFERENCE)
             result = problem.evaluate(unit)
             # one trial alone need not excite every direction of a campaign
-            good = (result.missed <= 1e-4).all(axis=0)
+            good = (result.missed <= TOLERANCE).all(axis=0)
             pool += list(unit[good])
             if len(pool) >= REFERENCE or not good.any():
                 break
@@ -134,6 +138,7 @@ def search_campaign(
     effort: float = 1.0,
     progress: Progress | None = None,
     workers: int | None = None,
+    quick: bool = False,
 ) -> Found:
     """Search for the sequences of all trials.
 
@@ -147,6 +152,8 @@ def search_campaign(
         (K, nc) a trial to start from, such as the best random ones or a design to be improved.
     effort : float
         Share of the usual number of evaluations.
+    quick : bool
+        One round from the start alone, for a design that was nearly right.
     """
     trials = len(problems)
     rng = np.random.default_rng([19, request.seed])
@@ -155,7 +162,11 @@ def search_campaign(
     best = [assess(p, u[None])[0] for p, u in zip(problems, first, strict=True)]
     passes = _PASSES if trials > 1 else 1
     rounds = _ROUNDS if trials == 1 else 2
+    if quick:
+        passes = rounds = 1
     budget = max(30, round(_EVALUATIONS * effort / (_CHAINS * rounds * passes * trials)))
+    if any(_tight(p, rng) for p in problems):
+        budget = max(_LIMITED * budget, _LEAST // 2 if quick else _LEAST)
     total, done, spent, stopped = _CHAINS * rounds * passes * trials, 0, 0, False
     workers = workers or _worth_processes(problems[0], best[0].unit, budget * total)
     try:
@@ -170,7 +181,9 @@ def search_campaign(
                 scale = limit_scale(problem)
                 here = problem.with_known(known)
                 best[t] = assess(here, best[t].unit[None])[0]
-                chains = _chain_starts(here, best[t], rng)
+                chains = (
+                    [best[t].unit[None]] * _CHAINS if quick else _chain_starts(here, best[t], rng)
+                )
                 for round_ in range(rounds):
                     pieces = [
                         Piece(request, t, known, s, 100 * round_ + i, budget)
@@ -196,9 +209,20 @@ def search_campaign(
     return Found(tuple(replace(b, evaluations=spent) for b in best), spent, stopped)
 
 
+def _tight(problem: TrialProblem, rng: np.random.Generator) -> bool:
+    """Whether fewer than half of random sequences keep the limits."""
+    missed = problem.evaluate(draw_two_level(problem, rng, 40)).missed
+    return bool((missed <= TOLERANCE).all(axis=0).mean() < 0.5)
+
+
 def _chain_starts(problem: TrialProblem, best: Candidate, rng: np.random.Generator) -> list[Array]:
     """Return the starts of each chain: the best two-level and PRBS sequences, shared out."""
-    drawn = np.concatenate([draw_two_level(problem, rng, REFERENCE), draw_prbs(problem, 7)])
+    drawn = np.concatenate(
+        [
+            draw_two_level(problem, rng, REFERENCE),
+            within_reach(problem, prbs(*problem.shape)),
+        ]
+    )
     found = assess(problem, drawn)
     scale = limit_scale(problem)
     # feasible first; else those that miss least
