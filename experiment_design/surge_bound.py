@@ -32,7 +32,7 @@ _STEPS = 25
 _ENOUGH = 2e-3
 # commands at which the extremes of the force are looked for
 _PROBES = 40_000
-# by how much of its span the range of speeds and forces is widened
+# by how much of its span the range of speeds is widened
 _WIDER = 2e-3
 
 
