@@ -31,15 +31,15 @@ Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 
 # gradient evaluations of a search at effort 1, in all
-_EVALUATIONS = 4000
+_EVALUATIONS = 2400
 _CHAINS = 4
-_ROUNDS = 3
+_ROUNDS = 2
 # passes over the trials of a campaign
 _PASSES = 2
 # times the evaluations where few sequences keep the limits, and the least that a chain needs then
 _LIMITED, _LEAST = 2, 400
 # seconds of work from which processes are worth starting
-_PARALLEL = 3.0
+_PARALLEL = 4.0
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ def search_campaign(
 ) -> Found:
     """Search for the sequences of all trials.
 
-    One trial: four chains of iterated local search in three rounds, the best
+    One trial: four chains of iterated local search in two rounds, the best
     design so far handed to the weakest chain. Several: one trial after another
     with the others' information known, twice around.
 
