@@ -19,7 +19,7 @@ KNOT = 0.514444
 HEADING_FLOOR = np.deg2rad(10.0)
 POSITION_FLOOR = 10.0
 # heading past which "off the plan" has no meaning
-_BLIND = np.deg2rad(120.0)
+_BLIND = np.deg2rad(90.0)
 _LONGEST_NAME = 60
 _SIDES = {
     ("u", 1): "ahead",
@@ -172,10 +172,13 @@ def _facts(design: Design, band: MotionBand) -> tuple[tuple[str, str], ...]:
 
 def _warnings(design: Design, band: MotionBand) -> tuple[str, ...]:
     found = []
-    for x in design.limits:
-        if x.trial == band.trial and x.missed > 10 * TOLERANCE:
-            by = f" by {x.missed:.3g} {x.unit}".rstrip() if np.isfinite(x.missed) else ""
-            found.append(f"This plan breaks a limit: {x.name}{by}.")
+    broken = [
+        x.name + (f" by {x.missed:.3g} {x.unit}".rstrip() if np.isfinite(x.missed) else "")
+        for x in design.limits
+        if x.trial == band.trial and x.missed > 10 * TOLERANCE
+    ]
+    if broken:
+        found.append(f"This plan breaks its limits: {', '.join(broken)}.")
     keeping = design.keeping
     if keeping is not None and keeping.probability < design.request.probability:
         found.append(

@@ -65,12 +65,12 @@ def draw_plan_track(axes: Any, design: Design, band: MotionBand, size: float = 7
         axes.add_collection(
             PolyCollection(
                 list(band.ellipses(index)), facecolor=BAND, edgecolor="none", zorder=1,
-                label="95 % of predicted positions",
+                label="95 % band",
             )
         )  # fmt: skip
     if r.limits.area is not None:
         _draw_room(axes, r.limits.area, r.limits.clearance, low, high)
-    axes.plot(east, north, color=BLUE, linewidth=1.2, zorder=3, label="expected track")
+    axes.plot(east, north, color=BLUE, linewidth=1.2, zorder=3, label="track")
     marks = np.arange(0, len(north), max(1, round(step / r.sample_time)))
     if not band.certain:
         axes.add_collection(
@@ -99,11 +99,22 @@ def draw_plan_track(axes: Any, design: Design, band: MotionBand, size: float = 7
     axes.yaxis.set_major_locator(MaxNLocator(6))
     tidy(axes)
     _draw_numbers(axes, east, north, marks[1:], step, low, high, size)
+    box = axes.get_window_extent()
+    across, up = (72 / axes.figure.dpi * v for v in (box.width, box.height))
+    x = 1 - 1.2 * size / across
     axes.annotate(
-        "N", (0.975, 0.99), (0.975, 0.90), xycoords="axes fraction", ha="center", va="center",
-        fontsize=size + 1, fontweight="bold", zorder=6,
-        arrowprops={"arrowstyle": "-|>", "color": BLACK, "linewidth": 1.0},
-    )  # fmt: skip
+        "N",
+        (x, 1 - 0.3 * size / up),
+        (x, 1 - 3.0 * size / up),
+        xycoords="axes fraction",
+        ha="center",
+        va="center",
+        fontsize=size + 1,
+        fontweight="bold",
+        zorder=6,
+        path_effects=[withStroke(linewidth=1.6, foreground="white")],
+        arrowprops={"arrowstyle": "-|>", "color": BLACK, "linewidth": 1.0, "shrinkA": 5},
+    )
     axes.legend(
         fontsize=size - 0.5, loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.2,
         ncols=3, frameon=False, columnspacing=1.0, handletextpad=0.4,
@@ -152,7 +163,7 @@ def _draw_room(axes: Any, area: Array | Circle, clearance: float, low: Array, hi
         )
         axes.plot(
             [], [], color=VERMILION, linestyle="--", linewidth=0.9,
-            label=f"{clearance:g} m from its edge",
+            label=f"{clearance:g} m inside",
         )  # fmt: skip
 
 
@@ -160,7 +171,7 @@ def _draw_numbers(
     axes: Any, east: Array, north: Array, marks: Any, step: float, low: Array, high: Array,
     size: float,
 ) -> None:  # fmt: skip
-    """Number the marks, each where it hides least of the track and of the other numbers."""
+    """Put numbers to the marks, each where it hides least of the track and of the other numbers."""
     box = axes.get_window_extent()
     metres = float(high[0] - low[0]) / max(box.height, 1.0)
     # height and half width of two digits, in metres on this map
@@ -286,7 +297,7 @@ def draw_states(axes: Any, design: Design, band: MotionBand, size: float = 9.0) 
         spread = float(np.ptp(signal.nominal)) or 0.1 * float(np.abs(signal.nominal).max()) or 0.1
         low = max(min(float(v.min()) for v in values), signal.nominal.min() - 3 * spread)
         high = min(max(float(v.max()) for v in values), signal.nominal.max() + 3 * spread)
-        room = 0.08 * (high - low)
+        room = 0.08 * ((high - low) or spread)
         low, high = low - room, high + room
         for edge, side in zones:
             ax.fill_between(

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import io
+import re
+import textwrap
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from textwrap import wrap
 from typing import Any
 
 import numpy as np
@@ -105,6 +106,12 @@ def write_sheet(design: Design, path: str | Path) -> None:
         data = _pdf(pages) if kind == ".pdf" else _stacked_png(pages)
     with replacing(path, "wb") as handle:
         handle.write(data)
+
+
+def wrap(text: str, width: int, **options: Any) -> list[str]:
+    """Wrap text, a number and its unit kept together."""
+    tied = re.sub(r"(?<=\d) (?=(?:m/s|rad/s|kn|m|s|%|min)(?:\W|$))", "\u00a0", text)
+    return textwrap.wrap(tied.replace("(N, E)", "(N,\u00a0E)"), width, **options)
 
 
 @contextmanager
@@ -497,8 +504,11 @@ def _section(design: Design, band: MotionBand) -> dict[str, Any]:
     layout = parts.table
     cells = list(zip(*[c.cells for c in layout.columns], strict=True))
     rows = -(-len(cells) // layout.blocks)
-    track = new_figure(parts.map / 25.4, parts.map / 25.4)
-    draw_plan_track(track.subplots(), design, band, 6.8)
+    size = parts.map
+    track = Figure(figsize=(size / 25.4, size / 25.4))
+    draw_plan_track(
+        track.add_axes((13 / size, 9 / size, 1 - 14 / size, 1 - 18 / size)), design, band, 6.5
+    )
     commands = new_figure(_INNER / 25.4, (count * parts.panel + 8) / 25.4)
     draw_commands(commands.subplots(count, 1, squeeze=False)[:, 0], design, band.trial, 6.8)
     north, east = band["x_n"].nominal, band["y_n"].nominal
