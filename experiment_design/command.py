@@ -62,7 +62,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--duration", type=positive, metavar="S", help="length of each trial [s]")
     add("--out", required=True, metavar="PLAN", help="where to write the commands (CSV)")
     add("--json", metavar="F", help="write the design as JSON; - is stdout")
-    add("--sheet", metavar="HTML", help="write the sheet to take on board")
+    add("--sheet", metavar="FILE", help="write the sheet to take on board: .pdf, .html, .svg, .png")
+    add("--report", metavar="HTML", help="write a page with pictures and what the plan is worth")
     goal = parser.add_argument_group("what is to be learnt")
     goal.add_argument("--criterion", choices=("D", "A", "E", "c"), default="D")
     goal.add_argument(
@@ -167,7 +168,11 @@ def run(options: argparse.Namespace) -> None:
     from greybox.model.model import load_model
     from greybox.vessel.toml import load_vessel
 
-    check_targets(options.out, options.json, options.sheet)
+    check_targets(options.out, options.json, options.sheet, options.report)
+    if options.sheet:
+        from experiment_design.sheet import sheet_kind
+
+        sheet_kind(options.sheet)
     model = load_model(options.model)
     vessel = load_vessel(options.vessel)
     if options.duration is None:
@@ -186,11 +191,22 @@ def run(options: argparse.Namespace) -> None:
         data: dict[str, Any] = design.to_dict()
         data["notes"] = [*prepared.notes, *data["notes"]]
         write_json(data | {"provenance": record}, options.json)
+    if options.sheet:
+        from experiment_design.sheet import write_sheet
+
+        write_sheet(design, options.sheet)
+    if options.report:
+        from experiment_design.report import design_page
+        from greybox.report.page import write_page
+
+        write_page(design_page(design, prepared.notes, record), options.report)
     if options.json != "-":
         say(design.summary())
         for note in prepared.notes:
             say(f"Note: {note}")
-        say(f"wrote {options.out}")
+        for path in (options.out, options.sheet, options.report):
+            if path:
+                say(f"wrote {path}")
 
 
 def _wishes(options: argparse.Namespace, model: Any) -> Any:

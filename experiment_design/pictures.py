@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 from matplotlib.collections import PolyCollection
-from matplotlib.patches import Polygon
 from matplotlib.patches import Circle as Disc
+from matplotlib.patches import Polygon
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, MaxNLocator, MultipleLocator
 from numpy.typing import NDArray
@@ -117,7 +117,7 @@ def draw_plan_track(axes: Any, design: Design, band: MotionBand, size: float = 7
     )
     axes.legend(
         fontsize=size - 0.5, loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.2,
-        ncols=3, frameon=False, columnspacing=1.0, handletextpad=0.4,
+        ncols=3, frameon=False, columnspacing=1.0, handletextpad=0.4, handlelength=1.3,
     )  # fmt: skip
 
 
@@ -148,15 +148,16 @@ def _frame(design: Design, band: MotionBand, north: Array, east: Array) -> tuple
 
 def _draw_room(axes: Any, area: Array | Circle, clearance: float, low: Array, high: Array) -> None:
     style: dict[str, Any] = {"facecolor": "none", "edgecolor": BLACK, "linewidth": 1.6, "zorder": 2}
-    if isinstance(area, Circle):
-        axes.add_patch(Disc((area.east, area.north), area.radius, label="sea room", **style))
-    else:
-        corners = np.asarray(area, float)[:, ::-1]
-        axes.add_patch(Polygon(corners, closed=True, label="sea room", **style))
-    if clearance <= 0:
-        return
     north, east = (np.linspace(a, b, 240) for a, b in zip(low, high, strict=True))
     inside = edge_distance(area, north[:, None] + 0 * east, east + 0 * north[:, None])
+    style["label"] = "sea room" if inside.min() < 0 else "sea room (beyond map)"
+    if isinstance(area, Circle):
+        axes.add_patch(Disc((area.east, area.north), area.radius, **style))
+    else:
+        corners = np.asarray(area, float)[:, ::-1]
+        axes.add_patch(Polygon(corners, closed=True, **style))
+    if clearance <= 0:
+        return
     if inside.min() < clearance < inside.max():
         axes.contour(
             east, north, inside, [clearance], colors=[VERMILION], linestyles="--", linewidths=0.9

@@ -150,7 +150,7 @@ def predict_motion(design: Design, draws: int = 200) -> tuple[MotionBand, ...]:
                 nominal,
                 low,
                 high,
-                np.einsum("rni,rnj->nij", away, away) / len(away),
+                np.asarray(np.einsum("rni,rnj->nij", away, away) / len(away), float),
                 _corridor(heading),
                 _corridor(np.linalg.norm(away, axis=-1)),
                 draws,

@@ -48,16 +48,17 @@ def design_page(design: Design, notes: Sequence[str], record: dict[str, Any]) ->
     r = design.request
     bands = predict_motion(design)
     reference = random_std(design)
-    trials = f"{r.trials} trials of {clock(r.duration)} min" if r.trials > 1 else clock(
-        r.duration
-    ) + " min"  # fmt: skip
+    trials = f"{clock(r.duration)} min"
+    if r.trials > 1:
+        trials = f"{r.trials} trials of {trials}"
     parts = [_trial(design, band) for band in bands]
     one = parts[0] if len(parts) == 1 else None
+    keeping = [design.keeping.sentence()] if design.keeping is not None else []
+    said = [design.status, *keeping, *notes, *design.notes]
     return Page(
         title=f"Plan for {plain_name(r.vessel.name)}: {trials}",
         headline=headline(design),
-        sentences=[design.status + ".", *([design.keeping.sentence() + "."] if design.keeping else []),
-                   *notes, *design.notes],
+        sentences=[_sentence(s) for s in said],
         pictures=[*(one.pictures if one else []), _std_picture(design, reference)],
         tables=[
             _std_table(design, reference),
@@ -67,6 +68,11 @@ def design_page(design: Design, notes: Sequence[str], record: dict[str, Any]) ->
         computed=flatten(record),
         sections=[] if one else parts,
     )  # fmt: skip
+
+
+def _sentence(text: str) -> str:
+    """Return text with a capital and a full stop."""
+    return text[:1].upper() + text[1:] + ("" if text.endswith(".") else ".")
 
 
 def headline(design: Design) -> str:
@@ -123,8 +129,8 @@ def _trial(design: Design, band: MotionBand) -> Section:
         "The model is taken as exactly known and nothing else as moving the vessel, so there is "
         "no band."
         if band.certain
-        else f"The band holds 95 % of {band.draws - band.lost} motions, of models drawn from the "
-        f"prior with process noise"
+        else f"The band holds about 95 % of {band.draws - band.lost} motions, of models drawn from "
+        f"the prior with process noise"
         + (f"; {band.lost} more ran away and are left out." if band.lost else ".")
     )
     cells = ", ".join(
@@ -205,13 +211,16 @@ def _std_table(design: Design, reference: Array | None) -> Table:
         value, std = float(design.values[i]), float(design.std[i])
         rows.append([
             name, f"{value:.4g}", f"{std:.2g}", f"{abs(std / value):.1%}" if value else "–",
-            "–" if reference is None else f"{reference[i]:.2g}",
+            *([] if reference is None else [f"{reference[i]:.2g}"]),
         ])  # fmt: skip
     return Table(
         "Predicted standard errors of the wanted parameters",
-        ["parameter", "prior", "this plan", "relative", "best random"],
+        [
+            "parameter", "prior", "this plan", "relative",
+            *([] if reference is None else ["best random"]),
+        ],
         rows,
-    )
+    )  # fmt: skip
 
 
 def _alternatives(design: Design) -> list[Table]:

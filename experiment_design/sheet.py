@@ -40,7 +40,7 @@ _BOTH_FROM = 6.2
 _GAP = 4.0
 # map and commands [mm], roomy to tight: a long table takes their room
 _PARTS = ((104.0, 54.0), (92.0, 48.0), (82.0, 42.0), (72.0, 36.0), (62.0, 30.0))
-_COMFORTABLE = (7.2, 6.4, 5.6)
+_COMFORTABLE = (6.4, 5.6)
 _GREY, _RED = "#f0f0f0", "#8a1c00"
 
 
