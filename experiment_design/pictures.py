@@ -105,7 +105,7 @@ def draw_plan_track(axes: Any, design: Design, band: MotionBand, size: float = 7
     axes.annotate(
         "N",
         (x, 1 - 0.3 * size / up),
-        (x, 1 - 3.0 * size / up),
+        (x, 1 - 3.6 * size / up),
         xycoords="axes fraction",
         ha="center",
         va="center",

@@ -145,12 +145,12 @@ def predict_motion(design: Design, draws: int = 200) -> tuple[MotionBand, ...]:
         found.append(
             MotionBand(
                 trial,
-                np.arange(samples + 1) * r.sample_time,
+                np.asarray(np.arange(samples + 1) * r.sample_time, float),
                 names,
                 nominal,
                 low,
                 high,
-                np.asarray(np.einsum("rni,rnj->nij", away, away) / len(away), float),
+                np.einsum("rni,rnj->nij", away, away) / len(away),
                 _corridor(heading),
                 _corridor(np.linalg.norm(away, axis=-1)),
                 draws,
