@@ -10,6 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from experiment_design.inputs import prbs
+from experiment_design.limits import TOLERANCE
 from experiment_design.moments import Moments
 from experiment_design.problem import TrialProblem
 from experiment_design.request import DesignRequest, build_problem
@@ -19,9 +21,9 @@ from experiment_design.search import (
     assess,
     best_random,
     climb,
-    draw_prbs,
     draw_two_level,
     limit_scale,
+    within_reach,
 )
 from greybox.study.parallel import map_pieces, processors
 
@@ -34,6 +36,8 @@ _CHAINS = 4
 _ROUNDS = 3
 # passes over the trials of a campaign
 _PASSES = 2
+# times the evaluations where few sequences keep the limits, and the least that a chain needs then
+_LIMITED, _LEAST = 2, 400
 # seconds of work from which processes are worth starting
 _PARALLEL = 3.0
 
@@ -110,7 +114,7 @@ def random_campaign(problems: list[TrialProblem], seed: int) -> tuple[list[Array
             unit = draw_two_level(problem, rng, REFERENCE)
             result = problem.evaluate(unit)
             # one trial alone need not excite every direction of a campaign
-            good = (result.missed <= 1e-4).all(axis=0)
+            good = (result.missed <= TOLERANCE).all(axis=0)
             pool += list(unit[good])
             if len(pool) >= REFERENCE or not good.any():
                 break
@@ -156,6 +160,8 @@ def search_campaign(
     passes = _PASSES if trials > 1 else 1
     rounds = _ROUNDS if trials == 1 else 2
     budget = max(30, round(_EVALUATIONS * effort / (_CHAINS * rounds * passes * trials)))
+    if any(_tight(p, rng) for p in problems):
+        budget = max(_LIMITED * budget, _LEAST)
     total, done, spent, stopped = _CHAINS * rounds * passes * trials, 0, 0, False
     workers = workers or _worth_processes(problems[0], best[0].unit, budget * total)
     try:
@@ -196,9 +202,20 @@ def search_campaign(
     return Found(tuple(replace(b, evaluations=spent) for b in best), spent, stopped)
 
 
+def _tight(problem: TrialProblem, rng: np.random.Generator) -> bool:
+    """Whether fewer than half of random sequences keep the limits."""
+    missed = problem.evaluate(draw_two_level(problem, rng, 40)).missed
+    return bool((missed <= TOLERANCE).all(axis=0).mean() < 0.5)
+
+
 def _chain_starts(problem: TrialProblem, best: Candidate, rng: np.random.Generator) -> list[Array]:
     """Return the starts of each chain: the best two-level and PRBS sequences, shared out."""
-    drawn = np.concatenate([draw_two_level(problem, rng, REFERENCE), draw_prbs(problem, 7)])
+    drawn = np.concatenate(
+        [
+            draw_two_level(problem, rng, REFERENCE),
+            within_reach(problem, prbs(*problem.shape)),
+        ]
+    )
     found = assess(problem, drawn)
     scale = limit_scale(problem)
     # feasible first; else those that miss least

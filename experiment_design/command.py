@@ -58,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
     add("--vessel", required=True, metavar="V", help="vessel file (TOML) with limits")
-    add("--model", required=True, metavar="MODEL", help="prior model of greybox estimate")
+    add("--model", metavar="MODEL", help="prior model of greybox estimate")
     add("--duration", type=positive, metavar="S", help="length of each trial [s]")
     add("--out", required=True, metavar="PLAN", help="where to write the commands (CSV)")
     add("--json", metavar="F", help="write the design as JSON; - is stdout")
@@ -76,7 +76,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--target",
         nargs="+",
         metavar="NAME=STD",
-        help="find the least duration that reaches these standard errors",
+        help="least trial time for these standard errors, --duration at most",
     )
     goal.add_argument("--predictor", choices=("basic", "augmented", "wind", "basic+wind"))
     goal.add_argument(
@@ -163,6 +163,7 @@ def run(options: argparse.Namespace) -> None:
     from experiment_design.design import design_trial
     from experiment_design.plan import write_plan
     from experiment_design.prepare import prepare_request
+    from experiment_design.timing import least_duration
     from greybox.errors import UsageError
     from greybox.files import check_targets, write_json
     from greybox.model.model import load_model
@@ -173,14 +174,27 @@ def run(options: argparse.Namespace) -> None:
         from experiment_design.sheet import sheet_kind
 
         sheet_kind(options.sheet)
-    model = load_model(options.model)
+    if options.between is None and options.model is None:
+        raise UsageError("--model is missing: name a prior model, or two with --between A B.")
+    model = load_model(options.between[0] if options.between else options.model)
     vessel = load_vessel(options.vessel)
     if options.duration is None:
         raise UsageError("--duration is missing: say how long the trial may last, in seconds.")
     wishes = _wishes(options, model)
     prepared = prepare_request(model, wishes, vessel)
+    request = prepared.request
+    if options.between:
+        _run_between(options, request, prepared.notes)
+        return
+    if options.target:
+        request = least_duration(
+            request,
+            dict(_target(text) for text in options.target),
+            progress=progress("duration"),
+            workers=options.workers,
+        )
     design = design_trial(
-        prepared.request,
+        request,
         best_effort=options.best_effort,
         progress=progress("design"),
         workers=options.workers,
@@ -191,6 +205,63 @@ def run(options: argparse.Namespace) -> None:
         data: dict[str, Any] = design.to_dict()
         data["notes"] = [*prepared.notes, *data["notes"]]
         write_json(data | {"provenance": record}, options.json)
+    _show(options, design, prepared.notes)
+    if options.json != "-":
+        say(design.summary())
+        for note in prepared.notes:
+            say(f"Note: {note}")
+        for path in (options.out, options.sheet, options.report):
+            if path:
+                say(f"wrote {path}")
+
+
+def _run_between(options: argparse.Namespace, request: Any, notes: tuple[str, ...]) -> None:
+    """Design the trial between two models and write it."""
+    from experiment_design.discriminate import design_between
+    from experiment_design.plan import write_plan
+    from experiment_design.request import Rival, full_structure
+    from greybox.errors import UsageError
+    from greybox.files import write_json
+    from greybox.model.model import load_model
+
+    first, second = (Path(p).stem for p in options.between)
+    if first == second:
+        first, second = options.between
+    other = load_model(options.between[1])
+    if other.sample_time != request.sample_time:
+        raise UsageError(
+            f"'{first}' has the sample time {request.sample_time:g} s and '{second}' "
+            f"{other.sample_time:g} s: estimate both at one."
+        )
+    structure, theta = full_structure(other)
+    found = design_between(
+        request,
+        Rival(second, structure, theta, other.d),
+        (first, second),
+        best_effort=options.best_effort,
+        progress=progress("design"),
+        workers=options.workers,
+    )
+    write_plan(found.design, options.out)
+    if options.json:
+        data = found.to_dict()
+        data["notes"] = [*notes, *data["notes"]]
+        write_json(data | {"provenance": provenance(options)}, options.json)
+    lines = found.summary().splitlines()
+    _show(options, found.design, notes, f"{lines[0]}: {lines[3]}.")
+    if options.json != "-":
+        say(found.summary())
+        for note in notes:
+            say(f"Note: {note}")
+        for path in (options.out, options.sheet, options.report):
+            if path:
+                say(f"wrote {path}")
+
+
+def _show(
+    options: argparse.Namespace, design: Any, notes: tuple[str, ...], headline: str = ""
+) -> None:
+    """Write the sheet and the page that were asked for."""
     if options.sheet:
         from experiment_design.sheet import write_sheet
 
@@ -199,14 +270,8 @@ def run(options: argparse.Namespace) -> None:
         from experiment_design.report import design_page
         from greybox.report.page import write_page
 
-        write_page(design_page(design, prepared.notes, record), options.report)
-    if options.json != "-":
-        say(design.summary())
-        for note in prepared.notes:
-            say(f"Note: {note}")
-        for path in (options.out, options.sheet, options.report):
-            if path:
-                say(f"wrote {path}")
+        page = design_page(design, notes, provenance(options), headline)
+        write_page(page, options.report)
 
 
 def _wishes(options: argparse.Namespace, model: Any) -> Any:
@@ -279,6 +344,18 @@ def _end(text: str) -> tuple[str, tuple[float, float]]:
     except ValueError as error:
         raise UsageError(
             f"--end '{text}' cannot be read: write NAME=VALUE:TOLERANCE, such as x_n=0:20."
+        ) from error
+
+
+def _target(text: str) -> tuple[str, float]:
+    from greybox.errors import UsageError
+
+    name, _, value = text.partition("=")
+    try:
+        return name, float(value)
+    except ValueError as error:
+        raise UsageError(
+            f"--target '{text}' cannot be read: write NAME=STD, such as Yvv=0.01."
         ) from error
 
 

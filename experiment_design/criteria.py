@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 CriterionKind = Literal["D", "A", "E", "c"]
 CRITERIA: tuple[CriterionKind, ...] = ("D", "A", "E", "c")
 # smallest eigenvalue of a correlation-scaled Gram matrix that counts as excited
-_FLOOR = 1e-13
+_FLOOR = 1e-12
 # exponent of the norm that stands for the largest eigenvalue while climbing
 _SHARP = 8
 

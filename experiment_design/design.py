@@ -26,6 +26,7 @@ from experiment_design.request import DesignRequest, build_problem
 from experiment_design.robust import Keeping, keep_probability
 from experiment_design.rollout import Motion
 from experiment_design.search import REFERENCE, Candidate, assess
+from experiment_design.timing import telling_duration
 from greybox.errors import InfeasibleError
 
 Array = NDArray[np.float64]
@@ -34,6 +35,8 @@ Array = NDArray[np.float64]
 _TIGHTENINGS = 3
 # share of the effort that a design after a tightening gets
 _AGAIN = 0.4
+# relative standard error from which nothing was learnt of a parameter
+_VAGUE = 10.0
 
 
 @dataclass(frozen=True)
@@ -74,8 +77,10 @@ class Design:
     efficiency_vs_random : float or None
         Against the best of 200 random two-level sequences that keep the limits;
         None where none of them does.
+    random_value : float
+        Criterion of that one, nan where there is none.
     random_kept : int
-        How many were found that do.
+        How many were found that keep the limits.
     certificate : Certificate
     margins : dict of str to float
         Least |u_r| and |v_r| (or |r|) over all trials.
@@ -100,6 +105,7 @@ class Design:
     covariance: Array
     criterion_value: float
     efficiency_vs_random: float | None
+    random_value: float
     random_kept: int
     certificate: Certificate
     margins: dict[str, float]
@@ -211,11 +217,15 @@ class Design:
             share = f"{abs(std / value):.1%}" if value else "-"
             lines.append(f"{name:<14}{value:>12.4g}{std:>12.2g}{share:>11}")
         if self.alternatives:
-            lines += ["", f"{'instead of':<28}{'tried':>7}{'kept':>7}{'this plan gives':>18}"]
+            lines += ["", f"{'instead of':<28}{'tried':>7}{'kept':>7}  this plan gives"]
             for a in self.alternatives:
                 gain = self._gain(a)
                 shown = "-" if gain is None else f"{gain:.2f} times"
-                lines.append(f"{a.name:<28}{a.tried:>7}{a.kept:>7}{shown:>18}")
+                if gain is None or gain > 1000:
+                    shown = "tells nothing"
+                if not a.kept:
+                    shown += " (breaks limits)"
+                lines.append(f"{a.name:<28}{a.tried:>7}{a.kept:>7}  {shown}")
         lines += [f"Note: {n}" for n in self.notes]
         return "\n".join(lines)
 
@@ -281,14 +291,24 @@ def design_trial(
     reference, kept = random_campaign(problems, request.seed)
     if reference is None:
         _require_stable(problems[0], request)
+    else:
+        _require_informative(request, problems, reference, hopeless=10.0)
     initial = reference
     if first is not None:
         initial = [
             np.clip((v - p.schedule.lower) / _span(p), 0, 1)
             for v, p in zip(first, problems, strict=True)
         ]
-    found = search_campaign(request, problems, initial, progress=progress, workers=workers)
-    candidates, evaluations, notes = list(found.candidates), found.evaluations, []
+    found = search_campaign(
+        request,
+        problems,
+        initial,
+        effort=request.effort,
+        progress=progress,
+        workers=workers,
+    )
+    candidates, evaluations = list(found.candidates), found.evaluations
+    notes: list[str] = []
     status = "solved: local optimum of many ascents"
     if found.stopped:
         status = "stopped by the user: the best plan found so far"
@@ -318,18 +338,23 @@ def design_trial(
     criterion = problems[0].criterion
     sums = add_up([own_moments(p, u) for p, u in zip(problems, units, strict=True)])
     covariance = criterion.covariance(sums[0])[0]
-    if not np.isfinite(covariance).all():
+    if not np.isfinite(covariance).all() and not request.rivals:
         raise InfeasibleError(_unexcited(problems, units, request))
-    versus = None
+    predictor = request.build_predictor()
+    names = tuple(predictor.columns[i].name for i in criterion.wanted)
+    if not missing or not best_effort:
+        notes += _require_informative(request, problems, units)
+    versus, random_value = None, float("nan")
     if reference is not None:
         other = add_up([own_moments(p, u) for p, u in zip(problems, reference, strict=True)])
         gain = logdet_information(covariance) - logdet_information(
             criterion.covariance(other[0])[0]
         )
         versus = float(np.exp(gain / len(covariance)))
+        random_value = float(criterion.value(other[0])[0])
+        if request.rivals:
+            random_value = float(problems[0].evaluate(reference[0][None]).value[0])
     certificate = certify(problems, units)
-    predictor = request.build_predictor()
-    names = tuple(predictor.columns[i].name for i in criterion.wanted)
     values = np.array(
         [
             sum(
@@ -346,6 +371,10 @@ def design_trial(
     classical: tuple[Alternative, ...] = ()
     if alternatives and request.trials == 1:
         classical = compare_classical(problems[0], request.seed)
+        if reference is not None:
+            value = float(problems[0].evaluate(reference[0][None]).value[0])
+            two = Alternative("random two-level", kept, kept, value, reference[0])
+            classical = (two, *classical)
     return Design(
         request,
         commands,
@@ -356,6 +385,7 @@ def design_trial(
         covariance,
         float(criterion.of_covariance(covariance[None])[0]),
         versus,
+        random_value,
         kept,
         certificate,
         _margins(problems, motions),
@@ -385,6 +415,47 @@ def _require_horizon(request: DesignRequest) -> None:
             f"unknowns of one equation: use --duration {2 * most * request.sample_time:g} or "
             f"more, or --predictor basic."
         )
+
+
+def _require_informative(
+    request: DesignRequest,
+    problems: list[TrialProblem],
+    units: list[Array],
+    hopeless: float = 1.0,
+) -> list[str]:
+    """Raise where the trial is too short to tell most parameters; return notes on doubtful ones.
+
+    `hopeless` is how many times vaguer random sequences may be than the design.
+    """
+    if request.targets or request.rivals or request.criterion == "c":
+        return []
+    criterion = problems[0].criterion
+    predictor = request.build_predictor()
+    names = [predictor.columns[i].name for i in criterion.wanted]
+    sums = add_up([own_moments(p, u) for p, u in zip(problems, units, strict=True)])
+    covariance = criterion.covariance(sums[0])[0]
+    if hopeless > 1 and not np.isfinite(covariance).all():
+        return []
+    share = np.sqrt(np.diag(covariance)) / criterion.scale
+    vague = [n for n, s in zip(names, share, strict=True) if s > hopeless * _VAGUE]
+    if 2 * len(vague) > len(names):
+        longer = telling_duration(request, _VAGUE)
+        advice = "Use --predictor basic, or --want fewer parameters"
+        if longer is not None:
+            advice = f"Use --duration {longer:g}, or --predictor basic"
+        raise InfeasibleError(
+            f"a trial of {request.duration:g} s is too short: the predicted standard error of "
+            f"{', '.join(vague)} is more than {_VAGUE:g} times the prior value "
+            f"({share.max():.2g} times at worst). {advice}."
+        )
+    doubtful = [n for n, s in zip(names, share, strict=True) if s > 1]
+    if not doubtful:
+        return []
+    one = len(doubtful) == 1
+    return [
+        f"{', '.join(doubtful)} will stay unknown by more than {'its' if one else 'their'} prior "
+        f"value: lengthen the trial, or leave {'it' if one else 'them'} out with --want"
+    ]
 
 
 def _require_start(problem: TrialProblem, request: DesignRequest, trial: int) -> None:
@@ -488,7 +559,7 @@ def _unexcited(problems: list[TrialProblem], units: list[Array], request: Design
             label = predictor.columns[mine[int(np.abs(vectors[:, 0]).argmax())]].label
     return (
         f"this trial cannot tell the regressors of {state} apart: along {label} their smallest "
-        f"eigenvalue is {max(worst, 0):.1e} of the largest, 1e-13 is needed. Lengthen the trial, "
+        f"eigenvalue is {max(worst, 0):.1e} of the largest, 1e-12 is needed. Lengthen the trial, "
         f"widen the limits, use --predictor basic, or plan --trials 2 in other regimes."
     )
 
@@ -513,7 +584,11 @@ def _tighten(
         tighter = replace(current, backoff=tuple(backoff + 1.05 * kept.shortfall))
         again = [build_problem(tighter, t) for t in range(request.trials)]
         found = search_campaign(
-            tighter, again, [c.unit for c in previous], effort=_AGAIN, workers=workers
+            tighter,
+            again,
+            [c.unit for c in previous],
+            effort=_AGAIN * request.effort,
+            workers=workers,
         )
         spent += found.evaluations
         now = keep_probability(plain, [c.unit for c in found.candidates])

@@ -8,7 +8,7 @@ from scipy.optimize import minimize
 
 from experiment_design.limits import TOLERANCE, LimitName
 from experiment_design.problem import TrialProblem
-from experiment_design.search import Candidate, assess, draw_two_level, limit_scale, to_unit
+from experiment_design.search import Candidate, assess, draw_two_level, limit_scale, within_reach
 
 Array = NDArray[np.float64]
 
@@ -51,7 +51,7 @@ def closest(problem: TrialProblem, starts: Array, seed: int) -> Candidate:
                 options={"maxiter": _ITERATIONS},
             )
             unit = np.asarray(result.x).reshape(problem.shape)
-            unit = to_unit(problem, problem.schedule.within_reach(problem.levels(unit)))
+            unit = within_reach(problem, unit)
             candidate = assess(problem, unit[None])[0]
             if _short(candidate, scale) < _short(best, scale):
                 best = candidate

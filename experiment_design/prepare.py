@@ -278,7 +278,7 @@ def _start_of(
     structure: Structure,
     margins: dict[str, float],
 ) -> Array:
-    if start is not None and all(start[structure.states.index(s)] * v > 0 for s, v in signs):
+    if start is not None and all(start[structure.states.index(s)] * v >= 0 for s, v in signs):
         return start
     found = steady_start(steady, structure.states, signs, margins)
     if found is None:
@@ -308,13 +308,12 @@ def _choose_regimes(
             continue
         own = begin
         if start is not None:
-            if any(start[states.index(s)] * v <= margins.get(s, 0.0) * 0.999 for s, v in signs):
-                if wishes.trials == 1:
-                    continue
-            else:
+            if all(start[states.index(s)] * v >= 0 for s, v in signs):
                 own = start
+            elif wishes.trials == 1:
+                continue
         depth = min(abs(float(own[states.index(s)])) - margins.get(s, 0.0) for s, _ in signs)
-        if depth < -1e-6:
+        if depth < -1e-6 and own is not start:
             continue
         try:
             request = replace(base, regimes=(signs,), starts=(own,))
@@ -349,8 +348,12 @@ def _choose_regimes(
         )
         return (chosen[0],)
     picked = tuple(chosen[i % len(chosen)] for i in range(wishes.trials))
-    notes.append(
-        f"regimes {', '.join(spell_regime(c) for c in picked)}: trials of different signs "
-        f"determine together what one alone cannot (Remark 4.1)"
-    )
+    shown = ", ".join(spell_regime(c) for c in picked)
+    if len(chosen) > 1:
+        notes.append(
+            f"regimes {shown}: trials of different signs determine together what one alone "
+            f"cannot (Remark 4.1)"
+        )
+    else:
+        notes.append(f"regimes {shown}: no other one can be held within the thrusters' limits")
     return picked

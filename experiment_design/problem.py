@@ -23,6 +23,18 @@ _TOGETHER = 64
 _INSIDE = 0.01
 
 
+class Objective(Protocol):
+    """A number to be made large that is no sum of information, such as a distance of models."""
+
+    def value(self, commands: Array) -> Array:
+        """Return the logarithm of it for sequences (R, N, nc)."""
+        ...
+
+    def gradient(self, commands: Array) -> tuple[float, Array]:
+        """Return it for one sequence with its derivative (N, nc)."""
+        ...
+
+
 class Yardstick(Protocol):
     """Sums over samples from which the covariance follows."""
 
@@ -81,6 +93,8 @@ class TrialProblem:
         Sums of other trials of the campaign, one a scenario.
     worst_case : bool
         Look at the worst scenario instead of the expectation.
+    contrast : Objective, optional
+        Takes the place of the criterion.
     """
 
     schedule: Schedule
@@ -88,6 +102,7 @@ class TrialProblem:
     criterion: Criterion
     known: tuple[Moments, ...] = ()
     worst_case: bool = False
+    contrast: Objective | None = None
 
     @cached_property
     def shape(self) -> tuple[int, int]:
@@ -119,7 +134,10 @@ class TrialProblem:
             each, worst = [], None
             for i, scenario in enumerate(self.scenarios):
                 motion = scenario.rollout.run(commands)
-                value = self.criterion.value(self.moments(motion, i))
+                if self.contrast is None:
+                    value = self.criterion.value(self.moments(motion, i))
+                elif i == 0:
+                    value = self.contrast.value(commands)
                 value[~motion.stable] = -np.inf
                 each.append(value)
                 v = scenario.limits.violations(motion)
@@ -166,6 +184,9 @@ class TrialProblem:
             if not motion.stable[0]:
                 parts.append((-np.inf, np.zeros(0), np.zeros(0)))
                 continue
+            if self.contrast is not None:
+                parts.append((0.0, np.zeros(0), np.zeros(0)))
+                continue
             parts.append(self.criterion.gradient(self.moments(motion, i)))
         each = np.array([[p[0]] for p in parts])
         span = s.upper - s.lower
@@ -174,6 +195,12 @@ class TrialProblem:
         value, weights = self._combine(each)
         size = len(self.criterion.wanted)
         total = np.zeros_like(commands)
+        if self.contrast is not None:
+            size = 1
+            distance, total = self.contrast.gradient(commands)
+            value = np.array([distance])
+            if not np.isfinite(distance):
+                return -np.inf, -np.inf, np.zeros(self.shape), np.zeros(0)
         terms, rows, first = 0.0, [], 0
         for (sc, motion), part, weight in zip(
             zip(self.scenarios, motions, strict=True), parts, weights[:, 0], strict=True
@@ -181,7 +208,7 @@ class TrialProblem:
             nx, state = sc.rollout.nx, motion.state[0]
             d_state = np.zeros_like(state)
             d_tau = np.zeros_like(motion.tau[0])
-            if weight > 0:
+            if weight > 0 and self.contrast is None:
                 d_x, d_tau = sc.yardstick.gradient(
                     state[:-1, :nx], state[:-1, nx], motion.tau[0], part[1], part[2]
                 )

@@ -27,10 +27,14 @@ Array = NDArray[np.float64]
 # narrow enough that text is legible on a phone
 _WIDTH = 6.2
 _SIZE = 9.0
+# times the information from which the other sequence tells nothing
+_TELLS_NOTHING = 1000.0
 _SHOWN = ("u", "v", "r", "psi")
 
 
-def design_page(design: Design, notes: Sequence[str], record: dict[str, Any]) -> Page:
+def design_page(
+    design: Design, notes: Sequence[str], record: dict[str, Any], headline: str = ""
+) -> Page:
     """Return the page of a design.
 
     Parameters
@@ -40,6 +44,8 @@ def design_page(design: Design, notes: Sequence[str], record: dict[str, Any]) ->
         What was chosen for the user.
     record : dict
         How it was computed.
+    headline : str
+        Instead of what the plan saves, as for a trial between two explanations.
 
     Returns
     -------
@@ -47,7 +53,7 @@ def design_page(design: Design, notes: Sequence[str], record: dict[str, Any]) ->
     """
     r = design.request
     bands = predict_motion(design)
-    reference = random_std(design)
+    reference = None if r.rivals else random_std(design)
     trials = f"{clock(r.duration)} min"
     if r.trials > 1:
         trials = f"{r.trials} trials of {trials}"
@@ -57,12 +63,12 @@ def design_page(design: Design, notes: Sequence[str], record: dict[str, Any]) ->
     said = [design.status, *keeping, *notes, *design.notes]
     return Page(
         title=f"Plan for {plain_name(r.vessel.name)}: {trials}",
-        headline=headline(design),
+        headline=headline or saving(design),
         sentences=[_sentence(s) for s in said],
-        pictures=[*(one.pictures if one else []), _std_picture(design, reference)],
+        pictures=[*(one.pictures if one else []), *_std_pictures(design, reference)],
         tables=[
-            _std_table(design, reference),
-            *_alternatives(design),
+            *([_std_table(design, reference)] if np.isfinite(design.std).all() else []),
+            *([] if r.rivals else _alternatives(design)),
             _limits(design),
         ],
         computed=flatten(record),
@@ -75,7 +81,7 @@ def _sentence(text: str) -> str:
     return text[:1].upper() + text[1:] + ("" if text.endswith(".") else ".")
 
 
-def headline(design: Design) -> str:
+def saving(design: Design) -> str:
     """Return what the plan saves, and how near it is to the best possible."""
     r = design.request
     whole = r.duration * r.trials
@@ -163,8 +169,10 @@ def _trial(design: Design, band: MotionBand) -> Section:
     )
 
 
-def _std_picture(design: Design, reference: Array | None) -> Picture:
+def _std_pictures(design: Design, reference: Array | None) -> list[Picture]:
     shown = [i for i, v in enumerate(design.values) if v]
+    if not shown or not np.isfinite(design.std).all():
+        return []
     figure = new_figure(_WIDTH, 0.3 * max(len(shown), 2) + 1.1)
     ax = figure.subplots()
     place = np.arange(len(shown))
@@ -200,9 +208,8 @@ def _std_picture(design: Design, reference: Array | None) -> Picture:
     if left:
         caption += f" Left out, because their prior value is 0: {', '.join(left)}."
     words = ", ".join(f"{n} {v:.2g} %" for n, v in zip(names, relative, strict=True))
-    return Picture(
-        to_svg(figure, "precision"), caption, f"Bars of relative standard errors: {words}."
-    )
+    alternative = f"Bars of relative standard errors: {words}."
+    return [Picture(to_svg(figure, "precision"), caption, alternative)]
 
 
 def _std_table(design: Design, reference: Array | None) -> Table:
@@ -227,9 +234,11 @@ def _alternatives(design: Design) -> list[Table]:
     rows = []
     for item in design.to_dict()["alternatives"]:
         gain = item["efficiency_of_design"]
+        telling = gain is not None and gain < _TELLS_NOTHING
         rows.append([
             item["name"], str(item["tried"]), str(item["kept"]),
-            "none keeps the limits" if gain is None else f"{gain:.2f}",
+            (f"{gain:.2f}" if telling else "tells nothing")
+            + ("" if item["kept"] else " (breaks limits)"),
         ])  # fmt: skip
     if not rows:
         return []

@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from experiment_design.contrast import Contrast
 from experiment_design.criteria import Criterion, CriterionKind
 from experiment_design.limits import LimitProgram, TrialLimits
 from experiment_design.moments import MomentProgram, Moments
@@ -26,6 +27,16 @@ Array = NDArray[np.float64]
 EstimatorKind = Literal["iv", "iv-white", "oe"]
 ESTIMATORS: tuple[EstimatorKind, ...] = ("iv", "iv-white", "oe")
 Signs = tuple[tuple[str, int], ...]
+
+
+@dataclass(frozen=True)
+class Rival:
+    """Another explanation of the same ship: its structure, parameters and disturbances."""
+
+    name: str
+    structure: Structure
+    theta: Array
+    d: Array
 
 
 @dataclass(frozen=True)
@@ -59,6 +70,8 @@ class DesignRequest:
         Parameters that count; empty for all of the undisturbed model.
     combination : mapping of str to float
         Gradient of the function of the parameters for ``c``.
+    targets : tuple of float
+        Wanted standard errors of `wanted`, the scale of A and E in place of prior values.
     d : ndarray
         (nd,) expected current and wind [m/s].
     prior : (tuple of str, ndarray), optional
@@ -73,6 +86,8 @@ class DesignRequest:
         With which the path limits are to be kept under models drawn from it.
     backoff : tuple of float
         By how much each path limit is tightened for that, in its unit.
+    rivals : tuple of Rival
+        Other explanations; the trial is then to tell the prior model from them.
     seed : int
     effort : float
         Evaluations of the search, 1 being the usual number.
@@ -93,6 +108,7 @@ class DesignRequest:
     criterion: CriterionKind = "D"
     wanted: tuple[str, ...] = ()
     combination: Mapping[str, float] = field(default_factory=dict)
+    targets: tuple[float, ...] = ()
     d: Array = field(default_factory=lambda: np.zeros(4))
     prior: tuple[tuple[str, ...], Array] | None = None
     covariance: Array | None = None
@@ -100,6 +116,7 @@ class DesignRequest:
     worst_case: bool = False
     probability: float = 0.9
     backoff: tuple[float, ...] = ()
+    rivals: tuple[Rival, ...] = ()
     seed: int = 0
     effort: float = 1.0
 
@@ -210,6 +227,8 @@ def build_criterion(request: DesignRequest, predictor: Predictor) -> Criterion:
     )
     # a parameter that is zero a priori is measured by what the others of its equation are
     scale = np.where(scale > 0, scale, scale[scale > 0].min(initial=1.0))
+    if request.targets:
+        scale = np.array(request.targets, float)
     combination = np.zeros(len(names))
     for name, slope in request.combination.items():
         combination[wanted.index(wanted_columns(predictor, (name,))[0])] += slope
@@ -276,7 +295,29 @@ def build_problem(
         scenarios.append(
             Scenario(rollout, _yardstick(request, predictor, theta), program, 1.0 if k else 2.0)
         )
-    return TrialProblem(schedule, tuple(scenarios), criterion, known, request.worst_case)
+    contrast = None
+    if request.rivals:
+        for rival in request.rivals:
+            rollout = Rollout(
+                request.vessel,
+                rival.structure,
+                rival.theta,
+                rival.d,
+                rival_start(request, rival, trial),
+                request.sample_time,
+            )
+            program = LimitProgram(rollout, schedule, limits, backoff=request.backoff)
+            scenarios.append(Scenario(rollout, scenarios[0].yardstick, program, 0.0))
+        contrast = Contrast(
+            scenarios[0].rollout, [s.rollout for s in scenarios[1:]], request.noise, schedule
+        )
+    return TrialProblem(schedule, tuple(scenarios), criterion, known, request.worst_case, contrast)
+
+
+def rival_start(request: DesignRequest, rival: Rival, trial: int) -> Array:
+    """Return a rival's initial states and heading, those that it lacks left out."""
+    start = dict(zip((*request.structure.states, "psi"), request.starts[trial], strict=True))
+    return np.array([start.get(s, 0.0) for s in (*rival.structure.states, "psi")])
 
 
 def _yardstick(request: DesignRequest, predictor: Predictor, theta: Array) -> Yardstick:

@@ -196,7 +196,11 @@ def force_vector(vessel: Vessel, structure: Structure, commands: ca.SX) -> ca.SX
 
 
 def step_expression(
-    vessel: Vessel, structure: Structure, theta: Array, d: Array, sample_time: float
+    vessel: Vessel,
+    structure: Structure,
+    theta: Array | ca.SX,
+    d: Array | ca.SX,
+    sample_time: float,
 ) -> tuple[tuple[ca.SX, ca.SX], ca.SX]:
     """Return symbols (state (nx+3,), commands (nc,)) and the next state, by Euler (3.51).
 
@@ -207,9 +211,7 @@ def step_expression(
     place = ca.vertcat(ca.SX.sym("north"), ca.SX.sym("east"))
     f = structure.increment_expression(air_measured=False)
     x_next = s.x + f if structure.increment else f
-    fixed = ca.substitute(
-        x_next, ca.vertcat(s.d, s.theta), ca.DM(np.concatenate([np.asarray(d), np.asarray(theta)]))
-    )
+    fixed = ca.substitute(x_next, ca.vertcat(s.d, s.theta), ca.vertcat(ca.SX(d), ca.SX(theta)))
     fixed = ca.substitute(fixed, s.tau, force_vector(vessel, structure, commands))
     states = structure.states
     u = s.x[states.index("u")]

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
-from scipy.signal import max_len_seq
 
+from experiment_design.inputs import random_two_level
 from experiment_design.limits import TOLERANCE
 from experiment_design.problem import TrialProblem
 
@@ -24,8 +24,10 @@ Array = NDArray[np.float64]
 # random sequences that `efficiency_vs_random` is measured against
 REFERENCE = 200
 _DRAWS = 4000
-_OUTER = 7
+_OUTER = 10
 _ITERATIONS = 150
+# fewer where limits matter: multipliers are better renewed than a penalty followed to its end
+_LIMITED_ITERATIONS = 50
 # a criterion a parameter that is gained for each scaled unit of a limit, at first
 _PENALTY = 3.0
 
@@ -93,25 +95,14 @@ def to_unit(problem: TrialProblem, levels: Array) -> Array:
     return np.asarray((levels - s.lower) / span)
 
 
+def within_reach(problem: TrialProblem, unit: Array) -> Array:
+    """Return unit coordinates (..., K, nc) clipped to what limits and rates allow."""
+    return to_unit(problem, problem.schedule.within_reach(problem.levels(unit)))
+
+
 def draw_two_level(problem: TrialProblem, rng: np.random.Generator, count: int) -> Array:
     """Draw sequences (count, K, nc) with each command at one of its limits, as rates allow."""
-    unit = (rng.random((count, *problem.shape)) < 0.5).astype(float)
-    return to_unit(problem, problem.schedule.within_reach(problem.levels(unit)))
-
-
-def draw_prbs(problem: TrialProblem, count: int) -> Array:
-    """Return maximum-length sequences (≤ count, K, nc), each command shifted."""
-    holds, commands = problem.shape
-    found = []
-    for bits in range(4, 11):
-        sequence = max_len_seq(bits)[0].astype(float)
-        columns = [
-            np.resize(np.roll(sequence, i * len(sequence) // commands), holds)
-            for i in range(commands)
-        ]
-        found.append(np.column_stack(columns))
-    unit = np.array(found[:count])
-    return to_unit(problem, problem.schedule.within_reach(problem.levels(unit)))
+    return within_reach(problem, random_two_level(*problem.shape, count, rng))
 
 
 def best_random(
@@ -157,7 +148,8 @@ def ascend(problem: TrialProblem, unit: Array, budget: int) -> Candidate:
     multipliers: Array | None = None
     penalty = _PENALTY
     current = np.asarray(unit, float)
-    for _ in range(_OUTER):
+    iterations = _ITERATIONS
+    for outer in range(_OUTER):
         held = multipliers
 
         def cost(
@@ -168,19 +160,19 @@ def ascend(problem: TrialProblem, unit: Array, budget: int) -> Candidate:
                 return 1e6, np.zeros(flat.size)
             return -value, -slope.ravel()
 
-        most = max(2, min(2 * _ITERATIONS, budget - spent))
+        most = max(2, min(2 * iterations, budget - spent))
         result = minimize(
             cost,
             current.ravel(),
             jac=True,
             method="L-BFGS-B",
             bounds=[(0.0, 1.0)] * current.size,
-            options={"maxiter": _ITERATIONS, "maxfun": most},
+            options={"maxiter": iterations, "maxfun": most},
         )
         spent += int(result.nfev)
         current = np.asarray(result.x).reshape(shape)
         if problem.schedule.limited:
-            current = to_unit(problem, problem.schedule.within_reach(problem.levels(current)))
+            current = within_reach(problem, current)
         candidate = assess(problem, current[None])[0]
         if candidate.beats(best, scale):
             best = candidate
@@ -190,11 +182,12 @@ def ascend(problem: TrialProblem, unit: Array, budget: int) -> Candidate:
             break
         known = np.zeros_like(h) if multipliers is None else multipliers
         updated = np.maximum(0.0, known + penalty * h)
-        if h.max() <= 1e-3 and np.abs(updated - known).max() <= 1e-3 * max(1.0, updated.max()):
+        if h.max() <= 1e-3 and (outer > 1 or not updated.any()):
             break
+        iterations = _LIMITED_ITERATIONS
+        if multipliers is not None and h.max() > 1e-3:
+            penalty *= 2.0
         multipliers = updated
-        if h.max() > 0.02:
-            penalty *= 4.0
     assert best is not None
     return Candidate(best.unit, best.value, best.missed, spent)
 
@@ -221,7 +214,7 @@ def exchange(problem: TrialProblem, unit: Array, passes: int) -> Candidate:
         trials = np.repeat(best.unit[None], len(places), axis=0)
         where = places[:, :2].astype(int)
         trials[np.arange(len(places)), where[:, 0], where[:, 1]] = places[:, 2]
-        trials = to_unit(problem, problem.schedule.within_reach(problem.levels(trials)))
+        trials = within_reach(problem, trials)
         found = assess(problem, trials)
         spent += len(found)
         good = [i for i, c in enumerate(found) if c.beats(best, scale)]
@@ -234,7 +227,7 @@ def exchange(problem: TrialProblem, unit: Array, passes: int) -> Candidate:
             current = current.copy()
             current[where[i, 0], where[i, 1]] = places[i, 2]
             stacked.append(current)
-        several = to_unit(problem, problem.schedule.within_reach(problem.levels(np.array(stacked))))
+        several = within_reach(problem, np.array(stacked))
         candidates = [found[good[0]], *assess(problem, several)]
         spent += len(several)
         before = best

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from greybox.trial.checks.finding import CheckReport, Finding
     from greybox.trial.conditioning import decimate
     from greybox.trial.contents import describe_recording
-    from greybox.trial.importing import ImportOptions, import_recording
+    from greybox.trial.importing import import_recording
     from greybox.trial.log import TrialLog, make_log
     from greybox.trial.manoeuvres import find_manoeuvres
     from greybox.trial.reading import read_log, read_segments
@@ -46,7 +46,7 @@ _WHERE = {
     "CheckReport": "greybox.trial.checks.finding",
     "Estimate": "greybox.estimation.result",
     "Finding": "greybox.trial.checks.finding",
-    "ImportOptions": "greybox.trial.importing",
+    "ImportOptions": "greybox.trial.options",
     "ManoeuvringModel": "greybox.model.model",
     "Predictor": "greybox.model.predictor",
     "Recording": "greybox.trial.recording",

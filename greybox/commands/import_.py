@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Any
 from greybox.commands.common import positive, provenance, say
 
 if TYPE_CHECKING:
-    from greybox.trial.importing import ImportOptions
+    from greybox.trial.options import ImportOptions
 
 HELP = "make a log of raw files: CSV, Parquet, NMEA 0183, MATLAB, ROS bags, MCAP"
 EXAMPLES = """examples:
   greybox import trial.nmea --vessel ship.toml --out trial.csv
   greybox import gnss.nmea thrusters.csv --vessel ship.toml --sample-time 0.5 --out trial.parquet
   greybox import raw.csv --vessel ship.toml --fix --out trial.csv --note draught="1.2 m"
+  greybox import raw.csv --vessel ship.toml --smooth r=2 --smooth psi=1 --out trial.csv
 
 Files of one trial are merged on their clocks. Columns are found by the vessel file's
 [columns], by canonical name, or guessed; every guess is stated. Gaps stay gaps.
@@ -60,6 +61,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=2.0,
         metavar="S",
         help="window of Savitzky-Golay [s] (2)",
+    )
+    parser.add_argument(
+        "--smooth",
+        action="append",
+        default=[],
+        metavar="CHANNEL=S",
+        help="smooth this channel by local polynomials over a window [s], before anything is "
+        "derived from it; nothing is smoothed by default (repeat)",
     )
     parser.add_argument(
         "--reference-height",
@@ -126,7 +135,7 @@ def run(options: argparse.Namespace) -> None:
 
 def import_options(options: argparse.Namespace) -> ImportOptions:
     """Return the options of the import, checked."""
-    from greybox.trial.importing import ImportOptions
+    from greybox.trial.options import ImportOptions
 
     return ImportOptions(
         sample_time=options.sample_time,
@@ -136,7 +145,23 @@ def import_options(options: argparse.Namespace) -> ImportOptions:
         reference_height=options.reference_height,
         origin=_origin(options.origin),
         notes=pairs(options.note, "--note"),
+        smooth=_windows(options.smooth),
     )
+
+
+def _windows(given: list[str]) -> dict[str, float]:
+    from greybox.errors import UsageError
+
+    windows = {}
+    for channel, text in pairs(given, "--smooth").items():
+        try:
+            windows[channel] = positive(text)
+        except ValueError:
+            raise UsageError(
+                f"--smooth {channel} has a window of '{text}', it must be a positive number of "
+                f"seconds: write --smooth {channel}=2."
+            ) from None
+    return windows
 
 
 def pairs(given: list[str], option: str, *, empty: bool = False) -> dict[str, str]:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from greybox.channels import CHANNELS, unit_factor
 from greybox.errors import LogError, suggestion
 from greybox.files import sha256
+from greybox.trial.completing import wind_state
 from greybox.trial.names import Assigned, assign
 from greybox.trial.readers.formats import open_raw
 from greybox.trial.readers.table import Batch, TableFile, read_columns
@@ -67,8 +68,10 @@ def read_recording(
             # what greybox wrote is canonical: a mapping would convert it twice
             vessel, guess = replace(vessel, columns={}), False
         raw, assigned = table_recording(raw, vessel, guess=guess)
-        if record is not None and raw.epoch is None:
-            raw = replace(raw, epoch=recorded_provenance(record).epoch)
+        if record is not None:
+            known = recorded_provenance(record)
+            epoch = known.epoch if raw.epoch is None else raw.epoch
+            raw = replace(raw, epoch=epoch, derived=known.derived)
     else:
         assigned = assign(
             raw.names,
@@ -326,7 +329,8 @@ def merge(recordings: list[Recording]) -> Recording:
     Raises
     ------
     LogError
-        Some have a UNIX time and some not.
+        Some have a UNIX time and some not; or one wind was moved or brought to
+        another height before, and the other not.
     """
     if len(recordings) == 1:
         return recordings[0]
@@ -361,6 +365,7 @@ def merge(recordings: list[Recording]) -> Recording:
             )
     signals = []
     clocks: dict[tuple[int, ...], Array] = {}
+    derived = {r.name: r.derived for r in recordings}
     for name, parts in found.items():
         kept = [parts[0]]
         for part in parts[1:]:
@@ -372,6 +377,8 @@ def merge(recordings: list[Recording]) -> Recording:
                 )
             else:
                 kept.append(part)
+        if name in ("u_q", "v_q"):
+            _refuse_two_winds([(n, derived[n]) for n, _ in kept])
         kept.sort(key=lambda p: _span(p[1])[0])
         # columns of one table go on sharing their clock
         key = tuple(id(p[1].t) for p in kept)
@@ -386,7 +393,19 @@ def merge(recordings: list[Recording]) -> Recording:
         epoch,
         tuple(f for r in recordings for f in r.files),
         tuple(notes),
+        derived=tuple(dict.fromkeys(d for r in recordings for d in r.derived)),
     )
+
+
+def _refuse_two_winds(parts: list[tuple[str, tuple[str, ...]]]) -> None:
+    """Refuse winds of several files that are not of one place and height."""
+    (first, derived), *others = parts
+    for name, more in others:
+        if wind_state(more) != wind_state(derived):
+            raise LogError(
+                f"the wind of '{first}' is {wind_state(derived)}, that of '{name}' is "
+                f"{wind_state(more)}: they cannot be merged. Import both from their raw files."
+            )
 
 
 def _span(signal: Signal) -> tuple[float, float]:

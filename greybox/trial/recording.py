@@ -79,6 +79,8 @@ class Recording:
         What was guessed, skipped or recovered while reading, one sentence each.
     guessed : frozenset of str
         Signals whose meaning was guessed: another file that states it is preferred.
+    derived : tuple of str
+        What was derived before, where the file is a log that greybox wrote.
     """
 
     name: str
@@ -88,6 +90,7 @@ class Recording:
     files: tuple[SourceFile, ...] = ()
     notes: tuple[str, ...] = ()
     guessed: frozenset[str] = frozenset()
+    derived: tuple[str, ...] = ()
 
     def __contains__(self, name: object) -> bool:
         return any(s.name == name for s in self.signals)

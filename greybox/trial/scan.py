@@ -20,8 +20,9 @@ from greybox.trial.canonical import (
     unused_mappings,
 )
 from greybox.trial.deriving import derive_signals
-from greybox.trial.importing import Extent, ImportOptions, Plan, extent, plan_import
 from greybox.trial.names import Assigned
+from greybox.trial.options import ImportOptions
+from greybox.trial.planning import Extent, Plan, extent, plan_import
 from greybox.trial.readers.table import Batch, TableFile
 from greybox.trial.recording import Recording, Signal
 from greybox.trial.resampling import clock
@@ -49,6 +50,8 @@ class Scan:
         By how much time goes back at most [s].
     plan : Plan
     notes : tuple of str
+    derived : tuple of str
+        What was derived before, where the table is a log that greybox wrote.
     """
 
     assigned: dict[str, Assigned]
@@ -57,6 +60,7 @@ class Scan:
     back: float
     plan: Plan
     notes: tuple[str, ...]
+    derived: tuple[str, ...] = ()
 
 
 def scan_table(table: TableFile, vessel: Vessel, options: ImportOptions) -> Scan:
@@ -79,8 +83,9 @@ def scan_table(table: TableFile, vessel: Vessel, options: ImportOptions) -> Scan
         # nothing to measure: the message is that of an empty time column
         time_scale(np.empty(0), assigned["t"], table)
         raise AssertionError
-    if record is not None and found.scale.epoch is None:
-        found.scale = replace(found.scale, epoch=recorded_provenance(record).epoch)
+    before = recorded_provenance(record or {})
+    if found.scale.epoch is None:
+        found.scale = replace(found.scale, epoch=before.epoch)
     if found.back > _MAX_BACK_ROWS * found.usual:
         raise LogError(
             f"time in '{table.path.name}' goes back by {found.back:.6g} s, at most "
@@ -108,7 +113,9 @@ def scan_table(table: TableFile, vessel: Vessel, options: ImportOptions) -> Scan
             f"{found.repeated} row{'s' if found.repeated > 1 else ''} repeat a time: "
             f"the first is kept"
         )
-    return Scan(decided, found.scale, found.origin, found.back, plan, (*notes, *plan.notes))
+    return Scan(
+        decided, found.scale, found.origin, found.back, plan, (*notes, *plan.notes), before.derived
+    )
 
 
 class _Parts:

@@ -77,7 +77,7 @@ def savgol_velocities(
             f"x_n, y_n and psi have {len(x_n)}, {len(y_n)} and {len(psi)} samples: "
             f"give arrays of one length."
         )
-    count = _window(len(psi), sample_time, window_s, order, least_order=1)
+    count = window_samples(len(psi), sample_time, window_s, order, least_order=1)
     for name, value in (("x_n", x_n), ("y_n", y_n), ("psi", psi)):
         _require_finite(name, value)
 
@@ -120,7 +120,7 @@ def smooth(value: Array, sample_time: float, window_s: float, order: int = 2) ->
         A value is not finite; the order is below 0; the window holds fewer than
         order + 2 samples, or more than the log.
     """
-    count = _window(len(value), sample_time, window_s, order, least_order=0)
+    count = window_samples(len(value), sample_time, window_s, order, least_order=0)
     _require_finite("the signal", value)
     return np.asarray(savgol_filter(value, count, order), float)
 
@@ -150,15 +150,38 @@ def derivative_noise(sample_time: float, window_s: float, order: int = 2) -> flo
     LogError
         The order is below 1, or the window holds fewer than order + 2 samples.
     """
-    count = _window(None, sample_time, window_s, order, least_order=1)
+    count = window_samples(None, sample_time, window_s, order, least_order=1)
     weights = savgol_coeffs(count, order, deriv=1, delta=sample_time)
     return float(np.linalg.norm(weights))
 
 
-def _window(
-    samples: int | None, sample_time: float, window_s: float, order: int, *, least_order: int
+def window_samples(
+    samples: int | None,
+    sample_time: float,
+    window_s: float,
+    order: int = 2,
+    *,
+    least_order: int = 0,
 ) -> int:
-    """Return the odd number of samples of a window."""
+    """Return the odd number of samples of a window.
+
+    Parameters
+    ----------
+    samples : int, optional
+        Of the log; None where it is not known.
+    sample_time : float
+        Ts [s].
+    window_s : float
+        Length of the window [s], as in `savgol_velocities`.
+    order, least_order : int
+        Of the polynomials, and the lowest that makes sense.
+
+    Raises
+    ------
+    LogError
+        The order is too low, the window is not positive, or it holds fewer than
+        order + 2 samples or more than the log.
+    """
     if order < least_order or order != int(order):
         raise LogError(
             f"polynomials of order {order}: the order is a whole number of at least {least_order}."

@@ -21,16 +21,11 @@ from greybox.trial.canonical import (
     unused_mappings,
 )
 from greybox.trial.checks.check import check_recording
-from greybox.trial.importing import (
-    ImportOptions,
-    clean_signals,
-    cut_segments,
-    gap_notes,
-    import_recording,
-    make_provenance,
-    too_short,
-)
+from greybox.trial.importing import cut_segments, import_recording, make_provenance
 from greybox.trial.log import Provenance, TrialLog
+from greybox.trial.options import ImportOptions
+from greybox.trial.ordering import clean_signals
+from greybox.trial.planning import gap_notes, too_short
 from greybox.trial.readers.formats import open_raw
 from greybox.trial.readers.table import Batch, TableFile
 from greybox.trial.recording import Recording, SourceFile
@@ -150,7 +145,7 @@ def _in_blocks(
     stream = _Stream(table, vessel, options, scan)
     write_log(stream.segments(), out, extra=extra, provenance=stream.provenance)
     assert stream.first is not None
-    notes = [*stream.provenance().read, *stream.provenance().derived]
+    notes = [*stream.provenance().read, *stream.derived]
     return _summary(
         stream.first,
         stream.samples,
@@ -180,12 +175,17 @@ class _Stream:
         """Time that blocks share, so that no filter sees a block's end [s]."""
         plan = self.scan.plan
         slowest = max(plan.periods.values())
-        return 8 * (plan.sample_time + slowest) + 2 * self.options.window + self.scan.back
+        return 8 * (plan.sample_time + slowest) + 2 * self.options.reach + self.scan.back
 
     def provenance(self) -> Provenance:
         """Return where the log came from, with all that is known by now."""
-        notes = dict.fromkeys([*self.table.notes, *self.scan.notes, *gap_notes(self.spans, 0)])
-        whole = Recording(self.table.path.stem, (), epoch=self.scan.scale.epoch, files=(self.file,))
+        notes = dict.fromkeys(
+            [*self.table.notes, *self.scan.notes, *gap_notes(self.spans, 0, self.scan.plan.least)]
+        )
+        whole = Recording(
+            self.table.path.stem, (), epoch=self.scan.scale.epoch, files=(self.file,),
+            derived=self.scan.derived,
+        )  # fmt: skip
         return make_provenance(whole, self.options, list(notes), list(self.derived))
 
     def segments(self) -> Iterator[TrialLog]:
@@ -248,10 +248,10 @@ class _Stream:
         notes: list[str] = []
         signals = clean_signals(recording, scan.origin, notes)
         # samples beside those wanted, so that stretches do not end where the block does
-        margin = _MARGIN + int(np.ceil(self.options.window / plan.sample_time))
+        margin = _MARGIN + int(np.ceil(self.options.reach / plan.sample_time))
         span = (max(self.done - margin, 0), min(stop + margin, plan.count))
         found, derived, _ = cut_segments(
-            signals, recording.text, plan, span, self.vessel, self.options
+            signals, recording.text, plan, span, self.vessel, self.options, scan.derived
         )
         self.derived.update(dict.fromkeys(derived))
         low, high = plan.grid(self.done, self.done + 1)[0], plan.grid(stop, stop + 1)[0]

@@ -10,6 +10,7 @@ import random
 import numpy as np
 import pandas as pd
 import pytest
+from mcap.writer import Writer
 from virtual import recorded, virtual_log, write_csv
 
 from greybox.commands.main import main
@@ -251,3 +252,233 @@ def test_damaged_files_give_a_log_or_a_message(tmp_path, capsys, seed):
         assert status == 1
         assert err.count("\n") == 1
         assert left == [f"raw{ending}"]
+
+
+MAST = (4.0, -1.5, 5.0)
+MAST_SHIP = f"""name = "S"
+length = 30
+[[thruster]]
+type = "azimuth"
+speed = "n"
+angle = "alpha1"
+[sensors]
+anemometer = [{MAST[0]}, {MAST[1]}, {MAST[2]}]
+"""
+
+
+def turning(seconds=90):
+    """NMEA of a ship in a steady turn, and ν_q of its origin in the wind at 10 m.
+
+    Complex numbers, north + i east: the mast's velocity is the derivative of its path.
+    """
+    rate, heading = 0.04, 0.3
+    psi = heading + rate * np.arange(seconds)
+    bow = np.exp(1j * psi)
+    ground = (2.0 + 0.2j) * bow
+    mast = ground + 1j * rate * complex(*MAST[:2]) * bow
+    wind = 4.0 - 3.0j
+    felt = (wind - mast) / bow
+    towards = np.angle(-felt)
+    lines = []
+    for k in range(seconds):
+        course = np.degrees(np.angle(ground[k])) % 360
+        for body in (
+            f"GPRMC,10{k // 60:02}{k % 60:02}.00,A,6325.0,N,01024.0,E,"
+            f"{abs(ground[k]) * 3600 / 1852:.9f},{course:.9f},010623,,,A",
+            f"HEHDT,{np.degrees(psi[k]) % 360:.9f},T", f"TIROT,{np.degrees(rate) * 60:.9f},A",
+            f"WIMWV,{np.degrees(towards[k]) % 360:.9f},R,{abs(felt[k]):.9f},M,A",
+        ):  # fmt: skip
+            check = 0
+            for c in body.encode():
+                check ^= c
+            lines.append(f"${body}*{check:02X}\r\n")
+    through = (ground - wind * 2 ** (1 / 7)) / bow
+    return "".join(lines).encode(), through
+
+
+def test_wind_is_moved_from_the_mast_and_brought_to_a_height(tmp_path, capsys):
+    ship, out = tmp_path / "ship.toml", tmp_path / "log.csv"
+    ship.write_text(MAST_SHIP)
+    sentences, through = turning()
+    (tmp_path / "all.nmea").write_bytes(sentences)
+    arguments = ("--vessel", ship, "--reference-height", 10, "--out", out)
+    status, said, _ = run(capsys, "import", tmp_path / "all.nmea", *arguments)
+    assert status == 0
+    assert "u_q, v_q moved from the anemometer at (4, -1.5) m to the origin" in said
+    assert "true wind brought from 5 to 10 m (1/7 power law)" in said
+    log = pd.read_csv(out)
+    first = round(float(log["t"].iloc[0]))
+    np.testing.assert_allclose(
+        log["u_q"] + 1j * log["v_q"], through[first : first + len(log)], atol=1e-7
+    )
+    # no height of the anemometer is known
+    ship.write_text(MAST_SHIP.partition("[sensors]")[0])
+    status, _, err = run(capsys, "import", tmp_path / "all.nmea", *arguments)
+    assert status == 1
+    assert "cannot be brought to 10 m without the height of the anemometer" in err
+
+
+@pytest.mark.parametrize("cells", [None, 0], ids=["memory", "blocks"])
+def test_a_log_that_is_imported_again_is_the_same(tmp_path, capsys, monkeypatch, cells):
+    ship = tmp_path / "ship.toml"
+    ship.write_text(MAST_SHIP)
+    (tmp_path / "all.nmea").write_bytes(turning()[0])
+    if cells is not None:
+        monkeypatch.setattr("greybox.trial.stream._LARGE_CELLS", cells)
+    source = "all.nmea"
+    records = []
+    for name in ("a.csv", "b.csv", "c.csv"):
+        assert run(
+            capsys, "import", tmp_path / source, "--vessel", ship, "--reference-height", 10,
+            "--out", tmp_path / name,
+        )[0] == 0  # fmt: skip
+        records.append(json.loads((tmp_path / f"{name}.json").read_text()))
+        source = name
+    assert (tmp_path / "b.csv").read_bytes() == (tmp_path / "a.csv").read_bytes()
+    assert (tmp_path / "c.csv").read_bytes() == (tmp_path / "a.csv").read_bytes()
+    assert records[0]["derived"] == records[1]["derived"] == records[2]["derived"]
+
+
+def test_a_height_is_changed_from_that_of_the_log(tmp_path, capsys):
+    ship = tmp_path / "ship.toml"
+    ship.write_text(MAST_SHIP)
+    (tmp_path / "all.nmea").write_bytes(turning()[0])
+    for source, height, name in (
+        ("all.nmea", 10, "ten"), ("ten.csv", 20, "by_ten"), ("all.nmea", 20, "direct"),
+    ):  # fmt: skip
+        assert run(
+            capsys, "import", tmp_path / source, "--vessel", ship, "--reference-height", height,
+            "--out", tmp_path / f"{name}.csv",
+        )[0] == 0  # fmt: skip
+    one, two = pd.read_csv(tmp_path / "by_ten.csv"), pd.read_csv(tmp_path / "direct.csv")
+    pd.testing.assert_frame_equal(one, two, rtol=1e-12)
+
+
+def test_winds_in_two_states_are_not_merged(tmp_path, capsys):
+    ship = tmp_path / "ship.toml"
+    ship.write_text(MAST_SHIP)
+    (tmp_path / "all.nmea").write_bytes(turning()[0])
+    command = ("--vessel", ship, "--out")
+    assert run(capsys, "import", tmp_path / "all.nmea", *command, tmp_path / "a.csv")[0] == 0
+    later = pd.read_csv(tmp_path / "a.csv")
+    later["t"] += json.loads((tmp_path / "a.csv.json").read_text())["epoch"] + 90
+    later.to_csv(tmp_path / "later.csv", index=False)
+    status, _, err = run(
+        capsys, "import", tmp_path / "a.csv", tmp_path / "later.csv", *command, tmp_path / "b.csv"
+    )
+    assert status == 1
+    assert "the wind of 'a' is moved to the origin and at the height of its sensor, that of" in err
+    assert "'later' is not moved" in err
+
+
+def test_topics_of_a_bag_are_chosen_and_named(tmp_path, capsys):
+    bag = tmp_path / "trial.mcap"
+    t = 0.5 * np.arange(60)
+    said = {
+        "/nav": [{"heading": 0.1 * s, "over_ground": {"ahead": 2.0 + s / 9}} for s in t],
+        "/engine": [{"speed": 100.0 + s} for s in t],
+        "/other": [{"psi": 9.0, "u": 9.0} for _ in t],
+    }
+    with open(bag, "wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        for topic, messages in said.items():
+            channel = writer.register_channel(topic, "json", 0)
+            for s, message in zip(t, messages, strict=True):
+                nanos = 1_714_550_400 * 10**9 + int(1e9 * s)
+                writer.add_message(channel, nanos, json.dumps(message).encode(), nanos)
+        writer.finish()
+    arguments = ("import", bag, "--vessel", "thesis", "--out", tmp_path / "log.csv")
+    status, _, _ = run(
+        capsys, *arguments, "--topic", "/nav=heading=psi,over_ground.ahead=u",
+        "--topic", "/engine=n",
+    )  # fmt: skip
+    assert status == 0
+    log = pd.read_csv(tmp_path / "log.csv")
+    np.testing.assert_allclose(log["psi"], 0.1 * log["t"])
+    np.testing.assert_allclose(log["u"], 2 + log["t"] / 9)
+    # a command is held: the mean over the sample that follows
+    np.testing.assert_allclose(log["n"], 100 + log["t"])
+    for given, words in (
+        ("/nva=psi", "no topic '/nva'. Did you mean '/nav'"),
+        ("/nav=headin=psi", "no numeric field 'headin'"),
+        ("=psi", "--topic =psi has no value"),
+    ):
+        status, _, err = run(capsys, *arguments, "--topic", given)
+        assert status == 1
+        assert words in err
+
+
+@pytest.mark.parametrize("cells", [None, 0], ids=["memory", "blocks"])
+def test_channels_are_smoothed_where_asked(tmp_path, capsys, monkeypatch, cells):
+    if cells is not None:
+        monkeypatch.setattr("greybox.trial.stream._LARGE_CELLS", cells)
+        monkeypatch.setattr("greybox.trial.stream._BLOCK_ROWS", 50)
+        monkeypatch.setattr("greybox.trial.readers.csv._BLOCK_BYTES", 1 << 12)
+    rng = np.random.default_rng(5)
+    table = data(300).drop(columns=["r"])
+    table["psi"] = 0.3 + 0.01 * table["t"]
+    table["v"] = 0.1 * rng.standard_normal(300)
+    table["u"] = rng.standard_normal(300)
+    table = table.drop(index=[*range(100, 110), *range(114, 120)])
+    table.to_csv(tmp_path / "raw.csv", index=False)
+    out = tmp_path / "log.csv"
+    arguments = ("import", tmp_path / "raw.csv", "--vessel", "thesis", "--out", out)
+    status, said, _ = run(
+        capsys, *arguments, "--smooth", "u=4", "--smooth", "r=2.9", "--smooth", "psi=2"
+    )
+    assert status == 0
+    record = json.loads((tmp_path / "log.csv.json").read_text())
+    assert record["derived"] == [
+        "u smoothed over 4 s (local polynomials of order 2)",
+        "psi smoothed over 2 s (local polynomials of order 2)",
+        "r from heading by central differences (3.57)",
+        "r smoothed over 2.9 s (local polynomials of order 2)",
+    ]
+    assert record["command"]["smooth"] == ["u=4", "r=2.9", "psi=2"]
+    assert "u smoothed over 4 s" in said
+    # the four samples between two gaps are fewer than a window
+    assert [s[2] for s in record["segments"]] == [98, 178]
+    log = pd.read_csv(out).set_index("t")
+    np.testing.assert_allclose(log["r"], 0.01, atol=1e-12)
+    raw = table.set_index("t")
+    np.testing.assert_array_equal(log["v"], raw["v"][log.index])
+    for at in (0.5, 20.0, 49.0, 60.5, 100.0, 149.0):
+        # the parabola through the nine samples around, of the outermost at the ends
+        stretch = raw["u"].loc[:49.5] if at < 50 else raw["u"].loc[60.0:]
+        k = int(np.clip(stretch.index.get_loc(at), 4, len(stretch) - 5))
+        near = stretch.iloc[k - 4 : k + 5]
+        fitted = np.polyval(np.polyfit(near.index - at, near, 2), 0.0)
+        assert log["u"][at] == pytest.approx(fitted, abs=1e-9)
+
+
+@pytest.mark.parametrize("cells", [None, 0], ids=["memory", "blocks"])
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ("r", "--smooth r has no value"),
+        ("r=0", "--smooth r has a window of '0', it must be a positive number of seconds"),
+        ("r=-1", "'-1', it must be a positive number"), ("r=nan", "'nan', it must be a positive"),
+        ("r=x", "'x', it must be a positive"), ("r=1e999", "'1e999', it must be a positive"),
+        ("psy=4", "'psy' is to be smoothed and the log has no such channel. Did you mean 'psi'?"),
+        ("t=4", "'t' is to be smoothed and the log has no such channel"),
+        ("r=1", "r cannot be smoothed: a window of 1 s holds 3 samples of 0.5 s, order 2 needs 4"),
+        ("r=50", "a window of 50 s holds 101 samples, the log has 60: use a window of at most 29"),
+        ("r=25", "no 51 that follow each other"),
+    ],
+)  # fmt: skip
+def test_windows_that_cannot_be(tmp_path, capsys, monkeypatch, cells, given, words):
+    if cells is not None:
+        monkeypatch.setattr("greybox.trial.stream._LARGE_CELLS", cells)
+    table = data()
+    (table.drop(index=range(30, 36)) if given == "r=25" else table).to_csv(
+        tmp_path / "raw.csv", index=False
+    )
+    status, _, err = run(
+        capsys, "import", tmp_path / "raw.csv", "--vessel", "thesis",
+        "--out", tmp_path / "log.csv", "--smooth", given,
+    )  # fmt: skip
+    assert status == 1
+    assert words in err
+    assert err.count("\n") == 1
+    assert os.listdir(tmp_path) == ["raw.csv"]

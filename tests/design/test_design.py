@@ -1,65 +1,388 @@
-"""Sequences keep their limits; predicted precision equals what Monte Carlo finds."""
+"""Designs: what they gain, what they keep, and what is said when they cannot be."""
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from designs import limited_ship, make_request, thesis_model
 
-from experiment_design import prbs, predict_precision, random_two_level, to_log
-from greybox.errors import ExcitationError, VesselError
-from greybox.model.predictor import build_predictor
-from greybox.model.simulation import simulate
-from greybox.study.monte_carlo import Batch, BatchRegression
-from greybox.vessel.toml import load_vessel
-
-START = np.array([1.5, 1.2, 0.0, 0.0])
-
-
-def test_two_level_sequences_sit_at_their_limits(ship):
-    c = random_two_level(ship, 95, 10, np.random.default_rng(0))
-    assert set(np.unique(c["n"])) <= {10.0, 20.0}
-    assert set(np.unique(c["alpha1"])) <= {0.6, 1.1}
-    changes = np.flatnonzero(np.diff(c["n"])) + 1
-    assert (changes % 10 == 0).all()
-    assert len(c["n"]) == 95
-
-
-def test_prbs_is_balanced_and_shifted(ship):
-    c = prbs(ship, 511, 1)
-    assert abs((c["n"] == 20).mean() - 256 / 511) < 1e-9
-    assert abs(np.corrcoef(c["n"], c["alpha1"])[0, 1]) < 0.01
+from experiment_design import (
+    Circle,
+    TrialLimits,
+    Wishes,
+    design_trial,
+    least_duration,
+    predict_precision,
+    prepare_request,
+)
+from experiment_design.expressions import gradient_of
+from experiment_design.inputs import multisines, prbs, random_two_level, zig_zags
+from experiment_design.regimes import parse_regime, spell_regime
+from experiment_design.request import build_problem
+from experiment_design.search import assess, best_random, exchange
+from greybox.errors import ExcitationError, InfeasibleError, StructureError, UsageError
+from greybox.files import plain
+from greybox.model.catalogue import get_structure
+from greybox.model.model import ManoeuvringModel
 
 
-def test_commands_without_limits_are_refused():
-    with pytest.raises(VesselError, match="'n1' has no limits"):
-        prbs(load_vessel("ferry"), 10, 1)
+def replay(request, commands, theta=None, start=None):
+    """The ship of (3.51) stepped by hand, without the package's simulation: (N+1, 6)."""
+    p = dict(zip(request.structure.parameters, request.theta if theta is None else theta,
+                 strict=True))  # fmt: skip
+    u, v, r, psi = request.starts[0] if start is None else start
+    north = east = 0.0
+    rows = [(u, v, r, psi, north, east)]
+    for n, a1, a2 in commands:
+        tx = n * (np.cos(a1) + np.cos(a2))
+        ty = n * (np.sin(a1) + np.sin(a2))
+        tn = n * 9.0 * (np.sin(a1) - np.sin(a2))
+        du = p["Xu"] * u + p["Xvr"] * v * r + (p["Xuu"] + p["Wuu"]) * abs(u) * u
+        du += p["Xmu"] * tx + p["Xkappa"] * u * tx
+        dv = p["Yv"] * v + p["Yur"] * u * r + (p["Yvv"] + p["Wvv"]) * abs(v) * v
+        dv += p["Yvr"] * abs(v) * r + p["Ymu"] * ty
+        dr = p["Nr"] * r + (p["Nuv"] + p["Wuv"]) * u * v + p["Nvv"] * abs(v) * v
+        dr += p["Nvr"] * abs(v) * r + p["Nmu"] * tn
+        north += np.cos(psi) * u - np.sin(psi) * v
+        east += np.sin(psi) * u + np.cos(psi) * v
+        u, v, r, psi = u + du, v + dv, r + dr, psi + r
+        rows.append((u, v, r, psi, north, east))
+    return np.array(rows)
 
 
-def test_predicted_precision_holds(ship, thesis, true_theta):
-    """White equation error: the spread of IV estimates is the predicted one."""
-    rng = np.random.default_rng(1)
-    plan = to_log(ship, random_two_level(ship, 600, 10, rng), 1.0)
-    predictor = build_predictor(thesis, "basic", (("u", (1,)), ("v", (1,))))
-    noise = {"u": 2e-3, "v": 2e-3, "r": 4e-4}
-    predicted = predict_precision(predictor, true_theta, plan, START, noise)
-    runs = 300
-    tau = plan.forces(thesis.inputs)
-    w = rng.standard_normal((runs, 600, 3)) * list(noise.values())
-    ship_runs = simulate(thesis, true_theta, START[:3], tau, 1.0, process_noise=w)
-    batch = Batch(ship_runs.x, np.array(ship_runs.psi), tau[None], None, START[:3])
-    iv = BatchRegression(predictor, batch).refine(true_theta)
-    spread = iv.theta[:, predictor.parameter_columns].std(axis=0, ddof=1)
-    # basic regressors see the process noise too, which moves the states a little
-    assert np.abs(np.log(spread / predicted.std)).max() < 0.3
-    assert predicted.names == predictor.parameter_names
-    assert "log det" in predicted.summary()
+@pytest.fixture(scope="module")
+def basic():
+    """The issue's first design: 15 parameters, 300 s."""
+    return design_trial(make_request(duration=300.0), workers=1)
 
 
-def test_a_plan_that_moves_nothing(ship, thesis, true_theta):
-    still = {"n": np.full(60, 10.0), "alpha1": np.zeros(60), "alpha2": np.zeros(60)}
-    predictor = build_predictor(thesis, "basic", (("u", (1,)), ("v", (1,))))
-    start = np.array([1.0, 0.0, 0.0, 0.0])
-    with pytest.raises(ExcitationError, match="is not excited by this plan"):
-        predict_precision(
-            predictor, true_theta, to_log(ship, still, 1.0), start, {"u": 1, "v": 1, "r": 1}
-        )
+def test_a_design_beats_the_best_of_200_random_sequences(basic):
+    assert basic.efficiency_vs_random >= 1.3
+    assert basic.random_kept == 200
+    assert basic.status.startswith("solved")
+    assert basic.seconds < 120
+    problem = build_problem(basic.request)
+    reference, _ = best_random(problem, basic.request.seed)
+    gain = np.exp((basic.logdet - reference.value) / 15)
+    assert basic.efficiency_vs_random == pytest.approx(gain)
+
+
+def test_the_plan_keeps_its_limits_in_another_integrator(basic):
+    motion = replay(basic.request, basic.commands[0])
+    np.testing.assert_allclose(motion, basic.motions[0].state[0], atol=1e-9)
+    assert motion[:, 0].min() >= 0.5 - 1e-3
+    assert motion[:, 1].min() >= 0.4 - 1e-3
+    commands = basic.commands[0]
+    assert (commands.min(axis=0) >= [10.0, 0.6, 0.6]).all()
+    assert (commands.max(axis=0) <= [20.0, 1.1, 1.1]).all()
+    assert (np.diff(commands, axis=0)[np.arange(299) % 10 != 9] == 0).all()
+    assert basic.margins["u"] == pytest.approx(motion[:, 0].min())
+
+
+def test_a_design_shows_itself(basic):
+    text = basic.summary()
+    assert "times the information of the best of 200 random two-level sequences" in text
+    assert "zig-zag" in text
+    assert basic._repr_html_().startswith("<pre>")
+    data = json.loads(json.dumps(plain(basic.to_dict())))
+    for key in ("status", "criterion", "logdet", "efficiency_vs_random", "efficiency_lower_bound",
+                "predicted_std", "margins", "wall_s"):  # fmt: skip
+        assert key in data
+    assert set(data["predicted_std"]) == set(basic.names)
+    assert data["margins"]["u"] >= 0.5
+
+
+def test_the_same_seed_gives_the_same_plan():
+    request = make_request(duration=120.0, effort=0.1)
+    one = design_trial(request, workers=1, alternatives=False)
+    two = design_trial(request, workers=2, alternatives=False)
+    np.testing.assert_array_equal(one.commands[0], two.commands[0])
+    other = design_trial(replace(request, seed=1), workers=1, alternatives=False)
+    assert not np.array_equal(one.commands[0], other.commands[0])
+
+
+@pytest.mark.long
+def test_augmented_design_and_what_it_saves():
+    """41 regressors, 600 s: as told as 3000 s of uniformly drawn pulses."""
+    design = design_trial(make_request(duration=600.0, predictor="augmented"))
+    assert design.efficiency_vs_random >= 1.4
+    longer = make_request(duration=3000.0, predictor="augmented")
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        pulses = np.repeat(rng.uniform([10, 0.6, 0.6], [20, 1.1, 1.1], (300, 3)), 10, axis=0)
+        plan = dict(zip(("n", "alpha1", "alpha2"), pulses.T, strict=True))
+        assert design.logdet > predict_precision(longer, [plan]).logdet
+
+
+@pytest.mark.parametrize(
+    "limits",
+    [
+        TrialLimits(margins={"u": 1.2, "v": 0.9}, area=Circle(0.0, 0.0, 80.0), clearance=5.0),
+        TrialLimits(
+            margins={"u": 0.5, "v": 0.4}, speed_cap=2.3, yaw_cap=0.08,
+            end={"x_n": (0.0, 15.0), "y_n": (0.0, 15.0)}, energy=0.5, headings=3.0,
+        ),
+    ],
+)  # fmt: skip
+def test_limits_are_kept(limits):
+    request = make_request(
+        duration=240.0, limits=limits, vessel=limited_ship(2.0, 0.03), effort=0.25
+    )
+    design = design_trial(request, workers=1, alternatives=False)
+    motion = replay(request, design.commands[0])
+    tolerance = 1e-3
+    assert motion[:, 0].min() >= limits.margins["u"] - tolerance
+    assert motion[:, 1].min() >= limits.margins["v"] - tolerance
+    step = np.abs(np.diff(design.commands[0], axis=0)).max(axis=0)
+    assert (step <= np.array([2.0, 0.03, 0.03]) + 1e-9).all()
+    if limits.area is not None:
+        assert np.hypot(motion[:, 4], motion[:, 5]).max() <= 75.0 + tolerance
+    else:
+        assert np.hypot(motion[:, 0], motion[:, 1]).max() <= 2.3 + tolerance
+        assert np.abs(motion[:, 2]).max() <= 0.08 + tolerance
+        assert np.abs(motion[-1, 4:]).max() <= 15.0 + tolerance
+        assert (np.abs(design.commands[0][:, 0] / 20) ** 3).mean() <= 0.5 + tolerance
+        assert np.ptp(motion[:, 3]) >= 3.0 - tolerance
+    assert all(x.missed <= 1e-4 for x in design.limits)
+
+
+def test_a_plan_keeps_its_margins_under_the_prior():
+    """With the stated probability, judged by other draws and another integrator."""
+    model = thesis_model(spread=0.1)
+    wishes = Wishes(
+        300.0, margin_u=1.0, margin_v=0.8, start=(1.5, 1.2, 0.0, 0.0), predictor="basic",
+        effort=0.25, probability=0.9,
+    )  # fmt: skip
+    request = prepare_request(model, wishes).request
+    design = design_trial(request, workers=1, alternatives=False)
+    assert design.keeping.probability >= 0.9
+    rng = np.random.default_rng(99)
+    kept = 0
+    for _ in range(200):
+        theta = model.theta * (1 + 0.1 * rng.standard_normal(18))
+        motion = replay(request, design.commands[0], theta=theta)
+        kept += motion[:, 0].min() >= 1.0 - 1e-3 and motion[:, 1].min() >= 0.8 - 1e-3
+    # three standard errors of a share of 200
+    assert kept / 200 >= 0.9 - 3 * np.sqrt(0.9 * 0.1 / 200)
+
+
+def test_robust_designs_look_at_several_models():
+    request = make_request(
+        covariance=np.diag((0.1 * make_request().theta) ** 2), scenarios=3, effort=0.05
+    )
+    expected = build_problem(request)
+    worst = build_problem(replace(request, worst_case=True))
+    unit = np.random.default_rng(0).random((2, *expected.shape))
+    assert (worst.evaluate(unit).value <= expected.evaluate(unit).value).all()
+    for problem in (expected, worst):
+        _, _, slope, _ = problem.gradient(unit[0])
+        ends = []
+        for step in (1e-6, -1e-6):
+            moved = unit[0].copy()
+            moved[2, 1] += step
+            ends.append(problem.gradient(moved)[1])
+        assert slope[2, 1] == pytest.approx((ends[0] - ends[1]) / 2e-6, rel=1e-3)
+
+
+def test_exchange_improves_what_it_is_given():
+    problem = build_problem(make_request(duration=150.0))
+    reference, _ = best_random(problem, 0, 20)
+    found = exchange(problem, reference.unit, 2)
+    assert found.value > reference.value
+    assert found.feasible
+
+
+def test_a_campaign_determines_what_one_regime_cannot():
+    """v·r and |v|·r are one function where v keeps its sign (Remark 4.1)."""
+    structure = get_structure("thesis").with_terms("Y_vr")
+    theta = np.append(make_request().theta, 0.02)
+    ship = limited_ship(angles=(-1.1, 1.1))
+    alone = make_request(structure="thesis", vessel=ship)
+    alone = replace(alone, structure=structure, theta=theta)
+    merged = alone.build_predictor()
+    assert "Yvr+Y_vr" in [c.label for c in merged.columns]
+    both = replace(
+        alone, regimes=((("u", 1), ("v", 1)), (("u", 1), ("v", -1))),
+        starts=(np.array([1.5, 0.8, 0.0, 0.0]), np.array([1.5, -0.8, 0.0, 0.0])),
+        limits=TrialLimits(margins={"u": 0.3, "v": 0.2}), duration=150.0, effort=0.1,
+    )  # fmt: skip
+    design = design_trial(both, workers=1)
+    assert len(design.commands) == 2
+    assert np.isfinite(design.std).all()
+    assert design.motions[0].state[0, :, 1].min() >= 0.2 - 1e-3
+    assert design.motions[1].state[0, :, 1].max() <= -0.2 + 1e-3
+    assert "Y_vr" in design.names
+
+
+def test_earlier_trials_add_their_information():
+    request = make_request(duration=150.0, effort=0.05)
+    first = design_trial(request, workers=1, alternatives=False)
+    information = np.linalg.inv(first.covariance)
+    second = design_trial(
+        replace(request, prior=(first.names, information)), workers=1, alternatives=False
+    )
+    assert (second.std < first.std).all()
+    # the same trial twice halves the variance; a chosen second one does better
+    assert second.logdet > first.logdet + 15 * np.log(2)
+
+
+def test_least_trial_time():
+    request = make_request(duration=600.0, effort=0.1)
+    shorter = least_duration(request, {"Yvv": 0.02, "Yur": 0.045}, workers=1)
+    assert 60 < shorter.duration < 600
+    design = design_trial(shorter, workers=1, alternatives=False)
+    # the final design searches longer than the ones that found the duration
+    assert (design.std <= np.array([0.02, 0.045]) * 1.03).all()
+    with pytest.raises(InfeasibleError, match="600 s do not reach the target"):
+        least_duration(request, {"Yvv": 1e-4}, workers=1)
+    with pytest.raises(UsageError, match="must be positive"):
+        least_duration(request, {"Yvv": 0.0}, workers=1)
+
+
+@pytest.mark.parametrize(
+    ("wishes", "message"),
+    [
+        ({"margin_v": 1.9}, "no steady motion keeps the margins"),
+        ({"regime": "u-v+"}, "no constant command within the limits of the thrusters holds"),
+        ({"start": (0.2, 1.2, 0, 0), "margin_u": 0.5}, "starts 0.3 m/s beyond the margin of surge"),
+        ({"duration": 20.0, "predictor": "augmented"}, "a trial of 20 s is too short"),
+        (
+            {"duration": 30.0, "predictor": "wind", "wind": (5.0, 0.0)},
+            "Lengthen the trial|too short",
+        ),
+        ({"limits": TrialLimits(area=Circle(500.0, 0.0, 50.0))}, "450.0 m outside the sea room"),
+        (
+            {"limits": TrialLimits(area=Circle(0.0, 0.0, 12.0)), "start": (1.5, 1.2, 0, 0)},
+            "the sea room is 24 m across; the smallest circle|sea room is too small",
+        ),
+        ({"limits": TrialLimits(headings=30.0)}, "headings cannot cover 30 rad"),
+        ({"limits": TrialLimits(speed_cap=1.0), "start": (0.7, 0.6, 0, 0)}, "speed cap"),
+    ],
+)
+def test_what_cannot_be_is_said(wishes, message):
+    asked = {"duration": 150.0, "predictor": "basic", "effort": 0.05} | wishes
+    with pytest.raises(InfeasibleError, match=message):
+        design_trial(prepare_request(thesis_model(), Wishes(**asked)).request, workers=1)
+
+
+def test_the_closest_plan_on_request():
+    asked = Wishes(
+        150.0, predictor="basic", effort=0.05, limits=TrialLimits(headings=30.0), regime="u+v+"
+    )
+    design = design_trial(prepare_request(thesis_model(), asked).request, best_effort=True)
+    assert design.status.startswith("limits not kept")
+    assert any("headings cannot cover 30 rad" in n for n in design.notes)
+
+
+def test_an_unstable_prior():
+    model = thesis_model()
+    theta = model.theta.copy()
+    theta[model.names.index("Yv")] = 0.9
+    theta[model.names.index("Yvv")] = 0.3
+    with pytest.raises(InfeasibleError, match="unstable in free run"):
+        prepare_request(replace(model, theta=theta), Wishes(150.0))
+
+
+def test_wishes_that_exclude_one_another():
+    model = thesis_model()
+    with pytest.raises(UsageError, match="--wind 5,0"):
+        prepare_request(model, Wishes(150.0, predictor="wind"))
+    with pytest.raises(UsageError, match="names 2 regimes for 1 trial"):
+        prepare_request(model, Wishes(150.0, regime="u+v+,u+v-"))
+    with pytest.raises(UsageError, match="--trials is 0"):
+        prepare_request(model, Wishes(150.0, trials=0))
+    with pytest.raises(UsageError, match="--start has 3 numbers, 4 are needed"):
+        prepare_request(model, Wishes(150.0, start=(1, 2, 3)))
+    with pytest.raises(
+        UsageError, match=r"'Xuw' is no parameter of this model\. Did you mean 'Xu'"
+    ):
+        design_trial(prepare_request(model, Wishes(150.0, wanted=("Xuw",))).request)
+    with pytest.raises(UsageError, match="a standard error of 0"):
+        prepare_request(model, Wishes(150.0, prior=model))
+    siso = get_structure("siso")
+    wrong = ManoeuvringModel(siso, np.array([-0.1, 1.0]), np.zeros((2, 2)), 1.0, model.vessel)
+    with pytest.raises(StructureError, match="has no surge speed u"):
+        prepare_request(wrong, Wishes(150.0))
+
+
+def test_a_sum_of_terms_gets_its_parts_back():
+    """An estimate keeps Xuu for Xuu + Wuu; the disturbed trial needs both terms."""
+    full = thesis_model()
+    keep = [n for n in full.names if n not in ("Wuu", "Wvv", "Wuv")]
+    theta = np.array([full.theta[full.names.index(n)] for n in keep])
+    merged = ManoeuvringModel(
+        full.structure.without("Wuu", "Wvv", "Wuv"), theta, np.zeros((15, 15)), 1.0, full.vessel,
+        sums={"Xuu": ("Xuu", "Wuu"), "Yvv": ("Yvv", "Wvv"), "Nuv": ("Nuv", "Wuv")},
+    )  # fmt: skip
+    request = prepare_request(merged, Wishes(300.0, regime="u+v+")).request
+    assert len(request.build_predictor().columns) == 41
+
+
+def test_regimes_as_text():
+    assert parse_regime("u+v-", ("u", "v", "r")) == (("u", 1), ("v", -1))
+    assert spell_regime(parse_regime("v-", ("u", "v"))) == "v-"
+    with pytest.raises(UsageError, match="cannot be read at 'v'"):
+        parse_regime("u+v", ("u", "v"))
+    with pytest.raises(UsageError, match="names 'w'"):
+        parse_regime("w+", ("u", "v"))
+    with pytest.raises(UsageError, match="names 'u' twice"):
+        parse_regime("u+u-", ("u", "v"))
+
+
+def test_functions_of_the_parameters():
+    values = {"Xuu": -0.05, "Xmu": 0.02}
+    found = gradient_of("-Xuu/Xmu + sqrt(Xmu)**2", values)
+    assert found["Xuu"] == pytest.approx(-50.0)
+    assert found["Xmu"] == pytest.approx(-0.05 / 0.02**2 + 1)
+    for text in (
+        "__import__('os')",
+        "Xuu.real",
+        "(lambda: 1)()",
+        "Xuu if 1 else 2",
+        "1 +",
+        "x" * 900,
+    ):
+        with pytest.raises(UsageError, match="--of"):
+            gradient_of(text, values)
+    with pytest.raises(UsageError, match="no finite slope"):
+        gradient_of("3", values)
+
+
+def test_classical_sequences():
+    rng = np.random.default_rng(0)
+    two = random_two_level(95, 3, 4, rng)
+    assert two.shape == (4, 95, 3)
+    assert set(np.unique(two)) == {0.0, 1.0}
+    p = prbs(511, 2, (9,))[0]
+    assert p[:, 0].mean() == pytest.approx(256 / 511)
+    assert abs(np.corrcoef(p.T)[0, 1]) < 0.01
+    m = multisines(64, 2, 3, rng)
+    assert m.min() == pytest.approx(0.0)
+    assert m.max() == pytest.approx(1.0)
+    # harmonics of two commands do not overlap
+    spectra = np.abs(np.fft.rfft(m[0] - m[0].mean(axis=0), axis=0))
+    assert (spectra[:, 0] * spectra[:, 1]).max() < 1e-6 * spectra.max() ** 2
+    z = zig_zags(20, limited_ship())
+    assert z.shape[1:] == (20, 3)
+    np.testing.assert_allclose(z[..., 1] + z[..., 2], 1.0)
+
+
+def test_precision_of_a_given_plan():
+    request = make_request(duration=200.0)
+    still = {"n": np.full(200, 10.0), "alpha1": np.full(200, 0.8), "alpha2": np.full(200, 0.8)}
+    with pytest.raises(ExcitationError, match="do not excite every direction"):
+        predict_precision(request, [still])
+    problem = build_problem(request)
+    reference, _ = best_random(problem, 0, 20)
+    commands = problem.schedule.expand(problem.levels(reference.unit))
+    plan = dict(zip(("n", "alpha1", "alpha2"), commands.T, strict=True))
+    found = predict_precision(request, [plan])
+    assert found.logdet == pytest.approx(assess(problem, reference.unit[None])[0].value)
+    assert "−log det" in found.summary()
+    with pytest.raises(UsageError, match="has 100 samples, the request 200"):
+        predict_precision(request, [{k: v[:100] for k, v in plan.items()}])
+    with pytest.raises(UsageError, match="0 plans for 1 trials"):
+        predict_precision(request, [])

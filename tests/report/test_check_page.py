@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import re
-import shutil
-import subprocess
-import tempfile
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from browser import needs_browser, require_legible
 from virtual import as_recording, recorded
 
 from greybox.commands.main import main
@@ -36,7 +34,6 @@ from greybox.trial.checks.windage import wind_findings
 from greybox.trial.recording import Recording, Signal
 from greybox.vessel.toml import load_vessel
 
-CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 SHIP = load_vessel("thesis")
 COLUMNS = {wide: recorded(3, seconds=300.0, wide=wide, arm=(0.0, 0.0)) for wide in (False, True)}
 
@@ -353,32 +350,10 @@ def test_command_on_several_logs(tmp_path, capsys):
     assert '"log": "bad"' in found.read_text()
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no browser installed")
+@needs_browser
 @pytest.mark.parametrize("width", [390, 1200])
 def test_in_a_browser(tmp_path, width):
     """Opens, shows its figures, and does not scroll sideways."""
     path = tmp_path / "page.html"
     check_page([row_case("gap")], [Path("a.csv")], SHIP, path)
-    probe = (
-        "<script>addEventListener('load',()=>{const e=document.documentElement;"
-        "document.title=JSON.stringify([e.scrollWidth<=e.clientWidth,"
-        "document.querySelector('svg').getBoundingClientRect().width>200,e.clientWidth])})"
-        "</script></body>"
-    )
-    (tmp_path / "probe.html").write_text(path.read_text().replace("</body>", probe))
-    outer = tmp_path / "outer.html"
-    outer.write_text(
-        f"<iframe id=f src=probe.html width={width} height=800></iframe><script>"
-        "addEventListener('load',()=>{document.title=f.contentDocument.title})</script>"
-    )
-    with tempfile.TemporaryDirectory() as profile:
-        done = subprocess.run(
-            [
-                CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic",
-                "--no-first-run", "--disable-background-networking", "--disable-component-update",
-                "--disable-sync", "--allow-file-access-from-files", f"--user-data-dir={profile}",
-                "--virtual-time-budget=5000", "--dump-dom", f"file://{outer}",
-            ],
-            capture_output=True, text=True, timeout=120, check=False,
-        )  # fmt: skip
-    assert "<title>[true,true," in done.stdout, done.stdout[:500] + done.stderr[-500:]
+    require_legible(path, width)

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import shutil
-import subprocess
-import tempfile
-
 import numpy as np
 import pytest
+from browser import needs_browser, require_legible
 
 from greybox.report.figures import comparison_figure, overview_figure, to_svg
 from greybox.report.page import Page, Picture, Table, flatten, render, write_page
-
-CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 
 
 def page(width=3):
@@ -67,34 +62,10 @@ def test_comparison_figure_has_labels_and_units(clean_log, thesis, true_theta):
     assert figure.axes[-1].get_xlabel() == "time [s]"
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no browser installed")
+@needs_browser
 @pytest.mark.parametrize("width", [390, 1200])
 def test_in_a_browser(tmp_path, width):
     """Opens, shows its figure, and does not scroll sideways."""
     path = tmp_path / "page.html"
     write_page(page(width=12), path)
-    probe = (
-        "<script>addEventListener('load',()=>{const e=document.documentElement;"
-        "document.title=JSON.stringify([e.scrollWidth<=e.clientWidth,"
-        "document.querySelector('svg').getBoundingClientRect().width>200,e.clientWidth])})"
-        "</script></body>"
-    )
-    frame = tmp_path / "probe.html"
-    frame.write_text(path.read_text().replace("</body>", probe))
-    # an own width needs a frame: a headless window is never narrower than 500 px
-    outer = tmp_path / "outer.html"
-    outer.write_text(
-        f"<iframe id=f src=probe.html width={width} height=800></iframe><script>"
-        "addEventListener('load',()=>{document.title=f.contentDocument.title})</script>"
-    )
-    with tempfile.TemporaryDirectory() as profile:
-        done = subprocess.run(
-            [
-                CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic",
-                "--no-first-run", "--disable-background-networking", "--disable-component-update",
-                "--disable-sync", "--allow-file-access-from-files", f"--user-data-dir={profile}",
-                "--virtual-time-budget=5000", "--dump-dom", f"file://{outer}",
-            ],
-            capture_output=True, text=True, timeout=120, check=False,
-        )  # fmt: skip
-    assert "<title>[true,true," in done.stdout, done.stdout[:500] + done.stderr[-500:]
+    require_legible(path, width)

@@ -414,3 +414,10 @@ def test_planted_offsets_are_found(ship):
             found[kind] += any(f.id == kind and right[kind](f) for f in report.findings)
     least = logs * (0.95 - 2 * np.sqrt(0.95 * 0.05 / logs))
     assert all(n >= least for n in found.values()), found
+
+
+@pytest.mark.parametrize("late", [{}, {"u": 2.0, "v": 2.0}])
+def test_readings_of_long_logs_are_judged_on_parts_of_them(ship, monkeypatch, late):
+    monkeypatch.setattr("greybox.trial.checks.frames._EXCERPT", 400)
+    report = check_recording(as_recording(recorded(4, rate=2.0, seconds=600, late=late)), ship)
+    assert {f.id for f in report.findings} == ({"clock_offset"} if late else set())

@@ -14,7 +14,8 @@ from virtual import as_recording, recorded
 from greybox.errors import LogError
 from greybox.trial import stream
 from greybox.trial.canonical import merge, read_recording
-from greybox.trial.importing import ImportOptions, import_recording
+from greybox.trial.importing import import_recording
+from greybox.trial.options import ImportOptions
 from greybox.trial.readers import csv as csv_reader
 from greybox.trial.reading import read_segments
 from greybox.trial.recording import Recording, Signal
@@ -263,7 +264,15 @@ def large(case, n=9000):
 
 
 @pytest.mark.parametrize("case", ["plain", "gaps", "geographic", "disorder", "modes"])
-@pytest.mark.parametrize("options", [{}, {"sample_time": 1.0}, {"velocities": "savgol"}])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {}, {"sample_time": 1.0}, {"velocities": "savgol"},
+        {"smooth": {"psi": 2.0, "u": 6.0, "alpha2": 1.0}},
+        {"smooth": {"psi": 12.0}, "velocities": "savgol"},
+    ],
+    ids=["plain", "slower", "savgol", "smooth", "smooth-savgol"],
+)  # fmt: skip
 @pytest.mark.parametrize("ending", ["csv", "parquet"])
 def test_blocks_give_the_log_that_memory_gives(tmp_path, monkeypatch, case, options, ending):
     loop = {"closed_loop": {"column": "mode", "values": ["dp"]}}

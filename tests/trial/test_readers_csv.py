@@ -15,6 +15,7 @@ from pyarrow import parquet
 
 from greybox.errors import LogError
 from greybox.trial.canonical import read_recording
+from greybox.trial.readers import cells
 from greybox.trial.readers.csv import open_csv
 from greybox.trial.readers.formats import open_raw
 from greybox.trial.readers.parquet import open_parquet
@@ -386,6 +387,57 @@ def test_a_parquet_row_group_that_unpacks_too_far(tmp_path, monkeypatch):
     parquet.write_table(table, tmp_path / "x.parquet", compression="zstd", use_dictionary=False)
     with pytest.raises(LogError, match=r"a row group of .* unpacks to \d+ bytes, at most 65536"):
         read(tmp_path / "x.parquet")
+
+
+def test_a_parquet_row_group_of_long_texts(tmp_path, monkeypatch):
+    monkeypatch.setattr("greybox.trial.readers.parquet._MAX_GROUP_BYTES", 1 << 18)
+    columns = {"t": np.arange(10.0), "u": np.arange(10.0)}
+    table = pa.table(columns | {"said": ["x" * 10**5] * 10})
+    options = {"compression": "none", "use_dictionary": False}
+    parquet.write_table(table, tmp_path / "x.parquet", **options)
+    with pytest.raises(LogError, match=r"has 1000\d\d bytes a row, more than the 65536 of any log"):
+        read(tmp_path / "x.parquet")
+    # bytes are no text: they are not read at all
+    table = pa.table(columns | {"picture": [b"x" * 10**5] * 10})
+    parquet.write_table(table, tmp_path / "x.parquet", **options)
+    assert len(read(tmp_path / "x.parquet")[0]["u"]) == 10
+
+
+@pytest.mark.parametrize("kind", [pa.string(), pa.large_string()])
+@pytest.mark.parametrize("stored", [False, True])
+def test_a_long_word_in_every_row_of_a_parquet_file(tmp_path, kind, stored):
+    words = pa.array(["d" * 10**6, "dp"], kind)
+    chosen = pa.array([0, 1, None, *[0] * 100_000], pa.int32())
+    column = pa.DictionaryArray.from_arrays(chosen, words)
+    table = pa.table({"t": np.arange(len(chosen)) * 1.0, "mode": column})
+    # a decoded batch would hold 100 GB
+    parquet.write_table(
+        table, tmp_path / "x.parquet", compression="zstd", store_schema=stored,
+        use_dictionary=["mode"], dictionary_pagesize_limit=1 << 24,
+    )  # fmt: skip
+    read_back = read(tmp_path / "x.parquet")[0]["mode"]
+    assert list(read_back[:4]) == ["d" * 256, "dp", "", "d" * 256]
+
+
+@pytest.mark.parametrize("kind", [pa.string(), pa.large_string()])
+def test_long_words_are_cut(kind):
+    words = cells.text(pa.array(["dp", None, "é" * 10**6], kind))
+    assert list(words[:2]) == ["dp", ""]
+    assert words[2] == "é" * 128
+
+
+@pytest.mark.parametrize(
+    ("tail", "words"),
+    [
+        ("a" * 70000, "a line is longer than 8388608 bytes"),
+        ('1,"' + "a\n" * 40000, "a quoted cell holds line ends, or its quote is never closed"),
+    ],
+)
+def test_lines_without_an_end_after_a_good_start(tmp_path, monkeypatch, tail, words):
+    monkeypatch.setattr("greybox.trial.readers.csv._BLOCK_BYTES", 1 << 14)
+    path = written(tmp_path / "x.csv", frame().to_csv(index=False) + tail)
+    with pytest.raises(LogError, match=words):
+        read(path)
 
 
 def test_a_damaged_footer_does_not_end_the_process(tmp_path):

@@ -593,6 +593,14 @@ def test_hdf_links_and_foreign_data_are_not_followed(tmp_path):
         assert reason in notes
 
 
+def test_a_reference_that_is_no_array_is_a_cell(tmp_path):
+    def edit(file):
+        item = file.create_dataset("one", data=file["u"].ref, dtype=h5py.ref_dtype)
+        item.attrs["MATLAB_class"] = np.bytes_("cell")
+
+    assert "u" in read_mat(hdf(tmp_path / "a.mat", {"t": T, "u": U}, edit)).names
+
+
 class Trap:
     """Creates a file when it is unpickled."""
 

@@ -24,7 +24,6 @@ from greybox.trial.checks.windage import wind_findings
 from greybox.trial.deriving import derive_signals
 from greybox.trial.recording import Recording
 from greybox.trial.repair import apply_repairs
-from greybox.trial.writing import read_record
 from greybox.vessel.vessel import Vessel
 
 
@@ -43,30 +42,18 @@ def check_files(paths: Sequence[str | Path], vessel: Vessel) -> list[CheckReport
     """
     reports = []
     for path in paths:
-        recording, derived = _read(Path(path), vessel)
-        reports.append(check_recording(recording, vessel, derived=derived))
+        reports.append(check_recording(read_recording(path, vessel), vessel))
     return reports
 
 
-def _read(path: Path, vessel: Vessel) -> tuple[Recording, tuple[str, ...]]:
-    record = read_record(path) if path.is_file() else None
-    # what greybox derived is no sensor of its own
-    derived = tuple(str(d) for d in (record or {}).get("derived") or ())
-    return read_recording(path, vessel), derived
-
-
-def check_recording(
-    recording: Recording, vessel: Vessel, *, derived: tuple[str, ...] = ()
-) -> CheckReport:
+def check_recording(recording: Recording, vessel: Vessel) -> CheckReport:
     """Check one recording.
 
     Parameters
     ----------
     recording : Recording
-        Canonical signals as they were recorded.
+        Canonical signals as they were recorded; what it says was derived proves nothing.
     vessel : Vessel
-    derived : tuple of str
-        What the record of the log says was derived: such channels prove nothing.
 
     Returns
     -------
@@ -78,7 +65,7 @@ def check_recording(
     findings += missing_findings(recording)
     findings += angle_unit_findings(recording, vessel)
     whole = derive_signals(apply_repairs(recording, findings))
-    measured = _independent(whole, derived)
+    measured = _independent(whole)
     rows = [
         *stuck_findings(measured, vessel),
         *spike_findings(measured),
@@ -86,7 +73,7 @@ def check_recording(
     ]
     findings += rows
     steady = apply_repairs(whole, [f for f in rows if f.safe])
-    independent = _independent(steady, derived)
+    independent = _independent(steady)
     motion = make_motion(independent)
     outcomes = {o.id: o for o in frame_outcomes(motion)}
     if motion is not None and (motion.positioned or motion.turned):
@@ -112,10 +99,10 @@ def check_recording(
     )
 
 
-def _independent(recording: Recording, derived: tuple[str, ...]) -> Recording:
+def _independent(recording: Recording) -> Recording:
     """Leave out what was derived from other channels."""
     gone: set[str] = set()
-    for sentence in derived:
+    for sentence in recording.derived:
         names, _, source = sentence.partition(" from ")
         if source.startswith(("positions", "heading", "the velocity over ground")):
             gone |= {n.strip() for n in names.split(",")}

@@ -214,7 +214,7 @@ def find_reading(motion: Motion) -> Reading:
     turned = _turned(motion)
     if motion.positioned:
         ranked.append(((turned,), scorer.score((turned,)), turned.cost))
-        ranked += [((c,), scorer.score((c,)), c.cost) for c in _late(motion)]
+        ranked += [((c,), scorer.score((c,)), c.cost) for c in _late(scorer.motion)]
     for a, b in combinations(usable, 2):
         if a.group == b.group or set(a.channels) & set(b.channels):
             continue

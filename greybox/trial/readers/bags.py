@@ -7,127 +7,21 @@ are inflated here and not by the libraries, which inflate whatever comes.
 
 from __future__ import annotations
 
-import bz2
-import os
 import re
-import sqlite3
-import struct
 import tempfile
-import zlib
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from io import BytesIO
+from collections.abc import Iterator
 from pathlib import Path, PurePath
-from typing import IO, Any
-from urllib.parse import quote
+from typing import Any
 
 from greybox.errors import LogError
+from greybox.trial.readers import mcapfile, rosdatabase
+from greybox.trial.readers.bagparts import MAX_CHUNK, Budget, CutError, Message, Wanted
+from greybox.trial.readers.inflating import inflate_file, inflate_zstd
+from greybox.trial.readers.mcapfile import read_mcap
+from greybox.trial.readers.rosbag1 import read_bag1
+from greybox.trial.readers.rosdatabase import read_database
 
-GIB = 2**30
-# all that compressed chunks or a database may hold together; honest files exceed it
-# only when they are large themselves, hence the factor on the size of the file
-MAX_BYTES = 2 * GIB
-MAX_RATIO = 16
-# one chunk, message or record: it is held in memory as a whole
-MAX_CHUNK = GIB // 2
-MAX_MESSAGES = 20_000_000
 _MAX_METADATA = 4 * 2**20
-# a window of 128 MiB is what the zstd tool itself accepts without being asked
-_ZSTD_WINDOW = 2**27
-_BLOCK = 2**20
-
-_MCAP = b"\x89MCAP0\r\n"
-_SQLITE = b"SQLite format 3\0"
-
-
-@dataclass(frozen=True)
-class Channel:
-    """One topic as one writer declared it.
-
-    Parameters
-    ----------
-    topic : str
-    msgtype : str
-        As ROS 2 spells it: ``sensor_msgs/msg/Imu``.
-    encoding : str
-        Of the messages: ``ros1``, ``cdr``, ``json`` or another.
-    definition : str
-        Text of the message definition, empty where the file holds none.
-    definition_format : str
-        ``msg`` for the language of ROS, else the name of another one.
-    """
-
-    topic: str
-    msgtype: str
-    encoding: str
-    definition: str = ""
-    definition_format: str = "msg"
-
-
-@dataclass
-class Budget:
-    """How much may still be inflated and read, so that no file exhausts the machine.
-
-    Parameters
-    ----------
-    name : str
-        File, for the messages.
-    size : int
-        Its size [bytes]: large files may hold more.
-    """
-
-    name: str
-    size: int
-    used: int = 0
-    messages: int = 0
-
-    @property
-    def limit(self) -> int:
-        """Bytes that may be inflated in all."""
-        return max(MAX_BYTES, MAX_RATIO * self.size)
-
-    def charge(self, count: int) -> None:
-        """Count `count` bytes before they are made.
-
-        Raises
-        ------
-        LogError
-            More than a chunk or the whole file may hold.
-        """
-        if count > MAX_CHUNK:
-            raise LogError(
-                f"'{self.name}' holds a chunk of {count} bytes, at most {MAX_CHUNK} are read: "
-                f"write it again with smaller chunks, or leave out cameras and lidars."
-            )
-        self.used += count
-        if self.used > self.limit:
-            raise LogError(
-                f"'{self.name}' ({self.size} bytes) inflates to more than {self.limit} bytes: "
-                f"filter the topics that are needed into a bag of their own."
-            )
-
-    def message(self) -> None:
-        """Count one message.
-
-        Raises
-        ------
-        LogError
-            There are more than `MAX_MESSAGES`.
-        """
-        self.messages += 1
-        if self.messages > MAX_MESSAGES:
-            raise LogError(
-                f"'{self.name}' holds more than {MAX_MESSAGES} messages: "
-                f"name the topics that are needed, or split the bag."
-            )
-
-
-Message = tuple[Channel, int, bytes]
-Wanted = Callable[[str], bool]
-
-
-class _CutError(Exception):
-    """The file ends, or stops making sense, at some byte."""
 
 
 def storage_files(path: Path) -> tuple[list[Path], str, list[str]]:
@@ -193,14 +87,19 @@ def _digits(name: str) -> list[str]:
 
 def _metadata(path: Path) -> dict[str, Any]:
     from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
 
     if path.stat().st_size > _MAX_METADATA:
         return {}
     try:
         tree = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
         information = tree["rosbag2_bagfile_information"]
+    # values that their tags or spelling promise and that do not convert raise Python's own;
     # whatever is wrong with it, the files can be found without it
-    except Exception:
+    except (
+        YAMLError, OSError, ValueError, LookupError, TypeError, ArithmeticError, AssertionError,
+        RecursionError,
+    ):  # fmt: skip
         return {}
     return information if isinstance(information, dict) else {}
 
@@ -240,22 +139,22 @@ def read_messages(
         if mode == "file" and magic[:4] == b"\x28\xb5\x2f\xfd":
             with tempfile.TemporaryDirectory() as folder:
                 plain = Path(folder) / "storage"
-                _inflate_file(handle, plain, budget)
+                inflate_file(handle, plain, budget)
                 yield from read_messages(plain, "", budget, notes, wanted)
             return
         try:
             if magic.startswith(b"#ROSBAG V"):
-                yield from _bag(handle, budget, notes, wanted)
-            elif magic.startswith(_MCAP):
-                yield from _counted(_mcap(handle, budget, notes, wanted), mode, budget, notes)
-            elif magic == _SQLITE:
-                yield from _counted(_sqlite(path, budget, wanted), mode, budget, notes)
+                yield from read_bag1(handle, budget, notes, wanted)
+            elif magic.startswith(mcapfile.MAGIC):
+                yield from _counted(read_mcap(handle, budget, notes, wanted), mode, budget, notes)
+            elif magic == rosdatabase.MAGIC:
+                yield from _counted(read_database(path, budget, wanted), mode, budget, notes)
             else:
                 raise LogError(
                     f"'{budget.name}' is no ROS bag, MCAP or rosbag2 database "
                     f"(it begins with {magic[:8]!r}): name another file, or record it again."
                 )
-        except _CutError as cut:
+        except CutError as cut:
             if not budget.messages:
                 raise LogError(
                     f"'{budget.name}' {cut} and no message stands before that: "
@@ -273,7 +172,7 @@ def _counted(
     bad = 0
     for channel, time, data in messages:
         if mode == "message":
-            inflated = _zstd(data, min(MAX_CHUNK, budget.limit - budget.used) + 1)
+            inflated = inflate_zstd(data, min(MAX_CHUNK, budget.limit - budget.used) + 1)
             budget.charge(len(inflated))
             bad += not inflated
             yield channel, time, inflated
@@ -281,359 +180,3 @@ def _counted(
             yield channel, time, data
     if bad:
         notes.append(f"{bad} compressed messages of '{budget.name}' could not be inflated.")
-
-
-def _zstd(data: bytes, limit: int) -> bytes:
-    """Return at most `limit` bytes; what comes before the damage where there is some."""
-    import zstandard
-
-    inflater = zstandard.ZstdDecompressor(max_window_size=_ZSTD_WINDOW)
-    parts: list[bytes] = []
-    try:
-        with inflater.stream_reader(data, read_across_frames=True) as stream:
-            # in blocks, for what is asked for is allocated whether it comes or not
-            while limit and (part := stream.read(min(limit, _BLOCK))):
-                parts.append(part)
-                limit -= len(part)
-    except zstandard.ZstdError:
-        pass
-    return b"".join(parts)
-
-
-def _inflate_file(source: IO[bytes], target: Path, budget: Budget) -> None:
-    import zstandard
-
-    inflater = zstandard.ZstdDecompressor(max_window_size=_ZSTD_WINDOW)
-    try:
-        with inflater.stream_reader(source, closefd=False) as stream, open(target, "wb") as sink:
-            while block := stream.read(_BLOCK):
-                budget.charge(len(block))
-                sink.write(block)
-    except zstandard.ZstdError as error:
-        raise LogError(
-            f"'{budget.name}' is zstd-compressed and damaged ({error}): "
-            f"copy the file again, or name another."
-        ) from None
-
-
-def _inflate(data: bytes, kind: str, stated: int, budget: Budget) -> bytes:
-    """Return a chunk's content: what the file states is checked before and after."""
-    if kind in ("none", ""):
-        return data
-    if kind not in ("lz4", "bz2", "zstd"):
-        raise LogError(
-            f"'{budget.name}' is compressed with '{kind}', which is not read "
-            f"(lz4, bz2, zstd and none are): write it again without compression."
-        )
-    budget.charge(stated)
-    limit = stated + 1
-    try:
-        if kind == "lz4":
-            import lz4.frame
-
-            raw = bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=limit))
-        elif kind == "bz2":
-            raw = bz2.BZ2Decompressor().decompress(data, max_length=limit)
-        else:
-            raw = _zstd(data, limit)
-    # lz4 and bz2 say damaged data in their own ways
-    except (RuntimeError, OSError, ValueError, EOFError):
-        return b""
-    if len(raw) > stated:
-        raise LogError(
-            f"'{budget.name}' holds a chunk that inflates to more than the {stated} bytes that "
-            f"it states: the file is damaged or hostile, record or copy it again."
-        )
-    return raw
-
-
-def _take(stream: IO[bytes], count: int, end: int) -> bytes:
-    start = stream.tell()
-    if start + count > end:
-        raise _CutError(f"ends at byte {end} inside a record that begins before byte {start}")
-    if count > MAX_CHUNK:
-        raise _CutError(f"states a record of {count} bytes at byte {start}")
-    data = stream.read(count)
-    if len(data) != count:
-        raise _CutError(f"ends inside the record at byte {start}")
-    return data
-
-
-def _size(stream: IO[bytes]) -> int:
-    position = stream.tell()
-    end = stream.seek(0, os.SEEK_END)
-    stream.seek(position)
-    return end
-
-
-# ROS 1 bags, format 2.0
-
-
-def _fields(header: bytes) -> dict[str, bytes]:
-    fields: dict[str, bytes] = {}
-    position = 0
-    while position + 4 <= len(header):
-        (size,) = struct.unpack_from("<I", header, position)
-        name, equals, value = header[position + 4 : position + 4 + size].partition(b"=")
-        if not equals or position + 4 + size > len(header):
-            raise _CutError("holds a record header that makes no sense")
-        fields[name.decode("ascii", "replace")] = value
-        position += 4 + size
-    return fields
-
-
-def _number(fields: dict[str, bytes], name: str, layout: str = "<I") -> int:
-    value = fields.get(name, b"")
-    if len(value) != struct.calcsize(layout):
-        raise _CutError(f"holds a record without '{name}'")
-    return int(struct.unpack(layout, value)[0])
-
-
-def _bag(handle: IO[bytes], budget: Budget, notes: list[str], wanted: Wanted) -> Iterator[Message]:
-    line = handle.readline(32)
-    if line.strip() != b"#ROSBAG V2.0":
-        raise LogError(
-            f"'{budget.name}' is a bag of format {line.strip().decode('ascii', 'replace')!r}, "
-            f"only 2.0 is read: convert it with 'rosbag migrate'."
-        )
-    state = _Bag({}, budget, notes, wanted)
-    yield from state.records(handle, _size(handle), top=True)
-    if state.damaged:
-        notes.append(
-            f"{state.damaged} chunks of '{budget.name}' are damaged and were read as far as "
-            f"they go."
-        )
-
-
-@dataclass
-class _Bag:
-    channels: dict[int, Channel]
-    budget: Budget
-    notes: list[str]
-    wanted: Wanted
-    damaged: int = 0
-
-    def records(self, stream: IO[bytes], end: int, *, top: bool) -> Iterator[Message]:
-        while stream.tell() < end:
-            (size,) = struct.unpack("<I", _take(stream, 4, end))
-            fields = _fields(_take(stream, size, end))
-            (length,) = struct.unpack("<I", _take(stream, 4, end))
-            kind = fields.get("op", b"")[:1]
-            if kind == b"\x02":
-                channel = self.channels.get(_number(fields, "conn"))
-                seconds, nanos = divmod(_number(fields, "time", "<Q"), 2**32)[::-1]
-                data = _take(stream, length, end)
-                if channel is not None and self.wanted(channel.topic):
-                    self.budget.message()
-                    yield channel, seconds * 10**9 + nanos, data
-            elif kind == b"\x07":
-                self._connection(fields, _take(stream, length, end))
-            elif kind == b"\x05" and top:
-                yield from self._chunk(stream, fields, length, end)
-            elif kind == b"\x03" and fields.get("encryptor"):
-                raise LogError(
-                    f"'{self.budget.name}' is encrypted: decrypt it with 'rosbag decrypt' first."
-                )
-            elif kind in (b"\x03", b"\x04", b"\x06"):
-                _skip(stream, length, end)
-            else:
-                raise _CutError(f"holds a record of no known kind at byte {stream.tell()}")
-
-    def _chunk(
-        self, stream: IO[bytes], fields: dict[str, bytes], length: int, end: int
-    ) -> Iterator[Message]:
-        start = stream.tell()
-        whole = start + length <= end
-        data = _take(stream, min(length, end - start), end)
-        compression = fields.get("compression", b"none").decode("ascii", "replace")
-        content = _inflate(data, compression, _number(fields, "size"), self.budget)
-        try:
-            yield from self.records(BytesIO(content), len(content), top=False)
-        except _CutError:
-            self.damaged += whole
-        if not whole:
-            raise _CutError(f"ends at byte {end} inside the chunk at byte {start}")
-
-    def _connection(self, fields: dict[str, bytes], data: bytes) -> None:
-        number = _number(fields, "conn")
-        if number in self.channels:
-            return
-        inner = _fields(data)
-        self.channels[number] = Channel(
-            fields.get("topic", b"").decode("utf-8", "replace"),
-            normal_type(inner.get("type", b"").decode("utf-8", "replace")),
-            "ros1",
-            inner.get("message_definition", b"").decode("utf-8", "replace"),
-        )
-
-
-def _skip(stream: IO[bytes], count: int, end: int) -> None:
-    start = stream.tell()
-    if start + count > end:
-        raise _CutError(f"ends at byte {end} inside a record that begins before byte {start}")
-    stream.seek(start + count)
-
-
-def normal_type(name: str) -> str:
-    """Return the name of a message type as ROS 2 spells it."""
-    parts = name.split("/")
-    return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else name
-
-
-# MCAP
-
-
-@dataclass
-class _Mcap:
-    schemas: dict[int, tuple[str, str, str]]
-    channels: dict[int, Channel]
-    budget: Budget
-    notes: list[str]
-    wanted: Wanted
-    damaged: int = 0
-
-    def records(self, stream: IO[bytes], end: int, *, top: bool) -> Iterator[Message]:
-        from mcap.opcode import Opcode
-
-        while stream.tell() < end:
-            kind, length = struct.unpack("<BQ", _take(stream, 9, end))
-            if kind == Opcode.MESSAGE:
-                if length < 22:
-                    raise _CutError(f"holds a message record of {length} bytes")
-                number, _, time, _ = struct.unpack("<HIQQ", _take(stream, 22, end))
-                channel = self.channels.get(number)
-                if channel is None or not self.wanted(channel.topic):
-                    _skip(stream, length - 22, end)
-                    continue
-                data = _take(stream, length - 22, end)
-                self.budget.message()
-                yield channel, min(time, 2**63 - 1), data
-            elif kind in (Opcode.SCHEMA, Opcode.CHANNEL):
-                self._declare(kind == Opcode.SCHEMA, _take(stream, length, end))
-            elif kind == Opcode.CHUNK and top:
-                yield from self._chunk(stream, length, end)
-            elif kind == Opcode.DATA_END:
-                return
-            elif kind == 0:
-                raise _CutError(f"holds a record of no known kind at byte {stream.tell()}")
-            else:
-                _skip(stream, length, end)
-        if top:
-            raise _CutError(f"ends at byte {end} without an end record")
-
-    def _declare(self, schema: bool, content: bytes) -> None:
-        from mcap import records
-        from mcap.data_stream import ReadDataStream
-        from mcap.exceptions import McapError
-
-        stream = ReadDataStream(BytesIO(content))
-        try:
-            if schema:
-                s = records.Schema.read(stream)
-                text = s.data.decode("utf-8", "replace")
-                self.schemas.setdefault(s.id, (s.name, s.encoding, text))
-                return
-            c = records.Channel.read(stream)
-        except (McapError, struct.error, ValueError) as error:
-            raise _CutError(f"holds a damaged declaration ({error})") from None
-        name, language, text = self.schemas.get(c.schema_id, ("", "", ""))
-        language = "msg" if language in ("ros1msg", "ros2msg") else language
-        self.channels.setdefault(
-            c.id, Channel(c.topic, normal_type(name), c.message_encoding, text, language)
-        )
-
-    def _chunk(self, stream: IO[bytes], length: int, end: int) -> Iterator[Message]:
-        start = stream.tell()
-        whole = start + length <= end
-        content = _take(stream, min(length, end - start), end)
-        if len(content) < 32:
-            raise _CutError(f"ends inside the chunk at byte {start}")
-        stated, crc, named = struct.unpack_from("<QII", content, 16)
-        data = content[32 + named + 8 :]
-        kind = content[32 : 32 + named].decode("ascii", "replace")
-        if whole:
-            (held,) = struct.unpack_from("<Q", content.ljust(40 + named, b"\0"), 32 + named)
-            data = data[:held]
-        raw = _inflate(data, kind, stated, self.budget)
-        sound = whole and len(raw) == stated and (not crc or zlib.crc32(raw) == crc)
-        try:
-            yield from self.records(BytesIO(raw), len(raw), top=False)
-        except _CutError:
-            sound = False
-        if not whole:
-            raise _CutError(f"ends at byte {end} inside the chunk at byte {start}")
-        self.damaged += not sound
-
-
-def _mcap(handle: IO[bytes], budget: Budget, notes: list[str], wanted: Wanted) -> Iterator[Message]:
-    handle.seek(len(_MCAP))
-    state = _Mcap({}, {}, budget, notes, wanted)
-    yield from state.records(handle, _size(handle), top=True)
-    if state.damaged:
-        notes.append(
-            f"{state.damaged} chunks of '{budget.name}' are damaged or fail their checksum; "
-            f"they were read as far as they go."
-        )
-
-
-# rosbag2 databases
-
-
-def _sqlite(path: Path, budget: Budget, wanted: Wanted) -> Iterator[Message]:
-    try:
-        database = sqlite3.connect(
-            f"file:{quote(str(path.resolve()))}?mode=ro&immutable=1", uri=True
-        )
-    except sqlite3.Error as error:
-        raise LogError(f"cannot open '{budget.name}' ({error}): copy the file again.") from None
-    try:
-        database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_CHUNK)
-        database.text_factory = lambda raw: raw.decode("utf-8", "replace")
-        channels = _tables(database, budget)
-        chosen = [n for n, c in channels.items() if wanted(c.topic)]
-        marks = ",".join("?" * len(chosen))
-        rows = database.execute(
-            f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({marks})", chosen
-        )
-        for number, time, data in rows:
-            if isinstance(time, int) and isinstance(data, bytes):
-                budget.charge(len(data))
-                budget.message()
-                yield channels[number], time, data
-    except (sqlite3.Error, TypeError, ValueError) as error:
-        if isinstance(error, LogError):
-            raise
-        raise _CutError(f"is a damaged database ({error})") from None
-    finally:
-        database.close()
-
-
-def _tables(database: sqlite3.Connection, budget: Budget) -> dict[int, Channel]:
-    """Return the channels by number, once the tables are known to be plain tables."""
-    database.execute("PRAGMA trusted_schema=OFF")
-    database.execute("PRAGMA cell_size_check=ON")
-    made = dict(database.execute("SELECT name, sql FROM sqlite_master WHERE type = 'table'"))
-    # a view, a virtual table or a computed column runs the stranger's SQL
-    for name in ("topics", "messages", "message_definitions"):
-        sql = made.get(name)
-        if sql is None and name == "message_definitions":
-            continue
-        if sql is None or re.search(r"\bVIRTUAL\b|\bAS\b", str(sql), re.IGNORECASE):
-            raise LogError(
-                f"'{budget.name}' is a database without a plain table '{name}', so it is no "
-                f"rosbag2 storage: name a .db3 file of a bag."
-            )
-    definitions: dict[str, tuple[str, str]] = {}
-    if "message_definitions" in made:
-        for kind, language, text in database.execute(
-            "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
-        ):
-            definitions[str(kind)] = (str(text), "msg" if language == "ros2msg" else str(language))
-    return {
-        int(number): Channel(
-            str(topic), normal_type(str(kind)), str(encoding), *definitions.get(str(kind), ("",))
-        )
-        for number, topic, kind, encoding in database.execute(
-            "SELECT id, name, type, serialization_format FROM topics"
-        )
-    }

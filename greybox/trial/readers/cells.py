@@ -23,6 +23,8 @@ _DATE = re.compile(r"\d{4}([-/])\d\d\1\d\d[T ]\d\d:\d\d|\d\d\.\d\d\.\d{4}[T ]\d\
 _CLOCK = re.compile(r"\d\d?:\d\d:\d\d([.,]\d+)?")
 # RE2, on bytes
 _PLAIN = r"^-?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?$"
+# bytes of a word: the mode of a controller or a date is shorter
+_MAX_WORD = 256
 
 
 def is_blank(cell: str) -> bool:
@@ -118,10 +120,20 @@ def _ascii(cell: str) -> str | None:
 
 
 def text(column: Any) -> NDArray[Any]:
-    """Return a column of text as an array of str, (n,) object."""
+    """Return a column of text, or a dictionary of it, as str, (n,) object, long cells cut."""
     import pyarrow as pa
+    from pyarrow import compute
 
-    raw = column.cast(pa.binary()).to_pylist()
+    if pa.types.is_dictionary(column.type):
+        words = [*text(column.dictionary), ""]
+        at = compute.fill_null(column.indices.cast(pa.int64()), len(words) - 1).to_pylist()
+        return np.array([words[k] for k in at], object)
+    large = pa.types.is_large_string(column.type) or pa.types.is_large_binary(column.type)
+    # NumPy gives every word of an array the room of the longest
+    cut = compute.binary_slice(
+        column.cast(pa.large_binary() if large else pa.binary()), 0, _MAX_WORD
+    )
+    raw = cut.to_pylist()
     return np.array(["" if c is None else c.decode("utf-8", "replace") for c in raw], object)
 
 

@@ -17,6 +17,11 @@ from greybox.trial.readers.layout import find_layout
 from greybox.trial.readers.table import Batch
 
 _BLOCK_BYTES = 1 << 23
+# what Arrow says of its blocks, in words about the file
+_REASONS = {
+    "straddles two block boundaries": f"a line is longer than {_BLOCK_BYTES} bytes",
+    "out of sync with chunker": "a quoted cell holds line ends, or its quote is never closed",
+}
 _BLANKS = re.compile(rb"[ \t]+")
 
 
@@ -90,7 +95,8 @@ class CsvFile:
         except (pa.ArrowException, OSError, UnicodeError, ValueError) as error:
             if isinstance(error, LogError):
                 raise
-            reason = " ".join(str(error).split())[:200]
+            reason = " ".join(str(error).split())[:200].rstrip(".")
+            reason = next((said for sign, said in _REASONS.items() if sign in reason), reason)
             raise LogError(
                 f"cannot read '{self.path.name}' as CSV after {rows} rows: {reason}. "
                 f"Cut the file before that place, or export it again."

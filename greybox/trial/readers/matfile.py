@@ -449,8 +449,8 @@ def _load_hdf(path: Path) -> Tree:
             return _Hdf(path, file).tree()
     except (LogError, _MalformedError, MemoryError, RecursionError):
         raise
-    # HDF5 reports damage as whatever its layers raise
-    except Exception as error:
+    # what h5py makes of the errors of HDF5, and of names and types that it cannot turn to Python's
+    except (OSError, KeyError, RuntimeError, ValueError, TypeError) as error:
         reason = " ".join(str(error).split())
         size = os.path.getsize(path)
         raise _MalformedError(f"({size} bytes) cannot be read as HDF5 ({reason})") from None
@@ -539,7 +539,7 @@ class _Hdf:
                 raise _too_large(
                     self.path.name, "variables, fields or cells", self.items + numel, MAX_ITEMS
                 )
-            cells = [self._cell(r, depth, above) for r in item[()].ravel()]
+            cells = [self._cell(r, depth, above) for r in np.ravel(np.asarray(item[()], object))]
             return _Cells(cells) if kind != "cell" else cells
         if item.dtype.kind == "V" and item.dtype.names == ("real", "imag"):
             return Unreadable("it is complex: save its real and imaginary parts")

@@ -16,6 +16,8 @@ _BATCH_ROWS = 1 << 17
 # a page is decoded as a whole, and a row group may be one page a column
 _MAX_GROUP_BYTES = 1 << 29
 _MAX_RATIO = 4
+# of a large row group: a thousand columns of numbers take eight thousand
+_MAX_ROW_BYTES = 1 << 16
 # times are never repeated: even delta coding needs a bit or two for each row
 _MAX_ROWS_PER_BYTE = 8
 _HONEST_ROWS = 1_000_000
@@ -57,10 +59,13 @@ class ParquetFile:
 
         try:
             # read in pieces: else whole row groups are held, however large they were written
+            texts = [c for c in columns if c in self.text or c in self.parsed]
+            # a long text that stands once in the file may stand in every row
             with parquet.ParquetFile(
-                self.path, memory_map=False, pre_buffer=False, buffer_size=_READ_BYTES
-            ) as file:
-                _refuse_bombs(self.path, file.metadata)
+                self.path, memory_map=False, pre_buffer=False, buffer_size=_READ_BYTES,
+                read_dictionary=texts,
+            ) as file:  # fmt: skip
+                _refuse_bombs(self.path, file.metadata, texts=bool(texts))
                 for batch in file.iter_batches(
                     batch_size=_BATCH_ROWS, columns=list(columns), use_threads=True
                 ):
@@ -73,12 +78,13 @@ class ParquetFile:
     def _values(self, column: Any, name: str) -> Any:
         import pyarrow as pa
 
+        if name in self.text or name in self.parsed:
+            words = cell_text.text(column)
+            if name in self.text:
+                return words
+            return cell_text.dates(pa.array([w or None for w in words], pa.string()))
         if pa.types.is_dictionary(column.type):
             column = column.dictionary_decode()
-        if name in self.parsed:
-            return cell_text.dates(column.cast(pa.string()))
-        if name in self.text:
-            return cell_text.text(column)
         if name in self.dates:
             if pa.types.is_date(column.type):
                 column = column.cast(pa.timestamp("s"))
@@ -187,10 +193,12 @@ def _written_dates(path: Path, text: Sequence[str]) -> frozenset[str]:
     if not text:
         return frozenset()
     try:
-        with parquet.ParquetFile(path, memory_map=False, buffer_size=_READ_BYTES) as file:
-            _refuse_bombs(path, file.metadata)
+        with parquet.ParquetFile(
+            path, memory_map=False, buffer_size=_READ_BYTES, read_dictionary=list(text)
+        ) as file:
+            _refuse_bombs(path, file.metadata, texts=True)
             batch = next(file.iter_batches(batch_size=64, columns=list(text)))
-            first = {c: [str(v or "") for v in batch.column(c).to_pylist()] for c in text}
+            first = {c: cell_text.text(batch.column(c)).tolist() for c in text}
     except _ERRORS as error:
         raise _unreadable(path, error) from None
     except pa.ArrowException as error:
@@ -198,11 +206,12 @@ def _written_dates(path: Path, text: Sequence[str]) -> frozenset[str]:
     return frozenset(c for c in text if cell_text.kind(first[c], comma=False) == "date")
 
 
-def _refuse_bombs(path: Path, metadata: Any) -> None:
+def _refuse_bombs(path: Path, metadata: Any, *, texts: bool) -> None:
     # groups only: asking pyarrow for a damaged column chunk ends the process (26.0)
     size = path.stat().st_size
     for k in range(metadata.num_row_groups):
-        unpacked = metadata.row_group(k).total_byte_size
+        group = metadata.row_group(k)
+        unpacked, rows = group.total_byte_size, max(group.num_rows, 1)
         # what hardly shrank is as large as its file, and is cut into pages of a megabyte
         if unpacked > max(_MAX_GROUP_BYTES, _MAX_RATIO * size):
             raise LogError(
@@ -210,12 +219,19 @@ def _refuse_bombs(path: Path, metadata: Any) -> None:
                 f"{max(_MAX_GROUP_BYTES, _MAX_RATIO * size)} are read at once: write it with "
                 f"smaller row groups."
             )
+        # texts that long fill one page, however many rows it holds
+        if texts and unpacked > _MAX_GROUP_BYTES and unpacked > _MAX_ROW_BYTES * rows:
+            raise LogError(
+                f"a row group of '{path.name}' has {unpacked / rows:.0f} bytes a row, more than "
+                f"the {_MAX_ROW_BYTES} of any log: export it without texts, pictures and clouds, "
+                f"or with row groups below {_MAX_GROUP_BYTES} bytes."
+            )
 
 
 def _unreadable(path: Path, error: Exception) -> LogError:
     if isinstance(error, LogError):
         return error
-    reason = " ".join(str(error).split())[:200]
+    reason = " ".join(str(error).split())[:200].rstrip(".")
     return LogError(
         f"cannot read '{path.name}' as Parquet: {reason}. "
         f"Export it again, or give the file the ending of its format."

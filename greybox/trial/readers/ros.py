@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from greybox.channels import CHANNELS
 from greybox.errors import LogError, suggestion
 from greybox.files import sha256
-from greybox.trial.readers.bags import Budget, Channel, read_messages, storage_files
+from greybox.trial.readers.bagparts import Budget, Channel
+from greybox.trial.readers.bags import read_messages, storage_files
 from greybox.trial.readers.rosmessages import (
     Decoded,
     DecodeError,

@@ -12,7 +12,7 @@ import struct
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from greybox.trial.readers.bags import Channel
+from greybox.trial.readers.bagparts import Channel
 
 # longer arrays are covariances, ranges or images: noted, not signals
 MAX_ELEMENTS = 16
@@ -115,7 +115,7 @@ def _json(data: bytes) -> Decoded:
 
 
 def _definitions(channel: Channel) -> dict[str, list[tuple[str, Any]]]:
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+    from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
     store = Stores.ROS1_NOETIC if channel.encoding == "ros1" else Stores.ROS2_HUMBLE
     types = {name: fields for name, (_, fields) in get_typestore(store).fielddefs.items()}
@@ -126,8 +126,8 @@ def _definitions(channel: Channel) -> dict[str, list[tuple[str, Any]]]:
         raise DecodeError(f"its definition has {len(text)} characters")
     try:
         own = get_types_from_msg(text, channel.msgtype)
-    # the parser of the library fails in many ways on text that is no definition
-    except Exception as error:
+    # lists as constants trip an assertion, numbers of thousands of digits Python itself
+    except (TypesysError, AssertionError, ValueError) as error:
         raise DecodeError(f"its definition cannot be parsed ({type(error).__name__})") from None
     return types | {name: fields for name, (_, fields) in own.items()}
 

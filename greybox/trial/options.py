@@ -1,0 +1,47 @@
+"""What the user may decide about an import."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class ImportOptions:
+    """What the user may decide about an import.
+
+    Parameters
+    ----------
+    sample_time : float, optional
+        Ts of the log [s]; that of the slowest motion sensor by default.
+    hole : float, optional
+        Shortest step that counts as a gap [s]; 2.5 usual steps of the sensor
+        by default.
+    velocities : {"central", "savgol"}
+        How u, v, r are made from positions where nothing measured them.
+    window : float
+        Window of the Savitzky-Golay filter [s].
+    reference_height : float, optional
+        Height [m] to which the wind is brought; as measured by default.
+    origin : tuple of float, optional
+        Latitude and longitude [deg] of ``x_n = y_n = 0``.
+    notes : mapping of str to str
+        Draught, loading, depth, sea state and what else was noted of the trial.
+    smooth : mapping of str to float
+        Window [s] of the local polynomials for each channel of the log that is to be
+        smoothed; none by default.
+    """
+
+    sample_time: float | None = None
+    hole: float | None = None
+    velocities: str = "central"
+    window: float = 2.0
+    reference_height: float | None = None
+    origin: tuple[float, float] | None = None
+    notes: Mapping[str, str] = field(default_factory=dict)
+    smooth: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def reach(self) -> float:
+        """Time over which filters see their neighbours, at most [s]."""
+        return self.window + max(self.smooth.values(), default=0.0)

@@ -1,0 +1,119 @@
+"""Signals in order of time, each time once, ready for a uniform clock."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.errors import LogError
+from greybox.trial.deriving import derive_signals
+from greybox.trial.recording import Recording, Signal
+from greybox.trial.resampling import usual_step
+
+Array = NDArray[np.float64]
+
+# usual steps by which time may go back without there being two runs in a file
+_FAR = 50.0
+_MAX_RUNS = 1000
+
+
+def clean_signals(
+    recording: Recording, origin: tuple[float, float] | None, notes: list[str]
+) -> dict[str, Signal]:
+    """Return the signals in order of time, each time once, derived ones among them."""
+    recording = in_order(recording, notes)
+    made = derive_signals(recording, origin)
+    notes += made.notes[len(recording.notes) :]
+    repeated: dict[int, tuple[str, int]] = {}
+    signals: dict[str, Signal] = {}
+    clocks: dict[tuple[int, bytes], Array] = {}
+    for s in made.signals:
+        keep = np.isfinite(s.value) & np.isfinite(s.t)
+        once = np.concatenate([[True], np.diff(s.t) > 0]) if len(s) else keep
+        if not once.all():
+            repeated.setdefault(id(s.t), (s.name, int((~once).sum())))
+            keep &= _first_kept(s.t, keep)
+        if not keep.all():
+            # signals that keep the same rows go on sharing their clock
+            t = clocks.setdefault((id(s.t), np.packbits(keep).tobytes()), s.t[keep])
+            s = replace(s, t=t, value=s.value[keep])
+        signals[s.name] = s
+    for name, count in repeated.values():
+        notes.append(
+            f"{count} value{'s' if count > 1 else ''} of {name} repeat a time: the first is kept"
+        )
+    return signals
+
+
+def _first_kept(t: Array, keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Whether each is the first of those kept at its time, (N,)."""
+    rows = np.flatnonzero(keep)
+    first = np.zeros(len(t), bool)
+    first[rows[np.concatenate([[True], np.diff(t[rows]) > 0])] if len(rows) else rows] = True
+    return first
+
+
+def in_order(recording: Recording, notes: list[str]) -> Recording:
+    """Return the recording with every signal and text in order of time.
+
+    Raises
+    ------
+    LogError
+        Time goes back over what was recorded before: there are two runs in it.
+    """
+    orders: dict[int, tuple[NDArray[np.int64], Array] | None] = {}
+
+    def order(t: Array, name: str) -> tuple[NDArray[np.int64], Array] | None:
+        if id(t) not in orders:
+            orders[id(t)] = _order(t, name, recording.name, notes)
+        return orders[id(t)]
+
+    signals = []
+    for s in recording.signals:
+        found = order(s.t, s.name)
+        signals.append(s if found is None else replace(s, t=found[1], value=s.value[found[0]]))
+    text = {}
+    for name, (t, words) in recording.text.items():
+        found = order(t, name)
+        text[name] = (t, words) if found is None else (found[1], words[found[0]])
+    return replace(recording, signals=tuple(signals), text=text)
+
+
+def _order(
+    t: Array, signal: str, name: str, notes: list[str]
+) -> tuple[NDArray[np.int64], Array] | None:
+    steps = np.diff(t)
+    if (steps >= 0).all() and np.isfinite(t).all():
+        return None
+    rows = np.flatnonzero(np.isfinite(t))
+    ordered = t[rows]
+    back = np.flatnonzero(np.diff(ordered) < 0)
+    if len(back):
+        _refuse_two_runs(ordered, back, signal, name)
+        notes.append(
+            f"time of {signal} goes back {len(back)} time{'s' if len(back) > 1 else ''}, first "
+            f"from {ordered[back[0]]:.6g} to {ordered[back[0] + 1]:.6g} s: put in order"
+        )
+        rows = rows[np.argsort(ordered, kind="stable")]
+    return rows, t[rows]
+
+
+def _refuse_two_runs(t: Array, back: NDArray[np.int64], signal: str, name: str) -> None:
+    """Refuse times that go back far, over times that are there already."""
+    usual = usual_step(np.sort(t)) or float(np.median(np.abs(np.diff(t))))
+    far = back[t[back] - t[back + 1] > _FAR * usual]
+    edges = np.concatenate([[0], far + 1, [len(t)]])
+    if len(far) > _MAX_RUNS:
+        return
+    spans = sorted((t[a:b].min(), t[a:b].max()) for a, b in pairwise(edges))
+    for (_, stop), (start, end) in pairwise(spans):
+        if min(stop, end) - start > _FAR * usual:
+            k = int(far[0])
+            raise LogError(
+                f"time of {signal} in '{name}' goes back from {t[k]:.6g} to {t[k + 1]:.6g} s, over "
+                f"{min(stop, end) - start:.4g} s that are there twice: cut the file there and "
+                f"import each run, or mend it with --fix."
+            )

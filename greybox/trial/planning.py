@@ -1,0 +1,245 @@
+"""The samples of a log: where they begin and end, how far apart they are, what leads."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.errors import LogError
+from greybox.trial.options import ImportOptions
+from greybox.trial.resampling import Clock, nice_period
+from greybox.vessel.vessel import Vessel
+
+Array = NDArray[np.float64]
+
+_MOTION = ("x_n", "y_n", "psi", "u", "v", "r", "v_n", "v_e")
+_WIND = ("u_q", "v_q", "w_n", "w_e", "w_x", "w_y")
+_BODY, _EARTH, _PLACE = frozenset({"u", "v"}), frozenset({"v_n", "v_e"}), frozenset({"x_n", "y_n"})
+# what serves as well as a motion signal
+_INSTEAD: dict[str, tuple[frozenset[str], ...]] = {
+    "r": (frozenset({"psi"}),), "v_n": (_BODY, _PLACE), "v_e": (_BODY, _PLACE),
+    "x_n": (_BODY, _EARTH), "y_n": (_BODY, _EARTH), "u": (_EARTH, _PLACE), "v": (_EARTH, _PLACE),
+}  # fmt: skip
+MIN_SEGMENT = 3
+# a grid of more samples than this many times those read is a mistake in the times
+_MAX_GROWTH = 50
+# share of uneven steps below which missing values are a hole and not a quiet sensor
+_STEADY = 0.05
+# share of the time of the longest signal that another must cover to be of use
+_ENOUGH = 0.5
+
+
+@dataclass(frozen=True)
+class Extent:
+    """What the samples of a log depend on of one signal's clock.
+
+    Parameters
+    ----------
+    first, last : float
+        [s]
+    count : int
+        Values.
+    period, mean : float
+        Usual step, and mean step in the longest stretch without a hole [s].
+    covered : float
+        Time within stretches [s].
+    irregular : int
+        Steps within stretches that are not the usual one.
+    """
+
+    first: float
+    last: float
+    count: int
+    period: float
+    mean: float
+    covered: float
+    irregular: int
+
+    @property
+    def steady(self) -> bool:
+        """Whether the signal comes at its own rate, so that missing values are a hole."""
+        return self.count > 2 and self.irregular < _STEADY * self.count
+
+
+def extent(of: Clock) -> Extent:
+    """Return what the samples of a log depend on of a clock."""
+    return Extent(
+        float(of.t[0]), float(of.t[-1]), len(of.t), of.period, of.mean, of.covered, of.irregular
+    )
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The samples of a log, and which signals it is made of.
+
+    Parameters
+    ----------
+    name : str
+    sample_time, start : float
+        [s]
+    count : int
+        Samples, those in gaps included.
+    periods : mapping of str to float
+        Usual step of each signal that is used [s].
+    leading : tuple of str
+        Signals whose holes are gaps.
+    notes : tuple of str
+    least : int
+        Samples of the shortest stretch that is kept.
+    """
+
+    name: str
+    sample_time: float
+    start: float
+    count: int
+    periods: Mapping[str, float]
+    leading: tuple[str, ...]
+    notes: tuple[str, ...]
+    least: int
+
+    def grid(self, first: int, stop: int) -> Array:
+        """Return the times of some samples [s]."""
+        # rounding keeps 0.3 from becoming 0.30000000000000004 in the file
+        return np.round(self.start + self.sample_time * np.arange(first, stop), 9)
+
+
+def plan_import(
+    extents: Mapping[str, Extent], vessel: Vessel, options: ImportOptions, name: str
+) -> Plan:
+    """Decide on the samples of a log.
+
+    Raises
+    ------
+    LogError
+        Nothing moves in the recording, or its signals do not overlap; a window
+        of smoothing is too short or too long.
+    """
+    notes = [
+        f"{n} has {e.count} value{'s' if e.count != 1 else ''}: left out"
+        for n, e in extents.items()
+        if e.count < MIN_SEGMENT
+    ]
+    commands = set(vessel.commands)
+    used = {
+        n: e
+        for n, e in extents.items()
+        if e.count >= MIN_SEGMENT and n in {*_MOTION, *_WIND, *commands}
+    }
+    motion = [n for n in _MOTION if n in used]
+    inputs = [c for c in vessel.commands if c in used]
+    if not motion and not inputs:
+        raise LogError(
+            f"'{name}' has no position, heading, velocity or thruster column with values among "
+            f"{', '.join(extents) or 'nothing'}: map its columns in the vessel file."
+        )
+    missing = [c for c in vessel.commands if c not in used]
+    if missing:
+        notes.append(
+            f"no thruster column {', '.join(missing)}: motion only, no force model can be fitted"
+        )
+    most = max(used[n].covered for n in (motion or inputs))
+    brief = {n for n in used if n not in commands and used[n].covered < _ENOUGH * most}
+    for n in sorted(brief):
+        others = used.keys() - brief
+        # a sensor that soon died must not take the others with it, where they do without
+        if n in _WIND or any(pair <= others for pair in _INSTEAD.get(n, ())):
+            notes.append(f"{n} covers {used[n].covered:.4g} of {most:.4g} s: left out")
+            used.pop(n)
+    leading = [n for n in _MOTION if n in used] or inputs
+    sample_time = options.sample_time or _sample_time([used[n] for n in leading])
+    held = [n for n in used if n not in leading and used[n].steady]
+    late = [n for n in inputs if n not in leading and n not in held]
+    leading = [*leading, *held]
+    start = max(used[n].first for n in (*leading, *late))
+    stop = min(used[n].last for n in leading)
+    # a held value lasts until the next would have come
+    if stop - start < (MIN_SEGMENT - 1) * sample_time * (1 - 1e-6):
+        one = max((*leading, *late), key=lambda n: used[n].first)
+        two = min(leading, key=lambda n: used[n].last)
+        raise LogError(
+            f"the signals of '{name}' overlap from {start:.6g} s ({one}) to {stop:.6g} s ({two}), "
+            f"less than {MIN_SEGMENT} samples of {sample_time:g} s: check the clocks of the "
+            f"files, or choose a shorter sample time."
+        )
+    values = sum(used[n].count for n in leading)
+    samples = (stop - start) / sample_time + 1
+    if samples > _MAX_GROWTH * values + 1000:
+        raise LogError(
+            f"'{name}' spans {stop - start:.4g} s, {samples:.4g} samples of {sample_time:g} s, but "
+            f"holds {values} values: correct its times, or choose a longer sample time."
+        )
+    longest = max(e.last for e in used.values()) - min(e.first for e in used.values())
+    if stop - start < 0.9 * longest:
+        one = max((*leading, *late), key=lambda n: used[n].first)
+        two = min(leading, key=lambda n: used[n].last)
+        notes.append(
+            f"of {longest:.4g} s, {start:.6g} s ({one} begins) to {stop:.6g} s ({two} ends) are "
+            f"covered by every signal"
+        )
+    count = int(np.floor((stop - start) / sample_time + 1e-6)) + 1
+    return Plan(
+        name,
+        sample_time,
+        start,
+        count,
+        {n: e.period for n, e in used.items()},
+        tuple(leading),
+        tuple(notes),
+        max([MIN_SEGMENT, *_windows(options, count, sample_time)]),
+    )
+
+
+def _windows(options: ImportOptions, count: int, sample_time: float) -> Iterator[int]:
+    """Yield the samples of each window of smoothing."""
+    if options.smooth:
+        from greybox.trial.smoothing import window_samples
+    for name, seconds in options.smooth.items():
+        try:
+            yield window_samples(count, sample_time, seconds)
+        except LogError as error:
+            raise LogError(f"{name} cannot be smoothed: {error}") from None
+
+
+def _sample_time(extents: list[Extent]) -> float:
+    slowest = max(extents, key=lambda e: e.period)
+    if slowest.period <= 0:
+        raise LogError("the motion sensors have one sample each: name a longer recording.")
+    near = abs(slowest.mean - slowest.period) < 0.2 * slowest.mean
+    return nice_period(slowest.mean if near else slowest.period)
+
+
+def gap_notes(spans: Sequence[tuple[float, float]], short: int, least: int) -> list[str]:
+    """Say how many gaps there are between spans [s], and what was too short to keep."""
+    notes = []
+    if short:
+        notes.append(
+            f"{short} stretch{'es' if short > 1 else ''} of fewer than {least} samples left out"
+            f"{', since none can be smoothed' if least > MIN_SEGMENT else ''}"
+        )
+    gaps = [(a[1], b[0]) for a, b in pairwise(spans)]
+    if gaps:
+        longest = max(gaps, key=_length)
+        notes.append(
+            f"{len(gaps)} gap{'s' if len(gaps) > 1 else ''} kept as such, the longest of "
+            f"{_length(longest):.3g} s at t = {longest[0]:.6g} s: {len(spans)} segments"
+        )
+    return notes
+
+
+def too_short(plan: Plan) -> LogError:
+    """Return the error of a plan without a segment."""
+    other = " or a shorter window of smoothing" if plan.least > MIN_SEGMENT else ""
+    return LogError(
+        f"'{plan.name}' has {plan.count} samples of {plan.sample_time:g} s but no "
+        f"{plan.least} that follow each other in which {', '.join(plan.leading)} all have "
+        f"values (two more where velocities are derived): choose another sample time or "
+        f"hole{other}."
+    )
+
+
+def _length(gap: tuple[float, float]) -> float:
+    return gap[1] - gap[0]

@@ -1,0 +1,156 @@
+"""What the storage formats of bags share: channels, a budget, records cut short."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import IO
+
+from greybox.errors import LogError
+
+GIB = 2**30
+# all that compressed chunks or a database may hold together; honest files exceed it
+# only when they are large themselves, hence the factor on the size of the file
+MAX_BYTES = 2 * GIB
+MAX_RATIO = 16
+# one chunk, message or record: it is held in memory as a whole
+MAX_CHUNK = GIB // 2
+MAX_MESSAGES = 20_000_000
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One topic as one writer declared it.
+
+    Parameters
+    ----------
+    topic : str
+    msgtype : str
+        As ROS 2 spells it: ``sensor_msgs/msg/Imu``.
+    encoding : str
+        Of the messages: ``ros1``, ``cdr``, ``json`` or another.
+    definition : str
+        Text of the message definition, empty where the file holds none.
+    definition_format : str
+        ``msg`` for the language of ROS, else the name of another one.
+    """
+
+    topic: str
+    msgtype: str
+    encoding: str
+    definition: str = ""
+    definition_format: str = "msg"
+
+
+@dataclass
+class Budget:
+    """How much may still be inflated and read, so that no file exhausts the machine.
+
+    Parameters
+    ----------
+    name : str
+        File, for the messages.
+    size : int
+        Its size [bytes]: large files may hold more.
+    """
+
+    name: str
+    size: int
+    used: int = 0
+    messages: int = 0
+
+    @property
+    def limit(self) -> int:
+        """Bytes that may be inflated in all."""
+        return max(MAX_BYTES, MAX_RATIO * self.size)
+
+    def charge(self, count: int) -> None:
+        """Count `count` bytes before they are made.
+
+        Raises
+        ------
+        LogError
+            More than a chunk or the whole file may hold.
+        """
+        if count > MAX_CHUNK:
+            raise LogError(
+                f"'{self.name}' holds a chunk of {count} bytes, at most {MAX_CHUNK} are read: "
+                f"write it again with smaller chunks, or leave out cameras and lidars."
+            )
+        self.used += count
+        if self.used > self.limit:
+            raise LogError(
+                f"'{self.name}' ({self.size} bytes) inflates to more than {self.limit} bytes: "
+                f"filter the topics that are needed into a bag of their own."
+            )
+
+    def message(self) -> None:
+        """Count one message.
+
+        Raises
+        ------
+        LogError
+            There are more than `MAX_MESSAGES`.
+        """
+        self.messages += 1
+        if self.messages > MAX_MESSAGES:
+            raise LogError(
+                f"'{self.name}' holds more than {MAX_MESSAGES} messages: "
+                f"name the topics that are needed, or split the bag."
+            )
+
+
+Message = tuple[Channel, int, bytes]
+Wanted = Callable[[str], bool]
+
+
+class CutError(Exception):
+    """The file ends, or stops making sense, at some byte."""
+
+
+def take(stream: IO[bytes], count: int, end: int) -> bytes:
+    """Return the next bytes of a file.
+
+    Raises
+    ------
+    CutError
+        There are not so many before `end`, or no record may be so large.
+    """
+    start = stream.tell()
+    if start + count > end:
+        raise CutError(f"ends at byte {end} inside a record that begins before byte {start}")
+    if count > MAX_CHUNK:
+        raise CutError(f"states a record of {count} bytes at byte {start}")
+    data = stream.read(count)
+    if len(data) != count:
+        raise CutError(f"ends inside the record at byte {start}")
+    return data
+
+
+def file_size(stream: IO[bytes]) -> int:
+    """Return the size of a file [bytes] and leave it where it was."""
+    position = stream.tell()
+    end = stream.seek(0, os.SEEK_END)
+    stream.seek(position)
+    return end
+
+
+def skip(stream: IO[bytes], count: int, end: int) -> None:
+    """Go past the next bytes of a file.
+
+    Raises
+    ------
+    CutError
+        There are not so many before `end`.
+    """
+    start = stream.tell()
+    if start + count > end:
+        raise CutError(f"ends at byte {end} inside a record that begins before byte {start}")
+    stream.seek(start + count)
+
+
+def normal_type(name: str) -> str:
+    """Return the name of a message type as ROS 2 spells it."""
+    parts = name.split("/")
+    return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else name

@@ -1,0 +1,156 @@
+"""Limits: their values, their derivatives, and what a sequence may do between two levels."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from designs import limited_ship, make_request
+
+from experiment_design.limits import Circle, LimitProgram, TrialLimits
+from experiment_design.request import build_problem
+from experiment_design.schedule import make_schedule
+from greybox.errors import UsageError, VesselError
+from greybox.vessel.toml import load_vessel
+from greybox.vessel.vessel import Limits
+
+ROOM = np.array([[-60.0, -40.0], [90.0, -40.0], [90.0, 20.0], [30.0, 60.0], [90.0, 110.0],
+                 [-60.0, 110.0]])  # fmt: skip
+
+
+def inside(corners, point):
+    """Winding number of a polygon around a point, by angles."""
+    away = corners - point
+    angle = np.arctan2(away[:, 1], away[:, 0])
+    turn = np.diff(np.append(angle, angle[0]))
+    turn = (turn + np.pi) % (2 * np.pi) - np.pi
+    return abs(turn.sum()) > np.pi
+
+
+def test_distance_to_a_sea_room_that_is_not_convex():
+    request = make_request(limits=TrialLimits(area=ROOM, position=(5.0, 7.0)), regimes=((),))
+    program = build_problem(request).scenarios[0].limits
+    rng = np.random.default_rng(0)
+    state = np.zeros((300, 6))
+    state[:, 4:] = rng.uniform(-120, 150, (300, 2))
+    found = program.path_values(state)[0]
+    for value, place in zip(found, state[:, 4:] + [5.0, 7.0], strict=True):
+        nearest = np.inf
+        for a, b in zip(ROOM, np.roll(ROOM, -1, axis=0), strict=True):
+            t = np.clip((place - a) @ (b - a) / ((b - a) @ (b - a)), 0, 1)
+            nearest = min(nearest, np.linalg.norm(place - a - t * (b - a)))
+        sign = -1 if inside(ROOM, place) else 1
+        assert value == pytest.approx(sign * nearest, abs=1e-5)
+
+
+def test_every_limit_has_its_derivative():
+    limits = TrialLimits(
+        margins={"u": 1.2, "v": 0.85}, area=Circle(10.0, 20.0, 25.0), speed_cap=1.5, yaw_cap=0.03,
+        end={"x_n": (0.0, 5.0), "psi": (1.0, 0.1)}, energy=0.2, headings=5.0, clearance=3.0,
+    )  # fmt: skip
+    request = make_request(
+        limits=limits, vessel=limited_ship(0.5, 0.02), d=np.array([0.2, 0.1, 0, 0])
+    )
+    problem = build_problem(request)
+    rng = np.random.default_rng(2)
+    unit = rng.random(problem.shape)
+    h = problem.gradient(unit, None, 1.0)[3]
+    multipliers = rng.random(h.size) * 0.1
+    _, _, slope, _ = problem.gradient(unit, multipliers, 2.0)
+    for k, c in ((0, 0), (4, 1), (9, 2), (11, 0)):
+        ends = []
+        for step in (1e-6, -1e-6):
+            moved = unit.copy()
+            moved[k, c] += step
+            ends.append(problem.gradient(moved, multipliers, 2.0)[1])
+        difference = (ends[0] - ends[1]) / 2e-6
+        assert slope[k, c] == pytest.approx(difference, rel=1e-4, abs=1e-5 * abs(slope).max())
+
+
+def test_margins_see_the_current():
+    """u_r and u must both keep their sign (5.7)."""
+    request = make_request(d=np.array([0.3, 0.0, 0.0, 0.0]))
+    program = build_problem(request).scenarios[0].limits
+    state = np.zeros((2, 6))
+    state[:, 0], state[:, 1] = 0.7, 0.5
+    state[1, 3] = np.pi
+    values = program.path_values(state)
+    assert values[0, 0] == pytest.approx(0.5 - (0.7 - 0.3))
+    assert values[0, 1] == pytest.approx(0.5 - 0.7)
+    assert values[1, 0] == pytest.approx(0.4 - 0.5)
+
+
+def test_ramps_keep_the_rates():
+    ship = limited_ship(speed=2.0, angle=0.02)
+    schedule = make_schedule(ship, 100.0, 10.0, 1.0)
+    assert schedule.ramp == (5, 10, 10)
+    assert schedule.reach[0] == np.inf
+    assert schedule.reach[1] == pytest.approx(0.2)
+    rng = np.random.default_rng(1)
+    levels = schedule.within_reach(rng.uniform(schedule.lower, schedule.upper, (7, 10, 3)))
+    commands = schedule.expand(levels)
+    step = np.abs(np.diff(commands, axis=1)).max(axis=(0, 1))
+    assert (step <= np.array([2.0, 0.02, 0.02]) + 1e-9).all()
+    # gathering is the transpose of expanding
+    weight = rng.standard_normal((100, 3))
+    there = (schedule.expand(levels[0]) * weight).sum()
+    back = (levels[0] * schedule.gather(weight)).sum()
+    assert there == pytest.approx(back)
+
+
+def test_a_last_hold_that_is_cut_short():
+    schedule = make_schedule(limited_ship(), 35.0, 10.0, 1.0)
+    assert schedule.holds == 4
+    assert schedule.expand(np.zeros((4, 3))).shape == (35, 3)
+    assert schedule.gather(np.ones((35, 3)))[-1, 0] == 5
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"margins": {"u": -1.0}}, "margin of u is -1 m/s"),
+        ({"speed_cap": 0.0}, "the speed cap is 0"),
+        ({"energy": -1.0}, "the energy share is -1"),
+        ({"headings": 0.0}, "heading coverage is 0"),
+        (
+            {"signs": {"u": 1, "v": 1}, "margins": {"u": 0.6, "v": 0.8}, "speed_cap": 0.9},
+            "need a speed of at least 1 m/s, the cap is 0.9 m/s",
+        ),
+    ],
+)
+def test_limits_that_cannot_be(change, message):
+    with pytest.raises(UsageError, match=message):
+        TrialLimits(**change)
+
+
+def test_an_end_state_of_nothing():
+    request = make_request(limits=TrialLimits(end={"w": (0.0, 1.0)}))
+    with pytest.raises(UsageError, match="the end state names 'w'"):
+        build_problem(request)
+
+
+def test_holds_that_cannot_be():
+    ship = limited_ship()
+    with pytest.raises(UsageError, match="--hold 2"):
+        make_schedule(ship, 100.0, 2.5, 1.0)
+    with pytest.raises(UsageError, match="a trial of 15 s has no change of command"):
+        make_schedule(ship, 15.0, 10.0, 1.0)
+    with pytest.raises(VesselError, match="'n1' has no limits"):
+        make_schedule(load_vessel("ferry"), 100.0, 10.0, 1.0)
+    first, second = ship.thrusters
+    apart = replace(second, speed_limits=Limits(25.0, 30.0))
+    with pytest.raises(VesselError, match="limits of 'n' contradict: the lower one is 25"):
+        make_schedule(replace(ship, thrusters=(first, apart)), 100.0, 10.0, 1.0)
+
+
+def test_a_backoff_tightens_path_limits_only():
+    request = make_request()
+    plain = build_problem(request).scenarios[0]
+    tight = LimitProgram(
+        plain.rollout, plain.limits.schedule, request.trial_limits(0), backoff=(0.1, 0.2)
+    )
+    state = np.ones((1, 6))
+    np.testing.assert_allclose(
+        tight.path_values(state) - plain.limits.path_values(state), [[0.1], [0.2]]
+    )
