@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -96,6 +97,12 @@ def compass(angle: float) -> str:
 def signed(value: float, decimals: int = 0) -> str:
     """Return a number with a true minus sign and no negative zero."""
     return f"{round(value, decimals) + 0.0:.{decimals}f}".replace("-", "−")
+
+
+def tie(text: str) -> str:
+    """Return text in which a line does not end between a number and its unit."""
+    tied = re.sub(r"(?<=\d) (?=(?:m/s|rad/s|kn|m|s|%|min)(?:\W|$))", "\u00a0", text)
+    return tied.replace("(N, E)", "(N,\u00a0E)")
 
 
 def plain_name(name: str) -> str:
@@ -234,11 +241,11 @@ def _abort(design: Design, band: MotionBand) -> tuple[str, ...]:
         )
         text += f"; the plan comes within {signed(edge.nominal.min())} m"
         if not band.certain:
-            low = float(edge.low.min())
+            low = band.edge_kept
             text += (
-                f", 97.5 % of the predictions stay at least {low:.0f} m inside"
+                f", 97.5 % of the predicted motions stay at least {low:.0f} m inside"
                 if low > 0
-                else f", and 2.5 % of the predictions are {-low:.0f} m or more outside at some time"
+                else f", 2.5 % of the predicted motions come {-low:.0f} m or more outside"
             )
         said.append(text + ".")
     heading, place = corridor(design, band)

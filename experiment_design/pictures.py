@@ -61,10 +61,10 @@ def draw_plan_track(axes: Any, design: Design, band: MotionBand, size: float = 7
     low, high = _frame(design, band, north, east)
     if not band.certain:
         index = np.unique(np.linspace(0, len(north) - 1, _ENVELOPE).astype(int))
-        # one flat colour, so that the ellipses join to an envelope
+        # one flat colour, so that they join to an envelope
         axes.add_collection(
             PolyCollection(
-                list(band.ellipses(index)), facecolor=BAND, edgecolor="none", zorder=1,
+                band.hulls(index), facecolor=BAND, edgecolor="none", zorder=1,
                 label="95 % band",
             )
         )  # fmt: skip
@@ -75,7 +75,7 @@ def draw_plan_track(axes: Any, design: Design, band: MotionBand, size: float = 7
     if not band.certain:
         axes.add_collection(
             PolyCollection(
-                list(band.ellipses(marks[1:])), facecolor="none", edgecolor="#6ba3cc",
+                band.hulls(marks[1:]), facecolor="none", edgecolor="#6ba3cc",
                 linewidth=0.5, zorder=2,
             )
         )  # fmt: skip
@@ -136,7 +136,7 @@ def _frame(design: Design, band: MotionBand, north: Array, east: Array) -> tuple
         points.append(room)
     if not band.certain:
         index = np.arange(0, len(north), max(1, len(north) // 60))
-        rings = band.ellipses(index).reshape(-1, 2)[:, ::-1]
+        rings = band.places[:, index].reshape(-1, 2)
         # a band that explodes must not shrink the track to a dot
         middle = (track.max(axis=0) + track.min(axis=0)) / 2
         points.append(np.clip(rings, middle - 0.8 * extent, middle + 0.8 * extent))

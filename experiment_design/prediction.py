@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 
 from experiment_design.design import Design
 from experiment_design.limits import Circle
@@ -46,8 +47,12 @@ class MotionBand:
     nominal, low, high : ndarray
         (N+1, n) under the prior model, and 2.5 % and 97.5 % quantiles
         [m/s, rad/s, rad, m].
-    spread : ndarray
-        (N+1, 2, 2) covariance of north and east [m²].
+    places : ndarray
+        (R, N+1, 2) north and east [m] of the 95 % of motions that stay nearest to
+        the nominal one.
+    edge_kept : float
+        Distance from the edge that 97.5 % of the motions keep all the way [m], nan
+        without a sea room.
     heading_off, position_off : ndarray
         (N+1,) within which 95 % of the motions have stayed of the nominal one
         since the start [rad, m].
@@ -63,7 +68,8 @@ class MotionBand:
     nominal: Array
     low: Array
     high: Array
-    spread: Array
+    places: Array
+    edge_kept: float
     heading_off: Array
     position_off: Array
     draws: int
@@ -81,15 +87,16 @@ class MotionBand:
         """Whether nothing was uncertain, so that the bands have no width."""
         return self.draws == 1
 
-    def ellipses(self, index: NDArray[np.intp]) -> Array:
-        """Return 95 % ellipses of the position (M, 48, 2), east and north, at samples (M,)."""
-        values, vectors = np.linalg.eigh(self.spread[index])
-        # 0.95 quantile of chi-square with two degrees of freedom
-        root = vectors * np.sqrt(5.991 * np.maximum(values, 0.0))[:, None, :]
-        angle = np.linspace(0, 2 * np.pi, 48)
-        ring = np.stack([np.cos(angle), np.sin(angle)])
-        middle = np.stack([self["x_n"].nominal, self["y_n"].nominal], axis=-1)[index]
-        return np.asarray((root @ ring).transpose(0, 2, 1) + middle[:, None])[..., ::-1]
+    def hulls(self, index: NDArray[np.intp]) -> list[Array]:
+        """Return what the places span at samples (M,): polygons (m, 2) of east and north."""
+        found = []
+        for k in index:
+            points = self.places[:, k, ::-1]
+            # a hull needs room in both directions
+            if np.linalg.matrix_rank(points - points[0], tol=1e-3) == 2:
+                points = points[ConvexHull(points).vertices]
+            found.append(points)
+        return found
 
 
 def predict_motion(design: Design, draws: int = 200) -> tuple[MotionBand, ...]:
@@ -139,8 +146,13 @@ def predict_motion(design: Design, draws: int = 200) -> tuple[MotionBand, ...]:
         if draws == 1 or not len(drawn):
             drawn = nominal[None]
         low, high = np.quantile(drawn, _QUANTILES, axis=0)
-        place = drawn[..., [names.index("x_n"), names.index("y_n")]]
-        away = place - nominal[:, [names.index("x_n"), names.index("y_n")]]
+        where = [names.index("x_n"), names.index("y_n")]
+        away = np.linalg.norm(drawn[..., where] - nominal[:, where], axis=-1)
+        near = away.max(axis=1) <= np.quantile(away.max(axis=1), _CORRIDOR)
+        edge_kept = float("nan")
+        if "edge" in names:
+            least = drawn[..., names.index("edge")].min(axis=1)
+            edge_kept = float(np.quantile(least, _QUANTILES[0]))
         heading = np.abs(drawn - nominal)[..., names.index("psi")]
         found.append(
             MotionBand(
@@ -150,9 +162,10 @@ def predict_motion(design: Design, draws: int = 200) -> tuple[MotionBand, ...]:
                 nominal,
                 low,
                 high,
-                np.einsum("rni,rnj->nij", away, away) / len(away),
+                drawn[near][..., where],
+                edge_kept,
                 _corridor(heading),
-                _corridor(np.linalg.norm(away, axis=-1)),
+                _corridor(away),
                 draws,
                 int((~stable).sum()) if draws > 1 else 0,
             )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import re
 import textwrap
 import warnings
 from collections.abc import Iterator
@@ -16,7 +15,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from experiment_design.briefing import Briefing, Column, brief
+from experiment_design.briefing import Briefing, Column, brief, tie
 from experiment_design.design import Design
 from experiment_design.pictures import draw_commands, draw_plan_track
 from experiment_design.prediction import MotionBand, predict_motion
@@ -110,8 +109,7 @@ def write_sheet(design: Design, path: str | Path) -> None:
 
 def wrap(text: str, width: int, **options: Any) -> list[str]:
     """Wrap text, a number and its unit kept together."""
-    tied = re.sub(r"(?<=\d) (?=(?:m/s|rad/s|kn|m|s|%|min)(?:\W|$))", "\u00a0", text)
-    return textwrap.wrap(tied.replace("(N, E)", "(N,\u00a0E)"), width, **options)
+    return textwrap.wrap(tie(text), width, **options)
 
 
 @contextmanager
@@ -457,12 +455,12 @@ section + section { border-top: 2px solid #ddd; margin-top: 2rem; padding-top: 1
 <body>
 {% for trial in trials %}{% set b = trial.briefing %}<section>
 <h1>{{ b.title }}</h1>
-<p>{{ b.subtitle }}</p>
-<dl>{% for name, text in b.facts %}<dt>{{ name }}</dt><dd>{{ text }}</dd>{% endfor %}</dl>
+<p>{{ b.subtitle | tie }}</p>
+<dl>{% for name, text in b.facts %}<dt>{{ name }}</dt><dd>{{ text | tie }}</dd>{% endfor %}</dl>
 {% if b.warnings %}<p class="warning">{{ b.warnings | join(" ") }}</p>
 {% endif %}<div class="top" id="top{{ loop.index }}">
 <figure role="img" aria-label="{{ trial.track_words }}">{{ trial.track | safe }}</figure>
-<div class="abort"><h2>Abort when</h2><ul>{% for text in b.abort %}<li>{{ text }}</li>
+<div class="abort"><h2>Abort when</h2><ul>{% for text in b.abort %}<li>{{ text | tie }}</li>
 {% endfor %}</ul><p><em>The master's judgement stands above this sheet.</em></p></div>
 </div>
 <div class="wide commands"><figure role="img" aria-label="{{ trial.commands_words }}">
@@ -491,8 +489,9 @@ def _html(design: Design, bands: tuple[MotionBand, ...]) -> str:
     from jinja2 import Environment
 
     trials = [_section(design, band) for band in bands]
-    template = Environment(autoescape=True, trim_blocks=True).from_string(_TEMPLATE)
-    return template.render(trials=trials)
+    environment = Environment(autoescape=True, trim_blocks=True)
+    environment.filters["tie"] = tie
+    return environment.from_string(_TEMPLATE).render(trials=trials)
 
 
 def _section(design: Design, band: MotionBand) -> dict[str, Any]:
@@ -507,7 +506,7 @@ def _section(design: Design, band: MotionBand) -> dict[str, Any]:
     size = parts.map
     track = Figure(figsize=(size / 25.4, size / 25.4))
     draw_plan_track(
-        track.add_axes((13 / size, 9 / size, 1 - 14 / size, 1 - 18 / size)), design, band, 6.5
+        track.add_axes((13 / size, 9 / size, 1 - 14 / size, 1 - 20 / size)), design, band, 6.5
     )
     commands = new_figure(_INNER / 25.4, (count * parts.panel + 8) / 25.4)
     draw_commands(commands.subplots(count, 1, squeeze=False)[:, 0], design, band.trial, 6.8)
