@@ -64,7 +64,7 @@ def draw_plan_track(axes: Any, design: Design, band: MotionBand, size: float = 7
         # one flat colour, so that they join to an envelope
         axes.add_collection(
             PolyCollection(
-                band.hulls(index), facecolor=BAND, edgecolor="none", zorder=1,
+                band.hulls(index, joined=True), facecolor=BAND, edgecolor="none", zorder=1,
                 label="95 % band",
             )
         )  # fmt: skip
@@ -72,7 +72,7 @@ def draw_plan_track(axes: Any, design: Design, band: MotionBand, size: float = 7
         _draw_room(axes, r.limits.area, r.limits.clearance, low, high)
     axes.plot(east, north, color=BLUE, linewidth=1.2, zorder=3, label="track")
     marks = np.arange(0, len(north), max(1, round(step / r.sample_time)))
-    if not band.certain:
+    if not band.certain and len(marks) > 1:
         axes.add_collection(
             PolyCollection(
                 band.hulls(marks[1:]), facecolor="none", edgecolor="#6ba3cc",

@@ -87,11 +87,14 @@ class MotionBand:
         """Whether nothing was uncertain, so that the bands have no width."""
         return self.draws == 1
 
-    def hulls(self, index: NDArray[np.intp]) -> list[Array]:
-        """Return what the places span at samples (M,): polygons (m, 2) of east and north."""
+    def hulls(self, index: NDArray[np.intp], *, joined: bool = False) -> list[Array]:
+        """Return what the places span at samples (M,): polygons (m, 2) of east and north.
+
+        Joined, each spans the next sample's places too, so that they overlap.
+        """
         found = []
-        for k in index:
-            points = self.places[:, k, ::-1]
+        for k, after in zip(index, [*index[1:], index[-1]], strict=True):
+            points = self.places[:, [k, after] if joined else [k], ::-1].reshape(-1, 2)
             # a hull needs room in both directions
             if np.linalg.matrix_rank(points - points[0], tol=1e-3) == 2:
                 points = points[ConvexHull(points).vertices]
