@@ -1,21 +1,31 @@
-"""What a sequence would tell, before anyone goes to sea."""
+"""What given sequences would tell, before anyone goes to sea."""
 
 import numpy as np
 
 import greybox as gb
-from experiment_design import prbs, predict_precision, random_two_level, to_log
+from experiment_design import Wishes, build_problem, predict_precision, prepare_request
+from experiment_design.inputs import prbs, random_two_level, zig_zags
+from greybox.errors import ExcitationError
 from greybox.study.chapter6 import START, TRUE
 
 ship = gb.load_vessel("thesis")
 structure = gb.get_structure("thesis")
 theta = np.array([TRUE[name] for name in structure.parameters])
-predictor = gb.build_predictor(structure, "augmented", (("u", (1,)), ("v", (1,))))
-noise = {"u": 0.02, "v": 0.02, "r": 0.02}
+prior = gb.ManoeuvringModel(structure, theta, np.zeros((theta.size,) * 2), 1.0, ship)
+wishes = Wishes(1200.0, hold=20.0, regime="u+v+", start=[*START, 0.0], predictor="basic")
+request = prepare_request(prior, wishes).request
+schedule = build_problem(request).schedule
+holds, commands = schedule.holds, len(schedule.commands)
 sequences = {
-    "two-level": random_two_level(ship, 1200, 20, np.random.default_rng(0)),
-    "PRBS": prbs(ship, 1200, 20),
+    "two-level": random_two_level(holds, commands, 1, np.random.default_rng(0))[0],
+    "PRBS": prbs(holds, commands, (6,))[0],
+    "zig-zag": zig_zags(holds, ship)[5],
 }
-for name, commands in sequences.items():
-    plan = to_log(ship, commands, 1.0)
+for name, unit in sequences.items():
+    levels = schedule.lower + (schedule.upper - schedule.lower) * unit
+    plan = dict(zip(schedule.commands, schedule.expand(levels).T, strict=True))
     print(name)
-    print(predict_precision(predictor, theta, plan, np.append(START, 0.0), noise).summary())
+    try:
+        print(predict_precision(request, [plan]).summary())
+    except ExcitationError as error:
+        print(error)

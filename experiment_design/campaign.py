@@ -138,6 +138,7 @@ def search_campaign(
     effort: float = 1.0,
     progress: Progress | None = None,
     workers: int | None = None,
+    quick: bool = False,
 ) -> Found:
     """Search for the sequences of all trials.
 
@@ -151,6 +152,8 @@ def search_campaign(
         (K, nc) a trial to start from, such as the best random ones or a design to be improved.
     effort : float
         Share of the usual number of evaluations.
+    quick : bool
+        One round from the start alone, for a design that was nearly right.
     """
     trials = len(problems)
     rng = np.random.default_rng([19, request.seed])
@@ -159,9 +162,11 @@ def search_campaign(
     best = [assess(p, u[None])[0] for p, u in zip(problems, first, strict=True)]
     passes = _PASSES if trials > 1 else 1
     rounds = _ROUNDS if trials == 1 else 2
+    if quick:
+        passes = rounds = 1
     budget = max(30, round(_EVALUATIONS * effort / (_CHAINS * rounds * passes * trials)))
     if any(_tight(p, rng) for p in problems):
-        budget = max(_LIMITED * budget, _LEAST)
+        budget = max(_LIMITED * budget, _LEAST // 2 if quick else _LEAST)
     total, done, spent, stopped = _CHAINS * rounds * passes * trials, 0, 0, False
     workers = workers or _worth_processes(problems[0], best[0].unit, budget * total)
     try:
@@ -176,7 +181,9 @@ def search_campaign(
                 scale = limit_scale(problem)
                 here = problem.with_known(known)
                 best[t] = assess(here, best[t].unit[None])[0]
-                chains = _chain_starts(here, best[t], rng)
+                chains = (
+                    [best[t].unit[None]] * _CHAINS if quick else _chain_starts(here, best[t], rng)
+                )
                 for round_ in range(rounds):
                     pieces = [
                         Piece(request, t, known, s, 100 * round_ + i, budget)

@@ -69,27 +69,25 @@ def steady_filter(rollout: Rollout, outputs: tuple[str, ...], noise: NoiseLevels
 
 
 class Contrast:
-    """Logarithm of the expected log-likelihood ratio between a model and its rivals.
+    """Logarithm of the expected log-likelihood ratio between explanations.
 
-    The two directions (which of them is true) are averaged; over several rivals
-    the harmonic mean is taken, which the nearest one rules.
+    The two directions (which of them is true) are averaged; over several pairs
+    the harmonic mean is taken, which the nearest pair rules.
 
     Parameters
     ----------
-    truth : Rollout
-    rivals : sequence of Rollout
+    pairs : sequence of (Rollout, Rollout)
     noise : NoiseLevels
     schedule : Schedule
     """
 
     def __init__(
         self,
-        truth: Rollout,
-        rivals: Sequence[Rollout],
+        pairs: Sequence[tuple[Rollout, Rollout]],
         noise: NoiseLevels,
         schedule: Schedule,
     ) -> None:
-        self.pairs = [Pair(truth, rival, noise, schedule.samples) for rival in rivals]
+        self.pairs = [Pair(a, b, noise, schedule.samples) for a, b in pairs]
 
     def value(self, commands: Array) -> Array:
         """Return the objective of sequences (R, N, nc)."""

@@ -18,6 +18,7 @@ from experiment_design.campaign import (
 )
 from experiment_design.certificate import Certificate, certify
 from experiment_design.classical import Alternative, compare_classical
+from experiment_design.criteria import Criterion
 from experiment_design.feasible import closest, in_words, least_change
 from experiment_design.limits import TOLERANCE, Circle
 from experiment_design.problem import TrialProblem
@@ -32,7 +33,7 @@ from greybox.errors import InfeasibleError
 Array = NDArray[np.float64]
 
 # rounds of tightening limits until they are kept with the wanted probability
-_TIGHTENINGS = 3
+_TIGHTENINGS = 5
 # share of the effort that a design after a tightening gets
 _AGAIN = 0.4
 # relative standard error from which nothing was learnt of a parameter
@@ -338,7 +339,7 @@ def design_trial(
     criterion = problems[0].criterion
     sums = add_up([own_moments(p, u) for p, u in zip(problems, units, strict=True)])
     covariance = criterion.covariance(sums[0])[0]
-    if not np.isfinite(covariance).all() and not request.rivals:
+    if not np.isfinite(covariance).all() and not request.contrasts:
         raise InfeasibleError(_unexcited(problems, units, request))
     predictor = request.build_predictor()
     names = tuple(predictor.columns[i].name for i in criterion.wanted)
@@ -352,8 +353,11 @@ def design_trial(
         )
         versus = float(np.exp(gain / len(covariance)))
         random_value = float(criterion.value(other[0])[0])
-        if request.rivals:
+        if request.contrasts:
             random_value = float(problems[0].evaluate(reference[0][None]).value[0])
+            versus = float(
+                np.exp(_criterion_value(problems, units, criterion, covariance) - random_value)
+            )
     certificate = certify(problems, units)
     values = np.array(
         [
@@ -383,7 +387,7 @@ def design_trial(
         names,
         values,
         covariance,
-        float(criterion.of_covariance(covariance[None])[0]),
+        _criterion_value(problems, units, criterion, covariance),
         versus,
         random_value,
         kept,
@@ -397,6 +401,14 @@ def design_trial(
         evaluations,
         time.perf_counter() - began,
     )
+
+
+def _criterion_value(
+    problems: list[TrialProblem], units: list[Array], criterion: Criterion, covariance: Array
+) -> float:
+    if problems[0].contrast is not None:
+        return float(problems[0].evaluate(units[0][None]).value[0])
+    return float(criterion.of_covariance(covariance[None])[0])
 
 
 def _span(problem: TrialProblem) -> Array:
@@ -427,7 +439,7 @@ def _require_informative(
 
     `hopeless` is how many times vaguer random sequences may be than the design.
     """
-    if request.targets or request.rivals or request.criterion == "c":
+    if request.targets or request.contrasts or request.criterion == "c":
         return []
     criterion = problems[0].criterion
     predictor = request.build_predictor()
@@ -575,13 +587,13 @@ def _tighten(
     plain = replace(request, backoff=())
     keeping = keep_probability(plain, [c.unit for c in candidates])
     best = (request, problems, candidates, keeping)
+    backoff = np.zeros(len(keeping.shortfall))
+    previous, shortfall = candidates, keeping.shortfall
     for _ in range(_TIGHTENINGS):
-        if best[3].probability >= request.probability or not best[3].shortfall.any():
+        if best[3].probability >= request.probability or not shortfall.any():
             break
-        current, _, previous, kept = best
-        backoff = np.zeros(len(kept.shortfall))
-        backoff[: len(current.backoff)] = current.backoff
-        tighter = replace(current, backoff=tuple(backoff + 1.05 * kept.shortfall))
+        backoff = backoff + 1.1 * shortfall
+        tighter = replace(request, backoff=tuple(backoff))
         again = [build_problem(tighter, t) for t in range(request.trials)]
         found = search_campaign(
             tighter,
@@ -589,19 +601,20 @@ def _tighten(
             [c.unit for c in previous],
             effort=_AGAIN * request.effort,
             workers=workers,
+            quick=True,
         )
         spent += found.evaluations
-        now = keep_probability(plain, [c.unit for c in found.candidates])
-        if now.probability <= kept.probability or not all(
-            np.isfinite(c.value) for c in found.candidates
-        ):
+        if not all(np.isfinite(c.value) for c in found.candidates):
             break
-        # what is reported is measured against the limits as they were asked for
-        renewed = [
-            assess(p, c.unit[None])[0] for p, c in zip(problems, found.candidates, strict=True)
-        ]
-        best = (tighter, problems, renewed, now)
-    return (replace(best[0]), *best[1:], spent)
+        now = keep_probability(plain, [c.unit for c in found.candidates])
+        previous, shortfall = list(found.candidates), now.shortfall
+        if now.probability > best[3].probability:
+            # what is reported is measured against the limits as they were asked for
+            renewed = [
+                assess(p, c.unit[None])[0] for p, c in zip(problems, found.candidates, strict=True)
+            ]
+            best = (tighter, problems, renewed, now)
+    return (*best, spent)
 
 
 def _margins(problems: list[TrialProblem], motions: tuple[Motion, ...]) -> dict[str, float]:

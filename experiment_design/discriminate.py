@@ -20,6 +20,8 @@ Array = NDArray[np.float64]
 
 # share of the usual search: distances are smoother in the levels than information is
 _EFFORT = 0.2
+# share of the ratio that is left when one explanation can become the other
+_NESTED = 1e-3
 # a log-likelihood ratio that no trial makes out
 _SAME = 1e-6
 # rounds in which the rival is fitted to the design and a new trial is sought
@@ -40,6 +42,9 @@ class Discrimination:
         if the second is true.
     ratio_refitted : (float, float)
         The same when every parameter of the wrong one is fitted to the new trial.
+    nested : bool
+        Whether one of them, fitted, can be the other: then only the case counts
+        in which the other cannot follow.
     random : float
         Mean ratio of the best of 200 random two-level sequences, nan if none.
     """
@@ -48,6 +53,7 @@ class Discrimination:
     names: tuple[str, str]
     ratio: tuple[float, float]
     ratio_refitted: tuple[float, float]
+    nested: bool
     random: float
 
     @property
@@ -58,7 +64,12 @@ class Discrimination:
     @property
     def probability_refitted(self) -> float:
         """The same when the wrong one may fit all its parameters anew."""
-        return probability_right(min(self.ratio_refitted))
+        return probability_right(self.telling)
+
+    @property
+    def telling(self) -> float:
+        """Log-likelihood ratio that is left when the wrong one is fitted anew."""
+        return max(self.ratio_refitted) if self.nested else min(self.ratio_refitted)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields for JSON: those of the design, and the discrimination."""
@@ -72,6 +83,7 @@ class Discrimination:
                     a: self.ratio_refitted[0],
                     b: self.ratio_refitted[1],
                 },
+                "nested": self.nested,
                 "best_random": self.random,
                 "probability_right": self.probability,
                 "probability_right_refitted": self.probability_refitted,
@@ -139,12 +151,13 @@ def design_between(
     """
     if request.trials != 1:
         raise UsageError("--between designs one trial at a time: leave out --trials.")
-    rivals = [rival]
-    _require_different(replace(request, rivals=(rival,)), names)
+    first = Rival(names[0], request.structure, request.theta, request.d)
+    pairs = [(first, rival)]
+    _require_different(replace(request, contrasts=tuple(pairs)), names)
     best: Discrimination | None = None
     for _ in range(_REFITS):
         asked = replace(
-            request, rivals=tuple(rivals), effort=_EFFORT * request.effort, estimator="iv"
+            request, contrasts=tuple(pairs), effort=_EFFORT * request.effort, estimator="iv"
         )
         design = design_trial(
             asked,
@@ -154,14 +167,17 @@ def design_between(
             alternatives=False,
             first=None if best is None else best.design.levels,
         )
-        problem = build_problem(asked)
-        if not isinstance(problem.contrast, Contrast):
-            raise UsageError("the request names no rival.")
-        pair = problem.contrast.pairs[0]
-        found = _judge(design, pair, names)
-        if best is None or min(found.ratio_refitted) > min(best.ratio_refitted):
+        contrast = build_problem(asked).contrast
+        assert isinstance(contrast, Contrast)
+        steps = _steps(contrast.pairs[0], design.commands[0])
+        found = _judge(design, contrast.pairs[0], steps, names)
+        if best is None or found.telling > best.telling:
             best = found
-        rivals.append(_fitted(rival, pair, design.commands[0]))
+        # each is fitted to the other's motion, unless it can become the other
+        for which, explanation in enumerate((first, rival)):
+            if found.ratio_refitted[1 - which] > _NESTED * found.ratio[1 - which]:
+                fitted = _fitted(explanation, steps[which][2])
+                pairs.append((first, fitted) if which else (fitted, rival))
     assert best is not None
     return best
 
@@ -189,37 +205,40 @@ def _free(model: Any) -> list[int]:
 def _steps(pair: Pair, commands: Array) -> list[tuple[Array, Array, Array]]:
     """Return innovations, sensitivities and the fitted step of each model's filter."""
     out = []
+    seen = pair.innovations(commands)
     for which, model in enumerate((pair.first, pair.second)):
-        seen = pair.innovations(commands)[which]
         slope = pair.sensitivities(commands, which, _free(model))
         size = np.linalg.norm(slope, axis=0)
         size[size == 0] = 1.0
-        step = -np.linalg.lstsq(slope / size, seen, rcond=1e-8)[0] / size
-        out.append((seen, slope, step))
+        step = -np.linalg.lstsq(slope / size, seen[which], rcond=1e-8)[0] / size
+        out.append((seen[which], slope, step))
     return out
 
 
-def _judge(design: Design, pair: Pair, names: tuple[str, str]) -> Discrimination:
-    steps = _steps(pair, design.commands[0])
+def _judge(
+    design: Design,
+    pair: Pair,
+    steps: list[tuple[Array, Array, Array]],
+    names: tuple[str, str],
+) -> Discrimination:
     plain, refitted = [], []
     for seen, slope, step in steps:
         plain.append(float(seen @ seen) / 2)
         rest = seen + slope @ step
-        refitted.append(min(float(rest @ rest) / 2, float(seen @ seen) / 2))
-    # the first model's filter is wrong when the second one is true
-    random = float("nan")
-    if design.efficiency_vs_random is not None:
-        random = float(np.exp(design.random_value))
-    return Discrimination(design, names, (plain[1], plain[0]), (refitted[1], refitted[0]), random)
+        refitted.append(min(float(rest @ rest) / 2, plain[-1]))
+    # the first model's filter is the wrong one when the second model is true
+    ratio, left = (plain[1], plain[0]), (refitted[1], refitted[0])
+    nested = any(b < _NESTED * a for a, b in zip(ratio, left, strict=True))
+    random = float(np.exp(design.random_value)) if design.random_kept else float("nan")
+    return Discrimination(design, names, ratio, left, nested, random)
 
 
-def _fitted(rival: Rival, pair: Pair, commands: Array) -> Rival:
-    """Return the rival after one Gauss-Newton step towards the first model's motion."""
-    _, _, step = _steps(pair, commands)[1]
-    both = np.concatenate([rival.theta, rival.d])
-    free = _free(pair.second)
+def _fitted(explanation: Rival, step: Array) -> Rival:
+    """Return an explanation after one Gauss-Newton step towards the other's motion."""
+    both = np.concatenate([explanation.theta, explanation.d])
+    free = _free(explanation)
     # a step is trusted as far as the linearisation may be
     size = np.maximum(0.3 * np.abs(both[free]), 1e-4)
     both[free] += np.clip(step, -size, size)
-    split = rival.theta.size
-    return Rival(rival.name, rival.structure, both[:split], both[split:])
+    split = explanation.theta.size
+    return Rival(explanation.name, explanation.structure, both[:split], both[split:])

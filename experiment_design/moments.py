@@ -118,14 +118,35 @@ class MomentProgram:
             *[np.ascontiguousarray(tau[..., i]) for i in range(tau.shape[-1])],
         ]
 
-    def _rows(self, signals: list[Array]) -> tuple[Array, Array]:
-        """Return centred regressors (p, R, N) and slopes (nx, channels, R, N)."""
+    def regressors(self, x: Array, psi: Array, tau: Array) -> tuple[Array, Array]:
+        """Return regressors (p, R, N), not centred, and slopes (nx, channels, R, N).
+
+        The slopes are those of the next state in what is measured with noise: the
+        states first, the others without memory.
+        """
+        return self._samples(self._signals(x, psi, tau))
+
+    @property
+    def channel_std(self) -> Array:
+        """Standard deviation of each noise channel, (channels,)."""
+        return self._std
+
+    @property
+    def process_std(self) -> Array:
+        """Standard deviation of the process noise, (nx,)."""
+        return self._process
+
+    def _samples(self, signals: list[Array]) -> tuple[Array, Array]:
         shape = signals[0].shape
         out = np.empty((self._forward.size, *shape))
         self._forward(signals, out)
-        z = out[: self.columns]
+        return out[: self.columns], out[self.columns :].reshape(self.nx, self._channels, *shape)
+
+    def _rows(self, signals: list[Array]) -> tuple[Array, Array]:
+        """Return centred regressors (p, R, N) and slopes (nx, channels, R, N)."""
+        z, a = self._samples(signals)
         z -= z.mean(axis=-1, keepdims=True)
-        return z, out[self.columns :].reshape(self.nx, self._channels, *shape)
+        return z, a
 
     def _scattered(self, z: Array, a: Array) -> Array:
         """Return what each noise value adds to the scores, (R, p, channels·(N+1))."""

@@ -31,7 +31,7 @@ Signs = tuple[tuple[str, int], ...]
 
 @dataclass(frozen=True)
 class Rival:
-    """Another explanation of the same ship: its structure, parameters and disturbances."""
+    """One explanation of the ship's motion: its structure, parameters and disturbances."""
 
     name: str
     structure: Structure
@@ -86,8 +86,9 @@ class DesignRequest:
         With which the path limits are to be kept under models drawn from it.
     backoff : tuple of float
         By how much each path limit is tightened for that, in its unit.
-    rivals : tuple of Rival
-        Other explanations; the trial is then to tell the prior model from them.
+    contrasts : tuple of (Rival, Rival)
+        Pairs of explanations that the trial is to tell apart in place of
+        measuring parameters; the first of the first pair is the prior model.
     seed : int
     effort : float
         Evaluations of the search, 1 being the usual number.
@@ -116,7 +117,7 @@ class DesignRequest:
     worst_case: bool = False
     probability: float = 0.9
     backoff: tuple[float, ...] = ()
-    rivals: tuple[Rival, ...] = ()
+    contrasts: tuple[tuple[Rival, Rival], ...] = ()
     seed: int = 0
     effort: float = 1.0
 
@@ -296,22 +297,23 @@ def build_problem(
             Scenario(rollout, _yardstick(request, predictor, theta), program, 1.0 if k else 2.0)
         )
     contrast = None
-    if request.rivals:
-        for rival in request.rivals:
-            rollout = Rollout(
-                request.vessel,
-                rival.structure,
-                rival.theta,
-                rival.d,
-                rival_start(request, rival, trial),
-                request.sample_time,
-            )
-            program = LimitProgram(rollout, schedule, limits, backoff=request.backoff)
-            scenarios.append(Scenario(rollout, scenarios[0].yardstick, program, 0.0))
-        contrast = Contrast(
-            scenarios[0].rollout, [s.rollout for s in scenarios[1:]], request.noise, schedule
-        )
+    if request.contrasts:
+        pairs = [
+            (_rival_rollout(request, a, trial), _rival_rollout(request, b, trial))
+            for a, b in request.contrasts
+        ]
+        other = pairs[0][1]
+        program = LimitProgram(other, schedule, limits, backoff=request.backoff)
+        scenarios.append(Scenario(other, scenarios[0].yardstick, program, 0.0))
+        contrast = Contrast(pairs, request.noise, schedule)
     return TrialProblem(schedule, tuple(scenarios), criterion, known, request.worst_case, contrast)
+
+
+def _rival_rollout(request: DesignRequest, rival: Rival, trial: int) -> Rollout:
+    start = rival_start(request, rival, trial)
+    return Rollout(
+        request.vessel, rival.structure, rival.theta, rival.d, start, request.sample_time
+    )
 
 
 def rival_start(request: DesignRequest, rival: Rival, trial: int) -> Array:

@@ -1,0 +1,180 @@
+"""`greybox design` as a user types it."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+from designs import thesis_model
+
+from greybox.commands.main import main
+from greybox.vessel.toml import vessel_to_dict
+
+FAST = ["--effort", "0.05", "--workers", "1"]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    from greybox.model.model import model_from_dict
+
+    where = tmp_path_factory.mktemp("design")
+    model = thesis_model()
+    model.save(where / "model.json")
+    data = model.to_dict()
+    data["theta"][list(data["names"]).index("Nvr")] = -0.08
+    model_from_dict(data).save(where / "other.json")
+    thesis_model("surge").save(where / "surge.json")
+    thesis_model(spread=0.1).save(where / "prior.json")
+    assert vessel_to_dict(model.vessel)["name"] == "Thesis ship"
+    text = (
+        'name = "Thesis ship"\nlength = 30.0\n'
+        + "".join(
+            f'[[thruster]]\ntype = "azimuth"\nx = {x}\ny = 0.0\nspeed = "n"\nangle = "{a}"\n'
+            f"speed_limits = [10.0, 20.0]\nangle_limits = [0.6, 1.1]\n"
+            for x, a in ((9.0, "alpha1"), (-9.0, "alpha2"))
+        )
+        + "[sensors]\nu_std = 0.0141\nv_std = 0.0141\nr_std = 0.0141\nheading_std = 0.01\n"
+    )
+    (where / "ship.toml").write_text(text)
+    return where
+
+
+def run(folder, *options, model="model.json"):
+    plan = folder / "plan.csv"
+    plan.unlink(missing_ok=True)
+    given = ["design", "--vessel", str(folder / "ship.toml"), "--model", str(folder / model)]
+    status = main([*given, "--out", str(plan), *FAST, *options])
+    return status, plan
+
+
+def test_plan_and_json(folder, capsys):
+    out = folder / "design.json"
+    status, plan = run(
+        folder, "--duration", "150", "--predictor", "basic", "--regime", "u+v+", "--margin-u",
+        "0.5", "--margin-v", "0.4", "--start", "1.5,1.2,0,0", "--json", str(out),
+    )  # fmt: skip
+    assert status == 0
+    table = pd.read_csv(plan)
+    assert list(table) == ["t", "n", "alpha1", "alpha2"]
+    np.testing.assert_allclose(table["t"], np.arange(150))
+    data = json.loads(out.read_text())
+    assert data["efficiency_vs_random"] > 0.9
+    assert 0 < data["efficiency_lower_bound"] <= 1
+    assert data["margins"]["v"] >= 0.4
+    assert data["starts"] == [{"u": 1.5, "v": 1.2, "r": 0.0, "psi": 0.0}]
+    assert data["criterion"] == "D"
+    assert "predicted" not in capsys.readouterr().err
+
+
+def test_same_seed_same_bytes(folder):
+    _, plan = run(folder, "--duration", "100", "--predictor", "basic", "--seed", "3")
+    first = plan.read_bytes()
+    _, plan = run(folder, "--duration", "100", "--predictor", "basic", "--seed", "3")
+    assert plan.read_bytes() == first
+
+
+def test_surge_model(folder, capsys):
+    status, plan = run(folder, "--duration", "200", "--json", "-", model="surge.json")
+    assert status == 0
+    data = json.loads(capsys.readouterr().out)
+    assert set(data["predicted_std"]) == {"Xu", "Xuu", "Xmu"}
+    assert list(data["margins"]) == ["u"]
+    assert plan.exists()
+
+
+def test_campaign_has_a_trial_column(folder):
+    status, plan = run(folder, "--duration", "100", "--predictor", "basic", "--trials", "2")
+    assert status == 0
+    table = pd.read_csv(plan)
+    assert list(table)[:2] == ["trial", "t"]
+    assert table.groupby("trial").size().to_dict() == {1: 100, 2: 100}
+
+
+def test_sea_room_file(folder):
+    room = folder / "room.csv"
+    room.write_text("x_n,y_n\n-150,-150\n150,-150\n150,150\n-150,150\n")
+    status, _ = run(folder, "--duration", "100", "--predictor", "basic", "--area", str(room))
+    assert status == 0
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a,b\n1,2\n", "needs columns x_n and y_n"),
+        ("x_n,y_n\n1,2\n3,4\n", "has 2 corners"),
+        ("x_n,y_n\n1,x\n3,4\n5,6\n", "no number"),
+        ("", "needs columns"),
+    ],
+)
+def test_sea_rooms_that_are_none(folder, capsys, text, message):
+    room = folder / "bad.csv"
+    room.write_text(text)
+    status, plan = run(folder, "--duration", "100", "--area", str(room))
+    assert status == 1
+    assert message in capsys.readouterr().err
+    assert not plan.exists()
+
+
+def test_between(folder, capsys):
+    pair = [str(folder / "model.json"), str(folder / "other.json")]
+    status, plan = run(folder, "--duration", "100", "--between", *pair, "--json", "-")
+    assert status == 0
+    data = json.loads(capsys.readouterr().out)
+    assert data["discrimination"]["between"] == ["model", "other"]
+    assert plan.exists()
+
+
+def test_least_time(folder, capsys):
+    status, plan = run(folder, "--duration", "400", "--predictor", "basic", "--target", "Yvv=0.03")
+    assert status == 0
+    assert len(pd.read_csv(plan)) < 400
+
+
+def test_one_function_of_the_parameters(folder, capsys):
+    status, _ = run(folder, "--duration", "100", "--predictor", "basic", "--of", "Yvv/Ymu",
+                    "--json", "-")  # fmt: skip
+    assert status == 0
+    data = json.loads(capsys.readouterr().out)
+    assert data["criterion"] == "c"
+    assert set(data["predicted_std"]) == {"Yvv", "Ymu"}
+
+
+def test_prior_of_earlier_trials(folder, capsys):
+    base = ["--duration", "100", "--predictor", "basic", "--json", "-"]
+    run(folder, *base)
+    alone = json.loads(capsys.readouterr().out)
+    run(folder, *base, "--prior", str(folder / "prior.json"))
+    both = json.loads(capsys.readouterr().out)
+    assert both["logdet"] > alone["logdet"]
+    for name, value in both["parameters"].items():
+        # merged columns hold two parameters, whose prior errors add
+        assert both["predicted_std"][name] < 0.11 * abs(value)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--duration", "100", "--margin-v", "3"], "no steady motion keeps the margins"),
+        (["--duration", "100", "--area", "nowhere.csv"], "cannot read the sea room"),
+        (["--duration", "100", "--circle", "0,0"], "--circle needs three numbers"),
+        (["--duration", "100", "--end", "x_n"], "--end 'x_n' cannot be read"),
+        (["--duration", "100", "--target", "Yvv"], "--target 'Yvv' cannot be read"),
+        (["--duration", "100", "--want", "Yv2"], "Did you mean 'Yv'"),
+        ([], "--duration is missing"),
+    ],
+)
+def test_errors_are_one_sentence(folder, capsys, options, message):
+    status, plan = run(folder, *options)
+    assert status == 1
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+    assert not plan.exists()
+
+
+def test_wrong_usage(folder):
+    with pytest.raises(SystemExit) as stop:
+        run(folder, "--duration", "-5")
+    assert stop.value.code == 2
