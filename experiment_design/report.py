@@ -136,7 +136,7 @@ def _trial(design: Design, band: MotionBand) -> Section:
         "no band."
         if band.certain
         else f"The band holds about 95 % of {band.draws - band.lost} motions, of models drawn from "
-        f"the prior with process noise"
+        f"the prior{' with process noise' if r.noise.process.any() else ''}"
         + (f"; {band.lost} more ran away and are left out." if band.lost else ".")
     )
     cells = ", ".join(
