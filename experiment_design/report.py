@@ -53,7 +53,7 @@ def design_page(
     """
     r = design.request
     bands = predict_motion(design)
-    reference = None if r.rivals else random_std(design)
+    reference = None if headline else random_std(design)
     trials = f"{clock(r.duration)} min"
     if r.trials > 1:
         trials = f"{r.trials} trials of {trials}"
@@ -68,7 +68,7 @@ def design_page(
         pictures=[*(one.pictures if one else []), *_std_pictures(design, reference)],
         tables=[
             *([_std_table(design, reference)] if np.isfinite(design.std).all() else []),
-            *([] if r.rivals else _alternatives(design)),
+            *([] if headline else _alternatives(design)),
             _limits(design),
         ],
         computed=flatten(record),
