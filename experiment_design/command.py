@@ -62,7 +62,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--duration", type=positive, metavar="S", help="length of each trial [s]")
     add("--out", required=True, metavar="PLAN", help="where to write the commands (CSV)")
     add("--json", metavar="F", help="write the design as JSON; - is stdout")
-    add("--sheet", metavar="HTML", help="write the sheet to take on board")
+    add("--sheet", metavar="FILE", help="write the sheet to take on board: .pdf, .html, .svg, .png")
+    add("--report", metavar="HTML", help="write a page with pictures and what the plan is worth")
     goal = parser.add_argument_group("what is to be learnt")
     goal.add_argument("--criterion", choices=("D", "A", "E", "c"), default="D")
     goal.add_argument(
@@ -168,7 +169,11 @@ def run(options: argparse.Namespace) -> None:
     from greybox.model.model import load_model
     from greybox.vessel.toml import load_vessel
 
-    check_targets(options.out, options.json, options.sheet)
+    check_targets(options.out, options.json, options.sheet, options.report)
+    if options.sheet:
+        from experiment_design.sheet import sheet_kind
+
+        sheet_kind(options.sheet)
     if options.between is None and options.model is None:
         raise UsageError("--model is missing: name a prior model, or two with --between A B.")
     model = load_model(options.between[0] if options.between else options.model)
@@ -200,11 +205,14 @@ def run(options: argparse.Namespace) -> None:
         data: dict[str, Any] = design.to_dict()
         data["notes"] = [*prepared.notes, *data["notes"]]
         write_json(data | {"provenance": record}, options.json)
+    _show(options, design, prepared.notes)
     if options.json != "-":
         say(design.summary())
         for note in prepared.notes:
             say(f"Note: {note}")
-        say(f"wrote {options.out}")
+        for path in (options.out, options.sheet, options.report):
+            if path:
+                say(f"wrote {path}")
 
 
 def _run_between(options: argparse.Namespace, request: Any, notes: tuple[str, ...]) -> None:
@@ -239,11 +247,31 @@ def _run_between(options: argparse.Namespace, request: Any, notes: tuple[str, ..
         data = found.to_dict()
         data["notes"] = [*notes, *data["notes"]]
         write_json(data | {"provenance": provenance(options)}, options.json)
+    lines = found.summary().splitlines()
+    _show(options, found.design, notes, f"{lines[0]}: {lines[3]}.")
     if options.json != "-":
         say(found.summary())
         for note in notes:
             say(f"Note: {note}")
-        say(f"wrote {options.out}")
+        for path in (options.out, options.sheet, options.report):
+            if path:
+                say(f"wrote {path}")
+
+
+def _show(
+    options: argparse.Namespace, design: Any, notes: tuple[str, ...], headline: str = ""
+) -> None:
+    """Write the sheet and the page that were asked for."""
+    if options.sheet:
+        from experiment_design.sheet import write_sheet
+
+        write_sheet(design, options.sheet)
+    if options.report:
+        from experiment_design.report import design_page
+        from greybox.report.page import write_page
+
+        page = design_page(design, notes, provenance(options), headline)
+        write_page(page, options.report)
 
 
 def _wishes(options: argparse.Namespace, model: Any) -> Any:

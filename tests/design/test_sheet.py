@@ -1,0 +1,379 @@
+"""What goes on board and what is shown of a plan: right numbers, one page, nothing runs over."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import tempfile
+import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
+from itertools import pairwise
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from experiment_design.briefing import brief, clock, compass, plain_name, signed
+from experiment_design.campaign import add_up, own_moments
+from experiment_design.classical import Alternative
+from experiment_design.design import Design, LimitReport
+from experiment_design.limits import Circle, TrialLimits
+from experiment_design.pictures import forbidden
+from experiment_design.prediction import edge_distance, predict_motion
+from experiment_design.prepare import Wishes, prepare_request
+from experiment_design.report import design_page, random_std
+from experiment_design.request import build_problem
+from experiment_design.robust import Keeping
+from experiment_design.sheet import sheet_figures, sheet_kind, write_sheet
+from greybox.commands.main import main
+from greybox.errors import UsageError
+from greybox.model.model import ManoeuvringModel
+from greybox.report.page import render
+
+CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+ROOM = np.array([[-400.0, -300], [400, -300], [400, 300], [0, 200], [-400, 300]])
+HOSTILE = '</title><script>alert("x")</script> $\\frac{1}$ & 船'
+
+
+def prior(ship, thesis, theta, uncertain):
+    spread = np.diag((0.01 * np.abs(theta)) ** 2) * uncertain
+    return ManoeuvringModel(thesis, theta, spread, 1.0, ship)
+
+
+def made(model, ship, *, duration=600.0, uncertain=False, trials=1, limits=None, **wishes):
+    """A design of random levels: what is drawn does not ask how they were found."""
+    options = {"regime": "u+v+", "start": [1.5, 1.2, 0, 0], "margin_u": 0.5, "margin_v": 0.4}
+    asked = Wishes(
+        duration=duration, hold=10.0, trials=trials, predictor="basic",
+        limits=limits or TrialLimits(), **(options | wishes),
+    )  # fmt: skip
+    request = prepare_request(model, asked, ship).request
+    problems = [build_problem(request, t) for t in range(trials)]
+    rng = np.random.default_rng(0)
+    units = [rng.random(p.shape).round(2) for p in problems]
+    levels = tuple(p.levels(u) for p, u in zip(problems, units, strict=True))
+    commands = tuple(p.schedule.expand(v) for p, v in zip(problems, levels, strict=True))
+    motions = tuple(
+        p.scenarios[0].rollout.run(c[None]) for p, c in zip(problems, commands, strict=True)
+    )
+    criterion = problems[0].criterion
+    sums = add_up([own_moments(p, u) for p, u in zip(problems, units, strict=True)])
+    names = tuple(request.build_predictor().columns[i].name for i in criterion.wanted)
+    return Design(
+        request=request, commands=commands, levels=levels, motions=motions, names=names,
+        values=np.array([request.theta[request.structure.index(n)] for n in names]),
+        covariance=criterion.covariance(sums[0])[0], criterion_value=1.0,
+        efficiency_vs_random=1.25, random_value=0.8, random_kept=200,
+        certificate=SimpleNamespace(
+            sentence=lambda: "at least 0.7 of the best possible", efficiency_lower_bound=0.7,
+            to_dict=dict,
+        ),
+        margins={"u": 0.9, "v": 0.5},
+        limits=(LimitReport(0, "margin of surge", 0.5, "m/s", 0.0),),
+        keeping=None,
+        alternatives=(
+            Alternative("PRBS", 7, 7, 0.5, units[0]), Alternative("zig-zag", 8, 0, 0.1, units[0]),
+            Alternative("pulses", 8, 8, -np.inf, units[0]),
+        ),
+        status="solved", notes=("a note",), evaluations=1, seconds=1.0,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def known(ship, thesis, true_theta):
+    return made(prior(ship, thesis, true_theta, 0), ship)
+
+
+@pytest.fixture(scope="module")
+def short(ship, thesis, true_theta):
+    return made(prior(ship, thesis, true_theta, 0), ship, duration=120.0)
+
+
+@pytest.fixture(scope="module")
+def unsure(ship, thesis, true_theta):
+    limits = TrialLimits(area=ROOM, clearance=20.0, speed_cap=4.0, yaw_cap=0.2)
+    design = made(
+        prior(ship, thesis, true_theta, 1), ship, limits=limits, current=(0.2, 0.1),
+        process_noise=np.array([2e-3, 2e-3, 4e-4]),
+    )  # fmt: skip
+    return replace(design, request=replace(design.request, seed=4))
+
+
+def pages_of(path):
+    return len(re.findall(rb"/Type\s*/Page\b", path.read_bytes()))
+
+
+def chromium(*arguments):
+    with tempfile.TemporaryDirectory() as profile:
+        return subprocess.run(
+            [
+                CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic",
+                "--no-first-run", "--disable-background-networking", "--disable-component-update",
+                "--disable-sync", "--allow-file-access-from-files", f"--user-data-dir={profile}",
+                "--enable-logging=stderr", *arguments,
+            ],
+            capture_output=True, text=True, timeout=120, check=False,
+        )  # fmt: skip
+
+
+def test_bands_are_nominal_where_nothing_is_uncertain(known):
+    (band,) = predict_motion(known)
+    assert band.certain
+    state = known.motions[0].state[0]
+    for i, name in enumerate(("u", "v", "r", "psi", "x_n", "y_n")):
+        np.testing.assert_allclose(band[name].nominal, state[:, i], atol=1e-9)
+        np.testing.assert_allclose(band[name].low, band[name].high)
+    assert band.position_off.max() == 0
+
+
+def test_bands_repeat_and_hold_new_draws(unsure):
+    (band,), (again,) = predict_motion(unsure), predict_motion(unsure)
+    np.testing.assert_array_equal(band.low, again.low)
+    other = replace(unsure, request=replace(unsure.request, seed=5))
+    (fresh,) = predict_motion(other)
+    assert np.abs(fresh.low - band.low).max() > 0
+    assert (band.low <= band.high).all()
+    # widths of independent draws agree within their sampling error
+    width = (band.high - band.low)[100:, :3].mean(axis=0)
+    np.testing.assert_allclose((fresh.high - fresh.low)[100:, :3].mean(axis=0), width, rtol=0.25)
+    assert (np.diff(band.position_off) >= 0).all()
+    assert band.lost == 0
+
+
+def test_positions_start_where_the_trial_does(ship, thesis, true_theta):
+    limits = TrialLimits(position=(100.0, -50.0), area=Circle(100.0, -50.0, 500.0))
+    design = made(prior(ship, thesis, true_theta, 0), ship, limits=limits, duration=200.0)
+    (band,) = predict_motion(design)
+    assert (band["x_n"].nominal[0], band["y_n"].nominal[0]) == (100.0, -50.0)
+    assert band["edge"].nominal[0] == 500.0
+
+
+def test_a_model_that_runs_away_is_counted(known):
+    wild = np.zeros((len(known.request.theta),) * 2)
+    # some draws are pushed by their own square of speed
+    k = known.request.structure.index("Xuu")
+    wild[k, k] = 0.1**2
+    (band,) = predict_motion(
+        replace(known, request=replace(known.request, covariance=wild)), draws=50
+    )
+    assert 0 < band.lost < 50
+    assert np.isfinite(band.low).all()
+    briefing = brief(replace(known, request=replace(known.request, covariance=wild)), band)
+    assert any("run away" in w for w in briefing.warnings)
+
+
+def test_distance_to_the_edge():
+    square = np.array([[0.0, 0], [0, 10], [10, 10], [10, 0]])
+    north, east = np.array([5.0, 2, 12, -3]), np.array([5.0, 5, 5, -4])
+    np.testing.assert_allclose(edge_distance(square, north, east), [5, 2, -2, -5])
+    np.testing.assert_allclose(edge_distance(Circle(5, 5, 5), north, east)[:3], [5, 2, -2])
+
+
+def test_words_of_numbers():
+    assert [clock(v) for v in (0, 65, 599.96, 7.5)] == ["0:00", "1:05", "10:00", "0:07.5"]
+    assert [compass(np.deg2rad(v)) for v in (-1, 359.7, 725)] == ["359", "000", "005"]
+    assert [signed(v) for v in (-0.2, -3.4, 12)] == ["0", "−3", "12"]
+    assert plain_name("a\n b\x00" + 80 * "c").startswith("a b c")
+    assert len(plain_name(80 * "c")) == 60
+
+
+def test_way_points_are_the_changes(known):
+    (band,) = predict_motion(known)
+    same = tuple(np.repeat(v[::2], 2, axis=0) for v in known.levels)
+    briefing = brief(replace(known, levels=same), band)
+    assert briefing.rows == 31
+    cells = {c.name: c.cells for c in briefing.columns}
+    assert cells["time"][:3] == ("0:00", "0:20", "0:40")
+    assert cells["time"][-1] == "10:00"
+    angle = same[0][0, 1]
+    assert cells["alpha1"][0] == f"{np.rad2deg(angle):.1f} ({angle:.2f})"
+    k = 20
+    assert cells["N"][1] == signed(known.motions[0].state[0, k, 4])
+    assert cells["hdg"][1] == compass(known.motions[0].state[0, k, 3])
+
+
+def test_abort_limits_in_words(unsure, known):
+    (band,) = predict_motion(unsure)
+    said = "\n".join(brief(unsure, band).abort)
+    assert "Speed over ground above 4.00 m/s (7.8 kn)" in said
+    assert "11.5°/s (0.200 rad/s)" in said
+    assert "Nearer than 20 m to the edge" in said
+    assert "Surge ahead below 0.50 m/s" in said
+    assert "columns ±" in said
+    facts = dict(brief(unsure, band).facts)
+    assert facts["Expected"] == "current 0.22 m/s (0.4 kn) setting towards 027°"
+    (band,) = predict_motion(known)
+    said = "\n".join(brief(known, band).abort)
+    assert "Heading more than 10° or position more than 30 m off the table." in said
+    assert "no cap was set" in said
+
+
+def test_wind_is_named_by_where_it_comes_from(known):
+    design = replace(known, request=replace(known.request, d=np.array([0, 0, -5.0, 0])))
+    (band,) = predict_motion(known)
+    assert "wind 5.0 m/s (10 kn) from 000°" in dict(brief(design, band).facts)["Expected"]
+
+
+def test_broken_limits_are_shouted(known):
+    broken = (LimitReport(0, "sea room", 0.0, "m", 16.0),)
+    keeping = Keeping(0.4, 0.3, 0.5, 400, np.zeros(1), {})
+    design = replace(known, limits=broken, keeping=keeping)
+    (band,) = predict_motion(design)
+    warnings = brief(design, band).warnings
+    assert warnings[0] == "This plan breaks its limits: sea room by 16 m."
+    assert "probability 0.40 only" in warnings[1]
+
+
+def test_margins_forbid_what_the_current_takes(unsure):
+    (band,) = predict_motion(unsure)
+    ((edge, side),) = forbidden(unsure, band, "u")
+    psi = band["psi"].nominal
+    through = 0.2 * np.cos(psi) + 0.1 * np.sin(psi)
+    np.testing.assert_allclose(edge, 0.5 + np.maximum(through, 0))
+    assert side == -1
+    assert [s for _, s in forbidden(unsure, band, "r")] == [1, -1]
+
+
+@pytest.mark.parametrize("which", ["known", "unsure"])
+def test_sixty_holds_fit_one_page(request, tmp_path, which):
+    design = request.getfixturevalue(which)
+    (band,) = predict_motion(design)
+    assert brief(design, band).rows == 61
+    (figure,) = sheet_figures(design, band)
+    assert figure.get_size_inches() == pytest.approx((210 / 25.4, 297 / 25.4))
+    figure.canvas.draw()
+    page = figure.axes[0]
+    frame = figure.bbox
+    boxes = [t.get_window_extent() for t in page.texts]
+    assert all(frame.x0 < b.x0 and b.x1 < frame.x1 and frame.y0 < b.y0 for b in boxes)
+    # cells of one row do not touch
+    rows = {}
+    for text, box in zip(page.texts, boxes, strict=True):
+        if text.get_ha() == "right":
+            rows.setdefault(round(text.get_position()[1], 2), []).append(box)
+    assert len(rows) >= 30
+    for row in rows.values():
+        row.sort(key=lambda b: b.x0)
+        assert all(a.x1 < b.x0 for a, b in pairwise(row))
+    assert min(t.get_fontsize() for t in page.texts) >= 5
+    write_sheet(design, tmp_path / "sheet.pdf")
+    assert pages_of(tmp_path / "sheet.pdf") == 1
+
+
+def test_a_long_table_goes_on(ship, thesis, true_theta):
+    design = made(prior(ship, thesis, true_theta, 0), ship, duration=2400.0)
+    (band,) = predict_motion(design)
+    figures = sheet_figures(design, band)
+    assert len(figures) > 1
+    written = [t.get_text() for f in figures for t in f.axes[0].texts]
+    times = brief(design, band).columns[0].cells
+    assert [t for t in written if t in set(times)] == list(times)
+
+
+def test_several_trials_are_several_pages(ship, thesis, true_theta, tmp_path):
+    design = made(prior(ship, thesis, true_theta, 0), ship, duration=120.0, trials=2)
+    for kind in ("pdf", "svg", "png", "html"):
+        write_sheet(design, tmp_path / f"sheet.{kind}")
+    assert pages_of(tmp_path / "sheet.pdf") == 2
+    root = ElementTree.fromstring((tmp_path / "sheet.svg").read_text())
+    assert root.get("height") == "594mm"
+    html = (tmp_path / "sheet.html").read_text()
+    assert html.count("<section>") == 2
+    assert "trial 2 of 2" in html
+    assert (tmp_path / "sheet.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+    ids = re.findall(r'\bid="([^"]+)"', html)
+    assert len(ids) == len(set(ids))
+
+
+def test_same_design_same_bytes(short, tmp_path):
+    for kind in ("pdf", "svg", "html"):
+        for name in ("a", "b"):
+            write_sheet(short, tmp_path / f"{name}.{kind}")
+        assert (tmp_path / f"a.{kind}").read_bytes() == (tmp_path / f"b.{kind}").read_bytes()
+
+
+def test_a_name_cannot_break_a_sheet(short, tmp_path):
+    vessel = replace(short.request.vessel, name=HOSTILE)
+    design = replace(short, request=replace(short.request, vessel=vessel))
+    for kind in ("html", "svg", "pdf"):
+        write_sheet(design, tmp_path / f"sheet.{kind}")
+    html = (tmp_path / "sheet.html").read_text()
+    assert "<script" not in html
+    assert "&lt;script&gt;" in html
+    assert not re.search(r'(src|href)="(?!#)', html)
+    ElementTree.fromstring((tmp_path / "sheet.svg").read_text())
+    page = render(design_page(design, ["<b>"], {"program": "<i>"}))
+    assert "<script" not in page
+    assert "&lt;b&gt;." in page
+
+
+def test_other_endings_are_refused(known, tmp_path):
+    with pytest.raises(UsageError, match=r"the sheet 'plan\.docx' has no ending .* use \.pdf"):
+        write_sheet(known, tmp_path / "plan.docx")
+    assert not list(tmp_path.iterdir())
+    assert sheet_kind("a.HTM") == ".html"
+
+
+def test_the_page_says_what_is_saved(unsure):
+    html = render(design_page(unsure, ["regime chosen"], {"program": "p"}))
+    assert "This plan saves 150 s of trial" in html
+    assert "at least 0.7 of the best possible" in html
+    assert html.count("<svg") == 4
+    assert html.count('role="group"') == 4
+    assert "tells nothing" in html
+    assert "(breaks limits)" in html
+    reference = random_std(unsure)
+    assert reference is not None
+    assert f"<td>{reference[0]:.2g}</td>" in html
+    assert "Regime chosen." in html
+
+
+def test_the_page_of_a_plan_that_nothing_equals(known):
+    design = replace(known, efficiency_vs_random=None)
+    page = design_page(design, [], {}, "Tells A from B.")
+    assert page.headline == "Tells A from B."
+    assert design_page(design, [], {}).headline.startswith("No random two-level sequence")
+
+
+def test_command_writes_both(ship, thesis, true_theta, tmp_path, monkeypatch, short):
+    monkeypatch.setattr("experiment_design.design.design_trial", lambda *a, **k: short)
+    prior(ship, thesis, true_theta, 0).save(tmp_path / "model.json")
+    common = [
+        "design", "--vessel", "thesis", "--model", str(tmp_path / "model.json"), "--duration",
+        "600", "--regime", "u+v+", "--start", "1.5,1.2,0,0", "--out", str(tmp_path / "plan.csv"),
+    ]  # fmt: skip
+    sheet, page = tmp_path / "sheet.pdf", tmp_path / "page.html"
+    assert main([*common, "--sheet", str(sheet), "--report", str(page)]) == 0
+    assert pages_of(sheet) == 1
+    assert "<h1>Plan for" in page.read_text()
+    assert main([*common, "--sheet", str(tmp_path / "sheet.txt")]) != 0
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no browser installed")
+def test_in_a_browser(unsure, tmp_path):
+    """No complaint on the console, no sideways scrolling on a phone, one page when printed."""
+    write_sheet(unsure, tmp_path / "sheet.html")
+    (tmp_path / "page.html").write_text(render(design_page(unsure, [], {"program": "p"})))
+    probe = (
+        "<script>addEventListener('load',()=>{const e=document.documentElement;"
+        "document.title=JSON.stringify([e.scrollWidth<=e.clientWidth,"
+        "document.querySelector('svg').getBoundingClientRect().width>200,e.clientWidth])})"
+        "</script></body>"
+    )
+    frames = ""
+    for name in ("sheet", "page"):
+        text = (tmp_path / f"{name}.html").read_text().replace("</body>", probe)
+        (tmp_path / f"{name}_probe.html").write_text(text)
+        frames += f"<iframe id={name} src={name}_probe.html width=390 height=800></iframe>"
+    outer = tmp_path / "outer.html"
+    outer.write_text(
+        f"{frames}<script>addEventListener('load',()=>{{document.title=["
+        "sheet.contentDocument.title,page.contentDocument.title].join(';')})</script>"
+    )
+    done = chromium("--virtual-time-budget=5000", "--dump-dom", f"file://{outer}")
+    assert re.search(r"<title>\[true,true,\d+\];\[true,true,\d+\]", done.stdout), done.stdout[:300]
+    assert "CONSOLE" not in done.stderr
+    printed = tmp_path / "printed.pdf"
+    chromium("--no-pdf-header-footer", f"--print-to-pdf={printed}", f"file://{tmp_path}/sheet.html")
+    assert pages_of(printed) == 1
