@@ -600,63 +600,73 @@ class Shooting:
                 out.append(column)
             return out
 
-        gram = [ca.SX(0)] * self.grams
-        other = [ca.SX(0)] * self.others
+        regressors: list[list[ca.SX]] = []
+        scores: list[list[ca.SX]] = []
+        squares = [ca.SX(0)] * len(self.blocks)
         used, kept_path = ca.SX(0), []
-        old: list[ca.SX] | None = None
-
-        def add_scores(columns_of_noise: list[list[ca.SX]]) -> None:
-            for column in columns_of_noise:
-                entry = 0
-                for q in range(len(column)):
-                    for p in range(q + 1):
-                        other[entry] = other[entry] + column[p] * column[q]
-                        entry += 1
-
         for t in range(n):
             c = real[0] + shares[:, t] * (real[1] - real[0]) if self.ramped else real[1]
             z, a = rows(state, c)
-            for (p, q), entry in self.gram_at.items():
-                gram[entry] = gram[entry] + z[p] * z[q]
             if not self.exact:
                 for i in range(len(self.blocks)):
                     square = ca.sumsqr(a[i, :].T * ca.DM(y.channel_std))
-                    other[i] = other[i] + square / float(self.spread[i])
-            elif old is None:
-                # the very first sample has no predecessor
-                add_scores([[flags[0] * e for e in col] for col in score(None, z, a)])
+                    squares[i] += square / float(self.spread[i])
+            elif regressors:
+                scores += score(regressors[-1], z, a)
             else:
-                add_scores(score(old, z, a))
-            old = z
+                # the very first sample has no predecessor
+                scores += [[flags[0] * e for e in column] for column in score(None, z, a)]
+            regressors.append(z)
             state = step(state, c)
             if self.limits.path_names:
                 kept_path.append(path(state) / ca.DM(self.limits.path_scale))
             if self.energy:
                 for place, full in self.limits.speeds:
-                    used = used + ca.fabs(c[place] / full) ** 3
+                    used += ca.fabs(c[place] / full) ** 3
         if self.exact:
             c = real[1] * mix[:, 1] + real[2] * mix[:, 2]
             if self.ramped:
                 c = c + real[0] * mix[:, 0]
             z, a = rows(state, c)
-            add_scores(score(old, [flags[1] * e for e in z], a))
-        out = [ca.vertcat(*[state[k] for k in self.kept]) / ca.DM(self.state_scale)]
-        out += [ca.vertcat(*kept_path), ca.vertcat(*gram), ca.vertcat(*other)]
+            scores += score(regressors[-1], [flags[1] * e for e in z], a)
+        ends = [ca.vertcat(*[state[k] for k in self.kept]) / ca.DM(self.state_scale), *kept_path]
+        single = [] if self.exact else squares
         if self.energy:
-            out.append(used / (s.samples * len(self.limits.speeds)))
+            single.append(used / (s.samples * len(self.limits.speeds)))
+        first, last = ca.vertcat(*ends), ca.vertcat(*single)
+        score_at = {
+            (p, q): q * (q + 1) // 2 + p for q in range(len(self.order)) for p in range(q + 1)
+        }
+        quadratic = [(self.gram_at, regressors)] + [(score_at, scores)] * self.exact
+        weights = ca.SX.sym("w", first.numel() + self.lifted + self.energy)
+        sums, passed = [], first.numel()
+        # what is weighted is Σ zᵀ W z, whose slope is 2 W z carried back along z
+        seeds, seeded = [weights[:passed]], [first]
+        for entries, vectors in quadratic:
+            total = [ca.SX(0)] * len(entries)
+            inner = ca.SX(len(self.order), len(self.order))
+            for (p, q), entry in entries.items():
+                for v in vectors:
+                    total[entry] += v[p] * v[q]
+                inner[p, q] += weights[passed + entry]
+                inner[q, p] += weights[passed + entry]
+            for v in vectors:
+                seeded.append(ca.vertcat(*v))
+                seeds.append(ca.mtimes(inner, seeded[-1]))
+            sums += total
+            passed += len(entries)
+        seeds.append(weights[passed:])
+        seeded.append(last)
+        outputs = ca.vertcat(first, *sums, last)
         seen = [node, now] + [before] * self.ramped + [after] * self.exact
         arguments = ca.vertcat(*seen)
         known = ca.vertcat(ca.vec(shares), ca.vec(mix), flags)
-        outputs = ca.vertcat(*out)
-        weights = ca.SX.sym("w", outputs.numel())
-        slope = ca.jtimes(outputs, arguments, weights, True)
-        options = {"cse": True}
+        slope = ca.jtimes(ca.vertcat(*seeded), arguments, ca.vertcat(*seeds), True)
+        curves = ca.triu(ca.jacobian(slope, arguments))
         return (
-            ca.Function("value", [arguments, known], [outputs], options),
-            ca.Function("slopes", [arguments, known], [ca.jacobian(outputs, arguments)], options),
-            ca.Function(
-                "curves", [arguments, known, weights], [ca.jacobian(slope, arguments)], options
-            ),
+            ca.Function("value", [arguments, known], [outputs]),
+            ca.Function("slopes", [arguments, known], [ca.jacobian(outputs, arguments)]),
+            ca.Function("curves", [arguments, known, weights], [curves]),
         )
 
     def _assemble(self) -> None:
@@ -711,7 +721,10 @@ class Shooting:
             weights = multipliers[target.ravel(order="F").tolist()]
             weights = ca.reshape(weights, *target.shape) * ca.DM(sign)
             curves = ca.vec(ca.MX(hess.map(m)(y, known, weights)).nz[:])
-            curve.add(index[r].ravel(order="F"), index[c].ravel(order="F"), curves)
+            i, j = index[r].ravel(order="F"), index[c].ravel(order="F")
+            # one entry stands for both halves, which meet where two arguments are one variable
+            twice = 1.0 + ((i == j) & np.tile(r != c, m))
+            curve.add(np.minimum(i, j), np.maximum(i, j), curves * twice)
         # nodes and lifted sums enter their constraints linearly
         follow = np.arange(nk * count)
         gather.add(continuity + follow, self.nodes_at + nk + follow, ca.MX(-ca.DM.ones(nk * count)))
