@@ -19,9 +19,10 @@ solves G̃ x = h are lifted as well.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -111,7 +112,7 @@ class _LogDet:
     @property
     def size(self) -> int:
         """Rows of X."""
-        return round(np.sqrt(len(self.base)))
+        return int(np.sqrt(len(self.base)) + 0.5)
 
 
 @dataclass
@@ -135,9 +136,7 @@ class _Affine:
 
     def term(self, weight: float, entries: int, positive: int) -> _LogDet:
         """Return its weighted log determinant."""
-        slope = csc_matrix(
-            (self.values, (self.rows, self.columns)), shape=(self.size**2, entries)
-        )
+        slope = csc_matrix((self.values, (self.rows, self.columns)), shape=(self.size**2, entries))
         return _LogDet(weight, slope, self.base.ravel(order="F"), positive)
 
 
@@ -172,7 +171,7 @@ def _dm(matrix: csc_matrix) -> ca.DM:
     m = csc_matrix(matrix)
     m.sum_duplicates()
     m.sort_indices()
-    sparsity = ca.Sparsity(*m.shape, m.indptr.tolist(), m.indices.tolist())
+    sparsity = ca.Sparsity(m.shape[0], m.shape[1], m.indptr.tolist(), m.indices.tolist())
     return ca.DM(sparsity, m.data)
 
 
@@ -227,8 +226,8 @@ class _Terminal:
 
     extra: int
     constraints: int
-    first: Callable[[ca.MX], tuple[ca.MX, ca.MX, ca.MX, ca.MX]]
-    second: Callable[[ca.MX, ca.MX, ca.MX], ca.MX]
+    first: Callable[..., Any]
+    second: Callable[..., Any]
     begin: Callable[[Array], Array]
 
 
@@ -259,7 +258,7 @@ class _Iterates(ca.Callback):
         n = self._sizes.get(str(ca.nlpsol_out(i)), 0)
         return ca.Sparsity.dense(n, 1) if n else ca.Sparsity(0, 0)
 
-    def eval(self, arg: list[ca.DM]) -> list[int]:
+    def eval(self, arg: Sequence[ca.DM]) -> list[int]:
         self.seen.append(np.array(arg[0][: self._levels], dtype=float).ravel())
         return [0]
 
@@ -372,7 +371,7 @@ class Shooting:
         return [*out, s.samples]
 
     def _index_sums(self) -> None:
-        """Number the lifted sums and state the criterion in them."""
+        """Give each lifted sum its place among the variables."""
         y = self.yardstick
         samples = self.schedule.samples
         self.blocks = [list(e) for e in y.equations]
@@ -587,7 +586,7 @@ class Shooting:
             constant = ca.SX(1 / np.sqrt(s.samples))
             return [constant if p is None else z[p] for _, p in self.order], a
 
-        def score(old: list[ca.SX] | None, new: list[ca.SX] | None, a: ca.SX) -> list[ca.SX]:
+        def score(old: list[ca.SX] | None, new: list[ca.SX] | None, a: ca.SX) -> list[list[ca.SX]]:
             """Return Z(k−1) − Z(k)A(k), each noise by its standard deviation."""
             out = []
             for h, (std, own) in enumerate(zip(y.channel_std, y.channel_own, strict=True)):
@@ -637,9 +636,11 @@ class Shooting:
         score_at = {
             (p, q): q * (q + 1) // 2 + p for q in range(len(self.order)) for p in range(q + 1)
         }
+        quadratic: list[tuple[dict[tuple[int, int], int], list[list[ca.SX]]]]
         quadratic = [(self.gram_at, regressors)] + [(score_at, scores)] * self.exact
         weights = ca.SX.sym("w", first.numel() + self.lifted + self.energy)
-        sums, passed = [], first.numel()
+        sums: list[ca.SX] = []
+        passed = first.numel()
         # what is weighted is Σ zᵀ W z, whose slope is 2 W z carried back along z
         seeds, seeded = [weights[:passed]], [first]
         for entries, vectors in quadratic:
@@ -653,7 +654,7 @@ class Shooting:
             for v in vectors:
                 seeded.append(ca.vertcat(*v))
                 seeds.append(ca.mtimes(inner, seeded[-1]))
-            sums += total
+            sums.extend(total)
             passed += len(entries)
         seeds.append(weights[passed:])
         seeded.append(last)
@@ -744,9 +745,9 @@ class Shooting:
         end = self._terminal.second(tail, sigma, multipliers[extra_at:])
         r, c = _coordinates(end.sparsity())
         curve.add(self.sums_at + r, self.sums_at + c, ca.vec(end.nz[:]))
-        places = np.concatenate([t.ravel(order="F") for t, _ in g_rows])
-        pick = csc_matrix((np.ones(len(places)), (places, np.arange(len(places)))),
-                          shape=(rates, len(places)))  # fmt: skip
+        into = np.concatenate([t.ravel(order="F") for t, _ in g_rows])
+        ones = np.ones(len(into))
+        pick = csc_matrix((ones, (into, np.arange(len(into)))), shape=(rates, len(into)))
         g = ca.mtimes(ca.MX(_dm(pick)), ca.vertcat(*[ca.vec(v) for _, v in g_rows]))
         shift = ca.vertcat(
             w[self.nodes_at + nk : self.sums_at],
@@ -755,14 +756,14 @@ class Shooting:
             ca.MX.zeros(int(self.energy)),
         )
         g = ca.vertcat(g - shift, ca.mtimes(ca.MX(_dm(linear)), w), extra)
-        p = ca.MX.sym("p", 0)
+        empty = ca.MX.sym("p", 0)
         grad = ca.vertcat(ca.MX.zeros(self.sums_at), slope)
         jac_g = gather.matrix()
         self.functions = {
-            "nlp": ca.Function("nlp", [w, p], [f, g], ["x", "p"], ["f", "g"]),
-            "grad_f": ca.Function("grad_f", [w, p], [f, grad]),
-            "jac_g": ca.Function("jac_g", [w, p], [g, jac_g]),
-            "hess_lag": ca.Function("hess_lag", [w, p, sigma, multipliers], [curve.matrix()]),
+            "nlp": ca.Function("nlp", [w, empty], [f, g], ["x", "p"], ["f", "g"]),
+            "grad_f": ca.Function("grad_f", [w, empty], [f, grad]),
+            "jac_g": ca.Function("jac_g", [w, empty], [g, jac_g]),
+            "hess_lag": ca.Function("hess_lag", [w, empty, sigma, multipliers], [curve.matrix()]),
         }
         self.rows = rows
         energy = [-np.inf] * self.energy
@@ -776,7 +777,7 @@ class Shooting:
             [np.zeros(nk * count), np.full(int(starts[-1]), -_INSIDE), np.zeros(self.lifted),
              top, upper, np.zeros(self._terminal.constraints)]
         )  # fmt: skip
-        self._symbols = (w, p, f, g)
+        self._symbols = (w, empty, f, g)
 
     def _arguments(self, k: int) -> list[int]:
         """Return the variables that interval k looks at."""
@@ -847,7 +848,7 @@ class Shooting:
         slopes = [ca.MX(_dm(t.slope)) for t in terms]
         share = 1.0 / len(self.wanted)
 
-        def matrices(tail: ca.MX) -> list[tuple[ca.MX, ca.MX]]:
+        def matrices(tail: ca.MX) -> list[Any]:
             out = []
             for term, factor, slope in zip(terms, factors, slopes, strict=True):
                 x = ca.reshape(ca.DM(term.base) + ca.mtimes(slope, tail), term.size, term.size)
@@ -901,7 +902,7 @@ class Shooting:
         def at(term: _LogDet, sums: Array) -> Array:
             return np.asarray((term.base + term.slope @ sums).reshape(size, size, order="F"))
 
-        def variance(i: int, sums: ca.SX | Array) -> ca.SX | float:
+        def variance(i: int, sums: Any) -> Any:
             return self.floor_variance[i] + self.mean_spread[i] * sums[self.grams + i]
 
         ones = self._sums(self._start_z, self._start_a)
@@ -912,9 +913,9 @@ class Shooting:
         ]
         scale = [max(float(np.abs(x).max()), 1e-300) for x in x0]
 
-        def worth(x: list[ca.SX] | list[Array], g: ca.SX | Array, m: ca.SX | Array,
-                  sums: ca.SX | Array) -> ca.SX | float:  # fmt: skip
-            total: ca.SX | float = 0.0
+        def worth(x: Any, m: Any, sums: Any) -> Any:
+            """Return Σ xᵀ M̃ x, symbolic or not."""
+            total: Any = 0.0
             for part, h, a in zip(x, sides, active, strict=True):
                 if self.exact:
                     for row, p in enumerate(a):
@@ -926,7 +927,7 @@ class Shooting:
                         total = total + variance(int(equation[p]), sums) * h[p] * part[row]
             return total
 
-        start = float(worth(x0, g0, m0, ones))  # type: ignore[arg-type]
+        start = float(worth(x0, m0, ones))
         sums = ca.SX.sym("sums", self.lifted)
         g = ca.reshape(ca.DM(g_term.base) + ca.mtimes(_dm(g_term.slope), sums), size, size)
         m = ca.reshape(ca.DM(m_term.base) + ca.mtimes(_dm(m_term.slope), sums), size, size)
@@ -941,7 +942,7 @@ class Shooting:
             ])  # fmt: skip
             rows.append(block - ca.DM(h[a] / unit))
         scaled = [part * unit for part, unit in zip(symbols, scale, strict=True)]
-        rows.append(q - worth(scaled, g, m, sums) / start)
+        rows.append(q - worth(scaled, m, sums) / start)
         constraints = ca.vertcat(*rows)
         f = ca.log(ca.fmax(q, 1e-300)) + float(np.log(start))
         mu, sigma = ca.SX.sym("mu", constraints.numel()), ca.SX.sym("sigma")
@@ -958,7 +959,7 @@ class Shooting:
                 np.linalg.lstsq(matrix[np.ix_(a, a)], h[a], rcond=None)[0]
                 for h, a in zip(sides, active, strict=True)
             ]
-            value = worth(found, matrix, at(m_term, at_start), at_start)
+            value = worth(found, at(m_term, at_start), at_start)
             parts = [x / unit for x, unit in zip(found, scale, strict=True)]
             return np.concatenate([*parts, [float(value) / start]])
 
@@ -1017,7 +1018,7 @@ class Shooting:
         start = np.clip(np.asarray(unit, float), 0.0, 1.0)
         w, p, f, g = self._symbols
         watch = _Iterates(self.variables, self.rows, self.levels)
-        options: dict[str, object] = {
+        options: dict[str, Any] = {
             "grad_f": self.functions["grad_f"],
             "jac_g": self.functions["jac_g"],
             "iteration_callback": watch,
