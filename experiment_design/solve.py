@@ -70,6 +70,8 @@ _STATUS = {
     "Maximum_CpuTime_Exceeded": Outcome.TIME,
     "Maximum_WallTime_Exceeded": Outcome.TIME,
     "User_Requested_Stop": Outcome.INTERRUPTED,
+    # what CasADi makes of Ctrl-C inside IPOPT
+    "NonIpopt_Exception_Thrown": Outcome.INTERRUPTED,
     "Infeasible_Problem_Detected": Outcome.INFEASIBLE,
     "Restoration_Failed": Outcome.INFEASIBLE,
 }
