@@ -202,9 +202,7 @@ def pyomo_doe(intervals: int, first: Array) -> Run:
                 x.append(x[-1] + A * x[-1] + B * x[-1] ** 2 + C * value)
             m.x = pyo.Var(m.k, initialize=lambda m, k: x[k])
             m.x[0].fix(START)
-            m.u = pyo.Var(
-                m.j, bounds=(LOW, HIGH), initialize=lambda m, k: float(first[k])
-            )
+            m.u = pyo.Var(m.j, bounds=(LOW, HIGH), initialize=lambda m, k: float(first[k]))
             m.a, m.b, m.c = (pyo.Var(initialize=v) for v in (A, B, C))
             for v in (m.a, m.b, m.c):
                 v.fix()
@@ -275,9 +273,7 @@ def pydex(intervals: int, candidates: Array) -> Run:
             )
             designer.error_cov = np.array([[SIGMA**2]])
             designer.initialize(verbose=0)
-            designer.design_experiment(
-                designer.d_opt_criterion, package="cvxpy", write=False
-            )
+            designer.design_experiment(designer.d_opt_criterion, package="cvxpy", write=False)
             efforts = np.asarray(designer.efforts, float).reshape(len(candidates), -1).sum(axis=1)
     except Exception as reason:  # as above
         return Run(None, time.perf_counter() - began, f"{type(reason).__name__}: {reason}")

@@ -34,6 +34,9 @@ from greybox.vectorised import Vectorised
 
 Array = NDArray[np.float64]
 
+# runs up to which each is solved by itself
+_FEW = 4
+
 
 class SensitivityProgram:
     """Compiled sensitivities of one structure at one prior model; a `Yardstick`.
@@ -137,19 +140,26 @@ class SensitivityProgram:
                 s.x[states.index("u")] - (c * d[2] + sn * d[3]), v - (c * d[3] - sn * d[2])
             )
         values = ca.DM(np.concatenate([d, theta]))
-        outputs = ca.vertcat(ca.vec(ca.densify(slope).T), ca.vec(entry.T))
-        outputs = ca.substitute(
-            ca.substitute(outputs, ca.vertcat(s.d, s.theta), values), s.air, air
+        slope, entry = (
+            ca.substitute(ca.substitute(e, ca.vertcat(s.d, s.theta), values), s.air, air)
+            for e in (ca.densify(slope), entry)
         )
+        # what IPOPT's interval functions are built from
+        self.symbols = (s.x, s.psi, s.tau)
+        self.expressions = (slope, entry)
+        outputs = ca.vertcat(ca.vec(slope.T), ca.vec(entry.T))
         scalars = [*ca.vertsplit(s.x), s.psi, *ca.vertsplit(s.tau)]
         self._driven = entry.shape[1]
         self._initial = self.size if initial else 0
         self.columns = self._driven + self._initial
         # parameters, initial states, means: the driven columns without the initial states
         p = len(columns)
-        self._order = np.array(
+        self.order = np.array(
             [*range(p), *range(self._driven, self.columns), *range(p, self._driven)]
         )
+        # S(0), driven columns first
+        self.first = np.zeros((self.size, self.columns))
+        self.first[:, self._driven :] = np.eye(self.size)[:, : self._initial]
         first = [f"{n}(0)" for n in (*states, *["psi"] * heading)] if initial else []
         self.names = (*predictor.parameter_names, *first, *means)
         self.wanted = tuple(range(p))
@@ -175,7 +185,7 @@ class SensitivityProgram:
         n, samples = self.size, a.shape[-1]
         right = np.zeros((samples + 1, n, self.columns))
         right[1:, :, : self._driven] = b.transpose(2, 0, 1)
-        right[0, :, self._driven :] = np.eye(n)[:, : self._initial]
+        right[0] = self.first
         band = np.zeros((2 * n, n * (samples + 1)))
         band[0] = 1.0
         for i in range(n):
@@ -186,6 +196,21 @@ class SensitivityProgram:
         flat = right.reshape(n * (samples + 1), -1)
         solved = solve_banded((0, 2 * n - 1), band[::-1, ::-1], flat[::-1], check_finite=False)
         return np.asarray(solved[::-1].reshape(samples + 1, n, -1))
+
+    def _recursions(self, a: Array, b: Array) -> Array:
+        """Return S (R, N+1, n, columns) of many runs, driven columns first."""
+        runs, samples = a.shape[2:]
+        if runs <= _FEW:
+            return np.array([self._recursion(a[:, :, r], b[:, :, r]) for r in range(runs)])
+        # many runs step by step together cost less than one banded system each
+        forward = np.ascontiguousarray(a.transpose(3, 2, 0, 1))
+        entry = np.ascontiguousarray(b.transpose(3, 2, 0, 1))
+        out = np.empty((samples + 1, runs, self.size, self.columns))
+        out[0] = self.first
+        for k in range(samples):
+            np.matmul(forward[k], out[k], out=out[k + 1])
+            out[k + 1, ..., : self._driven] += entry[k]
+        return out.transpose(1, 0, 2, 3)
 
     def _adjoint(self, a: Array, seed: Array) -> Array:
         """Return Λ(k) = seed(k) + Aᵀ(k) Λ(k+1), (N+1, n, columns)."""
@@ -208,8 +233,7 @@ class SensitivityProgram:
         Rows are the states, and the heading [rad] last where it is simulated.
         """
         a, b = self._slopes(self._signals(x, psi, tau))
-        runs = [self._recursion(a[:, :, r], b[:, :, r]) for r in range(a.shape[2])]
-        return np.array(runs)[..., self._order]
+        return self._recursions(a, b)[..., self.order]
 
     def __call__(self, x: Array, psi: Array, tau: Array) -> Moments:
         """Return the information of R sequences, as G and as M, so that C = F⁻¹.
@@ -224,12 +248,9 @@ class SensitivityProgram:
             (R, N, nu) generalised inputs.
         """
         a, b = self._slopes(self._signals(x, psi, tau))
-        out = np.empty((a.shape[2], self.columns, self.columns))
-        root = np.sqrt(self.weight)[:, None]
-        order = np.ix_(self._order, self._order)
-        for r in range(len(out)):
-            scaled = (self._recursion(a[:, :, r], b[:, :, r]) * root).reshape(-1, self.columns)
-            out[r] = (scaled.T @ scaled)[order]
+        s = self._recursions(a, b)[..., self.order] * np.sqrt(self.weight)[:, None]
+        rows = s.reshape(len(s), -1, self.columns)
+        out = rows.transpose(0, 2, 1) @ rows
         return Moments(out, out)
 
     def gradient(
@@ -253,7 +274,7 @@ class SensitivityProgram:
         a, b = self._slopes(signals)
         a, b = a[:, :, 0], b[:, :, 0]
         s = self._recursion(a, b)
-        back_to = np.argsort(self._order)
+        back_to = np.argsort(self.order)
         d_f = (d_gram + d_score)[np.ix_(back_to, back_to)]
         costate = self._adjoint(a, 2.0 * self.weight[:, None] * (s @ d_f))[1:]
         samples, n = a.shape[-1], self.size

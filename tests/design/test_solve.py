@@ -17,7 +17,7 @@ from experiment_design.problem import Scenario, TrialProblem
 from experiment_design.rollout import Rollout
 from experiment_design.schedule import make_schedule
 from experiment_design.search import assess, draw_two_level
-from experiment_design.solve import Outcome, Shooting, solve_ipopt
+from experiment_design.solve import Outcome, make_shooting, run_ipopt, solve_ipopt
 from greybox.errors import UsageError
 from greybox.model.predictor import build_predictor
 from greybox.vessel.vessel import Limits
@@ -60,7 +60,7 @@ def test_objective_is_the_criterion(ship, thesis, true_theta, kind, white):
     p = problem(ship, thesis, true_theta, white=white, kind=kind)
     rng = np.random.default_rng(0)
     unit = rng.random((2, *p.shape))
-    shooting = Shooting(p, unit[0])
+    shooting = make_shooting(p, unit[0])
     assert shooting.exact is not white
     expected = p.evaluate(unit).value
     for u, value in zip(unit, expected, strict=True):
@@ -83,7 +83,7 @@ def test_objective_with_ramps_cut_holds_nuisance_and_earlier_trials(
     if not white:
         motion = p.scenarios[0].rollout.run(p.schedule.expand(p.levels(unit[:1])))
         p = p.with_known((p.moments(motion, 0),))
-    value = Shooting(p, unit[0]).value(unit[1])
+    value = make_shooting(p, unit[0]).value(unit[1])
     assert value == pytest.approx(p.evaluate(unit[1:]).value[0], abs=1e-8)
 
 
@@ -104,7 +104,7 @@ def test_derivatives(ship, thesis, true_theta, kind, exact):
     )  # fmt: skip
     rng = np.random.default_rng(2)
     unit = rng.random(p.shape)
-    s = Shooting(p, unit, exact)
+    s = make_shooting(p, unit, exact)
     x, empty = s.begin(unit), ca.DM(0, 1)
     multipliers = rng.normal(size=s.rows)
 
@@ -168,16 +168,18 @@ def test_refusals_are_values(ship, thesis, true_theta):
     assert found.outcome is Outcome.REFUSED
     assert "not smooth" in found.status
     assert found.value == assess(p, unit[None])[0].value
+    p = problem(ship, thesis, true_theta)
     other = dataclasses.replace(p.scenarios[0], yardstick=lambda *a: None)
     with pytest.raises(UsageError, match="zero-mean IV"):
-        Shooting(dataclasses.replace(p, scenarios=(other,)), unit)
+        make_shooting(dataclasses.replace(p, scenarios=(other,)), unit)
 
 
 def test_interrupt_keeps_the_best_iterate(ship, thesis, true_theta, monkeypatch):
     p = problem(ship, thesis, true_theta)
     unit = draw_two_level(p, np.random.default_rng(3), 1)[0]
-    shooting = Shooting(p, unit, exact=False)
-    full = shooting.solve(unit)
+    shooting = make_shooting(p, unit, exact=False)
+    full = run_ipopt(shooting, unit)
+    shooting.solvers.clear()
 
     class Interrupted:
         """Runs a few iterations, then is stopped as Ctrl-C would."""
@@ -192,6 +194,6 @@ def test_interrupt_keeps_the_best_iterate(ship, thesis, true_theta, monkeypatch)
 
     original = ca.nlpsol
     monkeypatch.setattr(ca, "nlpsol", Interrupted)
-    found = shooting.solve(unit)
+    found = run_ipopt(shooting, unit)
     assert found.outcome is Outcome.INTERRUPTED
     assert assess(p, unit[None])[0].value < found.value <= full.value
