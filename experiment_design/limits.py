@@ -23,7 +23,7 @@ from greybox.vectorised import Vectorised
 Array = NDArray[np.float64]
 
 # how much of each quantity counts as one in the solvers
-_SCALE = {"m/s": 0.1, "rad/s": 0.01, "m": 10.0, "rad": 0.1, "": 0.01}
+UNIT_SCALE = {"m/s": 0.1, "rad/s": 0.01, "m": 10.0, "rad": 0.1, "": 0.01}
 # what a plan may miss a limit by, in its unit, and still count as keeping it
 TOLERANCE = 1e-4
 _NAMES = {"u": "surge", "v": "sway", "r": "yaw rate"}
@@ -200,10 +200,11 @@ class LimitProgram:
         self.backoff[: len(backoff)] = backoff
         rows = [row + more for row, more in zip(rows, self.backoff.tolist(), strict=True)]
         self.path = ca.vertcat(*rows) if rows else ca.SX(0, 1)
-        self.path_scale = np.array([_SCALE[n.unit] for n in names])
+        self.path_scale = np.array([UNIT_SCALE[n.unit] for n in names])
         self.end_names, self._ends = self._end_limits(limits)
+        self.end_values = tuple(self._ends)
         self.whole_names = tuple(self._whole_names(limits))
-        self.whole_scale = np.array([_SCALE[n.unit] for n in self.whole_names])
+        self.whole_scale = np.array([UNIT_SCALE[n.unit] for n in self.whole_names])
         scalars = ca.vertsplit(state)
         if rows:
             self._path = Vectorised(ca.vertsplit(self.path), scalars)
@@ -213,6 +214,8 @@ class LimitProgram:
         self._full = np.maximum(np.abs(schedule.lower), np.abs(schedule.upper))
         speeds = {t.speed for t in rollout.vessel.thrusters}
         self._speeds = [i for i, n in enumerate(schedule.commands) if n in speeds]
+        # what the energy is the mean cube of: places among the commands, and full speeds
+        self.speeds = tuple((i, float(self._full[i])) for i in self._speeds)
 
     @property
     def names(self) -> tuple[LimitName, ...]:

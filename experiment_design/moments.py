@@ -110,6 +110,12 @@ class MomentProgram:
         back = ca.jtimes(outputs, arguments, weights, True)
         self._backward = Vectorised(ca.vertsplit(back), [*scalars, *ca.vertsplit(weights)])
         self._arguments = len(scalars)
+        # what IPOPT's interval functions are built from
+        self.symbols = (s.x, s.psi, s.tau)
+        self.expressions = (z, a)
+        self.channel_std = self._std
+        self.channel_own = tuple(self._own)
+        self.process = self._process
 
     def _signals(self, x: Array, psi: Array, tau: Array) -> list[Array]:
         return [

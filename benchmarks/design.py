@@ -1,0 +1,357 @@
+"""D-optimal input design by this package, by Pyomo.DoE and by pydex, in one run.
+
+Surge, x⁺ = x + a x + b x|x| + c u (steps of 1 s), the speed x measured after each
+step with white noise, the first speed known, and u free within two limits in
+each of N intervals. The yardstick is log det of the Cramér-Rao information of
+(a, b, c), F = Σ S(k)ᵀ S(k) / σ², which is what Pyomo.DoE maximises too. It writes
+S by central differences between copies of the model; here S follows from its
+recursion. Every design is judged by the same function, this package's exact F,
+which a loop over finite differences of simulations confirms.
+
+Because u keeps x positive, x|x| is written x² for Pyomo, which spares it the
+modulus. Times include building the problem. Pyomo gets the same IPOPT library
+as CasADi's where cyipopt was built against that, and is called in this process.
+Both tools start from mid-range and from the same two-level sequence, and the
+better log det counts. Our time is that of both starts, drawing the sequence
+included; for Pyomo both starts and the quicker one alone are shown.
+
+pydex chooses among candidate sequences and weighs them; it has no free input.
+It is given the random two-level sequences that our search starts from, and its
+weighted mixture is normalised to one trial.
+
+    pip install ".[bench]"
+    python benchmarks/design.py [--intervals 25 50 100 200]
+
+cyipopt needs an IPOPT and Pyomo's ``pynumero_ASL``: `pip install cyipopt` with
+``PKG_CONFIG_PATH`` at ``casadi/pkgconfig`` builds it against CasADi's IPOPT. An
+``ipopt`` executable on the path is used in its place.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import logging
+import time
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from experiment_design.criteria import Criterion
+from experiment_design.limits import LimitProgram, TrialLimits
+from experiment_design.noise import NoiseLevels
+from experiment_design.problem import Scenario, TrialProblem
+from experiment_design.rollout import Rollout
+from experiment_design.schedule import make_schedule
+from experiment_design.search import draw_prbs, draw_two_level
+from experiment_design.sensitivities import SensitivityProgram
+from experiment_design.solve import make_shooting, run_ipopt
+from greybox.model.catalogue import get_structure
+from greybox.model.predictor import build_predictor
+from greybox.vessel.vessel import Limits, Thruster, Vessel
+
+Array = NDArray[np.float64]
+
+A, B, C = -0.05, -0.05, 0.1
+START, SIGMA = 0.5, 0.014
+LOW, HIGH = 0.1, 2.25
+NAMES = ("Xu", "Xuu", "Xmu")
+
+
+@dataclass(frozen=True)
+class Run:
+    """One tool's design: input (N,), seconds, and what there is to say."""
+
+    u: Array | None
+    seconds: float
+    note: str = ""
+    logdet: float = float("nan")
+
+
+def information(u: Array, step: float = 1e-6) -> float:
+    """Log det F by central differences of simulations, one loop over the samples."""
+    theta = np.array([A, B, C])
+
+    def simulate(theta: Array) -> Array:
+        x, out = START, []
+        for value in u:
+            x = x + theta[0] * x + theta[1] * abs(x) * x + theta[2] * value
+            out.append(x)
+        return np.array(out)
+
+    slopes = []
+    for i in range(3):
+        d = np.eye(3)[i] * step
+        slopes.append((simulate(theta + d) - simulate(theta - d)) / (2 * step))
+    s = np.array(slopes) / SIGMA
+    return float(np.linalg.slogdet(s @ s.T)[1])
+
+
+def ours_problem(intervals: int) -> TrialProblem:
+    structure = get_structure("surge-Wuu")
+    theta = np.array([{"Xu": A, "Xuu": B, "Xmu": C}[n] for n in structure.parameters])
+    engine = Thruster("fixed", 0.0, 0.0, "n", speed_limits=Limits(LOW, HIGH))
+    vessel = Vessel("surge", 10.0, (engine,))
+    predictor = build_predictor(structure, "basic", (("u", (1,)),))
+    noise = NoiseLevels(structure.states, np.array([SIGMA]), np.zeros(1))
+    schedule = make_schedule(vessel, float(intervals), 1.0, 1.0)
+    d = np.zeros(len(structure.disturbances))
+    rollout = Rollout(vessel, structure, theta, d, np.array([START, 0.0]), 1.0)
+    program = SensitivityProgram(predictor, theta, d, noise, 1.0, initial=False)
+    criterion = Criterion("D", program.wanted, np.ones(3), np.ones(3))
+    limits = LimitProgram(rollout, schedule, TrialLimits())
+    return TrialProblem(schedule, (Scenario(rollout, program, limits),), criterion)
+
+
+def starts(problem: TrialProblem, count: int = 200) -> tuple[Array, Array]:
+    """Return random two-level and PRBS starts, best first, and their values."""
+    rng = np.random.default_rng(0)
+    held = draw_two_level(problem, rng, count)
+    # long holds matter as much as short ones: each sequence is stretched
+    for i, width in enumerate(rng.integers(1, 16, count)):
+        held[i] = np.repeat(held[i], width, axis=0)[: held.shape[1]]
+    unit = np.concatenate([held, draw_prbs(problem, 4)])
+    value = problem.evaluate(unit).value
+    order = np.argsort(-value)
+    return unit[order], value[order]
+
+
+def middle(intervals: int) -> Array:
+    """Return the mid-range start (N,); a constant would have a determinant of nearly 0."""
+    out = np.full(intervals, (LOW + HIGH) / 2)
+    out[: intervals // 2] *= 1.2
+    return out
+
+
+def ours(intervals: int) -> tuple[Run, Array]:
+    """Design by IPOPT from mid-range and from the best two-level sequence; also those."""
+    began = time.perf_counter()
+    problem = ours_problem(intervals)
+    unit, _ = starts(problem)
+    s = problem.schedule
+    first = ((middle(intervals) - s.lower) / (s.upper - s.lower))[:, None]
+    program = make_shooting(problem, first)
+    found = [run_ipopt(program, start, barrier=0.1) for start in (first, unit[0])]
+    best = max(found, key=lambda f: f.value)
+    seconds = time.perf_counter() - began
+    note = "; ".join(f"{f.value:.4f} after {f.iterations} iterations" for f in found)
+    return Run(problem.levels(best.unit)[:, 0], seconds, note, best.value), problem.levels(unit)[
+        :, :, 0
+    ]
+
+
+def pyomo_solver():
+    """Return an IPOPT that Pyomo can call, or the reason why there is none."""
+    import pyomo.environ as pyo
+
+    executable = pyo.SolverFactory("ipopt")
+    if executable.available(False):
+        executable.options["max_iter"] = 3000
+        return executable, "ipopt executable"
+    from pyomo.contrib.pynumero.asl import AmplInterface
+
+    library = pyo.SolverFactory("cyipopt")
+    if not library.available(False):
+        return None, "no IPOPT for Pyomo: neither an ipopt executable nor cyipopt"
+    if not AmplInterface.available():
+        return None, "cyipopt is there, Pyomo's pynumero_ASL library is not"
+    import cyipopt
+    from pyomo.contrib.pynumero.algorithms.solvers import cyipopt_solver
+    from pyomo.core.base.block import BlockData
+
+    cyipopt_solver.Block = BlockData
+    library.config.options["max_iter"] = 3000
+
+    class InProcess:
+        """The cyipopt solver as Pyomo.DoE calls a solver.
+
+        It solves members of an indexed block, which the solver's check of its
+        argument would refuse, and leaves constant objectives in them, of which
+        the solver takes only one.
+        """
+
+        def solve(self, model: BlockData, tee: bool = False) -> object:
+            active = list(model.component_data_objects(pyo.Objective, active=True))
+            real = [o for o in active if o.expr is not None and not pyo.is_fixed(o.expr)]
+            kept = (real or active)[:1]
+            idle = [o for o in active if all(o is not k for k in kept)]
+            for o in idle:
+                o.deactivate()
+            try:
+                return library.solve(model, tee=tee)
+            finally:
+                for o in idle:
+                    o.activate()
+
+    return InProcess(), "cyipopt, IPOPT " + ".".join(map(str, cyipopt.IPOPT_VERSION))
+
+
+def pyomo_doe(intervals: int, first: Array) -> Run:
+    """Design by Pyomo.DoE from the input `first`, square-solved at that input by itself."""
+    try:
+        import pyomo.environ as pyo
+        from pyomo.contrib.doe import DesignOfExperiments
+    except ImportError as reason:
+        return Run(None, 0.0, f"skipped: {reason}")
+    solver, text = pyomo_solver()
+    if solver is None:
+        return Run(None, 0.0, f"skipped: {text}")
+
+    class Surge:
+        """The experiment as Pyomo.DoE asks for it."""
+
+        def get_labeled_model(self, **_: object):
+            m = pyo.ConcreteModel()
+            m.k, m.j = pyo.RangeSet(0, intervals), pyo.RangeSet(0, intervals - 1)
+            x = [START]
+            for value in first:
+                x.append(x[-1] + A * x[-1] + B * x[-1] ** 2 + C * value)
+            m.x = pyo.Var(m.k, initialize=lambda m, k: x[k])
+            m.x[0].fix(START)
+            m.u = pyo.Var(m.j, bounds=(LOW, HIGH), initialize=lambda m, k: float(first[k]))
+            m.a, m.b, m.c = (pyo.Var(initialize=v) for v in (A, B, C))
+            for v in (m.a, m.b, m.c):
+                v.fix()
+            m.step = pyo.Constraint(
+                m.j,
+                rule=lambda m, k: (
+                    m.x[k + 1] == m.x[k] + m.a * m.x[k] + m.b * m.x[k] ** 2 + m.c * m.u[k]
+                ),
+            )
+            m.experiment_outputs = pyo.Suffix(direction=pyo.Suffix.LOCAL)
+            m.experiment_outputs.update((m.x[k], None) for k in m.k if k)
+            m.measurement_error = pyo.Suffix(direction=pyo.Suffix.LOCAL)
+            m.measurement_error.update((m.x[k], SIGMA) for k in m.k if k)
+            m.experiment_inputs = pyo.Suffix(direction=pyo.Suffix.LOCAL)
+            m.experiment_inputs.update((m.u[k], None) for k in m.j)
+            m.unknown_parameters = pyo.Suffix(direction=pyo.Suffix.LOCAL)
+            m.unknown_parameters.update((v, pyo.value(v)) for v in (m.a, m.b, m.c))
+            return m
+
+    began = time.perf_counter()
+    doe = DesignOfExperiments(
+        Surge(), fd_formula="central", step=1e-3, objective_option="determinant",
+        scale_nominal_param_value=True, scale_constant_value=1.0, solver=solver,
+        logger_level=logging.ERROR,
+    )  # fmt: skip
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):
+            doe.run_doe()
+    except Exception as reason:  # a benchmark reports whatever stops the other tool
+        return Run(None, time.perf_counter() - began, f"{text}: {type(reason).__name__}: {reason}")
+    seconds = time.perf_counter() - began
+    u = np.array(doe.results["Experiment Design"], float)
+    note = (
+        f"{text}, {doe.results['Termination Condition']}; build "
+        f"{doe.results['Build Time']:.2f}, initialise {doe.results['Initialization Time']:.2f}, "
+        f"solve {doe.results['Solve Time']:.2f} s"
+    )
+    return Run(u, seconds, note, information(u))
+
+
+def pydex(intervals: int, candidates: Array) -> Run:
+    """Weigh candidate inputs (M, N) by pydex."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            from pydex.core.designer import Designer
+    except ImportError as reason:
+        return Run(None, 0.0, f"skipped: {reason}")
+
+    def simulate(ti_controls, sampling_times, model_parameters):
+        a, b, c = model_parameters
+        x, out = START, []
+        for value in ti_controls:
+            x = x + a * x + b * abs(x) * x + c * value
+            out.append(x)
+        return np.array(out)[:, None]
+
+    began = time.perf_counter()
+    try:
+        with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+            warnings.simplefilter("ignore")
+            designer = Designer()
+            designer.simulate = simulate
+            designer.model_parameters = np.array([A, B, C])
+            designer.ti_controls_candidates = candidates
+            designer.sampling_times_candidates = np.tile(
+                np.arange(1.0, intervals + 1), (len(candidates), 1)
+            )
+            designer.error_cov = np.array([[SIGMA**2]])
+            designer.initialize(verbose=0)
+            # its default first step of 2 takes these parameters into divergence
+            designer.eval_sensitivities(base_step=1e-3, step_ratio=2, num_steps=5)
+            designer.design_experiment(
+                designer.d_opt_criterion, package="cvxpy", optimizer="CLARABEL", write=False
+            )
+            efforts = np.asarray(designer.efforts, float).reshape(len(candidates), -1).sum(axis=1)
+    except Exception as reason:  # as above
+        return Run(None, time.perf_counter() - began, f"{type(reason).__name__}: {reason}")
+    seconds = time.perf_counter() - began
+    problem = ours_problem(intervals)
+    s = problem.schedule
+    unit = (candidates[..., None] - s.lower) / (s.upper - s.lower)
+    motion = problem.scenarios[0].rollout.run(s.expand(problem.levels(unit)))
+    grams = problem.moments(motion, 0).gram
+    mixture = np.einsum("m,mij->ij", efforts / efforts.sum(), grams)
+    note = f"mixture of {int((efforts > 1e-3).sum())} of {len(candidates)} given sequences"
+    return Run(None, seconds, note, float(np.linalg.slogdet(mixture)[1]))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="D-optimal surge design against other tools.")
+    parser.add_argument("--intervals", type=int, nargs="+", default=[25, 50, 100, 200])
+    parser.add_argument("--candidates", type=int, default=50, help="sequences given to pydex")
+    parser.add_argument("--repeats", type=int, default=3, help="the shortest time counts")
+    options = parser.parse_args()
+    # imports and first compilations are nobody's design time
+    ours(10)
+    pyomo_doe(10, middle(10))
+    notes = []
+    print(
+        f"{'N':>4} {'alternative':<24}{'log det':>10}{'ours':>10}{'seconds':>10}{'ours':>8}"
+        f"{'ratio':>8}"
+    )
+    for n in options.intervals:
+        mine, given = ours(n)
+        theirs = [[pyomo_doe(n, middle(n))], [pyomo_doe(n, given[0])]]
+        for _ in range(options.repeats - 1):
+            again, _ = ours(n)
+            mine = min(mine, again, key=lambda r: r.seconds)
+            for runs, start in zip(theirs, (middle(n), given[0]), strict=True):
+                if runs[0].u is not None:
+                    runs.append(pyomo_doe(n, start))
+        assert mine.u is not None
+        check = information(mine.u)
+        assert abs(check - mine.logdet) < 1e-4, (check, mine.logdet)
+        notes.append(f"N={n} ours: {mine.note}")
+        shortest = [min(runs, key=lambda r: r.seconds) for runs in theirs]
+        for label, run in zip(("mid-range", "two-level"), shortest, strict=True):
+            notes.append(
+                f"N={n} Pyomo.DoE from {label}: {run.logdet:.4f}, {run.seconds:.2f} s; {run.note}"
+            )
+        rows = []
+        done = [r for r in shortest if np.isfinite(r.logdet)]
+        if done:
+            best = max(r.logdet for r in done)
+            rows.append(("Pyomo.DoE, both starts", best, sum(r.seconds for r in done)))
+            quick = min(done, key=lambda r: r.seconds)
+            rows.append(("Pyomo.DoE, quicker one", quick.logdet, quick.seconds))
+        other = pydex(n, given[: options.candidates])
+        notes.append(f"N={n} pydex: {other.note}")
+        if np.isfinite(other.logdet):
+            rows.append(("pydex (given inputs)", other.logdet, other.seconds))
+        for name, value, seconds in rows or [("none installed", np.nan, np.nan)]:
+            print(
+                f"{n:>4} {name:<24}{value:>10.4f}{mine.logdet:>10.4f}{seconds:>10.2f}"
+                f"{mine.seconds:>8.3f}{seconds / mine.seconds:>8.1f}",
+                flush=True,
+            )
+    print("\n".join(["", *notes]))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,199 @@
+"""IPOPT climbs the criterion that the moments state, keeps the limits, and never returns less."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import casadi as ca
+import numpy as np
+import pytest
+from scipy.sparse import csc_matrix
+
+from experiment_design.criteria import Criterion
+from experiment_design.limits import Circle, LimitProgram, TrialLimits
+from experiment_design.moments import MomentProgram
+from experiment_design.noise import NoiseLevels
+from experiment_design.problem import Scenario, TrialProblem
+from experiment_design.rollout import Rollout
+from experiment_design.schedule import make_schedule
+from experiment_design.search import assess, draw_two_level
+from experiment_design.solve import Outcome, make_shooting, run_ipopt, solve_ipopt
+from greybox.errors import UsageError
+from greybox.model.predictor import build_predictor
+from greybox.vessel.vessel import Limits
+
+REGIME = (("u", (1,)), ("v", (1,)), ("r", (1, -1)))
+KEPT = TrialLimits({"u": 1, "v": 1}, {"u": 0.5, "v": 0.4})
+
+
+def problem(
+    ship, thesis, theta, *, predictor="basic", duration=80.0, hold=10.0, limits=KEPT,
+    rates=(None, None), white=False, kind="D", current=0.0,
+):  # fmt: skip
+    vessel = dataclasses.replace(
+        ship,
+        thrusters=tuple(
+            dataclasses.replace(
+                t, speed_limits=Limits(10, 20, rates[0]), angle_limits=Limits(0.6, 1.1, rates[1])
+            )
+            for t in ship.thrusters
+        ),
+    )
+    noise = NoiseLevels(
+        thesis.states, np.full(3, 0.014), np.array([2e-3, 2e-3, 4e-4]), heading=0.002
+    )
+    columns = build_predictor(thesis, predictor, REGIME)
+    schedule = make_schedule(vessel, duration, hold, 1.0)
+    d = np.array([current, -current / 2, 0.0, 0.0])
+    rollout = Rollout(vessel, thesis, theta, d, np.array([1.5, 1.2, 0.0, 0.0]), 1.0)
+    yardstick = MomentProgram(columns, theta, d, noise, white=white)
+    wanted = tuple(columns.parameter_columns)
+    weights = np.linspace(-1, 1, len(wanted))
+    criterion = Criterion(kind, wanted, np.abs(theta[list(range(len(wanted)))]), weights)
+    program = LimitProgram(rollout, schedule, limits)
+    return TrialProblem(schedule, (Scenario(rollout, yardstick, program),), criterion)
+
+
+@pytest.mark.parametrize("kind", ["D", "A", "c"])
+@pytest.mark.parametrize("white", [True, False])
+def test_objective_is_the_criterion(ship, thesis, true_theta, kind, white):
+    p = problem(ship, thesis, true_theta, white=white, kind=kind)
+    rng = np.random.default_rng(0)
+    unit = rng.random((2, *p.shape))
+    shooting = make_shooting(p, unit[0])
+    assert shooting.exact is not white
+    expected = p.evaluate(unit).value
+    for u, value in zip(unit, expected, strict=True):
+        assert shooting.value(u) == pytest.approx(value, rel=1e-8, abs=1e-8)
+
+
+@pytest.mark.parametrize("white", [True, False])
+def test_objective_with_ramps_cut_holds_nuisance_and_earlier_trials(
+    ship, thesis, true_theta, white
+):
+    p = problem(
+        ship, thesis, true_theta, duration=130.0, hold=20.0, rates=(2.0, 0.02), white=white,
+        current=0.2,
+    )  # fmt: skip
+    # one parameter not wanted is nuisance
+    wanted = p.criterion.wanted[1:]
+    p = dataclasses.replace(p, criterion=Criterion("D", wanted, np.ones(14), np.ones(14)))
+    rng = np.random.default_rng(1)
+    unit = rng.random((2, *p.shape))
+    if not white:
+        motion = p.scenarios[0].rollout.run(p.schedule.expand(p.levels(unit[:1])))
+        p = p.with_known((p.moments(motion, 0),))
+    value = make_shooting(p, unit[0]).value(unit[1])
+    assert value == pytest.approx(p.evaluate(unit[1:]).value[0], abs=1e-8)
+
+
+def _dense(matrix):
+    s = matrix.sparsity()
+    return csc_matrix((matrix.nonzeros(), s.row(), s.colind()), shape=matrix.shape).toarray()
+
+
+@pytest.mark.parametrize(("kind", "exact"), [("D", False), ("D", True), ("A", False), ("c", True)])
+def test_derivatives(ship, thesis, true_theta, kind, exact):
+    limits = dataclasses.replace(
+        KEPT, area=Circle(0, 0, 150), speed_cap=2.5, yaw_cap=0.1, end={"x_n": (0, 20)},
+        energy=0.5, headings=3.0,
+    )  # fmt: skip
+    p = problem(
+        ship, thesis, true_theta, duration=45.0, hold=10.0, rates=(2.0, 0.03), kind=kind,
+        limits=limits,
+    )  # fmt: skip
+    rng = np.random.default_rng(2)
+    unit = rng.random(p.shape)
+    s = make_shooting(p, unit, exact)
+    x, empty = s.begin(unit), ca.DM(0, 1)
+    multipliers = rng.normal(size=s.rows)
+
+    def first(x):
+        f, slope = s.functions["grad_f"](x, empty)
+        g, jac = s.functions["jac_g"](x, empty)
+        return float(f), np.array(slope).ravel(), np.array(g).ravel(), _dense(jac)
+
+    half = _dense(s.functions["hess_lag"](x, empty, 1.7, multipliers))
+    hessian = half + np.triu(half, 1).T
+    _, slope, _, jac = first(x)
+    for _ in range(3):
+        d = rng.normal(size=len(x))
+        step = 1e-6
+        up, down = first(x + step * d), first(x - step * d)
+        assert slope @ d == pytest.approx((up[0] - down[0]) / (2 * step), rel=1e-3, abs=1e-3)
+        np.testing.assert_allclose(
+            jac @ d, (up[2] - down[2]) / (2 * step), atol=1e-6 * np.abs(jac @ d).max()
+        )
+        change = 1.7 * (up[1] - down[1]) + (up[3] - down[3]).T @ multipliers
+        np.testing.assert_allclose(
+            hessian @ d, change / (2 * step), atol=5e-3 * np.abs(hessian @ d).max()
+        )
+
+
+def test_infeasible_start_ends_within_all_limits(ship, thesis, true_theta):
+    corners = np.array([[-60, -60], [90, -60], [90, 90], [-60, 90]])
+    limits = dataclasses.replace(
+        KEPT, area=corners, speed_cap=2.3, yaw_cap=0.1, end={"u": (1.0, 0.1), "x_n": (0, 30)},
+        energy=0.6, headings=2.0,
+    )  # fmt: skip
+    p = problem(
+        ship, thesis, true_theta, duration=160.0, rates=(0.8, 0.04), limits=limits
+    )  # fmt: skip
+    unit = draw_two_level(p, np.random.default_rng(0), 1)[0]
+    assert not assess(p, unit[None])[0].feasible
+    found = solve_ipopt(p, unit, exact=False, iterations=150)
+    assert found.feasible, (found.status, found.missed)
+    assert found.iterations > 3
+    levels = p.levels(found.unit)
+    assert (np.abs(np.diff(levels, axis=0)) <= p.schedule.reach + 1e-6).all()
+
+
+def test_polish_gains_and_says_how_it_ended(ship, thesis, true_theta):
+    p = problem(ship, thesis, true_theta)
+    unit = draw_two_level(p, np.random.default_rng(3), 1)[0]
+    found = solve_ipopt(p, unit)
+    assert found.outcome is Outcome.CONVERGED
+    assert found.value > assess(p, unit[None])[0].value + 1
+    assert found.value == assess(p, found.unit[None])[0].value
+    again = solve_ipopt(p, found.unit, iterations=0)
+    assert again.outcome is Outcome.ITERATIONS
+    assert again.value == found.value
+    assert "was better and was kept" in again.status
+
+
+def test_refusals_are_values(ship, thesis, true_theta):
+    p = problem(ship, thesis, true_theta, kind="E")
+    unit = draw_two_level(p, np.random.default_rng(3), 1)[0]
+    found = solve_ipopt(p, unit)
+    assert found.outcome is Outcome.REFUSED
+    assert "not smooth" in found.status
+    assert found.value == assess(p, unit[None])[0].value
+    p = problem(ship, thesis, true_theta)
+    other = dataclasses.replace(p.scenarios[0], yardstick=lambda *a: None)
+    with pytest.raises(UsageError, match="zero-mean IV"):
+        make_shooting(dataclasses.replace(p, scenarios=(other,)), unit)
+
+
+def test_interrupt_keeps_the_best_iterate(ship, thesis, true_theta, monkeypatch):
+    p = problem(ship, thesis, true_theta)
+    unit = draw_two_level(p, np.random.default_rng(3), 1)[0]
+    shooting = make_shooting(p, unit, exact=False)
+    full = run_ipopt(shooting, unit)
+    shooting.solvers.clear()
+
+    class Interrupted:
+        """Runs a few iterations, then is stopped as Ctrl-C would."""
+
+        def __init__(self, *args):
+            args[3]["ipopt.max_iter"] = 25
+            self.solver = original(*args)
+
+        def __call__(self, **inputs):
+            self.solver(**inputs)
+            raise KeyboardInterrupt
+
+    original = ca.nlpsol
+    monkeypatch.setattr(ca, "nlpsol", Interrupted)
+    found = run_ipopt(shooting, unit)
+    assert found.outcome is Outcome.INTERRUPTED
+    assert assess(p, unit[None])[0].value < found.value <= full.value
