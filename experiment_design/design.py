@@ -21,12 +21,14 @@ from experiment_design.classical import Alternative, compare_classical
 from experiment_design.criteria import Criterion
 from experiment_design.feasible import closest, in_words, least_change
 from experiment_design.limits import TOLERANCE, Circle
+from experiment_design.moments import MomentProgram, Moments
 from experiment_design.problem import TrialProblem
 from experiment_design.regimes import spell_regime, steady_motions
-from experiment_design.request import DesignRequest, build_problem
+from experiment_design.request import DesignRequest, build_problem, wanted_parameters
 from experiment_design.robust import Keeping, keep_probability
 from experiment_design.rollout import Motion
-from experiment_design.search import REFERENCE, Candidate, assess
+from experiment_design.search import REFERENCE, Candidate, assess, limit_scale
+from experiment_design.solve import EXACT_COLUMNS, Outcome, solve_ipopt
 from experiment_design.timing import telling_duration
 from greybox.errors import InfeasibleError
 
@@ -34,6 +36,8 @@ Array = NDArray[np.float64]
 
 # rounds of tightening limits until they are kept with the wanted probability
 _TIGHTENINGS = 5
+# scaled units from which a limit counts as active; iterations and seconds of the polish
+_NEAR, _POLISH, _PATIENCE = 0.1, 40, 3600.0
 # share of the effort that a design after a tightening gets
 _AGAIN = 0.4
 # relative standard error from which nothing was learnt of a parameter
@@ -313,6 +317,11 @@ def design_trial(
     status = "solved: local optimum of many ascents"
     if found.stopped:
         status = "stopped by the user: the best plan found so far"
+    if not found.stopped:
+        candidates, more, polished = _polish(problems, candidates)
+        evaluations += more
+        if polished:
+            status = f"solved: many ascents, then multiple shooting; {polished}"
     missing = [t for t, c in enumerate(candidates) if not c.feasible]
     if missing:
         t = missing[0]
@@ -341,8 +350,8 @@ def design_trial(
     covariance = criterion.covariance(sums[0])[0]
     if not np.isfinite(covariance).all() and not request.contrasts:
         raise InfeasibleError(_unexcited(problems, units, request))
-    predictor = request.build_predictor()
-    names = tuple(predictor.columns[i].name for i in criterion.wanted)
+    columns = wanted_parameters(request, criterion)
+    names = tuple(c.name for c in columns)
     if not missing or not best_effort:
         notes += _require_informative(request, problems, units)
     versus, random_value = None, float("nan")
@@ -360,12 +369,7 @@ def design_trial(
             )
     certificate = certify(problems, units)
     values = np.array(
-        [
-            sum(
-                float(request.theta[request.structure.index(n)]) for n in predictor.columns[i].terms
-            )
-            for i in criterion.wanted
-        ]
+        [sum(float(request.theta[request.structure.index(n)]) for n in c.terms) for c in columns]
     )
     levels = tuple(p.levels(u) for p, u in zip(problems, units, strict=True))
     commands = tuple(p.schedule.expand(v) for p, v in zip(problems, levels, strict=True))
@@ -401,6 +405,52 @@ def design_trial(
         evaluations,
         time.perf_counter() - began,
     )
+
+
+def _polish(
+    problems: list[TrialProblem], candidates: list[Candidate]
+) -> tuple[list[Candidate], int, str]:
+    """Let IPOPT polish the trials whose limits on the motion are active.
+
+    Returns
+    -------
+    tuple
+        Candidates, the iterations, and what IPOPT said last, empty where it was not asked.
+    """
+    out, spent, said = list(candidates), 0, ""
+    for t, problem in enumerate(problems):
+        if problem.contrast is not None or not _active(problem, out[t]):
+            continue
+        known: tuple[Moments, ...] = ()
+        if len(problems) > 1:
+            pairs = enumerate(zip(problems, out, strict=True))
+            known = add_up([own_moments(p, c.unit) for o, (p, c) in pairs if o != t])
+        here = problem.with_known(known)
+        result = solve_ipopt(here, out[t].unit, iterations=_POLISH, seconds=_PATIENCE)
+        if result.outcome is Outcome.REFUSED:
+            continue
+        spent += result.iterations
+        said = result.status
+        if result.beats(assess(here, out[t].unit[None])[0], limit_scale(problem)):
+            out[t] = assess(here, result.unit[None])[0]
+    return out, spent, said
+
+
+def _active(problem: TrialProblem, candidate: Candidate) -> bool:
+    """Whether some limit on the motion is missed or nearly reached, and IPOPT can weigh it."""
+    yardstick = problem.scenarios[0].yardstick
+    if isinstance(yardstick, MomentProgram) and (
+        not yardstick.white and yardstick.columns > EXACT_COLUMNS
+    ):
+        return False
+    if len(problem.scenarios) > 1 or problem.criterion.prior is not None:
+        return False
+    program = problem.scenarios[0].limits
+    commands = problem.schedule.expand(problem.levels(candidate.unit))
+    motion = problem.scenarios[0].rollout.run(commands[None])
+    path = program.path_values(motion.state[0]).max(axis=1, initial=-np.inf) / program.path_scale
+    whole = program.whole_values(motion)[:, 0] / program.whole_scale
+    return bool((np.concatenate([path, whole]) > -_NEAR).any())
 
 
 def _criterion_value(
@@ -442,8 +492,7 @@ def _require_informative(
     if request.targets or request.contrasts or request.criterion == "c":
         return []
     criterion = problems[0].criterion
-    predictor = request.build_predictor()
-    names = [predictor.columns[i].name for i in criterion.wanted]
+    names = [c.name for c in wanted_parameters(request, criterion)]
     sums = add_up([own_moments(p, u) for p, u in zip(problems, units, strict=True)])
     covariance = criterion.covariance(sums[0])[0]
     if hopeless > 1 and not np.isfinite(covariance).all():
@@ -552,6 +601,11 @@ def _turning(problem: TrialProblem, request: DesignRequest, name: str) -> str:
 
 def _unexcited(problems: list[TrialProblem], units: list[Array], request: DesignRequest) -> str:
     """Return which regressor no sequence moves enough to be told from the others."""
+    if request.estimator == "oe":
+        return (
+            "this trial cannot tell the parameters of an output-error fit apart: lengthen it, widen "
+            "the limits, or use --predictor basic."
+        )
     sums = add_up([own_moments(p, u) for p, u in zip(problems, units, strict=True)])[0]
     predictor = request.build_predictor()
     worst, label, state = np.inf, "", ""

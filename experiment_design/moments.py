@@ -113,7 +113,6 @@ class MomentProgram:
         # what IPOPT's interval functions are built from
         self.symbols = (s.x, s.psi, s.tau)
         self.expressions = (z, a)
-        self.channel_std = self._std
         self.channel_own = tuple(self._own)
         self.process = self._process
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from experiment_design.campaign import add_up
 from experiment_design.limits import LimitName
 from experiment_design.moments import Moments
-from experiment_design.request import DesignRequest, build_problem
+from experiment_design.request import DesignRequest, build_problem, wanted_parameters
 from greybox.errors import ExcitationError, UsageError
 
 Array = NDArray[np.float64]
@@ -103,10 +103,10 @@ def predict_precision(
     criterion = problem.criterion
     total = add_up(sums)[0]
     covariance = criterion.covariance(total)[0]
-    predictor = request.build_predictor()
     if not np.isfinite(covariance).all():
+        predictor = request.build_predictor()
         size = np.sqrt(np.diag(total.gram[0]))
-        weakest = predictor.columns[int(size.argmin())].label
+        weakest = predictor.columns[int(size[: len(predictor.columns)].argmin())].label
         raise ExcitationError(
             f"these plans do not excite every direction: the regressor of {weakest} varies by "
             f"{size.min():.2g} over {samples} samples. Move what it multiplies."
@@ -114,7 +114,7 @@ def predict_precision(
     limits = problem.scenarios[0].limits.names
     missed = np.max(worst, axis=0) if limits else np.zeros(0)
     return PredictedPrecision(
-        tuple(predictor.columns[i].name for i in criterion.wanted),
+        tuple(c.name for c in wanted_parameters(request, criterion)),
         covariance,
         tuple(zip(limits, missed.tolist(), strict=True)),
     )

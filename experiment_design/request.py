@@ -17,9 +17,11 @@ from experiment_design.noise import NoiseLevels
 from experiment_design.problem import Scenario, TrialProblem, Yardstick
 from experiment_design.rollout import Rollout
 from experiment_design.schedule import Schedule, make_schedule
+from experiment_design.sensitivities import SensitivityProgram
 from greybox.errors import UsageError, suggestion
+from greybox.model.disturbances import CURRENT, WIND
 from greybox.model.model import ManoeuvringModel
-from greybox.model.predictor import Predictor, Regime, build_predictor
+from greybox.model.predictor import Column, Predictor, Regime, build_predictor
 from greybox.model.structure import Structure
 from greybox.vessel.vessel import Vessel
 
@@ -217,13 +219,13 @@ def build_criterion(request: DesignRequest, predictor: Predictor) -> Criterion:
     UsageError
         A name is unknown, or ``c`` has no function to look at.
     """
-    wanted = wanted_columns(predictor, request.wanted or tuple(request.combination))
-    names = [predictor.columns[i].name for i in wanted]
+    chosen = wanted_columns(predictor, request.wanted or tuple(request.combination))
+    names = [predictor.columns[i].name for i in chosen]
     structure = request.structure
     scale = np.array(
         [
             abs(sum(float(request.theta[structure.index(t)]) for t in predictor.columns[i].terms))
-            for i in wanted
+            for i in chosen
         ]
     )
     # a parameter that is zero a priori is measured by what the others of its equation are
@@ -232,7 +234,7 @@ def build_criterion(request: DesignRequest, predictor: Predictor) -> Criterion:
         scale = np.array(request.targets, float)
     combination = np.zeros(len(names))
     for name, slope in request.combination.items():
-        combination[wanted.index(wanted_columns(predictor, (name,))[0])] += slope
+        combination[chosen.index(wanted_columns(predictor, (name,))[0])] += slope
     if request.criterion == "c" and not combination.any():
         raise UsageError(
             "criterion c looks at one coefficient or one function of the parameters: name it, "
@@ -241,7 +243,20 @@ def build_criterion(request: DesignRequest, predictor: Predictor) -> Criterion:
     prior = None
     if request.prior is not None:
         prior = _prior_information(names, *request.prior)
+    wanted = chosen
+    if request.estimator == "oe":
+        # sensitivities stand in the order of the parameters, bias-capturing columns left out
+        wanted = tuple(predictor.parameter_columns.index(i) for i in chosen)
     return Criterion(request.criterion, wanted, scale, combination, prior)
+
+
+def wanted_parameters(request: DesignRequest, criterion: Criterion) -> tuple[Column, ...]:
+    """Return the predictor's columns of the wanted parameters, in the order of the criterion."""
+    predictor = request.build_predictor()
+    places = predictor.parameter_columns
+    if request.estimator == "oe":
+        return tuple(predictor.columns[places[i]] for i in criterion.wanted)
+    return tuple(predictor.columns[i] for i in criterion.wanted)
 
 
 def _prior_information(names: list[str], known: tuple[str, ...], information: Array) -> Array:
@@ -323,6 +338,15 @@ def rival_start(request: DesignRequest, rival: Rival, trial: int) -> Array:
 
 
 def _yardstick(request: DesignRequest, predictor: Predictor, theta: Array) -> Yardstick:
+    if request.estimator == "oe":
+        means: tuple[str, ...] = ()
+        if predictor.kind in ("augmented", "wind"):
+            means = CURRENT
+        if predictor.kind == "augmented" and request.structure.uses_air:
+            means = CURRENT + WIND
+        return SensitivityProgram(
+            predictor, theta, request.d, request.noise, request.sample_time, means=means
+        )
     return MomentProgram(
         predictor, theta, request.d, request.noise, white=request.estimator == "iv-white"
     )
