@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from experiment_design.certificate import Certificate, certify
-    from experiment_design.design import Design, design_trial
+    from experiment_design.design import design_trial
     from experiment_design.discriminate import Discrimination, design_between
     from experiment_design.inputs import prbs, random_two_level, to_log
     from experiment_design.limits import Circle, TrialLimits
@@ -20,12 +20,13 @@ if TYPE_CHECKING:
     from experiment_design.precision import PredictedPrecision, predict_precision
     from experiment_design.prepare import Wishes, prepare_request
     from experiment_design.request import DesignRequest, Rival, build_problem
+    from experiment_design.result import Design
     from experiment_design.timing import least_duration
 
 _WHERE = {
     "Certificate": "certificate",
     "Circle": "limits",
-    "Design": "design",
+    "Design": "result",
     "DesignRequest": "request",
     "Discrimination": "discriminate",
     "NoiseLevels": "noise",

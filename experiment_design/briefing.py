@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from experiment_design.design import Design
 from experiment_design.limits import TOLERANCE
 from experiment_design.prediction import MotionBand
 from experiment_design.regimes import spell_regime
+from experiment_design.result import Design
 
 Array = NDArray[np.float64]
 

@@ -39,7 +39,7 @@ _DRAWS = 200
 _KEPT = 10
 # seconds that the default budget is meant for, and what an evaluation costs: a
 # constant and a part for each sample and column
-_SECONDS = 2.5
+_SECONDS = 1.8
 _COST = (9e-4, 1.1e-7)
 # scenarios of an uncertain prior model that are certified one by one
 _SCENARIOS = 8

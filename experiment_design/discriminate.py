@@ -11,8 +11,9 @@ from scipy.stats import norm
 
 from experiment_design.campaign import Progress
 from experiment_design.contrast import Contrast, Pair
-from experiment_design.design import Design, design_trial
+from experiment_design.design import design_trial
 from experiment_design.request import DesignRequest, Rival, build_problem
+from experiment_design.result import Design
 from experiment_design.search import draw_two_level
 from greybox.errors import UsageError
 

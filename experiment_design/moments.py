@@ -110,6 +110,9 @@ class MomentProgram:
         back = ca.jtimes(outputs, arguments, weights, True)
         self._backward = Vectorised(ca.vertsplit(back), [*scalars, *ca.vertsplit(weights)])
         self._arguments = len(scalars)
+        self._last: tuple[Array, Array, Array, tuple[list[Array], Array, Array, Array]] | None = (
+            None
+        )
         # what IPOPT's interval functions are built from
         self.symbols = (s.x, s.psi, s.tau)
         self.expressions = (z, a)
@@ -153,6 +156,29 @@ class MomentProgram:
         z -= z.mean(axis=-1, keepdims=True)
         return z, a
 
+    def _prepare(self, x: Array, psi: Array, tau: Array) -> tuple[list[Array], Array, Array, Array]:
+        """Return signals, centred regressors, slopes and scattered noise.
+
+        A climb asks for the sums and the derivatives of the same sequence one
+        after the other: the last single one is kept.
+        """
+        last = self._last
+        if (
+            len(x) == 1
+            and last is not None
+            and np.array_equal(last[0], x)
+            and np.array_equal(last[1], psi)
+            and np.array_equal(last[2], tau)
+        ):
+            return last[3]
+        signals = self._signals(x, psi, tau)
+        z, a = self._rows(signals)
+        s = np.empty(0) if self.white else self._scattered(z, a)
+        found = (signals, z, a, s)
+        if len(x) == 1:
+            self._last = (x.copy(), psi.copy(), tau.copy(), found)
+        return found
+
     def _scattered(self, z: Array, a: Array) -> Array:
         """Return what each noise value adds to the scores, (R, p, channels·(N+1))."""
         runs, samples = z.shape[1:]
@@ -195,7 +221,7 @@ class MomentProgram:
         tau : ndarray
             (R, N, nu) generalised inputs.
         """
-        z, a = self._rows(self._signals(x, psi, tau))
+        _, z, a, s = self._prepare(x, psi, tau)
         gram = self._gram(z)
         weights = (
             self._variances(a)
@@ -207,7 +233,6 @@ class MomentProgram:
             rows = slice(mine[0], mine[-1] + 1)
             score[:, rows, rows] = gram[:, rows, rows] * weights[:, i, None, None]
         if not self.white:
-            s = self._scattered(z, a)
             score += s @ s.transpose(0, 2, 1)
         return Moments(gram, score)
 
@@ -228,16 +253,14 @@ class MomentProgram:
         tuple of ndarray
             (N, nx + 1) derivative in states and heading, (N, nu) in the inputs.
         """
-        signals = self._signals(x[None], psi[None], tau[None])
-        z, a = self._rows(signals)
+        signals, z, a, scattered = self._prepare(x[None], psi[None], tau[None])
         samples = z.shape[2]
         back = np.zeros((self._forward.size, samples))
         d_z = back[: self.columns]
         d_a = back[self.columns :].reshape(self.nx, self._channels, samples)
         weights = self._variances(a)[0] if self.white else self._process**2
         if not self.white:
-            s = self._scattered(z, a)[0]
-            q = (2.0 * d_score @ s).reshape(self.columns, self._channels, samples + 1)
+            q = (2.0 * d_score @ scattered[0]).reshape(self.columns, self._channels, samples + 1)
             q *= self._std[None, :, None]
         for i, mine in enumerate(self.equations):
             rows = slice(mine[0], mine[-1] + 1)

@@ -13,9 +13,9 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator, MultipleLocator
 from numpy.typing import NDArray
 
 from experiment_design.briefing import clock
-from experiment_design.design import Design
 from experiment_design.limits import Circle
 from experiment_design.prediction import MotionBand, edge_distance
+from experiment_design.result import Design
 from greybox.report.figures import BLACK, BLUE, COLOURS, GREEN, VERMILION, tidy
 
 Array = NDArray[np.float64]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiment_design.design import Design
+from experiment_design.result import Design
 from greybox.files import replacing
 
 

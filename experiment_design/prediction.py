@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from experiment_design.design import Design
 from experiment_design.limits import Circle
+from experiment_design.result import Design
 from greybox.model.simulation import positions, simulate
 from greybox.vessel.force import generalised_force
 

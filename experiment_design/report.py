@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from experiment_design.briefing import clock, plain_name, signed
 from experiment_design.campaign import add_up, own_moments, random_campaign
-from experiment_design.design import Design
 from experiment_design.pictures import draw_commands, draw_plan_track, draw_states
 from experiment_design.prediction import MotionBand, predict_motion
 from experiment_design.regimes import spell_regime
 from experiment_design.request import build_problem
+from experiment_design.result import Design
 from experiment_design.search import REFERENCE
 from greybox.report.figures import BLUE, ORANGE, new_figure, tidy, to_svg
 from greybox.report.page import Page, Picture, Section, Table, flatten

@@ -16,9 +16,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from experiment_design.briefing import Briefing, Column, brief, tie
-from experiment_design.design import Design
 from experiment_design.pictures import draw_commands, draw_plan_track
 from experiment_design.prediction import MotionBand, predict_motion
+from experiment_design.result import Design
 from greybox.errors import UsageError
 from greybox.files import replacing, write_text
 from greybox.report.figures import new_figure, to_svg

@@ -17,13 +17,13 @@ import pytest
 from experiment_design.briefing import brief, clock, compass, plain_name, signed
 from experiment_design.campaign import add_up, own_moments
 from experiment_design.classical import Alternative
-from experiment_design.design import Design, LimitReport
 from experiment_design.limits import Circle, TrialLimits
 from experiment_design.pictures import forbidden
 from experiment_design.prediction import edge_distance, predict_motion
 from experiment_design.prepare import Wishes, prepare_request
 from experiment_design.report import design_page, random_std
 from experiment_design.request import build_problem
+from experiment_design.result import Design, LimitReport
 from experiment_design.robust import Keeping
 from experiment_design.sheet import sheet_figures, sheet_kind, write_sheet
 from greybox.commands.main import main

@@ -1,0 +1,188 @@
+"""What a trial needs before and after the search, and why it cannot be where it cannot."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from experiment_design.campaign import (
+    add_up,
+    own_moments,
+)
+from experiment_design.feasible import in_words, least_change
+from experiment_design.limits import TOLERANCE, Circle
+from experiment_design.problem import TrialProblem
+from experiment_design.regimes import steady_motions
+from experiment_design.request import DesignRequest, wanted_parameters
+from experiment_design.search import Candidate
+from experiment_design.timing import telling_duration
+from greybox.errors import InfeasibleError
+
+Array = NDArray[np.float64]
+
+# relative standard error from which nothing was learnt of a parameter
+_VAGUE = 10.0
+
+
+def require_horizon(request: DesignRequest) -> None:
+    """Raise where the trial has fewer samples than an equation has unknowns."""
+    predictor = request.build_predictor()
+    samples = request.schedule.samples
+    most = max(len(predictor.equation(s)) + 1 for s in request.structure.states)
+    if samples * request.trials <= most:
+        raise InfeasibleError(
+            f"a trial of {request.duration:g} s has {samples} samples, too few for the {most} "
+            f"unknowns of one equation: use --duration {2 * most * request.sample_time:g} or "
+            f"more, or --predictor basic."
+        )
+
+
+def require_informative(
+    request: DesignRequest,
+    problems: list[TrialProblem],
+    units: list[Array],
+    hopeless: float = 1.0,
+) -> list[str]:
+    """Raise where the trial is too short to tell most parameters; return notes on doubtful ones.
+
+    `hopeless` is how many times vaguer random sequences may be than the design.
+    """
+    if request.targets or request.contrasts or request.criterion == "c":
+        return []
+    criterion = problems[0].criterion
+    names = [c.name for c in wanted_parameters(request, criterion)]
+    sums = add_up([own_moments(p, u) for p, u in zip(problems, units, strict=True)])
+    covariance = criterion.covariance(sums[0])[0]
+    if hopeless > 1 and not np.isfinite(covariance).all():
+        return []
+    share = np.sqrt(np.diag(covariance)) / criterion.scale
+    vague = [n for n, s in zip(names, share, strict=True) if s > hopeless * _VAGUE]
+    if 2 * len(vague) > len(names):
+        longer = telling_duration(request, _VAGUE)
+        advice = "Use --predictor basic, or --want fewer parameters"
+        if longer is not None:
+            advice = f"Use --duration {longer:g}, or --predictor basic"
+        raise InfeasibleError(
+            f"a trial of {request.duration:g} s is too short: the predicted standard error of "
+            f"{', '.join(vague)} is more than {_VAGUE:g} times the prior value "
+            f"({share.max():.2g} times at worst). {advice}."
+        )
+    doubtful = [n for n, s in zip(names, share, strict=True) if s > 1]
+    if not doubtful:
+        return []
+    one = len(doubtful) == 1
+    return [
+        f"{', '.join(doubtful)} will stay unknown by more than {'its' if one else 'their'} prior "
+        f"value: lengthen the trial, or leave {'it' if one else 'them'} out with --want"
+    ]
+
+
+def require_start(problem: TrialProblem, request: DesignRequest, trial: int) -> None:
+    """Raise where the start itself breaks a limit."""
+    program = problem.scenarios[0].limits
+    start = np.zeros(program.nx + 3)
+    start[: program.nx + 1] = request.starts[trial]
+    missed = program.path_values(start[None])[:, 0]
+    for name, m, more in zip(
+        program.path_names, missed, [*request.backoff, *[0.0] * len(missed)], strict=False
+    ):
+        if m - more > TOLERANCE:
+            where = (
+                f"{m:.1f} m outside the sea room"
+                if name.name == "sea room"
+                else f"{m:.3g} {name.unit} beyond the {name.name} of {name.bound:g} {name.unit}"
+            )
+            option = "--position" if name.name == "sea room" else "--start"
+            raise InfeasibleError(
+                f"the trial starts {where}: change {option}, or relax {name.option} by {m:.3g}."
+            )
+
+
+def require_stable(problem: TrialProblem, request: DesignRequest) -> None:
+    """Raise where the prior model runs away under any constant command."""
+    steady = steady_motions(
+        request.vessel,
+        request.structure,
+        request.theta,
+        request.d,
+        problem.schedule,
+        request.starts[0],
+    )
+    if len(steady.x) == 0:
+        raise InfeasibleError(
+            f"the prior model is unstable in free run: under each of {steady.unstable} constant "
+            f"commands a state passes 100 m/s or 10 rad/s within 400 s. Design with a stable "
+            f"model: estimate it with fewer terms (--structure linear), or start elsewhere."
+        )
+
+
+def feasible_or_reason(
+    problem: TrialProblem, request: DesignRequest, best: Candidate, nearest: Candidate
+) -> tuple[Candidate, str]:
+    """Return the better of two candidates, and why limits cannot be kept, empty if they can."""
+    chosen = nearest if nearest.missed.max(initial=0) < best.missed.max(initial=0) else best
+    if (chosen.missed <= TOLERANCE).all():
+        if np.isfinite(chosen.value):
+            return chosen, ""
+        return chosen, unexcited([problem], [chosen.unit], request)
+    name, amount = least_change(problem, chosen)[0]
+    return chosen, in_words(name, amount, _turning(problem, request, name.name))
+
+
+def _turning(problem: TrialProblem, request: DesignRequest, name: str) -> str:
+    """Return what the turning circle has to do with it, where it has."""
+    if name != "sea room":
+        return ""
+    steady = steady_motions(
+        request.vessel, request.structure, request.theta, request.d, problem.schedule
+    )
+    signs = np.ones(len(steady.x), bool)
+    for state, sign in request.regimes[0]:
+        column = steady.x[:, request.structure.states.index(state)]
+        signs &= column * sign >= request.limits.margins.get(state, 0.0)
+    if not signs.any():
+        return ""
+    smallest = float(steady.diameter[signs].min())
+    area = request.limits.area
+    if isinstance(area, Circle):
+        width = 2 * area.radius
+    else:
+        corners = np.asarray(area, float)
+        width = float(np.ptp(corners, axis=0).min())
+    if not np.isfinite(smallest):
+        return " No constant command within the limits turns the vessel."
+    return (
+        f" The sea room is {width:.0f} m across; the smallest circle that the vessel turns within "
+        f"these limits is {smallest:.0f} m."
+    )
+
+
+def unexcited(problems: list[TrialProblem], units: list[Array], request: DesignRequest) -> str:
+    """Return which regressor no sequence moves enough to be told from the others."""
+    if request.estimator == "oe":
+        return (
+            "this trial cannot tell the parameters of an output-error fit apart: lengthen it, "
+            "widen the limits, or use --predictor basic."
+        )
+    sums = add_up([own_moments(p, u) for p, u in zip(problems, units, strict=True)])[0]
+    predictor = request.build_predictor()
+    worst, label, state = np.inf, "", ""
+    for name in request.structure.states:
+        mine = predictor.equation(name)
+        gram = sums.gram[0][np.ix_(mine, mine)]
+        size = np.sqrt(np.maximum(np.diag(gram), 0.0))
+        if (size <= 0).any():
+            still = predictor.columns[mine[int(size.argmin())]].label
+            return (
+                f"no sequence within these limits moves {still}: its regressor varies by 0. "
+                f"Widen the limits, or leave it out of the structure."
+            )
+        values, vectors = np.linalg.eigh(gram / np.outer(size, size))
+        if values[0] < worst:
+            worst, state = float(values[0]), name
+            label = predictor.columns[mine[int(np.abs(vectors[:, 0]).argmax())]].label
+    return (
+        f"this trial cannot tell the regressors of {state} apart: along {label} their smallest "
+        f"eigenvalue is {max(worst, 0):.1e} of the largest, 1e-12 is needed. Lengthen the trial, "
+        f"widen the limits, use --predictor basic, or plan --trials 2 in other regimes."
+    )

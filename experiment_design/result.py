@@ -1,0 +1,223 @@
+"""What a design is: sequences, what they are worth, and how they stand to the limits."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from experiment_design.certificate import Certificate
+from experiment_design.classical import Alternative
+from experiment_design.regimes import spell_regime
+from experiment_design.request import DesignRequest
+from experiment_design.robust import Keeping
+from experiment_design.rollout import Motion
+from experiment_design.search import REFERENCE
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class LimitReport:
+    """One limit and how the plan stands to it.
+
+    ``missed`` is 0 where it is kept, else by how much it is not, in `unit`.
+    """
+
+    trial: int
+    name: str
+    bound: float
+    unit: str
+    missed: float
+
+
+@dataclass(frozen=True)
+class Design:
+    """Sequences for the next trials and what they are worth.
+
+    Parameters
+    ----------
+    request : DesignRequest
+    commands : tuple of ndarray
+        (N, nc) a trial: speeds in the log's unit, angles [rad].
+    levels : tuple of ndarray
+        (K, nc) a trial, one row a hold.
+    motions : tuple of Motion
+        Predicted motion of each trial under the nominal model.
+    names : tuple of str
+        The wanted parameters.
+    values : ndarray
+        (p_w,) their prior values.
+    covariance : ndarray
+        (p_w, p_w) predicted covariance of their estimates.
+    criterion_value : float
+        On the scale of `Criterion`.
+    efficiency_vs_random : float or None
+        Against the best of 200 random two-level sequences that keep the limits;
+        None where none of them does.
+    random_value : float
+        Criterion of that one, nan where there is none.
+    random_kept : int
+        How many were found that keep the limits.
+    certificate : Certificate
+    margins : dict of str to float
+        Least |u_r| and |v_r| (or |r|) over all trials.
+    limits : tuple of LimitReport
+    keeping : Keeping or None
+        Probability of keeping the limits under models drawn from the prior.
+    alternatives : tuple of Alternative
+        Classical sequences by the same yardstick, for the first trial of one.
+    status : str
+        A sentence on how the design ended.
+    notes : tuple of str
+    evaluations : int
+    seconds : float
+    """
+
+    request: DesignRequest
+    commands: tuple[Array, ...]
+    levels: tuple[Array, ...]
+    motions: tuple[Motion, ...]
+    names: tuple[str, ...]
+    values: Array
+    covariance: Array
+    criterion_value: float
+    efficiency_vs_random: float | None
+    random_value: float
+    random_kept: int
+    certificate: Certificate
+    margins: dict[str, float]
+    limits: tuple[LimitReport, ...]
+    keeping: Keeping | None
+    alternatives: tuple[Alternative, ...]
+    status: str
+    notes: tuple[str, ...]
+    evaluations: int
+    seconds: float
+
+    @property
+    def std(self) -> Array:
+        """Predicted standard errors (p_w,)."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    @property
+    def logdet(self) -> float:
+        """−log det of the predicted covariance."""
+        return logdet_information(self.covariance)
+
+    def efficiency(self, covariance: Array) -> float:
+        """Return (det C_other / det C)^(1/p) of another covariance (p_w, p_w)."""
+        gain = self.logdet - logdet_information(covariance)
+        return float(np.exp(gain / len(self.names)))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fields for JSON, those of the contract first."""
+        r = self.request
+        return {
+            "status": self.status,
+            "criterion": r.criterion,
+            "logdet": self.logdet,
+            "efficiency_vs_random": self.efficiency_vs_random,
+            "efficiency_lower_bound": self.certificate.efficiency_lower_bound,
+            "predicted_std": dict(zip(self.names, self.std, strict=True)),
+            "margins": self.margins,
+            "wall_s": self.seconds,
+            "parameters": dict(zip(self.names, self.values, strict=True)),
+            "predictor": r.predictor,
+            "estimator": r.estimator,
+            "trials": r.trials,
+            "duration": r.duration,
+            "hold": r.hold,
+            "regimes": [spell_regime(s) for s in r.regimes],
+            "starts": [dict(zip((*r.structure.states, "psi"), s, strict=True)) for s in r.starts],
+            "random_kept": self.random_kept,
+            "certificate": self.certificate.to_dict(),
+            "limits": [
+                {
+                    "trial": x.trial + 1,
+                    "name": x.name,
+                    "bound": x.bound,
+                    "unit": x.unit,
+                    "missed": x.missed,
+                }
+                for x in self.limits
+            ],
+            "keeps_limits": None if self.keeping is None else self.keeping.to_dict(),
+            "alternatives": [
+                {
+                    "name": a.name,
+                    "tried": a.tried,
+                    "kept": a.kept,
+                    "efficiency_of_design": self._gain(a),
+                }
+                for a in self.alternatives
+            ],
+            "noise": {
+                "measurement": dict(zip(r.structure.states, r.noise.measurement, strict=True)),
+                "process": dict(zip(r.structure.states, r.noise.process, strict=True)),
+                "source": r.noise.source,
+            },
+            "evaluations": self.evaluations,
+            "notes": list(self.notes),
+        }
+
+    def _gain(self, alternative: Alternative) -> float | None:
+        if not np.isfinite(alternative.value):
+            return None
+        size = len(self.names) if self.request.criterion == "D" else 1
+        return float(np.exp((self.criterion_value - alternative.value) / size))
+
+    def summary(self) -> str:
+        """Return the design as text."""
+        r = self.request
+        lines = [
+            f"Plan for {r.vessel.name}: {r.trials} trial{'s' if r.trials > 1 else ''} of "
+            f"{r.duration:g} s, commands change every {r.hold:g} s, regime "
+            f"{', '.join(spell_regime(s) for s in r.regimes)}",
+            f"{self.status}",
+        ]
+        if self.efficiency_vs_random is not None:
+            lines.append(
+                f"{self.efficiency_vs_random:.2f} times the information of the best of "
+                f"{min(self.random_kept, REFERENCE)} random two-level sequences, which would need "
+                f"{self.efficiency_vs_random * r.duration * r.trials:.0f} s for the same precision"
+            )
+        else:
+            lines.append("no random two-level sequence keeps the limits, so there is none to beat")
+        lines.append(self.certificate.sentence())
+        margins = ", ".join(f"{k} {v:.3g}" for k, v in self.margins.items())
+        if margins:
+            lines.append(f"least distance from zero: {margins} (m/s, rad/s)")
+        if self.keeping is not None:
+            lines.append(self.keeping.sentence())
+        lines += ["", f"{'parameter':<14}{'prior':>12}{'std err':>12}{'relative':>11}"]
+        for name, value, std in zip(self.names, self.values, self.std, strict=True):
+            share = f"{abs(std / value):.1%}" if value else "-"
+            lines.append(f"{name:<14}{value:>12.4g}{std:>12.2g}{share:>11}")
+        if self.alternatives:
+            lines += ["", f"{'instead of':<28}{'tried':>7}{'kept':>7}  this plan gives"]
+            for a in self.alternatives:
+                gain = self._gain(a)
+                shown = "-" if gain is None else f"{gain:.2f} times"
+                if gain is None or gain > 1000:
+                    shown = "tells nothing"
+                if not a.kept:
+                    shown += " (breaks limits)"
+                lines.append(f"{a.name:<28}{a.tried:>7}{a.kept:>7}  {shown}")
+        lines += [f"Note: {n}" for n in self.notes]
+        return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        from html import escape
+
+        return f"<pre>{escape(self.summary())}</pre>"
+
+
+def logdet_information(covariance: Array) -> float:
+    """Return −log det of a covariance, scaled so that units cost no digits."""
+    d = np.sqrt(np.diag(covariance))
+    if not np.isfinite(d).all() or not (d > 0).all():
+        return float("-inf")
+    return -float(np.linalg.slogdet(covariance / np.outer(d, d))[1] + 2 * np.log(d).sum())
