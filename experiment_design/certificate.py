@@ -37,10 +37,8 @@ _ASCENT = 60
 # random sequences that the mixture starts from, and how many of the best it keeps
 _DRAWS = 200
 _KEPT = 10
-# seconds that the default budget is meant for, and what an evaluation costs: a
-# constant and a part for each sample and column
-_SECONDS = 1.8
-_COST = (9e-4, 1.1e-7)
+# evaluations of the linear functional in all ascents
+_BUDGET = 1200
 # scenarios of an uncertain prior model that are certified one by one
 _SCENARIOS = 8
 # wanted parameters up to which the information of all columns is mixed: a matrix of
@@ -344,13 +342,6 @@ def _wanted_only(criterion: Criterion) -> Criterion:
     return replace(criterion, wanted=tuple(range(len(criterion.wanted))))
 
 
-def default_budget(problem: TrialProblem) -> int:
-    """Return the evaluations that fit into a few seconds."""
-    columns = problem.scenarios[0].yardstick
-    count = int(getattr(columns, "columns", len(problem.criterion.wanted)))
-    return int(_SECONDS / (_COST[0] + _COST[1] * problem.schedule.samples * count))
-
-
 def certify(
     problems: Sequence[TrialProblem],
     units: Sequence[Array],
@@ -392,7 +383,7 @@ def certify(
             f"{_SCENARIOS} are made",
             began,
         )
-    spend = default_budget(first) if budget is None else budget
+    spend = _BUDGET if budget is None else budget
     spend = max(4 * _ASCENT, spend // count)
     parts: list[_Part] = []
     for i in range(count):
