@@ -37,8 +37,9 @@ _ASCENT = 60
 # random sequences that the mixture starts from, and how many of the best it keeps
 _DRAWS = 200
 _KEPT = 10
-# evaluations of the linear functional in all ascents
+# evaluations of the linear functional in all ascents, usually and at least
 _BUDGET = 1200
+_LEAST = 150
 # scenarios of an uncertain prior model that are certified one by one
 _SCENARIOS = 8
 # wanted parameters up to which the information of all columns is mixed: a matrix of
@@ -347,6 +348,7 @@ def certify(
     units: Sequence[Array],
     seed: int = 0,
     budget: int | None = None,
+    effort: float = 1.0,
 ) -> Certificate:
     """Bound what any admissible inputs of one or several trials could reach.
 
@@ -363,6 +365,8 @@ def certify(
     seed : int
     budget : int, optional
         Evaluations to spend; a few seconds by default.
+    effort : float
+        Share of the default budget.
 
     Returns
     -------
@@ -383,7 +387,7 @@ def certify(
             f"{_SCENARIOS} are made",
             began,
         )
-    spend = _BUDGET if budget is None else budget
+    spend = max(_LEAST, round(_BUDGET * effort)) if budget is None else budget
     spend = max(4 * _ASCENT, spend // count)
     parts: list[_Part] = []
     for i in range(count):

@@ -87,6 +87,21 @@ def design_trial(
     Ljungberg (2020), A10, A15 and section 5.2 for the margins; Atkinson, Donev and
     Tobias (2007) for the criteria.
     """
+    from threadpoolctl import threadpool_limits
+
+    # many small matrix products: threads of BLAS only get in each other's way
+    with threadpool_limits(1, "blas"):
+        return _design(request, best_effort, progress, workers, first, alternatives)
+
+
+def _design(
+    request: DesignRequest,
+    best_effort: bool,
+    progress: Progress | None,
+    workers: int | None,
+    first: tuple[Array, ...] | None,
+    alternatives: bool,
+) -> Design:
     began = time.perf_counter()
     require_horizon(request)
     problems = [build_problem(request, t) for t in range(request.trials)]
@@ -166,7 +181,7 @@ def design_trial(
             versus = float(
                 np.exp(_criterion_value(problems, units, criterion, covariance) - random_value)
             )
-    certificate = certify(problems, units)
+    certificate = certify(problems, units, effort=min(1.0, request.effort))
     values = np.array(
         [sum(float(request.theta[request.structure.index(n)]) for n in c.terms) for c in columns]
     )

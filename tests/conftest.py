@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 import os
+
+# two test processes on two cores: threads of BLAS would only wait for each other
+for _name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
 from pathlib import Path
 
 import numpy as np
