@@ -17,10 +17,12 @@ from experiment_design.problem import Scenario, TrialProblem
 from experiment_design.rollout import Rollout
 from experiment_design.schedule import make_schedule
 from experiment_design.search import assess, draw_two_level
+from experiment_design.sensitivities import SensitivityProgram
 from experiment_design.solve import Outcome, make_shooting, run_ipopt, solve_ipopt
 from greybox.errors import UsageError
+from greybox.model.catalogue import get_structure
 from greybox.model.predictor import build_predictor
-from greybox.vessel.vessel import Limits
+from greybox.vessel.vessel import Limits, Thruster, Vessel
 
 REGIME = (("u", (1,)), ("v", (1,)), ("r", (1, -1)))
 KEPT = TrialLimits({"u": 1, "v": 1}, {"u": 0.5, "v": 0.4})
@@ -128,6 +130,70 @@ def test_derivatives(ship, thesis, true_theta, kind, exact):
         np.testing.assert_allclose(
             hessian @ d, change / (2 * step), atol=5e-3 * np.abs(hessian @ d).max()
         )
+
+
+def surge_problem(kind="D", initial=False, duration=24.0):
+    structure = get_structure("surge-Wuu")
+    theta = np.array([{"Xu": -0.05, "Xuu": -0.05, "Xmu": 0.1}[n] for n in structure.parameters])
+    engine = Thruster("fixed", 0.0, 0.0, "n", speed_limits=Limits(0.1, 2.25))
+    vessel = Vessel("surge", 10.0, (engine,))
+    noise = NoiseLevels(structure.states, np.array([0.014]), np.zeros(1))
+    schedule = make_schedule(vessel, duration, 2.0, 1.0)
+    d = np.zeros(len(structure.disturbances))
+    rollout = Rollout(vessel, structure, theta, d, np.array([0.5, 0.0]), 1.0)
+    columns = build_predictor(structure, "basic", (("u", (1,)),))
+    program = SensitivityProgram(columns, theta, d, noise, 1.0, initial=initial)
+    criterion = Criterion(kind, program.wanted, np.abs(theta), np.array([1.0, -2.0, 0.5]))
+    limits = LimitProgram(rollout, schedule, TrialLimits(speed_cap=1.5))
+    return TrialProblem(schedule, (Scenario(rollout, program, limits),), criterion)
+
+
+@pytest.mark.parametrize("kind", ["D", "A", "c"])
+@pytest.mark.parametrize("initial", [False, True])
+def test_output_error_objective_and_derivatives(kind, initial):
+    p = surge_problem(kind, initial)
+    rng = np.random.default_rng(0)
+    unit = rng.random((2, *p.shape))
+    s = make_shooting(p, unit[0])
+    assert s.value(unit[1]) == pytest.approx(p.evaluate(unit[1:]).value[0], abs=1e-8)
+    x, empty, multipliers = s.begin(unit[1]), ca.DM(0, 1), rng.normal(size=s.rows)
+    half = _dense(s.functions["hess_lag"](x, empty, 1.0, multipliers))
+    hessian = half + np.triu(half, 1).T
+
+    def slope(x):
+        _, f = s.functions["grad_f"](x, empty)
+        _, jac = s.functions["jac_g"](x, empty)
+        return np.array(f).ravel() + _dense(jac).T @ multipliers
+
+    d = rng.normal(size=len(x))
+    change = (slope(x + 1e-6 * d) - slope(x - 1e-6 * d)) / 2e-6
+    np.testing.assert_allclose(hessian @ d, change, atol=1e-4 * np.abs(change).max())
+
+
+def test_output_error_polish():
+    p = surge_problem()
+    unit = np.random.default_rng(1).random(p.shape)
+    found = solve_ipopt(p, unit, barrier=0.1)
+    assert found.outcome is Outcome.CONVERGED
+    assert found.feasible
+    # no single level can be moved for the better
+    moved = np.repeat(found.unit[None], 2 * unit.size, axis=0)
+    for i in range(unit.size):
+        moved[2 * i, i], moved[2 * i + 1, i] = 0.0, 1.0
+    others = p.evaluate(moved)
+    kept = others.feasible(1e-4)
+    assert others.value[kept].max() <= found.value + 1e-6
+    assert found.value > assess(p, unit[None])[0].value + 0.5
+
+
+def test_output_error_of_many_unknowns_is_refused(ship, thesis, true_theta):
+    p = problem(ship, thesis, true_theta)
+    y = p.scenarios[0].yardstick
+    noise = NoiseLevels(thesis.states, np.full(3, 0.014), np.zeros(3))
+    program = SensitivityProgram(y.predictor, true_theta, np.zeros(4), noise, 1.0)
+    other = dataclasses.replace(p.scenarios[0], yardstick=program)
+    with pytest.raises(UsageError, match="at most 8 unknowns, and this one has 18"):
+        make_shooting(dataclasses.replace(p, scenarios=(other,)), np.full(p.shape, 0.5))
 
 
 def test_infeasible_start_ends_within_all_limits(ship, thesis, true_theta):
