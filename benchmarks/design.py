@@ -21,7 +21,7 @@ search draws, and two figures are shown: the best single sequence of those that 
 chose, which is what one trial can use, and in the notes its weighted mixture, an
 information that only several trials can have and that may exceed any one trial's.
 
-    pip install ".[bench]"
+    pip install ".[bench-design]"
     python benchmarks/design.py [--intervals 25 50 100 200]
 
 cyipopt needs an IPOPT and Pyomo's ``pynumero_ASL``: `pip install cyipopt` with
@@ -43,12 +43,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiment_design.criteria import Criterion
+from experiment_design.inputs import prbs
 from experiment_design.limits import LimitProgram, TrialLimits
 from experiment_design.noise import NoiseLevels
 from experiment_design.problem import Scenario, TrialProblem
 from experiment_design.rollout import Rollout
 from experiment_design.schedule import make_schedule
-from experiment_design.search import draw_prbs, draw_two_level
+from experiment_design.search import draw_two_level, within_reach
 from experiment_design.sensitivities import SensitivityProgram
 from experiment_design.solve import make_shooting, run_ipopt
 from greybox.model.catalogue import get_structure
@@ -115,7 +116,7 @@ def starts(problem: TrialProblem, count: int = 200) -> tuple[Array, Array]:
     # long holds matter as much as short ones: each sequence is stretched
     for i, width in enumerate(rng.integers(1, 16, count)):
         held[i] = np.repeat(held[i], width, axis=0)[: held.shape[1]]
-    unit = np.concatenate([held, draw_prbs(problem, 4)])
+    unit = np.concatenate([held, within_reach(problem, prbs(*problem.shape))[:4]])
     value = problem.evaluate(unit).value
     order = np.argsort(-value)
     return unit[order], value[order]
