@@ -38,6 +38,8 @@ _ROUNDS = 2
 _PASSES = 2
 # times the evaluations where few sequences keep the limits, and the least that a chain needs then
 _LIMITED, _LEAST = 2, 400
+# most evaluations of one chain in one round
+_LONGEST = 400
 # seconds of work from which processes are worth starting
 _PARALLEL = 4.0
 
@@ -142,7 +144,7 @@ def search_campaign(
 ) -> Found:
     """Search for the sequences of all trials.
 
-    One trial: four chains of iterated local search in two rounds, the best
+    One trial: four chains of iterated local search in rounds, the best
     design so far handed to the weakest chain. Several: one trial after another
     with the others' information known, twice around.
 
@@ -161,7 +163,9 @@ def search_campaign(
         first = [draw_two_level(p, rng, 1)[0] for p in problems]
     best = [assess(p, u[None])[0] for p, u in zip(problems, first, strict=True)]
     passes = _PASSES if trials > 1 else 1
-    rounds = _ROUNDS if trials == 1 else 2
+    # pieces stay short, so that progress shows and an interrupt loses little
+    share = _EVALUATIONS * effort / (_CHAINS * passes * trials)
+    rounds = max(_ROUNDS, int(np.ceil(share / _LONGEST)))
     if quick:
         passes = rounds = 1
     budget = max(30, round(_EVALUATIONS * effort / (_CHAINS * rounds * passes * trials)))

@@ -104,6 +104,17 @@ def test_the_same_seed_gives_the_same_plan():
     assert not np.array_equal(one.commands[0], other.commands[0])
 
 
+def test_an_interrupt_returns_the_best_so_far():
+    def stop(done, total):
+        raise KeyboardInterrupt
+
+    request = make_request(duration=120.0, effort=0.1)
+    design = design_trial(request, workers=1, alternatives=False, progress=stop)
+    assert design.status.startswith("stopped by the user")
+    assert design.efficiency_vs_random >= 1.0
+    assert len(design.commands[0]) == 120
+
+
 @pytest.mark.long
 def test_augmented_design_and_what_it_saves():
     """41 regressors, 600 s: as told as 3000 s of uniformly drawn pulses."""
@@ -207,7 +218,7 @@ def test_a_campaign_determines_what_one_regime_cannot():
     both = replace(
         alone, regimes=((("u", 1), ("v", 1)), (("u", 1), ("v", -1))),
         starts=(np.array([1.5, 0.8, 0.0, 0.0]), np.array([1.5, -0.8, 0.0, 0.0])),
-        limits=TrialLimits(margins={"u": 0.3, "v": 0.2}), duration=150.0, effort=0.1,
+        limits=TrialLimits(margins={"u": 0.3, "v": 0.2}), duration=120.0, effort=0.03,
     )  # fmt: skip
     design = design_trial(both, workers=1)
     assert len(design.commands) == 2
