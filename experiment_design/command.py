@@ -126,6 +126,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     belief.add_argument("--current", type=_pair, metavar="N,E", help="expected current [m/s]")
     belief.add_argument("--wind", type=_pair, metavar="N,E", help="expected wind [m/s]")
     belief.add_argument(
+        "--gust", type=_not_negative, metavar="M", help="wind about its mean [m/s] (15 %% of it)"
+    )
+    belief.add_argument(
         "--process-noise", type=_floats, metavar="U,V,R", help="per sample, beside the model"
     )
     belief.add_argument(
@@ -319,6 +322,7 @@ def _wishes(options: argparse.Namespace, model: Any) -> Any:
         combination=combination,
         current=options.current,
         wind=options.wind,
+        gust=options.gust,
         process_noise=process,
         limits=limits,
         prior=None if options.prior is None else load_model(options.prior),

@@ -51,6 +51,10 @@ class MomentProgram:
     noise : NoiseLevels
     white : bool
         Take the equation error as white with its average variance: M ∝ G.
+    gust : ndarray, optional
+        (N, 2) what the wind adds to its mean at each sample, north and east [m/s].
+        A measured wind that never varies is no regressor of its own: the terms of
+        the air are then combinations of those of the water.
     """
 
     def __init__(
@@ -61,6 +65,7 @@ class MomentProgram:
         noise: NoiseLevels,
         *,
         white: bool = False,
+        gust: Array | None = None,
     ) -> None:
         structure = predictor.structure
         s = structure.symbols
@@ -71,9 +76,12 @@ class MomentProgram:
         self.columns = len(predictor.columns)
         # the velocity through the air that would be measured, where it is a regressor
         air = s.air
+        blow = ca.SX(0, 1)
+        self.gust = gust
         if predictor.air_measured and structure.disturbance == "marine":
             c, sn = ca.cos(s.psi), ca.sin(s.psi)
-            north, east = float(d[2]), float(d[3])
+            blow = ca.SX.sym("gust", 2)
+            north, east = float(d[2]) + blow[0], float(d[3]) + blow[1]
             air = ca.vertcat(
                 s.x[structure.states.index("u")] - (c * north + sn * east),
                 (s.x[structure.states.index("v")] if "v" in structure.states else 0)
@@ -101,7 +109,12 @@ class MomentProgram:
         self._own = [own for _, _, own in channels]
         self._process = np.asarray(noise.process, float)
         self._channels = len(channels)
-        scalars = [*ca.vertsplit(s.x), s.psi, *ca.vertsplit(s.tau)]
+        self._inputs = len(structure.inputs)
+        if gust is None and blow.numel():
+            fixed = [ca.substitute(e, blow, ca.DM.zeros(2)) for e in fixed]
+            blow = ca.SX(0, 1)
+        moving = ca.vertsplit(blow) if blow.numel() else []
+        scalars = [*ca.vertsplit(s.x), s.psi, *ca.vertsplit(s.tau), *moving]
         z, a = fixed
         outputs = ca.vertcat(z, ca.vec(a.T))
         self._forward = Vectorised(ca.vertsplit(outputs), scalars)
@@ -124,6 +137,7 @@ class MomentProgram:
             *[np.ascontiguousarray(x[..., i]) for i in range(self.nx)],
             np.ascontiguousarray(psi),
             *[np.ascontiguousarray(tau[..., i]) for i in range(tau.shape[-1])],
+            *([] if self.gust is None else [self.gust[: x.shape[-2], i] for i in range(2)]),
         ]
 
     def regressors(self, x: Array, psi: Array, tau: Array) -> tuple[Array, Array]:
@@ -280,5 +294,6 @@ class MomentProgram:
                     d_z[rows] += mine_q[:, 1:]
         d_z -= d_z.mean(axis=1, keepdims=True)
         out = np.empty((self._arguments, samples))
-        self._backward([*[v[0] for v in signals], *back], out)
-        return out[: self.nx + 1].T, out[self.nx + 1 :].T
+        first = [v[0] if v.ndim > 1 else v for v in signals]
+        self._backward([*first, *back], out)
+        return out[: self.nx + 1].T, out[self.nx + 1 : self.nx + 1 + self._inputs].T

@@ -33,6 +33,8 @@ Array = NDArray[np.float64]
 
 # a disturbance bound of A10 where nothing is known of currents and wind [m/s]
 _DISTURBANCE = 0.1
+# turbulence intensity of the wind over the sea, as a share of its mean
+_GUSTINESS = 0.15
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,8 @@ class Wishes:
     predictor : str, optional
     current, wind : (float, float), optional
         Expected means, north and east [m/s].
+    gust : float, optional
+        Standard deviation of the wind about its mean [m/s]; by default 15 % of it.
     process_noise : ndarray, optional
         (nx,) per sample.
     limits : TrialLimits
@@ -77,6 +81,7 @@ class Wishes:
     combination: Mapping[str, float] = field(default_factory=dict)
     current: tuple[float, float] | None = None
     wind: tuple[float, float] | None = None
+    gust: float | None = None
     process_noise: Array | None = None
     limits: TrialLimits = field(default_factory=TrialLimits)
     prior: ManoeuvringModel | None = None
@@ -139,6 +144,14 @@ def prepare_request(
             f"predictor '{predictor}' measures the wind, and in still air its terms are those of "
             f"the water: give the wind to expect, such as --wind 5,0 (north, east, m/s)."
         )
+    gust = wishes.gust
+    if gust is None:
+        gust = _GUSTINESS * float(np.hypot(*d[2:]))
+        if predictor in ("wind", "basic+wind"):
+            notes.append(
+                f"the wind is taken to vary by {gust:.2g} m/s about its mean, without which its "
+                f"terms could not be told from the water's (--gust to change)"
+            )
     margins = _margins(model, structure, noise.measurement, wishes, notes)
     covariance = np.zeros((theta.size, theta.size))
     size = model.covariance.shape[0]
@@ -160,6 +173,7 @@ def prepare_request(
         wanted=wishes.wanted,
         combination=wishes.combination,
         d=d,
+        gust=gust,
         prior=_prior(wishes.prior),
         covariance=covariance if covariance.any() else None,
         scenarios=wishes.robust,

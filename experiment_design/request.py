@@ -22,6 +22,7 @@ from greybox.errors import UsageError, suggestion
 from greybox.model.disturbances import CURRENT, WIND
 from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor import Column, Predictor, Regime, build_predictor
+from greybox.model.simulation import stationary_disturbance
 from greybox.model.structure import Structure
 from greybox.vessel.vessel import Vessel
 
@@ -29,6 +30,8 @@ Array = NDArray[np.float64]
 EstimatorKind = Literal["iv", "iv-white", "oe"]
 ESTIMATORS: tuple[EstimatorKind, ...] = ("iv", "iv-white", "oe")
 Signs = tuple[tuple[str, int], ...]
+# memory of the wind's variation [s]
+_GUST_SECONDS = 20.0
 
 
 @dataclass(frozen=True)
@@ -76,6 +79,8 @@ class DesignRequest:
         Wanted standard errors of `wanted`, the scale of A and E in place of prior values.
     d : ndarray
         (nd,) expected current and wind [m/s].
+    gust : float
+        Standard deviation of each component of the wind about its mean [m/s].
     prior : (tuple of str, ndarray), optional
         Names and information matrix of earlier trials.
     covariance : ndarray, optional
@@ -113,6 +118,7 @@ class DesignRequest:
     combination: Mapping[str, float] = field(default_factory=dict)
     targets: tuple[float, ...] = ()
     d: Array = field(default_factory=lambda: np.zeros(4))
+    gust: float = 0.0
     prior: tuple[tuple[str, ...], Array] | None = None
     covariance: Array | None = None
     scenarios: int = 0
@@ -348,5 +354,24 @@ def _yardstick(request: DesignRequest, predictor: Predictor, theta: Array) -> Ya
             predictor, theta, request.d, request.noise, request.sample_time, means=means
         )
     return MomentProgram(
-        predictor, theta, request.d, request.noise, white=request.estimator == "iv-white"
+        predictor,
+        theta,
+        request.d,
+        request.noise,
+        white=request.estimator == "iv-white",
+        gust=_gusts(request) if predictor.air_measured else None,
     )
+
+
+def _gusts(request: DesignRequest) -> Array:
+    """Draw what the wind adds to its mean, (N, 2) [m/s]; the same for every sequence."""
+    rng = np.random.default_rng([31, request.seed])
+    drawn = stationary_disturbance(
+        rng,
+        np.zeros(2),
+        request.gust,
+        request.schedule.samples,
+        correlation_time=_GUST_SECONDS,
+        sample_time=request.sample_time,
+    )
+    return np.asarray(drawn[0], float)

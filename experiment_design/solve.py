@@ -141,6 +141,11 @@ def make_shooting(problem: TrialProblem, unit: Array, exact: bool | None = None)
             "use the ascent (search.ascend), or --criterion A."
         )
     if isinstance(yardstick, MomentProgram):
+        if yardstick.gust is not None:
+            raise UsageError(
+                "IPOPT polishes designs whose regressors follow from state and command alone, and "
+                "a measured wind has its own time: use the ascent (search.ascend)."
+            )
         small = yardstick.columns <= EXACT_COLUMNS
         chosen = not yardstick.white and (small if exact is None else exact)
         return MomentShooting(problem, unit, yardstick, chosen)

@@ -75,7 +75,7 @@ def why_not_surge(problem: TrialProblem) -> str:
     rollout, yardstick = scenario.rollout, scenario.yardstick
     if rollout.structure.states != ("u",) or rollout.structure.inputs != ("taux",):
         return "the model has more than one state or force"
-    if not isinstance(yardstick, MomentProgram) or yardstick.white:
+    if not isinstance(yardstick, MomentProgram) or yardstick.white or yardstick.gust is not None:
         return "the yardstick is no sum over samples"
     if max(problem.schedule.ramp) > 1 or problem.schedule.limited:
         return "commands are ramped"

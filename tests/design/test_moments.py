@@ -100,6 +100,25 @@ def test_gradient_equals_finite_differences(kind, estimator):
         assert slope[k, c] == pytest.approx(difference, rel=1e-4, abs=1e-5 * abs(slope).max())
 
 
+def test_measured_wind_is_told_by_its_gusts():
+    """With a steady wind the air's terms are combinations of the water's; gusts tell them apart."""
+    steady = make_request(
+        duration=300.0, predictor="wind", d=np.array([0.1, 0.0, 5.0, 2.0]), gust=0.0
+    )
+    problem, unit, motion = _random_motion(steady)
+    assert problem.evaluate(unit).value[0] == -np.inf
+    problem, unit, motion = _random_motion(replace(steady, gust=0.8))
+    assert np.isfinite(problem.evaluate(unit).value[0])
+    assert len(problem.criterion.wanted) == 18
+    _, _, slope, _ = problem.gradient(unit[0])
+    ends = []
+    for step in (1e-6, -1e-6):
+        moved = unit[0].copy()
+        moved[8, 1] += step
+        ends.append(problem.evaluate(moved[None]).value[0])
+    assert slope[8, 1] == pytest.approx((ends[0] - ends[1]) / 2e-6 / 18, rel=1e-4, abs=1e-6)
+
+
 def test_gradient_with_prior_and_known_trials():
     information = np.diag(1 / (0.3 * np.abs(make_request().theta[:2])) ** 2)
     request = make_request(prior=(("Xu", "Xvr"), information), predictor="augmented",
