@@ -105,9 +105,9 @@ def test_measured_wind_is_told_by_its_gusts():
     steady = make_request(
         duration=300.0, predictor="wind", d=np.array([0.1, 0.0, 5.0, 2.0]), gust=0.0
     )
-    problem, unit, motion = _random_motion(steady)
+    problem, unit, _ = _random_motion(steady)
     assert problem.evaluate(unit).value[0] == -np.inf
-    problem, unit, motion = _random_motion(replace(steady, gust=0.8))
+    problem, unit, _ = _random_motion(replace(steady, gust=0.8))
     assert np.isfinite(problem.evaluate(unit).value[0])
     assert len(problem.criterion.wanted) == 18
     _, _, slope, _ = problem.gradient(unit[0])
