@@ -31,7 +31,7 @@ Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 
 # gradient evaluations of a search at effort 1, in all
-_EVALUATIONS = 2200
+_EVALUATIONS = 3000
 _CHAINS = 4
 _ROUNDS = 2
 # passes over the trials of a campaign
