@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from experiment_design.criteria import Criterion
+from experiment_design.limits import LimitProgram, TrialLimits
 from experiment_design.moments import Moments
 from experiment_design.problem import TrialProblem
 from experiment_design.search import ascend, draw_two_level, perturb
@@ -40,6 +41,8 @@ _KEPT = 10
 # evaluations of the linear functional in all ascents, usually and at least
 _BUDGET = 1200
 _LEAST = 150
+# a gap that only a search that found nothing leaves
+_CONVERGED = 1e-6
 # scenarios of an uncertain prior model that are certified one by one
 _SCENARIOS = 8
 # wanted parameters up to which the information of all columns is mixed: a matrix of
@@ -379,10 +382,10 @@ def certify(
     began = time.perf_counter()
     first = problems[0]
     if any(p.contrast is not None for p in problems):
-        return _absent("discrimination between models maximises no information matrix", began)
+        return absent("discrimination between models maximises no information matrix", began)
     count = len(first.scenarios)
     if count > _SCENARIOS:
-        return _absent(
+        return absent(
             f"{count} scenarios of the prior model would need as many bounds, and at most "
             f"{_SCENARIOS} are made",
             began,
@@ -398,8 +401,14 @@ def certify(
         ]
         value = float(first.criterion.value(sum(total[1:], total[0]))[0])
         if not np.isfinite(value):
-            return _absent("the design leaves some direction without excitation", began)
+            return absent("the design leaves some direction without excitation", began)
         parts.append(_bound(alone, units, value, seed, spend))
+    if min(p.gap for p in parts) < _CONVERGED and first.scenarios[0].rollout.nx > 1:
+        return absent(
+            "its search met no sequence beside the design that tells more, which is too good to be "
+            "believed after so few ascents: raise --effort",
+            began,
+        )
     share = np.array([s.weight for s in first.scenarios])
     values = np.array([p.value for p in parts])
     bounds = np.array([p.bound for p in parts])
@@ -427,10 +436,18 @@ def _expand(problem: TrialProblem, units: Array) -> Array:
 
 
 def _single(problem: TrialProblem, scenario: int, known: bool) -> TrialProblem:
-    """Return the problem under one scenario, with the sums of other trials where wanted."""
+    """Return the problem under one scenario, with the sums of other trials where wanted.
+
+    Limits on the motion and on the rates are dropped: that only raises the bound,
+    and ascents that had to keep them would be spent on keeping them.
+    """
+    schedule = replace(problem.schedule, reach=np.full(len(problem.schedule.commands), np.inf))
+    chosen = problem.scenarios[scenario]
+    free = replace(chosen, limits=LimitProgram(chosen.rollout, schedule, TrialLimits()))
     return replace(
         problem,
-        scenarios=(problem.scenarios[scenario],),
+        schedule=schedule,
+        scenarios=(free,),
         known=problem.known[scenario : scenario + 1] if known else (),
     )
 
@@ -457,7 +474,7 @@ def _bound(
     )
 
 
-def _absent(reason: str, began: float) -> Certificate:
-    return Certificate(
-        None, np.nan, np.nan, np.nan, 0, 0, False, "", "", reason, time.perf_counter() - began
-    )
+def absent(reason: str, began: float | None = None) -> Certificate:
+    """Return a certificate that says why there is none."""
+    spent = 0.0 if began is None else time.perf_counter() - began
+    return Certificate(None, np.nan, np.nan, np.nan, 0, 0, False, "", "", reason, spent)

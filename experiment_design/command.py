@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from greybox.commands.common import add_seed, positive, progress, provenance, say
+from greybox.commands.common import add_seed, count, positive, progress, provenance, say
 
 HELP = "design the thruster sequences of the next trial"
 EXAMPLES = """examples:
@@ -22,7 +22,7 @@ EXAMPLES = """examples:
 
 
 def _pair(text: str) -> tuple[float, float]:
-    first, second = (float(v) for v in text.split(","))
+    first, second = _floats(text)
     return first, second
 
 
@@ -41,14 +41,25 @@ def _share(text: str) -> float:
 
 
 def _floats(text: str) -> list[float]:
-    return [float(v) for v in text.split(",")]
+    values = [float(v) for v in text.split(",")]
+    if not all(abs(v) < float("inf") for v in values):
+        raise ValueError(text)
+    return values
+
+
+def _whole(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise ValueError(text)
+    return value
 
 
 for _type, _name in (
-    (_pair, "two numbers A,B"),
+    (_pair, "two finite numbers A,B"),
     (_not_negative, "number of at least 0"),
     (_share, "number between 0 and 1"),
-    (_floats, "numbers separated by commas"),
+    (_floats, "finite numbers separated by commas"),
+    (_whole, "whole number of at least 1"),
 ):
     _type.__name__ = _name
 
@@ -96,7 +107,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--hold", type=positive, default=10.0, metavar="S", help="commands change every S s (10)"
     )
     motion.add_argument("--start", type=_floats, metavar="u,v,r,psi", help="state at the start")
-    motion.add_argument("--trials", type=int, default=1, metavar="K", help="trials of a campaign")
+    motion.add_argument(
+        "--trials", type=_whole, default=1, metavar="K", help="trials of a campaign"
+    )
     motion.add_argument("--area", metavar="CSV", help="sea room, a polygon of x_n, y_n [m]")
     motion.add_argument(
         "--circle", type=_floats, metavar="N,E,R", help="round sea room: centre and radius [m]"
@@ -114,7 +127,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         default=[],
         metavar="NAME=VALUE:TOL",
-        help="final u, v, r, psi, x_n or y_n with tolerance",
+        help="final u, v, r, psi, x_n or y_n with tolerance (0.05)",
     )
     motion.add_argument(
         "--energy", type=positive, metavar="E", help="mean (n/n_max)^3 at most, such as 0.5"
@@ -133,7 +146,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     belief.add_argument(
         "--robust",
-        type=int,
+        type=count,
         default=0,
         metavar="S",
         help="expect the criterion over S models drawn from the prior's covariance",
@@ -153,7 +166,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--best-effort", action="store_true", help="write the closest plan if limits stop it"
     )
     work.add_argument("--effort", type=positive, default=1.0, help="times the usual search (1)")
-    work.add_argument("--workers", type=int, metavar="N", help="processes (as needed)")
+    work.add_argument("--workers", type=_whole, metavar="N", help="processes (as needed)")
     add_seed(work)  # type: ignore[arg-type]
 
 
@@ -169,6 +182,7 @@ def run(options: argparse.Namespace) -> None:
     from greybox.vessel.toml import load_vessel
 
     check_targets(options.out, options.json, options.sheet, options.report)
+    _require_apart(options)
     if options.sheet:
         from experiment_design.sheet import sheet_kind
 
@@ -212,6 +226,30 @@ def run(options: argparse.Namespace) -> None:
         for path in (options.out, options.sheet, options.report):
             if path:
                 say(f"wrote {path}")
+
+
+def _require_apart(options: argparse.Namespace) -> None:
+    """Raise where an output would replace an input or another output."""
+    from greybox.errors import UsageError
+
+    taken: dict[Path, str] = {}
+    inputs = {"--vessel": options.vessel, "--model": options.model, "--prior": options.prior}
+    inputs |= {"--area": options.area}
+    inputs |= {f"--between {p}": p for p in options.between or ()}
+    for name, given in inputs.items():
+        if given is not None:
+            taken[Path(given).resolve()] = name
+    outputs = {"--out": options.out, "--json": options.json, "--sheet": options.sheet}
+    for name, given in (outputs | {"--report": options.report}).items():
+        if given is None or given == "-":
+            continue
+        place = Path(given).resolve()
+        if place in taken:
+            raise UsageError(
+                f"{name} would write over '{given}', which {taken[place]} names too: name another "
+                f"file."
+            )
+        taken[place] = name
 
 
 def _run_between(options: argparse.Namespace, request: Any, notes: tuple[str, ...]) -> None:

@@ -21,7 +21,7 @@ from greybox.errors import InfeasibleError
 Array = NDArray[np.float64]
 
 # relative standard error from which nothing was learnt of a parameter
-_VAGUE = 10.0
+_VAGUE = 2.0
 
 
 def require_horizon(request: DesignRequest) -> None:
@@ -30,10 +30,11 @@ def require_horizon(request: DesignRequest) -> None:
     samples = request.schedule.samples
     most = max(len(predictor.equation(s)) + 1 for s in request.structure.states)
     if samples * request.trials <= most:
+        longer = max(2 * most * request.sample_time, 6 * request.hold)
+        other = "." if request.predictor == "basic" else ", or --predictor basic."
         raise InfeasibleError(
             f"a trial of {request.duration:g} s has {samples} samples, too few for the {most} "
-            f"unknowns of one equation: use --duration {2 * most * request.sample_time:g} or "
-            f"more, or --predictor basic."
+            f"unknowns of one equation: use --duration {longer:g} or more{other}"
         )
 
 
@@ -59,9 +60,10 @@ def require_informative(
     vague = [n for n, s in zip(names, share, strict=True) if s > hopeless * _VAGUE]
     if 2 * len(vague) > len(names):
         longer = telling_duration(request, _VAGUE)
-        advice = "Use --predictor basic, or --want fewer parameters"
-        if longer is not None:
-            advice = f"Use --duration {longer:g}, or --predictor basic"
+        other = "--want fewer parameters"
+        if request.predictor != "basic":
+            other = "--predictor basic"
+        advice = f"Use {other}" if longer is None else f"Use --duration {longer:g}, or {other}"
         raise InfeasibleError(
             f"a trial of {request.duration:g} s is too short: the predicted standard error of "
             f"{', '.join(vague)} is more than {_VAGUE:g} times the prior value "
@@ -92,9 +94,12 @@ def require_start(problem: TrialProblem, request: DesignRequest, trial: int) -> 
                 if name.name == "sea room"
                 else f"{m:.3g} {name.unit} beyond the {name.name} of {name.bound:g} {name.unit}"
             )
-            option = "--position" if name.name == "sea room" else "--start"
+            if name.name == "sea room":
+                raise InfeasibleError(
+                    f"the trial starts {where}: move it by --position, or the sea room."
+                )
             raise InfeasibleError(
-                f"the trial starts {where}: change {option}, or relax {name.option} by {m:.3g}."
+                f"the trial starts {where}: change --start, or relax {name.option} by {m:.3g}."
             )
 
 
@@ -126,7 +131,13 @@ def feasible_or_reason(
             return chosen, ""
         return chosen, unexcited([problem], [chosen.unit], request)
     name, amount = least_change(problem, chosen)[0]
-    return chosen, in_words(name, amount, _turning(problem, request, name.name))
+    more = _turning(problem, request, name.name)
+    if name.name.startswith("margin of") and request.d[:2].any():
+        more += (
+            f" Margins are kept through the water too, and a current of "
+            f"{float(np.hypot(*request.d[:2])):.2g} m/s is expected."
+        )
+    return chosen, in_words(name, amount, more)
 
 
 def _turning(problem: TrialProblem, request: DesignRequest, name: str) -> str:

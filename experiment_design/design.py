@@ -15,7 +15,7 @@ from experiment_design.campaign import (
     random_campaign,
     search_campaign,
 )
-from experiment_design.certificate import certify
+from experiment_design.certificate import absent, certify
 from experiment_design.classical import Alternative, compare_classical
 from experiment_design.criteria import Criterion
 from experiment_design.demands import (
@@ -129,13 +129,15 @@ def _design(
     candidates, evaluations = list(found.candidates), found.evaluations
     notes: list[str] = []
     status = "solved: local optimum of many ascents"
-    if found.stopped:
-        status = "stopped by the user: the best plan found so far"
-    if not found.stopped:
-        candidates, more, polished = _polish(problems, candidates)
-        evaluations += more
-        if polished:
-            status = f"solved: many ascents, then multiple shooting; {polished}"
+    stopped = found.stopped
+    if not stopped:
+        try:
+            candidates, more, polished = _polish(problems, candidates)
+            evaluations += more
+            if polished:
+                status = f"solved: many ascents, then multiple shooting; {polished}"
+        except KeyboardInterrupt:
+            stopped = True
     missing = [t for t, c in enumerate(candidates) if not c.feasible]
     if missing:
         t = missing[0]
@@ -146,13 +148,16 @@ def _design(
                 raise InfeasibleError(sentence)
             status = "limits not kept: the closest plan that was found"
             notes.append(sentence)
-    keeping = None
-    if request.uncertain and not found.stopped:
-        request, problems, candidates, keeping, more = _tighten(
-            request, problems, candidates, workers
-        )
-        evaluations += more
-        if keeping.probability < request.probability:
+    keeping: Keeping | None = None
+    if request.uncertain and not stopped:
+        try:
+            request, problems, candidates, keeping, more = _tighten(
+                request, problems, candidates, workers
+            )
+            evaluations += more
+        except KeyboardInterrupt:
+            stopped = True
+        if keeping is not None and keeping.probability < request.probability:
             notes.append(
                 f"the limits are kept with probability {keeping.probability:.2f}, "
                 f"{request.probability:g} was asked for: lower the margins, or trust the prior "
@@ -181,7 +186,12 @@ def _design(
             versus = float(
                 np.exp(_criterion_value(problems, units, criterion, covariance) - random_value)
             )
-    certificate = certify(problems, units, effort=min(1.0, request.effort))
+    certificate = absent("the user stopped the design")
+    if not stopped:
+        try:
+            certificate = certify(problems, units, effort=min(1.0, request.effort))
+        except KeyboardInterrupt:
+            stopped = True
     values = np.array(
         [sum(float(request.theta[request.structure.index(n)]) for n in c.terms) for c in columns]
     )
@@ -191,12 +201,14 @@ def _design(
         p.scenarios[0].rollout.run(c[None]) for p, c in zip(problems, commands, strict=True)
     )
     classical: tuple[Alternative, ...] = ()
-    if alternatives and request.trials == 1:
+    if alternatives and request.trials == 1 and not stopped:
         classical = compare_classical(problems[0], request.seed)
         if reference is not None:
             value = float(problems[0].evaluate(reference[0][None]).value[0])
             two = Alternative("random two-level", kept, kept, value, reference[0])
             classical = (two, *classical)
+    if stopped:
+        status = "stopped by the user: the best plan found so far"
     return Design(
         request,
         commands,

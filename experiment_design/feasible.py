@@ -108,10 +108,17 @@ def in_words(name: LimitName, amount: float, what: str = "") -> str:
             f"it by {np.ceil(amount):.0f} m on every side, or shorten the trial.{what}"
         )
     if name.name == "heading coverage":
+        least = np.floor(99 * (name.bound - a)) / 100
         return (
             f"headings cannot cover {name.bound:.3g} rad: {name.bound - amount:.3g} rad is the "
-            f"most that was reached. Lower --headings to {name.bound - a:.3g} or lengthen the "
-            f"trial.{what}"
+            f"most that was reached. Lower --headings to {least:g} or "
+            f"lengthen the trial.{what}"
+        )
+    if name.name.startswith("end state of"):
+        return (
+            f"the {name.name} within {name.bound:g}{unit} cannot be reached: it is missed by "
+            f"{amount:.3g}{unit} beyond that. Raise the tolerance in --end to "
+            f"{name.bound + a:.4g}{unit}, or lengthen the trial.{what}"
         )
     return (
         f"the {name.name} of {name.bound:g}{unit} cannot be kept: it is missed by "

@@ -82,8 +82,10 @@ class TrialLimits:
         for what, cap in (("speed", self.speed_cap), ("yaw-rate", self.yaw_cap)):
             if cap is not None and not 0 < cap < np.inf:
                 raise UsageError(f"the {what} cap is {cap:g}, it must be positive.")
-        if self.energy is not None and not self.energy > 0:
-            raise UsageError(f"the energy share is {self.energy:g}, it must be positive.")
+        if self.energy is not None and not 0 < self.energy <= 1:
+            raise UsageError(
+                f"the energy share is {self.energy:g}, it must lie between 0 and 1, full speed."
+            )
         if self.headings is not None and not self.headings > 0:
             raise UsageError(f"the heading coverage is {self.headings:g} rad, must be positive.")
         kept = [self.margins.get(s, 0.0) for s in ("u", "v") if s in self.signs]
@@ -230,7 +232,14 @@ class LimitProgram:
         for name, (value, tolerance) in limits.end.items():
             if name not in place:
                 raise UsageError(f"the end state names '{name}': it can name {', '.join(place)}.")
-            names.append(LimitName(f"end state of {name}", tolerance, units[name], "--end"))
+            if not (np.isfinite(value) and 0 < tolerance < np.inf):
+                raise UsageError(
+                    f"the end state {name} = {value:g} has the tolerance {tolerance:g}, it must be "
+                    f"positive: write --end {name}=VALUE:TOLERANCE."
+                )
+            names.append(
+                LimitName(f"end state of {name} = {value:g}", tolerance, units[name], "--end")
+            )
             shift = {"x_n": limits.position[0], "y_n": limits.position[1]}.get(name, 0.0)
             ends.append((place[name], value - shift))
         return names, ends

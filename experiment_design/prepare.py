@@ -153,6 +153,12 @@ def prepare_request(
                 f"terms could not be told from the water's (--gust to change)"
             )
     margins = _margins(model, structure, noise.measurement, wishes, notes)
+    if (np.diag(model.covariance) < 0).any():
+        name = model.names[int(np.diag(model.covariance).argmin())]
+        raise UsageError(
+            f"the prior model gives {name} the variance {np.diag(model.covariance).min():.2g}, "
+            f"which cannot be: estimate the model again."
+        )
     covariance = np.zeros((theta.size, theta.size))
     size = model.covariance.shape[0]
     covariance[:size, :size] = model.covariance
@@ -200,7 +206,11 @@ def prepare_request(
                 f"trial{'s' if wishes.trials > 1 else ''}: give one, or one a trial."
             )
         regimes = tuple(parts * wishes.trials if len(parts) == 1 else parts)
-    starts = tuple(_start_of(signs, start, steady, structure, margins) for signs in regimes)
+    caps = (wishes.limits.speed_cap, wishes.limits.yaw_cap)
+    starts = tuple(
+        _start_of(signs, start, steady, structure, margins, caps, wishes.trials)
+        for signs in regimes
+    )
     if start is None:
         shown = ", ".join(
             f"{n} {v:.2f}" for n, v in zip((*structure.states, "psi"), starts[0], strict=True)
@@ -277,7 +287,7 @@ def _start(wishes: Wishes, structure: Structure) -> Array | None:
         # u,v,r,psi for a model of fewer states
         names = ("u", "v", "r")
         given = np.array([given[names.index(s)] for s in structure.states] + [given[3]])
-    if given.size != expected or not np.isfinite(given).all():
+    if given.size != expected:
         raise UsageError(
             f"--start has {given.size} numbers, {expected} are needed: "
             f"{','.join(structure.states)},psi."
@@ -291,10 +301,19 @@ def _start_of(
     steady: Steady,
     structure: Structure,
     margins: dict[str, float],
+    caps: tuple[float | None, float | None],
+    trials: int,
 ) -> Array:
     if start is not None and all(start[structure.states.index(s)] * v >= 0 for s, v in signs):
         return start
-    found = steady_start(steady, structure.states, signs, margins)
+    if start is not None and trials == 1:
+        name, sign = next((s, v) for s, v in signs if start[structure.states.index(s)] * v < 0)
+        raise InfeasibleError(
+            f"the trial starts with {name} = {start[structure.states.index(name)]:g} m/s and the "
+            f"regime {spell_regime(signs)} asks for {'more' if sign > 0 else 'less'} than 0: "
+            f"change --start or --regime."
+        )
+    found = steady_start(steady, structure.states, signs, margins, caps)
     if found is None:
         reached = [
             spell_regime(c)
@@ -317,7 +336,8 @@ def _choose_regimes(
     margins = dict(base.limits.margins)
     worth: list[tuple[float, Signs]] = []
     for signs in candidate_regimes(states):
-        begin = steady_start(steady, states, signs, margins)
+        caps = (wishes.limits.speed_cap, wishes.limits.yaw_cap)
+        begin = steady_start(steady, states, signs, margins, caps)
         if begin is None:
             continue
         own = begin

@@ -114,9 +114,21 @@ def candidate_regimes(states: tuple[str, ...]) -> list[Signs]:
 
 
 def steady_start(
-    steady: Steady, states: tuple[str, ...], signs: Signs, margins: dict[str, float]
+    steady: Steady,
+    states: tuple[str, ...],
+    signs: Signs,
+    margins: dict[str, float],
+    caps: tuple[float | None, float | None] = (None, None),
 ) -> Array | None:
-    """Return the steady motion that lies deepest in a regime, with heading 0; None where none is.
+    """Return a steady motion well inside a regime, with heading 0; None where none is.
+
+    Of those a fifth beyond the margins and a tenth below the caps the one of the
+    most moderate commands; else the one that lies deepest in the regime.
+
+    Parameters
+    ----------
+    caps : (float, float)
+        Largest speed [m/s] and rate of turn [rad/s], None where there is none.
 
     Returns
     -------
@@ -125,13 +137,23 @@ def steady_start(
     """
     if not len(steady.x):
         return None
-    if not signs:
-        middle = int(np.abs(steady.unit - 0.5).sum(axis=1).argmin())
-        return np.append(steady.x[middle], 0.0)
-    depth = np.min(
-        [steady.x[:, states.index(s)] * v / max(margins.get(s, 0.0), 0.05) for s, v in signs],
-        axis=0,
-    )
+    depth = np.full(len(steady.x), np.inf)
+    for s, v in signs:
+        reached = steady.x[:, states.index(s)] * v / max(margins.get(s, 0.0), 0.05)
+        depth = np.minimum(depth, reached)
+    speed = np.hypot(steady.x[:, 0], steady.x[:, states.index("v")] if "v" in states else 0.0)
+    below = np.ones(len(steady.x), bool)
+    if caps[0] is not None:
+        below &= speed <= 0.9 * caps[0]
+    if caps[1] is not None and "r" in states:
+        below &= np.abs(steady.x[:, states.index("r")]) <= 0.9 * caps[1]
+    moderate = np.abs(steady.unit - 0.5).sum(axis=1)
+    inside = below & (depth >= 1.2)
+    if inside.any():
+        best = int(np.where(inside, moderate, np.inf).argmin())
+        return np.append(steady.x[best], 0.0)
+    if below.any():
+        depth = np.where(below, depth, -np.inf)
     best = int(depth.argmax())
     if depth[best] <= 0:
         return None

@@ -16,6 +16,9 @@ from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
 
+# samples of the longest trial that is designed in one piece
+_MOST = 50_000
+
 
 @dataclass(frozen=True)
 class Schedule:
@@ -110,6 +113,11 @@ def make_schedule(vessel: Vessel, duration: float, hold: float, sample_time: flo
     UsageError
         The hold is no multiple of the sample time or longer than the trial.
     """
+    if duration / sample_time > _MOST:
+        raise UsageError(
+            f"a trial of {duration:g} s has {duration / sample_time:.3g} samples, {_MOST} is the "
+            f"most: use --duration {_MOST * sample_time:g} or less."
+        )
     samples, held = round(duration / sample_time), round(hold / sample_time)
     if held < 1 or abs(held * sample_time - hold) > 1e-6 * hold:
         raise UsageError(

@@ -27,9 +27,17 @@ def positive(text: str) -> float:
     return value
 
 
+def count(text: str) -> int:
+    """Return a whole number of at least 0, as an option's type."""
+    value = int(text)
+    if value < 0:
+        raise ValueError(text)
+    return value
+
+
 def add_seed(parser: argparse.ArgumentParser) -> None:
     """Add --seed."""
-    parser.add_argument("--seed", type=int, default=0, help="seed of whatever is random (0)")
+    parser.add_argument("--seed", type=count, default=0, help="seed of whatever is random (0)")
 
 
 def read_logs(

@@ -186,7 +186,7 @@ def _limits(table: dict[str, Any], key: str, where: str) -> Limits:
         if not isinstance(pair, list) or len(pair) != 2:
             raise VesselError(f"{key}_limits of {where} must be [lowest, highest]: correct it.")
         lower, upper = (_number(v, f"{key}_limits of {where}") for v in pair)
-        if lower >= upper:
+        if lower > upper:
             raise VesselError(
                 f"{key}_limits of {where} run from {lower:g} to {upper:g}: "
                 f"the first must be the smaller."
