@@ -163,6 +163,13 @@ def test_prior_of_earlier_trials(folder, capsys):
         (["--duration", "100", "--target", "Yvv"], "--target 'Yvv' cannot be read"),
         (["--duration", "100", "--want", "Yv2"], "Did you mean 'Yv'"),
         ([], "--duration is missing"),
+        (["--duration", "1e9"], "50000 is the most"),
+        (["--duration", "100", "--end", "u=1:-1"], "has the tolerance -1"),
+        (["--duration", "100", "--energy", "2"], "between 0 and 1"),
+        (
+            ["--duration", "100", "--regime", "u+v+", "--start=-1.5,1.2,0,0"],
+            "starts with u = -1.5 m/s and the regime u+v+ asks for more than 0",
+        ),
     ],
 )
 def test_errors_are_one_sentence(folder, capsys, options, message):
@@ -172,6 +179,28 @@ def test_errors_are_one_sentence(folder, capsys, options, message):
     assert message in error
     assert error.count("\n") == 1
     assert not plan.exists()
+
+
+def test_outputs_never_replace_inputs(folder, capsys):
+    model = folder / "model.json"
+    before = model.read_bytes()
+    status = main(["design", "--vessel", str(folder / "ship.toml"), "--model", str(model),
+                   "--duration", "100", "--out", str(model)])  # fmt: skip
+    assert status == 1
+    assert "would write over" in capsys.readouterr().err
+    assert model.read_bytes() == before
+    status, plan = run(folder, "--duration", "100", "--json", str(folder / "plan.csv"))
+    assert status == 1
+    assert not plan.exists()
+
+
+@pytest.mark.parametrize(
+    "options", [["--seed", "-1"], ["--current", "nan,0"], ["--robust", "-3"], ["--workers", "0"]]
+)
+def test_numbers_that_cannot_be_are_wrong_usage(folder, options):
+    with pytest.raises(SystemExit) as stop:
+        run(folder, "--duration", "100", *options)
+    assert stop.value.code == 2
 
 
 def test_wrong_usage(folder):

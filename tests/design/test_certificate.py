@@ -7,9 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from designs import limited_ship, make_request
 
 from experiment_design.certificate import _FEW, _information, _Tangent, certify
 from experiment_design.criteria import Criterion
+from experiment_design.design import design_trial
 from experiment_design.limits import LimitProgram, TrialLimits
 from experiment_design.moments import MomentProgram
 from experiment_design.noise import NoiseLevels
@@ -231,3 +233,17 @@ def test_a_design_that_excites_nothing_has_no_certificate(ship):
     assert constant.efficiency_lower_bound is None
     assert "excitation" in constant.sentence()
     assert constant.to_dict()["bound"] is None
+
+
+def test_tight_limits_do_not_tighten_the_bound_below_the_truth():
+    """A search that must keep caps and rates finds little; the bound must not rest on that."""
+    limits = TrialLimits(margins={"u": 0.5, "v": 0.4}, speed_cap=2.2, yaw_cap=0.06)
+    request = make_request(
+        duration=200.0, limits=limits, vessel=limited_ship(2.0, 0.02), effort=0.05
+    )
+    hasty = design_trial(request, workers=1, alternatives=False)
+    better = design_trial(replace(request, seed=4, effort=0.5), workers=1, alternatives=False)
+    assert better.criterion_value > hasty.criterion_value
+    assert hasty.certificate.bound >= better.criterion_value
+    truth = np.exp((hasty.logdet - better.logdet) / 15)
+    assert hasty.certificate.efficiency_lower_bound <= truth

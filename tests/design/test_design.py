@@ -104,6 +104,34 @@ def test_the_same_seed_gives_the_same_plan():
     assert not np.array_equal(one.commands[0], other.commands[0])
 
 
+def test_an_interrupt_after_the_search_keeps_the_plan(monkeypatch):
+    def stop(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("experiment_design.design.certify", stop)
+    design = design_trial(make_request(duration=120.0, effort=0.1), workers=1)
+    assert design.status.startswith("stopped by the user")
+    assert design.certificate.efficiency_lower_bound is None
+    assert "stopped" in design.certificate.sentence()
+
+
+def test_steady_starts_keep_the_caps():
+    limits = TrialLimits(speed_cap=2.2, yaw_cap=0.05)
+    request = prepare_request(thesis_model(), Wishes(150.0, limits=limits)).request
+    u, v, r, _ = request.starts[0]
+    assert np.hypot(u, v) <= 2.2
+    assert abs(r) <= 0.05
+
+
+def test_a_locked_thruster_has_equal_limits():
+    request = make_request(
+        structure="surge", vessel=limited_ship(angles=(0.8, 0.8)), effort=0.05, duration=150.0
+    )
+    design = design_trial(request, workers=1, alternatives=False)
+    assert (design.commands[0][:, 1:] == 0.8).all()
+    assert design.efficiency_vs_random > 0.9
+
+
 def test_an_interrupt_returns_the_best_so_far():
     def stop(done, total):
         raise KeyboardInterrupt
