@@ -22,6 +22,7 @@ from experiment_design.search import (
     best_random,
     climb,
     draw_two_level,
+    exchange,
     limit_scale,
     within_reach,
 )
@@ -220,7 +221,7 @@ def _tight(problem: TrialProblem, rng: np.random.Generator) -> bool:
 
 
 def _chain_starts(problem: TrialProblem, best: Candidate, rng: np.random.Generator) -> list[Array]:
-    """Return the starts of each chain: the best two-level and PRBS sequences, shared out."""
+    """Return the starts of each chain: an exchanged one, the best two-level and PRBS sequences."""
     drawn = np.concatenate(
         [
             draw_two_level(problem, rng, REFERENCE),
@@ -238,6 +239,9 @@ def _chain_starts(problem: TrialProblem, best: Candidate, rng: np.random.Generat
         ),
     )
     top = [best.unit, *[drawn[i] for i in order[: 2 * _CHAINS - 1]]]
+    if problem.contrast is None and np.isfinite(best.value):
+        # what single moves reach from the best start, beside what gradients reach from the others
+        top[0] = exchange(problem, best.unit, 1).unit
     return [np.array(top[c::_CHAINS]) for c in range(_CHAINS)]
 
 
