@@ -45,7 +45,6 @@ from numpy.typing import NDArray
 from experiment_design.criteria import Criterion
 from experiment_design.inputs import prbs
 from experiment_design.limits import LimitProgram, TrialLimits
-from experiment_design.noise import NoiseLevels
 from experiment_design.problem import Scenario, TrialProblem
 from experiment_design.rollout import Rollout
 from experiment_design.schedule import make_schedule
@@ -53,6 +52,7 @@ from experiment_design.search import draw_two_level, within_reach
 from experiment_design.sensitivities import SensitivityProgram
 from experiment_design.solve import make_shooting, run_ipopt
 from greybox.model.catalogue import get_structure
+from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import build_predictor
 from greybox.vessel.vessel import Limits, Thruster, Vessel
 

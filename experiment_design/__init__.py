@@ -15,13 +15,14 @@ if TYPE_CHECKING:
     from experiment_design.discriminate import Discrimination, design_between
     from experiment_design.inputs import prbs, random_two_level, to_log
     from experiment_design.limits import Circle, TrialLimits
-    from experiment_design.noise import NoiseLevels, noise_levels
+    from experiment_design.noise import noise_levels
     from experiment_design.plan import write_plan
     from experiment_design.precision import PredictedPrecision, predict_precision
     from experiment_design.prepare import Wishes, prepare_request
     from experiment_design.request import DesignRequest, Rival, build_problem
     from experiment_design.result import Design
     from experiment_design.timing import least_duration
+    from greybox.model.noise import NoiseLevels
 
 _WHERE = {
     "Certificate": "certificate",

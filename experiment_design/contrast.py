@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_discrete_are
 
-from experiment_design.noise import NoiseLevels
 from experiment_design.rollout import Rollout, step_expression
 from experiment_design.schedule import Schedule
+from greybox.model.noise import NoiseLevels
 
 Array = NDArray[np.float64]
 

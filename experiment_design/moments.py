@@ -20,7 +20,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from experiment_design.noise import NoiseLevels
+from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import Predictor
 from greybox.vectorised import Vectorised
 

@@ -2,53 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import UsageError
 from greybox.model.functions import jacobians
 from greybox.model.model import ManoeuvringModel
+from greybox.model.noise import NoiseLevels
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class NoiseLevels:
-    """Standard deviations that a predicted precision rests on.
-
-    Parameters
-    ----------
-    states : tuple of str
-    measurement : ndarray
-        (nx,) of the measured states [m/s, rad/s].
-    process : ndarray
-        (nx,) of what moves the states beside the model, per sample [m/s, rad/s].
-    heading : float
-        Of the measured heading [rad].
-    wind : float
-        Of each component of the measured velocity through the air [m/s].
-    source : str
-        Where the figures came from, one sentence.
-    """
-
-    states: tuple[str, ...]
-    measurement: Array
-    process: Array
-    heading: float = 0.0
-    wind: float = 0.0
-    source: str = ""
-
-    def __post_init__(self) -> None:
-        total = self.measurement**2 + self.process**2
-        if not (np.isfinite(total).all() and (total > 0).all()):
-            worst = self.states[int(np.argmin(np.where(np.isfinite(total), total, -1.0)))]
-            raise UsageError(
-                f"the noise of {worst} is 0, so any trial would give its equation without error: "
-                f"state {worst}_std under [sensors] in the vessel file."
-            )
 
 
 def noise_levels(
@@ -65,7 +28,7 @@ def noise_levels(
     Parameters
     ----------
     model : ManoeuvringModel
-        Its ``residual_std`` is used where `process` is not given.
+        Its ``noise``, else its ``residual_std``, is used where `process` is not given.
     vessel : Vessel
         Its sensors' standard deviations.
     process : ndarray, optional
@@ -87,6 +50,11 @@ def noise_levels(
         )[0]
     )  # fmt: skip
     missing = [s for s, v in zip(states, stated, strict=True) if v is None]
+    if missing and model.noise is not None:
+        stated = [
+            m if v is None else v for m, v in zip(model.noise.measurement, stated, strict=True)
+        ]
+        missing = []
     if missing and not has_residual:
         raise UsageError(
             f"nothing tells how noisy {', '.join(missing)} "
@@ -98,7 +66,10 @@ def noise_levels(
         [residual[i] / np.sqrt(2.0) if v is None else v for i, v in enumerate(stated)]
     )
     told = ["sensors of the vessel file" if not missing else "residuals of the model"]
-    if process is None and has_residual:
+    if process is None and model.noise is not None:
+        process = np.asarray(model.noise.process, float)
+        told.append("process noise as the model's estimate found it")
+    elif process is None and has_residual:
         beyond = residual**2 - measurement**2 - a**2 @ measurement**2
         process = np.sqrt(np.maximum(beyond, 0.0))
         told.append("process noise from the model's residuals")

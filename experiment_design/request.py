@@ -13,7 +13,6 @@ from experiment_design.contrast import Contrast
 from experiment_design.criteria import Criterion, CriterionKind
 from experiment_design.limits import LimitProgram, TrialLimits
 from experiment_design.moments import MomentProgram, Moments
-from experiment_design.noise import NoiseLevels
 from experiment_design.problem import Scenario, TrialProblem, Yardstick
 from experiment_design.rollout import Rollout
 from experiment_design.schedule import Schedule, make_schedule
@@ -21,6 +20,7 @@ from experiment_design.sensitivities import SensitivityProgram
 from greybox.errors import UsageError, suggestion
 from greybox.model.disturbances import CURRENT, WIND
 from greybox.model.model import ManoeuvringModel
+from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import Column, Predictor, Regime, build_predictor
 from greybox.model.simulation import stationary_disturbance
 from greybox.model.structure import Structure

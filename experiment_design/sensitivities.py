@@ -27,8 +27,8 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_banded
 
 from experiment_design.moments import Moments
-from experiment_design.noise import NoiseLevels
 from greybox.errors import UsageError
+from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import Predictor
 from greybox.vectorised import Vectorised
 

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from experiment_design.limits import TrialLimits
-from experiment_design.noise import NoiseLevels
 from experiment_design.request import DesignRequest
 from greybox.model.catalogue import get_structure
 from greybox.model.model import ManoeuvringModel
+from greybox.model.noise import NoiseLevels
 from greybox.study.chapter6 import TRUE
 from greybox.vessel.toml import load_vessel
 from greybox.vessel.vessel import Limits

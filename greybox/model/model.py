@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from greybox.errors import GreyboxError, ModelFileError
 from greybox.files import plain, write_json
+from greybox.model.noise import NoiseLevels, noise_from_dict
 from greybox.model.structure import Structure
 from greybox.model.terms import Factor, Term
 from greybox.model.units import parameter_unit
@@ -45,6 +46,8 @@ class ManoeuvringModel:
         Known disturbance means and their standard errors [m/s].
     residual_std : ndarray
         (nx,) standard deviation of the one-step residuals.
+    noise : NoiseLevels, optional
+        What the estimate found of the noises.
     sums : mapping of str to tuple of str
         Parameters that stand for a sum, such as Xuu for Xuu + Wuu.
     record : mapping
@@ -59,6 +62,7 @@ class ManoeuvringModel:
     integrator: Literal["euler", "rk4"] = "euler"
     disturbances: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     residual_std: Array = field(default_factory=lambda: np.zeros(0))
+    noise: NoiseLevels | None = None
     sums: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     record: Mapping[str, Any] = field(default_factory=dict)
 
@@ -150,6 +154,7 @@ class ManoeuvringModel:
                 k: {"value": v, "std": e, "unit": "m/s"} for k, (v, e) in self.disturbances.items()
             },
             "residual_std": dict(zip(s.states, self.residual_std, strict=False)),
+            "noise": None if self.noise is None else self.noise.to_dict(),
             "vessel": vessel_to_dict(self.vessel),
         }
         out: dict[str, Any] = plain(data | dict(self.record))
@@ -162,7 +167,8 @@ class ManoeuvringModel:
 
 _CORE = {
     "format", "version", "sample_time", "integrator", "structure", "names", "theta", "std",
-    "units", "theta_per_second", "covariance", "sums", "disturbances", "residual_std", "vessel",
+    "units", "theta_per_second", "covariance", "sums", "disturbances", "residual_std",
+    "noise", "vessel",
 }  # fmt: skip
 
 
@@ -230,6 +236,7 @@ def model_from_dict(data: Any, source: str = "model") -> ManoeuvringModel:
                 for k, v in data.get("disturbances", {}).items()
             },
             residual_std=np.array(list(data.get("residual_std", {}).values()), float),
+            noise=(noise_from_dict(data["noise"], structure.states) if data.get("noise") else None),
             sums={k: tuple(v) for k, v in data.get("sums", {}).items()},
             record={k: v for k, v in data.items() if k not in _CORE},
         )

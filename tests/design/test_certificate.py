@@ -14,13 +14,13 @@ from experiment_design.criteria import Criterion
 from experiment_design.design import design_trial
 from experiment_design.limits import LimitProgram, TrialLimits
 from experiment_design.moments import MomentProgram
-from experiment_design.noise import NoiseLevels
 from experiment_design.problem import Scenario, TrialProblem
 from experiment_design.rollout import Rollout
 from experiment_design.schedule import make_schedule
 from experiment_design.search import ascend, climb, draw_two_level
 from experiment_design.surge_bound import _Programme, _Sums, _Trial, why_not_surge
 from greybox.model.catalogue import get_structure
+from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import build_predictor
 from greybox.study.chapter6 import TRUE
 

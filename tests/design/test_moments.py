@@ -11,10 +11,11 @@ from designs import make_request
 
 from experiment_design.criteria import Criterion
 from experiment_design.moments import Moments
-from experiment_design.noise import NoiseLevels, noise_levels
+from experiment_design.noise import noise_levels
 from experiment_design.request import build_problem
 from greybox.errors import UsageError
 from greybox.model.functions import jacobians
+from greybox.model.noise import NoiseLevels
 from greybox.model.simulation import simulate
 from greybox.study.monte_carlo import Batch, BatchRegression
 from greybox.vessel.toml import load_vessel

@@ -9,13 +9,13 @@ import pytest
 
 from experiment_design.criteria import Criterion
 from experiment_design.limits import LimitProgram, TrialLimits
-from experiment_design.noise import NoiseLevels
 from experiment_design.problem import Scenario, TrialProblem
 from experiment_design.rollout import Rollout
 from experiment_design.schedule import make_schedule
 from experiment_design.search import ascend
 from experiment_design.sensitivities import SensitivityProgram
 from greybox.errors import UsageError
+from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import build_predictor
 
 REGIME = (("u", (1,)), ("v", (1,)), ("r", (1, -1)))

@@ -12,7 +12,6 @@ from scipy.sparse import csc_matrix
 from experiment_design.criteria import Criterion
 from experiment_design.limits import Circle, LimitProgram, TrialLimits
 from experiment_design.moments import MomentProgram
-from experiment_design.noise import NoiseLevels
 from experiment_design.problem import Scenario, TrialProblem
 from experiment_design.rollout import Rollout
 from experiment_design.schedule import make_schedule
@@ -21,6 +20,7 @@ from experiment_design.sensitivities import SensitivityProgram
 from experiment_design.solve import Outcome, make_shooting, run_ipopt, solve_ipopt
 from greybox.errors import UsageError
 from greybox.model.catalogue import get_structure
+from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import build_predictor
 from greybox.vessel.vessel import Limits, Thruster, Vessel
 

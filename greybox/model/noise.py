@@ -1,0 +1,80 @@
+"""How noisy measurements are, and how much moves a ship beside its model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.errors import UsageError
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class NoiseLevels:
+    """Standard deviations that a precision or a band rests on.
+
+    Parameters
+    ----------
+    states : tuple of str
+    measurement : ndarray
+        (nx,) of the measured states [m/s, rad/s].
+    process : ndarray
+        (nx,) of what moves the states beside the model, per sample [m/s, rad/s].
+    heading : float
+        Of the measured heading [rad].
+    wind : float
+        Of each component of the measured velocity through the air [m/s].
+    source : str
+        Where the figures came from, one sentence.
+    """
+
+    states: tuple[str, ...]
+    measurement: Array
+    process: Array
+    heading: float = 0.0
+    wind: float = 0.0
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        total = self.measurement**2 + self.process**2
+        if not (np.isfinite(total).all() and (total > 0).all()):
+            worst = self.states[int(np.argmin(np.where(np.isfinite(total), total, -1.0)))]
+            raise UsageError(
+                f"the noise of {worst} is 0, so any trial would give its equation without error: "
+                f"state {worst}_std under [sensors] in the vessel file."
+            )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the levels for JSON [m/s, rad/s, rad]."""
+        return {
+            "measurement": dict(zip(self.states, map(float, self.measurement), strict=True)),
+            "process": dict(zip(self.states, map(float, self.process), strict=True)),
+            "heading": float(self.heading),
+            "wind": float(self.wind),
+            "source": self.source,
+        }
+
+
+def noise_from_dict(data: Mapping[str, Any], states: tuple[str, ...]) -> NoiseLevels:
+    """Build levels from the tables of a model file.
+
+    Raises
+    ------
+    UsageError
+        A state has no noise at all.
+    KeyError, TypeError, ValueError
+        The tables are incomplete.
+    """
+    return NoiseLevels(
+        states,
+        np.array([float(data["measurement"][s]) for s in states]),
+        np.array([float(data["process"][s]) for s in states]),
+        float(data["heading"]),
+        float(data["wind"]),
+        str(data["source"]),
+    )
