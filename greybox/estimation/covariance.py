@@ -114,6 +114,72 @@ def score_covariance(
     return _positive(total), lags
 
 
+def shared_score_covariance(
+    scores: Sequence[tuple[Array, Array]], kind: CovarianceKind, lags: int
+) -> Array:
+    """Estimate the covariance of Σ E(k) r(k) where all channels share the parameters.
+
+    Parameters
+    ----------
+    scores : sequence of tuple
+        (q, N, ny) derivatives and (N, ny) residuals of each experiment, both in
+        noise deviations.
+    kind : {"ma", "hac", "white"}
+        ``ma``: Σ E R Eᵀ with the residuals' own autocovariance, channels
+        together; ``hac``: from the products, flat-top kernel; ``white``.
+    lags : int
+        Memory in samples.
+
+    Returns
+    -------
+    ndarray
+        (q, q)
+
+    References
+    ----------
+    Ljung (1999), eq. 9.42; Newey and West (1987); Politis (2003).
+    """
+    q = scores[0][0].shape[0]
+    total = np.zeros((q, q))
+    if kind != "ma":
+        for rows, residuals in scores:
+            product = np.einsum("qkc,kc->qk", rows, residuals)
+            for lag in range(min(0 if kind == "white" else 2 * lags, product.shape[1] - 1) + 1):
+                block = product[:, lag:] @ product[:, : product.shape[1] - lag].T
+                total += flat_top(lag, lags) * (block if lag == 0 else block + block.T)
+        return _positive(total)
+    ny = scores[0][1].shape[1]
+    samples = sum(len(r) for _, r in scores)
+    reach = min(2 * lags, max(len(r) for _, r in scores) - 1)
+    # gamma[lag] = mean of r(k + lag) r(k)ᵀ over all experiments
+    gamma = np.zeros((reach + 1, ny, ny))
+    for lag in range(reach + 1):
+        for _, r in scores:
+            if len(r) > lag:
+                gamma[lag] += r[lag:].T @ r[: len(r) - lag]
+    gamma *= np.array([flat_top(lag, lags) for lag in range(reach + 1)])[:, None, None] / samples
+    for rows, r in scores:
+        total += _filtered_products(rows, gamma[: len(r)])
+    return _positive(total)
+
+
+def _filtered_products(rows: Array, gamma: Array) -> Array:
+    """Return Σ E(k) Γ(k − j) E(j)ᵀ over all pairs of samples, by fast convolution."""
+    from scipy.fft import irfft, next_fast_len, rfft
+
+    q, samples, _ = rows.shape
+    size = next_fast_len(samples + 2 * len(gamma), real=True)
+    # Γ(−lag) = Γ(lag)ᵀ, wrapped around
+    kernel = np.zeros((size, *gamma.shape[1:]))
+    kernel[: len(gamma)] = gamma
+    kernel[size - len(gamma) + 1 :] = gamma[:0:-1].transpose(0, 2, 1)
+    spectrum = rfft(kernel, axis=0)
+    moved = np.einsum("fab,qfb->qfa", spectrum, rfft(rows, size, axis=1))
+    filtered = irfft(moved, size, axis=1)[:, :samples]
+    product = rows.reshape(q, -1) @ filtered.reshape(q, -1).T
+    return np.asarray((product + product.T) / 2)
+
+
 def _moving_average(
     projected: Sequence[Sequence[Array]],
     residuals: Sequence[Sequence[Array]],

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.model.model import ManoeuvringModel
+from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import Predictor
 from greybox.model.units import parameter_unit
 from greybox.vessel.vessel import Vessel
@@ -79,6 +80,8 @@ class Estimate:
         Free-run fit (6.12) on the estimation logs [%].
     logs : tuple of dict
         Name, hash and length of each log.
+    noise : NoiseLevels, optional
+        What was found of measurement and process noise.
     """
 
     predictor: Predictor
@@ -99,6 +102,7 @@ class Estimate:
     notes: tuple[str, ...] = ()
     fit: dict[str, float] = field(default_factory=dict)
     logs: tuple[dict[str, Any], ...] = ()
+    noise: NoiseLevels | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -143,6 +147,7 @@ class Estimate:
             vessel=self.vessel,
             disturbances={n: (v, s) for n, v, s in self.current},
             residual_std=self.residual_std,
+            noise=self.noise,
             sums={c.name: c.terms for c in columns if len(c.terms) > 1},
             record=self.record(),
         )

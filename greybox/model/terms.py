@@ -89,6 +89,18 @@ class Term:
         """Equation and factors without order: equal for terms that are the same function."""
         return self.state, tuple(sorted((f.signal, f.modulus) for f in self.factors))
 
+    @property
+    def dissipates(self) -> bool:
+        """Whether the term is damping: an odd function of its own velocity alone.
+
+        Its parameter is then negative on a ship that nothing drives. The velocity
+        through the air counts as its own.
+        """
+        own = {self.state, f"{self.state}q"}
+        signals = {f.signal for f in self.factors}
+        plain = sum(not f.modulus for f in self.factors)
+        return len(signals) == 1 and signals <= own and plain % 2 == 1
+
     def __str__(self) -> str:
         return "·".join([self.name, *map(str, self.factors)])
 

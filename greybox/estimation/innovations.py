@@ -1,0 +1,232 @@
+"""Maximum likelihood with process noise: innovations of an extended Kalman filter.
+
+Parameters and initial states move by Gauss-Newton steps on the innovations, with
+the exact gradient of the likelihood; the variances of the measurements and of the
+process noise maximise the same likelihood in between.
+
+References
+----------
+Åström (1980), Maximum likelihood and prediction error methods, eq. 4.6; Ljung
+(1999), section 7.4.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.estimation.shooting import (
+    Linearised,
+    Measured,
+    Restrictions,
+    Segments,
+    ShootingFit,
+    cut,
+    fit_segments,
+    solve_step,
+)
+from greybox.model.output import Filter, OutputModel
+
+Array = NDArray[np.float64]
+
+_ROUNDS = 12
+_NOISE_STEPS = 4
+# change of a logarithm for its derivative, and the largest in a step
+_DIFFERENCE, _LARGEST = 1e-4, 3.0
+# change of every noise deviation, and of the cost, below which the alternation ends
+_SETTLED, _COST = 0.02, 1e-3
+# variances between these shares of a step's mean square
+_LOW, _HIGH = 1e-8, 10.0
+
+
+class FilterRuns:
+    """Innovations of logs side by side at given noise variances.
+
+    Parameters
+    ----------
+    model : OutputModel
+    segments : Segments
+        One a log, none joined.
+    noise : ndarray
+        (ny + nz,) variances of the measurements and of what is added a step.
+    """
+
+    def __init__(self, model: OutputModel, segments: Segments, noise: Array) -> None:
+        self.model = model
+        self.segments = segments
+        self.noise = noise
+        self._filter = Filter(model, segments.w, segments.y, segments.use)
+
+    def linearise(self, p: Array, nodes: Array) -> Linearised:
+        """Return innovations, their derivatives at fixed gains, and the exact gradient."""
+        r, rows, levels = self._filter(nodes, p, self.noise)
+        runs, _, columns, _ = rows.shape
+        _, by_start, by_p = self._filter.likelihood(nodes, p, self.noise)
+        downhill = np.zeros((runs, columns))
+        # the parameters are common to all logs: their gradient is counted once
+        downhill[0, : len(p)] = -by_p
+        downhill[:, len(p) :] = -by_start
+        nz = nodes.shape[1]
+        return Linearised(
+            r,
+            rows.transpose(0, 2, 1, 3).reshape(runs, columns, -1),
+            np.zeros((runs, nz)),
+            np.zeros((runs, columns, nz)),
+            float(levels.sum()) / 2,
+            downhill,
+        )
+
+    def value(self, p: Array, nodes: Array) -> tuple[Array, Array, float]:
+        """Return the innovations and half the sum of the logarithms of their variances."""
+        r, levels = self.filtered(p, nodes, self.noise)
+        return r, np.zeros_like(nodes), float(levels.sum()) / 2
+
+    def filtered(self, p: Array, nodes: Array, noise: Array) -> tuple[Array, Array]:
+        """Return innovations of unit variance and the logarithms of their variances."""
+        r, _, levels = self._filter(nodes, p, noise, sensitivities=False)
+        return r, levels
+
+    def with_noise(self, noise: Array) -> FilterRuns:
+        """Return the same logs with other variances."""
+        return FilterRuns(self.model, self.segments, noise)
+
+
+def fit_noise(runs: FilterRuns, p: Array, nodes: Array, known: Array) -> Array:
+    """Maximise the likelihood over the variances.
+
+    Parameters
+    ----------
+    runs : FilterRuns
+        Whose ``noise`` is the start.
+    p, nodes : ndarray
+        (q,) and (M, nz), held.
+    known : ndarray of bool
+        (ny + nz,) variances that stay as they are.
+
+    Returns
+    -------
+    ndarray
+        (ny + nz,)
+    """
+    free = np.flatnonzero(~known)
+    if not len(free):
+        return runs.noise
+    scale = _scale(runs.segments, nodes.shape[1])
+    low, high = np.log(_LOW * scale[free]), np.log(_HIGH * scale[free])
+
+    def at(logs: Array) -> tuple[float, Array, Array]:
+        noise = runs.noise.copy()
+        noise[free] = np.exp(logs)
+        r, levels = runs.filtered(p, nodes, noise)
+        value = (float((r**2).sum()) + float(levels.sum())) / 2
+        return (value if np.isfinite(value) else np.inf), r.ravel(), levels.ravel()
+
+    logs = np.clip(np.log(runs.noise[free]), low, high)
+    value, r, levels = at(logs)
+    for _ in range(_NOISE_STEPS):
+        by_r, by_level = np.empty((len(free), r.size)), np.empty((len(free), r.size))
+        for i in range(len(free)):
+            shifted = logs.copy()
+            shifted[i] += _DIFFERENCE
+            _, r_i, level_i = at(shifted)
+            by_level[i] = (level_i - levels) / _DIFFERENCE
+            # of the innovation itself, its deviation held
+            by_r[i] = (r_i - r) / _DIFFERENCE + r * by_level[i] / 2
+        # scoring: the expected second derivatives of the Gaussian likelihood
+        information = by_level @ by_level.T / 2 + by_r @ by_r.T
+        downhill = -(by_level @ (1 - r**2) / 2 + by_r @ r)
+        step = solve_step(
+            information,
+            downhill,
+            np.maximum(low - logs, -_LARGEST),
+            np.minimum(high - logs, _LARGEST),
+        )
+        for share in (1.0, 0.3, 0.1):
+            found = at(logs + share * step)
+            if found[0] < value:
+                break
+        else:
+            break
+        gained = value - found[0]
+        logs = logs + share * step
+        value, r, levels = found
+        if gained < _COST:
+            break
+    noise = runs.noise.copy()
+    noise[free] = np.exp(logs)
+    return noise
+
+
+def _scale(segments: Segments, nz: int) -> Array:
+    """Return the mean square of a step of each output, for outputs and for states."""
+    steps = np.diff(segments.y, axis=1)
+    both = segments.use[:, 1:, None]
+    size = (steps**2 * both).sum(axis=(0, 1)) / max(float(both.sum()), 1.0)
+    level = (segments.y**2).mean(axis=(0, 1))
+    size = np.maximum(size, np.maximum(1e-12 * level, 1e-300))
+    return np.concatenate([size, size[:nz]])
+
+
+def first_noise(logs: Sequence[Measured], nz: int) -> Array:
+    """Return variances to start from: a step's mean square, half and a tenth of it."""
+    scale = _scale(cut(logs, max(len(log.y) for log in logs)), nz)
+    share = np.full(len(scale), 0.5)
+    share[len(scale) - nz :] = 0.1
+    return np.asarray(share * scale)
+
+
+def fit_innovations(
+    model: OutputModel,
+    logs: Sequence[Measured],
+    p: Array,
+    *,
+    restrictions: Restrictions,
+    noise: Array | None = None,
+    known: NDArray[np.bool_] | None = None,
+) -> tuple[ShootingFit, FilterRuns]:
+    """Maximise the likelihood of the innovations over parameters, starts and variances.
+
+    Parameters
+    ----------
+    model : OutputModel
+    logs : sequence of Measured
+    p : ndarray
+        (q,) start.
+    restrictions : Restrictions
+    noise : ndarray, optional
+        (ny + nz,) first variances.
+    known : ndarray of bool, optional
+        Which of them are known and stay.
+
+    Returns
+    -------
+    tuple of (ShootingFit, FilterRuns)
+    """
+    nz = len(model.states)
+    whole = cut(logs, max(len(log.y) for log in logs))
+    noise = first_noise(logs, nz) if noise is None else noise
+    known = np.zeros(len(noise), bool) if known is None else known
+    runs = FilterRuns(model, whole, noise)
+    count = min(5, whole.y.shape[1])
+    nodes = np.asarray(whole.y[:, :count, :nz].mean(axis=1))
+    fit = ShootingFit(p, nodes, np.zeros((len(p), len(p))), np.inf, 0.0, 0, False)
+    total, before = 0, np.inf
+    for turn in range(_ROUNDS):
+        fit = fit_segments(runs, fit.p, fit.nodes, restrictions, most=3)
+        total += fit.iterations
+        again = fit_noise(runs, fit.p, fit.nodes, known)
+        moved = np.abs(np.log(again / runs.noise)) * _weight(again, runs.noise)
+        runs = runs.with_noise(again)
+        if (fit.converged and (moved < _SETTLED).all()) or abs(before - fit.cost) < _COST:
+            break
+        before = fit.cost
+    fit = fit_segments(runs, fit.p, fit.nodes, restrictions, most=8, tolerance=1e-3)
+    return replace(fit, iterations=total + fit.iterations), runs
+
+
+def _weight(noise: Array, before: Array) -> Array:
+    """Return how much each variance counts: one that is nearly nothing may move."""
+    return np.asarray(np.maximum(noise, before) > 1e-4 * np.maximum(noise, before).max(), float)

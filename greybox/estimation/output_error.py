@@ -1,0 +1,459 @@
+"""Output error and maximum likelihood: the free run itself is fitted to the log.
+
+Unknown besides the parameters are each log's initial state, the mean current, and
+what an unmeasured wind does (its moments are coefficients, as in chapter 5).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.errors import ExcitationError, LogError, UsageError, suggestion
+from greybox.estimation.covariance import correlation_lags, shared_score_covariance
+from greybox.estimation.innovations import FilterRuns, fit_innovations
+from greybox.estimation.result import Estimate
+from greybox.estimation.shooting import (
+    RANK,
+    FreeRuns,
+    Linearised,
+    Loss,
+    Measured,
+    Restrictions,
+    Segments,
+    ShootingFit,
+    fit_free_runs,
+    loss_weights,
+)
+from greybox.model.disturbances import CURRENT, WIND
+from greybox.model.noise import NoiseLevels
+from greybox.model.output import OutputModel, Role, Simulator, current_means
+from greybox.model.predictor import Predictor, Regime, build_predictor
+from greybox.model.structure import Structure
+from greybox.regression.regression import common_sample_time
+from greybox.trial.log import TrialLog
+
+Array = NDArray[np.float64]
+Shooting = Literal["auto", "single", "multiple"]
+Damping = Literal["warn", "enforce"]
+
+# coefficient of a parameter at its bound has no spread
+_AT_BOUND = 1e-9
+# samples per unknown that a fit needs
+_ROWS = 2
+
+
+@dataclass(frozen=True)
+class OutputErrorOptions:
+    """How an output-error estimate is made.
+
+    Parameters
+    ----------
+    process_noise : bool
+        Maximise the likelihood of the innovations instead of fitting free runs.
+    heading : {"input", "output"}
+        The measured heading drives the run, or is simulated and compared.
+    wind : {"input", "output"}
+        Likewise the measured wind; as an output it follows from a constant wind.
+    loss : {"gaussian", "huber"}
+        ``huber`` limits what single outliers can do.
+    shooting : {"auto", "single", "multiple"}
+    bounds : mapping of str to (float, float)
+        Limits of a parameter, by name.
+    priors : mapping of str to (float, float)
+        Mean and standard deviation known before, by name.
+    damping : {"warn", "enforce"}
+        Whether damping terms are kept from driving the ship.
+    covariance : {"ma", "hac", "white"}
+        ``ma``: residuals with a memory of their own, independent of the inputs;
+        ``hac``: robust also to a variance that changes; ``white``: none.
+    """
+
+    process_noise: bool = False
+    heading: Role = "input"
+    wind: Role = "input"
+    loss: Loss = "gaussian"
+    shooting: Shooting = "auto"
+    bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    priors: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    damping: Damping = "warn"
+    covariance: Literal["ma", "hac", "white"] = "ma"
+
+
+def output_predictor(structure: Structure, kind: str, regime: Regime) -> Predictor:
+    """Return the columns that output error estimates under a kind of predictor.
+
+    The mean current stands in the model itself; bias-capturing columns remain
+    for what an unmeasured wind does, with a constant in each equation.
+    """
+    if kind in ("basic", "basic+wind"):
+        return build_predictor(structure, kind, regime)
+    if kind == "wind":
+        return replace(build_predictor(structure, "basic+wind", regime), kind="wind")
+    if structure.disturbance != "marine" or not structure.uses_air:
+        return replace(build_predictor(structure, "basic", regime), kind=kind)
+    return build_predictor(structure, kind, regime, disturbances=WIND, intercept=True)
+
+
+def output_model(
+    predictor: Predictor, sample_time: float, heading: Role = "input", wind: Role = "input"
+) -> OutputModel:
+    """Return the simulator of a predictor's kind, its unknown means as parameters."""
+    means: tuple[str, ...] = ()
+    if predictor.kind in ("augmented", "wind"):
+        means = current_means(predictor)
+    if wind == "output":
+        means = (*means, *WIND)
+    return OutputModel(predictor, sample_time, heading, wind, means)
+
+
+def measured(model: OutputModel, log: TrialLog) -> Measured:
+    """Return what a log gives to a fit of `model`.
+
+    Raises
+    ------
+    LogError
+        The wind is asked for and was not measured.
+    """
+    structure = model.predictor.structure
+    needs = [n for n in (*model.drivers, *model.outputs) if n in ("u_q", "v_q")]
+    if needs and not log.has_wind:
+        raise LogError(
+            f"predictor '{model.predictor.kind}' needs the wind, and '{log.name}' has neither "
+            f"u_q, v_q nor V_q, gamma_q: use the predictor 'augmented' or 'basic'."
+        )
+    marine = structure.disturbance == "marine"
+    inputs = dict(
+        zip(structure.inputs, log.forces(structure.inputs).T, strict=True)
+        if marine
+        else ((n, log[n]) for n in structure.inputs)
+    )
+    def signal(name: str) -> Array:
+        if name in inputs:
+            return inputs[name]
+        # a structure without yaw may come with a log without heading
+        return log[name] if name in log or name != "psi" else np.zeros(len(log))
+
+    return Measured(
+        np.column_stack([signal(n) for n in model.drivers]),
+        np.column_stack([signal(n) for n in model.outputs]),
+    )
+
+
+def estimate_oe(
+    predictor: Predictor,
+    logs: Sequence[TrialLog],
+    *,
+    start: Array | Estimate | None = None,
+    options: OutputErrorOptions = OutputErrorOptions(),
+) -> Estimate:
+    """Fit free runs to logs, or maximise the likelihood of their innovations.
+
+    Parameters
+    ----------
+    predictor : Predictor
+        Of `output_predictor`.
+    logs : sequence of TrialLog
+        One experiment each, with an initial state of its own.
+    start : ndarray or Estimate, optional
+        (p,) parameters of the structure, or an estimate such as that of IV. By
+        default zero: short segments find the way from there.
+    options : OutputErrorOptions
+
+    Returns
+    -------
+    Estimate
+        ``status`` says how the iteration ended; ``current`` holds the means.
+
+    Raises
+    ------
+    ExcitationError
+        A combination of parameters leaves the run unchanged, or the log is too
+        short for the unknowns.
+    LogError
+        A channel is missing, or sample times differ.
+    UsageError
+        A bound or prior names no parameter, or cannot hold.
+
+    References
+    ----------
+    Ljung (1999), sections 7.2-7.4 and 9.4; Åström (1980).
+    """
+    model = output_model(predictor, common_sample_time(logs), options.heading, options.wind)
+    data = [measured(model, log) for log in logs]
+    _require_rows(model, data)
+    p0 = _first(model, start)
+    restrictions = _restrictions(model, options)
+    fit: ShootingFit
+    runs: FreeRuns | FilterRuns
+    fit, runs = fit_free_runs(
+        model, data, p0, restrictions=restrictions, loss=options.loss, shooting=options.shooting
+    )
+    if options.process_noise:
+        fit, runs = fit_innovations(model, data, fit.p, restrictions=restrictions)
+    if not np.isfinite(fit.cost):
+        raise ExcitationError(
+            f"the free run of {predictor.structure.name} leaves every bound from this start: give "
+            f"a stable model with --nominal, a smaller structure, or --method iv."
+        )
+    return _result(model, logs, data, fit, runs, restrictions, options)
+
+
+def _require_rows(model: OutputModel, data: Sequence[Measured]) -> None:
+    rows = sum(len(d.y) for d in data)
+    unknown = len(model.parameters) + len(data) * len(model.states)
+    most = _ROWS * unknown
+    if rows <= most or min(len(d.y) for d in data) < 3:
+        raise ExcitationError(
+            f"{rows} samples and {unknown} unknowns (parameters, disturbance means and initial "
+            f"states): more than {most} samples, and 3 in each log, are needed. Use a longer log "
+            f"or a smaller structure."
+        )
+
+
+def _first(model: OutputModel, start: Array | Estimate | None) -> Array:
+    predictor = model.predictor
+    p = np.zeros(len(model.parameters))
+    if start is None:
+        return p
+    known: dict[str, float] = {}
+    if isinstance(start, Estimate):
+        theta = start.structure_theta()
+        names = start.predictor.structure.parameters
+        known = {n: value for n, value, _ in start.current}
+    else:
+        theta, names = np.asarray(start, float), predictor.structure.parameters
+    values = dict(zip(names, theta, strict=True))
+    for i in predictor.parameter_columns:
+        p[i] = values.get(predictor.columns[i].terms[0], 0.0)
+    for i, name in enumerate(model.means):
+        p[len(predictor.columns) + i] = known.get(name, 0.0)
+    return p
+
+
+def _restrictions(model: OutputModel, options: OutputErrorOptions) -> Restrictions:
+    predictor = model.predictor
+    q = len(model.parameters)
+    names = {predictor.columns[i].name: i for i in predictor.parameter_columns}
+    names |= {n: len(predictor.columns) + i for i, n in enumerate(model.means)}
+    low, high = np.full(q, -np.inf), np.full(q, np.inf)
+    mean, precision = np.zeros(q), np.zeros(q)
+
+    def place(name: str, what: str) -> int:
+        if name not in names:
+            raise UsageError(
+                f"the {what} names '{name}', which is not estimated."
+                f"{suggestion(name, names)} Estimated are: {', '.join(names)}."
+            )
+        return names[name]
+
+    if options.damping == "enforce":
+        structure = predictor.structure
+        for i in predictor.parameter_columns:
+            if all(structure.terms[structure.index(t)].dissipates
+                   for t in predictor.columns[i].terms):  # fmt: skip
+                high[i] = 0.0
+    for name, (least, most) in options.bounds.items():
+        if not least < most:
+            raise UsageError(
+                f"the bounds of {name} are {least:g} and {most:g}: the first must be the smaller."
+            )
+        low[place(name, "bound")], high[place(name, "bound")] = least, most
+    for name, (value, std) in options.priors.items():
+        if not std > 0:
+            raise UsageError(f"the prior of {name} has the deviation {std:g}, it must be positive.")
+        i = place(name, "prior")
+        mean[i], precision[i] = value, 1 / std**2
+    return Restrictions(low, high, mean, precision)
+
+
+def log_rows(at: Linearised, segments: Segments, q: int) -> list[tuple[Array, Array]]:
+    """Return derivatives and residuals of each whole log, segments chained.
+
+    Returns
+    -------
+    list of tuple
+        (q + nz, N·ny) derivatives in the parameters and the log's first state,
+        and (N·ny,) residuals, channels of one sample together.
+    """
+    found = []
+    nz = at.rows.shape[1] - q
+    link = np.zeros((q + nz, nz))
+    rows: list[Array] = []
+    residuals: list[Array] = []
+    for j in range(len(at.r)):
+        if not rows:
+            link = np.vstack([np.zeros((q, nz)), np.eye(nz)])
+        samples = int(segments.use[j].sum())
+        width = at.r.shape[2]
+        own = link @ at.rows[j, q:]
+        own[:q] += at.rows[j, :q]
+        rows.append(own[:, : samples * width])
+        residuals.append(at.r[j, :samples].ravel())
+        slope = link @ at.slope[j, q:]
+        slope[:q] += at.slope[j, :q]
+        link = slope
+        if not segments.joined[j]:
+            found.append((np.hstack(rows), np.concatenate(residuals)))
+            rows, residuals = [], []
+    return found
+
+
+def without_start(rows: Array, q: int) -> Array:
+    """Return the part of the parameters' derivatives that the first state cannot imitate.
+
+    Parameters
+    ----------
+    rows : ndarray
+        (q + nz, n) of one log.
+
+    Returns
+    -------
+    ndarray
+        (q, n)
+    """
+    basis = rows[q:]
+    scale = np.sqrt((basis**2).sum(axis=1, keepdims=True))
+    left, values, _ = np.linalg.svd(basis / np.where(scale > 0, scale, 1.0), full_matrices=False)
+    known = values > 1e-10 * values.max(initial=0.0)
+    unit = (left[:, known] / values[known]).T @ (basis / np.where(scale > 0, scale, 1.0))
+    return np.asarray(rows[:q] - (rows[:q] @ unit.T) @ unit)
+
+
+def _result(
+    model: OutputModel,
+    logs: Sequence[TrialLog],
+    data: Sequence[Measured],
+    fit: ShootingFit,
+    runs: FreeRuns | FilterRuns,
+    restrictions: Restrictions,
+    options: OutputErrorOptions,
+) -> Estimate:
+    predictor = model.predictor
+    q, ny, nz = len(fit.p), len(model.outputs), len(model.states)
+    at = runs.linearise(fit.p, fit.nodes)
+    whole = log_rows(at, runs.segments, q)
+    rows = [without_start(r, q) for r, _ in whole]
+    residuals = [r for _, r in whole]
+    bound = (fit.p <= restrictions.low + _AT_BOUND) | (fit.p >= restrictions.high - _AT_BOUND)
+    loss: Loss = "gaussian" if options.process_noise else options.loss
+    hessian = sum(
+        (e * (loss_weights(r, loss) >= 1.0)) @ e.T for e, r in zip(rows, residuals, strict=True)
+    ) + np.diag(restrictions.precision)
+    _require_known(model, np.asarray(hessian), bound)
+    scores = [
+        (e.reshape(q, -1, ny), (loss_weights(r, loss) * r).reshape(-1, ny))
+        for e, r in zip(rows, residuals, strict=True)
+    ]
+    lags = 0
+    if options.covariance != "white":
+        lags = max(correlation_lags([s[:, i] for _, s in scores]) for i in range(ny))
+    middle = shared_score_covariance(scores, options.covariance, lags)
+    samples = sum(len(d.y) for d in data)
+    unknown = q + nz * len(data)
+    # degrees of freedom, as a regression counts them
+    middle *= samples * ny / max(samples * ny - unknown, 1)
+    covariance = _sandwich(np.asarray(hessian), middle + np.diag(restrictions.precision), bound)
+    count = len(predictor.columns)
+    means = {n: (fit.p[count + i], covariance[count + i, count + i] ** 0.5)
+             for i, n in enumerate(model.means)}  # fmt: skip
+    status = (
+        f"converged after {fit.iterations} iterations"
+        if fit.converged
+        else f"no longer improved after {fit.iterations} iterations"
+    )
+    if len(runs.segments.use) > len(data):
+        status += f", {len(runs.segments.use)} segments joined within {fit.gap:.1g} noise deviations"
+    own = predictor.structure.states
+    notes = []
+    held = [n for n, b in zip(model.parameters, bound, strict=True) if b]
+    if held:
+        notes.append(f"{', '.join(held)} ended at a bound; its standard error is not known.")
+    return Estimate(
+        predictor=predictor,
+        method="oe",
+        theta=fit.p[:count],
+        covariance=covariance[:count, :count],
+        residual_std=_one_step(model, data, fit.p)[: len(own)],
+        vessel=logs[0].vessel,
+        sample_time=model.sample_time,
+        samples=samples,
+        kept=samples,
+        covariance_kind=options.covariance,
+        lags=lags,
+        iterations=fit.iterations,
+        status=status,
+        current=tuple((n, float(v), float(s)) for n, (v, s) in means.items() if n in CURRENT),
+        noise=_noise_levels(model, runs),
+        notes=tuple(notes),
+        logs=tuple(
+            {"name": log.name, "sha256": log.provenance.sha256, "samples": len(log)} for log in logs
+        ),
+    )
+
+
+def _require_known(model: OutputModel, hessian: Array, bound: NDArray[np.bool_]) -> None:
+    free = np.flatnonzero(~bound)
+    scale = np.sqrt(np.maximum(np.diag(hessian)[free], 0.0))
+    names = [model.parameters[i] for i in free]
+    if not (scale > 0).all():
+        lost = [n for n, s in zip(names, scale, strict=True) if not s > 0]
+        raise ExcitationError(
+            f"parameter {', '.join(lost)} leaves the run unchanged over the whole log: move what "
+            f"it multiplies, or leave it out."
+        )
+    unit = hessian[np.ix_(free, free)] / np.outer(scale, scale)
+    values, vectors = np.linalg.eigh((unit + unit.T) / 2)
+    if values[0] > RANK * values[-1]:
+        return
+    size = np.abs(vectors[:, 0])
+    involved = [names[i] for i in np.argsort(-size) if size[i] > 0.2]
+    raise ExcitationError(
+        f"{', '.join(involved)} cannot be told apart by the free run (relative eigenvalue "
+        f"{max(values[0] / values[-1], 0):.1e}, needs {RANK:.0e}): excite them separately, leave "
+        f"one out, or give one a prior (--prior NAME=VALUE:STD)."
+    )
+
+
+def _sandwich(hessian: Array, middle: Array, bound: NDArray[np.bool_]) -> Array:
+    free = np.flatnonzero(~bound)
+    scale = 1 / np.sqrt(np.diag(hessian)[free])
+    part = np.ix_(free, free)
+    inverse = np.linalg.inv(hessian[part] * np.outer(scale, scale)) * np.outer(scale, scale)
+    out = np.zeros_like(hessian)
+    out[part] = inverse @ middle[part] @ inverse
+    return (out + out.T) / 2
+
+
+def _one_step(model: OutputModel, data: Sequence[Measured], p: Array) -> Array:
+    """Return the deviation of the one-step errors from the measured states, (nz,)."""
+    nz = len(model.states)
+    total, count = np.zeros(nz), 0
+    for log in data:
+        _, end = Simulator(model, log.w[:-1, None])(log.y[:-1, :nz], p)
+        total += ((log.y[1:, :nz] - end) ** 2).sum(axis=0)
+        count += len(end)
+    return np.sqrt(total / max(count, 1))
+
+
+def _noise_levels(model: OutputModel, runs: FreeRuns | FilterRuns) -> NoiseLevels:
+    states, ny = model.predictor.structure.states, len(model.outputs)
+    if isinstance(runs, FilterRuns):
+        sigma, process = np.sqrt(runs.noise[:ny]), np.sqrt(runs.noise[ny:])
+        source = "likelihood of the innovations"
+    else:
+        sigma, process = runs.sigma, np.zeros(len(model.states))
+        source = "residuals of the free run, process noise taken as none"
+    seen = dict(zip(model.outputs, sigma, strict=True))
+    return NoiseLevels(
+        states,
+        np.array([seen[s] for s in states]),
+        process[: len(states)],
+        float(seen.get("psi", 0.0)),
+        float(seen.get("u_q", 0.0)),
+        source,
+    )

@@ -1,0 +1,559 @@
+"""Gauss-Newton on free runs: one shot, or many segments that must join.
+
+Each segment starts from its own unknown state; where a segment continues another
+the end of the one must meet the start of the next. The linearised problem,
+
+    minimise ½‖r − J_p δp − J_s δs‖²  subject to  c + F_p δp + F_s δs − δs⁺ = 0,
+
+is reduced to the parameters by a sparse solve for the starts and multipliers, so
+that an unstable model costs no more than a stable one. Normal equations add over
+segments and logs.
+
+References
+----------
+Bock (1983), generalised Gauss-Newton for multiple shooting; Nocedal and Wright
+(2006), Numerical Optimization, sections 10.3 and 18.3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import block_diag, bmat, csc_matrix
+from scipy.sparse.linalg import splu
+
+from greybox.model.output import OutputModel, Simulator
+
+Array = NDArray[np.float64]
+Loss = Literal["gaussian", "huber"]
+
+# a step shorter than this many standard errors ends the iteration
+TOLERANCE = 1e-6
+# starts and ends of segments meet within this many noise deviations
+_JOINED = 1e-6
+_MOST = 60
+_HUBER = 1.345
+# relative singular value of the scaled normal equations below which a direction is unknown
+RANK = 1e-10
+# segments of a log, and samples that a segment has at least
+_SEGMENTS, _LEAST = 64, 50
+# samples of the segments that a start far off is first fitted to
+_SHORT = 10
+# noise-free signals still need a scale
+_FLOOR = 1e-9
+_DAMPING_LIMIT = 1e8
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What one log gives to a fit: drivers w (N, nw) and measured outputs y (N, ny)."""
+
+    w: Array
+    y: Array
+
+
+@dataclass(frozen=True)
+class Segments:
+    """Logs cut into segments of m samples, the last ones padded.
+
+    Parameters
+    ----------
+    w, y : ndarray
+        (M, m, nw) and (M, m, ny).
+    use : ndarray
+        (M, m) 1 where a sample belongs to a log.
+    joined : ndarray of bool
+        (M,) whether the next segment continues this one.
+    """
+
+    w: Array
+    y: Array
+    use: Array
+    joined: NDArray[np.bool_]
+
+
+def cut(logs: Sequence[Measured], steps: int, *, joined_up: bool = True) -> Segments:
+    """Cut logs into segments of `steps` samples, to be joined or each by itself."""
+    w, y, use, joined = [], [], [], []
+    for log in logs:
+        samples = len(log.y)
+        count = -(-samples // steps)
+        for j in range(count):
+            index = np.minimum(np.arange(j * steps, (j + 1) * steps), samples - 1)
+            w.append(log.w[index])
+            y.append(log.y[index])
+            use.append((np.arange(j * steps, (j + 1) * steps) < samples).astype(float))
+            joined.append(joined_up and j + 1 < count)
+    return Segments(np.array(w), np.array(y), np.array(use), np.array(joined))
+
+
+def segment_length(logs: Sequence[Measured]) -> int:
+    """Return the samples of a segment for multiple shooting."""
+    longest = max(len(log.y) for log in logs)
+    total = sum(len(log.y) for log in logs)
+    return min(longest, max(_LEAST, -(-total // _SEGMENTS)))
+
+
+@dataclass(frozen=True)
+class Restrictions:
+    """Bounds and priors of the parameters.
+
+    Parameters
+    ----------
+    low, high : ndarray
+        (q,)
+    mean, precision : ndarray
+        (q,) of independent Gaussian priors; precision 0 where there is none.
+    """
+
+    low: Array
+    high: Array
+    mean: Array
+    precision: Array
+
+    def penalty(self, p: Array) -> float:
+        """Return the priors' share of the cost."""
+        return 0.5 * float(self.precision @ (p - self.mean) ** 2)
+
+
+def unrestricted(q: int) -> Restrictions:
+    """Return no bounds and no priors."""
+    return Restrictions(np.full(q, -np.inf), np.full(q, np.inf), np.zeros(q), np.zeros(q))
+
+
+@dataclass(frozen=True)
+class Linearised:
+    """Weighted residuals and rows of every segment at one point.
+
+    ``r`` (M, m, ny) residuals in noise deviations; ``rows`` (M, q + nz, m·ny)
+    derivatives of the outputs in the same units; ``end`` (M, nz) and ``slope``
+    (M, q + nz, nz) of the states after each segment; ``level`` what the
+    likelihood adds beside the squares; ``downhill`` (M, q + nz) the negative
+    gradient where it is not ``rows @ r``.
+    """
+
+    r: Array
+    rows: Array
+    end: Array
+    slope: Array
+    level: float = 0.0
+    downhill: Array | None = None
+
+
+class Runs(Protocol):
+    """What the iteration asks of a problem."""
+
+    segments: Segments
+
+    def linearise(self, p: Array, nodes: Array) -> Linearised:
+        """Return residuals and derivatives at parameters (q,) and starts (M, nz)."""
+
+    def value(self, p: Array, nodes: Array) -> tuple[Array, Array, float]:
+        """Return residuals, ends and level without derivatives."""
+
+
+class FreeRuns:
+    """Free runs of an output model on segments, weighted by the noise of each output.
+
+    Parameters
+    ----------
+    model : OutputModel
+    segments : Segments
+    sigma : ndarray
+        (ny,) noise of each output.
+    """
+
+    def __init__(self, model: OutputModel, segments: Segments, sigma: Array) -> None:
+        self.model = model
+        self.segments = segments
+        self.sigma = sigma
+        self._simulator = Simulator(model, segments.w)
+
+    def with_sigma(self, sigma: Array) -> FreeRuns:
+        """Return the same runs with other weights."""
+        return FreeRuns(self.model, self.segments, sigma)
+
+    def _weighted(self, y: Array) -> Array:
+        use = self.segments.use[..., None] > 0
+        # padding may run away, its weight must not
+        error = np.where(use, self.segments.y - y, 0.0)
+        return np.asarray(error / self.sigma)
+
+    def linearise(self, p: Array, nodes: Array) -> Linearised:
+        """Return residuals and derivatives at parameters (q,) and starts (M, nz)."""
+        y, rows, end, slope = self._simulator.sensitivities(nodes, p)
+        used = np.where(self.segments.use[:, :, None, None] > 0, rows, 0.0) / self.sigma
+        runs, _, columns, _ = used.shape
+        return Linearised(
+            self._weighted(y), used.transpose(0, 2, 1, 3).reshape(runs, columns, -1), end, slope
+        )
+
+    def value(self, p: Array, nodes: Array) -> tuple[Array, Array, float]:
+        """Return residuals, ends and level without derivatives."""
+        y, end = self._simulator(nodes, p)
+        return self._weighted(y), end, 0.0
+
+
+@dataclass(frozen=True)
+class ShootingFit:
+    """Where the iteration ended.
+
+    Parameters
+    ----------
+    p : ndarray
+        (q,)
+    nodes : ndarray
+        (M, nz) start of each segment.
+    hessian : ndarray
+        (q, q) of the cost in the parameters, starts eliminated, priors included.
+    cost : float
+    gap : float
+        Largest distance between the end of a segment and the next start, in
+        noise deviations.
+    iterations : int
+    converged : bool
+    """
+
+    p: Array
+    nodes: Array
+    hessian: Array
+    cost: float
+    gap: float
+    iterations: int
+    converged: bool
+
+
+def loss_weights(r: Array, loss: Loss) -> Array:
+    """Return the weight of each squared residual (iteratively reweighted)."""
+    if loss == "gaussian":
+        return np.ones_like(r)
+    return np.asarray(np.minimum(1.0, _HUBER / np.maximum(np.abs(r), 1e-12)))
+
+
+def loss_value(r: Array, loss: Loss) -> float:
+    """Return the sum of the losses of residuals in noise deviations."""
+    # a run that escapes is no error here, only worse than any other
+    with np.errstate(over="ignore", invalid="ignore"):
+        if loss == "gaussian":
+            return 0.5 * float((r**2).sum())
+        size = np.abs(r)
+        return float(np.where(size <= _HUBER, 0.5 * r**2, _HUBER * (size - _HUBER / 2)).sum())
+
+
+@dataclass(frozen=True)
+class _Reduced:
+    """The linearised problem in the parameters alone."""
+
+    hessian: Array
+    gradient: Array
+    starts: Array
+    starts_by_p: Array
+    multipliers: Array
+    multipliers_by_p: Array
+    gap: Array
+
+
+def _reduce(at: Linearised, segments: Segments, nodes: Array, q: int, loss: Loss) -> _Reduced:
+    runs, nz = nodes.shape
+    flat = at.r.reshape(runs, -1)
+    weighted = at.rows * loss_weights(flat, loss)[:, None, :]
+    normal = weighted @ at.rows.transpose(0, 2, 1)
+    right = (weighted @ flat[..., None])[..., 0] if at.downhill is None else at.downhill
+    own = block_diag(list(normal[:, q:, q:]), format="csc")
+    cross = normal[:, q:, :q].reshape(runs * nz, q)
+    links = np.flatnonzero(segments.joined)
+    gap = (at.end - np.roll(nodes, -1, axis=0))[links]
+    size = len(links) * nz
+    by_p = at.slope[links][:, :q].transpose(0, 2, 1).reshape(size, q)
+    matrix = own
+    if size:
+        place = np.arange(size).reshape(len(links), nz)
+        rows = np.repeat(place[:, :, None], nz, axis=2).ravel()
+        before = (links[:, None] * nz + np.arange(nz))[:, None, :].repeat(nz, axis=1).ravel()
+        values = at.slope[links][:, q:].transpose(0, 2, 1).ravel()
+        after = ((links + 1)[:, None] * nz + np.arange(nz)).ravel()
+        join = csc_matrix((values, (rows, before)), shape=(size, runs * nz)) - csc_matrix(
+            (np.ones(size), (place.ravel(), after)), shape=(size, runs * nz)
+        )
+        matrix = bmat([[own, join.T], [join, None]], format="csc")
+    sides = np.vstack(
+        [
+            np.column_stack([right[:, q:].ravel(), cross]),
+            np.column_stack([-gap.ravel(), by_p]),
+        ]
+    )
+    solved = splu(matrix).solve(sides)
+    starts, multipliers = solved[: runs * nz], solved[runs * nz :]
+    hessian = normal[:, :q, :q].sum(axis=0) - cross.T @ starts[:, 1:] - by_p.T @ multipliers[:, 1:]
+    gradient = right[:, :q].sum(axis=0) - cross.T @ starts[:, 0] - by_p.T @ multipliers[:, 0]
+    return _Reduced(
+        (hessian + hessian.T) / 2,
+        gradient,
+        starts[:, 0].reshape(runs, nz),
+        starts[:, 1:].reshape(runs, nz, q),
+        multipliers[:, 0],
+        multipliers[:, 1:],
+        gap,
+    )
+
+
+def solve_step(
+    hessian: Array, gradient: Array, low: Array, high: Array, damping: float = 0.0
+) -> Array:
+    """Minimise ½ δᵀHδ − gᵀδ within bounds, in the directions that are known.
+
+    Parameters
+    ----------
+    hessian : ndarray
+        (q, q) positive semidefinite.
+    gradient : ndarray
+        (q,)
+    low, high : ndarray
+        (q,) bounds on δ.
+    damping : float
+        Levenberg-Marquardt share added to the diagonal.
+    """
+    scale = np.sqrt(np.maximum(np.diag(hessian), 0.0))
+    scale[scale == 0] = 1.0
+    unit = hessian / np.outer(scale, scale)
+    values, vectors = np.linalg.eigh((unit + unit.T) / 2)
+    values = np.where(values > RANK * values[-1], values, np.inf) + damping
+    root = vectors / np.sqrt(values)
+    step = (root @ (root.T @ (gradient / scale))) / scale
+    if (step >= low).all() and (step <= high).all():
+        return np.asarray(step)
+    from scipy.optimize import lsq_linear
+
+    known = np.isfinite(values)
+    factor = np.sqrt(values[known])[:, None] * vectors[:, known].T
+    target = (vectors[:, known].T @ (gradient / scale)) / np.sqrt(values[known])
+    # a direction that nothing determines stays where it is
+    factor = np.vstack([factor, 1e-6 * np.eye(len(gradient))])
+    target = np.concatenate([target, np.zeros(len(gradient))])
+    solved = lsq_linear(factor, target, bounds=(low * scale, high * scale), method="bvls")
+    return np.clip(solved.x / scale, low, high)
+
+
+def _scales(runs: Runs, nz: int) -> Array:
+    """Return the noise of each simulated state, (nz,), to weigh gaps with."""
+    sigma = getattr(runs, "sigma", None)
+    return np.ones(nz) if sigma is None else np.asarray(sigma[:nz])
+
+
+def fit_segments(
+    runs: Runs,
+    p: Array,
+    nodes: Array,
+    restrictions: Restrictions,
+    *,
+    loss: Loss = "gaussian",
+    most: int = _MOST,
+    tolerance: float = TOLERANCE,
+) -> ShootingFit:
+    """Minimise the cost over parameters and starts, segments joined.
+
+    Parameters
+    ----------
+    runs : Runs
+    p : ndarray
+        (q,) first parameters.
+    nodes : ndarray
+        (M, nz) first starts.
+    restrictions : Restrictions
+    loss : {"gaussian", "huber"}
+    most : int
+        Iterations at most.
+    tolerance : float
+        Length of the last step in standard errors.
+
+    Returns
+    -------
+    ShootingFit
+        ``converged`` False where no step lowered the cost any more or `most` were taken.
+    """
+    segments = runs.segments
+    p = np.clip(p, restrictions.low, restrictions.high)
+    links = np.flatnonzero(segments.joined)
+    scale = _scales(runs, nodes.shape[1])
+    weight, damping, done = 0.0, 0.0, False
+    iteration = 0
+    at = runs.linearise(p, nodes)
+    hessian = np.zeros((len(p), len(p)))
+
+    def merit(r: Array, end: Array, level: float, p: Array, nodes: Array) -> float:
+        cost = loss_value(r, loss) + level + restrictions.penalty(p)
+        gap = (end - np.roll(nodes, -1, axis=0))[links] / scale
+        total = cost + weight * float(np.abs(gap).sum())
+        return total if np.isfinite(total) else np.inf
+
+    for iteration in range(1, most + 1):
+        if not (np.isfinite(at.rows).all() and np.isfinite(at.slope).all()):
+            break
+        reduced = _reduce(at, segments, nodes, len(p), loss)
+        hessian = reduced.hessian + np.diag(restrictions.precision)
+        gradient = reduced.gradient - restrictions.precision * (p - restrictions.mean)
+        accepted = False
+        while damping < _DAMPING_LIMIT:
+            step = solve_step(
+                hessian, gradient, restrictions.low - p, restrictions.high - p, damping
+            )
+            shift = reduced.starts - reduced.starts_by_p @ step
+            if len(links):
+                multipliers = reduced.multipliers - reduced.multipliers_by_p @ step
+                sized = np.abs(multipliers.reshape(len(links), -1) * scale)
+                weight = max(weight, 2.0 * float(sized.max()))
+            gap = float(np.abs(reduced.gap / scale).max(initial=0.0))
+            length = float(np.sqrt(max(step @ hessian @ step, 0.0)))
+            if length < tolerance and gap < _JOINED:
+                done = True
+                break
+            now = merit(at.r, at.end, at.level, p, nodes)
+            for share in (1.0, 0.5, 0.25, 0.1):
+                r, end, level = runs.value(p + share * step, nodes + share * shift)
+                if merit(r, end, level, p + share * step, nodes + share * shift) < now:
+                    accepted = True
+                    break
+            if accepted:
+                p, nodes = p + share * step, nodes + share * shift
+                damping = 0.0 if share == 1.0 and damping < 1e-6 else damping / 10
+                break
+            # nothing to gain beyond rounding
+            if length < 1e-3 and gap < _JOINED:
+                done = True
+                break
+            damping = max(10 * damping, 1e-6)
+        if done or not accepted:
+            break
+        at = runs.linearise(p, nodes)
+    gap = float(np.abs((at.end - np.roll(nodes, -1, axis=0))[links] / scale).max(initial=0.0))
+    cost = loss_value(at.r, loss) + at.level + restrictions.penalty(p)
+    return ShootingFit(p, nodes, hessian, cost, gap, iteration, done)
+
+
+def noise_of(r: Array, sigma: Array, use: Array, loss: Loss, floor: Array) -> Array:
+    """Return the noise of each output from weighted residuals r (M, m, ny)."""
+    errors = (r * sigma)[use > 0]
+    if loss == "gaussian":
+        found = np.sqrt((errors**2).mean(axis=0))
+    else:
+        found = 1.4826 * np.median(np.abs(errors), axis=0)
+    return np.asarray(np.maximum(found, floor))
+
+
+def fit_free_runs(
+    model: OutputModel,
+    logs: Sequence[Measured],
+    p: Array,
+    *,
+    restrictions: Restrictions | None = None,
+    loss: Loss = "gaussian",
+    sigma: Array | None = None,
+    shooting: Literal["auto", "single", "multiple"] = "auto",
+) -> tuple[ShootingFit, FreeRuns]:
+    """Fit parameters and initial states to logs; the noise of each output with them.
+
+    Segments first, from the measured states: a model far off, or unstable,
+    cannot run away within one. Then whole runs, where they stay bounded.
+
+    Parameters
+    ----------
+    model : OutputModel
+    logs : sequence of Measured
+    p : ndarray
+        (q,) start.
+    restrictions : Restrictions, optional
+    loss : {"gaussian", "huber"}
+    sigma : ndarray, optional
+        (ny,) noise of each output, known; by default estimated (its likelihood
+        concentrated: the residuals' own deviation).
+    shooting : {"auto", "single", "multiple"}
+        ``multiple`` ends with segments, ``single`` begins with whole runs.
+
+    Returns
+    -------
+    tuple of (ShootingFit, FreeRuns)
+    """
+    restrictions = unrestricted(len(p)) if restrictions is None else restrictions
+    floor = _FLOOR * np.maximum(
+        np.sqrt(np.mean([(log.y**2).mean(axis=0) for log in logs], axis=0)), _FLOOR
+    )
+    first = np.sqrt(np.mean([(np.diff(log.y, axis=0) ** 2).mean(axis=0) for log in logs], axis=0))
+    weights = np.maximum(first, floor) if sigma is None else sigma
+    steps = segment_length(logs)
+    longest = max(len(log.y) for log in logs)
+    nz = len(model.states)
+    fit: ShootingFit | None = None
+    if shooting != "single":
+        # a few samples ahead every model is nearly linear in its parameters
+        short = cut(logs, min(_SHORT, longest), joined_up=False)
+        near, _ = _settle(
+            FreeRuns(model, short, weights), p, _starts(short, nz), restrictions, loss,
+            sigma is None, floor, rounds=3,
+        )  # fmt: skip
+        p = near.p
+    if shooting != "single" and (steps < longest or shooting == "multiple"):
+        segments = cut(logs, steps)
+        fit, runs = _settle(
+            FreeRuns(model, segments, weights), p, _starts(segments, nz),
+            restrictions, loss, sigma is None, floor,
+        )  # fmt: skip
+        p = fit.p
+        weights = runs.sigma
+        if shooting == "multiple":
+            return fit, runs
+    whole = cut(logs, longest)
+    starts = _starts(whole, nz)
+    if fit is not None:
+        begin = np.flatnonzero(np.append(True, ~segments.joined[:-1]))
+        starts = fit.nodes[begin]
+    single, single_runs = _settle(
+        FreeRuns(model, whole, weights), p, starts, restrictions, loss, sigma is None, floor
+    )
+    if fit is None or single.converged:
+        return single, single_runs
+    return fit, runs
+
+
+def _starts(segments: Segments, nz: int) -> Array:
+    """Return the mean of the first samples of each segment, (M, nz)."""
+    count = min(5, segments.y.shape[1])
+    use = segments.use[:, :count, None]
+    return np.asarray((segments.y[:, :count, :nz] * use).sum(axis=1) / use.sum(axis=1))
+
+
+def _settle(
+    runs: FreeRuns,
+    p: Array,
+    nodes: Array,
+    restrictions: Restrictions,
+    loss: Loss,
+    estimate_noise: bool,
+    floor: Array,
+    rounds: int = 12,
+) -> tuple[ShootingFit, FreeRuns]:
+    """Alternate between the fit and the noise of the outputs until both stay."""
+    if not estimate_noise:
+        return fit_segments(runs, p, nodes, restrictions, loss=loss), runs
+    total = 0
+    fit = ShootingFit(p, nodes, np.zeros((len(p), len(p))), np.inf, np.inf, 0, False)
+    for turn in range(rounds):
+        # a few steps at a time while the weights are still rough
+        fit = fit_segments(
+            runs, fit.p, fit.nodes, restrictions, loss=loss, most=4 if turn < 5 else _MOST
+        )
+        total += fit.iterations
+        r, _, _ = runs.value(fit.p, fit.nodes)
+        if not np.isfinite(r).all():
+            break
+        sigma = noise_of(r, runs.sigma, runs.segments.use, loss, floor)
+        if fit.converged and (np.abs(sigma / runs.sigma - 1) < 1e-8).all():
+            break
+        stuck = not fit.converged and fit.iterations < 4
+        runs = runs.with_sigma(sigma)
+        if stuck and turn > 5:
+            break
+    return replace(fit, iterations=total), runs
