@@ -17,6 +17,9 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 CovarianceKind = Literal["hac", "ma", "white"]
 
+# of the draws of `memory_correction`, and the most that it may multiply a variance by
+_SEED, _CORRECTION = 11, 9.0
+
 
 def correlation_lags(residuals: Sequence[Array], largest: int | None = None) -> int:
     """Return the lag after which the autocorrelation stays insignificant.
@@ -148,19 +151,121 @@ def shared_score_covariance(
                 block = product[:, lag:] @ product[:, : product.shape[1] - lag].T
                 total += flat_top(lag, lags) * (block if lag == 0 else block + block.T)
         return _positive(total)
-    ny = scores[0][1].shape[1]
-    samples = sum(len(r) for _, r in scores)
-    reach = min(2 * lags, max(len(r) for _, r in scores) - 1)
-    # gamma[lag] = mean of r(k + lag) r(k)ᵀ over all experiments
-    gamma = np.zeros((reach + 1, ny, ny))
-    for lag in range(reach + 1):
-        for _, r in scores:
-            if len(r) > lag:
-                gamma[lag] += r[lag:].T @ r[: len(r) - lag]
-    gamma *= np.array([flat_top(lag, lags) for lag in range(reach + 1)])[:, None, None] / samples
+    gamma = autocovariance([r for _, r in scores], lags)
     for rows, r in scores:
         total += _filtered_products(rows, gamma[: len(r)])
     return _positive(total)
+
+
+def autocovariance(residuals: Sequence[Array], lags: int) -> Array:
+    """Return the flat-top estimate of E r(k + lag) r(k)ᵀ, (2·lags + 1, ny, ny).
+
+    Parameters
+    ----------
+    residuals : sequence of ndarray
+        (N, ny) an uninterrupted stretch each.
+    lags : int
+        Memory in samples.
+    """
+    from scipy.fft import irfft, next_fast_len, rfft
+
+    ny = residuals[0].shape[1]
+    samples = sum(len(r) for r in residuals)
+    reach = min(2 * lags, max(len(r) for r in residuals) - 1)
+    gamma = np.zeros((reach + 1, ny, ny))
+    for r in residuals:
+        size = next_fast_len(len(r) + reach + 1, real=True)
+        spectrum = rfft(r, size, axis=0)
+        products = irfft(spectrum[:, :, None] * spectrum.conj()[:, None, :], size, axis=0)
+        gamma += products[: reach + 1]
+    weight = np.array([flat_top(lag, lags) for lag in range(reach + 1)])
+    return np.asarray(gamma * weight[:, None, None] / samples)
+
+
+def memory_correction(
+    rows: Sequence[Array], hessian: Array, residuals: Sequence[Array], lags: int, *, draws: int = 40
+) -> Array:
+    """Return by how much the fit hides the memory of its residuals from the standard errors.
+
+    A fit bends towards slow errors, so the residuals show less of them than there
+    is. Errors are drawn with the autocovariance found, fitted likewise to first
+    order, and the estimate of the standard errors compared with the one that the
+    drawing used.
+
+    Parameters
+    ----------
+    rows : sequence of ndarray
+        (q, N, ny) derivatives of each experiment.
+    hessian : ndarray
+        (q, q) Σ E Eᵀ.
+    residuals : sequence of ndarray
+        (N, ny) of each experiment.
+    lags : int
+    draws : int
+
+    Returns
+    -------
+    ndarray
+        (q,) factors of at least 1 on the standard errors.
+    """
+    rng = np.random.default_rng(_SEED)
+    gamma = autocovariance(residuals, lags)
+    roots = [_spectral_root(gamma, len(r)) for r in residuals]
+    inverse = np.linalg.pinv(hessian, hermitian=True)
+    moved = [np.einsum("ij,jkc->ikc", inverse, e) for e in rows]
+    products = [_lagged_products(e, len(gamma)) for e in moved]
+
+    def variance(g: Array) -> Array:
+        return np.asarray(sum(np.einsum("lab,qlab->q", g[: c.shape[1]], c) for c in products))
+
+    found = np.zeros(len(hessian))
+    for _ in range(draws):
+        errors = [_draw(rng, root, len(r)) for root, r in zip(roots, residuals, strict=True)]
+        shift = sum(np.einsum("qkc,kc->q", e, r) for e, r in zip(moved, errors, strict=True))
+        left = [r - np.einsum("qkc,q->kc", e, shift) for e, r in zip(rows, errors, strict=True)]
+        found += np.maximum(variance(autocovariance(left, lags)), 0.0)
+    truth = np.maximum(variance(gamma), 0.0)
+    ratio = truth * draws / np.maximum(found, 1e-300)
+    return np.asarray(np.sqrt(np.clip(ratio, 1.0, _CORRECTION)))
+
+
+def _spectral_root(gamma: Array, samples: int) -> NDArray[np.complex128]:
+    """Return a root of the spectrum of an autocovariance on a circle, (F, ny, ny)."""
+    from scipy.fft import next_fast_len, rfft
+
+    size = 2 * next_fast_len(samples // 2 + len(gamma), real=True)
+    kernel = np.zeros((size, *gamma.shape[1:]))
+    kernel[: len(gamma)] = gamma
+    kernel[size - len(gamma) + 1 :] = gamma[:0:-1].transpose(0, 2, 1)
+    values, vectors = np.linalg.eigh(rfft(kernel, axis=0))
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :])
+
+
+def _draw(rng: np.random.Generator, root: NDArray[np.complex128], samples: int) -> Array:
+    """Draw (samples, ny) with the spectrum whose root is given."""
+    from scipy.fft import irfft, rfft
+
+    size = 2 * (len(root) - 1)
+    white = rfft(rng.standard_normal((size, root.shape[1])), axis=0)
+    return np.asarray(irfft(np.einsum("fab,fb->fa", root, white), size, axis=0)[:samples])
+
+
+def _lagged_products(rows: Array, reach: int) -> Array:
+    """Return C with Σ_lag Σ_ab γ_ab(lag) C_lab,q the variance that γ gives, (q, reach, ny, ny)."""
+    from scipy.fft import irfft, next_fast_len, rfft
+
+    q, samples, ny = rows.shape
+    reach = min(reach, samples)
+    size = next_fast_len(samples + reach, real=True)
+    spectrum = rfft(rows, size, axis=1)
+    out = np.empty((q, reach, ny, ny))
+    for a in range(ny):
+        for b in range(ny):
+            product = irfft(spectrum[:, :, a] * spectrum[:, :, b].conj(), size, axis=1)
+            out[:, :, a, b] = product[:, :reach]
+    # both signs of every lag but the first
+    out[:, 1:] *= 2.0
+    return out
 
 
 def _filtered_products(rows: Array, gamma: Array) -> Array:

@@ -14,7 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import ExcitationError, LogError, UsageError, suggestion
-from greybox.estimation.covariance import correlation_lags, shared_score_covariance
+from greybox.estimation.covariance import (
+    correlation_lags,
+    memory_correction,
+    shared_score_covariance,
+)
 from greybox.estimation.innovations import FilterRuns, fit_innovations
 from greybox.estimation.result import Estimate
 from greybox.estimation.shooting import (
@@ -352,12 +356,17 @@ def _result(
     lags = 0
     if options.covariance != "white":
         lags = max(correlation_lags([s[:, i] for _, s in scores]) for i in range(ny))
+        # a weak but long memory stays below every single lag's limit
+        lags = max(lags, round(min(len(d.y) for d in data) ** (1 / 3)))
     middle = shared_score_covariance(scores, options.covariance, lags)
     samples = sum(len(d.y) for d in data)
     unknown = q + nz * len(data)
     # degrees of freedom, as a regression counts them
     middle *= samples * ny / max(samples * ny - unknown, 1)
     covariance = _sandwich(np.asarray(hessian), middle + np.diag(restrictions.precision), bound)
+    if options.covariance == "ma" and lags:
+        factor = memory_correction([s[0] for s in scores], np.asarray(hessian), [s[1] for s in scores], lags)
+        covariance *= np.outer(factor, factor)
     count = len(predictor.columns)
     means = {n: (fit.p[count + i], covariance[count + i, count + i] ** 0.5)
              for i, n in enumerate(model.means)}  # fmt: skip
