@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import replace
+from typing import Literal
 
 from greybox.commands.common import add_logs, add_seed, positive, provenance, read_logs, say
 
@@ -11,6 +12,7 @@ HELP = "estimate a model from logs"
 EXAMPLES = """examples:
   greybox estimate trial.csv --vessel ship.toml --out model.json
   greybox estimate a.csv b.csv --vessel ship.toml --method iv --predictor augmented --out m.json
+  greybox estimate trial.csv --vessel ship.toml --method oe --bound Xu=-0.2:0 --out m.json
   greybox estimate trial.csv --vessel ship.toml --structure 'thesis+N_|r|r-Xkappa' --out m.json
 """
 
@@ -18,7 +20,11 @@ EXAMPLES = """examples:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_logs(parser)
-    parser.add_argument("--method", choices=("ls", "iv"), help="by default chosen, and said why")
+    parser.add_argument(
+        "--method",
+        choices=("ls", "iv", "oe"),
+        help="least squares, instrumental variables, output error; by default chosen, and said why",
+    )
     parser.add_argument(
         "--predictor",
         choices=("basic", "augmented", "wind", "basic+wind"),
@@ -45,8 +51,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--heading",
         choices=("measured", "simulated"),
-        default="measured",
-        help="heading inside the instruments",
+        help="heading inside the instruments (measured); with oe whether it drives the run, or is "
+        "simulated and compared (chosen)",
     )
     parser.add_argument(
         "--instruments",
@@ -57,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--nominal",
         metavar="MODEL",
-        help="model that simulates the first instruments (least squares by default)",
+        help="model that simulates the first instruments, or starts oe (least squares by default)",
     )
     parser.add_argument(
         "--loop",
@@ -70,6 +76,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=("ma", "hac", "white", "bootstrap"),
         help="standard errors: moving average (iv), robust (ls), white, block bootstrap",
     )
+    _add_output_error(parser)
     parser.add_argument(
         "--mass", type=positive, metavar="KG", help="mass, for physical coefficients"
     )
@@ -78,8 +85,80 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_seed(parser)
 
 
+def _add_output_error(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("output error (--method oe)")
+    group.add_argument(
+        "--process-noise",
+        action="store_true",
+        help="estimate what moves the ship beside the model too: likelihood of the innovations",
+    )
+    group.add_argument(
+        "--wind",
+        choices=("measured", "simulated"),
+        default="measured",
+        help="wind that drives the run, or a constant one that is compared (measured)",
+    )
+    group.add_argument(
+        "--loss", choices=("gaussian", "huber"), default="gaussian", help="huber resists outliers"
+    )
+    group.add_argument(
+        "--shooting",
+        choices=("auto", "single", "multiple"),
+        default="auto",
+        help="whole runs, or segments that join, for long or unstable logs",
+    )
+    group.add_argument(
+        "--bound",
+        nargs="+",
+        default=[],
+        metavar="NAME=LOW:HIGH",
+        help="limits of parameters, such as Xu=-0.2:0",
+    )
+    group.add_argument(
+        "--prior",
+        nargs="+",
+        default=[],
+        metavar="NAME=VALUE:STD",
+        help="what was known of parameters before, such as Nr=-0.1:0.02",
+    )
+    group.add_argument(
+        "--damping",
+        choices=("warn", "enforce"),
+        default="warn",
+        help="enforce keeps damping terms from driving the ship",
+    )
+
+
+def _pairs(texts: list[str], what: str) -> dict[str, tuple[float, float]]:
+    """Read NAME=A:B."""
+    from greybox.errors import UsageError
+
+    found = {}
+    for text in texts:
+        name, _, values = text.partition("=")
+        try:
+            first, second = (float(v) for v in values.split(":"))
+        except ValueError:
+            raise UsageError(
+                f"--{what} '{text}' cannot be read: write NAME={_FORMS[what]}, such as "
+                f"{_EXAMPLES[what]}."
+            ) from None
+        found[name] = (first, second)
+    return found
+
+
+_FORMS = {"bound": "LOW:HIGH", "prior": "VALUE:STD"}
+_EXAMPLES = {"bound": "Xu=-0.2:0", "prior": "Nr=-0.1:0.02"}
+_ROLES: dict[str | None, Literal["auto", "input", "output"]] = {
+    None: "auto",
+    "measured": "input",
+    "simulated": "output",
+}
+
+
 def run(options: argparse.Namespace) -> None:
     """Read, estimate, report, write."""
+    from greybox.estimation.output_error import OutputErrorOptions
     from greybox.files import check_targets, write_json
     from greybox.model.catalogue import get_structure
     from greybox.model.model import load_model
@@ -101,7 +180,17 @@ def run(options: argparse.Namespace) -> None:
             structure=options.structure,
             margins=margins or None,
             covariance=options.covariance,
-            heading=options.heading,
+            heading=options.heading or "measured",
+            output_error=OutputErrorOptions(
+                process_noise=options.process_noise,
+                heading=_ROLES[options.heading],
+                wind="output" if options.wind == "simulated" else "input",
+                loss=options.loss,
+                shooting=options.shooting,
+                bounds=_pairs(options.bound, "bound"),
+                priors=_pairs(options.prior, "prior"),
+                damping=options.damping,
+            ),
             loop=options.loop,
             zero_mean=options.instruments == "zero-mean",
             nominal=load_model(options.nominal) if options.nominal else None,

@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 CovarianceKind = Literal["hac", "ma", "white"]
 
+# cycles a log below which power counts as slow
+_CORNERS = (8.0, 24.0, 72.0)
 # of the draws of `memory_correction`, and the most that it may multiply a variance by
 _SEED, _CORRECTION = 11, 9.0
 
@@ -226,7 +228,7 @@ def memory_correction(
         found += np.maximum(variance(autocovariance(left, lags)), 0.0)
     truth = np.maximum(variance(gamma), 0.0)
     ratio = truth * draws / np.maximum(found, 1e-300)
-    return np.asarray(np.sqrt(np.clip(ratio, 1.0, _CORRECTION)))
+    return np.asarray(np.sqrt(np.clip(ratio, 1.0, _CORRECTION)), float)
 
 
 def _spectral_root(gamma: Array, samples: int) -> NDArray[np.complex128]:
@@ -375,3 +377,65 @@ def block_bootstrap(
     a = np.tensordot(counts, np.array(information), axes=1)
     b = counts @ np.array(right)
     return np.asarray(np.linalg.solve(a, b[..., None])[..., 0])
+
+
+def slow_errors(
+    rows: Sequence[Array], hessian: Array, residuals: Sequence[Array], *, draws: int = 99
+) -> tuple[Array, Array]:
+    """Test whether free-run errors wander, channel by channel.
+
+    The statistic is the power below one of some corner frequencies. White noise is
+    drawn and fitted to first order with the same derivatives, because a fit removes most
+    of what is slow.
+
+    Parameters
+    ----------
+    rows : sequence of ndarray
+        (q, N, ny) derivatives of each experiment, in noise deviations.
+    hessian : ndarray
+        (q, q) Σ E Eᵀ.
+    residuals : sequence of ndarray
+        (N, ny) of each experiment.
+    draws : int
+
+    Returns
+    -------
+    tuple of ndarray
+        (ny,) how many standard deviations of the drawn powers the power lies above
+        their mean, and (ny,) Monte Carlo p-values, multiples of 1/(draws + 1).
+
+    References
+    ----------
+    Barnard (1963), Monte Carlo tests.
+    """
+    rng = np.random.default_rng(_SEED)
+    inverse = np.linalg.pinv(hessian, hermitian=True)
+
+    def power(errors: Sequence[Array]) -> Array:
+        out = np.zeros((len(_CORNERS), errors[0].shape[1]))
+        for r in errors:
+            spectrum = np.abs(np.fft.rfft(r, axis=0)) ** 2
+            cycles = np.arange(len(spectrum))
+            for i, corner in enumerate(_CORNERS):
+                out[i] += (1 / (1 + (cycles / corner) ** 2)) @ spectrum
+        level = np.sum([(r**2).sum(axis=0) for r in errors], axis=0)
+        return np.asarray(out / np.maximum(level, 1e-300))
+
+    drawn = [power(residuals)]
+    for _ in range(draws):
+        errors = [rng.standard_normal(r.shape) for r in residuals]
+        shift = inverse @ sum(
+            e.reshape(len(e), -1) @ r.ravel() for e, r in zip(rows, errors, strict=True)
+        )
+        drawn.append(
+            power(
+                [
+                    r - (shift @ e.reshape(len(e), -1)).reshape(r.shape)
+                    for e, r in zip(rows, errors, strict=True)
+                ]
+            )
+        )
+    values = np.array(drawn)
+    spread = values[1:].std(axis=0)
+    most = ((values - values[1:].mean(axis=0)) / np.where(spread > 0, spread, 1.0)).max(axis=1)
+    return most[0], (1 + (most[1:] >= most[0]).sum(axis=0)) / (1 + draws)

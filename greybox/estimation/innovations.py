@@ -94,7 +94,7 @@ class FilterRuns:
         return FilterRuns(self.model, self.segments, noise)
 
 
-def fit_noise(runs: FilterRuns, p: Array, nodes: Array, known: Array) -> Array:
+def fit_noise(runs: FilterRuns, p: Array, nodes: Array, known: NDArray[np.bool_]) -> Array:
     """Maximise the likelihood over the variances.
 
     Parameters
@@ -214,7 +214,7 @@ def fit_innovations(
     nodes = np.asarray(whole.y[:, :count, :nz].mean(axis=1))
     fit = ShootingFit(p, nodes, np.zeros((len(p), len(p))), np.inf, 0.0, 0, False)
     total, before = 0, np.inf
-    for turn in range(_ROUNDS):
+    for _ in range(_ROUNDS):
         fit = fit_segments(runs, fit.p, fit.nodes, restrictions, most=3)
         total += fit.iterations
         again = fit_noise(runs, fit.p, fit.nodes, known)

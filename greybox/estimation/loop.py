@@ -37,7 +37,7 @@ def assess_loop(
     Parameters
     ----------
     logs : sequence of TrialLog
-    method : {"iv", "ls"}
+    method : {"iv", "ls", "oe"}
     loop : {"open", "closed", "auto"}
         ``auto`` follows the mode column that the vessel file names in
         ``[closed_loop]``; without one the logs count as open loop.
@@ -57,6 +57,9 @@ def assess_loop(
                 f"so instruments are delayed by {CLOSED_LOOP_LAG} samples; that removes the "
                 f"dependence on measurement noise, not on slow gusts. "
                 if method == "iv"
+                else "which a free run that is driven by the commands feels only through process "
+                "noise. "
+                if method == "oe"
                 else "and least squares has nothing against it: its bias is not known. "
             )
             + "Prefer a trial with open-loop commands."

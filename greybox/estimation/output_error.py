@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -18,9 +19,11 @@ from greybox.estimation.covariance import (
     correlation_lags,
     memory_correction,
     shared_score_covariance,
+    slow_errors,
 )
+from greybox.estimation.estimate import UnexcitedBiasError
 from greybox.estimation.innovations import FilterRuns, fit_innovations
-from greybox.estimation.result import Estimate
+from greybox.estimation.result import Estimate, TestResult
 from greybox.estimation.shooting import (
     RANK,
     FreeRuns,
@@ -45,10 +48,18 @@ Array = NDArray[np.float64]
 Shooting = Literal["auto", "single", "multiple"]
 Damping = Literal["warn", "enforce"]
 
+# sensitivities beyond this are no numbers to compute with
+_LARGEST = 1e100
+# weight in an unknown direction from which on a bias-capturing column can be left out
+_SHARES = 0.2
 # coefficient of a parameter at its bound has no spread
 _AT_BOUND = 1e-9
 # samples per unknown that a fit needs
 _ROWS = 2
+# p-value up to which a free-run error counts as wandering
+_WANDERS = 0.01
+# deviations above what a fit to white noise leaves, from which on the heading drifts
+_DRIFTS = 5.0
 
 
 @dataclass(frozen=True)
@@ -59,8 +70,10 @@ class OutputErrorOptions:
     ----------
     process_noise : bool
         Maximise the likelihood of the innovations instead of fitting free runs.
-    heading : {"input", "output"}
-        The measured heading drives the run, or is simulated and compared.
+    heading : {"auto", "input", "output"}
+        The measured heading drives the run, or is simulated and compared. ``auto``
+        compares it unless its error wanders, as it does where something beside
+        the model turns the ship.
     wind : {"input", "output"}
         Likewise the measured wind; as an output it follows from a constant wind.
     loss : {"gaussian", "huber"}
@@ -78,7 +91,7 @@ class OutputErrorOptions:
     """
 
     process_noise: bool = False
-    heading: Role = "input"
+    heading: Literal["auto", "input", "output"] = "auto"
     wind: Role = "input"
     loss: Loss = "gaussian"
     shooting: Shooting = "auto"
@@ -136,9 +149,10 @@ def measured(model: OutputModel, log: TrialLog) -> Measured:
         if marine
         else ((n, log[n]) for n in structure.inputs)
     )
+
     def signal(name: str) -> Array:
         if name in inputs:
-            return inputs[name]
+            return np.asarray(inputs[name])
         # a structure without yaw may come with a log without heading
         return log[name] if name in log or name != "psi" else np.zeros(len(log))
 
@@ -187,24 +201,96 @@ def estimate_oe(
     ----------
     Ljung (1999), sections 7.2-7.4 and 9.4; Åström (1980).
     """
-    model = output_model(predictor, common_sample_time(logs), options.heading, options.wind)
-    data = [measured(model, log) for log in logs]
-    _require_rows(model, data)
-    p0 = _first(model, start)
-    restrictions = _restrictions(model, options)
-    fit: ShootingFit
-    runs: FreeRuns | FilterRuns
-    fit, runs = fit_free_runs(
-        model, data, p0, restrictions=restrictions, loss=options.loss, shooting=options.shooting
-    )
-    if options.process_noise:
-        fit, runs = fit_innovations(model, data, fit.p, restrictions=restrictions)
-    if not np.isfinite(fit.cost):
+    fitted = _fit(predictor, logs, start, options)
+    if not (np.isfinite(fitted.fit.cost) and fitted.bounded):
         raise ExcitationError(
             f"the free run of {predictor.structure.name} leaves every bound from this start: give "
             f"a stable model with --nominal, a smaller structure, or --method iv."
         )
-    return _result(model, logs, data, fit, runs, restrictions, options)
+    return _result(fitted, logs, options)
+
+
+@dataclass(frozen=True)
+class _Fitted:
+    """A model with its data and where its fit ended."""
+
+    model: OutputModel
+    data: Sequence[Measured]
+    fit: ShootingFit
+    runs: FreeRuns | FilterRuns
+    restrictions: Restrictions
+    loss: Loss
+
+    @property
+    def bounded(self) -> bool:
+        """Whether the run and all its derivatives are finite numbers."""
+        at = self.runs.linearise(self.fit.p, self.fit.nodes)
+        return bool(np.isfinite(at.r).all() and (np.abs(at.rows) < _LARGEST).all())
+
+    @cached_property
+    def rows(self) -> list[tuple[Array, Array]]:
+        """Derivatives (q, N, ny) without the first state's, and residuals (N, ny), a log."""
+        q, ny = len(self.fit.p), len(self.model.outputs)
+        whole = log_rows(self.runs.linearise(self.fit.p, self.fit.nodes), self.runs.segments, q)
+        return [(without_start(e, q).reshape(q, -1, ny), r.reshape(-1, ny)) for e, r in whole]
+
+    @cached_property
+    def hessian(self) -> Array:
+        """Σ E Eᵀ over the samples whose loss is quadratic, with the priors, (q, q)."""
+        total = np.diag(self.restrictions.precision)
+        for e, r in self.rows:
+            counted = e * (loss_weights(r, self.loss) >= 1.0)
+            total = total + counted.reshape(len(e), -1) @ e.reshape(len(e), -1).T
+        return total
+
+    @cached_property
+    def slow(self) -> dict[str, tuple[float, float]]:
+        """How much errors wander and with which p-value, by output."""
+        z, p = slow_errors([e for e, _ in self.rows], self.hessian, [r for _, r in self.rows])
+        pairs = [(float(a), float(b)) for a, b in zip(z, p, strict=True)]
+        return dict(zip(self.model.outputs, pairs, strict=True))
+
+
+def _fit(
+    predictor: Predictor,
+    logs: Sequence[TrialLog],
+    start: Array | Estimate | None,
+    options: OutputErrorOptions,
+) -> _Fitted:
+    sample_time = common_sample_time(logs)
+
+    def free_run(heading: Role, p: Array | None, shooting: Shooting) -> _Fitted:
+        model = output_model(predictor, sample_time, heading, options.wind)
+        data = [measured(model, log) for log in logs]
+        _require_rows(model, data)
+        restrictions = _restrictions(model, options)
+        fit, runs = fit_free_runs(
+            model, data, _first(model, start) if p is None else p,
+            restrictions=restrictions, loss=options.loss, shooting=shooting,
+        )  # fmt: skip
+        return _Fitted(model, data, fit, runs, restrictions, options.loss)
+
+    structure = predictor.structure
+    turns = "r" in structure.states and structure.disturbance == "marine"
+    seen = turns and all("psi" in log for log in logs)
+    heading = options.heading
+    if heading != "auto":
+        found = free_run(heading, None, options.shooting)
+    else:
+        found = free_run("input", None, options.shooting)
+        if seen and found.fit.converged:
+            compared = free_run("output", found.fit.p, "single")
+            steady = compared.fit.converged and np.isfinite(compared.fit.cost)
+            if steady and (
+                options.process_noise or max(compared.slow[n][0] for n in ("r", "psi")) < _DRIFTS
+            ):
+                found = compared
+    if not options.process_noise:
+        return found
+    fit, runs = fit_innovations(
+        found.model, found.data, found.fit.p, restrictions=found.restrictions
+    )
+    return _Fitted(found.model, found.data, fit, runs, found.restrictions, "gaussian")
 
 
 def _require_rows(model: OutputModel, data: Sequence[Measured]) -> None:
@@ -328,44 +414,29 @@ def without_start(rows: Array, q: int) -> Array:
     return np.asarray(rows[:q] - (rows[:q] @ unit.T) @ unit)
 
 
-def _result(
-    model: OutputModel,
-    logs: Sequence[TrialLog],
-    data: Sequence[Measured],
-    fit: ShootingFit,
-    runs: FreeRuns | FilterRuns,
-    restrictions: Restrictions,
-    options: OutputErrorOptions,
-) -> Estimate:
-    predictor = model.predictor
+def _result(fitted: _Fitted, logs: Sequence[TrialLog], options: OutputErrorOptions) -> Estimate:
+    model, data, fit, runs = fitted.model, fitted.data, fitted.fit, fitted.runs
+    predictor, restrictions = model.predictor, fitted.restrictions
     q, ny, nz = len(fit.p), len(model.outputs), len(model.states)
-    at = runs.linearise(fit.p, fit.nodes)
-    whole = log_rows(at, runs.segments, q)
-    rows = [without_start(r, q) for r, _ in whole]
-    residuals = [r for _, r in whole]
     bound = (fit.p <= restrictions.low + _AT_BOUND) | (fit.p >= restrictions.high - _AT_BOUND)
-    loss: Loss = "gaussian" if options.process_noise else options.loss
-    hessian = sum(
-        (e * (loss_weights(r, loss) >= 1.0)) @ e.T for e, r in zip(rows, residuals, strict=True)
-    ) + np.diag(restrictions.precision)
-    _require_known(model, np.asarray(hessian), bound)
-    scores = [
-        (e.reshape(q, -1, ny), (loss_weights(r, loss) * r).reshape(-1, ny))
-        for e, r in zip(rows, residuals, strict=True)
-    ]
+    _require_known(model, fitted.hessian, bound)
+    rows = [e for e, _ in fitted.rows]
+    residuals = [loss_weights(r, fitted.loss) * r for _, r in fitted.rows]
     lags = 0
     if options.covariance != "white":
-        lags = max(correlation_lags([s[:, i] for _, s in scores]) for i in range(ny))
-        # a weak but long memory stays below every single lag's limit
-        lags = max(lags, round(min(len(d.y) for d in data) ** (1 / 3)))
-    middle = shared_score_covariance(scores, options.covariance, lags)
+        lags = max(correlation_lags([r[:, i] for r in residuals]) for i in range(ny))
+        if not options.process_noise:
+            # a weak but long memory stays below every single lag's limit
+            lags = max(lags, round(min(len(r) for r in residuals) ** (1 / 3)))
+    middle = shared_score_covariance(
+        list(zip(rows, residuals, strict=True)), options.covariance, lags
+    )
     samples = sum(len(d.y) for d in data)
-    unknown = q + nz * len(data)
     # degrees of freedom, as a regression counts them
-    middle *= samples * ny / max(samples * ny - unknown, 1)
-    covariance = _sandwich(np.asarray(hessian), middle + np.diag(restrictions.precision), bound)
+    middle *= samples * ny / max(samples * ny - q - nz * len(data), 1)
+    covariance = _sandwich(fitted.hessian, middle + np.diag(restrictions.precision), bound)
     if options.covariance == "ma" and lags:
-        factor = memory_correction([s[0] for s in scores], np.asarray(hessian), [s[1] for s in scores], lags)
+        factor = memory_correction(rows, fitted.hessian, residuals, lags)
         covariance *= np.outer(factor, factor)
     count = len(predictor.columns)
     means = {n: (fit.p[count + i], covariance[count + i, count + i] ** 0.5)
@@ -376,12 +447,16 @@ def _result(
         else f"no longer improved after {fit.iterations} iterations"
     )
     if len(runs.segments.use) > len(data):
-        status += f", {len(runs.segments.use)} segments joined within {fit.gap:.1g} noise deviations"
+        status += (
+            f", {len(runs.segments.use)} segments joined within {fit.gap:.1g} noise deviations"
+        )
     own = predictor.structure.states
     notes = []
     held = [n for n, b in zip(model.parameters, bound, strict=True) if b]
     if held:
         notes.append(f"{', '.join(held)} ended at a bound; its standard error is not known.")
+    if "psi" in model.outputs:
+        notes.append("the heading was simulated and compared with the measured one.")
     return Estimate(
         predictor=predictor,
         method="oe",
@@ -399,18 +474,47 @@ def _result(
         current=tuple((n, float(v), float(s)) for n, (v, s) in means.items() if n in CURRENT),
         noise=_noise_levels(model, runs),
         notes=tuple(notes),
+        tests=() if options.process_noise else _slow_tests(fitted.slow),
         logs=tuple(
             {"name": log.name, "sha256": log.provenance.sha256, "samples": len(log)} for log in logs
         ),
     )
 
 
+def _slow_tests(slow: Mapping[str, tuple[float, float]]) -> tuple[TestResult, ...]:
+    out = []
+    for name, (z, p) in slow.items():
+        found = (
+            "wanders more than a fit to white noise would: something beside the model moves the "
+            "ship; the standard errors allow for it, and --process-noise estimates with it."
+            if p <= _WANDERS
+            else "shows no slow part beyond noise."
+        )
+        out.append(
+            TestResult(
+                f"slow_errors_{name}",
+                f"the free-run error of {name} is white: nothing beside the model moves it",
+                z,
+                p,
+                f"the free-run error of {name} {found}",
+            )
+        )
+    return tuple(out)
+
+
 def _require_known(model: OutputModel, hessian: Array, bound: NDArray[np.bool_]) -> None:
     free = np.flatnonzero(~bound)
     scale = np.sqrt(np.maximum(np.diag(hessian)[free], 0.0))
     names = [model.parameters[i] for i in free]
+
+    def require_parameter(column: int) -> None:
+        columns = model.predictor.columns
+        if column < len(columns) and columns[column].is_bias:
+            raise UnexcitedBiasError(column, model.parameters[column])
+
     if not (scale > 0).all():
         lost = [n for n, s in zip(names, scale, strict=True) if not s > 0]
+        require_parameter(int(free[np.argmin(scale)]))
         raise ExcitationError(
             f"parameter {', '.join(lost)} leaves the run unchanged over the whole log: move what "
             f"it multiplies, or leave it out."
@@ -421,6 +525,9 @@ def _require_known(model: OutputModel, hessian: Array, bound: NDArray[np.bool_])
         return
     size = np.abs(vectors[:, 0])
     involved = [names[i] for i in np.argsort(-size) if size[i] > 0.2]
+    for i in np.argsort(-size):
+        if size[i] > _SHARES:
+            require_parameter(int(free[i]))
     raise ExcitationError(
         f"{', '.join(involved)} cannot be told apart by the free run (relative eigenvalue "
         f"{max(values[0] / values[-1], 0):.1e}, needs {RANK:.0e}): excite them separately, leave "

@@ -45,6 +45,8 @@ _SEGMENTS, _LEAST = 64, 50
 _SHORT = 10
 # noise-free signals still need a scale
 _FLOOR = 1e-9
+# a run this many times beyond the largest measured value has escaped
+_ESCAPED = 1e3
 _DAMPING_LIMIT = 1e8
 
 
@@ -172,6 +174,7 @@ class FreeRuns:
         self.segments = segments
         self.sigma = sigma
         self._simulator = Simulator(model, segments.w)
+        self._bound = _ESCAPED * np.abs(segments.y).max(axis=(0, 1), initial=0.0) + _ESCAPED * sigma
 
     def with_sigma(self, sigma: Array) -> FreeRuns:
         """Return the same runs with other weights."""
@@ -179,14 +182,16 @@ class FreeRuns:
 
     def _weighted(self, y: Array) -> Array:
         use = self.segments.use[..., None] > 0
-        # padding may run away, its weight must not
+        # padding may run away, its weight must not; a run that escapes has no cost at all
         error = np.where(use, self.segments.y - y, 0.0)
-        return np.asarray(error / self.sigma)
+        bounded = (np.abs(error) <= self._bound).all()
+        return np.asarray(error / self.sigma) if bounded else np.full_like(error, np.inf)
 
     def linearise(self, p: Array, nodes: Array) -> Linearised:
         """Return residuals and derivatives at parameters (q,) and starts (M, nz)."""
         y, rows, end, slope = self._simulator.sensitivities(nodes, p)
-        used = np.where(self.segments.use[:, :, None, None] > 0, rows, 0.0) / self.sigma
+        with np.errstate(over="ignore", invalid="ignore"):
+            used = np.where(self.segments.use[:, :, None, None] > 0, rows, 0.0) / self.sigma
         runs, _, columns, _ = used.shape
         return Linearised(
             self._weighted(y), used.transpose(0, 2, 1, 3).reshape(runs, columns, -1), end, slope
@@ -335,7 +340,7 @@ def solve_step(
     factor = np.vstack([factor, 1e-6 * np.eye(len(gradient))])
     target = np.concatenate([target, np.zeros(len(gradient))])
     solved = lsq_linear(factor, target, bounds=(low * scale, high * scale), method="bvls")
-    return np.clip(solved.x / scale, low, high)
+    return np.asarray(np.clip(solved.x / scale, low, high))
 
 
 def _scales(runs: Runs, nz: int) -> Array:
@@ -380,18 +385,20 @@ def fit_segments(
     links = np.flatnonzero(segments.joined)
     scale = _scales(runs, nodes.shape[1])
     weight, damping, done = 0.0, 0.0, False
-    iteration = 0
+    taken = 0
     at = runs.linearise(p, nodes)
     hessian = np.zeros((len(p), len(p)))
 
     def merit(r: Array, end: Array, level: float, p: Array, nodes: Array) -> float:
         cost = loss_value(r, loss) + level + restrictions.penalty(p)
-        gap = (end - np.roll(nodes, -1, axis=0))[links] / scale
-        total = cost + weight * float(np.abs(gap).sum())
+        with np.errstate(over="ignore", invalid="ignore"):
+            gap = (end - np.roll(nodes, -1, axis=0))[links] / scale
+            total = cost + weight * float(np.abs(gap).sum())
         return total if np.isfinite(total) else np.inf
 
-    for iteration in range(1, most + 1):
-        if not (np.isfinite(at.rows).all() and np.isfinite(at.slope).all()):
+    while taken < most:
+        taken += 1
+        if not all(np.isfinite(a).all() for a in (at.r, at.rows, at.slope)):
             break
         reduced = _reduce(at, segments, nodes, len(p), loss)
         hessian = reduced.hessian + np.diag(restrictions.precision)
@@ -407,7 +414,7 @@ def fit_segments(
                 sized = np.abs(multipliers.reshape(len(links), -1) * scale)
                 weight = max(weight, 2.0 * float(sized.max()))
             gap = float(np.abs(reduced.gap / scale).max(initial=0.0))
-            length = float(np.sqrt(max(step @ hessian @ step, 0.0)))
+            length = float(np.sqrt(max(float(step @ hessian @ step), 0.0)))
             if length < tolerance and gap < _JOINED:
                 done = True
                 break
@@ -429,9 +436,10 @@ def fit_segments(
         if done or not accepted:
             break
         at = runs.linearise(p, nodes)
-    gap = float(np.abs((at.end - np.roll(nodes, -1, axis=0))[links] / scale).max(initial=0.0))
+    with np.errstate(over="ignore", invalid="ignore"):
+        gap = float(np.abs((at.end - np.roll(nodes, -1, axis=0))[links] / scale).max(initial=0.0))
     cost = loss_value(at.r, loss) + at.level + restrictions.penalty(p)
-    return ShootingFit(p, nodes, hessian, cost, gap, iteration, done)
+    return ShootingFit(p, nodes, hessian, cost, gap, taken, done)
 
 
 def noise_of(r: Array, sigma: Array, use: Array, loss: Loss, floor: Array) -> Array:

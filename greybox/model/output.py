@@ -139,7 +139,9 @@ def _step(model: OutputModel) -> _Step:
     regressors = structure.regressors(air_measured=predictor.air_measured)
     at_zero = predictor.expressions
     # biases capture what the means do not; wind that is not measured is in them
-    unknown_wind = [] if predictor.air_measured else [n for n in WIND if n in structure.disturbances]
+    unknown_wind = (
+        [] if predictor.air_measured else [n for n in WIND if n in structure.disturbances]
+    )
     calm = [s.d[structure.disturbances.index(n)] for n in unknown_wind]
     rows = [ca.SX(0)] * len(names)
     for i, column in enumerate(predictor.columns):
@@ -150,9 +152,7 @@ def _step(model: OutputModel) -> _Step:
     change = ca.substitute(
         ca.vertcat(*rows),
         ca.vertcat(s.x, s.psi, s.tau, s.d, s.air),
-        ca.vertcat(
-            z[: len(names)], heading, *[given[n] for n in structure.inputs], *d, air
-        ),
+        ca.vertcat(z[: len(names)], heading, *[given[n] for n in structure.inputs], *d, air),
     )
     after = z[: len(names)] + change if structure.increment else change
     if model.heading == "output":
@@ -407,7 +407,6 @@ class Filter:
         _evaluate(function, (z0, np.zeros((runs, nz, nz)), first, self._w, p, noise), out)
         return out[3], out[4], out[5]
 
-
     def likelihood(self, z0: Array, p: Array, noise: Array) -> tuple[float, Array, Array]:
         """Return the negative log-likelihood and its derivatives, gains included.
 
@@ -431,9 +430,7 @@ class Filter:
         return float(out[0][0]), out[1], out[2]
 
 
-def _evaluate(
-    function: ca.Function, arguments: tuple[Array, ...], out: tuple[Array, ...]
-) -> None:
+def _evaluate(function: ca.Function, arguments: tuple[Array, ...], out: tuple[Array, ...]) -> None:
     buffer, trigger = function.buffer()
     held = [np.ascontiguousarray(a, float) for a in arguments]
     for i, a in enumerate(held):

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.errors import ExcitationError, GreyboxError, LogError
+from greybox.errors import DivergenceError, ExcitationError, GreyboxError, LogError, UsageError
 from greybox.estimation.estimate import (
     Covariance,
     UnexcitedBiasError,
@@ -17,6 +17,11 @@ from greybox.estimation.estimate import (
     estimate_ls,
 )
 from greybox.estimation.loop import CLOSED_LOOP_LAG, Loop, assess_loop
+from greybox.estimation.output_error import (
+    OutputErrorOptions,
+    estimate_oe,
+    output_predictor,
+)
 from greybox.estimation.result import Estimate
 from greybox.model.catalogue import structure_for
 from greybox.model.model import ManoeuvringModel
@@ -60,7 +65,8 @@ class Request:
     """What to estimate; None leaves the choice to the data.
 
     ``margins`` are |u|, |v| [m/s] below which samples are cut out; ``nominal``
-    simulates the first instruments (least squares does without it).
+    simulates the first instruments, or starts output error (least squares does
+    without it); ``output_error`` is what only ``oe`` heeds.
     """
 
     method: str | None = None
@@ -73,6 +79,7 @@ class Request:
     zero_mean: bool = True
     refine: bool | int = True
     nominal: ManoeuvringModel | None = None
+    output_error: OutputErrorOptions = field(default_factory=OutputErrorOptions)
     seed: int = 0
 
 
@@ -163,6 +170,8 @@ def estimate_once(
         A channel is missing.
     """
     require_informative(logs, kind)
+    if method == "oe":
+        return _estimate_oe(logs, structure, kind, request)
     closed, loop_test = assess_loop(logs, request.loop, method)
     common: dict[str, Any] = {"margins": request.margins, "seed": request.seed}
     if request.covariance is not None:
@@ -213,6 +222,49 @@ def estimate_once(
     return replace(estimate, tests=(*estimate.tests, loop_test), notes=tuple(notes))
 
 
+def _estimate_oe(
+    logs: Sequence[TrialLog], structure: Structure, kind: str, request: Request
+) -> Estimate:
+    """Fit free runs, from the nominal model, else from an estimate by IV or least squares."""
+    if request.margins:
+        raise UsageError(
+            f"margins cut samples out of a regression, and a free run needs every one: leave "
+            f"--margin-{min(request.margins)} out, or use --method iv."
+        )
+    if request.covariance == "bootstrap":
+        raise UsageError(
+            "the block bootstrap resamples rows of a regression: use --covariance ma, hac or white "
+            "with --method oe."
+        )
+    options = request.output_error
+    if request.covariance is not None:
+        options = replace(options, covariance=request.covariance)
+    predictor = output_predictor(structure, kind, regime_of(logs, structure))
+    start: Estimate | NDArray[np.float64] | None = _nominal_theta(request.nominal, structure)
+    notes = ["it started from the nominal model."]
+    if start is None:
+        quick = replace(
+            request, covariance="white", refine=_RANKING_REFINEMENTS, output_error=options
+        )
+        for method in ("iv", "ls"):
+            try:
+                start = estimate_once(logs, structure, method, kind, quick)
+                notes = [f"it started from the {method} estimate."]
+                break
+            except (ExcitationError, DivergenceError):
+                notes = ["it started from a fit of short segments."]
+    while True:
+        try:
+            estimate = estimate_oe(predictor, logs, start=start, options=options)
+            break
+        except UnexcitedBiasError as error:
+            label = predictor.columns[error.column].label
+            notes.append(f"the bias-capturing regressor {label} does not vary and was left out.")
+            predictor = predictor.without_bias(error.column)
+    _, loop_test = assess_loop(logs, request.loop, "oe")
+    return replace(estimate, tests=(*estimate.tests, loop_test), notes=(*estimate.notes, *notes))
+
+
 def estimate_model(logs: Sequence[TrialLog], request: Request = Request()) -> Estimate:
     """Estimate a model, choosing what the request leaves open.
 
@@ -252,7 +304,13 @@ def estimate_model(logs: Sequence[TrialLog], request: Request = Request()) -> Es
                 f"V_q, gamma_q: use --predictor augmented or basic."
             )
     alternatives = [Alternative(s, m, k) for s in structures for m in methods for k in kinds]
-    if len(alternatives) > 1:
+    if request.method == "oe":
+        reason = (
+            "a free run feels the mean current itself, so it needs no sign condition, and the "
+            "first structure whose run stays bounded is kept"
+        )
+        alternatives = [replace(a, reason=reason) for a in alternatives if a.kind == kinds[0]]
+    elif len(alternatives) > 1:
         theory = _theory(logs, structures[0], wind)
         first = [
             a
@@ -297,6 +355,8 @@ def _first_that_runs(
             own.append(f"{alternative.label} was taken: {alternative.reason}.")
         if estimate.method == "iv":
             own.append(f"instruments: {estimate.status}.")
+        elif estimate.method == "oe":
+            own.append(f"the fit {estimate.status}.")
         if estimate.predictor.contaminated:
             own.append(
                 f"{', '.join(estimate.predictor.contaminated)} also carry a second moment of the "
