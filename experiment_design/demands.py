@@ -63,6 +63,8 @@ def require_informative(
         other = "--want fewer parameters"
         if request.predictor != "basic":
             other = "--predictor basic"
+        if request.limits.margin_air:
+            other = "a lower --margin-air"
         advice = f"Use {other}" if longer is None else f"Use --duration {longer:g}, or {other}"
         raise InfeasibleError(
             f"a trial of {request.duration:g} s is too short: the predicted standard error of "

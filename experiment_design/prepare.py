@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from experiment_design.air import MEASURING, clear_heading
 from experiment_design.campaign import random_campaign
 from experiment_design.criteria import CriterionKind
 from experiment_design.limits import TrialLimits
@@ -139,7 +140,13 @@ def prepare_request(
         d[:2] = wishes.current
     if wishes.wind is not None:
         d[2:] = wishes.wind
-    if predictor in ("wind", "basic+wind") and not d[2:].any():
+    measuring = predictor in MEASURING
+    if wishes.limits.margin_air is not None and not measuring:
+        raise UsageError(
+            f"--margin-air keeps the measured velocity through the air from zero, and predictor "
+            f"'{predictor}' does not measure it: leave it out, or use --predictor wind."
+        )
+    if measuring and not d[2:].any():
         raise UsageError(
             f"predictor '{predictor}' measures the wind, and in still air its terms are those of "
             f"the water: give the wind to expect, such as --wind 5,0 (north, east, m/s)."
@@ -147,7 +154,7 @@ def prepare_request(
     gust = wishes.gust
     if gust is None:
         gust = _GUSTINESS * float(np.hypot(*d[2:]))
-        if predictor in ("wind", "basic+wind"):
+        if measuring:
             notes.append(
                 f"the wind is taken to vary by {gust:.2g} m/s about its mean, without which its "
                 f"terms could not be told from the water's (--gust to change)"
@@ -211,6 +218,7 @@ def prepare_request(
         _start_of(signs, start, steady, structure, margins, caps, wishes.trials)
         for signs in regimes
     )
+    starts = tuple(s if s is start else _clear_of_wind(s, base) for s in starts)
     if start is None:
         shown = ", ".join(
             f"{n} {v:.2f}" for n, v in zip((*structure.states, "psi"), starts[0], strict=True)
@@ -328,6 +336,14 @@ def _start_of(
     return found
 
 
+def _clear_of_wind(start: Array, base: DesignRequest) -> Array:
+    """Return a chosen start, turned to where a margin through the air is kept best."""
+    if base.limits.margin_air is None:
+        return start
+    velocity = [start[base.structure.states.index(s)] for s in base.limits.margins]
+    return np.append(start[:-1], clear_heading(np.array(velocity), np.asarray(base.d[2:], float)))
+
+
 def _choose_regimes(
     base: DesignRequest, steady: Steady, start: Array | None, wishes: Wishes, notes: list[str]
 ) -> tuple[Signs, ...]:
@@ -340,7 +356,7 @@ def _choose_regimes(
         begin = steady_start(steady, states, signs, margins, caps)
         if begin is None:
             continue
-        own = begin
+        own = _clear_of_wind(begin, base)
         if start is not None:
             if all(start[states.index(s)] * v >= 0 for s, v in signs):
                 own = start
