@@ -15,6 +15,7 @@ from experiment_design.problem import TrialProblem
 from experiment_design.regimes import steady_motions
 from experiment_design.request import DesignRequest, wanted_parameters
 from experiment_design.search import Candidate
+from experiment_design.stability import unstable_sentence
 from experiment_design.timing import telling_duration
 from greybox.errors import InfeasibleError
 
@@ -107,7 +108,7 @@ def require_start(problem: TrialProblem, request: DesignRequest, trial: int) -> 
 
 def require_stable(problem: TrialProblem, request: DesignRequest) -> None:
     """Raise where the prior model runs away under any constant command."""
-    steady = steady_motions(
+    sentence = unstable_sentence(
         request.vessel,
         request.structure,
         request.theta,
@@ -115,12 +116,8 @@ def require_stable(problem: TrialProblem, request: DesignRequest) -> None:
         problem.schedule,
         request.starts[0],
     )
-    if len(steady.x) == 0:
-        raise InfeasibleError(
-            f"the prior model is unstable in free run: under each of {steady.unstable} constant "
-            f"commands a state passes 100 m/s or 10 rad/s within 400 s. Design with a stable "
-            f"model: estimate it with fewer terms (--structure linear), or start elsewhere."
-        )
+    if sentence:
+        raise InfeasibleError(sentence)
 
 
 def feasible_or_reason(

@@ -24,6 +24,7 @@ from experiment_design.regimes import (
 )
 from experiment_design.request import DesignRequest, EstimatorKind, build_problem, full_structure
 from experiment_design.schedule import make_schedule
+from experiment_design.stability import unstable_sentence
 from greybox.errors import InfeasibleError, StructureError, UsageError
 from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor import PREDICTORS
@@ -197,11 +198,7 @@ def prepare_request(
     )
     steady = steady_motions(vessel, structure, theta, d, schedule)
     if not len(steady.x):
-        raise InfeasibleError(
-            f"the prior model is unstable in free run: under each of {steady.unstable} constant "
-            f"commands a state passes 100 m/s or 10 rad/s within 400 s. Design with a stable "
-            f"model: estimate it with fewer terms (--structure linear), or on more data."
-        )
+        raise InfeasibleError(unstable_sentence(vessel, structure, theta, d, schedule))
     start = _start(wishes, structure)
     if wishes.regime.strip().lower() == "auto":
         regimes = _choose_regimes(base, steady, start, wishes, notes)
