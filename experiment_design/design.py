@@ -157,7 +157,7 @@ def _design(
     if missing:
         t = missing[0]
         candidates[t], sentence = feasible_or_reason(
-            problems[t], request, candidates[t], nearest[t]
+            problems[t], request, t, candidates[t], nearest[t]
         )
         if sentence:
             if not best_effort:

@@ -113,8 +113,19 @@ def least_change(problem: TrialProblem, best: Candidate) -> list[tuple[LimitName
     return sorted(missed, key=lambda item: -item[1] / order[item[0].name])
 
 
-def in_words(name: LimitName, amount: float, what: str = "") -> str:
-    """Return one sentence: what stops the trial, and the least change that was found to help."""
+def in_words(name: LimitName, amount: float, what: str = "", lower: str = "") -> str:
+    """Return one sentence: what stops the trial, and the least change that was found to help.
+
+    Parameters
+    ----------
+    name : LimitName
+    amount : float
+        By how much it is missed at best, in its unit.
+    what : str
+        What more there is to say.
+    lower : str
+        Margins to ask for instead, as options.
+    """
     a = float(np.ceil(amount * 1e3) / 1e3)
     unit = f" {name.unit}" if name.unit else ""
     if name.name.startswith("margin of"):
@@ -125,8 +136,8 @@ def in_words(name: LimitName, amount: float, what: str = "") -> str:
                 other = "choose another --regime"
             return (
                 f"the {name.name}, {name.bound:g}{unit}, cannot be kept: {reached:.3f}{unit} is "
-                f"the most that was reached. Lower {name.option} to {reached:.3f}, widen the "
-                f"limits of the thrusters, or {other}.{what}"
+                f"the most that was reached. Use {lower or f'{name.option} {0.9 * reached:.3f}'}, "
+                f"widen the limits of the thrusters, or {other}.{what}"
             )
         return (
             f"the {name.name}, {name.bound:g}{unit}, cannot be kept: the sign changes by "
