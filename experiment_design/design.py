@@ -35,7 +35,7 @@ from experiment_design.request import DesignRequest, build_problem, wanted_param
 from experiment_design.result import Design, LimitReport, logdet_information
 from experiment_design.robust import Keeping, keep_probability
 from experiment_design.rollout import Motion
-from experiment_design.search import Candidate, assess, limit_scale
+from experiment_design.search import Candidate, assess, limit_scale, to_unit, within_reach
 from experiment_design.solve import EXACT_COLUMNS, Outcome, solve_ipopt
 from greybox.errors import InfeasibleError
 
@@ -70,7 +70,7 @@ def design_trial(
     workers : int, optional
         Processes; by default as the work asks for. The result does not depend on it.
     first : tuple of ndarray, optional
-        (K, nc) levels a trial to start from, feasible or not.
+        (K, nc) levels a trial to start from; brought within range and rates, whatever else.
     alternatives : bool
         Evaluate the classical sequences too.
 
@@ -120,10 +120,7 @@ def _design(
         if all(c is not None for c in moved):
             initial = [c.unit for c in moved if c is not None]
     if first is not None:
-        initial = [
-            np.clip((v - p.schedule.lower) / _span(p), 0, 1)
-            for v, p in zip(first, problems, strict=True)
-        ]
+        initial = [within_reach(p, to_unit(p, v)) for v, p in zip(first, problems, strict=True)]
     found = search_campaign(
         request,
         problems,
@@ -320,11 +317,6 @@ def _criterion_value(
     if problems[0].contrast is not None:
         return float(problems[0].evaluate(units[0][None]).value[0])
     return float(criterion.of_covariance(covariance[None])[0])
-
-
-def _span(problem: TrialProblem) -> Array:
-    s = problem.schedule
-    return np.where(s.upper > s.lower, s.upper - s.lower, 1.0)
 
 
 def _tighten(

@@ -449,3 +449,34 @@ def test_precision_of_a_given_plan():
         predict_precision(request, [{k: v[:100] for k, v in plan.items()}])
     with pytest.raises(UsageError, match="0 plans for 1 trials"):
         predict_precision(request, [])
+
+
+def test_a_design_starts_from_what_it_is_given():
+    request = make_request(duration=120.0, effort=0.02)
+    good = design_trial(make_request(duration=120.0, effort=0.1), workers=1, alternatives=False)
+    again = design_trial(request, workers=1, alternatives=False, first=good.levels)
+    assert again.logdet >= good.logdet - 1e-9
+    cold = design_trial(request, workers=1, alternatives=False)
+    assert cold.logdet < good.logdet
+
+
+def test_a_first_sequence_need_not_keep_the_limits():
+    """Slow ahead is below the margins; what lies beyond the thrusters is clipped."""
+    limits = TrialLimits(margins={"u": 0.8, "v": 0.73})
+    request = make_request(duration=120.0, effort=0.02, limits=limits)
+    levels = np.tile([-99.0, 0.6, 0.6], (12, 1))
+    missed = assess(build_problem(request), np.zeros((1, 12, 3)))[0].missed
+    assert missed.max() > 0.02
+    design = design_trial(request, workers=1, alternatives=False, first=(levels,))
+    assert design.margins["u"] >= 0.8 - 1e-3
+    assert design.margins["v"] >= 0.73 - 1e-3
+    assert np.isfinite(design.std).all()
+
+
+def test_a_first_sequence_is_brought_within_the_rates():
+    request = make_request(duration=120.0, effort=0.02, vessel=limited_ship(0.5, 0.01))
+    good = design_trial(make_request(duration=120.0, effort=0.1), workers=1, alternatives=False)
+    assert np.abs(np.diff(good.levels[0], axis=0)).max(axis=0)[1] > 0.1
+    design = design_trial(request, workers=1, alternatives=False, first=good.levels)
+    step = np.abs(np.diff(design.commands[0], axis=0)).max(axis=0)
+    assert (step <= np.array([0.5, 0.01, 0.01]) + 1e-9).all()
