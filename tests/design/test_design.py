@@ -460,6 +460,7 @@ def test_a_design_starts_from_what_it_is_given():
     assert cold.logdet < good.logdet
 
 
+@pytest.mark.long
 def test_a_first_sequence_need_not_keep_the_limits():
     """Slow ahead is below the margins; what lies beyond the thrusters is clipped."""
     limits = TrialLimits(margins={"u": 0.8, "v": 0.73})
