@@ -58,6 +58,9 @@ from greybox.vessel.vessel import Limits, Thruster, Vessel
 
 Array = NDArray[np.float64]
 
+# how the other tools say that their numbers went astray, which a benchmark reports
+_NUMERICAL = (ArithmeticError, RuntimeError, ValueError)
+
 A, B, C = -0.05, -0.05, 0.1
 START, SIGMA = 0.5, 0.014
 LOW, HIGH = 0.1, 2.25
@@ -251,7 +254,7 @@ def pyomo_doe(intervals: int, first: Array) -> Run:
     try:
         with contextlib.redirect_stdout(io.StringIO()):
             doe.run_doe()
-    except Exception as reason:  # a benchmark reports whatever stops the other tool
+    except _NUMERICAL as reason:
         return Run(None, time.perf_counter() - began, f"{text}: {type(reason).__name__}: {reason}")
     seconds = time.perf_counter() - began
     u = np.array(doe.results["Experiment Design"], float)
@@ -268,6 +271,7 @@ def pydex(intervals: int, candidates: Array) -> Run:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
+            from cvxpy.error import SolverError
             from pydex.core.designer import Designer
     except ImportError as reason:
         return Run(None, 0.0, f"skipped: {reason}")
@@ -300,12 +304,12 @@ def pydex(intervals: int, candidates: Array) -> Run:
                 designer.design_experiment(
                     designer.d_opt_criterion, package="cvxpy", optimizer="CLARABEL"
                 )
-            except Exception:  # its problem is badly scaled; the other free solver may cope
+            except SolverError:  # its problem is badly scaled; the other free solver may cope
                 designer.design_experiment(
                     designer.d_opt_criterion, package="cvxpy", optimizer="SCS"
                 )
             efforts = np.asarray(designer.efforts, float).reshape(len(candidates), -1).sum(axis=1)
-    except Exception as reason:  # as above
+    except (SolverError, *_NUMERICAL) as reason:
         return Run(None, time.perf_counter() - began, f"{type(reason).__name__}: {reason}")
     seconds = time.perf_counter() - began
     problem = ours_problem(intervals)

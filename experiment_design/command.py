@@ -104,6 +104,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     motion.add_argument("--margin-u", type=_not_negative, metavar="M", help="least |u_r| [m/s]")
     motion.add_argument("--margin-v", type=_not_negative, metavar="M", help="least |v_r| [m/s]")
     motion.add_argument(
+        "--margin-air",
+        type=_not_negative,
+        metavar="M",
+        help="least |u_q| and |v_q|, of either sign, where the wind is measured [m/s]",
+    )
+    motion.add_argument(
         "--hold", type=positive, default=10.0, metavar="S", help="commands change every S s (10)"
     )
     motion.add_argument("--start", type=_floats, metavar="u,v,r,psi", help="state at the start")
@@ -330,6 +336,7 @@ def _wishes(options: argparse.Namespace, model: Any) -> Any:
             raise UsageError("--circle needs three numbers: north, east and a positive radius.")
         area = Circle(*options.circle)
     limits = TrialLimits(
+        margin_air=options.margin_air,
         area=area,
         position=options.position,
         clearance=options.clearance,

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from experiment_design.campaign import (
     add_up,
     own_moments,
+    random_campaign,
 )
-from experiment_design.feasible import in_words, least_change
-from experiment_design.limits import TOLERANCE, Circle
+from experiment_design.feasible import in_words, least_change, moved_constant, stirred
+from experiment_design.limits import TOLERANCE, Circle, LimitName, TrialLimits
 from experiment_design.problem import TrialProblem
 from experiment_design.regimes import steady_motions
-from experiment_design.request import DesignRequest, wanted_parameters
-from experiment_design.search import Candidate
+from experiment_design.request import DesignRequest, build_problem, wanted_parameters
+from experiment_design.search import Candidate, ascend, assess
+from experiment_design.stability import unstable_sentence
 from experiment_design.timing import telling_duration
 from greybox.errors import InfeasibleError
 
@@ -22,6 +26,10 @@ Array = NDArray[np.float64]
 
 # relative standard error from which nothing was learnt of a parameter
 _VAGUE = 2.0
+# evaluations by which it is found out whether a trial tells enough
+_BRIEF = 200
+# shares of what is reached at best that are tried as margins
+ROOM = (0.95, 0.9, 0.8, 0.65, 0.4, 0.2)
 
 
 def require_horizon(request: DesignRequest) -> None:
@@ -50,19 +58,18 @@ def require_informative(
     """
     if request.targets or request.contrasts or request.criterion == "c":
         return []
-    criterion = problems[0].criterion
-    names = [c.name for c in wanted_parameters(request, criterion)]
-    sums = add_up([own_moments(p, u) for p, u in zip(problems, units, strict=True)])
-    covariance = criterion.covariance(sums[0])[0]
-    if hopeless > 1 and not np.isfinite(covariance).all():
+    names = [c.name for c in wanted_parameters(request, problems[0].criterion)]
+    share = _relative_errors(problems, units)
+    if hopeless > 1 and not np.isfinite(share).all():
         return []
-    share = np.sqrt(np.diag(covariance)) / criterion.scale
     vague = [n for n, s in zip(names, share, strict=True) if s > hopeless * _VAGUE]
     if 2 * len(vague) > len(names):
         longer = telling_duration(request, _VAGUE)
         other = "--want fewer parameters"
         if request.predictor != "basic":
             other = "--predictor basic"
+        if request.limits.margin_air:
+            other = "a lower --margin-air"
         advice = f"Use {other}" if longer is None else f"Use --duration {longer:g}, or {other}"
         raise InfeasibleError(
             f"a trial of {request.duration:g} s is too short: the predicted standard error of "
@@ -77,6 +84,13 @@ def require_informative(
         f"{', '.join(doubtful)} will stay unknown by more than {'its' if one else 'their'} prior "
         f"value: lengthen the trial, or leave {'it' if one else 'them'} out with --want"
     ]
+
+
+def _relative_errors(problems: list[TrialProblem], units: list[Array]) -> Array:
+    """Return the predicted standard errors as shares of the prior values."""
+    criterion = problems[0].criterion
+    sums = add_up([own_moments(p, u) for p, u in zip(problems, units, strict=True)])
+    return np.asarray(np.sqrt(np.diag(criterion.covariance(sums[0])[0])) / criterion.scale)
 
 
 def require_start(problem: TrialProblem, request: DesignRequest, trial: int) -> None:
@@ -98,14 +112,16 @@ def require_start(problem: TrialProblem, request: DesignRequest, trial: int) -> 
                 raise InfeasibleError(
                     f"the trial starts {where}: move it by --position, or the sea room."
                 )
+            # a start on the limit itself could be left on one side only
+            room = f"{1.2 * m:.2g}"
             raise InfeasibleError(
-                f"the trial starts {where}: change --start, or relax {name.option} by {m:.3g}."
+                f"the trial starts {where}: change --start, or relax {name.option} by {room}."
             )
 
 
 def require_stable(problem: TrialProblem, request: DesignRequest) -> None:
     """Raise where the prior model runs away under any constant command."""
-    steady = steady_motions(
+    sentence = unstable_sentence(
         request.vessel,
         request.structure,
         request.theta,
@@ -113,16 +129,12 @@ def require_stable(problem: TrialProblem, request: DesignRequest) -> None:
         problem.schedule,
         request.starts[0],
     )
-    if len(steady.x) == 0:
-        raise InfeasibleError(
-            f"the prior model is unstable in free run: under each of {steady.unstable} constant "
-            f"commands a state passes 100 m/s or 10 rad/s within 400 s. Design with a stable "
-            f"model: estimate it with fewer terms (--structure linear), or start elsewhere."
-        )
+    if sentence:
+        raise InfeasibleError(sentence)
 
 
 def feasible_or_reason(
-    problem: TrialProblem, request: DesignRequest, best: Candidate, nearest: Candidate
+    problem: TrialProblem, request: DesignRequest, trial: int, best: Candidate, nearest: Candidate
 ) -> tuple[Candidate, str]:
     """Return the better of two candidates, and why limits cannot be kept, empty if they can."""
     chosen = nearest if nearest.missed.max(initial=0) < best.missed.max(initial=0) else best
@@ -130,14 +142,73 @@ def feasible_or_reason(
         if np.isfinite(chosen.value):
             return chosen, ""
         return chosen, unexcited([problem], [chosen.unit], request)
-    name, amount = least_change(problem, chosen)[0]
+    changes = least_change(problem, chosen)
+    name, amount = changes[0]
     more = _turning(problem, request, name.name)
     if name.name.startswith("margin of") and request.d[:2].any():
         more += (
             f" Margins are kept through the water too, and a current of "
             f"{float(np.hypot(*request.d[:2])):.2g} m/s is expected."
         )
-    return chosen, in_words(name, amount, more)
+    lower = ""
+    if all(n.option.startswith("--margin-") for n, _ in changes):
+        lower = _margins_within_reach(request, trial, chosen, changes)
+    return chosen, in_words(name, amount, more, lower)
+
+
+def _margins_within_reach(
+    request: DesignRequest, trial: int, chosen: Candidate, changes: list[tuple[LimitName, float]]
+) -> str:
+    """Return the margins, as options, under which sequences around one keep every limit.
+
+    What it reaches itself leaves no room to move in, so that shares of it are tried.
+    """
+    reached = {n.option.removeprefix("--margin-"): n.bound - m for n, m in changes}
+    for share in ROOM:
+        margins = {n: np.floor(1e3 * share * v) / 1e3 for n, v in reached.items()}
+        if min(margins.values()) < 0:
+            return ""
+        problem = build_problem(
+            replace(request, limits=with_margins(request.limits, margins)), trial
+        )
+        if stirred(problem, assess(problem, chosen.unit[None])[0], request.seed).feasible:
+            return " ".join(f"--margin-{n} {v:g}" for n, v in margins.items())
+    return ""
+
+
+def with_margins(limits: TrialLimits, margins: dict[str, float]) -> TrialLimits:
+    """Return the limits with other margins, that through the air under the name ``air``."""
+    kept = {k: v for k, v in margins.items() if k != "air"}
+    return replace(
+        limits,
+        margins=dict(limits.margins) | kept,
+        margin_air=margins.get("air", limits.margin_air),
+    )
+
+
+def tells_enough(request: DesignRequest) -> bool:
+    """Whether one ascent a trial finds sequences that keep the limits and tell enough."""
+    problems = [build_problem(request, t) for t in range(request.trials)]
+    units, _ = random_campaign(problems, request.seed)
+    if units is None:
+        moved = [moved_constant(p, request.seed) for p in problems]
+        units = [c.unit for c in moved if c is not None]
+    if len(units) < len(problems):
+        return False
+    for t, problem in enumerate(problems):
+        here = problem
+        if request.trials > 1:
+            pairs = zip(problems, units, strict=True)
+            here = problem.with_known(
+                add_up([own_moments(p, u) for o, (p, u) in enumerate(pairs) if o != t])
+            )
+        found = ascend(here, units[t], _BRIEF)
+        if found.feasible:
+            units[t] = found.unit
+    if request.targets or request.contrasts or request.criterion == "c":
+        return True
+    share = _relative_errors(problems, units)
+    return bool(2 * (share > _VAGUE).sum() <= share.size)
 
 
 def _turning(problem: TrialProblem, request: DesignRequest, name: str) -> str:

@@ -8,7 +8,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from experiment_design.air import air_notes
 from experiment_design.campaign import (
+    Found,
     Progress,
     add_up,
     own_moments,
@@ -26,14 +28,14 @@ from experiment_design.demands import (
     require_start,
     unexcited,
 )
-from experiment_design.feasible import closest
+from experiment_design.feasible import closest, moved_constant, stirred
 from experiment_design.moments import MomentProgram, Moments
 from experiment_design.problem import TrialProblem
 from experiment_design.request import DesignRequest, build_problem, wanted_parameters
 from experiment_design.result import Design, LimitReport, logdet_information
 from experiment_design.robust import Keeping, keep_probability
 from experiment_design.rollout import Motion
-from experiment_design.search import Candidate, assess, limit_scale
+from experiment_design.search import Candidate, assess, limit_scale, to_unit, within_reach
 from experiment_design.solve import EXACT_COLUMNS, Outcome, solve_ipopt
 from greybox.errors import InfeasibleError
 
@@ -68,7 +70,7 @@ def design_trial(
     workers : int, optional
         Processes; by default as the work asks for. The result does not depend on it.
     first : tuple of ndarray, optional
-        (K, nc) levels a trial to start from, feasible or not.
+        (K, nc) levels a trial to start from; brought within range and rates, whatever else.
     alternatives : bool
         Evaluate the classical sequences too.
 
@@ -113,11 +115,12 @@ def _design(
     else:
         require_informative(request, problems, reference, hopeless=10.0)
     initial = reference
+    if reference is None:
+        moved = [moved_constant(p, request.seed) for p in problems]
+        if all(c is not None for c in moved):
+            initial = [c.unit for c in moved if c is not None]
     if first is not None:
-        initial = [
-            np.clip((v - p.schedule.lower) / _span(p), 0, 1)
-            for v, p in zip(first, problems, strict=True)
-        ]
+        initial = [within_reach(p, to_unit(p, v)) for v, p in zip(first, problems, strict=True)]
     found = search_campaign(
         request,
         problems,
@@ -138,11 +141,21 @@ def _design(
                 status = f"solved: many ascents, then multiple shooting; {polished}"
         except KeyboardInterrupt:
             stopped = True
+    if not all(c.feasible for c in candidates):
+        nearest = tuple(
+            c if c.feasible else closest(p, c.unit[None], request.seed)
+            for p, c in zip(problems, candidates, strict=True)
+        )
+        again = _from_closest(request, problems, nearest, workers)
+        if again is not None:
+            candidates, evaluations = list(again.candidates), evaluations + again.evaluations
+            stopped = stopped or again.stopped
     missing = [t for t, c in enumerate(candidates) if not c.feasible]
     if missing:
         t = missing[0]
-        nearest = closest(problems[t], candidates[t].unit[None], request.seed)
-        candidates[t], sentence = feasible_or_reason(problems[t], request, candidates[t], nearest)
+        candidates[t], sentence = feasible_or_reason(
+            problems[t], request, t, candidates[t], nearest[t]
+        )
         if sentence:
             if not best_effort:
                 raise InfeasibleError(sentence)
@@ -200,6 +213,7 @@ def _design(
     motions = tuple(
         p.scenarios[0].rollout.run(c[None]) for p, c in zip(problems, commands, strict=True)
     )
+    notes += air_notes(request, motions)
     classical: tuple[Alternative, ...] = ()
     if alternatives and request.trials == 1 and not stopped:
         classical = compare_classical(problems[0], request.seed)
@@ -231,6 +245,24 @@ def _design(
         evaluations,
         time.perf_counter() - began,
     )
+
+
+def _from_closest(
+    request: DesignRequest,
+    problems: list[TrialProblem],
+    nearest: tuple[Candidate, ...],
+    workers: int | None,
+) -> Found | None:
+    """Search once more around the sequences that miss the limits least, None where they do.
+
+    An ascent from outside may be stopped by a limit that no path crosses, such as
+    a component of the velocity through the air that keeps either sign.
+    """
+    lively = [stirred(p, c, request.seed) for p, c in zip(problems, nearest, strict=True)]
+    if not all(c.feasible for c in lively):
+        return None
+    first = [c.unit for c in lively]
+    return search_campaign(request, problems, first, effort=request.effort, workers=workers)
 
 
 def _polish(
@@ -285,11 +317,6 @@ def _criterion_value(
     if problems[0].contrast is not None:
         return float(problems[0].evaluate(units[0][None]).value[0])
     return float(criterion.of_covariance(covariance[None])[0])
-
-
-def _span(problem: TrialProblem) -> Array:
-    s = problem.schedule
-    return np.where(s.upper > s.lower, s.upper - s.lower, 1.0)
 
 
 def _tighten(

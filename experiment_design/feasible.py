@@ -16,6 +16,8 @@ _STARTS = 6
 _ITERATIONS = 200
 # penalties of the squared shortfall; the last one weighs the worst sample most
 _PENALTIES = (1.0, 100.0)
+# sizes, in unit coordinates, and number of the changes that are made to a constant sequence
+_STIRS, _STIRRED = (0.3, 0.1, 0.03, 0.01), 32
 
 
 def closest(problem: TrialProblem, starts: Array, seed: int) -> Candidate:
@@ -29,11 +31,7 @@ def closest(problem: TrialProblem, starts: Array, seed: int) -> Candidate:
     seed : int
     """
     rng = np.random.default_rng([23, seed])
-    holds, commands = problem.shape
-    constant = rng.random((400, commands))
-    pool = np.concatenate(
-        [starts, np.repeat(constant[:, None], holds, axis=1), draw_two_level(problem, rng, 100)]
-    )
+    pool = np.concatenate([starts, _constant(problem, rng), draw_two_level(problem, rng, 100)])
     scale = limit_scale(problem)
     found = assess(problem, pool)
     order = sorted(range(len(pool)), key=lambda i: _short(found[i], scale))
@@ -57,6 +55,36 @@ def closest(problem: TrialProblem, starts: Array, seed: int) -> Candidate:
                 best = candidate
         if _short(best, scale) == 0.0:
             break
+    return best
+
+
+def _constant(problem: TrialProblem, rng: np.random.Generator) -> Array:
+    holds, commands = problem.shape
+    return np.repeat(rng.random((400, 1, commands)), holds, axis=1)
+
+
+def moved_constant(problem: TrialProblem, seed: int) -> Candidate | None:
+    """Return a telling sequence around a constant one that keeps the limits, None without one."""
+    scale = limit_scale(problem)
+    found = assess(problem, _constant(problem, np.random.default_rng([23, seed])))
+    nearest = min(found, key=lambda c: _short(c, scale))
+    lively = stirred(problem, nearest, seed)
+    return lively if lively.feasible else None
+
+
+def stirred(problem: TrialProblem, still: Candidate, seed: int) -> Candidate:
+    """Return the most telling of the sequences around one that keep the limits as it does.
+
+    The sequence that misses limits least is often a constant one, which tells nothing.
+    """
+    rng = np.random.default_rng([29, seed])
+    best = still
+    for size in _STIRS:
+        noise = size * rng.standard_normal((_STIRRED, *problem.shape))
+        around = within_reach(problem, np.clip(still.unit + noise, 0, 1))
+        for candidate in assess(problem, around):
+            if candidate.feasible and candidate.value > best.value:
+                best = candidate
     return best
 
 
@@ -85,17 +113,31 @@ def least_change(problem: TrialProblem, best: Candidate) -> list[tuple[LimitName
     return sorted(missed, key=lambda item: -item[1] / order[item[0].name])
 
 
-def in_words(name: LimitName, amount: float, what: str = "") -> str:
-    """Return one sentence: what stops the trial, and the least change that was found to help."""
+def in_words(name: LimitName, amount: float, what: str = "", lower: str = "") -> str:
+    """Return one sentence: what stops the trial, and the least change that was found to help.
+
+    Parameters
+    ----------
+    name : LimitName
+    amount : float
+        By how much it is missed at best, in its unit.
+    what : str
+        What more there is to say.
+    lower : str
+        Margins to ask for instead, as options.
+    """
     a = float(np.ceil(amount * 1e3) / 1e3)
     unit = f" {name.unit}" if name.unit else ""
     if name.name.startswith("margin of"):
         reached = name.bound - a
         if reached >= 0:
+            other = "start on another heading (--start)"
+            if name.option != "--margin-air":
+                other = "choose another --regime"
             return (
                 f"the {name.name}, {name.bound:g}{unit}, cannot be kept: {reached:.3f}{unit} is "
-                f"the most that was reached. Lower {name.option} to {reached:.3f}, widen the "
-                f"limits of the thrusters, or choose another --regime.{what}"
+                f"the most that was reached. Use {lower or f'{name.option} {0.9 * reached:.3f}'}, "
+                f"widen the limits of the thrusters, or {other}.{what}"
             )
         return (
             f"the {name.name}, {name.bound:g}{unit}, cannot be kept: the sign changes by "

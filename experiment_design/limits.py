@@ -48,6 +48,10 @@ class TrialLimits:
         Sign that each named state keeps, such as ``{"u": 1, "v": 1}``.
     margins : mapping of str to float
         Least magnitude of each of them [m/s] (A10).
+    margin_air : float, optional
+        Least magnitude of each component of the velocity through the air, of either
+        sign, under the expected mean wind [m/s] (A15; (5.50), (5.54)-(5.56),
+        (5.77)-(5.80)).
     area : ndarray or Circle, optional
         (m, 2) corners of the sea room, north and east [m], or a circle.
     position : (float, float)
@@ -66,6 +70,7 @@ class TrialLimits:
 
     signs: Mapping[str, int] = field(default_factory=dict)
     margins: Mapping[str, float] = field(default_factory=dict)
+    margin_air: float | None = None
     area: Array | Circle | None = None
     position: tuple[float, float] = (0.0, 0.0)
     clearance: float = 0.0
@@ -79,6 +84,11 @@ class TrialLimits:
         for name, value in self.margins.items():
             if not 0 <= value < np.inf:
                 raise UsageError(f"the margin of {name} is {value:g} m/s, it must be 0 or more.")
+        if self.margin_air is not None and not 0 <= self.margin_air < np.inf:
+            raise UsageError(
+                f"the margin of the velocity through the air is {self.margin_air:g} m/s, it must "
+                f"be 0 or more."
+            )
         for what, cap in (("speed", self.speed_cap), ("yaw-rate", self.yaw_cap)):
             if cap is not None and not 0 < cap < np.inf:
                 raise UsageError(f"the {what} cap is {cap:g}, it must be positive.")
@@ -178,6 +188,15 @@ class LimitProgram:
             )  # fmt: skip
             rows.append(margin - least)
         u, v = where["u"], where.get("v", ca.SX(0))
+        if limits.margin_air is not None:
+            blown = rotate_to_body(psi, ca.SX(float(d[2])), ca.SX(float(d[3])))
+            for name, wind in zip(("u", "v"), blown, strict=True):
+                if name in where:
+                    names.append(
+                        LimitName(f"margin of {_NAMES[name]} through the air", limits.margin_air,
+                                  "m/s", "--margin-air")
+                    )  # fmt: skip
+                    rows.append(limits.margin_air - ca.fabs(where[name] - wind))
         if limits.speed_cap is not None:
             names.append(LimitName("speed cap", limits.speed_cap, "m/s", "--speed-cap"))
             rows.append(ca.sqrt(u**2 + v**2 + 1e-12) - limits.speed_cap)

@@ -8,8 +8,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from experiment_design.air import MEASURING, clear_heading
 from experiment_design.campaign import random_campaign
 from experiment_design.criteria import CriterionKind
+from experiment_design.demands import ROOM, tells_enough, with_margins
 from experiment_design.limits import TrialLimits
 from experiment_design.noise import noise_levels
 from experiment_design.regimes import (
@@ -23,6 +25,7 @@ from experiment_design.regimes import (
 )
 from experiment_design.request import DesignRequest, EstimatorKind, build_problem, full_structure
 from experiment_design.schedule import make_schedule
+from experiment_design.stability import unstable_sentence
 from greybox.errors import InfeasibleError, StructureError, UsageError
 from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor import PREDICTORS
@@ -139,7 +142,13 @@ def prepare_request(
         d[:2] = wishes.current
     if wishes.wind is not None:
         d[2:] = wishes.wind
-    if predictor in ("wind", "basic+wind") and not d[2:].any():
+    measuring = predictor in MEASURING
+    if wishes.limits.margin_air is not None and not measuring:
+        raise UsageError(
+            f"--margin-air keeps the measured velocity through the air from zero, and predictor "
+            f"'{predictor}' does not measure it: leave it out, or use --predictor wind."
+        )
+    if measuring and not d[2:].any():
         raise UsageError(
             f"predictor '{predictor}' measures the wind, and in still air its terms are those of "
             f"the water: give the wind to expect, such as --wind 5,0 (north, east, m/s)."
@@ -147,7 +156,7 @@ def prepare_request(
     gust = wishes.gust
     if gust is None:
         gust = _GUSTINESS * float(np.hypot(*d[2:]))
-        if predictor in ("wind", "basic+wind"):
+        if measuring:
             notes.append(
                 f"the wind is taken to vary by {gust:.2g} m/s about its mean, without which its "
                 f"terms could not be told from the water's (--gust to change)"
@@ -190,11 +199,7 @@ def prepare_request(
     )
     steady = steady_motions(vessel, structure, theta, d, schedule)
     if not len(steady.x):
-        raise InfeasibleError(
-            f"the prior model is unstable in free run: under each of {steady.unstable} constant "
-            f"commands a state passes 100 m/s or 10 rad/s within 400 s. Design with a stable "
-            f"model: estimate it with fewer terms (--structure linear), or on more data."
-        )
+        raise InfeasibleError(unstable_sentence(vessel, structure, theta, d, schedule))
     start = _start(wishes, structure)
     if wishes.regime.strip().lower() == "auto":
         regimes = _choose_regimes(base, steady, start, wishes, notes)
@@ -207,10 +212,16 @@ def prepare_request(
             )
         regimes = tuple(parts * wishes.trials if len(parts) == 1 else parts)
     caps = (wishes.limits.speed_cap, wishes.limits.yaw_cap)
+    if start is None and wishes.regime.strip().lower() != "auto":
+        for signs in regimes:
+            begin = steady_start(steady, structure.states, signs, margins, caps)
+            if begin is not None and _depth(begin, signs, margins, structure.states) < -1e-6:
+                raise InfeasibleError(_beyond_reach(base, steady, [signs], wishes.limits))
     starts = tuple(
         _start_of(signs, start, steady, structure, margins, caps, wishes.trials)
         for signs in regimes
     )
+    starts = tuple(s if s is start else _clear_of_wind(s, base) for s in starts)
     if start is None:
         shown = ", ".join(
             f"{n} {v:.2f}" for n, v in zip((*structure.states, "psi"), starts[0], strict=True)
@@ -328,6 +339,65 @@ def _start_of(
     return found
 
 
+def _depth(
+    start: Array, signs: Signs, margins: Mapping[str, float], states: tuple[str, ...]
+) -> float:
+    """Return by how much a start keeps its margins at least [m/s]."""
+    if not signs:
+        return np.inf
+    return min(abs(float(start[states.index(s)])) - margins.get(s, 0.0) for s, _ in signs)
+
+
+def _clear_of_wind(start: Array, base: DesignRequest) -> Array:
+    """Return a chosen start, turned to where a margin through the air is kept best."""
+    if base.limits.margin_air is None:
+        return start
+    velocity = [start[base.structure.states.index(s)] for s in base.limits.margins]
+    return np.append(start[:-1], clear_heading(np.array(velocity), np.asarray(base.d[2:], float)))
+
+
+def _beyond_reach(
+    base: DesignRequest, steady: Steady, candidates: list[Signs], limits: TrialLimits
+) -> str:
+    """Return what margins steady motions reach, and which leave a trial room to tell enough."""
+    states, asked = base.structure.states, dict(base.limits.margins)
+    caps = (limits.speed_cap, limits.yaw_cap)
+    shown = ", ".join(f"{k} {v:.3g}" for k, v in asked.items())
+    # the motion that keeps the largest share of every margin
+    share, reached, held = -np.inf, asked, candidates[0]
+    for signs in candidates:
+        kept = np.array([steady.x[:, states.index(s)] * v for s, v in signs]).T
+        wanted = np.array([max(asked.get(s, 0.0), 1e-9) for s, _ in signs])
+        least = np.minimum(kept / wanted, 1.0)
+        order = least.min(axis=1) + 1e-3 * least.mean(axis=1)
+        best = int(order.argmax())
+        if order[best] > share:
+            share, held = float(order[best]), signs
+            reached = {s: float(kept[best, i]) for i, (s, _) in enumerate(signs)}
+    best_shown = ", ".join(f"{k} {v:.3g}" for k, v in reached.items())
+    said = (
+        f"no steady motion keeps the margins {shown} m/s: the one that comes closest within the "
+        f"limits of the thrusters keeps {best_shown} m/s."
+    )
+    for part in ROOM:
+        margins = {s: min(v, np.floor(1e3 * part * reached[s]) / 1e3) for s, v in asked.items()}
+        if min(margins.values()) < 0:
+            break
+        start = steady_start(steady, states, held, margins, caps)
+        if start is None:
+            continue
+        eased = replace(
+            base,
+            regimes=(held,) * base.trials,
+            starts=(_clear_of_wind(start, base),) * base.trials,
+            limits=with_margins(base.limits, margins),
+        )
+        if tells_enough(eased):
+            options = " ".join(f"--margin-{n} {v:g}" for n, v in margins.items())
+            return f"{said} Use {options}, or widen the limits."
+    return f"{said} Widen the limits of the thrusters, or lower the margins far below these."
+
+
 def _choose_regimes(
     base: DesignRequest, steady: Steady, start: Array | None, wishes: Wishes, notes: list[str]
 ) -> tuple[Signs, ...]:
@@ -340,14 +410,13 @@ def _choose_regimes(
         begin = steady_start(steady, states, signs, margins, caps)
         if begin is None:
             continue
-        own = begin
+        own = _clear_of_wind(begin, base)
         if start is not None:
             if all(start[states.index(s)] * v >= 0 for s, v in signs):
                 own = start
             elif wishes.trials == 1:
                 continue
-        depth = min(abs(float(own[states.index(s)])) - margins.get(s, 0.0) for s, _ in signs)
-        if depth < -1e-6 and own is not start:
+        if _depth(own, signs, margins, states) < -1e-6 and own is not start:
             continue
         try:
             request = replace(base, regimes=(signs,), starts=(own,))
@@ -364,15 +433,8 @@ def _choose_regimes(
             value = float(problem.evaluate(np.array(units)).value[0])
         worth.append((value, signs))
     if not worth:
-        shown = ", ".join(f"{k} {v:.3g}" for k, v in margins.items())
-        most = {
-            s: float(np.abs(steady.x[:, states.index(s)]).max()) for s in margins if s in states
-        }
-        best = ", ".join(f"{k} {v:.3g}" for k, v in most.items())
-        raise InfeasibleError(
-            f"no steady motion keeps the margins {shown} m/s: the limits of the thrusters reach "
-            f"at most {best} m/s. Lower --margin-u and --margin-v below these, or widen the limits."
-        )
+        candidates = candidate_regimes(states)
+        raise InfeasibleError(_beyond_reach(base, steady, candidates, wishes.limits))
     worth.sort(key=lambda item: -item[0])
     chosen = [signs for _, signs in worth]
     if wishes.trials == 1:

@@ -359,11 +359,11 @@ def _yardstick(request: DesignRequest, predictor: Predictor, theta: Array) -> Ya
         request.d,
         request.noise,
         white=request.estimator == "iv-white",
-        gust=_gusts(request) if predictor.air_measured else None,
+        gust=draw_gusts(request) if predictor.air_measured else None,
     )
 
 
-def _gusts(request: DesignRequest) -> Array:
+def draw_gusts(request: DesignRequest) -> Array:
     """Draw what the wind adds to its mean, (N, 2) [m/s]; the same for every sequence."""
     rng = np.random.default_rng([31, request.seed])
     drawn = stationary_disturbance(

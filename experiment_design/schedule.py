@@ -17,7 +17,7 @@ from greybox.vessel.vessel import Vessel
 Array = NDArray[np.float64]
 
 # samples of the longest trial that is designed in one piece
-_MOST = 50_000
+MOST_SAMPLES = 50_000
 
 
 @dataclass(frozen=True)
@@ -113,10 +113,10 @@ def make_schedule(vessel: Vessel, duration: float, hold: float, sample_time: flo
     UsageError
         The hold is no multiple of the sample time or longer than the trial.
     """
-    if duration / sample_time > _MOST:
+    if duration / sample_time > MOST_SAMPLES:
         raise UsageError(
-            f"a trial of {duration:g} s has {duration / sample_time:.3g} samples, {_MOST} is the "
-            f"most: use --duration {_MOST * sample_time:g} or less."
+            f"a trial of {duration:g} s has {duration / sample_time:.3g} samples, {MOST_SAMPLES} "
+            f"is the most: use --duration {MOST_SAMPLES * sample_time:g} or less."
         )
     samples, held = round(duration / sample_time), round(hold / sample_time)
     if held < 1 or abs(held * sample_time - hold) > 1e-6 * hold:

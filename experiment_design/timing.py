@@ -17,6 +17,7 @@ from experiment_design.campaign import (
 )
 from experiment_design.problem import TrialProblem
 from experiment_design.request import DesignRequest, build_problem, wanted_columns
+from experiment_design.schedule import MOST_SAMPLES
 from greybox.errors import InfeasibleError, UsageError
 
 Array = NDArray[np.float64]
@@ -46,6 +47,8 @@ def _std(problems: list[TrialProblem], units: list[Array]) -> Array:
 def telling_duration(request: DesignRequest, vague: float) -> float | None:
     """Return a duration at which random sequences tell at least half of the parameters.
 
+    None where they never do, or keep no limits.
+
     Parameters
     ----------
     vague : float
@@ -54,8 +57,13 @@ def telling_duration(request: DesignRequest, vague: float) -> float | None:
     duration = request.duration
     for _ in range(_DOUBLINGS):
         duration *= 2
+        if duration > MOST_SAMPLES * request.sample_time:
+            return None
         share = random_shares(replace(request, duration=duration))
-        if share is not None and 2 * (share > vague).sum() <= len(share):
+        if share is None:
+            # limits that no random sequence keeps are kept no longer
+            return None
+        if 2 * (share > vague).sum() <= len(share):
             return duration
     return None
 

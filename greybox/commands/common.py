@@ -13,6 +13,10 @@ if TYPE_CHECKING:
     from greybox.vessel.vessel import Vessel
 
 
+# back to the first column, and the line erased
+CLEAR = "\r\x1b[K"
+
+
 def add_logs(parser: argparse.ArgumentParser) -> None:
     """Add the log files as positional arguments, and the vessel."""
     parser.add_argument("logs", nargs="+", metavar="LOG", help="log files, CSV or Parquet")
@@ -60,11 +64,24 @@ def progress(title: str) -> Callable[[int, int], None]:
         return lambda done, total: None
 
     def show(done: int, total: int) -> None:
-        end = "\n" if done >= total else ""
-        sys.stderr.write(f"\r{title}: {done} of {total}{end}")
+        text = "" if done >= total else f"{title}: {done} of {total}"
+        sys.stderr.write(CLEAR + text)
         sys.stderr.flush()
 
     return show
+
+
+def _clear() -> None:
+    """Erase progress that was broken off."""
+    if sys.stderr.isatty():
+        sys.stderr.write(CLEAR)
+        sys.stderr.flush()
+
+
+def complain(text: str) -> None:
+    """Tell the user what stopped a command."""
+    _clear()
+    sys.stderr.write(text + "\n")
 
 
 def provenance(options: argparse.Namespace) -> dict[str, Any]:
@@ -75,4 +92,5 @@ def provenance(options: argparse.Namespace) -> dict[str, Any]:
 
 def say(text: str) -> None:
     """Print a result for the user."""
+    _clear()
     sys.stdout.write(text + "\n")

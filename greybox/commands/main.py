@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from importlib import import_module
 from importlib.metadata import entry_points, version
 
+from greybox.commands.common import complain
 from greybox.errors import GreyboxError, suggestion
 
 GROUP = "greybox.commands"
@@ -95,13 +96,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         options.run(options)
     except GreyboxError as error:
-        print(f"greybox {options.command}: {error}", file=sys.stderr)
+        complain(f"greybox {options.command}: {error}")
         return 1
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except KeyboardInterrupt:
-        print("greybox: stopped", file=sys.stderr)
+        complain("greybox: stopped")
         return 1
     return 0
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
 import pandas as pd
@@ -179,6 +180,36 @@ def test_errors_are_one_sentence(folder, capsys, options, message):
     assert message in error
     assert error.count("\n") == 1
     assert not plan.exists()
+
+
+@pytest.mark.parametrize(
+    ("asked", "duration"),
+    [
+        (["--margin-u", "0.5", "--margin-v", "3"], "300"),
+        pytest.param(
+            ["--margin-u", "0.5", "--margin-v", "1.55", "--start", "1.5,1.6,0,0"],
+            "150",
+            marks=pytest.mark.long,
+        ),
+    ],
+)
+def test_advice_on_margins_beyond_reach_can_be_followed(folder, capsys, asked, duration):
+    """Beyond every steady motion, and beyond what is kept after a start that still keeps it."""
+    asked = ["--duration", duration, "--predictor", "basic", *asked]
+    status, _ = run(folder, *asked)
+    assert status == 1
+    error = capsys.readouterr().err
+    advised = re.search(r"Use ((?:--margin-[uv] [\d.]+ ?)+),", error).group(1).split()
+    # options that are given again replace the first ones
+    status, plan = run(folder, *asked, *advised, "--json", str(folder / "eased.json"))
+    assert status == 0, capsys.readouterr().err
+    assert plan.exists()
+    margins = json.loads((folder / "eased.json").read_text())["margins"]
+    wanted = dict(zip(advised[::2], map(float, advised[1::2]), strict=True))
+    for option, value in wanted.items():
+        assert margins[option[-1]] >= value - 1e-3
+    # the advice asks for no less than a third of what a steady motion keeps, 1.51 m/s
+    assert wanted["--margin-v"] > 0.5
 
 
 def test_outputs_never_replace_inputs(folder, capsys):

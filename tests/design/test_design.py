@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -20,8 +21,9 @@ from experiment_design import (
 )
 from experiment_design.expressions import gradient_of
 from experiment_design.inputs import multisines, prbs, random_two_level, zig_zags
-from experiment_design.regimes import parse_regime, spell_regime
+from experiment_design.regimes import parse_regime, spell_regime, steady_motions
 from experiment_design.request import build_problem
+from experiment_design.schedule import make_schedule
 from experiment_design.search import assess, best_random, exchange
 from greybox.errors import ExcitationError, InfeasibleError, StructureError, UsageError
 from greybox.files import plain
@@ -319,10 +321,32 @@ def test_the_closest_plan_on_request():
 def test_an_unstable_prior():
     model = thesis_model()
     theta = model.theta.copy()
-    theta[model.names.index("Yv")] = 0.9
-    theta[model.names.index("Yvv")] = 0.3
-    with pytest.raises(InfeasibleError, match="unstable in free run"):
+    theta[model.names.index("Xuu")] = 0.5
+    theta[model.names.index("Yvv")] = 0.5
+    with pytest.raises(InfeasibleError, match="unstable in free run") as told:
         prepare_request(replace(model, theta=theta), Wishes(150.0))
+    assert "Lowering one of Xu, Yv, Nr alone does not help" in str(told.value)
+
+
+def test_the_least_damping_of_an_unstable_prior():
+    """The advice followed gives steady motions; two percent less of it does not."""
+    model = thesis_model()
+    theta = model.theta.copy()
+    place = model.names.index("Nr")
+    theta[place] = 0.3
+    unstable = replace(model, theta=theta)
+    with pytest.raises(InfeasibleError, match="unstable in free run") as told:
+        prepare_request(unstable, Wishes(150.0))
+    name, value, needed = re.search(
+        r"(\w+) would have to fall from (-?[\d.]+) to (-?[\d.]+) for", str(told.value)
+    ).groups()
+    assert float(value) == theta[model.names.index(name)]
+    schedule = make_schedule(model.vessel, 150.0, 10.0, 1.0)
+    for factor, settles in ((1.0, True), (0.98, False)):
+        changed = theta.copy()
+        changed[model.names.index(name)] += factor * (float(needed) - float(value))
+        steady = steady_motions(model.vessel, model.structure, changed, np.zeros(4), schedule)
+        assert (len(steady.x) > 0) == settles
 
 
 def test_wishes_that_exclude_one_another():
@@ -425,3 +449,35 @@ def test_precision_of_a_given_plan():
         predict_precision(request, [{k: v[:100] for k, v in plan.items()}])
     with pytest.raises(UsageError, match="0 plans for 1 trials"):
         predict_precision(request, [])
+
+
+def test_a_design_starts_from_what_it_is_given():
+    request = make_request(duration=120.0, effort=0.02)
+    good = design_trial(make_request(duration=120.0, effort=0.1), workers=1, alternatives=False)
+    again = design_trial(request, workers=1, alternatives=False, first=good.levels)
+    assert again.logdet >= good.logdet - 1e-9
+    cold = design_trial(request, workers=1, alternatives=False)
+    assert cold.logdet < good.logdet
+
+
+@pytest.mark.long
+def test_a_first_sequence_need_not_keep_the_limits():
+    """Slow ahead is below the margins; what lies beyond the thrusters is clipped."""
+    limits = TrialLimits(margins={"u": 0.8, "v": 0.73})
+    request = make_request(duration=120.0, effort=0.02, limits=limits)
+    levels = np.tile([-99.0, 0.6, 0.6], (12, 1))
+    missed = assess(build_problem(request), np.zeros((1, 12, 3)))[0].missed
+    assert missed.max() > 0.02
+    design = design_trial(request, workers=1, alternatives=False, first=(levels,))
+    assert design.margins["u"] >= 0.8 - 1e-3
+    assert design.margins["v"] >= 0.73 - 1e-3
+    assert np.isfinite(design.std).all()
+
+
+def test_a_first_sequence_is_brought_within_the_rates():
+    request = make_request(duration=120.0, effort=0.02, vessel=limited_ship(0.5, 0.01))
+    good = design_trial(make_request(duration=120.0, effort=0.1), workers=1, alternatives=False)
+    assert np.abs(np.diff(good.levels[0], axis=0)).max(axis=0)[1] > 0.1
+    design = design_trial(request, workers=1, alternatives=False, first=good.levels)
+    step = np.abs(np.diff(design.commands[0], axis=0)).max(axis=0)
+    assert (step <= np.array([0.5, 0.01, 0.01]) + 1e-9).all()

@@ -81,6 +81,26 @@ def test_margins_see_the_current():
     assert values[1, 0] == pytest.approx(0.4 - 0.5)
 
 
+def test_the_velocity_through_the_air_keeps_a_margin_of_either_sign():
+    """|u_q| and |v_q| of (5.3) from the law of cosines, wind 3 north and 4 east."""
+    request = make_request(
+        predictor="wind", d=np.array([0.0, 0.0, 3.0, 4.0]), limits=TrialLimits(margin_air=0.7)
+    )
+    program = build_problem(request).scenarios[0].limits
+    names = [n.name for n in program.path_names[2:]]
+    assert names == ["margin of surge through the air", "margin of sway through the air"]
+    assert program.path_names[3].option == "--margin-air"
+    state = np.zeros((1, 6))
+    state[0, :4] = 1.5, 1.2, 0.0, 0.4
+    ground = np.array([[np.cos(0.4), -np.sin(0.4)], [np.sin(0.4), np.cos(0.4)]]) @ state[0, :2]
+    through = ground - [3.0, 4.0]
+    along = np.array([np.cos(0.4), np.sin(0.4)])
+    expected = [0.7 - abs(through @ along), 0.7 - abs(through @ [-along[1], along[0]])]
+    np.testing.assert_allclose(program.path_values(state)[2:, 0], expected, atol=1e-12)
+    with pytest.raises(UsageError, match="through the air is -1 m/s"):
+        TrialLimits(margin_air=-1.0)
+
+
 def test_ramps_keep_the_rates():
     ship = limited_ship(speed=2.0, angle=0.02)
     schedule = make_schedule(ship, 100.0, 10.0, 1.0)

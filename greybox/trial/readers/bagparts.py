@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import IO
+from typing import IO, Protocol
 
 from greybox.errors import LogError
 
@@ -154,3 +154,50 @@ def normal_type(name: str) -> str:
     """Return the name of a message type as ROS 2 spells it."""
     parts = name.split("/")
     return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else name
+
+
+class Records(Protocol):
+    """One format's reader of records: what it may read, and what it found damaged.
+
+    Parameters
+    ----------
+    budget : Budget
+        Charged with all that is read.
+    notes : list of str
+        Receives what was skipped or recovered.
+    damaged : int
+        Chunks that were read as far as they go.
+    """
+
+    budget: Budget
+    notes: list[str]
+    damaged: int
+
+    def records(self, stream: IO[bytes], end: int, *, top: bool) -> Iterator[Message]:
+        """Yield the messages from here to the byte `end`, those in chunks too at the top."""
+        ...
+
+
+def read_records(reader: Records, handle: IO[bytes]) -> Iterator[Message]:
+    """Yield the messages of a file in its order, and note what was damaged.
+
+    Parameters
+    ----------
+    reader : Records
+        Of the file's format.
+    handle : file
+        Open for reading, past the mark of its format.
+
+    Raises
+    ------
+    CutError
+        The file ends too early, or stops making sense.
+    LogError
+        It exceeds the budget.
+    """
+    yield from reader.records(handle, file_size(handle), top=True)
+    if reader.damaged:
+        reader.notes.append(
+            f"{reader.damaged} chunks of '{reader.budget.name}' are damaged or fail their "
+            f"checksum; they were read as far as they go."
+        )

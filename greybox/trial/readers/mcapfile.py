@@ -15,8 +15,8 @@ from greybox.trial.readers.bagparts import (
     CutError,
     Message,
     Wanted,
-    file_size,
     normal_type,
+    read_records,
     skip,
     take,
 )
@@ -110,29 +110,6 @@ class _Mcap:
 def read_mcap(
     handle: IO[bytes], budget: Budget, notes: list[str], wanted: Wanted
 ) -> Iterator[Message]:
-    """Yield the messages of an MCAP file in the order of the file.
-
-    Parameters
-    ----------
-    handle : file
-        Open for reading.
-    budget : Budget
-        Charged with all that is read.
-    notes : list of str
-        Receives what was skipped or recovered.
-    wanted : callable
-        Whether the messages of a topic are needed.
-
-    Raises
-    ------
-    CutError
-        The file ends too early, or stops making sense.
-    """
+    """Yield the messages of an MCAP file, as `read_records` does."""
     handle.seek(len(MAGIC))
-    state = _Mcap({}, {}, budget, notes, wanted)
-    yield from state.records(handle, file_size(handle), top=True)
-    if state.damaged:
-        notes.append(
-            f"{state.damaged} chunks of '{budget.name}' are damaged or fail their checksum; "
-            f"they were read as far as they go."
-        )
+    yield from read_records(_Mcap({}, {}, budget, notes, wanted), handle)

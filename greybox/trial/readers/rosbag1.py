@@ -15,8 +15,8 @@ from greybox.trial.readers.bagparts import (
     CutError,
     Message,
     Wanted,
-    file_size,
     normal_type,
+    read_records,
     skip,
     take,
 )
@@ -46,25 +46,12 @@ def _number(fields: dict[str, bytes], name: str, layout: str = "<I") -> int:
 def read_bag1(
     handle: IO[bytes], budget: Budget, notes: list[str], wanted: Wanted
 ) -> Iterator[Message]:
-    """Yield the messages of a ROS 1 bag in the order of the file.
-
-    Parameters
-    ----------
-    handle : file
-        Open for reading.
-    budget : Budget
-        Charged with all that is read.
-    notes : list of str
-        Receives what was skipped or recovered.
-    wanted : callable
-        Whether the messages of a topic are needed.
+    """Yield the messages of a ROS 1 bag, as `read_records` does.
 
     Raises
     ------
-    CutError
-        The file ends too early, or stops making sense.
     LogError
-        It is of another version, encrypted, or exceeds the budget.
+        It is of another version, or encrypted.
     """
     line = handle.readline(32)
     if line.strip() != b"#ROSBAG V2.0":
@@ -72,13 +59,7 @@ def read_bag1(
             f"'{budget.name}' is a bag of format {line.strip().decode('ascii', 'replace')!r}, "
             f"only 2.0 is read: convert it with 'rosbag migrate'."
         )
-    state = _Bag({}, budget, notes, wanted)
-    yield from state.records(handle, file_size(handle), top=True)
-    if state.damaged:
-        notes.append(
-            f"{state.damaged} chunks of '{budget.name}' are damaged and were read as far as "
-            f"they go."
-        )
+    yield from read_records(_Bag({}, budget, notes, wanted), handle)
 
 
 @dataclass

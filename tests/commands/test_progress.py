@@ -1,0 +1,59 @@
+"""Progress on a terminal, and silence in a pipe."""
+
+from __future__ import annotations
+
+import os
+import pty
+import subprocess
+import sys
+
+SCRIPT = """
+from greybox.commands.common import progress
+show = progress("design")
+for done in range(1, 4):
+    show(done, 3)
+"""
+
+
+def on_a_terminal(*arguments: str) -> tuple[int, str]:
+    """Run Python with its standard error on a pseudo-terminal; its status and what was shown."""
+    master, slave = pty.openpty()
+    try:
+        done = subprocess.run(
+            [sys.executable, *arguments], stderr=slave, stdout=subprocess.DEVNULL, timeout=120
+        )
+        return done.returncode, os.read(master, 10_000).decode()
+    finally:
+        os.close(slave)
+        os.close(master)
+
+
+def on_the_screen(shown: str) -> str:
+    """Return the line that a terminal is left with."""
+    line = ""
+    for part in shown.replace("\r\n", "\n").split("\r"):
+        line = part.removeprefix("\x1b[K") if part.startswith("\x1b[K") else part or line
+    return line
+
+
+def test_progress_shows_and_clears():
+    status, shown = on_a_terminal("-c", SCRIPT)
+    assert status == 0
+    assert "design: 1 of 3" in shown
+    assert "design: 2 of 3" in shown
+    assert on_the_screen(shown) == ""
+
+
+def test_an_error_takes_the_place_of_progress():
+    """A command that fails half way leaves its one sentence alone on the line."""
+    script = SCRIPT.replace("range(1, 4)", "range(1, 3)") + (
+        "from greybox.commands.common import complain\ncomplain('greybox design: it went wrong.')\n"
+    )
+    _, shown = on_a_terminal("-c", script)
+    assert on_the_screen(shown).strip() == "greybox design: it went wrong."
+
+
+def test_silent_in_a_pipe():
+    done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, timeout=60)
+    assert done.stderr == b""
+    assert done.stdout == b""
