@@ -125,19 +125,21 @@ class ErrorLikelihood:
         )
         bounds = [(low, 1.0)] * (len(free) + nx)
         bounds += [(0.0, longest)] * (nx if start.remembers else 0)
-        first = np.clip(first, [b[0] for b in bounds], [b[1] for b in bounds])
+        # in these units curvature is about 1, and a slope of 0.05 moves the loss by 0.001
+        unit = np.sqrt(sum(band.rows for band in self.bands))
+        ends = np.array(bounds) * unit
         found = minimize(
-            lambda p: self.loss(unpack(p)),
-            first,
+            lambda p: self.loss(unpack(p / unit)),
+            np.clip(first * unit, ends[:, 0], ends[:, 1]),
             method="L-BFGS-B",
-            bounds=bounds,
-            options={"ftol": 1e-9, "eps": 1e-4, "maxiter": 60},
+            bounds=ends,
+            options={"ftol": 1e-9, "gtol": 0.05, "eps": 1e-4 * unit, "maxiter": 40},
         )
-        return replace(start, noise=unpack(found.x)), float(found.fun)
+        return replace(start, noise=unpack(found.x / unit)), float(found.fun)
 
 
-def fit_noise(likelihood: ErrorLikelihood, stated: Array, further: Array) -> NoiseFit:
-    """Find the levels of measurement and process noise.
+def first_levels(likelihood: ErrorLikelihood, stated: Array, further: Array) -> NoiseFit:
+    """Find levels with stated sensors kept and a process noise without memory.
 
     Parameters
     ----------
@@ -146,28 +148,31 @@ def fit_noise(likelihood: ErrorLikelihood, stated: Array, further: Array) -> Noi
         (nx,) standard deviation of each measured state, nan where it is not known.
     further : ndarray
         (m,) of heading and wind, 0 where not known.
-
-    Returns
-    -------
-    NoiseFit
-        Stated sensors are kept unless the errors contradict them (p = 0.001); the
-        process noise has a memory where that explains the errors better (likewise).
     """
-    nx = len(stated)
     free = np.isnan(stated)
     # the error holds the measurement about twice
     guess = np.where(free, 0.6 * likelihood.scale, stated)
-    start = NoiseFit(
-        ErrorNoise(guess, 0.2 * likelihood.scale, np.zeros(nx), np.asarray(further, float)), free
+    noise = ErrorNoise(
+        guess, 0.2 * likelihood.scale, np.zeros(len(stated)), np.asarray(further, float)
     )
+    return likelihood.fit(NoiseFit(noise, free))[0]
+
+
+def fit_noise(likelihood: ErrorLikelihood, start: NoiseFit) -> NoiseFit:
+    """Find the levels, and decide what the errors say beyond the first ones.
+
+    The process noise has a memory where that explains the errors better, and
+    stated sensors are given up where the errors contradict them (p = 0.001 each).
+    """
+    nx = len(start.free)
     best, loss = likelihood.fit(start)
     slow = replace(best.noise, memory=np.full(nx, 0.9))
     remembering, found = likelihood.fit(replace(best, noise=slow, remembers=True))
     if 2 * (loss - found) > _BELIEVED:
         best, loss = remembering, found
-    if not free.all():
+    if not start.free.all():
         opened, found = likelihood.fit(replace(best, free=np.ones(nx, bool), contradicted=True))
-        if not 2 * (loss - found) <= _BELIEVED:
+        if 2 * (loss - found) > _BELIEVED:
             best = opened
     return best
 

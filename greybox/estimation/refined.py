@@ -22,6 +22,7 @@ from greybox.estimation.estimate import Covariance, estimate_iv
 from greybox.estimation.noise import (
     ErrorLikelihood,
     NoiseFit,
+    first_levels,
     fit_noise,
     noise_levels_of,
     stated_levels,
@@ -208,9 +209,10 @@ def estimate_refined_iv(
     for round_ in range(1, _MOST + 1):
         bands = [ErrorBand(m.slopes, k) for m, k in zip(point.motions, keep, strict=True)]
         if fit is None:
-            fit = fit_noise(work.likelihood(bands, theta), stated, further)
+            fit = first_levels(work.likelihood(bands, theta), stated, further)
         elif round_ <= _NOISE_ROUNDS:
-            fit = work.likelihood(bands, theta).fit(fit)[0]
+            # the errors of the plain estimate are too far off to decide anything by
+            fit = fit_noise(work.likelihood(bands, theta), fit)
         rows = work.rows(bands, fit, point)
         new, inverse = solve_white(rows)
         if not np.isfinite(new).all():
