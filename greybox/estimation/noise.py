@@ -125,7 +125,7 @@ class ErrorLikelihood:
         )
         bounds = [(low, 1.0)] * (len(free) + nx)
         bounds += [(0.0, longest)] * (nx if start.remembers else 0)
-        # in these units curvature is about 1, and a slope of 0.05 moves the loss by 0.001
+        # in these units curvature is about 1, and a slope of 0.01 is next to nothing
         unit = np.sqrt(sum(band.rows for band in self.bands))
         ends = np.array(bounds) * unit
         found = minimize(
@@ -133,7 +133,7 @@ class ErrorLikelihood:
             np.clip(first * unit, ends[:, 0], ends[:, 1]),
             method="L-BFGS-B",
             bounds=ends,
-            options={"ftol": 1e-9, "gtol": 0.05, "eps": 1e-4 * unit, "maxiter": 40},
+            options={"ftol": 1e-9, "gtol": 0.01, "eps": 1e-4 * unit, "maxiter": 40},
         )
         return replace(start, noise=unpack(found.x / unit)), float(found.fun)
 
