@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.errors import DivergenceError
 from greybox.estimation.white_rows import own_constants, solve_white, white_rows
 from greybox.estimation.whitening import ErrorBand, ErrorNoise
 from greybox.model.noise import NoiseLevels

@@ -47,8 +47,9 @@ Array = NDArray[np.float64]
 _SETTLED = 1e-2
 _RELATIVE = 1e-6
 _MOST = 30
-# rounds in which the noise is sought anew; then it stays, or the two would chase each other
-_NOISE_ROUNDS = 2
+# round that settles the noise: the errors of the plain estimate are too far off to decide by,
+# and were it sought in every round the two would chase each other
+_NOISE_ROUND = 2
 
 
 @dataclass(frozen=True)
@@ -96,9 +97,7 @@ class _Refinement:
         """Return y − Φᵀθ of each log, (N, nx)."""
         equations = [self.predictor.equation(s) for s in self.predictor.structure.states]
         return [
-            np.stack(
-                [y[i] - theta[mine] @ phi[mine] for i, mine in enumerate(equations)], axis=1
-            )
+            np.stack([y[i] - theta[mine] @ phi[mine] for i, mine in enumerate(equations)], axis=1)
             for phi, y in zip(self.phi, self.y, strict=True)
         ]
 
@@ -116,11 +115,16 @@ class _Refinement:
         for _ in range(4):
             if point.diverged < 0:
                 break
-            means = [
-                (a + b) / 2 for a, b in zip(point.constants, bounded.constants, strict=True)
-            ]
+            means = [(a + b) / 2 for a, b in zip(point.constants, bounded.constants, strict=True)]
             point = self.point((point.theta + bounded.theta) / 2, means)
         return point
+
+    def start(self, theta: Array, keep: Sequence[NDArray[np.bool_]]) -> _Point:
+        """Return the point of a plain estimate, or one between it and its model in still water."""
+        bias = np.array([c.is_bias for c in self.predictor.columns])
+        none = [np.zeros(len(self.predictor.structure.states))] * len(self.logs)
+        still = self.point(np.where(bias, 0.0, theta), none)
+        return self.towards(theta, self.constants(theta, keep), still)
 
     def rows(self, bands: Sequence[ErrorBand], fit: NoiseFit, point: _Point) -> list[WhiteRows]:
         return [
@@ -128,13 +132,17 @@ class _Refinement:
             for band, motion, phi, y in zip(bands, point.motions, self.phi, self.y, strict=True)
         ]
 
+    def bands(self, point: _Point, keep: Sequence[NDArray[np.bool_]]) -> list[ErrorBand]:
+        return [ErrorBand(m.slopes, k) for m, k in zip(point.motions, keep, strict=True)]
+
+    def first_levels(self, bands: Sequence[ErrorBand], theta: Array) -> NoiseFit:
+        stated, further = stated_levels(
+            self.logs[0].vessel, self.predictor.structure.states, further_channels(self.predictor)
+        )
+        return first_levels(self.likelihood(bands, theta), stated, further)
+
     def likelihood(self, bands: Sequence[ErrorBand], theta: Array) -> ErrorLikelihood:
         return ErrorLikelihood(bands, self.errors(theta), own_constants(self.predictor))
-
-
-def _still(predictor: Predictor, theta: Array) -> Array:
-    """Return the coefficients without what only captures a bias."""
-    return np.where([c.is_bias for c in predictor.columns], 0.0, theta)
 
 
 def estimate_refined_iv(
@@ -194,8 +202,7 @@ def estimate_refined_iv(
     work = _Refinement(regression, logs, heading, wind)
     states = predictor.structure.states
     keep = [e.keep for e in regression.experiments]
-    still = work.point(_still(predictor, plain.theta), [np.zeros(len(states))] * len(logs))
-    point = work.towards(plain.theta, work.constants(plain.theta, keep), still)
+    point = work.start(plain.theta, keep)
     if point.diverged >= 0:
         log, motion = logs[point.diverged], point.motions[point.diverged]
         raise ExcitationError(
@@ -204,78 +211,128 @@ def estimate_refined_iv(
         )
     # rows are cut once, by simulated states, which do not select on the noise
     keep = [within_margins(m.x, states, margins) for m in point.motions]
-    stated, further = stated_levels(logs[0].vessel, states, further_channels(predictor))
-    theta, fit, status = plain.theta, None, f"the refinement still moved after {_MOST} rounds"
-    for round_ in range(1, _MOST + 1):
-        bands = [ErrorBand(m.slopes, k) for m, k in zip(point.motions, keep, strict=True)]
-        if fit is None:
-            fit = first_levels(work.likelihood(bands, theta), stated, further)
-        elif round_ <= _NOISE_ROUNDS:
-            # the errors of the plain estimate are too far off to decide anything by
-            fit = fit_noise(work.likelihood(bands, theta), fit)
-        rows = work.rows(bands, fit, point)
-        new, inverse = solve_white(rows)
-        if not np.isfinite(new).all():
-            raise ExcitationError(
-                f"the prefiltered instruments are singular on {sum(b.rows for b in bands)} "
-                f"samples: estimate without --prefilter, or leave out what is weakly determined."
-            )
-        std = np.sqrt(np.sum([((inverse @ r.z) ** 2).sum(axis=1) for r in rows], axis=0))
-        still_moving = np.abs(new - theta) > _SETTLED * std + _RELATIVE * np.abs(theta)
-        halfway = point.theta is not theta
-        theta = new
-        if round_ > _NOISE_ROUNDS and not halfway and not still_moving.any():
-            status = f"converged after {round_} rounds"
-            break
-        following = work.towards(theta, work.constants(theta, keep), point)
-        if following.diverged >= 0:
-            status = (
-                f"stopped after {round_} rounds: the motion predicted for "
-                f"'{logs[following.diverged].name}' diverges; the last estimate with bounded "
-                f"instruments is given"
-            )
-            break
-        point = following
+    found = _refine(work, point, plain.theta, keep)
+    theta, kept = found.theta, sum(b.rows for b in found.bands)
     matrix, lags = white_covariance(
-        rows,
-        bands,
+        found.rows,
+        found.bands,
         theta,
-        inverse,
+        found.inverse,
         covariance,
-        samples=[len(m.x) for m in point.motions],
+        samples=[len(k) for k in keep],
         seed=seed,
     )
-    kept = sum(b.rows for b in bands)
-    errors = [e[b.keep] for e, b in zip(work.errors(theta), bands, strict=True)]
-    innovations = [(r.y - theta @ r.phi).reshape(-1, len(states)) for r in rows]
+    innovations = [(r.y - theta @ r.phi).reshape(-1, len(states)) for r in found.rows]
     colour = {
         f"whiteness_{s}": whiteness(
             s, [e[:, i] for e in innovations if len(e)], len(predictor.equation(s))
         )
         for i, s in enumerate(states)
     }
-    levels = noise_levels_of(fit, states, logs[0].vessel, regression.sample_time)
+    vessel = logs[0].vessel
     return replace(
         plain,
         theta=theta,
         covariance=matrix,
-        residual_std=np.sqrt(
-            np.sum([((e - e.mean(axis=0)) ** 2).sum(axis=0) for e in errors if len(e)], axis=0)
-            / kept
-        ),
+        residual_std=_spread(work.errors(theta), keep),
         kept=kept,
         covariance_kind=covariance,
         lags=lags,
-        iterations=plain.iterations + round_,
-        status=f"{plain.status}; prefiltered by the noise: {status}",
+        iterations=plain.iterations + found.rounds,
+        status=f"{plain.status}; prefiltered by the noise: {found.status}",
         current=estimate_current(
             predictor,
             theta,
             matrix,
-            heading_std=logs[0].vessel.std("psi") or 0.0,
+            heading_std=vessel.std("psi") or 0.0,
             heading_measured=heading == "measured",
         ),
         tests=tuple(colour.get(t.name, t) for t in plain.tests),
         prefilter="noise",
-        noise=levels,
+        noise=noise_levels_of(found.fit, states, vessel, regression.sample_time),
     )
+
+
+@dataclass(frozen=True)
+class _Refined:
+    """Where the rounds ended."""
+
+    theta: Array
+    inverse: Array
+    rows: list[WhiteRows]
+    bands: list[ErrorBand]
+    fit: NoiseFit
+    rounds: int
+    status: str
+
+
+def _refine(
+    work: _Refinement, point: _Point, theta: Array, keep: Sequence[NDArray[np.bool_]]
+) -> _Refined:
+    """Find noise, coefficients and motions in turn until the coefficients settle."""
+    status = f"still moving after {_MOST} rounds"
+    bands = work.bands(point, keep)
+    fit = work.first_levels(bands, theta)
+    for rounds in range(1, _MOST + 1):
+        bands = work.bands(point, keep)
+        if rounds == _NOISE_ROUND:
+            fit = fit_noise(work.likelihood(bands, theta), fit)
+        rows = work.rows(bands, fit, point)
+        new, inverse = solve_white(rows)
+        if not np.isfinite(new).all():
+            raise ExcitationError(
+                f"the prefiltered instruments of {len(new)} coefficients are singular on "
+                f"{sum(b.rows for b in bands)} samples: estimate without --prefilter, or leave "
+                f"out what is weakly determined."
+            )
+        std = np.sqrt(np.sum([((inverse @ r.z) ** 2).sum(axis=1) for r in rows], axis=0))
+        moving = np.abs(new - theta) > _SETTLED * std + _RELATIVE * np.abs(theta)
+        # a halfway motion settles too, but is not that of an estimate
+        halfway = point.theta is not theta
+        theta = new
+        if rounds > _NOISE_ROUND and not halfway and not moving.any():
+            status = f"converged after {rounds} rounds"
+            break
+        following = work.towards(theta, work.constants(theta, keep), point)
+        if following.diverged >= 0:
+            status = (
+                f"stopped after {rounds} rounds: the motion predicted for "
+                f"'{work.logs[following.diverged].name}' diverges; the last estimate with "
+                f"bounded instruments is given"
+            )
+            break
+        point = following
+    return _Refined(theta, inverse, rows, bands, fit, rounds, status)
+
+
+def _spread(errors: Sequence[Array], keep: Sequence[NDArray[np.bool_]]) -> Array:
+    """Return the standard deviation (nx,) of errors (N, nx) about the mean of each log."""
+    kept = [e[k] - e[k].mean(axis=0) for e, k in zip(errors, keep, strict=True) if k.any()]
+    return np.asarray(np.concatenate(kept).std(axis=0))
+
+
+def with_noise(
+    estimate: Estimate,
+    logs: Sequence[TrialLog],
+    *,
+    heading: Literal["measured", "simulated"] = "measured",
+    wind: Literal["smoothed", "measured"] = "smoothed",
+    margins: dict[str, float] | None = None,
+) -> Estimate:
+    """Return a plain estimate with the noise levels that its equation errors tell.
+
+    Sensors are taken as stated and the process noise as white: errors of plain
+    coefficients are too far off to decide more. Without change where the motion
+    that the estimate predicts diverges.
+    """
+    regression = build_regression(estimate.predictor, logs, margins=margins)
+    work = _Refinement(regression, logs, heading, wind)
+    keep = [e.keep for e in regression.experiments]
+    point = work.start(estimate.theta, keep)
+    if point.diverged >= 0:
+        return estimate
+    fit = work.first_levels(work.bands(point, keep), estimate.theta)
+    levels = noise_levels_of(
+        fit, estimate.predictor.structure.states, logs[0].vessel, regression.sample_time
+    )
+    return replace(estimate, noise=levels)

@@ -187,10 +187,11 @@ class Estimate:
         """Return the result as text, in the manner of a regression table."""
         width = 78
         unit = self.vessel.force_unit
+        prefiltered = ", prefiltered" if self.prefilter == "noise" else ""
         lines = [
             f"{'Estimate of ' + self.vessel.name:^{width}}",
             "=" * width,
-            f"{'Method:':<18}{self.method:<22}{'Samples:':<18}{self.samples}",
+            f"{'Method:':<18}{self.method + prefiltered:<22}{'Samples:':<18}{self.samples}",
             f"{'Predictor:':<18}{self.predictor.kind:<22}{'Samples used:':<18}{self.kept}",
             f"{'Structure:':<18}{self.predictor.structure.name:<22}{'Sample time:':<18}"
             f"{self.sample_time:g} s",

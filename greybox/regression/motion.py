@@ -55,9 +55,7 @@ def further_channels(predictor: Predictor) -> tuple[str, ...]:
 
 
 @lru_cache(maxsize=32)
-def _step(
-    predictor: Predictor, samples: int, heading: str, relative: bool
-) -> ca.Function:
+def _step(predictor: Predictor, samples: int, heading: str, relative: bool) -> ca.Function:
     """Return ``samples`` steps ``(state, w, coefficients and constants and dt) -> states``.
 
     ``w`` holds heading, inputs and air: the velocity through the air, or, where

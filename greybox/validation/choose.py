@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.errors import ExcitationError, GreyboxError, LogError
+from greybox.errors import ExcitationError, GreyboxError, LogError, UsageError
 from greybox.estimation.estimate import (
     Covariance,
     UnexcitedBiasError,
@@ -17,6 +17,7 @@ from greybox.estimation.estimate import (
     estimate_ls,
 )
 from greybox.estimation.loop import CLOSED_LOOP_LAG, Loop, assess_loop
+from greybox.estimation.refined import estimate_refined_iv, with_noise
 from greybox.estimation.result import Estimate
 from greybox.model.catalogue import structure_for
 from greybox.model.model import ManoeuvringModel
@@ -60,7 +61,8 @@ class Request:
     """What to estimate; None leaves the choice to the data.
 
     ``margins`` are |u|, |v| [m/s] below which samples are cut out; ``nominal``
-    simulates the first instruments (least squares does without it).
+    simulates the first instruments (least squares does without it); ``prefilter``
+    is ``noise`` for refined instrumental variables, ``none`` for plain ones.
     """
 
     method: str | None = None
@@ -74,6 +76,7 @@ class Request:
     refine: bool | int = True
     nominal: ManoeuvringModel | None = None
     seed: int = 0
+    prefilter: Literal["auto", "noise", "none"] = "auto"
 
 
 def heading_range(logs: Sequence[TrialLog]) -> float:
@@ -192,6 +195,10 @@ def estimate_once(
             label = predictor.columns[error.column].label
             notes.append(f"the bias-capturing regressor {label} does not vary and was left out.")
             predictor = predictor.without_bias(error.column)
+    if method == "iv":
+        estimate = _prefiltered(
+            estimate, logs, request, "smoothed" if noisy_wind else "measured", closed, notes
+        )
     if kind in ("wind", "basic+wind") and method == "iv" and noisy_wind:
         notes.append(
             f"the wind in the instruments is the measured one averaged over {WIND_WINDOW:g} s, "
@@ -211,6 +218,85 @@ def estimate_once(
             f"standard errors leave out. Compare with a shorter sample time."
         )
     return replace(estimate, tests=(*estimate.tests, loop_test), notes=tuple(notes))
+
+
+def _prefiltered(
+    plain: Estimate,
+    logs: Sequence[TrialLog],
+    request: Request,
+    wind: Literal["smoothed", "measured"],
+    closed: bool,
+    notes: list[str],
+) -> Estimate:
+    """Refine a plain IV estimate by its noise, unless something speaks against it.
+
+    Raises
+    ------
+    UsageError
+        The request asks for what zero-mean, undelayed instruments only can do.
+    ExcitationError
+        The refinement that the request asks for fails.
+    """
+    common: dict[str, Any] = {
+        "heading": request.heading,
+        "wind": wind,
+        "margins": request.margins,
+    }
+    against = ""
+    if closed:
+        against = "instruments are delayed for the closed loop, which a prefilter would undo"
+    elif not request.zero_mean:
+        against = "instruments keep their mean"
+    if request.prefilter == "noise" and against:
+        raise UsageError(
+            f"--prefilter noise needs open loop and zero-mean instruments, and {against}: "
+            f"use --prefilter none."
+        )
+    if request.prefilter != "none" and not against:
+        kind: dict[str, Any] = (
+            {} if request.covariance is None else {"covariance": request.covariance}
+        )
+        try:
+            refined = estimate_refined_iv(
+                plain.predictor, logs, start=plain, seed=request.seed, **kind, **common
+            )
+            if request.prefilter == "noise":
+                return refined
+            against = _worse(plain, refined, logs)
+            if not against:
+                return refined
+        except ExcitationError as error:
+            if request.prefilter == "noise":
+                raise
+            against = str(error).rstrip(".")
+    if against and request.prefilter == "auto":
+        notes.append(f"the instruments were not refined by the noise: {against}.")
+    return with_noise(plain, logs, **common)
+
+
+def _worse(plain: Estimate, refined: Estimate, logs: Sequence[TrialLog]) -> str:
+    """Return why a refined estimate is not preferred, empty where it is.
+
+    The two differ by noise only where the model holds; where it does not, the
+    refined one trusts the model further.
+    """
+    before = [run_model(plain.model(), log) for log in logs]
+    after = [run_model(refined.model(), log) for log in logs]
+    if any(r.diverged >= 0 for r in before):
+        return ""
+    if any(r.diverged >= 0 for r in after):
+        return "the free run of the refined model diverges"
+    loss = [
+        old - new
+        for old, new in zip(average_fit(before).values(), average_fit(after).values(), strict=True)
+    ]
+    mean = float(np.mean(loss))
+    if mean <= _PREFERENCE:
+        return ""
+    return (
+        f"the free run of the refined model fits these logs {mean:.1f} points worse, "
+        f"more than {_PREFERENCE:g}"
+    )
 
 
 def estimate_model(logs: Sequence[TrialLog], request: Request = Request()) -> Estimate:
@@ -403,7 +489,7 @@ def _compare(
 ) -> list[Alternative]:
     """Order the alternatives by the held-out free run, the earlier ones preferred."""
     # a ranking needs neither standard errors nor the last digit
-    request = replace(request, covariance="white", refine=_RANKING_REFINEMENTS)
+    request = replace(request, covariance="white", refine=_RANKING_REFINEMENTS, prefilter="none")
     fitting, held = [], []
     for log in logs:
         cut = len(log) - int(len(log) * _HELD_OUT)
