@@ -25,7 +25,8 @@ _LEAST = 1e-3
 _SLOWEST = 300.0
 # 2 Δ log-likelihood beyond which nx further levels are believed (χ², p = 0.001, 3 of them)
 _BELIEVED = 16.3
-_TINY = 1e-12
+# loss where a covariance is singular: finite, so that differences stay numbers
+_IMPOSSIBLE = 1e100
 
 
 @dataclass(frozen=True)
@@ -67,17 +68,24 @@ class ErrorLikelihood:
         (N, nx) a log.
     equations : sequence of bool
         (nx,) which equations have a constant of their own in each log.
+    least : ndarray
+        (nx,) spread below which errors count as none.
     """
 
     def __init__(
-        self, bands: Sequence[ErrorBand], residuals: Sequence[Array], equations: Sequence[bool]
+        self,
+        bands: Sequence[ErrorBand],
+        residuals: Sequence[Array],
+        equations: Sequence[bool],
+        least: Array,
     ) -> None:
         self.bands = bands
         self.values = [
             np.concatenate([r[None], constant_rows(len(r), equations)]) for r in residuals
         ]
         kept = np.concatenate([r[b.keep] for r, b in zip(residuals, bands, strict=True)])
-        self.scale = np.maximum(kept.std(axis=0), _TINY)
+        self.scale = np.maximum(kept.std(axis=0), least)
+        self.exact = bool((kept.std(axis=0) < least).any())
 
     def loss(self, noise: ErrorNoise) -> float:
         """Return minus the logarithm of the likelihood, up to a constant."""
@@ -87,7 +95,7 @@ class ErrorLikelihood:
                 continue
             factor = band.factor(noise)
             if factor is None:
-                return np.inf
+                return _IMPOSSIBLE
             white = band.whiten(factor, noise, values)
             error, constants = white[0], white[1:]
             total += float(np.log(factor[0]).sum()) + 0.5 * float(error @ error)
@@ -163,7 +171,10 @@ def fit_noise(likelihood: ErrorLikelihood, start: NoiseFit) -> NoiseFit:
 
     The process noise has a memory where that explains the errors better, and
     stated sensors are given up where the errors contradict them (p = 0.001 each).
+    Errors that are no more than rounding decide nothing.
     """
+    if likelihood.exact:
+        return start
     nx = len(start.free)
     best, loss = likelihood.fit(start)
     slow = replace(best.noise, memory=np.full(nx, 0.9))

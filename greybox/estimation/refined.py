@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from greybox.errors import ExcitationError
 from greybox.estimation.checks import whiteness
 from greybox.estimation.disturbance import estimate_current
-from greybox.estimation.estimate import Covariance, estimate_iv
+from greybox.estimation.estimate import Covariance, estimate_iv, estimate_ls
 from greybox.estimation.noise import (
     ErrorLikelihood,
     NoiseFit,
@@ -47,6 +47,13 @@ Array = NDArray[np.float64]
 _SETTLED = 1e-2
 _RELATIVE = 1e-6
 _MOST = 30
+# share of the increments' spread below which errors are rounding
+_EXACT = 1e-6
+# rounds after which the noise is settled at the latest
+_NOISE_ROUNDS = 6
+_MOST = 30
+# share of the increments' spread below which errors are rounding
+_EXACT = 1e-6
 # round that settles the noise: the errors of the plain estimate are too far off to decide by,
 # and were it sought in every round the two would chase each other
 _NOISE_ROUND = 2
@@ -120,7 +127,7 @@ class _Refinement:
         return point
 
     def start(self, theta: Array, keep: Sequence[NDArray[np.bool_]]) -> _Point:
-        """Return the point of a plain estimate, or one between it and its model in still water."""
+        """Return the point of coefficients, or one between it and their model in still water."""
         bias = np.array([c.is_bias for c in self.predictor.columns])
         none = [np.zeros(len(self.predictor.structure.states))] * len(self.logs)
         still = self.point(np.where(bias, 0.0, theta), none)
@@ -142,7 +149,10 @@ class _Refinement:
         return first_levels(self.likelihood(bands, theta), stated, further)
 
     def likelihood(self, bands: Sequence[ErrorBand], theta: Array) -> ErrorLikelihood:
-        return ErrorLikelihood(bands, self.errors(theta), own_constants(self.predictor))
+        spread = np.concatenate(self.y, axis=1).std(axis=1)
+        return ErrorLikelihood(
+            bands, self.errors(theta), own_constants(self.predictor), _EXACT * spread
+        )
 
 
 def estimate_refined_iv(
@@ -202,7 +212,12 @@ def estimate_refined_iv(
     work = _Refinement(regression, logs, heading, wind)
     states = predictor.structure.states
     keep = [e.keep for e in regression.experiments]
-    point = work.start(plain.theta, keep)
+    theta = plain.theta
+    point = work.start(theta, keep)
+    if point.diverged >= 0:
+        # plain instruments may fail on a short log where refined ones do not
+        theta = estimate_ls(predictor, logs, margins=margins, covariance="white").theta
+        point = work.start(theta, keep)
     if point.diverged >= 0:
         log, motion = logs[point.diverged], point.motions[point.diverged]
         raise ExcitationError(
@@ -211,7 +226,7 @@ def estimate_refined_iv(
         )
     # rows are cut once, by simulated states, which do not select on the noise
     keep = [within_margins(m.x, states, margins) for m in point.motions]
-    found = _refine(work, point, plain.theta, keep)
+    found = _refine(work, point, theta, keep)
     theta, kept = found.theta, sum(b.rows for b in found.bands)
     matrix, lags = white_covariance(
         found.rows,
@@ -239,7 +254,7 @@ def estimate_refined_iv(
         covariance_kind=covariance,
         lags=lags,
         iterations=plain.iterations + found.rounds,
-        status=f"{plain.status}; prefiltered by the noise: {found.status}",
+        status=f"prefiltered by the noise, {found.status}",
         current=estimate_current(
             predictor,
             theta,
@@ -271,12 +286,16 @@ def _refine(
 ) -> _Refined:
     """Find noise, coefficients and motions in turn until the coefficients settle."""
     status = f"still moving after {_MOST} rounds"
-    bands = work.bands(point, keep)
-    fit = work.first_levels(bands, theta)
+    fit = work.first_levels(work.bands(point, keep), theta)
+    settling, settled = False, False
     for rounds in range(1, _MOST + 1):
         bands = work.bands(point, keep)
-        if rounds == _NOISE_ROUND:
-            fit = fit_noise(work.likelihood(bands, theta), fit)
+        if settling:
+            # errors of coefficients that are still far off would decide wrongly, and were the
+            # noise sought in every round the two would chase each other
+            fit, settled = fit_noise(work.likelihood(bands, theta), fit), True
+        elif rounds > 1 and not settled:
+            fit = work.likelihood(bands, theta).fit(fit)[0]
         rows = work.rows(bands, fit, point)
         new, inverse = solve_white(rows)
         if not np.isfinite(new).all():
@@ -286,11 +305,13 @@ def _refine(
                 f"out what is weakly determined."
             )
         std = np.sqrt(np.sum([((inverse @ r.z) ** 2).sum(axis=1) for r in rows], axis=0))
-        moving = np.abs(new - theta) > _SETTLED * std + _RELATIVE * np.abs(theta)
+        moved, rounding = np.abs(new - theta), _RELATIVE * np.abs(theta)
         # a halfway motion settles too, but is not that of an estimate
         halfway = point.theta is not theta
         theta = new
-        if rounds > _NOISE_ROUND and not halfway and not moving.any():
+        near = not halfway and bool((moved < std + rounding).all())
+        settling = not settled and (near or rounds >= _NOISE_ROUNDS)
+        if settled and not halfway and (moved < _SETTLED * std + rounding).all():
             status = f"converged after {rounds} rounds"
             break
         following = work.towards(theta, work.constants(theta, keep), point)

@@ -108,7 +108,7 @@ class ErrorBand:
         from scipy.linalg.lapack import dpbtrf
 
         factor, info = dpbtrf(self.covariance(noise), lower=1)
-        return np.asarray(factor) if info == 0 else None
+        return np.asarray(factor) if info == 0 and np.isfinite(factor[0]).all() else None
 
     def whiten(self, factor: Array, noise: ErrorNoise, values: Array) -> Array:
         """Return values of all equations with the error made white.
