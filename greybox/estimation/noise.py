@@ -70,6 +70,9 @@ class ErrorLikelihood:
         (nx,) which equations have a constant of their own in each log.
     least : ndarray
         (nx,) spread below which errors count as none.
+    regressors : sequence of ndarray, optional
+        (p, N, nx) a log, whose coefficients were estimated: what they took from the
+        errors is then allowed for (restricted likelihood, each log by itself).
     """
 
     def __init__(
@@ -78,10 +81,24 @@ class ErrorLikelihood:
         residuals: Sequence[Array],
         equations: Sequence[bool],
         least: Array,
+        regressors: Sequence[Array] | None = None,
     ) -> None:
         self.bands = bands
+        self._own = int(np.sum(equations))
+        self._shared = 0 if regressors is None else len(regressors[0])
+        # coefficients belong to all logs, so their scale must be one
+        size: Array | float = 1.0
+        if regressors is not None:
+            size = np.sqrt(sum((z**2).sum(axis=(1, 2), keepdims=True) for z in regressors))
         self.values = [
-            np.concatenate([r[None], constant_rows(len(r), equations)]) for r in residuals
+            np.concatenate(
+                [
+                    constant_rows(len(r), equations),
+                    r[None],
+                    *([] if regressors is None else [regressors[i] / size]),
+                ]
+            )
+            for i, r in enumerate(residuals)
         ]
         kept = np.concatenate([r[b.keep] for r, b in zip(residuals, bands, strict=True)])
         self.scale = np.maximum(kept.std(axis=0), least)
@@ -90,20 +107,32 @@ class ErrorLikelihood:
     def loss(self, noise: ErrorNoise) -> float:
         """Return minus the logarithm of the likelihood, up to a constant."""
         total = 0.0
-        for band, values in zip(self.bands, self.values, strict=True):
-            if not band.rows:
-                continue
-            factor = band.factor(noise)
-            if factor is None:
-                return _IMPOSSIBLE
-            white = band.whiten(factor, noise, values)
-            error, constants = white[0], white[1:]
-            total += float(np.log(factor[0]).sum()) + 0.5 * float(error @ error)
-            if len(constants):
-                gram, score = constants @ constants.T, constants @ error
+        gram, score = np.zeros((self._shared, self._shared)), np.zeros(self._shared)
+        try:
+            for band, values in zip(self.bands, self.values, strict=True):
+                if not band.rows:
+                    continue
+                factor = band.factor(noise)
+                if factor is None:
+                    return _IMPOSSIBLE
+                white = band.whiten(factor, noise, values)
+                constants, rest = white[: self._own], white[self._own :]
+                total += float(np.log(factor[0]).sum())
+                if self._own:
+                    root = np.linalg.cholesky(constants @ constants.T)
+                    basis = np.linalg.solve(root, constants)
+                    rest = rest - (rest @ basis.T) @ basis
+                    total += float(np.log(np.diag(root)).sum())
+                error, regressors = rest[0], rest[1:]
+                total += 0.5 * float(error @ error)
+                gram += regressors @ regressors.T
+                score += regressors @ error
+            if self._shared:
                 root = np.linalg.cholesky(gram)
-                along = np.linalg.solve(root, score)
-                total += float(np.log(np.diag(root)).sum()) - 0.5 * float(along @ along)
+                taken = np.linalg.solve(root, score)
+                total += float(np.log(np.diag(root)).sum()) - 0.5 * float(taken @ taken)
+        except np.linalg.LinAlgError:
+            return _IMPOSSIBLE
         return total
 
     def fit(self, start: NoiseFit) -> tuple[NoiseFit, float]:

@@ -32,6 +32,7 @@ from greybox.estimation.white_rows import (
     WhiteRows,
     own_constants,
     solve_white,
+    spread_columns,
     white_covariance,
     white_rows,
 )
@@ -148,10 +149,15 @@ class _Refinement:
         )
         return first_levels(self.likelihood(bands, theta), stated, further)
 
-    def likelihood(self, bands: Sequence[ErrorBand], theta: Array) -> ErrorLikelihood:
+    def likelihood(
+        self, bands: Sequence[ErrorBand], theta: Array, restricted: _Point | None = None
+    ) -> ErrorLikelihood:
         spread = np.concatenate(self.y, axis=1).std(axis=1)
+        regressors = None
+        if restricted is not None:
+            regressors = [spread_columns(self.predictor, m.z) for m in restricted.motions]
         return ErrorLikelihood(
-            bands, self.errors(theta), own_constants(self.predictor), _EXACT * spread
+            bands, self.errors(theta), own_constants(self.predictor), _EXACT * spread, regressors
         )
 
 
@@ -294,6 +300,9 @@ def _refine(
             # errors of coefficients that are still far off would decide wrongly, and were the
             # noise sought in every round the two would chase each other
             fit, settled = fit_noise(work.likelihood(bands, theta), fit), True
+            if fit.remembers:
+                # slow noise looks like slow regressors, which take much of it
+                fit = work.likelihood(bands, theta, point).fit(fit)[0]
         elif rounds > 1 and not settled:
             fit = work.likelihood(bands, theta).fit(fit)[0]
         rows = work.rows(bands, fit, point)

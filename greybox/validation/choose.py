@@ -262,9 +262,10 @@ def _prefiltered(
             )
             if request.prefilter == "noise":
                 return refined
-            against = _worse(plain, refined, logs)
-            if not against:
+            runs = [run_model(refined.model(), log) for log in logs]
+            if all(r.diverged < 0 for r in runs):
                 return refined
+            against = "the free run of the refined model diverges"
         except ExcitationError as error:
             if request.prefilter == "noise":
                 raise
@@ -272,31 +273,6 @@ def _prefiltered(
     if against and request.prefilter == "auto":
         notes.append(f"the instruments were not refined by the noise: {against}.")
     return with_noise(plain, logs, **common)
-
-
-def _worse(plain: Estimate, refined: Estimate, logs: Sequence[TrialLog]) -> str:
-    """Return why a refined estimate is not preferred, empty where it is.
-
-    The two differ by noise only where the model holds; where it does not, the
-    refined one trusts the model further.
-    """
-    before = [run_model(plain.model(), log) for log in logs]
-    after = [run_model(refined.model(), log) for log in logs]
-    if any(r.diverged >= 0 for r in before):
-        return ""
-    if any(r.diverged >= 0 for r in after):
-        return "the free run of the refined model diverges"
-    loss = [
-        old - new
-        for old, new in zip(average_fit(before).values(), average_fit(after).values(), strict=True)
-    ]
-    mean = float(np.mean(loss))
-    if mean <= _PREFERENCE:
-        return ""
-    return (
-        f"the free run of the refined model fits these logs {mean:.1f} points worse, "
-        f"more than {_PREFERENCE:g}"
-    )
 
 
 def estimate_model(logs: Sequence[TrialLog], request: Request = Request()) -> Estimate:

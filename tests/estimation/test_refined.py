@@ -6,12 +6,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 from virtual import virtual_log
 
 from greybox.errors import DivergenceError, ExcitationError, UsageError
 from greybox.estimation.bound import iv_bound
 from greybox.estimation.estimate import estimate_iv
-from greybox.estimation.noise import ErrorLikelihood, first_levels, fit_noise
+from greybox.estimation.noise import (
+    ErrorLikelihood,
+    constant_rows,
+    first_levels,
+    fit_noise,
+)
 from greybox.estimation.refined import estimate_refined_iv, with_noise
 from greybox.estimation.white_rows import solve_white, spread_columns, white_rows
 from greybox.estimation.whitening import ErrorBand, ErrorNoise
@@ -227,6 +233,28 @@ def test_the_memory_of_process_noise_is_found():
             np.testing.assert_allclose(fit.noise.process, 0.1, rtol=0.4)
         else:
             assert (fit.noise.process < 0.02).all()
+
+
+def test_the_restricted_likelihood_equals_dense_algebra():
+    rng = np.random.default_rng(3)
+    keep = np.ones(25, bool)
+    noise = replace(NOISE, memory=np.zeros(3), further=np.zeros(0))
+    slopes = [0.5 * rng.normal(size=(25, 3, 3)) for _ in range(2)]
+    errors = [rng.normal(size=(25, 3)) for _ in range(2)]
+    z = [rng.normal(size=(5, 25, 3)) for _ in range(2)]
+    own = [True, False, True]
+    bands = [ErrorBand(s, keep) for s in slopes]
+    got = ErrorLikelihood(bands, errors, own, np.full(3, 1e-9), z).loss(noise)
+    omega = block_diag(*[dense_covariance(s, keep, noise) for s in slopes])
+    ones = block_diag(*[constant_rows(25, own).reshape(2, -1).T] * 2)
+    size = np.sqrt(sum((part**2).sum(axis=(1, 2)) for part in z))
+    shared = np.concatenate([part.reshape(5, -1).T for part in z]) / size
+    x, y = np.hstack([ones, shared]), np.concatenate([e.ravel() for e in errors])
+    inverse = np.linalg.inv(omega)
+    information = x.T @ inverse @ x
+    weight = inverse - inverse @ x @ np.linalg.solve(information, x.T @ inverse)
+    want = np.linalg.slogdet(omega)[1] + np.linalg.slogdet(information)[1] + y @ weight @ y
+    np.testing.assert_allclose(got, want / 2, rtol=1e-10)
 
 
 def test_plain_estimates_keep_noise_levels(basic, still_log):
