@@ -61,6 +61,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="zero-mean instruments (IV2, IV3) or with their mean (IV1)",
     )
     parser.add_argument(
+        "--prefilter",
+        choices=("auto", "noise", "none"),
+        default="auto",
+        help="refine instrumental variables by the noise, all equations jointly; auto: where "
+        "nothing speaks against it",
+    )
+    parser.add_argument(
         "--nominal",
         metavar="MODEL",
         help="model that simulates the first instruments, or starts oe (least squares by default)",
@@ -193,6 +200,7 @@ def run(options: argparse.Namespace) -> None:
             ),
             loop=options.loop,
             zero_mean=options.instruments == "zero-mean",
+            prefilter=options.prefilter,
             nominal=load_model(options.nominal) if options.nominal else None,
             seed=options.seed,
         ),

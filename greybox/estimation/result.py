@@ -82,6 +82,8 @@ class Estimate:
         Name, hash and length of each log.
     noise : NoiseLevels, optional
         What was found of measurement and process noise.
+    prefilter : {"none", "noise"}
+        Whether all equations were solved jointly with their error made white.
     """
 
     predictor: Predictor
@@ -103,6 +105,7 @@ class Estimate:
     fit: dict[str, float] = field(default_factory=dict)
     logs: tuple[dict[str, Any], ...] = ()
     noise: NoiseLevels | None = None
+    prefilter: str = "none"
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -157,6 +160,7 @@ class Estimate:
         biases = [i for i, c in enumerate(self.predictor.columns) if c.is_bias]
         return {
             "method": self.method,
+            "prefilter": self.prefilter,
             "predictor": self.predictor.kind,
             "regime": {s: list(v) for s, v in self.predictor.regime},
             "fit": self.fit,
@@ -183,10 +187,11 @@ class Estimate:
         """Return the result as text, in the manner of a regression table."""
         width = 78
         unit = self.vessel.force_unit
+        prefiltered = ", prefiltered" if self.prefilter == "noise" else ""
         lines = [
             f"{'Estimate of ' + self.vessel.name:^{width}}",
             "=" * width,
-            f"{'Method:':<18}{self.method:<22}{'Samples:':<18}{self.samples}",
+            f"{'Method:':<18}{self.method + prefiltered:<22}{'Samples:':<18}{self.samples}",
             f"{'Predictor:':<18}{self.predictor.kind:<22}{'Samples used:':<18}{self.kept}",
             f"{'Structure:':<18}{self.predictor.structure.name:<22}{'Sample time:':<18}"
             f"{self.sample_time:g} s",

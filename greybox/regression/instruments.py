@@ -116,22 +116,30 @@ def simulate_log(
     )
 
 
-def _air_instrument(log: TrialLog, x: Array, psi: Array, wind: str) -> tuple[Array, Array]:
-    """Return the velocity through the air of a simulated ship in the smoothed wind.
+def smoothed_wind(log: TrialLog) -> tuple[Array, Array] | None:
+    """Return the measured wind north and east (N,), averaged over a minute [m/s].
 
-    The n-frame wind follows from what was measured, averaged over a minute, so
-    that hardly any of the sensor's noise at a sample is left in its instrument.
+    So hardly any of the sensor's noise at a sample is left in its instrument.
+    None where the log lacks what the wind follows from.
     """
-    known = {"u", "v", "psi"} <= log.channels.keys() and x.shape[1] > 1
-    if wind == "measured" or not known:
-        return log["u_q"][: len(x)], log["v_q"][: len(x)]
+    if not {"u", "v", "psi", "u_q", "v_q"} <= log.channels.keys():
+        return None
     from scipy.ndimage import uniform_filter1d
 
     u_w, v_w = log["u"] - log["u_q"], log["v"] - log["v_q"]
     c, s = np.cos(log["psi"]), np.sin(log["psi"])
     window = min(max(_LEAST_WINDOW, round(WIND_WINDOW / log.sample_time)), len(log))
-    north = uniform_filter1d(c * u_w - s * v_w, window, mode="nearest")[: len(x)]
-    east = uniform_filter1d(s * u_w + c * v_w, window, mode="nearest")[: len(x)]
+    north = uniform_filter1d(c * u_w - s * v_w, window, mode="nearest")
+    east = uniform_filter1d(s * u_w + c * v_w, window, mode="nearest")
+    return north, east
+
+
+def _air_instrument(log: TrialLog, x: Array, psi: Array, wind: str) -> tuple[Array, Array]:
+    """Return the velocity through the air of a simulated ship in the smoothed wind."""
+    blow = smoothed_wind(log) if wind != "measured" and x.shape[1] > 1 else None
+    if blow is None:
+        return log["u_q"][: len(x)], log["v_q"][: len(x)]
+    north, east = blow[0][: len(x)], blow[1][: len(x)]
     c, s = np.cos(psi), np.sin(psi)
     return x[:, 0] - (c * north + s * east), x[:, 1] - (-s * north + c * east)
 

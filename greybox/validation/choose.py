@@ -22,6 +22,7 @@ from greybox.estimation.output_error import (
     estimate_oe,
     output_predictor,
 )
+from greybox.estimation.refined import estimate_refined_iv, with_noise
 from greybox.estimation.result import Estimate
 from greybox.model.catalogue import structure_for
 from greybox.model.model import ManoeuvringModel
@@ -66,7 +67,8 @@ class Request:
 
     ``margins`` are |u|, |v| [m/s] below which samples are cut out; ``nominal``
     simulates the first instruments, or starts output error (least squares does
-    without it); ``output_error`` is what only ``oe`` heeds.
+    without it); ``output_error`` is what only ``oe`` heeds; ``prefilter`` is
+    ``noise`` for refined instrumental variables, ``none`` for plain ones.
     """
 
     method: str | None = None
@@ -81,6 +83,7 @@ class Request:
     nominal: ManoeuvringModel | None = None
     output_error: OutputErrorOptions = field(default_factory=OutputErrorOptions)
     seed: int = 0
+    prefilter: Literal["auto", "noise", "none"] = "auto"
 
 
 def heading_range(logs: Sequence[TrialLog]) -> float:
@@ -201,6 +204,10 @@ def estimate_once(
             label = predictor.columns[error.column].label
             notes.append(f"the bias-capturing regressor {label} does not vary and was left out.")
             predictor = predictor.without_bias(error.column)
+    if method == "iv":
+        estimate = _prefiltered(
+            estimate, logs, request, "smoothed" if noisy_wind else "measured", closed, notes
+        )
     if kind in ("wind", "basic+wind") and method == "iv" and noisy_wind:
         notes.append(
             f"the wind in the instruments is the measured one averaged over {WIND_WINDOW:g} s, "
@@ -243,9 +250,7 @@ def _estimate_oe(
     start: Estimate | NDArray[np.float64] | None = _nominal_theta(request.nominal, structure)
     notes = ["it started from the nominal model."]
     if start is None:
-        quick = replace(
-            request, covariance="white", refine=_RANKING_REFINEMENTS, output_error=options
-        )
+        quick = replace(request, covariance="white", refine=_RANKING_REFINEMENTS, prefilter="none")
         for method in ("iv", "ls"):
             try:
                 start = estimate_once(logs, structure, method, kind, quick)
@@ -263,6 +268,61 @@ def _estimate_oe(
             predictor = predictor.without_bias(error.column)
     _, loop_test = assess_loop(logs, request.loop, "oe")
     return replace(estimate, tests=(*estimate.tests, loop_test), notes=(*estimate.notes, *notes))
+
+
+def _prefiltered(
+    plain: Estimate,
+    logs: Sequence[TrialLog],
+    request: Request,
+    wind: Literal["smoothed", "measured"],
+    closed: bool,
+    notes: list[str],
+) -> Estimate:
+    """Refine a plain IV estimate by its noise, unless something speaks against it.
+
+    Raises
+    ------
+    UsageError
+        The request asks for what zero-mean, undelayed instruments only can do.
+    ExcitationError
+        The refinement that the request asks for fails.
+    """
+    common: dict[str, Any] = {
+        "heading": request.heading,
+        "wind": wind,
+        "margins": request.margins,
+    }
+    against = ""
+    if closed:
+        against = "instruments are delayed for the closed loop, which a prefilter would undo"
+    elif not request.zero_mean:
+        against = "instruments keep their mean"
+    if request.prefilter == "noise" and against:
+        raise UsageError(
+            f"--prefilter noise needs open loop and zero-mean instruments, and {against}: "
+            f"use --prefilter none."
+        )
+    if request.prefilter != "none" and not against:
+        kind: dict[str, Any] = (
+            {} if request.covariance is None else {"covariance": request.covariance}
+        )
+        try:
+            refined = estimate_refined_iv(
+                plain.predictor, logs, start=plain, seed=request.seed, **kind, **common
+            )
+            if request.prefilter == "noise":
+                return refined
+            runs = [run_model(refined.model(), log) for log in logs]
+            if all(r.diverged < 0 for r in runs):
+                return refined
+            against = "the free run of the refined model diverges"
+        except ExcitationError as error:
+            if request.prefilter == "noise":
+                raise
+            against = str(error).rstrip(".")
+    if against and request.prefilter == "auto":
+        notes.append(f"the instruments were not refined by the noise: {against}.")
+    return with_noise(plain, logs, **common)
 
 
 def estimate_model(logs: Sequence[TrialLog], request: Request = Request()) -> Estimate:
@@ -463,7 +523,7 @@ def _compare(
 ) -> list[Alternative]:
     """Order the alternatives by the held-out free run, the earlier ones preferred."""
     # a ranking needs neither standard errors nor the last digit
-    request = replace(request, covariance="white", refine=_RANKING_REFINEMENTS)
+    request = replace(request, covariance="white", refine=_RANKING_REFINEMENTS, prefilter="none")
     fitting, held = [], []
     for log in logs:
         cut = len(log) - int(len(log) * _HELD_OUT)

@@ -1,0 +1,256 @@
+"""How noisy the measurements and the motion were, from the errors of an estimate.
+
+Exact Gaussian likelihood of the equation errors at given coefficients, over the
+levels of measurement and process noise: neighbouring errors share a measurement,
+which no process noise imitates. The constants of each log are integrated out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.estimation.whitening import ErrorBand, ErrorNoise
+from greybox.model.noise import NoiseLevels
+from greybox.vessel.vessel import Vessel
+
+Array = NDArray[np.float64]
+
+# levels are sought down to this share of the residual's standard deviation
+_LEAST = 1e-3
+# slowest process noise that is told from a constant, in samples
+_SLOWEST = 300.0
+# 2 Δ log-likelihood beyond which nx further levels are believed (χ², p = 0.001, 3 of them)
+_BELIEVED = 16.3
+# loss where a covariance is singular: finite, so that differences stay numbers
+_IMPOSSIBLE = 1e100
+
+
+@dataclass(frozen=True)
+class NoiseFit:
+    """Levels, and which of them were sought.
+
+    Parameters
+    ----------
+    noise : ErrorNoise
+    free : ndarray of bool
+        (nx,) states whose measurement noise was estimated.
+    remembers : bool
+        Whether the process noise was found to have a memory.
+    contradicted : bool
+        Whether stated sensors were given up because the errors contradict them.
+    """
+
+    noise: ErrorNoise
+    free: NDArray[np.bool_]
+    remembers: bool = False
+    contradicted: bool = False
+
+
+def constant_rows(rows: int, equations: Sequence[bool]) -> Array:
+    """Return a constant for each equation that has one, (q, N, nx)."""
+    own = np.flatnonzero(equations)
+    out = np.zeros((len(own), rows, len(equations)))
+    out[np.arange(len(own)), :, own] = 1.0
+    return out
+
+
+class ErrorLikelihood:
+    """The likelihood of some logs' equation errors.
+
+    Parameters
+    ----------
+    bands : sequence of ErrorBand
+    residuals : sequence of ndarray
+        (N, nx) a log.
+    equations : sequence of bool
+        (nx,) which equations have a constant of their own in each log.
+    least : ndarray
+        (nx,) spread below which errors count as none.
+    regressors : sequence of ndarray, optional
+        (p, N, nx) a log, whose coefficients were estimated: what they took from the
+        errors is then allowed for (restricted likelihood, each log by itself).
+    """
+
+    def __init__(
+        self,
+        bands: Sequence[ErrorBand],
+        residuals: Sequence[Array],
+        equations: Sequence[bool],
+        least: Array,
+        regressors: Sequence[Array] | None = None,
+    ) -> None:
+        self.bands = bands
+        self._own = int(np.sum(equations))
+        self._shared = 0 if regressors is None else len(regressors[0])
+        # coefficients belong to all logs, so their scale must be one
+        size: Array | float = 1.0
+        if regressors is not None:
+            size = np.sqrt(sum((z**2).sum(axis=(1, 2), keepdims=True) for z in regressors))
+        self.values = [
+            np.concatenate(
+                [
+                    constant_rows(len(r), equations),
+                    r[None],
+                    *([] if regressors is None else [regressors[i] / size]),
+                ]
+            )
+            for i, r in enumerate(residuals)
+        ]
+        kept = np.concatenate([r[b.keep] for r, b in zip(residuals, bands, strict=True)])
+        self.scale = np.maximum(kept.std(axis=0), least)
+        self.exact = bool((kept.std(axis=0) < least).any())
+
+    def loss(self, noise: ErrorNoise) -> float:
+        """Return minus the logarithm of the likelihood, up to a constant."""
+        total = 0.0
+        gram, score = np.zeros((self._shared, self._shared)), np.zeros(self._shared)
+        try:
+            for band, values in zip(self.bands, self.values, strict=True):
+                if not band.rows:
+                    continue
+                factor = band.factor(noise)
+                if factor is None:
+                    return _IMPOSSIBLE
+                white = band.whiten(factor, noise, values)
+                constants, rest = white[: self._own], white[self._own :]
+                total += float(np.log(factor[0]).sum())
+                if self._own:
+                    root = np.linalg.cholesky(constants @ constants.T)
+                    basis = np.linalg.solve(root, constants)
+                    rest = rest - (rest @ basis.T) @ basis
+                    total += float(np.log(np.diag(root)).sum())
+                error, regressors = rest[0], rest[1:]
+                total += 0.5 * float(error @ error)
+                gram += regressors @ regressors.T
+                score += regressors @ error
+            if self._shared:
+                root = np.linalg.cholesky(gram)
+                taken = np.linalg.solve(root, score)
+                total += float(np.log(np.diag(root)).sum()) - 0.5 * float(taken @ taken)
+        except np.linalg.LinAlgError:
+            return _IMPOSSIBLE
+        return total
+
+    def fit(self, start: NoiseFit) -> tuple[NoiseFit, float]:
+        """Return the levels of greatest likelihood from a start, and the loss there."""
+        from scipy.optimize import minimize
+
+        nx = len(self.scale)
+        free = np.flatnonzero(start.free)
+        longest = np.log(_SLOWEST)
+
+        def unpack(p: Array) -> ErrorNoise:
+            measurement = start.noise.measurement.copy()
+            measurement[free] = self.scale[free] * np.exp(p[: len(free)])
+            process = self.scale * np.exp(p[len(free) : len(free) + nx])
+            memory = np.zeros(nx)
+            if start.remembers:
+                memory = -np.expm1(-p[len(free) + nx :])
+            return replace(start.noise, measurement=measurement, process=process, memory=memory)
+
+        low = np.log(_LEAST)
+        first = np.concatenate(
+            [
+                np.log(start.noise.measurement[free] / self.scale[free]),
+                np.log(start.noise.process / self.scale),
+                -np.log1p(-start.noise.memory) if start.remembers else [],
+            ]
+        )
+        bounds = [(low, 1.0)] * (len(free) + nx)
+        bounds += [(0.0, longest)] * (nx if start.remembers else 0)
+        # in these units curvature is about 1, and a slope of 0.01 is next to nothing
+        unit = np.sqrt(sum(band.rows for band in self.bands))
+        ends = np.array(bounds) * unit
+        found = minimize(
+            lambda p: self.loss(unpack(p / unit)),
+            np.clip(first * unit, ends[:, 0], ends[:, 1]),
+            method="L-BFGS-B",
+            bounds=ends,
+            options={"ftol": 1e-9, "gtol": 0.01, "eps": 1e-4 * unit, "maxiter": 40},
+        )
+        return replace(start, noise=unpack(found.x / unit)), float(found.fun)
+
+
+def first_levels(likelihood: ErrorLikelihood, stated: Array, further: Array) -> NoiseFit:
+    """Find levels with stated sensors kept and a process noise without memory.
+
+    Parameters
+    ----------
+    likelihood : ErrorLikelihood
+    stated : ndarray
+        (nx,) standard deviation of each measured state, nan where it is not known.
+    further : ndarray
+        (m,) of heading and wind, 0 where not known.
+    """
+    free = np.isnan(stated)
+    # the error holds the measurement about twice
+    guess = np.where(free, 0.6 * likelihood.scale, stated)
+    noise = ErrorNoise(
+        guess, 0.2 * likelihood.scale, np.zeros(len(stated)), np.asarray(further, float)
+    )
+    return likelihood.fit(NoiseFit(noise, free))[0]
+
+
+def fit_noise(likelihood: ErrorLikelihood, start: NoiseFit) -> NoiseFit:
+    """Find the levels, and decide what the errors say beyond the first ones.
+
+    The process noise has a memory where that explains the errors better, and
+    stated sensors are given up where the errors contradict them (p = 0.001 each).
+    Errors that are no more than rounding decide nothing.
+    """
+    if likelihood.exact:
+        return start
+    nx = len(start.free)
+    best, loss = likelihood.fit(start)
+    slow = replace(best.noise, memory=np.full(nx, 0.9))
+    remembering, found = likelihood.fit(replace(best, noise=slow, remembers=True))
+    if 2 * (loss - found) > _BELIEVED:
+        best, loss = remembering, found
+    if not start.free.all():
+        opened, found = likelihood.fit(replace(best, free=np.ones(nx, bool), contradicted=True))
+        if 2 * (loss - found) > _BELIEVED:
+            best = opened
+    return best
+
+
+def stated_levels(
+    vessel: Vessel, states: Sequence[str], further: Sequence[str]
+) -> tuple[Array, Array]:
+    """Return what the vessel file says of its sensors, nan and 0 where it is silent."""
+    measured = [vessel.std(s) for s in states]
+    rest = [vessel.std("psi" if n == "psi" else "wind") or 0.0 for n in further]
+    return np.array([np.nan if v is None else v for v in measured]), np.array(rest)
+
+
+def noise_levels_of(
+    fit: NoiseFit, states: tuple[str, ...], vessel: Vessel, sample_time: float
+) -> NoiseLevels:
+    """Return the levels as a model keeps them, with a sentence on their origin."""
+    found = [s for s, f in zip(states, fit.free, strict=True) if f]
+    known = [s for s, f in zip(states, fit.free, strict=True) if not f]
+    told = []
+    if known:
+        told.append(f"noise of {', '.join(known)} as the vessel file states it")
+    if found:
+        why = ", because the vessel file's contradicts them" if fit.contradicted else ""
+        told.append(f"noise of {', '.join(found)} from the equation errors{why}")
+    remembered = ""
+    if fit.remembers:
+        parts = []
+        for state, rho in zip(states, fit.noise.memory, strict=True):
+            if rho > 0:
+                parts.append(f"{state} {-sample_time / np.log(rho):.3g} s")
+        remembered = f", with a memory ({', '.join(parts)})" if parts else ""
+    told.append(f"process noise from the equation errors{remembered}")
+    return NoiseLevels(
+        states,
+        fit.noise.measurement,
+        fit.noise.process,
+        vessel.std("psi") or 0.0,
+        vessel.std("wind") or 0.0,
+        "; ".join(told),
+    )

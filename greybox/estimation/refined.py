@@ -1,0 +1,368 @@
+"""Refined instrumental variables: one solve of all equations with the error made white.
+
+The error of (4.3) is a moving average, so a sum over unfiltered samples weighs
+what nearly cancels as if it did not. With Ω its covariance, the optimal
+instruments are Ω⁻¹ times the noise-free regressors, θ̂ = (Zᵀ Ω⁻¹ Φ)⁻¹ Zᵀ Ω⁻¹ y
+(Söderström and Stoica, 1983; Young, 2008).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.errors import ExcitationError
+from greybox.estimation.checks import whiteness
+from greybox.estimation.disturbance import estimate_current
+from greybox.estimation.estimate import Covariance, estimate_iv, estimate_ls
+from greybox.estimation.noise import (
+    ErrorLikelihood,
+    NoiseFit,
+    first_levels,
+    fit_noise,
+    noise_levels_of,
+    stated_levels,
+)
+from greybox.estimation.result import Estimate
+from greybox.estimation.white_rows import (
+    WhiteRows,
+    own_constants,
+    solve_white,
+    spread_columns,
+    white_covariance,
+    white_rows,
+)
+from greybox.estimation.whitening import ErrorBand
+from greybox.model.predictor import Predictor
+from greybox.regression.motion import Motion, further_channels, predicted_motion
+from greybox.regression.regression import Regression, build_regression, within_margins
+from greybox.trial.log import TrialLog
+
+Array = NDArray[np.float64]
+
+# a coefficient has settled when it moves by less than this share of its standard error
+_SETTLED = 1e-2
+_RELATIVE = 1e-6
+_MOST = 30
+# share of the increments' spread below which errors are rounding
+_EXACT = 1e-6
+# rounds after which the noise is settled at the latest
+_NOISE_ROUNDS = 6
+_MOST = 30
+# share of the increments' spread below which errors are rounding
+_EXACT = 1e-6
+# round that settles the noise: the errors of the plain estimate are too far off to decide by,
+# and were it sought in every round the two would chase each other
+_NOISE_ROUND = 2
+
+
+@dataclass(frozen=True)
+class _Point:
+    """Coefficients (p,), the constants (nx,) of each log, and the motions that they predict."""
+
+    theta: Array
+    constants: tuple[Array, ...]
+    motions: tuple[Motion, ...]
+
+    @property
+    def diverged(self) -> int:
+        """Position of the first log whose motion left its bound, −1 where none did."""
+        return next((i for i, m in enumerate(self.motions) if m.diverged >= 0), -1)
+
+
+class _Refinement:
+    """What the rounds share: the regression, and how a motion is predicted."""
+
+    def __init__(
+        self,
+        regression: Regression,
+        logs: Sequence[TrialLog],
+        heading: Literal["measured", "simulated"],
+        wind: Literal["smoothed", "measured"],
+    ) -> None:
+        self.regression = regression
+        self.predictor = regression.predictor
+        self.logs = logs
+        self._heading: Literal["measured", "simulated"] = heading
+        self._wind: Literal["smoothed", "measured"] = wind
+        self.phi = [e.phi for e in regression.experiments]
+        self.y = [e.y for e in regression.experiments]
+
+    def point(self, theta: Array, constants: Sequence[Array]) -> _Point:
+        motions = [
+            predicted_motion(
+                self.predictor, log, theta, own, heading=self._heading, wind=self._wind
+            )
+            for log, own in zip(self.logs, constants, strict=True)
+        ]
+        return _Point(theta, tuple(constants), tuple(motions))
+
+    def errors(self, theta: Array) -> list[Array]:
+        """Return y − Φᵀθ of each log, (N, nx)."""
+        equations = [self.predictor.equation(s) for s in self.predictor.structure.states]
+        return [
+            np.stack([y[i] - theta[mine] @ phi[mine] for i, mine in enumerate(equations)], axis=1)
+            for phi, y in zip(self.phi, self.y, strict=True)
+        ]
+
+    def constants(self, theta: Array, keep: Sequence[NDArray[np.bool_]]) -> list[Array]:
+        """Return the mean error of each equation and log where it has a constant of its own."""
+        own = np.array(own_constants(self.predictor))
+        return [
+            np.where(own, e[k].mean(axis=0), 0.0) if k.any() else np.zeros(len(own))
+            for e, k in zip(self.errors(theta), keep, strict=True)
+        ]
+
+    def towards(self, target: Array, constants: Sequence[Array], bounded: _Point) -> _Point:
+        """Return the point at `target`, or one halfway to it whose motions stay bounded."""
+        point = self.point(target, constants)
+        for _ in range(4):
+            if point.diverged < 0:
+                break
+            means = [(a + b) / 2 for a, b in zip(point.constants, bounded.constants, strict=True)]
+            point = self.point((point.theta + bounded.theta) / 2, means)
+        return point
+
+    def start(self, theta: Array, keep: Sequence[NDArray[np.bool_]]) -> _Point:
+        """Return the point of coefficients, or one between it and their model in still water."""
+        bias = np.array([c.is_bias for c in self.predictor.columns])
+        none = [np.zeros(len(self.predictor.structure.states))] * len(self.logs)
+        still = self.point(np.where(bias, 0.0, theta), none)
+        return self.towards(theta, self.constants(theta, keep), still)
+
+    def rows(self, bands: Sequence[ErrorBand], fit: NoiseFit, point: _Point) -> list[WhiteRows]:
+        return [
+            white_rows(self.predictor, band, fit.noise, motion.z, phi, y)
+            for band, motion, phi, y in zip(bands, point.motions, self.phi, self.y, strict=True)
+        ]
+
+    def bands(self, point: _Point, keep: Sequence[NDArray[np.bool_]]) -> list[ErrorBand]:
+        return [ErrorBand(m.slopes, k) for m, k in zip(point.motions, keep, strict=True)]
+
+    def first_levels(self, bands: Sequence[ErrorBand], theta: Array) -> NoiseFit:
+        stated, further = stated_levels(
+            self.logs[0].vessel, self.predictor.structure.states, further_channels(self.predictor)
+        )
+        return first_levels(self.likelihood(bands, theta), stated, further)
+
+    def likelihood(
+        self, bands: Sequence[ErrorBand], theta: Array, restricted: _Point | None = None
+    ) -> ErrorLikelihood:
+        spread = np.concatenate(self.y, axis=1).std(axis=1)
+        regressors = None
+        if restricted is not None:
+            regressors = [spread_columns(self.predictor, m.z) for m in restricted.motions]
+        return ErrorLikelihood(
+            bands, self.errors(theta), own_constants(self.predictor), _EXACT * spread, regressors
+        )
+
+
+def estimate_refined_iv(
+    predictor: Predictor,
+    logs: Sequence[TrialLog],
+    *,
+    start: Array | Estimate | None = None,
+    heading: Literal["measured", "simulated"] = "measured",
+    wind: Literal["smoothed", "measured"] = "smoothed",
+    margins: dict[str, float] | None = None,
+    covariance: Covariance = "ma",
+    seed: int = 0,
+) -> Estimate:
+    """Estimate the parameters by refined instrumental variables, all equations jointly.
+
+    Instruments, noise levels and coefficients are found in turn, from the plain
+    estimate with zero-mean instruments. The instruments are the regressors of the
+    motion that the predictor itself predicts, with its bias-capturing terms and
+    the constants of each log.
+
+    Parameters
+    ----------
+    predictor : Predictor
+    logs : sequence of TrialLog
+        One experiment each, in open loop.
+    start : ndarray or Estimate, optional
+        A plain IV estimate of the same predictor and logs, or where that one starts.
+    heading, wind, margins, seed
+        As `estimate_iv`.
+    covariance : {"ma", "hac", "white", "bootstrap"}
+        ``white`` believes the noise model, which is then as efficient as it says;
+        the others allow for innovations that keep some colour.
+
+    Returns
+    -------
+    Estimate
+        ``prefilter`` is ``noise`` and ``noise`` holds the levels. Where a motion
+        diverges, the step is halved; where that does not help, the last estimate
+        with bounded motions is given and ``status`` says so.
+
+    Raises
+    ------
+    ExcitationError
+        The plain estimate fails, its own prediction diverges, or some direction
+        is not excited.
+
+    References
+    ----------
+    Söderström and Stoica (1983); Young (2008).
+    """
+    plain = start if isinstance(start, Estimate) and start.method == "iv" else None
+    if plain is None:
+        plain = estimate_iv(
+            predictor, logs, start=start, heading=heading, wind=wind, margins=margins
+        )
+    regression = build_regression(predictor, logs, margins=margins)
+    work = _Refinement(regression, logs, heading, wind)
+    states = predictor.structure.states
+    keep = [e.keep for e in regression.experiments]
+    theta = plain.theta
+    point = work.start(theta, keep)
+    if point.diverged >= 0:
+        # plain instruments may fail on a short log where refined ones do not
+        theta = estimate_ls(predictor, logs, margins=margins, covariance="white").theta
+        point = work.start(theta, keep)
+    if point.diverged >= 0:
+        log, motion = logs[point.diverged], point.motions[point.diverged]
+        raise ExcitationError(
+            f"the motion that the estimate predicts for '{log.name}' left its bound at sample "
+            f"{motion.diverged} of {len(log)}: estimate without --prefilter."
+        )
+    # rows are cut once, by simulated states, which do not select on the noise
+    keep = [within_margins(m.x, states, margins) for m in point.motions]
+    found = _refine(work, point, theta, keep)
+    theta, kept = found.theta, sum(b.rows for b in found.bands)
+    matrix, lags = white_covariance(
+        found.rows,
+        found.bands,
+        theta,
+        found.inverse,
+        covariance,
+        samples=[len(k) for k in keep],
+        seed=seed,
+    )
+    innovations = [(r.y - theta @ r.phi).reshape(-1, len(states)) for r in found.rows]
+    colour = {
+        f"whiteness_{s}": whiteness(
+            s, [e[:, i] for e in innovations if len(e)], len(predictor.equation(s))
+        )
+        for i, s in enumerate(states)
+    }
+    vessel = logs[0].vessel
+    return replace(
+        plain,
+        theta=theta,
+        covariance=matrix,
+        residual_std=_spread(work.errors(theta), keep),
+        kept=kept,
+        covariance_kind=covariance,
+        lags=lags,
+        iterations=plain.iterations + found.rounds,
+        status=f"prefiltered by the noise, {found.status}",
+        current=estimate_current(
+            predictor,
+            theta,
+            matrix,
+            heading_std=vessel.std("psi") or 0.0,
+            heading_measured=heading == "measured",
+        ),
+        tests=tuple(colour.get(t.name, t) for t in plain.tests),
+        prefilter="noise",
+        noise=noise_levels_of(found.fit, states, vessel, regression.sample_time),
+    )
+
+
+@dataclass(frozen=True)
+class _Refined:
+    """Where the rounds ended."""
+
+    theta: Array
+    inverse: Array
+    rows: list[WhiteRows]
+    bands: list[ErrorBand]
+    fit: NoiseFit
+    rounds: int
+    status: str
+
+
+def _refine(
+    work: _Refinement, point: _Point, theta: Array, keep: Sequence[NDArray[np.bool_]]
+) -> _Refined:
+    """Find noise, coefficients and motions in turn until the coefficients settle."""
+    status = f"still moving after {_MOST} rounds"
+    fit = work.first_levels(work.bands(point, keep), theta)
+    settling, settled = False, False
+    for rounds in range(1, _MOST + 1):
+        bands = work.bands(point, keep)
+        if settling:
+            # errors of coefficients that are still far off would decide wrongly, and were the
+            # noise sought in every round the two would chase each other
+            fit, settled = fit_noise(work.likelihood(bands, theta), fit), True
+            if fit.remembers:
+                # slow noise looks like slow regressors, which take much of it
+                fit = work.likelihood(bands, theta, point).fit(fit)[0]
+        elif rounds > 1 and not settled:
+            fit = work.likelihood(bands, theta).fit(fit)[0]
+        rows = work.rows(bands, fit, point)
+        new, inverse = solve_white(rows)
+        if not np.isfinite(new).all():
+            raise ExcitationError(
+                f"the prefiltered instruments of {len(new)} coefficients are singular on "
+                f"{sum(b.rows for b in bands)} samples: estimate without --prefilter, or leave "
+                f"out what is weakly determined."
+            )
+        std = np.sqrt(np.sum([((inverse @ r.z) ** 2).sum(axis=1) for r in rows], axis=0))
+        moved, rounding = np.abs(new - theta), _RELATIVE * np.abs(theta)
+        # a halfway motion settles too, but is not that of an estimate
+        halfway = point.theta is not theta
+        theta = new
+        near = not halfway and bool((moved < std + rounding).all())
+        settling = not settled and (near or rounds >= _NOISE_ROUNDS)
+        if settled and not halfway and (moved < _SETTLED * std + rounding).all():
+            status = f"converged after {rounds} rounds"
+            break
+        following = work.towards(theta, work.constants(theta, keep), point)
+        if following.diverged >= 0:
+            status = (
+                f"stopped after {rounds} rounds: the motion predicted for "
+                f"'{work.logs[following.diverged].name}' diverges; the last estimate with "
+                f"bounded instruments is given"
+            )
+            break
+        point = following
+    return _Refined(theta, inverse, rows, bands, fit, rounds, status)
+
+
+def _spread(errors: Sequence[Array], keep: Sequence[NDArray[np.bool_]]) -> Array:
+    """Return the standard deviation (nx,) of errors (N, nx) about the mean of each log."""
+    kept = [e[k] - e[k].mean(axis=0) for e, k in zip(errors, keep, strict=True) if k.any()]
+    return np.asarray(np.concatenate(kept).std(axis=0))
+
+
+def with_noise(
+    estimate: Estimate,
+    logs: Sequence[TrialLog],
+    *,
+    heading: Literal["measured", "simulated"] = "measured",
+    wind: Literal["smoothed", "measured"] = "smoothed",
+    margins: dict[str, float] | None = None,
+) -> Estimate:
+    """Return a plain estimate with the noise levels that its equation errors tell.
+
+    Sensors are taken as stated and the process noise as white: errors of plain
+    coefficients are too far off to decide more. Without change where the motion
+    that the estimate predicts diverges.
+    """
+    regression = build_regression(estimate.predictor, logs, margins=margins)
+    work = _Refinement(regression, logs, heading, wind)
+    keep = [e.keep for e in regression.experiments]
+    point = work.start(estimate.theta, keep)
+    if point.diverged >= 0:
+        return estimate
+    fit = work.first_levels(work.bands(point, keep), estimate.theta)
+    levels = noise_levels_of(
+        fit, estimate.predictor.structure.states, logs[0].vessel, regression.sample_time
+    )
+    return replace(estimate, noise=levels)

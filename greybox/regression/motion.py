@@ -1,0 +1,192 @@
+"""The motion that a predictor itself predicts, bias-capturing terms included.
+
+Still-water instruments (4.61) need no more than a model. Once the coefficients
+of a predictor are estimated, its own one-step prediction, fed back, follows the
+disturbed ship without its noise: regressors there are the noise-free ones, and
+derivatives there say how each measurement's noise enters the equation error.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Literal
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.model.predictor import Predictor
+from greybox.regression.instruments import initial_state, smoothed_wind, state_bound
+from greybox.trial.log import TrialLog
+from greybox.vectorised import Vectorised
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Motion:
+    """One log's predicted motion.
+
+    Parameters
+    ----------
+    x : ndarray
+        (N, nx) states [m/s, rad/s].
+    z : ndarray
+        (p, N) regressors at those states, not centred.
+    slopes : ndarray
+        (N, nx, nx + m) derivative of the next state in the states and in the m
+        further measured channels: the heading, then the velocity through the air.
+    diverged : int
+        First sample outside the bound, −1 where there is none.
+    """
+
+    x: Array
+    z: Array
+    slopes: Array
+    diverged: int
+
+
+def further_channels(predictor: Predictor) -> tuple[str, ...]:
+    """Return what a predictor reads beside states and inputs: ``psi``, ``u_q``, ``v_q``."""
+    if predictor.structure.disturbance != "marine":
+        return ()
+    return ("psi", "u_q", "v_q") if predictor.air_measured else ("psi",)
+
+
+@lru_cache(maxsize=32)
+def _step(predictor: Predictor, samples: int, heading: str, relative: bool) -> ca.Function:
+    """Return ``samples`` steps ``(state, w, coefficients and constants and dt) -> states``.
+
+    ``w`` holds heading, inputs and air: the velocity through the air, or, where
+    `relative`, the wind along the body axes, from which the state is taken.
+    """
+    s = predictor.structure.symbols
+    coefficients = ca.SX.sym("c", len(predictor.columns))
+    constants = ca.SX.sym("k", s.x.numel())
+    dt, psi = ca.SX.sym("dt"), ca.SX.sym("psi")
+    air = ca.SX.sym("air", 2)
+    increment = ca.vertcat(*predicted(predictor, coefficients)) + constants
+    through = s.x[:2] - air if relative else air
+    increment = ca.substitute(increment, s.air, through)
+    after = s.x + increment if predictor.structure.increment else increment
+    turn = dt * s.x[predictor.structure.states.index("r")] if heading == "simulated" else 0.0
+    # the last state is the heading of a simulated one; a measured one comes with w
+    own = ca.SX.sym("own")
+    after = ca.substitute(after, s.psi, own if heading == "simulated" else psi)
+    state = ca.vertcat(s.x, own)
+    one = ca.Function(
+        "step",
+        [state, ca.vertcat(psi, s.tau, air), ca.vertcat(coefficients, constants, dt)],
+        [ca.vertcat(after, own + turn)],
+        {"cse": True},
+    )
+    return one.mapaccum("motion", samples, [0], [0])
+
+
+def predicted(predictor: Predictor, coefficients: ca.SX) -> list[ca.SX]:
+    """Return φᵀθ of each equation as expressions."""
+    out = []
+    for state in predictor.structure.states:
+        mine = predictor.equation(state)
+        out.append(sum((coefficients[i] * predictor.expressions[i] for i in mine), ca.SX(0)))
+    return out
+
+
+@lru_cache(maxsize=32)
+def _slopes(predictor: Predictor) -> Vectorised:
+    s = predictor.structure.symbols
+    coefficients = ca.SX.sym("c", len(predictor.columns))
+    after = ca.vertcat(*predicted(predictor, coefficients))
+    if predictor.structure.increment:
+        after = after + s.x
+    further = {"psi": s.psi, "u_q": s.air[0], "v_q": s.air[1]}
+    symbols = ca.vertcat(s.x, *[further[n] for n in further_channels(predictor)])
+    scalars = [*ca.vertsplit(s.x), s.psi, *ca.vertsplit(s.tau), *ca.vertsplit(s.air)]
+    jacobian = ca.jacobian(after, symbols)
+    return Vectorised(
+        ca.vertsplit(ca.densify(ca.vec(jacobian.T))), [*scalars, *ca.vertsplit(coefficients)]
+    )
+
+
+def predicted_motion(
+    predictor: Predictor,
+    log: TrialLog,
+    theta: Array,
+    constants: Array,
+    *,
+    heading: Literal["measured", "simulated"] = "measured",
+    wind: Literal["smoothed", "measured"] = "smoothed",
+) -> Motion:
+    """Feed a predictor's own prediction back along a log's inputs.
+
+    Parameters
+    ----------
+    predictor : Predictor
+    log : TrialLog
+    theta : ndarray
+        (p,) coefficients of all columns.
+    constants : ndarray
+        (nx,) what zero-mean instruments leave to each equation of this log.
+    heading, wind : str
+        As in `build_instruments`.
+
+    Returns
+    -------
+    Motion
+        Of N−1 samples of the log, as its regression has.
+    """
+    structure = predictor.structure
+    marine = structure.disturbance == "marine"
+    samples, nx = len(log) - 1, len(structure.states)
+    psi = np.asarray(log["psi"][:-1], float) if marine else np.zeros(samples)
+    tau = (
+        log.forces(structure.inputs)[:-1]
+        if marine
+        else np.column_stack([log[n] for n in structure.inputs])[:-1]
+    )
+    air = np.zeros((samples, 2))
+    blow = smoothed_wind(log) if wind == "smoothed" and predictor.air_measured and nx > 1 else None
+    if blow is not None:
+        c, s = np.cos(psi), np.sin(psi)
+        north, east = blow[0][:-1], blow[1][:-1]
+        air = np.column_stack([c * north + s * east, c * east - s * north])
+    elif predictor.air_measured:
+        air = np.column_stack([log["u_q"][:-1], log["v_q"][:-1]])
+    start = np.append(initial_state(log, structure.states), psi[0])
+    run = _step(predictor, samples, heading, blow is not None)
+    p = np.concatenate([theta, constants, [log.sample_time]])
+    after = run(start, np.column_stack([psi, tau, air]).T, ca.repmat(ca.DM(p), 1, samples))
+    whole = np.vstack([start, np.asarray(after.full()).T[:-1]])
+    x = whole[:, :nx]
+    with np.errstate(invalid="ignore"):
+        outside = np.asarray(~(np.abs(x) <= state_bound(log, structure.states)).all(axis=1))
+    if outside.any():
+        return Motion(x, np.empty((0, 0)), np.empty((0, 0, 0)), int(outside.argmax()))
+    angle = whole[:, nx] if heading == "simulated" else psi
+    through = x[:, :2] - air if blow is not None else air
+    z, slopes = regressors_along(predictor, x, angle, tau, through, theta)
+    return Motion(x, z, slopes, -1)
+
+
+def regressors_along(
+    predictor: Predictor, x: Array, psi: Array, tau: Array, air: Array, theta: Array
+) -> tuple[Array, Array]:
+    """Return regressors (p, N) and slopes (N, nx, nx + m) along a motion.
+
+    Parameters
+    ----------
+    x, psi, tau, air : ndarray
+        (N, nx), (N,), (N, nu), (N, 2).
+    theta : ndarray
+        (p,) coefficients of all columns, which the slopes depend on.
+    """
+    states = [np.ascontiguousarray(v) for v in x.T]
+    inputs = [np.ascontiguousarray(v) for v in tau.T]
+    pair = (np.ascontiguousarray(air[:, 0]), np.ascontiguousarray(air[:, 1]))
+    z = predictor.evaluate(states, psi, inputs, pair)
+    nx = x.shape[1]
+    channels = nx + len(further_channels(predictor))
+    slopes = np.empty((nx * channels, len(x)))
+    _slopes(predictor)([*states, psi, *inputs, *pair, *map(float, theta)], slopes)
+    return z, np.ascontiguousarray(slopes.T).reshape(len(x), nx, channels)

@@ -1,0 +1,358 @@
+"""Refined IV: equal to dense algebra, exact without noise, as precise as its bound."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.linalg import block_diag
+from virtual import virtual_log
+
+from greybox.errors import DivergenceError, ExcitationError, UsageError
+from greybox.estimation.bound import iv_bound
+from greybox.estimation.estimate import estimate_iv
+from greybox.estimation.noise import (
+    ErrorLikelihood,
+    constant_rows,
+    first_levels,
+    fit_noise,
+)
+from greybox.estimation.refined import estimate_refined_iv, with_noise
+from greybox.estimation.white_rows import solve_white, spread_columns, white_rows
+from greybox.estimation.whitening import ErrorBand, ErrorNoise
+from greybox.model.model import model_from_dict
+from greybox.model.noise import NoiseLevels
+from greybox.model.predictor import build_predictor
+from greybox.model.simulation import stationary_disturbance
+from greybox.regression.motion import predicted_motion
+from greybox.regression.regression import build_regression
+from greybox.validation.choose import Request, estimate_once
+
+REGIME = (("u", (1,)), ("v", (1,)), ("r", (1, -1)))
+STILL = {"wind": 0.0, "current": (0.0, 0.0), "spread": 0.0}
+NOISE = ErrorNoise(
+    np.array([0.1, 0.2, 0.3]),
+    np.array([0.05, 0.1, 0.2]),
+    np.array([0.9, 0.5, 0.0]),
+    np.array([0.1, 0.2]),
+)
+
+
+def dense_covariance(slopes, keep, noise):
+    """The covariance of kept errors, written out noise by noise."""
+    samples, nx, channels = slopes.shape
+    state = np.zeros((samples * nx, (samples + 1) * nx))
+    further = np.zeros((samples * nx, samples * (channels - nx)))
+    process = np.zeros((samples * nx, samples * nx))
+    stretch = np.cumsum(~keep)
+    for k in range(samples):
+        rows = slice(k * nx, k * nx + nx)
+        state[rows, (k + 1) * nx : (k + 2) * nx] = np.eye(nx)
+        state[rows, rows] = -slopes[k, :, :nx]
+        further[rows, k * (channels - nx) : (k + 1) * (channels - nx)] = -slopes[k, :, nx:]
+        for j in range(samples):
+            if stretch[j] == stretch[k]:
+                memory = np.where(j == k, 1.0, noise.memory ** abs(j - k))
+                process[rows, j * nx : j * nx + nx] = np.diag(noise.process**2 * memory)
+    total = state @ np.kron(np.eye(samples + 1), np.diag(noise.measurement**2)) @ state.T
+    total += further @ np.kron(np.eye(samples), np.diag(noise.further**2)) @ further.T
+    index = np.repeat(keep, nx)
+    return (total + process)[np.ix_(index, index)]
+
+
+@pytest.fixture(scope="module")
+def still_log():
+    return virtual_log(11, 1500, **STILL)
+
+
+@pytest.fixture(scope="module")
+def basic(thesis):
+    return build_predictor(thesis, "basic", REGIME)
+
+
+@pytest.fixture(scope="module")
+def refined(basic, still_log):
+    return estimate_refined_iv(basic, [still_log])
+
+
+@pytest.mark.parametrize("remembers", [False, True])
+@pytest.mark.parametrize("cut", [False, True])
+def test_the_band_equals_the_dense_covariance(remembers, cut):
+    rng = np.random.default_rng(0)
+    slopes = 0.5 * rng.normal(size=(30, 3, 5))
+    keep = np.ones(30, bool)
+    if cut:
+        keep[[7, 8, 15, 20]] = False
+    noise = NOISE if remembers else replace(NOISE, memory=np.zeros(3))
+    band = ErrorBand(slopes, keep)
+    factor = band.factor(noise)
+    omega = dense_covariance(slopes, keep, noise)
+    values = rng.normal(size=(4, 30, 3))
+    white = band.whiten(factor, noise, values)
+    flat = values[:, keep].reshape(4, -1)
+    np.testing.assert_allclose(
+        white @ white.T, flat @ np.linalg.solve(omega, flat.T), rtol=1e-10, atol=1e-9
+    )
+    np.testing.assert_allclose(2 * np.log(factor[0]).sum(), np.linalg.slogdet(omega)[1], rtol=1e-12)
+
+
+def test_the_estimator_equals_dense_generalised_instrumental_variables(thesis, true_theta, basic):
+    logs = [virtual_log(s, 150, **STILL) for s in (1, 2)]
+    regression = build_regression(basic, logs)
+    theta = estimate_iv(basic, logs, start=true_theta, refine=False).theta
+    noise = ErrorNoise(
+        np.full(3, 0.014), np.array([2e-3, 4e-3, 2e-4]), np.zeros(3), np.array([0.01])
+    )
+    keep = np.ones(149, bool)
+    keep[40:60] = False
+    rows, left, right = [], 0.0, 0.0
+    for log, e in zip(logs, regression.experiments, strict=True):
+        motion = predicted_motion(basic, log, theta, np.zeros(3))
+        rows.append(white_rows(basic, ErrorBand(motion.slopes, keep), noise, motion.z, e.phi, e.y))
+        inverse = np.linalg.inv(dense_covariance(motion.slopes, keep, noise))
+        ones = np.tile(np.eye(3), (int(keep.sum()), 1))
+        inner = np.linalg.inv(ones.T @ inverse @ ones)
+        weight = inverse - inverse @ ones @ inner @ ones.T @ inverse
+        z, phi = (spread_columns(basic, m)[:, keep].reshape(len(m), -1) for m in (motion.z, e.phi))
+        left = left + z @ weight @ phi.T
+        right = right + z @ weight @ e.y.T[keep].ravel()
+    got, inverse = solve_white(rows)
+    np.testing.assert_allclose(got, np.linalg.solve(left, right), rtol=1e-8, atol=1e-12)
+    mixed = [
+        replace(r, z=np.random.default_rng(1).normal(size=(len(r.z),) * 2) @ r.z) for r in rows
+    ]
+    np.testing.assert_allclose(solve_white(mixed)[0], got, rtol=1e-6)
+
+
+def test_slopes_are_the_derivatives_of_the_prediction(basic, still_log, true_theta):
+    theta = estimate_iv(basic, [still_log], start=true_theta, refine=False).theta
+    motion = predicted_motion(basic, still_log, theta, np.zeros(3))
+    k, step = 100, 1e-6
+    tau = still_log.forces(basic.structure.inputs)[k]
+
+    def after(x):
+        phi = basic.evaluate([np.array([v]) for v in x], 0.0, [np.array([v]) for v in tau])[:, 0]
+        return x + [theta[basic.equation(s)] @ phi[basic.equation(s)] for s in "uvr"]
+
+    x = motion.x[k]
+    np.testing.assert_allclose(after(x), motion.x[k + 1], rtol=1e-10)
+    for j in range(3):
+        move = step * np.eye(3)[j]
+        slope = (after(x + move) - after(x - move)) / (2 * step)
+        np.testing.assert_allclose(motion.slopes[k, :, j], slope, atol=1e-8)
+
+
+@pytest.mark.parametrize("kind", ["basic", "augmented", "wind"])
+def test_exact_without_noise(thesis, true_theta, kind):
+    still = kind == "basic"
+    log = virtual_log(
+        3,
+        800,
+        wind=0.0 if still else 0.3,
+        current=(0.0, 0.0) if still else (0.2, -0.2),
+        noise=0.0,
+        spread=0.0,
+        wind_spread=1.0 if kind == "wind" else 0.0,
+    )
+    predictor = build_predictor(thesis, kind, REGIME)
+    estimate = estimate_refined_iv(predictor, [log], start=true_theta, wind="measured")
+    want = [
+        sum(true_theta[thesis.index(t)] for t in predictor.columns[i].terms)
+        for i in predictor.parameter_columns
+    ]
+    got = estimate.theta[predictor.parameter_columns]
+    np.testing.assert_allclose(got, want, rtol=2e-5, atol=1e-8)
+
+
+def test_standard_errors_reach_the_bound(basic, still_log, true_theta, refined):
+    noise = NoiseLevels(("u", "v", "r"), np.full(3, 0.014142), np.zeros(3), 0.01)
+    bound = iv_bound(basic, [still_log], true_theta, noise)
+    np.testing.assert_allclose(refined.std, np.sqrt(np.diag(bound)), rtol=0.25)
+    plain = estimate_iv(basic, [still_log])
+    assert (refined.std < plain.std).all()
+    assert np.median(refined.std / plain.std) < 0.5
+    error = refined.theta - estimate_iv(basic, [virtual_log(11, 1500, noise=0.0, **STILL)]).theta
+    assert float(error @ np.linalg.solve(refined.covariance, error)) < 40  # χ² of 15, p = 5e-4
+
+
+def test_two_logs_halve_the_variance_bound(basic, still_log, true_theta):
+    noise = NoiseLevels(("u", "v", "r"), np.full(3, 0.014), np.full(3, 1e-3))
+    one = iv_bound(basic, [still_log], true_theta, noise)
+    two = iv_bound(basic, [still_log, still_log], true_theta, noise)
+    np.testing.assert_allclose(two, one / 2, rtol=1e-8)
+
+
+@pytest.mark.parametrize("kind", ["hac", "white", "bootstrap"])
+def test_other_covariances_agree(basic, still_log, refined, kind):
+    plain = estimate_iv(basic, [still_log])
+    other = estimate_refined_iv(basic, [still_log], start=plain, covariance=kind)
+    np.testing.assert_allclose(other.theta, refined.theta, rtol=1e-10)
+    np.testing.assert_allclose(other.std, refined.std, rtol=0.35)
+    assert other.covariance_kind == kind
+
+
+def test_noise_levels_are_found_and_kept(basic, still_log):
+    vessel = replace(still_log.vessel, sensors={})
+    estimate = estimate_refined_iv(basic, [replace(still_log, vessel=vessel)])
+    noise = estimate.noise
+    # an nx-th of 1500 squares each: four standard errors
+    np.testing.assert_allclose(noise.measurement, 0.014142, rtol=4 / np.sqrt(2 * 1500))
+    assert (noise.process < 4e-3).all()
+    assert noise.source.startswith("noise of u, v, r from the equation errors")
+    read = model_from_dict(estimate.model().to_dict())
+    np.testing.assert_allclose(read.noise.measurement, noise.measurement)
+    assert read.record["prefilter"] == "noise"
+    assert "iv, prefiltered" in estimate.summary()
+
+
+def test_wrong_sensors_are_contradicted(basic, still_log):
+    sensors = {"u_std": 0.05, "v_std": 0.003, "r_std": 0.014, "heading_std": 0.01}
+    log = replace(still_log, vessel=replace(still_log.vessel, sensors=sensors))
+    noise = estimate_refined_iv(basic, [log]).noise
+    assert "contradicts" in noise.source
+    np.testing.assert_allclose(noise.measurement, 0.014142, rtol=0.1)
+
+
+def test_the_memory_of_process_noise_is_found():
+    rng = np.random.default_rng(4)
+    samples = 3000
+    slopes = np.tile(np.diag([0.9, 0.8, 0.9])[None], (samples, 1, 1))
+    e = 0.1 * rng.normal(size=(samples + 1, 3))
+    slow = stationary_disturbance(rng, np.zeros(3), 0.1, samples, correlation_time=20.0)[0]
+    errors = e[1:] - np.einsum("kij,kj->ki", slopes, e[:-1])
+    band = ErrorBand(slopes, np.ones(samples, bool))
+    stated = np.full(3, 0.1)
+    for added, remembers in ((slow, True), (0.0, False)):
+        likelihood = ErrorLikelihood([band], [errors + added], [True] * 3, np.full(3, 1e-9))
+        fit = fit_noise(likelihood, first_levels(likelihood, stated, np.zeros(0)))
+        assert fit.remembers == remembers
+        assert not fit.contradicted
+        if remembers:
+            np.testing.assert_allclose(fit.noise.memory, np.exp(-1 / 20), atol=0.04)
+            np.testing.assert_allclose(fit.noise.process, 0.1, rtol=0.4)
+        else:
+            assert (fit.noise.process < 0.02).all()
+
+
+def test_the_restricted_likelihood_equals_dense_algebra():
+    rng = np.random.default_rng(3)
+    keep = np.ones(25, bool)
+    noise = replace(NOISE, memory=np.zeros(3), further=np.zeros(0))
+    slopes = [0.5 * rng.normal(size=(25, 3, 3)) for _ in range(2)]
+    errors = [rng.normal(size=(25, 3)) for _ in range(2)]
+    z = [rng.normal(size=(5, 25, 3)) for _ in range(2)]
+    own = [True, False, True]
+    bands = [ErrorBand(s, keep) for s in slopes]
+    got = ErrorLikelihood(bands, errors, own, np.full(3, 1e-9), z).loss(noise)
+    omega = block_diag(*[dense_covariance(s, keep, noise) for s in slopes])
+    ones = block_diag(*[constant_rows(25, own).reshape(2, -1).T] * 2)
+    size = np.sqrt(sum((part**2).sum(axis=(1, 2)) for part in z))
+    shared = np.concatenate([part.reshape(5, -1).T for part in z]) / size
+    x, y = np.hstack([ones, shared]), np.concatenate([e.ravel() for e in errors])
+    inverse = np.linalg.inv(omega)
+    information = x.T @ inverse @ x
+    weight = inverse - inverse @ x @ np.linalg.solve(information, x.T @ inverse)
+    want = np.linalg.slogdet(omega)[1] + np.linalg.slogdet(information)[1] + y @ weight @ y
+    np.testing.assert_allclose(got, want / 2, rtol=1e-10)
+
+
+def test_plain_estimates_keep_noise_levels(basic, still_log):
+    estimate = with_noise(estimate_iv(basic, [still_log]), [still_log])
+    assert estimate.prefilter == "none"
+    np.testing.assert_allclose(estimate.noise.measurement, 0.014142)
+
+
+def test_margins_cut_rows_of_the_simulated_motion(basic, still_log):
+    estimate = estimate_refined_iv(basic, [still_log], margins={"v": 1.0})
+    assert estimate.kept < estimate.samples
+    assert estimate.status.startswith("prefiltered by the noise, converged")
+
+
+def test_a_short_log_is_estimated(basic):
+    estimate = estimate_refined_iv(basic, [virtual_log(7, 150, **STILL)])
+    assert np.isfinite(estimate.theta).all()
+    assert (estimate.std > 0).all()
+
+
+def test_the_choice_says_why_it_does_not_refine(thesis, still_log):
+    refined = estimate_once([still_log], thesis, "iv", "basic", Request())
+    assert refined.prefilter == "noise"
+    closed = estimate_once([still_log], thesis, "iv", "basic", Request(loop="closed"))
+    assert closed.prefilter == "none"
+    assert closed.noise is not None
+    assert any("not refined by the noise" in n for n in closed.notes)
+    with pytest.raises(UsageError, match="open loop and zero-mean instruments, and instruments"):
+        estimate_once(
+            [still_log], thesis, "iv", "basic", Request(prefilter="noise", zero_mean=False)
+        )
+
+
+def test_a_prediction_that_diverges_is_an_error(basic, still_log, refined, monkeypatch):
+    plain = estimate_iv(basic, [still_log])
+    wild = replace(plain, theta=1e3 * plain.theta)
+    assert with_noise(wild, [still_log]).noise is None
+    # least squares serves as a start where the plain estimate cannot be simulated
+    again = estimate_refined_iv(basic, [still_log], start=wild)
+    assert (np.abs(again.theta - refined.theta) < 0.05 * refined.std).all()
+    monkeypatch.setattr("greybox.estimation.refined.estimate_ls", lambda *_, **__: wild)
+    with pytest.raises(ExcitationError, match="left its bound at sample"):
+        estimate_refined_iv(basic, [still_log], start=wild)
+
+
+def test_singular_instruments_are_an_error(basic, still_log):
+    e = build_regression(basic, [still_log]).experiments[0]
+    motion = predicted_motion(basic, still_log, np.zeros(len(basic.columns)), np.zeros(3))
+    noise = replace(NOISE, memory=np.zeros(3), further=np.array([0.01]))
+    band = ErrorBand(motion.slopes, np.ones(len(motion.x), bool))
+    rows = white_rows(basic, band, noise, np.tile(e.phi[:1], (len(e.phi), 1)), e.phi, e.y)
+    assert np.isnan(solve_white([rows])[0]).all()
+    bad = replace(noise, measurement=np.full(3, np.nan))
+    with pytest.raises(ExcitationError, match="covariance of 1499 equation errors is singular"):
+        white_rows(basic, band, bad, motion.z, e.phi, e.y)
+
+
+def test_a_bound_needs_a_model_that_runs(basic, still_log, true_theta):
+    noise = NoiseLevels(("u", "v", "r"), np.full(3, 0.014), np.zeros(3))
+    with pytest.raises(DivergenceError, match="the model on the inputs of 'virtual'"):
+        iv_bound(basic, [still_log], -20 * true_theta, noise)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("correlation_time", [0.0, 40.0])
+def test_intervals_cover_and_the_bound_is_reached(thesis, true_theta, basic, correlation_time):
+    """60 trials with process noise, white or slow: coverage, and efficiency where white."""
+    from scipy.special import digamma
+
+    from greybox.model.simulation import simulate
+    from greybox.trial.log import make_log
+
+    runs, samples = 60, 1200
+    base = virtual_log(21, samples, noise=0.0, **STILL)
+    tau = base.forces(thesis.inputs)[:-1]
+    levels = np.array([2e-3, 4e-3, 2e-4])
+    rng = np.random.default_rng(8)
+    want = estimate_iv(basic, [base], start=true_theta).theta
+    theta, std = [], []
+    for _ in range(runs):
+        w = levels * stationary_disturbance(
+            rng, np.zeros(3), 1.0, samples - 1, correlation_time=correlation_time
+        )
+        run = simulate(thesis, true_theta, np.array([1.5, 1.2, 0.0]), tau, 1.0, process_noise=w)
+        x = run.x[0] + np.sqrt(2e-4) * rng.standard_normal(run.x[0].shape)
+        channels = dict(base.channels) | {"u": x[:, 0], "v": x[:, 1], "r": x[:, 2]}
+        channels["psi"] = run.psi[0] + 0.01 * rng.standard_normal(samples)
+        estimate = estimate_refined_iv(basic, [make_log(base.vessel, channels, 1.0, "run")])
+        theta.append(estimate.theta)
+        std.append(estimate.std)
+    inside = (np.abs(np.array(theta) - want) < 1.96 * np.array(std)).mean(axis=1)
+    assert abs(inside.mean() - 0.95) < 0.01 + 3 * inside.std() / np.sqrt(runs)
+    noise = NoiseLevels(("u", "v", "r"), np.full(3, np.sqrt(2e-4)), levels, 0.01)
+    memory = np.full(3, np.exp(-1 / correlation_time)) if correlation_time else None
+    bound = iv_bound(basic, [base], true_theta, noise, memory=memory)
+    p = len(want)
+    # mean of log det of a sample covariance
+    shift = digamma((runs - 1 - np.arange(p)) / 2).sum() + p * np.log(2 / (runs - 1))
+    empirical = np.linalg.slogdet(np.cov(np.array(theta).T))[1] - shift
+    efficiency = np.exp((np.linalg.slogdet(bound)[1] - empirical) / p)
+    assert efficiency > 0.9 * (1 - 3 * np.sqrt(2 / (runs * p)))
