@@ -62,13 +62,18 @@ class FilterRuns:
 
     def linearise(self, p: Array, nodes: Array) -> Linearised:
         """Return innovations, their derivatives at fixed gains, and the exact gradient."""
-        r, rows, levels = self._filter(nodes, p, self.noise)
-        runs, _, columns, _ = rows.shape
+        found = self.rows(p, nodes)
         _, by_start, by_p = self._filter.likelihood(nodes, p, self.noise)
-        downhill = np.zeros((runs, columns))
+        downhill = np.zeros(found.rows.shape[:2])
         # the parameters are common to all logs: their gradient is counted once
         downhill[0, : len(p)] = -by_p
         downhill[:, len(p) :] = -by_start
+        return replace(found, downhill=downhill)
+
+    def rows(self, p: Array, nodes: Array) -> Linearised:
+        """Return innovations and their derivatives at fixed gains alone."""
+        r, rows, levels = self._filter(nodes, p, self.noise)
+        runs, _, columns, _ = rows.shape
         nz = nodes.shape[1]
         return Linearised(
             r,
@@ -76,7 +81,6 @@ class FilterRuns:
             np.zeros((runs, nz)),
             np.zeros((runs, columns, nz)),
             float(levels.sum()) / 2,
-            downhill,
         )
 
     def value(self, p: Array, nodes: Array) -> tuple[Array, Array, float]:
