@@ -182,15 +182,12 @@ def test_errors_are_one_sentence(folder, capsys, options, message):
     assert not plan.exists()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("asked", "duration"),
     [
         (["--margin-u", "0.5", "--margin-v", "3"], "300"),
-        pytest.param(
-            ["--margin-u", "0.5", "--margin-v", "1.55", "--start", "1.5,1.6,0,0"],
-            "150",
-            marks=pytest.mark.long,
-        ),
+        (["--margin-u", "0.5", "--margin-v", "1.55", "--start", "1.5,1.6,0,0"], "150"),
     ],
 )
 def test_advice_on_margins_beyond_reach_can_be_followed(folder, capsys, asked, duration):
