@@ -496,13 +496,7 @@ def fit_free_runs(
     nz = len(model.states)
     fit: ShootingFit | None = None
     if shooting != "single":
-        # a few samples ahead every model is nearly linear in its parameters
-        short = cut(logs, min(_SHORT, longest), joined_up=False)
-        near, _ = _settle(
-            FreeRuns(model, short, weights), p, _starts(short, nz), restrictions, loss,
-            sigma is None, floor, rounds=3,
-        )  # fmt: skip
-        p = near.p
+        p = _near(model, logs, p, restrictions, loss, weights, sigma is None, floor)
     if shooting != "single" and (steps < longest or shooting == "multiple"):
         segments = cut(logs, steps)
         fit, runs = _settle(
@@ -524,6 +518,34 @@ def fit_free_runs(
     if fit is None or single.converged:
         return single, single_runs
     return fit, runs
+
+
+def _near(
+    model: OutputModel,
+    logs: Sequence[Measured],
+    p: Array,
+    restrictions: Restrictions,
+    loss: Loss,
+    weights: Array,
+    estimate_noise: bool,
+    floor: Array,
+) -> Array:
+    """Return parameters that fit a few samples ahead, from `p` or from none.
+
+    So little ahead every model is nearly linear in its parameters; a start that is
+    worse than none, as an estimate in bias may be, is left.
+    """
+    short = cut(logs, min(_SHORT, max(len(log.y) for log in logs)), joined_up=False)
+    best, least = p, np.inf
+    for first in (p, np.zeros_like(p)):
+        fit, runs = _settle(
+            FreeRuns(model, short, weights), first, _starts(short, len(model.states)),
+            restrictions, loss, estimate_noise, floor, rounds=3,
+        )  # fmt: skip
+        level = fit.cost + short.use.sum() * float(np.log(runs.sigma).sum())
+        if level < least:
+            best, least = fit.p, level
+    return best
 
 
 def _starts(segments: Segments, nz: int) -> Array:

@@ -42,6 +42,8 @@ _HELD_OUT = 1 / 3
 _PREFERENCE = 3.0
 # refinements of the instruments while alternatives are compared
 _RANKING_REFINEMENTS = 4
+# refinements of the instruments where a free-run fit starts
+_STARTING_REFINEMENTS = 2
 # share of samples that must meet a sign condition
 _KEPT = 0.9
 
@@ -250,14 +252,8 @@ def _estimate_oe(
     start: Estimate | NDArray[np.float64] | None = _nominal_theta(request.nominal, structure)
     notes = ["it started from the nominal model."]
     if start is None:
-        quick = replace(request, covariance="white", refine=_RANKING_REFINEMENTS, prefilter="none")
-        for method in ("iv", "ls"):
-            try:
-                start = estimate_once(logs, structure, method, kind, quick)
-                notes = [f"it started from the {method} estimate."]
-                break
-            except (ExcitationError, DivergenceError):
-                notes = ["it started from a fit of short segments."]
+        start, said = _quick_start(logs, structure, kind)
+        notes = [said]
     while True:
         try:
             estimate = estimate_oe(predictor, logs, start=start, options=options)
@@ -268,6 +264,27 @@ def _estimate_oe(
             predictor = predictor.without_bias(error.column)
     _, loop_test = assess_loop(logs, request.loop, "oe")
     return replace(estimate, tests=(*estimate.tests, loop_test), notes=(*estimate.notes, *notes))
+
+
+def _quick_start(
+    logs: Sequence[TrialLog], structure: Structure, kind: str
+) -> tuple[Estimate | None, str]:
+    """Return an estimate by IV, else by least squares, that a free-run fit can start from.
+
+    Bias-capturing terms are left out: the fit finds the current by itself.
+    """
+    plain = "basic+wind" if kind in ("wind", "basic+wind") else "basic"
+    predictor = _predictor(structure, plain, logs, ls=True)
+    try:
+        found = estimate_iv(predictor, logs, refine=_STARTING_REFINEMENTS, covariance="white")
+        return found, "it started from an estimate by instrumental variables."
+    except (ExcitationError, DivergenceError):
+        pass
+    try:
+        found = estimate_ls(predictor, logs, covariance="white")
+        return found, "it started from the least-squares estimate."
+    except ExcitationError:
+        return None, "it started from a fit of short segments."
 
 
 def _prefiltered(
