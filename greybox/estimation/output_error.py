@@ -22,6 +22,7 @@ from greybox.estimation.covariance import (
     slow_errors,
 )
 from greybox.estimation.estimate import UnexcitedBiasError
+from greybox.estimation.free_run import Shooting, fit_free_runs
 from greybox.estimation.innovations import FilterRuns, fit_innovations
 from greybox.estimation.result import Estimate, TestResult
 from greybox.estimation.shooting import (
@@ -33,7 +34,6 @@ from greybox.estimation.shooting import (
     Restrictions,
     Segments,
     ShootingFit,
-    fit_free_runs,
     loss_weights,
 )
 from greybox.model.disturbances import CURRENT, WIND
@@ -45,11 +45,12 @@ from greybox.regression.regression import common_sample_time
 from greybox.trial.log import TrialLog
 
 Array = NDArray[np.float64]
-Shooting = Literal["auto", "single", "multiple"]
 Damping = Literal["warn", "enforce"]
 
 # sensitivities beyond this are no numbers to compute with
 _LARGEST = 1e100
+# no current is stronger, and no mean wind [m/s]
+_STRONGEST = (5.0, 60.0)
 # weight in an unknown direction from which on a bias-capturing column can be left out
 _SHARES = 0.2
 # coefficient of a parameter at its bound has no spread
@@ -179,7 +180,7 @@ def estimate_oe(
         One experiment each, with an initial state of its own.
     start : ndarray or Estimate, optional
         (p,) parameters of the structure, or an estimate such as that of IV. By
-        default zero: short segments find the way from there.
+        default zero: a filter finds the way from there.
     options : OutputErrorOptions
 
     Returns
@@ -331,6 +332,9 @@ def _restrictions(model: OutputModel, options: OutputErrorOptions) -> Restrictio
     names = {predictor.columns[i].name: i for i in predictor.parameter_columns}
     names |= {n: len(predictor.columns) + i for i, n in enumerate(model.means)}
     low, high = np.full(q, -np.inf), np.full(q, np.inf)
+    for i, name in enumerate(model.means):
+        most = _STRONGEST[name in WIND]
+        low[len(predictor.columns) + i], high[len(predictor.columns) + i] = -most, most
     mean, precision = np.zeros(q), np.zeros(q)
 
     def place(name: str, what: str) -> int:

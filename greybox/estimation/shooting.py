@@ -18,7 +18,7 @@ Bock (1983), generalised Gauss-Newton for multiple shooting; Nocedal and Wright
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal, Protocol
 
 import numpy as np
@@ -39,12 +39,6 @@ _MOST = 60
 _HUBER = 1.345
 # relative singular value of the scaled normal equations below which a direction is unknown
 RANK = 1e-10
-# segments of a log, and samples that a segment has at least
-_SEGMENTS, _LEAST = 64, 50
-# samples of the segments that a start far off is first fitted to
-_SHORT = 10
-# noise-free signals still need a scale
-_FLOOR = 1e-9
 # a run this many times beyond the largest measured value has escaped
 _ESCAPED = 1e3
 _DAMPING_LIMIT = 1e8
@@ -91,13 +85,6 @@ def cut(logs: Sequence[Measured], steps: int, *, joined_up: bool = True) -> Segm
             use.append((np.arange(j * steps, (j + 1) * steps) < samples).astype(float))
             joined.append(joined_up and j + 1 < count)
     return Segments(np.array(w), np.array(y), np.array(use), np.array(joined))
-
-
-def segment_length(logs: Sequence[Measured]) -> int:
-    """Return the samples of a segment for multiple shooting."""
-    longest = max(len(log.y) for log in logs)
-    total = sum(len(log.y) for log in logs)
-    return min(longest, max(_LEAST, -(-total // _SEGMENTS)))
 
 
 @dataclass(frozen=True)
@@ -307,7 +294,11 @@ def _reduce(at: Linearised, segments: Segments, nodes: Array, q: int, loss: Loss
 
 
 def solve_step(
-    hessian: Array, gradient: Array, low: Array, high: Array, damping: float = 0.0
+    hessian: Array,
+    gradient: Array,
+    low: Array,
+    high: Array,
+    damping: float = 0.0,
 ) -> Array:
     """Minimise ½ δᵀHδ − gᵀδ within bounds, in the directions that are known.
 
@@ -442,148 +433,8 @@ def fit_segments(
     return ShootingFit(p, nodes, hessian, cost, gap, taken, done)
 
 
-def noise_of(r: Array, sigma: Array, use: Array, loss: Loss, floor: Array) -> Array:
-    """Return the noise of each output from weighted residuals r (M, m, ny)."""
-    errors = (r * sigma)[use > 0]
-    if loss == "gaussian":
-        found = np.sqrt((errors**2).mean(axis=0))
-    else:
-        found = 1.4826 * np.median(np.abs(errors), axis=0)
-    return np.asarray(np.maximum(found, floor))
-
-
-def fit_free_runs(
-    model: OutputModel,
-    logs: Sequence[Measured],
-    p: Array,
-    *,
-    restrictions: Restrictions | None = None,
-    loss: Loss = "gaussian",
-    sigma: Array | None = None,
-    shooting: Literal["auto", "single", "multiple"] = "auto",
-) -> tuple[ShootingFit, FreeRuns]:
-    """Fit parameters and initial states to logs; the noise of each output with them.
-
-    Segments first, from the measured states: a model far off, or unstable,
-    cannot run away within one. Then whole runs, where they stay bounded.
-
-    Parameters
-    ----------
-    model : OutputModel
-    logs : sequence of Measured
-    p : ndarray
-        (q,) start.
-    restrictions : Restrictions, optional
-    loss : {"gaussian", "huber"}
-    sigma : ndarray, optional
-        (ny,) noise of each output, known; by default estimated (its likelihood
-        concentrated: the residuals' own deviation).
-    shooting : {"auto", "single", "multiple"}
-        ``multiple`` ends with segments, ``single`` begins with whole runs.
-
-    Returns
-    -------
-    tuple of (ShootingFit, FreeRuns)
-    """
-    restrictions = unrestricted(len(p)) if restrictions is None else restrictions
-    floor = _FLOOR * np.maximum(
-        np.sqrt(np.mean([(log.y**2).mean(axis=0) for log in logs], axis=0)), _FLOOR
-    )
-    first = np.sqrt(np.mean([(np.diff(log.y, axis=0) ** 2).mean(axis=0) for log in logs], axis=0))
-    weights = np.maximum(first, floor) if sigma is None else sigma
-    steps = segment_length(logs)
-    longest = max(len(log.y) for log in logs)
-    nz = len(model.states)
-    fit: ShootingFit | None = None
-    if shooting != "single":
-        p = _near(model, logs, p, restrictions, loss, weights, sigma is None, floor)
-    if shooting != "single" and (steps < longest or shooting == "multiple"):
-        segments = cut(logs, steps)
-        fit, runs = _settle(
-            FreeRuns(model, segments, weights), p, _starts(segments, nz),
-            restrictions, loss, sigma is None, floor,
-        )  # fmt: skip
-        p = fit.p
-        weights = runs.sigma
-        if shooting == "multiple":
-            return fit, runs
-    whole = cut(logs, longest)
-    starts = _starts(whole, nz)
-    if fit is not None:
-        begin = np.flatnonzero(np.append(True, ~segments.joined[:-1]))
-        starts = fit.nodes[begin]
-    single, single_runs = _settle(
-        FreeRuns(model, whole, weights), p, starts, restrictions, loss, sigma is None, floor
-    )
-    if fit is None or single.converged:
-        return single, single_runs
-    return fit, runs
-
-
-def _near(
-    model: OutputModel,
-    logs: Sequence[Measured],
-    p: Array,
-    restrictions: Restrictions,
-    loss: Loss,
-    weights: Array,
-    estimate_noise: bool,
-    floor: Array,
-) -> Array:
-    """Return parameters that fit a few samples ahead, from `p` or from none.
-
-    So little ahead every model is nearly linear in its parameters; a start that is
-    worse than none, as an estimate in bias may be, is left.
-    """
-    short = cut(logs, min(_SHORT, max(len(log.y) for log in logs)), joined_up=False)
-    best, least = p, np.inf
-    for first in (p, np.zeros_like(p)):
-        fit, runs = _settle(
-            FreeRuns(model, short, weights), first, _starts(short, len(model.states)),
-            restrictions, loss, estimate_noise, floor, rounds=3,
-        )  # fmt: skip
-        level = fit.cost + short.use.sum() * float(np.log(runs.sigma).sum())
-        if level < least:
-            best, least = fit.p, level
-    return best
-
-
-def _starts(segments: Segments, nz: int) -> Array:
+def measured_starts(segments: Segments, nz: int) -> Array:
     """Return the mean of the first samples of each segment, (M, nz)."""
     count = min(5, segments.y.shape[1])
     use = segments.use[:, :count, None]
     return np.asarray((segments.y[:, :count, :nz] * use).sum(axis=1) / use.sum(axis=1))
-
-
-def _settle(
-    runs: FreeRuns,
-    p: Array,
-    nodes: Array,
-    restrictions: Restrictions,
-    loss: Loss,
-    estimate_noise: bool,
-    floor: Array,
-    rounds: int = 12,
-) -> tuple[ShootingFit, FreeRuns]:
-    """Alternate between the fit and the noise of the outputs until both stay."""
-    if not estimate_noise:
-        return fit_segments(runs, p, nodes, restrictions, loss=loss), runs
-    total = 0
-    fit = ShootingFit(p, nodes, np.zeros((len(p), len(p))), np.inf, np.inf, 0, False)
-    for turn in range(rounds):
-        # a few steps at a time while the weights are still rough
-        fit = fit_segments(
-            runs, fit.p, fit.nodes, restrictions, loss=loss, most=4 if turn < 5 else _MOST
-        )
-        total += fit.iterations
-        r, _, _ = runs.value(fit.p, fit.nodes)
-        if not np.isfinite(r).all():
-            break
-        sigma = noise_of(r, runs.sigma, runs.segments.use, loss, floor)
-        if fit.converged and (np.abs(sigma / runs.sigma - 1) < 1e-8).all():
-            break
-        stuck = not fit.converged and fit.iterations < 4
-        runs = runs.with_sigma(sigma)
-        if stuck and turn > 5:
-            break
-    return replace(fit, iterations=total), runs

@@ -284,7 +284,7 @@ def _quick_start(
         found = estimate_ls(predictor, logs, covariance="white")
         return found, "it started from the least-squares estimate."
     except ExcitationError:
-        return None, "it started from a fit of short segments."
+        return None, "it started from nothing."
 
 
 def _prefiltered(

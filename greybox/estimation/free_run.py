@@ -1,0 +1,199 @@
+"""Free runs fitted to logs: a filter that trusts the model more and more, then the run itself.
+
+The free run is so bent a function of its parameters that a start far off ends
+anywhere. A filter that corrects the state at every sample is nearly linear in them;
+its gain is lowered in steps until what is left is the free run.
+
+References
+----------
+Ljung (1999), section 10.5, on the search for output-error models; Bock (1983).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.estimation.innovations import FixedGains
+from greybox.estimation.shooting import (
+    FreeRuns,
+    Loss,
+    Measured,
+    Restrictions,
+    ShootingFit,
+    cut,
+    fit_segments,
+    loss_value,
+    measured_starts,
+    unrestricted,
+)
+from greybox.model.output import OutputModel
+
+Array = NDArray[np.float64]
+Shooting = Literal["auto", "single", "multiple"]
+
+# process over measurement variance of the filters, one after the other
+_RATIOS = (1.0, 0.1, 0.01, 1e-3)
+# iterations of each, and the length of a step in standard errors that is near enough
+_STEPS, _NEAR = 6, 0.1
+# segments of a log, and samples that a segment has at least
+_SEGMENTS, _LEAST = 64, 50
+# noise-free signals still need a scale
+_FLOOR = 1e-9
+# iterations with rough weights, and with good ones
+_ROUGH, _FINE = 4, 60
+
+
+def segment_length(logs: Sequence[Measured]) -> int:
+    """Return the samples of a segment for multiple shooting."""
+    longest = max(len(log.y) for log in logs)
+    total = sum(len(log.y) for log in logs)
+    return min(longest, max(_LEAST, -(-total // _SEGMENTS)))
+
+
+def noise_of(r: Array, sigma: Array, use: Array, loss: Loss, floor: Array) -> Array:
+    """Return the noise of each output from weighted residuals r (M, m, ny)."""
+    errors = (r * sigma)[use > 0]
+    if loss == "gaussian":
+        found = np.sqrt((errors**2).mean(axis=0))
+    else:
+        found = 1.4826 * np.median(np.abs(errors), axis=0)
+    return np.asarray(np.maximum(found, floor))
+
+
+def fit_free_runs(
+    model: OutputModel,
+    logs: Sequence[Measured],
+    p: Array,
+    *,
+    restrictions: Restrictions | None = None,
+    loss: Loss = "gaussian",
+    sigma: Array | None = None,
+    shooting: Literal["auto", "single", "multiple"] = "auto",
+) -> tuple[ShootingFit, FreeRuns]:
+    """Fit parameters and initial states to logs; the noise of each output with them.
+
+    Segments first, from the measured states: a model far off, or unstable,
+    cannot run away within one. Then whole runs, where they stay bounded.
+
+    Parameters
+    ----------
+    model : OutputModel
+    logs : sequence of Measured
+    p : ndarray
+        (q,) start.
+    restrictions : Restrictions, optional
+    loss : {"gaussian", "huber"}
+    sigma : ndarray, optional
+        (ny,) noise of each output, known; by default estimated (its likelihood
+        concentrated: the residuals' own deviation).
+    shooting : {"auto", "single", "multiple"}
+        ``multiple`` ends with segments, ``single`` begins with whole runs.
+
+    Returns
+    -------
+    tuple of (ShootingFit, FreeRuns)
+    """
+    restrictions = unrestricted(len(p)) if restrictions is None else restrictions
+    size = np.sqrt(np.mean([(log.y**2).mean(axis=0) for log in logs], axis=0))
+    floor = _FLOOR * np.maximum(size, _FLOOR)
+    change = np.sqrt(np.mean([(np.diff(log.y, axis=0) ** 2).mean(axis=0) for log in logs], axis=0))
+    weights = np.maximum(change, floor) if sigma is None else sigma
+    whole = cut(logs, max(len(log.y) for log in logs))
+    starts = measured_starts(whole, len(model.states))
+    p, starts = approach(model, logs, p, starts, restrictions, np.maximum(change, floor))
+    single: ShootingFit | None = None
+    if shooting != "multiple":
+        single, runs = _settle(
+            FreeRuns(model, whole, weights), p, starts, restrictions, loss, sigma is None, floor
+        )
+        if single.converged or shooting == "single":
+            return single, runs
+    segments = cut(logs, segment_length(logs))
+    fit, joined = _settle(
+        FreeRuns(model, segments, weights), p, measured_starts(segments, len(model.states)),
+        restrictions, loss, sigma is None, floor,
+    )  # fmt: skip
+    if single is not None and not fit.converged and np.isfinite(single.cost):
+        return single, runs
+    return fit, joined
+
+
+def approach(
+    model: OutputModel,
+    logs: Sequence[Measured],
+    p: Array,
+    starts: Array,
+    restrictions: Restrictions,
+    change: Array,
+) -> tuple[Array, Array]:
+    """Return parameters and initial states near those of the free run, from `p` or from none.
+
+    Parameters
+    ----------
+    model, logs, restrictions
+        As `fit_free_runs`.
+    p, starts : ndarray
+        (q,) and (M, nz).
+    change : ndarray
+        (ny,) root mean square of the outputs' change from sample to sample.
+    """
+    whole = cut(logs, max(len(log.y) for log in logs))
+    variance = change**2 / 2
+    nz = starts.shape[1]
+
+    def gains(ratio: float) -> FixedGains:
+        return FixedGains(model, whole, np.concatenate([variance, ratio * variance[:nz]]))
+
+    first = gains(_RATIOS[0])
+    best, least = p, np.inf
+    for candidate in (p, np.zeros_like(p)):
+        r, _, level = first.value(candidate, starts)
+        cost = loss_value(r, "gaussian") + level
+        if cost < least:
+            best, least = candidate, cost
+    for ratio in _RATIOS:
+        fit = fit_segments(gains(ratio), best, starts, restrictions, most=_STEPS, tolerance=_NEAR)
+        if not np.isfinite(fit.cost):
+            break
+        best, starts = fit.p, fit.nodes
+    return best, starts
+
+
+def _settle(
+    runs: FreeRuns,
+    p: Array,
+    nodes: Array,
+    restrictions: Restrictions,
+    loss: Loss,
+    estimate_noise: bool,
+    floor: Array,
+    rounds: int = 12,
+) -> tuple[ShootingFit, FreeRuns]:
+    """Alternate between the fit and the noise of the outputs until both stay."""
+    if not estimate_noise:
+        return fit_segments(runs, p, nodes, restrictions, loss=loss), runs
+    total = 0
+    fit = ShootingFit(p, nodes, np.zeros((len(p), len(p))), np.inf, np.inf, 0, False)
+    for turn in range(rounds):
+        # a few steps at a time while the weights are still rough
+        fit = fit_segments(
+            runs, fit.p, fit.nodes, restrictions, loss=loss,
+            most=_ROUGH if turn < 5 else _FINE,
+        )  # fmt: skip
+        total += fit.iterations
+        r, _, _ = runs.value(fit.p, fit.nodes)
+        if not np.isfinite(r).all():
+            break
+        sigma = noise_of(r, runs.sigma, runs.segments.use, loss, floor)
+        if fit.converged and (np.abs(sigma / runs.sigma - 1) < 1e-8).all():
+            break
+        stuck = not fit.converged and fit.iterations < 4
+        runs = runs.with_sigma(sigma)
+        if stuck and turn > 5:
+            break
+    return replace(fit, iterations=total), runs
