@@ -25,6 +25,8 @@ _LEAST = 1e-3
 _SLOWEST = 300.0
 # 2 Δ log-likelihood beyond which nx further levels are believed (χ², p = 0.001, 3 of them)
 _BELIEVED = 16.3
+# steps of a climb that tell whether it is worth going on, and the gain from which it is
+_PROBE, _PROMISING = 3, 5.0
 # loss where a covariance is singular: finite, so that differences stay numbers
 _IMPOSSIBLE = 1e100
 
@@ -135,8 +137,15 @@ class ErrorLikelihood:
             return _IMPOSSIBLE
         return total
 
-    def fit(self, start: NoiseFit) -> tuple[NoiseFit, float]:
-        """Return the levels of greatest likelihood from a start, and the loss there."""
+    def fit(self, start: NoiseFit, most: int = 40) -> tuple[NoiseFit, float]:
+        """Return the levels of greatest likelihood from a start, and the loss there.
+
+        Parameters
+        ----------
+        start : NoiseFit
+        most : int
+            Steps of the climb at most.
+        """
         from scipy.optimize import minimize
 
         nx = len(self.scale)
@@ -170,7 +179,7 @@ class ErrorLikelihood:
             np.clip(first * unit, ends[:, 0], ends[:, 1]),
             method="L-BFGS-B",
             bounds=ends,
-            options={"ftol": 1e-9, "gtol": 0.01, "eps": 1e-4 * unit, "maxiter": 40},
+            options={"ftol": 1e-9, "gtol": 0.01, "eps": 1e-4 * unit, "maxiter": most},
         )
         return replace(start, noise=unpack(found.x / unit)), float(found.fun)
 
@@ -211,7 +220,10 @@ def fit_noise(likelihood: ErrorLikelihood, start: NoiseFit) -> NoiseFit:
     if 2 * (loss - found) > _BELIEVED:
         best, loss = remembering, found
     if not start.free.all():
-        opened, found = likelihood.fit(replace(best, free=np.ones(nx, bool), contradicted=True))
+        free = replace(best, free=np.ones(nx, bool), contradicted=True)
+        opened, found = likelihood.fit(free, most=_PROBE)
+        if 2 * (loss - found) > _PROMISING:
+            opened, found = likelihood.fit(opened)
         if 2 * (loss - found) > _BELIEVED:
             best = opened
     return best
