@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -22,6 +23,21 @@ class TestResult:
 
     ``statistic`` and ``p_value`` are None where the test does not apply; the
     sentence then says why.
+
+    Parameters
+    ----------
+    name : str
+    null : str
+    statistic, p_value : float or None
+    sentence : str
+    level : float, optional
+        What the statistic, or the p-value where there is one, is compared with.
+    passed : bool, optional
+        None where the test does not apply or only informs.
+    parameters : tuple of str
+        Parameters that the finding concerns.
+    detail : mapping
+        Numbers behind the sentence, for machines.
     """
 
     name: str
@@ -29,6 +45,10 @@ class TestResult:
     statistic: float | None
     p_value: float | None
     sentence: str
+    level: float | None = None
+    passed: bool | None = None
+    parameters: tuple[str, ...] = ()
+    detail: Mapping[str, Any] = field(default_factory=dict)
 
     __test__ = False  # not a test case
 
@@ -39,6 +59,42 @@ class TestResult:
             "statistic": self.statistic,
             "p_value": self.p_value,
             "sentence": self.sentence,
+            "level": self.level,
+            "passed": self.passed,
+            "parameters": list(self.parameters),
+            "detail": dict(self.detail),
+        }
+
+
+def not_applicable(name: str, null: str, reason: str) -> TestResult:
+    """Return a test that does not apply, with the reason."""
+    return TestResult(name, null, None, None, f"not applicable: {reason}.")
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether to trust an estimate.
+
+    Parameters
+    ----------
+    text : str
+        ``trust``, ``trust except A, B`` or ``do not trust: reason``.
+    excepted : tuple of str
+        Parameters not to rely on.
+    reasons : tuple of str
+        One sentence a finding.
+    """
+
+    text: str
+    excepted: tuple[str, ...] = ()
+    reasons: tuple[str, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fields for JSON."""
+        return {
+            "text": self.text,
+            "excepted": list(self.excepted),
+            "reasons": list(self.reasons),
         }
 
 
@@ -73,6 +129,7 @@ class Estimate:
         (name, value, standard error) of each current component; empty where the
         predictor cannot tell it.
     tests : tuple of TestResult
+    verdict : Verdict
     notes : tuple of str
         Choices made and warnings.
     fit : dict
@@ -96,6 +153,7 @@ class Estimate:
     status: str = "solved"
     current: tuple[tuple[str, float, float], ...] = ()
     tests: tuple[TestResult, ...] = ()
+    verdict: Verdict = field(default_factory=lambda: Verdict("not judged"))
     notes: tuple[str, ...] = ()
     fit: dict[str, float] = field(default_factory=dict)
     logs: tuple[dict[str, Any], ...] = ()
@@ -104,6 +162,11 @@ class Estimate:
     def names(self) -> tuple[str, ...]:
         """Names of the parameters, biases left out."""
         return self.predictor.parameter_names
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Labels of the parameters, sums spelled out, such as ``Xuu+Wuu``."""
+        return tuple(self.predictor.columns[i].label for i in self.predictor.parameter_columns)
 
     @property
     def std(self) -> Array:
@@ -155,6 +218,7 @@ class Estimate:
             "predictor": self.predictor.kind,
             "regime": {s: list(v) for s, v in self.predictor.regime},
             "fit": self.fit,
+            "verdict": self.verdict.to_dict(),
             "tests": {t.name: t.to_dict() for t in self.tests},
             "notes": list(self.notes),
             "status": self.status,

@@ -1,0 +1,84 @@
+"""Would least squares do? The Durbin-Wu-Hausman test in its robust score form."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from greybox.estimation.covariance import correlation_lags
+from greybox.estimation.credibility.evidence import Equation
+from greybox.estimation.credibility.scores import score_test
+from greybox.estimation.result import TestResult, not_applicable
+
+LEVEL = 0.05
+
+
+def endogeneity(equation: Equation) -> TestResult:
+    """Test that least squares and instrumental variables estimate the same.
+
+    The moments of the instruments are taken with the residuals of least
+    squares; their covariance is the scores' own (kernel), since under the null
+    the regressors still depend on earlier residuals.
+
+    References
+    ----------
+    Durbin (1954); Hausman (1978); Wooldridge (1995), score form.
+    """
+    name = f"endogeneity_{equation.state}"
+    null = "the regressors do not depend on the noise: least squares suffices"
+    if not equation.determined:
+        return not_applicable(
+            name, null, "the equation is not determined, or has no residuals to judge by"
+        )
+    gram = np.asarray(sum(f @ f.T for f in equation.phi))
+    right = np.asarray(sum(f @ y for f, y in zip(equation.phi, equation.y, strict=True)))
+    size = np.sqrt(np.diag(gram))
+    theta = np.linalg.lstsq(gram / np.outer(size, size), right / size, rcond=None)[0] / size
+    errors = [y - theta @ f for y, f in zip(equation.y, equation.phi, strict=True)]
+    lags = correlation_lags([e[k] for e, k in zip(errors, equation.keep, strict=True)])
+    score = score_test(
+        equation.solution.projected,
+        equation.phi,
+        equation.phi,
+        errors,
+        equation.keep,
+        memory="hac",
+        lags=lags,
+    )
+    if not score.freedom:
+        return not_applicable(name, null, "no regressor of this equation is noisy")
+    suffices = score.p_value >= LEVEL
+    std = np.where(equation_std(equation) > 0, equation_std(equation), np.inf)
+    gap = np.abs(theta - equation.solution.theta) / std
+    far = int(np.argmax(gap))
+    return TestResult(
+        name,
+        null,
+        score.statistic,
+        score.p_value,
+        f"χ²({score.freedom}) = {score.statistic:.1f} (p = {score.p_value:.2g}): "
+        + (
+            "least squares is not told from instrumental variables here."
+            if suffices
+            else f"least squares is biased here, most in {equation.labels[far]} "
+            f"(by {gap[far]:.1f} standard errors of the instrumental estimate)."
+        ),
+        LEVEL,
+        suffices,
+        (),
+        {
+            "degrees_of_freedom": score.freedom,
+            "least_squares": dict(zip(equation.labels, theta.tolist(), strict=True)),
+        },
+    )
+
+
+def equation_std(equation: Equation) -> np.ndarray:
+    """Return standard errors of the plain instrumental estimate, Σ ẑ R ẑᵀ in the middle (p,)."""
+    from greybox.estimation.credibility.kernel import autocovariance, independent_covariance
+
+    gamma = autocovariance(
+        [e[None] for e in equation.residuals], equation.keep, equation.lags, len(equation.labels)
+    )
+    middle = independent_covariance(equation.solution.projected, gamma)
+    inverse = np.linalg.pinv(equation.solution.information, rcond=1e-15)
+    return np.sqrt(np.maximum(np.diag(inverse @ middle @ inverse.T), 0.0))

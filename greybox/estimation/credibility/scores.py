@@ -1,0 +1,117 @@
+"""Score tests: further moments Σ ξ e against what the estimate leaves of them.
+
+An estimate that solves Σ ẑ e = 0 moves with the noise, so Σ ξ ê = Σ ξ̃ e with
+ξ̃ = ξ − (Σ ξ φᵀ) G⁻¹ ẑ and G = Σ ẑ φᵀ. Overidentification (ξ further
+instruments), endogeneity (ξ the instruments, ẑ the regressors of least squares)
+and independence of the inputs (ξ their lags) are this one statistic.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.estimation.credibility.kernel import (
+    autocovariance,
+    independent_covariance,
+    lagged_products,
+    quadratic_form,
+    robust_covariance,
+)
+
+Array = NDArray[np.float64]
+Memory = Literal["iid", "white", "hac", "ma"]
+
+
+@dataclass(frozen=True)
+class Score:
+    """A score test.
+
+    Parameters
+    ----------
+    statistic : float
+    freedom : int
+        Rank of the covariance: restrictions that are not copies of one another.
+    p_value : float
+    moments : ndarray
+        (k,) Σ ξ ê.
+    covariance : ndarray
+        (k, k)
+    """
+
+    statistic: float
+    freedom: int
+    p_value: float
+    moments: Array
+    covariance: Array
+
+
+def residualise(xi: Sequence[Array], phi: Sequence[Array], zhat: Sequence[Array]) -> list[Array]:
+    """Return ξ̃ = ξ − (Σ ξ φᵀ) G⁻¹ ẑ, experiment by experiment."""
+    cross = lagged_products(xi, phi, 0)
+    gram = lagged_products(zhat, phi, 0)
+    size = np.sqrt(np.maximum(np.abs(np.diag(gram)), 1e-300))
+    weights = np.linalg.solve((gram / np.outer(size, size)).T, (cross / size).T).T / size
+    return [x - weights @ z for x, z in zip(xi, zhat, strict=True)]
+
+
+def _without_copies(xi: Sequence[Array], tilde: list[Array]) -> list[Array]:
+    """Return ξ̃ with zeros where ξ lies in the span of ẑ, whose moments vanish by themselves."""
+    before = np.asarray(sum((x**2).sum(axis=1) for x in xi))
+    after = np.asarray(sum((x**2).sum(axis=1) for x in tilde))
+    fresh = after > 1e-10 * before
+    return [np.where(fresh[:, None], x, 0.0) for x in tilde]
+
+
+def score_test(
+    xi: Sequence[Array],
+    phi: Sequence[Array],
+    zhat: Sequence[Array],
+    errors: Sequence[Array],
+    keep: Sequence[NDArray[np.bool_]],
+    *,
+    memory: Memory = "ma",
+    lags: int = 0,
+    lost: float = 0.0,
+) -> Score:
+    """Test E ξ e = 0 where the estimate solves Σ ẑ ê = 0.
+
+    Parameters
+    ----------
+    xi : sequence of ndarray
+        (k, N) an experiment, zero in rows that do not take part.
+    phi, zhat : sequence of ndarray
+        (p, N) regressors, and instruments as the estimator combined them.
+    errors : sequence of ndarray
+        (N,) residuals.
+    keep : sequence of ndarray of bool
+    memory : {"iid", "white", "hac", "ma"}
+        Equal independent errors (Sargan, Durbin); independent of changing size
+        (Wooldridge); with memory, the scores' own kernel estimate; with memory,
+        ξ and ẑ independent of the errors, Σ ξ̃ R ξ̃ᵀ.
+    lags : int
+    lost : float
+        Degrees of freedom of the residuals that the estimate took.
+
+    References
+    ----------
+    Sargan (1958); Hansen (1982); Wooldridge (1995); Durbin (1954).
+    """
+    from scipy.special import chdtrc
+
+    tilde = _without_copies(xi, residualise(xi, phi, zhat))
+    moments = np.asarray(sum(x @ e for x, e in zip(xi, errors, strict=True)))
+    rows = [e[None] for e in errors]
+    if memory in ("hac", "white"):
+        scores = [x * e for x, e in zip(tilde, errors, strict=True)]
+        covariance = robust_covariance(scores, lags if memory == "hac" else 0)
+    else:
+        gamma = autocovariance(rows, keep, lags if memory == "ma" else 0, lost)
+        covariance = independent_covariance(tilde, gamma)
+    statistic, freedom = quadratic_form(moments, covariance)
+    p = float(chdtrc(freedom, statistic)) if freedom else 1.0
+    return Score(statistic, freedom, p, moments, covariance)
