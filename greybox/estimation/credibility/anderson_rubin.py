@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.estimation.covariance import correlation_lags
 from greybox.estimation.credibility.evidence import Equation
 from greybox.estimation.result import TestResult, not_applicable
 
@@ -114,34 +115,42 @@ def confidence_sets(equation: Equation, level: float = 0.95) -> list[ConfidenceS
     follow = inverse / np.diag(inverse)
     # residuals move by δ·b as θ_i is held off its estimate and the others follow
     shift = [follow.T @ (f - h) for f, h in zip(equation.phi, explained, strict=True)]
-    errors = _unexplained(equation)
-    v00, v01, v11 = (np.zeros(p) for _ in range(3))
-    spare = len(equation.phi) * p
-    for lag in range(equation.lags + 1):
-        pairs, memory = 0, np.zeros(p)
-        g00, g01, g11 = np.zeros(p), np.zeros(p), np.zeros(p)
+    colour = equation.colour
+    errors = [colour.innovations(e) for e in _unexplained(equation)]
+    shift = [colour.innovations(b) for b in shift]
+    weights = [colour.adjoint(w) for w in weights]
+    freedom = max(equation.freedom - p * len(equation.phi), 1)
+    lost = equation.rows / freedom
+    v00 = lost * sum(((w * e) ** 2).sum(axis=1) for w, e in zip(weights, errors, strict=True))
+    v01, v11 = _of_shift(equation, weights, errors, shift, lost)
+    v11 = np.maximum(v11, v01**2 / np.where(v00 > 0, v00, np.inf))
+    c = float(fdtri(1, freedom, level))
+    return [solve_quadratic(float(solution.theta[i]), v00[i], v01[i], v11[i], c) for i in range(p)]
+
+
+def _of_shift(
+    equation: Equation, weights: list[Array], errors: list[Array], shift: list[Array], lost: float
+) -> tuple[Array, Array]:
+    """Return Σ Σ w w E(e b) and Σ Σ w w E(b b), after whitening by the residuals' model."""
+    p = len(equation.labels)
+    lags = max(
+        correlation_lags([b[i, k] for b, k in zip(shift, equation.keep, strict=True)])
+        for i in range(p)
+    )
+    v01, v11 = np.zeros(p), np.zeros(p)
+    for lag in range(lags + 1):
+        pairs, memory, g01, g11 = 0, np.zeros(p), np.zeros(p), np.zeros(p)
         for w, b, e, keep in zip(weights, shift, errors, equation.keep, strict=True):
             n = len(e) - lag
             if n <= 0:
                 continue
             pairs += int((keep[lag:] & keep[:n]).sum())
             memory += (w[:, lag:] * w[:, :n]).sum(axis=1)
-            g00 += float(e[lag:] @ e[:n])
             g01 += (b[:, lag:] @ e[:n] + b[:, :n] @ e[lag:]) / 2
             g11 += (b[:, lag:] * b[:, :n]).sum(axis=1)
-        memory *= (1.0 if lag == 0 else 2.0) / max(pairs, 1)
-        v00, v01, v11 = v00 + memory * g00, v01 + memory * g01, v11 + memory * g11
-    freedom = max(equation.freedom - spare, 1)
-    lost = equation.rows / freedom
-    c = float(fdtri(1, freedom, level))
-    floor = 1e-12 * np.abs(v00)
-    return [
-        solve_quadratic(
-            float(solution.theta[i]), max(lost * v00[i], floor[i]), lost * v01[i],
-            max(lost * v11[i], 0.0), c,
-        )
-        for i in range(p)
-    ]  # fmt: skip
+        memory *= (1.0 if lag == 0 else 2.0) * lost / max(pairs, 1)
+        v01, v11 = v01 + memory * g01, v11 + memory * g11
+    return v01, v11
 
 
 def _unexplained(equation: Equation) -> list[Array]:
@@ -157,15 +166,13 @@ def _unexplained(equation: Equation) -> list[Array]:
 
 
 def anderson_rubin(
-    equation: Equation, std: Array, biases: frozenset[str]
+    equation: Equation, biases: frozenset[str]
 ) -> tuple[TestResult, dict[str, ConfidenceSet]]:
-    """Compare the sets with the ordinary intervals of the parameters.
+    """Compare the sets with the ordinary intervals of instrumental variables.
 
     Parameters
     ----------
     equation : Equation
-    std : ndarray
-        (p,) standard errors of the estimate, in the order of the equation.
     biases : frozenset of str
     """
     name = f"anderson_rubin_{equation.state}"
@@ -175,7 +182,7 @@ def anderson_rubin(
         return not_applicable(name, null, reason), {}
     sets = dict(zip(equation.labels, confidence_sets(equation), strict=True))
     wide, ratios = [], []
-    for label, s in zip(equation.labels, std, strict=True):
+    for label, s in zip(equation.labels, equation.std, strict=True):
         if label in biases:
             continue
         found = sets[label]

@@ -49,14 +49,8 @@ def assess(evidence: Evidence) -> tuple[TestResult, ...]:
             for name, null in _OF_EQUATIONS.items():
                 reason = evidence.instruments.diverged or "there are no instruments"
                 tests.append(not_applicable(f"{name}_{state}", null, reason))
-    for state, equation_residuals in zip(states, evidence.residuals, strict=True):
-        rows = [
-            e[k] - e[k].mean()
-            for e, k in zip(equation_residuals, evidence.keep, strict=True)
-            if k.any()
-        ]
-        tests.append(whiteness(state, rows, len(evidence.predictor.equation(state))))
-        tests.append(combinations(evidence, state))
+    for row, state in enumerate(states):
+        tests += [whiteness(evidence, row), combinations(evidence, state)]
     if evidence.predictor.structure.disturbance == "marine":
         kept = sum(int(k.sum()) for k in evidence.keep)
         cut = evidence.regression.samples - kept
@@ -67,7 +61,6 @@ def assess(evidence: Evidence) -> tuple[TestResult, ...]:
 
 def _of_equation(evidence: Evidence, equation: Equation) -> list[TestResult]:
     biases = frozenset(c.label for c in evidence.predictor.columns if c.is_bias)
-    std = evidence.std[list(equation.columns)]
     if not len(equation.columns) or not np.isfinite(equation.solution.theta).all():
         reason = "its instruments leave a direction free"
         return [
@@ -77,7 +70,7 @@ def _of_equation(evidence: Evidence, equation: Equation) -> list[TestResult]:
     return [
         excitation(equation),
         *weak_instruments(equation, biases),
-        anderson_rubin(equation, std, biases)[0],
+        anderson_rubin(equation, biases)[0],
         overidentification(equation, biases),
         input_independence(evidence, equation),
         endogeneity(equation),

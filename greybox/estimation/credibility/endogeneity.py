@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from greybox.estimation.covariance import correlation_lags
 from greybox.estimation.credibility.evidence import Equation
 from greybox.estimation.credibility.scores import score_test
 from greybox.estimation.result import TestResult, not_applicable
@@ -16,8 +15,9 @@ def endogeneity(equation: Equation) -> TestResult:
     """Test that least squares and instrumental variables estimate the same.
 
     The moments of the instruments are taken with the residuals of least
-    squares; their covariance is the scores' own (kernel), since under the null
-    the regressors still depend on earlier residuals.
+    squares. Regressors hold earlier states, so least squares can only suffice
+    where the residuals have no memory: the covariance allows for noise of
+    changing size, not for colour.
 
     References
     ----------
@@ -34,20 +34,17 @@ def endogeneity(equation: Equation) -> TestResult:
     size = np.sqrt(np.diag(gram))
     theta = np.linalg.lstsq(gram / np.outer(size, size), right / size, rcond=None)[0] / size
     errors = [y - theta @ f for y, f in zip(equation.y, equation.phi, strict=True)]
-    lags = correlation_lags([e[k] for e, k in zip(errors, equation.keep, strict=True)])
     score = score_test(
         equation.solution.projected,
         equation.phi,
         equation.phi,
         errors,
-        equation.keep,
-        memory="hac",
-        lags=lags,
+        memory="white",
     )
     if not score.freedom:
         return not_applicable(name, null, "no regressor of this equation is noisy")
     suffices = score.p_value >= LEVEL
-    std = np.where(equation_std(equation) > 0, equation_std(equation), np.inf)
+    std = np.where(equation.std > 0, equation.std, np.inf)
     gap = np.abs(theta - equation.solution.theta) / std
     far = int(np.argmax(gap))
     return TestResult(
@@ -71,14 +68,3 @@ def endogeneity(equation: Equation) -> TestResult:
         },
     )
 
-
-def equation_std(equation: Equation) -> np.ndarray:
-    """Return standard errors of the plain instrumental estimate, Σ ẑ R ẑᵀ in the middle (p,)."""
-    from greybox.estimation.credibility.kernel import autocovariance, independent_covariance
-
-    gamma = autocovariance(
-        [e[None] for e in equation.residuals], equation.keep, equation.lags, len(equation.labels)
-    )
-    middle = independent_covariance(equation.solution.projected, gamma)
-    inverse = np.linalg.pinv(equation.solution.information, rcond=1e-15)
-    return np.sqrt(np.maximum(np.diag(inverse @ middle @ inverse.T), 0.0))

@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.estimation.covariance import correlation_lags
+from greybox.estimation.credibility.colour import Colour, fit_colour
 from greybox.estimation.moments import Solution, solve_stacked
 from greybox.model.predictor import Predictor
 from greybox.regression.instruments import Instruments
@@ -78,9 +78,19 @@ class Equation:
         return tuple(y - theta @ f for y, f in zip(self.y, self.phi, strict=True))
 
     @cached_property
-    def lags(self) -> int:
-        """Memory of those residuals, in samples."""
-        return correlation_lags([r[k] for r, k in zip(self.residuals, self.keep, strict=True)])
+    def colour(self) -> Colour:
+        """Noise model of those residuals."""
+        return fit_colour(self.residuals, self.keep)
+
+    @cached_property
+    def std(self) -> Array:
+        """Standard errors of that estimate, (p,)."""
+        weights = [self.colour.adjoint(h) for h in self.solution.projected]
+        innovations = [self.colour.innovations(e) for e in self.residuals]
+        scores = [w * i for w, i in zip(weights, innovations, strict=True)]
+        middle = sum(s @ s.T for s in scores) * self.rows / max(self.freedom - len(self.labels), 1)
+        inverse = np.linalg.pinv(self.solution.information, rcond=1e-15)
+        return np.sqrt(np.maximum(np.diag(inverse @ middle @ inverse.T), 0.0))
 
     @cached_property
     def determined(self) -> bool:

@@ -22,7 +22,7 @@ def input_independence(evidence: Evidence, equation: Equation) -> TestResult:
     """Test jointly that residuals are uncorrelated with the inputs at all delays.
 
     Each ξ is a generalised input at one delay, corrected for the estimate; the
-    covariance Σ ξ̃ R ξ̃ᵀ holds the residuals' own autocovariance.
+    covariance Σ ξ̃ R ξ̃ᵀ holds a noise model of the residuals.
 
     References
     ----------
@@ -50,10 +50,8 @@ def input_independence(evidence: Evidence, equation: Equation) -> TestResult:
         equation.phi,
         equation.solution.projected,
         equation.residuals,
-        equation.keep,
-        memory="ma",
-        lags=equation.lags,
-        lost=len(equation.labels),
+        colour=equation.colour,
+        correction=equation.rows / max(equation.freedom - len(equation.labels), 1),
     )
     if not score.freedom:
         return not_applicable(name, null, "no input varies beyond what the estimate used")

@@ -15,7 +15,8 @@ _DELAY = 5
 
 
 def overidentification(equation: Equation, biases: frozenset[str]) -> TestResult:
-    """Test that all instruments are valid (Sargan-Hansen), robust to the moving average.
+    """Test that all instruments are valid (Sargan-Hansen), robust to the moving average
+    and to noise that changes its size.
 
     Several logs bring more equations than parameters by their own instruments;
     to these, and to a single log, the parameters' instruments delayed by five
@@ -41,10 +42,8 @@ def overidentification(equation: Equation, biases: frozenset[str]) -> TestResult
         equation.phi,
         equation.solution.projected,
         equation.residuals,
-        equation.keep,
-        memory="ma",
-        lags=equation.lags,
-        lost=len(equation.labels),
+        colour=equation.colour,
+        correction=equation.rows / max(equation.freedom - len(equation.labels), 1),
     )
     if not score.freedom:
         return not_applicable(name, null, "no further instrument says anything new")

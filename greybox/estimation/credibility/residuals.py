@@ -2,48 +2,80 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
-from numpy.typing import NDArray
 
+from greybox.estimation.credibility.evidence import Equation, Evidence
+from greybox.estimation.credibility.kernel import Array
+from greybox.estimation.credibility.scores import score_test
 from greybox.estimation.result import TestResult, not_applicable
-
-Array = NDArray[np.float64]
 
 LEVEL = 0.05
 _LAGS = 10
 
 
-def whiteness(state: str, residuals: Sequence[Array], columns: int) -> TestResult:
-    """Test the one-step residuals for memory (Ljung-Box, 10 lags).
+def whiteness(evidence: Evidence, row: int) -> TestResult:
+    """Test the one-step residuals of an equation for memory, 10 lags together.
 
-    Residuals of a regression on noisy measurements are a moving average by
-    construction, so a rejection asks for robust standard errors, not for
-    another model.
+    The autocovariances are scaled by Σ e²(t) e²(t−k), which noise of changing
+    size needs, and corrected for the estimated parameters. Residuals of a
+    regression on noisy measurements are a moving average by construction, so a
+    rejection asks for robust standard errors, not for another model.
 
     References
     ----------
-    Ljung and Box (1978).
+    Breusch (1978); Godfrey (1978); Lobato, Nankervis and Savin (2002).
     """
-    from scipy.special import chdtrc
-
+    state = evidence.predictor.structure.states[row]
     name, null = f"whiteness_{state}", "the one-step residuals are white"
-    total = sum(len(r) for r in residuals)
-    variance = sum(float(r @ r) for r in residuals)
-    if variance == 0.0 or total <= _LAGS + columns:
+    residuals = _centred(evidence, row)
+    total = sum(int(k.sum()) for k in evidence.keep)
+    variance = sum(float(e @ e) for e in residuals)
+    columns = evidence.predictor.equation(state)
+    if variance < 1e-30 or total <= _LAGS + 2 * len(columns):
         return not_applicable(name, null, f"{total} residuals, or none that differ from zero")
-    rho = np.array(
-        [
-            sum(float(r[k:] @ r[: len(r) - k]) for r in residuals if len(r) > k) / variance
-            for k in range(1, _LAGS + 1)
-        ]
-    )
-    statistic = total * (total + 2) * float((rho**2 / (total - np.arange(1, _LAGS + 1))).sum())
-    p = float(chdtrc(_LAGS, statistic))
+    xi = [np.array([_later(e, lag) for lag in range(1, _LAGS + 1)]) for e in residuals]
+    phi, zhat = _normal_equations(evidence, row, residuals)
+    score = score_test(xi, phi, zhat, residuals, memory="white")
+    white = score.p_value >= LEVEL
     found = (
-        "coloured, as noisy regressors make them; the standard errors allow for it."
-        if p < LEVEL
-        else "not told from white."
+        "not told from white."
+        if white
+        else "coloured, as noisy regressors make them; the standard errors allow for it."
     )
-    return TestResult(name, null, statistic, p, f"residuals are {found}", LEVEL)
+    return TestResult(
+        name, null, score.statistic, score.p_value, f"residuals are {found}", LEVEL,
+        detail={"degrees_of_freedom": score.freedom},
+    )  # fmt: skip
+
+
+def _later(e: Array, lag: int) -> Array:
+    out = np.zeros_like(e)
+    out[lag:] = e[: max(len(e) - lag, 0)]
+    return out
+
+
+def _centred(evidence: Evidence, row: int) -> list[Array]:
+    out = []
+    for e, keep in zip(evidence.residuals[row], evidence.keep, strict=True):
+        mean = e[keep].mean() if keep.any() else 0.0
+        out.append(np.where(keep, e - mean, 0.0))
+    return out
+
+
+def _normal_equations(
+    evidence: Evidence, row: int, residuals: list[Array]
+) -> tuple[list[Array], list[Array]]:
+    """Return φ and ẑ of the equations that these residuals solve, or empty ones.
+
+    Residuals of another estimator than least squares and instrumental variables
+    are taken as they are.
+    """
+    empty = [np.zeros((0, len(e))) for e in residuals]
+    if not evidence.equations or evidence.method not in ("ls", "iv"):
+        return empty, empty
+    equation: Equation = evidence.equations[row]
+    same = all(np.array_equal(a, b) for a, b in zip(equation.keep, evidence.keep, strict=True))
+    if not equation.determined or not same:
+        return empty, empty
+    zhat = equation.phi if evidence.method == "ls" else equation.solution.projected
+    return list(equation.phi), list(zhat)

@@ -15,16 +15,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.estimation.credibility.kernel import (
-    autocovariance,
-    independent_covariance,
-    lagged_products,
-    quadratic_form,
-    robust_covariance,
-)
+from greybox.estimation.credibility.colour import WHITE, Colour
+from greybox.estimation.credibility.kernel import lagged_products, quadratic_form
 
 Array = NDArray[np.float64]
-Memory = Literal["iid", "white", "hac", "ma"]
+Memory = Literal["iid", "white", "coloured"]
 
 
 @dataclass(frozen=True)
@@ -52,6 +47,8 @@ class Score:
 
 def residualise(xi: Sequence[Array], phi: Sequence[Array], zhat: Sequence[Array]) -> list[Array]:
     """Return ξ̃ = ξ − (Σ ξ φᵀ) G⁻¹ ẑ, experiment by experiment."""
+    if not phi[0].shape[0]:
+        return list(xi)
     cross = lagged_products(xi, phi, 0)
     gram = lagged_products(zhat, phi, 0)
     size = np.sqrt(np.maximum(np.abs(np.diag(gram)), 1e-300))
@@ -72,11 +69,10 @@ def score_test(
     phi: Sequence[Array],
     zhat: Sequence[Array],
     errors: Sequence[Array],
-    keep: Sequence[NDArray[np.bool_]],
     *,
-    memory: Memory = "ma",
-    lags: int = 0,
-    lost: float = 0.0,
+    memory: Memory = "coloured",
+    colour: Colour = WHITE,
+    correction: float = 1.0,
 ) -> Score:
     """Test E ξ e = 0 where the estimate solves Σ ẑ ê = 0.
 
@@ -88,14 +84,14 @@ def score_test(
         (p, N) regressors, and instruments as the estimator combined them.
     errors : sequence of ndarray
         (N,) residuals.
-    keep : sequence of ndarray of bool
-    memory : {"iid", "white", "hac", "ma"}
-        Equal independent errors (Sargan, Durbin); independent of changing size
-        (Wooldridge); with memory, the scores' own kernel estimate; with memory,
-        ξ and ẑ independent of the errors, Σ ξ̃ R ξ̃ᵀ.
-    lags : int
-    lost : float
-        Degrees of freedom of the residuals that the estimate took.
+    memory : {"iid", "white", "coloured"}
+        Errors alike and independent (Sargan, Durbin); uncorrelated, their size
+        changing (Wooldridge); e = H ε with ξ and ẑ independent of the errors,
+        Σ (Hᵀξ̃)(Hᵀξ̃)ᵀ ε².
+    colour : Colour
+        H, for ``coloured``.
+    correction : float
+        Factor on the covariance for the degrees of freedom that the estimate took.
 
     References
     ----------
@@ -105,13 +101,14 @@ def score_test(
 
     tilde = _without_copies(xi, residualise(xi, phi, zhat))
     moments = np.asarray(sum(x @ e for x, e in zip(xi, errors, strict=True)))
-    rows = [e[None] for e in errors]
-    if memory in ("hac", "white"):
-        scores = [x * e for x, e in zip(tilde, errors, strict=True)]
-        covariance = robust_covariance(scores, lags if memory == "hac" else 0)
+    if memory == "iid":
+        square = sum(float(e @ e) for e in errors) / sum(len(e) for e in errors)
+        covariance = lagged_products(tilde, tilde, 0) * square
     else:
-        gamma = autocovariance(rows, keep, lags if memory == "ma" else 0, lost)
-        covariance = independent_covariance(tilde, gamma)
+        h = colour if memory == "coloured" else WHITE
+        scores = [h.adjoint(x) * h.innovations(e) for x, e in zip(tilde, errors, strict=True)]
+        covariance = lagged_products(scores, scores, 0)
+    covariance = covariance * correction
     statistic, freedom = quadratic_form(moments, covariance)
     p = float(chdtrc(freedom, statistic)) if freedom else 1.0
     return Score(statistic, freedom, p, moments, covariance)

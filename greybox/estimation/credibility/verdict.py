@@ -89,7 +89,7 @@ def holm(p_values: Sequence[float], level: float) -> list[int]:
 def _misfit(tests: Sequence[TestResult]) -> list[str]:
     family = [t for t in tests if t.name.startswith(_OF_THE_MODEL) and t.p_value is not None]
     found = [family[i] for i in holm([t.p_value or 0.0 for t in family], _FAMILY)]
-    states = sorted({t.name.rsplit("_", 1)[1] for t in found})
+    states = list(dict.fromkeys(t.name.rsplit("_", 1)[1] for t in family if t in found))
     if not states:
         return []
     return [
@@ -109,7 +109,7 @@ def _of_least_squares(tests: Sequence[TestResult], method: str) -> list[str]:
     found = [known[i] for i in holm([t.p_value or 0.0 for t in known], 0.05)]
     if not found:
         return []
-    states = [t.name.rsplit("_", 1)[1] for t in found]
+    states = [t.name.rsplit("_", 1)[1] for t in known if t in found]
     return [f"noise in the regressors of {listed(states)} biases least squares (--method iv)"]
 
 
