@@ -14,6 +14,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.estimation.colour import fit_colour
+
 Array = NDArray[np.float64]
 CovarianceKind = Literal["hac", "ma", "white"]
 
@@ -79,10 +81,11 @@ def score_covariance(
         (N,) residuals, zero in rows that do not take part.
     kind : {"hac", "ma", "white"}
         ``hac``: robust to colour and to variance that changes, flat-top kernel;
-        ``ma``: Σ Z R Zᵀ with the residuals' own autocovariance, for
-        instruments independent of the noise; ``white``: no memory.
+        ``ma``: Σ Z R Zᵀ for instruments independent of the noise, R by a noise
+        model of each equation's residuals; ``white``: no memory.
     lags : int, optional
-        Memory in samples; by default found from the residuals.
+        Memory in samples; by default found from the residuals. Given with
+        ``ma``, R holds the residuals' own autocovariance up to there.
 
     Returns
     -------
@@ -93,6 +96,8 @@ def score_covariance(
     ----------
     Ljungberg (2020), eq. 2.21; Newey and West (1987); Politis (2003).
     """
+    if kind == "ma" and lags is None:
+        return _coloured(projected, residuals)
     if lags is None:
         lags = 0
         if kind != "white":
@@ -112,6 +117,24 @@ def score_covariance(
             block = scores[:, lag:] @ scores[:, : samples - lag].T
             total += weight * (block if lag == 0 else block + block.T)
     return _positive(total), lags
+
+
+def _coloured(
+    projected: Sequence[Sequence[Array]], residuals: Sequence[Sequence[Array]]
+) -> tuple[Array, int]:
+    """Return Σ s sᵀ with s = (Hᵀ ẑ) ε of all equations, and the longest memory of a model."""
+    keep = [np.asarray(hat.any(axis=0)) for hat in projected[0]]
+    colours = [fit_colour(equation, keep) for equation in residuals]
+    total = 0.0
+    for e in range(len(keep)):
+        scores = np.vstack(
+            [
+                c.adjoint(hats[e]) * c.innovations(errors[e])
+                for c, hats, errors in zip(colours, projected, residuals, strict=True)
+            ]
+        )
+        total = total + scores @ scores.T
+    return np.asarray(total), max(c.memory for c in colours)
 
 
 def _moving_average(

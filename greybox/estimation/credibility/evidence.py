@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.estimation.credibility.colour import Colour, fit_colour
+from greybox.estimation.colour import Colour, fit_colour
 from greybox.estimation.moments import Solution, solve_stacked
 from greybox.model.predictor import Predictor
 from greybox.regression.instruments import Instruments

@@ -51,7 +51,6 @@ def input_independence(evidence: Evidence, equation: Equation) -> TestResult:
         equation.solution.projected,
         equation.residuals,
         colour=equation.colour,
-        correction=equation.rows / max(equation.freedom - len(equation.labels), 1),
     )
     if not score.freedom:
         return not_applicable(name, null, "no input varies beyond what the estimate used")

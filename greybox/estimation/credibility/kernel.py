@@ -10,8 +10,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.estimation.covariance import flat_top
-
 Array = NDArray[np.float64]
 
 
@@ -61,24 +59,10 @@ def independent_covariance(z: Sequence[Array], gamma: Sequence[Array]) -> Array:
     return total
 
 
-def robust_covariance(scores: Sequence[Array], lags: int) -> Array:
-    """Return the covariance of Σ s by a flat-top kernel of 2·lags samples.
-
-    References
-    ----------
-    Newey and West (1987); Politis (2003).
-    """
-    total = np.zeros((scores[0].shape[0],) * 2)
-    for lag in range(2 * lags + 1):
-        block = lagged_products(scores, scores, lag) * flat_top(lag, lags)
-        total += block if lag == 0 else block + block.T
-    return total
-
-
-def quadratic_form(moments: Array, covariance: Array) -> tuple[float, int]:
+def quadratic_form(moments: Array, covariance: Array, least: float = 1e-9) -> tuple[float, int]:
     """Return mᵀ C⁺ m and the rank, in correlation units.
 
-    Directions that carry less than 1e-9 of the largest variance are copies of others.
+    Directions that carry less than `least` of the largest variance are left out.
     """
     size = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     used = size > 1e-150
@@ -86,25 +70,6 @@ def quadratic_form(moments: Array, covariance: Array) -> tuple[float, int]:
         return 0.0, 0
     scaled = covariance[np.ix_(used, used)] / np.outer(size[used], size[used])
     values, vectors = np.linalg.eigh((scaled + scaled.T) / 2)
-    good = values > 1e-9 * values[-1]
+    good = values > least * values[-1]
     along = vectors[:, good].T @ (moments[used] / size[used])
     return float((along**2 / values[good]).sum()), int(good.sum())
-
-
-def projection(z: Array, rows: Array) -> Array:
-    """Return what instruments (q, N) explain of rows (k, N), by an orthonormal basis."""
-    basis = orthonormal(z)
-    return np.asarray((rows @ basis.T) @ basis)
-
-
-def orthonormal(z: Array) -> Array:
-    """Return an orthonormal basis of the rows of z, copies of one another left out."""
-    size = np.linalg.norm(z, axis=1)
-    z = z[size > 0] / size[size > 0, None]
-    if not len(z):
-        return z
-    values, vectors = np.linalg.eigh(z @ z.T)
-    good = values > 1e-12 * values[-1]
-    basis = (vectors[:, good] / np.sqrt(values[good])).T @ z
-    # a second pass: the squared moments lose half the digits
-    return np.asarray(np.linalg.qr(basis.T)[0].T)

@@ -43,7 +43,6 @@ def overidentification(equation: Equation, biases: frozenset[str]) -> TestResult
         equation.solution.projected,
         equation.residuals,
         colour=equation.colour,
-        correction=equation.rows / max(equation.freedom - len(equation.labels), 1),
     )
     if not score.freedom:
         return not_applicable(name, null, "no further instrument says anything new")

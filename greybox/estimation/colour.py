@@ -42,6 +42,14 @@ class Colour:
         """Whether there is no memory."""
         return len(self.moving_average) == 1 and len(self.autoregression) == 1
 
+    @property
+    def memory(self) -> int:
+        """Samples until the impulse response of H stays below one hundredth."""
+        pulse = np.zeros(400)
+        pulse[-1] = 1.0
+        above = np.flatnonzero(np.abs(self.adjoint(pulse)[::-1]) > 0.01)
+        return int(above[-1])
+
     def innovations(self, e: Array) -> Array:
         """Return ε = D/C e along the last axis."""
         from scipy.signal import lfilter
