@@ -125,7 +125,8 @@ def _coloured(
     """Return Σ s sᵀ with s = (Hᵀ ẑ) ε of all equations, and the longest memory of a model."""
     keep = [np.asarray(hat.any(axis=0)) for hat in projected[0]]
     colours = [fit_colour(equation, keep) for equation in residuals]
-    total = 0.0
+    sizes = sum(equation[0].shape[0] for equation in projected)
+    total = np.zeros((sizes, sizes))
     for e in range(len(keep)):
         scores = np.vstack(
             [
@@ -133,8 +134,8 @@ def _coloured(
                 for c, hats, errors in zip(colours, projected, residuals, strict=True)
             ]
         )
-        total = total + scores @ scores.T
-    return np.asarray(total), max(c.memory for c in colours)
+        total += scores @ scores.T
+    return total, max(c.memory for c in colours)
 
 
 def _moving_average(

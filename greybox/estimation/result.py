@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.estimation.summary import summarise
 from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor import Predictor
-from greybox.model.units import parameter_unit
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
@@ -239,46 +239,8 @@ class Estimate:
         }
 
     def summary(self) -> str:
-        """Return the result as text, in the manner of a regression table."""
-        width = 78
-        unit = self.vessel.force_unit
-        lines = [
-            f"{'Estimate of ' + self.vessel.name:^{width}}",
-            "=" * width,
-            f"{'Method:':<18}{self.method:<22}{'Samples:':<18}{self.samples}",
-            f"{'Predictor:':<18}{self.predictor.kind:<22}{'Samples used:':<18}{self.kept}",
-            f"{'Structure:':<18}{self.predictor.structure.name:<22}{'Sample time:':<18}"
-            f"{self.sample_time:g} s",
-            f"{'Std errors:':<18}{self.covariance_kind + f', {self.lags} lags':<22}"
-            f"{'Refinements:':<18}{self.iterations}",
-            "=" * width,
-            f"{'parameter':<14}{'value':>12}{'std err':>11}{'[0.025':>12}{'0.975]':>12}"
-            f"{'per second':>12}  unit",
-        ]
-        for state in self.predictor.structure.states:
-            lines.append("-" * width)
-            for i in self.predictor.equation(state):
-                column = self.predictor.columns[i]
-                if column.is_bias:
-                    continue
-                value, std = self.theta[i], self.std[i]
-                term = self.predictor.structure.terms[
-                    self.predictor.structure.index(column.terms[0])
-                ]
-                lines.append(
-                    f"{column.label:<14}{value:>12.4g}{std:>11.2g}{value - 1.96 * std:>12.4g}"
-                    f"{value + 1.96 * std:>12.4g}{value / self.sample_time:>12.4g}  "
-                    f"{parameter_unit(term, unit)}"
-                )
-        lines.append("=" * width)
-        for name, value, std in self.current:
-            lines.append(f"{name:<16}{value:>10.3f} ± {1.96 * std:.3f} m/s (95 %)")
-        if self.fit:
-            shown = ", ".join(f"{k} {v:.1f} %" for k, v in self.fit.items())
-            lines.append(f"Free-run fit on the estimation logs: {shown}")
-        lines += [f"{t.name}: {t.sentence}" for t in self.tests]
-        lines += [f"Note: {n}" for n in self.notes]
-        return "\n".join(lines)
+        """Return the result as text: verdict, table, tests."""
+        return summarise(self)
 
     def _repr_html_(self) -> str:
         from html import escape

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import ExcitationError, GreyboxError, LogError
+from greybox.estimation.credibility import judge
 from greybox.estimation.estimate import (
     Covariance,
     UnexcitedBiasError,
@@ -17,7 +18,7 @@ from greybox.estimation.estimate import (
     estimate_ls,
 )
 from greybox.estimation.loop import CLOSED_LOOP_LAG, Loop, assess_loop
-from greybox.estimation.result import Estimate
+from greybox.estimation.result import Estimate, Verdict
 from greybox.model.catalogue import structure_for
 from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor import Predictor, Regime, build_predictor
@@ -60,7 +61,8 @@ class Request:
     """What to estimate; None leaves the choice to the data.
 
     ``margins`` are |u|, |v| [m/s] below which samples are cut out; ``nominal``
-    simulates the first instruments (least squares does without it).
+    simulates the first instruments (least squares does without it); ``judged``
+    asks for the tests and the verdict.
     """
 
     method: str | None = None
@@ -74,6 +76,7 @@ class Request:
     refine: bool | int = True
     nominal: ManoeuvringModel | None = None
     seed: int = 0
+    judged: bool = True
 
 
 def heading_range(logs: Sequence[TrialLog]) -> float:
@@ -164,7 +167,11 @@ def estimate_once(
     """
     require_informative(logs, kind)
     closed, loop_test = assess_loop(logs, request.loop, method)
-    common: dict[str, Any] = {"margins": request.margins, "seed": request.seed}
+    common: dict[str, Any] = {
+        "margins": request.margins,
+        "seed": request.seed,
+        "judged": request.judged,
+    }
     if request.covariance is not None:
         common["covariance"] = request.covariance
     keep_constant = method == "ls" or not request.zero_mean
@@ -309,8 +316,11 @@ def _first_that_runs(
                 f"the free run of {', '.join(poor)} is worse than a constant on the very logs it "
                 f"was estimated on: this model does not explain that motion."
             )
+        diverged = any(r.diverged >= 0 for r in runs)
         estimate = replace(estimate, notes=(*notes, *own), fit=fit)
-        if all(r.diverged < 0 for r in runs):
+        if request.judged:
+            estimate = replace(estimate, verdict=_verdict(estimate, diverged))
+        if not diverged:
             return estimate
         notes.append(f"{alternative.label} was left: its free run diverges.")
         fallback = fallback or estimate
@@ -321,6 +331,18 @@ def _first_that_runs(
         "Use a smaller structure or a longer, more exciting log."
     )
     return replace(fallback, notes=(*fallback.notes, warning))
+
+
+def _verdict(estimate: Estimate, diverged: bool) -> Verdict:
+    """Weigh the tests again, now with the loop and the free run."""
+    return judge(
+        estimate.tests,
+        estimate.labels,
+        estimate.method,
+        contaminated=estimate.predictor.contaminated,
+        fit=estimate.fit,
+        diverged=diverged,
+    )
 
 
 def _structures(logs: Sequence[TrialLog], wind: bool) -> list[str]:
@@ -402,8 +424,8 @@ def _compare(
     notes: list[str],
 ) -> list[Alternative]:
     """Order the alternatives by the held-out free run, the earlier ones preferred."""
-    # a ranking needs neither standard errors nor the last digit
-    request = replace(request, covariance="white", refine=_RANKING_REFINEMENTS)
+    # a ranking needs neither standard errors, nor tests, nor the last digit
+    request = replace(request, covariance="white", refine=_RANKING_REFINEMENTS, judged=False)
     fitting, held = [], []
     for log in logs:
         cut = len(log) - int(len(log) * _HELD_OUT)

@@ -73,5 +73,5 @@ def _of_equation(evidence: Evidence, equation: Equation) -> list[TestResult]:
         anderson_rubin(equation, biases)[0],
         overidentification(equation, biases),
         input_independence(evidence, equation),
-        endogeneity(equation),
+        endogeneity(equation, evidence.method),
     ]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from greybox.estimation.credibility.evidence import Evidence
@@ -32,20 +34,23 @@ def combinations(evidence: Evidence, state: str) -> TestResult:
             factor = 1 / np.sqrt(max(1 - rho**2, 1e-12))
             found.append((factor, i, j))
     found.sort(reverse=True)
-    shown, parts = [], []
+    shown: list[dict[str, Any]] = []
+    parts: list[str] = []
     used: set[int] = set()
     for factor, i, j in found:
         if factor < _FACTOR or len(shown) == _REPORTED or {i, j} <= used:
             continue
         used |= {i, j}
         c = -float(evidence.covariance[i, j]) / float(std[j]) ** 2
-        a, b = predictor.columns[i].label, predictor.columns[j].label
+        one, other = predictor.columns[i].label, predictor.columns[j].label
         together, alone = 1.96 * std[i] / factor, 1.96 * std[i]
         parts.append(
-            f"{a} {'+' if c > 0 else '−'} {abs(c):.2g}·{b} is known to ± {together:.2g}, "
-            f"{a} alone only to ± {alone:.2g}"
+            f"{one} {'+' if c > 0 else '−'} {abs(c):.2g}·{other} is known to ± {together:.2g}, "
+            f"{one} alone only to ± {alone:.2g}"
         )
-        shown.append({"of": [a, b], "weights": [1.0, c], "half_width": together, "alone": alone})
+        shown.append(
+            {"of": [one, other], "weights": [1.0, c], "half_width": together, "alone": alone}
+        )
     sentence = (
         "; ".join(parts) + "."
         if parts

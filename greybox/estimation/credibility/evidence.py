@@ -90,7 +90,7 @@ class Equation:
         scores = [w * i for w, i in zip(weights, innovations, strict=True)]
         middle = sum(s @ s.T for s in scores) * self.rows / max(self.freedom - len(self.labels), 1)
         inverse = np.linalg.pinv(self.solution.information, rcond=1e-15)
-        return np.sqrt(np.maximum(np.diag(inverse @ middle @ inverse.T), 0.0))
+        return np.asarray(np.sqrt(np.maximum(np.diag(inverse @ middle @ inverse.T), 0.0)))
 
     @cached_property
     def determined(self) -> bool:

@@ -54,7 +54,9 @@ def input_independence(evidence: Evidence, equation: Equation) -> TestResult:
     )
     if not score.freedom:
         return not_applicable(name, null, "no input varies beyond what the estimate used")
-    size = np.sqrt(sum((x**2).sum(axis=1) for x in xi) * sum(float(e @ e) for e in equation.residuals))
+    size = np.sqrt(
+        sum((x**2).sum(axis=1) for x in xi) * sum(float(e @ e) for e in equation.residuals)
+    )
     size = np.where(size > 0, size, 1.0)
     std = np.sqrt(np.maximum(np.diag(score.covariance), 0.0))
     ratio = np.divide(np.abs(score.moments), std, out=np.zeros_like(std), where=std > 0)

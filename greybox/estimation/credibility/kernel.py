@@ -59,17 +59,21 @@ def independent_covariance(z: Sequence[Array], gamma: Sequence[Array]) -> Array:
     return total
 
 
-def quadratic_form(moments: Array, covariance: Array, least: float = 1e-9) -> tuple[float, int]:
-    """Return mᵀ C⁺ m and the rank, in correlation units.
+def quadratic_form(
+    moments: Array, covariance: Array, least: float = 1e-9
+) -> tuple[float, int, Array]:
+    """Return mᵀ C⁺ m, the rank, and the whitening W with W C Wᵀ = I, (rank, k).
 
-    Directions that carry less than `least` of the largest variance are left out.
+    Works in correlation units; directions that carry less than `least` of the
+    largest variance are left out.
     """
     size = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    used = size > 1e-150
-    if not used.any():
-        return 0.0, 0
+    used = np.flatnonzero(size > 1e-150)
+    if not len(used):
+        return 0.0, 0, np.zeros((0, len(moments)))
     scaled = covariance[np.ix_(used, used)] / np.outer(size[used], size[used])
     values, vectors = np.linalg.eigh((scaled + scaled.T) / 2)
     good = values > least * values[-1]
-    along = vectors[:, good].T @ (moments[used] / size[used])
-    return float((along**2 / values[good]).sum()), int(good.sum())
+    whitening = np.zeros((int(good.sum()), len(moments)))
+    whitening[:, used] = (vectors[:, good] / np.sqrt(values[good])).T / size[used]
+    return float(((whitening @ moments) ** 2).sum()), int(good.sum()), whitening

@@ -1,4 +1,4 @@
-"""Do more instruments than parameters agree on one estimate?"""
+"""Whether more instruments than parameters agree on one estimate."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ _DELAY = 5
 
 
 def overidentification(equation: Equation, biases: frozenset[str]) -> TestResult:
-    """Test that all instruments are valid (Sargan-Hansen), robust to the moving average
-    and to noise that changes its size.
+    """Test that all instruments are valid (Sargan-Hansen).
 
+    Robust to the moving average and to noise that changes its size.
     Several logs bring more equations than parameters by their own instruments;
     to these, and to a single log, the parameters' instruments delayed by five
     samples are added.

@@ -34,6 +34,8 @@ class Score:
     freedom : int
         Rank of the covariance: restrictions that are not copies of one another.
     p_value : float
+        Of χ², or of the gamma distribution with the mean and the variance that the
+        statistic has when the signs of the scores are random.
     moments : ndarray
         (k,) Σ ξ ê.
     covariance : ndarray
@@ -94,23 +96,27 @@ def score_test(
 
     References
     ----------
-    Sargan (1958); Hansen (1982); Wooldridge (1995); Durbin (1954).
+    Sargan (1958); Hansen (1982); Wooldridge (1995); Durbin (1954); random
+    signs: Davidson and Flachaire (2008), whose bootstrap moments are used.
     """
-    from scipy.special import chdtrc
+    from scipy.special import gammaincc
 
     tilde = _without_copies(xi, residualise(xi, phi, zhat))
     moments = np.asarray(sum(x @ e for x, e in zip(xi, errors, strict=True)))
+    taken = 0.0
     if memory == "iid":
         square = sum(float(e @ e) for e in errors) / sum(len(e) for e in errors)
         covariance = lagged_products(tilde, tilde, 0) * square
+        statistic, freedom, _ = quadratic_form(moments, covariance, _LEAST)
     else:
         h = colour if memory == "coloured" else WHITE
         scores = [h.adjoint(x) * h.innovations(e) for x, e in zip(tilde, errors, strict=True)]
         covariance = lagged_products(scores, scores, 0)
-    statistic, freedom = quadratic_form(moments, covariance, _LEAST)
-    rows = sum(len(e) for e in errors)
-    if memory == "coloured" and statistic < rows / 2:
-        # the scores' own mean is no part of their variance
-        statistic /= 1 - statistic / rows
-    p = float(chdtrc(freedom, statistic)) if freedom else 1.0
+        statistic, freedom, whitening = quadratic_form(moments, covariance, _LEAST)
+        # Σ h² of the leverages: what a few large scores take from the variance 2k of χ²
+        taken = sum(float((((whitening @ s) ** 2).sum(axis=0) ** 2).sum()) for s in scores)
+    p = 1.0
+    if freedom:
+        share = max(1.0 - taken / freedom, 0.05)
+        p = float(gammaincc(freedom / (2 * share), statistic / (2 * share)))
     return Score(statistic, freedom, p, moments, covariance)

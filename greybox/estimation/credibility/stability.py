@@ -1,4 +1,4 @@
-"""Is the identified model stable, and does its damping dissipate?"""
+"""Whether the identified model is stable and its damping dissipates."""
 
 from __future__ import annotations
 

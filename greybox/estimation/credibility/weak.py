@@ -107,9 +107,8 @@ def measure_strength(equation: Equation) -> Strength:
 
 def _inverse(matrix: Array) -> Array:
     size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    return np.asarray(np.linalg.pinv(matrix / np.outer(size, size), rcond=1e-15)) / np.outer(
-        size, size
-    )
+    unit = matrix / np.outer(size, size)
+    return np.asarray(np.linalg.pinv(unit, rcond=1e-15) / np.outer(size, size))
 
 
 def _orthonormal(z: Array) -> Array:
@@ -168,7 +167,7 @@ def _joint(
         stop = start + len(b)
         blocks[start:stop, start:stop] = independent_covariance([b], gamma)
         start = stop
-    rank, freedom = quadratic_form(left.T @ coordinates @ weak, left.T @ blocks @ left)
+    rank, freedom, _ = quadratic_form(left.T @ coordinates @ weak, left.T @ blocks @ left)
     spread = np.sqrt(np.asarray(sum((f**2).sum(axis=1) for f in equation.phi)))
     direction = weak * spread
     return (
@@ -267,6 +266,4 @@ def weak_instruments(equation: Equation, biases: frozenset[str]) -> list[TestRes
 
 def _finite(labels: tuple[str, ...], values: Array) -> dict[str, float | None]:
     """Return values by label, None where infinite: a regressor without noise."""
-    return {
-        n: float(v) if np.isfinite(v) else None for n, v in zip(labels, values, strict=True)
-    }
+    return {n: float(v) if np.isfinite(v) else None for n, v in zip(labels, values, strict=True)}
