@@ -177,9 +177,8 @@ def anderson_rubin(
     """
     name = f"anderson_rubin_{equation.state}"
     null = "intervals that hold under weak instruments are as wide as the ordinary ones"
-    if not equation.determined:
-        reason = "the equation is not determined, or has no residuals to judge by"
-        return not_applicable(name, null, reason), {}
+    if equation.obstacle:
+        return not_applicable(name, null, equation.obstacle), {}
     sets = dict(zip(equation.labels, confidence_sets(equation), strict=True))
     wide, ratios = [], []
     for label, s in zip(equation.labels, equation.std, strict=True):

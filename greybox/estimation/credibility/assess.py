@@ -10,6 +10,7 @@ from greybox.estimation.credibility.endogeneity import endogeneity
 from greybox.estimation.credibility.evidence import Equation, Evidence
 from greybox.estimation.credibility.excitation import excitation
 from greybox.estimation.credibility.independence import input_independence
+from greybox.estimation.credibility.many import many_instruments
 from greybox.estimation.credibility.margins import margin_bias, sign_margins
 from greybox.estimation.credibility.overidentification import overidentification
 from greybox.estimation.credibility.residuals import whiteness
@@ -24,6 +25,7 @@ _OF_EQUATIONS = {
     "anderson_rubin": "intervals that hold under weak instruments are as wide as the ordinary ones",
     "overidentification": "the estimate satisfies the equations of all instruments",
     "input_independence": "the residuals do not depend on the inputs, at any delay",
+    "many_instruments": "the instruments of several logs are few enough not to fit the noise",
     "endogeneity": "the regressors do not depend on the noise: least squares suffices",
 }
 
@@ -73,5 +75,6 @@ def _of_equation(evidence: Evidence, equation: Equation) -> list[TestResult]:
         anderson_rubin(equation, biases)[0],
         overidentification(equation, biases),
         input_independence(evidence, equation),
+        many_instruments(equation, biases),
         endogeneity(equation, evidence.method),
     ]

@@ -28,10 +28,8 @@ def endogeneity(equation: Equation, method: str = "ls") -> TestResult:
     """
     name = f"endogeneity_{equation.state}"
     null = "the regressors do not depend on the noise: least squares suffices"
-    if not equation.determined:
-        return not_applicable(
-            name, null, "the equation is not determined, or has no residuals to judge by"
-        )
+    if equation.obstacle:
+        return not_applicable(name, null, equation.obstacle)
     gram = np.asarray(sum(f @ f.T for f in equation.phi))
     right = np.asarray(sum(f @ y for f, y in zip(equation.phi, equation.y, strict=True)))
     size = np.sqrt(np.diag(gram))

@@ -93,16 +93,18 @@ class Equation:
         return np.asarray(np.sqrt(np.maximum(np.diag(inverse @ middle @ inverse.T), 0.0)))
 
     @cached_property
-    def determined(self) -> bool:
-        """Whether the instruments explain every direction, and residuals are left to judge by."""
+    def obstacle(self) -> str:
+        """Why this regression cannot be tested; empty where it can."""
+        p = len(self.columns)
+        if self.freedom <= 2 * p:
+            return f"{self.freedom} rows are too few for {p} coefficients"
         values = self.solution.singular_values
+        if not values[-1] > 1e-9 * values[0]:
+            return "the instruments leave a direction free"
         left = sum(float(r @ r) for r in self.residuals)
-        total = sum(float(y @ y) for y in self.y)
-        return bool(
-            self.freedom > 2 * len(self.columns)
-            and values[-1] > 1e-9 * values[0]
-            and left > 1e-18 * total
-        )
+        if left <= 1e-18 * sum(float(y @ y) for y in self.y):
+            return "there are no residuals to judge by"
+        return ""
 
     @cached_property
     def stacked(self) -> tuple[Array, ...]:

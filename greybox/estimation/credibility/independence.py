@@ -31,10 +31,8 @@ def input_independence(evidence: Evidence, equation: Equation) -> TestResult:
     state = equation.state
     name = f"input_independence_{state}"
     null = "the residuals do not depend on the inputs, at any delay"
-    if not equation.determined:
-        return not_applicable(
-            name, null, "the equation is not determined, or has no residuals to judge by"
-        )
+    if equation.obstacle:
+        return not_applicable(name, null, equation.obstacle)
     structure = evidence.predictor.structure
     xi = []
     for log, keep in zip(evidence.logs, equation.keep, strict=True):

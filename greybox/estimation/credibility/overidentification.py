@@ -28,10 +28,8 @@ def overidentification(equation: Equation, biases: frozenset[str]) -> TestResult
     """
     name = f"overidentification_{equation.state}"
     null = "the estimate satisfies the equations of all instruments, delayed ones included"
-    if not equation.determined:
-        return not_applicable(
-            name, null, "the equation is not determined, or has no residuals to judge by"
-        )
+    if equation.obstacle:
+        return not_applicable(name, null, equation.obstacle)
     wanted = [i for i, n in enumerate(equation.labels) if n not in biases]
     later = [delayed(z[wanted], k, _DELAY) for z, k in zip(equation.z, equation.keep, strict=True)]
     xi = later
@@ -70,6 +68,8 @@ def delayed(rows: Array, keep: np.ndarray, delay: int) -> Array:
     """Return rows (k, N) delayed, without mean over the rows that take part, zero elsewhere."""
     out = np.zeros_like(rows)
     valid = keep.copy()
+    if delay >= len(keep):
+        return out
     valid[:delay] = False
     # a cut row has no value to hand on
     valid[delay:] &= keep[: len(keep) - delay]

@@ -50,7 +50,8 @@ def whiteness(evidence: Evidence, row: int) -> TestResult:
 
 def _later(e: Array, lag: int) -> Array:
     out = np.zeros_like(e)
-    out[lag:] = e[: max(len(e) - lag, 0)]
+    if lag < len(e):
+        out[lag:] = e[: len(e) - lag]
     return out
 
 
@@ -75,7 +76,7 @@ def _normal_equations(
         return empty, empty
     equation: Equation = evidence.equations[row]
     same = all(np.array_equal(a, b) for a, b in zip(equation.keep, evidence.keep, strict=True))
-    if not equation.determined or not same:
+    if equation.obstacle or not same:
         return empty, empty
     zhat = equation.phi if evidence.method == "ls" else equation.solution.projected
     return list(equation.phi), list(zhat)

@@ -11,7 +11,7 @@ from greybox.estimation.result import TestResult, Verdict
 _FAMILY = 0.01
 # findings that concern some parameters and leave the others
 _OF_PARAMETERS = (
-    "relevance_", "weak_instruments_", "anderson_rubin_", "damping_signs", "margin_bias",
+    "relevance_", "weak_instruments_", "many_instruments_", "anderson_rubin_", "damping_signs", "margin_bias",
 )  # fmt: skip
 _OF_THE_MODEL = ("input_independence_", "overidentification_")
 
@@ -87,6 +87,9 @@ def holm(p_values: Sequence[float], level: float) -> list[int]:
 
 
 def _misfit(tests: Sequence[TestResult]) -> list[str]:
+    if any(t.name.startswith("many_instruments_") and t.passed is False for t in tests):
+        # the bias of surplus instruments alone makes inputs explain the residuals
+        return []
     family = [t for t in tests if t.name.startswith(_OF_THE_MODEL) and t.p_value is not None]
     found = [family[i] for i in holm([t.p_value or 0.0 for t in family], _FAMILY)]
     states = list(dict.fromkeys(t.name.rsplit("_", 1)[1] for t in family if t in found))
@@ -104,7 +107,7 @@ def _of_least_squares(tests: Sequence[TestResult], method: str) -> list[str]:
     if any(t.name == "closed_loop" and t.passed is False for t in tests):
         return ["least squares on a closed loop is biased by an unknown amount (--method iv)"]
     known = [t for t in family if t.p_value is not None]
-    if family and not known:
+    if any("left its bound" in t.sentence for t in family):
         return ["least squares could not be compared with instruments, so its bias is not known"]
     found = [known[i] for i in holm([t.p_value or 0.0 for t in known], 0.05)]
     if not found:

@@ -199,9 +199,8 @@ def weak_instruments(equation: Equation, biases: frozenset[str]) -> list[TestRes
         "some combination of the regressors is hardly moved by the instruments",
         "the part of a regressor that no other has is hardly moved by the instruments",
     )
-    if not equation.determined:
-        reason = "the instruments leave a direction free, or residuals are too few or zero"
-        return [not_applicable(n, h, reason) for n, h in zip(names, nulls, strict=True)]
+    if equation.obstacle:
+        return [not_applicable(n, h, equation.obstacle) for n, h in zip(names, nulls, strict=True)]
     s = measure_strength(equation)
     if not np.isfinite(s.own).any():
         reason = "no regressor of this equation is noisy"
