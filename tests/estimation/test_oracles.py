@@ -81,9 +81,7 @@ def test_least_squares_with_memory_equals_statsmodels():
     x, e = rng.normal(size=(2, ROWS)), np.convolve(rng.normal(size=ROWS + 3), np.ones(4), "valid")
     y = np.array([1.0, 2.0]) @ x + e
     solution = solve_stacked([x], [x], [y])
-    oracle = sm.OLS(y, x.T).fit(
-        cov_type="HAC", cov_kwds={"maxlags": 5, "use_correction": False}
-    )
+    oracle = sm.OLS(y, x.T).fit(cov_type="HAC", cov_kwds={"maxlags": 5, "use_correction": False})
     residual = y - solution.theta @ x
     scores = x * residual
     middle = scores @ scores.T
