@@ -16,7 +16,8 @@ _GROUPS = {
     "What the log determines": ("excitation", "relevance", "weak_instruments", "anderson_rubin",
                                 "combinations"),
     "Whether the model explains it": ("input_independence", "overidentification", "whiteness"),
-    "What noise does to it": ("endogeneity", "many_instruments", "margin_u", "margin_v", "margin_bias", "closed_loop"),
+    "What noise does to it": ("endogeneity", "many_instruments", "margin_u", "margin_v",
+                              "margin_bias", "closed_loop"),
     "What the model does": ("stability", "damping_signs"),
 }  # fmt: skip
 _MARKS = {True: "ok", False: "!!", None: "  "}

@@ -66,7 +66,8 @@ def test_a_good_estimate_is_trusted(good):
 
 def test_every_test_says_something_finite(good):
     for t in good.tests:
-        assert t.sentence.endswith(".") and t.null
+        assert t.sentence.endswith(".")
+        assert t.null
         assert t.statistic is None or np.isfinite(t.statistic), t.name
         assert t.p_value is None or 0 <= t.p_value <= 1, t.name
 
@@ -132,7 +133,9 @@ def test_confidence_sets_of_each_shape():
     plain = solve_quadratic(1.0, 0.04, 0.0, 0.0, c)
     assert plain.pieces[0] == pytest.approx((1 - 0.2 * np.sqrt(c), 1 + 0.2 * np.sqrt(c)))
     rays = solve_quadratic(1.0, 0.01, 0.3, 1.0, c)
-    assert len(rays.pieces) == 2 and 1.0 in rays and not rays.bounded
+    assert len(rays.pieces) == 2
+    assert 1.0 in rays
+    assert not rays.bounded
     assert solve_quadratic(1.0, 1.0, 0.0, 1.0, c).words() == "any value"
     for v01, v11 in ((0.0, 0.0), (0.3, 1.0), (0.01, 0.1), (-0.05, 0.05), (0.02, 1 / c)):
         found = solve_quadratic(1.0, 0.09, v01, v11, c)
@@ -268,7 +271,8 @@ def test_surplus_instruments_are_told(thesis, true_theta):
         build_predictor(thesis, "augmented", REGIME), logs, start=true_theta, refine=False
     )
     test = by_name(estimate)["many_instruments_v"]
-    assert "Ymu" in test.parameters and not test.passed
+    assert "Ymu" in test.parameters
+    assert not test.passed
     assert "use fewer, longer logs" in test.sentence
     assert "Ymu" in estimate.verdict.excepted
 

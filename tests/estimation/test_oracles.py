@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 import statsmodels.api as sm
@@ -61,7 +63,7 @@ def test_several_experiments_with_their_own_instruments():
     cut = (0, 150, 290, ROWS)
     y, exact, first, outer = endogenous(2)
     phi, z = np.vstack([first, exact]), np.vstack([outer, exact])
-    parts = [slice(a, b) for a, b in zip(cut, cut[1:], strict=False)]
+    parts = [slice(a, b) for a, b in pairwise(cut)]
     zs = [z[:, s] - z[:, s].mean(axis=1, keepdims=True) for s in parts]
     blocks = np.zeros((5 * 3, ROWS))
     for i, (s, part) in enumerate(zip(parts, zs, strict=True)):

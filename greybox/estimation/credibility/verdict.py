@@ -11,7 +11,8 @@ from greybox.estimation.result import TestResult, Verdict
 _FAMILY = 0.01
 # findings that concern some parameters and leave the others
 _OF_PARAMETERS = (
-    "relevance_", "weak_instruments_", "many_instruments_", "anderson_rubin_", "damping_signs", "margin_bias",
+    "relevance_", "weak_instruments_", "many_instruments_", "anderson_rubin_", "damping_signs",
+    "margin_bias",
 )  # fmt: skip
 _OF_THE_MODEL = ("input_independence_", "overidentification_")
 
