@@ -66,7 +66,7 @@ def _table(estimate: Estimate) -> list[str]:
             sets |= test.detail.get("sets", {})
     lines = [
         f"{'parameter':<12}{'value':>10}{'std err':>9}{'[0.025':>11}{'0.975]':>11}"
-        f"{'weak-safe 95 %':>22}{'per second':>12}  unit"
+        f"{'weak-safe 95 %':>24}{'per second':>11}  unit"
     ]
     unit = estimate.vessel.force_unit
     structure = estimate.predictor.structure
@@ -80,8 +80,8 @@ def _table(estimate: Estimate) -> list[str]:
             term = structure.terms[structure.index(column.terms[0])]
             lines.append(
                 f"{column.label:<12}{value:>10.4g}{std:>9.2g}{value - 1.96 * std:>11.4g}"
-                f"{value + 1.96 * std:>11.4g}{_set(sets, column.label):>22}"
-                f"{value / estimate.sample_time:>12.4g}  {parameter_unit(term, unit)}"
+                f"{value + 1.96 * std:>11.4g}{_set(sets, column.label):>24}"
+                f"{value / estimate.sample_time:>11.4g}  {parameter_unit(term, unit)}"
             )
     return lines
 
@@ -91,7 +91,7 @@ def _set(sets: Mapping[str, Sequence[Sequence[float | None]]], label: str) -> st
         return ""
     pieces = sets[label]
     if len(pieces) == 2:
-        return f"not {pieces[0][1]:.3g} to {pieces[1][0]:.3g}"
+        return f"not {pieces[0][1]:.2g} to {pieces[1][0]:.2g}"
     low, high = pieces[0]
     if low is None and high is None:
         return "any value"

@@ -321,6 +321,17 @@ def result(name, passed, parameters=(), p=None, **detail):
     return TestResult(name, "", 1.0, p, "it is so.", 0.05, passed, parameters, detail)
 
 
+def test_the_summary_keeps_to_a_hundred_columns(good):
+    rays = replace(
+        by_name(good)["anderson_rubin_u"],
+        detail={"sets": {"Xu": [[None, -0.00257], [0.00251, None]], "Xvr": [[None, None]]}},
+    )
+    text = replace(good, tests=(*good.tests, rays), notes=("a note " * 40,)).summary()
+    assert max(len(line) for line in text.splitlines()) <= 100
+    assert " not -0.0026 to 0.0025 " in text
+    assert " any value " in text
+
+
 def test_verdicts():
     names = ["Nuv", "Nvv", "Wuv", "Nr"]
     weak = result("weak_instruments_r", False, ("Wuv", "Nvv"))
@@ -375,3 +386,19 @@ def test_rescaling_changes_no_statistic(thesis, noisy_log, true_theta):
 def test_unsolvable_logs_still_raise(thesis, noisy_log):
     with pytest.raises(GreyboxError):
         estimate_iv(build_predictor(thesis, "augmented", REGIME), [noisy_log.window(0, 20)])
+
+
+@pytest.mark.long
+def test_bands_of_single_delays_cover(true_theta):
+    """Each correlation of input and residual lies in its band in 95 % of correct models."""
+    p = build_predictor(get_structure("thesis"), "augmented", REGIME)
+    inside = []
+    for seed in range(100):
+        e = estimate_iv(p, [virtual_log(8000 + seed, 2000, wind=0.3)], start=true_theta, refine=2)
+        for state in "uvr":
+            for entry in by_name(e)[f"input_independence_{state}"].detail["inputs"].values():
+                value, band = np.abs(entry["correlation"]), np.array(entry["band"])
+                # an input that the estimate uses itself has no band of its own
+                inside += list(value[band > 1e-9] <= band[band > 1e-9])
+    # delays of one run are related: a run counts as some six independent draws
+    assert abs(np.mean(inside) - 0.95) < 3 * np.sqrt(0.95 * 0.05 / 600)

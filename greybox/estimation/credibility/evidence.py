@@ -7,7 +7,6 @@ properties of that regression.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -205,8 +204,3 @@ def _prepare(rows: Array, keep: NDArray[np.bool_], centred: bool) -> Array:
     if centred and keep.any():
         rows = rows - rows[:, keep].mean(axis=1, keepdims=True)
     return np.where(keep, rows, 0.0)
-
-
-def rows_together(parts: Sequence[Array]) -> Array:
-    """Return experiments after one another, along the last axis."""
-    return np.concatenate(parts, axis=-1)
