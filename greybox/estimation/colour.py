@@ -10,7 +10,7 @@ follows from the innovations ε, whose variance may change along the log.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,8 @@ _ORDERS = ((0, 0), (0, 1), (1, 0), (1, 1), (2, 2))
 _LEAST_ROWS = 60
 # partial correlations closer to one than this are not told from a difference
 _EDGE = 0.9995
+# the linear error of a fit says little at a unit root
+_LEAST_FREEDOM = 8.0
 
 
 @dataclass(frozen=True)
@@ -32,10 +34,13 @@ class Colour:
     ----------
     moving_average, autoregression : ndarray
         (m+1,) and (n+1,) coefficients of C and D in delays, each led by 1.
+    neighbours : tuple of Colour
+        Models one standard error away along each principal axis of the fit.
     """
 
     moving_average: Array
     autoregression: Array
+    neighbours: tuple[Colour, ...] = ()
 
     @property
     def white(self) -> bool:
@@ -62,6 +67,29 @@ class Colour:
 
         back = lfilter(self.moving_average, self.autoregression, z[..., ::-1], axis=-1)
         return np.asarray(back[..., ::-1])
+
+    def freedom_of(self, z: Sequence[Array], *, together: bool = False) -> Array:
+        """Return the degrees of freedom of the variance of Σ z e, for each row of z.
+
+        2/ρ² with ρ the relative standard error that the fit leaves to it.
+
+        Parameters
+        ----------
+        z : sequence of ndarray
+            (k, N) an experiment.
+        together : bool
+            Of all rows together, (1,), in place of (k,).
+        """
+
+        def variance(colour: Colour) -> Array:
+            each = np.asarray(sum((colour.adjoint(x) ** 2).sum(axis=1) for x in z))
+            return each.sum(keepdims=True) if together else each
+
+        base = np.maximum(variance(self), 1e-300)
+        square = np.zeros_like(base)
+        for other in self.neighbours:
+            square += (variance(other) / base - 1) ** 2
+        return np.asarray(np.clip(2 / np.maximum(square, 1e-12), _LEAST_FREEDOM, 1e9))
 
 
 WHITE = Colour(np.ones(1), np.ones(1))
@@ -127,4 +155,10 @@ def _fit(series: Array, inside: NDArray[np.bool_], ar: int, ma: int) -> tuple[Co
     start[:ar] = -0.6
     found = least_squares(innovations, start, method="trf", x_scale=1.0, max_nfev=40, xtol=1e-4,
                           ftol=1e-6)  # fmt: skip
-    return colour(found.x), float(2 * found.cost)
+    best = colour(found.x)
+    spread = np.linalg.pinv(found.jac.T @ found.jac) * 2 * found.cost / max(len(series), 1)
+    values, vectors = np.linalg.eigh(spread)
+    axes = (vectors * np.sqrt(np.maximum(values, 0.0))).T
+    return replace(best, neighbours=tuple(colour(found.x + axis) for axis in axes)), float(
+        2 * found.cost
+    )

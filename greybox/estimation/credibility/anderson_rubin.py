@@ -118,14 +118,18 @@ def confidence_sets(equation: Equation, level: float = 0.95) -> list[ConfidenceS
     colour = equation.colour
     errors = [colour.innovations(e) for e in _unexplained(equation)]
     shift = [colour.innovations(b) for b in shift]
-    weights = [colour.adjoint(w) for w in weights]
     freedom = max(equation.freedom - p * len(equation.phi), 1)
+    known = np.minimum(colour.freedom_of(weights), freedom)
+    weights = [colour.adjoint(w) for w in weights]
     lost = equation.rows / freedom
     v00 = lost * sum(((w * e) ** 2).sum(axis=1) for w, e in zip(weights, errors, strict=True))
     v01, v11 = _of_shift(equation, weights, errors, shift, lost)
     v11 = np.maximum(v11, v01**2 / np.where(v00 > 0, v00, np.inf))
-    c = float(fdtri(1, freedom, level))
-    return [solve_quadratic(float(solution.theta[i]), v00[i], v01[i], v11[i], c) for i in range(p)]
+    c = fdtri(1, known, level)
+    return [
+        solve_quadratic(float(solution.theta[i]), v00[i], v01[i], v11[i], float(c[i]))
+        for i in range(p)
+    ]
 
 
 def _of_shift(

@@ -34,8 +34,8 @@ class Score:
     freedom : int
         Rank of the covariance: restrictions that are not copies of one another.
     p_value : float
-        Of χ², or of the gamma distribution with the mean and the variance that the
-        statistic has when the signs of the scores are random.
+        Of χ², or with the variance that the statistic has when the signs of the
+        scores are random; of F where the noise model leaves the variance uncertain.
     moments : ndarray
         (k,) Σ ξ ê.
     covariance : ndarray
@@ -99,11 +99,11 @@ def score_test(
     Sargan (1958); Hansen (1982); Wooldridge (1995); Durbin (1954); random
     signs: Davidson and Flachaire (2008), whose bootstrap moments are used.
     """
-    from scipy.special import gammaincc
+    from scipy.special import fdtrc
 
     tilde = _without_copies(xi, residualise(xi, phi, zhat))
     moments = np.asarray(sum(x @ e for x, e in zip(xi, errors, strict=True)))
-    taken = 0.0
+    taken, known = 0.0, 1e9
     if memory == "iid":
         square = sum(float(e @ e) for e in errors) / sum(len(e) for e in errors)
         covariance = lagged_products(tilde, tilde, 0) * square
@@ -114,9 +114,11 @@ def score_test(
         covariance = lagged_products(scores, scores, 0)
         statistic, freedom, whitening = quadratic_form(moments, covariance, _LEAST)
         # Σ h² of the leverages: what a few large scores take from the variance 2k of χ²
+        if freedom:
+            known = float(h.freedom_of([whitening @ x for x in tilde], together=True)[0])
         taken = sum(float((((whitening @ s) ** 2).sum(axis=0) ** 2).sum()) for s in scores)
     p = 1.0
     if freedom:
         share = max(1.0 - taken / freedom, 0.05)
-        p = float(gammaincc(freedom / (2 * share), statistic / (2 * share)))
+        p = float(fdtrc(freedom / share, known, statistic / freedom))
     return Score(statistic, freedom, p, moments, covariance)
