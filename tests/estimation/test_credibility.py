@@ -91,7 +91,7 @@ def test_a_missing_effect_is_noticed(thesis, true_theta):
     p = build_predictor(get_structure("thesis-Yur"), "basic", REGIME)
     estimate = estimate_iv(p, [log], refine=False)
     assert "the inputs still explain the residuals" in estimate.verdict.text
-    assert by_name(estimate)["input_independence_v"].p_value < 1e-4
+    assert by_name(estimate)["input_independence_v"].p_value < 1e-3
 
 
 @pytest.mark.parametrize("kind", ["pulses", "binary", "sine"])
