@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import ExcitationError, UsageError
-from greybox.estimation.checks import excitation, sign_margins, whiteness
 from greybox.estimation.covariance import (
     CovarianceKind,
     block_bootstrap,
     score_covariance,
 )
+from greybox.estimation.credibility import Evidence, assess, judge
 from greybox.estimation.disturbance import estimate_current
 from greybox.estimation.moments import Solution, solve_stacked
 from greybox.estimation.result import Estimate
@@ -50,6 +51,7 @@ def estimate_ls(
     margins: dict[str, float] | None = None,
     covariance: Covariance = "hac",
     seed: int = 0,
+    judged: bool = True,
 ) -> Estimate:
     """Estimate the parameters by least squares, experiments pooled.
 
@@ -66,6 +68,8 @@ def estimate_ls(
         ``hac`` by default: regressors that hold the noise rule ``ma`` out.
     seed : int
         For the bootstrap.
+    judged : bool
+        Test the estimate and give a verdict; an estimate among many does without.
 
     Returns
     -------
@@ -84,8 +88,22 @@ def estimate_ls(
     regression = build_regression(predictor, logs, margins=margins)
     instruments = _regressors_as_instruments(regression)
     solutions = _solve(regression, instruments)
+    simulated = None
+    if judged:
+        theta = _structure_theta(predictor, _coefficients(solutions))
+        simulated = build_instruments(
+            predictor, logs, theta, zero_mean=False, keep=[e.keep for e in regression.experiments]
+        )
     return _result(
-        "ls", regression, instruments, solutions, logs, covariance, seed, margins=margins
+        "ls",
+        regression,
+        instruments,
+        solutions,
+        logs,
+        covariance,
+        seed,
+        margins=margins,
+        evidence=simulated,
     )
 
 
@@ -103,6 +121,7 @@ def estimate_iv(
     covariance: Covariance = "ma",
     metric: str = "moments",
     seed: int = 0,
+    judged: bool = True,
 ) -> Estimate:
     """Estimate the parameters by instrumental variables, experiments stacked (4.5).
 
@@ -129,7 +148,7 @@ def estimate_iv(
         ``ma`` by default, C = G⁻¹ (Σ Z R Zᵀ) G⁻ᵀ: the equation error is a moving
         average and the instruments are independent of it. ``hac`` where the
         noise changes its size along the log; it is noisier.
-    margins, seed
+    margins, seed, judged
         As `estimate_ls`.
     metric : {"moments", "identity"}
         How the stacked equations of several experiments are weighted.
@@ -221,6 +240,7 @@ def estimate_iv(
         centred=zero_mean,
         margins=margins,
         heading=heading,
+        evidence=instruments if judged else None,
     )
 
 
@@ -394,25 +414,18 @@ def _result(
     centred: bool = False,
     margins: dict[str, float] | None = None,
     heading: str = "measured",
+    evidence: Instruments | None = None,
 ) -> Estimate:
+    """Collect what was found; `evidence` are the simulated instruments to test it with."""
     predictor = regression.predictor
     projected, residuals = _masked(solutions, regression, instruments, centred=centred)
     covariance, lags = _covariance(solutions, regression, projected, residuals, kind, seed, centred)
     kept = sum(int(k.sum()) for k in instruments.keep)
     theta = _coefficients(solutions)
-    states = predictor.structure.states
-    tests = [excitation(predictor, s, x) for s, x in zip(states, solutions, strict=True)]
-    for state, equation in zip(states, residuals, strict=True):
-        rows = [
-            e[k] - e[k].mean() for e, k in zip(equation, instruments.keep, strict=True) if k.any()
-        ]
-        tests.append(whiteness(state, rows, len(predictor.equation(state))))
-    if predictor.structure.disturbance == "marine":
-        tests += sign_margins(logs, states, margins, regression.samples - kept)
     residual_std = np.array(
         [np.sqrt(sum(float(e @ e) for e in equation) / max(kept, 1)) for equation in residuals]
     )
-    return Estimate(
+    estimate = Estimate(
         predictor=predictor,
         method=method,
         theta=theta,
@@ -433,8 +446,29 @@ def _result(
             heading_std=logs[0].vessel.std("psi") or 0.0,
             heading_measured=heading == "measured",
         ),
-        tests=tuple(tests),
         logs=tuple(
             {"name": log.name, "sha256": log.provenance.sha256, "samples": len(log)} for log in logs
         ),
+    )
+    if evidence is None:
+        return estimate
+    tests = assess(
+        Evidence(
+            predictor,
+            regression,
+            tuple(logs),
+            evidence,
+            theta,
+            covariance,
+            tuple(tuple(equation) for equation in residuals),
+            instruments.keep,
+            method,
+            centred,
+            margins,
+        )
+    )
+    return replace(
+        estimate,
+        tests=tests,
+        verdict=judge(tests, estimate.labels, method, contaminated=predictor.contaminated),
     )

@@ -13,8 +13,6 @@ Initial states, mean currents and the moments of an unmeasured wind are nuisance
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +27,7 @@ from greybox.estimation.output_error import (
     output_predictor,
     without_start,
 )
-from greybox.estimation.result import Estimate
+from greybox.estimation.result import Estimate, Limit
 from greybox.estimation.shooting import Measured, Segments, cut
 from greybox.model.noise import NoiseLevels
 from greybox.model.output import OutputModel, Simulator
@@ -41,33 +39,6 @@ Array = NDArray[np.float64]
 _LEAST = 1e-6
 # relative eigenvalue below which the bound of a direction is no number
 _RANK = 1e-13
-
-
-@dataclass(frozen=True)
-class Limit:
-    """One bound beside the standard errors of an estimate.
-
-    Parameters
-    ----------
-    std : dict of str to float
-        The least standard error of each parameter.
-    efficiency : dict of str to float
-        (bound / reported variance) of each parameter, 1 at best.
-    determinant : float
-        (det C_bound / det C)^(1/p), 1 at best.
-    """
-
-    std: dict[str, float]
-    efficiency: dict[str, float]
-    determinant: float
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the fields for JSON."""
-        return {
-            "std": self.std,
-            "efficiency": self.efficiency,
-            "determinant_efficiency": self.determinant,
-        }
 
 
 def noise_variances(model: OutputModel, noise: NoiseLevels) -> Array:

@@ -48,6 +48,7 @@ def assess_loop(
     """
     null = "the inputs do not depend on the measured states (A4)"
     share = closed_loop_share(logs)
+    unknown = share is None and loop == "auto"
     closed = loop == "closed" or (loop == "auto" and share is not None and share > _SHARE)
     if closed:
         amount = "the user says so" if share is None else f"{100 * share:.0f} % of the samples"
@@ -64,11 +65,13 @@ def assess_loop(
             )
             + "Prefer a trial with open-loop commands."
         )
-    elif share is None and loop == "auto":
+    elif unknown:
         sentence = (
             "not known: the vessel file names no mode column in [closed_loop]; "
             "the log is taken as open loop."
         )
     else:
         sentence = "open loop."
-    return closed, TestResult("closed_loop", null, share, None, sentence)
+    return closed, TestResult(
+        "closed_loop", null, share, None, sentence, passed=None if unknown else not closed
+    )

@@ -15,14 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import ExcitationError, LogError, UsageError, suggestion
-from greybox.estimation.covariance import (
-    correlation_lags,
+from greybox.estimation.covariance import correlation_lags
+from greybox.estimation.estimate import UnexcitedBiasError
+from greybox.estimation.free_run import Shooting, fit_free_runs
+from greybox.estimation.free_run_errors import (
     memory_correction,
     shared_score_covariance,
     slow_errors,
 )
-from greybox.estimation.estimate import UnexcitedBiasError
-from greybox.estimation.free_run import Shooting, fit_free_runs
 from greybox.estimation.innovations import FilterRuns, fit_innovations
 from greybox.estimation.result import Estimate, TestResult
 from greybox.estimation.shooting import (
@@ -455,6 +455,7 @@ def _result(fitted: _Fitted, logs: Sequence[TrialLog], options: OutputErrorOptio
             f", {len(runs.segments.use)} segments joined within {fit.gap:.1g} noise deviations"
         )
     own = predictor.structure.states
+    errors = np.vstack([one_step_errors(model, log, fit.p) for log in data])
     notes = []
     held = [n for n, b in zip(model.parameters, bound, strict=True) if b]
     if held:
@@ -466,7 +467,7 @@ def _result(fitted: _Fitted, logs: Sequence[TrialLog], options: OutputErrorOptio
         method="oe",
         theta=fit.p[:count],
         covariance=covariance[:count, :count],
-        residual_std=_one_step(model, data, fit.p)[: len(own)],
+        residual_std=np.sqrt((errors**2).mean(axis=0))[: len(own)],
         vessel=logs[0].vessel,
         sample_time=model.sample_time,
         samples=samples,
@@ -549,15 +550,11 @@ def _sandwich(hessian: Array, middle: Array, bound: NDArray[np.bool_]) -> Array:
     return (out + out.T) / 2
 
 
-def _one_step(model: OutputModel, data: Sequence[Measured], p: Array) -> Array:
-    """Return the deviation of the one-step errors from the measured states, (nz,)."""
+def one_step_errors(model: OutputModel, log: Measured, p: Array) -> Array:
+    """Return the measured next states less those predicted from measured ones, (N−1, nz)."""
     nz = len(model.states)
-    total, count = np.zeros(nz), 0
-    for log in data:
-        _, end = Simulator(model, log.w[:-1, None])(log.y[:-1, :nz], p)
-        total += ((log.y[1:, :nz] - end) ** 2).sum(axis=0)
-        count += len(end)
-    return np.sqrt(total / max(count, 1))
+    _, end = Simulator(model, log.w[:-1, None])(log.y[:-1, :nz], p)
+    return np.asarray(log.y[1:, :nz] - end)
 
 
 def _noise_levels(model: OutputModel, runs: FreeRuns | FilterRuns) -> NoiseLevels:

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import ExcitationError
-from greybox.estimation.checks import whiteness
 from greybox.estimation.disturbance import estimate_current
 from greybox.estimation.estimate import Covariance, estimate_iv, estimate_ls
 from greybox.estimation.noise import (
@@ -212,7 +211,13 @@ def estimate_refined_iv(
     plain = start if isinstance(start, Estimate) and start.method == "iv" else None
     if plain is None:
         plain = estimate_iv(
-            predictor, logs, start=start, heading=heading, wind=wind, margins=margins
+            predictor,
+            logs,
+            start=start,
+            heading=heading,
+            wind=wind,
+            margins=margins,
+            judged=False,
         )
     regression = build_regression(predictor, logs, margins=margins)
     work = _Refinement(regression, logs, heading, wind)
@@ -243,13 +248,6 @@ def estimate_refined_iv(
         samples=[len(k) for k in keep],
         seed=seed,
     )
-    innovations = [(r.y - theta @ r.phi).reshape(-1, len(states)) for r in found.rows]
-    colour = {
-        f"whiteness_{s}": whiteness(
-            s, [e[:, i] for e in innovations if len(e)], len(predictor.equation(s))
-        )
-        for i, s in enumerate(states)
-    }
     vessel = logs[0].vessel
     return replace(
         plain,
@@ -268,7 +266,7 @@ def estimate_refined_iv(
             heading_std=vessel.std("psi") or 0.0,
             heading_measured=heading == "measured",
         ),
-        tests=tuple(colour.get(t.name, t) for t in plain.tests),
+        tests=(),
         prefilter="noise",
         noise=noise_levels_of(found.fit, states, vessel, regression.sample_time),
     )

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.estimation.summary import summarise
 from greybox.model.model import ManoeuvringModel
 from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import Predictor
-from greybox.model.units import parameter_unit
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
@@ -23,6 +24,21 @@ class TestResult:
 
     ``statistic`` and ``p_value`` are None where the test does not apply; the
     sentence then says why.
+
+    Parameters
+    ----------
+    name : str
+    null : str
+    statistic, p_value : float or None
+    sentence : str
+    level : float, optional
+        What the statistic, or the p-value where there is one, is compared with.
+    passed : bool, optional
+        None where the test does not apply or only informs.
+    parameters : tuple of str
+        Parameters that the finding concerns.
+    detail : mapping
+        Numbers behind the sentence, for machines.
     """
 
     name: str
@@ -30,6 +46,10 @@ class TestResult:
     statistic: float | None
     p_value: float | None
     sentence: str
+    level: float | None = None
+    passed: bool | None = None
+    parameters: tuple[str, ...] = ()
+    detail: Mapping[str, Any] = field(default_factory=dict)
 
     __test__ = False  # not a test case
 
@@ -40,6 +60,79 @@ class TestResult:
             "statistic": self.statistic,
             "p_value": self.p_value,
             "sentence": self.sentence,
+            "level": self.level,
+            "passed": self.passed,
+            "parameters": list(self.parameters),
+            "detail": dict(self.detail),
+        }
+
+
+def not_applicable(name: str, null: str, reason: str) -> TestResult:
+    """Return a test that does not apply, with the reason."""
+    return TestResult(name, null, None, None, f"not applicable: {reason}.")
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether to trust an estimate.
+
+    Parameters
+    ----------
+    text : str
+        ``trust``, ``trust except A, B`` or ``do not trust: reason``.
+    excepted : tuple of str
+        Parameters not to rely on.
+    reasons : tuple of str
+        One sentence a finding.
+    """
+
+    text: str
+    excepted: tuple[str, ...] = ()
+    reasons: tuple[str, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fields for JSON."""
+        return {
+            "text": self.text,
+            "excepted": list(self.excepted),
+            "reasons": list(self.reasons),
+        }
+
+
+@dataclass(frozen=True)
+class Limit:
+    """One bound beside the standard errors of an estimate.
+
+    Parameters
+    ----------
+    std : dict of str to float
+        The least standard error of each parameter.
+    efficiency : dict of str to float
+        (bound / reported variance) of each parameter, 1 at best.
+    determinant : float
+        (det C_bound / det C)^(1/p), 1 at best.
+    """
+
+    std: dict[str, float]
+    efficiency: dict[str, float]
+    determinant: float
+
+    @property
+    def sentence(self) -> str:
+        """What is lost, overall and at worst."""
+        worst = min(self.efficiency, key=lambda n: self.efficiency[n])
+        most = np.sqrt(1 / self.efficiency[worst]) if self.efficiency[worst] > 0 else np.inf
+        return (
+            f"efficiency {100 * self.determinant:.2g} % by determinant; the standard error of "
+            f"{worst} is {most:.2g} times the least possible one, {self.std[worst]:.2g}."
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fields for JSON."""
+        return {
+            "std": self.std,
+            "efficiency": self.efficiency,
+            "determinant_efficiency": self.determinant,
         }
 
 
@@ -74,6 +167,7 @@ class Estimate:
         (name, value, standard error) of each current component; empty where the
         predictor cannot tell it.
     tests : tuple of TestResult
+    verdict : Verdict
     notes : tuple of str
         Choices made and warnings.
     fit : dict
@@ -82,6 +176,8 @@ class Estimate:
         Name, hash and length of each log.
     noise : NoiseLevels, optional
         What was found of measurement and process noise.
+    limits : dict of str to Limit
+        ``cramer_rao`` and ``optimal_iv`` beside the standard errors.
     prefilter : {"none", "noise"}
         Whether all equations were solved jointly with their error made white.
     """
@@ -101,16 +197,23 @@ class Estimate:
     status: str = "solved"
     current: tuple[tuple[str, float, float], ...] = ()
     tests: tuple[TestResult, ...] = ()
+    verdict: Verdict = field(default_factory=lambda: Verdict("not judged"))
     notes: tuple[str, ...] = ()
     fit: dict[str, float] = field(default_factory=dict)
     logs: tuple[dict[str, Any], ...] = ()
     noise: NoiseLevels | None = None
+    limits: Mapping[str, Limit] = field(default_factory=dict)
     prefilter: str = "none"
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the parameters, biases left out."""
         return self.predictor.parameter_names
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Labels of the parameters, sums spelled out, such as ``Xuu+Wuu``."""
+        return tuple(self.predictor.columns[i].label for i in self.predictor.parameter_columns)
 
     @property
     def std(self) -> Array:
@@ -164,6 +267,7 @@ class Estimate:
             "predictor": self.predictor.kind,
             "regime": {s: list(v) for s, v in self.predictor.regime},
             "fit": self.fit,
+            "verdict": self.verdict.to_dict(),
             "tests": {t.name: t.to_dict() for t in self.tests},
             "notes": list(self.notes),
             "status": self.status,
@@ -172,6 +276,7 @@ class Estimate:
             "iterations": self.iterations,
             "samples": self.samples,
             "samples_used": self.kept,
+            "limits": {k: v.to_dict() for k, v in self.limits.items()},
             "nuisance": {
                 "names": [
                     f"{self.predictor.columns[i].state}: {self.predictor.columns[i].name}"
@@ -184,47 +289,8 @@ class Estimate:
         }
 
     def summary(self) -> str:
-        """Return the result as text, in the manner of a regression table."""
-        width = 78
-        unit = self.vessel.force_unit
-        prefiltered = ", prefiltered" if self.prefilter == "noise" else ""
-        lines = [
-            f"{'Estimate of ' + self.vessel.name:^{width}}",
-            "=" * width,
-            f"{'Method:':<18}{self.method + prefiltered:<22}{'Samples:':<18}{self.samples}",
-            f"{'Predictor:':<18}{self.predictor.kind:<22}{'Samples used:':<18}{self.kept}",
-            f"{'Structure:':<18}{self.predictor.structure.name:<22}{'Sample time:':<18}"
-            f"{self.sample_time:g} s",
-            f"{'Std errors:':<18}{self.covariance_kind + f', {self.lags} lags':<22}"
-            f"{'Refinements:':<18}{self.iterations}",
-            "=" * width,
-            f"{'parameter':<14}{'value':>12}{'std err':>11}{'[0.025':>12}{'0.975]':>12}"
-            f"{'per second':>12}  unit",
-        ]
-        for state in self.predictor.structure.states:
-            lines.append("-" * width)
-            for i in self.predictor.equation(state):
-                column = self.predictor.columns[i]
-                if column.is_bias:
-                    continue
-                value, std = self.theta[i], self.std[i]
-                term = self.predictor.structure.terms[
-                    self.predictor.structure.index(column.terms[0])
-                ]
-                lines.append(
-                    f"{column.label:<14}{value:>12.4g}{std:>11.2g}{value - 1.96 * std:>12.4g}"
-                    f"{value + 1.96 * std:>12.4g}{value / self.sample_time:>12.4g}  "
-                    f"{parameter_unit(term, unit)}"
-                )
-        lines.append("=" * width)
-        for name, value, std in self.current:
-            lines.append(f"{name:<16}{value:>10.3f} ± {1.96 * std:.3f} m/s (95 %)")
-        if self.fit:
-            shown = ", ".join(f"{k} {v:.1f} %" for k, v in self.fit.items())
-            lines.append(f"Free-run fit on the estimation logs: {shown}")
-        lines += [f"{t.name}: {t.sentence}" for t in self.tests]
-        lines += [f"Note: {n}" for n in self.notes]
-        return "\n".join(lines)
+        """Return the result as text: verdict, table, tests."""
+        return summarise(self)
 
     def _repr_html_(self) -> str:
         from html import escape

@@ -156,7 +156,7 @@ def _estimates(structure: Structure, logs: list[TrialLog], wind: bool) -> dict[s
     found: dict[str, Estimate | str] = {}
     for k, predictor in predictors(structure, wind).items():
         try:
-            ls = estimate_ls(predictor, logs, covariance="white")
+            ls = estimate_ls(predictor, logs, covariance="white", judged=False)
         except GreyboxError as error:
             found[f"LS{k}"] = found[f"IV{k}"] = str(error)
             continue
@@ -172,6 +172,7 @@ def _estimates(structure: Structure, logs: list[TrialLog], wind: bool) -> dict[s
                 wind="measured",
                 refine=False,
                 covariance="white",
+                judged=False,
             )
         except GreyboxError as error:
             found[f"IV{k}"] = str(error)

@@ -10,12 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import DivergenceError, ExcitationError, GreyboxError, LogError, UsageError
+from greybox.estimation.credibility import judge
 from greybox.estimation.estimate import (
     Covariance,
     UnexcitedBiasError,
     estimate_iv,
     estimate_ls,
 )
+from greybox.estimation.judging import judge_estimate
+from greybox.estimation.limits import limits_of
 from greybox.estimation.loop import CLOSED_LOOP_LAG, Loop, assess_loop
 from greybox.estimation.output_error import (
     OutputErrorOptions,
@@ -23,7 +26,7 @@ from greybox.estimation.output_error import (
     output_predictor,
 )
 from greybox.estimation.refined import estimate_refined_iv, with_noise
-from greybox.estimation.result import Estimate
+from greybox.estimation.result import Estimate, Verdict
 from greybox.model.catalogue import structure_for
 from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor import Predictor, Regime, build_predictor
@@ -70,7 +73,8 @@ class Request:
     ``margins`` are |u|, |v| [m/s] below which samples are cut out; ``nominal``
     simulates the first instruments, or starts output error (least squares does
     without it); ``output_error`` is what only ``oe`` heeds; ``prefilter`` is
-    ``noise`` for refined instrumental variables, ``none`` for plain ones.
+    ``noise`` for refined instrumental variables, ``none`` for plain ones; ``judged``
+    asks for the tests and the verdict.
     """
 
     method: str | None = None
@@ -86,6 +90,7 @@ class Request:
     output_error: OutputErrorOptions = field(default_factory=OutputErrorOptions)
     seed: int = 0
     prefilter: Literal["auto", "noise", "none"] = "auto"
+    judged: bool = True
 
 
 def heading_range(logs: Sequence[TrialLog]) -> float:
@@ -178,7 +183,12 @@ def estimate_once(
     if method == "oe":
         return _estimate_oe(logs, structure, kind, request)
     closed, loop_test = assess_loop(logs, request.loop, method)
-    common: dict[str, Any] = {"margins": request.margins, "seed": request.seed}
+    common: dict[str, Any] = {
+        "margins": request.margins,
+        "seed": request.seed,
+        # instruments are judged once, after the prefilter
+        "judged": request.judged and method == "ls",
+    }
     if request.covariance is not None:
         common["covariance"] = request.covariance
     keep_constant = method == "ls" or not request.zero_mean
@@ -207,9 +217,18 @@ def estimate_once(
             notes.append(f"the bias-capturing regressor {label} does not vary and was left out.")
             predictor = predictor.without_bias(error.column)
     if method == "iv":
-        estimate = _prefiltered(
-            estimate, logs, request, "smoothed" if noisy_wind else "measured", closed, notes
-        )
+        averaged: Literal["smoothed", "measured"] = "smoothed" if noisy_wind else "measured"
+        estimate = _prefiltered(estimate, logs, request, averaged, closed, notes)
+        if request.judged:
+            estimate = judge_estimate(
+                estimate,
+                logs,
+                margins=request.margins,
+                zero_mean=request.zero_mean,
+                heading=request.heading,
+                wind=averaged,
+                lag=CLOSED_LOOP_LAG if closed else 0,
+            )
     if kind in ("wind", "basic+wind") and method == "iv" and noisy_wind:
         notes.append(
             f"the wind in the instruments is the measured one averaged over {WIND_WINDOW:g} s, "
@@ -262,6 +281,8 @@ def _estimate_oe(
             label = predictor.columns[error.column].label
             notes.append(f"the bias-capturing regressor {label} does not vary and was left out.")
             predictor = predictor.without_bias(error.column)
+    if request.judged:
+        estimate = judge_estimate(estimate, logs)
     _, loop_test = assess_loop(logs, request.loop, "oe")
     return replace(estimate, tests=(*estimate.tests, loop_test), notes=(*estimate.notes, *notes))
 
@@ -276,12 +297,14 @@ def _quick_start(
     plain = "basic+wind" if kind in ("wind", "basic+wind") else "basic"
     predictor = _predictor(structure, plain, logs, ls=True)
     try:
-        found = estimate_iv(predictor, logs, refine=_STARTING_REFINEMENTS, covariance="white")
+        found = estimate_iv(
+            predictor, logs, refine=_STARTING_REFINEMENTS, covariance="white", judged=False
+        )
         return found, "it started from an estimate by instrumental variables."
     except (ExcitationError, DivergenceError):
         pass
     try:
-        found = estimate_ls(predictor, logs, covariance="white")
+        found = estimate_ls(predictor, logs, covariance="white", judged=False)
         return found, "it started from the least-squares estimate."
     except ExcitationError:
         return None, "it started from nothing."
@@ -446,8 +469,18 @@ def _first_that_runs(
                 f"the free run of {', '.join(poor)} is worse than a constant on the very logs it "
                 f"was estimated on: this model does not explain that motion."
             )
+        diverged = any(r.diverged >= 0 for r in runs)
         estimate = replace(estimate, notes=(*notes, *own), fit=fit)
-        if all(r.diverged < 0 for r in runs):
+        if request.judged:
+            found, trouble = limits_of(estimate, logs)
+            lacking = (f"bounds: {trouble}",) if trouble else ()
+            estimate = replace(
+                estimate,
+                verdict=_verdict(estimate, diverged),
+                limits=found,
+                notes=(*estimate.notes, *lacking),
+            )
+        if not diverged:
             return estimate
         notes.append(f"{alternative.label} was left: its free run diverges.")
         fallback = fallback or estimate
@@ -458,6 +491,18 @@ def _first_that_runs(
         "Use a smaller structure or a longer, more exciting log."
     )
     return replace(fallback, notes=(*fallback.notes, warning))
+
+
+def _verdict(estimate: Estimate, diverged: bool) -> Verdict:
+    """Weigh the tests again, now with the loop and the free run."""
+    return judge(
+        estimate.tests,
+        estimate.labels,
+        estimate.method,
+        contaminated=estimate.predictor.contaminated,
+        fit=estimate.fit,
+        diverged=diverged,
+    )
 
 
 def _structures(logs: Sequence[TrialLog], wind: bool) -> list[str]:
@@ -539,8 +584,14 @@ def _compare(
     notes: list[str],
 ) -> list[Alternative]:
     """Order the alternatives by the held-out free run, the earlier ones preferred."""
-    # a ranking needs neither standard errors nor the last digit
-    request = replace(request, covariance="white", refine=_RANKING_REFINEMENTS, prefilter="none")
+    # a ranking needs neither standard errors, nor tests, nor the last digit
+    request = replace(
+        request,
+        covariance="white",
+        refine=_RANKING_REFINEMENTS,
+        prefilter="none",
+        judged=False,
+    )
     fitting, held = [], []
     for log in logs:
         cut = len(log) - int(len(log) * _HELD_OUT)

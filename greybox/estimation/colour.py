@@ -1,0 +1,164 @@
+"""A small noise model of the residuals, so that their variance under sums is known well.
+
+The equation error of (4.3) is nearly a difference of measurement noise: what a
+slow instrument sums of it almost cancels, and sample autocovariances miss the
+small rest by more than its size (in yaw by several times). A fitted
+H(q) = C(q)/D(q) is positive by construction, and var Σ z e = Σ (Hᵀz)² var ε
+follows from the innovations ε, whose variance may change along the log.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+# (AR, MA) orders tried; the least BIC is taken
+_ORDERS = ((0, 0), (0, 1), (1, 0), (1, 1), (2, 2))
+_LEAST_ROWS = 60
+# partial correlations closer to one than this are not told from a difference
+_EDGE = 0.9995
+# the linear error of a fit says little at a unit root
+_LEAST_FREEDOM = 8.0
+
+
+@dataclass(frozen=True)
+class Colour:
+    """e = C(q)/D(q) ε.
+
+    Parameters
+    ----------
+    moving_average, autoregression : ndarray
+        (m+1,) and (n+1,) coefficients of C and D in delays, each led by 1.
+    neighbours : tuple of Colour
+        Models one standard error away along each principal axis of the fit.
+    """
+
+    moving_average: Array
+    autoregression: Array
+    neighbours: tuple[Colour, ...] = ()
+
+    @property
+    def white(self) -> bool:
+        """Whether there is no memory."""
+        return len(self.moving_average) == 1 and len(self.autoregression) == 1
+
+    @property
+    def memory(self) -> int:
+        """Samples until the impulse response of H stays below one hundredth."""
+        pulse = np.zeros(400)
+        pulse[-1] = 1.0
+        above = np.flatnonzero(np.abs(self.adjoint(pulse)[::-1]) > 0.01)
+        return int(above[-1])
+
+    def innovations(self, e: Array) -> Array:
+        """Return ε = D/C e along the last axis."""
+        from scipy.signal import lfilter
+
+        return np.asarray(lfilter(self.autoregression, self.moving_average, e, axis=-1))
+
+    def adjoint(self, z: Array) -> Array:
+        """Return Hᵀz along the last axis, with Σ z e = Σ (Hᵀz) ε."""
+        from scipy.signal import lfilter
+
+        back = lfilter(self.moving_average, self.autoregression, z[..., ::-1], axis=-1)
+        return np.asarray(back[..., ::-1])
+
+    def freedom_of(self, z: Sequence[Array], *, together: bool = False) -> Array:
+        """Return the degrees of freedom of the variance of Σ z e, for each row of z.
+
+        2/ρ² with ρ the relative standard error that the fit leaves to it.
+
+        Parameters
+        ----------
+        z : sequence of ndarray
+            (k, N) an experiment.
+        together : bool
+            Of all rows together, (1,), in place of (k,).
+        """
+
+        def variance(colour: Colour) -> Array:
+            each = np.asarray(sum((colour.adjoint(x) ** 2).sum(axis=1) for x in z))
+            return each.sum(keepdims=True) if together else each
+
+        base = np.maximum(variance(self), 1e-300)
+        square = np.zeros_like(base)
+        for other in self.neighbours:
+            square += (variance(other) / base - 1) ** 2
+        return np.asarray(np.clip(2 / np.maximum(square, 1e-12), _LEAST_FREEDOM, 1e9))
+
+
+WHITE = Colour(np.ones(1), np.ones(1))
+
+
+def fit_colour(residuals: Sequence[Array], keep: Sequence[NDArray[np.bool_]]) -> Colour:
+    """Fit the noise model by least squares of the innovations, its order by BIC.
+
+    Parameters
+    ----------
+    residuals : sequence of ndarray
+        (N,) an experiment, zero in rows that do not take part.
+    keep : sequence of ndarray of bool
+        Only uninterrupted stretches are used; too few rows give white noise.
+
+    References
+    ----------
+    Box and Jenkins (1976), section 7.1; Schwarz (1978).
+    """
+    stretches = [r for e, k in zip(residuals, keep, strict=True) for r in _stretches(e, k)]
+    rows = sum(len(r) for r in stretches)
+    scale = np.sqrt(sum(float(r @ r) for r in stretches) / max(rows, 1))
+    if rows < _LEAST_ROWS or not scale > 0:
+        return WHITE
+    # a gap of zeros between stretches lets one filter call serve them all
+    series = np.concatenate([np.append(r / scale, np.zeros(30)) for r in stretches])
+    inside = np.concatenate([np.append(np.ones(len(r)), np.zeros(30)) for r in stretches]) > 0
+    best, least = WHITE, np.inf
+    for ar, ma in _ORDERS:
+        candidate, squares = _fit(series, inside, ar, ma)
+        criterion = rows * np.log(squares / rows) + (ar + ma) * np.log(rows)
+        if criterion < least:
+            best, least = candidate, criterion
+    return best
+
+
+def _stretches(e: Array, keep: NDArray[np.bool_]) -> list[Array]:
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], keep.astype(int), [0]])))
+    return [e[a:b] for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= 20]
+
+
+def _polynomial(free: Array) -> Array:
+    """Return a polynomial in delays with its roots inside the unit circle (Levinson)."""
+    out = np.ones(1)
+    for value in np.clip(np.tanh(free), -_EDGE, _EDGE):
+        padded = np.append(out, 0.0)
+        out = padded + value * padded[::-1]
+    return out
+
+
+def _fit(series: Array, inside: NDArray[np.bool_], ar: int, ma: int) -> tuple[Colour, float]:
+    from scipy.optimize import least_squares
+
+    def colour(free: Array) -> Colour:
+        return Colour(_polynomial(free[ar:]), _polynomial(free[:ar]))
+
+    def innovations(free: Array) -> Array:
+        return colour(free).innovations(series)[inside]
+
+    if ar + ma == 0:
+        return WHITE, float(innovations(np.zeros(0)) @ innovations(np.zeros(0)))
+    start = np.full(ar + ma, -0.3)
+    start[:ar] = -0.6
+    found = least_squares(innovations, start, method="trf", x_scale=1.0, max_nfev=40, xtol=1e-4,
+                          ftol=1e-6)  # fmt: skip
+    best = colour(found.x)
+    spread = np.linalg.pinv(found.jac.T @ found.jac) * 2 * found.cost / max(len(series), 1)
+    values, vectors = np.linalg.eigh(spread)
+    axes = (vectors * np.sqrt(np.maximum(values, 0.0))).T
+    return replace(best, neighbours=tuple(colour(found.x + axis) for axis in axes)), float(
+        2 * found.cost
+    )

@@ -1,0 +1,7 @@
+"""Whether to believe an estimate: tests, and one verdict."""
+
+from greybox.estimation.credibility.assess import assess
+from greybox.estimation.credibility.evidence import Equation, Evidence
+from greybox.estimation.credibility.verdict import judge
+
+__all__ = ["Equation", "Evidence", "assess", "judge"]

@@ -1,0 +1,80 @@
+"""All tests of an estimate, in the order in which a reader wants them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from greybox.estimation.credibility.anderson_rubin import anderson_rubin
+from greybox.estimation.credibility.combinations import combinations
+from greybox.estimation.credibility.endogeneity import endogeneity
+from greybox.estimation.credibility.evidence import Equation, Evidence
+from greybox.estimation.credibility.excitation import excitation
+from greybox.estimation.credibility.independence import input_independence
+from greybox.estimation.credibility.many import many_instruments
+from greybox.estimation.credibility.margins import margin_bias, sign_margins
+from greybox.estimation.credibility.overidentification import overidentification
+from greybox.estimation.credibility.residuals import whiteness
+from greybox.estimation.credibility.stability import damping_signs, stability
+from greybox.estimation.credibility.weak import weak_instruments
+from greybox.estimation.result import TestResult, not_applicable
+
+_OF_EQUATIONS = {
+    "excitation": "the regressors that the instruments explain are independent",
+    "relevance": "some combination of the regressors is hardly moved by the instruments",
+    "weak_instruments": "the part of a regressor that no other has is hardly moved",
+    "anderson_rubin": "intervals that hold under weak instruments are as wide as the ordinary ones",
+    "overidentification": "the estimate satisfies the equations of all instruments",
+    "input_independence": "the residuals do not depend on the inputs, at any delay",
+    "many_instruments": "the instruments of several logs are few enough not to fit the noise",
+    "endogeneity": "the regressors do not depend on the noise: least squares suffices",
+}
+
+
+def assess(evidence: Evidence) -> tuple[TestResult, ...]:
+    """Run every test of an estimate.
+
+    Parameters
+    ----------
+    evidence : Evidence
+
+    Returns
+    -------
+    tuple of TestResult
+        A test that does not apply is among them, with the reason.
+    """
+    tests: list[TestResult] = []
+    for equation in evidence.equations:
+        tests += _of_equation(evidence, equation)
+    states = evidence.predictor.structure.states
+    if not evidence.equations:
+        for state in states:
+            for name, null in _OF_EQUATIONS.items():
+                reason = evidence.instruments.diverged or "there are no instruments"
+                tests.append(not_applicable(f"{name}_{state}", null, reason))
+    for row, state in enumerate(states):
+        tests += [whiteness(evidence, row), combinations(evidence, state)]
+    if evidence.predictor.structure.disturbance == "marine":
+        kept = sum(int(k.sum()) for k in evidence.keep)
+        cut = evidence.regression.samples - kept
+        tests += sign_margins(evidence.logs, states, evidence.margins, cut)
+    tests += [margin_bias(evidence), stability(evidence), damping_signs(evidence)]
+    return tuple(tests)
+
+
+def _of_equation(evidence: Evidence, equation: Equation) -> list[TestResult]:
+    biases = frozenset(c.label for c in evidence.predictor.columns if c.is_bias)
+    if not len(equation.columns) or not np.isfinite(equation.solution.theta).all():
+        reason = "its instruments leave a direction free"
+        return [
+            not_applicable(f"{name}_{equation.state}", null, reason)
+            for name, null in _OF_EQUATIONS.items()
+        ]
+    return [
+        excitation(equation),
+        *weak_instruments(equation, biases),
+        anderson_rubin(equation, biases)[0],
+        overidentification(equation, biases),
+        input_independence(evidence, equation),
+        many_instruments(equation, biases),
+        endogeneity(equation, evidence.method),
+    ]

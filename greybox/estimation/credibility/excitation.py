@@ -1,0 +1,66 @@
+"""What the instruments determine of each parameter, and the direction that is missing."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from greybox.estimation.credibility.evidence import Equation
+from greybox.estimation.credibility.words import combination
+from greybox.estimation.result import TestResult
+
+# a direction with a smaller share of the largest singular value is called weak
+_WEAK = 1e-3
+_NAMED = 0.3
+
+
+def excitation(equation: Equation) -> TestResult:
+    """Tell how far the instruments move each regressor apart from the others.
+
+    The variance inflation of each explained regressor, and what remains of it
+    against the noise of its measurement, are in ``detail``.
+
+    References
+    ----------
+    Belsley, Kuh and Welsch (1980).
+    """
+    solution = equation.solution
+    labels = equation.labels
+    values = solution.singular_values
+    ratio = float(values[-1] / values[0]) if values[0] > 0 else 0.0
+    gram = solution.information
+    size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    inverse = np.linalg.pinv(gram / np.outer(size, size), rcond=1e-15)
+    inflation = np.maximum(np.diag(inverse), 1.0)
+    noise = np.sqrt(
+        sum(
+            ((f - h) ** 2).sum(axis=1)
+            for f, h in zip(equation.phi, solution.projected, strict=True)
+        )
+    )
+    alone = size / np.sqrt(inflation)
+    against = np.divide(alone, noise, out=np.full(len(labels), np.inf), where=noise > 1e-9 * size)
+    worst = int(np.argmax(inflation))
+    missing = combination(labels, solution.weakest, _NAMED)
+    verdict = (
+        f"{missing} is weakly determined: move what these multiply separately."
+        if ratio < _WEAK
+        else f"every direction is determined, the weakest is {missing}."
+    )
+    return TestResult(
+        f"excitation_{equation.state}",
+        "the regressors that the instruments explain are independent",
+        ratio,
+        None,
+        f"smallest relative singular value {ratio:.1e} ({_WEAK:.0e} asked for): {verdict} "
+        f"{labels[worst]} has the largest variance inflation, {inflation[worst]:.3g}.",
+        _WEAK,
+        ratio >= _WEAK,
+        (),
+        {
+            "variance_inflation": dict(zip(labels, inflation.tolist(), strict=True)),
+            "movement_against_noise": {
+                n: float(v) if np.isfinite(v) else None
+                for n, v in zip(labels, against, strict=True)
+            },
+        },
+    )

@@ -1,0 +1,143 @@
+"""The tests of an estimate that no regression of its own comes with.
+
+Refined instruments and free runs are judged by the plain regression beside them,
+with instruments simulated by their own model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.errors import ExcitationError
+from greybox.estimation.credibility import Evidence, assess, judge
+from greybox.estimation.output_error import measured, one_step_errors, output_model
+from greybox.estimation.result import Estimate, TestResult, Verdict
+from greybox.model.predictor import Predictor, build_predictor
+from greybox.regression.instruments import build_instruments
+from greybox.regression.regression import Regression, build_regression
+from greybox.trial.log import TrialLog
+
+Array = NDArray[np.float64]
+
+
+def judge_estimate(
+    estimate: Estimate,
+    logs: Sequence[TrialLog],
+    *,
+    margins: dict[str, float] | None = None,
+    zero_mean: bool = True,
+    heading: Literal["measured", "simulated"] = "measured",
+    wind: Literal["smoothed", "measured"] = "smoothed",
+    lag: int = 0,
+) -> Estimate:
+    """Return an estimate with its tests and verdict.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        By instruments or by free runs. Tests that it has already stay, in place of
+        those of the same name.
+    logs : sequence of TrialLog
+        Those it was estimated on.
+    margins, zero_mean, heading, wind, lag
+        Of its instruments, as `build_instruments`.
+    """
+    predictor = _regression_predictor(estimate)
+    try:
+        regression = build_regression(predictor, logs, margins=margins)
+    except ExcitationError as error:
+        text = f"do not trust: {str(error).rstrip('.')}"
+        return replace(estimate, verdict=Verdict(text, estimate.labels, (str(error),)))
+    instruments = build_instruments(
+        predictor,
+        logs,
+        estimate.structure_theta(),
+        zero_mean=zero_mean,
+        heading=heading,
+        wind=wind,
+        lag=lag,
+        margins=margins,
+    )
+    keep = instruments.keep or tuple(e.keep for e in regression.experiments)
+    theta, covariance = _coefficients(estimate, predictor)
+    evidence = Evidence(
+        predictor,
+        regression,
+        tuple(logs),
+        instruments,
+        theta,
+        covariance,
+        _residuals(estimate, regression, logs, keep, zero_mean),
+        keep,
+        estimate.method if estimate.method == "oe" or not estimate.prefilter else "refined iv",
+        zero_mean,
+        margins,
+    )
+    own = {t.name: t for t in estimate.tests}
+    tests: list[TestResult] = [own.pop(t.name, t) for t in assess(evidence)]
+    tests += own.values()
+    return replace(
+        estimate, tests=tuple(tests), verdict=judge(tests, estimate.labels, estimate.method)
+    )
+
+
+def _regression_predictor(estimate: Estimate) -> Predictor:
+    """Return the predictor whose regression stands beside the estimate.
+
+    A free run has the current in the model; a regression captures it by columns.
+    """
+    own = estimate.predictor
+    if estimate.method != "oe":
+        return own
+    return build_predictor(own.structure, own.kind, own.regime)
+
+
+def _coefficients(estimate: Estimate, predictor: Predictor) -> tuple[Array, Array]:
+    """Return the estimate's parameters among the columns of `predictor`, biases 0."""
+    p = len(predictor.columns)
+    theta, covariance = np.zeros(p), np.zeros((p, p))
+    place = {c.name: i for i, c in enumerate(predictor.columns) if not c.is_bias}
+    own = estimate.predictor
+    there = np.array([place[own.columns[i].name] for i in own.parameter_columns])
+    theta[there] = estimate.theta[own.parameter_columns]
+    covariance[np.ix_(there, there)] = estimate.covariance[
+        np.ix_(own.parameter_columns, own.parameter_columns)
+    ]
+    if predictor is own:
+        return estimate.theta, estimate.covariance
+    return theta, covariance
+
+
+def _residuals(
+    estimate: Estimate,
+    regression: Regression,
+    logs: Sequence[TrialLog],
+    keep: Sequence[NDArray[np.bool_]],
+    zero_mean: bool,
+) -> tuple[tuple[Array, ...], ...]:
+    """Return the one-step errors of the estimate, equation by equation, zero where cut."""
+    predictor = estimate.predictor
+    states = predictor.structure.states
+    found: list[list[Array]] = [[] for _ in states]
+    model = output_model(predictor, estimate.sample_time) if estimate.method == "oe" else None
+    current = {n: v for n, v, _ in estimate.current}
+    for e, log, rows in zip(regression.experiments, logs, keep, strict=True):
+        if model is not None:
+            p = np.append(estimate.theta, [current.get(n, 0.0) for n in model.means])
+            errors = one_step_errors(model, measured(model, log), p).T
+        else:
+            errors = np.stack(
+                [
+                    e.y[i] - estimate.theta[mine] @ e.phi[mine]
+                    for i, mine in enumerate(predictor.equation(s) for s in states)
+                ]
+            )
+        for i, error in enumerate(errors[: len(states)]):
+            centred = error - error[rows].mean() if zero_mean and rows.any() else error
+            found[i].append(np.where(rows, centred, 0.0))
+    return tuple(tuple(f) for f in found)

@@ -1,0 +1,125 @@
+"""An estimate as text: the verdict, the table, the tests in groups."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from greybox.model.units import parameter_unit
+
+if TYPE_CHECKING:
+    from greybox.estimation.result import Estimate, TestResult
+
+WIDTH = 100
+_GROUPS = {
+    "What the log determines": ("excitation", "relevance", "weak_instruments", "anderson_rubin",
+                                "combinations"),
+    "Whether the model explains it": ("input_independence", "overidentification", "whiteness"),
+    "What noise does to it": ("endogeneity", "many_instruments", "margin_u", "margin_v",
+                              "margin_bias", "closed_loop"),
+    "What the model does": ("stability", "damping_signs", "slow_errors"),
+}  # fmt: skip
+_BOUNDS = {
+    "cramer_rao": "Against the Cramér-Rao bound",
+    "optimal_iv": "Against the best instruments",
+}
+_MARKS = {True: "ok", False: "!!", None: "  "}
+
+
+def summarise(estimate: Estimate) -> str:
+    """Return the verdict, the parameters in the manner of a regression table, and the tests."""
+    lines = [f"{'Estimate of ' + estimate.vessel.name:^{WIDTH}}".rstrip(), "=" * WIDTH]
+    lines += _wrapped(f"Verdict: {estimate.verdict.text}", "  ")
+    lines += ["=" * WIDTH, *_head(estimate), "=" * WIDTH, *_table(estimate), "=" * WIDTH]
+    for name, value, std in estimate.current:
+        lines.append(f"{name:<16}{value:>10.3f} ± {1.96 * std:.3f} m/s (95 %)")
+    if estimate.fit:
+        shown = ", ".join(f"{k} {v:.1f} %" for k, v in estimate.fit.items())
+        lines.append(f"Free-run fit on the estimation logs: {shown}")
+    for name, limit in estimate.limits.items():
+        lines += _wrapped(f"{_BOUNDS[name]}: {limit.sentence}", "  ")
+    lines += _tests(estimate.tests)
+    if estimate.notes:
+        lines += ["", "Notes"]
+    for note in estimate.notes:
+        lines += _wrapped(f"  {note}", "    ")
+    return "\n".join(lines)
+
+
+def _wrapped(text: str, indent: str) -> list[str]:
+    return textwrap.wrap(
+        text, WIDTH, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
+    )
+
+
+def _head(estimate: Estimate) -> list[str]:
+    rows = (
+        ("Method:", estimate.method, "Samples:", f"{estimate.samples}"),
+        ("Predictor:", estimate.predictor.kind, "Samples used:", f"{estimate.kept}"),
+        ("Structure:", estimate.predictor.structure.name, "Sample time:",
+         f"{estimate.sample_time:g} s"),
+        ("Std errors:", f"{estimate.covariance_kind}, {estimate.lags} lags", "Refinements:",
+         f"{estimate.iterations}"),
+    )  # fmt: skip
+    return [f"{a:<18}{b:<28}{c:<18}{d}" for a, b, c, d in rows]
+
+
+def _table(estimate: Estimate) -> list[str]:
+    sets: dict[str, Sequence[Sequence[float | None]]] = {}
+    for test in estimate.tests:
+        if test.name.startswith("anderson_rubin"):
+            sets |= test.detail.get("sets", {})
+    lines = [
+        f"{'parameter':<12}{'value':>10}{'std err':>9}{'[0.025':>11}{'0.975]':>11}"
+        f"{'weak-safe 95 %':>24}{'per second':>11}  unit"
+    ]
+    unit = estimate.vessel.force_unit
+    structure = estimate.predictor.structure
+    for state in structure.states:
+        lines.append("-" * WIDTH)
+        for i in estimate.predictor.equation(state):
+            column = estimate.predictor.columns[i]
+            if column.is_bias:
+                continue
+            value, std = estimate.theta[i], estimate.std[i]
+            term = structure.terms[structure.index(column.terms[0])]
+            lines.append(
+                f"{column.label:<12}{value:>10.4g}{std:>9.2g}{value - 1.96 * std:>11.4g}"
+                f"{value + 1.96 * std:>11.4g}{_set(sets, column.label):>24}"
+                f"{value / estimate.sample_time:>11.4g}  {parameter_unit(term, unit)}"
+            )
+    return lines
+
+
+def _set(sets: Mapping[str, Sequence[Sequence[float | None]]], label: str) -> str:
+    if label not in sets:
+        return ""
+    pieces = sets[label]
+    if len(pieces) == 2:
+        return f"not {pieces[0][1]:.2g} to {pieces[1][0]:.2g}"
+    low, high = pieces[0]
+    if low is None and high is None:
+        return "any value"
+    if low is None:
+        return f"below {high:.3g}"
+    if high is None:
+        return f"above {low:.3g}"
+    return f"{low:.3g} to {high:.3g}"
+
+
+def _tests(tests: Sequence[TestResult]) -> list[str]:
+    lines: list[str] = []
+    left = list(tests)
+    for title, prefixes in _GROUPS.items():
+        mine = [t for t in left if t.name.startswith(prefixes)]
+        if mine:
+            lines += ["", title]
+        for test in mine:
+            left.remove(test)
+            lines += _wrapped(f"  {_MARKS[test.passed]} {test.name}: {test.sentence}", " " * 7)
+    if left:
+        lines += ["", "Further"]
+    for test in left:
+        lines += _wrapped(f"  {_MARKS[test.passed]} {test.name}: {test.sentence}", " " * 7)
+    return lines

@@ -1,0 +1,178 @@
+"""Estimates, covariances and tests against linearmodels and statsmodels."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import statsmodels.api as sm
+from linearmodels.iv import IV2SLS
+
+from greybox.estimation.colour import WHITE, fit_colour
+from greybox.estimation.covariance import score_covariance
+from greybox.estimation.credibility.evidence import Equation
+from greybox.estimation.credibility.scores import score_test
+from greybox.estimation.credibility.weak import measure_strength
+from greybox.estimation.moments import solve_stacked
+
+ROWS = 400
+
+
+def endogenous(seed=0, q=4, changing=False):
+    """Two noisy regressors and an exact one, with q instruments beside it."""
+    rng = np.random.default_rng(seed)
+    exact, outer = rng.normal(size=(1, ROWS)), rng.normal(size=(q, ROWS))
+    noise, e = rng.normal(size=(2, ROWS)), rng.normal(size=ROWS)
+    e = e + 0.5 * noise[0]
+    if changing:
+        e = e * (1 + np.abs(outer[0]))
+    first = rng.normal(size=(2, q)) @ outer + 0.4 * exact + noise
+    y = np.array([1.0, -0.5]) @ first + 0.3 * exact[0] + e
+    return y, exact, first, outer
+
+
+def as_equation(y, exact, first, outer):
+    phi, z = np.vstack([first, exact]), np.vstack([outer, exact])
+    keep = np.ones(len(y), bool)
+    return Equation("u", (0, 1, 2), ("a", "b", "c"), (y,), (phi,), (z,), (keep,), False)
+
+
+def fitted(seed=0, q=4, changing=False, **options):
+    y, exact, first, outer = endogenous(seed, q, changing)
+    return as_equation(y, exact, first, outer), IV2SLS(y, exact.T, first.T, outer.T).fit(**options)
+
+
+# the exact regressor comes first there and last here
+ORDER = [1, 2, 0]
+
+
+def test_two_stage_least_squares_and_its_robust_covariance():
+    for changing in (False, True):
+        equation, oracle = fitted(1, changing=changing, cov_type="robust", debiased=False)
+        solution = equation.solution
+        np.testing.assert_allclose(solution.theta, oracle.params.to_numpy()[ORDER], rtol=1e-8)
+        middle, _ = score_covariance([solution.projected], [equation.residuals], "white")
+        inverse = np.linalg.inv(solution.information)
+        want = oracle.cov.to_numpy()[np.ix_(ORDER, ORDER)]
+        np.testing.assert_allclose(inverse @ middle @ inverse, want, rtol=1e-8)
+
+
+def test_several_experiments_with_their_own_instruments():
+    """Stacked as (4.5): blocks of instruments, each zero-mean in its own rows."""
+    cut = (0, 150, 290, ROWS)
+    y, exact, first, outer = endogenous(2)
+    phi, z = np.vstack([first, exact]), np.vstack([outer, exact])
+    parts = [slice(a, b) for a, b in pairwise(cut)]
+    zs = [z[:, s] - z[:, s].mean(axis=1, keepdims=True) for s in parts]
+    blocks = np.zeros((5 * 3, ROWS))
+    for i, (s, part) in enumerate(zip(parts, zs, strict=True)):
+        blocks[5 * i : 5 * i + 5, s] = part
+    solution = solve_stacked(zs, [phi[:, s] for s in parts], [y[s] for s in parts])
+    oracle = IV2SLS(y, None, phi.T, blocks.T).fit(cov_type="robust", debiased=False)
+    np.testing.assert_allclose(solution.theta, oracle.params.to_numpy(), rtol=1e-8)
+    errors = [y[s] - solution.theta @ phi[:, s] for s in parts]
+    middle, _ = score_covariance([solution.projected], [errors], "white")
+    inverse = np.linalg.inv(solution.information)
+    np.testing.assert_allclose(inverse @ middle @ inverse, oracle.cov.to_numpy(), rtol=1e-8)
+
+
+def test_least_squares_with_memory_equals_statsmodels():
+    """The kernel is flat-top, so Bartlett's weights are put in its place."""
+    rng = np.random.default_rng(3)
+    x, e = rng.normal(size=(2, ROWS)), np.convolve(rng.normal(size=ROWS + 3), np.ones(4), "valid")
+    y = np.array([1.0, 2.0]) @ x + e
+    solution = solve_stacked([x], [x], [y])
+    oracle = sm.OLS(y, x.T).fit(cov_type="HAC", cov_kwds={"maxlags": 5, "use_correction": False})
+    residual = y - solution.theta @ x
+    scores = x * residual
+    middle = scores @ scores.T
+    for lag in range(1, 6):
+        block = scores[:, lag:] @ scores[:, :-lag].T
+        middle += (1 - lag / 6) * (block + block.T)
+    inverse = np.linalg.inv(solution.information)
+    np.testing.assert_allclose(solution.theta, oracle.params, rtol=1e-8)
+    np.testing.assert_allclose(inverse @ middle @ inverse, oracle.cov_params(), rtol=1e-8)
+
+
+def test_sargan_and_its_robust_form():
+    equation, oracle = fitted(4)
+    args = (equation.z, equation.phi, equation.solution.projected, equation.residuals)
+    sargan = score_test(*args, memory="iid")
+    assert sargan.freedom == 2
+    np.testing.assert_allclose(sargan.statistic, oracle.sargan.stat, rtol=1e-8)
+    np.testing.assert_allclose(sargan.p_value, oracle.sargan.pval, rtol=1e-8)
+    equation, oracle = fitted(5, changing=True)
+    args = (equation.z, equation.phi, equation.solution.projected, equation.residuals)
+    robust = score_test(*args, memory="white")
+    np.testing.assert_allclose(robust.statistic, oracle.wooldridge_overid.stat, rtol=1e-8)
+
+
+def test_durbin_and_its_robust_score():
+    for seed, memory, name in ((6, "iid", "durbin"), (7, "white", "wooldridge_score")):
+        equation, oracle = fitted(seed, changing=memory == "white")
+        phi = equation.phi[0]
+        theta = np.linalg.solve(phi @ phi.T, phi @ equation.y[0])
+        found = score_test(
+            equation.solution.projected, [phi], [phi], [equation.y[0] - theta @ phi], memory=memory
+        )
+        want = getattr(oracle, name)
+        want = want() if callable(want) else want
+        assert found.freedom == 2
+        np.testing.assert_allclose(found.statistic, want.stat, rtol=1e-8)
+
+
+def test_shea_and_the_first_stage():
+    equation, oracle = fitted(8)
+    strength = measure_strength(equation)
+    first = oracle.first_stage.diagnostics
+    np.testing.assert_allclose(strength.shea[:2], first["shea.rsquared"], rtol=1e-8)
+    assert np.isinf(strength.own[2])
+
+
+def test_cragg_donald_of_one_regressor_is_its_first_stage_f():
+    """And Kleibergen-Paap without memory is the homoskedastic statistic times its freedom."""
+    y, exact, first, outer = endogenous(9)
+    phi, z = np.vstack([first[:1], exact]), np.vstack([outer, exact])
+    keep = np.ones(ROWS, bool)
+    equation = Equation("u", (0, 1), ("a", "c"), (y,), (phi,), (z,), (keep,), False)
+    strength = measure_strength(equation)
+    full = sm.OLS(first[0], z.T).fit()
+    restricted = sm.OLS(first[0], exact.T).fit()
+    f = full.compare_f_test(restricted)[0]
+    np.testing.assert_allclose(strength.cragg_donald, f, rtol=1e-8)
+    assert strength.rank_freedom == 4
+    assert 0.5 * f < strength.rank / 4 < 2 * f
+
+
+def test_noise_model_equals_statsmodels():
+    rng = np.random.default_rng(10)
+    white = rng.normal(size=3001)
+    series = white[1:] - 0.9 * white[:-1]
+    series = series - series.mean()
+    keep = np.ones(3000, bool)
+    found = fit_colour([series], [keep])
+    oracle = sm.tsa.ARIMA(series, order=(0, 0, 1), trend="n").fit()
+    assert len(found.moving_average) == 2
+    assert abs(found.moving_average[1] - oracle.params[0]) < 0.3 * oracle.bse[0]
+    assert fit_colour([rng.normal(size=2000)], [np.ones(2000, bool)]) == WHITE
+
+
+def test_adjoint_and_innovations_are_one_operator():
+    rng = np.random.default_rng(11)
+    white = rng.normal(size=501)
+    series = np.convolve(white, [1, 0.6], "valid")
+    colour = fit_colour([series], [np.ones(500, bool)])
+    z = rng.normal(size=(3, 500))
+    np.testing.assert_allclose(
+        colour.adjoint(z) @ colour.innovations(series), z @ series, rtol=1e-8
+    )
+
+
+@pytest.mark.parametrize("lag", [0, 1])
+def test_white_noise_has_the_plain_covariance(lag):
+    rng = np.random.default_rng(12 + lag)
+    z, e = rng.normal(size=(2, 3000)), rng.normal(size=3000)
+    found, memory = score_covariance([[z]], [[e]], "ma")
+    np.testing.assert_allclose(found, (z * e) @ (z * e).T, rtol=0.15, atol=60)
+    assert memory <= 2
