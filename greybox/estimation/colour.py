@@ -57,15 +57,11 @@ class Colour:
 
     def innovations(self, e: Array) -> Array:
         """Return ε = D/C e along the last axis."""
-        from scipy.signal import lfilter
-
-        return np.asarray(lfilter(self.autoregression, self.moving_average, e, axis=-1))
+        return _filtered(self.autoregression, self.moving_average, e)
 
     def adjoint(self, z: Array) -> Array:
         """Return Hᵀz along the last axis, with Σ z e = Σ (Hᵀz) ε."""
-        from scipy.signal import lfilter
-
-        back = lfilter(self.moving_average, self.autoregression, z[..., ::-1], axis=-1)
+        back = _filtered(self.moving_average, self.autoregression, z[..., ::-1])
         return np.asarray(back[..., ::-1])
 
     def freedom_of(self, z: Sequence[Array], *, together: bool = False) -> Array:
@@ -93,6 +89,25 @@ class Colour:
 
 
 WHITE = Colour(np.ones(1), np.ones(1))
+
+
+def _filtered(numerator: Array, denominator: Array, rows: Array) -> Array:
+    """Run rows (..., N) through numerator over denominator, both with a leading 1.
+
+    A banded triangular system; a signal library would take longer to load than to run.
+    """
+    from scipy.linalg import solve_banded
+
+    samples = rows.shape[-1]
+    out = np.zeros(rows.shape)
+    for i, coefficient in enumerate(numerator[:samples]):
+        out[..., i:] += coefficient * rows[..., : samples - i]
+    order = min(len(denominator), samples) - 1
+    if order < 1:
+        return out
+    band = np.repeat(np.asarray(denominator, float)[: order + 1, None], samples, axis=1)
+    flat = out.reshape(-1, samples).T
+    return np.asarray(solve_banded((order, 0), band, flat, check_finite=False).T.reshape(out.shape))
 
 
 def fit_colour(residuals: Sequence[Array], keep: Sequence[NDArray[np.bool_]]) -> Colour:

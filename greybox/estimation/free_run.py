@@ -39,7 +39,9 @@ Shooting = Literal["auto", "single", "multiple"]
 # process over measurement variance of the filters, one after the other
 _RATIOS = (1.0, 0.1, 0.01, 1e-3)
 # iterations of each, and the length of a step in standard errors that is near enough
-_STEPS, _NEAR = 6, 0.1
+_STEPS, _NEAR = 6, 0.3
+# samples of each log that are enough to come near
+_PART = 2000
 # segments of a log, and samples that a segment has at least
 _SEGMENTS, _LEAST = 64, 50
 # noise-free signals still need a scale
@@ -73,7 +75,8 @@ def fit_free_runs(
     restrictions: Restrictions | None = None,
     loss: Loss = "gaussian",
     sigma: Array | None = None,
-    shooting: Literal["auto", "single", "multiple"] = "auto",
+    shooting: Shooting = "auto",
+    near: bool = False,
 ) -> tuple[ShootingFit, FreeRuns]:
     """Fit parameters and initial states to logs; the noise of each output with them.
 
@@ -93,6 +96,8 @@ def fit_free_runs(
         concentrated: the residuals' own deviation).
     shooting : {"auto", "single", "multiple"}
         ``multiple`` ends with segments, ``single`` begins with whole runs.
+    near : bool
+        Whether `p` is near already, such as that of another heading.
 
     Returns
     -------
@@ -105,7 +110,9 @@ def fit_free_runs(
     weights = np.maximum(change, floor) if sigma is None else sigma
     whole = cut(logs, max(len(log.y) for log in logs))
     starts = measured_starts(whole, len(model.states))
-    p, starts = approach(model, logs, p, starts, restrictions, np.maximum(change, floor))
+    if not near:
+        part = [Measured(log.w[:_PART], log.y[:_PART]) for log in logs]
+        p, starts = approach(model, part, p, starts, restrictions, np.maximum(change, floor))
     single: ShootingFit | None = None
     if shooting != "multiple":
         single, runs = _settle(

@@ -84,9 +84,10 @@ def solve_stacked(
         basis = ze / scale[:, None]
         if metric == "moments":
             # an orthonormal basis of the instruments, never their squared moments
-            _, values, vt = np.linalg.svd(basis, full_matrices=False)
+            thin, triangle = np.linalg.qr(basis.T)
+            left, values, _ = np.linalg.svd(triangle, full_matrices=False)
             # an experiment of which every row was cut has no singular values
-            basis = vt[values > _RANK * values.max(initial=0.0)]
+            basis = (thin @ left[:, values > _RANK * values.max(initial=0.0)]).T
         else:
             basis = basis / np.sqrt(max(fe.shape[1], 1))
         bases.append(basis)

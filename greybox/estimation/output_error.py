@@ -260,14 +260,15 @@ def _fit(
 ) -> _Fitted:
     sample_time = common_sample_time(logs)
 
-    def free_run(heading: Role, p: Array | None, shooting: Shooting) -> _Fitted:
+    def free_run(heading: Role, p: Array | None = None) -> _Fitted:
         model = output_model(predictor, sample_time, heading, options.wind)
         data = [measured(model, log) for log in logs]
         _require_rows(model, data)
         restrictions = _restrictions(model, options)
         fit, runs = fit_free_runs(
             model, data, _first(model, start) if p is None else p,
-            restrictions=restrictions, loss=options.loss, shooting=shooting,
+            restrictions=restrictions, loss=options.loss, shooting=options.shooting,
+            near=p is not None,
         )  # fmt: skip
         return _Fitted(model, data, fit, runs, restrictions, options.loss)
 
@@ -276,11 +277,11 @@ def _fit(
     seen = turns and all("psi" in log for log in logs)
     heading = options.heading
     if heading != "auto":
-        found = free_run(heading, None, options.shooting)
+        found = free_run(heading)
     else:
-        found = free_run("input", None, options.shooting)
+        found = free_run("input")
         if seen and found.fit.converged:
-            compared = free_run("output", found.fit.p, "single")
+            compared = free_run("output", found.fit.p)
             steady = compared.fit.converged and np.isfinite(compared.fit.cost)
             if steady and (
                 options.process_noise or max(compared.slow[n][0] for n in ("r", "psi")) < _DRIFTS

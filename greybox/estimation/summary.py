@@ -54,8 +54,9 @@ def _wrapped(text: str, indent: str) -> list[str]:
 
 
 def _head(estimate: Estimate) -> list[str]:
+    method = estimate.method + (", prefiltered" if estimate.prefilter == "noise" else "")
     rows = (
-        ("Method:", estimate.method, "Samples:", f"{estimate.samples}"),
+        ("Method:", method, "Samples:", f"{estimate.samples}"),
         ("Predictor:", estimate.predictor.kind, "Samples used:", f"{estimate.kept}"),
         ("Structure:", estimate.predictor.structure.name, "Sample time:",
          f"{estimate.sample_time:g} s"),

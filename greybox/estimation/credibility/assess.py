@@ -62,6 +62,9 @@ def assess(evidence: Evidence) -> tuple[TestResult, ...]:
 
 
 def _of_equation(evidence: Evidence, equation: Equation) -> list[TestResult]:
+    if evidence.method == "oe":
+        # a free run needs no instruments: only what speaks of the model is asked
+        return [input_independence(evidence, equation)]
     biases = frozenset(c.label for c in evidence.predictor.columns if c.is_bias)
     if not len(equation.columns) or not np.isfinite(equation.solution.theta).all():
         reason = "its instruments leave a direction free"
