@@ -6,18 +6,19 @@ import argparse
 
 from greybox.commands.common import add_seed, positive, progress, provenance, say
 
-HELP = "repeat the studies of the thesis"
+HELP = "repeat the studies of the thesis, and that of the estimators' efficiency"
 EXAMPLES = """examples:
   greybox reproduce chapter4 --out chapter4
   greybox reproduce chapter6 --runs 500 --out chapter6
   greybox reproduce chapter7 --out chapter7
+  greybox reproduce efficiency --runs 200 --out efficiency
   greybox reproduce chapter7 --vessel ship.toml --estimate windy*.csv --validate calm*.csv
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("study", choices=("chapter4", "chapter6", "chapter7"))
+    parser.add_argument("study", choices=("chapter4", "chapter6", "chapter7", "efficiency"))
     parser.add_argument("--runs", type=int, default=500, metavar="N", help="Monte Carlo runs (500)")
     parser.add_argument("--out", metavar="DIR", help="folder for tables.csv, figures and the page")
     parser.add_argument("--estimate", nargs="+", metavar="LOG", help="chapter 7: estimation logs")
@@ -62,6 +63,21 @@ def run(options: argparse.Namespace) -> None:
             progress=progress("chapter 6"),
         )
         output = studies.chapter6_output(six, record)
+    elif options.study == "efficiency":
+        from greybox.report.efficiency import efficiency_output
+        from greybox.study.efficiency import LEAST_RUNS, reproduce_efficiency
+
+        if options.runs < LEAST_RUNS:
+            raise UsageError(
+                f"--runs is {options.runs}, the covariance of the estimates needs at least "
+                f"{LEAST_RUNS} runs."
+            )
+        output = efficiency_output(
+            reproduce_efficiency(
+                options.runs, options.seed, workers=options.workers, progress=progress("efficiency")
+            ),
+            record,
+        )
     else:
         output = studies.chapter7_output(_chapter7(options), record)
     say(output.text)

@@ -31,7 +31,7 @@ from greybox.estimation.result import Estimate
 from greybox.model.catalogue import get_structure
 from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import Predictor, Regime, build_predictor
-from greybox.model.simulation import simulate
+from greybox.model.simulation import simulate, stationary_disturbance
 from greybox.study.chapter6 import TRUE, pulse_commands
 from greybox.study.parallel import map_pieces
 from greybox.study.tables import Row, summarise
@@ -44,9 +44,13 @@ SAMPLES = 2000
 # (6.2a-d)
 SENSOR_VARIANCE, HEADING_VARIANCE = 2e-4, 1e-4
 CURRENT, WIND = (0.2, -0.2), (1.0, 1.0)
+# standard deviation and memory of the measured gusts [m/s, s]
+GUST, GUST_MEMORY = 1.0, 20.0
 _START = np.array([1.5, 1.2, 0.0])
 _REGIME: Regime = (("u", (1,)), ("v", (1,)), ("r", (1, -1)))
-_PIECE = 5
+_GUSTS, _PIECE = 6, 5
+# for a covariance of 18 parameters to have a determinant
+LEAST_RUNS = 24
 
 
 @dataclass(frozen=True)
@@ -195,14 +199,22 @@ def determinant_efficiency(errors: Array, bound: Array) -> Share:
 
 
 def virtual_trial(rng: np.random.Generator, case: Case, samples: int = SAMPLES) -> TrialLog:
-    """Draw one trial of the thesis's ship in constant current and measured wind."""
+    """Draw one trial of the thesis's ship in constant current and measured wind.
+
+    Commands and gusts are those of every trial; measurement and process noise are drawn.
+    """
     structure, vessel = get_structure("thesis"), load_vessel("thesis")
     commands = pulse_commands(samples)
     tau = make_log(vessel, commands, 1.0).forces(structure.inputs)
     theta = np.array([TRUE[n] for n in structure.parameters])
+    wind = stationary_disturbance(
+        np.random.default_rng(_GUSTS), np.array(WIND), GUST, samples,
+        correlation_time=GUST_MEMORY,
+    )[0]  # fmt: skip
+    d = np.column_stack([np.tile(CURRENT, (samples, 1)), wind])
     run = simulate(
         structure, theta, _START, tau[:-1], 1.0,
-        d=np.tile([*CURRENT, *WIND], (samples - 1, 1)),
+        d=d[:-1],
         process_noise=rng.standard_normal((samples - 1, 3)) * np.array(case.process),
     )  # fmt: skip
     x, heading = run.x[0], run.psi[0]
@@ -210,8 +222,8 @@ def virtual_trial(rng: np.random.Generator, case: Case, samples: int = SAMPLES) 
     noise = np.sqrt(SENSOR_VARIANCE) * rng.standard_normal(x.shape)
     channels = {n: x[:, i] + noise[:, i] for i, n in enumerate(structure.states)}
     channels["psi"] = heading + np.sqrt(HEADING_VARIANCE) * rng.standard_normal(samples)
-    channels["u_q"] = x[:, 0] - (c * WIND[0] + s * WIND[1])
-    channels["v_q"] = x[:, 1] - (c * WIND[1] - s * WIND[0])
+    channels["u_q"] = x[:, 0] - (c * wind[:, 0] + s * wind[:, 1])
+    channels["v_q"] = x[:, 1] - (c * wind[:, 1] - s * wind[:, 0])
     return make_log(vessel, commands | channels, 1.0, case.name)
 
 
