@@ -80,7 +80,7 @@ def efficiency_output(study: Efficiency, record: dict[str, Any]) -> StudyOutput:
         caption = f"{result.case.name}: efficiency by determinant, p-th root, 95 % interval"
         tables.append(Table(caption, head, rows))
         widths = (14, 24, 24, 28, 26, 6)
-        lines.append(f"{result.case.name}")
+        lines.append(result.case.name)
         for cells in (head, *rows):
             lines.append("  " + "".join(f"{c:<{w}}" for c, w in zip(cells, widths, strict=True)))
         tables.append(
@@ -104,7 +104,7 @@ def efficiency_output(study: Efficiency, record: dict[str, Any]) -> StudyOutput:
         last = result.case.estimators[-1]
         reached = result.determinant(last, result.cramer_rao)
         sentences.append(
-            f"{result.case.name}: {last} reaches {100 * reached.value:.0f} % "
+            f"{result.case.name.capitalize()}: {last} reaches {100 * reached.value:.0f} % "
             f"({100 * reached.low:.0f}-{100 * reached.high:.0f}) of the Cramér-Rao bound by "
             f"determinant."
         )

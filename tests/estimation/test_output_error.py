@@ -1,0 +1,504 @@
+"""Output error and likelihood of innovations: exact, against oracles, and when to refuse."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from virtual import virtual_log, write_csv
+
+from greybox.commands.main import main
+from greybox.errors import ExcitationError, StructureError, UsageError
+from greybox.estimation.free_run import fit_free_runs
+from greybox.estimation.free_run_errors import (
+    autocovariance,
+    shared_score_covariance,
+    slow_errors,
+)
+from greybox.estimation.innovations import FilterRuns, fit_innovations
+from greybox.estimation.limits import cramer_rao, information, noise_variances
+from greybox.estimation.output_error import (
+    OutputErrorOptions,
+    estimate_oe,
+    measured,
+    output_model,
+    output_predictor,
+)
+from greybox.estimation.shooting import Measured, cut, solve_step, unrestricted
+from greybox.model.catalogue import get_structure
+from greybox.model.noise import NoiseLevels
+from greybox.model.output import Filter, OutputModel, Simulator
+from greybox.study.chapter6 import TRUE
+from greybox.study.efficiency import CASES, determinant_efficiency, virtual_trial
+
+REGIME = (("u", (1,)), ("v", (1,)), ("r", (1, -1)))
+THESIS = get_structure("thesis")
+CURRENT = (0.2, -0.2)
+
+
+def truth(predictor):
+    return np.array([TRUE[predictor.columns[i].terms[0]] for i in predictor.parameter_columns])
+
+
+@pytest.fixture(scope="module")
+def predictor():
+    return output_predictor(THESIS, "wind", REGIME)
+
+
+@pytest.fixture(scope="module")
+def clean():
+    return virtual_log(3, 400, spread=0.0, noise=0.0)
+
+
+@pytest.fixture(scope="module")
+def noisy():
+    return virtual_log(3, 600, spread=0.0)
+
+
+def problem(predictor, log, heading="output"):
+    model = output_model(predictor, 1.0, heading)
+    p = np.array([*truth(predictor), *CURRENT])
+    return model, measured(model, log), p
+
+
+class TestSensitivities:
+    def test_equal_finite_differences(self, predictor, noisy):
+        model, data, p = problem(predictor, noisy)
+        runs = Simulator(model, data.w[None, :200])
+        z0 = data.y[:1]
+        _, rows, _, slope = runs.sensitivities(z0, p)
+        for j in range(len(p)):
+            h = 1e-6 * max(abs(p[j]), 1e-3)
+            up, down = p.copy(), p.copy()
+            up[j] += h
+            down[j] -= h
+            (y1, end1), (y0, end0) = runs(z0, up), runs(z0, down)
+            expected = (y1 - y0) / (2 * h)
+            size = np.abs(expected).max()
+            np.testing.assert_allclose(rows[:, :, j], expected, atol=1e-5 * size)
+            np.testing.assert_allclose(
+                slope[:, j], (end1 - end0) / (2 * h), atol=1e-5 * np.abs(slope[:, j]).max() + 1e-9
+            )
+
+    def test_of_the_initial_state_too(self, predictor, noisy):
+        model, data, p = problem(predictor, noisy)
+        runs = Simulator(model, data.w[None, :100])
+        z0 = data.y[:1]
+        rows = runs.sensitivities(z0, p)[1]
+        for j in range(4):
+            shift = np.zeros((1, 4))
+            shift[0, j] = 1e-6
+            expected = (runs(z0 + shift, p)[0] - runs(z0 - shift, p)[0]) / 2e-6
+            np.testing.assert_allclose(rows[:, :, len(p) + j], expected, atol=1e-6)
+
+    def test_a_filter_without_process_noise_is_the_free_run(self, predictor, noisy):
+        model, data, p = problem(predictor, noisy)
+        sigma2 = np.full(4, 2e-4)
+        y, rows, _, _ = Simulator(model, data.w[None]).sensitivities(data.y[:1], p)
+        kalman = Filter(model, data.w[None], data.y[None], np.ones((1, len(data.y))))
+        r, derivatives, levels = kalman(data.y[:1], p, np.append(sigma2, np.zeros(4)))
+        np.testing.assert_allclose(r, (data.y - y) / np.sqrt(sigma2), atol=1e-9)
+        np.testing.assert_allclose(derivatives, rows / np.sqrt(2e-4), rtol=1e-9, atol=1e-7)
+        np.testing.assert_allclose(levels, np.log(2e-4), rtol=1e-12)
+
+    def test_the_likelihood_has_its_exact_gradient(self, predictor, noisy):
+        model, data, p = problem(predictor, noisy)
+        kalman = Filter(model, data.w[None, :80], data.y[None, :80], np.ones((1, 80)))
+        noise = np.array([2e-4, 2e-4, 2e-4, 1e-4, 1e-5, 1e-5, 1e-6, 1e-8])
+        _, by_start, by_p = kalman.likelihood(data.y[:1], p, noise)
+        for j in (0, 1, 3, 7, 17, 18):
+            h = 1e-6 * max(abs(p[j]), 1e-2)
+            up, down = p.copy(), p.copy()
+            up[j] += h
+            down[j] -= h
+            slope = kalman.likelihood(data.y[:1], up, noise)[0]
+            slope = (slope - kalman.likelihood(data.y[:1], down, noise)[0]) / (2 * h)
+            assert by_p[j] == pytest.approx(slope, rel=1e-4, abs=1e-3 * np.abs(by_p).max())
+        assert np.isfinite(by_start).all()
+
+    def test_the_likelihood_of_a_linear_model_is_that_of_a_gaussian(self):
+        from scipy.stats import multivariate_normal
+
+        structure = (
+            get_structure("surge").without("Xuu", "Wuu", "Xkappa")
+            if ("Xkappa" in get_structure("surge").parameters)
+            else get_structure("surge").without(
+                *[n for n in get_structure("surge").parameters if n not in ("Xu", "Xmu")]
+            )
+        )
+        predictor = output_predictor(structure, "basic", (("u", (1,)),))
+        model = OutputModel(predictor, 1.0)
+        rng = np.random.default_rng(4)
+        n, r, q = 12, 0.3, 0.2
+        drivers = rng.standard_normal((n, len(model.drivers)))
+        y = rng.standard_normal((n, 1))
+        p = np.array([-0.3 if c.name == "Xu" else 0.5 for c in predictor.columns])
+        tau = drivers[:, model.drivers.index("taux")]
+        gain = p[[c.name for c in predictor.columns].index("Xmu")]
+        a, x0 = 0.7, 0.4
+        mean, spread = np.zeros(n), np.zeros((n, n))
+        x = x0
+        for k in range(n):
+            mean[k] = x
+            x = a * x + gain * tau[k]
+        for i in range(n):
+            for j in range(n):
+                spread[i, j] = q * sum(
+                    a ** (i - 1 - k) * a ** (j - 1 - k) for k in range(min(i, j))
+                ) + (r if i == j else 0.0)
+        kalman = Filter(model, drivers[None], y[None], np.ones((1, n)))
+        value = kalman.likelihood(np.array([[x0]]), p, np.array([r, q]))[0]
+        expected = -multivariate_normal(mean, spread).logpdf(y[:, 0]) - n / 2 * np.log(2 * np.pi)
+        assert value == pytest.approx(expected, rel=1e-9)
+
+
+class TestFit:
+    def test_noise_free_data_give_the_parameters_from_nothing(self, predictor, clean):
+        found = estimate_oe(predictor, [clean])
+        np.testing.assert_allclose(found.theta, truth(predictor), rtol=1e-5)
+        values = [v for _, v, _ in found.current]
+        np.testing.assert_allclose(values, CURRENT, atol=1e-6)
+        assert found.status.startswith("converged")
+
+    def test_equals_the_optimum_of_scipy(self, predictor, noisy):
+        from scipy.optimize import least_squares
+
+        model, data, p = problem(predictor, noisy, "input")
+        sigma = np.full(3, np.sqrt(2e-4))
+        fit, runs = fit_free_runs(model, [data], p, sigma=sigma)
+        simulator = Simulator(model, data.w[None])
+        scale = np.sqrt(np.diag(np.linalg.inv(fit.hessian)))
+
+        def residuals(x):
+            y, _ = simulator(x[None, -3:], p + x[:-3] * scale)
+            return ((data.y - y[0]) / sigma).ravel()
+
+        found = least_squares(
+            residuals, np.append(np.zeros(len(p)), data.y[0]), xtol=1e-12, ftol=1e-12, gtol=1e-12
+        )
+        assert fit.cost == pytest.approx(found.cost, rel=1e-9)
+        assert fit.cost <= found.cost * (1 + 1e-12)
+        np.testing.assert_allclose((fit.p - p) / scale, found.x[:-3], atol=2e-3)
+
+    def test_segments_that_join_give_the_same_optimum(self, predictor, noisy):
+        model, data, p = problem(predictor, noisy, "input")
+        one, single = fit_free_runs(model, [data], p, shooting="single")
+        many, joined = fit_free_runs(model, [data], p, shooting="multiple")
+        assert many.converged
+        assert many.gap < 1e-6
+        assert len(joined.segments.use) > 5
+        np.testing.assert_allclose(joined.sigma, single.sigma, rtol=1e-6)
+        std = np.sqrt(np.diag(np.linalg.inv(one.hessian)))
+        np.testing.assert_allclose((many.p - one.p) / std, 0.0, atol=1e-3)
+        np.testing.assert_allclose(
+            many.hessian / np.outer(1 / std, 1 / std), one.hessian * np.outer(std, std), atol=1e-3
+        )
+
+    def test_a_start_far_off_ends_at_the_same_optimum(self, predictor, noisy):
+        rng = np.random.default_rng(1)
+        near = estimate_oe(predictor, [noisy], start=truth(predictor))
+        wild = estimate_oe(predictor, [noisy], start=rng.standard_normal(len(THESIS.terms)))
+        np.testing.assert_allclose((wild.theta - near.theta) / near.std, 0.0, atol=1e-2)
+
+    def test_an_unstable_ship_is_fitted(self):
+        structure = get_structure("surge").with_terms("X_uuu")
+        keep = {"Xu", "Xmu", "X_uuu"}
+        structure = structure.without(*[n for n in structure.parameters if n not in keep])
+        model = OutputModel(output_predictor(structure, "basic", (("u", (1, -1)),)), 1.0)
+        order = [c.name for c in model.columns]
+        p = np.array([{"Xu": 0.2, "X_uuu": -0.2, "Xmu": 0.1}[n] for n in order])
+        rng = np.random.default_rng(2)
+        w = np.zeros((800, len(model.drivers)))
+        w[:, model.drivers.index("taux")] = np.repeat(rng.choice([-1.0, 1.0], 40), 20)
+        y, _ = Simulator(model, w[None])(np.array([[0.1]]), p)
+        seen = y[0] + 0.05 * rng.standard_normal(y[0].shape)
+        for shooting in ("auto", "multiple"):
+            fit, _ = fit_free_runs(model, [Measured(w, seen)], 0 * p, shooting=shooting)
+            std = np.sqrt(np.diag(np.linalg.inv(fit.hessian)))
+            assert (np.abs(fit.p - p) < 4 * std).all()
+
+    def test_several_logs_have_their_own_starts(self, predictor):
+        logs = [virtual_log(s, 300, spread=0.0) for s in (5, 6)]
+        found = estimate_oe(predictor, logs)
+        assert found.samples == 600
+        assert (np.abs(found.theta - truth(predictor)) < 4.5 * found.std).all()
+
+    def test_outliers_hardly_move_the_robust_loss(self, predictor, noisy):
+        channels = dict(noisy.channels)
+        channels["u"] = channels["u"].copy()
+        channels["u"][::40] += 2.0
+        from dataclasses import replace
+
+        spoilt = replace(noisy, channels=channels)
+        heading = {"heading": "input"}
+        plain = estimate_oe(predictor, [spoilt], options=OutputErrorOptions(**heading))
+        robust = estimate_oe(
+            predictor, [spoilt], options=OutputErrorOptions(loss="huber", **heading)
+        )
+        clean = estimate_oe(predictor, [noisy], options=OutputErrorOptions(**heading))
+
+        def away(e):
+            return np.abs((e.theta - clean.theta) / clean.std)[:6].max()
+
+        assert away(robust) < 3
+        assert away(plain) > 3 * away(robust)
+
+    def test_scaling_the_input_scales_its_parameter(self, predictor, noisy):
+        model, data, p = problem(predictor, noisy, "input")
+        w = data.w.copy()
+        w[:, model.drivers.index("taux")] *= 10
+        one, _ = fit_free_runs(model, [data], p)
+        ten, _ = fit_free_runs(model, [Measured(w, data.y)], 0 * p)
+        i = [c.name for c in predictor.columns].index("Xmu")
+        assert ten.p[i] == pytest.approx(one.p[i] / 10, rel=1e-4)
+
+
+class TestRestrictions:
+    def test_bounds_hold_and_are_named(self, predictor, noisy):
+        found = estimate_oe(
+            predictor, [noisy], options=OutputErrorOptions(bounds={"Xu": (-0.03, 0.0)})
+        )
+        i = [c.name for c in predictor.columns].index("Xu")
+        assert found.theta[i] == pytest.approx(-0.03)
+        assert found.std[i] == 0
+        assert any("Xu ended at a bound" in n for n in found.notes)
+        assert np.isfinite(found.covariance).all()
+
+    def test_a_sharp_prior_holds_its_parameter(self, predictor, noisy):
+        found = estimate_oe(
+            predictor, [noisy], options=OutputErrorOptions(priors={"Wuu": (-0.0005, 1e-7)})
+        )
+        i = [c.name for c in predictor.columns].index("Wuu")
+        assert found.theta[i] == pytest.approx(-0.0005, abs=1e-6)
+        assert found.std[i] == pytest.approx(1e-7, rel=0.2)
+
+    def test_enforced_damping_never_drives(self, predictor):
+        log = virtual_log(11, 150, spread=0.0)
+        found = estimate_oe(predictor, [log], options=OutputErrorOptions(damping="enforce"))
+        for column, value in zip(predictor.columns, found.theta, strict=True):
+            if THESIS.terms[THESIS.index(column.terms[0])].dissipates:
+                assert value <= 0
+
+    def test_which_terms_dissipate(self):
+        damping = {t.name for t in THESIS.terms if t.dissipates}
+        assert damping == {"Xu", "Xuu", "Wuu", "Yv", "Yvv", "Wvv", "Nr"}
+
+    @pytest.mark.parametrize(
+        ("options", "words"),
+        [
+            ({"bounds": {"Xuv": (0, 1)}}, "'Xuv', which is not estimated. Did you mean"),
+            ({"bounds": {"Xu": (1, 0)}}, "the bounds of Xu are 1 and 0"),
+            ({"priors": {"Xu": (0, -1)}}, "deviation -1, it must be positive"),
+        ],
+    )
+    def test_wrong_ones_are_refused(self, predictor, noisy, options, words):
+        with pytest.raises(UsageError, match=words.split(",")[0].split(".")[0]):
+            estimate_oe(predictor, [noisy], options=OutputErrorOptions(**options))
+
+    def test_a_step_within_bounds_is_the_best_one(self):
+        rng = np.random.default_rng(0)
+        root = rng.standard_normal((6, 4))
+        hessian, gradient = root.T @ root, rng.standard_normal(4)
+        low, high = np.full(4, -0.1), np.full(4, 0.2)
+        step = solve_step(hessian, gradient, low, high)
+        assert (step >= low - 1e-12).all()
+        assert (step <= high + 1e-12).all()
+        slope = hessian @ step - gradient
+        assert (np.abs(slope[(step > low) & (step < high)]) < 1e-5).all()
+
+
+class TestRefusals:
+    def test_two_samples(self, predictor, noisy):
+        with pytest.raises(ExcitationError, match="2 samples and 23 unknowns"):
+            estimate_oe(
+                predictor, [noisy.window(0, 2)], options=OutputErrorOptions(heading="input")
+            )
+
+    def test_what_never_moves_is_named(self, predictor, noisy):
+        from dataclasses import replace
+
+        still = replace(noisy, channels={**noisy.channels, **{c: 0 * noisy[c] for c in ("n",)}})
+        with pytest.raises(ExcitationError, match="leaves the run unchanged|cannot be told apart"):
+            estimate_oe(predictor, [still], options=OutputErrorOptions(heading="input"))
+
+    def test_a_heading_needs_a_yaw_rate(self):
+        surge = output_predictor(get_structure("surge"), "basic", (("u", (1,)),))
+        with pytest.raises(StructureError, match="no yaw rate"):
+            OutputModel(surge, 1.0, "output")
+
+    def test_wind_as_an_output_needs_its_mean(self, predictor):
+        with pytest.raises(StructureError, match="take the wind as an input"):
+            OutputModel(predictor, 1.0, "input", "output")
+
+
+class TestInnovations:
+    def test_process_noise_is_found(self, predictor):
+        rng = np.random.default_rng(3)
+        log = virtual_trial(rng, CASES[1], 800)
+        found = estimate_oe(predictor, [log], options=OutputErrorOptions(process_noise=True))
+        assert found.noise.process[2] == pytest.approx(2e-4, rel=0.5)
+        assert found.noise.measurement == pytest.approx(np.full(3, np.sqrt(2e-4)), rel=0.15)
+        assert (np.abs(found.theta - truth(predictor)) < 4.5 * found.std).all()
+
+    def test_the_likelihood_never_falls(self, predictor):
+        log = virtual_trial(np.random.default_rng(5), CASES[1], 300)
+        model, data, p = problem(predictor, log)
+        fit, runs = fit_innovations(model, [data], p, restrictions=unrestricted(len(p)))
+        begin = FilterRuns(model, cut([data], len(data.y)), runs.noise)
+        _, _, _ = begin.value(p, fit.nodes)
+        at = begin.value(fit.p, fit.nodes)
+        before = begin.value(p, fit.nodes)
+        total = [(v[0] ** 2).sum() / 2 + v[2] for v in (at, before)]
+        assert total[0] < total[1]
+
+
+class TestLimits:
+    def test_information_equals_that_of_the_design(self, predictor):
+        from experiment_design.sensitivities import SensitivityProgram
+
+        log = virtual_log(9, 300, spread=0.0, noise=0.0)
+        model, data, p = problem(predictor, log)
+        noise = NoiseLevels(THESIS.states, np.full(3, 0.014), np.zeros(3), 0.01)
+        mine = information(model, [data], p, data.y[:1], noise_variances(model, noise))
+        other = SensitivityProgram(
+            predictor, np.array([TRUE[n] for n in THESIS.parameters]),
+            np.array([*CURRENT, 1.0, 1.0]), noise, 1.0,
+            means=("current_north", "current_east"),
+        )  # fmt: skip
+        tau = data.w[:-1, :3]
+        y, _ = Simulator(model, data.w[None])(data.y[:1], p)
+        f = other(y[:, :-1, :3], y[:, :-1, 3], tau[None]).gram[0]
+        p_, start = (
+            len(predictor.columns),
+            slice(len(predictor.columns), len(predictor.columns) + 4),
+        )
+        keep = [*range(p_), p_ + 4, p_ + 5]
+        eliminated = f[np.ix_(keep, keep)] - f[keep, start] @ np.linalg.solve(
+            f[start, start], f[start, keep]
+        )
+        scale = np.sqrt(np.diag(eliminated))
+        np.testing.assert_allclose(
+            mine / np.outer(scale, scale), eliminated / np.outer(scale, scale), atol=1e-6
+        )
+
+    def test_process_noise_takes_information_away(self, predictor, noisy):
+        model, data, p = problem(predictor, noisy)
+        quiet = NoiseLevels(THESIS.states, np.full(3, 0.014), np.zeros(3), 0.01)
+        pushed = NoiseLevels(THESIS.states, np.full(3, 0.014), np.full(3, 1e-3), 0.01)
+        small, large = (
+            np.diag(cramer_rao(model, [data], p, data.y[:1], noise_variances(model, n)))
+            for n in (quiet, pushed)
+        )
+        assert (large > small).all()
+
+    def test_determinants_are_corrected_for_the_run_count(self):
+        rng = np.random.default_rng(0)
+        bound = np.diag([1.0, 4.0, 9.0, 0.25])
+        shares = [
+            determinant_efficiency(rng.multivariate_normal(np.zeros(4), bound, 12), bound)
+            for _ in range(400)
+        ]
+        mean = np.mean([np.log(s.value) for s in shares])
+        assert abs(mean) < 4 * np.std([np.log(s.value) for s in shares]) / 20
+        inside = np.mean([s.low <= 1 <= s.high for s in shares])
+        assert inside == pytest.approx(0.95, abs=0.04)
+
+
+class TestErrors:
+    def test_shared_scores_equal_the_double_sum(self):
+        rng = np.random.default_rng(7)
+        rows, r = rng.standard_normal((3, 60, 2)), rng.standard_normal((60, 2))
+        r[1:] += 0.6 * r[:-1]
+        gamma = autocovariance([r], 3)
+        total = np.zeros((3, 3))
+        for k in range(60):
+            for j in range(60):
+                lag = abs(k - j)
+                if lag < len(gamma):
+                    g = gamma[lag] if k >= j else gamma[lag].T
+                    total += rows[:, k] @ g @ rows[:, j].T
+        found = shared_score_covariance([(rows, r)], "ma", 3)
+        values = np.linalg.eigvalsh(total)
+        assert values[0] > 0
+        np.testing.assert_allclose(found, total, rtol=1e-9)
+
+    def test_white_errors_do_not_wander_and_walks_do(self):
+        rng = np.random.default_rng(8)
+        rows = rng.standard_normal((4, 500, 2))
+        hessian = np.einsum("ikc,jkc->ij", rows, rows)
+        white = rng.standard_normal((500, 2))
+        walk = white + 0.15 * np.cumsum(rng.standard_normal((500, 2)), axis=0)
+        assert (slow_errors([rows], hessian, [white])[1] > 0.01).all()
+        assert (slow_errors([rows], hessian, [walk])[1] <= 0.01).all()
+
+
+class TestCommand:
+    def test_result_has_verdict_bounds_and_no_odd_numbers(self, tmp_path, noisy):
+        log = write_csv(noisy, tmp_path / "log.csv")
+        out = tmp_path / "m.json"
+        code = main(
+            ["estimate", str(log), "--vessel", "thesis", "--method", "oe", "--json", str(out),
+             "--bound", "Xu=-0.5:0", "--prior", "Nr=-0.1:0.05", "--damping", "enforce"]
+        )  # fmt: skip
+        assert code == 0
+        text = out.read_text()
+        assert "NaN" not in text
+        assert "Infinity" not in text
+        data = json.loads(text)
+        assert data["method"] == "oe"
+        assert data["verdict"]["text"].startswith(("trust", "do not trust"))
+        assert 0.3 < data["limits"]["cramer_rao"]["determinant_efficiency"] < 3
+        assert set(data["noise"]["measurement"]) == {"u", "v", "r"}
+        assert "slow_errors_psi" in data["tests"] or "slow_errors_r" in data["tests"]
+
+    @pytest.mark.parametrize(
+        ("words", "said"),
+        [
+            (["--bound", "Xu=1"], "write NAME=LOW:HIGH"),
+            (["--margin-u", "0.1"], "a free run needs every one"),
+            (["--covariance", "bootstrap"], "use --covariance ma, hac or white"),
+        ],
+    )
+    def test_wrong_options_are_said(self, tmp_path, noisy, capsys, words, said):
+        log = write_csv(noisy, tmp_path / "log.csv")
+        code = main(["estimate", str(log), "--vessel", "thesis", "--method", "oe", *words])
+        assert code == 1
+        assert said in capsys.readouterr().err
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("memory", [0.0, 20.0])
+def test_intervals_cover(predictor, memory):
+    """White errors, and process noise that remembers: 95 % intervals hold."""
+    from greybox.model.simulation import simulate, stationary_disturbance
+    from greybox.trial.log import make_log
+    from greybox.vessel.toml import load_vessel
+
+    inside = []
+    for seed in range(50):
+        base = virtual_log(4, 1000, spread=0.0, noise=0.0)
+        rng = np.random.default_rng([17, seed])
+        commands = {n: base[n] for n in ("n", "alpha1", "alpha2")}
+        tau = base.forces(THESIS.inputs)
+        push = None
+        if memory:
+            std = np.array([1e-3, 1e-3, 1e-4])
+            push = stationary_disturbance(rng, np.zeros(3), std, 999, correlation_time=memory)[0]
+        d = np.tile([*CURRENT, 1.0, 1.0], (999, 1))
+        run = simulate(
+            THESIS, np.array([TRUE[n] for n in THESIS.parameters]), np.array([1.5, 1.2, 0.0]),
+            tau[:-1], 1.0, d=d, process_noise=push,
+        )  # fmt: skip
+        x, psi = run.x[0], run.psi[0]
+        c, s = np.cos(psi), np.sin(psi)
+        channels = commands | {n: x[:, i] + np.sqrt(2e-4) * rng.standard_normal(1000)
+                               for i, n in enumerate("uvr")}  # fmt: skip
+        channels |= {"psi": psi + 0.01 * rng.standard_normal(1000),
+                     "u_q": x[:, 0] - (c + s), "v_q": x[:, 1] - (c - s)}  # fmt: skip
+        found = estimate_oe(predictor, [make_log(load_vessel("thesis"), channels, 1.0)])
+        inside.append(np.abs(found.theta - truth(predictor)) < 1.96 * found.std)
+    share = np.mean(inside)
+    # runs are independent, parameters within one are not
+    error = np.std(np.mean(inside, axis=1)) / np.sqrt(len(inside))
+    assert share == pytest.approx(0.95, abs=0.02 + 2 * error)
