@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -120,13 +121,8 @@ class TestSensitivities:
     def test_the_likelihood_of_a_linear_model_is_that_of_a_gaussian(self):
         from scipy.stats import multivariate_normal
 
-        structure = (
-            get_structure("surge").without("Xuu", "Wuu", "Xkappa")
-            if ("Xkappa" in get_structure("surge").parameters)
-            else get_structure("surge").without(
-                *[n for n in get_structure("surge").parameters if n not in ("Xu", "Xmu")]
-            )
-        )
+        surge = get_structure("surge")
+        structure = surge.without(*[n for n in surge.parameters if n not in ("Xu", "Xmu")])
         predictor = output_predictor(structure, "basic", (("u", (1,)),))
         model = OutputModel(predictor, 1.0)
         rng = np.random.default_rng(4)
@@ -166,7 +162,7 @@ class TestFit:
 
         model, data, p = problem(predictor, noisy, "input")
         sigma = np.full(3, np.sqrt(2e-4))
-        fit, runs = fit_free_runs(model, [data], p, sigma=sigma)
+        fit, _ = fit_free_runs(model, [data], p, sigma=sigma)
         simulator = Simulator(model, data.w[None])
         scale = np.sqrt(np.diag(np.linalg.inv(fit.hessian)))
 
@@ -228,8 +224,6 @@ class TestFit:
         channels = dict(noisy.channels)
         channels["u"] = channels["u"].copy()
         channels["u"][::40] += 2.0
-        from dataclasses import replace
-
         spoilt = replace(noisy, channels=channels)
         heading = {"heading": "input"}
         plain = estimate_oe(predictor, [spoilt], options=OutputErrorOptions(**heading))
@@ -316,10 +310,9 @@ class TestRefusals:
             )
 
     def test_what_never_moves_is_named(self, predictor, noisy):
-        from dataclasses import replace
-
-        still = replace(noisy, channels={**noisy.channels, **{c: 0 * noisy[c] for c in ("n",)}})
-        with pytest.raises(ExcitationError, match="leaves the run unchanged|cannot be told apart"):
+        short = noisy.window(0, 200)
+        still = replace(short, channels={**short.channels, "n": 0 * short["n"]})
+        with pytest.raises(ExcitationError, match=r"leaves the run unchanged|cannot be told apart"):
             estimate_oe(predictor, [still], options=OutputErrorOptions(heading="input"))
 
     def test_a_heading_needs_a_yaw_rate(self):
