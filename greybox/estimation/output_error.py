@@ -22,7 +22,7 @@ from greybox.estimation.covariance import (
     slow_errors,
 )
 from greybox.estimation.estimate import UnexcitedBiasError
-from greybox.estimation.innovations import FilterRuns, fit_innovations
+from greybox.estimation.innovations import FilterRuns, fit_innovations, fit_noise
 from greybox.estimation.result import Estimate, TestResult
 from greybox.estimation.shooting import (
     RANK,
@@ -33,6 +33,7 @@ from greybox.estimation.shooting import (
     Restrictions,
     Segments,
     ShootingFit,
+    cut,
     fit_free_runs,
     loss_weights,
 )
@@ -54,6 +55,10 @@ _LARGEST = 1e100
 _SHARES = 0.2
 # coefficient of a parameter at its bound has no spread
 _AT_BOUND = 1e-9
+# process noise to start from, in deviations of the measurements
+_BESIDE = 0.1
+# least and largest process noise that is tried, likewise, and how many
+_GRID = (3e-3, 1.0, 12)
 # samples per unknown that a fit needs
 _ROWS = 2
 # p-value up to which a free-run error counts as wandering
@@ -472,7 +477,7 @@ def _result(fitted: _Fitted, logs: Sequence[TrialLog], options: OutputErrorOptio
         iterations=fit.iterations,
         status=status,
         current=tuple((n, float(v), float(s)) for n, (v, s) in means.items() if n in CURRENT),
-        noise=_noise_levels(model, runs),
+        noise=_noise_levels(fitted),
         notes=tuple(notes),
         tests=() if options.process_noise else _slow_tests(fitted.slow),
         logs=tuple(
@@ -556,14 +561,14 @@ def _one_step(model: OutputModel, data: Sequence[Measured], p: Array) -> Array:
     return np.sqrt(total / max(count, 1))
 
 
-def _noise_levels(model: OutputModel, runs: FreeRuns | FilterRuns) -> NoiseLevels:
+def _noise_levels(fitted: _Fitted) -> NoiseLevels:
+    model, runs = fitted.model, fitted.runs
     states, ny = model.predictor.structure.states, len(model.outputs)
     if isinstance(runs, FilterRuns):
-        sigma, process = np.sqrt(runs.noise[:ny]), np.sqrt(runs.noise[ny:])
-        source = "likelihood of the innovations"
+        noise, source = runs.noise, "likelihood of the innovations"
     else:
-        sigma, process = runs.sigma, np.zeros(len(model.states))
-        source = "residuals of the free run, process noise taken as none"
+        noise, source = _noise_of_run(fitted, runs)
+    sigma, process = np.sqrt(noise[:ny]), np.sqrt(noise[ny:])
     seen = dict(zip(model.outputs, sigma, strict=True))
     return NoiseLevels(
         states,
@@ -573,3 +578,53 @@ def _noise_levels(model: OutputModel, runs: FreeRuns | FilterRuns) -> NoiseLevel
         float(seen.get("u_q", 0.0)),
         source,
     )
+
+
+def _noise_of_run(fitted: _Fitted, runs: FreeRuns) -> tuple[Array, str]:
+    """Return variances of the measurements and of a step, of a fit that knew the former only.
+
+    The parameters are held: a free run tells them best where little moves the ship
+    beside the model, and how much that is, its innovations tell.
+    """
+    nz, ends = len(fitted.model.states), np.flatnonzero(~runs.segments.joined)
+    alone = np.concatenate([runs.sigma**2, np.zeros(nz)])
+    taken = "residuals of the free run, process noise taken as none"
+    if fitted.loss != "gaussian":
+        return alone, taken
+    first = np.concatenate([[0], ends[:-1] + 1])
+    start = np.concatenate([runs.sigma**2, (_BESIDE * runs.sigma[:nz]) ** 2])
+    whole = cut(fitted.data, max(len(d.y) for d in fitted.data))
+    filtered = FilterRuns(fitted.model, whole, start)
+    nodes = fitted.fit.nodes[first]
+    if not np.isfinite(filtered.value(fitted.fit.p, nodes)[2]):
+        return alone, taken
+    found = fit_noise(filtered, fitted.fit.p, nodes, np.zeros(len(start), bool))
+    ny = len(runs.sigma)
+    mean = found.copy()
+    for i in range(ny, len(found)):
+        mean[i] = _mean_variance(filtered, fitted.fit.p, nodes, found, i, runs.sigma[i - ny])
+    return mean, "likelihood of the innovations at the coefficients of the free run"
+
+
+def _mean_variance(
+    runs: FilterRuns, p: Array, nodes: Array, noise: Array, i: int, unit: float
+) -> float:
+    """Return the mean of one variance under its likelihood, flat in the deviation.
+
+    Where little moves the ship the most likely deviation is often 0, and a band that
+    believes it is too narrow.
+    """
+    from scipy.interpolate import PchipInterpolator
+
+    steps = np.unique(np.append(unit * np.geomspace(*_GRID), np.sqrt(noise[i])))
+    loss = []
+    for step in steps:
+        trial = noise.copy()
+        trial[i] = step**2
+        r, levels = runs.filtered(p, nodes, trial)
+        loss.append((float((r**2).sum()) + float(levels.sum())) / 2)
+    fine = np.geomspace(steps[0], steps[-1], 400)
+    values = np.array(loss)
+    values = np.where(np.isfinite(values), values, np.nanmax(values[np.isfinite(values)]))
+    weight = np.exp(values.min() - PchipInterpolator(np.log(steps), values)(np.log(fine))) * fine
+    return float(weight @ fine**2 / weight.sum())

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from greybox.model.model import ManoeuvringModel
 from greybox.model.simulation import simulate
-from greybox.regression.instruments import START_SAMPLES, state_bound
+from greybox.regression.instruments import state_bound
 from greybox.trial.log import TrialLog
 from greybox.validation.fit import at_model_rate
 
@@ -49,6 +49,11 @@ class Coverage:
     usual: tuple[float, float]
     sentence: str
 
+    @property
+    def holds(self) -> bool:
+        """Whether the share is a usual one."""
+        return self.usual[0] <= self.share <= self.usual[1]
+
     def to_dict(self) -> dict[str, Any]:
         """Return the fields for JSON."""
         return {
@@ -73,7 +78,7 @@ class Bands:
         (2, N, nx) of its measurement, likewise.
     coverage : dict of str to Coverage
         How many of the log's samples `measurement` holds, by state; empty where the
-        log measures nothing or there is no band.
+        log measures nothing, the model has no noise levels, or there is no band.
     runs, diverged : int
         Draws made, and those left out from where their run left its bound.
     missing : tuple of str
@@ -160,18 +165,17 @@ def predict_bands(
         inside[good] += (ndtr((upper - kept) / spread) - ndtr((lower - kept) / spread)).sum(axis=1)
         counted += x.shape[1]
     coverage = {}
-    if good.any() and counted == len(log):
+    if model.noise is not None and counted == len(log):
         share = inside[good] / counted
         # which of the measurements lie inside is chance too
-        share += np.sqrt(share * (1 - share) / counted) * rng.standard_normal(share.shape)
+        chance = np.sqrt(share * (1 - share) / counted) * rng.standard_normal(share.shape)
+        share = np.clip(share + chance, 0.0, 1.0)
         usual = np.quantile(share, [_LIMITS[0], _LIMITS[2]], axis=0)
         for i, state in enumerate(states):
             if np.ptp(log[state]) > 0:
                 held = (log[state] >= measurement[0, :, i]) & (log[state] <= measurement[1, :, i])
                 coverage[state] = _coverage(state, float(held.mean()), usual[:, i])
-    return Bands(
-        states, motion, measurement, coverage, runs, int((~good).sum()), _missing(model)
-    )
+    return Bands(states, motion, measurement, coverage, runs, int((~good).sum()), _missing(model))
 
 
 def _coverage(state: str, share: float, usual: Array) -> Coverage:
@@ -221,7 +225,9 @@ def _pieces(
         std = [model.disturbances.get(n, (0.0, 0.0))[1] for n in structure.disturbances]
         d = (model.d + np.array(std) * rng.standard_normal((runs, len(std))))[:, None]
     zeros = np.zeros(nx)
-    x = _starts(log, structure.states, zeros if noise is None else noise.measurement, rng, runs)
+    # the run starts from a mean, which a ship that gathers way has not reached yet
+    start = zeros if noise is None else noise.measurement
+    x = log.states(structure.states)[0] + start * rng.standard_normal((runs, nx))
     process = zeros if noise is None else noise.process
     memory = zeros if noise is None or not noise.memory.size else noise.memory
     drive = process * np.sqrt(1 - memory**2)
@@ -262,22 +268,6 @@ def _normal(rng: np.random.Generator, mean: Array, covariance: Array, runs: int)
     values, vectors = np.linalg.eigh(covariance / np.outer(safe, safe))
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     return np.asarray(mean + size * (rng.standard_normal((runs, len(mean))) @ root.T))
-
-
-def _starts(
-    log: TrialLog, states: tuple[str, ...], noise: Array, rng: np.random.Generator, runs: int
-) -> Array:
-    """Draw first states (R, nx) about the line through the log's first samples.
-
-    The run itself starts from their mean, which a ship that gathers way has not
-    reached yet; its band must hold where the ship was.
-    """
-    first = log.states(states)[:START_SAMPLES]
-    k = np.arange(len(first)) - (len(first) - 1) / 2
-    square = max(float(k @ k), 1.0)
-    weights = 1 / len(first) + k[0] * k / square
-    std = noise * np.sqrt(weights @ weights)
-    return np.asarray(weights @ first + std * rng.standard_normal((runs, len(states))))
 
 
 def _noisy(rng: np.random.Generator, value: Array, std: float, runs: int) -> Array:
