@@ -22,7 +22,7 @@ from greybox.estimation.covariance import (
     slow_errors,
 )
 from greybox.estimation.estimate import UnexcitedBiasError
-from greybox.estimation.innovations import FilterRuns, fit_innovations, fit_noise
+from greybox.estimation.innovations import FilterRuns, first_noise, fit_innovations, fit_noise
 from greybox.estimation.result import Estimate, TestResult
 from greybox.estimation.shooting import (
     RANK,
@@ -275,15 +275,12 @@ def _fit(
         )  # fmt: skip
         return _Fitted(model, data, fit, runs, restrictions, options.loss)
 
-    structure = predictor.structure
-    turns = "r" in structure.states and structure.disturbance == "marine"
-    seen = turns and all("psi" in log for log in logs)
     heading = options.heading
     if heading != "auto":
         found = free_run(heading, None, options.shooting)
     else:
         found = free_run("input", None, options.shooting)
-        if seen and found.fit.converged:
+        if _turns(predictor.structure, logs) and found.fit.converged:
             compared = free_run("output", found.fit.p, "single")
             steady = compared.fit.converged and np.isfinite(compared.fit.cost)
             if steady and (
@@ -477,7 +474,7 @@ def _result(fitted: _Fitted, logs: Sequence[TrialLog], options: OutputErrorOptio
         iterations=fit.iterations,
         status=status,
         current=tuple((n, float(v), float(s)) for n, (v, s) in means.items() if n in CURRENT),
-        noise=_noise_levels(fitted),
+        noise=_noise_levels(fitted, logs),
         notes=tuple(notes),
         tests=() if options.process_noise else _slow_tests(fitted.slow),
         logs=tuple(
@@ -561,14 +558,15 @@ def _one_step(model: OutputModel, data: Sequence[Measured], p: Array) -> Array:
     return np.sqrt(total / max(count, 1))
 
 
-def _noise_levels(fitted: _Fitted) -> NoiseLevels:
+def _noise_levels(fitted: _Fitted, logs: Sequence[TrialLog]) -> NoiseLevels:
     model, runs = fitted.model, fitted.runs
-    states, ny = model.predictor.structure.states, len(model.outputs)
+    states = model.predictor.structure.states
     if isinstance(runs, FilterRuns):
-        noise, source = runs.noise, "likelihood of the innovations"
+        variances, source = runs.noise, "likelihood of the innovations"
     else:
-        noise, source = _noise_of_run(fitted, runs)
-    sigma, process = np.sqrt(noise[:ny]), np.sqrt(noise[ny:])
+        model, variances, source = _noise_of_run(fitted, runs, logs)
+    ny = len(model.outputs)
+    sigma, process = np.sqrt(variances[:ny]), np.sqrt(variances[ny:])
     seen = dict(zip(model.outputs, sigma, strict=True))
     return NoiseLevels(
         states,
@@ -580,36 +578,51 @@ def _noise_levels(fitted: _Fitted) -> NoiseLevels:
     )
 
 
-def _noise_of_run(fitted: _Fitted, runs: FreeRuns) -> tuple[Array, str]:
+def _noise_of_run(
+    fitted: _Fitted, runs: FreeRuns, logs: Sequence[TrialLog]
+) -> tuple[OutputModel, Array, str]:
     """Return variances of the measurements and of a step, of a fit that knew the former only.
 
     The parameters are held: a free run tells them best where little moves the ship
-    beside the model, and how much that is, its innovations tell.
+    beside the model, and how much that is, its innovations tell. Those of the heading
+    take part, because they tell yaw noise that the yaw rate's own sensor hides.
     """
-    nz, ends = len(fitted.model.states), np.flatnonzero(~runs.segments.joined)
+    model, nz = fitted.model, len(fitted.model.states)
     alone = np.concatenate([runs.sigma**2, np.zeros(nz)])
     taken = "residuals of the free run, process noise taken as none"
     if fitted.loss != "gaussian":
-        return alone, taken
-    first = np.concatenate([[0], ends[:-1] + 1])
-    start = np.concatenate([runs.sigma**2, (_BESIDE * runs.sigma[:nz]) ** 2])
-    whole = cut(fitted.data, max(len(d.y) for d in fitted.data))
-    filtered = FilterRuns(fitted.model, whole, start)
-    nodes = fitted.fit.nodes[first]
+        return model, alone, taken
+    ends = np.flatnonzero(~runs.segments.joined)
+    nodes = fitted.fit.nodes[np.concatenate([[0], ends[:-1] + 1])]
+    seen = dict(zip(model.outputs, runs.sigma, strict=True))
+    if _turns(model.predictor.structure, logs) and "psi" not in seen:
+        model = replace(model, heading="output")
+        nodes = np.column_stack([nodes, [log["psi"][0] for log in logs]])
+    data = [measured(model, log) for log in logs]
+    whole = cut(data, max(len(d.y) for d in data))
+    first = first_noise(data, len(model.states))
+    sigma = np.array([seen.get(n, np.sqrt(first[i])) for i, n in enumerate(model.outputs)])
+    start = np.concatenate([sigma, _BESIDE * sigma[: len(model.states)]]) ** 2
+    filtered = FilterRuns(model, whole, start)
     if not np.isfinite(filtered.value(fitted.fit.p, nodes)[2]):
-        return alone, taken
+        return fitted.model, alone, taken
     found = fit_noise(filtered, fitted.fit.p, nodes, np.zeros(len(start), bool))
-    ny = len(runs.sigma)
     mean = found.copy()
-    for i in range(ny, len(found)):
-        mean[i] = _mean_variance(filtered, fitted.fit.p, nodes, found, i, runs.sigma[i - ny])
-    return mean, "likelihood of the innovations at the coefficients of the free run"
+    for i in range(len(sigma), len(found)):
+        mean[i] = _mean_variance(filtered, fitted.fit.p, nodes, found, i, sigma[i - len(sigma)])
+    return model, mean, "likelihood of the innovations at the coefficients of the free run"
+
+
+def _turns(structure: Structure, logs: Sequence[TrialLog]) -> bool:
+    """Whether the structure turns the ship and every log has the heading."""
+    turning = "r" in structure.states and structure.disturbance == "marine"
+    return turning and all("psi" in log for log in logs)
 
 
 def _mean_variance(
     runs: FilterRuns, p: Array, nodes: Array, noise: Array, i: int, unit: float
 ) -> float:
-    """Return the mean of one variance under its likelihood, flat in the deviation.
+    """Return the mean of one variance under its likelihood, flat in the logarithm.
 
     Where little moves the ship the most likely deviation is often 0, and a band that
     believes it is too narrow.
@@ -626,5 +639,5 @@ def _mean_variance(
     fine = np.geomspace(steps[0], steps[-1], 400)
     values = np.array(loss)
     values = np.where(np.isfinite(values), values, np.nanmax(values[np.isfinite(values)]))
-    weight = np.exp(values.min() - PchipInterpolator(np.log(steps), values)(np.log(fine))) * fine
+    weight = np.exp(values.min() - PchipInterpolator(np.log(steps), values)(np.log(fine)))
     return float(weight @ fine**2 / weight.sum())
