@@ -7,7 +7,7 @@ candidates like terms: (7.1)-(7.3) are what the thesis kept of them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,15 +15,19 @@ import numpy as np
 from greybox.errors import ExcitationError
 from greybox.estimation.result import Estimate
 from greybox.model.catalogue import structure_for
+from greybox.model.predictor import Column
 from greybox.trial.log import TrialLog
 from greybox.validation.choose import Request, estimate_model
+from greybox.validation.criteria import independent_samples
 from greybox.validation.held_out import rank
 from greybox.validation.structures import (
+    CHOOSE,
     FOLDS,
     Bench,
     Progress,
     StructureChoice,
     Tried,
+    criteria_of,
     rows_of,
     settle,
     told,
@@ -34,6 +38,8 @@ from greybox.vessel.force import force_inputs
 _CLEAR = 0.3
 # p-value below which a column is not tried
 _SIGNIFICANT = 0.01
+# growth of AIC from which on the smaller structure has no support (Burnham and Anderson, 2002)
+_NO_SUPPORT = 10.0
 
 
 @dataclass(frozen=True)
@@ -56,10 +62,11 @@ def wald(estimate: Estimate, columns: Sequence[int]) -> float:
     return float(chdtrc(len(c), float(t @ np.linalg.pinv(unit, hermitian=True) @ t)))
 
 
-def least_earning(estimate: Estimate) -> list[Candidate]:
+def least_earning(estimate: Estimate, missed: Collection[str] = ()) -> list[Candidate]:
     """Return what may be left out next: all that is clearly insignificant, then less of it.
 
-    An equation keeps at least one term, and constants stay.
+    An equation keeps at least one term; constants stay, and the columns whose labels,
+    with their equation, are in `missed`.
     """
     predictor = estimate.predictor
     left = {s: sum(not predictor.columns[i].is_bias for i in predictor.equation(s))
@@ -70,7 +77,7 @@ def least_earning(estimate: Estimate) -> list[Candidate]:
     batch: list[int] = []
     for i in map(int, order):
         column = predictor.columns[i]
-        if i in constants or estimate.std[i] == 0:
+        if i in constants or estimate.std[i] == 0 or _spelled(column) in missed:
             continue
         if not column.is_bias and left[column.state] == 1:
             continue
@@ -85,6 +92,10 @@ def least_earning(estimate: Estimate) -> list[Candidate]:
     return [c for c in found if c.p_value >= _SIGNIFICANT]
 
 
+def _spelled(column: Column) -> str:
+    return f"{column.state}:{column.name}" if column.is_bias else column.label
+
+
 def _without(
     estimate: Estimate, request: Request, candidate: Candidate
 ) -> tuple[Request, list[str]]:
@@ -92,25 +103,24 @@ def _without(
     for i in candidate.columns:
         column = estimate.predictor.columns[i]
         if column.is_bias:
-            biases.append(f"{column.state}:{column.name}")
-            dropped.append(biases[-1])
+            biases.append(_spelled(column))
         else:
             name += "".join(f"-{t}" for t in column.terms)
-            dropped.append(column.label)
+        dropped.append(_spelled(column))
     return replace(request, structure=name, without=tuple(biases)), dropped
 
 
 def reduce_structure(
     logs: Sequence[TrialLog],
-    request: Request = Request(),
+    request: Request = CHOOSE,
     progress: Progress = lambda done, total: None,
 ) -> StructureChoice:
     """Leave out what earns least, again and again, while held-out free runs do not suffer.
 
     The column with the smallest robust Wald statistic goes first, several at once where
-    they are jointly insignificant; the rest is estimated again. It ends when the held-out
-    score falls behind the best by more than one standard error, or all that is left is
-    significant.
+    they are jointly insignificant; the rest is estimated again. A column stays where the
+    held-out score would fall behind the best by more than one standard error, or AIC grow by
+    more than 10; it ends when all that is left stays or is significant.
 
     Parameters
     ----------
@@ -143,26 +153,45 @@ def reduce_structure(
             f"'{settled.structure}' cannot be estimated on {FOLDS - 1} of {FOLDS} parts of the "
             f"logs, so held-out runs cannot tell what to leave out: {full.note}"
         )
-    tried = [full]
+    tried, missed = [full], set[str]()
     while current is not None:
         progress(full.size - current.size, full.size)
-        current = _step(bench, tried, current)
+        current = _step(bench, tried, current, missed)
     progress(full.size, full.size)
-    found = rank([t.scores for t in tried], [t.size for t in tried])
+    accepted = [None if t.note else t.scores for t in tried]
+    chosen = rank(accepted, [t.size for t in tried]).chosen
+    found = replace(rank([t.scores for t in tried], [t.size for t in tried]), chosen=chosen)
     estimate = estimate_model(logs, tried[found.chosen].request)
     return StructureChoice(told(estimate, found), rows_of(tried, found))
 
 
-def _step(bench: Bench, tried: list[Tried], current: Tried) -> Tried | None:
-    """Leave out what the held-out runs do not miss; None where they miss all that is tried."""
+def _step(bench: Bench, tried: list[Tried], current: Tried, missed: set[str]) -> Tried | None:
+    """Leave out what the held-out runs do not miss; None where they miss all that is tried.
+
+    A column that they miss is not tried again.
+    """
     assert current.estimate is not None
-    for candidate in least_earning(current.estimate):
-        request, dropped = _without(current.estimate, current.request, candidate)
-        found = bench.tried(request, full=True, dropped=tuple(dropped))
-        kept = [t for t in tried if not t.note]
-        ranking = rank([t.scores for t in [*kept, found]], [t.size for t in [*kept, found]])
-        if found.scores is not None and ranking.behind[-1] <= ranking.se[-1]:
-            tried.append(found)
-            return found
-        tried.append(replace(found, note=found.note or "kept: held-out runs miss it"))
+    while candidates := least_earning(current.estimate, missed):
+        for candidate in candidates:
+            request, dropped = _without(current.estimate, current.request, candidate)
+            found = bench.tried(request, full=True, dropped=tuple(dropped))
+            rows = [*(t for t in tried if not t.note), found]
+            ranking = rank([t.scores for t in rows], [t.size for t in rows])
+            near = found.scores is not None and ranking.behind[-1] <= ranking.se[-1]
+            if near and _supported(rows):
+                tried.append(found)
+                return found
+            reason = "kept: AIC misses it" if near else "kept: held-out runs miss it"
+            tried.append(replace(found, note=found.note or reason))
+        missed.update(dropped)
     return None
+
+
+def _supported(rows: Sequence[Tried]) -> bool:
+    """Whether AIC leaves the last row some support against the best of those before."""
+    if rows[0].errors is None:
+        return True
+    worth = independent_samples(rows[0].errors)
+    found = [criteria_of(t, worth)[0] for t in rows]
+    known = [v for v in found[:-1] if v is not None]
+    return found[-1] is not None and found[-1] <= min(known) + _NO_SUPPORT

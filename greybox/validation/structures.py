@@ -13,7 +13,7 @@ from greybox.errors import GreyboxError, UsageError
 from greybox.estimation.result import Estimate
 from greybox.model.catalogue import structure_for
 from greybox.trial.log import TrialLog
-from greybox.validation.choose import Request, estimate_model, estimate_once, ranking_request
+from greybox.validation.choose import Request, estimate_model, estimate_once
 from greybox.validation.criteria import independent_samples, information_criteria
 from greybox.validation.fit import run_model
 from greybox.validation.held_out import Ranking, folds, rank, score_runs, spread_of
@@ -23,6 +23,8 @@ Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 
 FOLDS = 5
+# leaves all to the data
+CHOOSE = Request()
 
 
 @dataclass(frozen=True)
@@ -108,7 +110,7 @@ def _cell(value: float | int | None, form: str) -> str:
 
 @dataclass(frozen=True)
 class Tried:
-    """A request's structure, its estimate on all of the logs, and its scores on the held-out parts."""
+    """A structure as requested: its estimate on all of the logs, its scores on held-out parts."""
 
     request: Request
     estimate: Estimate | None
@@ -134,13 +136,12 @@ class Bench:
 
     def once(self, logs: Sequence[TrialLog], request: Request) -> Estimate:
         """Estimate the request's structure with its method and predictor."""
-        assert request.structure and request.method and request.predictor
-        structure = structure_for(request.structure, self.inputs)
-        return estimate_once(logs, structure, request.method, request.predictor, request)
+        structure = structure_for(str(request.structure), self.inputs)
+        return estimate_once(logs, structure, str(request.method), str(request.predictor), request)
 
     def scores(self, request: Request) -> Array:
         """Return the held-out scores (FOLDS,)."""
-        quick = ranking_request(request)
+        quick = _without_errors(request)
         found = []
         for fitting, held in self.parts:
             model = self.once(fitting, quick).model()
@@ -156,7 +157,7 @@ class Bench:
         """
         try:
             scores = self.scores(request)
-            estimate = self.once(self.logs, request if full else ranking_request(request))
+            estimate = self.once(self.logs, request if full else _without_errors(request))
         except GreyboxError as error:
             return Tried(request, None, None, None, dropped, str(error))
         model = estimate.model()
@@ -167,16 +168,29 @@ class Bench:
         return Tried(request, estimate, scores, errors, dropped)
 
 
+def _without_errors(request: Request) -> Request:
+    """Return the request with the quickest standard errors; its prefilter decides scores."""
+    return replace(request, covariance="white")
+
+
+def criteria_of(tried: Tried, worth: Array) -> tuple[float, float] | tuple[None, None]:
+    """Return AIC and BIC of the free runs on the estimation logs, None where they diverge.
+
+    `worth` are the independent samples (nx,) that they count for, common to all structures.
+    """
+    if tried.estimate is None or tried.errors is None:
+        return None, None
+    means = len(tried.estimate.current) if tried.estimate.method == "oe" else 0
+    return information_criteria(np.concatenate(tried.errors), tried.size + means, worth)
+
+
 def rows_of(tried: Sequence[Tried], found: Ranking) -> tuple[StructureRow, ...]:
     """Return the table, criteria counted by the best row's independent samples."""
     base = tried[found.best].errors
     worth = None if base is None else independent_samples(base)
     rows = []
     for i, t in enumerate(tried):
-        aic = bic = None
-        if t.estimate is not None and t.errors is not None and worth is not None:
-            means = len(t.estimate.current) if t.estimate.method == "oe" else 0
-            aic, bic = information_criteria(np.concatenate(t.errors), t.size + means, worth)
+        aic, bic = (None, None) if worth is None else criteria_of(t, worth)
         scored = t.scores is not None
         rows.append(
             StructureRow(
@@ -212,7 +226,7 @@ def settle(logs: Sequence[TrialLog], request: Request) -> Request:
 def compare_structures(
     logs: Sequence[TrialLog],
     names: Sequence[str],
-    request: Request = Request(),
+    request: Request = CHOOSE,
     progress: Progress = lambda done, total: None,
 ) -> StructureChoice:
     """Compare structures by held-out free runs, and estimate the one that is chosen.
@@ -266,6 +280,7 @@ def compare_structures(
 
 
 def told(estimate: Estimate, found: Ranking) -> Estimate:
+    """Return the estimate with a note on how its structure was chosen."""
     note = (
         f"structure '{estimate.predictor.structure.name}' is the smallest of {len(found.score)} "
         f"whose held-out free run is within one standard error of the best "
