@@ -26,8 +26,12 @@ def virtual_log(
     spread: float = 1e-3,
     wind_spread: float | None = None,
     name: str = "virtual",
+    without: tuple[str, ...] = (),
 ) -> TrialLog:
-    """One run of the thesis's ship, with noises of (6.2) scaled by `noise`."""
+    """One run of the thesis's ship, with noises of (6.2) scaled by `noise`.
+
+    Terms in `without` are none of this ship's.
+    """
     structure, vessel = get_structure("thesis"), load_vessel("thesis")
     rng = np.random.default_rng([100, seed])
     commands = {
@@ -39,7 +43,7 @@ def virtual_log(
     variances = [spread, spread, *[spread if wind_spread is None else wind_spread] * 2]
     std = np.sqrt(variances)
     d = stationary_disturbance(rng, np.array([*current, wind, wind]), std, samples)[0]
-    theta = np.array([TRUE[n] for n in PARAMETERS])
+    theta = np.array([0.0 if n in without else TRUE[n] for n in PARAMETERS])
     run = simulate(structure, theta, np.array([1.5, 1.2, 0.0]), tau[:-1], 1.0, d=d[:-1])
     x, psi = run.x[0], run.psi[0]
     c, s = np.cos(psi), np.sin(psi)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from greybox.commands.common import provenance, say
+from greybox.commands.common import add_seed, provenance, say
 
 HELP = "compare free runs of models with logs"
 EXAMPLES = """examples:
@@ -25,6 +25,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--json", metavar="F", help="write the result as JSON; - is stdout")
     parser.add_argument("--report", metavar="HTML", help="write a page with plots")
+    parser.add_argument(
+        "--no-bands", action="store_true", help="leave out the bands that measurements should keep"
+    )
+    add_seed(parser)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -45,7 +49,9 @@ def run(options: argparse.Namespace) -> None:
         [read_log(path, model.vessel, states=model.structure.states) for path in options.log]
         for model in models
     ]
-    comparison = compare_models(models, names, logs, heading=options.heading)
+    comparison = compare_models(
+        models, names, logs, heading=options.heading, bands=not options.no_bands, seed=options.seed
+    )
     record = provenance(options) | {
         "logs": [log.provenance.source + " " + log.provenance.sha256[:12] for log in logs[0]]
     }

@@ -4,9 +4,22 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import replace
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
-from greybox.commands.common import add_logs, add_seed, positive, provenance, read_logs, say
+from greybox.commands.common import (
+    add_logs,
+    add_seed,
+    positive,
+    progress,
+    provenance,
+    read_logs,
+    say,
+)
+
+if TYPE_CHECKING:
+    from greybox.trial.log import TrialLog
+    from greybox.validation.choose import Request
+    from greybox.validation.structures import StructureChoice
 
 HELP = "estimate a model from logs"
 EXAMPLES = """examples:
@@ -14,6 +27,8 @@ EXAMPLES = """examples:
   greybox estimate a.csv b.csv --vessel ship.toml --method iv --predictor augmented --out m.json
   greybox estimate trial.csv --vessel ship.toml --method oe --bound Xu=-0.2:0 --out m.json
   greybox estimate trial.csv --vessel ship.toml --structure 'thesis+N_|r|r-Xkappa' --out m.json
+  greybox estimate trial.csv --vessel ship.toml --reduce --out m.json
+  greybox estimate a.csv b.csv --vessel ship.toml --compare-structures thesis linear modulus
 """
 
 
@@ -35,6 +50,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME",
         help="thesis, surge, linear, blanke, modulus, abkowitz; +TERM and -TERM change it; "
         "by default chosen",
+    )
+    chosen = parser.add_mutually_exclusive_group()
+    chosen.add_argument(
+        "--reduce",
+        action="store_true",
+        help="leave out the terms that earn least, as long as held-out free runs do not suffer",
+    )
+    chosen.add_argument(
+        "--compare-structures",
+        nargs="+",
+        metavar="NAME",
+        help="compare structures by held-out free runs and estimate the one that is chosen",
     )
     parser.add_argument(
         "--sample-time",
@@ -163,6 +190,28 @@ _ROLES: dict[str | None, Literal["auto", "input", "output"]] = {
 }
 
 
+def _choose(
+    logs: list[TrialLog], request: Request, options: argparse.Namespace
+) -> StructureChoice | None:
+    """Choose a structure where the options ask for it."""
+    from greybox.errors import UsageError
+    from greybox.validation.reduction import reduce_structure
+    from greybox.validation.structures import compare_structures
+
+    if options.reduce:
+        return reduce_structure(logs, request, progress("coefficients left out"))
+    if not options.compare_structures:
+        return None
+    if options.structure is not None:
+        raise UsageError(
+            f"--structure names '{options.structure}' and --compare-structures "
+            f"{len(options.compare_structures)} more: name all that are to be compared there."
+        )
+    return compare_structures(
+        logs, options.compare_structures, request, progress("structures compared")
+    )
+
+
 def run(options: argparse.Namespace) -> None:
     """Read, estimate, report, write."""
     from greybox.estimation.output_error import OutputErrorOptions
@@ -176,43 +225,47 @@ def run(options: argparse.Namespace) -> None:
     check_targets(options.out, options.json)
     vessel = load_vessel(options.vessel)
     # the vessel's own terms may be changed too: here only the states matter
-    states = get_structure((options.structure or "thesis").split("+")[0].split("-")[0]).states
+    named = options.structure or (options.compare_structures or ["thesis"])[0]
+    states = get_structure(named.split("+")[0].split("-")[0]).states
     logs = read_logs(options.logs, vessel, options.sample_time, states)
     margins = {k: v for k, v in (("u", options.margin_u), ("v", options.margin_v)) if v is not None}
-    estimate = estimate_model(
-        logs,
-        Request(
-            method=options.method,
-            predictor=options.predictor,
-            structure=options.structure,
-            margins=margins or None,
-            covariance=options.covariance,
-            heading=options.heading or "measured",
-            output_error=OutputErrorOptions(
-                process_noise=options.process_noise,
-                heading=_ROLES[options.heading],
-                wind="output" if options.wind == "simulated" else "input",
-                loss=options.loss,
-                shooting=options.shooting,
-                bounds=_pairs(options.bound, "bound"),
-                priors=_pairs(options.prior, "prior"),
-                damping=options.damping,
-            ),
-            loop=options.loop,
-            zero_mean=options.instruments == "zero-mean",
-            prefilter=options.prefilter,
-            nominal=load_model(options.nominal) if options.nominal else None,
-            seed=options.seed,
+    request = Request(
+        method=options.method,
+        predictor=options.predictor,
+        structure=options.structure,
+        margins=margins or None,
+        covariance=options.covariance,
+        heading=options.heading or "measured",
+        output_error=OutputErrorOptions(
+            process_noise=options.process_noise,
+            heading=_ROLES[options.heading],
+            wind="output" if options.wind == "simulated" else "input",
+            loss=options.loss,
+            shooting=options.shooting,
+            bounds=_pairs(options.bound, "bound"),
+            priors=_pairs(options.prior, "prior"),
+            damping=options.damping,
         ),
+        loop=options.loop,
+        zero_mean=options.instruments == "zero-mean",
+        prefilter=options.prefilter,
+        nominal=load_model(options.nominal) if options.nominal else None,
+        seed=options.seed,
     )
+    choice = _choose(logs, request, options)
+    estimate = choice.estimate if choice else estimate_model(logs, request)
     model = estimate.model()
-    model = replace(model, record={**model.record, "provenance": provenance(options)})
+    told = {"structure_choice": choice.to_list()} if choice else {}
+    record = {**model.record, **told, "provenance": provenance(options)}
+    model = replace(model, record=record)
     if options.out:
         model.save(options.out)
     if options.json:
         write_json(model.to_dict(), options.json)
     if options.json != "-":
         say(estimate.summary())
+        if choice:
+            say("\n" + choice.summary())
         mass = options.mass if options.mass is not None else vessel.mass
         if mass is not None:
             say("\n" + physical_summary(model, mass))

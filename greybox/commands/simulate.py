@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Literal
 
-from greybox.commands.common import say
+from greybox.commands.common import add_seed, say
 
 HELP = "run a model freely on the inputs of a log"
 EXAMPLES = """examples:
@@ -28,6 +28,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="start of the run where the log holds commands only [m/s, m/s, rad/s, rad]; "
         "write --start=-1,0,0,0 where the first number is negative",
     )
+    parser.add_argument(
+        "--no-bands",
+        action="store_true",
+        help="leave out the limits between which the motion lies with 95 %% probability",
+    )
+    add_seed(parser)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -39,6 +45,7 @@ def run(options: argparse.Namespace) -> None:
     from greybox.model.model import load_model
     from greybox.model.simulation import positions
     from greybox.trial.reading import read_log
+    from greybox.validation.bands import predict_bands
     from greybox.validation.fit import run_model
 
     check_targets(options.out)
@@ -78,6 +85,13 @@ def run(options: argparse.Namespace) -> None:
         )
         track = positions(result.x, result.psi, model.sample_time, start)
         columns |= {"x_n": track[:, 0], "y_n": track[:, 1]}
+    notes: tuple[str, ...] = ()
+    if not options.no_bands:
+        bands = predict_bands(model, result.log, heading=heading, seed=options.seed)
+        notes = bands.notes
+        for i, state in enumerate(states):
+            low, high = bands.motion[:, :, i]
+            columns |= {f"{state}_low": low, f"{state}_high": high}
     with replacing(options.out) as handle:
         handle.write(",".join(columns) + "\n")
         for row in zip(*columns.values(), strict=True):
@@ -90,6 +104,8 @@ def run(options: argparse.Namespace) -> None:
     ]
     if winds and not result.log.has_wind:
         say(f"note: {', '.join(winds)} act as in still air, because the log has no wind")
+    for note in notes:
+        say(f"note: {note}")
     if not fill:
         say(f"free run of {len(result.log)} samples, fit {shown}")
     say(f"wrote {options.out}")

@@ -265,4 +265,5 @@ def noise_levels_of(
         vessel.std("psi") or 0.0,
         vessel.std("wind") or 0.0,
         "; ".join(told),
+        fit.noise.memory if fit.remembers else np.zeros(0),
     )

@@ -23,7 +23,7 @@ from greybox.estimation.free_run_errors import (
     shared_score_covariance,
     slow_errors,
 )
-from greybox.estimation.innovations import FilterRuns, fit_innovations
+from greybox.estimation.innovations import FilterRuns, first_noise, fit_innovations, fit_noise
 from greybox.estimation.result import Estimate, TestResult
 from greybox.estimation.shooting import (
     RANK,
@@ -34,6 +34,7 @@ from greybox.estimation.shooting import (
     Restrictions,
     Segments,
     ShootingFit,
+    cut,
     loss_weights,
 )
 from greybox.model.disturbances import CURRENT, WIND
@@ -55,6 +56,10 @@ _STRONGEST = (5.0, 60.0)
 _SHARES = 0.2
 # coefficient of a parameter at its bound has no spread
 _AT_BOUND = 1e-9
+# process noise to start from, in deviations of the measurements
+_BESIDE = 0.1
+# least and largest process noise that is tried, likewise, and how many
+_GRID = (3e-3, 1.0, 12)
 # samples per unknown that a fit needs
 _ROWS = 2
 # p-value up to which a free-run error counts as wandering
@@ -272,15 +277,12 @@ def _fit(
         )  # fmt: skip
         return _Fitted(model, data, fit, runs, restrictions, options.loss)
 
-    structure = predictor.structure
-    turns = "r" in structure.states and structure.disturbance == "marine"
-    seen = turns and all("psi" in log for log in logs)
     heading = options.heading
     if heading != "auto":
         found = free_run(heading)
     else:
         found = free_run("input")
-        if seen and found.fit.converged:
+        if _turns(predictor.structure, logs) and found.fit.converged:
             compared = free_run("output", found.fit.p)
             steady = compared.fit.converged and np.isfinite(compared.fit.cost)
             if steady and (
@@ -478,7 +480,7 @@ def _result(fitted: _Fitted, logs: Sequence[TrialLog], options: OutputErrorOptio
         iterations=fit.iterations,
         status=status,
         current=tuple((n, float(v), float(s)) for n, (v, s) in means.items() if n in CURRENT),
-        noise=_noise_levels(model, runs),
+        noise=_noise_levels(fitted, logs),
         notes=tuple(notes),
         tests=() if options.process_noise else _slow_tests(fitted.slow),
         logs=tuple(
@@ -558,14 +560,15 @@ def one_step_errors(model: OutputModel, log: Measured, p: Array) -> Array:
     return np.asarray(log.y[1:, :nz] - end)
 
 
-def _noise_levels(model: OutputModel, runs: FreeRuns | FilterRuns) -> NoiseLevels:
-    states, ny = model.predictor.structure.states, len(model.outputs)
+def _noise_levels(fitted: _Fitted, logs: Sequence[TrialLog]) -> NoiseLevels:
+    model, runs = fitted.model, fitted.runs
+    states = model.predictor.structure.states
     if isinstance(runs, FilterRuns):
-        sigma, process = np.sqrt(runs.noise[:ny]), np.sqrt(runs.noise[ny:])
-        source = "likelihood of the innovations"
+        variances, source = runs.noise, "likelihood of the innovations"
     else:
-        sigma, process = runs.sigma, np.zeros(len(model.states))
-        source = "residuals of the free run, process noise taken as none"
+        model, variances, source = _noise_of_run(fitted, runs, logs)
+    ny = len(model.outputs)
+    sigma, process = np.sqrt(variances[:ny]), np.sqrt(variances[ny:])
     seen = dict(zip(model.outputs, sigma, strict=True))
     return NoiseLevels(
         states,
@@ -575,3 +578,68 @@ def _noise_levels(model: OutputModel, runs: FreeRuns | FilterRuns) -> NoiseLevel
         float(seen.get("u_q", 0.0)),
         source,
     )
+
+
+def _noise_of_run(
+    fitted: _Fitted, runs: FreeRuns, logs: Sequence[TrialLog]
+) -> tuple[OutputModel, Array, str]:
+    """Return variances of the measurements and of a step, of a fit that knew the former only.
+
+    The parameters are held: a free run tells them best where little moves the ship
+    beside the model, and how much that is, its innovations tell. Those of the heading
+    take part, because they tell yaw noise that the yaw rate's own sensor hides.
+    """
+    model, nz = fitted.model, len(fitted.model.states)
+    alone = np.concatenate([runs.sigma**2, np.zeros(nz)])
+    taken = "residuals of the free run, process noise taken as none"
+    if fitted.loss != "gaussian":
+        return model, alone, taken
+    ends = np.flatnonzero(~runs.segments.joined)
+    nodes = fitted.fit.nodes[np.concatenate([[0], ends[:-1] + 1])]
+    seen = dict(zip(model.outputs, runs.sigma, strict=True))
+    if _turns(model.predictor.structure, logs) and "psi" not in seen:
+        model = replace(model, heading="output")
+        nodes = np.column_stack([nodes, [log["psi"][0] for log in logs]])
+    data = [measured(model, log) for log in logs]
+    whole = cut(data, max(len(d.y) for d in data))
+    first = first_noise(data, len(model.states))
+    sigma = np.array([seen.get(n, np.sqrt(first[i])) for i, n in enumerate(model.outputs)])
+    start = np.concatenate([sigma, _BESIDE * sigma[: len(model.states)]]) ** 2
+    filtered = FilterRuns(model, whole, start)
+    if not np.isfinite(filtered.value(fitted.fit.p, nodes)[2]):
+        return fitted.model, alone, taken
+    found = fit_noise(filtered, fitted.fit.p, nodes, np.zeros(len(start), bool))
+    mean = found.copy()
+    for i in range(len(sigma), len(found)):
+        mean[i] = _mean_variance(filtered, fitted.fit.p, nodes, found, i, sigma[i - len(sigma)])
+    return model, mean, "likelihood of the innovations at the coefficients of the free run"
+
+
+def _turns(structure: Structure, logs: Sequence[TrialLog]) -> bool:
+    """Whether the structure turns the ship and every log has the heading."""
+    turning = "r" in structure.states and structure.disturbance == "marine"
+    return turning and all("psi" in log for log in logs)
+
+
+def _mean_variance(
+    runs: FilterRuns, p: Array, nodes: Array, noise: Array, i: int, unit: float
+) -> float:
+    """Return the mean of one variance under its likelihood, flat in the logarithm.
+
+    Where little moves the ship the most likely deviation is often 0, and a band that
+    believes it is too narrow.
+    """
+    from scipy.interpolate import PchipInterpolator
+
+    steps = np.unique(np.append(unit * np.geomspace(*_GRID), np.sqrt(noise[i])))
+    loss = []
+    for step in steps:
+        trial = noise.copy()
+        trial[i] = step**2
+        r, levels = runs.filtered(p, nodes, trial)
+        loss.append((float((r**2).sum()) + float(levels.sum())) / 2)
+    fine = np.geomspace(steps[0], steps[-1], 400)
+    values = np.array(loss)
+    values = np.where(np.isfinite(values), values, np.nanmax(values[np.isfinite(values)]))
+    weight = np.exp(values.min() - PchipInterpolator(np.log(steps), values)(np.log(fine)))
+    return float(weight @ fine**2 / weight.sum())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -31,6 +31,9 @@ class NoiseLevels:
         Of each component of the measured velocity through the air [m/s].
     source : str
         Where the figures came from, one sentence.
+    memory : ndarray
+        (nx,) correlation of the process noise from sample to sample, in [0, 1);
+        empty where it is white.
     """
 
     states: tuple[str, ...]
@@ -39,6 +42,7 @@ class NoiseLevels:
     heading: float = 0.0
     wind: float = 0.0
     source: str = ""
+    memory: Array = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         total = self.measurement**2 + self.process**2
@@ -57,6 +61,7 @@ class NoiseLevels:
             "heading": float(self.heading),
             "wind": float(self.wind),
             "source": self.source,
+            "memory": dict(zip(self.states, map(float, self.memory), strict=False)),
         }
 
 
@@ -77,4 +82,5 @@ def noise_from_dict(data: Mapping[str, Any], states: tuple[str, ...]) -> NoiseLe
         float(data["heading"]),
         float(data["wind"]),
         str(data["source"]),
+        np.array([float(m) for m in data.get("memory", {}).values()]),
     )

@@ -10,6 +10,7 @@ import numpy as np
 from greybox.model.model import ManoeuvringModel
 from greybox.report.figures import comparison_figure, to_svg
 from greybox.report.page import Page, Picture, Table, flatten
+from greybox.validation.bands import LEVEL
 from greybox.validation.comparison import Comparison
 
 _NAMES = {"u": "surge", "v": "sway", "r": "yaw rate"}
@@ -40,7 +41,10 @@ def comparison_page(
             f"Free run on {first.log.name} ({len(first.log)} samples of "
             f"{first.log.sample_time:g} s): measured, simulated, and their difference below."
         )
-        figure = comparison_figure(comparison.names, runs)
+        bands = [row[i] for row in comparison.bands]
+        if any(b is not None and b.coverage for b in bands):
+            caption += f" Shaded: where {100 * LEVEL:.0f} % of the measurements should lie."
+        figure = comparison_figure(comparison.names, runs, bands)
         pictures.append(Picture(to_svg(figure, f"log{i}{first.log.name}"), caption))
     fit_rows, ahead_rows = [], []
     for name, row, errors, aheads in zip(
@@ -68,6 +72,28 @@ def comparison_page(
             ahead_rows,
         ),
     ]
+    cover_rows = [
+        [
+            name,
+            run.log.name,
+            s,
+            f"{100 * c.share:.1f}",
+            "{:.0f}-{:.0f}".format(*(100 * u for u in c.usual)),
+        ]
+        for name, row, bands in zip(
+            comparison.names, comparison.runs, comparison.bands, strict=True
+        )
+        for run, band in zip(row, bands, strict=True)
+        for s, c in (band.coverage.items() if band else ())
+    ]
+    if cover_rows:
+        tables.append(
+            Table(
+                f"Measured samples inside the band of {100 * LEVEL:.0f} % [%]",
+                ["model", "log", "state", "inside", "usual where the model holds"],
+                cover_rows,
+            )
+        )
     tests = comparison.sign_tests if len(comparison.runs[0]) > 1 else ()
     if tests:
         tables.append(
@@ -83,7 +109,7 @@ def comparison_page(
     return Page(
         title="Measured against simulated",
         headline=headline(comparison),
-        sentences=[t.sentence for t in tests],
+        sentences=[*[t.sentence for t in tests], *_band_sentences(comparison)],
         pictures=pictures,
         tables=tables,
         texts=[
@@ -92,3 +118,16 @@ def comparison_page(
         ],
         computed=flatten(record) | {"start": "mean of the log's first 5 samples"},
     )
+
+
+def _band_sentences(comparison: Comparison) -> list[str]:
+    """Return what is notable of the bands: samples outside, and sources of error left out."""
+    told = []
+    for name, runs, bands in zip(comparison.names, comparison.runs, comparison.bands, strict=True):
+        for run, band in zip(runs, bands, strict=True):
+            if band is None:
+                continue
+            told += [f"{name} on {run.log.name}: {c.sentence}" for c in band.coverage.values()
+                     if not c.holds]  # fmt: skip
+            told += [f"Bands of {name}: {note}" for note in band.notes]
+    return list(dict.fromkeys(told))

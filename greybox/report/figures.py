@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from greybox.validation.bands import Bands
 from greybox.validation.fit import LogFit
 
 Array = NDArray[np.float64]
@@ -43,7 +44,9 @@ def tidy(axes: Any) -> None:
         axes.spines[side].set_visible(False)
 
 
-def comparison_figure(names: Sequence[str], runs: Sequence[LogFit]) -> Figure:
+def comparison_figure(
+    names: Sequence[str], runs: Sequence[LogFit], bands: Sequence[Bands | None] = ()
+) -> Figure:
     """Draw measured against simulated states, with residuals and the track.
 
     Parameters
@@ -52,8 +55,11 @@ def comparison_figure(names: Sequence[str], runs: Sequence[LogFit]) -> Figure:
         Of the models.
     runs : sequence of LogFit
         One a model, all of one log.
+    bands : sequence of Bands, optional
+        One a model: where measurements should lie is shaded, about the run and about zero.
     """
     log = runs[0].log
+    bands = bands or [None] * len(runs)
     states = list(runs[0].fit)
     figure = new_figure(10, 2.7 * len(states) + 0.6)
     grid = figure.add_gridspec(2 * len(states), 1, height_ratios=[1.6, 1] * len(states))
@@ -67,7 +73,7 @@ def comparison_figure(names: Sequence[str], runs: Sequence[LogFit]) -> Figure:
         top.plot(t, measured, color=BLACK, linewidth=1.0, label="measured")
         spread = float(np.ptp(measured)) or 1.0
         low, high = measured.min() - 0.6 * spread, measured.max() + 0.6 * spread
-        for j, (name, run) in enumerate(zip(names, runs, strict=True)):
+        for j, (name, run, band) in enumerate(zip(names, runs, bands, strict=True)):
             x = np.where(np.isfinite(run.x[:, i]), run.x[:, i], np.nan)
             style: dict[str, Any] = {
                 "color": COLOURS[j % 6],
@@ -78,6 +84,8 @@ def comparison_figure(names: Sequence[str], runs: Sequence[LogFit]) -> Figure:
             top.plot(t, np.clip(x, low, high), label=f"{name}: fit {shown}", **style)
             error = measured - x
             below.plot(t, np.clip(error, -spread, spread), **style)
+            if band is not None and band.coverage:
+                _shade(top, below, t, x, band.measurement[:, :, i], COLOURS[j % 6])
         below.axhline(0, color=BLACK, linewidth=0.6)
         top.set_ylabel(LABELS.get(state, state), fontsize=9)
         below.set_ylabel("measured −\nsimulated", fontsize=8)
@@ -97,6 +105,17 @@ def comparison_figure(names: Sequence[str], runs: Sequence[LogFit]) -> Figure:
             below.set_xlabel("time [s]")
     figure.suptitle(f"Free run on {log.name}", fontsize=11)
     return figure
+
+
+def _shade(top: Any, below: Any, t: Array, x: Array, limits: Array, colour: str) -> None:
+    """Shade the limits (2, N) of measurements about a run, and of their difference."""
+    view, gap = top.get_ylim(), below.get_ylim()
+    shade: dict[str, Any] = {"color": colour, "alpha": 0.18, "linewidth": 0}
+    top.fill_between(t, limits[0], limits[1], **shade)
+    below.fill_between(t, limits[0] - x, limits[1] - x, **shade)
+    # a wide band must not flatten what it is drawn about
+    top.set_ylim(view)
+    below.set_ylim(gap)
 
 
 def fit_figure(

@@ -34,15 +34,18 @@ from greybox.model.structure import Structure
 from greybox.regression.instruments import WIND_WINDOW
 from greybox.regression.regression import common_sample_time
 from greybox.trial.log import TrialLog
-from greybox.validation.fit import LogFit, average_fit, run_model
+from greybox.validation.fit import average_fit, run_model
+from greybox.validation.held_out import rank, score_runs, spread_of
 from greybox.vessel.force import force_inputs
+
+Array = NDArray[np.float64]
 
 # heading range that current north and east need to be told apart; least and advised [rad]
 LEAST_HEADING, ADVISED_HEADING = np.deg2rad(20), np.deg2rad(90)
 # held-out share of each log when alternatives are compared
 _HELD_OUT = 1 / 3
-# points of fit that a simpler or less robust alternative must gain to be preferred
-_PREFERENCE = 3.0
+# parts of the held-out runs, for a standard error
+_BLOCKS = 6
 # refinements of the instruments while alternatives are compared
 _RANKING_REFINEMENTS = 4
 # refinements of the instruments where a free-run fit starts
@@ -74,7 +77,8 @@ class Request:
     simulates the first instruments, or starts output error (least squares does
     without it); ``output_error`` is what only ``oe`` heeds; ``prefilter`` is
     ``noise`` for refined instrumental variables, ``none`` for plain ones; ``judged``
-    asks for the tests and the verdict.
+    asks for the tests and the verdict; ``without`` are bias-capturing columns to leave
+    out, spelled ``state:function``.
     """
 
     method: str | None = None
@@ -91,6 +95,7 @@ class Request:
     seed: int = 0
     prefilter: Literal["auto", "noise", "none"] = "auto"
     judged: bool = True
+    without: tuple[str, ...] = ()
 
 
 def heading_range(logs: Sequence[TrialLog]) -> float:
@@ -157,6 +162,16 @@ def _predictor(structure: Structure, kind: str, logs: Sequence[TrialLog], ls: bo
     )
 
 
+def _less(predictor: Predictor, without: Sequence[str]) -> Predictor:
+    """Return the predictor without some bias-capturing columns; those it lacks are none."""
+    for name in without:
+        for i, c in enumerate(predictor.columns):
+            if c.is_bias and f"{c.state}:{c.name}" == name:
+                predictor = predictor.without_bias(i)
+                break
+    return predictor
+
+
 def _nominal_theta(
     nominal: ManoeuvringModel | None, structure: Structure
 ) -> NDArray[np.float64] | None:
@@ -192,7 +207,7 @@ def estimate_once(
     if request.covariance is not None:
         common["covariance"] = request.covariance
     keep_constant = method == "ls" or not request.zero_mean
-    predictor = _predictor(structure, kind, logs, keep_constant)
+    predictor = _less(_predictor(structure, kind, logs, keep_constant), request.without)
     noisy_wind = float(logs[0].vessel.sensors.get("wind_std", 0.0)) > 0
     notes = []
     while True:
@@ -268,6 +283,7 @@ def _estimate_oe(
     if request.covariance is not None:
         options = replace(options, covariance=request.covariance)
     predictor = output_predictor(structure, kind, regime_of(logs, structure))
+    predictor = _less(predictor, request.without)
     start: Estimate | NDArray[np.float64] | None = _nominal_theta(request.nominal, structure)
     notes = ["it started from the nominal model."]
     if start is None:
@@ -563,66 +579,60 @@ def _theory(logs: Sequence[TrialLog], structure: Structure, wind: bool) -> str |
     return "augmented" if same else "wind"
 
 
-def _held_out_score(runs: Sequence[LogFit], spread: dict[str, float]) -> float:
-    """Return the fit against the spread of whole logs, averaged over the states [%].
-
-    A held-out third in which little moves would otherwise count for everything.
-    """
-    values = []
-    for i, state in enumerate(runs[0].fit):
-        error = np.concatenate([r.log[state] - r.x[:, i] for r in runs])
-        if spread[state] > 0:
-            ratio = float(np.sqrt(np.mean(error**2))) / spread[state]
-            values.append(max(100 * (1 - ratio), -100.0))
-    return float(np.mean(values)) if values else -np.inf
-
-
 def _compare(
     logs: Sequence[TrialLog],
     alternatives: list[Alternative],
     request: Request,
     notes: list[str],
 ) -> list[Alternative]:
-    """Order the alternatives by the held-out free run, the earlier ones preferred."""
-    # a ranking needs neither standard errors, nor tests, nor the last digit
-    request = replace(
+    """Put first the earliest alternative whose held-out run is within an error of the best."""
+    request = ranking_request(request)
+    fitting, held = [], []
+    for log in logs:
+        cut = len(log) - int(len(log) * _HELD_OUT)
+        fitting.append(log.window(0, cut, log.name))
+        held.append(log.window(cut, len(log), log.name))
+    spread = spread_of(logs, alternatives[0].structure.states)
+    scores: list[Array | None] = []
+    for alternative in alternatives:
+        try:
+            model = estimate_once(
+                fitting, alternative.structure, alternative.method, alternative.kind, request
+            ).model()
+            runs = [run_model(model, log) for log in held]
+            bounded = all(r.diverged < 0 for r in runs)
+            scores.append(score_runs(runs, spread, _BLOCKS) if bounded else None)
+        except GreyboxError:
+            scores.append(None)
+    if all(s is None for s in scores):
+        notes.append("no alternative could be run on the last third of each log.")
+        return alternatives
+    found = rank(scores, range(len(alternatives)))
+    order = sorted(range(len(alternatives)), key=lambda i: (i != found.chosen, -found.score[i]))
+    shown = ", ".join(
+        f"{alternatives[i].label} "
+        + (
+            f"{found.score[i]:.1f} ({found.behind[i]:.1f} ± {found.se[i]:.1f} behind)"
+            if np.isfinite(found.score[i])
+            else "diverged"
+        )
+        for i in order
+    )
+    notes.append(
+        f"chosen by the free run on the last third of each log when estimated on the first two "
+        f"(mean fit in % of the whole logs' spread, cut at −100; the fullest structure and the "
+        f"method least biased by noise that fall behind the best by no more than one standard "
+        f"error): {shown}."
+    )
+    return [alternatives[i] for i in order]
+
+
+def ranking_request(request: Request) -> Request:
+    """Return the request without standard errors, tests and the last digit."""
+    return replace(
         request,
         covariance="white",
         refine=_RANKING_REFINEMENTS,
         prefilter="none",
         judged=False,
     )
-    fitting, held = [], []
-    for log in logs:
-        cut = len(log) - int(len(log) * _HELD_OUT)
-        fitting.append(log.window(0, cut, log.name))
-        held.append(log.window(cut, len(log), log.name))
-    spread = {
-        s: float(np.std(np.concatenate([log[s] for log in logs])))
-        for s in alternatives[0].structure.states
-    }
-    scores: list[float] = []
-    for rank, alternative in enumerate(alternatives):
-        score = -np.inf
-        try:
-            model = estimate_once(
-                fitting, alternative.structure, alternative.method, alternative.kind, request
-            ).model()
-            runs = [run_model(model, log) for log in held]
-            if all(r.diverged < 0 for r in runs):
-                score = _held_out_score(runs, spread)
-        except GreyboxError:
-            pass
-        scores.append(score - _PREFERENCE * rank)
-    order = sorted(range(len(alternatives)), key=lambda i: -scores[i])
-    shown = ", ".join(
-        f"{alternatives[i].label} "
-        + (f"{scores[i] + _PREFERENCE * i:.1f}" if np.isfinite(scores[i]) else "diverged")
-        for i in order
-    )
-    notes.append(
-        f"chosen by the free run on the last third of each log when estimated on the first two "
-        f"(mean fit in % of the whole logs' spread, cut at −100; {_PREFERENCE:g} points must be "
-        f"gained to prefer a smaller structure or a method that noise biases more): {shown}."
-    )
-    return [alternatives[i] for i in order]

@@ -14,6 +14,7 @@ from greybox.model.model import ManoeuvringModel
 from greybox.model.simulation import simulate
 from greybox.regression.instruments import state_bound
 from greybox.trial.log import TrialLog
+from greybox.validation.bands import LEVEL, Bands, predict_bands
 from greybox.validation.fit import LogFit, run_model
 
 Array = NDArray[np.float64]
@@ -63,6 +64,9 @@ class Comparison:
         the measured state.
     sign_tests : tuple of SignTest
         Each model against the first, over the logs.
+    bands : tuple of tuple of Bands
+        Where the motion and its measurement should lie; None where they were not asked
+        for, or the run itself diverges.
     """
 
     names: tuple[str, ...]
@@ -70,6 +74,7 @@ class Comparison:
     rmse: tuple[tuple[dict[str, float], ...], ...]
     ahead: tuple[tuple[dict[str, dict[str, float]], ...], ...]
     sign_tests: tuple[SignTest, ...]
+    bands: tuple[tuple[Bands | None, ...], ...]
 
     def fits(self) -> list[dict[str, float]]:
         """Return the mean fit a model [%]."""
@@ -92,12 +97,22 @@ class Comparison:
                             "rmse": rmse,
                             "ahead": ahead,
                             "diverged_at_sample": run.diverged if run.diverged >= 0 else None,
+                            "band": {s: c.to_dict() for s, c in band.coverage.items()}
+                            if band
+                            else {},
+                            "band_notes": list(band.notes) if band else [],
                         }
-                        for run, rmse, ahead in zip(row, errors, aheads, strict=True)
+                        for run, rmse, ahead, band in zip(row, errors, aheads, bands, strict=True)
                     ],
                 }
-                for name, fit, row, errors, aheads in zip(
-                    self.names, self.fits(), self.runs, self.rmse, self.ahead, strict=True
+                for name, fit, row, errors, aheads, bands in zip(
+                    self.names,
+                    self.fits(),
+                    self.runs,
+                    self.rmse,
+                    self.ahead,
+                    self.bands,
+                    strict=True,
                 )
             ],
             "sign_test": [
@@ -144,9 +159,26 @@ class Comparison:
                 }
                 shown = ", ".join(f"{s} {e:.3g}" for s, e in error.items())
                 lines.append(f"{name[:23]:<24}{horizon} s ahead, rms error: {shown}")
+        lines += self._covered()
         if len(self.runs[0]) > 1:
             lines += [t.sentence for t in self.sign_tests]
         return "\n".join(lines)
+
+    def _covered(self) -> list[str]:
+        """Return a line a model on how many measurements its bands hold."""
+        lines = []
+        for name, row in zip(self.names, self.bands, strict=True):
+            held = [b for b in row if b is not None and b.coverage]
+            if held:
+                shown = ", ".join(
+                    f"{s} {100 * float(np.mean([b.coverage[s].share for b in held])):.0f} %"
+                    for s in held[0].coverage
+                    if all(s in b.coverage for b in held)
+                )
+                lines.append(f"{name[:23]:<24}samples in the {100 * LEVEL:.0f} % band: {shown}")
+            for note in dict.fromkeys(n for b in row if b is not None for n in b.notes):
+                lines.append(f"{name[:23]:<24}bands: {note}")
+        return lines
 
 
 def sign_test(
@@ -222,6 +254,8 @@ def compare_models(
     logs: Sequence[Sequence[TrialLog]],
     *,
     heading: Literal["measured", "simulated"] = "measured",
+    bands: bool = True,
+    seed: int = 0,
 ) -> Comparison:
     """Run every model freely on every log.
 
@@ -232,6 +266,8 @@ def compare_models(
     logs : sequence of sequence of TrialLog
         The logs as each model reads them (its vessel's columns).
     heading : {"measured", "simulated"}
+    bands : bool
+        Whether to draw bands, with the seed.
 
     Returns
     -------
@@ -270,4 +306,13 @@ def compare_models(
         for s in runs[0][0].fit
         if s in row[0].fit
     ]
-    return Comparison(tuple(names), runs, rmse, ahead, tuple(tests))
+    drawn = tuple(
+        tuple(
+            predict_bands(model, r.log, heading=heading, seed=seed)
+            if bands and r.diverged < 0
+            else None
+            for r in row
+        )
+        for model, row in zip(models, runs, strict=True)
+    )
+    return Comparison(tuple(names), runs, rmse, ahead, tuple(tests), drawn)

@@ -1,0 +1,290 @@
+"""Where a simulated motion, and its measurement, should lie with 95 % probability.
+
+Drawn together are what an estimate leaves uncertain: parameters, current, the start of
+the run, the heading and wind that drive it, and what moves the ship beside the model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.model.model import ManoeuvringModel
+from greybox.model.simulation import simulate
+from greybox.regression.instruments import state_bound
+from greybox.trial.log import TrialLog
+from greybox.validation.fit import at_model_rate
+
+Array = NDArray[np.float64]
+
+LEVEL = 0.95
+RUNS = 256
+_LIMITS = ((1 - LEVEL) / 2, 0.5, (1 + LEVEL) / 2)
+# of a normal distribution
+_Z = 1.959963984540054
+# steps simulated at once: bounds the memory, whatever the length of the log
+_STEPS = 2048
+# share of the draws that must stay bounded for their quantiles to mean something
+_LEAST = 0.5
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """Share of measured samples inside a band, and what it is where the model holds.
+
+    Parameters
+    ----------
+    share : float
+    usual : tuple of float
+        Interval that it lies in with 95 % probability: errors of one log are related,
+        because its run has one set of parameters.
+    sentence : str
+    """
+
+    share: float
+    usual: tuple[float, float]
+    sentence: str
+
+    @property
+    def holds(self) -> bool:
+        """Whether the share is a usual one."""
+        return self.usual[0] <= self.share <= self.usual[1]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fields for JSON."""
+        return {
+            "coverage": self.share,
+            "expected": LEVEL,
+            "usual": list(self.usual),
+            "sentence": self.sentence,
+        }
+
+
+@dataclass(frozen=True)
+class Bands:
+    """Intervals of 95 % at each sample of a log.
+
+    Parameters
+    ----------
+    states : tuple of str
+    motion : ndarray
+        (2, N, nx) lower and upper limit of the true motion [m/s, rad/s]; nan from
+        where half of the draws have diverged.
+    measurement : ndarray
+        (2, N, nx) of its measurement, likewise.
+    coverage : dict of str to Coverage
+        How many of the log's samples `measurement` holds, by state; empty where the
+        log measures nothing, the model has no noise levels, or there is no band.
+    runs, diverged : int
+        Draws made, and those left out from where their run left its bound.
+    missing : tuple of str
+        Sources of error that the model says nothing of, each a sentence.
+    """
+
+    states: tuple[str, ...]
+    motion: Array
+    measurement: Array
+    coverage: dict[str, Coverage]
+    runs: int
+    diverged: int
+    missing: tuple[str, ...]
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a reader of the bands has to know."""
+        told = list(self.missing)
+        if self.diverged:
+            told.append(
+                f"{self.diverged} of {self.runs} draws of the parameters diverge and were left out"
+                + (
+                    ", too many for a band: estimate a smaller structure, or on a longer log."
+                    if np.isnan(self.motion).any()
+                    else "."
+                )
+            )
+        return tuple(told)
+
+
+def predict_bands(
+    model: ManoeuvringModel,
+    log: TrialLog,
+    *,
+    heading: Literal["measured", "simulated"] = "measured",
+    seed: int = 0,
+    runs: int = RUNS,
+) -> Bands:
+    """Draw runs of a model on the inputs of a log, and take their quantiles.
+
+    Parameters
+    ----------
+    model : ManoeuvringModel
+        With its covariance and noise; what it lacks is named in ``missing``.
+    log : TrialLog
+    heading : {"measured", "simulated"}
+        As in the run that the bands belong to.
+    seed : int
+    runs : int
+        Draws.
+
+    Returns
+    -------
+    Bands
+        The motion's limits are quantiles of the draws; the measurement's add its
+        noise, root of the sum of squares about the median.
+    """
+    from scipy.special import ndtr
+
+    log = at_model_rate(log, model)
+    states = model.structure.states
+    noise = np.zeros(len(states)) if model.noise is None else model.noise.measurement
+    reach = _Z * noise
+    motion, measurement = (np.full((2, len(log), len(states)), np.nan) for _ in range(2))
+    inside, counted = np.zeros((runs, len(states))), 0
+    good = np.ones(runs, bool)
+    rng = np.random.default_rng([71, seed])
+    for first, x in _pieces(model, log, heading, rng, runs):
+        bound = state_bound(log, states)
+        good &= np.asarray((np.abs(x) <= bound).all(axis=(1, 2)))
+        if good.mean() <= _LEAST:
+            break
+        kept = x[good]
+        low, middle, high = np.quantile(kept, _LIMITS, axis=0, method="weibull")
+        piece = slice(first, first + x.shape[1])
+        motion[:, piece] = low, high
+        measurement[:, piece] = (
+            middle - np.hypot(middle - low, reach),
+            middle + np.hypot(high - middle, reach),
+        )
+        # chance that a measurement of each draw lies inside
+        spread = np.maximum(noise, 1e-300)
+        lower, upper = measurement[:, piece]
+        inside[good] += (ndtr((upper - kept) / spread) - ndtr((lower - kept) / spread)).sum(axis=1)
+        counted += x.shape[1]
+    coverage = {}
+    if model.noise is not None and counted == len(log):
+        share = inside[good] / counted
+        # which of the measurements lie inside is chance too
+        chance = np.sqrt(share * (1 - share) / counted) * rng.standard_normal(share.shape)
+        share = np.clip(share + chance, 0.0, 1.0)
+        usual = np.quantile(share, [_LIMITS[0], _LIMITS[2]], axis=0)
+        for i, state in enumerate(states):
+            if np.ptp(log[state]) > 0:
+                held = (log[state] >= measurement[0, :, i]) & (log[state] <= measurement[1, :, i])
+                coverage[state] = _coverage(state, float(held.mean()), usual[:, i])
+    return Bands(states, motion, measurement, coverage, runs, int((~good).sum()), _missing(model))
+
+
+def _coverage(state: str, share: float, usual: Array) -> Coverage:
+    low, high = float(usual[0]), float(usual[1])
+    sentence = (
+        f"{100 * share:.1f} % of the measured {state} lie in the band of {100 * LEVEL:.0f} % "
+        f"({100 * low:.0f}-{100 * high:.0f} % usual)"
+    )
+    if share < low:
+        sentence += ": something that the model lacks moves the ship, or it is another ship by now"
+    elif share > high:
+        sentence += ": this log is quieter than those that the model was estimated on"
+    return Coverage(share, (low, high), sentence + ".")
+
+
+def _missing(model: ManoeuvringModel) -> tuple[str, ...]:
+    told = []
+    if not model.covariance.any():
+        told.append("the model has no covariance, so its parameters were taken as exact.")
+    if model.noise is None:
+        told.append(
+            "the model has no noise levels, so bands hold what is uncertain of its parameters "
+            "only: estimate it with --method iv or oe."
+        )
+    return tuple(told)
+
+
+def _pieces(
+    model: ManoeuvringModel,
+    log: TrialLog,
+    heading: Literal["measured", "simulated"],
+    rng: np.random.Generator,
+    runs: int,
+) -> Iterator[tuple[int, Array]]:
+    """Yield the draws piece by piece: its first sample, and the states (R, n, nx)."""
+    structure, noise = model.structure, model.noise
+    nx = len(structure.states)
+    marine = structure.disturbance == "marine"
+    tau = (
+        log.forces(structure.inputs)
+        if marine
+        else np.column_stack([log[n] for n in structure.inputs])
+    )
+    theta = _normal(rng, model.theta, model.covariance, runs)
+    d = None
+    if model.disturbances:
+        std = [model.disturbances.get(n, (0.0, 0.0))[1] for n in structure.disturbances]
+        d = (model.d + np.array(std) * rng.standard_normal((runs, len(std))))[:, None]
+    zeros = np.zeros(nx)
+    # the run starts from a mean, which a ship that gathers way has not reached yet
+    start = zeros if noise is None else noise.measurement
+    x = log.states(structure.states)[0] + start * rng.standard_normal((runs, nx))
+    process = zeros if noise is None else noise.process
+    memory = zeros if noise is None or not noise.memory.size else noise.memory
+    drive = process * np.sqrt(1 - memory**2)
+    push = process * rng.standard_normal((runs, nx))
+    psi = log["psi"] if "psi" in log else np.zeros(len(log))
+    turned = 0.0 if noise is None else noise.heading
+    gust = 0.0 if noise is None else noise.wind
+    air = log.air if log.has_wind and structure.uses_air else None
+    follows = marine and (heading == "measured" or "r" not in structure.states)
+    psi0: Array = psi[0] + turned * rng.standard_normal(runs)
+    yield 0, x[:, None]
+    for first in range(0, len(log) - 1, _STEPS):
+        last = min(first + _STEPS, len(log) - 1)
+        n = last - first
+        if process.any():
+            pushes, push = _remembering(rng, push, memory, drive, n)
+        run = simulate(
+            structure,
+            theta,
+            x,
+            tau[first:last],
+            log.sample_time,
+            psi=_noisy(rng, psi[first : last + 1], turned, runs) if follows else None,
+            psi0=psi0,
+            d=d,
+            air=None if air is None else _noisy(rng, air[first:last], gust, runs),
+            process_noise=pushes if process.any() else None,
+            integrator=model.integrator,
+        )
+        x, psi0 = run.x[:, -1], run.psi[:, -1]
+        yield first + 1, run.x[:, 1:]
+
+
+def _normal(rng: np.random.Generator, mean: Array, covariance: Array, runs: int) -> Array:
+    """Draw (R, p) vectors; a covariance that rounding made indefinite is cut at zero."""
+    size = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    safe = np.where(size > 0, size, 1.0)
+    values, vectors = np.linalg.eigh(covariance / np.outer(safe, safe))
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    return np.asarray(mean + size * (rng.standard_normal((runs, len(mean))) @ root.T))
+
+
+def _noisy(rng: np.random.Generator, value: Array, std: float, runs: int) -> Array:
+    """Return what may have been where `value` was measured, (R, ...)."""
+    if std == 0:
+        return value
+    return np.asarray(value - std * rng.standard_normal((runs, *value.shape)))
+
+
+def _remembering(
+    rng: np.random.Generator, state: Array, memory: Array, drive: Array, steps: int
+) -> tuple[Array, Array]:
+    """Draw process noise (R, n, nx) that continues from `state` (R, nx), and its last value."""
+    from scipy.signal import lfilter
+
+    out = drive * rng.standard_normal((len(state), steps, len(memory)))
+    for i in np.flatnonzero(memory):
+        start = (memory[i] * state[:, i])[:, None]
+        out[:, :, i] = lfilter([1.0], [1.0, -memory[i]], out[:, :, i], axis=1, zi=start)[0]
+    return out, out[:, -1]

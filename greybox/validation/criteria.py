@@ -1,0 +1,69 @@
+"""Information criteria of free runs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def information_criteria(
+    residuals: Array, parameters: int, samples: Array | None = None
+) -> tuple[float, float]:
+    """Return the criteria of Akaike and Schwarz of Gaussian residuals, smaller is better.
+
+    Parameters
+    ----------
+    residuals : ndarray
+        (N, m) with a variance of each column's own.
+    parameters : int
+        Coefficients that were estimated.
+    samples : ndarray, optional
+        (m,) independent samples that the residuals are worth, N by default.
+
+    Returns
+    -------
+    tuple of float
+        −2 log L + 2k and −2 log L + k log n, as statsmodels counts them for one equation.
+
+    References
+    ----------
+    Akaike (1974); Schwarz (1978).
+    """
+    n = np.full(residuals.shape[1], float(len(residuals))) if samples is None else samples
+    variance = (residuals**2).mean(axis=0)
+    with np.errstate(divide="ignore"):
+        minus = float(n @ (np.log(2 * np.pi * variance) + 1))
+    return minus + 2 * parameters, minus + parameters * float(np.log(n.mean()))
+
+
+def independent_samples(residuals: Sequence[Array]) -> Array:
+    """Return how many independent samples coloured residuals are worth, (m,).
+
+    Parameters
+    ----------
+    residuals : sequence of ndarray
+        (N, m) a log.
+
+    Notes
+    -----
+    N / (1 + 2 Σ ρ(k)), summed to the first lag whose correlation is not significant, and
+    N at most.
+    """
+    total = sum(len(r) for r in residuals)
+    centred = [r - r.mean(axis=0) for r in residuals]
+    size = np.sum([(r**2).sum(axis=0) for r in centred], axis=0)
+    out = np.full(residuals[0].shape[1], float(total))
+    limit = 2 / np.sqrt(total)
+    for i in np.flatnonzero(size > 0):
+        memory = 1.0
+        for lag in range(1, min(len(r) for r in residuals)):
+            rho = sum(float(r[lag:, i] @ r[:-lag, i]) for r in centred) / size[i]
+            if rho < limit:
+                break
+            memory += 2 * rho
+        out[i] = total / memory
+    return out

@@ -1,0 +1,197 @@
+"""A structure without the terms that earn least.
+
+Every further coefficient takes its share of the noise, so a term that the logs hardly
+show makes the others worse (chapter 8 of the thesis). Bias-capturing columns are
+candidates like terms: (7.1)-(7.3) are what the thesis kept of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from greybox.errors import ExcitationError
+from greybox.estimation.result import Estimate
+from greybox.model.catalogue import structure_for
+from greybox.model.predictor import Column
+from greybox.trial.log import TrialLog
+from greybox.validation.choose import Request, estimate_model
+from greybox.validation.criteria import independent_samples
+from greybox.validation.held_out import rank
+from greybox.validation.structures import (
+    CHOOSE,
+    FOLDS,
+    Bench,
+    Progress,
+    StructureChoice,
+    Tried,
+    criteria_of,
+    rows_of,
+    settle,
+    told,
+)
+from greybox.vessel.force import force_inputs
+
+# joint p-value above which columns are clearly insignificant and are left out at once
+_CLEAR = 0.3
+# p-value below which a column is not tried
+_SIGNIFICANT = 0.01
+# growth of AIC from which on the smaller structure has no support (Burnham and Anderson, 2002)
+_NO_SUPPORT = 10.0
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """Columns of a predictor that may be left out together, with their Wald test."""
+
+    columns: tuple[int, ...]
+    p_value: float
+
+
+def wald(estimate: Estimate, columns: Sequence[int]) -> float:
+    """Return the p-value of the null that the coefficients of some columns are all zero."""
+    from scipy.special import chdtrc
+
+    c = list(columns)
+    theta, size = estimate.theta[c], estimate.std[c]
+    safe = np.where(size > 0, size, np.inf)
+    unit = estimate.covariance[np.ix_(c, c)] / np.outer(safe, safe)
+    t = theta / safe
+    return float(chdtrc(len(c), float(t @ np.linalg.pinv(unit, hermitian=True) @ t)))
+
+
+def least_earning(estimate: Estimate, missed: Collection[str] = ()) -> list[Candidate]:
+    """Return what may be left out next: all that is clearly insignificant, then less of it.
+
+    An equation keeps at least one term; constants stay, and the columns whose labels,
+    with their equation, are in `missed`.
+    """
+    predictor = estimate.predictor
+    left = {s: sum(not predictor.columns[i].is_bias for i in predictor.equation(s))
+            for s in predictor.structure.states}  # fmt: skip
+    constants = set(predictor.constants)
+    size = np.where(estimate.std > 0, estimate.std, np.inf)
+    order = np.argsort(np.abs(estimate.theta) / size)
+    batch: list[int] = []
+    for i in map(int, order):
+        column = predictor.columns[i]
+        if i in constants or estimate.std[i] == 0 or _spelled(column) in missed:
+            continue
+        if not column.is_bias and left[column.state] == 1:
+            continue
+        if batch and wald(estimate, [*batch, i]) < _CLEAR:
+            break
+        batch.append(i)
+        left[column.state] -= not column.is_bias
+    found = []
+    while batch:
+        found.append(Candidate(tuple(batch), wald(estimate, batch)))
+        batch = batch[: len(batch) // 2]
+    return [c for c in found if c.p_value >= _SIGNIFICANT]
+
+
+def _spelled(column: Column) -> str:
+    return f"{column.state}:{column.name}" if column.is_bias else column.label
+
+
+def _without(
+    estimate: Estimate, request: Request, candidate: Candidate
+) -> tuple[Request, list[str]]:
+    name, biases, dropped = str(request.structure), list(request.without), []
+    for i in candidate.columns:
+        column = estimate.predictor.columns[i]
+        if column.is_bias:
+            biases.append(_spelled(column))
+        else:
+            name += "".join(f"-{t}" for t in column.terms)
+        dropped.append(_spelled(column))
+    return replace(request, structure=name, without=tuple(biases)), dropped
+
+
+def reduce_structure(
+    logs: Sequence[TrialLog],
+    request: Request = CHOOSE,
+    progress: Progress = lambda done, total: None,
+) -> StructureChoice:
+    """Leave out what earns least, again and again, while held-out free runs do not suffer.
+
+    The column with the smallest robust Wald statistic goes first, several at once where
+    they are jointly insignificant; the rest is estimated again. A column stays where the
+    held-out score would fall behind the best by more than one standard error, or AIC grow by
+    more than 10; it ends when all that is left stays or is significant.
+
+    Parameters
+    ----------
+    logs : sequence of TrialLog
+    request : Request
+        What it leaves open is chosen first, for the full structure.
+    progress : callable
+        Called with how many coefficients were left out of how many.
+
+    Returns
+    -------
+    StructureChoice
+        Rows in the order of the steps, the full structure first.
+
+    Raises
+    ------
+    UsageError
+        The logs are too short to be cut into parts.
+    ExcitationError
+        The full structure cannot be estimated on the parts.
+    """
+    settled = settle(logs, request)
+    states = structure_for(str(settled.structure), force_inputs(logs[0].vessel)).states
+    bench = Bench(logs, states)
+    current: Tried | None = bench.tried(settled, full=True)
+    assert current is not None
+    full = current
+    if full.scores is None:
+        raise ExcitationError(
+            f"'{settled.structure}' cannot be estimated on {FOLDS - 1} of {FOLDS} parts of the "
+            f"logs, so held-out runs cannot tell what to leave out: {full.note}"
+        )
+    tried, missed = [full], set[str]()
+    while current is not None:
+        progress(full.size - current.size, full.size)
+        current = _step(bench, tried, current, missed)
+    progress(full.size, full.size)
+    accepted = [None if t.note else t.scores for t in tried]
+    chosen = rank(accepted, [t.size for t in tried]).chosen
+    found = replace(rank([t.scores for t in tried], [t.size for t in tried]), chosen=chosen)
+    estimate = estimate_model(logs, tried[found.chosen].request)
+    return StructureChoice(told(estimate, found), rows_of(tried, found))
+
+
+def _step(bench: Bench, tried: list[Tried], current: Tried, missed: set[str]) -> Tried | None:
+    """Leave out what the held-out runs do not miss; None where they miss all that is tried.
+
+    A column that they miss is not tried again.
+    """
+    assert current.estimate is not None
+    while candidates := least_earning(current.estimate, missed):
+        for candidate in candidates:
+            request, dropped = _without(current.estimate, current.request, candidate)
+            found = bench.tried(request, full=True, dropped=tuple(dropped))
+            rows = [*(t for t in tried if not t.note), found]
+            ranking = rank([t.scores for t in rows], [t.size for t in rows])
+            near = found.scores is not None and ranking.behind[-1] <= ranking.se[-1]
+            if near and _supported(rows):
+                tried.append(found)
+                return found
+            reason = "kept: AIC misses it" if near else "kept: held-out runs miss it"
+            tried.append(replace(found, note=found.note or reason))
+        missed.update(dropped)
+    return None
+
+
+def _supported(rows: Sequence[Tried]) -> bool:
+    """Whether AIC leaves the last row some support against the best of those before."""
+    if rows[0].errors is None:
+        return True
+    worth = independent_samples(rows[0].errors)
+    found = [criteria_of(t, worth)[0] for t in rows]
+    known = [v for v in found[:-1] if v is not None]
+    return found[-1] is not None and found[-1] <= min(known) + _NO_SUPPORT

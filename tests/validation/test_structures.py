@@ -1,0 +1,196 @@
+"""Choice of structure: one-standard-error rule, criteria, reduction."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import statsmodels.api as sm
+from virtual import virtual_log, write_csv
+
+from greybox.commands.main import main
+from greybox.errors import ExcitationError, UsageError
+from greybox.model.catalogue import get_structure
+from greybox.model.predictor import build_predictor
+from greybox.study.chapter7 import REDUCED_BIASES
+from greybox.validation.choose import Request, estimate_model
+from greybox.validation.criteria import independent_samples, information_criteria
+from greybox.validation.fit import run_model
+from greybox.validation.held_out import folds, rank, score_runs, spread_of
+from greybox.validation.reduction import least_earning, reduce_structure, wald
+from greybox.validation.structures import compare_structures
+
+ABSENT = ("Xkappa", "Yvr", "Nvv", "Wvv", "Wuv")
+STRONG = {"Xvr", "Xmu", "Yur", "Ymu", "Nr", "Nmu"}
+LS = Request(method="ls", predictor="basic+wind", structure="thesis")
+
+
+@pytest.fixture(scope="module")
+def quiet():
+    """Little noise and steady wind: least squares is nearly consistent."""
+    return virtual_log(
+        3, 1500, current=(0.0, 0.0), noise=0.05, spread=0.0, wind_spread=1e-3, without=ABSENT
+    )
+
+
+def test_one_standard_error_rule_on_a_table():
+    # differences to the first: 1 ± 0 and 2, 0, 4, 2 with mean 2 and standard error 0.816
+    scores = [
+        np.array([50.0, 60.0, 70.0, 80.0]),
+        np.array([49.0, 59.0, 69.0, 79.0]),
+        np.array([48.0, 60.0, 66.0, 78.0]),
+        np.array([30.0, 80.0, 50.0, 90.0]),
+        None,
+    ]
+    found = rank(scores, [9, 8, 7, 6, 1])
+    np.testing.assert_allclose(found.score, [65, 64, 63, 62.5, -np.inf])
+    np.testing.assert_allclose(found.behind[:4], [0, 1, 2, 2.5])
+    gap = np.array([20.0, -20.0, 20.0, -10.0])
+    np.testing.assert_allclose(found.se[:4], [0, 0, np.sqrt(8 / 3 / 4), gap.std(ddof=1) / 2])
+    assert (found.best, found.chosen) == (0, 3)
+    # without the one that scatters, no smaller one is near enough
+    assert rank(scores[:3], [9, 8, 7]).chosen == 0
+    # equal ones: the smaller
+    assert rank([scores[0], scores[0]], [5, 4]).chosen == 1
+    with pytest.raises(UsageError, match="none of the 2 alternatives"):
+        rank([None, None], [1, 2])
+
+
+def test_criteria_are_those_of_statsmodels():
+    rng = np.random.default_rng(1)
+    x = sm.add_constant(rng.standard_normal((200, 3)))
+    y = x @ [1.0, 0.5, 0.0, -2.0] + rng.standard_normal(200)
+    fit = sm.OLS(y, x).fit()
+    ours = information_criteria(np.asarray(fit.resid)[:, None], 4)
+    np.testing.assert_allclose(ours, [fit.aic, fit.bic], rtol=1e-12)
+    two = information_criteria(np.column_stack([fit.resid, fit.resid]), 8)
+    assert two[0] == pytest.approx(2 * fit.aic)
+
+
+def test_coloured_residuals_are_worth_fewer_samples():
+    rng = np.random.default_rng(2)
+    white = rng.standard_normal((20_000, 1))
+    slow = np.zeros_like(white)
+    for k in range(1, len(slow)):
+        slow[k] = 0.8 * slow[k - 1] + white[k]
+    # (1 − ρ) / (1 + ρ) of an autoregression; the standard error of the sum is some 5 %
+    assert independent_samples([slow])[0] / len(slow) == pytest.approx(0.2 / 1.8, rel=0.15)
+    assert independent_samples([white])[0] == pytest.approx(len(white), rel=0.05)
+
+
+def test_folds_hold_out_every_sample_once(quiet):
+    parts = folds([quiet, quiet.window(0, 333)], 4)
+    held = np.concatenate([h[0].t for _, h in parts])
+    np.testing.assert_array_equal(held, quiet.t)
+    assert [len(f) for f, _ in parts] == [2, 4, 4, 2]
+    assert all(sum(len(x) for x in f) + sum(len(x) for x in h) == 1833 for f, h in parts)
+    with pytest.raises(UsageError, match="5 parts of 9"):
+        folds([quiet.window(0, 48)], 5)
+
+
+def test_scores_of_blocks_average_the_whole(quiet):
+    model = estimate_model([quiet], LS).model()
+    run = run_model(model, quiet)
+    spread = spread_of([quiet], ("u", "v", "r"))
+    whole = score_runs([run], spread)
+    error = np.sqrt(((quiet.states(("u", "v", "r")) - run.x) ** 2).mean(axis=0))
+    want = np.mean([100 * (1 - e / s) for e, s in zip(error, spread.values(), strict=True)])
+    assert whole[0] == pytest.approx(want)
+    assert score_runs([run], spread, 6).shape == (6,)
+
+
+def test_least_earning_columns_are_jointly_insignificant(quiet):
+    estimate = estimate_model([quiet], LS)
+    found = least_earning(estimate)
+    # all at once, then half of it, down to one
+    sizes = [len(c.columns) for c in found]
+    assert sizes == sorted(sizes, reverse=True)
+    assert sizes[-1] == 1
+    names = [estimate.predictor.columns[i].name for i in found[0].columns]
+    assert set(names) <= set(ABSENT) | {"Xuu", "Wuu", "Yvv", "Nuv"}
+    i = found[-1].columns[0]
+    z = estimate.theta[i] / estimate.std[i]
+    from scipy.stats import norm
+
+    assert wald(estimate, [i]) == pytest.approx(2 * norm.sf(abs(z)))
+    assert all(estimate.predictor.columns[c].name not in STRONG for c in found[0].columns)
+
+
+def test_what_the_ship_lacks_is_left_out(quiet):
+    choice = reduce_structure([quiet], LS)
+    kept = set(choice.estimate.names)
+    assert kept >= STRONG
+    assert len(kept & set(ABSENT)) <= 1
+    assert choice.rows[0].dropped == ()
+    assert sum(r.chosen for r in choice.rows) == 1
+    chosen = next(r for r in choice.rows if r.chosen)
+    assert chosen.structure.startswith("thesis-")
+    assert chosen.parameters == len(kept)
+    assert get_structure(chosen.structure).parameters == choice.estimate.names
+    assert "held-out" in choice.summary()
+    assert any("within one standard error of the best" in n for n in choice.estimate.notes)
+
+
+def test_comparison_prefers_the_smaller_of_equals(quiet):
+    smaller = "thesis-" + "-".join(ABSENT)
+    names = ["thesis", smaller, smaller + "-Xvr"]
+    choice = compare_structures([quiet], names, LS)
+    assert [r.structure for r in choice.rows] == names
+    assert choice.estimate.predictor.structure.name == smaller
+    full, small, wrong = choice.rows
+    assert small.chosen
+    assert small.bic < full.bic
+    assert wrong.aic > full.aic + 100
+    assert wrong.behind > 3 * wrong.se
+
+
+def test_comparison_refuses_what_cannot_be_compared(quiet):
+    with pytest.raises(UsageError, match="1 structures are named"):
+        compare_structures([quiet], ["thesis"], LS)
+    with pytest.raises(UsageError, match="compare structures of the same states"):
+        compare_structures([quiet], ["thesis", "surge"], LS)
+    with pytest.raises(UsageError, match="use longer logs"):
+        compare_structures([quiet.window(0, 90)], ["thesis", "linear"], LS)
+    still = {**quiet.channels, **{c: 0 * quiet[c] + 1 for c in quiet.vessel.commands}}
+    from greybox.trial.log import make_log
+
+    with pytest.raises(ExcitationError, match="cannot be estimated on 4 of 5 parts"):
+        reduce_structure([make_log(quiet.vessel, still, 1.0)], LS)
+
+
+def test_reduced_predictors_of_the_thesis_are_candidates():
+    """(7.1)-(7.3) keep some of the columns that the derivation gives, up to their spelling."""
+    regime = (("u", (1,)), ("v", (1,)), ("r", (1, -1)))
+    predictor = build_predictor(get_structure("thesis"), "augmented", regime)
+    candidates = {f"{c.state}:{c.name}" for c in predictor.columns if c.is_bias}
+    assert set(REDUCED_BIASES) <= candidates
+
+
+def test_commands_choose_a_structure(quiet, tmp_path, capsys):
+    trial, out = write_csv(quiet, tmp_path / "a.csv"), tmp_path / "m.json"
+    base = ["estimate", str(trial), "--vessel", "thesis", "--method", "ls",
+            "--predictor", "basic+wind", "--out", str(out)]  # fmt: skip
+    assert main([*base, "--compare-structures", "thesis", "linear"]) == 0
+    assert "Structures by free runs" in capsys.readouterr().out
+    rows = json.loads(out.read_text())["structure_choice"]
+    assert [r["structure"] for r in rows] == ["thesis", "linear"]
+    assert {"parameters", "score", "se", "aic", "bic", "chosen"} <= set(rows[0])
+    assert main([*base, "--structure", "thesis", "--reduce"]) == 0
+    rows = json.loads(out.read_text())["structure_choice"]
+    assert rows[0]["dropped"] == []
+    assert sum(r["chosen"] for r in rows) == 1
+    assert main([*base, "--structure", "linear", "--compare-structures", "thesis"]) == 1
+    assert "name all that are to be compared there" in capsys.readouterr().err
+
+
+@pytest.mark.long
+def test_reduction_drops_what_is_absent_and_never_what_is_strong():
+    absent, runs = 0, 5
+    for seed in range(runs):
+        log = virtual_log(seed, 1200, wind=1.0, spread=0.0, without=ABSENT)
+        request = Request(method="oe", predictor="wind", structure="thesis")
+        kept = set(reduce_structure([log], request).estimate.names)
+        assert kept >= STRONG
+        absent += len(set(ABSENT) - kept)
+    assert absent > 0.7 * runs * len(ABSENT)
