@@ -214,6 +214,14 @@ def _choose(
 
 def run(options: argparse.Namespace) -> None:
     """Read, estimate, report, write."""
+    from threadpoolctl import threadpool_limits
+
+    # matrices are small: threads would only wait for one another
+    with threadpool_limits(1):
+        _run(options)
+
+
+def _run(options: argparse.Namespace) -> None:
     from greybox.estimation.output_error import OutputErrorOptions
     from greybox.files import check_targets, write_json
     from greybox.model.catalogue import get_structure

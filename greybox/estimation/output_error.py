@@ -60,6 +60,8 @@ _AT_BOUND = 1e-9
 _BESIDE = 0.1
 # least and largest process noise that is tried, likewise, and how many
 _GRID = (3e-3, 1.0, 12)
+# samples of each log that noise levels are sought in
+_NOISE_SAMPLES = 2000
 # samples per unknown that a fit needs
 _ROWS = 2
 # p-value up to which a free-run error counts as wandering
@@ -600,7 +602,11 @@ def _noise_of_run(
     if _turns(model.predictor.structure, logs) and "psi" not in seen:
         model = replace(model, heading="output")
         nodes = np.column_stack([nodes, [log["psi"][0] for log in logs]])
-    data = [measured(model, log) for log in logs]
+    # levels need fewer samples than coefficients
+    data = [
+        Measured(d.w[:_NOISE_SAMPLES], d.y[:_NOISE_SAMPLES])
+        for d in (measured(model, log) for log in logs)
+    ]
     whole = cut(data, max(len(d.y) for d in data))
     first = first_noise(data, len(model.states))
     sigma = np.array([seen.get(n, np.sqrt(first[i])) for i, n in enumerate(model.outputs)])
