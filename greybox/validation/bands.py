@@ -225,9 +225,11 @@ def _pieces(
         std = [model.disturbances.get(n, (0.0, 0.0))[1] for n in structure.disturbances]
         d = (model.d + np.array(std) * rng.standard_normal((runs, len(std))))[:, None]
     zeros = np.zeros(nx)
-    # the run starts from a mean, which a ship that gathers way has not reached yet
-    start = zeros if noise is None else noise.measurement
-    x = log.states(structure.states)[0] + start * rng.standard_normal((runs, nx))
+    # the run starts from a mean, which a ship that gathers way has not reached yet; a plan
+    # holds its start alone, which is stated and not measured
+    own = log.states(structure.states)
+    start = np.where(np.ptp(own, axis=0) > 0, zeros if noise is None else noise.measurement, 0.0)
+    x = own[0] + start * rng.standard_normal((runs, nx))
     process = zeros if noise is None else noise.process
     memory = zeros if noise is None or not noise.memory.size else noise.memory
     drive = process * np.sqrt(1 - memory**2)

@@ -105,6 +105,14 @@ def test_process_noise_spreads_as_the_linear_theory_says():
     np.testing.assert_allclose((slow[1] - slow[0])[100:, 2].mean() / 2, want[-1] * gain, rtol=0.06)
 
 
+def test_models_keep_the_memory_of_their_noise(tmp_path):
+    for memory in ([], [0.0, 0.5, 0.9]):
+        model = model_of(noise=levels(0.01, 1e-3, memory))
+        model.save(tmp_path / "m.json")
+        again = load_model(tmp_path / "m.json").noise
+        np.testing.assert_array_equal(again.memory, memory)
+
+
 def test_measurements_add_their_noise_as_squares():
     log, _ = pushed(2, 200)
     bands = predict_bands(model_of(noise=levels(0.02, 1e-3)), log)
@@ -198,16 +206,19 @@ def test_commands_write_bands(tmp_path, capsys):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("push", [0.0, 1.0])
-def test_bands_cover_the_motion_of_another_log(push):
-    """Estimated on one log, the bands hold another one's motion and measurements."""
+@pytest.mark.parametrize(("push", "least", "most"), [(0.0, 0.95, 1.0), (1.0, 0.92, 0.98)])
+def test_bands_cover_the_motion_of_another_log(push, least, most):
+    """Estimated on one log, the bands hold another one's motion and measurements.
+
+    Without process noise they are wide, because a log never tells that there is none.
+    """
     motion, measured = [], []
-    for k in range(40):
+    for k in range(24):
         log, _ = pushed(2 * k, 1500, push)
         new, x = pushed(2 * k + 1, 600, push)
         request = Request(method="oe", predictor="wind", structure="thesis")
         bands = predict_bands(estimate_model([log], request).model(), new, seed=k)
         motion.append(((x >= bands.motion[0]) & (x <= bands.motion[1])).mean())
         measured.append(np.mean([c.share for c in bands.coverage.values()]))
-    assert 0.93 < np.mean(motion) < 0.99
+    assert least < np.mean(motion) <= most
     assert np.mean(measured) == pytest.approx(0.95, abs=0.01)

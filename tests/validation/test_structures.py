@@ -186,7 +186,7 @@ def test_commands_choose_a_structure(quiet, tmp_path, capsys):
 
 @pytest.mark.long
 def test_reduction_drops_what_is_absent_and_never_what_is_strong():
-    absent, runs = 0, 5
+    absent, runs = 0, 4
     for seed in range(runs):
         log = virtual_log(seed, 1200, wind=1.0, spread=0.0, without=ABSENT)
         request = Request(method="oe", predictor="wind", structure="thesis")
