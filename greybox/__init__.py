@@ -17,7 +17,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from greybox.estimation.estimate import estimate_iv, estimate_ls
-    from greybox.estimation.result import Estimate
+    from greybox.estimation.output_error import OutputErrorOptions, estimate_oe, output_predictor
+    from greybox.estimation.refined import estimate_refined_iv
+    from greybox.estimation.result import Estimate, Verdict
     from greybox.model.catalogue import get_structure, structure_names
     from greybox.model.model import ManoeuvringModel, load_model
     from greybox.model.predictor import Predictor, build_predictor
@@ -48,11 +50,13 @@ _WHERE = {
     "Finding": "greybox.trial.checks.finding",
     "ImportOptions": "greybox.trial.options",
     "ManoeuvringModel": "greybox.model.model",
+    "OutputErrorOptions": "greybox.estimation.output_error",
     "Predictor": "greybox.model.predictor",
     "Recording": "greybox.trial.recording",
     "Request": "greybox.validation.choose",
     "Structure": "greybox.model.structure",
     "TrialLog": "greybox.trial.log",
+    "Verdict": "greybox.estimation.result",
     "Vessel": "greybox.vessel.vessel",
     "build_predictor": "greybox.model.predictor",
     "check_files": "greybox.trial.checks.check",
@@ -62,6 +66,8 @@ _WHERE = {
     "estimate_iv": "greybox.estimation.estimate",
     "estimate_ls": "greybox.estimation.estimate",
     "estimate_model": "greybox.validation.choose",
+    "estimate_oe": "greybox.estimation.output_error",
+    "estimate_refined_iv": "greybox.estimation.refined",
     "find_manoeuvres": "greybox.trial.manoeuvres",
     "fit_percent": "greybox.validation.fit",
     "get_structure": "greybox.model.catalogue",
@@ -73,6 +79,7 @@ _WHERE = {
     "read_log": "greybox.trial.reading",
     "read_recording": "greybox.trial.canonical",
     "read_segments": "greybox.trial.reading",
+    "output_predictor": "greybox.estimation.output_error",
     "repair": "greybox.trial.repair",
     "run_model": "greybox.validation.fit",
     "simulate": "greybox.model.simulation",
@@ -89,11 +96,13 @@ __all__ = [
     "Finding",
     "ImportOptions",
     "ManoeuvringModel",
+    "OutputErrorOptions",
     "Predictor",
     "Recording",
     "Request",
     "Structure",
     "TrialLog",
+    "Verdict",
     "Vessel",
     "build_predictor",
     "check_files",
@@ -104,6 +113,8 @@ __all__ = [
     "estimate_iv",
     "estimate_ls",
     "estimate_model",
+    "estimate_oe",
+    "estimate_refined_iv",
     "find_manoeuvres",
     "fit_percent",
     "get_structure",
@@ -112,6 +123,7 @@ __all__ = [
     "load_model",
     "load_vessel",
     "make_log",
+    "output_predictor",
     "read_log",
     "read_recording",
     "read_segments",
