@@ -122,9 +122,13 @@ class Limit:
         """What is lost, overall and at worst."""
         worst = min(self.efficiency, key=lambda n: self.efficiency[n])
         most = np.sqrt(1 / self.efficiency[worst]) if self.efficiency[worst] > 0 else np.inf
+        share = 100 * self.determinant
+        reached = f"{share:.0f} %" if share >= 10 else f"{share:.2g} %"
+        if share > 100:
+            reached = "all of it, as far as estimated standard errors can tell"
         return (
-            f"efficiency {100 * self.determinant:.2g} % by determinant; the standard error of "
-            f"{worst} is {most:.2g} times the least possible one, {self.std[worst]:.2g}."
+            f"efficiency by determinant {reached}; the standard error of {worst} is {most:.2g} "
+            f"times the least possible one, {self.std[worst]:.2g}."
         )
 
     def to_dict(self) -> dict[str, Any]:

@@ -71,9 +71,11 @@ def _table(estimate: Estimate) -> list[str]:
     for test in estimate.tests:
         if test.name.startswith("anderson_rubin"):
             sets |= test.detail.get("sets", {})
+    # only instruments can be weak
+    safe = 24 if sets else 0
     lines = [
         f"{'parameter':<12}{'value':>10}{'std err':>9}{'[0.025':>11}{'0.975]':>11}"
-        f"{'weak-safe 95 %':>24}{'per second':>11}  unit"
+        f"{'weak-safe 95 %' if sets else '':>{safe}}{'per second':>11}  unit"
     ]
     unit = estimate.vessel.force_unit
     structure = estimate.predictor.structure
@@ -87,7 +89,7 @@ def _table(estimate: Estimate) -> list[str]:
             term = structure.terms[structure.index(column.terms[0])]
             lines.append(
                 f"{column.label:<12}{value:>10.4g}{std:>9.2g}{value - 1.96 * std:>11.4g}"
-                f"{value + 1.96 * std:>11.4g}{_set(sets, column.label):>24}"
+                f"{value + 1.96 * std:>11.4g}{_set(sets, column.label):>{safe}}"
                 f"{value / estimate.sample_time:>11.4g}  {parameter_unit(term, unit)}"
             )
     return lines
