@@ -213,7 +213,7 @@ def test_bands_cover_the_motion_of_another_log(push, least, most):
     Without process noise they are wide, because a log never tells that there is none.
     """
     motion, measured = [], []
-    for k in range(24):
+    for k in range(20):
         log, _ = pushed(2 * k, 1500, push)
         new, x = pushed(2 * k + 1, 600, push)
         request = Request(method="oe", predictor="wind", structure="thesis")
