@@ -240,7 +240,10 @@ def _estimates(case: Case, log: TrialLog) -> dict[str, Estimate]:
     plain = estimate_iv(linear, [log], wind="measured")
     found = {"IV": plain}
     ways: dict[str, Callable[[], Estimate]] = {
-        "refined IV": lambda: estimate_refined_iv(linear, [log], start=plain, wind="measured"),
+        # process noise moves the ship through the air too, so its wind is averaged
+        "refined IV": lambda: estimate_refined_iv(
+            linear, [log], start=plain, wind="smoothed" if any(case.process) else "measured"
+        ),
         "OE": lambda: estimate_oe(output, [log], start=plain),
         "innovations": lambda: estimate_oe(
             output, [log], start=plain, options=OutputErrorOptions(process_noise=True)

@@ -50,6 +50,8 @@ _BLOCKS = 6
 _RANKING_REFINEMENTS = 4
 # refinements of the instruments where a free-run fit starts
 _STARTING_REFINEMENTS = 2
+# process noise, in deviations of the measurements, from which on it counts
+_PUSHED = 0.05
 # share of samples that must meet a sign condition
 _KEPT = 0.9
 
@@ -369,9 +371,15 @@ def _prefiltered(
             if request.prefilter == "noise":
                 return refined
             runs = [run_model(refined.model(), log) for log in logs]
-            if all(r.diverged < 0 for r in runs):
+            mixed = wind == "measured" and _pushed_through_air(refined)
+            if all(r.diverged < 0 for r in runs) and not mixed:
                 return refined
-            against = "the free run of the refined model diverges"
+            against = (
+                "something beside the model moves the ship, and the measured wind, which holds "
+                "that motion, would be mixed into its neighbours (give wind_std in [sensors])"
+                if mixed
+                else "the free run of the refined model diverges"
+            )
         except ExcitationError as error:
             if request.prefilter == "noise":
                 raise
@@ -379,6 +387,14 @@ def _prefiltered(
     if against and request.prefilter == "auto":
         notes.append(f"the instruments were not refined by the noise: {against}.")
     return with_noise(plain, logs, **common)
+
+
+def _pushed_through_air(estimate: Estimate) -> bool:
+    """Whether process noise is in the measured velocity through the air of the instruments."""
+    noise = estimate.noise
+    if noise is None or not estimate.predictor.air_measured:
+        return False
+    return bool((noise.process > _PUSHED * noise.measurement).any())
 
 
 def estimate_model(logs: Sequence[TrialLog], request: Request = Request()) -> Estimate:
