@@ -214,9 +214,10 @@ def _choose(
 
 def run(options: argparse.Namespace) -> None:
     """Read, estimate, report, write."""
+    import scipy.linalg  # noqa: F401
     from threadpoolctl import threadpool_limits
 
-    # matrices are small: threads would only wait for one another
+    # matrices are small: threads would only wait for one another; loaded libraries can be told so
     with threadpool_limits(1):
         _run(options)
 

@@ -46,6 +46,8 @@ _PART = 2000
 _SEGMENTS, _LEAST = 64, 50
 # noise-free signals still need a scale
 _FLOOR = 1e-9
+# relative change of the noise of an output below which it stays
+_SETTLED = 1e-5
 # iterations with rough weights, and with good ones
 _ROUGH, _FINE = 4, 60
 
@@ -197,7 +199,7 @@ def _settle(
         if not np.isfinite(r).all():
             break
         sigma = noise_of(r, runs.sigma, runs.segments.use, loss, floor)
-        if fit.converged and (np.abs(sigma / runs.sigma - 1) < 1e-8).all():
+        if fit.converged and (np.abs(sigma / runs.sigma - 1) < _SETTLED).all():
             break
         stuck = not fit.converged and fit.iterations < 4
         runs = runs.with_sigma(sigma)

@@ -61,7 +61,7 @@ _BESIDE = 0.1
 # least and largest process noise that is tried, likewise, and how many
 _GRID = (3e-3, 1.0, 12)
 # samples of each log that noise levels are sought in
-_NOISE_SAMPLES = 2000
+_NOISE_SAMPLES = 1500
 # samples per unknown that a fit needs
 _ROWS = 2
 # p-value up to which a free-run error counts as wandering

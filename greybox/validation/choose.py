@@ -49,7 +49,7 @@ _BLOCKS = 6
 # refinements of the instruments while alternatives are compared
 _RANKING_REFINEMENTS = 4
 # refinements of the instruments where a free-run fit starts
-_STARTING_REFINEMENTS = 2
+_STARTING_REFINEMENTS = 1
 # process noise, in deviations of the measurements, from which on it counts
 _PUSHED = 0.05
 # share of samples that must meet a sign condition
