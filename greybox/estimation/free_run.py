@@ -38,6 +38,8 @@ Shooting = Literal["auto", "single", "multiple"]
 
 # process over measurement variance of the filters, one after the other
 _RATIOS = (1.0, 0.1, 0.01, 1e-3)
+# and where those ended in doubt: errors beyond so many changes from sample to sample
+_SLOWLY, _DOUBTFUL = (3.0, 1.0, 0.3, 0.1, 0.03, 0.01, 3e-3, 1e-3, 1e-4), 1.0
 # iterations of each, and the length of a step in standard errors that is near enough
 _STEPS, _NEAR = 6, 0.3
 # samples of each log that are enough to come near
@@ -112,24 +114,42 @@ def fit_free_runs(
     weights = np.maximum(change, floor) if sigma is None else sigma
     whole = cut(logs, max(len(log.y) for log in logs))
     starts = measured_starts(whole, len(model.states))
-    if not near:
-        part = [Measured(log.w[:_PART], log.y[:_PART]) for log in logs]
-        p, starts = approach(model, part, p, starts, restrictions, np.maximum(change, floor))
-    single: ShootingFit | None = None
-    if shooting != "multiple":
-        single, runs = _settle(
-            FreeRuns(model, whole, weights), p, starts, restrictions, loss, sigma is None, floor
-        )
-        if single.converged or shooting == "single":
+
+    def attempt(p: Array, starts: Array) -> tuple[ShootingFit, FreeRuns]:
+        single: ShootingFit | None = None
+        if shooting != "multiple":
+            single, runs = _settle(
+                FreeRuns(model, whole, weights), p, starts, restrictions, loss, sigma is None, floor
+            )
+            if single.converged or shooting == "single":
+                return single, runs
+        segments = cut(logs, segment_length(logs))
+        fit, joined = _settle(
+            FreeRuns(model, segments, weights), p, measured_starts(segments, len(model.states)),
+            restrictions, loss, sigma is None, floor,
+        )  # fmt: skip
+        if single is not None and not fit.converged and np.isfinite(single.cost):
             return single, runs
-    segments = cut(logs, segment_length(logs))
-    fit, joined = _settle(
-        FreeRuns(model, segments, weights), p, measured_starts(segments, len(model.states)),
-        restrictions, loss, sigma is None, floor,
-    )  # fmt: skip
-    if single is not None and not fit.converged and np.isfinite(single.cost):
-        return single, runs
-    return fit, joined
+        return fit, joined
+
+    if near:
+        return attempt(p, starts)
+    noise = np.maximum(change, floor)
+    part = [Measured(log.w[:_PART], log.y[:_PART]) for log in logs]
+    found = [attempt(*approach(model, part, p, starts, restrictions, noise))]
+    fit, runs = found[0]
+    if not fit.converged or (runs.sigma > _DOUBTFUL * change).any():
+        # more error than the sensors show: another way may end elsewhere
+        found.append(attempt(*approach(model, logs, p, starts, restrictions, noise, _SLOWLY)))
+        if p.any():
+            found.append(attempt(p, starts))
+    samples = float(whole.use.sum())
+
+    def level(pair: tuple[ShootingFit, FreeRuns]) -> float:
+        value = pair[0].cost + samples * float(np.log(pair[1].sigma).sum())
+        return value if np.isfinite(value) else np.inf
+
+    return min(found, key=level)
 
 
 def approach(
@@ -139,6 +159,7 @@ def approach(
     starts: Array,
     restrictions: Restrictions,
     change: Array,
+    ratios: Sequence[float] = _RATIOS,
 ) -> tuple[Array, Array]:
     """Return parameters and initial states near those of the free run, from `p` or from none.
 
@@ -150,6 +171,8 @@ def approach(
         (q,) and (M, nz).
     change : ndarray
         (ny,) root mean square of the outputs' change from sample to sample.
+    ratios : sequence of float
+        Process over measurement variance of the filters, one after the other.
     """
     whole = cut(logs, max(len(log.y) for log in logs))
     variance = change**2 / 2
@@ -158,14 +181,14 @@ def approach(
     def gains(ratio: float) -> FixedGains:
         return FixedGains(model, whole, np.concatenate([variance, ratio * variance[:nz]]))
 
-    first = gains(_RATIOS[0])
+    first = gains(ratios[0])
     best, least = p, np.inf
     for candidate in (p, np.zeros_like(p)):
         r, _, level = first.value(candidate, starts)
         cost = loss_value(r, "gaussian") + level
         if cost < least:
             best, least = candidate, cost
-    for ratio in _RATIOS:
+    for ratio in ratios:
         fit = fit_segments(gains(ratio), best, starts, restrictions, most=_STEPS, tolerance=_NEAR)
         if not np.isfinite(fit.cost):
             break

@@ -178,7 +178,9 @@ class FreeRuns:
         """Return residuals and derivatives at parameters (q,) and starts (M, nz)."""
         y, rows, end, slope = self._simulator.sensitivities(nodes, p)
         with np.errstate(over="ignore", invalid="ignore"):
-            used = np.where(self.segments.use[:, :, None, None] > 0, rows, 0.0) / self.sigma
+            used = np.divide(rows, self.sigma, out=rows)
+            if not self.segments.use.all():
+                used[self.segments.use == 0] = 0.0
         runs, _, columns, _ = used.shape
         return Linearised(
             self._weighted(y), used.transpose(0, 2, 1, 3).reshape(runs, columns, -1), end, slope
