@@ -144,7 +144,7 @@ class Problem:
         found = []
         for i, log in enumerate(self.data):
             y = self.run(unknown[q + 3 * i : q + 3 * i + 3], log.w, unknown[:q])
-            with np.errstate(over="ignore", invalid="ignore"):
+            with np.errstate(all="ignore"):
                 found.append(((log.y - y) / self.sigma).ravel())
         errors = np.nan_to_num(np.concatenate(found), nan=_ESCAPED)
         return np.clip(errors, -_ESCAPED, _ESCAPED)
