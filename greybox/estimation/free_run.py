@@ -38,8 +38,11 @@ Shooting = Literal["auto", "single", "multiple"]
 
 # process over measurement variance of the filters, one after the other
 _RATIOS = (1.0, 0.1, 0.01, 1e-3)
-# and where those ended in doubt: errors beyond so many changes from sample to sample
-_SLOWLY, _DOUBTFUL = (3.0, 1.0, 0.3, 0.1, 0.03, 0.01, 3e-3, 1e-3, 1e-4), 1.0
+# and where those ended in doubt
+_SLOWLY = (3.0, 1.0, 0.3, 0.1, 0.03, 0.01, 3e-3, 1e-3, 1e-4)
+# errors, in changes from sample to sample, up to which a start is tried as it is, and
+# beyond which an end is in doubt
+_NEARBY, _DOUBTFUL = 10.0, 1.0
 # iterations of each, and the length of a step in standard errors that is near enough
 _STEPS, _NEAR = 6, 0.3
 # samples of each log that are enough to come near
@@ -134,15 +137,22 @@ def fit_free_runs(
 
     if near:
         return attempt(p, starts)
+
+    def doubtful(pair: tuple[ShootingFit, FreeRuns]) -> bool:
+        return not pair[0].converged or bool((pair[1].sigma > _DOUBTFUL * change).any())
+
     noise = np.maximum(change, floor)
+    found: list[tuple[ShootingFit, FreeRuns]] = []
+    r, _, _ = FreeRuns(model, whole, noise).value(p, starts)
+    if p.any() and np.isfinite(r).all() and float((r**2).mean()) < _NEARBY**2:
+        found.append(attempt(p, starts))
+        if not doubtful(found[0]):
+            return found[0]
     part = [Measured(log.w[:_PART], log.y[:_PART]) for log in logs]
-    found = [attempt(*approach(model, part, p, starts, restrictions, noise))]
-    fit, runs = found[0]
-    if not fit.converged or (runs.sigma > _DOUBTFUL * change).any():
+    found.append(attempt(*approach(model, part, p, starts, restrictions, noise)))
+    if doubtful(found[-1]):
         # more error than the sensors show: another way may end elsewhere
         found.append(attempt(*approach(model, logs, p, starts, restrictions, noise, _SLOWLY)))
-        if p.any():
-            found.append(attempt(p, starts))
     samples = float(whole.use.sum())
 
     def level(pair: tuple[ShootingFit, FreeRuns]) -> float:
