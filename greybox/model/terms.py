@@ -15,6 +15,8 @@ import casadi as ca
 
 from greybox.errors import StructureError, suggestion
 
+# velocity through the air -> the state it would be in still air
+_AIR = {"uq": "u", "vq": "v"}
 # equation letter of SNAME -> state whose increment the equation gives
 EQUATIONS = {"X": "u", "Y": "v", "N": "r"}
 
@@ -91,15 +93,18 @@ class Term:
 
     @property
     def dissipates(self) -> bool:
-        """Whether the term is damping: an odd function of its own velocity alone.
+        """Whether a negative parameter takes energy out: state times regressor is never negative.
 
-        Its parameter is then negative on a ship that nothing drives. The velocity
-        through the air counts as its own.
+        Velocities through the air count as those over ground, as in still air.
         """
-        own = {self.state, f"{self.state}q"}
-        signals = {f.signal for f in self.factors}
-        plain = sum(not f.modulus for f in self.factors)
-        return len(signals) == 1 and signals <= own and plain % 2 == 1
+        powers: dict[str, int] = {}
+        for factor in self.factors:
+            if not factor.modulus:
+                signal = _AIR.get(factor.signal, factor.signal)
+                powers[signal] = powers.get(signal, 0) + 1
+        powers[self.state] = powers.get(self.state, 0) + 1
+        own = powers.pop(self.state)
+        return own > 1 and own % 2 == 0 and all(v % 2 == 0 for v in powers.values())
 
     def __str__(self) -> str:
         return "·".join([self.name, *map(str, self.factors)])

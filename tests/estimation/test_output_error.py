@@ -276,7 +276,7 @@ class TestRestrictions:
 
     def test_which_terms_dissipate(self):
         damping = {t.name for t in THESIS.terms if t.dissipates}
-        assert damping == {"Xu", "Xuu", "Wuu", "Yv", "Yvv", "Wvv", "Nr"}
+        assert damping == {"Xu", "Xuu", "Wuu", "Yv", "Yvv", "Wvv", "Nr", "Nvr"}
 
     @pytest.mark.parametrize(
         ("options", "words"),

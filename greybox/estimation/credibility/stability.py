@@ -9,7 +9,6 @@ from greybox.estimation.credibility.evidence import Evidence
 from greybox.estimation.credibility.words import listed
 from greybox.estimation.result import TestResult, not_applicable
 from greybox.model.functions import jacobians
-from greybox.model.terms import Term
 
 Array = NDArray[np.float64]
 
@@ -17,7 +16,6 @@ LEVEL = 0.05
 # probability of an unstable model from which a user is warned
 UNSTABLE = 0.05
 _POINTS, _DRAWS = 60, 200
-_AIR = {"uq": "u", "vq": "v"}
 
 
 def stability(evidence: Evidence, seed: int = 0) -> TestResult:
@@ -115,21 +113,6 @@ def _spectral_radius(constant: Array, slopes: Array, theta: Array) -> Array:
     return np.asarray(np.abs(np.linalg.eigvals(matrices)).max(axis=-1))
 
 
-def dissipates(term: Term) -> bool:
-    """Whether a negative parameter takes energy out: state times regressor is never negative.
-
-    Velocities through the air count as those over ground, as in still air.
-    """
-    powers: dict[str, int] = {}
-    for factor in term.factors:
-        if not factor.modulus:
-            signal = _AIR.get(factor.signal, factor.signal)
-            powers[signal] = powers.get(signal, 0) + 1
-    powers[term.state] = powers.get(term.state, 0) + 1
-    own = powers.pop(term.state)
-    return own > 1 and own % 2 == 0 and all(v % 2 == 0 for v in powers.values())
-
-
 def damping_signs(evidence: Evidence) -> TestResult:
     """Test each damping parameter for the wrong sign, one-sided.
 
@@ -149,7 +132,7 @@ def damping_signs(evidence: Evidence) -> TestResult:
     for i in predictor.parameter_columns:
         column = predictor.columns[i]
         owned = [structure.terms[structure.index(t)] for t in column.terms]
-        if not structure.increment or not all(dissipates(t) for t in owned):
+        if not structure.increment or not all(t.dissipates for t in owned):
             continue
         std = evidence.std[i]
         p = float(ndtr(-evidence.theta[i] / std)) if std > 0 else float(evidence.theta[i] <= 0)
