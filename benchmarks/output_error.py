@@ -46,13 +46,8 @@ import greybox as gb
 from greybox.errors import GreyboxError
 from greybox.estimation.estimate import estimate_iv, estimate_ls
 from greybox.estimation.free_run import fit_free_runs
-from greybox.estimation.output_error import (
-    OutputErrorOptions,
-    estimate_oe,
-    measured,
-    output_model,
-    output_predictor,
-)
+from greybox.estimation.output_error import OutputErrorOptions, estimate_oe
+from greybox.estimation.output_setup import measured, output_model, output_predictor
 from greybox.estimation.result import Estimate
 from greybox.estimation.shooting import Measured
 from greybox.model.catalogue import get_structure, structure_for

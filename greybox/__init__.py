@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from greybox.estimation.estimate import estimate_iv, estimate_ls
-    from greybox.estimation.output_error import OutputErrorOptions, estimate_oe, output_predictor
+    from greybox.estimation.output_error import OutputErrorOptions, estimate_oe
+    from greybox.estimation.output_setup import output_predictor
     from greybox.estimation.refined import estimate_refined_iv
     from greybox.estimation.result import Estimate, Verdict
     from greybox.model.catalogue import get_structure, structure_names
@@ -79,7 +80,7 @@ _WHERE = {
     "read_log": "greybox.trial.reading",
     "read_recording": "greybox.trial.canonical",
     "read_segments": "greybox.trial.reading",
-    "output_predictor": "greybox.estimation.output_error",
+    "output_predictor": "greybox.estimation.output_setup",
     "repair": "greybox.trial.repair",
     "run_model": "greybox.validation.fit",
     "simulate": "greybox.model.simulation",

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from greybox.errors import ExcitationError
 from greybox.estimation.credibility import Evidence, assess, judge
-from greybox.estimation.output_error import measured, one_step_errors, output_model
+from greybox.estimation.output_error import one_step_errors
+from greybox.estimation.output_setup import measured, output_model
 from greybox.estimation.result import Estimate, TestResult, Verdict
 from greybox.model.predictor import Predictor, build_predictor
 from greybox.regression.instruments import build_instruments

@@ -20,13 +20,8 @@ from numpy.typing import NDArray
 from greybox.errors import DivergenceError, ExcitationError, GreyboxError
 from greybox.estimation.bound import iv_bound
 from greybox.estimation.innovations import FilterRuns
-from greybox.estimation.output_error import (
-    log_rows,
-    measured,
-    output_model,
-    output_predictor,
-    without_start,
-)
+from greybox.estimation.output_error import log_rows, without_start
+from greybox.estimation.output_setup import measured, output_model, output_predictor
 from greybox.estimation.result import Estimate, Limit
 from greybox.estimation.shooting import Measured, Segments, cut
 from greybox.model.noise import NoiseLevels

@@ -7,14 +7,14 @@ what an unmeasured wind does (its moments are coefficients, as in chapter 5).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.errors import ExcitationError, LogError, UsageError, suggestion
+from greybox.errors import ExcitationError, UsageError, suggestion
 from greybox.estimation.covariance import correlation_lags
 from greybox.estimation.estimate import UnexcitedBiasError
 from greybox.estimation.free_run import Shooting, fit_free_runs
@@ -23,7 +23,9 @@ from greybox.estimation.free_run_errors import (
     shared_score_covariance,
     slow_errors,
 )
-from greybox.estimation.innovations import FilterRuns, first_noise, fit_innovations, fit_noise
+from greybox.estimation.free_run_noise import noise_of_run, noise_of_sensors
+from greybox.estimation.innovations import FilterRuns, fit_innovations
+from greybox.estimation.output_setup import measured, output_model, turns
 from greybox.estimation.result import Estimate, TestResult
 from greybox.estimation.shooting import (
     RANK,
@@ -34,14 +36,12 @@ from greybox.estimation.shooting import (
     Restrictions,
     Segments,
     ShootingFit,
-    cut,
     loss_weights,
 )
 from greybox.model.disturbances import CURRENT, WIND
 from greybox.model.noise import NoiseLevels
-from greybox.model.output import OutputModel, Role, Simulator, current_means
-from greybox.model.predictor import Predictor, Regime, build_predictor
-from greybox.model.structure import Structure
+from greybox.model.output import OutputModel, Role, Simulator
+from greybox.model.predictor import Predictor
 from greybox.regression.regression import common_sample_time
 from greybox.trial.log import TrialLog
 
@@ -56,12 +56,6 @@ _STRONGEST = (5.0, 60.0)
 _SHARES = 0.2
 # coefficient of a parameter at its bound has no spread
 _AT_BOUND = 1e-9
-# process noise to start from, in deviations of the measurements
-_BESIDE = 0.1
-# least and largest process noise that is tried, likewise, and how many
-_GRID = (3e-3, 1.0, 12)
-# samples of each log that noise levels are sought in
-_NOISE_SAMPLES = 1500
 # samples per unknown that a fit needs
 _ROWS = 2
 # p-value up to which a free-run error counts as wandering
@@ -107,67 +101,6 @@ class OutputErrorOptions:
     priors: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     damping: Damping = "warn"
     covariance: Literal["ma", "hac", "white"] = "ma"
-
-
-def output_predictor(structure: Structure, kind: str, regime: Regime) -> Predictor:
-    """Return the columns that output error estimates under a kind of predictor.
-
-    The mean current stands in the model itself; bias-capturing columns remain
-    for what an unmeasured wind does, with a constant in each equation.
-    """
-    if kind in ("basic", "basic+wind"):
-        return build_predictor(structure, kind, regime)
-    if kind == "wind":
-        return replace(build_predictor(structure, "basic+wind", regime), kind="wind")
-    if structure.disturbance != "marine" or not structure.uses_air:
-        return replace(build_predictor(structure, "basic", regime), kind=kind)
-    return build_predictor(structure, kind, regime, disturbances=WIND, intercept=True)
-
-
-def output_model(
-    predictor: Predictor, sample_time: float, heading: Role = "input", wind: Role = "input"
-) -> OutputModel:
-    """Return the simulator of a predictor's kind, its unknown means as parameters."""
-    means: tuple[str, ...] = ()
-    if predictor.kind in ("augmented", "wind"):
-        means = current_means(predictor)
-    if wind == "output":
-        means = (*means, *WIND)
-    return OutputModel(predictor, sample_time, heading, wind, means)
-
-
-def measured(model: OutputModel, log: TrialLog) -> Measured:
-    """Return what a log gives to a fit of `model`.
-
-    Raises
-    ------
-    LogError
-        The wind is asked for and was not measured.
-    """
-    structure = model.predictor.structure
-    needs = [n for n in (*model.drivers, *model.outputs) if n in ("u_q", "v_q")]
-    if needs and not log.has_wind:
-        raise LogError(
-            f"predictor '{model.predictor.kind}' needs the wind, and '{log.name}' has neither "
-            f"u_q, v_q nor V_q, gamma_q: use the predictor 'augmented' or 'basic'."
-        )
-    marine = structure.disturbance == "marine"
-    inputs = dict(
-        zip(structure.inputs, log.forces(structure.inputs).T, strict=True)
-        if marine
-        else ((n, log[n]) for n in structure.inputs)
-    )
-
-    def signal(name: str) -> Array:
-        if name in inputs:
-            return np.asarray(inputs[name])
-        # a structure without yaw may come with a log without heading
-        return log[name] if name in log or name != "psi" else np.zeros(len(log))
-
-    return Measured(
-        np.column_stack([signal(n) for n in model.drivers]),
-        np.column_stack([signal(n) for n in model.outputs]),
-    )
 
 
 def estimate_oe(
@@ -284,7 +217,7 @@ def _fit(
         found = free_run(heading)
     else:
         found = free_run("input")
-        if _turns(predictor.structure, logs) and found.fit.converged:
+        if turns(predictor.structure, logs) and found.fit.converged:
             compared = free_run("output", found.fit.p)
             steady = compared.fit.converged and np.isfinite(compared.fit.cost)
             if steady and (
@@ -568,7 +501,12 @@ def _noise_levels(fitted: _Fitted, logs: Sequence[TrialLog]) -> NoiseLevels:
     if isinstance(runs, FilterRuns):
         variances, source = runs.noise, "likelihood of the innovations"
     else:
-        model, variances, source = _noise_of_run(fitted, runs, logs)
+        found = (
+            noise_of_run(runs, fitted.fit.p, fitted.fit.nodes, logs)
+            if fitted.loss == "gaussian"
+            else noise_of_sensors(runs)
+        )
+        model, variances, source = found
     ny = len(model.outputs)
     sigma, process = np.sqrt(variances[:ny]), np.sqrt(variances[ny:])
     seen = dict(zip(model.outputs, sigma, strict=True))
@@ -580,72 +518,3 @@ def _noise_levels(fitted: _Fitted, logs: Sequence[TrialLog]) -> NoiseLevels:
         float(seen.get("u_q", 0.0)),
         source,
     )
-
-
-def _noise_of_run(
-    fitted: _Fitted, runs: FreeRuns, logs: Sequence[TrialLog]
-) -> tuple[OutputModel, Array, str]:
-    """Return variances of the measurements and of a step, of a fit that knew the former only.
-
-    The parameters are held: a free run tells them best where little moves the ship
-    beside the model, and how much that is, its innovations tell. Those of the heading
-    take part, because they tell yaw noise that the yaw rate's own sensor hides.
-    """
-    model, nz = fitted.model, len(fitted.model.states)
-    alone = np.concatenate([runs.sigma**2, np.zeros(nz)])
-    taken = "residuals of the free run, process noise taken as none"
-    if fitted.loss != "gaussian":
-        return model, alone, taken
-    ends = np.flatnonzero(~runs.segments.joined)
-    nodes = fitted.fit.nodes[np.concatenate([[0], ends[:-1] + 1])]
-    seen = dict(zip(model.outputs, runs.sigma, strict=True))
-    if _turns(model.predictor.structure, logs) and "psi" not in seen:
-        model = replace(model, heading="output")
-        nodes = np.column_stack([nodes, [log["psi"][0] for log in logs]])
-    # levels need fewer samples than coefficients
-    data = [
-        Measured(d.w[:_NOISE_SAMPLES], d.y[:_NOISE_SAMPLES])
-        for d in (measured(model, log) for log in logs)
-    ]
-    whole = cut(data, max(len(d.y) for d in data))
-    first = first_noise(data, len(model.states))
-    sigma = np.array([seen.get(n, np.sqrt(first[i])) for i, n in enumerate(model.outputs)])
-    start = np.concatenate([sigma, _BESIDE * sigma[: len(model.states)]]) ** 2
-    filtered = FilterRuns(model, whole, start)
-    if not np.isfinite(filtered.value(fitted.fit.p, nodes)[2]):
-        return fitted.model, alone, taken
-    found = fit_noise(filtered, fitted.fit.p, nodes, np.zeros(len(start), bool))
-    mean = found.copy()
-    for i in range(len(sigma), len(found)):
-        mean[i] = _mean_variance(filtered, fitted.fit.p, nodes, found, i, sigma[i - len(sigma)])
-    return model, mean, "likelihood of the innovations at the coefficients of the free run"
-
-
-def _turns(structure: Structure, logs: Sequence[TrialLog]) -> bool:
-    """Whether the structure turns the ship and every log has the heading."""
-    turning = "r" in structure.states and structure.disturbance == "marine"
-    return turning and all("psi" in log for log in logs)
-
-
-def _mean_variance(
-    runs: FilterRuns, p: Array, nodes: Array, noise: Array, i: int, unit: float
-) -> float:
-    """Return the mean of one variance under its likelihood, flat in the logarithm.
-
-    Where little moves the ship the most likely deviation is often 0, and a band that
-    believes it is too narrow.
-    """
-    from scipy.interpolate import PchipInterpolator
-
-    steps = np.unique(np.append(unit * np.geomspace(*_GRID), np.sqrt(noise[i])))
-    loss = []
-    for step in steps:
-        trial = noise.copy()
-        trial[i] = step**2
-        r, levels = runs.filtered(p, nodes, trial)
-        loss.append((float((r**2).sum()) + float(levels.sum())) / 2)
-    fine = np.geomspace(steps[0], steps[-1], 400)
-    values = np.array(loss)
-    values = np.where(np.isfinite(values), values, np.nanmax(values[np.isfinite(values)]))
-    weight = np.exp(values.min() - PchipInterpolator(np.log(steps), values)(np.log(fine)))
-    return float(weight @ fine**2 / weight.sum())

@@ -26,7 +26,7 @@ from greybox.estimation.noise import (
     noise_levels_of,
     stated_levels,
 )
-from greybox.estimation.result import Estimate
+from greybox.estimation.result import UNJUDGED, Estimate
 from greybox.estimation.white_rows import (
     WhiteRows,
     own_constants,
@@ -51,12 +51,6 @@ _MOST = 30
 _EXACT = 1e-6
 # rounds after which the noise is settled at the latest
 _NOISE_ROUNDS = 6
-_MOST = 30
-# share of the increments' spread below which errors are rounding
-_EXACT = 1e-6
-# round that settles the noise: the errors of the plain estimate are too far off to decide by,
-# and were it sought in every round the two would chase each other
-_NOISE_ROUND = 2
 
 
 @dataclass(frozen=True)
@@ -266,7 +260,9 @@ def estimate_refined_iv(
             heading_std=vessel.std("psi") or 0.0,
             heading_measured=heading == "measured",
         ),
+        # those of the plain estimate say nothing of this one
         tests=(),
+        verdict=UNJUDGED,
         prefilter="noise",
         noise=noise_levels_of(found.fit, states, vessel, regression.sample_time),
     )

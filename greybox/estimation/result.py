@@ -99,6 +99,9 @@ class Verdict:
         }
 
 
+UNJUDGED = Verdict("not judged")
+
+
 @dataclass(frozen=True)
 class Limit:
     """One bound beside the standard errors of an estimate.
@@ -201,7 +204,7 @@ class Estimate:
     status: str = "solved"
     current: tuple[tuple[str, float, float], ...] = ()
     tests: tuple[TestResult, ...] = ()
-    verdict: Verdict = field(default_factory=lambda: Verdict("not judged"))
+    verdict: Verdict = UNJUDGED
     notes: tuple[str, ...] = ()
     fit: dict[str, float] = field(default_factory=dict)
     logs: tuple[dict[str, Any], ...] = ()

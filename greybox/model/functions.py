@@ -116,7 +116,7 @@ def jacobians(structure: Structure, *, air_measured: bool = False) -> ca.Functio
     )
 
 
-def _bind(setter: Callable[..., None], index: int, array: Array) -> None:
+def bind(setter: Callable[..., None], index: int, array: Array) -> None:
     """Point an argument or a result of a buffered call at a contiguous array."""
     setter(index, memoryview(array))  # type: ignore[arg-type]
 
@@ -248,8 +248,8 @@ class FreeRunKernel:
         self._history = np.zeros((size, self._padded, nx))
         buffer, self._trigger = _free_run(structure, variant, blocks, size).buffer()
         for i, argument in enumerate((self.x0, self.w, self.theta, self._dt)):
-            _bind(buffer.set_arg, i, argument)
-        _bind(buffer.set_res, 0, self._history)
+            bind(buffer.set_arg, i, argument)
+        bind(buffer.set_res, 0, self._history)
         self._buffer = buffer
 
     def __call__(self, dt: float, out: Array) -> None:
@@ -363,10 +363,10 @@ class OverRunsKernel:
         self._w[samples:] = self._w[samples - 1]
         buffer, trigger = self._steps.buffer()
         step_length = np.array([float(dt)])
-        _bind(buffer.set_arg, 2, self.theta)
-        _bind(buffer.set_arg, 3, step_length)
+        bind(buffer.set_arg, 2, self.theta)
+        bind(buffer.set_arg, 3, step_length)
         for k in range(0, len(self._w), _GROUP):
-            _bind(buffer.set_arg, 0, self._x[k])
-            _bind(buffer.set_arg, 1, self._w[k : k + _GROUP])
-            _bind(buffer.set_res, 0, self._x[k + 1 : k + 1 + _GROUP])
+            bind(buffer.set_arg, 0, self._x[k])
+            bind(buffer.set_arg, 1, self._w[k : k + _GROUP])
+            bind(buffer.set_res, 0, self._x[k + 1 : k + 1 + _GROUP])
             trigger()

@@ -10,7 +10,6 @@ covariance of an extended Kalman filter beside it, the innovations.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal
@@ -21,6 +20,7 @@ from numpy.typing import NDArray
 
 from greybox.errors import StructureError
 from greybox.model.disturbances import CURRENT, WIND, rotate_to_body
+from greybox.model.functions import bind
 from greybox.model.predictor import Column, Predictor
 
 Array = NDArray[np.float64]
@@ -279,11 +279,6 @@ def _likelihood(model: OutputModel, steps: int, runs: int) -> ca.Function:
     return ca.Function("likelihood", [z0, w, p, noise], [value, *slopes])
 
 
-def _bind(setter: Callable[..., None], index: int, array: Array) -> None:
-    """Point an argument or a result of a buffered call at a contiguous array."""
-    setter(index, memoryview(array))  # type: ignore[arg-type]
-
-
 class Simulator:
     """Free runs of equal length side by side, with sensitivities and buffers.
 
@@ -435,10 +430,10 @@ def _evaluate(function: ca.Function, arguments: tuple[Array, ...], out: tuple[Ar
     held = [np.ascontiguousarray(a, float) for a in arguments]
     for i, a in enumerate(held):
         if a.size:
-            _bind(buffer.set_arg, i, a)
+            bind(buffer.set_arg, i, a)
     for i, a in enumerate(out):
         if a.size:
-            _bind(buffer.set_res, i, a)
+            bind(buffer.set_res, i, a)
     trigger()
 
 

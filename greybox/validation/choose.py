@@ -20,11 +20,8 @@ from greybox.estimation.estimate import (
 from greybox.estimation.judging import judge_estimate
 from greybox.estimation.limits import limits_of
 from greybox.estimation.loop import CLOSED_LOOP_LAG, Loop, assess_loop
-from greybox.estimation.output_error import (
-    OutputErrorOptions,
-    estimate_oe,
-    output_predictor,
-)
+from greybox.estimation.output_error import OutputErrorOptions, estimate_oe
+from greybox.estimation.output_setup import output_predictor
 from greybox.estimation.refined import estimate_refined_iv, with_noise
 from greybox.estimation.result import Estimate, Verdict
 from greybox.model.catalogue import structure_for

@@ -19,13 +19,8 @@ from greybox.estimation.free_run_errors import (
 )
 from greybox.estimation.innovations import FilterRuns, fit_innovations
 from greybox.estimation.limits import cramer_rao, information, noise_variances
-from greybox.estimation.output_error import (
-    OutputErrorOptions,
-    estimate_oe,
-    measured,
-    output_model,
-    output_predictor,
-)
+from greybox.estimation.output_error import OutputErrorOptions, estimate_oe
+from greybox.estimation.output_setup import measured, output_model, output_predictor
 from greybox.estimation.shooting import Measured, cut, solve_step, unrestricted
 from greybox.model.catalogue import get_structure
 from greybox.model.noise import NoiseLevels

@@ -1,0 +1,86 @@
+"""What output error simulates: the columns, the unknown means, and the signals of a log."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.errors import LogError
+from greybox.estimation.shooting import Measured
+from greybox.model.disturbances import WIND
+from greybox.model.output import OutputModel, Role, current_means
+from greybox.model.predictor import Predictor, Regime, build_predictor
+from greybox.model.structure import Structure
+from greybox.trial.log import TrialLog
+
+Array = NDArray[np.float64]
+
+
+def output_predictor(structure: Structure, kind: str, regime: Regime) -> Predictor:
+    """Return the columns that output error estimates under a kind of predictor.
+
+    The mean current stands in the model itself; bias-capturing columns remain
+    for what an unmeasured wind does, with a constant in each equation.
+    """
+    if kind in ("basic", "basic+wind"):
+        return build_predictor(structure, kind, regime)
+    if kind == "wind":
+        return replace(build_predictor(structure, "basic+wind", regime), kind="wind")
+    if structure.disturbance != "marine" or not structure.uses_air:
+        return replace(build_predictor(structure, "basic", regime), kind=kind)
+    return build_predictor(structure, kind, regime, disturbances=WIND, intercept=True)
+
+
+def output_model(
+    predictor: Predictor, sample_time: float, heading: Role = "input", wind: Role = "input"
+) -> OutputModel:
+    """Return the simulator of a predictor's kind, its unknown means as parameters."""
+    means: tuple[str, ...] = ()
+    if predictor.kind in ("augmented", "wind"):
+        means = current_means(predictor)
+    if wind == "output":
+        means = (*means, *WIND)
+    return OutputModel(predictor, sample_time, heading, wind, means)
+
+
+def measured(model: OutputModel, log: TrialLog) -> Measured:
+    """Return what a log gives to a fit of `model`.
+
+    Raises
+    ------
+    LogError
+        The wind is asked for and was not measured.
+    """
+    structure = model.predictor.structure
+    needs = [n for n in (*model.drivers, *model.outputs) if n in ("u_q", "v_q")]
+    if needs and not log.has_wind:
+        raise LogError(
+            f"predictor '{model.predictor.kind}' needs the wind, and '{log.name}' has neither "
+            f"u_q, v_q nor V_q, gamma_q: use the predictor 'augmented' or 'basic'."
+        )
+    marine = structure.disturbance == "marine"
+    inputs = dict(
+        zip(structure.inputs, log.forces(structure.inputs).T, strict=True)
+        if marine
+        else ((n, log[n]) for n in structure.inputs)
+    )
+
+    def signal(name: str) -> Array:
+        if name in inputs:
+            return np.asarray(inputs[name])
+        # a structure without yaw may come with a log without heading
+        return log[name] if name in log or name != "psi" else np.zeros(len(log))
+
+    return Measured(
+        np.column_stack([signal(n) for n in model.drivers]),
+        np.column_stack([signal(n) for n in model.outputs]),
+    )
+
+
+def turns(structure: Structure, logs: Sequence[TrialLog]) -> bool:
+    """Whether the structure turns the ship and every log has the heading."""
+    turning = "r" in structure.states and structure.disturbance == "marine"
+    return turning and all("psi" in log for log in logs)
