@@ -209,6 +209,15 @@ class TestFit:
             std = np.sqrt(np.diag(np.linalg.inv(fit.hessian)))
             assert (np.abs(fit.p - p) < 4 * std).all()
 
+    def test_a_constant_wind_can_be_compared_instead_of_driving(self, predictor):
+        log = virtual_log(3, 600, spread=0.0, wind=3.0)
+        rng = np.random.default_rng(0)
+        noisy = {n: log[n] + 0.3 * rng.standard_normal(600) for n in ("u_q", "v_q")}
+        log = replace(log, channels={**log.channels, **noisy})
+        found = estimate_oe(predictor, [log], options=OutputErrorOptions(wind="output"))
+        assert found.noise.wind == pytest.approx(0.3, rel=0.1)
+        assert (np.abs(found.theta - truth(predictor)) < 4.5 * found.std).all()
+
     def test_several_logs_have_their_own_starts(self, predictor):
         logs = [virtual_log(s, 300, spread=0.0) for s in (5, 6)]
         found = estimate_oe(predictor, logs)
