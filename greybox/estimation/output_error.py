@@ -58,6 +58,9 @@ _SHARES = 0.2
 _AT_BOUND = 1e-9
 # samples per unknown that a fit needs
 _ROWS = 2
+# relative singular value below which a direction counts as weak, and the weight from
+# which a parameter is named in it
+_WEAK, _SHOWN = 1e-3, 0.3
 # p-value up to which a free-run error counts as wandering
 _WANDERS = 0.01
 # deviations above what a fit to white noise leaves, from which on the heading drifts
@@ -417,11 +420,62 @@ def _result(fitted: _Fitted, logs: Sequence[TrialLog], options: OutputErrorOptio
         current=tuple((n, float(v), float(s)) for n, (v, s) in means.items() if n in CURRENT),
         noise=_noise_levels(fitted, logs),
         notes=tuple(notes),
-        tests=() if options.process_noise else _slow_tests(fitted.slow),
+        tests=(
+            *_excitation_tests(model, fitted.hessian, bound),
+            *(() if options.process_noise else _slow_tests(fitted.slow)),
+        ),
         logs=tuple(
             {"name": log.name, "sha256": log.provenance.sha256, "samples": len(log)} for log in logs
         ),
     )
+
+
+def _excitation_tests(
+    model: OutputModel, hessian: Array, bound: NDArray[np.bool_]
+) -> tuple[TestResult, ...]:
+    """Tell, equation by equation, how well the run determines its weakest parameter and direction.
+
+    The share of a parameter's sensitivity that no other unknown imitates is
+    1/(Hᵢᵢ (H⁻¹)ᵢᵢ), the inverse of its variance inflation.
+    """
+    free = np.flatnonzero(~bound)
+    scale = np.sqrt(np.diag(hessian)[free])
+    unit = hessian[np.ix_(free, free)] / np.outer(scale, scale)
+    share = 1 / np.diag(np.linalg.inv(unit))
+    columns = model.predictor.columns
+    out = []
+    for state in model.predictor.structure.states:
+        mine = [i for i, k in enumerate(free) if k < len(columns) and columns[k].state == state]
+        if not mine:
+            continue
+        values, vectors = np.linalg.eigh(unit[np.ix_(mine, mine)])
+        ratio = float(np.sqrt(max(values[0] / values[-1], 0.0)))
+        size = np.abs(vectors[:, 0])
+        names = [model.parameters[free[mine[i]]] for i in np.argsort(-size) if size[i] > _SHOWN]
+        least = mine[int(np.argmin(share[mine]))]
+        passed = ratio >= _WEAK
+        found = (
+            f"every direction is determined, the weakest combines {', '.join(names)}"
+            if passed
+            else f"the combination of {', '.join(names)} is weakly determined: move what these "
+            f"multiply separately"
+        )
+        out.append(
+            TestResult(
+                f"excitation_{state}",
+                "the sensitivities of the run are independent",
+                ratio,
+                None,
+                f"smallest relative singular value {ratio:.1e} ({_WEAK:.0e} asked for): {found}. "
+                f"{model.parameters[free[least]]} has the least share of its own, "
+                f"{float(share[least]):.1e}.",
+                _WEAK,
+                passed,
+                tuple(names),
+                {"own_share": {model.parameters[free[i]]: float(share[i]) for i in mine}},
+            )
+        )
+    return tuple(out)
 
 
 def _slow_tests(slow: Mapping[str, tuple[float, float]]) -> tuple[TestResult, ...]:

@@ -252,6 +252,34 @@ class TestFit:
         assert ten.p[i] == pytest.approx(one.p[i] / 10, rel=1e-4)
 
 
+class TestExcitation:
+    def test_the_own_share_is_one_less_the_others_explanation(self, predictor, noisy):
+        """Regressing one sensitivity on all others leaves that share of it."""
+        model, data, p = problem(predictor, noisy, "input")
+        found = estimate_oe(
+            predictor, [noisy], options=OutputErrorOptions(heading="input", covariance="white")
+        )
+        tests = {t.name: t for t in found.tests}
+        p = np.append(found.theta, [v for _, v, _ in found.current])
+        runs = Simulator(model, data.w[None])
+        fit, free = fit_free_runs(model, [data], p, near=True)
+        rows = runs.sensitivities(fit.nodes, fit.p)[1][0] / free.sigma
+        flat = rows.transpose(1, 0, 2).reshape(rows.shape[1], -1)
+        for state, name in (("u", "Xuu"), ("r", "Nvr")):
+            i = list(model.parameters).index(name)
+            # initial states are eliminated from both, then the other parameters
+            others = np.delete(flat, i, axis=0)
+            starts = flat[len(p) :]
+
+            def left(of, by):
+                return of - np.linalg.lstsq(by.T, of, rcond=None)[0] @ by
+
+            share = (left(flat[i], others) ** 2).sum() / (left(flat[i], starts) ** 2).sum()
+            assert tests[f"excitation_{state}"].detail["own_share"][name] == pytest.approx(
+                share, rel=1e-3
+            )
+
+
 class TestRestrictions:
     def test_bounds_hold_and_are_named(self, predictor, noisy):
         found = estimate_oe(
