@@ -19,6 +19,24 @@ def _shown(share: Share) -> str:
     return f"{share.value:.2g} ({share.low:.2g}-{share.high:.2g})"
 
 
+def _parameters(result: CaseResult, single: list[float]) -> Table:
+    """Return the factors of each parameter: against best IV, that against Cramér-Rao, in all."""
+    head, columns = ["parameter", "best IV against Cramér-Rao"], []
+    for estimator in result.case.estimators:
+        if "IV" in estimator:
+            head.append(f"{estimator} against best IV")
+            columns.append(result.parameter(estimator, result.optimal_iv))
+        head.append(f"{estimator}, total")
+        columns.append(result.parameter(estimator, result.cramer_rao))
+    rows = [
+        [name, f"{single[i]:.2g}", *[_shown(column[i]) for column in columns]]
+        for i, name in enumerate(result.names)
+    ]
+    return Table(
+        f"{result.case.name}: each parameter, total = the two factors' product", head, rows
+    )
+
+
 def _figure(result: CaseResult) -> Figure:
     """Draw each parameter's efficiency against the Cramér-Rao bound."""
     figure = new_figure(8.5, 0.28 * len(result.names) + 1.6)
@@ -83,24 +101,7 @@ def efficiency_output(study: Efficiency, record: dict[str, Any]) -> StudyOutput:
         lines.append(result.case.name)
         for cells in (head, *rows):
             lines.append("  " + "".join(f"{c:<{w}}" for c, w in zip(cells, widths, strict=True)))
-        tables.append(
-            Table(
-                f"{result.case.name}: each parameter, total = against best IV × best IV "
-                f"against Cramér-Rao",
-                ["parameter", "best IV", *[f"{e}" for e in result.case.estimators]],
-                [
-                    [
-                        name,
-                        f"{single[i]:.2g}",
-                        *[
-                            _shown(result.parameter(e, result.cramer_rao)[i])
-                            for e in result.case.estimators
-                        ],
-                    ]
-                    for i, name in enumerate(result.names)
-                ],
-            )
-        )
+        tables.append(_parameters(result, single))
         last = result.case.estimators[-1]
         reached = result.determinant(last, result.cramer_rao)
         sentences.append(
