@@ -8,11 +8,12 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from experiment_design.logdet import Affine, LogDet
 from experiment_design.moments import MomentProgram
 from experiment_design.problem import TrialProblem
 from experiment_design.rollout import force_vector
 from experiment_design.sensitivities import SensitivityProgram
-from experiment_design.shooting import Affine, LogDet, Passed, Shooting
+from experiment_design.shooting import Passed, Shooting
 
 Array = NDArray[np.float64]
 
@@ -155,7 +156,7 @@ class MomentShooting(Shooting):
     def _earlier_score(self) -> Array | None:
         return self.problem.known[0].score[0] if self.problem.known else None
 
-    def _border(self, nuisance: list[int]) -> LogDet:
+    def _border(self, nuisance: list[int]) -> list[LogDet]:
         size, known = len(self.order), self._fixed_gram()
         matrix = Affine(size + len(nuisance))
         scale = self.score_scale
@@ -163,7 +164,7 @@ class MomentShooting(Shooting):
         for a, n in enumerate(nuisance):
             for p in range(size):
                 self._gram_entry(matrix, p, size + a, p, n, float(scale[p]), known)
-        return matrix.term(-1.0, self.lifted, size)
+        return [matrix.term(-1.0, self.lifted, size)]
 
     def _score_block(self, matrix: Affine, scale: Array) -> None:
         """Write M̃, rows and columns scaled, into the leading block."""
@@ -321,3 +322,9 @@ class SensitivityShooting(Shooting):
 
     def _carried(self, passed: Passed) -> list[ca.SX]:
         return [ca.vec(passed.sensitivity.T) / ca.DM(self.s_scale.ravel())]
+
+    def _close(self, passed: Passed, state: ca.SX, command: ca.SX, more: ca.SX) -> None:
+        """Nothing crosses: measurements of two samples are independent."""
+
+    def _score_block(self, matrix: Affine, scale: Array) -> None:
+        """Nothing to fill: the covariance is the inverse of the information."""

@@ -18,8 +18,9 @@ solves G̃ x = h are lifted as well.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
@@ -27,126 +28,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_matrix
 
+from experiment_design.gathering import Gatherer, Index, coordinates, to_dm
 from experiment_design.limits import UNIT_SCALE
+from experiment_design.logdet import Affine, LogDet, determinant_factor
 from experiment_design.problem import TrialProblem
 
 Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 # samples a shooting interval has at most: longer holds are cut
 _LONGEST = 15
-# smallest pivot of a correlation-scaled matrix that is taken as it is
-_GUARD = 1e-11
 # scaled units by which the limits are kept more strictly than asked
 _INSIDE = 2e-3
-
-
-@dataclass(frozen=True)
-class LogDet:
-    """weight · log |det X|, vec X = base + slope · ℓ; `positive` pivots come first."""
-
-    weight: float
-    slope: csc_matrix
-    base: Array
-    positive: int
-
-    @property
-    def size(self) -> int:
-        """Rows of X."""
-        return int(np.sqrt(len(self.base)) + 0.5)
-
-
-@dataclass
-class Affine:
-    """A symmetric matrix under construction, affine in the lifted sums."""
-
-    size: int
-    rows: list[int] = field(default_factory=list)
-    columns: list[int] = field(default_factory=list)
-    values: list[float] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        self.base = np.zeros((self.size, self.size))
-
-    def add(self, i: int, j: int, entry: int, weight: float) -> None:
-        """Add weight · ℓ[entry] at (i, j) and (j, i)."""
-        for a, b in {(i, j), (j, i)}:
-            self.rows.append(b * self.size + a)
-            self.columns.append(entry)
-            self.values.append(weight)
-
-    def term(self, weight: float, entries: int, positive: int) -> LogDet:
-        """Return its weighted log determinant."""
-        slope = csc_matrix((self.values, (self.rows, self.columns)), shape=(self.size**2, entries))
-        return LogDet(weight, slope, self.base.ravel(order="F"), positive)
-
-
-def _guarded(pivot: ca.SX) -> ca.SX:
-    return (pivot + ca.sqrt(pivot**2 + 4 * _GUARD**2)) / 2
-
-
-def _factor(size: int, positive: int) -> ca.Function:
-    """Return X ↦ (log |det X|, X⁻¹) through L D Lᵀ with guarded pivots of known sign."""
-    x = ca.SX.sym("X", size, size)
-    signs = [1.0] * positive + [-1.0] * (size - positive)
-    low = ca.SX.eye(size)
-    d: list[ca.SX] = []
-    for j in range(size):
-        scaled = ca.SX.zeros(1, j)
-        for k in range(j):
-            scaled[0, k] = low[j, k] * d[k]
-        pivot = x[j, j] - (ca.dot(low[j, :j], scaled) if j else 0)
-        d.append(signs[j] * _guarded(signs[j] * pivot))
-        for i in range(j + 1, size):
-            low[i, j] = (x[i, j] - (ca.dot(low[i, :j], scaled) if j else 0)) / d[j]
-    inverse = ca.SX.eye(size)
-    for j in range(size):
-        for i in range(j + 1, size):
-            inverse[i, j] = -ca.dot(low[i, j:i].T, inverse[j:i, j])
-    v = ca.mtimes([inverse.T, ca.diag(1 / ca.vertcat(*d)), inverse])
-    logdet = sum(ca.log(s * p) for s, p in zip(signs, d, strict=True))
-    return ca.Function("factor", [x], [logdet, ca.densify(v)])
-
-
-def _dm(matrix: csc_matrix) -> ca.DM:
-    m = csc_matrix(matrix)
-    m.sum_duplicates()
-    m.sort_indices()
-    sparsity = ca.Sparsity(m.shape[0], m.shape[1], m.indptr.tolist(), m.indices.tolist())
-    return ca.DM(sparsity, m.data)
-
-
-class Gatherer:
-    """Nonzeros of a large sparse matrix as sums of nonzeros of small blocks."""
-
-    def __init__(self, rows: int, columns: int, *, upper: bool = False) -> None:
-        self.shape = (rows, columns)
-        self.upper = upper
-        self._places: list[Index] = []
-        self._blocks: list[ca.MX] = []
-
-    def add(self, rows: Index, columns: Index, values: ca.MX) -> None:
-        """Add values (n,) at the positions given."""
-        place = columns.astype(np.int64) * self.shape[0] + rows
-        self._places.append(np.where(rows <= columns, place, -1) if self.upper else place)
-        self._blocks.append(values)
-
-    def matrix(self) -> ca.MX:
-        """Return the matrix."""
-        places = np.concatenate(self._places)
-        sources = np.flatnonzero(places >= 0)
-        unique, target = np.unique(places[sources], return_inverse=True)
-        pick = csc_matrix(
-            (np.ones(len(sources)), (target, sources)), shape=(len(unique), len(places))
-        )
-        rows, columns = unique % self.shape[0], unique // self.shape[0]
-        sparsity = ca.Sparsity.triplet(*self.shape, rows.tolist(), columns.tolist())
-        return ca.MX(sparsity, ca.mtimes(ca.MX(_dm(pick)), ca.vertcat(*self._blocks)))
-
-
-def _coordinates(sparsity: ca.Sparsity) -> tuple[Index, Index]:
-    rows, columns = sparsity.get_triplet()
-    return np.array(rows, dtype=np.int64), np.array(columns, dtype=np.int64)
 
 
 @dataclass(frozen=True)
@@ -182,7 +74,7 @@ class Passed:
     sensitivity: ca.SX
 
 
-class Shooting:
+class Shooting(ABC):
     """The nominal scenario of a trial problem as one nonlinear program.
 
     Only the first scenario is solved for; `solve_ipopt` judges what comes out by
@@ -226,30 +118,31 @@ class Shooting:
 
     # -- what subclasses say ----------------------------------------------------------------
 
+    @abstractmethod
     def _measure(self, unit: Array) -> None:
         """Take the scales of nodes and columns from the motion of a typical sequence."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _index_sums(self) -> None:
         """Give each lifted sum its place among the variables."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _nodes_and_sums(self, unit: Array) -> tuple[Array, Array]:
         """Return the scaled nodes (I+1, nk) and the lifted sums (L,) of a sequence."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _first_node(self) -> Array:
         """Return the node that a trial starts from, scaled."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _open(self, node: ca.SX) -> Passed:
         """Return what an interval starts from."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _look(self, passed: Passed, state: ca.SX, command: ca.SX, first: ca.SX) -> None:
         """Collect a sample."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _close(self, passed: Passed, state: ca.SX, command: ca.SX, more: ca.SX) -> None:
         """Collect what crosses the border to the next interval."""
 
@@ -269,11 +162,13 @@ class Shooting:
         """Return what adds to the Gram matrix beside the sums, by column."""
         return self.problem.known[0].gram[0] if self.problem.known else None
 
-    def _border(self, nuisance: list[int]) -> LogDet:
-        raise NotImplementedError
+    def _border(self, nuisance: list[int]) -> list[LogDet]:
+        """Return what the exact covariance adds to the terms."""
+        return []
 
+    @abstractmethod
     def _score_block(self, matrix: Affine, scale: Array) -> None:
-        raise NotImplementedError
+        """Fill the score's matrix M̃ of the exact covariance."""
 
     def _scaled(self) -> float:
         """Return what the scaling of M̃ adds to the log determinant."""
@@ -380,7 +275,7 @@ class Shooting:
             terms += more
             constant += shift
         if self.exact:
-            terms.append(self._border(nuisance_all))
+            terms += self._border(nuisance_all)
         return terms, constant + self._scaled()
 
     # -- the nonlinear program --------------------------------------------------------------
@@ -528,11 +423,11 @@ class Shooting:
             sign = np.ones(target.shape[0])
             sign[nk + n * path : nk + n * path + self.lifted] = -1.0
             g_rows.append((target, ca.DM(sign) * shares))
-            r, c = _coordinates(jac.sparsity_out(0))
+            r, c = coordinates(jac.sparsity_out(0))
             places = target[r].ravel(order="F"), index[c].ravel(order="F")
             slopes = ca.vec(ca.MX(jac.map(m)(y, given)).nz[:])
             gather.add(*places, slopes * np.tile(sign[r], m))
-            r, c = _coordinates(hess.sparsity_out(0))
+            r, c = coordinates(hess.sparsity_out(0))
             weights = multipliers[target.ravel(order="F").tolist()]
             weights = ca.reshape(weights, *target.shape) * ca.DM(sign)
             curves = ca.vec(ca.MX(hess.map(m)(y, given, weights)).nz[:])
@@ -552,24 +447,24 @@ class Shooting:
             )
         tail = w[self.sums_at :]
         f, slope, extra, extra_jac = self._terminal.first(tail)
-        r, c = _coordinates(extra_jac.sparsity())
+        r, c = coordinates(extra_jac.sparsity())
         if len(r):
             gather.add(extra_at + r, self.sums_at + c, ca.vec(extra_jac.nz[:]))
         sigma = ca.MX.sym("lam_f")
         end = self._terminal.second(tail, sigma, multipliers[extra_at:])
-        r, c = _coordinates(end.sparsity())
+        r, c = coordinates(end.sparsity())
         curve.add(self.sums_at + r, self.sums_at + c, ca.vec(end.nz[:]))
         into = np.concatenate([t.ravel(order="F") for t, _ in g_rows])
         ones = np.ones(len(into))
         pick = csc_matrix((ones, (into, np.arange(len(into)))), shape=(rates, len(into)))
-        g = ca.mtimes(ca.MX(_dm(pick)), ca.vertcat(*[ca.vec(v) for _, v in g_rows]))
+        g = ca.mtimes(ca.MX(to_dm(pick)), ca.vertcat(*[ca.vec(v) for _, v in g_rows]))
         shift = ca.vertcat(
             w[self.nodes_at + nk : self.sums_at],
             ca.MX.zeros(int(starts[-1])),
             -w[self.sums_at : self.sums_at + self.lifted],
             ca.MX.zeros(int(self.energy)),
         )
-        g = ca.vertcat(g - shift, ca.mtimes(ca.MX(_dm(linear)), w), extra)
+        g = ca.vertcat(g - shift, ca.mtimes(ca.MX(to_dm(linear)), w), extra)
         empty = ca.MX.sym("p", 0)
         grad = ca.vertcat(ca.MX.zeros(self.sums_at), slope)
         jac_g = gather.matrix()
@@ -658,8 +553,8 @@ class Shooting:
 
     def _terminal_closed(self) -> Terminal:
         terms, constant = self._terms()
-        factors = [_factor(t.size, t.positive) for t in terms]
-        slopes = [ca.MX(_dm(t.slope)) for t in terms]
+        factors = [determinant_factor(t.size, t.positive) for t in terms]
+        slopes = [ca.MX(to_dm(t.slope)) for t in terms]
         share = 1.0 / len(self.wanted)
 
         def matrices(tail: ca.MX) -> list[Any]:
@@ -740,8 +635,8 @@ class Shooting:
 
         start = float(worth(x0, m0, typical))
         sums = ca.SX.sym("sums", self.lifted)
-        g = ca.reshape(ca.DM(g_term.base) + ca.mtimes(_dm(g_term.slope), sums), size, size)
-        m = ca.reshape(ca.DM(m_term.base) + ca.mtimes(_dm(m_term.slope), sums), size, size)
+        g = ca.reshape(ca.DM(g_term.base) + ca.mtimes(to_dm(g_term.slope), sums), size, size)
+        m = ca.reshape(ca.DM(m_term.base) + ca.mtimes(to_dm(m_term.slope), sums), size, size)
         symbols = [ca.SX.sym("x", len(a)) for a in active]
         q = ca.SX.sym("q")
         tail = ca.vertcat(sums, *symbols, q)
