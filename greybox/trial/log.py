@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import LogError
-from greybox.vessel.force import generalised_force
+from greybox.vessel.actuation import actuated_force
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
@@ -93,8 +93,12 @@ class TrialLog:
         return np.column_stack([self[n] for n in names])
 
     def forces(self, inputs: tuple[str, ...]) -> Array:
-        """Return the generalised inputs of (3.46) as (N, nu); zero where none can be made."""
-        made = generalised_force(self.vessel, {c: self[c] for c in self.vessel.commands})
+        """Return the generalised inputs of (3.46) as (N, nu); zero where none can be made.
+
+        They follow the commands as late as the vessel's `actuation` says.
+        """
+        commands = {c: self[c] for c in self.vessel.commands}
+        made = actuated_force(self.vessel, commands, self.sample_time)
         return np.column_stack([made.get(n, np.zeros(len(self))) for n in inputs])
 
     @property

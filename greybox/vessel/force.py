@@ -4,7 +4,8 @@ Azimuth, fixed and tunnel thrusters give the force and moment of (3.46),
 
     taux = Σ T cos α,  tauy = Σ T sin α,  taun = Σ T (Δx sin α − Δy cos α),
 
-with T the thrust law of the propeller speed. A propeller with a rudder gives
+with T the thrust law of the propeller speed times the thruster's gain, and α or
+the rudder angle δ the logged one plus the thruster's angle offset. A propeller with a rudder gives
 its thrust along the bow and a rudder force from the inflow. In MMG form the
 normal force of a rudder at angle δ is F_N = ½ρ A f U_R² sin δ, with the force
 −F_N sin δ along and −F_N cos δ across the ship (Yasukawa and Yoshimura, 2015).
@@ -71,10 +72,13 @@ def force_expressions(vessel: Vessel, commands: ca.SX) -> dict[str, ca.SX]:
 
     for t in vessel.thrusters:
         thrust = t.thrust.force(column[t.speed])
+        if t.gain != 1:
+            thrust = t.gain * thrust
         c: ca.SX | float
         s: ca.SX | float
         if isinstance(t.angle, str):
-            c, s = ca.cos(column[t.angle]), ca.sin(column[t.angle])
+            angle = column[t.angle] + t.angle_offset
+            c, s = ca.cos(angle), ca.sin(angle)
         else:  # rounded, so that a tunnel thruster has exactly no force along the ship
             c, s = round(float(np.cos(t.angle)), 15), round(float(np.sin(t.angle)), 15)
         along, across = thrust * c, thrust * s
@@ -82,7 +86,7 @@ def force_expressions(vessel: Vessel, commands: ca.SX) -> dict[str, ca.SX]:
         add("tauy", across)
         add("taun", t.x * across - t.y * along)
         if t.rudder is not None:
-            delta = column[t.rudder]
+            delta = column[t.rudder] + t.angle_offset
             race = ca.fmax(thrust, 0)
             add("race", race * ca.sin(delta) * ca.cos(delta))
             add("rudder", ca.sin(delta) * ca.cos(delta))

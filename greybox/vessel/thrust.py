@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import inf
 from typing import Literal
 
 import casadi as ca
@@ -21,12 +22,33 @@ class ThrustLaw:
     table : tuple of (float, float)
         Speed and force [N] of the bollard points, speed increasing. Points with
         zero force make a dead band; the ends are extended by their last slope.
+    quadratic_share : float
+        Share s of a linear law that goes with n|n|: (1 − s) n + s n|n|/reference.
+    reference : float
+        Speed at which both parts are equal, in the unit of the speed.
     """
 
     kind: Literal["linear", "quadratic", "table"] = "linear"
     table: tuple[tuple[float, float], ...] = ()
+    quadratic_share: float = 0.0
+    reference: float = 1.0
 
     def __post_init__(self) -> None:
+        if not 0 <= self.quadratic_share <= 1:
+            raise VesselError(
+                f"quadratic_share is {self.quadratic_share:g}, it must be within 0 (force ~ n) "
+                f"and 1 (force ~ n|n|): correct it."
+            )
+        if not 0 < self.reference < inf:
+            raise VesselError(
+                f"the reference speed of a quadratic share is {self.reference:g}, it must be "
+                f"positive: give a usual speed of the propeller."
+            )
+        if self.kind != "linear" and (self.quadratic_share, self.reference) != (0, 1):
+            raise VesselError(
+                f"a {self.kind} thrust law has quadratic_share = {self.quadratic_share:g} and "
+                f"reference = {self.reference:g}, which only a linear law can have: remove them."
+            )
         if self.kind != "table":
             return
         if len(self.table) < 2:
@@ -53,7 +75,8 @@ class ThrustLaw:
         formula that can be differentiated and designed with.
         """
         if self.kind == "linear":
-            return speed
+            s = self.quadratic_share
+            return (1 - s) * speed + s / self.reference * speed * ca.fabs(speed) if s else speed
         if self.kind == "quadratic":
             return speed * ca.fabs(speed)
         slopes = [

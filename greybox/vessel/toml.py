@@ -11,9 +11,16 @@ from typing import Any
 from greybox.channels import CHANNELS, unit_factor
 from greybox.errors import LogError, VesselError, suggestion
 from greybox.vessel.thrust import ThrustLaw
-from greybox.vessel.vessel import THRUSTER_TYPES, ColumnMapping, Limits, Thruster, Vessel
+from greybox.vessel.vessel import (
+    THRUSTER_TYPES,
+    Actuation,
+    ColumnMapping,
+    Limits,
+    Thruster,
+    Vessel,
+)
 
-_TOP = {"name", "length", "thruster", "columns", "sensors", "closed_loop", "mass"}
+_TOP = {"name", "length", "thruster", "columns", "sensors", "closed_loop", "mass", "actuation"}
 _THRUSTER = {
     "type": str,
     "x": float,
@@ -27,12 +34,15 @@ _THRUSTER = {
     "angle_rate": float,
     "rudder_limits": list,
     "rudder_rate": float,
-    "thrust": (str, list),
+    "thrust": (str, list, dict),
+    "gain": float,
+    "angle_offset": float,
     "drive": str,
     "speed_command": str,
     "angle_command": str,
     "rudder_command": str,
 }
+_MIXED = {"quadratic_share": 0.0, "reference": 1.0}
 _SENSORS = {
     "heading_std",
     "u_std",
@@ -117,6 +127,7 @@ def vessel_from_dict(data: dict[str, Any]) -> Vessel:
         sensors=_sensors(data.get("sensors", {})),
         closed_loop=_closed_loop(data.get("closed_loop")),
         mass=_number(data["mass"], "mass") if "mass" in data else None,
+        actuation=_actuation(data.get("actuation", {})),
     )
     columns = _columns(data.get("columns", {}), vessel)
     return Vessel(**{**vessel.__dict__, "columns": columns})
@@ -141,11 +152,19 @@ def vessel_to_dict(vessel: Vessel) -> dict[str, Any]:
             if limits.rate is not None:
                 row[f"{key}_rate"] = limits.rate
         row["thrust"] = [list(p) for p in t.thrust.table] or t.thrust.kind
+        if t.thrust.quadratic_share or t.thrust.reference != 1:
+            row["thrust"] = {k: getattr(t.thrust, k) for k in _MIXED}
+        if t.gain != 1:
+            row["gain"] = t.gain
+        if t.angle_offset:
+            row["angle_offset"] = t.angle_offset
         thrusters.append(row)
     data: dict[str, Any] = {"name": vessel.name, "length": vessel.length, "thruster": thrusters}
     if vessel.columns:
         data["columns"] = {
-            raw: {"name": c.name} | ({"unit": c.unit} if c.unit else {})
+            raw: {"name": c.name}
+            | ({"unit": c.unit} if c.unit else {})
+            | ({"sign": c.sign} if c.sign != 1 else {})
             for raw, c in vessel.columns.items()
         }
     if vessel.sensors:
@@ -159,6 +178,8 @@ def vessel_to_dict(vessel: Vessel) -> dict[str, Any]:
         }
     if vessel.mass is not None:
         data["mass"] = vessel.mass
+    if vessel.actuation != Actuation():
+        data["actuation"] = vars(vessel.actuation).copy()
     return data
 
 
@@ -209,11 +230,16 @@ def _thrust(value: Any, where: str) -> ThrustLaw:
                 for n, f in value
             ),
         )
+    if isinstance(value, dict):
+        _known_keys(value, _MIXED, f"the thrust law of {where}")
+        share, reference = (_number(value.get(k, d), f"{k} of {where}") for k, d in _MIXED.items())
+        return ThrustLaw("linear", (), share, reference)
     laws = ("linear", "quadratic")
     if value not in laws:
         raise VesselError(
             f"{where} has the thrust law '{value}'.{suggestion(str(value), laws)} "
-            f"Use 'linear', 'quadratic' or a table of [speed, force] pairs."
+            f"Use 'linear', 'quadratic', a table of [speed, force] pairs, or "
+            f"{{ quadratic_share = 0.5, reference = 10.0 }}."
         )
     return ThrustLaw(value)
 
@@ -270,6 +296,17 @@ def _thruster(table: Any, number: int) -> Thruster:
         speed_limits=_limits(table, "speed", where),
         angle_limits=_limits(table, "angle", where),
         rudder_limits=_limits(table, "rudder", where),
+        gain=_number(table.get("gain", 1.0), f"gain of {where}"),
+        angle_offset=_number(table.get("angle_offset", 0.0), f"angle_offset of {where}"),
+    )
+
+
+def _actuation(table: Any) -> Actuation:
+    _known_keys(table, ("lag", "lag_on", "delay"), "[actuation]")
+    return Actuation(
+        lag=_number(table.get("lag", 0.0), "lag of [actuation]"),
+        lag_on=table.get("lag_on", "force"),
+        delay=_number(table.get("delay", 0.0), "delay of [actuation]"),
     )
 
 

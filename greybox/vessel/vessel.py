@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from math import inf, isfinite
+from typing import Any, Literal, get_args
 
+from greybox.errors import VesselError, suggestion
 from greybox.vessel.thrust import ThrustLaw
 
 ThrusterType = Literal["azimuth", "fixed", "tunnel", "propeller_rudder"]
@@ -39,6 +41,15 @@ class Thruster:
         Column with the rudder angle, positive turns to starboard [rad].
     thrust : ThrustLaw
     speed_limits, angle_limits, rudder_limits : Limits
+    gain : float
+        Share of the thrust law that the thruster gives, 1 for all of it.
+    angle_offset : float
+        True minus logged direction of an azimuth, or angle of a rudder [rad].
+
+    Raises
+    ------
+    VesselError
+        Gain or offset is not finite, or there is an offset but no logged angle.
     """
 
     type: ThrusterType
@@ -51,6 +62,22 @@ class Thruster:
     speed_limits: Limits = field(default_factory=Limits)
     angle_limits: Limits = field(default_factory=Limits)
     rudder_limits: Limits = field(default_factory=Limits)
+    gain: float = 1.0
+    angle_offset: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("gain", "angle_offset"):
+            if not isfinite(getattr(self, name)):
+                raise VesselError(
+                    f"{name} of the thruster driven by '{self.speed}' is "
+                    f"{getattr(self, name)}, a finite number is needed: correct it."
+                )
+        if self.angle_offset and not isinstance(self.angle, str) and self.rudder is None:
+            raise VesselError(
+                f"the thruster driven by '{self.speed}' has angle_offset = "
+                f"{self.angle_offset:g}, but it is of type {self.type} and its angle is not "
+                f"logged: correct 'angle' or 'type' instead."
+            )
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -61,6 +88,51 @@ class Thruster:
         if self.rudder is not None:
             names.append(self.rudder)
         return tuple(names)
+
+
+LagOn = Literal["force", "speed", "command"]
+
+
+@dataclass(frozen=True)
+class Actuation:
+    """How late the force follows the logged commands.
+
+    Parameters
+    ----------
+    lag : float
+        Time constant of a first-order lag [s], 0 for none.
+    lag_on : {"force", "speed", "command"}
+        What follows slowly: each generalised force, the propeller speeds, or
+        all commands.
+    delay : float
+        Pure delay of all commands [s].
+
+    Raises
+    ------
+    VesselError
+        A time is negative or not finite, or `lag_on` is none of the three.
+    """
+
+    lag: float = 0.0
+    lag_on: LagOn = "force"
+    delay: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name, value in (("lag", self.lag), ("delay", self.delay)):
+            if not 0 <= value < inf:
+                raise VesselError(
+                    f"{name} of [actuation] is {value:g} s, it must be zero or positive: "
+                    f"correct it."
+                )
+        if self.lag_on not in get_args(LagOn):
+            raise VesselError(
+                f"lag_on of [actuation] is '{self.lag_on}'."
+                f"{suggestion(str(self.lag_on), get_args(LagOn))} "
+                f"Use {', '.join(get_args(LagOn))}."
+            )
+
+    def __bool__(self) -> bool:
+        return self.lag > 0 or self.delay > 0
 
 
 @dataclass(frozen=True)
@@ -90,6 +162,7 @@ class Vessel:
         Log column and its values under which a controller moves the thrusters.
     mass : float, optional
         [kg]
+    actuation : Actuation
     """
 
     name: str
@@ -99,6 +172,7 @@ class Vessel:
     sensors: Mapping[str, Any] = field(default_factory=dict)
     closed_loop: tuple[str, tuple[str, ...]] | None = None
     mass: float | None = None
+    actuation: Actuation = Actuation()
 
     @property
     def commands(self) -> tuple[str, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 
 import casadi as ca
@@ -9,9 +10,12 @@ import numpy as np
 import pytest
 
 from greybox.errors import VesselError
+from greybox.trial.log import make_log
+from greybox.vessel.actuation import Actuation, actuated_force
 from greybox.vessel.force import force_function, force_inputs, generalised_force
 from greybox.vessel.thrust import ThrustLaw
 from greybox.vessel.toml import load_vessel, vessel_from_dict, vessel_to_dict
+from greybox.vessel.vessel import Thruster
 
 AZIMUTH = {"type": "azimuth", "x": 2.0, "y": -1.0, "speed": "n", "angle": "a"}
 
@@ -83,6 +87,7 @@ def test_rudder_inputs_have_the_signs_of_the_derivation():
     [
         ThrustLaw("linear"),
         ThrustLaw("quadratic"),
+        ThrustLaw("linear", quadratic_share=0.3, reference=6.0),
         ThrustLaw("table", ((-9.0, -33.0), (-1.0, 0.0), (1.5, 0.0), (4.0, 10.0), (9.0, 42.0))),
     ],
 )
@@ -93,7 +98,8 @@ def test_thrust_laws(law):
         if law.kind == "table":
             want = np.interp(value, *np.array(law.table).T)
         else:
-            want = value if law.kind == "linear" else value * abs(value)
+            share = law.quadratic_share if law.kind == "linear" else 1.0
+            want = (1 - share) * value + share * value * abs(value) / law.reference
         assert float(f(value)) == pytest.approx(want, abs=1e-12)
     if law.kind == "table":  # beyond the ends by the last slope
         assert float(f(10)) == pytest.approx(42 + 32 / 5)
@@ -105,6 +111,75 @@ def test_the_file_says_what_drives_the_model():
     }  # fmt: skip
     assert vessel(logged).commands == ("n_ref", "a_ref")
     assert vessel({**logged, "drive": "feedback"}).commands == ("n", "a")
+
+
+def test_gain_and_offset_of_an_azimuth_and_of_a_rudder():
+    v = vessel(
+        {**AZIMUTH, "gain": 0.7, "angle_offset": 0.1},
+        {"type": "propeller_rudder", "x": -5, "speed": "m", "rudder": "d", "gain": 2,
+         "angle_offset": -0.05},
+    )  # fmt: skip
+    plain = vessel(AZIMUTH, {"type": "propeller_rudder", "x": -5, "speed": "m", "rudder": "d"})
+    rng = np.random.default_rng(3)
+    n, a, m, d = rng.uniform(-1, 1, (4, 50))
+    got = generalised_force(v, {"n": n, "a": a, "m": m, "d": d})
+    want = generalised_force(plain, {"n": 0.7 * n, "a": a + 0.1, "m": 2 * m, "d": d - 0.05})
+    for name, value in want.items():
+        np.testing.assert_allclose(got[name], value, atol=1e-14)
+
+
+def slow_force(vessel, commands, step):
+    """The delay and the lag sample by sample, one command at a time."""
+    late = vessel.actuation
+    a = math.exp(-step / late.lag)
+    t = np.arange(len(next(iter(commands.values())))) * step
+
+    def lag(c):
+        x = [c[0]]
+        for k in range(len(c) - 1):
+            x.append(a * x[k] + (1 - a) * c[k])
+        return np.array(x)
+
+    moved = {k: np.interp(t - late.delay, t, c) for k, c in commands.items()}
+    if late.lag_on == "force":
+        return {k: lag(f) for k, f in generalised_force(vessel, moved).items()}
+    slow = vessel.commands if late.lag_on == "command" else {t.speed for t in vessel.thrusters}
+    return generalised_force(vessel, {k: lag(c) if k in slow else c for k, c in moved.items()})
+
+
+@pytest.mark.parametrize("on", ["force", "speed", "command"])
+@pytest.mark.parametrize("delay", [0.0, 1.0, 1.3, 500.0])
+def test_late_force_equals_the_recursion(on, delay):
+    v = vessel(
+        {**AZIMUTH, "thrust": "quadratic"}, actuation={"lag": 2.0, "lag_on": on, "delay": delay}
+    )
+    rng = np.random.default_rng(4)
+    values = {"n": rng.uniform(-9, 9, (3, 200)), "a": rng.uniform(-3, 3, (3, 200))}
+    got = actuated_force(v, values, 0.5)
+    for run in range(3):
+        want = slow_force(v, {k: c[run] for k, c in values.items()}, 0.5)
+        for name, value in want.items():
+            np.testing.assert_allclose(got[name][run], value, atol=1e-11)
+
+
+def test_a_lag_is_exact_for_held_commands():
+    """The step response of a first-order lag, and none without lag and delay."""
+    commands = {"n": np.array([1.0] + [3.0] * 40), "a": np.zeros(41)}
+    late = vessel(AZIMUTH, actuation={"lag": 4.0})
+    got = actuated_force(late, commands, 0.5)["taux"]
+    want = 1 + 2 * (1 - np.exp(-0.5 * np.arange(40) / 4))
+    np.testing.assert_allclose(got[1:], want, rtol=1e-12)
+    plain = vessel(AZIMUTH)
+    np.testing.assert_array_equal(actuated_force(plain, commands, 0.5)["taux"], commands["n"])
+
+
+def test_a_log_gives_the_late_force():
+    v = vessel(AZIMUTH, actuation={"lag": 2.0, "delay": 0.7})
+    rng = np.random.default_rng(5)
+    values = {"n": rng.uniform(0, 9, 50), "a": rng.uniform(-1, 1, 50)}
+    got = make_log(v, values, 0.5).forces(("taux", "taun", "race"))
+    want = actuated_force(v, values, 0.5)
+    np.testing.assert_array_equal(got.T, [want["taux"], want["taun"], np.zeros(50)])
 
 
 def test_limits_of_a_shared_column_are_the_tightest():
@@ -119,7 +194,21 @@ def test_limits_of_a_shared_column_are_the_tightest():
 def test_examples_survive_a_round_trip(name):
     v = load_vessel(name)
     assert vessel_to_dict(vessel_from_dict(vessel_to_dict(v))) == vessel_to_dict(v)
-    assert vessel_from_dict(vessel_to_dict(v)).thrusters == v.thrusters
+    assert vessel_from_dict(vessel_to_dict(v)) == v
+
+
+def test_all_that_a_diagnosis_adds_survives_a_round_trip():
+    v = vessel(
+        {**AZIMUTH, "gain": 0.8, "angle_offset": -0.03,
+         "thrust": {"quadratic_share": 0.25, "reference": 15}},
+        columns={"yaw": {"name": "r", "unit": "rad/s", "sign": -1}},
+        actuation={"lag": 1.5, "lag_on": "speed", "delay": 0.4},
+    )  # fmt: skip
+    assert v.thrusters[0].thrust == ThrustLaw("linear", (), 0.25, 15.0)
+    assert v.actuation == Actuation(1.5, "speed", 0.4)
+    assert vessel_from_dict(json.loads(json.dumps(vessel_to_dict(v)))) == v
+    plain = vessel_to_dict(vessel(AZIMUTH))
+    assert not {"actuation", "gain", "angle_offset"} & (plain.keys() | plain["thruster"][0].keys())
 
 
 @pytest.mark.parametrize(
@@ -137,6 +226,12 @@ def test_examples_survive_a_round_trip(name):
         ({"drive": "comand"}, "Did you mean 'command'"),
         ({"drive": "command"}, "has no 'angle_command'"),
         ({"rudder": "d"}, "cannot have a rudder"),
+        ({"gain": math.nan}, "gain of thruster 1 is nan, a finite number"),
+        ({"angle_offset": "x"}, "angle_offset of thruster 1 is 'x'"),
+        ({"type": "fixed", "angle": 0.0, "angle_offset": 0.1}, "its angle is not logged"),
+        ({"thrust": {"quadratic_share": 1.2}}, "quadratic_share is 1.2, it must be within 0"),
+        ({"thrust": {"quadratic_share": 0.2, "reference": 0}}, "is 0, it must be positive"),
+        ({"thrust": {"quadratic_shar": 0.2}}, "Did you mean 'quadratic_share'"),
     ],
 )
 def test_bad_thrusters(change, message):
@@ -156,11 +251,24 @@ def test_bad_thrusters(change, message):
         ({"sensors": {"u_std": -1}}, "cannot be negative"),
         ({"lenght": 3}, "Did you mean 'length'"),
         ({"closed_loop": {"column": 3}}, "needs column ="),
+        ({"actuation": {"lag": -1}}, "lag of \\[actuation\\] is -1 s, it must be zero or positive"),
+        ({"actuation": {"delay": math.inf}}, "delay of \\[actuation\\] is inf, a finite number"),
+        ({"actuation": {"lag_on": "forc"}}, "Did you mean 'force'"),
+        ({"actuation": {"lagg": 1}}, "Did you mean 'lag'"),
     ],
 )
 def test_bad_vessels(more, message):
     with pytest.raises(VesselError, match=message):
         vessel(AZIMUTH, **more)
+
+
+def test_what_cannot_be_built_in_code_either():
+    with pytest.raises(VesselError, match="gain of the thruster driven by 'n' is inf"):
+        Thruster("tunnel", 0.0, 0.0, "n", gain=math.inf)
+    with pytest.raises(VesselError, match="a quadratic thrust law has quadratic_share"):
+        ThrustLaw("quadratic", quadratic_share=0.5)
+    with pytest.raises(VesselError, match="is nan s, it must be zero"):
+        Actuation(lag=math.nan)
 
 
 def test_missing_and_foreign_files(tmp_path):

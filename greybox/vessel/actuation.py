@@ -1,0 +1,85 @@
+"""The force that follows commands late: a pure delay and a first-order lag.
+
+A command c held from sample to sample moves a first-order lag of time constant
+T, ẋ = (c − x)/T, exactly by x[k+1] = a x[k] + (1 − a) c[k] with a = exp(−Ts/T).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.vessel.force import generalised_force
+from greybox.vessel.vessel import Actuation, Vessel
+
+Array = NDArray[np.float64]
+
+__all__ = ["Actuation", "actuated_force", "delayed", "lagged"]
+
+
+def actuated_force(
+    vessel: Vessel, commands: dict[str, Array], sample_time: float
+) -> dict[str, Array]:
+    """Evaluate the generalised inputs on commands that act late.
+
+    Parameters
+    ----------
+    vessel : Vessel
+        Its `actuation` says how late.
+    commands : dict of str to ndarray
+        (..., N) each column of `Vessel.commands`, time last. What was commanded
+        before is taken as the first value.
+    sample_time : float
+        [s]
+
+    Returns
+    -------
+    dict of str to ndarray
+        (..., N) each input of `force_inputs`.
+    """
+    late = vessel.actuation
+    if not late:
+        return generalised_force(vessel, commands)
+    moved = {c: delayed(commands[c], late.delay / sample_time) for c in vessel.commands}
+    if late.lag == 0:
+        return generalised_force(vessel, moved)
+    samples = late.lag / sample_time
+    if late.lag_on == "force":
+        made = generalised_force(vessel, moved)
+        return {name: lagged(value, samples) for name, value in made.items()}
+    speeds = {t.speed for t in vessel.thrusters}
+    return generalised_force(
+        vessel,
+        {
+            c: lagged(value, samples) if late.lag_on == "command" or c in speeds else value
+            for c, value in moved.items()
+        },
+    )
+
+
+def delayed(value: Array, samples: float) -> Array:
+    """Delay a signal (..., N) by a number of samples, interpolated linearly.
+
+    The first value is held before the start.
+    """
+    value = np.asarray(value, float)
+    if samples == 0:
+        return value
+    last = value.shape[-1] - 1
+    place = np.clip(np.arange(last + 1) - samples, 0.0, None)
+    before = place.astype(np.intp)
+    share = place - before
+    after = np.minimum(before + 1, last)
+    return np.asarray((1 - share) * value[..., before] + share * value[..., after])
+
+
+def lagged(value: Array, samples: float) -> Array:
+    """Pass a signal (..., N) through a lag of this many samples, at rest on its first value."""
+    from scipy.signal import lfilter
+
+    value = np.asarray(value, float)
+    if samples == 0:
+        return value
+    a = np.exp(-1.0 / samples)
+    out, _ = lfilter([0.0, 1.0 - a], [1.0, -a], value, axis=-1, zi=value[..., :1])
+    return np.asarray(out)
