@@ -1,0 +1,75 @@
+"""One way in which a ship may differ from its model: a few numbers with a null value."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.diagnosis.ship import Ship
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A number of a cause.
+
+    Parameters
+    ----------
+    name : str
+        As in the JSON of a diagnosis.
+    unit : str
+    start : float
+        Where its search begins, and its sensitivity is taken: off the null where
+        it vanishes there.
+    low, high : float
+        Physical bounds.
+    null : float
+        The value that leaves the model as it is.
+    step : float
+        For its derivative by differences, and its scale.
+    """
+
+    name: str
+    unit: str
+    start: float
+    low: float = -np.inf
+    high: float = np.inf
+    null: float = 0.0
+    step: float = 1e-4
+
+
+@dataclass(frozen=True)
+class Atom:
+    """A cause with its place: which thruster, which coefficient, which channel.
+
+    Parameters
+    ----------
+    cause : str
+        Id of the cause.
+    key : str
+        Unique among all atoms, such as ``thruster_gain:n1``.
+    parameters : tuple of Parameter
+    columns : tuple of str
+        Coefficients or currents that the parameters are, in their order; empty
+        where `apply` is needed.
+    apply : callable, optional
+        ``(ship, values) -> ship``.
+    starts : tuple of tuple of float
+        Further values to begin from, where the likelihood has several hills.
+    """
+
+    cause: str
+    key: str
+    parameters: tuple[Parameter, ...]
+    columns: tuple[str, ...] = ()
+    apply: Callable[[Ship, Array], Ship] | None = None
+    starts: tuple[tuple[float, ...], ...] = ()
+
+    @property
+    def start(self) -> Array:
+        """Values to begin from."""
+        return np.array([p.start for p in self.parameters])

@@ -1,0 +1,109 @@
+"""What every cause says of itself, and what it is told of the case."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.diagnosis.atom import Atom
+from greybox.model.structure import Structure
+from greybox.vessel.vessel import Vessel
+
+Array = NDArray[np.float64]
+Kind = Literal["force", "flow", "thruster", "sensor", "change"]
+
+
+@dataclass(frozen=True)
+class Context:
+    """The case that causes are sought for.
+
+    Parameters
+    ----------
+    structure : Structure
+        Of the model that is diagnosed.
+    vessel : Vessel
+    outputs : tuple of str
+        Channels that are compared.
+    has_wind : bool
+        Whether the velocity through the air was measured in every log.
+    duration : float
+        Of the shortest log [s].
+    sample_time : float
+        [s]
+    speeds : mapping of str to float
+        Typical size of each propeller speed.
+    current_known : bool
+        Whether the model has a current already.
+    """
+
+    structure: Structure
+    vessel: Vessel
+    outputs: tuple[str, ...]
+    has_wind: bool
+    duration: float
+    sample_time: float
+    speeds: Mapping[str, float]
+    current_known: bool = False
+
+    def lacking(self, *terms: str) -> tuple[str, ...]:
+        """Return those of the terms that the structure could have and has not."""
+        from greybox.model.terms import parse_term
+
+        keys = {t.key for t in self.structure.terms}
+        signals = {*self.structure.states, *self.structure.inputs, "uq", "vq"}
+        out = []
+        for name in terms:
+            term = parse_term(name)
+            fits = term.state in self.structure.states and all(
+                f.signal in signals for f in term.factors
+            )
+            if fits and term.key not in keys:
+                out.append(name)
+        return tuple(out)
+
+
+class Cause(ABC):
+    """A reason why a simulation may disagree with the sea.
+
+    A subclass states the class variables and gives its atoms. It becomes known to
+    every diagnosis by an entry point of the group ``greybox.causes``.
+
+    Attributes
+    ----------
+    id : str
+        By which results name it.
+    kind : {"force", "flow", "thruster", "sensor", "change"}
+    title : str
+        A few words.
+    signature : str
+        What it looks like in a log, one sentence.
+    extension : str
+        What the extended model has.
+    reference : str
+    """
+
+    id: ClassVar[str]
+    kind: ClassVar[Kind]
+    title: ClassVar[str]
+    signature: ClassVar[str]
+    extension: ClassVar[str]
+    reference: ClassVar[str]
+
+    @abstractmethod
+    def atoms(self, context: Context) -> Sequence[Atom]:
+        """Return the ways in which this cause may be at work; none where it cannot."""
+
+    @abstractmethod
+    def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
+        """Return one sentence that an engineer understands.
+
+        Parameters
+        ----------
+        values : mapping of str to (float, float)
+            Parameter name -> estimate and standard error.
+        """

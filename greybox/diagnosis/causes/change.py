@@ -1,0 +1,58 @@
+"""Coefficients that change while the log runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.diagnosis.atom import Atom, Parameter
+from greybox.diagnosis.causes.cause import Cause, Context
+from greybox.diagnosis.ship import Change, Ship
+
+Array = NDArray[np.float64]
+
+# the change lies between these shares of the log, and multiplies by less
+_EARLIEST, _LATEST = 0.05, 0.95
+_FACTORS = (0.05, 20.0)
+
+
+class ParameterChange(Cause):
+    """One coefficient is another from some moment on."""
+
+    id = "parameter_change"
+    kind = "change"
+    title = "coefficient that changes during the log"
+    signature = "the model fits up to some moment and errs from then on, or the reverse"
+    extension = "the coefficient with its value before and after that moment"
+    reference = "Andrews (1993)"
+
+    def atoms(self, context: Context) -> Sequence[Atom]:
+        """Return one a coefficient; where in time, a scan has to tell."""
+        out = []
+        for i, term in enumerate(context.structure.terms):
+
+            def apply(ship: Ship, value: Array, i: int = i) -> Ship:
+                change = Change(i, float(value[0]), float(value[1]))
+                return replace(ship, changes=(*ship.changes, change))
+
+            parameters = (
+                Parameter(f"{term.name}_factor", "1", 1.0, *_FACTORS, 1.0),
+                Parameter(
+                    f"{term.name}_time", "s", 0.5 * context.duration,
+                    _EARLIEST * context.duration, _LATEST * context.duration,
+                    step=0.5 * context.sample_time,
+                ),
+            )  # fmt: skip
+            out.append(Atom(self.id, f"{self.id}:{term.name}", parameters, (), apply))
+        return out
+
+    def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
+        """Say which, when and how much."""
+        (name, (factor, _)), (_, (time, std)) = list(values.items())[:2]
+        return (
+            f"{name.removesuffix('_factor')} is {factor:.2f} times its value from {time:.0f} ± "
+            f"{max(std, 1):.0f} s on"
+        )

@@ -1,0 +1,86 @@
+"""Water and air that move: current and wind."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from greybox.diagnosis.atom import Atom, Parameter
+from greybox.diagnosis.causes.cause import Cause, Context
+from greybox.model.terms import parse_term
+from greybox.model.units import parameter_unit
+
+# no current is stronger [m/s]
+_STRONGEST = 5.0
+
+
+class Current(Cause):
+    """A current that is constant over the trial."""
+
+    id = "current"
+    kind = "flow"
+    title = "current"
+    signature = (
+        "errors of surge and sway over ground that turn with the heading: one compass direction "
+        "is always too slow, the opposite too fast"
+    )
+    extension = "the mean current, north and east; forces see the velocity through the water"
+    reference = "Ljungberg (2020), eq. 5.2; Fossen (2011), section 8.3"
+
+    def atoms(self, context: Context) -> Sequence[Atom]:
+        """Return the two components together."""
+        if context.current_known or context.structure.disturbance != "marine":
+            return ()
+        return (
+            Atom(
+                self.id, self.id,
+                tuple(
+                    Parameter(n, "m/s", 0.0, -_STRONGEST, _STRONGEST)
+                    for n in ("current_north", "current_east")
+                ),
+                columns=("current_north", "current_east"),
+            ),
+        )  # fmt: skip
+
+    def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
+        """Say speed and direction."""
+        north, east = values["current_north"][0], values["current_east"][0]
+        return (
+            f"the errors of surge and sway turn with the heading as in a current of "
+            f"{np.hypot(north, east):.2f} m/s towards "
+            f"{np.rad2deg(np.arctan2(east, north)) % 360:.0f} deg"
+        )
+
+
+class Wind(Cause):
+    """Forces of the measured wind."""
+
+    id = "wind"
+    kind = "flow"
+    title = "wind force"
+    signature = "errors that follow the square of the measured velocity through the air"
+    extension = "the wind terms of (3.51) on the measured velocity through the air"
+    reference = "Ljungberg (2020), eq. 3.51; Blendermann (1994)"
+
+    def atoms(self, context: Context) -> Sequence[Atom]:
+        """Return the lacking wind terms together, where the wind was measured."""
+        lacking = context.lacking("Wuu", "Wvv", "Wuv") if context.has_wind else ()
+        if not lacking:
+            return ()
+        unit = context.vessel.force_unit
+        return (
+            Atom(
+                self.id, self.id,
+                tuple(Parameter(n, parameter_unit(parse_term(n), unit), 0.0) for n in lacking),
+                columns=lacking,
+            ),
+        )  # fmt: skip
+
+    def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
+        """Say which equations feel it."""
+        felt = [n for n, (v, s) in values.items() if s > 0 and abs(v) > 2 * s] or list(values)
+        return (
+            f"the errors follow the square of the measured velocity through the air "
+            f"({', '.join(f'{n} = {values[n][0]:.2g}' for n in felt)})"
+        )

@@ -1,0 +1,114 @@
+"""Forces of the hull that a structure lacks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from greybox.diagnosis.atom import Atom, Parameter
+from greybox.diagnosis.causes.cause import Cause, Context
+from greybox.model.terms import parse_term
+from greybox.model.units import parameter_unit
+
+_WORDS = {"u": "surge", "v": "sway", "r": "yaw"}
+
+
+def term_atom(cause: str, names: Sequence[str], context: Context) -> Atom:
+    """Return an atom of terms that enter together."""
+    unit = context.vessel.force_unit
+    parameters = tuple(Parameter(n, parameter_unit(parse_term(n), unit), 0.0) for n in names)
+    return Atom(cause, f"{cause}:{'+'.join(names)}", parameters, columns=tuple(names))
+
+
+def listed(values: Mapping[str, tuple[float, float]]) -> str:
+    """Return estimates as text."""
+    return ", ".join(f"{n} = {v:.2g} ± {s:.1g}" for n, (v, s) in values.items())
+
+
+def equations(values: Mapping[str, tuple[float, float]]) -> str:
+    """Return the motions that the named terms belong to."""
+    return " and ".join(dict.fromkeys(_WORDS.get(parse_term(n).state, n) for n in values))
+
+
+class CubicDamping(Cause):
+    """Damping that grows with the third power of a velocity."""
+
+    id = "cubic_damping"
+    kind = "force"
+    title = "cubic damping"
+    signature = "the ship is slower than simulated where it is fastest, by the cube of the velocity"
+    extension = "a term in the cube of surge, sway or yaw rate"
+    reference = "Abkowitz (1964)"
+
+    def atoms(self, context: Context) -> Sequence[Atom]:
+        """Return one an equation."""
+        return [
+            term_atom(self.id, (n,), context) for n in context.lacking("X_uuu", "Y_vvv", "N_rrr")
+        ]
+
+    def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
+        """Say in which equation."""
+        return f"the error of {equations(values)} grows with the cube ({listed(values)})"
+
+
+class QuadraticYawDamping(Cause):
+    """Damping by |r|r."""
+
+    id = "quadratic_yaw_damping"
+    kind = "force"
+    title = "quadratic yaw damping"
+    signature = "fast turns are slower than simulated, slow turns are not"
+    extension = "the term N_|r|r"
+    reference = "Fedyaevsky and Sobolev (1964); Norrbin (1970)"
+
+    def atoms(self, context: Context) -> Sequence[Atom]:
+        """Return the term, where the structure lacks it."""
+        return [term_atom(self.id, (n,), context) for n in context.lacking("N_|r|r")]
+
+    def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
+        """Say its size."""
+        return f"the error of the yaw rate follows |r|r ({listed(values)})"
+
+
+class Crossflow(Cause):
+    """Couplings of sway and yaw by the cross-flow along the hull."""
+
+    id = "crossflow"
+    kind = "force"
+    title = "cross-flow coupling of sway and yaw"
+    signature = "errors of sway and yaw where the ship drifts and turns at once"
+    extension = "terms in |r|v, |v|r, |v|v or |r|r"
+    reference = "Fossen (2011), section 6.4.3; Hooft (1994)"
+
+    def atoms(self, context: Context) -> Sequence[Atom]:
+        """Return one a term."""
+        names = context.lacking(
+            "Y_|v|v", "Y_|v|r", "Y_|r|v", "Y_|r|r", "N_|v|v", "N_|v|r", "N_|r|v"
+        )
+        return [term_atom(self.id, (n,), context) for n in names]
+
+    def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
+        """Say in which equation."""
+        return (
+            f"the error of {equations(values)} follows the cross-flow of drift and turn "
+            f"({listed(values)})"
+        )
+
+
+class Asymmetry(Cause):
+    """A constant side force and moment."""
+
+    id = "asymmetry"
+    kind = "force"
+    title = "constant side force or moment"
+    signature = "the ship drifts and turns to one side, whatever its heading and speed"
+    extension = "constants in the sway and yaw equations"
+    reference = "Fossen (2011), section 10.1"
+
+    def atoms(self, context: Context) -> Sequence[Atom]:
+        """Return both constants together."""
+        names = context.lacking("Y_0", "N_0")
+        return [term_atom(self.id, names, context)] if names else []
+
+    def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
+        """Say their sizes."""
+        return f"{equations(values)} is pushed to one side at every heading ({listed(values)})"

@@ -1,0 +1,185 @@
+"""Sensors that show something else than the motion of the origin now."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.diagnosis.atom import Atom, Parameter
+from greybox.diagnosis.causes.cause import Cause, Context
+from greybox.diagnosis.ship import Ship
+
+Array = NDArray[np.float64]
+
+# clocks that are looked for differ by less [s]
+_LATEST = 60.0
+
+
+def _has_velocities(context: Context) -> bool:
+    return {"u", "v", "r"} <= set(context.outputs)
+
+
+class HeadingBias(Cause):
+    """A compass that is off, where the velocities were turned with it."""
+
+    id = "heading_bias"
+    kind = "sensor"
+    title = "compass bias"
+    signature = "sway in proportion to surge, at every heading and thrust"
+    extension = "the bias of the compass in the vessel; logs are turned back when read"
+    reference = "Fossen (2011), section 2.2"
+
+    def atoms(self, context: Context) -> Sequence[Atom]:
+        """Return the turn of u and v."""
+        if not _has_velocities(context):
+            return ()
+
+        def apply(ship: Ship, value: Array) -> Ship:
+            return replace(ship, sensors=replace(ship.sensors, turned=float(value[0])))
+
+        parameter = Parameter("heading_bias", "rad", 0.0, -np.pi / 2, np.pi / 2)
+        return (Atom(self.id, self.id, (parameter,), (), apply),)
+
+    def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
+        """Say by how much."""
+        value, std = values["heading_bias"]
+        return (
+            f"surge and sway are turned against the ship's axes by {np.rad2deg(value):.1f} ± "
+            f"{np.rad2deg(std):.1g} deg, as by a compass that shows so much too much"
+        )
+
+
+class LeverArm(Cause):
+    """Velocities or positions of an antenna that is not at the origin."""
+
+    id = "lever_arm"
+    kind = "sensor"
+    title = "lever arm of the antenna"
+    signature = "errors of surge and sway in proportion to the yaw rate, without delay"
+    extension = "the place of the antenna in the vessel"
+    reference = "Fossen (2011), section 2.2"
+
+    def atoms(self, context: Context) -> Sequence[Atom]:
+        """Return both coordinates together."""
+        if not _has_velocities(context):
+            return ()
+        most = 2 * context.vessel.length
+
+        def apply(ship: Ship, value: Array) -> Ship:
+            lever = (float(value[0]), float(value[1]))
+            return replace(ship, sensors=replace(ship.sensors, lever=lever))
+
+        names = ("lever_arm_x", "lever_arm_y")
+        parameters = tuple(Parameter(n, "m", 0.0, -most, most, step=1e-3) for n in names)
+        return (Atom(self.id, self.id, parameters, (), apply),)
+
+    def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
+        """Say where the antenna is."""
+        x, y = values["lever_arm_x"][0], values["lever_arm_y"][0]
+        return (
+            f"the velocities are those of a point {abs(x):.1f} m {'ahead' if x > 0 else 'abaft'} "
+            f"and {abs(y):.1f} m to {'starboard' if y > 0 else 'port'} of the origin"
+        )
+
+
+class ClockOffset(Cause):
+    """One sensor shows an older time than the others."""
+
+    id = "clock_offset"
+    kind = "sensor"
+    title = "clock of one sensor"
+    signature = "the error of one channel follows that channel's own rate of change"
+    extension = "the latency of the channel in the vessel; logs are shifted back when read"
+    reference = "Ljung (1999), section 14.3"
+
+    def atoms(self, context: Context) -> Sequence[Atom]:
+        """Return one a channel."""
+        most = min(_LATEST, 0.1 * context.duration)
+        out = []
+        for name in context.outputs:
+
+            def apply(ship: Ship, value: Array, name: str = name) -> Ship:
+                late = (*ship.sensors.late, (name, float(value[0])))
+                return replace(ship, sensors=replace(ship.sensors, late=late))
+
+            parameter = Parameter(
+                f"clock_{name}", "s", 0.5 * context.sample_time, -most, most,
+                step=0.1 * context.sample_time,
+            )  # fmt: skip
+            out.append(
+                Atom(
+                    self.id, f"{self.id}:{name}", (parameter,), (), apply,
+                    starts=((3 * context.sample_time,), (-2 * context.sample_time,)),
+                )
+            )  # fmt: skip
+        return out
+
+    def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
+        """Say which and how late."""
+        name, (value, std) = next(iter(values.items()))
+        return (
+            f"{name.removeprefix('clock_')} comes {abs(value):.2f} ± {std:.1g} s too "
+            f"{'late' if value > 0 else 'early'} against the other channels"
+        )
+
+
+class RateBias(Cause):
+    """A yaw-rate sensor whose zero is off."""
+
+    id = "rate_bias"
+    kind = "sensor"
+    title = "bias of the yaw-rate sensor"
+    signature = "the yaw rate differs from the change of the heading by a constant"
+    extension = "the bias in the vessel; logs are corrected when read"
+    reference = "Fossen (2011), section 14.1"
+
+    def atoms(self, context: Context) -> Sequence[Atom]:
+        """Return the bias, where the heading tells it."""
+        if not {"r", "psi"} <= set(context.outputs):
+            return ()
+
+        def apply(ship: Ship, value: Array) -> Ship:
+            return replace(ship, sensors=replace(ship.sensors, rate_bias=float(value[0])))
+
+        parameter = Parameter("rate_bias", "rad/s", 0.0, -0.2, 0.2, step=1e-5)
+        return (Atom(self.id, self.id, (parameter,), (), apply),)
+
+    def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
+        """Say how large."""
+        value, std = values["rate_bias"]
+        return f"the yaw rate is {value:.2g} ± {std:.1g} rad/s more than the heading's change"
+
+
+class Sign(Cause):
+    """A channel of the wrong sign."""
+
+    id = "sign"
+    kind = "sensor"
+    title = "reversed channel"
+    signature = "a motion opposite to what its forces and the other motions say"
+    extension = "the channel with its sign turned"
+    reference = "Fossen (2011), table 2.1"
+
+    def atoms(self, context: Context) -> Sequence[Atom]:
+        """Return each motion and each thruster's angle reversed."""
+        motions = [_reversed(self.id, n, motion=True) for n in context.outputs]
+        angles = sorted(context.vessel.angle_commands)
+        return motions + [_reversed(self.id, n, motion=False) for n in angles]
+
+    def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
+        """Say which."""
+        names = ", ".join(n.removeprefix("sign_") for n in values)
+        return f"{names} has the opposite sign of what the motion shows"
+
+
+def _reversed(cause: str, name: str, *, motion: bool) -> Atom:
+    def apply(ship: Ship, value: Array) -> Ship:
+        if motion:
+            turned = (*ship.sensors.reversed, name)
+            return replace(ship, sensors=replace(ship.sensors, reversed=turned))
+        return replace(ship, reversed=(*ship.reversed, name))
+
+    return Atom(cause, f"{cause}:{name}", (), (), apply)

@@ -1,0 +1,346 @@
+"""Fitting a ship under a hypothesis to logs: free runs, whitened errors, Gauss-Newton."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.diagnosis.atom import Atom
+from greybox.diagnosis.noise import Noise, fit_noise
+from greybox.diagnosis.ship import CURRENTS, LogRun, Ship
+
+Array = NDArray[np.float64]
+
+# a step that promises less than this of −2 log L ends the search
+_ENOUGH = 0.02
+_MOST = 25
+_DAMPING_LIMIT = 1e6
+# eigenvalue of the scaled normal matrix below which a direction stays as it is
+_UNKNOWN = 1e-9
+
+
+@dataclass(frozen=True)
+class Point:
+    """A hypothesis with values.
+
+    Parameters
+    ----------
+    base : Ship
+        Coefficients, currents and the vessel before the atoms with `apply`.
+    starts : tuple of ndarray
+        Start of each log.
+    places : tuple of int
+        Free coefficients and currents.
+    atoms : tuple of Atom
+        In force; those with columns have them among `places`.
+    values : tuple of ndarray
+        Of the atoms with `apply`, empty for the others.
+    """
+
+    base: Ship
+    starts: tuple[Array, ...]
+    places: tuple[int, ...]
+    atoms: tuple[Atom, ...] = ()
+    values: tuple[Array, ...] = ()
+
+    @property
+    def ship(self) -> Ship:
+        """The ship with every atom applied."""
+        ship = self.base
+        for atom, value in zip(self.atoms, self.values, strict=True):
+            if atom.apply is not None:
+                ship = atom.apply(ship, value)
+        return ship
+
+    def vector(self) -> Array:
+        """Return all free numbers: coefficients, then the atoms' values, then starts."""
+        full = np.concatenate([self.base.theta, self.base.current])
+        return np.concatenate([full[list(self.places)], *self.values, *self.starts])
+
+    def at(self, vector: Array) -> Point:
+        """Return the point with other free numbers."""
+        m = len(self.places)
+        full = np.concatenate([self.base.theta, self.base.current])
+        full[list(self.places)] = vector[:m]
+        p = len(self.base.theta)
+        base = replace(self.base, theta=full[:p], current=full[p:])
+        values, starts = [], []
+        for old in self.values:
+            values.append(vector[m : m + len(old)])
+            m += len(old)
+        for old in self.starts:
+            starts.append(vector[m : m + len(old)])
+            m += len(old)
+        return replace(self, base=base, values=tuple(values), starts=tuple(starts))
+
+    def bounds(self) -> tuple[Array, Array]:
+        """Return least and largest values of the free numbers."""
+        size = len(self.places) + sum(map(len, self.values)) + sum(map(len, self.starts))
+        low, high = np.full(size, -np.inf), np.full(size, np.inf)
+        m = len(self.places)
+        for atom, value in zip(self.atoms, self.values, strict=True):
+            if atom.apply is not None:
+                for i, parameter in enumerate(atom.parameters):
+                    low[m + i], high[m + i] = parameter.low, parameter.high
+                m += len(value)
+        return low, high
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Where a fit ended.
+
+    Parameters
+    ----------
+    point : Point
+    noise : Noise
+        Colours that the errors were whitened with.
+    cost : float
+        −2 log L, constants apart.
+    nu : tuple of ndarray
+        (N, ny) innovations of each log, of unit variance.
+    errors : tuple of ndarray
+        (N, ny) measured less simulated.
+    converged : bool
+    """
+
+    point: Point
+    noise: Noise
+    cost: float
+    nu: tuple[Array, ...]
+    errors: tuple[Array, ...]
+    converged: bool
+
+    @property
+    def escaped(self) -> bool:
+        """Whether the run has no bound."""
+        return not np.isfinite(self.cost)
+
+
+def groups_of(run: LogRun) -> list[tuple[int, ...]]:
+    """Return channels that share a state of the noise: the yaw rate with the heading."""
+    names = run.outputs
+    out: list[tuple[int, ...]] = []
+    for i, name in enumerate(names):
+        if name == "r" and "psi" in names:
+            out.append((i, names.index("psi")))
+        elif name != "psi":
+            out.append((i,))
+    return out
+
+
+class Problem:
+    """Logs, ready to be explained.
+
+    Parameters
+    ----------
+    runs : sequence of LogRun
+        Of one structure and sample time.
+    """
+
+    def __init__(self, runs: Sequence[LogRun]) -> None:
+        self.runs = tuple(runs)
+        self.structure = runs[0].structure
+        self.sample_time = runs[0].sample_time
+        self.groups = groups_of(runs[0])
+        self.names = (*self.structure.parameters, *CURRENTS)
+
+    def place(self, name: str) -> int:
+        """Return the index of a coefficient or current."""
+        return self.names.index(name)
+
+    def add(self, point: Point, atom: Atom, value: Array | None = None) -> Point:
+        """Return the point with one more atom in force."""
+        value = atom.start if value is None else value
+        if atom.apply is not None:
+            return replace(
+                point, atoms=(*point.atoms, atom), values=(*point.values, np.array(value, float))
+            )
+        places = [self.place(n) for n in atom.columns]
+        new = [i for i in places if i not in point.places]
+        return replace(
+            point,
+            atoms=(*point.atoms, atom),
+            values=(*point.values, np.zeros(0)),
+            places=(*point.places, *new),
+        )
+
+    def drop(self, point: Point, atom: Atom) -> Point:
+        """Return the point without an atom, its coefficients at zero."""
+        k = [a.key for a in point.atoms].index(atom.key)
+        base = point.base
+        places = point.places
+        if atom.apply is None:
+            gone = [self.place(n) for n in atom.columns]
+            for i in gone:
+                base = base.with_value(i, 0.0)
+            places = tuple(i for i in places if i not in gone)
+        return replace(
+            point,
+            base=base,
+            places=places,
+            atoms=point.atoms[:k] + point.atoms[k + 1 :],
+            values=point.values[:k] + point.values[k + 1 :],
+        )
+
+    def errors(self, point: Point) -> list[Array]:
+        """Return measured less simulated of each log, infinite where a run escaped."""
+        ship = point.ship
+        return [
+            run.y - run.run(ship, start).y
+            for run, start in zip(self.runs, point.starts, strict=True)
+        ]
+
+    def whitened(self, noise: Noise, errors: Sequence[Array]) -> tuple[list[Array], float]:
+        """Return innovations and −2 log L of errors."""
+        if not all(np.isfinite(e).all() for e in errors):
+            return [], np.inf
+        nu = [noise.whiten(e[:, :, None])[:, :, 0] for e in errors]
+        with np.errstate(over="ignore"):
+            cost = sum(float((n**2).sum()) for n in nu)
+        return nu, cost + noise.log_det * sum(len(e) for e in errors)
+
+    def rows(self, point: Point, noise: Noise) -> list[Array]:
+        """Return whitened derivatives of the outputs in the free numbers, (N, ny, q) a log."""
+        ship = point.ship
+        places = np.array(point.places, int)
+        own, starts = len(places), sum(map(len, point.starts))
+        inner = sum(map(len, point.values))
+        vector = point.vector()
+        out = []
+        before = 0
+        for run, start in zip(self.runs, point.starts, strict=True):
+            shown = run.run(ship, start)
+            slopes = run.columns(ship, run.linearise(ship, shown), places)
+            rows = np.zeros((run.samples, slopes.shape[1], own + inner + starts))
+            rows[:, :, :own] = slopes[:, :, :own]
+            first = own + inner + before
+            rows[:, :, first : first + len(start)] = slopes[:, :, own:]
+            before += len(start)
+            k = own
+            for atom, value in zip(point.atoms, point.values, strict=True):
+                for i in range(len(value)):
+                    rows[:, :, k] = self._difference(point, vector, run, start, k, atom, i)
+                    k += 1
+            out.append(noise.whiten(rows))
+        return out
+
+    def _difference(
+        self, point: Point, vector: Array, run: LogRun, start: Array, k: int, atom: Atom, i: int
+    ) -> Array:
+        step = atom.parameters[i].step
+        low, high = atom.parameters[i].low, atom.parameters[i].high
+        ends = np.clip([vector[k] - step, vector[k] + step], low, high)
+        shown = []
+        for end in ends:
+            moved = vector.copy()
+            moved[k] = end
+            shown.append(run.run(point.at(moved).ship, start).y)
+        return np.asarray((shown[1] - shown[0]) / (ends[1] - ends[0]))
+
+    def fit(self, point: Point, noise: Noise, most: int = _MOST) -> Fit:
+        """Minimise −2 log L over the free numbers at a given noise."""
+        low, high = point.bounds()
+        vector = np.clip(point.vector(), low, high)
+        point = point.at(vector)
+        errors = self.errors(point)
+        nu, cost = self.whitened(noise, errors)
+        converged = not np.isfinite(cost)
+        damping = 0.0
+        for _ in range(most):
+            if converged:
+                break
+            rows = np.concatenate([r.reshape(-1, r.shape[2]) for r in self.rows(point, noise)])
+            if not np.isfinite(rows).all():
+                break
+            residual = np.concatenate([n.ravel() for n in nu])
+            normal, gradient = rows.T @ rows, rows.T @ residual
+            accepted = False
+            while damping <= _DAMPING_LIMIT:
+                step = bounded_step(normal, gradient, low - vector, high - vector, damping)
+                promise = float(2 * gradient @ step - step @ normal @ step)
+                if promise < _ENOUGH and damping < 1:
+                    converged = True
+                    break
+                trial = point.at(vector + step)
+                trial_errors = self.errors(trial)
+                trial_nu, trial_cost = self.whitened(noise, trial_errors)
+                if trial_cost < cost:
+                    accepted = True
+                    break
+                damping = max(10 * damping, 1e-3)
+            if not accepted:
+                break
+            little = cost - trial_cost < _ENOUGH
+            point, vector, errors, nu, cost = (
+                trial, vector + step, trial_errors, trial_nu, trial_cost,
+            )  # fmt: skip
+            damping = damping / 10 if damping > 1e-5 else 0.0
+            if little:
+                converged = True
+        return Fit(point, noise, cost, tuple(nu), tuple(errors), converged)
+
+    def poles(self, point: Point) -> Array:
+        """Return what is left of each channel's own error after a sample, on average."""
+        ship = point.ship
+        nx = len(self.structure.states)
+        found = []
+        for run, start in zip(self.runs, point.starts, strict=True):
+            shown = run.run(ship, start)
+            found.append(run.linearise(ship, shown).a.mean(axis=0))
+        mean = np.mean(found, axis=0)
+        return np.array([mean[i, i] if i < nx else 1.0 for i in range(len(self.runs[0].outputs))])
+
+    def settle(self, fit: Fit, rounds: int = 2) -> Fit:
+        """Alternate between the noise and the fit."""
+        for _ in range(rounds):
+            if fit.escaped:
+                return fit
+            noise = fit_noise(
+                fit.errors, self.poles(fit.point), self.sample_time, self.groups,
+                fit.noise if fit.noise.estimated else None,
+            )  # fmt: skip
+            before = self.whitened(noise, fit.errors)[1]
+            fit = self.fit(fit.point, noise)
+            if before - fit.cost < 0.5:
+                break
+        return fit
+
+
+def bounded_step(normal: Array, gradient: Array, low: Array, high: Array, damping: float) -> Array:
+    """Minimise ½ δᵀNδ − gᵀδ; numbers that would leave their bounds stop there.
+
+    Parameters
+    ----------
+    normal : ndarray
+        (q, q)
+    gradient : ndarray
+        (q,)
+    low, high : ndarray
+        (q,) of δ.
+    damping : float
+        Levenberg-Marquardt share.
+    """
+    step = np.zeros(len(gradient))
+    free = np.ones(len(gradient), bool)
+    for _ in range(len(gradient)):
+        part = np.ix_(free, free)
+        right = gradient[free] - normal[np.ix_(free, ~free)] @ step[~free]
+        step[free] = _solve(normal[part], right, damping)
+        outside = free & ((step < low) | (step > high))
+        if not outside.any():
+            break
+        step[outside] = np.clip(step, low, high)[outside]
+        free &= ~outside
+    return step
+
+
+def _solve(normal: Array, right: Array, damping: float) -> Array:
+    scale = np.sqrt(np.maximum(np.diag(normal), 0.0))
+    scale[scale == 0] = 1.0
+    values, vectors = np.linalg.eigh(normal / np.outer(scale, scale))
+    inverse = np.where(values > _UNKNOWN, 1 / (np.maximum(values, _UNKNOWN) + damping), 0.0)
+    return np.asarray(vectors @ (inverse * (vectors.T @ (right / scale))) / scale)

@@ -1,0 +1,265 @@
+"""A ship under a hypothesis, and what its sensors would show on a log.
+
+Whatever a cause changes is one of: a coefficient, the current, how thrusters follow
+their commands, a coefficient from some moment on, or how a sensor sees the motion.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.diagnosis.simulator import Linear, Simulator, sensitivities
+from greybox.model.functions import Integrator
+from greybox.model.structure import Structure
+from greybox.trial.log import TrialLog
+from greybox.vessel.actuation import actuated_force
+from greybox.vessel.vessel import Vessel
+
+Array = NDArray[np.float64]
+
+CURRENTS = ("current_north", "current_east")
+
+
+@dataclass(frozen=True)
+class Change:
+    """A coefficient is `factor` times its value from `time` on [s after the log's start]."""
+
+    index: int
+    factor: float
+    time: float
+
+
+@dataclass(frozen=True)
+class Sensors:
+    """How sensors see the motion.
+
+    Parameters
+    ----------
+    lever : tuple of float
+        Where u and v are measured, forward and starboard of the origin [m].
+    turned : float
+        Measured less true direction of the axes of u and v [rad].
+    late : tuple of (str, float)
+        Channels that show an older time, by so many seconds.
+    rate_bias : float
+        Measured less true yaw rate [rad/s].
+    reversed : tuple of str
+        Channels of the wrong sign.
+    """
+
+    lever: tuple[float, float] = (0.0, 0.0)
+    turned: float = 0.0
+    late: tuple[tuple[str, float], ...] = ()
+    rate_bias: float = 0.0
+    reversed: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Ship:
+    """Everything that a run depends on beside the log.
+
+    Parameters
+    ----------
+    theta : ndarray
+        (p,) coefficients of the universe's structure.
+    current : ndarray
+        (2,) north and east [m/s].
+    vessel : Vessel
+        With its thrusters as they act.
+    changes : tuple of Change
+    sensors : Sensors
+    reversed : tuple of str
+        Thruster columns of the wrong sign.
+    """
+
+    theta: Array
+    current: Array
+    vessel: Vessel
+    changes: tuple[Change, ...] = ()
+    sensors: Sensors = field(default_factory=Sensors)
+    reversed: tuple[str, ...] = ()
+
+    def with_value(self, place: int, value: float) -> Ship:
+        """Return the ship with one coefficient, or current past the coefficients, set."""
+        p = len(self.theta)
+        if place < p:
+            theta = self.theta.copy()
+            theta[place] = value
+            return replace(self, theta=theta)
+        current = self.current.copy()
+        current[place - p] = value
+        return replace(self, current=current)
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A run as the sensors show it.
+
+    Parameters
+    ----------
+    x : ndarray
+        (N, nx) states.
+    y : ndarray
+        (N, ny) outputs, the heading last where it is one.
+    """
+
+    x: Array
+    y: Array
+
+
+class LogRun:
+    """One log ready to be run under hypotheses.
+
+    Parameters
+    ----------
+    structure : Structure
+        With every term that any hypothesis may use.
+    log : TrialLog
+    integrator : {"euler", "rk4"}
+    """
+
+    def __init__(self, structure: Structure, log: TrialLog, integrator: Integrator) -> None:
+        self.structure, self.log = structure, log
+        self.samples, self.sample_time = len(log), log.sample_time
+        self.time = log.t - log.t[0]
+        self.states = structure.states
+        self._turns = "r" in self.states and "psi" in log
+        self.outputs = (*self.states, "psi") if self._turns else self.states
+        self.y = np.column_stack([log[n] for n in self.outputs])
+        self._psi = log["psi"] if "psi" in log else np.zeros(len(log))
+        air = log.air
+        self.air_measured = air is not None and structure.uses_air
+        self._air = air if air is not None else np.zeros((len(log), 2))
+        self._commands = {c: log[c] for c in log.vessel.commands}
+        self._simulator = Simulator(structure, len(log), self.air_measured, integrator)
+        self._trapezoid = integrator == "rk4"
+        self._forces: tuple[Vessel, tuple[str, ...], Array] | None = None
+
+    def forces(self, vessel: Vessel, reversed: tuple[str, ...] = ()) -> Array:
+        """Return the generalised inputs (N, nu) as the vessel's thrusters give them."""
+        known = self._forces
+        if known is None or known[0] is not vessel or known[1] != reversed:
+            commands = {c: -v if c in reversed else v for c, v in self._commands.items()}
+            made = actuated_force(vessel, commands, self.sample_time)
+            zero = np.zeros(self.samples)
+            tau = np.column_stack([made.get(n, zero) for n in self.structure.inputs])
+            self._forces = known = (vessel, reversed, tau)
+        return known[2]
+
+    def weights(self, change: Change) -> Array:
+        """Return the share of each step that lies after a change, (N,)."""
+        return np.asarray(
+            np.clip((self.time + self.sample_time - change.time) / self.sample_time, 0.0, 1.0)
+        )
+
+    def parameters(self, ship: Ship) -> Array:
+        """Return the coefficients (p,), or (N, p) where they change."""
+        if not ship.changes:
+            return ship.theta
+        theta = np.tile(ship.theta, (self.samples, 1))
+        for change in ship.changes:
+            theta[:, change.index] *= 1 + (change.factor - 1) * self.weights(change)
+        return theta
+
+    def start(self) -> Array:
+        """Return the mean of the first samples, of outputs (ny,)."""
+        return np.asarray(self.y[:5].mean(axis=0))
+
+    def run(self, ship: Ship, start: Array) -> Shown:
+        """Run freely from a start (nx [+ 1],), the initial heading last."""
+        nx = len(self.states)
+        drivers = np.column_stack(
+            [
+                self.forces(ship.vessel, ship.reversed),
+                self._psi,
+                self._air,
+                np.broadcast_to(ship.current, (self.samples, 2)),
+            ]
+        )
+        x = self._simulator(start[:nx], drivers, self.parameters(ship))
+        full = x
+        if self._turns:
+            full = np.column_stack([x, start[nx] + self._heading(x[:, self.states.index("r")])])
+        y = self.sense(ship.sensors, full[..., None])[..., 0]
+        if ship.sensors.rate_bias:
+            y[:, self.states.index("r")] += ship.sensors.rate_bias
+        return Shown(x, y)
+
+    def _heading(self, r: Array) -> Array:
+        """Integrate a yaw rate (N, ...) from zero."""
+        out = np.zeros_like(r)
+        rate = (r[1:] + r[:-1]) / 2 if self._trapezoid else r[:-1]
+        np.cumsum(rate * self.sample_time, axis=0, out=out[1:])
+        return out
+
+    def sense(self, sensors: Sensors, x: Array) -> Array:
+        """Return what sensors show of motions (N, ny, m); linear in the motion."""
+        names = self.outputs
+        if sensors == Sensors():
+            return x.copy()
+        y = x.copy()
+        if "u" in names and "v" in names:
+            iu, iv = names.index("u"), names.index("v")
+            if "r" in names:
+                rate = x[:, names.index("r")]
+                y[:, iu] = y[:, iu] - sensors.lever[1] * rate
+                y[:, iv] = y[:, iv] + sensors.lever[0] * rate
+            if sensors.turned:
+                c, s = np.cos(sensors.turned), np.sin(sensors.turned)
+                u, v = y[:, iu].copy(), y[:, iv].copy()
+                y[:, iu], y[:, iv] = c * u + s * v, c * v - s * u
+        for name, seconds in sensors.late:
+            i = names.index(name)
+            y[:, i] = shifted(y[:, i], seconds / self.sample_time)
+        for name in sensors.reversed:
+            i = names.index(name)
+            y[:, i] = -y[:, i]
+        return y
+
+    def linearise(self, ship: Ship, shown: Shown) -> Linear:
+        """Return the derivatives along the run that was made last."""
+        return self._simulator.linearise(shown.x)
+
+    def columns(self, ship: Ship, linear: Linear, places: Array) -> Array:
+        """Return ∂y of coefficients and currents at `places`, then of the start.
+
+        Parameters
+        ----------
+        places : ndarray of int
+            (m,) coefficients, and past them the current north and east.
+
+        Returns
+        -------
+        ndarray
+            (N, ny, m + nx [+ 1])
+        """
+        driven = np.concatenate([linear.theta, linear.current], axis=2)[:, :, places]
+        for change in ship.changes:
+            here = places == change.index
+            if here.any():
+                factor = 1 + (change.factor - 1) * self.weights(change)[:-1]
+                driven[:, :, here] *= factor[:, None, None]
+        return self.seen(ship, sensitivities(linear, driven))
+
+    def seen(self, ship: Ship, slope: Array) -> Array:
+        """Return ∂y (N, ny, m [+ 1]) of motions' derivatives ∂x (N, nx, m)."""
+        if self._turns:
+            turned = self._heading(slope[:, self.states.index("r")])
+            slope = np.concatenate([slope, turned[:, None]], axis=1)
+            first = np.zeros((self.samples, slope.shape[1], 1))
+            first[:, -1] = 1.0
+            slope = np.concatenate([slope, first], axis=2)
+        return self.sense(ship.sensors, slope)
+
+
+def shifted(value: Array, samples: float) -> Array:
+    """Return value (N, ...) as of `samples` earlier, linearly between, held at the ends."""
+    last = len(value) - 1
+    place = np.clip(np.arange(last + 1) - samples, 0.0, last)
+    before = place.astype(np.intp)
+    share = (place - before).reshape(-1, *[1] * (value.ndim - 1))
+    after = np.minimum(before + 1, last)
+    return np.asarray((1 - share) * value[before] + share * value[after])

@@ -1,0 +1,186 @@
+"""Free runs of one structure with parameters that may change along the way, linearised.
+
+The step is the structure's own expression. Its derivatives along a run give every
+sensitivity by one linear recursion, however many parameters there are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.diagnosis.recursion import propagate
+from greybox.model.functions import Integrator, bind, step_function
+from greybox.model.structure import Structure
+
+Array = NDArray[np.float64]
+
+# steps in one scalar function
+_UNROLLED = 10
+# a state past this has escaped
+_ESCAPED = 1e3
+
+
+@dataclass(frozen=True)
+class Linear:
+    """Derivatives of each step along a run.
+
+    Parameters
+    ----------
+    a : ndarray
+        (N−1, nx, nx) in the state before.
+    theta : ndarray
+        (N−1, nx, p) in the parameters at that step.
+    current : ndarray
+        (N−1, nx, 2) in the current, north and east.
+    """
+
+    a: Array
+    theta: Array
+    current: Array
+
+
+@lru_cache(maxsize=32)
+def _step(structure: Structure, air_measured: bool, integrator: Integrator) -> ca.Function:
+    """Return ``(x, [tau, psi, air, current, theta]) -> x⁺``."""
+    s = structure.symbols
+    step = step_function(structure, air_measured=air_measured, integrator=integrator)
+    nu, nd, p = s.tau.numel(), s.d.numel(), s.theta.numel()
+    w = ca.SX.sym("w", nu + 5 + p)
+    d = ca.vertcat(w[nu + 3 : nu + 5], ca.SX.zeros(max(nd - 2, 0)))[:nd]
+    after = step(s.x, w[nu], w[:nu], d, w[nu + 1 : nu + 3], w[nu + 5 :], 1.0)
+    return ca.Function("step", [s.x, w], [after], {"cse": True})
+
+
+@lru_cache(maxsize=64)
+def _run(
+    structure: Structure, air_measured: bool, integrator: Integrator, blocks: int
+) -> ca.Function:
+    step = _step(structure, air_measured, integrator)
+    x0 = ca.SX.sym("x", step.size1_in(0))
+    w = ca.SX.sym("w", step.size1_in(1), _UNROLLED)
+    states = []
+    x = x0
+    for k in range(_UNROLLED):
+        x = step(x, w[:, k])
+        states.append(x)
+    several = ca.Function("steps", [x0, w], [x, ca.horzcat(*states)])
+    return several.mapaccum("run", blocks, [0], [0])
+
+
+@lru_cache(maxsize=64)
+def _linear(
+    structure: Structure, air_measured: bool, integrator: Integrator, steps: int
+) -> ca.Function:
+    step = _step(structure, air_measured, integrator)
+    nu = len(structure.inputs)
+    x, w = ca.SX.sym("x", step.size1_in(0)), ca.SX.sym("w", step.size1_in(1))
+    after = step(x, w)
+    slopes = [ca.jacobian(after, v) for v in (x, w[nu + 3 : nu + 5], w[nu + 5 :])]
+    one = ca.Function("slopes", [x, w], [ca.densify(v) for v in slopes], {"cse": True})
+    return one.map(steps)
+
+
+class Simulator:
+    """Runs of one length.
+
+    Parameters
+    ----------
+    structure : Structure
+    samples : int
+        N, of the log.
+    air_measured : bool
+        Whether terms see a measured velocity through the air.
+    integrator : {"euler", "rk4"}
+    """
+
+    def __init__(
+        self, structure: Structure, samples: int, air_measured: bool, integrator: Integrator
+    ) -> None:
+        self.structure = structure
+        self.samples = samples
+        blocks = -(-(samples - 1) // _UNROLLED)
+        key = (structure, air_measured, integrator)
+        function = _run(*key, blocks)
+        nx, width = len(structure.states), function.size1_in(1)
+        self._x0 = np.zeros(nx)
+        self._w = np.zeros((blocks * _UNROLLED, width))
+        self._last = np.zeros((blocks, nx))
+        self._history = np.zeros((blocks * _UNROLLED, nx))
+        buffer, self._trigger = function.buffer()
+        bind(buffer.set_arg, 0, self._x0)
+        bind(buffer.set_arg, 1, self._w)
+        bind(buffer.set_res, 0, self._last)
+        bind(buffer.set_res, 1, self._history)
+        self._buffer = buffer
+        slopes = _linear(*key, samples - 1)
+        nu = len(structure.inputs)
+        self._before = np.zeros((samples - 1, nx))
+        self._slopes = [np.zeros((samples - 1, m, nx)) for m in (nx, 2, width - nu - 5)]
+        self._linear, self._linearise = slopes.buffer()
+        bind(self._linear.set_arg, 0, self._before)
+        bind(self._linear.set_arg, 1, self._w[: samples - 1])
+        for i, slope in enumerate(self._slopes):
+            bind(self._linear.set_res, i, slope)
+
+    def __call__(self, x0: Array, drivers: Array, theta: Array) -> Array:
+        """Run from x0.
+
+        Parameters
+        ----------
+        x0 : ndarray
+            (nx,)
+        drivers : ndarray
+            (N, nu + 5) generalised inputs, heading, velocity through the air,
+            current north and east.
+        theta : ndarray
+            (p,) or (N, p)
+
+        Returns
+        -------
+        ndarray
+            (N, nx); infinite where the run escaped.
+        """
+        steps = self.samples - 1
+        split = drivers.shape[1]
+        self._w[:steps, :split] = drivers[:steps]
+        self._w[:steps, split:] = theta[:steps] if theta.ndim == 2 else theta
+        self._w[steps:] = self._w[steps - 1]
+        self._x0[:] = x0
+        self._trigger()
+        out = np.vstack([x0, self._history[:steps]])
+        with np.errstate(invalid="ignore"):
+            if not (np.abs(out) < _ESCAPED).all():
+                out = np.full_like(out, np.inf)
+        return out
+
+    def linearise(self, x: Array) -> Linear:
+        """Return the derivatives along the run that was made last, x (N, nx)."""
+        self._before[:] = x[:-1]
+        self._linearise()
+        a, current, theta = (slope.transpose(0, 2, 1).copy() for slope in self._slopes)
+        return Linear(a, theta, current)
+
+
+def sensitivities(linear: Linear, driven: Array) -> Array:
+    """Return ∂x of every column and of the initial state.
+
+    Parameters
+    ----------
+    linear : Linear
+    driven : ndarray
+        (N−1, nx, m) what a unit of each column adds to a step.
+
+    Returns
+    -------
+    ndarray
+        (N, nx, m + nx), the initial state last.
+    """
+    steps, nx, columns = driven.shape
+    full = np.concatenate([driven, np.zeros((steps, nx, nx))], axis=2)
+    start = np.hstack([np.zeros((nx, columns)), np.eye(nx)])
+    return propagate(linear.a, full, start)
