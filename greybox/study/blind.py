@@ -1,0 +1,370 @@
+"""Blind trials: drawn from a seed alone, with a known truth that the log does not tell.
+
+A ship is drawn around Table 6.1, sailed in continuous time by a simulator of
+its own, and logged once for the estimate and once for the validation, with
+none, one or two effects that its model lacks.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.errors import LogError, UsageError, suggestion
+from greybox.files import write_json, write_text
+from greybox.study.blind_effects import Effect, Typical, act, check_effects, draw_effect
+from greybox.study.blind_inputs import KINDS
+from greybox.study.blind_sensors import gauss_markov, observe, wanted
+from greybox.study.blind_ship import LEAD, NAMES, History, Ship, simulate_ships
+from greybox.study.chapter6 import TRUE
+from greybox.trial.log import TrialLog, make_log
+from greybox.trial.writing import write_log
+from greybox.vessel.toml import vessel_from_dict
+from greybox.vessel.vessel import Vessel
+
+Array = NDArray[np.float64]
+
+_THRUSTER = """
+[[thruster]]
+type = "azimuth"
+x = {x}
+y = 0.0
+speed = "{speed}"
+angle = "{angle}"
+speed_limits = [-20.0, 20.0]
+angle_limits = [-3.1416, 3.1416]
+"""
+_SENSORS = """
+[sensors]
+u_std = 0.014142
+v_std = 0.014142
+r_std = 0.014142
+heading_std = 0.01
+position_std = 0.1
+wind_std = 0.2
+"""
+# per second: surge, sway [m/s], yaw rate [rad/s]
+PROCESS = np.array([1e-3, 1e-3, 3e-4])
+# undisturbed motion past these is no sensible trial, disturbed past the second row a runaway
+_SANE, _RUNAWAY = np.array([5.0, 3.0, 0.15]), np.array([8.0, 5.0, 0.5])
+_ATTEMPTS = 50
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """Everything about a trial but what is wrong with it.
+
+    Parameters
+    ----------
+    kind : {"manoeuvres", "pulses", "zigzag"}
+        Of the inputs.
+    colour : {"white", "memory"}
+        Of the process noise; its memory is drawn from 10-30 s.
+    gusts : bool
+        Wind of zero mean that nobody measures: 3-5 m/s, 10-30 s.
+    positions : bool
+        Whether the log holds positions.
+    anemometer : bool, optional
+        Whether it holds the velocity through the air; by default where wind is wrong.
+    single : bool
+        Both propellers run at one speed, in one column ``n``.
+    change_inside : bool
+        The validation log too has the change of a parameter inside.
+    linear : bool
+        Commands go linearly from one second to the next, instead of being held.
+    euler : bool
+        Steps of a second as (3.51) instead of Runge-Kutta.
+    noise, process : float
+        Factors on the noises of the sensors and on the process noise.
+    samples : int
+        Of each log, one a second.
+    """
+
+    kind: str = "manoeuvres"
+    colour: str = "white"
+    gusts: bool = False
+    positions: bool = True
+    anemometer: bool | None = None
+    single: bool = False
+    change_inside: bool = False
+    linear: bool = False
+    euler: bool = False
+    noise: float = 1.0
+    process: float = 1.0
+    samples: int = 1200
+
+    def __post_init__(self) -> None:
+        for what, value, known in (
+            ("kind of inputs", self.kind, tuple(KINDS)),
+            ("colour", self.colour, ("white", "memory")),
+        ):
+            if value not in known:
+                raise UsageError(
+                    f"there is no {what} '{value}'.{suggestion(value, known)} "
+                    f"Known: {', '.join(known)}."
+                )
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Two logs of one ship, and what is wrong with them.
+
+    Parameters
+    ----------
+    estimation, validation : TrialLog
+    vessel : Vessel
+    truth : tuple of Effect
+        None, one or two.
+    ship : mapping of str to float
+        The true parameters per second.
+    conditions : Conditions
+    """
+
+    estimation: TrialLog
+    validation: TrialLog
+    vessel: Vessel
+    truth: tuple[Effect, ...]
+    ship: dict[str, float]
+    conditions: Conditions
+
+
+@dataclass(frozen=True)
+class Order:
+    """What to draw: ids of effects, and the size that scales them (1: as stated)."""
+
+    effects: tuple[str, ...] = ()
+    size: float = 1.0
+
+
+@dataclass
+class _Draft:
+    """A trial on its way: its seed, and both logs' ships."""
+
+    seed: int
+    ships: list[Ship]
+    effects: tuple[Effect, ...] = ()
+    # the air that the anemometer feels on each log
+    felt: list[Array] = field(default_factory=list)
+
+    def rng(self, log: int, use: int) -> np.random.Generator:
+        """Return a stream of its own for each use, so that one effect moves no other draw."""
+        return np.random.default_rng([self.seed, log, use])
+
+
+def vessel_text(single: bool = False) -> str:
+    """Return the vessel file of the blind trials: thrusters at x = ±9, linear law."""
+    speeds = ("n", "n") if single else ("n1", "n2")
+    head = 'name = "Blind ship"\nlength = 30.0\n'
+    thrusters = [
+        _THRUSTER.format(x=x, speed=speed, angle=angle)
+        for x, speed, angle in ((9.0, speeds[0], "alpha1"), (-9.0, speeds[1], "alpha2"))
+    ]
+    return "".join([head, *thrusters, _SENSORS])
+
+
+def blind_vessel(single: bool = False) -> Vessel:
+    """Return the vessel of the blind trials, with speed columns n1, n2 or one column n."""
+    return vessel_from_dict(tomllib.loads(vessel_text(single)))
+
+
+def draw(
+    rng: np.random.Generator,
+    effects: Sequence[str] = (),
+    *,
+    size: float = 1.0,
+    **conditions: Any,
+) -> Trial:
+    """Draw one blind trial.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        All that is drawn follows from it: without effects, with small or with large
+        ones the ship, its inputs and its noises are the same.
+    effects : sequence of str
+        Ids of what is wrong, at most a few: see `greybox.study.blind_effects.EFFECTS`.
+    size : float
+        Scales the effects: 1 as stated, 0 none.
+    **conditions
+        Fields of `Conditions`.
+
+    Raises
+    ------
+    UsageError
+        An effect, kind or colour does not exist, or cannot show in such a trial.
+    """
+    return draw_many([rng], [Order(tuple(effects), size)], Conditions(**conditions))[0]
+
+
+def draw_many(
+    rngs: Sequence[np.random.Generator], orders: Sequence[Order], conditions: Conditions
+) -> list[Trial]:
+    """Draw several trials of the same conditions, sailed side by side.
+
+    Parameters
+    ----------
+    rngs : sequence of numpy.random.Generator
+        One a trial.
+    orders : sequence of Order
+        One a trial.
+    conditions : Conditions
+
+    Raises
+    ------
+    UsageError
+        As `draw`.
+    """
+    for order in orders:
+        check_effects(order.effects, conditions.kind)
+        if conditions.single and "thruster_gain" in order.effects:
+            raise UsageError(
+                "a weak thruster cannot be told where both have 1 speed column: draw with 2."
+            )
+    trials: dict[int, Trial] = {}
+    for _ in range(_ATTEMPTS):
+        left = [i for i in range(len(rngs)) if i not in trials]
+        if not left:
+            break
+        drafts = [_drafted(rngs[i], conditions) for i in left]
+        history = _sail(drafts, conditions, step=1.0)
+        sane = _bounded(history, _SANE)
+        kept = [j for j in range(len(left)) if sane[j]]
+        if not kept:
+            continue
+        for j in kept:
+            _disturb(drafts[j], orders[left[j]], history, 2 * j, conditions)
+        chosen = [drafts[j] for j in kept]
+        history = _sail(chosen, conditions)
+        for place, (j, steady) in enumerate(zip(kept, _bounded(history, _RUNAWAY), strict=True)):
+            if steady:
+                trials[left[j]] = _logged(drafts[j], history, 2 * place, conditions)
+    else:
+        raise UsageError(
+            f"{len(rngs) - len(trials)} of {len(rngs)} ships ran away in each of {_ATTEMPTS} "
+            f"draws: draw smaller effects."
+        )
+    return [trials[i] for i in range(len(rngs))]
+
+
+def _drafted(rng: np.random.Generator, conditions: Conditions) -> _Draft:
+    draft = _Draft(int(rng.integers(2**62)), [])
+    own = draft.rng(0, 0)
+    theta = np.array([TRUE[n] for n in NAMES]) * own.uniform(0.75, 1.25, len(NAMES))
+    seconds = conditions.samples + LEAD
+    for log in (1, 2):
+        programme = KINDS[conditions.kind](draft.rng(log, 1), seconds, conditions.single)
+        start = draft.rng(log, 2)
+        surge = start.uniform(1.0, 2.0)
+        # pulses never change the sign of sway: their ship drifts from the start
+        sway = start.uniform(0.6, 1.2) if conditions.kind == "pulses" else 0.0
+        state = np.array([surge, sway, 0.0, start.uniform(-np.pi, np.pi)])
+        still = np.zeros((seconds, 2))
+        draft.ships.append(Ship(theta, programme, state, still, np.zeros((seconds, 3))))
+    return draft
+
+
+def _disturb(
+    draft: _Draft, order: Order, history: History, column: int, conditions: Conditions
+) -> None:
+    """Draw noises and effects, sized on the undisturbed motion of the estimation log."""
+    motion = history.x[LEAD:, :3, column]
+    u, v, r = np.sqrt((motion**2).mean(axis=0))
+    typical = Typical(
+        draft.ships[0].theta, u, v, r, motion[:, 0], history.commands[LEAD:, :, column]
+    )
+    own = draft.rng(0, 1)
+    memory = own.uniform(10, 30) if conditions.colour == "memory" else 0.0
+    gust, gust_memory = own.uniform(3, 5), own.uniform(10, 30)
+    draft.effects = tuple(
+        draw_effect(name, draft.rng(0, 2 + i), order.size, typical)
+        for i, name in enumerate(order.effects)
+    )
+    for log, ship in enumerate(draft.ships, 1):
+        seconds = len(ship.wind)
+        process = gauss_markov(draft.rng(log, 3), seconds, 1.0, memory, 3)
+        felt = np.zeros((seconds, 2))
+        for effect in draft.effects:
+            if effect.id == "wind":
+                mean = np.array([effect.number("wind_north"), effect.number("wind_east")])
+                felt += mean + gauss_markov(
+                    draft.rng(log, 4), seconds, effect.number("turbulence"), 20.0
+                )
+        gusts = gauss_markov(draft.rng(log, 5), seconds, gust, gust_memory)
+        ship = act(ship, draft.effects, later=log == 2 and not conditions.change_inside)
+        draft.ships[log - 1] = replace(
+            ship,
+            wind=felt + conditions.gusts * (gusts - gusts.mean(axis=0)),
+            process=conditions.process * PROCESS * process,
+        )
+        draft.felt.append(felt)
+
+
+def _sail(drafts: Sequence[_Draft], conditions: Conditions, step: float | None = None) -> History:
+    ships = [ship for draft in drafts for ship in draft.ships]
+    if step is not None:
+        return simulate_ships(ships, euler=conditions.euler, linear=conditions.linear, step=step)
+    return simulate_ships(ships, euler=conditions.euler, linear=conditions.linear)
+
+
+def _bounded(history: History, bound: Array) -> list[bool]:
+    """Return for each pair of ships whether both stayed inside."""
+    inside = (np.abs(history.x[:, :3]) <= bound[:, None]).all(axis=(0, 1))
+    return [bool(a and b) for a, b in zip(inside[::2], inside[1::2], strict=True)]
+
+
+def _logged(draft: _Draft, history: History, column: int, conditions: Conditions) -> Trial:
+    vessel = blind_vessel(conditions.single)
+    anemometer = conditions.anemometer
+    if anemometer is None:
+        anemometer = any(e.id == "wind" for e in draft.effects)
+    logs = []
+    for log, name in ((1, "estimation"), (2, "validation")):
+        channels = observe(
+            history,
+            column + log - 1,
+            draft.felt[log - 1],
+            draft.effects,
+            LEAD,
+            noise=conditions.noise,
+            sensors=draft.rng(log, 6),
+            sea=draft.rng(log, 7),
+        )
+        if conditions.single:
+            channels["n"] = channels.pop("n1")
+            channels.pop("n2")
+        kept = wanted(channels, conditions.positions, anemometer)
+        logs.append(make_log(vessel, kept, 1.0, name))
+    ship = dict(zip(NAMES, map(float, draft.ships[0].theta), strict=True))
+    return Trial(logs[0], logs[1], vessel, draft.effects, ship, conditions)
+
+
+def write(trial: Trial, folder: str | Path) -> None:
+    """Write vessel.toml, estimation.csv, validation.csv, and the truth apart in truth.json.
+
+    Raises
+    ------
+    LogError
+        The folder cannot be made.
+    """
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise LogError(
+            f"cannot make the folder '{folder}': {error.strerror}. Name another."
+        ) from error
+    write_text(vessel_text(trial.conditions.single), folder / "vessel.toml")
+    for log in (trial.estimation, trial.validation):
+        write_log([log], folder / f"{log.name}.csv")
+    truth = {
+        "effects": [{"id": e.id, "parameters": dict(e.parameters)} for e in trial.truth],
+        "ship": trial.ship,
+        "conditions": asdict(trial.conditions),
+    }
+    write_json(truth, folder / "truth.json")

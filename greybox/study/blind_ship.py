@@ -1,0 +1,305 @@
+"""The ship of a blind trial: many ships side by side, in continuous time.
+
+The equations are those of (3.51) with the discrete parameters taken per second,
+integrated by Runge-Kutta of fourth order at 0.1 s; nothing here is shared with
+the engine that is judged on its trials.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.study.blind_inputs import RATES, Programme
+
+Array = NDArray[np.float64]
+
+NAMES = (
+    "Xu", "Xvr", "Xuu", "Wuu", "Xmu", "Xkappa", "Yv", "Yur", "Yvv", "Yvr", "Wvv", "Ymu",
+    "Nr", "Nuv", "Nvv", "Nvr", "Wuv", "Nmu",
+)  # fmt: skip
+EXTRA = ("X_uuu", "Y_vvv", "N_rrr", "N_|r|r", "Y_|r|r", "Y_|r|v", "N_|r|v")
+STEP = 0.1
+# seconds that a ship runs before its log begins: late sensors and commands have a past
+LEAD = 10
+# where the two azimuths stand ahead of the origin [m]
+_X1, _X2 = 9.0, -9.0
+
+
+@dataclass(frozen=True)
+class Ship:
+    """One ship on one trial, each effect at its null value unless drawn.
+
+    Parameters
+    ----------
+    theta : ndarray
+        (18,) parameters per second in the order of `NAMES`.
+    programme : Programme
+        Over N seconds.
+    start : ndarray
+        (4,) u, v [m/s], r [rad/s], ψ [rad].
+    wind : ndarray
+        (N, 2) velocity of the air, north and east [m/s].
+    process : ndarray
+        (N, 3) added to u, v, r at each second.
+    current : (float, float)
+        North and east [m/s].
+    extra : tuple of float
+        (7,) coefficients of `EXTRA`.
+    gain : (float, float)
+        Of each thruster.
+    speed_lag, force_lag, delay : float
+        First-order lag of the speeds, of the force, and delay of all commands [s].
+    quadratic, reference : float
+        Share of the thrust that goes as n|n|/reference.
+    advance : float
+        Loss of side force and moment per m/s.
+    change : (int, float, float)
+        Parameter, its factor, and the second from which it holds.
+    dead_band : float
+        Speed below which the propellers give nothing.
+    interaction : (float, float, float)
+        Largest loss of thruster 2, centre and width of the angles of thruster 1 [rad].
+    backlash : float
+        Half the play of the azimuths [rad].
+    asymmetry : float
+        Share by which sway damping is larger to starboard.
+    shallow : (float, float)
+        Coefficient of (|u| − u0)² and u0 [m/s].
+    swell : (float, float, float, float)
+        Amplitude [m/s²], period [s], direction and phase [rad] of a slow force.
+    """
+
+    theta: Array
+    programme: Programme
+    start: Array
+    wind: Array
+    process: Array
+    current: tuple[float, float] = (0.0, 0.0)
+    extra: tuple[float, ...] = field(default=(0.0,) * len(EXTRA))
+    gain: tuple[float, float] = (1.0, 1.0)
+    speed_lag: float = 0.0
+    force_lag: float = 0.0
+    delay: float = 0.0
+    quadratic: float = 0.0
+    reference: float = 1.0
+    advance: float = 0.0
+    change: tuple[int, float, float] = (0, 1.0, np.inf)
+    dead_band: float = 0.0
+    interaction: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    backlash: float = 0.0
+    asymmetry: float = 0.0
+    shallow: tuple[float, float] = (0.0, 0.0)
+    swell: tuple[float, float, float, float] = (0.0, 1.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class History:
+    """Motion of B ships.
+
+    Parameters
+    ----------
+    t : ndarray
+        (M,) time at every step [s].
+    x : ndarray
+        (M, 4, B) u, v [m/s], r [rad/s], ψ [rad].
+    commands : ndarray
+        (N, 4, B) n1, n2, alpha1, alpha2 [rad] at every second.
+    """
+
+    t: Array
+    x: Array
+    commands: Array
+
+    def positions(self, ship: int) -> tuple[Array, Array, Array]:
+        """Return times (K,), and positions north and east (K,) [m] from steps of 0.1 s."""
+        t = np.arange(round(self.t[-1] / STEP) + 1) * STEP
+        u, v, _, psi = (np.interp(t, self.t, self.x[:, i, ship]) for i in range(4))
+        c, s = np.cos(psi), np.sin(psi)
+        rate = np.array([c * u - s * v, s * u + c * v])
+        way = np.cumsum(0.5 * STEP * (rate[:, 1:] + rate[:, :-1]), axis=1)
+        north, east = np.concatenate([np.zeros((2, 1)), way], axis=1)
+        return t, north, east
+
+
+class _Fleet:
+    """The parameters of B ships as arrays, and their equations."""
+
+    def __init__(self, ships: Sequence[Ship]) -> None:
+        def stack(name: str) -> Array:
+            return np.array([getattr(s, name) for s in ships], float).T
+
+        self.theta = stack("theta")
+        self.current, self.extra, self.gain = stack("current"), stack("extra"), stack("gain")
+        self.speed_lag, self.force_lag = stack("speed_lag"), stack("force_lag")
+        self.delay, self.quadratic = stack("delay"), stack("quadratic")
+        self.reference, self.advance = stack("reference"), stack("advance")
+        self.change, self.dead_band = stack("change"), stack("dead_band")
+        self.interaction, self.backlash = stack("interaction"), stack("backlash")
+        self.asymmetry, self.shallow, self.swell = (
+            stack("asymmetry"), stack("shallow"), stack("swell")
+        )  # fmt: skip
+        self.peculiar = bool(
+            self.extra.any() or self.asymmetry.any() or self.shallow[0].any() or self.swell[0].any()
+        )
+
+    def decay(self, lag: Array, step: float) -> Array:
+        """Return what remains of a lagged value at the start, middle and end of a step."""
+        after = np.array([0.0, 0.5, 1.0])[:, None] * step
+        return np.where(lag > 0, np.exp(-after / np.where(lag > 0, lag, 1.0)), 0.0)
+
+    def thrust(self, n: Array, angle: Array) -> Array:
+        """Return τx, τy, τψ (3, K, B) of speeds and angles (2, K, B) (3.46)."""
+        size = np.abs(n)
+        law = (1 - self.quadratic) * n + self.quadratic * n * size / self.reference
+        force = np.where(size < self.dead_band, 0.0, law) * self.gain[:, None]
+        loss, centre, width = self.interaction
+        race = loss * np.exp(-(((angle[0] - centre) / width) ** 2))
+        force[1] *= 1 - np.where(n[0] > 0, race, 0.0)
+        along, across = force * np.cos(angle), force * np.sin(angle)
+        return np.array([along[0] + along[1], across[0] + across[1],
+                         _X1 * across[0] + _X2 * across[1]])  # fmt: skip
+
+    def rates(self, x: Array, tau: Array, wind: Array, t: float) -> Array:
+        """Return du/dt, dv/dt, dr/dt and dψ/dt (4, B) of (3.51)."""
+        (Xu, Xvr, Xuu, Wuu, Xmu, Xkappa, Yv, Yur, Yvv, Yvr, Wvv, Ymu,
+         Nr, Nuv, Nvv, Nvr, Wuv, Nmu) = self.theta  # fmt: skip
+        u, v, r, psi = x
+        c, s = np.cos(psi), np.sin(psi)
+        north, east = self.current
+        ur, vr = u - (c * north + s * east), v - (c * east - s * north)
+        uq, vq = u - (c * wind[0] + s * wind[1]), v - (c * wind[1] - s * wind[0])
+        size = np.abs(vr)
+        loss = 1 - self.advance * ur
+        du = (
+            (Xu + Xuu * np.abs(ur)) * ur + Xvr * vr * r + Wuu * np.abs(uq) * uq
+            + (Xmu + Xkappa * ur) * tau[0]
+        )  # fmt: skip
+        dv = (
+            (Yv + Yvv * size) * vr + (Yur * ur + Yvr * size) * r + Wvv * np.abs(vq) * vq
+            + Ymu * loss * tau[1]
+        )  # fmt: skip
+        dr = (
+            (Nr + Nvr * size) * r + (Nuv * ur + Nvv * size) * vr + Wuv * uq * vq
+            + Nmu * loss * tau[2]
+        )  # fmt: skip
+        if self.peculiar:
+            turn = np.abs(r)
+            e = self.extra
+            beyond = np.maximum(np.abs(ur) - self.shallow[1], 0.0)
+            push = self.swell[0] * np.cos(2 * np.pi * t / self.swell[1] + self.swell[3])
+            du += e[0] * ur**3 + self.shallow[0] * beyond**2 * np.sign(ur)
+            du += push * np.cos(self.swell[2] - psi)
+            dv += e[1] * vr**3 + e[4] * turn * r + e[5] * turn * vr
+            dv += self.asymmetry * Yv * np.maximum(vr, 0.0) + push * np.sin(self.swell[2] - psi)
+            dr += e[2] * r**3 + e[3] * turn * r + e[6] * turn * vr
+        return np.array([du, dv, dr, r])
+
+
+def simulate_ships(
+    ships: Sequence[Ship],
+    *,
+    euler: bool = False,
+    linear: bool = False,
+    step: float = STEP,
+) -> History:
+    """Run ships side by side over their programmes.
+
+    Parameters
+    ----------
+    ships : sequence of Ship
+        B, of equally long programmes.
+    euler : bool
+        Step by Euler at 1 s, exactly as (3.51), instead of Runge-Kutta.
+    linear : bool
+        Go from one command to the next within the second instead of holding it.
+    step : float
+        Of Runge-Kutta [s]; divides a second.
+
+    Returns
+    -------
+    History
+        A ship that runs away leaves numbers that are not finite.
+    """
+    fleet = _Fleet(ships)
+    step = 1.0 if euler else step
+    inner = round(1 / step)
+    seconds, count = len(ships[0].wind), len(ships)
+    wind = np.array([s.wind for s in ships]).transpose(1, 2, 0)
+    process = np.array([s.process for s in ships]).transpose(1, 2, 0)
+    x = np.array([s.start for s in ships]).T
+    history = np.empty(((seconds - 1) * inner + 1, 4, count))
+    history[0] = x
+    commands = np.empty((seconds, 4, count))
+    helm = _Helm([s.programme for s in ships])
+    commands[0] = helm.targets[0]
+    speed, play = commands[0, :2].copy(), commands[0, 2:].copy()
+    force = fleet.thrust(speed[:, None], play[:, None])[:, 0]
+    keep_speed, keep_force = fleet.decay(fleet.speed_lag, step), fleet.decay(fleet.force_lag, step)
+    stages = np.array([0.0, 0.5, 1.0])[:, None] * step
+    everyone = np.arange(count)
+    with np.errstate(all="ignore"):
+        for k in range(seconds - 1):
+            commands[k + 1] = helm.next(k, x[3], commands[k])
+            where, factor, since = fleet.change
+            now = since == k
+            if now.any():
+                fleet.theta[where[now].astype(int), everyone[now]] *= factor[now]
+            for i in range(inner):
+                t = k + i * step
+                # the middle of the step tells which second it lies in
+                at = np.clip(t + step / 2 - fleet.delay, 0, seconds - 1)
+                before = np.floor(at + 1e-9).astype(int)
+                wanted = commands[before, :, everyone].T[:, None]
+                if linear:
+                    share = np.maximum(t + stages - fleet.delay, 0) - before
+                    after = commands[np.minimum(before + 1, k + 1), :, everyone].T[:, None]
+                    wanted = wanted + share * (after - wanted)
+                else:
+                    wanted = np.repeat(wanted, 3, axis=1)
+                n = wanted[:2] + (speed[:, None] - wanted[:2]) * keep_speed
+                angle = np.clip(
+                    play[:, None], wanted[2:] - fleet.backlash, wanted[2:] + fleet.backlash
+                )
+                raw = fleet.thrust(n, angle)
+                tau = raw + (force[:, None] - raw) * keep_force
+                speed, play, force = n[:, 2], angle[:, 2], tau[:, 2]
+                air = [wind[k] + (i + a) * step * (wind[k + 1] - wind[k]) for a in (0, 0.5, 1)]
+                a = fleet.rates(x, tau[:, 0], air[0], t)
+                if euler:
+                    x = x + a
+                else:
+                    b = fleet.rates(x + 0.5 * step * a, tau[:, 1], air[1], t + step / 2)
+                    c = fleet.rates(x + 0.5 * step * b, tau[:, 1], air[1], t + step / 2)
+                    d = fleet.rates(x + step * c, tau[:, 2], air[2], t + step)
+                    x = x + step / 6 * (a + 2 * (b + c) + d)
+                if i == inner - 1:
+                    x[:3] += process[k]
+                history[k * inner + i + 1] = x
+    return History(np.arange(len(history)) * step, history, commands)
+
+
+class _Helm:
+    """Turns programmes into commands, second by second."""
+
+    def __init__(self, programmes: Sequence[Programme]) -> None:
+        self.targets = np.array([p.target for p in programmes]).transpose(1, 2, 0)
+        self.threshold = np.array([p.threshold for p in programmes]).T
+        self.side = np.array([p.side for p in programmes]).T
+        self.begins = np.array([p.begins for p in programmes]).T
+        self.reference = np.zeros(len(programmes))
+        self.sign = np.ones(len(programmes))
+
+    def next(self, k: int, psi: Array, command: Array) -> Array:
+        """Return the commands (4, B) of second k + 1 from the heading at second k."""
+        self.reference = np.where(self.begins[k], psi, self.reference)
+        self.sign = np.where(self.begins[k], 1.0, self.sign)
+        turned = self.sign * self.side[k] * (psi - self.reference)
+        self.sign = np.where(turned > self.threshold[k], -self.sign, self.sign)
+        target = self.targets[k + 1].copy()
+        target[2:] *= np.where(np.isfinite(self.threshold[k + 1]), self.sign, 1.0)
+        rate = RATES[:, None]
+        return np.asarray(command + np.clip(target - command, -rate, rate))
