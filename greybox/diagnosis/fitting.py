@@ -283,6 +283,47 @@ class Problem:
                 converged = True
         return Fit(point, noise, cost, tuple(nu), tuple(errors), converged)
 
+    def fit_starts(self, point: Point, noise: Noise) -> Fit:
+        """Fit the starts alone, as a held-out log asks."""
+        frozen = replace(
+            point,
+            base=replace(point.base),
+            places=(),
+            atoms=(),
+            values=(),
+            starts=tuple(run.start() for run in self.runs),
+        )
+        return self.fit(replace(frozen, base=point.ship), noise, most=8)
+
+    def contributions(self, fit: Fit) -> list[Array]:
+        """Return what each sample adds to −2 log L, (N,) a log."""
+        return [(nu**2).sum(axis=1) + fit.noise.log_det for nu in fit.nu]
+
+    def covariance(self, fit: Fit) -> tuple[Array, Array]:
+        """Return the estimate's free numbers but the starts, and their covariance.
+
+        Robust to what memory the innovations have left (Newey and West, 1987), and
+        never less than what white innovations would give.
+        """
+        rows = np.concatenate(self.rows(fit.point, fit.noise))
+        nu = np.concatenate(fit.nu)
+        samples, _, q = rows.shape
+        normal = np.einsum("kic,kid->cd", rows, rows)
+        scores = np.einsum("kic,ki->kc", rows, nu)
+        middle = scores.T @ scores
+        lags = round(samples ** (1 / 3))
+        for lag in range(1, lags + 1):
+            part = scores[lag:].T @ scores[:-lag]
+            middle += (1 - lag / (lags + 1)) * (part + part.T)
+        inverse = _inverse(normal)
+        robust = inverse @ middle @ inverse * samples / max(samples - q, 1)
+        widen = np.sqrt(
+            np.maximum(np.diag(inverse) / np.maximum(np.diag(robust), 1e-300), 1.0)
+        )
+        full = robust * np.outer(widen, widen)
+        free = len(fit.point.places) + sum(map(len, fit.point.values))
+        return fit.point.vector()[:free], full[:free, :free]
+
     def poles(self, point: Point) -> Array:
         """Return what is left of each channel's own error after a sample, on average."""
         ship = point.ship
@@ -336,6 +377,15 @@ def bounded_step(normal: Array, gradient: Array, low: Array, high: Array, dampin
         step[outside] = np.clip(step, low, high)[outside]
         free &= ~outside
     return step
+
+
+def _inverse(normal: Array) -> Array:
+    scale = np.sqrt(np.maximum(np.diag(normal), 0.0))
+    scale[scale == 0] = 1.0
+    values, vectors = np.linalg.eigh(normal / np.outer(scale, scale))
+    # what nothing determines has a spread that no number of the log bounds
+    values = np.maximum(values, _UNKNOWN * max(values[-1], 1e-300))
+    return np.asarray((vectors / values) @ vectors.T / np.outer(scale, scale))
 
 
 def _solve(normal: Array, right: Array, damping: float) -> Array:

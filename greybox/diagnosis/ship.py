@@ -119,12 +119,20 @@ class LogRun:
         With every term that any hypothesis may use.
     log : TrialLog
     integrator : {"euler", "rk4"}
+    origin : float, optional
+        Time that changes count from [s]; by default the log's first sample.
     """
 
-    def __init__(self, structure: Structure, log: TrialLog, integrator: Integrator) -> None:
-        self.structure, self.log = structure, log
+    def __init__(
+        self,
+        structure: Structure,
+        log: TrialLog,
+        integrator: Integrator,
+        origin: float | None = None,
+    ) -> None:
+        self.structure, self.log, self.integrator = structure, log, integrator
         self.samples, self.sample_time = len(log), log.sample_time
-        self.time = log.t - log.t[0]
+        self.time = log.t - (log.t[0] if origin is None else origin)
         self.states = structure.states
         self._turns = "r" in self.states and "psi" in log
         self.outputs = (*self.states, "psi") if self._turns else self.states

@@ -1,0 +1,168 @@
+"""What a cause does for logs that it was not fitted to."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.diagnosis.fitting import Fit, Point, Problem
+from greybox.diagnosis.ship import Ship
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Proof:
+    """Fall of −2 log L of held-out logs.
+
+    Parameters
+    ----------
+    gain : float
+    std : float
+        Its standard error, the errors' memory counted.
+    p_value : float
+        One-sided, of no gain.
+    samples : ndarray
+        (N,) what each held-out sample adds to the gain.
+    """
+
+    gain: float
+    std: float
+    p_value: float
+    samples: Array
+
+
+class HeldOut(Protocol):
+    """Where causes have to prove themselves."""
+
+    def contributions(self, fit: Fit) -> Array:
+        """Return what each held-out sample adds to −2 log L of a fitted hypothesis, (N,)."""
+
+    def prove(self, before: Fit, after: Fit) -> Proof:
+        """Return what the second hypothesis gains on the first."""
+
+
+def proof_of(difference: Array) -> Proof:
+    """Return the proof that differences of each sample (N,) give."""
+    from scipy.stats import norm
+
+    if not np.isfinite(difference).all():
+        worse = float(np.nan_to_num(difference, nan=-np.inf).sum())
+        return Proof(worse, 0.0, 1.0 if worse < 0 else 0.0, difference)
+    gain = float(difference.sum())
+    std = float(np.sqrt(long_run_variance(difference) * len(difference)))
+    p = float(norm.sf(gain / std)) if std > 0 else float(gain <= 0)
+    return Proof(gain, std, p, difference)
+
+
+def long_run_variance(series: Array) -> float:
+    """Return the variance per sample of a sum, by blocks of N^(1/2) samples.
+
+    References
+    ----------
+    Carlstein (1986), non-overlapping blocks.
+    """
+    size = max(5, round(len(series) ** 0.5))
+    count = len(series) // size
+    if count < 2:
+        return float(np.var(series)) if len(series) > 1 else 0.0
+    sums = series[: count * size].reshape(count, size).sum(axis=1)
+    return float(np.var(sums, ddof=1)) / size
+
+
+class OtherLogs:
+    """Validation logs.
+
+    Parameters
+    ----------
+    problem : Problem
+        Of the validation logs, same structure.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+        self._known: dict[int, tuple[Fit, Fit]] = {}
+
+    def run(self, fit: Fit) -> Fit:
+        """Return the hypothesis on the held-out logs, its starts fitted to them.
+
+        A coefficient that changed during the estimation may have changed before
+        these logs, or within them: the likelier counts.
+        """
+        known = self._known.get(id(fit))
+        if known is not None and known[0] is fit:
+            return known[1]
+        points = [replace(fit.point, base=ship, atoms=(), values=()) for ship in stories(fit.point)]
+        best = min(
+            (self.problem.fit_starts(p, fit.noise) for p in points), key=lambda found: found.cost
+        )
+        self._known[id(fit)] = (fit, best)
+        return best
+
+    def contributions(self, fit: Fit) -> Array:
+        """Return what each held-out sample adds to −2 log L of a fitted hypothesis, (N,)."""
+        found = self.run(fit)
+        if found.escaped:
+            return np.full(sum(len(r.y) for r in self.problem.runs), np.inf)
+        return np.concatenate(self.problem.contributions(found))
+
+    def prove(self, before: Fit, after: Fit) -> Proof:
+        """Return what the second hypothesis gains on the first."""
+        one, two = self.contributions(before), self.contributions(after)
+        with np.errstate(invalid="ignore"):
+            return proof_of(one - two)
+
+
+def stories(point: Point) -> list[Ship]:
+    """Return the ship with its changes within the log, and with them made before."""
+    ship = point.ship
+    if not ship.changes:
+        return [ship]
+    theta = ship.theta.copy()
+    for change in ship.changes:
+        theta[change.index] *= change.factor
+    return [ship, replace(ship, theta=theta, changes=())]
+
+
+class Folds:
+    """Parts of the estimation logs, each predicted from a fit to the others.
+
+    Parameters
+    ----------
+    parts : sequence of (Problem, Problem)
+        To fit on, and held out.
+    """
+
+    def __init__(self, parts: Sequence[tuple[Problem, Problem]]) -> None:
+        self.parts = tuple(parts)
+        self._known: dict[int, tuple[Fit, Array]] = {}
+
+    def contributions(self, fit: Fit) -> Array:
+        """Return what each held-out sample adds to −2 log L of a fitted hypothesis, (N,)."""
+        known = self._known.get(id(fit))
+        if known is not None and known[0] is fit:
+            return known[1]
+        out = []
+        for fitting, held in self.parts:
+            starts = tuple(run.start() for run in fitting.runs)
+            refitted = fitting.fit(replace(fit.point, starts=starts), fit.noise, most=10)
+            found = held.fit_starts(refitted.point, fit.noise)
+            size = sum(len(r.y) for r in held.runs)
+            out.append(
+                np.full(size, np.inf)
+                if refitted.escaped or found.escaped
+                else np.concatenate(held.contributions(found))
+            )
+        joined = np.concatenate(out)
+        self._known[id(fit)] = (fit, joined)
+        return joined
+
+    def prove(self, before: Fit, after: Fit) -> Proof:
+        """Return what the second hypothesis gains on the first."""
+        one, two = self.contributions(before), self.contributions(after)
+        with np.errstate(invalid="ignore"):
+            return proof_of(one - two)

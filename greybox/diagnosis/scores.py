@@ -1,0 +1,212 @@
+"""What every cause could explain of the errors, judged at once without refitting.
+
+The sensitivity of the free run to a cause, less what the coefficients and the start can
+imitate, is what its error would look like. How much of the squared innovations lies
+along it ranks the causes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.diagnosis.atom import Atom
+from greybox.diagnosis.fitting import Fit, Point, Problem
+from greybox.diagnosis.noise import Noise
+from greybox.diagnosis.simulator import sensitivities
+
+Array = NDArray[np.float64]
+
+CHANGE = "parameter_change"
+# moments at which a change is tried
+_MOMENTS = 19
+# share of a direction that must be left when the nuisance is taken out
+_OWN = 1e-6
+# factor at which a change's search begins, at least so far from one
+_LEAST_FACTOR, _MOST_FACTOR = 0.3, 3.0
+
+
+@dataclass(frozen=True)
+class Score:
+    """What a cause promises.
+
+    Parameters
+    ----------
+    atom : Atom
+    value : ndarray
+        Where its fit should begin.
+    gain : float
+        Predicted fall of −2 log L.
+    """
+
+    atom: Atom
+    value: Array
+    gain: float
+
+
+class Directions:
+    """Innovations and directions with the nuisance taken out.
+
+    Parameters
+    ----------
+    problem : Problem
+    fit : Fit
+    noise : Noise
+        Metric; by default that of the fit.
+    """
+
+    def __init__(self, problem: Problem, fit: Fit, noise: Noise | None = None) -> None:
+        self.problem, self.fit = problem, fit
+        self.noise = fit.noise if noise is None else noise
+        nuisance = _stacked(problem.rows(fit.point, self.noise))
+        scale = np.sqrt((nuisance**2).sum(axis=0))
+        scale[scale == 0] = 1.0
+        left, values, _ = np.linalg.svd(nuisance / scale, full_matrices=False)
+        self.basis = left[:, values > 1e-8 * values[0]]
+        self.nu = self._clear(_stacked(problem.whitened(self.noise, fit.errors)[0]))
+
+    def _clear(self, rows: Array) -> Array:
+        return np.asarray(rows - self.basis @ (self.basis.T @ rows))
+
+    def clear(self, columns: Sequence[Array]) -> tuple[Array, Array]:
+        """Return whitened columns (n, m) without nuisance, and their squares before (m,).
+
+        Parameters
+        ----------
+        columns : sequence of ndarray
+            (N, ny, m) of each log.
+        """
+        rows = _stacked([self.noise.whiten(c) for c in columns])
+        return self._clear(rows), (rows**2).sum(axis=0)
+
+    def gain(self, cleared: Array, before: Array) -> tuple[float, Array]:
+        """Return the fall of −2 log L and the coefficients of directions taken together."""
+        own = (cleared**2).sum(axis=0) > _OWN * before
+        coefficients = np.zeros(cleared.shape[1])
+        if not own.any():
+            return 0.0, coefficients
+        found = np.linalg.lstsq(cleared[:, own], self.nu, rcond=1e-8)[0]
+        coefficients[own] = found
+        return float(self.nu @ (cleared[:, own] @ found)), coefficients
+
+
+def _stacked(parts: Sequence[Array]) -> Array:
+    return np.concatenate(
+        [p.reshape(-1, p.shape[2]) if p.ndim == 3 else p.ravel() for p in parts]
+    )
+
+
+def score_atoms(directions: Directions, atoms: Sequence[Atom]) -> list[Score]:
+    """Score every atom at a fit, the most promising first.
+
+    Parameters
+    ----------
+    directions : Directions
+    atoms : sequence of Atom
+        Not in force yet.
+    """
+    out = [
+        *_score_columns(directions, [a for a in atoms if a.apply is None]),
+        *_score_moves(directions, [a for a in atoms if a.apply and a.cause != CHANGE]),
+        *_score_changes(directions, [a for a in atoms if a.cause == CHANGE]),
+    ]
+    return sorted(out, key=lambda s: -s.gain)
+
+
+def _score_columns(directions: Directions, atoms: Sequence[Atom]) -> list[Score]:
+    problem, point = directions.problem, directions.fit.point
+    names = list(dict.fromkeys(n for a in atoms for n in a.columns))
+    if not names:
+        return []
+    places = np.array([problem.place(n) for n in names])
+    ship = point.ship
+    slopes = []
+    for run, start in zip(problem.runs, point.starts, strict=True):
+        shown = run.run(ship, start)
+        slopes.append(run.columns(ship, run.linearise(ship, shown), places)[:, :, : len(names)])
+    cleared, before = directions.clear(slopes)
+    out = []
+    for atom in atoms:
+        index = [names.index(n) for n in atom.columns]
+        gain, _ = directions.gain(cleared[:, index], before[index])
+        out.append(Score(atom, np.zeros(0), gain))
+    return out
+
+
+def _score_moves(directions: Directions, atoms: Sequence[Atom]) -> list[Score]:
+    """Score atoms by how the run moves from the null to where their search begins."""
+    problem, point = directions.problem, directions.fit.point
+    now = [r.run(point.ship, s).y for r, s in zip(problem.runs, point.starts, strict=True)]
+
+    def moved(ship_of: Point) -> list[Array] | None:
+        ship = ship_of.ship
+        parts = [
+            r.run(ship, s).y - y
+            for r, s, y in zip(problem.runs, point.starts, now, strict=True)
+        ]
+        return parts if all(np.isfinite(p).all() for p in parts) else None
+
+    out = []
+    for atom in atoms:
+        best = Score(atom, atom.start, -np.inf)
+        for value in (atom.start, *(np.array(s) for s in atom.starts)):
+            parts = []
+            if not len(value):
+                one = moved(problem.add(point, atom, value))
+                parts = [one] if one is not None else []
+            for i, parameter in enumerate(atom.parameters):
+                trial = np.array([p.null for p in atom.parameters])
+                off = value[i] != parameter.null
+                trial[i] = value[i] if off else parameter.null + parameter.step
+                one = moved(problem.add(point, atom, trial))
+                if one is not None:
+                    parts.append([p / (1.0 if off else parameter.step) for p in one])
+            if not parts:
+                continue
+            columns = [np.stack([p[k] for p in parts], axis=2) for k in range(len(now))]
+            cleared, before = directions.clear(columns)
+            if len(value):
+                gain, _ = directions.gain(cleared, before)
+            else:
+                # a channel is reversed or it is not
+                gain = float(2 * cleared[:, 0] @ directions.nu - cleared[:, 0] @ cleared[:, 0])
+            if gain > best.gain:
+                best = Score(atom, value, gain)
+        out.append(best)
+    return out
+
+
+def _score_changes(directions: Directions, atoms: Sequence[Atom]) -> list[Score]:
+    """Score changes of coefficients at many moments at once."""
+    problem, point = directions.problem, directions.fit.point
+    if not atoms:
+        return []
+    ship = point.ship
+    least = min(run.time[-1] for run in problem.runs)
+    moments = np.linspace(0.05, 0.95, _MOMENTS) * least
+    index = [problem.structure.index(a.parameters[0].name.removesuffix("_factor")) for a in atoms]
+    columns = []
+    for run, start in zip(problem.runs, point.starts, strict=True):
+        shown = run.run(ship, start)
+        linear = run.linearise(ship, shown)
+        after = run.time[:-1, None] >= moments
+        driven = linear.theta[:, :, index] * ship.theta[index]
+        both = (driven[:, :, :, None] * after[:, None, None, :]).reshape(*driven.shape[:2], -1)
+        slope = sensitivities(linear, both)
+        columns.append(run.seen(ship, slope)[:, :, : both.shape[2]])
+    cleared, before = directions.clear(columns)
+    squares = (cleared**2).sum(axis=0)
+    along = cleared.T @ directions.nu
+    with np.errstate(divide="ignore", invalid="ignore"):
+        gain = np.where(squares > _OWN * before, along**2 / squares, 0.0)
+        factor = np.where(squares > _OWN * before, along / squares, 0.0)
+    gain, factor = gain.reshape(len(atoms), -1), factor.reshape(len(atoms), -1)
+    out = []
+    for k, atom in enumerate(atoms):
+        j = int(np.argmax(gain[k]))
+        first = float(np.clip(1 + factor[k, j], _LEAST_FACTOR, _MOST_FACTOR))
+        out.append(Score(atom, np.array([first, moments[j]]), float(gain[k, j])))
+    return out

@@ -1,0 +1,222 @@
+"""The search for causes: score all, refit the best, take the likeliest that proves itself.
+
+Forward steps with a backward check; a cause counts only when it is significant after
+correction for all that were tried, and when it predicts logs that it was not fitted to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.diagnosis.atom import Atom
+from greybox.diagnosis.fitting import Fit, Problem
+from greybox.diagnosis.held_out import HeldOut, Proof
+from greybox.diagnosis.scores import Directions, Score, score_atoms
+
+Array = NDArray[np.float64]
+
+# atoms that are refitted at a step, and promised fall of −2 log L below which none is
+_SHORTLIST, _LEAST_GAIN = 7, 9.0
+# share of the best promise from which on an atom is worth a refit
+_PROMISING = 0.04
+# iterations of a refit before its noise is settled
+_FIRST = 12
+_MOST_CAUSES = 4
+# rounds of noise and fit for a cause that was taken
+_SETTLE = 4
+# significance after correction, of a cause and of its effect on held-out logs
+SIGNIFICANT, PROVEN = 0.01, 0.05
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One more cause, fitted.
+
+    Parameters
+    ----------
+    atom : Atom
+    fit : Fit
+        With all earlier causes and this one.
+    gain : float
+        Fall of −2 log L against the fit without it, at the noise that each has.
+    p_value, p_adjusted : float
+        Of that fall, and after correction for the number of causes tried (Holm).
+    proof : Proof
+        What it does for held-out logs.
+    """
+
+    atom: Atom
+    fit: Fit
+    gain: float
+    p_value: float
+    p_adjusted: float
+    proof: Proof
+
+    @property
+    def holds(self) -> bool:
+        """Whether the cause is significant and predicts."""
+        return self.p_adjusted < SIGNIFICANT and self.proof.p_value < PROVEN
+
+
+@dataclass(frozen=True)
+class Step:
+    """One round of the search.
+
+    Parameters
+    ----------
+    before : Fit
+    scores : tuple of Score
+        All causes, the most promising first.
+    candidates : tuple of Candidate
+        Those refitted, the likeliest first.
+    taken : Candidate or None
+    """
+
+    before: Fit
+    scores: tuple[Score, ...]
+    candidates: tuple[Candidate, ...]
+    taken: Candidate | None
+
+
+@dataclass(frozen=True)
+class Search:
+    """What a search went through and where it ended.
+
+    Parameters
+    ----------
+    base, final : Fit
+    steps : tuple of Step
+    causes : tuple of Candidate
+        In the order found, without those that later ones made needless.
+    tried : int
+        Atoms that were scored.
+    """
+
+    base: Fit
+    final: Fit
+    steps: tuple[Step, ...]
+    causes: tuple[Candidate, ...]
+    tried: int
+    said: tuple[str, ...] = field(default=())
+
+
+def _dof(atom: Atom) -> int:
+    return max(len(atom.parameters), 1)
+
+
+def refit(problem: Problem, fit: Fit, score: Score) -> Fit:
+    """Return the fit with one more atom, its noise settled."""
+    point = problem.add(fit.point, score.atom, score.value if len(score.value) else None)
+    first = problem.fit(point, fit.noise, most=_FIRST)
+    return problem.settle(first, 1)
+
+
+def shortlist(scores: Sequence[Score]) -> list[Score]:
+    """Return the atoms worth a refit."""
+    best = scores[0].gain if scores else 0.0
+    worth = [s for s in scores if s.gain > max(_LEAST_GAIN, _PROMISING * best)]
+    # several moments and variants of one kind must not crowd out the other kinds
+    out: list[Score] = []
+    for score in worth:
+        if sum(s.atom.cause == score.atom.cause for s in out) < 3 and len(out) < _SHORTLIST:
+            out.append(score)
+    return out
+
+
+def search(
+    problem: Problem,
+    held_out: HeldOut,
+    base: Fit,
+    atoms: Sequence[Atom],
+    *,
+    most: int = _MOST_CAUSES,
+    progress: Callable[[str], None] = lambda _: None,
+) -> Search:
+    """Look for causes until none proves itself any more.
+
+    Parameters
+    ----------
+    problem : Problem
+        The estimation logs.
+    held_out : HeldOut
+    base : Fit
+        Of the model without any cause, its noise settled.
+    atoms : sequence of Atom
+    most : int
+        Causes at most.
+    progress : callable
+        Told what is being done.
+    """
+    steps: list[Step] = []
+    fit = base
+    causes: list[Candidate] = []
+    while len(causes) < most:
+        held = {c.atom.key for c in causes}
+        own = {n for c in causes for n in c.atom.columns}
+        left = [
+            a for a in atoms
+            if a.key not in held and not own & set(a.columns)
+            and not (a.apply is not None and any(c.atom.cause == a.cause and
+                     set(_names(c.atom)) & set(_names(a)) for c in causes))
+        ]  # fmt: skip
+        scores = score_atoms(Directions(problem, fit), left)
+        progress(f"step {len(steps) + 1}: {len(left)} causes scored")
+        candidates = []
+        for score in shortlist(scores):
+            candidates.append(judge(problem, held_out, fit, refit(problem, fit, score),
+                                    score.atom, len(left)))  # fmt: skip
+        candidates.sort(key=_merit)
+        taken = next((c for c in candidates[:1] if c.holds), None)
+        steps.append(Step(fit, tuple(scores), tuple(candidates), taken))
+        if taken is None:
+            break
+        # what the noise had taken for its own until now would pass for more causes
+        taken = replace(taken, fit=problem.settle(taken.fit, _SETTLE))
+        causes.append(taken)
+        fit = taken.fit
+        fit, causes = _backward(problem, held_out, fit, causes, len(atoms))
+    return Search(base, fit, tuple(steps), tuple(causes), len(atoms))
+
+
+def _names(atom: Atom) -> list[str]:
+    return [p.name for p in atom.parameters] or [atom.key]
+
+
+def _merit(candidate: Candidate) -> float:
+    """Return −2 log L with the price of each number (Schwarz, 1978)."""
+    samples = sum(len(n) for n in candidate.fit.nu)
+    return candidate.fit.cost + _dof(candidate.atom) * float(np.log(samples))
+
+
+def judge(
+    problem: Problem, held_out: HeldOut, before: Fit, fit: Fit, atom: Atom, tried: int
+) -> Candidate:
+    """Return a refitted cause with its significance and what it does for held-out logs."""
+    from scipy.stats import chi2
+
+    gain = before.cost - fit.cost if np.isfinite(fit.cost) else -np.inf
+    p = float(chi2.sf(max(gain, 0.0), _dof(atom)))
+    proof = held_out.prove(before, fit)
+    return Candidate(atom, fit, gain, p, min(1.0, p * tried), proof)
+
+
+def _backward(
+    problem: Problem, held_out: HeldOut, fit: Fit, causes: list[Candidate], tried: int
+) -> tuple[Fit, list[Candidate]]:
+    """Drop causes that a later one made needless."""
+    if len(causes) < 2:
+        return fit, causes
+    kept = list(causes)
+    for cause in causes[:-1]:
+        without = problem.settle(
+            problem.fit(problem.drop(fit.point, cause.atom), fit.noise, most=_FIRST), 1
+        )
+        again = judge(problem, held_out, without, fit, cause.atom, tried)
+        if not again.holds:
+            fit = without
+            kept = [c for c in kept if c.atom.key != cause.atom.key]
+    return fit, kept
