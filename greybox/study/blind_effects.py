@@ -87,6 +87,12 @@ UNKNOWN: dict[str, Kind] = {
 EFFECTS = CAUSES | UNKNOWN
 
 
+def shows(name: str, kind: str) -> bool:
+    """Return whether an effect can show in trials of a kind of inputs."""
+    # pulses push to starboard only: sway never changes its sign
+    return not (name == "asymmetry" and kind == "pulses")
+
+
 def check_effects(ids: tuple[str, ...], kind: str) -> None:
     """Refuse effects that do not exist, or that cannot show in trials of a kind.
 
@@ -101,7 +107,7 @@ def check_effects(ids: tuple[str, ...], kind: str) -> None:
                 f"there is no effect '{name}'.{suggestion(name, EFFECTS)} "
                 f"Effects: {', '.join(EFFECTS)}."
             )
-    if "asymmetry" in ids and kind == "pulses":
+    if not all(shows(name, kind) for name in ids):
         raise UsageError(
             "asymmetry needs sway to both sides, and pulses push to starboard only: draw "
             "manoeuvres or zigzag."
