@@ -97,8 +97,9 @@ def _power_figure(study: Power) -> Figure:
         tidy(axes)
     for axes in grid[:, 0]:
         axes.set_ylabel("trials [%]")
-    for axes in grid[-1]:
+    for axes in grid.flat[max(0, len(labels) - columns) : len(labels)]:
         axes.set_xlabel("size (1: as stated)")
+        axes.tick_params(labelbottom=True)
     handles, names = grid.flat[0].get_legend_handles_labels()
     figure.legend(handles, names, loc="outside lower center", ncols=3, fontsize="small")
     return figure
