@@ -1,222 +1,24 @@
-"""What may be wrong in a blind trial: each effect, its range, and what it does to the ship.
-
-Effects of the sensors act in `greybox.study.blind_sensors`; here they are only
-drawn. Sizes are drawn from a range; `size` scales them towards no effect.
-"""
+"""Everything that may be wrong in a blind trial: causes with a name, and effects without one."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from greybox.errors import UsageError, suggestion
-from greybox.study.blind_ship import EXTRA, LEAD, NAMES, Ship
-
-Array = NDArray[np.float64]
-Value = float | str
-
-
-@dataclass(frozen=True)
-class Effect:
-    """One thing that is wrong: its id and parameters [SI, rad], those of the causes by name."""
-
-    id: str
-    parameters: Mapping[str, Value]
-
-    def number(self, name: str) -> float:
-        """Return a parameter that is a number."""
-        return float(self.parameters[name])
-
-
-@dataclass(frozen=True)
-class Typical:
-    """The undisturbed motion of the estimation trial that sizes are relative to.
-
-    Parameters
-    ----------
-    theta : ndarray
-        (18,) in the order of `NAMES`.
-    u, v, r : float
-        Root mean squares [m/s, rad/s].
-    surge : ndarray
-        (N,) [m/s]
-    commands : ndarray
-        (N, 4) n1, n2, alpha1, alpha2 [rad].
-    """
-
-    theta: Array
-    u: float
-    v: float
-    r: float
-    surge: Array
-    commands: Array
-
-    def value(self, name: str) -> float:
-        """Return a parameter of the ship."""
-        return float(self.theta[NAMES.index(name)])
-
-
-Draw = Callable[[np.random.Generator, float, Typical], dict[str, Value]]
-Act = Callable[[Ship, Effect, bool], Ship]
-
-
-def _keep(ship: Ship, effect: Effect, later: bool) -> Ship:
-    return ship
-
-
-@dataclass(frozen=True)
-class Kind:
-    """How an effect is drawn, and how it changes the ship."""
-
-    draw: Draw
-    act: Act = _keep
-
-
-def _signed(rng: np.random.Generator, low: float, high: float) -> float:
-    return float(rng.choice([-1.0, 1.0]) * rng.uniform(low, high))
-
-
-def _uniform(name: str, low: float, high: float) -> Draw:
-    return lambda rng, size, typical: {name: size * rng.uniform(low, high)}
-
-
-def _set(field: str, name: str) -> Act:
-    return lambda ship, effect, later: replace(ship, **{field: effect.number(name)})
-
-
-def _current(rng: np.random.Generator, size: float, typical: Typical) -> dict[str, Value]:
-    speed, towards = size * rng.uniform(0.2, 0.45), rng.uniform(0, 2 * np.pi)
-    return {"current_north": speed * np.cos(towards), "current_east": speed * np.sin(towards)}
-
-
-def _in_current(ship: Ship, effect: Effect, later: bool) -> Ship:
-    return replace(
-        ship, current=(effect.number("current_north"), effect.number("current_east"))
-    )  # fmt: skip
-
-
-def _wind(rng: np.random.Generator, size: float, typical: Typical) -> dict[str, Value]:
-    speed, towards = size * rng.uniform(6, 12), rng.uniform(0, 2 * np.pi)
-    return {
-        "wind_north": speed * np.cos(towards),
-        "wind_east": speed * np.sin(towards),
-        "turbulence": size * rng.uniform(0.5, 1.0),
-        **{name: typical.value(name) for name in ("Wuu", "Wvv", "Wuv")},
-    }
-
-
-def _gain(rng: np.random.Generator, size: float, typical: Typical) -> dict[str, Value]:
-    return {f"gain_n{rng.integers(1, 3)}": 1 - size * (1 - rng.uniform(0.6, 0.8))}
-
-
-def _weak(ship: Ship, effect: Effect, later: bool) -> Ship:
-    one, two = (float(effect.parameters.get(f"gain_n{i}", 1.0)) for i in (1, 2))
-    return replace(ship, gain=(one, two))
-
-
-def _lag(rng: np.random.Generator, size: float, typical: Typical) -> dict[str, Value]:
-    return {"lag": size * rng.uniform(4, 9), "variant": str(rng.choice(["speed", "force"]))}
-
-
-def _lagged(ship: Ship, effect: Effect, later: bool) -> Ship:
-    return replace(ship, **{f"{effect.parameters['variant']}_lag": effect.number("lag")})
-
-
-def _delay(rng: np.random.Generator, size: float, typical: Typical) -> dict[str, Value]:
-    # a multiple of the simulator's step
-    return {"delay": round(size * rng.uniform(3, 7), 1)}
-
-
-def _quadratic(rng: np.random.Generator, size: float, typical: Typical) -> dict[str, Value]:
-    speed = np.abs(typical.commands[:, :2])
-    # the linear law that fits n|n| best over the speeds of the trial has this slope
-    return {"quadratic_share": size, "reference": float((speed**3).sum() / (speed**2).sum())}
-
-
-def _squared(ship: Ship, effect: Effect, later: bool) -> Ship:
-    return replace(
-        ship, quadratic=effect.number("quadratic_share"), reference=effect.number("reference")
-    )
-
-
-def _relative(*names: str) -> Draw:
-    """Size one of several damping terms against the linear one at the typical motion."""
-
-    def draw(rng: np.random.Generator, size: float, typical: Typical) -> dict[str, Value]:
-        u, v, r = typical.u, typical.v, typical.r
-        # linear force over the new term's regressor, at the typical motion
-        scale = {
-            "X_uuu": typical.value("Xu") / u**2,
-            "Y_vvv": typical.value("Yv") / v**2,
-            "N_rrr": typical.value("Nr") / r**2,
-            "N_|r|r": typical.value("Nr") / r,
-            "Y_|r|r": typical.value("Yv") * v / r**2,
-            "Y_|r|v": typical.value("Yv") / r,
-            # turning to starboard the ship drifts to port: this sign damps the turn
-            "N_|r|v": -typical.value("Nr") / v,
-        }
-        name = str(rng.choice(names))
-        return {name: size * rng.uniform(0.3, 1.0) * scale[name]}
-
-    return draw
-
-
-def _with_terms(ship: Ship, effect: Effect, later: bool) -> Ship:
-    return replace(ship, extra=tuple(float(effect.parameters.get(n, 0.0)) for n in EXTRA))
-
-
-def _heading_bias(rng: np.random.Generator, size: float, typical: Typical) -> dict[str, Value]:
-    bias = size * np.radians(_signed(rng, 4, 9))
-    return {"heading_bias": bias, "variant": str(rng.choice(["body", "earth"]))}
-
-
-def _lever_arm(rng: np.random.Generator, size: float, typical: Typical) -> dict[str, Value]:
-    arm, towards = size * rng.uniform(4, 12), rng.uniform(0, 2 * np.pi)
-    return {
-        "lever_arm_x": arm * np.cos(towards),
-        "lever_arm_y": arm * np.sin(towards),
-        "variant": str(rng.choice(["positions", "antenna"])),
-    }
-
-
-def _angle_offset(rng: np.random.Generator, size: float, typical: Typical) -> dict[str, Value]:
-    return {f"offset_alpha{rng.integers(1, 3)}": size * np.radians(_signed(rng, 5, 10))}
-
-
-def _clock(rng: np.random.Generator, size: float, typical: Typical) -> dict[str, Value]:
-    return {f"clock_{rng.choice(['u', 'v', 'r', 'psi'])}": size * rng.uniform(2, 5)}
-
-
-def _change(rng: np.random.Generator, size: float, typical: Typical) -> dict[str, Value]:
-    name = str(rng.choice(["Xu", "Yv", "Nr", "Xuu", "Yvv", "Yvr", "Nvr"]))
-    return {
-        f"{name}_factor": 1 + size * (rng.uniform(1.5, 3.0) - 1),
-        f"{name}_time": float(np.round(rng.uniform(0.3, 0.7) * len(typical.commands))),
-    }
-
-
-def _changed(ship: Ship, effect: Effect, later: bool) -> Ship:
-    (name,) = (n[:-7] for n in effect.parameters if n.endswith("_factor"))
-    # a change that came to stay holds from the first step
-    since = 0.0 if later else LEAD + effect.number(f"{name}_time")
-    return replace(ship, change=(NAMES.index(name), effect.number(f"{name}_factor"), since))
-
-
-def _waves(rng: np.random.Generator, size: float, typical: Typical) -> dict[str, Value]:
-    return {"frequency": rng.uniform(0.06, 0.12), "ratio": 3 * size}
-
-
-def _sign(rng: np.random.Generator, size: float, typical: Typical) -> dict[str, Value]:
-    return {"channel": str(rng.choice(["alpha1", "alpha2", "r"]))}
+from greybox.study.blind_causes import CAUSES, Effect, Kind, Typical, Value, uniform
+from greybox.study.blind_ship import Ship
 
 
 def _dead_band(rng: np.random.Generator, size: float, typical: Typical) -> dict[str, Value]:
     # a share of the time in it, whatever the speeds of the trial
     speed = np.abs(typical.commands[:, :2])
     return {"dead_band": float(np.quantile(speed, size * rng.uniform(0.2, 0.4)))}
+
+
+def _stalled(ship: Ship, effect: Effect, later: bool) -> Ship:
+    return replace(ship, dead_band=effect.number("dead_band"))
 
 
 def _interaction(rng: np.random.Generator, size: float, typical: Typical) -> dict[str, Value]:
@@ -236,6 +38,10 @@ def _backlash(rng: np.random.Generator, size: float, typical: Typical) -> dict[s
     return {"half_play": size * np.radians(rng.uniform(10, 15)) / 2}
 
 
+def _slack(ship: Ship, effect: Effect, later: bool) -> Ship:
+    return replace(ship, backlash=effect.number("half_play"))
+
+
 def _slow_force(rng: np.random.Generator, size: float, typical: Typical) -> dict[str, Value]:
     return {
         "amplitude": size * rng.uniform(0.02, 0.04),
@@ -252,6 +58,10 @@ def _swelled(ship: Ship, effect: Effect, later: bool) -> Ship:
     return replace(ship, swell=(amplitude, period, towards, phase))
 
 
+def _lopsided(ship: Ship, effect: Effect, later: bool) -> Ship:
+    return replace(ship, asymmetry=effect.number("asymmetry"))
+
+
 def _shallow(rng: np.random.Generator, size: float, typical: Typical) -> dict[str, Value]:
     low, high = np.quantile(np.abs(typical.surge), [0.6, 0.95])
     ratio = size * rng.uniform(1.0, 2.0)
@@ -265,35 +75,22 @@ def _over_shoal(ship: Ship, effect: Effect, later: bool) -> Ship:
     return replace(ship, shallow=(effect.number("coefficient"), effect.number("threshold")))
 
 
-CAUSES: dict[str, Kind] = {
-    "current": Kind(_current, _in_current),
-    "wind": Kind(_wind),
-    "thruster_gain": Kind(_gain, _weak),
-    "thruster_lag": Kind(_lag, _lagged),
-    "input_delay": Kind(_delay, _set("delay", "delay")),
-    "quadratic_thrust": Kind(_quadratic, _squared),
-    "advance_speed": Kind(_uniform("loss", 0.04, 0.12), _set("advance", "loss")),
-    "cubic_damping": Kind(_relative("X_uuu", "Y_vvv", "N_rrr"), _with_terms),
-    "quadratic_yaw_damping": Kind(_relative("N_|r|r"), _with_terms),
-    "crossflow": Kind(_relative("Y_|r|r", "Y_|r|v", "N_|r|v"), _with_terms),
-    "heading_bias": Kind(_heading_bias),
-    "lever_arm": Kind(_lever_arm),
-    "angle_offset": Kind(_angle_offset),
-    "clock_offset": Kind(_clock),
-    "parameter_change": Kind(_change, _changed),
-    "waves": Kind(_waves),
-    "sign": Kind(_sign),
-}
 # none of these is a cause that has a name: they are to be found, not to be named
 UNKNOWN: dict[str, Kind] = {
-    "dead_band": Kind(_dead_band, _set("dead_band", "dead_band")),
+    "dead_band": Kind(_dead_band, _stalled),
     "interaction": Kind(_interaction, _in_race),
-    "backlash": Kind(_backlash, _set("backlash", "half_play")),
+    "backlash": Kind(_backlash, _slack),
     "slow_force": Kind(_slow_force, _swelled),
-    "asymmetry": Kind(_uniform("asymmetry", 0.5, 1.5), _set("asymmetry", "asymmetry")),
+    "asymmetry": Kind(uniform("asymmetry", 0.5, 1.5), _lopsided),
     "shallow": Kind(_shallow, _over_shoal),
 }
 EFFECTS = CAUSES | UNKNOWN
+
+
+def shows(name: str, kind: str) -> bool:
+    """Return whether an effect can show in trials of a kind of inputs."""
+    # pulses push to starboard only: sway never changes its sign
+    return not (name == "asymmetry" and kind == "pulses")
 
 
 def check_effects(ids: tuple[str, ...], kind: str) -> None:
@@ -310,7 +107,7 @@ def check_effects(ids: tuple[str, ...], kind: str) -> None:
                 f"there is no effect '{name}'.{suggestion(name, EFFECTS)} "
                 f"Effects: {', '.join(EFFECTS)}."
             )
-    if "asymmetry" in ids and kind == "pulses":
+    if not all(shows(name, kind) for name in ids):
         raise UsageError(
             "asymmetry needs sway to both sides, and pulses push to starboard only: draw "
             "manoeuvres or zigzag."

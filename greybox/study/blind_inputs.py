@@ -120,7 +120,7 @@ def zigzag(rng: np.random.Generator, samples: int, single: bool) -> Programme:
         steer = int(rng.integers(2))
         amplitude = np.radians(rng.uniform(10, 35))
         steering = rng.uniform(0.6, 1.0) * min(16.0, _TURN / np.sin(amplitude))
-        speeds = np.full(2, steering) if single else np.full(2, rng.uniform(8, 18))
+        speeds = np.full(2, steering) if single else np.full(2, rng.uniform(4, 18))
         speeds[steer] = steering
         target[part, :2] = speeds
         wave = np.full(part.stop - part.start, amplitude) * rng.choice([-1, 1])

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.study.blind_effects import Effect
+from greybox.study.blind_causes import Effect
 from greybox.study.blind_ship import History
 
 Array = NDArray[np.float64]

@@ -279,7 +279,8 @@ def simulate_ships(
                 if i == inner - 1:
                     x[:3] += process[k]
                 history[k * inner + i + 1] = x
-    return History(np.arange(len(history)) * step, history, commands)
+    times = np.arange(len(history), dtype=float) * step
+    return History(times, history, commands)
 
 
 class _Helm:

@@ -1,0 +1,344 @@
+"""How often a judge names what is wrong with blind trials: size, power, confusion.
+
+The judge is any function of a trial; it sees the logs and the vessel, and must
+not look at the truth, against which its judgement is counted.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+import numpy as np
+
+from greybox.errors import GreyboxError, UsageError
+from greybox.study.blind import Order, Trial, draw_many
+from greybox.study.blind_causes import CAUSES, Effect
+from greybox.study.blind_conditions import Conditions
+from greybox.study.blind_effects import UNKNOWN, shows
+from greybox.study.parallel import map_pieces
+from greybox.study.tables import Row
+
+ANSWERS = ("detected", "right", "group", "part", "wrong", "unexplained", "none", "failed")
+VERDICTS = ("named", "none", "confused", "unexplained")
+SINGLE = tuple((name,) for name in (*CAUSES, *UNKNOWN))
+# ships sailed side by side: enough to hide the cost of a step, few enough to share the work
+_PIECE = 32
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What a judge says of a trial.
+
+    Parameters
+    ----------
+    verdict : {"named", "none", "confused", "unexplained"}
+    ids : tuple of str
+        Causes in the order found.
+    groups : tuple of tuple of str
+        Causes that explain the data equally well.
+    parameters : mapping of str to (float, float)
+        Values and standard errors of the named causes' parameters.
+    gain : mapping of str to float
+        Fit (6.12) on the validation log after the extension less before [%]: u, v, r.
+    """
+
+    verdict: str
+    ids: tuple[str, ...] = ()
+    groups: tuple[tuple[str, ...], ...] = ()
+    parameters: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    gain: Mapping[str, float] = field(default_factory=dict)
+
+
+Judge = Callable[[Trial], Judgement]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One kind of trial: ids of what is wrong, its size, the kind of inputs."""
+
+    effects: tuple[str, ...]
+    size: float
+    kind: str
+
+    @property
+    def label(self) -> str:
+        """The effects' ids, ``none`` where nothing is wrong."""
+        return " + ".join(self.effects) or "none"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One judged trial.
+
+    Parameters
+    ----------
+    cell : Cell
+    run : int
+    truth : tuple of Effect
+    judgement : Judgement or None
+        None where the judge failed.
+    failure : str
+        Its message.
+    """
+
+    cell: Cell
+    run: int
+    truth: tuple[Effect, ...]
+    judgement: Judgement | None
+    failure: str = ""
+
+    @property
+    def detected(self) -> bool:
+        """Whether the judge says that something is wrong."""
+        return self.judgement is not None and self.judgement.verdict != "none"
+
+    @property
+    def answer(self) -> str:
+        """How the judgement compares with the truth.
+
+        ``right``: all causes named and no other; an effect that has no name left
+        unexplained; nothing found where nothing is. ``part``: some of them named, or
+        others beside them. ``group``: confused, every cause being in a group. ``failed``,
+        ``none``, ``unexplained`` and ``wrong`` are what is left.
+        """
+        if self.judgement is None:
+            return "failed"
+        verdict, ids = self.judgement.verdict, set(self.judgement.ids)
+        true = set(self.cell.effects)
+        nameless = bool(true) and true <= set(UNKNOWN)
+        members = {i for group in self.judgement.groups for i in group}
+        if verdict == "none":
+            return "right" if not true else "none"
+        if verdict == "unexplained":
+            return "right" if nameless else "unexplained"
+        if verdict == "confused":
+            return "group" if true and true <= ids | members else "wrong"
+        if ids == true:
+            return "right"
+        return "part" if ids & true else "wrong"
+
+    @property
+    def found(self) -> str:
+        """The column of the confusion matrix: the cause found first, or what was said instead."""
+        if self.judgement is None:
+            return "failed"
+        if self.judgement.verdict == "confused":
+            return "group with it" if self.answer == "group" else "group without"
+        if self.judgement.verdict == "named":
+            return self.judgement.ids[0]
+        return self.judgement.verdict
+
+
+@dataclass(frozen=True)
+class Share:
+    """A share of trials with its 95 % interval."""
+
+    hits: int
+    runs: int
+
+    @property
+    def value(self) -> float:
+        """The share itself."""
+        return self.hits / self.runs if self.runs else float("nan")
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """The interval of Wilson (1927)."""
+        n, p, z = self.runs, self.value, 1.959964
+        if n == 0:
+            return 0.0, 1.0
+        middle = (p + z**2 / (2 * n)) / (1 + z**2 / n)
+        half = z / (1 + z**2 / n) * np.sqrt(p * (1 - p) / n + z**2 / (4 * n**2))
+        # rounding must not push a bound past the share itself
+        return max(0.0, min(p, float(middle - half))), min(1.0, max(p, float(middle + half)))
+
+    def __str__(self) -> str:
+        if not self.runs:
+            return ""
+        low, high = self.interval
+        return f"{100 * self.value:.0f} % ({100 * low:.0f}-{100 * high:.0f})"
+
+
+@dataclass(frozen=True)
+class Power:
+    """The study: all judged trials, in the order of its cells."""
+
+    outcomes: tuple[Outcome, ...]
+
+    @property
+    def cells(self) -> tuple[Cell, ...]:
+        """Every kind of trial once."""
+        return tuple(dict.fromkeys(o.cell for o in self.outcomes))
+
+    def of(self, cell: Cell) -> list[Outcome]:
+        """Return the trials of a cell."""
+        return [o for o in self.outcomes if o.cell == cell]
+
+    def share(self, cell: Cell, *answers: str) -> Share:
+        """Return the share of a cell's trials with one of some answers.
+
+        ``detected`` counts every trial of which the judge says that something is wrong.
+        """
+        mine = self.of(cell)
+        hits = sum(o.answer in answers or ("detected" in answers and o.detected) for o in mine)
+        return Share(hits, len(mine))
+
+    def confusion(self, kind: str, size: float) -> dict[str, Counter[str]]:
+        """Return for each truth how often each thing was found; ``none`` has one size."""
+        return {
+            cell.label: Counter(o.found for o in self.of(cell))
+            for cell in self.cells
+            if cell.kind == kind and (cell.size == size or not cell.effects)
+        }
+
+    def errors(self, cell: Cell) -> dict[str, list[tuple[float, float]]]:
+        """Return errors and standard errors of the parameters where the causes were named."""
+        out: dict[str, list[tuple[float, float]]] = {}
+        for o in self.of(cell):
+            if o.judgement is None or o.answer != "right":
+                continue
+            true = {k: v for e in o.truth for k, v in e.parameters.items() if isinstance(v, float)}
+            for name, (value, std) in o.judgement.parameters.items():
+                if name in true:
+                    out.setdefault(name, []).append((value - true[name], std))
+        return out
+
+    def gains(self, cell: Cell) -> dict[str, list[float]]:
+        """Return the gains on the validation logs where something was found [%]."""
+        out: dict[str, list[float]] = {}
+        for o in self.of(cell):
+            if o.judgement is not None and o.detected:
+                for name, value in o.judgement.gain.items():
+                    out.setdefault(name, []).append(value)
+        return out
+
+    def rows(self) -> list[Row]:
+        """Return shares with their binomial standard errors, confusion, errors and gains."""
+        rows = []
+        for cell in self.cells:
+            place = f"{cell.kind}, size {cell.size:g}"
+
+            def row(
+                table: str, name: str, mean: float, sd: float, n: int, place: str = place,
+                label: str = cell.label,
+            ) -> Row:  # fmt: skip
+                return Row(table, place, label, name, mean, sd, None, None, n)
+
+            for answer in ANSWERS:
+                share = self.share(cell, answer)
+                p = share.value
+                rows.append(
+                    row("power", answer, p, float(np.sqrt(p * (1 - p) / share.runs)), share.runs)
+                )
+            count = Counter(o.found for o in self.of(cell))
+            for name, hits in sorted(count.items()):
+                p = hits / len(self.of(cell))
+                sd = float(np.sqrt(p * (1 - p) / len(self.of(cell))))
+                rows.append(row("confusion", name, p, sd, len(self.of(cell))))
+            for name, pairs in self.errors(cell).items():
+                rows.append(row("error", name, *_moments([e for e, _ in pairs]), len(pairs)))
+                inside = float(np.mean([abs(e) <= 1.96 * s for e, s in pairs]))
+                sd = float(np.sqrt(inside * (1 - inside) / len(pairs)))
+                rows.append(row("95 % interval holds", name, inside, sd, len(pairs)))
+            for name, values in self.gains(cell).items():
+                rows.append(row("gain", name, *_moments(values), len(values)))
+        return sorted(rows, key=lambda r: r.table)
+
+
+def _moments(values: Sequence[float]) -> tuple[float, float]:
+    spread = float(np.std(values, ddof=1)) if len(values) > 1 else float("nan")
+    return float(np.mean(values)), spread
+
+
+def _piece(
+    piece: Sequence[tuple[Cell, int]], judge: Judge, seed: int, conditions: Conditions
+) -> list[Outcome]:
+    rngs, orders = [], []
+    for cell, run in piece:
+        # the same ships and inputs at every size of an effect
+        key = zlib.crc32(f"{cell.label} {cell.kind}".encode())
+        rngs.append(np.random.default_rng([seed, key, run]))
+        orders.append(Order(cell.effects, cell.size))
+    trials = draw_many(rngs, orders, replace(conditions, kind=piece[0][0].kind))
+    return [
+        _judged(cell, run, trial, judge) for (cell, run), trial in zip(piece, trials, strict=True)
+    ]
+
+
+def _judged(cell: Cell, run: int, trial: Trial, judge: Judge) -> Outcome:
+    blind = replace(trial, truth=(), ship={})
+    try:
+        judgement = judge(blind)
+    except GreyboxError as error:
+        return Outcome(cell, run, trial.truth, None, str(error))
+    if judgement.verdict not in VERDICTS or (judgement.verdict == "named" and not judgement.ids):
+        raise UsageError(
+            f"the judge gave the verdict '{judgement.verdict}' with {len(judgement.ids)} ids: give "
+            f"one of {', '.join(VERDICTS)}, and at least 1 id where it is 'named'."
+        )
+    return Outcome(cell, run, trial.truth, judgement)
+
+
+def run_power(
+    judge: Judge,
+    *,
+    effects: Sequence[tuple[str, ...]] = SINGLE,
+    sizes: Sequence[float] = (0.25, 0.5, 1.0),
+    kinds: Sequence[str] = ("manoeuvres",),
+    runs: int = 20,
+    none_runs: int = 100,
+    seed: int = 0,
+    conditions: Conditions | None = None,
+    workers: int | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Power:
+    """Judge many blind trials of each effect and size, and of none.
+
+    Parameters
+    ----------
+    judge : callable
+        Trial -> Judgement; a module-level function where there are several workers. It
+        gets trials without truth. An error of this package counts as a failure.
+    effects : sequence of tuple of str
+        What is wrong: one id or more each.
+    sizes : sequence of float
+        1 is the stated range of an effect.
+    kinds : sequence of str
+        Of inputs. Effects that cannot show in a kind are left out there.
+    runs, none_runs : int
+        Trials of each effect, size and kind; trials of each kind with nothing wrong.
+    seed : int
+        A trial depends on it, its effects, its kind and its number only.
+    conditions : Conditions, optional
+        All else of the trials.
+    workers : int, optional
+        Processes.
+    progress : callable
+        Called with trials done and in all.
+
+    Raises
+    ------
+    UsageError
+        No trial is asked for, an effect does not exist, or the judge gives no verdict.
+    """
+    conditions = conditions or Conditions()
+    pieces: list[list[tuple[Cell, int]]] = []
+    for kind in kinds:
+        wanted = [(Cell((), 1.0, kind), run) for run in range(none_runs)]
+        for ids in effects:
+            if all(shows(name, kind) for name in ids):
+                cells = [Cell(tuple(ids), size, kind) for size in sizes]
+                wanted += [(cell, run) for cell in cells for run in range(runs)]
+        pieces += [wanted[k : k + _PIECE] for k in range(0, len(wanted), _PIECE)]
+    if not pieces:
+        raise UsageError("the study has 0 trials: ask for runs, none_runs and at least one kind.")
+    total, outcomes = sum(map(len, pieces)), list[Outcome]()
+    work = partial(_piece, judge=judge, seed=seed, conditions=conditions)
+    for found in map_pieces(work, pieces, workers=workers):
+        outcomes += found
+        progress(len(outcomes), total)
+    return Power(tuple(outcomes))
