@@ -31,6 +31,8 @@ class Parameter:
         The value that leaves the model as it is.
     step : float
         For its derivative by differences, and its scale.
+    least : float
+        Distance from the null below which sampling itself looks alike.
     """
 
     name: str
@@ -40,6 +42,7 @@ class Parameter:
     high: float = np.inf
     null: float = 0.0
     step: float = 1e-4
+    least: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -60,6 +63,9 @@ class Atom:
         ``(ship, values) -> ship``.
     starts : tuple of tuple of float
         Further values to begin from, where the likelihood has several hills.
+    afresh : bool
+        Whether the coefficients must be sought anew: what it changes is too much for
+        derivatives.
     """
 
     cause: str
@@ -68,6 +74,7 @@ class Atom:
     columns: tuple[str, ...] = ()
     apply: Callable[[Ship, Array], Ship] | None = None
     starts: tuple[tuple[float, ...], ...] = ()
+    afresh: bool = False
 
     @property
     def start(self) -> Array:

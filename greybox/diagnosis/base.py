@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.diagnosis.atom import Atom
 from greybox.diagnosis.fitting import Fit, Point, Problem
+from greybox.diagnosis.held_out import Folds, HeldOut, OtherLogs
 from greybox.diagnosis.noise import fit_noise
-from greybox.diagnosis.ship import LogRun, Ship
-from greybox.errors import ExcitationError, GreyboxError
+from greybox.diagnosis.ship import LogRun, Ship, wired
+from greybox.errors import ExcitationError
 from greybox.estimation.estimate import estimate_ls
 from greybox.estimation.output_error import OutputErrorOptions, estimate_oe
 from greybox.estimation.output_setup import output_predictor
+from greybox.estimation.result import Estimate
 from greybox.model.functions import Integrator
 from greybox.model.predictor import Regime, build_predictor
 from greybox.model.structure import Structure
@@ -21,13 +25,205 @@ from greybox.trial.log import TrialLog
 
 Array = NDArray[np.float64]
 
-_BOTH: tuple[Integrator, ...] = ("euler", "rk4")
+INTEGRATORS: tuple[Integrator, ...] = ("euler", "rk4")
+# fall of −2 log L from which on the other integrator is taken
+_BETTER = 6.0
+# fall of the one-step errors' −2 log L from which on a rewired log is worth a fit
+_REWIRED = 20.0
+# parts of the logs that are held out in turn where there is no validation log
+FOLDS = 3
+_SHORTEST = 60
 
 
-def rough_coefficients(
+class Case:
+    """Logs, a structure to diagnose, and a wider one that every cause fits in.
+
+    Parameters
+    ----------
+    structure, universe : Structure
+    logs, held_out : sequence of TrialLog
+        To estimate on, and to prove on; without the latter, parts of the former.
+    kind : str
+        Predictor of the first coefficients.
+    regime : Regime
+    """
+
+    def __init__(
+        self,
+        structure: Structure,
+        universe: Structure,
+        logs: Sequence[TrialLog],
+        held_out: Sequence[TrialLog],
+        kind: str,
+        regime: Regime,
+    ) -> None:
+        self.structure, self.universe = structure, universe
+        self.logs, self.held_out_logs = list(logs), list(held_out)
+        self.kind, self.regime = kind, regime
+        self._problems: dict[Integrator, Problem] = {}
+        self._held: dict[Integrator, HeldOut] = {}
+
+    def problem(self, integrator: Integrator) -> Problem:
+        """Return the estimation logs, ready to be run."""
+        if integrator not in self._problems:
+            self._problems[integrator] = self._made(self.logs, integrator)
+        return self._problems[integrator]
+
+    def held_out(self, integrator: Integrator) -> HeldOut:
+        """Return where causes have to prove themselves."""
+        if integrator not in self._held:
+            if self.held_out_logs:
+                self._held[integrator] = OtherLogs(self._made(self.held_out_logs, integrator))
+            else:
+                self._held[integrator] = Folds(self._folds(integrator))
+        return self._held[integrator]
+
+    def _made(
+        self,
+        logs: Sequence[TrialLog],
+        integrator: Integrator,
+        origins: Sequence[float] | None = None,
+    ) -> Problem:
+        return Problem(
+            [
+                LogRun(self.universe, log, integrator, None if origins is None else origins[i])
+                for i, log in enumerate(logs)
+            ]
+        )
+
+    def _folds(self, integrator: Integrator) -> list[tuple[Problem, Problem]]:
+        out = []
+        for k in range(FOLDS):
+            fitting: list[tuple[TrialLog, float]] = []
+            held: list[tuple[TrialLog, float]] = []
+            for log in self.logs:
+                edges = np.linspace(0, len(log), FOLDS + 1).astype(int)
+                first = float(log.t[0])
+                held.append((log.window(int(edges[k]), int(edges[k + 1])), first))
+                for a, b in ((0, int(edges[k])), (int(edges[k + 1]), len(log))):
+                    if b - a >= _SHORTEST:
+                        fitting.append((log.window(a, b), first))
+            made = [
+                self._made([part for part, _ in parts], integrator, [first for _, first in parts])
+                for parts in (fitting, held)
+            ]
+            out.append((made[0], made[1]))
+        return out
+
+    def base(self, coefficients: Mapping[str, float] | None, current: Array) -> Fit:
+        """Return the fit of the model without causes, with the likelier integrator.
+
+        A log from a simulation in steps of its sample time wants Euler's rule, a ship
+        whose commands are held between samples the classical Runge-Kutta rule.
+
+        Raises
+        ------
+        ExcitationError
+            No free run of the structure stays bounded.
+        """
+        if coefficients is not None:
+            ways = [lambda: coefficients]
+        else:
+            ways = [
+                lambda: rough(self.structure, self.logs, self.kind, self.regime)[0],
+                lambda: careful(self.structure, self.logs, self.kind, self.regime),
+            ]
+        for way in ways:
+            try:
+                values = way()
+            except ExcitationError:
+                if way is ways[-1]:
+                    raise
+                continue
+            fits = [self._fit(values, current, i) for i in INTEGRATORS]
+            bounded = [f for f in fits if f is not None and not f.escaped]
+            if bounded:
+                return min(bounded, key=lambda f: f.cost)
+        raise ExcitationError(
+            f"no free run of '{self.structure.name}' stays bounded on "
+            f"{', '.join(log.name for log in self.logs)}: give a model that follows them with "
+            f"--model."
+        )
+
+    def _fit(
+        self,
+        coefficients: Mapping[str, float],
+        current: Array,
+        integrator: Integrator,
+        atom: Atom | None = None,
+    ) -> Fit | None:
+        problem = self.problem(integrator)
+        theta = np.array([coefficients.get(n, 0.0) for n in self.universe.parameters])
+        places = tuple(problem.place(n) for n in self.structure.parameters)
+        starts = tuple(run.start() for run in problem.runs)
+        point = Point(Ship(theta, current, self.logs[0].vessel), starts, places)
+        if atom is not None:
+            point = problem.add(point, atom)
+            starts = tuple(
+                np.where([n in point.ship.sensors.reversed for n in run.outputs], -s, s)
+                for run, s in zip(problem.runs, starts, strict=True)
+            )
+            point = replace(point, starts=starts)
+        errors = problem.errors(point)
+        if not all(np.isfinite(e).all() for e in errors):
+            return None
+        # errors of a model far off look like a force with a memory, and weigh little as that
+        noise = fit_noise(errors, problem.poles(point), problem.sample_time, problem.groups)
+        return replace(problem.settle(problem.fit(point, noise), 3), integrator=integrator)
+
+    def other_integrator(self, fit: Fit) -> Fit:
+        """Return the fit with the other integrator, if that is likelier."""
+        other = next(i for i in INTEGRATORS if i != fit.integrator)
+        problem = self.problem(other)
+        found = problem.settle(problem.fit(fit.point, fit.noise), 2)
+        better = not found.escaped and found.cost < fit.cost - _BETTER
+        return replace(found, integrator=other) if better else fit
+
+    def rewired(self, fit: Fit, atoms: Sequence[Atom]) -> list[tuple[Atom, Fit]]:
+        """Return fits from first coefficients of their own, for atoms that ask for it.
+
+        Only those whose one-step errors by least squares are clearly smaller than
+        those of the log as it stands.
+        """
+        asked = [a for a in atoms if a.afresh]
+        if not asked:
+            return []
+        try:
+            level = rough(self.structure, self.logs, self.kind, self.regime)[1]
+        except ExcitationError:
+            return []
+        out = []
+        for atom in asked:
+            ship = self.problem(fit.integrator).add(fit.point, atom).ship
+            logs = [_as_it_should_be(log, ship) for log in self.logs]
+            try:
+                values, own = rough(self.structure, logs, self.kind, self.regime)
+            except ExcitationError:
+                continue
+            if level - own < _REWIRED:
+                continue
+            current = fit.point.base.current
+            found = [self._fit(values, current, i, atom) for i in INTEGRATORS]
+            bounded = [f for f in found if f is not None and not f.escaped]
+            if bounded:
+                out.append((atom, min(bounded, key=lambda f: f.cost)))
+        return out
+
+
+def _as_it_should_be(log: TrialLog, ship: Ship) -> TrialLog:
+    channels = dict(log.channels)
+    channels |= wired({c: log[c] for c in log.vessel.commands}, ship.wires)
+    for name in ship.sensors.reversed:
+        channels[name] = -log[name]
+    return replace(log, channels=channels)
+
+
+def rough(
     structure: Structure, logs: Sequence[TrialLog], kind: str, regime: Regime
-) -> dict[str, float]:
-    """Return the coefficients of least squares, biased by noise but near enough.
+) -> tuple[dict[str, float], float]:
+    """Return the coefficients of least squares, and −2 log L of its one-step errors.
+
+    Noise biases them, but they are near enough to begin with.
 
     Raises
     ------
@@ -35,10 +231,11 @@ def rough_coefficients(
         The logs do not determine them.
     """
     fitted = estimate_ls(build_predictor(structure, kind, regime), logs, judged=False)
-    return dict(zip(structure.parameters, map(float, fitted.structure_theta()), strict=True))
+    level = 2 * fitted.samples * float(np.log(np.maximum(fitted.residual_std, 1e-300)).sum())
+    return _coefficients(structure, fitted), level
 
 
-def careful_coefficients(
+def careful(
     structure: Structure, logs: Sequence[TrialLog], kind: str, regime: Regime
 ) -> dict[str, float]:
     """Return coefficients by output error, which finds a way from far off.
@@ -52,67 +249,8 @@ def careful_coefficients(
         output_predictor(structure, kind, regime), logs,
         options=OutputErrorOptions(heading="input", covariance="white"),
     )  # fmt: skip
+    return _coefficients(structure, fitted)
+
+
+def _coefficients(structure: Structure, fitted: Estimate) -> dict[str, float]:
     return dict(zip(structure.parameters, map(float, fitted.structure_theta()), strict=True))
-
-
-def make_problem(
-    universe: Structure,
-    logs: Sequence[TrialLog],
-    integrator: Integrator,
-    origins: Sequence[float] | None = None,
-) -> Problem:
-    """Return logs ready to be run with every term that a cause may add."""
-    return Problem(
-        [
-            LogRun(universe, log, integrator, None if origins is None else origins[i])
-            for i, log in enumerate(logs)
-        ]
-    )
-
-
-def fit_base(
-    problem: Problem, structure: Structure, coefficients: Mapping[str, float], current: Array
-) -> Fit:
-    """Fit the coefficients of the model that is diagnosed, then the colour of its errors."""
-    theta = np.array([coefficients.get(n, 0.0) for n in problem.structure.parameters])
-    places = tuple(problem.place(n) for n in structure.parameters)
-    starts = tuple(run.start() for run in problem.runs)
-    point = Point(Ship(theta, current, problem.runs[0].log.vessel), starts, places)
-    errors = problem.errors(point)
-    if not all(np.isfinite(e).all() for e in errors):
-        raise ExcitationError(
-            f"the free run of '{structure.name}' leaves every bound from its first coefficients: "
-            f"give a model that follows the logs with --model."
-        )
-    # errors of a model far off look like a force with a memory, and weigh little as that
-    noise = fit_noise(errors, problem.poles(point), problem.sample_time, problem.groups)
-    return problem.settle(problem.fit(point, noise), 3)
-
-
-def base_fit(
-    universe: Structure,
-    structure: Structure,
-    logs: Sequence[TrialLog],
-    coefficients: Mapping[str, float],
-    current: Array,
-) -> tuple[Problem, Fit]:
-    """Return the problem and fit with the integrator that the logs ask for.
-
-    A log from a simulation in steps of its sample time wants Euler's rule, a ship
-    whose commands are held between samples the classical Runge-Kutta rule.
-    """
-    found: list[tuple[Problem, Fit]] = []
-    failed: GreyboxError | None = None
-    for integrator in _BOTH:
-        problem = make_problem(universe, logs, integrator)
-        try:
-            found.append((problem, fit_base(problem, structure, coefficients, current)))
-        except ExcitationError as error:
-            failed = error
-    finite = [pair for pair in found if not pair[1].escaped]
-    if not finite:
-        raise failed or ExcitationError(
-            f"no free run of '{structure.name}' stays bounded on these logs: give a model that "
-            f"follows them with --model."
-        )
-    return min(finite, key=lambda pair: pair[1].cost)

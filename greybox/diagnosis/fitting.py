@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from greybox.diagnosis.atom import Atom
 from greybox.diagnosis.noise import Noise, fit_noise
 from greybox.diagnosis.ship import CURRENTS, LogRun, Ship
+from greybox.model.functions import Integrator
 
 Array = NDArray[np.float64]
 
@@ -105,6 +106,7 @@ class Fit:
     errors : tuple of ndarray
         (N, ny) measured less simulated.
     converged : bool
+    integrator : {"euler", "rk4"}
     """
 
     point: Point
@@ -113,6 +115,7 @@ class Fit:
     nu: tuple[Array, ...]
     errors: tuple[Array, ...]
     converged: bool
+    integrator: Integrator = "euler"
 
     @property
     def escaped(self) -> bool:
@@ -281,7 +284,9 @@ class Problem:
             damping = damping / 10 if damping > 1e-5 else 0.0
             if little:
                 converged = True
-        return Fit(point, noise, cost, tuple(nu), tuple(errors), converged)
+        return Fit(
+            point, noise, cost, tuple(nu), tuple(errors), converged, self.runs[0].integrator
+        )
 
     def fit_starts(self, point: Point, noise: Noise) -> Fit:
         """Fit the starts alone, as a held-out log asks."""

@@ -7,12 +7,13 @@ correction for all that were tried, and when it predicts logs that it was not fi
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from greybox.diagnosis.atom import Atom
+from greybox.diagnosis.base import Case
 from greybox.diagnosis.fitting import Fit, Problem
 from greybox.diagnosis.held_out import HeldOut, Proof
 from greybox.diagnosis.scores import Directions, Score, score_atoms
@@ -25,11 +26,13 @@ _SHORTLIST, _LEAST_GAIN = 7, 9.0
 _PROMISING = 0.04
 # iterations of a refit before its noise is settled
 _FIRST = 12
-_MOST_CAUSES = 4
+MOST_CAUSES = 4
 # rounds of noise and fit for a cause that was taken
 _SETTLE = 4
 # significance after correction, of a cause and of its effect on held-out logs
 SIGNIFICANT, PROVEN = 0.01, 0.05
+# fall of −2 log L, a measured number, from which on a cause matters
+RELEVANT = 0.005
 
 
 @dataclass(frozen=True)
@@ -57,9 +60,26 @@ class Candidate:
     proof: Proof
 
     @property
+    def relevant(self) -> bool:
+        """Whether the cause is large enough to matter, and to tell from sampling."""
+        numbers = sum(nu.size for nu in self.fit.nu)
+        return self.gain > RELEVANT * numbers and not self.unresolved
+
+    @property
+    def unresolved(self) -> bool:
+        """Whether sampling itself would look alike."""
+        if self.atom.apply is None:
+            return False
+        k = [a.key for a in self.fit.point.atoms].index(self.atom.key)
+        values = self.fit.point.values[k]
+        return any(
+            abs(v - p.null) < p.least for v, p in zip(values, self.atom.parameters, strict=True)
+        )
+
+    @property
     def holds(self) -> bool:
-        """Whether the cause is significant and predicts."""
-        return self.p_adjusted < SIGNIFICANT and self.proof.p_value < PROVEN
+        """Whether the cause matters, is significant, and predicts."""
+        return self.relevant and self.p_adjusted < SIGNIFICANT and self.proof.p_value < PROVEN
 
 
 @dataclass(frozen=True)
@@ -101,7 +121,6 @@ class Search:
     steps: tuple[Step, ...]
     causes: tuple[Candidate, ...]
     tried: int
-    said: tuple[str, ...] = field(default=())
 
 
 def _dof(atom: Atom) -> int:
@@ -128,21 +147,18 @@ def shortlist(scores: Sequence[Score]) -> list[Score]:
 
 
 def search(
-    problem: Problem,
-    held_out: HeldOut,
+    case: Case,
     base: Fit,
     atoms: Sequence[Atom],
     *,
-    most: int = _MOST_CAUSES,
+    most: int = MOST_CAUSES,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Search:
     """Look for causes until none proves itself any more.
 
     Parameters
     ----------
-    problem : Problem
-        The estimation logs.
-    held_out : HeldOut
+    case : Case
     base : Fit
         Of the model without any cause, its noise settled.
     atoms : sequence of Atom
@@ -155,31 +171,46 @@ def search(
     fit = base
     causes: list[Candidate] = []
     while len(causes) < most:
-        held = {c.atom.key for c in causes}
-        own = {n for c in causes for n in c.atom.columns}
-        left = [
-            a for a in atoms
-            if a.key not in held and not own & set(a.columns)
-            and not (a.apply is not None and any(c.atom.cause == a.cause and
-                     set(_names(c.atom)) & set(_names(a)) for c in causes))
-        ]  # fmt: skip
-        scores = score_atoms(Directions(problem, fit), left)
-        progress(f"step {len(steps) + 1}: {len(left)} causes scored")
-        candidates = []
-        for score in shortlist(scores):
-            candidates.append(judge(problem, held_out, fit, refit(problem, fit, score),
-                                    score.atom, len(left)))  # fmt: skip
-        candidates.sort(key=_merit)
-        taken = next((c for c in candidates[:1] if c.holds), None)
-        steps.append(Step(fit, tuple(scores), tuple(candidates), taken))
-        if taken is None:
+        step = take_step(case, fit, causes, atoms)
+        steps.append(step)
+        progress(f"step {len(steps)}: {len(step.scores)} causes scored")
+        if step.taken is None:
             break
-        # what the noise had taken for its own until now would pass for more causes
-        taken = replace(taken, fit=problem.settle(taken.fit, _SETTLE))
-        causes.append(taken)
-        fit = taken.fit
-        fit, causes = _backward(problem, held_out, fit, causes, len(atoms))
+        causes = [*causes, step.taken]
+        fit, causes = _backward(case, step.taken.fit, causes, len(atoms))
     return Search(base, fit, tuple(steps), tuple(causes), len(atoms))
+
+
+def take_step(
+    case: Case, fit: Fit, causes: Sequence[Candidate], atoms: Sequence[Atom]
+) -> Step:
+    """Score what is left, refit the best, and take the likeliest if it holds."""
+    left = [a for a in atoms if not _taken(a, causes)]
+    problem, held_out = case.problem(fit.integrator), case.held_out(fit.integrator)
+    scores = score_atoms(Directions(problem, fit), [a for a in left if not a.afresh])
+    fits = [(s.atom, refit(problem, fit, s)) for s in shortlist(scores)]
+    if not causes:
+        fits += case.rewired(fit, left)
+    candidates = sorted(
+        (judge(held_out, fit, found, atom, len(left)) for atom, found in fits), key=_merit
+    )
+    taken = next((c for c in candidates[:1] if c.holds), None)
+    if taken is not None:
+        # what the noise had taken for its own until now would pass for more causes
+        settled = problem if taken.fit.integrator == fit.integrator else case.problem(
+            taken.fit.integrator
+        )  # fmt: skip
+        taken = replace(taken, fit=case.other_integrator(settled.settle(taken.fit, _SETTLE)))
+    return Step(fit, tuple(scores), tuple(candidates), taken)
+
+
+def _taken(atom: Atom, causes: Sequence[Candidate]) -> bool:
+    """Whether an atom, or another form of it, is in force."""
+    return any(
+        atom.key == c.atom.key
+        or (atom.cause == c.atom.cause and set(_names(atom)) & set(_names(c.atom)))
+        for c in causes
+    )
 
 
 def _names(atom: Atom) -> list[str]:
@@ -192,31 +223,26 @@ def _merit(candidate: Candidate) -> float:
     return candidate.fit.cost + _dof(candidate.atom) * float(np.log(samples))
 
 
-def judge(
-    problem: Problem, held_out: HeldOut, before: Fit, fit: Fit, atom: Atom, tried: int
-) -> Candidate:
+def judge(held_out: HeldOut, before: Fit, fit: Fit, atom: Atom, tried: int) -> Candidate:
     """Return a refitted cause with its significance and what it does for held-out logs."""
     from scipy.stats import chi2
 
     gain = before.cost - fit.cost if np.isfinite(fit.cost) else -np.inf
     p = float(chi2.sf(max(gain, 0.0), _dof(atom)))
-    proof = held_out.prove(before, fit)
-    return Candidate(atom, fit, gain, p, min(1.0, p * tried), proof)
+    return Candidate(atom, fit, gain, p, min(1.0, p * tried), held_out.prove(before, fit))
 
 
 def _backward(
-    problem: Problem, held_out: HeldOut, fit: Fit, causes: list[Candidate], tried: int
+    case: Case, fit: Fit, causes: list[Candidate], tried: int
 ) -> tuple[Fit, list[Candidate]]:
     """Drop causes that a later one made needless."""
-    if len(causes) < 2:
-        return fit, causes
     kept = list(causes)
+    problem, held_out = case.problem(fit.integrator), case.held_out(fit.integrator)
     for cause in causes[:-1]:
         without = problem.settle(
-            problem.fit(problem.drop(fit.point, cause.atom), fit.noise, most=_FIRST), 1
+            problem.fit(problem.drop(fit.point, cause.atom), fit.noise, most=_FIRST), 2
         )
-        again = judge(problem, held_out, without, fit, cause.atom, tried)
-        if not again.holds:
+        if not judge(held_out, without, fit, cause.atom, tried).holds:
             fit = without
             kept = [c for c in kept if c.atom.key != cause.atom.key]
     return fit, kept

@@ -6,6 +6,7 @@ their commands, a coefficient from some moment on, or how a sensor sees the moti
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -20,6 +21,8 @@ from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
 
+# a command, the column that holds it, and its sign there
+Wire = tuple[str, str, float]
 CURRENTS = ("current_north", "current_east")
 
 
@@ -71,8 +74,8 @@ class Ship:
         With its thrusters as they act.
     changes : tuple of Change
     sensors : Sensors
-    reversed : tuple of str
-        Thruster columns of the wrong sign.
+    wires : tuple of Wire
+        Thruster columns that stand for another, or for its negative.
     """
 
     theta: Array
@@ -80,7 +83,7 @@ class Ship:
     vessel: Vessel
     changes: tuple[Change, ...] = ()
     sensors: Sensors = field(default_factory=Sensors)
-    reversed: tuple[str, ...] = ()
+    wires: tuple[Wire, ...] = ()
 
     def with_value(self, place: int, value: float) -> Ship:
         """Return the ship with one coefficient, or current past the coefficients, set."""
@@ -144,17 +147,16 @@ class LogRun:
         self._commands = {c: log[c] for c in log.vessel.commands}
         self._simulator = Simulator(structure, len(log), self.air_measured, integrator)
         self._trapezoid = integrator == "rk4"
-        self._forces: tuple[Vessel, tuple[str, ...], Array] | None = None
+        self._forces: tuple[Vessel, tuple[Wire, ...], Array] | None = None
 
-    def forces(self, vessel: Vessel, reversed: tuple[str, ...] = ()) -> Array:
+    def forces(self, vessel: Vessel, wires: tuple[Wire, ...] = ()) -> Array:
         """Return the generalised inputs (N, nu) as the vessel's thrusters give them."""
         known = self._forces
-        if known is None or known[0] is not vessel or known[1] != reversed:
-            commands = {c: -v if c in reversed else v for c, v in self._commands.items()}
-            made = actuated_force(vessel, commands, self.sample_time)
+        if known is None or known[0] is not vessel or known[1] != wires:
+            made = actuated_force(vessel, wired(self._commands, wires), self.sample_time)
             zero = np.zeros(self.samples)
             tau = np.column_stack([made.get(n, zero) for n in self.structure.inputs])
-            self._forces = known = (vessel, reversed, tau)
+            self._forces = known = (vessel, wires, tau)
         return known[2]
 
     def weights(self, change: Change) -> Array:
@@ -181,7 +183,7 @@ class LogRun:
         nx = len(self.states)
         drivers = np.column_stack(
             [
-                self.forces(ship.vessel, ship.reversed),
+                self.forces(ship.vessel, ship.wires),
                 self._psi,
                 self._air,
                 np.broadcast_to(ship.current, (self.samples, 2)),
@@ -261,6 +263,14 @@ class LogRun:
             first[:, -1] = 1.0
             slope = np.concatenate([slope, first], axis=2)
         return self.sense(ship.sensors, slope)
+
+
+def wired(commands: Mapping[str, Array], wires: Sequence[Wire]) -> dict[str, Array]:
+    """Return the commands as they act, where columns stand for others."""
+    out = dict(commands)
+    for command, column, sign in wires:
+        out[command] = sign * commands[column]
+    return out
 
 
 def shifted(value: Array, samples: float) -> Array:

@@ -10,12 +10,14 @@ from numpy.typing import NDArray
 
 from greybox.diagnosis.atom import Atom, Parameter
 from greybox.diagnosis.causes.cause import Cause, Context
-from greybox.diagnosis.ship import Ship
+from greybox.diagnosis.ship import Ship, Wire
 
 Array = NDArray[np.float64]
 
 # clocks that are looked for differ by less [s]
 _LATEST = 60.0
+# samples by which a hold between samples may pass for a clock
+UNRESOLVED = 0.75
 
 
 def _has_velocities(context: Context) -> bool:
@@ -107,7 +109,7 @@ class ClockOffset(Cause):
 
             parameter = Parameter(
                 f"clock_{name}", "s", 0.5 * context.sample_time, -most, most,
-                step=0.1 * context.sample_time,
+                step=0.1 * context.sample_time, least=UNRESOLVED * context.sample_time,
             )  # fmt: skip
             out.append(
                 Atom(
@@ -154,32 +156,46 @@ class RateBias(Cause):
 
 
 class Sign(Cause):
-    """A channel of the wrong sign."""
+    """A channel of the wrong sign, or two that were exchanged."""
 
     id = "sign"
     kind = "sensor"
-    title = "reversed channel"
+    title = "reversed or exchanged channel"
     signature = "a motion opposite to what its forces and the other motions say"
     extension = "the channel with its sign turned"
     reference = "Fossen (2011), table 2.1"
 
     def atoms(self, context: Context) -> Sequence[Atom]:
-        """Return each motion and each thruster's angle reversed."""
-        motions = [_reversed(self.id, n, motion=True) for n in context.outputs]
-        angles = sorted(context.vessel.angle_commands)
-        return motions + [_reversed(self.id, n, motion=False) for n in angles]
+        """Return each channel reversed, and commands of one kind exchanged."""
+        out = [_reversed(self.id, n) for n in context.outputs]
+        commands = context.vessel.commands
+        angles = context.vessel.angle_commands
+        out += [_wired(self.id, f"sign_{n}", ((n, n, -1.0),)) for n in commands]
+        for kind in ([c for c in commands if c in angles], [c for c in commands if c not in angles]):
+            for i, one in enumerate(kind):
+                for two in kind[i + 1 :]:
+                    swap = ((one, two, 1.0), (two, one, 1.0))
+                    out.append(_wired(self.id, f"swapped_{one}_{two}", swap))
+        return out
 
     def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
         """Say which."""
-        names = ", ".join(n.removeprefix("sign_") for n in values)
-        return f"{names} has the opposite sign of what the motion shows"
+        name = next(iter(values))
+        if name.startswith("swapped_"):
+            return f"{name.removeprefix('swapped_').replace('_', ' and ')} stand in each other's place"
+        return f"{name.removeprefix('sign_')} has the opposite sign of what the motion shows"
 
 
-def _reversed(cause: str, name: str, *, motion: bool) -> Atom:
+def _reversed(cause: str, name: str) -> Atom:
     def apply(ship: Ship, value: Array) -> Ship:
-        if motion:
-            turned = (*ship.sensors.reversed, name)
-            return replace(ship, sensors=replace(ship.sensors, reversed=turned))
-        return replace(ship, reversed=(*ship.reversed, name))
+        turned = (*ship.sensors.reversed, name)
+        return replace(ship, sensors=replace(ship.sensors, reversed=turned))
 
-    return Atom(cause, f"{cause}:{name}", (), (), apply)
+    return Atom(cause, f"{cause}:sign_{name}", (), (), apply, afresh=True)
+
+
+def _wired(cause: str, key: str, wires: tuple[Wire, ...]) -> Atom:
+    def apply(ship: Ship, value: Array) -> Ship:
+        return replace(ship, wires=(*ship.wires, *wires))
+
+    return Atom(cause, f"{cause}:{key}", (), (), apply, afresh=True)

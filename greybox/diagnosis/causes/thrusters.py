@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from greybox.diagnosis.atom import Atom, Parameter
 from greybox.diagnosis.causes.cause import Cause, Context
 from greybox.diagnosis.causes.hull import listed, term_atom
+from greybox.diagnosis.causes.sensors import UNRESOLVED
 from greybox.diagnosis.ship import Ship
 from greybox.vessel.vessel import LagOn, Thruster
 
@@ -92,7 +93,8 @@ class ThrusterLag(Cause):
             out.append(
                 Atom(
                     self.id, f"{self.id}:{on}",
-                    (Parameter("lag", "s", first, 1e-3, longest, step=1e-3),), (), apply,
+                    (Parameter("lag", "s", first, 1e-3, longest, step=1e-3,
+                               least=UNRESOLVED * context.sample_time),), (), apply,
                     starts=((4 * first,),),
                 )
             )  # fmt: skip
@@ -123,7 +125,8 @@ class InputDelay(Cause):
             return replace(ship, vessel=replace(ship.vessel, actuation=late))
 
         first = 1.5 * context.sample_time
-        parameter = Parameter("delay", "s", first, 0.0, longest, step=0.1 * context.sample_time)
+        parameter = Parameter("delay", "s", first, 0.0, longest, step=0.1 * context.sample_time,
+                              least=UNRESOLVED * context.sample_time)  # fmt: skip
         return (
             Atom(self.id, self.id, (parameter,), (), apply, starts=((3 * first,), (6 * first,))),
         )
@@ -154,13 +157,15 @@ class QuadraticThrust(Cause):
         if not linear:
             return ()
 
+        # one for all, so that the thrusters keep their proportions
+        reference = float(np.mean([context.speeds[context.vessel.thrusters[i].speed] for i in linear]))
+
         def apply(ship: Ship, value: Array) -> Ship:
             for i in linear:
                 thruster = ship.vessel.thrusters[i]
                 law = replace(
-                    thruster.thrust, quadratic_share=float(value[0]),
-                    reference=context.speeds[thruster.speed],
-                )  # fmt: skip
+                    thruster.thrust, quadratic_share=float(value[0]), reference=reference
+                )
                 ship = with_thruster(ship, i, thrust=law)
             return ship
 
