@@ -266,6 +266,7 @@ def _run_between(options: argparse.Namespace, request: Any, notes: tuple[str, ..
     from greybox.errors import UsageError
     from greybox.files import write_json
     from greybox.model.model import load_model
+    from greybox.vessel.actuation import with_actuators_of
 
     first, second = (Path(p).stem for p in options.between)
     if first == second:
@@ -276,10 +277,16 @@ def _run_between(options: argparse.Namespace, request: Any, notes: tuple[str, ..
             f"'{first}' has the sample time {request.sample_time:g} s and '{second}' "
             f"{other.sample_time:g} s: estimate both at one."
         )
+    notes = (
+        *notes,
+        *[f"{second}: {c.sentence}, and it is taken as it is then" for c in other.changes],
+    )
+    other = other.settled()
     structure, theta = full_structure(other)
+    vessel = with_actuators_of(request.vessel, other.vessel)
     found = design_between(
         request,
-        Rival(second, structure, theta, other.d),
+        Rival(second, structure, theta, other.d, vessel),
         (first, second),
         best_effort=options.best_effort,
         progress=progress("design"),
@@ -348,7 +355,7 @@ def _wishes(options: argparse.Namespace, model: Any) -> Any:
     )
     combination = {}
     if options.of:
-        values = dict(zip(model.names, model.theta, strict=True))
+        values = dict(zip(model.names, model.settled().theta, strict=True))
         combination = gradient_of(options.of, values)
     criterion: Any = "c" if options.of and options.criterion == "D" else options.criterion
     process = None if options.process_noise is None else np.array(options.process_noise)

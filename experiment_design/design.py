@@ -29,6 +29,7 @@ from experiment_design.demands import (
     unexcited,
 )
 from experiment_design.feasible import closest, moved_constant, stirred
+from experiment_design.lateness import late_notes
 from experiment_design.moments import MomentProgram, Moments
 from experiment_design.problem import TrialProblem
 from experiment_design.request import DesignRequest, build_problem, wanted_parameters
@@ -211,8 +212,11 @@ def _design(
     levels = tuple(p.levels(u) for p, u in zip(problems, units, strict=True))
     commands = tuple(p.schedule.expand(v) for p, v in zip(problems, levels, strict=True))
     motions = tuple(
-        p.scenarios[0].rollout.run(c[None]) for p, c in zip(problems, commands, strict=True)
+        p.scenarios[0].rollout.run(c[None], late=True)
+        for p, c in zip(problems, commands, strict=True)
     )
+    reports = _limit_reports(problems, motions)
+    notes += late_notes(request, problems, motions, reports, covariance)
     notes += air_notes(request, motions)
     classical: tuple[Alternative, ...] = ()
     if alternatives and request.trials == 1 and not stopped:
@@ -237,7 +241,7 @@ def _design(
         kept,
         certificate,
         _margins(problems, motions),
-        _limit_reports(problems, motions),
+        reports,
         keeping,
         classical,
         status,

@@ -242,4 +242,4 @@ def _fitted(explanation: Rival, step: Array) -> Rival:
     size = np.maximum(0.3 * np.abs(both[free]), 1e-4)
     both[free] += np.clip(step, -size, size)
     split = explanation.theta.size
-    return Rival(explanation.name, explanation.structure, both[:split], both[split:])
+    return replace(explanation, theta=both[:split], d=both[split:])

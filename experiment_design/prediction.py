@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull
 from experiment_design.limits import Circle
 from experiment_design.result import Design
 from greybox.model.simulation import positions, simulate
-from greybox.vessel.force import generalised_force
+from greybox.vessel.actuation import actuated_force
 
 Array = NDArray[np.float64]
 
@@ -126,9 +126,8 @@ def predict_motion(design: Design, draws: int = 200) -> tuple[MotionBand, ...]:
     found = []
     for trial, commands in enumerate(design.commands):
         start, samples = r.starts[trial], len(commands)
-        made = generalised_force(
-            r.vessel, {n: commands[:, i] for i, n in enumerate(r.vessel.commands)}
-        )
+        columns = {n: commands[:, i] for i, n in enumerate(r.vessel.commands)}
+        made = actuated_force(r.vessel, columns, r.sample_time)
         tau = np.stack([made.get(n, np.zeros(samples)) for n in r.structure.inputs], axis=-1)
         rng = np.random.default_rng([_STREAM, r.seed, trial])
         noise = None

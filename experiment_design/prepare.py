@@ -30,6 +30,7 @@ from greybox.errors import InfeasibleError, StructureError, UsageError
 from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor import PREDICTORS
 from greybox.model.structure import Structure
+from greybox.vessel.actuation import with_actuators_of
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
@@ -123,6 +124,18 @@ def prepare_request(
     InfeasibleError
         No motion within the limits keeps the wanted signs.
     """
+    changes = (*model.changes, *(wishes.prior.changes if wishes.prior is not None else ()))
+    notes: list[str] = [
+        f"{c.sentence}, and the trial is designed for what it is from then on"
+        for c in dict.fromkeys(changes)
+    ]
+    model = model.settled()
+    if vessel is not None and vessel != (acting := with_actuators_of(vessel, model.vessel)):
+        vessel = acting
+        notes.append(
+            "thrust laws, gains, angle offsets, lag and delay are those that the model was "
+            "estimated with, which the vessel file has otherwise"
+        )
     vessel = model.vessel if vessel is None else vessel
     structure, theta = full_structure(model)
     if structure.disturbance != "marine" or "u" not in structure.states:
@@ -130,7 +143,6 @@ def prepare_request(
             f"structure '{structure.name}' has no surge speed u, so no trial can be designed for "
             f"it: use a manoeuvring structure such as 'thesis' or 'surge'."
         )
-    notes: list[str] = []
     if wishes.trials < 1:
         raise UsageError(f"--trials is {wishes.trials}, it must be 1 or more.")
     schedule = make_schedule(vessel, wishes.duration, wishes.hold, model.sample_time)
@@ -278,6 +290,7 @@ def _margins(
 def _prior(model: ManoeuvringModel | None) -> tuple[tuple[str, ...], Array] | None:
     if model is None:
         return None
+    model = model.settled()
     d = model.std
     if not (d > 0).all():
         name = model.names[int(np.argmin(d))]

@@ -36,12 +36,16 @@ _GUST_SECONDS = 20.0
 
 @dataclass(frozen=True)
 class Rival:
-    """One explanation of the ship's motion: its structure, parameters and disturbances."""
+    """One explanation of the ship's motion: its structure, parameters and disturbances.
+
+    ``vessel`` says how its thrusters act, where that is another than the request's.
+    """
 
     name: str
     structure: Structure
     theta: Array
     d: Array
+    vessel: Vessel | None = None
 
 
 @dataclass(frozen=True)
@@ -332,9 +336,8 @@ def build_problem(
 
 def _rival_rollout(request: DesignRequest, rival: Rival, trial: int) -> Rollout:
     start = rival_start(request, rival, trial)
-    return Rollout(
-        request.vessel, rival.structure, rival.theta, rival.d, start, request.sample_time
-    )
+    vessel = request.vessel if rival.vessel is None else rival.vessel
+    return Rollout(vessel, rival.structure, rival.theta, rival.d, start, request.sample_time)
 
 
 def rival_start(request: DesignRequest, rival: Rival, trial: int) -> Array:

@@ -90,7 +90,7 @@ def keep_probability(request: DesignRequest, units: list[Array], draws: int = _D
             plain.vessel, plain.structure, plain.theta, plain.d, plain.starts[t], plain.sample_time
         )
         program = LimitProgram(nominal, schedule, plain.trial_limits(t), wind_matters=wind)
-        motion = nominal.run_models(thetas, c)
+        motion = nominal.run_models(thetas, c, late=True)
         over = program.path_values(motion.state[:, 1:]).max(axis=-1)
         over[:, ~motion.stable] = np.inf
         kept &= (over <= 1e-3).all(axis=0) & motion.stable

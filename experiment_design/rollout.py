@@ -13,6 +13,7 @@ from greybox.errors import StructureError
 from greybox.model.simulation import positions, simulate
 from greybox.model.structure import Structure
 from greybox.vectorised import Vectorised
+from greybox.vessel.actuation import actuated_force
 from greybox.vessel.force import force_expressions, generalised_force
 from greybox.vessel.vessel import Vessel
 
@@ -106,20 +107,22 @@ class Rollout:
         )
         self._names = s.x.numel()
 
-    def run(self, commands: Array) -> Motion:
-        """Run freely on commands (R, N, nc)."""
-        return self._run(self.theta, commands)
+    def run(self, commands: Array, *, late: bool = False) -> Motion:
+        """Run freely on commands (R, N, nc), with the vessel's lag and delay where `late`."""
+        return self._run(self.theta, commands, late)
 
-    def run_models(self, thetas: Array, commands: Array) -> Motion:
+    def run_models(self, thetas: Array, commands: Array, *, late: bool = False) -> Motion:
         """Run other parameters (R, p) on the same commands (N, nc)."""
-        return self._run(thetas, np.broadcast_to(commands, (len(thetas), *commands.shape)))
+        together = np.broadcast_to(commands, (len(thetas), *commands.shape))
+        return self._run(thetas, together, late)
 
-    def _run(self, theta: Array, commands: Array) -> Motion:
+    def _run(self, theta: Array, commands: Array, late: bool) -> Motion:
         structure = self.structure
-        made = generalised_force(
-            self.vessel,
-            {n: commands[..., i] for i, n in enumerate(self.vessel.commands)},
-        )
+        columns = {n: commands[..., i] for i, n in enumerate(self.vessel.commands)}
+        if late:
+            made = actuated_force(self.vessel, columns, self.sample_time)
+        else:
+            made = generalised_force(self.vessel, columns)
         tau = np.stack(
             [made.get(n, np.zeros(commands.shape[:2])) for n in structure.inputs], axis=-1
         )

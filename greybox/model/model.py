@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from math import isfinite
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.errors import GreyboxError, ModelFileError
+from greybox.errors import GreyboxError, ModelFileError, StructureError, suggestion
 from greybox.files import plain, write_json
+from greybox.model.changes import Change, factors_at
 from greybox.model.noise import NoiseLevels, noise_from_dict
 from greybox.model.structure import Structure
 from greybox.model.terms import Factor, Term
@@ -52,6 +54,13 @@ class ManoeuvringModel:
         Parameters that stand for a sum, such as Xuu for Xuu + Wuu.
     record : mapping
         What the estimate reported: fit, tests, method, notes, provenance.
+    changes : tuple of Change
+        Parameters that change during a log.
+
+    Raises
+    ------
+    StructureError
+        A change is of no parameter of the structure.
     """
 
     structure: Structure
@@ -65,6 +74,16 @@ class ManoeuvringModel:
     noise: NoiseLevels | None = None
     sums: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     record: Mapping[str, Any] = field(default_factory=dict)
+    changes: tuple[Change, ...] = ()
+
+    def __post_init__(self) -> None:
+        for change in self.changes:
+            if change.parameter not in self.names:
+                raise StructureError(
+                    f"a change is of '{change.parameter}', which is no parameter of structure "
+                    f"'{self.structure.name}'.{suggestion(change.parameter, self.names)} "
+                    f"It has: {', '.join(self.names)}."
+                )
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -93,6 +112,14 @@ class ManoeuvringModel:
             [self.disturbances.get(n, (0.0, 0.0))[0] for n in self.structure.disturbances]
         )
 
+    def settled(self) -> ManoeuvringModel:
+        """Return the model as it is after its last change."""
+        if not self.changes:
+            return self
+        now = factors_at(self.changes, self.names, np.inf)
+        covariance = self.covariance * np.outer(now, now)
+        return replace(self, theta=self.theta * now, covariance=covariance, changes=())
+
     def label(self, name: str) -> str:
         """Return a parameter's name with the terms it sums, such as ``Xuu+Wuu``."""
         return "+".join(self.sums.get(name, (name,)))
@@ -115,6 +142,7 @@ class ManoeuvringModel:
             )
         for name, (value, std) in self.disturbances.items():
             lines.append(f"{name:<16}{value:>13.5g}{std:>12.2g}{'':>13}  m/s")
+        lines += [f"{c.sentence}, of the log's clock" for c in self.changes]
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
@@ -157,6 +185,8 @@ class ManoeuvringModel:
             "noise": None if self.noise is None else self.noise.to_dict(),
             "vessel": vessel_to_dict(self.vessel),
         }
+        if self.changes:
+            data["changes"] = [vars(c) for c in self.changes]
         out: dict[str, Any] = plain(data | dict(self.record))
         return out
 
@@ -168,7 +198,7 @@ class ManoeuvringModel:
 _CORE = {
     "format", "version", "sample_time", "integrator", "structure", "names", "theta", "std",
     "units", "theta_per_second", "covariance", "sums", "disturbances", "residual_std",
-    "noise", "vessel",
+    "noise", "vessel", "changes",
 }  # fmt: skip
 
 
@@ -239,6 +269,7 @@ def model_from_dict(data: Any, source: str = "model") -> ManoeuvringModel:
             noise=(noise_from_dict(data["noise"], structure.states) if data.get("noise") else None),
             sums={k: tuple(v) for k, v in data.get("sums", {}).items()},
             record={k: v for k, v in data.items() if k not in _CORE},
+            changes=_changes(data.get("changes", []), structure.parameters, source),
         )
     except ModelFileError:
         raise
@@ -247,6 +278,31 @@ def model_from_dict(data: Any, source: str = "model") -> ManoeuvringModel:
             f"'{source}' is a damaged model file ({type(error).__name__}: {error}): "
             f"estimate the model again."
         ) from error
+
+
+def _changes(rows: Any, names: tuple[str, ...], source: str) -> tuple[Change, ...]:
+    found = []
+    for row in rows if isinstance(rows, list) else [rows]:
+        if not isinstance(row, dict) or row.keys() != {"parameter", "factor", "time"}:
+            raise ModelFileError(
+                f"'{source}' has the change {row!r}, where parameter, factor and time [s] are "
+                f"needed: write them."
+            )
+        name = row["parameter"]
+        if name not in names:
+            raise ModelFileError(
+                f"'{source}' has a change of '{name}', which is no parameter of the model."
+                f"{suggestion(str(name), names)} It has: {', '.join(names)}."
+            )
+        for key in ("factor", "time"):
+            value = row[key]
+            if isinstance(value, bool) or not isinstance(value, int | float) or not isfinite(value):
+                raise ModelFileError(
+                    f"'{source}' has a change of {name} with the {key} {value!r}, a finite number "
+                    f"is needed: correct it."
+                )
+        found.append(Change(name, float(row["factor"]), float(row["time"])))
+    return tuple(found)
 
 
 def load_model(path: str | Path) -> ManoeuvringModel:

@@ -13,8 +13,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.model.changes import Change, simulate_changing
 from greybox.model.predictor import Predictor
-from greybox.model.simulation import FreeRun, simulate
+from greybox.model.simulation import FreeRun
 from greybox.model.structure import Structure
 from greybox.regression.regression import within_margins
 from greybox.trial.log import TrialLog
@@ -73,6 +74,7 @@ def simulate_log(
     d: Array | None = None,
     use_wind: bool = False,
     integrator: Literal["euler", "rk4"] = "euler",
+    changes: Sequence[Change] = (),
 ) -> FreeRun:
     """Run a model freely on the inputs of a log, from its first samples.
 
@@ -87,6 +89,8 @@ def simulate_log(
         (nd,) disturbance means [m/s].
     use_wind : bool
         Whether the measured velocity through the air drives the wind terms.
+    changes : sequence of Change
+        Of parameters, on the clock of the log.
 
     Returns
     -------
@@ -101,9 +105,10 @@ def simulate_log(
     air = log.air if use_wind and structure.uses_air else None
     has_yaw = "r" in structure.states
     psi = log["psi"] if "psi" in log else np.zeros(len(log))
-    return simulate(
+    return simulate_changing(
         structure,
         theta,
+        changes,
         initial_state(log, structure.states),
         tau,
         log.sample_time,

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from greybox.channels import LOGGED
 from greybox.errors import LogError, suggestion
 from greybox.trial.conditioning import velocities_from_positions
+from greybox.trial.correcting import said_antenna
 from greybox.trial.deriving import earth_to_body
 from greybox.trial.options import ImportOptions
 from greybox.trial.wind import move_anemometer, wind_at_height
@@ -124,6 +125,7 @@ def complete_channels(
         part["u"] = u + r * antenna[1]
         part.setdefault("v", v - r * antenna[0])
         derived.append("u, v from the velocity over ground and the heading")
+        derived += said_antenna(antenna)
     if psi is not None and "u" not in part and {"x_n", "y_n"} <= part.keys() and len(psi) > 2:
         if options.velocities == "savgol":
             from greybox.trial.smoothing import savgol_velocities
@@ -144,6 +146,7 @@ def complete_channels(
         if any(d.startswith("r from") for d in derived):
             part["r"] = r
         derived.append(f"u, v from positions and heading by {how}")
+        derived += said_antenna(antenna)
         trim = True
     _complete_wind(part, vessel, options, derived, wind_state(earlier))
     channels = {n: part[n] for n in logged if n in part}

@@ -19,6 +19,7 @@ from greybox.channels import CHANNELS, unit_factor
 from greybox.errors import LogError, suggestion
 from greybox.files import sha256
 from greybox.trial.conditioning import velocities_from_positions
+from greybox.trial.correcting import correct_channels, said_antenna, too_late
 from greybox.trial.log import Provenance, TrialLog
 from greybox.trial.names import Assigned, assign
 from greybox.trial.readers.formats import open_raw
@@ -61,7 +62,8 @@ def read_log(
     Returns
     -------
     TrialLog
-        SI and radians, ψ unwrapped, velocities derived where absent (3.57), (3.64).
+        SI and radians, ψ unwrapped, velocities derived where absent (3.57), (3.64),
+        without the defects that ``[sensors]`` of the vessel file states.
 
     Raises
     ------
@@ -118,20 +120,23 @@ def read_segments(
     stretches, sample_time = _stretches(t, path.name)
     for name in {"psi", "gamma_q", *vessel.angle_commands} & channels.keys():
         channels[name] = np.unwrap(channels[name])
-    provenance = recorded_provenance(record) if record is not None else None
-    segments = []
+    known = Provenance(path.name) if record is None else recorded_provenance(record)
+    segments: list[TrialLog] = []
     for k, (start, stop) in enumerate(stretches):
         part = {n: v[start:stop] for n, v in channels.items()}
         words = {n: v[start:stop] for n, v in text.items()}
         name = path.stem if len(stretches) == 1 else f"{path.stem}[{k + 1}]"
         log = _segment(
             name, path, vessel, t[start:stop], sample_time, part, words, states, fill or {},
-            [str(c) for c in table.columns],
+            [str(c) for c in table.columns], known,
         )  # fmt: skip
-        segments.append(log)
-    if provenance is None:
-        provenance = Provenance(path.name, sha256(path), segments[0].provenance.derived)
-    return [replace(s, provenance=provenance) for s in segments]
+        if log is not None:
+            segments.append(log)
+    if not segments:
+        raise too_late(vessel, path.name)
+    derived = (*known.derived, *segments[0].provenance.derived)
+    known = replace(known, derived=derived, sha256=known.sha256 or sha256(path))
+    return [replace(s, provenance=known) for s in segments]
 
 
 def _segment(
@@ -145,9 +150,10 @@ def _segment(
     states: tuple[str, ...],
     fill: Mapping[str, float],
     columns: list[str],
-) -> TrialLog:
+    before: Provenance,
+) -> TrialLog | None:
+    """Return the log of one stretch, None where a late clock leaves too little of it."""
     derived: list[str] = []
-    _derive_velocities(channels, vessel, sample_time, derived)
     if "V_q" in channels and "u_q" not in channels:
         if "gamma_q" in channels:
             pair = relative_wind(channels["V_q"], channels["gamma_q"])
@@ -157,6 +163,15 @@ def _segment(
             pair = relative_wind_from_direction(channels["V_q"], channels["dir_q"])
             derived.append("u_q, v_q from the apparent wind's speed and direction (5.40)")
             channels["u_q"], channels["v_q"] = pair
+    correction = correct_channels(channels, sample_time, vessel, before.derived, before.fixed)
+    derived += correction.said
+    kept = slice(correction.before, len(t) - correction.after)
+    t = t[kept]
+    if len(t) < _MIN_SAMPLES:
+        return None
+    channels = {n: v[kept] for n, v in correction.channels.items()}
+    text = {n: v[kept] for n, v in text.items()}
+    _derive_velocities(channels, vessel, sample_time, derived)
     for other, value in fill.items():
         channels.setdefault(other, np.full(len(t), float(value)))
     _require(channels, vessel, states or ("u", "v", "r"), path.name, columns)
@@ -299,6 +314,8 @@ def _derive_velocities(
             channels[name] = value
     made = ", ".join(wanted)
     derived.append(f"{made} from positions and heading by central differences (3.57)")
+    if "u" in wanted:
+        derived += said_antenna(vessel.sensors.get("antenna", (0.0, 0.0)))
 
 
 def _require(

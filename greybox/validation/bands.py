@@ -13,8 +13,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.model.changes import simulate_changing
 from greybox.model.model import ManoeuvringModel
-from greybox.model.simulation import simulate
 from greybox.regression.instruments import state_bound
 from greybox.trial.log import TrialLog
 from greybox.validation.fit import at_model_rate
@@ -246,12 +246,14 @@ def _pieces(
         n = last - first
         if process.any():
             pushes, push = _remembering(rng, push, memory, drive, n)
-        run = simulate(
+        run = simulate_changing(
             structure,
             theta,
+            model.changes,
             x,
             tau[first:last],
             log.sample_time,
+            first=first * log.sample_time,
             psi=_noisy(rng, psi[first : last + 1], turned, runs) if follows else None,
             psi0=psi0,
             d=d,

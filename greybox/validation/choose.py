@@ -174,9 +174,13 @@ def _less(predictor: Predictor, without: Sequence[str]) -> Predictor:
 def _nominal_theta(
     nominal: ManoeuvringModel | None, structure: Structure
 ) -> NDArray[np.float64] | None:
-    """Return a nominal model's parameters in the order of a structure, absent ones zero."""
+    """Return a nominal model's parameters in the order of a structure, absent ones zero.
+
+    Of one whose parameters change, those after the last change.
+    """
     if nominal is None:
         return None
+    nominal = nominal.settled()
     known = dict(zip(nominal.names, nominal.theta, strict=True))
     return np.array([known.get(name, 0.0) for name in structure.parameters])
 

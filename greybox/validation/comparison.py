@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import UsageError
+from greybox.model.changes import Change, simulate_changing
 from greybox.model.model import ManoeuvringModel
-from greybox.model.simulation import simulate
 from greybox.regression.instruments import state_bound
 from greybox.trial.log import TrialLog
 from greybox.validation.bands import LEVEL, Bands, predict_bands
@@ -218,6 +218,7 @@ def errors_ahead(
     x = log.states(structure.states)
     tau = log.forces(structure.inputs)
     psi = log["psi"] if "psi" in log else np.zeros(len(log))
+    follows = heading == "measured" or "r" not in structure.states
     found = {}
     for horizon in HORIZONS:
         steps = round(horizon / log.sample_time)
@@ -227,25 +228,39 @@ def errors_ahead(
         starts = np.unique(np.linspace(0, last - 1, min(last, _MOST_STARTS)).astype(int))
         window = starts[:, None] + np.arange(steps + 1)
         air = log.air if log.has_wind and structure.uses_air else None
-        ahead = simulate(
-            structure,
-            model.theta,
-            x[starts],
-            tau[window[:, :-1]],
-            log.sample_time,
-            psi=psi[window] if heading == "measured" or "r" not in structure.states else None,
-            psi0=psi[starts],
-            d=model.d if model.disturbances else None,
-            air=None if air is None else air[window[:, :-1]],
-            integrator=model.integrator,
-            bound=state_bound(log, structure.states),
-        )
-        bounded = ahead.diverged < 0
+        end = np.empty((len(starts), x.shape[1]))
+        for rows in _alike(model.changes, starts * log.sample_time, steps * log.sample_time):
+            ahead = simulate_changing(
+                structure,
+                model.theta,
+                model.changes,
+                x[starts[rows]],
+                tau[window[rows, :-1]],
+                log.sample_time,
+                first=float(starts[rows[0]] * log.sample_time),
+                psi=psi[window[rows]] if follows else None,
+                psi0=psi[starts[rows]],
+                d=model.d if model.disturbances else None,
+                air=None if air is None else air[window[rows, :-1]],
+                integrator=model.integrator,
+                bound=state_bound(log, structure.states),
+            )
+            end[rows] = np.where(ahead.diverged[:, None] < 0, ahead.x[:, -1], np.inf)
         error = np.full(x.shape[1], np.inf)
-        if bounded.all():
-            error = np.sqrt(((ahead.x[:, -1] - x[starts + steps]) ** 2).mean(axis=0))
+        if np.isfinite(end).all():
+            error = np.sqrt(((end - x[starts + steps]) ** 2).mean(axis=0))
         found[f"{horizon:g}"] = dict(zip(structure.states, map(float, error), strict=True))
     return found
+
+
+def _alike(changes: Sequence[Change], starts: Array, horizon: float) -> list[NDArray[np.intp]]:
+    """Group runs that start at these times [s]: those with one set of parameters together."""
+    times = np.array(sorted({c.time for c in changes}))
+    before = np.searchsorted(times, starts, side="right")
+    crossing = np.searchsorted(times, starts + horizon, side="right") > before
+    groups = [np.flatnonzero(~crossing & (before == k)) for k in range(len(times) + 1)]
+    # each of the others meets its change after another number of samples
+    return [g for g in groups if len(g)] + [np.array([k]) for k in np.flatnonzero(crossing)]
 
 
 def compare_models(

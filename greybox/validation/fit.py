@@ -100,7 +100,8 @@ def run_model(
     """Run a model freely on a log and compare.
 
     The run starts from the mean of the log's first samples, uses the model's
-    current, and the wind where the log has it and the model has wind terms.
+    current, and the wind where the log has it and the model has wind terms. Its
+    parameters change when the model says so.
 
     Parameters
     ----------
@@ -121,6 +122,7 @@ def run_model(
         d=model.d if model.disturbances else None,
         use_wind=log.has_wind,
         integrator=model.integrator,
+        changes=model.changes,
     )
     states = model.structure.states
     fit = fit_percent(log.states(states), run.x[0])

@@ -6,6 +6,8 @@ T, ẋ = (c − x)/T, exactly by x[k+1] = a x[k] + (1 − a) c[k] with a = exp(�
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,7 +16,7 @@ from greybox.vessel.vessel import Actuation, Vessel
 
 Array = NDArray[np.float64]
 
-__all__ = ["Actuation", "actuated_force", "delayed", "lagged"]
+__all__ = ["Actuation", "actuated_force", "delayed", "lagged", "with_actuators_of"]
 
 
 def actuated_force(
@@ -55,6 +57,33 @@ def actuated_force(
             for c, value in moved.items()
         },
     )
+
+
+def with_actuators_of(vessel: Vessel, known: Vessel) -> Vessel:
+    """Return a vessel whose thrusters act as those of another description of it.
+
+    Thrust laws, gains, angle offsets, lag and delay are taken over: parameters
+    that were estimated with them mean nothing without. Places, limits, columns
+    and sensors stay.
+
+    Parameters
+    ----------
+    vessel : Vessel
+    known : Vessel
+        Where its thrusters are not the same in number, type, place and columns,
+        `vessel` is returned as it is.
+    """
+
+    def kept(v: Vessel) -> list[object]:
+        return [(t.type, t.x, t.y, t.columns, t.angle) for t in v.thrusters]
+
+    if kept(vessel) != kept(known):
+        return vessel
+    thrusters = tuple(
+        replace(t, thrust=k.thrust, gain=k.gain, angle_offset=k.angle_offset)
+        for t, k in zip(vessel.thrusters, known.thrusters, strict=True)
+    )
+    return replace(vessel, thrusters=thrusters, actuation=known.actuation)
 
 
 def delayed(value: Array, samples: float) -> Array:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import tomllib
+from collections.abc import Iterable, Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -52,7 +53,14 @@ _SENSORS = {
     "wind_std",
     "antenna",
     "anemometer",
+    "heading_bias",
+    "velocities_from_heading",
+    "velocity_at",
+    "clock",
+    "reversed",
 }
+_CORRECTED = ("x_n", "y_n", "psi", "u", "v", "r", "u_q", "v_q")
+_SIZES = {"antenna": (2, 3), "anemometer": (3,), "velocity_at": (2,)}
 _MAX_BYTES = 1_000_000
 
 
@@ -124,7 +132,9 @@ def vessel_from_dict(data: dict[str, Any]) -> Vessel:
         name=str(name),
         length=length,
         thrusters=thrusters,
-        sensors=_sensors(data.get("sensors", {})),
+        sensors=_sensors(
+            data.get("sensors", {}), dict.fromkeys(c for t in thrusters for c in t.columns)
+        ),
         closed_loop=_closed_loop(data.get("closed_loop")),
         mass=_number(data["mass"], "mass") if "mass" in data else None,
         actuation=_actuation(data.get("actuation", {})),
@@ -169,7 +179,8 @@ def vessel_to_dict(vessel: Vessel) -> dict[str, Any]:
         }
     if vessel.sensors:
         data["sensors"] = {
-            k: list(v) if isinstance(v, tuple) else v for k, v in vessel.sensors.items()
+            k: list(v) if isinstance(v, tuple) else dict(v) if isinstance(v, Mapping) else v
+            for k, v in vessel.sensors.items()
         }
     if vessel.closed_loop:
         data["closed_loop"] = {
@@ -348,12 +359,34 @@ def _columns(table: Any, vessel: Vessel) -> dict[str, ColumnMapping]:
     return found
 
 
-def _sensors(table: Any) -> dict[str, Any]:
+def _sensors(table: Any, commands: Iterable[str]) -> dict[str, Any]:
     _known_keys(table, _SENSORS, "[sensors]")
     found: dict[str, Any] = {}
     for key, value in table.items():
-        if key in ("antenna", "anemometer"):
-            size = {"antenna": (2, 3), "anemometer": (3,)}[key]
+        if key == "clock":
+            late = value if isinstance(value, dict) else {}
+            _corrected_channels(value, late, commands, "clock", "{ u = 1.2 }")
+            found[key] = {c: _number(s, f"clock of {c} in [sensors]") for c, s in late.items()}
+        elif key == "reversed":
+            names = value if isinstance(value, list) else []
+            _corrected_channels(value, names, commands, "reversed", '["r"]')
+            found[key] = tuple(names)
+        elif key == "velocities_from_heading":
+            if not isinstance(value, bool):
+                raise VesselError(
+                    f"velocities_from_heading in [sensors] is {value!r}: write true where u, v "
+                    f"were computed with the heading, else false."
+                )
+            found[key] = value
+        elif key == "heading_bias":
+            found[key] = _number(value, key)
+            if abs(found[key]) > 2 * math.pi:
+                raise VesselError(
+                    f"heading_bias in [sensors] is {found[key]:g} rad, more than a turn: write "
+                    f"it in radians."
+                )
+        elif key in _SIZES:
+            size = _SIZES[key]
             if not isinstance(value, list) or len(value) not in size:
                 raise VesselError(
                     f"{key} in [sensors] needs {size[0]} numbers [m]: write [x, y"
@@ -365,6 +398,23 @@ def _sensors(table: Any) -> dict[str, Any]:
             if found[key] < 0:
                 raise VesselError(f"{key} is {found[key]:g}, it cannot be negative: correct it.")
     return found
+
+
+def _corrected_channels(
+    value: Any, names: Iterable[Any], commands: Iterable[str], key: str, example: str
+) -> None:
+    """Refuse what lists no channels that a log may need to have corrected."""
+    known = (*_CORRECTED, *commands)
+    if not names:
+        raise VesselError(
+            f"{key} in [sensors] is {value!r}, it must name channels: write {key} = {example}."
+        )
+    for name in names:
+        if name not in known:
+            raise VesselError(
+                f"{key} in [sensors] names '{name}', which is no channel that can be corrected."
+                f"{suggestion(str(name), known)} Channels: {', '.join(known)}."
+            )
 
 
 def _closed_loop(table: Any) -> tuple[str, tuple[str, ...]] | None:

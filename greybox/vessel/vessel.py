@@ -134,6 +134,14 @@ class Actuation:
     def __bool__(self) -> bool:
         return self.lag > 0 or self.delay > 0
 
+    @property
+    def sentence(self) -> str:
+        """Lag and delay in words."""
+        of = {"force": "each force", "speed": "the propeller speeds", "command": "all commands"}
+        parts = [f"a lag of {self.lag:g} s of {of[self.lag_on]}"] if self.lag else []
+        parts += [f"a delay of {self.delay:g} s"] if self.delay else []
+        return " and ".join(parts) or "no lag and no delay"
+
 
 @dataclass(frozen=True)
 class ColumnMapping:

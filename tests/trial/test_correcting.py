@@ -1,0 +1,233 @@
+"""A log recorded with a defect, and a vessel file that says so, give the log without it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from greybox.errors import LogError, VesselError
+from greybox.trial.correcting import correct_log
+from greybox.trial.log import make_log
+from greybox.trial.reading import read_log
+from greybox.trial.stream import import_files
+from greybox.trial.writing import write_log
+from greybox.vessel.toml import vessel_from_dict, vessel_to_dict
+
+STEP = 0.1
+SHIP = {"name": "S", "length": 5, "thruster": [{"type": "azimuth", "speed": "n", "angle": "a"}]}
+
+
+def ship(**sensors):
+    return vessel_from_dict(SHIP | {"sensors": sensors})
+
+
+def signals(late=None, n=600):
+    """A weaving ship by formula; channels named in `late` as their sensors give them."""
+
+    def at(name):
+        t = np.arange(n) * STEP - (late or {}).get(name, 0.0)
+        return {
+            "psi": 0.7 * np.sin(0.2 * t) + 0.05 * t,
+            "r": 0.14 * np.cos(0.2 * t) + 0.05,
+            "u": 2 + 0.3 * np.sin(0.13 * t),
+            "v": 0.2 * np.cos(0.11 * t),
+            "n": 5 + np.sin(0.3 * t),
+            "a": 0.4 * np.sin(0.17 * t),
+        }[name]
+
+    return {c: at(c) for c in ("psi", "r", "u", "v", "n", "a")}
+
+
+def read(columns, tmp_path, vessel):
+    path = tmp_path / "log.csv"
+    n = len(next(iter(columns.values())))
+    pd.DataFrame({"t": np.arange(n) * STEP} | columns).to_csv(path, index=False)
+    return read_log(path, vessel)
+
+
+def body(angle, u, v):
+    c, s = np.cos(angle), np.sin(angle)
+    return c * u + s * v, c * v - s * u
+
+
+def test_reversed_channels_and_heading(tmp_path):
+    true = signals()
+    wrong = true | {"r": -true["r"], "a": -true["a"], "psi": true["psi"] + 0.08}
+    log = read(wrong, tmp_path, ship(reversed=["r", "a"], heading_bias=0.08))
+    for name, value in true.items():
+        np.testing.assert_allclose(log[name], value, atol=1e-12)
+    said = log.provenance.derived
+    assert any(d.startswith('[sensors] reversed = ["a","r"]') for d in said)
+    assert any(d.startswith("[sensors] heading_bias = 0.08: psi turned back") for d in said)
+
+
+def test_velocities_that_were_made_with_the_heading_keep_their_course(tmp_path):
+    true = signals()
+    u, v = body(0.08, true["u"], true["v"])
+    wrong = true | {"psi": true["psi"] + 0.08, "u": u, "v": v}
+    log = read(wrong, tmp_path, ship(heading_bias=0.08, velocities_from_heading=True))
+    for name in ("psi", "u", "v"):
+        np.testing.assert_allclose(log[name], true[name], atol=1e-12)
+
+
+def test_velocities_of_another_place(tmp_path):
+    true = signals()
+    wrong = true | {"u": true["u"] - true["r"] * -0.7, "v": true["v"] + true["r"] * 2.5}
+    log = read(wrong, tmp_path, ship(velocity_at=[2.5, -0.7]))
+    np.testing.assert_allclose(log["u"], true["u"], atol=1e-12)
+    np.testing.assert_allclose(log["v"], true["v"], atol=1e-12)
+
+
+def test_late_and_early_clocks(tmp_path):
+    """Exact for whole samples, to interpolation otherwise; what is not known is cut."""
+    late = {"u": 0.7, "psi": -0.3, "n": 0.25}
+    log = read(signals(late), tmp_path, ship(clock=late))
+    assert len(log) == 600 - 7 - 3
+    assert log.t[0] == pytest.approx(0.3)
+    true = signals()
+    for name in ("u", "psi", "v", "r", "a"):
+        np.testing.assert_allclose(log[name], true[name][3:-7], atol=1e-12)
+    np.testing.assert_allclose(log["n"], true["n"][3:-7], atol=STEP**2 / 8 * 0.09 * 1.01)
+
+
+def recorded(bias=0.0, arm=(0.0, 0.0), psi_late=0.0):
+    """Positions of an antenna and a heading, with the true u and v from fine integration."""
+    fine = 20
+    n = 600
+    t = np.arange(n * fine) * STEP / fine
+    psi = 0.7 * np.sin(0.2 * t) + 0.05 * t
+    u, v = 2 + 0.3 * np.sin(0.13 * t), 0.2 * np.cos(0.11 * t)
+    c, s = np.cos(psi), np.sin(psi)
+    step = STEP / fine
+    north, east = (
+        np.concatenate([[0], np.cumsum(0.5 * (w[1:] + w[:-1])) * step])
+        for w in (c * u - s * v, s * u + c * v)
+    )
+    later = t - psi_late
+    heading = 0.7 * np.sin(0.2 * later) + 0.05 * later
+    columns = {
+        "x_n": north + c * arm[0] - s * arm[1],
+        "y_n": east + s * arm[0] + c * arm[1],
+        "psi": heading + bias,
+        "n": np.ones_like(t),
+        "a": np.zeros_like(t),
+    }
+    return {k: w[::fine] for k, w in columns.items()}, u[::fine], v[::fine]
+
+
+DEFECTS = [
+    ({"bias": 0.1}, {"heading_bias": 0.1}),
+    ({"arm": (3.0, -1.0)}, {"antenna": [3.0, -1.0]}),
+    ({"psi_late": 0.6}, {"clock": {"psi": 0.6}}),
+    (
+        {"bias": 0.1, "arm": (3.0, -1.0), "psi_late": 0.6},
+        {"heading_bias": 0.1, "antenna": [3, -1], "clock": {"psi": 0.6}},
+    ),
+]
+
+
+@pytest.mark.parametrize(("defect", "sensors"), DEFECTS)
+@pytest.mark.parametrize("when", ["derived by the reader", "derived by an import", "in memory"])
+def test_velocities_derived_with_the_defect(defect, sensors, when, tmp_path):
+    """Whether u, v were made before the vessel file said so, or after, they come out right."""
+    columns, u, v = recorded(**defect)
+    path = tmp_path / "raw.csv"
+    frame = pd.DataFrame({"t": np.arange(600) * STEP} | columns)
+    frame.to_csv(path, index=False)
+    if when == "derived by the reader":
+        log = read_log(path, ship(**sensors))
+    elif when == "derived by an import":
+        import_files([path], ship(), tmp_path / "log.csv")
+        log = read_log(tmp_path / "log.csv", ship(**sensors))
+    else:
+        log = correct_log(read_log(path, ship()), ship(**sensors))
+    k = np.round(log.t / STEP).astype(int)
+    assert len(log) >= 590
+    rows = slice(2, -2)
+    np.testing.assert_allclose(log["u"][rows], u[k][rows], atol=2e-3)
+    np.testing.assert_allclose(log["v"][rows], v[k][rows], atol=2e-3)
+
+
+def test_a_corrected_log_is_not_corrected_again(tmp_path):
+    true = signals({"v": 0.5})
+    wrong = true | {"psi": true["psi"] + 0.08, "r": -true["r"], "u": true["u"] - true["r"]}
+    vessel = ship(heading_bias=0.08, reversed=["r"], clock={"v": 0.5}, velocity_at=[0.0, 1.0])
+    once = read(wrong, tmp_path, vessel)
+    write_log([once], tmp_path / "once.csv")
+    twice = read_log(tmp_path / "once.csv", vessel)
+    assert correct_log(twice).provenance == twice.provenance
+    import_files([tmp_path / "once.csv"], vessel, tmp_path / "again.csv")
+    thrice = read_log(tmp_path / "again.csv", vessel)
+    for log in (twice, correct_log(twice), thrice):
+        for name in once.channels:
+            np.testing.assert_allclose(log[name], once[name], atol=1e-12)
+    more = read_log(tmp_path / "once.csv", ship(heading_bias=0.1))
+    np.testing.assert_allclose(more["psi"], once["psi"] - 0.02, atol=1e-12)
+    assert any("heading_bias = 0.1:" in d for d in more.provenance.derived)
+
+
+def test_what_import_mended_is_left_to_it(tmp_path):
+    from dataclasses import replace
+
+    log = make_log(ship(), signals(), STEP)
+    mended = replace(log.provenance, fixed=("heading_bias of psi: the heading is off",))
+    write_log([replace(log, provenance=mended)], tmp_path / "log.csv")
+    got = read_log(tmp_path / "log.csv", ship(heading_bias=0.1))
+    np.testing.assert_allclose(got["psi"], log["psi"])
+    assert any("heading_bias is not applied: it was mended" in d for d in got.provenance.derived)
+
+
+def test_a_plan_has_nothing_to_correct(tmp_path):
+    vessel = ship(reversed=["a"], clock={"n": 1.0}, heading_bias=0.3)
+    frame = {"n": np.arange(20.0), "a": np.ones(20)}
+    path = tmp_path / "plan.csv"
+    pd.DataFrame({"t": np.arange(20) * STEP} | frame).to_csv(path, index=False)
+    log = read_log(path, vessel, fill={"u": 1.0, "v": 0.0, "r": 0.0, "psi": 0.2})
+    np.testing.assert_array_equal(log["a"], frame["a"])
+    np.testing.assert_array_equal(log["psi"], np.full(20, 0.2))
+
+
+def test_segments_shorter_than_the_clock_are_left_out(tmp_path):
+    """Each stretch between gaps has its own ends."""
+    from greybox.trial.reading import read_segments
+
+    columns = {"t": np.arange(600) * STEP} | signals({"u": 0.5})
+    gone = np.r_[100:120, 126:140]
+    path = tmp_path / "log.csv"
+    pd.DataFrame(columns).drop(index=gone).to_csv(path, index=False)
+    logs = read_segments(path, ship(clock={"u": 0.5}))
+    assert [len(s) for s in logs] == [95, 455]
+    with pytest.raises(LogError, match=r"fewer than 3 samples .* \(u by 100 s\)"):
+        read_segments(path, ship(clock={"u": 100.0}))
+    with pytest.raises(LogError, match="fewer than 3 samples"):
+        correct_log(logs[0], ship(clock={"u": 100.0}))
+
+
+def test_the_keys_survive_a_round_trip():
+    vessel = ship(
+        heading_bias=-0.02, velocities_from_heading=True, velocity_at=[1, 2],
+        clock={"u": 1.2, "psi": -0.5, "n": 0.1}, reversed=["r", "a"], antenna=[1, 0],
+    )  # fmt: skip
+    assert vessel_from_dict(vessel_to_dict(vessel)) == vessel
+
+
+@pytest.mark.parametrize(
+    ("sensors", "message"),
+    [
+        ({"heading_bias": "x"}, "heading_bias is 'x', a finite number"),
+        ({"heading_bias": 30.0}, "is 30 rad, more than a turn"),
+        ({"velocities_from_heading": 1}, "velocities_from_heading in .sensors. is 1: write true"),
+        ({"velocity_at": [1]}, "velocity_at in .sensors. needs 2 numbers"),
+        ({"clock": 1.2}, "clock in .sensors. is 1.2, it must name channels"),
+        ({"clock": {"u": math.inf}}, "clock of u in .sensors. is inf"),
+        ({"clock": {"psy": 1.0}}, "Did you mean 'psi'"),
+        ({"reversed": "r"}, "reversed in .sensors. is 'r', it must name channels"),
+        ({"reversed": ["t"]}, "names 't', which is no channel that can be corrected"),
+    ],
+)
+def test_bad_keys(sensors, message):
+    with pytest.raises(VesselError, match=message):
+        ship(**sensors)
