@@ -47,8 +47,6 @@ class Sensors:
         Measured less true direction of the axes of u and v [rad].
     late : tuple of (str, float)
         Channels that show an older time, by so many seconds.
-    rate_bias : float
-        Measured less true yaw rate [rad/s].
     reversed : tuple of str
         Channels of the wrong sign.
     """
@@ -56,7 +54,6 @@ class Sensors:
     lever: tuple[float, float] = (0.0, 0.0)
     turned: float = 0.0
     late: tuple[tuple[str, float], ...] = ()
-    rate_bias: float = 0.0
     reversed: tuple[str, ...] = ()
 
 
@@ -193,10 +190,7 @@ class LogRun:
         full = x
         if self._turns:
             full = np.column_stack([x, start[nx] + self._heading(x[:, self.states.index("r")])])
-        y = self.sense(ship.sensors, full[..., None])[..., 0]
-        if ship.sensors.rate_bias:
-            y[:, self.states.index("r")] += ship.sensors.rate_bias
-        return Shown(x, y)
+        return Shown(x, self.sense(ship.sensors, full[..., None])[..., 0])
 
     def _heading(self, r: Array) -> Array:
         """Integrate a yaw rate (N, ...) from zero."""

@@ -12,7 +12,6 @@ from greybox.diagnosis.causes.sensors import (
     ClockOffset,
     HeadingBias,
     LeverArm,
-    RateBias,
     Sign,
 )
 from greybox.diagnosis.causes.thrusters import (
@@ -30,7 +29,7 @@ __all__ = ["Cause", "Context", "known_causes"]
 _OWN: tuple[type[Cause], ...] = (
     Current, Wind, ThrusterGain, ThrusterLag, InputDelay, QuadraticThrust, AdvanceSpeed,
     CubicDamping, QuadraticYawDamping, Crossflow, Asymmetry, HeadingBias, LeverArm, AngleOffset,
-    ClockOffset, RateBias, Sign, ParameterChange,
+    ClockOffset, Sign, ParameterChange,
 )  # fmt: skip
 GROUP = "greybox.causes"
 

@@ -128,33 +128,6 @@ class ClockOffset(Cause):
         )
 
 
-class RateBias(Cause):
-    """A yaw-rate sensor whose zero is off."""
-
-    id = "rate_bias"
-    kind = "sensor"
-    title = "bias of the yaw-rate sensor"
-    signature = "the yaw rate differs from the change of the heading by a constant"
-    extension = "the bias in the vessel; logs are corrected when read"
-    reference = "Fossen (2011), section 14.1"
-
-    def atoms(self, context: Context) -> Sequence[Atom]:
-        """Return the bias, where the heading tells it."""
-        if not {"r", "psi"} <= set(context.outputs):
-            return ()
-
-        def apply(ship: Ship, value: Array) -> Ship:
-            return replace(ship, sensors=replace(ship.sensors, rate_bias=float(value[0])))
-
-        parameter = Parameter("rate_bias", "rad/s", 0.0, -0.2, 0.2, step=1e-5)
-        return (Atom(self.id, self.id, (parameter,), (), apply),)
-
-    def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
-        """Say how large."""
-        value, std = values["rate_bias"]
-        return f"the yaw rate is {value:.2g} ± {std:.1g} rad/s more than the heading's change"
-
-
 class Sign(Cause):
     """A channel of the wrong sign, or two that were exchanged."""
 

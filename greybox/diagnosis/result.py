@@ -1,0 +1,271 @@
+"""What a diagnosis returns."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.model.model import ManoeuvringModel
+from greybox.trial.log import TrialLog
+
+Array = NDArray[np.float64]
+Verdict = Literal["named", "none", "confused", "unexplained"]
+
+VERDICTS: Mapping[Verdict, str] = {
+    "named": "what is wrong has a name",
+    "none": "nothing is wrong beyond noise",
+    "confused": "something is wrong, and several causes explain it equally well",
+    "unexplained": "something is wrong, and no known cause explains it",
+}
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """An estimate with its standard error."""
+
+    value: float
+    std: float
+    unit: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return it for JSON."""
+        return {"value": self.value, "std": self.std, "unit": self.unit}
+
+
+@dataclass(frozen=True)
+class Found:
+    """One cause with its evidence.
+
+    Parameters
+    ----------
+    id : str
+    key : str
+        Id with the place: which thruster, coefficient or channel.
+    title : str
+    parameters : mapping of str to Quantity
+    p_value, p_adjusted : float
+        Of no such effect; after correction for all causes that were tried.
+    evidence, extension, reference : str
+    gain : float
+        Fall of −2 log L of the estimation logs.
+    held_out, held_out_std : float
+        Fall of −2 log L of logs it was not fitted to, and its standard error.
+    """
+
+    id: str
+    key: str
+    title: str
+    parameters: Mapping[str, Quantity]
+    p_value: float
+    p_adjusted: float
+    evidence: str
+    extension: str
+    reference: str
+    gain: float = 0.0
+    held_out: float = 0.0
+    held_out_std: float = 0.0
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the cause for JSON."""
+        return {
+            "id": self.id,
+            "parameters": {k: q.to_dict() for k, q in self.parameters.items()},
+            "p_value": self.p_value,
+            "p_adjusted": self.p_adjusted,
+            "evidence": self.evidence,
+            "extension": self.extension,
+            "place": self.key,
+            "likelihood_gain": self.gain,
+            "held_out_gain": {"value": self.held_out, "std": self.held_out_std},
+        }
+
+
+@dataclass(frozen=True)
+class Gain:
+    """Fit (6.12) of the free run before and after, with a 95 % interval of the difference [%]."""
+
+    before: float
+    after: float
+    ci: tuple[float, float]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the gain for JSON."""
+        return {"before": self.before, "after": self.after, "ci": list(self.ci)}
+
+
+@dataclass(frozen=True)
+class Ranked:
+    """How a cause did at one step of the search, for pictures and tables.
+
+    ``promise`` is the fall of −2 log L that its sensitivity predicts, ``gain`` that of
+    its refit and ``held_out`` that on held-out logs; None where it was not refitted.
+    """
+
+    key: str
+    promise: float
+    gain: float | None = None
+    held_out: float | None = None
+    held_out_std: float | None = None
+
+
+@dataclass(frozen=True)
+class Symptom:
+    """One thing that the simulation gets wrong.
+
+    Parameters
+    ----------
+    sentence : str
+    channel : str
+    size : float
+        Root mean square of the error it speaks of, in noise deviations.
+    """
+
+    sentence: str
+    channel: str
+    size: float
+
+
+@dataclass(frozen=True)
+class Runs:
+    """Free runs on one log for pictures: measured, before, and after.
+
+    Parameters
+    ----------
+    log : TrialLog
+    held_out : bool
+    measured, before, after : mapping of str to ndarray
+        (N,) by state.
+    """
+
+    log: TrialLog
+    held_out: bool
+    measured: Mapping[str, Array]
+    before: Mapping[str, Array]
+    after: Mapping[str, Array]
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What the simulation gets wrong, why, and what it gains to mend it.
+
+    Parameters
+    ----------
+    verdict : {"named", "none", "confused", "unexplained"}
+    causes : tuple of Found
+        In the order found.
+    groups : tuple of tuple of str
+        Causes that explain the logs equally well.
+    gain : mapping of str to Gain
+        By state, on the validation logs, or on parts held out in turn.
+    wrong : tuple of Symptom
+        Largest first.
+    partial : tuple of Found
+        Causes that help where the verdict is `unexplained`.
+    candidates : tuple of Found
+        Members of the groups, each as it would be by itself.
+    base, model : ManoeuvringModel
+        Before, and extended by what was found; the same where nothing was.
+    alternatives : mapping of str to ManoeuvringModel
+        A model for each member of the groups, for a trial that tells them apart.
+    remaining : str
+        What is left after all causes, one sentence.
+    validated_on : str
+        Where the gain was measured, one sentence.
+    next_steps : tuple of str
+        What to measure or do next.
+    steps : tuple of tuple of Ranked
+        The search.
+    runs : tuple of Runs
+    notes : tuple of str
+    tried : int
+        Causes that were scored.
+    """
+
+    verdict: Verdict
+    causes: tuple[Found, ...]
+    groups: tuple[tuple[str, ...], ...]
+    gain: Mapping[str, Gain]
+    wrong: tuple[Symptom, ...]
+    partial: tuple[Found, ...]
+    candidates: tuple[Found, ...]
+    base: ManoeuvringModel
+    model: ManoeuvringModel
+    alternatives: Mapping[str, ManoeuvringModel]
+    remaining: str
+    validated_on: str
+    next_steps: tuple[str, ...]
+    steps: tuple[tuple[Ranked, ...], ...] = ()
+    runs: tuple[Runs, ...] = ()
+    notes: tuple[str, ...] = ()
+    tried: int = 0
+    record: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def headline(self) -> str:
+        """The verdict in one sentence."""
+        if self.verdict == "named":
+            return "; ".join(f"{c.title}: {c.evidence}" for c in self.causes) + "."
+        if self.verdict == "confused":
+            return (
+                f"{VERDICTS['confused']}: {' or '.join(self.groups[0])}. These logs cannot tell "
+                f"them apart."
+            )
+        return f"{VERDICTS[self.verdict][0].upper()}{VERDICTS[self.verdict][1:]}."
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the diagnosis as CONTRACT's JSON, with more beside."""
+        return {
+            "verdict": self.verdict,
+            "causes": [c.to_dict() for c in self.causes],
+            "groups": [list(g) for g in self.groups],
+            "gain": {k: g.to_dict() for k, g in self.gain.items()},
+            "wrong": [s.sentence for s in self.wrong],
+            "headline": self.headline,
+            "partial": [c.to_dict() for c in self.partial],
+            "candidates": [c.to_dict() for c in self.candidates],
+            "remaining": self.remaining,
+            "validated_on": self.validated_on,
+            "next": list(self.next_steps),
+            "tried": self.tried,
+            "notes": list(self.notes),
+        }
+
+    def summary(self) -> str:
+        """Return the diagnosis as text."""
+        lines = [f"verdict: {self.verdict}", self.headline, "", "What the simulation gets wrong:"]
+        lines += [f"  {s.sentence}" for s in self.wrong] or ["  nothing beyond noise"]
+        for title, causes in (
+            ("Causes", self.causes), ("Helps, but does not explain all", self.partial),
+            ("Each would explain it", self.candidates),
+        ):  # fmt: skip
+            if causes:
+                lines += ["", f"{title}:"]
+            for c in causes:
+                lines.append(f"  {c.id}: {c.evidence}")
+                lines += [
+                    f"    {name:<22}{q.value:>12.5g} ± {q.std:.2g} {q.unit}"
+                    for name, q in c.parameters.items()
+                ]
+                lines.append(
+                    f"    adjusted p = {c.p_adjusted:.2g} ({self.tried} causes tried); held-out "
+                    f"−2 log L falls by {c.held_out:.0f} ± {c.held_out_std:.0f}"
+                )
+        if self.gain:
+            lines += ["", f"Fit of the free run (6.12) [%], {self.validated_on}:"]
+            lines += [
+                f"  {state:<3}{g.before:>8.1f} -> {g.after:.1f}   (gain {g.ci[0]:.1f} to "
+                f"{g.ci[1]:.1f})"
+                for state, g in self.gain.items()
+            ]
+        lines += ["", self.remaining, *(f"next: {n}" for n in self.next_steps)]
+        lines += [f"note: {n}" for n in self.notes]
+        return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        from html import escape
+
+        return f"<pre>{escape(self.summary())}</pre>"
