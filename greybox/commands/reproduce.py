@@ -3,23 +3,30 @@
 from __future__ import annotations
 
 import argparse
+from typing import Any
 
 from greybox.commands.common import add_seed, positive, progress, provenance, say
 
-HELP = "repeat the studies of the thesis, and that of the estimators' efficiency"
+HELP = "repeat the studies of the thesis, of the estimators' efficiency, of the diagnosis' power"
 EXAMPLES = """examples:
   greybox reproduce chapter4 --out chapter4
   greybox reproduce chapter6 --runs 500 --out chapter6
   greybox reproduce chapter7 --out chapter7
   greybox reproduce efficiency --runs 200 --out efficiency
+  greybox reproduce power --runs 5 --out power
   greybox reproduce chapter7 --vessel ship.toml --estimate windy*.csv --validate calm*.csv
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("study", choices=("chapter4", "chapter6", "chapter7", "efficiency"))
-    parser.add_argument("--runs", type=int, default=500, metavar="N", help="Monte Carlo runs (500)")
+    parser.add_argument(
+        "study", choices=("chapter4", "chapter6", "chapter7", "efficiency", "power")
+    )
+    parser.add_argument(
+        "--runs", type=int, metavar="N",
+        help="Monte Carlo runs (500); power: trials of each effect, size and kind of input (3)",
+    )  # fmt: skip
     parser.add_argument("--out", metavar="DIR", help="folder for tables.csv, figures and the page")
     parser.add_argument("--estimate", nargs="+", metavar="LOG", help="chapter 7: estimation logs")
     parser.add_argument("--validate", nargs="+", metavar="LOG", help="chapter 7: validation logs")
@@ -36,7 +43,9 @@ def run(options: argparse.Namespace) -> None:
     """Run a study and write what it found."""
     from greybox.errors import UsageError
 
-    if options.runs < 2:
+    if options.runs is None:
+        options.runs = 3 if options.study == "power" else 500
+    if options.runs < (1 if options.study == "power" else 2):
         raise UsageError(f"--runs is {options.runs}, a standard deviation needs at least 2 runs.")
     if options.study != "chapter7" and (options.estimate or options.validate or options.vessel):
         raise UsageError(
@@ -78,11 +87,28 @@ def run(options: argparse.Namespace) -> None:
             ),
             record,
         )
+    elif options.study == "power":
+        _power(options, record)
+        return
     else:
         output = studies.chapter7_output(_chapter7(options), record)
     say(output.text)
     if options.out:
         studies.write_output(output, options.out)
+        say(f"wrote {options.out}/tables.csv, {options.out}/report.html and the figures")
+
+
+def _power(options: argparse.Namespace, record: dict[str, Any]) -> None:
+    from greybox.report.power import power_output, write_power
+    from greybox.study.power import judge_by_diagnosis, run_power
+
+    study = run_power(
+        judge_by_diagnosis, runs=options.runs, none_runs=5 * options.runs, seed=options.seed,
+        workers=options.workers, progress=progress("power"),
+    )  # fmt: skip
+    say(power_output(study, record).text)
+    if options.out:
+        write_power(study, record, options.out)
         say(f"wrote {options.out}/tables.csv, {options.out}/report.html and the figures")
 
 

@@ -14,13 +14,12 @@ from greybox.diagnosis.held_out import Folds, HeldOut, OtherLogs
 from greybox.diagnosis.noise import fit_noise
 from greybox.diagnosis.ship import LogRun, Ship, wired
 from greybox.errors import ExcitationError
-from greybox.estimation.estimate import estimate_ls
-from greybox.estimation.output_error import OutputErrorOptions, estimate_oe
-from greybox.estimation.output_setup import output_predictor
-from greybox.estimation.result import Estimate
+from greybox.estimation.free_run import fit_free_runs
+from greybox.estimation.output_setup import measured, output_model, output_predictor
 from greybox.model.functions import Integrator
-from greybox.model.predictor import Regime, build_predictor
+from greybox.model.predictor import Predictor, Regime, build_predictor
 from greybox.model.structure import Structure
+from greybox.regression.regression import build_regression
 from greybox.trial.log import TrialLog
 
 Array = NDArray[np.float64]
@@ -30,6 +29,8 @@ INTEGRATORS: tuple[Integrator, ...] = ("euler", "rk4")
 _BETTER = 6.0
 # fall of the one-step errors' −2 log L from which on a rewired log is worth a fit
 _REWIRED = 20.0
+# free-run errors, in the sensors' deviations, up to which a first fit needs no second
+_NEAR = 3.0
 # parts of the logs that are held out in turn where there is no validation log
 FOLDS = 3
 _SHORTEST = 60
@@ -123,26 +124,43 @@ class Case:
         ExcitationError
             No free run of the structure stays bounded.
         """
+        found: list[Fit] = []
         for values in self._first(coefficients):
             fits = [self._fit(values, current, i) for i in INTEGRATORS]
-            bounded = [f for f in fits if f is not None and not f.escaped]
-            if bounded:
-                return min(bounded, key=lambda f: f.cost)
+            found += [f for f in fits if f is not None and not f.escaped]
+            if any(self._follows(f) for f in found):
+                break
+        if found:
+            return min(found, key=lambda f: (self._escapes(f), f.cost))
         raise ExcitationError(
             f"no free run of '{self.structure.name}' stays bounded on "
             f"{', '.join(log.name for log in self.logs)}: give a model that follows them with "
             f"--model."
         )
 
+    def _escapes(self, fit: Fit) -> bool:
+        """Whether the model runs away on what is held out."""
+        return any(pair.held_fit.escaped for pair in self.held_out(fit.integrator).pairs(fit))
+
+    def _follows(self, fit: Fit) -> bool:
+        """Whether a fit leaves little more than the sensors' noise, and holds elsewhere."""
+        if self._escapes(fit):
+            return False
+        sensor = np.concatenate([g.sensor for g in fit.noise.groups])
+        places = np.concatenate([g.outputs for g in fit.noise.groups]).astype(int)
+        errors = np.concatenate(fit.errors)[:, places]
+        nx = len(self.structure.states)
+        ratio = np.sqrt((errors**2).mean(axis=0)) / np.maximum(sensor, 1e-300)
+        return bool((ratio[places < nx] < _NEAR).all())
+
     def _first(self, coefficients: Mapping[str, float] | None) -> Iterator[Mapping[str, float]]:
         """Yield first coefficients, the quickest way to them first."""
         if coefficients is not None:
             yield coefficients
-            return
-        try:
-            yield rough(self.structure, self.logs, self.kind, self.regime)[0]
-        except ExcitationError:
-            pass
+        yield rough(self.structure, self.logs, self.kind, self.regime)[0]
+        if self.structure.disturbance == "marine" and self.kind == "basic":
+            # columns for a current and a wind, so that they bias the others less
+            yield rough(self.structure, self.logs, "augmented", self.regime)[0]
         yield careful(self.structure, self.logs, self.kind, self.regime)
 
     def _fit(
@@ -188,18 +206,12 @@ class Case:
         asked = [a for a in atoms if a.afresh]
         if not asked:
             return []
-        try:
-            level = rough(self.structure, self.logs, self.kind, self.regime)[1]
-        except ExcitationError:
-            return []
+        level = rough(self.structure, self.logs, self.kind, self.regime)[1]
         out = []
         for atom in asked:
             ship = self.problem(fit.integrator).add(fit.point, atom).ship
             logs = [_as_it_should_be(log, ship) for log in self.logs]
-            try:
-                values, own = rough(self.structure, logs, self.kind, self.regime)
-            except ExcitationError:
-                continue
+            values, own = rough(self.structure, logs, self.kind, self.regime)
             if level - own < _REWIRED:
                 continue
             current = fit.point.base.current
@@ -223,34 +235,40 @@ def rough(
 ) -> tuple[dict[str, float], float]:
     """Return the coefficients of least squares, and −2 log L of its one-step errors.
 
-    Noise biases them, but they are near enough to begin with.
-
-    Raises
-    ------
-    ExcitationError
-        The logs do not determine them.
+    Noise biases them, but they are near enough to begin with; what the logs do not
+    move stays at zero.
     """
-    fitted = estimate_ls(build_predictor(structure, kind, regime), logs, judged=False)
-    level = 2 * fitted.samples * float(np.log(np.maximum(fitted.residual_std, 1e-300)).sum())
-    return _coefficients(structure, fitted), level
+    predictor = build_predictor(structure, kind, regime)
+    regression = build_regression(predictor, logs)
+    y = np.concatenate([e.y for e in regression.experiments], axis=1)
+    phi = np.concatenate([e.phi for e in regression.experiments], axis=1)
+    theta = np.zeros(len(predictor.columns))
+    level = 0.0
+    for i, state in enumerate(structure.states):
+        mine = [k for k, c in enumerate(predictor.columns) if c.state == state]
+        size = np.sqrt((phi[mine] ** 2).mean(axis=1))
+        size[size == 0] = 1.0
+        theta[mine] = np.linalg.lstsq((phi[mine] / size[:, None]).T, y[i], rcond=1e-7)[0] / size
+        error = y[i] - theta[mine] @ phi[mine]
+        level += len(error) * float(np.log(max(float((error**2).mean()), 1e-300)))
+    return _coefficients(predictor, theta), level
 
 
 def careful(
     structure: Structure, logs: Sequence[TrialLog], kind: str, regime: Regime
 ) -> dict[str, float]:
-    """Return coefficients by output error, which finds a way from far off.
-
-    Raises
-    ------
-    ExcitationError
-        The logs do not determine them.
-    """
-    fitted = estimate_oe(
-        output_predictor(structure, kind, regime), logs,
-        options=OutputErrorOptions(heading="input", covariance="white"),
-    )  # fmt: skip
-    return _coefficients(structure, fitted)
+    """Return coefficients by output error, which finds a way from far off."""
+    predictor = output_predictor(structure, kind, regime)
+    model = output_model(predictor, logs[0].sample_time)
+    data = [measured(model, log) for log in logs]
+    fit, _ = fit_free_runs(model, data, np.zeros(len(model.parameters)))
+    return _coefficients(predictor, fit.p)
 
 
-def _coefficients(structure: Structure, fitted: Estimate) -> dict[str, float]:
-    return dict(zip(structure.parameters, map(float, fitted.structure_theta()), strict=True))
+def _coefficients(predictor: Predictor, theta: Array) -> dict[str, float]:
+    """Return the coefficients of a predictor's own terms; those of a sum stand for its first."""
+    return {
+        predictor.columns[i].terms[0]: float(theta[i])
+        for i in predictor.parameter_columns
+        if np.isfinite(theta[i])
+    }

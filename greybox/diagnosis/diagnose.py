@@ -98,7 +98,9 @@ def diagnose(
         A cause does not exist.
     """
     common_sample_time([*logs, *validate])
-    _require_samples([*logs, *validate])
+    short = [log.name for log in (*logs, *validate) if len(log) < _SHORTEST]
+    logs = _long_enough(logs)
+    validate = _long_enough(validate) if validate else []
     causes = _chosen(options.causes)
     say = options.progress
     say("log checks")
@@ -124,20 +126,22 @@ def diagnose(
         final = found.final
         waves = find_waves(final.nu, final.errors, problem.runs[0].outputs, problem.sample_time)
     say("gain")
-    report = _Report(case, structure, causes, found, model, options.seed)
+    report = _Report(case, structure, causes, found, model, options.seed, short)
     known = causes_of(findings, causes, tried)
     if waves is not None:
         known.append(found_waves(waves, causes["waves"], tried))
     return report.made(known, validate, tried)
 
 
-def _require_samples(logs: Sequence[TrialLog]) -> None:
-    for log in logs:
-        if len(log) < _SHORTEST:
-            raise LogError(
-                f"'{log.name}' has {len(log)} samples, a diagnosis needs at least {_SHORTEST}: "
-                f"give a longer log."
-            )
+def _long_enough(logs: Sequence[TrialLog]) -> list[TrialLog]:
+    kept = [log for log in logs if len(log) >= _SHORTEST]
+    if not kept:
+        longest = max(logs, key=len)
+        raise LogError(
+            f"'{longest.name}' has {len(longest)} samples, a diagnosis needs at least {_SHORTEST}: "
+            f"give a longer log."
+        )
+    return kept
 
 
 def _chosen(ids: Sequence[str] | None) -> dict[str, Cause]:
@@ -207,7 +211,9 @@ class _Report:
         found: Search,
         given: ManoeuvringModel | None,
         seed: int,
+        short: Sequence[str],
     ) -> None:
+        self.short = short
         self.case, self.structure, self.causes = case, structure, causes
         self.found, self.given, self.seed = found, given, seed
         self.current: dict[str, tuple[float, float]] = {}
@@ -351,6 +357,10 @@ class _Report:
 
     def _notes(self, after: ManoeuvringModel) -> list[str]:
         out = []
+        if self.short:
+            out.append(
+                f"left out for having fewer than {_SHORTEST} samples: {', '.join(self.short)}."
+            )
         if self.given is not None:
             out.append(
                 "the coefficients of the model were estimated anew on these logs before causes "

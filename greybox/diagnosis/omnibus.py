@@ -161,10 +161,10 @@ def _predicted(pair: Pair) -> tuple[Array, Array]:
     # what the coefficients give back, where they can imitate
     back = -((right[kept].T / values[kept]) @ (along @ delta)) / scale
     moved, _ = _pushed(held, held_fit, scales)
-    predicted = _rows(held, fit, moved) / size @ delta
+    predicted = _rows(held, held_fit, moved) / size @ delta
     predicted = predicted + _coefficients(held, fit, held_fit) @ back[:free]
     starts = np.concatenate(
-        [r.reshape(-1, r.shape[2]) for r in held.rows(held_fit.point, fit.noise)]
+        [r.reshape(-1, r.shape[2]) for r in held.rows(held_fit.point, held_fit.noise)]
     )
     basis = np.linalg.qr(starts)[0]
     predicted -= basis @ (basis.T @ predicted)
@@ -182,10 +182,22 @@ def disagreement(pairs: Sequence[Pair]) -> tuple[float, int]:
         if pair.held_fit.escaped:
             return np.inf, 1
         point = replace(pair.fit.point, starts=pair.held_fit.point.starts)
-        own = pair.held.fit(point, pair.fit.noise)
+        own = pair.held.settle(pair.held.fit(point, pair.held_fit.noise))
         fall += max(pair.held_fit.cost - own.cost, 0.0)
         count += len(point.places) + sum(map(len, point.values))
     return fall, count
+
+
+def with_own_noise(pairs: Sequence[Pair]) -> list[Pair]:
+    """Return the pairs with the colour of the held-out errors estimated on them.
+
+    Gusts and seas differ from day to day; that alone is no fault of a model.
+    """
+    return [
+        pair if pair.held_fit.escaped
+        else replace(pair, held_fit=pair.held.settle(pair.held_fit))
+        for pair in pairs
+    ]  # fmt: skip
 
 
 def _ridge(rows: Array, nu: Array) -> Array:
@@ -209,5 +221,5 @@ def _coefficients(held: Problem, fit: Fit, held_fit: Fit) -> Array:
     """Return whitened rows of the estimation fit's free numbers on the held-out logs."""
     point = replace(fit.point, starts=held_fit.point.starts)
     free = len(point.places) + sum(map(len, point.values))
-    rows = held.rows(point, fit.noise)
+    rows = held.rows(point, held_fit.noise)
     return np.concatenate([r.reshape(-1, r.shape[2]) for r in rows])[:, :free]

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from greybox.diagnosis.held_out import HeldOut
-from greybox.diagnosis.omnibus import Omnibus, disagreement, omnibus
+from greybox.diagnosis.omnibus import Omnibus, disagreement, omnibus, with_own_noise
 from greybox.diagnosis.result import Found, Verdict
 from greybox.diagnosis.search import RELEVANT, Candidate, Search
 from greybox.diagnosis.symptoms import coloured
@@ -56,7 +56,7 @@ def rule(
     known : sequence of Found
         Causes that the log proves without forces.
     """
-    pairs = held.pairs(found.final)
+    pairs = with_own_noise(held.pairs(found.final))
     left = omnibus(pairs)
     fall, count = disagreement(pairs)
     numbers = sum(nu.size for pair in pairs for nu in pair.held_fit.nu)

@@ -14,6 +14,7 @@ from functools import partial
 
 import numpy as np
 
+from greybox.diagnosis.diagnose import diagnose
 from greybox.errors import GreyboxError, UsageError
 from greybox.study.blind import Order, Trial, draw_many
 from greybox.study.blind_causes import CAUSES, Effect
@@ -54,6 +55,18 @@ class Judgement:
 
 
 Judge = Callable[[Trial], Judgement]
+
+
+def judge_by_diagnosis(trial: Trial) -> Judgement:
+    """Diagnose the estimation log, with the validation log held out."""
+    found = diagnose([trial.estimation], validate=[trial.validation])
+    return Judgement(
+        found.verdict,
+        tuple(c.id for c in found.causes),
+        found.groups,
+        {name: (q.value, q.std) for c in found.causes for name, q in c.parameters.items()},
+        {state: g.after - g.before for state, g in found.gain.items()},
+    )
 
 
 @dataclass(frozen=True)
