@@ -19,8 +19,9 @@ from greybox.study.chapter6 import TRUE
 from greybox.study.inputs import smoothed_pulses
 from greybox.trial.log import make_log
 from greybox.validation.bands import predict_bands
-from greybox.validation.choose import Request, estimate_model
+from greybox.validation.choose import estimate_model
 from greybox.validation.comparison import compare_models
+from greybox.validation.request import Request
 from greybox.vessel.toml import load_vessel
 
 STATES = ("u", "v", "r")
