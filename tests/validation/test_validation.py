@@ -88,6 +88,10 @@ def test_models_survive_their_file(thesis_model, tmp_path):
         ({"format": "x"}, "is not a model file"),
         ({"version": 99}, "has version 99"),
         ({"theta": [1.0]}, "15 terms but 1 parameters"),
+        (
+            {"disturbance_covariance": [[1.0]]},
+            r"15 parameters and 0 disturbances, but a covariance between them of shape \(1, 1\)",
+        ),
         ({"vessel": {}}, "damaged model file"),
         ({"structure": {"name": 3}}, "damaged model file"),
     ],
