@@ -10,6 +10,7 @@ import numpy as np
 
 from greybox.estimation.credibility.evidence import Equation, Evidence
 from greybox.estimation.credibility.kernel import Array
+from greybox.estimation.credibility.many import surplus_moments
 from greybox.estimation.credibility.overidentification import delayed
 from greybox.estimation.credibility.question import Finding, Question
 from greybox.estimation.credibility.scores import Score, score_test
@@ -44,6 +45,7 @@ def input_independence(evidence: Evidence, equation: Equation) -> TestResult:
             equation.solution.projected,
             equation.residuals,
             colour=equation.colour,
+            mean=surplus_moments(xi, equation),
         )
 
     def finding(score: Score, fine: bool) -> Finding:
