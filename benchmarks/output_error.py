@@ -60,8 +60,8 @@ from greybox.trial.conditioning import decimate
 from greybox.trial.log import TrialLog
 from greybox.trial.reading import read_segments
 from greybox.trial.writing import write_log
-from greybox.validation.choose import regime_of
 from greybox.validation.fit import average_fit, run_model
+from greybox.validation.informative import regime_of
 from greybox.vessel.force import force_inputs
 
 Array = NDArray[np.float64]

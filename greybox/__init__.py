@@ -39,9 +39,10 @@ if TYPE_CHECKING:
     from greybox.trial.repair import repair
     from greybox.trial.stream import import_files
     from greybox.trial.writing import write_log
-    from greybox.validation.choose import Request, estimate_model
+    from greybox.validation.choose import estimate_model
     from greybox.validation.comparison import compare_models
     from greybox.validation.fit import fit_percent, run_model
+    from greybox.validation.request import Request
     from greybox.vessel.toml import load_vessel, vessel_from_dict
     from greybox.vessel.vessel import Vessel
 
@@ -54,7 +55,7 @@ _WHERE = {
     "OutputErrorOptions": "greybox.estimation.output_error",
     "Predictor": "greybox.model.predictor",
     "Recording": "greybox.trial.recording",
-    "Request": "greybox.validation.choose",
+    "Request": "greybox.validation.request",
     "Structure": "greybox.model.structure",
     "TrialLog": "greybox.trial.log",
     "Verdict": "greybox.estimation.result",

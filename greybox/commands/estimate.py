@@ -18,7 +18,7 @@ from greybox.commands.common import (
 
 if TYPE_CHECKING:
     from greybox.trial.log import TrialLog
-    from greybox.validation.choose import Request
+    from greybox.validation.request import Request
     from greybox.validation.structures import StructureChoice
 
 HELP = "estimate a model from logs"
@@ -228,7 +228,8 @@ def _run(options: argparse.Namespace) -> None:
     from greybox.model.catalogue import get_structure
     from greybox.model.model import load_model
     from greybox.report.physical import physical_summary
-    from greybox.validation.choose import Request, estimate_model
+    from greybox.validation.choose import estimate_model
+    from greybox.validation.request import Request
     from greybox.vessel.toml import load_vessel
 
     check_targets(options.out, options.json)

@@ -24,6 +24,7 @@ from greybox.estimation.shooting import (
     Loss,
     Measured,
     Restrictions,
+    Segments,
     ShootingFit,
     cut,
     fit_segments,
@@ -51,6 +52,8 @@ _PART = 2000
 _SEGMENTS, _LEAST = 64, 50
 # noise-free signals still need a scale
 _FLOOR = 1e-9
+# cost of a run from the measured first states, in that of the fit, up to which both are one motion
+_FOLLOWS = 2.0
 # relative change of the noise of an output below which it stays
 _SETTLED = 1e-5
 # iterations with rough weights, and with good ones
@@ -88,7 +91,10 @@ def fit_free_runs(
     """Fit parameters and initial states to logs; the noise of each output with them.
 
     Segments first, from the measured states: a model far off, or unstable,
-    cannot run away within one. Then whole runs, where they stay bounded.
+    cannot run away within one. Then whole runs, where they stay bounded. A model
+    that only joined segments hold together, and that leaves more error than the
+    sensors have, is no unstable ship but a structure too small: whole runs are
+    fitted in its place, if any stays bounded.
 
     Parameters
     ----------
@@ -118,7 +124,9 @@ def fit_free_runs(
     whole = cut(logs, max(len(log.y) for log in logs))
     starts = measured_starts(whole, len(model.states))
 
-    def attempt(p: Array, starts: Array) -> tuple[ShootingFit, FreeRuns]:
+    def attempt(
+        p: Array, starts: Array, shooting: Shooting = shooting
+    ) -> tuple[ShootingFit, FreeRuns]:
         single: ShootingFit | None = None
         if shooting != "multiple":
             single, runs = _settle(
@@ -149,17 +157,30 @@ def fit_free_runs(
         if not doubtful(found[0]):
             return found[0]
     part = [Measured(log.w[:_PART], log.y[:_PART]) for log in logs]
-    found.append(attempt(*approach(model, part, p, starts, restrictions, noise)))
+    begun = [approach(model, part, p, starts, restrictions, noise)]
+    found.append(attempt(*begun[0]))
     if doubtful(found[-1]):
         # more error than the sensors show: another way may end elsewhere
-        found.append(attempt(*approach(model, logs, p, starts, restrictions, noise, _SLOWLY)))
+        begun.append(approach(model, logs, p, starts, restrictions, noise, _SLOWLY))
+        found.append(attempt(*begun[1]))
     samples = float(whole.use.sum())
 
     def level(pair: tuple[ShootingFit, FreeRuns]) -> float:
         value = pair[0].cost + samples * float(np.log(pair[1].sigma).sum())
         return value if np.isfinite(value) else np.inf
 
-    return min(found, key=level)
+    best = min(found, key=level)
+    if shooting == "auto" and doubtful(best) and not _follows(best, whole, starts):
+        bounded = [pair for pair in (attempt(*b, "single") for b in begun) if level(pair) < np.inf]
+        return min(bounded, key=level, default=best)
+    return best
+
+
+def _follows(pair: tuple[ShootingFit, FreeRuns], whole: Segments, starts: Array) -> bool:
+    """Whether the model follows the logs from their measured first states (M, nz)."""
+    fit, runs = pair
+    r, _, _ = FreeRuns(runs.model, whole, runs.sigma).value(fit.p, starts)
+    return bool(np.isfinite(r).all()) and 0.5 * float((r**2).sum()) < _FOLLOWS * fit.cost
 
 
 def approach(

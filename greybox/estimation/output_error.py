@@ -386,6 +386,7 @@ def _result(fitted: _Fitted, logs: Sequence[TrialLog], options: OutputErrorOptio
     count = len(predictor.columns)
     means = {n: (fit.p[count + i], covariance[count + i, count + i] ** 0.5)
              for i, n in enumerate(model.means)}  # fmt: skip
+    flow = [count + i for i, n in enumerate(model.means) if n in CURRENT]
     status = (
         f"converged after {fit.iterations} iterations"
         if fit.converged
@@ -418,6 +419,7 @@ def _result(fitted: _Fitted, logs: Sequence[TrialLog], options: OutputErrorOptio
         iterations=fit.iterations,
         status=status,
         current=tuple((n, float(v), float(s)) for n, (v, s) in means.items() if n in CURRENT),
+        current_covariance=covariance[np.ix_([*range(count), *flow], flow)],
         noise=_noise_levels(fitted, logs),
         notes=tuple(notes),
         tests=(

@@ -173,6 +173,9 @@ class Estimate:
     current : tuple
         (name, value, standard error) of each current component; empty where the
         predictor cannot tell it.
+    current_covariance : ndarray
+        (p + m, m) covariance of the coefficients, then of the m components, with these;
+        (0, 0) where only standard errors are known.
     tests : tuple of TestResult
     verdict : Verdict
     notes : tuple of str
@@ -203,6 +206,7 @@ class Estimate:
     iterations: int = 0
     status: str = "solved"
     current: tuple[tuple[str, float, float], ...] = ()
+    current_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
     tests: tuple[TestResult, ...] = ()
     verdict: Verdict = UNJUDGED
     notes: tuple[str, ...] = ()
@@ -250,6 +254,7 @@ class Estimate:
         """
         keep = self.predictor.parameter_columns
         columns = [self.predictor.columns[i] for i in keep]
+        shared = self.current_covariance
         full = self.predictor.structure
         terms = tuple(full.terms[full.index(c.terms[0])] for c in columns)
         return ManoeuvringModel(
@@ -259,6 +264,9 @@ class Estimate:
             sample_time=self.sample_time,
             vessel=self.vessel,
             disturbances={n: (v, s) for n, v, s in self.current},
+            disturbance_covariance=(
+                shared[[*keep, *range(len(self.theta), len(shared))]] if len(shared) else shared
+            ),
             residual_std=self.residual_std,
             noise=self.noise,
             sums={c.name: c.terms for c in columns if len(c.terms) > 1},

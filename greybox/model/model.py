@@ -46,6 +46,9 @@ class ManoeuvringModel:
     integrator : {"euler", "rk4"}
     disturbances : mapping of str to (float, float)
         Known disturbance means and their standard errors [m/s].
+    disturbance_covariance : ndarray
+        (p + m, m) covariance of the parameters, then of the m means in the order of
+        `disturbances`, with these means; (0, 0) where only standard errors are known.
     residual_std : ndarray
         (nx,) standard deviation of the one-step residuals.
     noise : NoiseLevels, optional
@@ -70,6 +73,7 @@ class ManoeuvringModel:
     vessel: Vessel
     integrator: Literal["euler", "rk4"] = "euler"
     disturbances: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    disturbance_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
     residual_std: Array = field(default_factory=lambda: np.zeros(0))
     noise: NoiseLevels | None = None
     sums: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
@@ -181,6 +185,7 @@ class ManoeuvringModel:
             "disturbances": {
                 k: {"value": v, "std": e, "unit": "m/s"} for k, (v, e) in self.disturbances.items()
             },
+            "disturbance_covariance": self.disturbance_covariance,
             "residual_std": dict(zip(s.states, self.residual_std, strict=False)),
             "noise": None if self.noise is None else self.noise.to_dict(),
             "vessel": vessel_to_dict(self.vessel),
@@ -197,8 +202,8 @@ class ManoeuvringModel:
 
 _CORE = {
     "format", "version", "sample_time", "integrator", "structure", "names", "theta", "std",
-    "units", "theta_per_second", "covariance", "sums", "disturbances", "residual_std",
-    "noise", "vessel", "changes",
+    "units", "theta_per_second", "covariance", "sums", "disturbances",
+    "disturbance_covariance", "residual_std", "noise", "vessel", "changes",
 }  # fmt: skip
 
 
@@ -253,6 +258,13 @@ def model_from_dict(data: Any, source: str = "model") -> ManoeuvringModel:
             )
         if not np.isfinite(theta).all():
             raise ModelFileError(f"'{source}' holds a parameter that is not a finite number.")
+        means = len(data.get("disturbances", {}))
+        shared = np.array(data.get("disturbance_covariance", []), float)
+        if shared.size and shared.shape != (len(terms) + means, means):
+            raise ModelFileError(
+                f"'{source}' has {len(terms)} parameters and {means} disturbances, but a "
+                f"covariance between them of shape {shared.shape}: estimate the model again."
+            )
         list(structure.regressors(air_measured=False))
         return ManoeuvringModel(
             structure=structure,
@@ -265,6 +277,7 @@ def model_from_dict(data: Any, source: str = "model") -> ManoeuvringModel:
                 k: (float(v["value"]), float(v["std"] or 0.0))
                 for k, v in data.get("disturbances", {}).items()
             },
+            disturbance_covariance=shared if shared.size else np.zeros((0, 0)),
             residual_std=np.array(list(data.get("residual_std", {}).values()), float),
             noise=(noise_from_dict(data["noise"], structure.states) if data.get("noise") else None),
             sums={k: tuple(v) for k, v in data.get("sums", {}).items()},

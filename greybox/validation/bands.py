@@ -219,11 +219,7 @@ def _pieces(
         if marine
         else np.column_stack([log[n] for n in structure.inputs])
     )
-    theta = _normal(rng, model.theta, model.covariance, runs)
-    d = None
-    if model.disturbances:
-        std = [model.disturbances.get(n, (0.0, 0.0))[1] for n in structure.disturbances]
-        d = (model.d + np.array(std) * rng.standard_normal((runs, len(std))))[:, None]
+    theta, d = _parameters(model, rng, runs)
     zeros = np.zeros(nx)
     # the run starts from a mean, which a ship that gathers way has not reached yet; a plan
     # holds its start alone, which is stated and not measured
@@ -263,6 +259,29 @@ def _pieces(
         )
         x, psi0 = run.x[:, -1], run.psi[:, -1]
         yield first + 1, run.x[:, 1:]
+
+
+def _parameters(
+    model: ManoeuvringModel, rng: np.random.Generator, runs: int
+) -> tuple[Array, Array | None]:
+    """Draw parameters (R, p) and disturbance means (R, 1, nd), errors of both together."""
+    p, known = len(model.theta), list(model.disturbances)
+    if not known:
+        return _normal(rng, model.theta, model.covariance, runs), None
+    joint = np.zeros((p + len(known),) * 2)
+    joint[:p, :p] = model.covariance
+    if model.disturbance_covariance.size:
+        joint[:, p:] = model.disturbance_covariance
+        joint[p:, :p] = model.disturbance_covariance[:p].T
+    else:
+        np.fill_diagonal(joint[p:, p:], [std**2 for _, std in model.disturbances.values()])
+    mean = np.append(model.theta, [value for value, _ in model.disturbances.values()])
+    drawn = _normal(rng, mean, joint, runs)
+    d = np.zeros((runs, 1, len(model.structure.disturbances)))
+    for i, name in enumerate(model.structure.disturbances):
+        if name in known:
+            d[:, 0, i] = drawn[:, p + known.index(name)]
+    return drawn[:, :p], d
 
 
 def _normal(rng: np.random.Generator, mean: Array, covariance: Array, runs: int) -> Array:

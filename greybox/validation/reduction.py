@@ -17,9 +17,10 @@ from greybox.estimation.result import Estimate
 from greybox.model.catalogue import structure_for
 from greybox.model.predictor import Column
 from greybox.trial.log import TrialLog
-from greybox.validation.choose import Request, estimate_model
+from greybox.validation.choose import estimate_model
 from greybox.validation.criteria import independent_samples
 from greybox.validation.held_out import rank
+from greybox.validation.request import Request
 from greybox.validation.structures import (
     CHOOSE,
     FOLDS,

@@ -13,10 +13,12 @@ from greybox.errors import GreyboxError, UsageError
 from greybox.estimation.result import Estimate
 from greybox.model.catalogue import structure_for
 from greybox.trial.log import TrialLog
-from greybox.validation.choose import Request, estimate_model, estimate_once
+from greybox.validation.choose import estimate_model
 from greybox.validation.criteria import independent_samples, information_criteria
 from greybox.validation.fit import run_model
 from greybox.validation.held_out import Ranking, folds, rank, score_runs, spread_of
+from greybox.validation.once import estimate_once
+from greybox.validation.request import Request
 from greybox.vessel.force import force_inputs
 
 Array = NDArray[np.float64]
@@ -214,7 +216,7 @@ def settle(logs: Sequence[TrialLog], request: Request) -> Request:
     """Return the request with method, predictor and structure as the data choose them."""
     if request.method and request.predictor and request.structure:
         return request
-    first = estimate_model(logs, request)
+    first = estimate_model(logs, replace(request, judged=False))
     return replace(
         request,
         method=first.method,

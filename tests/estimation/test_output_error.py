@@ -11,7 +11,8 @@ from virtual import virtual_log, write_csv
 
 from greybox.commands.main import main
 from greybox.errors import ExcitationError, StructureError, UsageError
-from greybox.estimation.free_run import fit_free_runs
+from greybox.estimation import free_run
+from greybox.estimation.free_run import _follows, fit_free_runs
 from greybox.estimation.free_run_errors import (
     autocovariance,
     shared_score_covariance,
@@ -21,7 +22,13 @@ from greybox.estimation.innovations import FilterRuns, fit_innovations
 from greybox.estimation.limits import cramer_rao, information, noise_variances
 from greybox.estimation.output_error import OutputErrorOptions, estimate_oe
 from greybox.estimation.output_setup import measured, output_model, output_predictor
-from greybox.estimation.shooting import Measured, cut, solve_step, unrestricted
+from greybox.estimation.shooting import (
+    Measured,
+    cut,
+    measured_starts,
+    solve_step,
+    unrestricted,
+)
 from greybox.model.catalogue import get_structure
 from greybox.model.noise import NoiseLevels
 from greybox.model.output import Filter, OutputModel, Simulator
@@ -208,6 +215,37 @@ class TestFit:
             fit, _ = fit_free_runs(model, [Measured(w, seen)], 0 * p, shooting=shooting)
             std = np.sqrt(np.diag(np.linalg.inv(fit.hessian)))
             assert (np.abs(fit.p - p) < 4 * std).all()
+
+    def test_what_only_segments_hold_together_does_not_follow_the_log(self, predictor, noisy):
+        model, data, p = problem(predictor, noisy, "input")
+        pair = fit_free_runs(model, [data], p, shooting="multiple")
+        whole = cut([data], len(data.y))
+        starts = measured_starts(whole, len(model.states))
+        assert _follows(pair, whole, starts)
+        driven = p.copy()
+        driven[model.parameters.index("Yv")] = 0.1
+        assert not _follows((replace(pair[0], p=driven), pair[1]), whole, starts)
+
+    def test_a_structure_too_small_gets_whole_runs(self, predictor, noisy, monkeypatch):
+        """Joined segments that neither follow nor explain the log are given up."""
+        model, data, p = problem(predictor, noisy, "input")
+
+        def never(runs, p, nodes, *rest):
+            fit, runs = settle(runs, p, nodes, *rest)
+            joined = len(runs.segments.use) > 1
+            return replace(fit, converged=joined, cost=-1e9 if joined else fit.cost), runs
+
+        settle = free_run._settle
+        monkeypatch.setattr(free_run, "_settle", never)
+        monkeypatch.setattr(free_run, "_DOUBTFUL", 0.0)
+        monkeypatch.setattr(free_run, "_follows", lambda *_: True)
+        _, runs = fit_free_runs(model, [data], p)
+        assert len(runs.segments.use) > 1
+        monkeypatch.setattr(free_run, "_follows", lambda *_: False)
+        fit, runs = fit_free_runs(model, [data], p)
+        assert len(runs.segments.use) == 1
+        std = np.sqrt(np.diag(np.linalg.inv(fit.hessian)))
+        assert (np.abs(fit.p - p) < 4.5 * std).all()
 
     def test_a_constant_wind_can_be_compared_instead_of_driving(self, predictor):
         log = virtual_log(3, 400, spread=0.0, wind=3.0)

@@ -27,7 +27,8 @@ from greybox.model.predictor import build_predictor
 from greybox.model.simulation import stationary_disturbance
 from greybox.regression.motion import predicted_motion
 from greybox.regression.regression import build_regression
-from greybox.validation.choose import Request, estimate_once
+from greybox.validation.once import estimate_once
+from greybox.validation.request import Request
 
 REGIME = (("u", (1,)), ("v", (1,)), ("r", (1, -1)))
 STILL = {"wind": 0.0, "current": (0.0, 0.0), "spread": 0.0}

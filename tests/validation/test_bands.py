@@ -8,9 +8,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from virtual import PARAMETERS, write_csv
+from virtual import PARAMETERS, virtual_log, write_csv
 
 from greybox.commands.main import main
+from greybox.estimation.output_error import estimate_oe
+from greybox.estimation.output_setup import output_predictor
 from greybox.model.catalogue import get_structure
 from greybox.model.model import ManoeuvringModel, load_model
 from greybox.model.noise import NoiseLevels
@@ -18,9 +20,10 @@ from greybox.model.simulation import simulate, stationary_disturbance
 from greybox.study.chapter6 import TRUE
 from greybox.study.inputs import smoothed_pulses
 from greybox.trial.log import make_log
-from greybox.validation.bands import predict_bands
-from greybox.validation.choose import Request, estimate_model
+from greybox.validation.bands import _parameters, predict_bands
+from greybox.validation.choose import estimate_model
 from greybox.validation.comparison import compare_models
+from greybox.validation.request import Request
 from greybox.vessel.toml import load_vessel
 
 STATES = ("u", "v", "r")
@@ -111,6 +114,46 @@ def test_models_keep_the_memory_of_their_noise(tmp_path):
         model.save(tmp_path / "m.json")
         again = load_model(tmp_path / "m.json").noise
         np.testing.assert_array_equal(again.memory, memory)
+
+
+def test_errors_of_parameters_and_current_are_drawn_together(tmp_path):
+    """What one gives the other takes: the sum is known well, its parts are not."""
+    p = len(PARAMETERS)
+    factor = np.zeros((p + 2, 2))
+    factor[0] = factor[p] = 0.01, 0.0
+    factor[p + 1] = -0.01, 0.001
+    joint = factor @ factor.T
+    model = model_of(joint[:p, :p], disturbance_covariance=joint[:, p:])
+    model = replace(
+        model, disturbances={"current_north": (0.2, 0.01), "current_east": (-0.2, 0.01)}
+    )
+    model.save(tmp_path / "m.json")
+    for m in (model, load_model(tmp_path / "m.json")):
+        theta, d = _parameters(m, np.random.default_rng(0), 4000)
+        np.testing.assert_allclose(theta[:, 0] - d[:, 0, 0], model.theta[0] - 0.2, atol=1e-9)
+        assert (theta[:, 0] + d[:, 0, 1]).std() == pytest.approx(0.001, rel=0.05)
+        assert d[:, 0, 0].std() == pytest.approx(0.01, rel=0.05)
+    apart = replace(model, disturbance_covariance=np.zeros((0, 0)))
+    theta, d = _parameters(apart, np.random.default_rng(0), 4000)
+    assert (theta[:, 0] - d[:, 0, 0]).std() == pytest.approx(0.01 * np.sqrt(2), rel=0.05)
+
+
+def test_an_estimate_tells_how_its_current_moves_with_its_parameters():
+    predictor = output_predictor(get_structure("thesis"), "wind", (("u", (1,)), ("v", (1,))))
+    estimate = estimate_oe(predictor, [virtual_log(3, 500, spread=0.0)])
+    model = estimate.model()
+    p = len(model.theta)
+    assert model.disturbance_covariance.shape == (p + 2, 2)
+    std = [s for _, s in model.disturbances.values()]
+    np.testing.assert_allclose(np.sqrt(np.diag(model.disturbance_covariance[p:])), std)
+    joint = np.block(
+        [
+            [model.covariance, model.disturbance_covariance[:p]],
+            [model.disturbance_covariance[:p].T, model.disturbance_covariance[p:]],
+        ]
+    )
+    scale = np.sqrt(np.diag(joint))
+    assert np.linalg.eigvalsh(joint / np.outer(scale, scale))[0] > 0
 
 
 def test_measurements_add_their_noise_as_squares():

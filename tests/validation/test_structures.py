@@ -14,11 +14,12 @@ from greybox.errors import ExcitationError, UsageError
 from greybox.model.catalogue import get_structure
 from greybox.model.predictor import build_predictor
 from greybox.study.chapter7 import REDUCED_BIASES
-from greybox.validation.choose import Request, estimate_model
+from greybox.validation.choose import estimate_model
 from greybox.validation.criteria import independent_samples, information_criteria
 from greybox.validation.fit import run_model
 from greybox.validation.held_out import folds, rank, score_runs, spread_of
 from greybox.validation.reduction import least_earning, reduce_structure, wald
+from greybox.validation.request import Request
 from greybox.validation.structures import compare_structures
 
 ABSENT = ("Xkappa", "Yvr", "Nvv", "Wvv", "Wuv")

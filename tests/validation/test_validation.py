@@ -16,6 +16,7 @@ from greybox.errors import (
     UsageError,
 )
 from greybox.estimation.estimate import UnexcitedBiasError, estimate_iv, estimate_ls
+from greybox.estimation.result import Verdict
 from greybox.model.catalogue import get_structure, structure_for
 from greybox.model.conversion import (
     Inertia,
@@ -30,9 +31,11 @@ from greybox.model.conversion import (
 from greybox.model.model import load_model, model_from_dict
 from greybox.model.predictor import build_predictor
 from greybox.trial.log import make_log
-from greybox.validation.choose import Request, estimate_model, heading_range, regime_of
+from greybox.validation.choose import estimate_model
 from greybox.validation.comparison import compare_models, sign_test
 from greybox.validation.fit import fit_percent, run_model
+from greybox.validation.informative import heading_range, regime_of
+from greybox.validation.request import Request
 
 
 @pytest.fixture(scope="module")
@@ -85,6 +88,10 @@ def test_models_survive_their_file(thesis_model, tmp_path):
         ({"format": "x"}, "is not a model file"),
         ({"version": 99}, "has version 99"),
         ({"theta": [1.0]}, "15 terms but 1 parameters"),
+        (
+            {"disturbance_covariance": [[1.0]]},
+            r"15 parameters and 0 disturbances, but a covariance between them of shape \(1, 1\)",
+        ),
         ({"vessel": {}}, "damaged model file"),
         ({"structure": {"name": 3}}, "damaged model file"),
     ],
@@ -131,6 +138,40 @@ def test_the_theory_chooses_where_its_conditions_hold(noisy_log):
     assert e.predictor.kind in ("wind", "augmented")
     assert any("was taken" in n and "(chapter 5)" in n for n in e.notes)
     assert e.fit["u"] > 50
+
+
+def test_output_error_takes_over_where_it_is_trusted_and_instruments_are_not():
+    """Constant measured wind: its terms move instruments little, the free run enough."""
+    log = virtual_log(4, 1500, spread=0.0)
+    assert estimate_model([log], Request(method="iv")).verdict.text.startswith("do not trust")
+    e = estimate_model([log])
+    assert e.method == "oe"
+    assert e.verdict.text == "trust"
+    assert "output error was taken, because it is judged 'trust' and iv" in e.notes[-1]
+    kept = estimate_model([log], Request(zero_mean=False))
+    assert kept.method != "oe"
+
+
+def test_output_error_that_is_judged_no_better_is_left(monkeypatch):
+    log = virtual_log(4, 1500, spread=0.0)
+    doubtful = Verdict("do not trust: a reason")
+    monkeypatch.setattr("greybox.validation.choose._verdict", lambda *_: doubtful)
+    e = estimate_model([log])
+    assert e.method == "iv"
+    assert e.notes[-1] == (
+        "output error was tried too, and is judged no better: 'do not trust: a reason'."
+    )
+
+
+def test_output_error_that_fails_is_told(monkeypatch):
+    def fail(*_):
+        raise ExcitationError("the run leaves every bound.")
+
+    log = virtual_log(4, 1500, spread=0.0)
+    monkeypatch.setattr("greybox.validation.once._estimate_oe", fail)
+    e = estimate_model([log])
+    assert e.method == "iv"
+    assert e.notes[-1] == "output error was tried too, and failed: the run leaves every bound."
 
 
 def test_held_out_runs_choose_elsewhere():

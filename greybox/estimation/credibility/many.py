@@ -7,10 +7,13 @@ estimate (4.5) drifts towards least squares by the surplus.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 from greybox.estimation.credibility.evidence import Equation
+from greybox.estimation.credibility.kernel import lagged_products
 from greybox.estimation.credibility.words import listed
 from greybox.estimation.result import TestResult, not_applicable
 
@@ -54,6 +57,16 @@ def surplus_bias(equation: Equation) -> Array:
     moved = traces @ meeting / max(equation.freedom - q, 1)
     inverse = np.linalg.pinv(equation.solution.information, rcond=1e-15)
     return np.asarray(inverse @ moved * max(q - p, 0) / max(q, 1))
+
+
+def surplus_moments(xi: Sequence[Array], equation: Equation) -> Array | None:
+    """Return E Σ ξ ê that the bias of surplus instruments leaves, (k,); None of one log.
+
+    ξ are free of the errors: Σ ξ ê moves by −Σ ξ φᵀ times the bias.
+    """
+    if len(equation.z) == 1:
+        return None
+    return np.asarray(-lagged_products(xi, equation.phi, 0) @ surplus_bias(equation))
 
 
 def _shifted(rows: Array, k: int) -> tuple[Array, Array]:

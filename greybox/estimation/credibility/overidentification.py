@@ -6,12 +6,17 @@ import numpy as np
 
 from greybox.estimation.credibility.evidence import Equation
 from greybox.estimation.credibility.kernel import Array
-from greybox.estimation.credibility.scores import score_test
-from greybox.estimation.result import TestResult, not_applicable
+from greybox.estimation.credibility.question import Finding, Question
+from greybox.estimation.credibility.scores import Score, score_test
+from greybox.estimation.result import TestResult
 
-LEVEL = 0.05
 # samples by which the further instruments of a single log are delayed
 _DELAY = 5
+_QUESTION = Question(
+    "overidentification",
+    "the estimate satisfies the equations of all instruments, delayed ones included",
+    "no further instrument says anything new",
+)
 
 
 def overidentification(equation: Equation, biases: frozenset[str]) -> TestResult:
@@ -26,41 +31,31 @@ def overidentification(equation: Equation, biases: frozenset[str]) -> TestResult
     ----------
     Sargan (1958); Hansen (1982); score form: Wooldridge (1995).
     """
-    name = f"overidentification_{equation.state}"
-    null = "the estimate satisfies the equations of all instruments, delayed ones included"
-    if equation.obstacle:
-        return not_applicable(name, null, equation.obstacle)
-    wanted = [i for i, n in enumerate(equation.labels) if n not in biases]
-    later = [delayed(z[wanted], k, _DELAY) for z, k in zip(equation.z, equation.keep, strict=True)]
-    xi = later
-    if len(equation.z) > 1:
-        xi = [np.vstack([s, d]) for s, d in zip(equation.stacked, later, strict=True)]
-    score = score_test(
-        xi,
-        equation.phi,
-        equation.solution.projected,
-        equation.residuals,
-        colour=equation.colour,
-    )
-    if not score.freedom:
-        return not_applicable(name, null, "no further instrument says anything new")
-    agree = score.p_value >= LEVEL
-    return TestResult(
-        name,
-        null,
-        score.statistic,
-        score.p_value,
-        f"J = {score.statistic:.1f} on {score.freedom} restrictions (p = {score.p_value:.2g}): "
-        + (
-            "the instruments agree."
-            if agree
-            else "the instruments contradict each other: the model lacks something that the inputs "
-            "move, or logs differ."
-        ),
-        LEVEL,
-        agree,
-        (),
-        {"degrees_of_freedom": score.freedom},
+
+    def score() -> Score:
+        wanted = [i for i, n in enumerate(equation.labels) if n not in biases]
+        xi = [delayed(z[wanted], k, _DELAY) for z, k in zip(equation.z, equation.keep, strict=True)]
+        if len(equation.z) > 1:
+            xi = [np.vstack([s, d]) for s, d in zip(equation.stacked, xi, strict=True)]
+        return score_test(
+            xi,
+            equation.phi,
+            equation.solution.projected,
+            equation.residuals,
+            colour=equation.colour,
+        )
+
+    return _QUESTION.answer(equation, score, _finding)
+
+
+def _finding(score: Score, agree: bool) -> Finding:
+    if agree:
+        return Finding("the instruments agree.", True, {})
+    return Finding(
+        "the instruments contradict each other: the model lacks something that the inputs move, or "
+        "logs differ.",
+        False,
+        {},
     )
 
 

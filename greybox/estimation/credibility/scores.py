@@ -37,7 +37,7 @@ class Score:
         Of χ², or with the variance that the statistic has when the signs of the
         scores are random; of F where the noise model leaves the variance uncertain.
     moments : ndarray
-        (k,) Σ ξ ê.
+        (k,) Σ ξ ê, less its expectation.
     covariance : ndarray
         (k, k)
     """
@@ -76,6 +76,7 @@ def score_test(
     *,
     memory: Memory = "coloured",
     colour: Colour = WHITE,
+    mean: Array | None = None,
 ) -> Score:
     """Test E ξ e = 0 where the estimate solves Σ ẑ ê = 0.
 
@@ -93,6 +94,8 @@ def score_test(
         Σ (Hᵀξ̃)(Hᵀξ̃)ᵀ ε².
     colour : Colour
         H, for ``coloured``.
+    mean : ndarray, optional
+        (k,) what Σ ξ ê is expected to be, where that is not zero.
 
     References
     ----------
@@ -103,6 +106,8 @@ def score_test(
 
     tilde = _without_copies(xi, residualise(xi, phi, zhat))
     moments = np.asarray(sum(x @ e for x, e in zip(xi, errors, strict=True)))
+    if mean is not None:
+        moments = moments - mean
     taken, known = 0.0, 1e9
     if memory == "iid":
         square = sum(float(e @ e) for e in errors) / sum(len(e) for e in errors)

@@ -47,7 +47,7 @@ def judge(
     diverged : bool
         Whether the free run on the estimation logs diverges.
     """
-    fatal = [*_misfit(tests), *_of_least_squares(tests, method), *_motion(tests, fit, diverged)]
+    fatal = [*misfit(tests), *_of_least_squares(tests, method), *_motion(tests, fit, diverged)]
     excepted: list[str] = []
     reasons: list[str] = []
     for test in tests:
@@ -87,7 +87,8 @@ def holm(p_values: Sequence[float], level: float) -> list[int]:
     return rejected
 
 
-def _misfit(tests: Sequence[TestResult]) -> list[str]:
+def misfit(tests: Sequence[TestResult]) -> list[str]:
+    """Return what speaks against the structure, whatever the estimator; empty if nothing."""
     if any(t.name.startswith("many_instruments_") and t.passed is False for t in tests):
         # the bias of surplus instruments alone makes inputs explain the residuals
         return []

@@ -1,0 +1,85 @@
+"""One score test of one equation: what it asks, and how its answer is told."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from greybox.estimation.credibility.evidence import Equation
+from greybox.estimation.credibility.scores import Score
+from greybox.estimation.result import TestResult, not_applicable
+
+LEVEL = 0.05
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What a score says.
+
+    Parameters
+    ----------
+    sentence : str
+        Without statistic and p-value.
+    passed : bool, optional
+        None where the test only informs.
+    detail : mapping
+    """
+
+    sentence: str
+    passed: bool | None
+    detail: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Question:
+    """What a score test asks.
+
+    Parameters
+    ----------
+    kind : str
+        The test's name without its equation.
+    null : str
+    silent : str
+        Why it does not apply where no moment is left to test.
+    """
+
+    kind: str
+    null: str
+    silent: str
+
+    def answer(
+        self,
+        equation: Equation,
+        score: Callable[[], Score],
+        finding: Callable[[Score, bool], Finding],
+    ) -> TestResult:
+        """Return the test of an equation, or why it does not apply.
+
+        Parameters
+        ----------
+        equation : Equation
+        score : callable
+            Called only where the equation can be tested.
+        finding : callable
+            Of the score, and whether it is accepted at the 5 % level.
+        """
+        name = f"{self.kind}_{equation.state}"
+        if equation.obstacle:
+            return not_applicable(name, self.null, equation.obstacle)
+        found = score()
+        if not found.freedom:
+            return not_applicable(name, self.null, self.silent)
+        told = finding(found, found.p_value >= LEVEL)
+        return TestResult(
+            name,
+            self.null,
+            found.statistic,
+            found.p_value,
+            f"χ²({found.freedom}) = {found.statistic:.1f} (p = {found.p_value:.2g}): "
+            f"{told.sentence}",
+            LEVEL,
+            told.passed,
+            (),
+            {"degrees_of_freedom": found.freedom, **told.detail},
+        )

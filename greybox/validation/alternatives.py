@@ -1,0 +1,218 @@
+"""Ways to estimate that logs and request leave open, and which one comes first."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.errors import GreyboxError, LogError
+from greybox.model.catalogue import structure_for
+from greybox.model.structure import Structure
+from greybox.trial.log import TrialLog
+from greybox.validation.fit import run_model
+from greybox.validation.held_out import rank, score_runs, spread_of
+from greybox.validation.informative import ADVISED_HEADING, heading_range
+from greybox.validation.once import estimate_once
+from greybox.validation.request import Request
+from greybox.vessel.force import force_inputs
+
+Array = NDArray[np.float64]
+
+# held-out share of each log when alternatives are compared
+_HELD_OUT = 1 / 3
+# parts of the held-out runs, for a standard error
+_BLOCKS = 6
+# refinements of the instruments while alternatives are compared
+_RANKING_REFINEMENTS = 4
+# share of samples that must meet a sign condition
+_KEPT = 0.9
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """One way to estimate."""
+
+    structure: Structure
+    method: str
+    kind: str
+    reason: str = ""
+
+    @property
+    def label(self) -> str:
+        """Method, predictor and structure in words."""
+        return f"{self.method} with predictor '{self.kind}' of structure '{self.structure.name}'"
+
+
+def alternatives_for(
+    logs: Sequence[TrialLog], request: Request, notes: list[str]
+) -> list[Alternative]:
+    """Return the ways to estimate, the preferred one first.
+
+    Where the conditions of consistency hold that is the one that theory names,
+    elsewhere the one whose held-out run is best; `notes` are told.
+
+    Raises
+    ------
+    LogError
+        A predictor needs a wind that a log lacks.
+    """
+    inputs = force_inputs(logs[0].vessel)
+    wind = all(log.has_wind for log in logs)
+    names = [request.structure] if request.structure is not None else _structures(logs, wind)
+    structures = [structure_for(name, inputs) for name in names]
+    methods = [request.method] if request.method else ["iv", "ls"]
+    kinds = (
+        [request.predictor] if request.predictor else _plausible(logs, structures[0], wind, notes)
+    )
+    for kind in kinds:
+        if kind in ("wind", "basic+wind") and not wind:
+            lacking = next(log.name for log in logs if not log.has_wind)
+            raise LogError(
+                f"predictor '{kind}' needs the wind, and '{lacking}' has neither u_q, v_q nor "
+                f"V_q, gamma_q: use --predictor augmented or basic."
+            )
+    alternatives = [Alternative(s, m, k) for s in structures for m in methods for k in kinds]
+    if request.method == "oe":
+        reason = (
+            "a free run feels the mean current itself, so it needs no sign condition, and the "
+            "first structure whose run stays bounded is kept"
+        )
+        alternatives = [replace(a, reason=reason) for a in alternatives if a.kind == kinds[0]]
+    elif len(alternatives) > 1:
+        theory = _theory(logs, structures[0], wind)
+        first = [
+            a
+            for a in alternatives
+            if a.structure is structures[0] and a.method == "iv" and a.kind == theory
+        ]
+        if first:
+            first[0] = replace(
+                first[0],
+                reason="heading turns enough and the states keep their signs, so its estimates "
+                "are consistent as long as current and unmeasured wind stay slower than the ship "
+                "(chapter 5)",
+            )
+            alternatives = [*first, *[a for a in alternatives if a.label != first[0].label]]
+        else:
+            alternatives = _compare(logs, alternatives, request, notes)
+    return alternatives
+
+
+def _structures(logs: Sequence[TrialLog], wind: bool) -> list[str]:
+    """Return the structures to try where the user names none, the fullest first.
+
+    On a nearly constant heading an unmeasured wind or current is a constant
+    force, which the bias-capturing terms cannot be told from.
+    """
+    if wind:
+        return ["thesis", "linear+Wuu+Wvv+Wuv"]
+    if heading_range(logs) < ADVISED_HEADING:
+        return ["thesis", "linear", "linear+X_0+Y_0+N_0"]
+    return ["thesis", "linear"]
+
+
+def _plausible(
+    logs: Sequence[TrialLog], structure: Structure, wind: bool, notes: list[str]
+) -> list[str]:
+    """Return the predictors that the logs can support."""
+    turned = heading_range(logs)
+    rows = sum(len(log) for log in logs)
+    measured = wind and structure.uses_air
+    kinds = ["basic+wind"] if measured else ["basic"]
+    most = 20 * 16
+    if turned >= ADVISED_HEADING and rows >= most:
+        kinds = ["wind", "augmented", *kinds] if measured else ["augmented", *kinds]
+    else:
+        notes.append(
+            f"bias-capturing terms were left out: heading covers {np.degrees(turned):.0f} deg "
+            f"(about {np.degrees(ADVISED_HEADING):.0f} are needed) on {rows} samples "
+            f"(about {most})."
+        )
+    return kinds
+
+
+def _theory(logs: Sequence[TrialLog], structure: Structure, wind: bool) -> str | None:
+    """Return the predictor whose consistency conditions the logs meet, if one does.
+
+    Without wind measurement u_r, u_q and u share a sign, likewise in sway (5.7),
+    (5.68); with it only u_r and v_r must keep theirs (5.50), (5.77).
+    """
+    if structure.disturbance != "marine":
+        return None
+    for log in logs:
+        for state in set(structure.states) & {"u", "v"}:
+            margin = 3 * (log.vessel.std(state) or 0.0)
+            sign = np.sign(np.median(log[state]))
+            if float((sign * log[state] > margin).mean()) < _KEPT:
+                return None
+    if not (wind and structure.uses_air):
+        return "augmented"
+    same = all(
+        float((log[air] * log[state] > 0).mean()) >= _KEPT
+        for log in logs
+        for state, air in (("u", "u_q"), ("v", "v_q"))
+        if state in structure.states
+    )
+    return "augmented" if same else "wind"
+
+
+def _compare(
+    logs: Sequence[TrialLog],
+    alternatives: list[Alternative],
+    request: Request,
+    notes: list[str],
+) -> list[Alternative]:
+    """Put first the earliest alternative whose held-out run is within an error of the best."""
+    request = ranking_request(request)
+    fitting, held = [], []
+    for log in logs:
+        cut = len(log) - int(len(log) * _HELD_OUT)
+        fitting.append(log.window(0, cut, log.name))
+        held.append(log.window(cut, len(log), log.name))
+    spread = spread_of(logs, alternatives[0].structure.states)
+    scores: list[Array | None] = []
+    for alternative in alternatives:
+        try:
+            model = estimate_once(
+                fitting, alternative.structure, alternative.method, alternative.kind, request
+            ).model()
+            runs = [run_model(model, log) for log in held]
+            bounded = all(r.diverged < 0 for r in runs)
+            scores.append(score_runs(runs, spread, _BLOCKS) if bounded else None)
+        except GreyboxError:
+            scores.append(None)
+    if all(s is None for s in scores):
+        notes.append("no alternative could be run on the last third of each log.")
+        return alternatives
+    found = rank(scores, range(len(alternatives)))
+    order = sorted(range(len(alternatives)), key=lambda i: (i != found.chosen, -found.score[i]))
+    shown = ", ".join(
+        f"{alternatives[i].label} "
+        + (
+            f"{found.score[i]:.1f} ({found.behind[i]:.1f} ± {found.se[i]:.1f} behind)"
+            if np.isfinite(found.score[i])
+            else "diverged"
+        )
+        for i in order
+    )
+    notes.append(
+        f"chosen by the free run on the last third of each log when estimated on the first two "
+        f"(mean fit in % of the whole logs' spread, cut at −100; the fullest structure and the "
+        f"method least biased by noise that fall behind the best by no more than one standard "
+        f"error): {shown}."
+    )
+    return [alternatives[i] for i in order]
+
+
+def ranking_request(request: Request) -> Request:
+    """Return the request without standard errors, tests and the last digit."""
+    return replace(
+        request,
+        covariance="white",
+        refine=_RANKING_REFINEMENTS,
+        prefilter="none",
+        judged=False,
+    )

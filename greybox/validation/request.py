@@ -1,0 +1,50 @@
+"""What a user asks of an estimate; what is left open the data choose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from greybox.estimation.estimate import Covariance
+from greybox.estimation.loop import Loop
+from greybox.estimation.output_error import OutputErrorOptions
+from greybox.model.model import ManoeuvringModel
+
+
+@dataclass(frozen=True)
+class Request:
+    """What to estimate; None leaves the choice to the data.
+
+    ``margins`` are |u|, |v| [m/s] below which samples are cut out; ``nominal``
+    simulates the first instruments, or starts output error (least squares does
+    without it); ``output_error`` is what only ``oe`` heeds; ``prefilter`` is
+    ``noise`` for refined instrumental variables, ``none`` for plain ones; ``judged``
+    asks for the tests and the verdict; ``without`` are bias-capturing columns to leave
+    out, spelled ``state:function``.
+    """
+
+    method: str | None = None
+    predictor: str | None = None
+    structure: str | None = None
+    margins: dict[str, float] | None = None
+    covariance: Covariance | None = None
+    heading: Literal["measured", "simulated"] = "measured"
+    loop: Loop = "auto"
+    zero_mean: bool = True
+    refine: bool | int = True
+    nominal: ManoeuvringModel | None = None
+    output_error: OutputErrorOptions = field(default_factory=OutputErrorOptions)
+    seed: int = 0
+    prefilter: Literal["auto", "noise", "none"] = "auto"
+    judged: bool = True
+    without: tuple[str, ...] = ()
+
+
+def regression_only(request: Request) -> bool:
+    """Whether the request holds what only an estimate from one-step equations can heed."""
+    return (
+        bool(request.margins)
+        or request.covariance == "bootstrap"
+        or request.prefilter == "noise"
+        or not request.zero_mean
+    )
