@@ -172,20 +172,52 @@ def _predicted(pair: Pair) -> tuple[Array, Array]:
     return predicted, seen
 
 
-def disagreement(pairs: Sequence[Pair]) -> tuple[float, int]:
-    """Return how far −2 log L of the held-out logs falls when the coefficients are fitted to them.
+@dataclass(frozen=True)
+class Disagreement:
+    """How far the coefficients that held-out logs ask for lie from the estimate.
 
-    Under a right model about twice the number of coefficients, which is returned beside.
+    Parameters
+    ----------
+    fall : float
+        Of −2 log L of the held-out logs when the coefficients are fitted to them.
+    p_value : float
+        Of coefficients that are the same (Wald), both covariances robust.
     """
-    fall, count = 0.0, 0
+
+    fall: float
+    p_value: float
+
+
+def disagreement(pairs: Sequence[Pair]) -> Disagreement:
+    """Compare the coefficients of the estimation with those of the held-out logs.
+
+    References
+    ----------
+    Wald (1943); Chow (1960) for regressions.
+    """
+    from scipy.stats import chi2
+
+    fall, distance, count = 0.0, 0.0, 0
     for pair in pairs:
-        if pair.held_fit.escaped:
-            return np.inf, 1
-        point = replace(pair.fit.point, starts=pair.held_fit.point.starts)
+        if pair.held_fit.escaped or pair.fit.escaped:
+            return Disagreement(np.inf, 0.0)
+        places = pair.fit.point.places
+        point = replace(pair.held_fit.point, places=places)
         own = pair.held.settle(pair.held.fit(point, pair.held_fit.noise))
         fall += max(pair.held_fit.cost - own.cost, 0.0)
-        count += len(point.places) + sum(map(len, point.values))
-    return fall, count
+        if own.escaped:
+            return Disagreement(fall, 0.0)
+        _, there = pair.held.covariance(own)
+        _, here = pair.problem.covariance(pair.fit)
+        m = len(places)
+        before = np.concatenate([point.base.theta, point.base.current])[list(places)]
+        after = np.concatenate([own.point.base.theta, own.point.base.current])[list(places)]
+        spread = here[:m, :m] + there[:m, :m]
+        size = np.sqrt(np.diag(spread))
+        away = (after - before) / size
+        distance += float(away @ np.linalg.pinv(spread / np.outer(size, size), 1e-10) @ away)
+        count += m
+    return Disagreement(fall, float(chi2.sf(distance, count)))
 
 
 def with_own_noise(pairs: Sequence[Pair]) -> list[Pair]:

@@ -15,9 +15,9 @@ from greybox.diagnosis.symptoms import coloured
 _SURE = 0.005
 # share of what the causes explain that may be left over, for the model's own simplicity
 _LEFT = 0.1
-# fall of −2 log L by fitting held-out logs themselves, in numbers of coefficients, that
-# noise of unknown colour may bring; and the share of the causes' gain that may stand beside
-_NOISE, _BESIDE = 10.0, 0.25
+# significance of other coefficients on the held-out logs, and the share of the causes' gain
+# that fitting them there may bring beside
+_APART, _BESIDE = 1e-4, 0.25
 
 
 @dataclass(frozen=True)
@@ -58,12 +58,12 @@ def rule(
     """
     pairs = with_own_noise(held.pairs(found.final))
     left = omnibus(pairs)
-    fall, count = disagreement(pairs)
+    other = disagreement(pairs)
     numbers = sum(nu.size for pair in pairs for nu in pair.held_fit.nu)
     explained = max(held.prove(found.base, found.final).gain, 0.0) if found.causes else 0.0
     allowed = max(RELEVANT * numbers, _LEFT * explained)
     wrong = left.proof.p_value < _SURE and left.gain > allowed
-    apart = fall > _NOISE * count + _BESIDE * explained
+    apart = other.p_value < _APART and other.fall > RELEVANT * numbers + _BESIDE * explained
     verdict: Verdict
     if wrong or apart:
         verdict = "unexplained"
