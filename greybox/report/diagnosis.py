@@ -5,27 +5,20 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-import numpy as np
-
-from greybox.diagnosis.causes import known_causes
-from greybox.diagnosis.result import VERDICTS, Diagnosis, Found, Runs
+from greybox.diagnosis.result import Diagnosis, Runs
 from greybox.report.diagnosis_figures import (
     LOWEST_FIT,
     gain_figure,
     heading_figure,
-    ranked_for_picture,
-    ranking_figure,
     regime_figure,
     run_figure,
     speed_figure,
 )
-from greybox.report.figures import to_svg
-from greybox.report.free_run_errors import Errors, gather, simulations
+from greybox.report.free_run_errors import REGIMES, Errors, gather, simulations
 from greybox.report.model_difference import (
     coefficient_table,
     marked_equations,
     other_changes,
-    with_error,
 )
 from greybox.report.page import Page, Picture, Section, Table, flatten
 
@@ -46,7 +39,7 @@ def diagnosis_page(diagnosis: Diagnosis, record: Mapping[str, Any]) -> Page:
     """
     sections = [
         _wrong(diagnosis),
-        _cause(diagnosis),
+        cause_section(diagnosis),
         _equations(diagnosis),
         _gain(diagnosis),
         Section("5. What remains", [diagnosis.remaining]),
@@ -73,7 +66,7 @@ def diagnosis_page(diagnosis: Diagnosis, record: Mapping[str, Any]) -> Page:
 
 
 def _summary(diagnosis: Diagnosis) -> list[str]:
-    told = [f"Verdict: {diagnosis.verdict}, {VERDICTS[diagnosis.verdict]}."]
+    told = [f"Verdict: {diagnosis.verdict}, after {diagnosis.tried} causes were tried."]
     if diagnosis.gain and _changed(diagnosis):
         gains = ", ".join(
             f"{_NAMES.get(s, s)} from {_percent(g.before)} to {_percent(g.after)}"
@@ -97,13 +90,15 @@ def _wrong(diagnosis: Diagnosis) -> Section:
     pictures: list[Picture] = []
     if diagnosis.runs:
         errors = gather(diagnosis.runs)
-        pictures = [*_followed(errors), *_run_pictures(diagnosis.runs)]
+        pictures = [*_run_pictures(diagnosis.runs), *_followed(errors)]
         left_out = len(diagnosis.runs) - len(_drawn(diagnosis.runs))
         if left_out:
             sentences.append(
                 f"Of {len(diagnosis.runs)} logs the first {_MOST_LOGS} of each kind are drawn "
                 f"against time; all are in the means."
             )
+        if len(errors.regimes) == 1:
+            sentences.append(f"All of it in one regime of signs, {REGIMES[errors.regimes[0]]}.")
         if errors.lost:
             sentences.append(
                 f"The free run runs away at {errors.lost} of {errors.samples} samples; "
@@ -125,16 +120,17 @@ def _followed(errors: Errors) -> Iterator[Picture]:
     )
     told = _rms_sentence(errors)
     if errors.heading is not None:
-        yield _narrow(
+        yield narrow(
             heading_figure(errors), "heading", f"{means}, by heading.",
             f"Mean error of each state against the heading. {told}",
         )  # fmt: skip
     if errors.speed is not None:
-        yield _narrow(
+        yield narrow(
             speed_figure(errors), "speed", f"{means}, by speed.",
             f"Mean error of each state against the speed. {told}",
         )  # fmt: skip
-        yield _narrow(
+    if len(errors.regimes) > 1:
+        yield narrow(
             regime_figure(errors), "regime",
             "Root mean square error with its 95 % interval, by the signs of surge and sway.",
             f"Bars of the root mean square error by the signs of surge and sway. {told}",
@@ -157,117 +153,15 @@ def _drawn(runs: Sequence[Runs]) -> list[Runs]:
 def _run_pictures(runs: Sequence[Runs]) -> Iterator[Picture]:
     for i, run in enumerate(_drawn(runs)):
         kind = "held out: nothing was fitted to it" if run.held_out else "estimated on"
-        shown = " and ".join(simulations(run))
+        changed = len(simulations(run)) > 1
+        shown = "measured, before and after" if changed else "measured and simulated"
         caption = (
             f"Free run on {run.log.name} ({kind}; {len(run.log)} samples of "
-            f"{run.log.sample_time:g} s): measured and {shown}, with measured − simulated below."
+            f"{run.log.sample_time:g} s): {shown}; below, measured − simulated."
         )
-        yield _narrow(
+        yield narrow(
             run_figure(run), f"run{i}", caption, f"{caption} {_rms_sentence(gather([run]))}"
         )
-
-
-def _narrow(figure: Any, name: str, caption: str, alternative: str) -> Picture:
-    return Picture(to_svg(figure, name), caption, alternative, narrow=True)
-
-
-def _cause(diagnosis: Diagnosis) -> Section:
-    """Show why: causes, their numbers, groups that look alike, and the search."""
-    told = {
-        "named": "",
-        "none": f"{diagnosis.tried} causes were tried; none of them proved itself.",
-        "confused": "Each of these explains the logs by itself; together they explain no more. "
-        "A model with the wrong one would fit these logs and fail on others.",
-        "unexplained": f"None of the {diagnosis.tried} causes that were tried explains the errors."
-        + (" These help, but leave errors beyond noise:" if diagnosis.partial else ""),
-    }[diagnosis.verdict]
-    found = _all_found(diagnosis)
-    points = [f"{c.key} ({c.title}): {c.evidence}." for c in found]
-    return Section(
-        "2. The cause" if diagnosis.verdict == "named" else "2. Causes",
-        [told] if told else [],
-        list(_ranking(diagnosis, [c.key for c in found])),
-        [t for t in (_numbers(found), _proofs(found, diagnosis.tried), _groups(diagnosis)) if t],
-        points=points,
-    )
-
-
-def _all_found(diagnosis: Diagnosis) -> tuple[Found, ...]:
-    every = (*diagnosis.causes, *diagnosis.partial, *diagnosis.candidates)
-    return tuple({c.key: c for c in every}.values())
-
-
-def _numbers(found: Sequence[Found]) -> Table | None:
-    rows = []
-    for cause in found:
-        for name, q in cause.parameters.items():
-            value = with_error(q.value, q.std)
-            unit = "" if q.unit == "1" else q.unit
-            if q.unit == "rad":
-                unit = f"rad ({with_error(np.rad2deg(q.value), np.rad2deg(q.std))} deg)"
-            rows.append([cause.key, name, value, unit])
-    caption = "What was estimated, ± one standard error"
-    return Table(caption, ["cause", "parameter", "value", "unit"], rows) if rows else None
-
-
-def _proofs(found: Sequence[Found], tried: int) -> Table | None:
-    rows = [
-        [
-            c.key, probability(c.p_value), probability(c.p_adjusted), f"{c.gain:.1f}",
-            f"{c.held_out:.1f} ± {c.held_out_std:.1f}",
-        ]
-        for c in found
-    ]  # fmt: skip
-    head = ["cause", "p", f"p, {tried} causes tried", "estimation logs", "held-out ± std. error"]
-    caption = "Evidence: probability of no such effect, and fall of −2 log L"
-    return Table(caption, head, rows) if rows else None
-
-
-def probability(p: float) -> str:
-    """Return a p-value as text; no test is exact enough for the last of many powers."""
-    return f"{p:.2g}" if p >= 1e-16 else "below 1e-16"
-
-
-def _groups(diagnosis: Diagnosis) -> Table | None:
-    """Return the members of confused groups, with how each shows itself."""
-    known = known_causes()
-    rows = []
-    for i, group in enumerate(diagnosis.groups):
-        for member in group:
-            cause = known.get(member.partition(":")[0])
-            shown = ("", "") if cause is None else (cause.signature, cause.extension)
-            rows.append([str(i + 1), member, *shown])
-    if not rows:
-        return None
-    caption = (
-        "Causes that these logs cannot tell apart. A trial tells them apart where what they look "
-        "like differs most: greybox design --between plans it from the models of two of them"
-    )
-    return Table(
-        caption, ["group", "cause", "looks like", "the model would have"], rows, sentences=True
-    )
-
-
-def _ranking(diagnosis: Diagnosis, kept: Sequence[str]) -> Iterator[Picture]:
-    for i, step in enumerate(diagnosis.steps):
-        if not step:
-            continue
-        shown = ranked_for_picture(step, kept)
-        best = shown[0]
-        more = (
-            f" The other {len(step) - len(shown)} are not drawn." if len(step) > len(shown) else ""
-        )
-        caption = (
-            f"Step {i + 1} of the search: fall of −2 log L that each cause's sensitivity "
-            f"promised, that its refit gained, and that held-out logs confirm (95 % interval). "
-            f"Bold: what the verdict names.{more}"
-        )
-        gain = "was not refitted" if best.gain is None else f"gained {best.gain:.0f}"
-        alternative = (
-            f"{caption} Best of {len(step)}: {best.key}, which promised {best.promise:.0f} and "
-            f"{gain}."
-        )
-        yield _narrow(ranking_figure(step, kept), f"step{i}", caption, alternative)
 
 
 def _equations(diagnosis: Diagnosis) -> Section:
@@ -280,7 +174,10 @@ def _equations(diagnosis: Diagnosis) -> Section:
         sentences = ["The equations keep their terms. What changes:"]
     elif changes:
         sentences = ["Beside the terms that are marked below, what changes:"]
-    extended = [f"{c.key}: {c.extension} ({c.reference})." for c in diagnosis.causes]
+    extended = [
+        f"For {c.key}, the model gets {c.extension}. Reference: {c.reference}."
+        for c in diagnosis.causes
+    ]
     return Section(
         "3. The equations before and after",
         sentences,
@@ -311,7 +208,7 @@ def _gain(diagnosis: Diagnosis) -> Section:
         caption += f" Below {LOWEST_FIT:.0f} % it is drawn at the edge."
     told = "; ".join(f"{r[0]} {r[1]} to {r[2]}" for r in table.rows)
     on = diagnosis.validated_on
-    picture = _narrow(gain_figure(diagnosis.gain), "gain", caption, f"{caption} {told}.")
+    picture = narrow(gain_figure(diagnosis.gain), "gain", caption, f"{caption} {told}.")
     return Section(
         "4. The gain", [on[:1].upper() + on[1:].rstrip(".") + "."] if on else [],
         [picture] if _changed(diagnosis) else [], [table],

@@ -12,15 +12,16 @@ from numpy.typing import NDArray
 
 from greybox.diagnosis.result import Gain, Ranked, Runs
 from greybox.report.error_profiles import Profile, profile
-from greybox.report.figures import BLACK, BLUE, LABELS, SKY, VERMILION, new_figure, tidy
+from greybox.report.figures import BLACK, BLUE, LABELS, SKY, VERMILION, new_figure, tidy, to_svg
 from greybox.report.free_run_errors import REGIMES, Errors, simulations
+from greybox.report.page import Picture
 from greybox.report.thinning import find_gaps, pick, thin
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 # inches: letters stay legible where the page is 390 px wide
-_WIDTH = 4.9
+_WIDTH = 4.4
 _POINTS = 600
 _COMPASS = ("N", "NE", "E", "SE", "S", "SW", "W", "NW")
 _SPEEDS = 8
@@ -85,7 +86,7 @@ def heading_figure(errors: Errors) -> Figure:
     sectors = 12
     width = 2 * np.pi / sectors
     group = np.round(errors.heading / width).astype(int) % sectors
-    place = 360 / sectors * np.arange(sectors)
+    place = np.arange(sectors) * 360.0 / sectors
     figure, axes = _profiles(errors, group, place, 360 / sectors)
     axes[-1].set_xticks(np.arange(0, 360, 45), _COMPASS)
     axes[-1].set_xlabel("measured heading", fontsize=9)
@@ -159,7 +160,7 @@ def regime_figure(errors: Errors) -> Figure:
     """Draw the root mean square error by the signs of surge and sway."""
     assert errors.regime is not None
     states = errors.states
-    met = [g for g in range(len(REGIMES)) if (errors.regime == g).any()]
+    met = list(errors.regimes)
     figure = new_figure(_WIDTH, 1.55 * len(states) + 0.9)
     axes = list(figure.subplots(len(states), 1, sharex=True, squeeze=False)[:, 0])
     wide = 0.8 / len(errors.error)
@@ -282,3 +283,8 @@ def _few_decades(ax: Any, values: Array, lows: Array) -> None:
     locator = SymmetricalLogLocator(base=10, linthresh=_LINEAR)
     locator.set_params(numticks=7)
     ax.xaxis.set_major_locator(locator)
+
+
+def narrow(figure: Figure, name: str, caption: str, alternative: str) -> Picture:
+    """Return a figure as a picture that stands beside others."""
+    return Picture(to_svg(figure, name), caption, alternative, narrow=True)

@@ -58,6 +58,11 @@ class Errors:
         return len(next(iter(next(iter(self.error.values())).values())))
 
     @property
+    def regimes(self) -> tuple[int, ...]:
+        """Places in `REGIMES` that were met."""
+        return () if self.regime is None else tuple(map(int, np.unique(self.regime)))
+
+    @property
     def lost(self) -> int:
         """Samples at which some run ran away."""
         bad = [~np.isfinite(e) for run in self.error.values() for e in run.values()]

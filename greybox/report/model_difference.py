@@ -48,17 +48,16 @@ def _pieces(shown: Mapping[str, list[str]], other: Mapping[str, list[str]], mark
 def coefficient_table(base: ManoeuvringModel, model: ManoeuvringModel) -> Table:
     """Return every coefficient and current before and after, ± one standard error."""
     old, new = _values(base), _values(model)
-    rows = []
-    for name, (value, std, unit) in new.items():
-        was = old.get(name)
-        rows.append(
-            [
-                name, "" if was is None else with_error(was[0], was[1]),
-                with_error(value, std), unit, "new" if was is None else "",
-            ]
-        )  # fmt: skip
-    rows += [[n, with_error(v, s), "", u, "gone"] for n, (v, s, u) in old.items() if n not in new]
     caption = f"Coefficients per sample of {model.sample_time:g} s, ± one standard error"
+    if old == new:
+        rows = [[n, with_error(v, s), shown_unit(u)] for n, (v, s, u) in new.items()]
+        return Table(caption, ["coefficient", "value", "unit"], rows)
+    rows = []
+    for name in dict.fromkeys([*old, *new]):
+        cells = [with_error(*side[name][:2]) if name in side else "" for side in (old, new)]
+        unit = (new.get(name) or old[name])[2]
+        note = "new" if name not in old else "gone" if name not in new else ""
+        rows.append([name, *cells, shown_unit(unit), note])
     return Table(caption, ["coefficient", "before", "after", "unit", ""], rows)
 
 
@@ -70,12 +69,19 @@ def _values(model: ManoeuvringModel) -> dict[str, tuple[float, float, str]]:
     return found | {n: (v, s, "m/s") for n, (v, s) in model.disturbances.items()}
 
 
+def shown_unit(unit: str) -> str:
+    """Return a unit as it stands in a table: nothing for a pure number."""
+    return "" if unit == "1" else unit.replace("^2", "²").replace("^3", "³")
+
+
 def with_error(value: float, std: float) -> str:
-    """Return a value with its standard error, no more digits than that allows."""
+    """Return a value with its standard error, to the latter's second digit."""
     if not np.isfinite(std) or std <= 0:
         return f"{value:.4g}"
-    digits = int(np.floor(np.log10(abs(value) / std))) + 2 if abs(value) > std else 2
-    return f"{value:.{min(max(digits, 2), 6)}g} ± {std:.2g}"
+    decimals = 1 - int(np.floor(np.log10(std)))
+    if 0 <= decimals <= 7 and abs(value) < 1e6:
+        return f"{value:.{decimals}f} ± {std:.{decimals}f}"
+    return f"{value:.3g} ± {std:.2g}"
 
 
 def other_changes(base: ManoeuvringModel, model: ManoeuvringModel) -> list[str]:

@@ -82,15 +82,15 @@ _TEMPLATE = """{% macro parts(of, level) %}
 {% endfor %}
 </div>
 {% endif %}
+{% for part in of.marked %}<{{ level }}>{{ part.title }}</{{ level }}><pre class="marked">
+{%- for text, mark in part.pieces %}{% if mark %}<{{ mark }}>{{ text }}</{{ mark }}>
+{%- else %}{{ text }}{% endif %}{% endfor %}</pre>
+{% endfor %}
 {% for table in of.tables %}<div class="wide"><table
 {%- if table.sentences %} class="sentences"{% endif %}><caption>{{ table.caption }}</caption>
 <thead><tr>{% for cell in table.header %}<th scope="col">{{ cell }}</th>{% endfor %}</tr></thead>
 <tbody>{% for row in table.rows %}<tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}</tr>
 {% endfor %}</tbody></table></div>
-{% endfor %}
-{% for part in of.marked %}<{{ level }}>{{ part.title }}</{{ level }}><pre class="marked">
-{%- for text, mark in part.pieces %}{% if mark %}<{{ mark }}>{{ text }}</{{ mark }}>
-{%- else %}{{ text }}{% endif %}{% endfor %}</pre>
 {% endfor %}
 {% for heading, text in of.texts %}<{{ level }}>{{ heading }}</{{ level }}><pre>{{ text }}</pre>
 {% endfor %}
@@ -111,7 +111,7 @@ h3 { font-size: 1rem; margin: 1.2rem 0 0.3rem; }
 h2 { font-size: 1.15rem; margin: 1.6rem 0 0.4rem; }
 .headline { font-size: 1.15rem; border-left: 4px solid #0072B2; padding-left: 0.8rem; }
 .pictures { display: grid; gap: 0 1.5rem; align-items: start;
-            grid-template-columns: repeat(auto-fit, minmax(min(100%, 26rem), 1fr)); }
+            grid-template-columns: repeat(auto-fill, minmax(min(100%, 26rem), 1fr)); }
 figure { margin: 1rem 0; min-width: 0; grid-column: 1 / -1; }
 figure.narrow { grid-column: auto; }
 figure svg { width: 100%; height: auto; }

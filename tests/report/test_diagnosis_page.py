@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from browser import needs_browser, require_legible
 from virtual import PARAMETERS, virtual_log
 
 from greybox.diagnosis.result import (
@@ -21,17 +20,15 @@ from greybox.diagnosis.result import (
 from greybox.model.catalogue import get_structure
 from greybox.model.changes import Change
 from greybox.model.model import ManoeuvringModel
-from greybox.report.diagnosis import diagnosis_page, probability
-from greybox.report.error_profiles import block_ids, memory, profile
-from greybox.report.free_run_errors import gather
-from greybox.report.model_difference import marked_equations, other_changes, with_error
-from greybox.report.page import render, write_page
+from greybox.report.diagnosis import diagnosis_page
+from greybox.report.page import render
 from greybox.study.chapter6 import TRUE
 from greybox.validation.fit import run_model
 from greybox.vessel.toml import load_vessel
 from greybox.vessel.vessel import Actuation
 
 HOSTILE = '<script>alert("x")</script> & $x^$'
+SIDE = {"v": -1, "r": -1, "psi": -1}
 VERDICTS = ("named", "none", "confused", "unexplained")
 RECORD = {"program": "greybox-marine 0.1.0", "command": {"logs": ["day1.csv"], "seed": 0},
           "logs": ["day1.csv 0123456789ab"]}  # fmt: skip
@@ -68,6 +65,11 @@ def runs_of(before, after, names):
         log = virtual_log(i, 1200, wind=0.0, name=name)
         x, y = (run_model(m, log).x.T for m in (before, after))
         states = ("u", "v", "r")
+        if i:  # another day to port
+            log = replace(log, channels={k: SIDE.get(k, 1) * v for k, v in log.channels.items()})
+            x, y = (
+                [SIDE.get(s, 1) * row for s, row in zip(states, z, strict=True)] for z in (x, y)
+            )
         out.append(
             Runs(log, i > 0, {s: log[s] for s in states}, dict(zip(states, x, strict=True)),
                  dict(zip(states, y, strict=True)))
