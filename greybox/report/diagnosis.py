@@ -6,10 +6,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from greybox.diagnosis.result import Diagnosis, Runs
+from greybox.report.diagnosed_causes import cause_section
 from greybox.report.diagnosis_figures import (
     LOWEST_FIT,
     gain_figure,
     heading_figure,
+    narrow,
     regime_figure,
     run_figure,
     speed_figure,

@@ -2,26 +2,25 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
+from browser import needs_browser, require_legible
 from virtual import PARAMETERS, virtual_log
 
-from greybox.diagnosis.result import (
-    Diagnosis,
-    Found,
-    Gain,
-    Quantity,
-    Ranked,
-    Runs,
-    Symptom,
-)
+from greybox.diagnosis.result import Diagnosis, Found, Gain, Quantity, Ranked, Runs, Symptom
 from greybox.model.catalogue import get_structure
 from greybox.model.changes import Change
 from greybox.model.model import ManoeuvringModel
+from greybox.report.diagnosed_causes import probability
 from greybox.report.diagnosis import diagnosis_page
-from greybox.report.page import render
+from greybox.report.error_profiles import block_ids, memory, profile
+from greybox.report.free_run_errors import gather
+from greybox.report.model_difference import marked_equations, other_changes, with_error
+from greybox.report.page import render, write_page
 from greybox.study.chapter6 import TRUE
 from greybox.validation.fit import run_model
 from greybox.vessel.toml import load_vessel
@@ -59,10 +58,19 @@ def extended():
     return replace(model, vessel=vessel)
 
 
-def runs_of(before, after, names):
+def flown():
+    current = {"current_north": (0.2, 0.004), "current_east": (-0.2, 0.005)}
+    model = model_of((*PARAMETERS, "N_|r|r"), disturbances=current)
+    return replace(model, theta=np.append(model.theta[:-1], -1e-6))
+
+
+@cache
+def runs_of(names, same):
+    before = model_of()
+    after = before if same else flown()
     out = []
     for i, name in enumerate(names):
-        log = virtual_log(i, 1200, wind=0.0, name=name)
+        log = virtual_log(i, 600, wind=0.0, name=name)
         x, y = (run_model(m, log).x.T for m in (before, after))
         states = ("u", "v", "r")
         if i:  # another day to port
@@ -79,7 +87,8 @@ def runs_of(before, after, names):
 
 CURRENT = Found(
     "current", "current", "current",
-    {"current_north": Quantity(0.203, 0.004, "m/s"), "current_east": Quantity(-0.197, 0.005, "m/s")},
+    {"current_north": Quantity(0.203, 0.004, "m/s"),
+     "current_east": Quantity(-0.197, 0.005, "m/s")},
     0.0, 1e-300, "the errors of surge and sway turn with the heading as in a current of 0.28 m/s "
     "towards 316 deg", "the mean current, north and east", "Fossen (2011)", 5210.4, 1804.2, 95.1,
 )  # fmt: skip
@@ -105,15 +114,10 @@ STEPS = (
 )
 
 
-def diagnosis_of(verdict, name="day 2", thesis=None):
+def diagnosis_of(verdict, name="day 2"):
+    same = verdict == "none"
     base = model_of()
-    current = {"current_north": (0.2, 0.004), "current_east": (-0.2, 0.005)}
-    flown = model_of((*PARAMETERS, "N_|r|r"), disturbances=current)
-    flown = replace(flown, theta=np.append(base.theta, -1e-6))
-    if verdict == "none":
-        flown = base
-    runs = runs_of(base, flown, ("day 1", name))
-    same = verdict in ("none",)
+    runs = runs_of(("day 1", name), same)
     gain = {
         "u": Gain(41.2, 41.2 if same else 88.1, (0.0, 0.0) if same else (43.0, 50.1)),
         "v": Gain(-3e4 if verdict == "confused" else 35.0, 35.0 if same else 79.3, (31.0, 55.0)),
@@ -133,7 +137,7 @@ def diagnosis_of(verdict, name="day 2", thesis=None):
         partial=(CURRENT,) if verdict == "unexplained" else (),
         candidates=(CURRENT, BIAS) if verdict == "confused" else (),
         base=base,
-        model=flown,
+        model=base if same else flown(),
         alternatives={},
         remaining="What remains of the error is noise (p = 0.41).",
         validated_on=f"on {name}, which nothing was fitted to",
@@ -148,4 +152,188 @@ def diagnosis_of(verdict, name="day 2", thesis=None):
 
 @pytest.fixture(scope="module")
 def pages():
-    return {v: render(diagnosis_page(diagnosis_of(v, HOSTILE), RECORD)) for v in VERDICTS}
+    return {v: diagnosis_page(diagnosis_of(v, HOSTILE), RECORD) for v in VERDICTS}
+
+
+def text_of(page):
+    return re.sub(r"<[^>]+>", "", re.sub(r"<svg.*?</svg>", "", render(page), flags=re.S))
+
+
+@pytest.mark.parametrize("verdict", VERDICTS)
+def test_story_in_its_order(pages, verdict):
+    shown = text_of(pages[verdict])
+    places = [shown.index(f"{k}. ") for k in range(1, 7)]
+    assert places == sorted(places)
+    assert f"Verdict: {verdict}, after 52 causes were tried." in shown
+    assert "What remains of the error is noise (p = 0.41)." in shown
+    assert "Calibrate the compass." in shown
+    assert "hides lags below 0.75 s" in shown
+    assert "0123456789ab" in shown
+    assert "greybox-marine 0.1.0" in shown
+
+
+@pytest.mark.parametrize("verdict", VERDICTS)
+def test_names_from_logs_are_escaped(pages, verdict):
+    html = render(pages[verdict])
+    assert "<script" not in html
+    assert "&lt;script&gt;alert(&#34;x&#34;)&lt;/script&gt; &amp; $x^$" in html
+
+
+def test_nothing_is_fetched(pages):
+    html = render(pages["named"])
+    assert not re.search(r'(?:src|href)="(?!#)', html)
+    assert not re.search(r"url\((?!#)", html)
+
+
+def test_named(pages):
+    shown = text_of(pages["named"])
+    assert pages["named"].headline.startswith("Current: the errors of surge and sway turn")
+    assert "surge is over-predicted by 0.21 m/s when heading south" in shown
+    assert "surge from 41.2 % to 88.1 %" in shown
+    assert "0.2030 ± 0.0040" in shown
+    assert "3.51 ± 0.12 deg" in shown
+    assert "below 1e-16" in shown
+    assert "1804.2 ± 95.1" in shown
+    assert "current_north is 0.2000 ± 0.0040 m/s; before, the water stood still." in shown
+    assert "For current, the model gets the mean current, north and east." in shown
+    assert "43.0 to 50.1" in shown
+    assert "<ins>N_|r|r·|r|·r</ins>" in render(pages["named"])
+
+
+def test_none(pages):
+    shown = text_of(pages["none"])
+    assert "Nothing is wrong beyond noise." in shown
+    assert "52 causes were tried; none of them proved itself." in shown
+    assert "The model stays as it is." in shown
+    assert "<ins>" not in render(pages["none"])
+    assert "before and after" not in pages["none"].sections[0].pictures[0].caption
+
+
+def test_confused(pages):
+    shown = text_of(pages["confused"])
+    assert "current or heading_bias. These logs cannot tell them apart." in shown
+    assert "greybox design --between" in shown
+    assert "heading_bias looks like sway in proportion to surge" in shown
+    assert "sway from diverged to 79.3 %" in shown
+    assert "drawn at the edge" in shown
+
+
+def test_unexplained(pages):
+    shown = text_of(pages["unexplained"])
+    assert "None of the 52 causes that were tried explains the errors. These help" in shown
+    assert "current: the errors of surge and sway" in shown
+
+
+def test_every_picture_says_what_it_shows(pages):
+    for page in pages.values():
+        pictures = [p for s in page.sections for p in s.pictures]
+        assert len(pictures) >= 6
+        assert all(len(p.alternative) > 60 for p in pictures)
+    runs = [p for p in pages["named"].sections[0].pictures if "Free run on" in p.caption]
+    assert ["held out" in p.caption for p in runs] == [False, True]
+    assert "Root mean square errors: surge [m/s] 0." in runs[0].alternative
+
+
+def test_logs_without_runs_or_gain():
+    bare = replace(diagnosis_of("unexplained"), runs=(), gain={}, steps=((),), partial=())
+    shown = text_of(diagnosis_page(bare, RECORD))
+    assert "No gain was measured." in shown
+    assert "<svg" not in render(diagnosis_page(bare, RECORD))
+
+
+def test_runs_that_run_away_are_left_out_and_said_so():
+    diagnosis = diagnosis_of("named")
+    run = diagnosis.runs[0]
+    wild = {s: np.where(np.arange(len(x)) < 500, x, np.inf) for s, x in run.before.items()}
+    diagnosis = replace(diagnosis, runs=(replace(run, before=wild), diagnosis.runs[1]))
+    errors = gather(diagnosis.runs)
+    assert errors.lost == 100
+    assert np.isfinite(errors.rms("before", "u"))
+    assert "runs away at 100 of 1200 samples" in text_of(diagnosis_page(diagnosis, RECORD))
+
+
+def test_what_changes_beside_the_equations():
+    told = " ".join(other_changes(model_of(), extended()))
+    for part in (
+        "gives 83.0 % of its thrust law, before 100 %",
+        "stands 2.86 deg (0.0500 rad) beyond its logged angle",
+        "a lag of 2.5 s of each force and a delay of 1 s; before, with no lag and no delay",
+        "The compass shows 3.44 deg (0.0600 rad) too much.",
+        "u comes 1.50 s too late.",
+        "r has its sign turned.",
+        "3.00 m ahead and -1.00 m to starboard",
+        "Xu is 1.6 times its value from 600 s on, on the log's clock.",
+        "current_east is -0.2000 ± 0.0050 m/s",
+    ):
+        assert part in told
+    assert other_changes(model_of(), model_of()) == []
+
+
+def test_equations_are_marked_where_they_differ():
+    before, after = marked_equations(extended(), model_of())
+    assert [t for t, mark in before.pieces if mark == "del"] == ["N_|r|r·|r|·r"]
+    assert not any(mark for _, mark in after.pieces)
+    same = marked_equations(model_of(), model_of())
+    assert [m.title for m in same] == ["Equations"]
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "shown"),
+    [
+        (0.31234, 0.0123, "0.312 ± 0.012"),
+        (1234.5, 12.0, "1234 ± 12"),
+        (3.2e-9, 1e-10, "3.2e-09 ± 1e-10"),
+        (0.25, 0.0, "0.25"),
+        (0.25, np.inf, "0.25"),
+    ],
+)
+def test_digits_follow_the_standard_error(value, std, shown):
+    assert with_error(value, std) == shown
+
+
+def test_probability():
+    assert probability(0.0123) == "0.012"
+    assert probability(0.0) == "below 1e-16"
+
+
+def test_intervals_of_means_hold_for_errors_with_a_memory():
+    """95 % intervals cover a zero mean about as often, where those of white noise would not."""
+    from scipy.signal import lfilter
+
+    rng = np.random.default_rng(11)
+    group = (np.arange(2000) // 20) % 4
+    series = lfilter([1], [1, -0.9], rng.standard_normal((300, 2000)))
+    inside, plain = [], []
+    for error in series:
+        found = profile(error, group, block_ids([error]), 4)
+        inside.append(np.abs(found.mean) < found.half)
+        white = [1.96 * error[group == g].std() / np.sqrt((group == g).sum()) for g in range(4)]
+        plain.append(np.abs(found.mean) < white)
+    # the four groups of a series are nearly independent
+    assert abs(np.mean(inside) - 0.95) < 4 * np.sqrt(0.95 * 0.05 / 1200) + 0.02
+    assert np.mean(plain) < 0.6
+
+
+def test_profile_is_exact_and_admits_ignorance():
+    value = np.r_[np.ones(50), 3 * np.ones(50)]
+    group = np.r_[np.zeros(50, int), np.ones(49, int), -1]
+    found = profile(value, group, np.arange(100) // 10, 3)
+    assert found.mean[:2] == pytest.approx([1, 3])
+    assert found.half[:2] == pytest.approx(0)
+    assert np.isnan(found.mean[2])
+    assert np.isnan(profile(value, group, np.arange(100) // 50, 2).half).all()
+    assert list(found.samples) == [50, 49, 0]
+
+
+def test_memory():
+    assert memory(np.zeros(10)) == 1
+    slow = np.sin(np.arange(400) * 2 * np.pi / 400)
+    assert 80 < memory(slow) < 120
+
+
+@needs_browser
+@pytest.mark.parametrize("verdict", VERDICTS)
+def test_in_a_browser(tmp_path, pages, verdict):
+    path = tmp_path / "page.html"
+    write_page(pages[verdict], path)
+    require_legible(path, 390)
