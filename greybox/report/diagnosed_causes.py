@@ -9,7 +9,7 @@ import numpy as np
 from greybox.diagnosis.causes import known_causes
 from greybox.diagnosis.result import Diagnosis, Found
 from greybox.report.diagnosis_figures import narrow, ranked_for_picture, ranking_figure
-from greybox.report.model_difference import shown_unit, with_error
+from greybox.report.model_difference import shown_unit, unbroken, with_error
 from greybox.report.page import Picture, Section, Table
 
 
@@ -18,8 +18,8 @@ def cause_section(diagnosis: Diagnosis) -> Section:
     told = {
         "named": "",
         "none": f"{diagnosis.tried} causes were tried; none of them proved itself.",
-        "confused": "Each of these explains the logs by itself; together they explain no more. "
-        "A model with the wrong one would fit these logs and fail on others.",
+        "confused": "Each of these explains the logs about as well as the others. A model with the "
+        "wrong one fits these logs, and may fail on the next.",
         "unexplained": f"None of the {diagnosis.tried} causes that were tried explains the errors."
         + (" These help, but leave errors beyond noise:" if diagnosis.partial else ""),
     }[diagnosis.verdict]
@@ -71,7 +71,7 @@ def _proofs(found: Sequence[Found], tried: int) -> Table | None:
 
 def probability(p: float) -> str:
     """Return a p-value as text; no test is exact enough for the last of many powers."""
-    return f"{p:.2g}" if p >= 1e-16 else "below 1e-16"
+    return unbroken(f"{p:.2g}" if p >= 1e-16 else "below 1e-16")
 
 
 def _groups(diagnosis: Diagnosis) -> Iterator[str]:

@@ -154,7 +154,7 @@ def _drawn(runs: Sequence[Runs]) -> list[Runs]:
 
 def _run_pictures(runs: Sequence[Runs]) -> Iterator[Picture]:
     for i, run in enumerate(_drawn(runs)):
-        kind = "held out: nothing was fitted to it" if run.held_out else "estimated on"
+        kind = "held out from the fit" if run.held_out else "estimated on"
         changed = len(simulations(run)) > 1
         shown = "measured, before and after" if changed else "measured and simulated"
         caption = (

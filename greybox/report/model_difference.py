@@ -81,7 +81,12 @@ def with_error(value: float, std: float) -> str:
     decimals = 1 - int(np.floor(np.log10(std)))
     if 0 <= decimals <= 7 and abs(value) < 1e6:
         return f"{value:.{decimals}f} ± {std:.{decimals}f}"
-    return f"{value:.3g} ± {std:.2g}"
+    return unbroken(f"{value:.3g} ± {std:.2g}")
+
+
+def unbroken(number: str) -> str:
+    """Return a number whose exponent stays with it: lines break after a hyphen."""
+    return number.replace("e-", "e−")
 
 
 def other_changes(base: ManoeuvringModel, model: ManoeuvringModel) -> list[str]:

@@ -130,7 +130,10 @@ pre.marked { white-space: pre-wrap; }
 ins { background: #cfe8fc; text-decoration: underline; font-weight: 600; }
 del { background: #f9ddcc; }
 @page { size: A4; margin: 15mm; }
-@media print { body { max-width: none; font-size: 11px; } figure { break-inside: avoid; }
+@media (max-width: 600px) {
+  table { font-size: 0.8rem; } th, td { white-space: normal; padding: 0.2rem 0.3rem; } }
+@media print { html { font-size: 11px; } body { max-width: none; font-size: 1rem; }
+  figure { break-inside: avoid; }
   .pictures { grid-template-columns: 1fr 1fr; } h2, h3 { break-after: avoid; }
   .wide { overflow: visible; } th, td { white-space: normal; padding: 0.2rem 0.3rem; }
   tr, li { break-inside: avoid; } pre { white-space: pre-wrap; } }

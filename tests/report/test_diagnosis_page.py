@@ -192,7 +192,7 @@ def test_named(pages):
     assert "surge from 41.2 % to 88.1 %" in shown
     assert "0.2030 ± 0.0040" in shown
     assert "3.51 ± 0.12 deg" in shown
-    assert "below 1e-16" in shown
+    assert "below 1e−16" in shown
     assert "1804.2 ± 95.1" in shown
     assert "current_north is 0.2000 ± 0.0040 m/s; before, the water stood still." in shown
     assert "For current, the model gets the mean current, north and east." in shown
@@ -282,7 +282,7 @@ def test_equations_are_marked_where_they_differ():
     [
         (0.31234, 0.0123, "0.312 ± 0.012"),
         (1234.5, 12.0, "1234 ± 12"),
-        (3.2e-9, 1e-10, "3.2e-09 ± 1e-10"),
+        (3.2e-9, 1e-10, "3.2e−09 ± 1e−10"),
         (0.25, 0.0, "0.25"),
         (0.25, np.inf, "0.25"),
     ],
@@ -293,7 +293,7 @@ def test_digits_follow_the_standard_error(value, std, shown):
 
 def test_probability():
     assert probability(0.0123) == "0.012"
-    assert probability(0.0) == "below 1e-16"
+    assert probability(0.0) == "below 1e−16"
 
 
 def test_intervals_of_means_hold_for_errors_with_a_memory():
