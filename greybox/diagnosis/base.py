@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -73,7 +73,9 @@ class Case:
         """Return where causes have to prove themselves."""
         if integrator not in self._held:
             if self.held_out_logs:
-                self._held[integrator] = OtherLogs(self._made(self.held_out_logs, integrator))
+                self._held[integrator] = OtherLogs(
+                    self.problem(integrator), self._made(self.held_out_logs, integrator)
+                )
             else:
                 self._held[integrator] = Folds(self._folds(integrator))
         return self._held[integrator]
@@ -121,20 +123,7 @@ class Case:
         ExcitationError
             No free run of the structure stays bounded.
         """
-        if coefficients is not None:
-            ways = [lambda: coefficients]
-        else:
-            ways = [
-                lambda: rough(self.structure, self.logs, self.kind, self.regime)[0],
-                lambda: careful(self.structure, self.logs, self.kind, self.regime),
-            ]
-        for way in ways:
-            try:
-                values = way()
-            except ExcitationError:
-                if way is ways[-1]:
-                    raise
-                continue
+        for values in self._first(coefficients):
             fits = [self._fit(values, current, i) for i in INTEGRATORS]
             bounded = [f for f in fits if f is not None and not f.escaped]
             if bounded:
@@ -144,6 +133,17 @@ class Case:
             f"{', '.join(log.name for log in self.logs)}: give a model that follows them with "
             f"--model."
         )
+
+    def _first(self, coefficients: Mapping[str, float] | None) -> Iterator[Mapping[str, float]]:
+        """Yield first coefficients, the quickest way to them first."""
+        if coefficients is not None:
+            yield coefficients
+            return
+        try:
+            yield rough(self.structure, self.logs, self.kind, self.regime)[0]
+        except ExcitationError:
+            pass
+        yield careful(self.structure, self.logs, self.kind, self.regime)
 
     def _fit(
         self,

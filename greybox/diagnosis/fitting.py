@@ -284,9 +284,7 @@ class Problem:
             damping = damping / 10 if damping > 1e-5 else 0.0
             if little:
                 converged = True
-        return Fit(
-            point, noise, cost, tuple(nu), tuple(errors), converged, self.runs[0].integrator
-        )
+        return Fit(point, noise, cost, tuple(nu), tuple(errors), converged, self.runs[0].integrator)
 
     def fit_starts(self, point: Point, noise: Noise) -> Fit:
         """Fit the starts alone, as a held-out log asks."""
@@ -322,9 +320,7 @@ class Problem:
             middle += (1 - lag / (lags + 1)) * (part + part.T)
         inverse = _inverse(normal)
         robust = inverse @ middle @ inverse * samples / max(samples - q, 1)
-        widen = np.sqrt(
-            np.maximum(np.diag(inverse) / np.maximum(np.diag(robust), 1e-300), 1.0)
-        )
+        widen = np.sqrt(np.maximum(np.diag(inverse) / np.maximum(np.diag(robust), 1e-300), 1.0))
         full = robust * np.outer(widen, widen)
         free = len(fit.point.places) + sum(map(len, fit.point.values))
         return fit.point.vector()[:free], full[:free, :free]

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,14 +36,48 @@ class Proof:
     samples: Array
 
 
-class HeldOut(Protocol):
+@dataclass(frozen=True)
+class Pair:
+    """A hypothesis where it was fitted, and where it has to prove itself."""
+
+    problem: Problem
+    fit: Fit
+    held: Problem
+    held_fit: Fit
+
+
+class HeldOut(ABC):
     """Where causes have to prove themselves."""
+
+    def __init__(self) -> None:
+        self._known: dict[int, tuple[Fit, list[Pair]]] = {}
+
+    @abstractmethod
+    def _pairs(self, fit: Fit) -> list[Pair]:
+        """Return the hypothesis on everything that is held out."""
+
+    def pairs(self, fit: Fit) -> list[Pair]:
+        """Return the hypothesis on everything that is held out; computed once a fit."""
+        known = self._known.get(id(fit))
+        if known is None or known[0] is not fit:
+            self._known[id(fit)] = known = (fit, self._pairs(fit))
+        return known[1]
 
     def contributions(self, fit: Fit) -> Array:
         """Return what each held-out sample adds to −2 log L of a fitted hypothesis, (N,)."""
+        out = []
+        for pair in self.pairs(fit):
+            if pair.held_fit.escaped:
+                out.append(np.full(sum(len(r.y) for r in pair.held.runs), np.inf))
+            else:
+                out += pair.held.contributions(pair.held_fit)
+        return np.concatenate(out)
 
     def prove(self, before: Fit, after: Fit) -> Proof:
         """Return what the second hypothesis gains on the first."""
+        one, two = self.contributions(before), self.contributions(after)
+        with np.errstate(invalid="ignore"):
+            return proof_of(one - two)
 
 
 def proof_of(difference: Array) -> Proof:
@@ -71,50 +105,30 @@ def long_run_variance(series: Array) -> float:
     if count < 2:
         return float(np.var(series)) if len(series) > 1 else 0.0
     sums = series[: count * size].reshape(count, size).sum(axis=1)
-    return float(np.var(sums, ddof=1)) / size
+    return float(np.var(sums, ddof=1) / size)
 
 
-class OtherLogs:
+class OtherLogs(HeldOut):
     """Validation logs.
 
     Parameters
     ----------
-    problem : Problem
-        Of the validation logs, same structure.
+    fitting, problem : Problem
+        Of the estimation and the validation logs, same structure and integrator.
     """
 
-    def __init__(self, problem: Problem) -> None:
-        self.problem = problem
-        self._known: dict[int, tuple[Fit, Fit]] = {}
+    def __init__(self, fitting: Problem, problem: Problem) -> None:
+        super().__init__()
+        self.fitting, self.problem = fitting, problem
 
-    def run(self, fit: Fit) -> Fit:
-        """Return the hypothesis on the held-out logs, its starts fitted to them.
-
-        A coefficient that changed during the estimation may have changed before
-        these logs, or within them: the likelier counts.
-        """
-        known = self._known.get(id(fit))
-        if known is not None and known[0] is fit:
-            return known[1]
+    def _pairs(self, fit: Fit) -> list[Pair]:
+        # a coefficient that changed during the estimation may have changed before these
+        # logs, or within them: the likelier counts
         points = [replace(fit.point, base=ship, atoms=(), values=()) for ship in stories(fit.point)]
         best = min(
             (self.problem.fit_starts(p, fit.noise) for p in points), key=lambda found: found.cost
         )
-        self._known[id(fit)] = (fit, best)
-        return best
-
-    def contributions(self, fit: Fit) -> Array:
-        """Return what each held-out sample adds to −2 log L of a fitted hypothesis, (N,)."""
-        found = self.run(fit)
-        if found.escaped:
-            return np.full(sum(len(r.y) for r in self.problem.runs), np.inf)
-        return np.concatenate(self.problem.contributions(found))
-
-    def prove(self, before: Fit, after: Fit) -> Proof:
-        """Return what the second hypothesis gains on the first."""
-        one, two = self.contributions(before), self.contributions(after)
-        with np.errstate(invalid="ignore"):
-            return proof_of(one - two)
+        return [Pair(self.fitting, fit, self.problem, best)]
 
 
 def stories(point: Point) -> list[Ship]:
@@ -128,7 +142,7 @@ def stories(point: Point) -> list[Ship]:
     return [ship, replace(ship, theta=theta, changes=())]
 
 
-class Folds:
+class Folds(HeldOut):
     """Parts of the estimation logs, each predicted from a fit to the others.
 
     Parameters
@@ -138,31 +152,13 @@ class Folds:
     """
 
     def __init__(self, parts: Sequence[tuple[Problem, Problem]]) -> None:
+        super().__init__()
         self.parts = tuple(parts)
-        self._known: dict[int, tuple[Fit, Array]] = {}
 
-    def contributions(self, fit: Fit) -> Array:
-        """Return what each held-out sample adds to −2 log L of a fitted hypothesis, (N,)."""
-        known = self._known.get(id(fit))
-        if known is not None and known[0] is fit:
-            return known[1]
+    def _pairs(self, fit: Fit) -> list[Pair]:
         out = []
         for fitting, held in self.parts:
             starts = tuple(run.start() for run in fitting.runs)
             refitted = fitting.fit(replace(fit.point, starts=starts), fit.noise, most=10)
-            found = held.fit_starts(refitted.point, fit.noise)
-            size = sum(len(r.y) for r in held.runs)
-            out.append(
-                np.full(size, np.inf)
-                if refitted.escaped or found.escaped
-                else np.concatenate(held.contributions(found))
-            )
-        joined = np.concatenate(out)
-        self._known[id(fit)] = (fit, joined)
-        return joined
-
-    def prove(self, before: Fit, after: Fit) -> Proof:
-        """Return what the second hypothesis gains on the first."""
-        one, two = self.contributions(before), self.contributions(after)
-        with np.errstate(invalid="ignore"):
-            return proof_of(one - two)
+            out.append(Pair(fitting, refitted, held, held.fit_starts(refitted.point, fit.noise)))
+        return out

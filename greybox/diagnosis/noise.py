@@ -37,7 +37,8 @@ class Colour:
     """Innovations form of the errors of one group of channels.
 
     ``e = C x + v``, ``x⁺ = A x + w``: ``closed`` = A − K C, ``gain`` = K and
-    ``root`` with root·rootᵀ the covariance of the innovations.
+    ``root`` with root·rootᵀ the covariance of the innovations; ``sensor`` (k,) deviation
+    of v, ``force`` of w, and its ``memory`` from sample to sample.
     """
 
     outputs: tuple[int, ...]
@@ -45,6 +46,9 @@ class Colour:
     closed: Array
     gain: Array
     root: Array
+    sensor: Array
+    force: float = 0.0
+    memory: float = 0.0
 
     def whiten(self, e: Array) -> Array:
         """Return innovations of unit variance.
@@ -120,7 +124,14 @@ class Noise:
 def white_noise(sigma: Array) -> Noise:
     """Return noise without memory of the given deviations (ny,)."""
     groups = tuple(
-        Colour((i,), np.ones((1, 1)), np.zeros((1, 1)), np.zeros((1, 1)), np.array([[s]]))
+        Colour(
+            (i,),
+            np.ones((1, 1)),
+            np.zeros((1, 1)),
+            np.zeros((1, 1)),
+            np.array([[s]]),
+            np.array([s]),
+        )
         for i, s in enumerate(sigma)
     )
     return Noise(groups, tuple(np.zeros(3) for _ in sigma), estimated=False)
@@ -202,7 +213,11 @@ def _innovations_form(
     p = solve_discrete_are(a.T, c.T, q, r, balanced=True)
     s = c @ p @ c.T + r
     gain = np.linalg.solve(s, c @ p @ a.T).T
-    return Colour(group, c, a - gain @ c, gain, cholesky(s, lower=True))
+    sensor = level * np.exp(x[2:])
+    return Colour(
+        group, c, a - gain @ c, gain, cholesky(s, lower=True), sensor,
+        float(np.exp(x[0]) * sensor[0]), float(a[-1, -1]),
+    )  # fmt: skip
 
 
 def fit_noise(

@@ -13,14 +13,14 @@ Tikhonov and Arsenin (1977); MacKay (1992), section 4, on the evidence.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from greybox.diagnosis.fitting import Fit, Problem
-from greybox.diagnosis.held_out import Proof, proof_of
-from greybox.diagnosis.ship import LogRun, wired
+from greybox.diagnosis.held_out import Pair, Proof, proof_of
+from greybox.diagnosis.ship import LogRun, shifted, wired
 from greybox.diagnosis.simulator import sensitivities
 
 Array = NDArray[np.float64]
@@ -74,7 +74,7 @@ def features(run: LogRun, fit: Fit, start: Array) -> Array:
         columns.append(np.sign(n))
     for force in tau.T:
         columns += [force * state for state in states]
-        columns += [_late(force, lag / run.sample_time) for lag in _LAGS]
+        columns += [shifted(force, lag / run.sample_time) for lag in _LAGS]
     psi = log["psi"] if "psi" in log else np.zeros(len(x))
     for k in (1, 2):
         columns += [np.cos(k * psi), np.sin(k * psi)]
@@ -84,12 +84,6 @@ def features(run: LogRun, fit: Fit, start: Array) -> Array:
     made = np.column_stack(columns)
     size = np.sqrt((made**2).mean(axis=0))
     return np.asarray(made[:, size > 0])
-
-
-def _late(value: Array, samples: float) -> Array:
-    from greybox.diagnosis.ship import shifted
-
-    return shifted(value, samples)
 
 
 def _pushed(problem: Problem, fit: Fit, scales: Array | None) -> tuple[list[Array], Array]:
@@ -118,16 +112,33 @@ def _rows(problem: Problem, fit: Fit, columns: Sequence[Array]) -> Array:
     return np.concatenate([r.reshape(-1, r.shape[2]) for r in rows])
 
 
-def omnibus(problem: Problem, fit: Fit, held: Problem, held_fit: Fit) -> Omnibus:
+def omnibus(pairs: Sequence[Pair]) -> Omnibus:
     """Fit any force to what a model leaves, and prove it on other logs.
 
     Parameters
     ----------
-    problem, held : Problem
-        Of the estimation and the held-out logs.
-    fit, held_fit : Fit
-        The hypothesis on both.
+    pairs : sequence of Pair
+        The hypothesis on the estimation and the held-out logs.
     """
+    along, size, total = [], 0.0, 0.0
+    for pair in pairs:
+        if pair.fit.escaped or pair.held_fit.escaped:
+            continue
+        predicted, seen = _predicted(pair)
+        channels = pair.held_fit.nu[0].shape[1]
+        along.append((seen * predicted).reshape(-1, channels).sum(axis=1))
+        size += float(predicted @ predicted)
+        total += float(seen @ seen)
+    if not along:
+        return Omnibus(proof_of(np.zeros(1)), 0.0, 0.0)
+    joined = np.concatenate(along)
+    agreed = max(float(joined.sum()), 0.0) ** 2 / max(size, 1e-300)
+    return Omnibus(proof_of(joined), agreed, agreed / max(total, 1e-300))
+
+
+def _predicted(pair: Pair) -> tuple[Array, Array]:
+    """Return the held-out innovations that any force predicts, and the true ones."""
+    problem, fit, held, held_fit = pair.problem, pair.fit, pair.held, pair.held_fit
     nuisance = np.concatenate(
         [r.reshape(-1, r.shape[2]) for r in problem.rows(fit.point, fit.noise)]
     )
@@ -158,11 +169,23 @@ def omnibus(problem: Problem, fit: Fit, held: Problem, held_fit: Fit) -> Omnibus
     basis = np.linalg.qr(starts)[0]
     predicted -= basis @ (basis.T @ predicted)
     seen = np.concatenate([n.ravel() for n in held_fit.nu])
-    channels = held_fit.nu[0].shape[1]
-    along = (seen * predicted).reshape(-1, channels).sum(axis=1)
-    size = float(predicted @ predicted)
-    agreed = max(float(along.sum()), 0.0) ** 2 / max(size, 1e-300)
-    return Omnibus(proof_of(along), agreed, agreed / max(float(seen @ seen), 1e-300))
+    return predicted, seen
+
+
+def disagreement(pairs: Sequence[Pair]) -> tuple[float, int]:
+    """Return how far −2 log L of the held-out logs falls when the coefficients are fitted to them.
+
+    Under a right model about twice the number of coefficients, which is returned beside.
+    """
+    fall, count = 0.0, 0
+    for pair in pairs:
+        if pair.held_fit.escaped:
+            return np.inf, 1
+        point = replace(pair.fit.point, starts=pair.held_fit.point.starts)
+        own = pair.held.fit(point, pair.fit.noise)
+        fall += max(pair.held_fit.cost - own.cost, 0.0)
+        count += len(point.places) + sum(map(len, point.values))
+    return fall, count
 
 
 def _ridge(rows: Array, nu: Array) -> Array:
@@ -184,8 +207,6 @@ def _ridge(rows: Array, nu: Array) -> Array:
 
 def _coefficients(held: Problem, fit: Fit, held_fit: Fit) -> Array:
     """Return whitened rows of the estimation fit's free numbers on the held-out logs."""
-    from dataclasses import replace
-
     point = replace(fit.point, starts=held_fit.point.starts)
     free = len(point.places) + sum(map(len, point.values))
     rows = held.rows(point, fit.noise)

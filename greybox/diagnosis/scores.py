@@ -94,9 +94,7 @@ class Directions:
 
 
 def _stacked(parts: Sequence[Array]) -> Array:
-    return np.concatenate(
-        [p.reshape(-1, p.shape[2]) if p.ndim == 3 else p.ravel() for p in parts]
-    )
+    return np.concatenate([p.reshape(-1, p.shape[2]) if p.ndim == 3 else p.ravel() for p in parts])
 
 
 def score_atoms(directions: Directions, atoms: Sequence[Atom]) -> list[Score]:
@@ -144,8 +142,7 @@ def _score_moves(directions: Directions, atoms: Sequence[Atom]) -> list[Score]:
     def moved(ship_of: Point) -> list[Array] | None:
         ship = ship_of.ship
         parts = [
-            r.run(ship, s).y - y
-            for r, s, y in zip(problem.runs, point.starts, now, strict=True)
+            r.run(ship, s).y - y for r, s, y in zip(problem.runs, point.starts, now, strict=True)
         ]
         return parts if all(np.isfinite(p).all() for p in parts) else None
 

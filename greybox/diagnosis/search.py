@@ -181,9 +181,7 @@ def search(
     return Search(base, fit, tuple(steps), tuple(causes), len(atoms))
 
 
-def take_step(
-    case: Case, fit: Fit, causes: Sequence[Candidate], atoms: Sequence[Atom]
-) -> Step:
+def take_step(case: Case, fit: Fit, causes: Sequence[Candidate], atoms: Sequence[Atom]) -> Step:
     """Score what is left, refit the best, and take the likeliest if it holds."""
     left = [a for a in atoms if not _taken(a, causes)]
     problem, held_out = case.problem(fit.integrator), case.held_out(fit.integrator)

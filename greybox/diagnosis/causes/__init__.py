@@ -8,6 +8,7 @@ from greybox.diagnosis.causes.cause import Cause, Context
 from greybox.diagnosis.causes.change import ParameterChange
 from greybox.diagnosis.causes.flow import Current, Wind
 from greybox.diagnosis.causes.hull import Asymmetry, Crossflow, CubicDamping, QuadraticYawDamping
+from greybox.diagnosis.causes.motion import Waves
 from greybox.diagnosis.causes.sensors import (
     ClockOffset,
     HeadingBias,
@@ -29,7 +30,7 @@ __all__ = ["Cause", "Context", "known_causes"]
 _OWN: tuple[type[Cause], ...] = (
     Current, Wind, ThrusterGain, ThrusterLag, InputDelay, QuadraticThrust, AdvanceSpeed,
     CubicDamping, QuadraticYawDamping, Crossflow, Asymmetry, HeadingBias, LeverArm, AngleOffset,
-    ClockOffset, Sign, ParameterChange,
+    ClockOffset, Sign, ParameterChange, Waves,
 )  # fmt: skip
 GROUP = "greybox.causes"
 

@@ -144,7 +144,8 @@ class Sign(Cause):
         commands = context.vessel.commands
         angles = context.vessel.angle_commands
         out += [_wired(self.id, f"sign_{n}", ((n, n, -1.0),)) for n in commands]
-        for kind in ([c for c in commands if c in angles], [c for c in commands if c not in angles]):
+        speeds = [c for c in commands if c not in angles]
+        for kind in (speeds, [c for c in commands if c in angles]):
             for i, one in enumerate(kind):
                 for two in kind[i + 1 :]:
                     swap = ((one, two, 1.0), (two, one, 1.0))
@@ -155,7 +156,8 @@ class Sign(Cause):
         """Say which."""
         name = next(iter(values))
         if name.startswith("swapped_"):
-            return f"{name.removeprefix('swapped_').replace('_', ' and ')} stand in each other's place"
+            pair = name.removeprefix("swapped_").replace("_", " and ")
+            return f"{pair} stand in each other's place"
         return f"{name.removeprefix('sign_')} has the opposite sign of what the motion shows"
 
 

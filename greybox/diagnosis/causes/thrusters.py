@@ -158,14 +158,13 @@ class QuadraticThrust(Cause):
             return ()
 
         # one for all, so that the thrusters keep their proportions
-        reference = float(np.mean([context.speeds[context.vessel.thrusters[i].speed] for i in linear]))
+        columns = [context.vessel.thrusters[i].speed for i in linear]
+        reference = float(np.mean([context.speeds[c] for c in columns]))
 
         def apply(ship: Ship, value: Array) -> Ship:
             for i in linear:
                 thruster = ship.vessel.thrusters[i]
-                law = replace(
-                    thruster.thrust, quadratic_share=float(value[0]), reference=reference
-                )
+                law = replace(thruster.thrust, quadratic_share=float(value[0]), reference=reference)
                 ship = with_thruster(ship, i, thrust=law)
             return ship
 

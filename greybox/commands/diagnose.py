@@ -1,0 +1,146 @@
+"""`greybox diagnose`: what the simulation gets wrong, why, and what it gains to mend it."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from greybox.commands.common import (
+    CLEAR,
+    add_logs,
+    add_seed,
+    positive,
+    provenance,
+    read_logs,
+    say,
+)
+
+if TYPE_CHECKING:
+    from greybox.diagnosis.result import Diagnosis
+    from greybox.trial.log import TrialLog
+
+HELP = "show what the simulation gets wrong, name the cause, extend the model"
+EXAMPLES = """examples:
+  greybox diagnose trial.csv --vessel ship.toml --validate other.csv --report diagnosis.html
+  greybox diagnose trial.csv --vessel ship.toml --model model.json --out better.json --json -
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add_logs(parser)
+    parser.add_argument(
+        "--model",
+        metavar="MODEL",
+        help="model to diagnose; by default (3.51) in still water and air, estimated on the logs",
+    )
+    parser.add_argument(
+        "--validate",
+        nargs="+",
+        default=[],
+        metavar="LOG",
+        help="logs that take no part in the fit; by default parts of the logs are held out in turn",
+    )
+    parser.add_argument("--json", metavar="F", help="write the diagnosis as JSON; - is stdout")
+    parser.add_argument("--report", metavar="HTML", help="write a page with plots")
+    parser.add_argument(
+        "--out",
+        metavar="MODEL",
+        help="write the extended model; of causes that cannot be told apart, MODEL.<id>.json each",
+    )
+    parser.add_argument(
+        "--structure",
+        default="thesis",
+        metavar="NAME",
+        help="structure to begin from without --model; its wind terms are left out (thesis)",
+    )
+    parser.add_argument(
+        "--causes", nargs="+", metavar="ID", help="look for these causes only (all that are known)"
+    )
+    parser.add_argument(
+        "--sample-time", type=positive, metavar="S", help="decimate the logs to this sample time"
+    )
+    add_seed(parser)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Read, diagnose, report, write."""
+    import scipy.linalg  # noqa: F401
+    from threadpoolctl import threadpool_limits
+
+    # matrices are small: threads would only wait for one another; loaded libraries can be told so
+    with threadpool_limits(1):
+        _run(options)
+
+
+def _run(options: argparse.Namespace) -> None:
+    from greybox.diagnosis.diagnose import Options, diagnose
+    from greybox.files import check_targets, write_json
+    from greybox.model.catalogue import get_structure
+    from greybox.model.model import load_model
+    from greybox.vessel.toml import load_vessel
+
+    check_targets(options.out, options.json, options.report)
+    vessel = load_vessel(options.vessel)
+    model = load_model(options.model) if options.model else None
+    structure = get_structure(options.structure) if model is None else model.structure
+    sample_time = options.sample_time or (model.sample_time if model else None)
+    logs = read_logs(options.logs, vessel, sample_time, structure.states)
+    validate = read_logs(options.validate, vessel, sample_time, structure.states)
+    diagnosis = diagnose(
+        logs,
+        model=model,
+        validate=validate,
+        options=Options(
+            structure=options.structure,
+            causes=options.causes,
+            seed=options.seed,
+            progress=_progress(),
+        ),
+    )
+    record = provenance(options) | {"logs": _read(logs), "validate": _read(validate)}
+    if options.out:
+        _save(diagnosis, options.out, record)
+    if options.json:
+        write_json(diagnosis.to_dict() | {"provenance": record}, options.json)
+    if options.report:
+        from greybox.report.diagnosis import diagnosis_page
+        from greybox.report.page import write_page
+
+        write_page(diagnosis_page(diagnosis, record), options.report)
+    if options.json != "-":
+        say(diagnosis.summary())
+        for path in (options.out, options.report):
+            if path:
+                say(f"wrote {path}")
+
+
+def _read(logs: list[TrialLog]) -> list[str]:
+    return [f"{log.provenance.source or log.name} {log.provenance.sha256[:12]}" for log in logs]
+
+
+def _save(diagnosis: Diagnosis, path: str, record: dict[str, Any]) -> None:
+    """Write the extended model, and one for each of the causes that cannot be told apart."""
+    from dataclasses import replace
+    from pathlib import Path
+
+    target = Path(path)
+    told = {"diagnosis": diagnosis.to_dict(), "provenance": record}
+    for name, model in diagnosis.alternatives.items():
+        replace(model, record={**model.record, **told}).save(
+            target.with_name(f"{target.stem}.{name}{target.suffix or '.json'}")
+        )
+    replace(diagnosis.model, record={**diagnosis.model.record, **told}).save(target)
+
+
+def _progress() -> Callable[[str], None]:
+    if not sys.stderr.isatty():
+        return lambda text: None
+
+    def show(text: str) -> None:
+        sys.stderr.write(f"{CLEAR}{text} …")
+        sys.stderr.flush()
+
+    return show

@@ -1,0 +1,65 @@
+"""Which causes explain the logs equally well.
+
+References
+----------
+Vuong (1989), on the likelihood ratio of rival models.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.diagnosis.fitting import Problem
+from greybox.diagnosis.held_out import HeldOut, proof_of
+from greybox.diagnosis.search import Candidate
+from greybox.model.functions import Integrator
+
+Array = NDArray[np.float64]
+
+# rivals closer than chance in held-out likelihood are as good, with so much probability
+_CHANCE = 0.05
+# difference of −2 log L on all logs that decides by itself, whatever its standard error
+_DECISIVE = 12.0
+# and one that never does
+_NOTHING = 4.0
+
+
+def rivals(
+    problem_of: Callable[[Integrator], Problem],
+    held_out_of: Callable[[Integrator], HeldOut],
+    best: Candidate,
+    others: Sequence[Candidate],
+) -> list[Candidate]:
+    """Return candidates of other causes that do as well as the best one.
+
+    Parameters
+    ----------
+    problem_of, held_out_of : callable
+        Of an integrator.
+    best : Candidate
+    others : sequence of Candidate
+        Fitted from the same logs and earlier causes.
+    """
+    out: list[Candidate] = []
+    for other in others:
+        if other.atom.cause == best.atom.cause or not other.holds:
+            continue
+        if any(o.atom.cause == other.atom.cause for o in out):
+            continue
+        fitted = [
+            np.concatenate(problem_of(c.fit.integrator).contributions(c.fit)) for c in (other, best)
+        ]
+        tested = [held_out_of(c.fit.integrator).contributions(c.fit) for c in (other, best)]
+        with np.errstate(invalid="ignore"):
+            here, there = fitted[0] - fitted[1], tested[0] - tested[1]
+        held = proof_of(there)
+        total = float(here.sum() + there.sum())
+        all_logs = proof_of(np.concatenate([here, there]))
+        alike_held = held.p_value > _CHANCE
+        alike = total < _NOTHING or all_logs.p_value > _CHANCE / 2
+        if total < _DECISIVE and alike_held or alike and alike_held:
+            out.append(other)
+    return out

@@ -1,0 +1,165 @@
+"""From a fitted hypothesis to an ordinary model, with the causes inside."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.diagnosis.fitting import Fit, Problem
+from greybox.diagnosis.ship import CURRENTS, Sensors, Wire
+from greybox.model.changes import Change
+from greybox.model.model import ManoeuvringModel
+from greybox.model.noise import NoiseLevels
+from greybox.model.structure import Structure
+from greybox.trial.log import TrialLog
+from greybox.vessel.vessel import Vessel
+
+Array = NDArray[np.float64]
+
+# where wind is not among the terms, these coefficients stand for sums
+_SUMS = {"Xuu": ("Xuu", "Wuu"), "Yvv": ("Yvv", "Wvv"), "Nuv": ("Nuv", "Wuv")}
+
+
+def extended_structure(structure: Structure, problem: Problem, fit: Fit) -> Structure:
+    """Return the structure with the terms that the hypothesis added."""
+    p = len(problem.structure.parameters)
+    names = [problem.names[i] for i in fit.point.places if i < p]
+    added = [n for n in names if n not in structure.parameters]
+    if not added:
+        return structure
+    named = replace(structure, name=structure.name + "".join(f"+{n}" for n in added))
+    return named.with_terms(*added)
+
+
+def extended_model(
+    structure: Structure,
+    problem: Problem,
+    fit: Fit,
+    logs: Sequence[TrialLog],
+    record: Mapping[str, Any],
+    known_current: Mapping[str, tuple[float, float]],
+) -> ManoeuvringModel:
+    """Return the hypothesis as a model that every command takes.
+
+    Parameters
+    ----------
+    structure : Structure
+        Of the model that was diagnosed.
+    problem : Problem
+        That the fit belongs to.
+    fit : Fit
+    logs : sequence of TrialLog
+        That it was fitted to.
+    record : mapping
+        What the model file tells beside.
+    known_current : mapping of str to (float, float)
+        Current of the model that was diagnosed, where it has one.
+    """
+    wide = extended_structure(structure, problem, fit)
+    ship = fit.point.ship
+    _, covariance = problem.covariance(fit)
+    where = {problem.names[i]: k for k, i in enumerate(fit.point.places)}
+    theta = np.array([ship.theta[problem.place(n)] for n in wide.parameters])
+    index = [where.get(n) for n in wide.parameters]
+    full = np.zeros((len(index), len(index)))
+    for i, a in enumerate(index):
+        for j, b in enumerate(index):
+            if a is not None and b is not None:
+                full[i, j] = covariance[a, b]
+    disturbances = dict(known_current)
+    for k, name in enumerate(CURRENTS):
+        if name in where:
+            i = where[name]
+            disturbances[name] = (float(ship.current[k]), float(np.sqrt(covariance[i, i])))
+    names = problem.structure.parameters
+    summed = {
+        name: parts for name, parts in _SUMS.items()
+        if name in wide.parameters and parts[1] not in wide.parameters
+    }  # fmt: skip
+    return ManoeuvringModel(
+        structure=wide,
+        theta=theta,
+        covariance=full,
+        sample_time=problem.sample_time,
+        vessel=extended_vessel(ship.vessel, ship.sensors, ship.wires, logs[0]),
+        integrator=fit.integrator,
+        disturbances=disturbances,
+        residual_std=_one_step(problem, fit),
+        noise=_noise(problem, fit),
+        sums=summed,
+        changes=tuple(Change(names[c.index], c.factor, c.time) for c in ship.changes),
+        record=dict(record),
+    )
+
+
+def extended_vessel(
+    vessel: Vessel, sensors: Sensors, wires: Sequence[Wire], log: TrialLog
+) -> Vessel:
+    """Return the vessel with what was found of its sensors and of its columns."""
+    said = dict(vessel.sensors)
+    if sensors.turned:
+        said["heading_bias"] = said.get("heading_bias", 0.0) + sensors.turned
+        said["velocities_from_heading"] = True
+    if any(sensors.lever):
+        # velocities that follow from positions are those of the antenna
+        derived = any(d.startswith("u, v") for d in log.provenance.derived)
+        key = "antenna" if derived else "velocity_at"
+        before = tuple(said.get(key, (0.0, 0.0)))
+        said[key] = (before[0] + sensors.lever[0], before[1] + sensors.lever[1], *before[2:])
+    if sensors.late:
+        clock = dict(said.get("clock", {}))
+        for name, seconds in sensors.late:
+            clock[name] = clock.get(name, 0.0) + seconds
+        said["clock"] = clock
+    turned = [*sensors.reversed, *(a for a, b, sign in wires if a == b and sign < 0)]
+    if turned:
+        said["reversed"] = tuple(dict.fromkeys([*said.get("reversed", ()), *turned]))
+    swaps = {a: b for a, b, _ in wires if a != b}
+    thrusters = tuple(
+        replace(
+            t,
+            speed=swaps.get(t.speed, t.speed),
+            angle=swaps.get(t.angle, t.angle) if isinstance(t.angle, str) else t.angle,
+            rudder=swaps.get(t.rudder, t.rudder) if t.rudder is not None else None,
+        )
+        for t in vessel.thrusters
+    )
+    return replace(vessel, sensors=said, thrusters=thrusters)
+
+
+def _one_step(problem: Problem, fit: Fit) -> Array:
+    """Return the deviation of the innovations of each state, (nx,)."""
+    nx = len(problem.structure.states)
+    out = np.zeros(nx)
+    for group in fit.noise.groups:
+        spread = np.sqrt(np.diag(group.root @ group.root.T))
+        for i, s in zip(group.outputs, spread, strict=True):
+            if i < nx:
+                out[i] = s
+    return out
+
+
+def _noise(problem: Problem, fit: Fit) -> NoiseLevels:
+    """Return the colours in the terms of a model file."""
+    states = problem.structure.states
+    outputs = problem.runs[0].outputs
+    sensor = dict.fromkeys(outputs, 0.0)
+    force, memory = dict.fromkeys(states, 0.0), dict.fromkeys(states, 0.0)
+    for group in fit.noise.groups:
+        for i, s in zip(group.outputs, group.sensor, strict=True):
+            sensor[outputs[i]] = float(s)
+        first = outputs[group.outputs[0]]
+        force[first], memory[first] = group.force, group.memory
+    return NoiseLevels(
+        states,
+        np.array([sensor[s] for s in states]),
+        np.array([force[s] for s in states]),
+        sensor.get("psi", 0.0),
+        0.0,
+        "likelihood of the whitened free-run errors",
+        np.array([memory[s] for s in states]),
+    )

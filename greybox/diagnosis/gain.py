@@ -1,0 +1,78 @@
+"""What an extension gains: the fit of the free run before and after, with its interval."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.diagnosis.result import Gain
+from greybox.model.model import ManoeuvringModel
+from greybox.trial.correcting import correct_log
+from greybox.trial.log import TrialLog
+from greybox.validation.fit import LogFit, run_model
+
+Array = NDArray[np.float64]
+
+_DRAWS = 1000
+# seconds of a block, and blocks at least
+_BLOCK, _LEAST_BLOCKS = 60.0, 8
+# an error this many times the motion itself counts as no more
+_WORST = 100.0
+
+
+def run_on(model: ManoeuvringModel, log: TrialLog) -> LogFit:
+    """Run a model on a log as its vessel file reads it."""
+    return run_model(model, correct_log(log, model.vessel))
+
+
+def gains(
+    before: Sequence[LogFit], after: Sequence[LogFit], sample_time: float, seed: int
+) -> dict[str, Gain]:
+    """Return the mean fit (6.12) before and after, by state.
+
+    The interval of the difference is by a moving-block bootstrap over the logs'
+    samples (Künsch, 1989).
+
+    Parameters
+    ----------
+    before, after : sequence of LogFit
+        The same logs by both models.
+    sample_time : float
+        [s]
+    seed : int
+    """
+    rng = np.random.default_rng([seed, 7])
+    out = {}
+    for i, state in enumerate(before[0].fit):
+        draws = np.zeros((2, _DRAWS))
+        point = np.zeros(2)
+        for one, two in zip(before, after, strict=True):
+            size = min(len(one.log), len(two.log))
+            parts = [_squares(run, i, state, size) for run in (one, two)]
+            length = int(np.clip(_BLOCK / sample_time, 1, max(size // _LEAST_BLOCKS, 1)))
+            count = -(-size // length)
+            start = rng.integers(0, size - length + 1, (_DRAWS, count))
+            for k, (error, spread) in enumerate(parts):
+                sums = [(np.cumsum(np.concatenate([[0.0], v]))) for v in (error, spread)]
+                e, s = ((c[start + length] - c[start]).sum(axis=1) for c in sums)
+                draws[k] += _fit(e, s) / len(before)
+                point[k] += float(_fit(error.sum(), spread.sum())) / len(before)
+        low, high = np.quantile(draws[1] - draws[0], [0.025, 0.975])
+        out[state] = Gain(float(point[0]), float(point[1]), (float(low), float(high)))
+    return out
+
+
+def _fit(error: Array | float, spread: Array | float) -> Array:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(100 * (1 - np.sqrt(error / np.maximum(spread, 1e-300))))
+
+
+def _squares(run: LogFit, i: int, state: str, size: int) -> tuple[Array, Array]:
+    measured = run.log[state][:size]
+    spread = (measured - measured.mean()) ** 2
+    with np.errstate(over="ignore", invalid="ignore"):
+        error = (measured - run.x[:size, i]) ** 2
+    worst = _WORST**2 * max(float(spread.mean()), 1e-300)
+    return np.minimum(np.nan_to_num(error, nan=worst, posinf=worst), worst), spread

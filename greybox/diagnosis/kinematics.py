@@ -1,0 +1,111 @@
+"""Measurement causes that need no force model: the log contradicts itself.
+
+Positions, heading, velocities and rates of one ship tie each other. What the log checks
+find there with certainty is taken out before forces are judged.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.stats import norm
+
+from greybox.channels import CHANNELS
+from greybox.diagnosis.causes import Cause
+from greybox.diagnosis.result import Found, Quantity
+from greybox.errors import GreyboxError
+from greybox.trial.checks.check import check_recording
+from greybox.trial.checks.finding import Finding
+from greybox.trial.log import TrialLog
+from greybox.trial.recording import Recording, Signal
+from greybox.vessel.vessel import Vessel
+
+# parameters of each cause by the ids of the checks, in the order of a finding's values
+_NAMES = {"lever_arm": ("lever_arm_x", "lever_arm_y"), "heading_bias": ("heading_bias",)}
+_POSITIONS = ("x_n", "y_n")
+# half a 95 % interval in standard errors
+_HALF = 1.96
+
+
+def recording_of(log: TrialLog) -> Recording:
+    """Return a log as the checks take it."""
+    signals = tuple(
+        Signal(n, log.t, v, CHANNELS[n].unit if n in CHANNELS else None, n, True)
+        for n, v in log.channels.items()
+    )
+    return replace(Recording(log.name, signals), derived=log.provenance.derived)
+
+
+def kinematic_findings(logs: Sequence[TrialLog]) -> list[Finding]:
+    """Return lever arms, heading biases and late positions that the logs prove themselves.
+
+    Clocks and signs of what forces act on are left to the force model, which sees
+    them more sharply. Several logs must agree; the first one's values are taken.
+    """
+    each: list[list[Finding]] = []
+    for log in logs:
+        if not set(_POSITIONS) <= log.channels.keys():
+            return []
+        try:
+            report = check_recording(recording_of(log), log.vessel)
+        except GreyboxError:
+            return []
+        each.append([f for f in report.findings if _kinematic(f)])
+    ids = [{f.id for f in found} for found in each]
+    shared = set.intersection(*ids) if ids else set()
+    return [f for f in each[0] if f.id in shared] if each else []
+
+
+def _kinematic(finding: Finding) -> bool:
+    channels = set(finding.channels or (finding.channel,))
+    if finding.id == "clock_offset":
+        return channels <= {*_POSITIONS, "x", "y"}
+    return finding.id in _NAMES
+
+
+def found_by_checks(finding: Finding, cause: Cause, tried: int) -> Found:
+    """Return a finding as a cause."""
+    values = finding.value if isinstance(finding.value, tuple) else (finding.value,)
+    cis = finding.ci if isinstance(finding.value, tuple) else (finding.ci,)
+    names = _NAMES.get(finding.id, tuple(f"clock_{c}" for c in finding.channels))
+    parameters = {}
+    z = 0.0
+    for name, value, ci in zip(names, values, cis, strict=False):
+        std = max((ci[1] - ci[0]) / (2 * _HALF), 1e-12)
+        parameters[name] = Quantity(float(value), float(std), finding.unit)
+        z = max(z, abs(value) / std)
+    p = float(2 * norm.sf(min(z, 37.0)))
+    return Found(
+        finding.id, f"{finding.id}:kinematics", cause.title, parameters, p, min(1.0, p * tried),
+        finding.evidence, cause.extension, cause.reference,
+    )  # fmt: skip
+
+
+def mended(vessel: Vessel, findings: Sequence[Finding]) -> Vessel:
+    """Return the vessel with what the findings say of its sensors."""
+    said = dict(vessel.sensors)
+    for finding in findings:
+        if finding.id == "heading_bias" and isinstance(finding.value, float):
+            said["heading_bias"] = said.get("heading_bias", 0.0) + finding.value
+        if finding.id == "lever_arm" and isinstance(finding.value, tuple):
+            before = tuple(said.get("antenna", (0.0, 0.0)))
+            said["antenna"] = tuple(
+                float(a + b) for a, b in zip(before, (*finding.value, 0.0), strict=False)
+            )
+        if finding.id == "clock_offset" and isinstance(finding.value, float):
+            clock = dict(said.get("clock", {}))
+            for name in finding.channels or (finding.channel,):
+                clock[name] = clock.get(name, 0.0) + finding.value
+            said["clock"] = clock
+    return replace(vessel, sensors=said)
+
+
+def causes_of(findings: Sequence[Finding], causes: Mapping[str, Cause], tried: int) -> list[Found]:
+    """Return findings as causes, each id once."""
+    out: list[Found] = []
+    for finding in findings:
+        if finding.id in causes and not any(f.id == finding.id for f in out):
+            out.append(found_by_checks(finding, causes[finding.id], tried))
+    return [f for f in out if all(np.isfinite(q.value) for q in f.parameters.values())]

@@ -1,0 +1,115 @@
+"""The ruling on what a search found, and on what it left."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from greybox.diagnosis.held_out import HeldOut
+from greybox.diagnosis.omnibus import Omnibus, disagreement, omnibus
+from greybox.diagnosis.result import Found, Verdict
+from greybox.diagnosis.search import RELEVANT, Candidate, Search
+from greybox.diagnosis.symptoms import coloured
+
+# significance of what any force could still explain
+_SURE = 0.005
+# share of what the causes explain that may be left over, for the model's own simplicity
+_LEFT = 0.1
+# fall of −2 log L by fitting held-out logs themselves, in numbers of coefficients, that
+# noise of unknown colour may bring; and the share of the causes' gain that may stand beside
+_NOISE, _BESIDE = 10.0, 0.25
+
+
+@dataclass(frozen=True)
+class Ruling:
+    """The verdict with what is left and what to do next.
+
+    Parameters
+    ----------
+    verdict : {"named", "none", "confused", "unexplained"}
+    remaining : str
+    next_steps : list of str
+    omnibus : Omnibus
+    """
+
+    verdict: Verdict
+    remaining: str
+    next_steps: list[str]
+    omnibus: Omnibus
+
+
+def rule(
+    found: Search,
+    held: HeldOut,
+    groups: Sequence[Sequence[Candidate]],
+    known: Sequence[Found],
+) -> Ruling:
+    """Decide what may be said.
+
+    Parameters
+    ----------
+    found : Search
+    held : HeldOut
+        For the final fit.
+    groups : sequence of sequence of Candidate
+        Causes that do equally well.
+    known : sequence of Found
+        Causes that the log proves without forces.
+    """
+    pairs = held.pairs(found.final)
+    left = omnibus(pairs)
+    fall, count = disagreement(pairs)
+    numbers = sum(nu.size for pair in pairs for nu in pair.held_fit.nu)
+    explained = max(held.prove(found.base, found.final).gain, 0.0) if found.causes else 0.0
+    allowed = max(RELEVANT * numbers, _LEFT * explained)
+    wrong = left.proof.p_value < _SURE and left.gain > allowed
+    apart = fall > _NOISE * count + _BESIDE * explained
+    verdict: Verdict
+    if wrong or apart:
+        verdict = "unexplained"
+    elif groups and not known and len(groups) == len(found.causes):
+        verdict = "confused"
+    elif found.causes or known:
+        verdict = "named"
+    else:
+        verdict = "none"
+    return Ruling(verdict, _remaining(found, left, wrong, apart), _next(verdict, groups), left)
+
+
+def _remaining(found: Search, left: Omnibus, wrong: bool, apart: bool) -> str:
+    outputs = ("u", "v", "r", "psi")[: found.final.errors[0].shape[1]]
+    moved = coloured(found.final, outputs)
+    tail = f" In these logs {moved}." if moved else ""
+    if wrong:
+        return (
+            f"What is left is not noise: forces that no cause stands for would explain another "
+            f"{100 * left.explicable:.1f} % of the squared errors of logs that they were not "
+            f"fitted to (p = {left.proof.p_value:.1g}).{tail}"
+        )
+    if apart:
+        return (
+            "What is left is not noise: the coefficients that these logs ask for do not hold for "
+            f"the held-out ones.{tail}"
+        )
+    return f"What is left is not told from noise.{tail}"
+
+
+def _next(verdict: Verdict, groups: Sequence[Sequence[Candidate]]) -> list[str]:
+    out = [
+        f"design a trial that tells {' from '.join(c.atom.cause for c in pair)}: greybox design "
+        f"--between {' '.join(f'MODEL.{c.atom.cause}.json' for c in pair[:2])}"
+        for pair in groups
+    ]
+    if verdict == "unexplained":
+        out.append(
+            "measure what the model does not know (wind, depth, draught, propeller and rudder as "
+            "they really moved), repeat a run of these logs, and diagnose both together"
+        )
+    elif verdict == "named":
+        out.append(
+            "design the next trial with the extended model, so that its least certain "
+            "coefficients move: greybox design --model MODEL"
+        )
+    elif verdict == "none":
+        out.append("the model may be used as it is; a trial in other conditions would tell more")
+    return out
