@@ -12,6 +12,9 @@ from greybox.report.diagnosis_figures import narrow, ranked_for_picture, ranking
 from greybox.report.model_difference import shown_unit, unbroken, with_error
 from greybox.report.page import Picture, Section, Table
 
+# of causes that the log shows without a force model
+_OUTSIDE = ["none needed", "none needed"]
+
 
 def cause_section(diagnosis: Diagnosis) -> Section:
     """Show why: causes, their numbers, groups that look alike, and the search."""
@@ -59,14 +62,20 @@ def _numbers(found: Sequence[Found]) -> Table | None:
 def _proofs(found: Sequence[Found], tried: int) -> Table | None:
     rows = [
         [
-            c.key, probability(c.p_value), probability(c.p_adjusted), f"{c.gain:.1f}",
-            f"{c.held_out:.1f} ± {c.held_out_std:.1f}",
+            c.key, probability(c.p_value), probability(c.p_adjusted),
+            *_falls(c),
         ]
         for c in found
     ]  # fmt: skip
     head = ["cause", "p", f"p, {tried} causes tried", "estimation logs", "held-out ± std. error"]
     caption = "Evidence: probability of no such effect, and fall of −2 log L"
     return Table(caption, head, rows) if rows else None
+
+
+def _falls(cause: Found) -> list[str]:
+    if not cause.gain:
+        return _OUTSIDE
+    return [f"{cause.gain:.1f}", f"{cause.held_out:.1f} ± {cause.held_out_std:.1f}"]
 
 
 def probability(p: float) -> str:
@@ -80,16 +89,12 @@ def _groups(diagnosis: Diagnosis) -> Iterator[str]:
     for group in diagnosis.groups:
         yield (
             f"These logs cannot tell {' from '.join(group)}. A trial tells them apart where what "
-            f"they look like differs most: greybox design --between plans it from the models of "
-            f"two of them."
+            f"they look like differs most; greybox design --between plans it."
         )
         for member in group:
             cause = known.get(member.partition(":")[0])
             if cause is not None:
-                yield (
-                    f"{member} looks like {cause.signature}; with it, the model would have "
-                    f"{cause.extension}."
-                )
+                yield (f"{member} looks like {cause.signature}. Its extension: {cause.extension}.")
 
 
 def _ranking(diagnosis: Diagnosis, kept: Sequence[str]) -> Iterator[Picture]:

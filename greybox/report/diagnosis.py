@@ -177,8 +177,7 @@ def _equations(diagnosis: Diagnosis) -> Section:
     elif changes:
         sentences = ["Beside the terms that are marked below, what changes:"]
     extended = [
-        f"For {c.key}, the model gets {c.extension}. Reference: {c.reference}."
-        for c in diagnosis.causes
+        f"Extension for {c.key}: {c.extension}. Reference: {c.reference}." for c in diagnosis.causes
     ]
     return Section(
         "3. The equations before and after",

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from greybox.diagnosis.result import Gain, Ranked, Runs
 from greybox.report.error_profiles import Profile, profile
 from greybox.report.figures import BLACK, BLUE, LABELS, SKY, VERMILION, new_figure, tidy, to_svg
-from greybox.report.free_run_errors import REGIMES, Errors, simulations
+from greybox.report.free_run_errors import REGIMES, Errors, simulated, simulations
 from greybox.report.page import Picture
 from greybox.report.thinning import find_gaps, pick, thin
 
@@ -56,10 +56,10 @@ def run_figure(run: Runs) -> Figure:
         spread = float(np.ptp(measured)) or 1.0
         low, high = measured.min() - 0.6 * spread, measured.max() + 0.6 * spread
         _line(top, t, measured, gaps, {"color": BLACK, "linewidth": 0.9, "label": "measured"})
-        for name, simulated in shown.items():
+        for name in shown:
             style = {k: v for k, v in _STYLE[name].items() if k != "marker"}
             style |= {"linewidth": 1.2, "label": name}
-            x = np.where(np.isfinite(simulated[state]), simulated[state], np.nan)
+            x = simulated(run, name, state)
             _line(top, t, np.clip(x, low, high), gaps, style)
             _line(below, t, np.clip(measured - x, -spread, spread), gaps, style)
         below.axhline(0, color=BLACK, linewidth=0.6)
@@ -96,8 +96,8 @@ def heading_figure(errors: Errors) -> Figure:
 def speed_figure(errors: Errors) -> Figure:
     """Draw the mean error of each state by speed, as many samples in each bin."""
     assert errors.speed is not None
-    edges = np.quantile(errors.speed, np.linspace(0, 1, _SPEEDS + 1)[1:-1])
-    group = np.searchsorted(edges, errors.speed)
+    edges = np.nanquantile(errors.speed, np.linspace(0, 1, _SPEEDS + 1)[1:-1])
+    group = np.where(np.isfinite(errors.speed), np.searchsorted(edges, errors.speed), -1)
     place = np.array(
         [errors.speed[group == g].mean() if (group == g).any() else np.nan for g in range(_SPEEDS)]
     )

@@ -32,9 +32,10 @@ class Errors:
     heading : ndarray or None
         (N,) [rad], from 0 up to 2π.
     speed : ndarray or None
-        (N,) simulated, over ground [m/s]: that of a sensor has the noise of the error.
+        (N,) simulated, over ground [m/s], NaN where it ran away. A sensor's would have
+        the noise of the error in it.
     regime : ndarray of int or None
-        (N,) place in `REGIMES`, by the simulated signs.
+        (N,) place in `REGIMES`, by the simulated signs, −1 where it ran away.
     """
 
     error: Mapping[str, Mapping[str, Array]]
@@ -60,7 +61,9 @@ class Errors:
     @property
     def regimes(self) -> tuple[int, ...]:
         """Places in `REGIMES` that were met."""
-        return () if self.regime is None else tuple(map(int, np.unique(self.regime)))
+        if self.regime is None:
+            return ()
+        return tuple(int(g) for g in np.unique(self.regime) if g >= 0)
 
     @property
     def lost(self) -> int:
@@ -69,11 +72,22 @@ class Errors:
         return int(np.any(bad, axis=0).sum())
 
 
-def simulations(run: Runs) -> dict[str, Mapping[str, Array]]:
-    """Return the runs to show: before and after, or one where they are the same."""
+def simulations(run: Runs) -> tuple[str, ...]:
+    """Return which runs to show: before and after, or one where they are the same."""
     if all(np.array_equal(run.before[s], run.after[s], equal_nan=True) for s in run.measured):
-        return {"simulated": run.before}
-    return {"before": run.before, "after": run.after}
+        return ("simulated",)
+    return ("before", "after")
+
+
+def simulated(run: Runs, name: str, state: str) -> Array:
+    """Return a simulated state (N,), NaN where it is no number or the run is over.
+
+    A model that corrects a late sensor has no input at an end of the log.
+    """
+    x = run.after[state] if name == "after" else run.before[state]
+    out = np.full(len(run.measured[state]), np.nan)
+    out[: len(x)] = np.where(np.isfinite(x), x, np.nan)
+    return out
 
 
 def gather(runs: Sequence[Runs]) -> Errors:
@@ -98,16 +112,15 @@ def gather(runs: Sequence[Runs]) -> Errors:
     if all("psi" in r.log for r in runs):
         heading = np.concatenate([r.log["psi"] for r in runs]) % (2 * np.pi)
     if {"u", "v"} <= set(runs[0].measured):
-        u, v = (np.concatenate([np.nan_to_num(r.after[s]) for r in runs]) for s in ("u", "v"))
+        u, v = (np.concatenate([simulated(r, "after", s) for r in runs]) for s in ("u", "v"))
         speed = np.hypot(u, v)
-        regime = 2 * (u < 0) + (v < 0)
+        regime = np.where(np.isfinite(speed), 2 * (u < 0) + (v < 0), -1)
     return Errors(error, blocks, heading, speed, regime)
 
 
 def _error(run: Runs, name: str, state: str) -> Array:
-    simulated = run.after[state] if name == "after" else run.before[state]
     measured = run.measured[state]
     spread = float(np.ptp(measured)) or 1.0
+    error = measured - simulated(run, name, state)
     with np.errstate(invalid="ignore"):
-        error = measured - simulated
         return np.where(np.abs(error) < _AWAY * spread, error, np.nan)

@@ -122,6 +122,8 @@ def vessel_changes(base: Vessel, vessel: Vessel) -> list[str]:
 
 def _thruster(name: str, old: Thruster, new: Thruster) -> list[str]:
     told = []
+    if old.columns != new.columns:
+        told.append(f"{name} was driven by {', '.join(old.columns)} before.")
     if old.gain != new.gain:
         told.append(
             f"{name} gives {100 * new.gain:.1f} % of its thrust law, before {100 * old.gain:.4g} %."

@@ -177,7 +177,9 @@ def flatten(record: dict[str, Any]) -> dict[str, str]:
         if isinstance(value, dict):
             rows |= {f"{key} {k}": v for k, v in flatten(value).items()}
         elif isinstance(value, (list, tuple)):
-            rows[key] = ", ".join(str(v) for v in value)
+            rows[key] = ", ".join(
+                " ".join(map(str, v.values())) if isinstance(v, dict) else str(v) for v in value
+            )
         else:
             rows[key] = str(value)
     return rows

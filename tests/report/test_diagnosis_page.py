@@ -45,8 +45,10 @@ def model_of(names=PARAMETERS, **more):
 def extended():
     vessel = load_vessel("thesis")
     first = replace(vessel.thrusters[0], gain=0.83, angle_offset=0.05)
+    second = replace(vessel.thrusters[1], angle="alpha9")
     vessel = replace(
-        vessel, thrusters=(first, *vessel.thrusters[1:]), actuation=Actuation(lag=2.5, delay=1.0),
+        vessel, thrusters=(first, second, *vessel.thrusters[2:]),
+        actuation=Actuation(lag=2.5, delay=1.0),
         sensors={**vessel.sensors, "heading_bias": 0.06, "clock": {"u": 1.5}, "reversed": ("r",),
                  "velocity_at": (3.0, -1.0)},
     )  # fmt: skip
@@ -195,7 +197,7 @@ def test_named(pages):
     assert "below 1e−16" in shown
     assert "1804.2 ± 95.1" in shown
     assert "current_north is 0.2000 ± 0.0040 m/s; before, the water stood still." in shown
-    assert "For current, the model gets the mean current, north and east." in shown
+    assert "Extension for current: the mean current, north and east." in shown
     assert "43.0 to 50.1" in shown
     assert "<ins>N_|r|r·|r|·r</ins>" in render(pages["named"])
 
@@ -252,12 +254,29 @@ def test_runs_that_run_away_are_left_out_and_said_so():
     assert "runs away at 100 of 1200 samples" in text_of(diagnosis_page(diagnosis, RECORD))
 
 
+def test_runs_that_end_before_their_log():
+    run = diagnosis_of("named").runs[0]
+    short = replace(run, after={s: x[:-5] for s, x in run.after.items()})
+    errors = gather([short])
+    assert errors.lost == 5
+    assert (errors.regime[-5:] == -1).all()
+    assert errors.regimes == (0,)
+
+
+def test_causes_that_need_no_force_model():
+    kinematic = replace(BIAS, key="heading_bias:kinematics", gain=0.0)
+    shown = text_of(diagnosis_page(replace(diagnosis_of("named"), causes=(kinematic,)), RECORD))
+    assert "none needed" in shown
+    assert "0.0 ± " not in shown
+
+
 def test_what_changes_beside_the_equations():
     told = " ".join(other_changes(model_of(), extended()))
     for part in (
         "gives 83.0 % of its thrust law, before 100 %",
         "stands 2.86 deg (0.0500 rad) beyond its logged angle",
         "a lag of 2.5 s of each force and a delay of 1 s; before, with no lag and no delay",
+        "Thruster 2 (n, alpha9) was driven by n, alpha2 before.",
         "The compass shows 3.44 deg (0.0600 rad) too much.",
         "u comes 1.50 s too late.",
         "r has its sign turned.",
