@@ -100,7 +100,9 @@ def _wrong(diagnosis: Diagnosis) -> Section:
                 f"against time; all are in the means."
             )
         if len(errors.regimes) == 1:
-            sentences.append(f"All of it in one regime of signs, {REGIMES[errors.regimes[0]]}.")
+            sentences.append(
+                f"All samples lie in one regime of signs, {REGIMES[errors.regimes[0]]}."
+            )
         if errors.lost:
             sentences.append(
                 f"The free run runs away at {errors.lost} of {errors.samples} samples; "

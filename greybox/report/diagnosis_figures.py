@@ -25,7 +25,7 @@ _WIDTH = 4.4
 _POINTS = 600
 _COMPASS = ("N", "NE", "E", "SE", "S", "SW", "W", "NW")
 _SPEEDS = 8
-_MOST_RANKED = 10
+_MOST_RANKED = 8
 # fall of −2 log L up to which the ranking's axis is linear
 _LINEAR = 10.0
 # worse fits than this are drawn at the edge [%]

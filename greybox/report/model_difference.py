@@ -11,6 +11,8 @@ from greybox.model.model import ManoeuvringModel
 from greybox.report.page import Marked, Table
 from greybox.vessel.vessel import Thruster, Vessel
 
+# value, standard error and unit by name
+_Values = Mapping[str, tuple[float, float, str]]
 _NOTE = "u_r, v_r: velocity through the water; u_q, v_q: through the air"
 
 
@@ -50,20 +52,31 @@ def coefficient_table(base: ManoeuvringModel, model: ManoeuvringModel) -> Table:
     old, new = _values(base), _values(model)
     caption = f"Coefficients per sample of {model.sample_time:g} s, ± one standard error"
     if old == new:
-        rows = [[n, with_error(v, s), shown_unit(u)] for n, (v, s, u) in new.items()]
+        rows = [[model.label(n), with_error(v, s), shown_unit(u)] for n, (v, s, u) in new.items()]
         return Table(caption, ["coefficient", "value", "unit"], rows)
     rows = []
     for name in dict.fromkeys([*old, *new]):
         cells = [with_error(*side[name][:2]) if name in side else "" for side in (old, new)]
         unit = (new.get(name) or old[name])[2]
-        note = "new" if name not in old else "gone" if name not in new else ""
-        rows.append([name, *cells, shown_unit(unit), note])
+        rows.append(
+            [model.label(name), *cells, shown_unit(unit), _note(name, base, model, old, new)]
+        )
     return Table(caption, ["coefficient", "before", "after", "unit", ""], rows)
 
 
-def _values(model: ManoeuvringModel) -> dict[str, tuple[float, float, str]]:
+def _note(
+    name: str, base: ManoeuvringModel, model: ManoeuvringModel, old: _Values, new: _Values
+) -> str:
+    if name not in old:
+        return "new"
+    if name not in new:
+        return "gone"
+    return f"before: {base.label(name)}" if base.label(name) != model.label(name) else ""
+
+
+def _values(model: ManoeuvringModel) -> _Values:
     found = {
-        model.label(n): (float(v), float(s), u)
+        n: (float(v), float(s), u)
         for n, v, s, u in zip(model.names, model.theta, model.std, model.units, strict=True)
     }
     return found | {n: (v, s, "m/s") for n, (v, s) in model.disturbances.items()}

@@ -19,7 +19,12 @@ from greybox.report.diagnosed_causes import probability
 from greybox.report.diagnosis import diagnosis_page
 from greybox.report.error_profiles import block_ids, memory, profile
 from greybox.report.free_run_errors import gather
-from greybox.report.model_difference import marked_equations, other_changes, with_error
+from greybox.report.model_difference import (
+    coefficient_table,
+    marked_equations,
+    other_changes,
+    with_error,
+)
 from greybox.report.page import render, write_page
 from greybox.study.chapter6 import TRUE
 from greybox.validation.fit import run_model
@@ -294,6 +299,15 @@ def test_equations_are_marked_where_they_differ():
     assert not any(mark for _, mark in after.pieces)
     same = marked_equations(model_of(), model_of())
     assert [m.title for m in same] == ["Equations"]
+
+
+def test_coefficients_that_stood_for_a_sum_are_told():
+    base = replace(model_of(), sums={"Xuu": ("Xuu", "Wuu")})
+    rows = {r[0]: r for r in coefficient_table(base, extended()).rows}
+    assert rows["Xuu"][-1] == "before: Xuu+Wuu"
+    assert rows["Xu"][-1] == ""
+    assert rows["N_|r|r"][1:] == ["", "-0.002000 ± 0.000040", "s", "new"]
+    assert coefficient_table(extended(), base).rows[-1][-1] == "gone"
 
 
 @pytest.mark.parametrize(
