@@ -116,7 +116,7 @@ STEPS = (
     (
         Ranked("heading_bias", 55.0, 61.2, 22.8, 9.4),
         Ranked("advance_speed:X_u*taux+Y_u*tauy+N_u*taun", 4.0),
-        Ranked("clock_offset:psi", 0.4),
+        Ranked("thruster_gain:n$x^{:<b>", 0.4),
     ),
 )
 
@@ -183,6 +183,7 @@ def test_story_in_its_order(pages, verdict):
 def test_names_from_logs_are_escaped(pages, verdict):
     html = render(pages[verdict])
     assert "<script" not in html
+    assert "<b>" not in html
     assert "&lt;script&gt;alert(&#34;x&#34;)&lt;/script&gt; &amp; $x^$" in html
 
 
