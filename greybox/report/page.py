@@ -5,18 +5,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from greybox.files import write_text
 
 
 @dataclass(frozen=True)
 class Picture:
-    """An SVG with the text below it, and the one that stands for it (the caption by default)."""
+    """An SVG with the text below it, and the one that stands for it (the caption by default).
+
+    Narrow ones stand beside one another where the window has room.
+    """
 
     svg: str
     caption: str
     alternative: str = ""
+    narrow: bool = False
 
 
 @dataclass(frozen=True)
@@ -30,6 +34,14 @@ class Table:
 
 
 @dataclass(frozen=True)
+class Marked:
+    """Text in pieces, some of them marked as new or as gone."""
+
+    title: str
+    pieces: Sequence[tuple[str, Literal["", "ins", "del"]]]
+
+
+@dataclass(frozen=True)
 class Section:
     """A part of a page under a heading of its own, such as one log of several."""
 
@@ -38,6 +50,8 @@ class Section:
     pictures: Sequence[Picture] = ()
     tables: Sequence[Table] = ()
     texts: Sequence[tuple[str, str]] = ()
+    points: Sequence[str] = ()
+    marked: Sequence[Marked] = ()
 
 
 @dataclass(frozen=True)
@@ -57,10 +71,20 @@ class Page:
 _TEMPLATE = """{% macro parts(of, level) %}
 {% for sentence in of.sentences %}<p>{{ sentence }}</p>
 {% endfor %}
-{% for picture in of.pictures %}<figure role="group"
- aria-label="{{ picture.alternative or picture.caption }}">
+{% if of.points %}<ul>{% for point in of.points %}<li>{{ point }}</li>
+{% endfor %}</ul>
+{% endif %}
+{% if of.pictures %}<div class="pictures">
+{% for picture in of.pictures %}<figure role="group"{% if picture.narrow %} class="narrow"
+{%- endif %} aria-label="{{ picture.alternative or picture.caption }}">
 {{ picture.svg | safe }}
 <figcaption>{{ picture.caption }}</figcaption></figure>
+{% endfor %}
+</div>
+{% endif %}
+{% for part in of.marked %}<{{ level }}>{{ part.title }}</{{ level }}><pre class="marked">
+{%- for text, mark in part.pieces %}{% if mark %}<{{ mark }}>{{ text }}</{{ mark }}>
+{%- else %}{{ text }}{% endif %}{% endfor %}</pre>
 {% endfor %}
 {% for table in of.tables %}<div class="wide"><table
 {%- if table.sentences %} class="sentences"{% endif %}><caption>{{ table.caption }}</caption>
@@ -86,7 +110,10 @@ section { border-top: 2px solid #ddd; margin-top: 2rem; }
 h3 { font-size: 1rem; margin: 1.2rem 0 0.3rem; }
 h2 { font-size: 1.15rem; margin: 1.6rem 0 0.4rem; }
 .headline { font-size: 1.15rem; border-left: 4px solid #0072B2; padding-left: 0.8rem; }
-figure { margin: 1rem 0; }
+.pictures { display: grid; gap: 0 1.5rem; align-items: start;
+            grid-template-columns: repeat(auto-fill, minmax(min(100%, 26rem), 1fr)); }
+figure { margin: 1rem 0; min-width: 0; grid-column: 1 / -1; }
+figure.narrow { grid-column: auto; }
 figure svg { width: 100%; height: auto; }
 figcaption { font-size: 0.9rem; color: #444; }
 .wide { overflow-x: auto; margin: 1rem 0; }
@@ -99,7 +126,17 @@ table.sentences th, table.sentences td { text-align: left; white-space: normal;
 table.sentences td:first-child { overflow-wrap: normal; }
 caption { text-align: left; font-weight: 600; padding: 0.3rem 0; }
 pre { font-size: 0.8rem; overflow-x: auto; background: #f6f6f6; padding: 0.6rem; }
-@media print { body { max-width: none; font-size: 11px; } figure { break-inside: avoid; } }
+pre.marked { white-space: pre-wrap; }
+ins { background: #cfe8fc; text-decoration: underline; font-weight: 600; }
+del { background: #f9ddcc; }
+@page { size: A4; margin: 15mm; }
+@media (max-width: 600px) {
+  table { font-size: 0.8rem; } th, td { white-space: normal; padding: 0.2rem 0.3rem; } }
+@media print { html { font-size: 11px; } body { max-width: none; font-size: 1rem; }
+  figure { break-inside: avoid; }
+  .pictures { grid-template-columns: 1fr 1fr; } h2, h3 { break-after: avoid; }
+  .wide { overflow: visible; } th, td { white-space: normal; padding: 0.2rem 0.3rem; }
+  tr, li { break-inside: avoid; } pre { white-space: pre-wrap; } }
 </style>
 </head>
 <body>
@@ -140,7 +177,9 @@ def flatten(record: dict[str, Any]) -> dict[str, str]:
         if isinstance(value, dict):
             rows |= {f"{key} {k}": v for k, v in flatten(value).items()}
         elif isinstance(value, (list, tuple)):
-            rows[key] = ", ".join(str(v) for v in value)
+            rows[key] = ", ".join(
+                " ".join(map(str, v.values())) if isinstance(v, dict) else str(v) for v in value
+            )
         else:
             rows[key] = str(value)
     return rows

@@ -1,0 +1,218 @@
+"""The page of `greybox diagnose`: what is wrong, why, how the model changes, what it gains."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from greybox.diagnosis.result import Diagnosis, Runs
+from greybox.report.diagnosed_causes import cause_section
+from greybox.report.diagnosis_figures import (
+    LOWEST_FIT,
+    gain_figure,
+    heading_figure,
+    narrow,
+    regime_figure,
+    run_figure,
+    speed_figure,
+)
+from greybox.report.free_run_errors import REGIMES, Errors, gather, simulations
+from greybox.report.model_difference import (
+    coefficient_table,
+    marked_equations,
+    other_changes,
+)
+from greybox.report.page import Page, Picture, Section, Table, flatten
+
+_NAMES = {"u": "surge", "v": "sway", "r": "yaw rate", "psi": "heading"}
+_UNITS = {"u": "m/s", "v": "m/s", "r": "rad/s", "psi": "rad"}
+# logs of each kind that are drawn: with more the page grows and tells nothing new
+_MOST_LOGS = 3
+
+
+def diagnosis_page(diagnosis: Diagnosis, record: Mapping[str, Any]) -> Page:
+    """Return the page, its story first.
+
+    Parameters
+    ----------
+    diagnosis : Diagnosis
+    record : mapping
+        How it was computed: versions, command, hashes of the logs, seed.
+    """
+    sections = [
+        _wrong(diagnosis),
+        cause_section(diagnosis),
+        _equations(diagnosis),
+        _gain(diagnosis),
+        Section("5. What remains", [diagnosis.remaining]),
+        Section("6. What to do next", points=diagnosis.next_steps),
+    ]
+    if diagnosis.notes:
+        sections.append(Section("Notes", points=diagnosis.notes))
+    headline = diagnosis.headline
+    return Page(
+        title="What the simulation gets wrong, and why",
+        headline=headline[:1].upper() + headline[1:],
+        sentences=_summary(diagnosis),
+        sections=sections,
+        computed=flatten(dict(diagnosis.record) | dict(record))
+        | {
+            "causes scored": str(diagnosis.tried),
+            "fall of −2 log L": "of the free run's errors, their noise coloured; a cause counts "
+            "when it is significant after correction for all that were tried (Holm) and "
+            "predicts logs, or parts of logs, that it was not fitted to",
+            "intervals of mean errors": "95 %, from blocks of samples longer than the errors' "
+            "memory (Liang and Zeger, 1986)",
+        },
+    )
+
+
+def _summary(diagnosis: Diagnosis) -> list[str]:
+    told = [f"Verdict: {diagnosis.verdict}, after {diagnosis.tried} causes were tried."]
+    if diagnosis.gain and _changed(diagnosis):
+        gains = ", ".join(
+            f"{_NAMES.get(s, s)} from {_percent(g.before)} to {_percent(g.after)}"
+            for s, g in diagnosis.gain.items()
+        )
+        told.append(f"The fit of the free run (100 % is perfect) goes: {gains}.")
+    return told
+
+
+def _changed(diagnosis: Diagnosis) -> bool:
+    return any(g.before != g.after for g in diagnosis.gain.values())
+
+
+def _percent(value: float) -> str:
+    return f"{value:.1f} %" if value > -1000 else "diverged"
+
+
+def _wrong(diagnosis: Diagnosis) -> Section:
+    """Show what the simulation gets wrong, in sentences and pictures."""
+    sentences = [] if diagnosis.wrong else ["Nothing beyond noise."]
+    pictures: list[Picture] = []
+    if diagnosis.runs:
+        errors = gather(diagnosis.runs)
+        pictures = [*_run_pictures(diagnosis.runs), *_followed(errors)]
+        left_out = len(diagnosis.runs) - len(_drawn(diagnosis.runs))
+        if left_out:
+            sentences.append(
+                f"Of {len(diagnosis.runs)} logs the first {_MOST_LOGS} of each kind are drawn "
+                f"against time; all are in the means."
+            )
+        if len(errors.regimes) == 1:
+            sentences.append(
+                f"All samples lie in one regime of signs, {REGIMES[errors.regimes[0]]}."
+            )
+        if errors.lost:
+            sentences.append(
+                f"The free run runs away at {errors.lost} of {errors.samples} samples; "
+                f"mean errors leave these out."
+            )
+    return Section(
+        "1. What the simulation gets wrong",
+        sentences,
+        pictures,
+        points=[s.sentence for s in diagnosis.wrong],
+    )
+
+
+def _followed(errors: Errors) -> Iterator[Picture]:
+    """Yield what the error goes with: heading, speed, signs."""
+    means = (
+        "Mean of measured − simulated with its 95 % interval (none where too little of the logs "
+        "is there to say)"
+    )
+    told = _rms_sentence(errors)
+    if errors.heading is not None:
+        yield narrow(
+            heading_figure(errors), "heading", f"{means}, by heading.",
+            f"Mean error of each state against the heading. {told}",
+        )  # fmt: skip
+    if errors.speed is not None:
+        yield narrow(
+            speed_figure(errors), "speed", f"{means}, by speed.",
+            f"Mean error of each state against the speed. {told}",
+        )  # fmt: skip
+    if len(errors.regimes) > 1:
+        yield narrow(
+            regime_figure(errors), "regime",
+            "Root mean square error with its 95 % interval, by the signs of surge and sway.",
+            f"Bars of the root mean square error by the signs of surge and sway. {told}",
+        )  # fmt: skip
+
+
+def _rms_sentence(errors: Errors) -> str:
+    parts = []
+    for state in errors.states:
+        sizes = ", ".join(f"{errors.rms(name, state):.3g} {name}" for name in errors.error)
+        parts.append(f"{_NAMES.get(state, state)} [{_UNITS.get(state, '')}] {sizes}")
+    return f"Root mean square errors: {'; '.join(parts)}."
+
+
+def _drawn(runs: Sequence[Runs]) -> list[Runs]:
+    kinds = ([r for r in runs if r.held_out is held] for held in (False, True))
+    return [r for kind in kinds for r in kind[:_MOST_LOGS]]
+
+
+def _run_pictures(runs: Sequence[Runs]) -> Iterator[Picture]:
+    for i, run in enumerate(_drawn(runs)):
+        kind = "held out from the fit" if run.held_out else "estimated on"
+        changed = len(simulations(run)) > 1
+        shown = "measured, before and after" if changed else "measured and simulated"
+        caption = (
+            f"Free run on {run.log.name} ({kind}; {len(run.log)} samples of "
+            f"{run.log.sample_time:g} s): {shown}; below, measured − simulated."
+        )
+        yield narrow(
+            run_figure(run), f"run{i}", caption, f"{caption} {_rms_sentence(gather([run]))}"
+        )
+
+
+def _equations(diagnosis: Diagnosis) -> Section:
+    """Show how the model changes."""
+    marked = marked_equations(diagnosis.base, diagnosis.model)
+    changes = other_changes(diagnosis.base, diagnosis.model)
+    same = len(marked) == 1 and not changes
+    sentences = ["The model stays as it is."] if same else []
+    if len(marked) == 1 and changes:
+        sentences = ["The equations keep their terms. What changes:"]
+    elif changes:
+        sentences = ["Beside the terms that are marked below, what changes:"]
+    extended = [
+        f"Extension for {c.key}: {c.extension}. Reference: {c.reference}." for c in diagnosis.causes
+    ]
+    return Section(
+        "3. The equations before and after",
+        sentences,
+        tables=[coefficient_table(diagnosis.base, diagnosis.model)],
+        points=[*changes, *extended],
+        marked=marked,
+    )
+
+
+def _gain(diagnosis: Diagnosis) -> Section:
+    """Show what the extended model gains on logs it was not fitted to."""
+    if not diagnosis.gain:
+        return Section("4. The gain", ["No gain was measured."])
+    table = Table(
+        "Fit (6.12) of the free run [%]",
+        ["state", "before", "after", "gain", "95 % interval"],
+        [
+            [
+                _NAMES.get(s, s), _percent(g.before), _percent(g.after),
+                f"{g.after - g.before:+.1f}" if g.before > -1000 else "",
+                f"{g.ci[0]:.1f} to {g.ci[1]:.1f}",
+            ]
+            for s, g in diagnosis.gain.items()
+        ],
+    )  # fmt: skip
+    caption = "Fit of the free run before and after, with the 95 % interval of the gain."
+    if any(min(g.before, g.after) < LOWEST_FIT for g in diagnosis.gain.values()):
+        caption += f" Below {LOWEST_FIT:.0f} % it is drawn at the edge."
+    told = "; ".join(f"{r[0]} {r[1]} to {r[2]}" for r in table.rows)
+    on = diagnosis.validated_on
+    picture = narrow(gain_figure(diagnosis.gain), "gain", caption, f"{caption} {told}.")
+    return Section(
+        "4. The gain", [on[:1].upper() + on[1:].rstrip(".") + "."] if on else [],
+        [picture] if _changed(diagnosis) else [], [table],
+    )  # fmt: skip

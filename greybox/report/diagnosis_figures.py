@@ -1,0 +1,290 @@
+"""Pictures of a diagnosis: runs before and after, what the error follows, gain, ranking."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator, SymmetricalLogLocator
+from numpy.typing import NDArray
+
+from greybox.diagnosis.result import Gain, Ranked, Runs
+from greybox.report.error_profiles import Profile, profile
+from greybox.report.figures import BLACK, BLUE, LABELS, SKY, VERMILION, new_figure, tidy, to_svg
+from greybox.report.free_run_errors import REGIMES, Errors, simulated, simulations
+from greybox.report.page import Picture
+from greybox.report.thinning import find_gaps, pick, thin
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+# inches: letters stay legible where the page is 390 px wide
+_WIDTH = 4.4
+_POINTS = 600
+_COMPASS = ("N", "NE", "E", "SE", "S", "SW", "W", "NW")
+_SPEEDS = 8
+_MOST_RANKED = 8
+# fall of −2 log L up to which the ranking's axis is linear
+_LINEAR = 10.0
+# worse fits than this are drawn at the edge [%]
+LOWEST_FIT = -50.0
+
+_STYLE: Mapping[str, dict[str, Any]] = {
+    "before": {"color": VERMILION, "linestyle": "--", "marker": "s"},
+    "after": {"color": BLUE, "linestyle": "-", "marker": "o"},
+    "simulated": {"color": BLUE, "linestyle": "-", "marker": "o"},
+}
+_SHORT = {"u": "surge [m/s]", "v": "sway [m/s]", "r": "yaw rate [rad/s]", "psi": "heading [rad]"}
+
+
+def run_figure(run: Runs) -> Figure:
+    """Draw each state of one log, measured and simulated, with the error below."""
+    states = list(run.measured)
+    shown = simulations(run)
+    figure = new_figure(_WIDTH, 2.35 * len(states) + 0.5)
+    grid = figure.add_gridspec(2 * len(states), 1, height_ratios=[1.6, 1] * len(states))
+    t = run.log.t - run.log.t[0]
+    gaps = find_gaps(t, run.log.sample_time)
+    first: Any = None
+    for i, state in enumerate(states):
+        top = figure.add_subplot(grid[2 * i], sharex=first)
+        first = first or top
+        below = figure.add_subplot(grid[2 * i + 1], sharex=first)
+        measured = run.measured[state]
+        spread = float(np.ptp(measured)) or 1.0
+        low, high = measured.min() - 0.6 * spread, measured.max() + 0.6 * spread
+        _line(top, t, measured, gaps, {"color": BLACK, "linewidth": 0.9, "label": "measured"})
+        for name in shown:
+            style = {k: v for k, v in _STYLE[name].items() if k != "marker"}
+            style |= {"linewidth": 1.2, "label": name}
+            x = simulated(run, name, state)
+            _line(top, t, np.clip(x, low, high), gaps, style)
+            _line(below, t, np.clip(measured - x, -spread, spread), gaps, style)
+        below.axhline(0, color=BLACK, linewidth=0.6)
+        top.set_ylabel(_SHORT.get(state, state), fontsize=9)
+        below.set_ylabel("error", fontsize=9)
+        for ax in (top, below):
+            tidy(ax)
+            ax.yaxis.set_major_locator(MaxNLocator(4 if ax is top else 3))
+            ax.tick_params(labelsize=8, labelbottom=ax is below and i == len(states) - 1)
+        if i == 0:
+            _legend(figure, top)
+    below.set_xlabel("time [s]", fontsize=9)
+    return figure
+
+
+def _line(axes: Any, t: Array, value: Array, gaps: Index, style: Mapping[str, Any]) -> None:
+    kept = thin(gaps, np.nan_to_num(value), points=_POINTS)
+    axes.plot(pick(t, kept), pick(value, kept), **style)
+
+
+def heading_figure(errors: Errors) -> Figure:
+    """Draw the mean error of each state in sectors of the measured heading."""
+    assert errors.heading is not None
+    sectors = 12
+    width = 2 * np.pi / sectors
+    group = np.round(errors.heading / width).astype(int) % sectors
+    place = np.arange(sectors) * 360.0 / sectors
+    figure, axes = _profiles(errors, group, place, 360 / sectors)
+    axes[-1].set_xticks(np.arange(0, 360, 45), _COMPASS)
+    axes[-1].set_xlabel("measured heading", fontsize=9)
+    return figure
+
+
+def speed_figure(errors: Errors) -> Figure:
+    """Draw the mean error of each state by speed, as many samples in each bin."""
+    assert errors.speed is not None
+    edges = np.nanquantile(errors.speed, np.linspace(0, 1, _SPEEDS + 1)[1:-1])
+    group = np.where(np.isfinite(errors.speed), np.searchsorted(edges, errors.speed), -1)
+    place = np.array(
+        [errors.speed[group == g].mean() if (group == g).any() else np.nan for g in range(_SPEEDS)]
+    )
+    figure, axes = _profiles(errors, group, place, float(np.nanmin(np.diff(place), initial=1.0)))
+    axes[-1].set_xlabel("simulated speed over ground [m/s]", fontsize=9)
+    return figure
+
+
+def _profiles(errors: Errors, group: Index, place: Array, step: float) -> tuple[Figure, list[Any]]:
+    """Draw one pair of axes a state, one line a run."""
+    states = errors.states
+    figure = new_figure(_WIDTH, 1.55 * len(states) + 0.9)
+    axes = list(figure.subplots(len(states), 1, sharex=True, squeeze=False)[:, 0])
+    for ax, state in zip(axes, states, strict=True):
+        drawn = []
+        for j, (name, run) in enumerate(errors.error.items()):
+            found = _profile(run[state], group, errors.blocks[name][state], len(place))
+            drawn.append(found)
+            shift = 0.12 * step * (j - (len(errors.error) - 1) / 2)
+            ax.errorbar(
+                place + shift, found.mean, yerr=found.half, label=name, linewidth=1.1,
+                markersize=4, capsize=2, elinewidth=0.9, **_STYLE[name],
+            )  # fmt: skip
+        ax.axhline(0, color=BLACK, linewidth=0.7)
+        _keep_in_view(ax, drawn)
+        ax.set_ylabel(_SHORT.get(state, state), fontsize=9)
+        ax.yaxis.set_major_locator(MaxNLocator(4))
+        ax.tick_params(labelsize=8)
+        tidy(ax)
+    _legend(figure, axes[0], enough=2)
+    return figure, axes
+
+
+def _profile(error: Array, group: Index, blocks: Index, groups: int) -> Profile:
+    known = np.isfinite(error)
+    return profile(error[known], group[known], blocks[known], groups)
+
+
+def _keep_in_view(ax: Any, drawn: Sequence[Profile]) -> None:
+    """Let the means rule the view: the interval of a bin hardly visited may leave it."""
+    means = np.concatenate([p.mean for p in drawn])
+    halves = np.concatenate([p.half for p in drawn])
+    reach = np.abs(means) + np.minimum(np.nan_to_num(halves), 2 * np.nanmax(np.abs(means)))
+    most = 1.1 * float(np.nanmax(reach))
+    if most > 0:
+        ax.set_ylim(-most, most)
+
+
+def _legend(figure: Figure, ax: Any, *, enough: int = 1) -> None:
+    """Put the legend above everything, where there are enough entries to need one."""
+    handles, labels = ax.get_legend_handles_labels()
+    if len(labels) >= enough:
+        figure.legend(
+            handles, labels, loc="outside upper left", ncols=3, fontsize=8.5, frameon=False,
+            handlelength=1.6, columnspacing=1.2,
+        )  # fmt: skip
+
+
+def regime_figure(errors: Errors) -> Figure:
+    """Draw the root mean square error by the signs of surge and sway."""
+    assert errors.regime is not None
+    states = errors.states
+    met = list(errors.regimes)
+    figure = new_figure(_WIDTH, 1.55 * len(states) + 0.9)
+    axes = list(figure.subplots(len(states), 1, sharex=True, squeeze=False)[:, 0])
+    wide = 0.8 / len(errors.error)
+    for ax, state in zip(axes, states, strict=True):
+        for j, (name, run) in enumerate(errors.error.items()):
+            found = _profile(
+                run[state] ** 2, errors.regime, errors.blocks[name][state], len(REGIMES)
+            )
+            mean, half = found.mean[met], found.half[met]
+            root = np.sqrt(mean)
+            low = root - np.sqrt(np.maximum(mean - half, 0))
+            high = np.sqrt(mean + half) - root
+            ax.bar(
+                np.arange(len(met)) + wide * (j - (len(errors.error) - 1) / 2), root, 0.92 * wide,
+                yerr=[low, high], label=name, color=_STYLE[name]["color"], capsize=3,
+                hatch="//" if name == "before" else None, edgecolor="white", linewidth=0,
+                error_kw={"elinewidth": 0.9},
+            )  # fmt: skip
+        ax.set_ylabel(_SHORT.get(state, state), fontsize=9)
+        ax.yaxis.set_major_locator(MaxNLocator(4))
+        ax.tick_params(labelsize=8)
+        tidy(ax)
+        ax.set_ylim(bottom=0)
+    total = len(errors.regime)
+    axes[-1].set_xticks(
+        range(len(met)),
+        [f"{REGIMES[g]}\n{100 * (errors.regime == g).sum() / total:.0f} %" for g in met],
+    )
+    axes[-1].set_xlabel("signs of surge and sway, share of the time", fontsize=9)
+    _legend(figure, axes[0], enough=2)
+    return figure
+
+
+def gain_figure(gain: Mapping[str, Gain]) -> Figure:
+    """Draw the fit of each state before and after, the interval of the gain on the latter."""
+    figure = new_figure(_WIDTH, 0.55 * len(gain) + 1.2)
+    ax = figure.subplots()
+    for i, g in enumerate(gain.values()):
+        before, after = max(g.before, LOWEST_FIT), max(g.after, LOWEST_FIT)
+        low, high = (max(g.before + c, LOWEST_FIT) for c in g.ci)
+        ax.plot([before, after], [i, i], color="0.6", linewidth=1.5, zorder=1)
+        ax.plot([low, high], [i, i], color=SKY, linewidth=6, alpha=0.8, zorder=2,
+                solid_capstyle="butt", label="gain, 95 %" if i == 0 else None)  # fmt: skip
+        for name, value in (("before", before), ("after", after)):
+            ax.plot(
+                value, i, _STYLE[name]["marker"], color=_STYLE[name]["color"], markersize=7,
+                markerfacecolor="white" if name == "before" else None, zorder=3,
+                label=name if i == 0 else None, linestyle="none",
+            )  # fmt: skip
+    ax.axvline(100, color=BLACK, linewidth=0.7)
+    names = [LABELS.get(s, s).split(" [")[0] for s in gain]
+    ax.set_yticks(range(len(gain)), names, fontsize=9)
+    ax.set_ylim(len(gain) - 0.5, -0.5)
+    ax.set_xlabel("fit of the free run (6.12) [%], 100 is perfect", fontsize=9)
+    ax.tick_params(axis="x", labelsize=8)
+    _legend(figure, ax)
+    tidy(ax)
+    return figure
+
+
+def ranked_for_picture(step: Sequence[Ranked], kept: Sequence[str]) -> list[Ranked]:
+    """Return the causes that a picture of a step shows, the best first.
+
+    Parameters
+    ----------
+    step : sequence of Ranked
+    kept : sequence of str
+        Keys that are shown wherever they rank.
+    """
+
+    def merit(r: Ranked) -> tuple[bool, float]:
+        return r.gain is not None, r.promise if r.gain is None else r.gain
+
+    order = sorted(step, key=merit, reverse=True)
+    shown = order[:_MOST_RANKED]
+    return shown + [r for r in order[_MOST_RANKED:] if r.key in kept]
+
+
+def ranking_figure(step: Sequence[Ranked], kept: Sequence[str]) -> Figure:
+    """Draw what each cause promised, gained, and proved at one step of the search.
+
+    Parameters
+    ----------
+    step, kept
+        As for `ranked_for_picture`; kept ones are set in bold.
+    """
+    rows = ranked_for_picture(step, kept)
+    figure = new_figure(_WIDTH, 0.42 * len(rows) + 1.5)
+    ax = figure.subplots()
+    place = np.arange(len(rows))
+    gains = np.array([np.nan if r.gain is None else r.gain for r in rows])
+    proofs = np.array([np.nan if r.held_out is None else r.held_out for r in rows])
+    spread = np.array([0.0 if r.held_out_std is None else 1.96 * r.held_out_std for r in rows])
+    ax.barh(place - 0.2, [r.promise for r in rows], 0.3, color="0.75", label="promised")
+    ax.barh(place + 0.12, gains, 0.3, color=SKY, label="refitted")
+    ax.errorbar(
+        proofs, place + 0.12, xerr=spread, fmt="D", color=BLACK, markersize=4, capsize=3,
+        linewidth=1.1, label="held-out, 95 %",
+    )  # fmt: skip
+    ax.axvline(0, color=BLACK, linewidth=0.7)
+    ax.set_xscale("symlog", linthresh=_LINEAR)
+    _few_decades(ax, np.concatenate([[r.promise for r in rows], gains, proofs]), proofs - spread)
+    labels = [r.key.replace(":", ":\n", 1) if len(r.key) > 22 else r.key for r in rows]
+    ax.set_yticks(place, labels, fontsize=8, parse_math=False)
+    for tick, row in zip(ax.get_yticklabels(), rows, strict=True):
+        tick.set_fontweight("bold" if row.key in kept else "normal")
+    ax.set_ylim(len(rows) - 0.5, -0.6)
+    ax.set_xlabel("fall of −2 log L", fontsize=9)
+    ax.tick_params(axis="x", labelsize=8)
+    _legend(figure, ax)
+    tidy(ax)
+    return figure
+
+
+def _few_decades(ax: Any, values: Array, lows: Array) -> None:
+    """Set limits and so few ticks that their labels stay apart."""
+    most = max(float(np.nanmax(values)), _LINEAR)
+    least = min(float(np.nanmin(np.append(lows, 0.0))), 0.0)
+    ax.set_xlim(1.6 * least if least < 0 else 0, 2.0 * most)
+    locator = SymmetricalLogLocator(base=10, linthresh=_LINEAR)
+    locator.set_params(numticks=7)
+    ax.xaxis.set_major_locator(locator)
+
+
+def narrow(figure: Figure, name: str, caption: str, alternative: str) -> Picture:
+    """Return a figure as a picture that stands beside others."""
+    return Picture(to_svg(figure, name), caption, alternative, narrow=True)

@@ -1,0 +1,115 @@
+"""Causes that other packages register, and the catalogue in the documentation."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from virtual import PARAMETERS
+
+from greybox.diagnosis import causes
+from greybox.diagnosis.causes import Context, known_causes
+from greybox.diagnosis.diagnose import Options, diagnose
+from greybox.errors import UsageError
+from greybox.model.catalogue import get_structure
+from greybox.model.simulation import simulate
+from greybox.study.chapter6 import TRUE
+from greybox.study.inputs import smoothed_pulses
+from greybox.trial.log import make_log
+from greybox.vessel.toml import load_vessel
+
+DOCUMENT = (Path(__file__).parents[2] / "docs" / "causes.md").read_text(encoding="utf-8")
+
+
+@dataclass
+class Entry:
+    name: str
+    made: Any
+
+    def load(self):
+        return self.made
+
+
+@pytest.fixture
+def drift_drag(monkeypatch):
+    """The example of the documentation, registered."""
+    (code,) = re.findall(r"```python\n(.*?)```", DOCUMENT, re.S)
+    found: dict[str, Any] = {}
+    exec(code, found)
+    register(monkeypatch, found["DriftDrag"])
+    return found["DriftDrag"]
+
+
+def register(monkeypatch, made):
+    monkeypatch.setattr(causes, "entry_points", lambda group: [Entry("theirs", made)])
+
+
+def drifting_log(seed, drag, samples=700):
+    structure, vessel = get_structure("thesis").with_terms("X_vv"), load_vessel("thesis")
+    rng = np.random.default_rng([300, seed])
+    commands = {
+        name: smoothed_pulses(rng, samples, low, high, widths=(20, 80), smoothing=10)
+        for name, low, high in (("n", 10, 20), ("alpha1", 0.6, 1.1), ("alpha2", 0.6, 1.1))
+    }
+    tau = make_log(vessel, commands, 1.0).forces(structure.inputs)
+    theta = np.array([*(0.0 if n.startswith("W") else TRUE[n] for n in PARAMETERS), drag])
+    run = simulate(structure, theta, np.array([1.5, 1.2, 0.0]), tau[:-1], 1.0, d=np.zeros(4))
+    states = {n: run.x[0, :, i] for i, n in enumerate(("u", "v", "r"))} | {"psi": run.psi[0]}
+    noisy = {n: x + 0.01 * rng.standard_normal(samples) for n, x in states.items()}
+    return make_log(vessel, commands | noisy, 1.0, f"day {seed}")
+
+
+def test_registered_cause_is_named(drift_drag):
+    logs = [drifting_log(k, -0.02) for k in (1, 2)]
+    found = diagnose(logs[:1], validate=logs[1:], options=Options())
+    assert found.verdict == "named"
+    assert [c.id for c in found.causes] == ["drift_drag"]
+    value = found.causes[0].parameters["X_vv"]
+    assert abs(value.value + 0.02) < 4 * value.std
+    assert "X_vv" in found.model.names
+
+
+def test_registered_cause_keeps_out_where_its_term_stands(drift_drag):
+    structure = get_structure("thesis")
+    context = Context(structure, load_vessel("thesis"), ("u", "v", "r"), False, 900.0, 1.0, {})
+    assert [a.key for a in drift_drag().atoms(context)] == ["drift_drag"]
+    taken = Context(
+        structure.with_terms("X_vv"), context.vessel, context.outputs, False, 900.0, 1.0, {}
+    )
+    assert drift_drag().atoms(taken) == []
+
+
+def test_classes_and_objects_register(drift_drag, monkeypatch):
+    assert "drift_drag" in known_causes()
+    register(monkeypatch, drift_drag())
+    assert list(known_causes())[-1] == "drift_drag"
+
+
+def test_an_id_in_use_is_refused(drift_drag, monkeypatch):
+    monkeypatch.setattr(drift_drag, "id", "current")
+    with pytest.raises(UsageError, match=r"'theirs' of greybox.causes takes the id 'current'"):
+        known_causes()
+
+
+def test_what_is_no_cause_is_refused(monkeypatch):
+    register(monkeypatch, "current")
+    with pytest.raises(UsageError, match=r"'theirs' of greybox.causes gives a str, no Cause"):
+        known_causes()
+
+
+def test_every_cause_is_documented():
+    described = re.findall(r"^#### `(\w+)`$", DOCUMENT, re.M)
+    assert sorted(described) == sorted(known_causes())
+    assert len(described) == len(set(described))
+
+
+def test_documentation_names_every_reference():
+    for cause in known_causes().values():
+        text = DOCUMENT[DOCUMENT.index(f"#### `{cause.id}`") :].split("\n#")[0]
+        flat = " ".join(text.split())
+        for author in re.findall(r"([A-Z][a-z]+)[^;(]* \(\d{4}\)", cause.reference):
+            assert author in flat, (cause.id, author)

@@ -1,0 +1,373 @@
+"""The page of a diagnosis: its story, its statistics, and legible in a real browser."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from browser import needs_browser, require_legible
+from virtual import PARAMETERS, virtual_log
+
+from greybox.diagnosis.result import Diagnosis, Found, Gain, Quantity, Ranked, Runs, Symptom
+from greybox.model.catalogue import get_structure
+from greybox.model.changes import Change
+from greybox.model.model import ManoeuvringModel
+from greybox.report.diagnosed_causes import probability
+from greybox.report.diagnosis import diagnosis_page
+from greybox.report.error_profiles import block_ids, memory, profile
+from greybox.report.free_run_errors import gather
+from greybox.report.model_difference import (
+    coefficient_table,
+    marked_equations,
+    other_changes,
+    with_error,
+)
+from greybox.report.page import render, write_page
+from greybox.study.chapter6 import TRUE
+from greybox.validation.fit import run_model
+from greybox.vessel.toml import load_vessel
+from greybox.vessel.vessel import Actuation
+
+HOSTILE = '<script>alert("x")</script> & $x^$'
+SIDE = {"v": -1, "r": -1, "psi": -1}
+VERDICTS = ("named", "none", "confused", "unexplained")
+RECORD = {"program": "greybox-marine 0.1.0", "command": {"logs": ["day1.csv"], "seed": 0},
+          "logs": ["day1.csv 0123456789ab"]}  # fmt: skip
+
+
+def model_of(names=PARAMETERS, **more):
+    structure = get_structure("thesis")
+    structure = structure.with_terms(*[n for n in names if n not in PARAMETERS])
+    theta = np.array([TRUE.get(n, -0.002) for n in structure.parameters])
+    return ManoeuvringModel(
+        structure, theta, np.diag((0.02 * theta) ** 2), 1.0, load_vessel("thesis"), **more
+    )
+
+
+def extended():
+    vessel = load_vessel("thesis")
+    first = replace(vessel.thrusters[0], gain=0.83, angle_offset=0.05)
+    second = replace(vessel.thrusters[1], angle="alpha9")
+    vessel = replace(
+        vessel, thrusters=(first, second, *vessel.thrusters[2:]),
+        actuation=Actuation(lag=2.5, delay=1.0),
+        sensors={**vessel.sensors, "heading_bias": 0.06, "clock": {"u": 1.5}, "reversed": ("r",),
+                 "velocity_at": (3.0, -1.0)},
+    )  # fmt: skip
+    model = model_of(
+        (*PARAMETERS, "N_|r|r"),
+        disturbances={"current_north": (0.2, 0.004), "current_east": (-0.2, 0.005)},
+        changes=(Change("Xu", 1.6, 600.0),),
+    )
+    return replace(model, vessel=vessel)
+
+
+def flown():
+    current = {"current_north": (0.2, 0.004), "current_east": (-0.2, 0.005)}
+    model = model_of((*PARAMETERS, "N_|r|r"), disturbances=current)
+    return replace(model, theta=np.append(model.theta[:-1], -1e-6))
+
+
+@cache
+def runs_of(names, same):
+    before = model_of()
+    after = before if same else flown()
+    out = []
+    for i, name in enumerate(names):
+        log = virtual_log(i, 600, wind=0.0, name=name)
+        x, y = (run_model(m, log).x.T for m in (before, after))
+        states = ("u", "v", "r")
+        if i:  # another day to port
+            log = replace(log, channels={k: SIDE.get(k, 1) * v for k, v in log.channels.items()})
+            x, y = (
+                [SIDE.get(s, 1) * row for s, row in zip(states, z, strict=True)] for z in (x, y)
+            )
+        out.append(
+            Runs(log, i > 0, {s: log[s] for s in states}, dict(zip(states, x, strict=True)),
+                 dict(zip(states, y, strict=True)))
+        )  # fmt: skip
+    return tuple(out)
+
+
+CURRENT = Found(
+    "current", "current", "current",
+    {"current_north": Quantity(0.203, 0.004, "m/s"),
+     "current_east": Quantity(-0.197, 0.005, "m/s")},
+    0.0, 1e-300, "the errors of surge and sway turn with the heading as in a current of 0.28 m/s "
+    "towards 316 deg", "the mean current, north and east", "Fossen (2011)", 5210.4, 1804.2, 95.1,
+)  # fmt: skip
+BIAS = Found(
+    "heading_bias", "heading_bias", "compass bias",
+    {"heading_bias": Quantity(0.0612, 0.0021, "rad")}, 3e-8, 1.2e-6,
+    "surge and sway are turned against the ship's axes by 3.5 ± 0.1 deg",
+    "the bias of the compass in the vessel", "Fossen (2011)", 61.2, 22.8, 9.4,
+)  # fmt: skip
+STEPS = (
+    (
+        Ranked("current", 4800.0, 5210.4, 1804.2, 95.1),
+        Ranked("heading_bias", 900.0, 1210.0, -240.0, 80.0),
+        Ranked("parameter_change:Xu", 610.0, 700.0, 30.0, 60.0),
+        Ranked("crossflow:Y_|r|v", 210.0, 180.0, 12.0, 21.0),
+        *[Ranked(f"thruster_gain:n:alpha{k}", 80.0 - 5 * k) for k in range(9)],
+    ),
+    (
+        Ranked("heading_bias", 55.0, 61.2, 22.8, 9.4),
+        Ranked("advance_speed:X_u*taux+Y_u*tauy+N_u*taun", 4.0),
+        Ranked("thruster_gain:n$x^{:<b>", 0.4),
+    ),
+)
+
+
+def diagnosis_of(verdict, name="day 2"):
+    same = verdict == "none"
+    base = model_of()
+    runs = runs_of(("day 1", name), same)
+    gain = {
+        "u": Gain(41.2, 41.2 if same else 88.1, (0.0, 0.0) if same else (43.0, 50.1)),
+        "v": Gain(-3e4 if verdict == "confused" else 35.0, 35.0 if same else 79.3, (31.0, 55.0)),
+        "r": Gain(81.0, 81.0 if same else 81.3, (-0.4, 1.0)),
+    }
+    return Diagnosis(
+        verdict=verdict,
+        causes=(CURRENT, BIAS) if verdict == "named" else (),
+        groups=(("current", "heading_bias"),) if verdict == "confused" else (),
+        gain=gain,
+        wrong=()
+        if same
+        else (
+            Symptom("surge is over-predicted by 0.21 m/s when heading south", "u", 14.2),
+            Symptom("sway is under-predicted by 0.19 m/s when heading east", "v", 12.9),
+        ),
+        partial=(CURRENT,) if verdict == "unexplained" else (),
+        candidates=(CURRENT, BIAS) if verdict == "confused" else (),
+        base=base,
+        model=base if same else flown(),
+        alternatives={},
+        remaining="What remains of the error is noise (p = 0.41).",
+        validated_on=f"on {name}, which nothing was fitted to",
+        next_steps=("Turn through all headings at one speed.", "Calibrate the compass."),
+        steps=STEPS[:1] if same else STEPS,
+        runs=runs,
+        notes=("The sample time of 1 s hides lags below 0.75 s.",),
+        tried=52,
+        record={"seed": 7},
+    )
+
+
+@pytest.fixture(scope="module")
+def pages():
+    return {v: diagnosis_page(diagnosis_of(v, HOSTILE), RECORD) for v in VERDICTS}
+
+
+def text_of(page):
+    return re.sub(r"<[^>]+>", "", re.sub(r"<svg.*?</svg>", "", render(page), flags=re.S))
+
+
+@pytest.mark.parametrize("verdict", VERDICTS)
+def test_story_in_its_order(pages, verdict):
+    shown = text_of(pages[verdict])
+    places = [shown.index(f"{k}. ") for k in range(1, 7)]
+    assert places == sorted(places)
+    assert f"Verdict: {verdict}, after 52 causes were tried." in shown
+    assert "What remains of the error is noise (p = 0.41)." in shown
+    assert "Calibrate the compass." in shown
+    assert "hides lags below 0.75 s" in shown
+    assert "0123456789ab" in shown
+    assert "greybox-marine 0.1.0" in shown
+
+
+@pytest.mark.parametrize("verdict", VERDICTS)
+def test_names_from_logs_are_escaped(pages, verdict):
+    html = render(pages[verdict])
+    assert "<script" not in html
+    assert "<b>" not in html
+    assert "&lt;script&gt;alert(&#34;x&#34;)&lt;/script&gt; &amp; $x^$" in html
+
+
+def test_nothing_is_fetched(pages):
+    html = render(pages["named"])
+    assert not re.search(r'(?:src|href)="(?!#)', html)
+    assert not re.search(r"url\((?!#)", html)
+
+
+def test_named(pages):
+    shown = text_of(pages["named"])
+    assert pages["named"].headline.startswith("Current: the errors of surge and sway turn")
+    assert "surge is over-predicted by 0.21 m/s when heading south" in shown
+    assert "surge from 41.2 % to 88.1 %" in shown
+    assert "0.2030 ± 0.0040" in shown
+    assert "3.51 ± 0.12 deg" in shown
+    assert "below 1e−16" in shown
+    assert "1804.2 ± 95.1" in shown
+    assert "current_north is 0.2000 ± 0.0040 m/s; before, the water stood still." in shown
+    assert "Extension for current: the mean current, north and east." in shown
+    assert "43.0 to 50.1" in shown
+    assert "<ins>N_|r|r·|r|·r</ins>" in render(pages["named"])
+
+
+def test_none(pages):
+    shown = text_of(pages["none"])
+    assert "Nothing is wrong beyond noise." in shown
+    assert "52 causes were tried; none of them proved itself." in shown
+    assert "The model stays as it is." in shown
+    assert "<ins>" not in render(pages["none"])
+    assert "before and after" not in pages["none"].sections[0].pictures[0].caption
+
+
+def test_confused(pages):
+    shown = text_of(pages["confused"])
+    assert "current or heading_bias. These logs cannot tell them apart." in shown
+    assert "greybox design --between" in shown
+    assert "heading_bias looks like sway in proportion to surge" in shown
+    assert "sway from diverged to 79.3 %" in shown
+    assert "drawn at the edge" in shown
+
+
+def test_unexplained(pages):
+    shown = text_of(pages["unexplained"])
+    assert "None of the 52 causes that were tried explains the errors. These help" in shown
+    assert "current: the errors of surge and sway" in shown
+
+
+def test_every_picture_says_what_it_shows(pages):
+    for page in pages.values():
+        pictures = [p for s in page.sections for p in s.pictures]
+        assert len(pictures) >= 6
+        assert all(len(p.alternative) > 60 for p in pictures)
+    runs = [p for p in pages["named"].sections[0].pictures if "Free run on" in p.caption]
+    assert ["held out" in p.caption for p in runs] == [False, True]
+    assert "Root mean square errors: surge [m/s] 0." in runs[0].alternative
+
+
+def test_logs_without_runs_or_gain():
+    bare = replace(diagnosis_of("unexplained"), runs=(), gain={}, steps=((),), partial=())
+    shown = text_of(diagnosis_page(bare, RECORD))
+    assert "No gain was measured." in shown
+    assert "<svg" not in render(diagnosis_page(bare, RECORD))
+
+
+def test_runs_that_run_away_are_left_out_and_said_so():
+    diagnosis = diagnosis_of("named")
+    run = diagnosis.runs[0]
+    wild = {s: np.where(np.arange(len(x)) < 500, x, np.inf) for s, x in run.before.items()}
+    diagnosis = replace(diagnosis, runs=(replace(run, before=wild), diagnosis.runs[1]))
+    errors = gather(diagnosis.runs)
+    assert errors.lost == 100
+    assert np.isfinite(errors.rms("before", "u"))
+    assert "runs away at 100 of 1200 samples" in text_of(diagnosis_page(diagnosis, RECORD))
+
+
+def test_runs_that_end_before_their_log():
+    run = diagnosis_of("named").runs[0]
+    short = replace(run, after={s: x[:-5] for s, x in run.after.items()})
+    errors = gather([short])
+    assert errors.lost == 5
+    assert (errors.regime[-5:] == -1).all()
+    assert errors.regimes == (0,)
+
+
+def test_causes_that_need_no_force_model():
+    kinematic = replace(BIAS, key="heading_bias:kinematics", gain=0.0)
+    shown = text_of(diagnosis_page(replace(diagnosis_of("named"), causes=(kinematic,)), RECORD))
+    assert "none needed" in shown
+    assert "0.0 ± " not in shown
+
+
+def test_what_changes_beside_the_equations():
+    told = " ".join(other_changes(model_of(), extended()))
+    for part in (
+        "gives 83.0 % of its thrust law, before 100 %",
+        "stands 2.86 deg (0.0500 rad) beyond its logged angle",
+        "a lag of 2.5 s of each force and a delay of 1 s; before, with no lag and no delay",
+        "Thruster 2 (n, alpha9) was driven by n, alpha2 before.",
+        "The compass shows 3.44 deg (0.0600 rad) too much.",
+        "u comes 1.50 s too late.",
+        "r has its sign turned.",
+        "3.00 m ahead and -1.00 m to starboard",
+        "Xu is 1.6 times its value from 600 s on, on the log's clock.",
+        "current_east is -0.2000 ± 0.0050 m/s",
+    ):
+        assert part in told
+    assert other_changes(model_of(), model_of()) == []
+
+
+def test_equations_are_marked_where_they_differ():
+    before, after = marked_equations(extended(), model_of())
+    assert [t for t, mark in before.pieces if mark == "del"] == ["N_|r|r·|r|·r"]
+    assert not any(mark for _, mark in after.pieces)
+    same = marked_equations(model_of(), model_of())
+    assert [m.title for m in same] == ["Equations"]
+
+
+def test_coefficients_that_stood_for_a_sum_are_told():
+    base = replace(model_of(), sums={"Xuu": ("Xuu", "Wuu")})
+    rows = {r[0]: r for r in coefficient_table(base, extended()).rows}
+    assert rows["Xuu"][-1] == "before: Xuu+Wuu"
+    assert rows["Xu"][-1] == ""
+    assert rows["N_|r|r"][1:] == ["", "-0.002000 ± 0.000040", "s", "new"]
+    assert coefficient_table(extended(), base).rows[-1][-1] == "gone"
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "shown"),
+    [
+        (0.31234, 0.0123, "0.312 ± 0.012"),
+        (1234.5, 12.0, "1234 ± 12"),
+        (3.2e-9, 1e-10, "3.2e−09 ± 1e−10"),
+        (0.25, 0.0, "0.25"),
+        (0.25, np.inf, "0.25"),
+    ],
+)
+def test_digits_follow_the_standard_error(value, std, shown):
+    assert with_error(value, std) == shown
+
+
+def test_probability():
+    assert probability(0.0123) == "0.012"
+    assert probability(0.0) == "below 1e−16"
+
+
+def test_intervals_of_means_hold_for_errors_with_a_memory():
+    """95 % intervals cover a zero mean about as often, where those of white noise would not."""
+    from scipy.signal import lfilter
+
+    rng = np.random.default_rng(11)
+    group = (np.arange(2000) // 20) % 4
+    series = lfilter([1], [1, -0.9], rng.standard_normal((300, 2000)))
+    inside, plain = [], []
+    for error in series:
+        found = profile(error, group, block_ids([error]), 4)
+        inside.append(np.abs(found.mean) < found.half)
+        white = [1.96 * error[group == g].std() / np.sqrt((group == g).sum()) for g in range(4)]
+        plain.append(np.abs(found.mean) < white)
+    # the four groups of a series are nearly independent
+    assert abs(np.mean(inside) - 0.95) < 4 * np.sqrt(0.95 * 0.05 / 1200) + 0.02
+    assert np.mean(plain) < 0.6
+
+
+def test_profile_is_exact_and_admits_ignorance():
+    value = np.r_[np.ones(50), 3 * np.ones(50)]
+    group = np.r_[np.zeros(50, int), np.ones(49, int), -1]
+    found = profile(value, group, np.arange(100) // 10, 3)
+    assert found.mean[:2] == pytest.approx([1, 3])
+    assert found.half[:2] == pytest.approx(0)
+    assert np.isnan(found.mean[2])
+    assert np.isnan(profile(value, group, np.arange(100) // 50, 2).half).all()
+    assert list(found.samples) == [50, 49, 0]
+
+
+def test_memory():
+    assert memory(np.zeros(10)) == 1
+    slow = np.sin(np.arange(400) * 2 * np.pi / 400)
+    assert 80 < memory(slow) < 120
+
+
+@needs_browser
+@pytest.mark.parametrize("verdict", VERDICTS)
+def test_in_a_browser(tmp_path, pages, verdict):
+    path = tmp_path / "page.html"
+    write_page(pages[verdict], path)
+    require_legible(path, 390)
