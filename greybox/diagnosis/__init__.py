@@ -1,0 +1,1 @@
+"""Diagnosis: what a simulation gets wrong, why, and what it gains to mend it."""

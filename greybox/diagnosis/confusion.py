@@ -23,8 +23,6 @@ Array = NDArray[np.float64]
 _CHANCE = 0.05
 # difference of −2 log L on all logs that decides by itself, whatever its standard error
 _DECISIVE = 12.0
-# and one that never does
-_NOTHING = 4.0
 
 
 def rivals(
@@ -59,7 +57,6 @@ def rivals(
         total = float(here.sum() + there.sum())
         all_logs = proof_of(np.concatenate([here, there]))
         alike_held = held.p_value > _CHANCE
-        alike = total < _NOTHING or all_logs.p_value > _CHANCE / 2
-        if total < _DECISIVE and alike_held or alike and alike_held:
+        if alike_held and (total < _DECISIVE or all_logs.p_value > _CHANCE / 2):
             out.append(other)
     return out

@@ -283,7 +283,7 @@ class _Report:
         problem = case.problem(found.base.integrator)
         return Diagnosis(
             verdict=ruling.verdict,
-            causes=tuple([*known, *([] if unexplained else shown)]),
+            causes=(*known, *([] if unexplained else shown)),
             groups=tuple(tuple(c.atom.cause for c in pair) for pair in groups),
             gain=gain,
             wrong=tuple(find_symptoms(problem, found.base)),
@@ -336,7 +336,7 @@ class _Report:
                 a.log, held,
                 {s: a.log[s] for s in a.fit},
                 {s: a.x[:, i] for i, s in enumerate(a.fit)},
-                {s: b.x[: len(a.x), i] for i, s in enumerate(b.fit)},
+                _as_shown(a, b),
             )
             for held, ones, twos in (
                 (False, [run_on(before, log) for log in self.case.logs],
@@ -404,6 +404,20 @@ def _likelier_story(model: ManoeuvringModel, logs: Sequence[TrialLog]) -> Manoeu
         )
 
     return settled if missed(settled) < missed(model) else model
+
+
+def _as_shown(before: LogFit, after: LogFit) -> dict[str, Array]:
+    """Return a run on a corrected log as its sensors would show it on the log as it is."""
+    if before.log.t[0] == after.log.t[0] and len(before.log) == len(after.log):
+        place = np.arange(len(after.log))
+    else:
+        place = np.searchsorted(before.log.t, after.log.t)
+    out = {}
+    for i, state in enumerate(after.fit):
+        shown = np.full(len(before.log), np.nan)
+        shown[place] = before.log[state][place] - (after.log[state] - after.x[:, i])
+        out[state] = shown
+    return out
 
 
 def _held_runs(pairs: Sequence[Pair]) -> list[LogFit]:

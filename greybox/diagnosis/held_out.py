@@ -15,6 +15,10 @@ from greybox.diagnosis.ship import Ship
 Array = NDArray[np.float64]
 
 
+# gain against a run that leaves every bound
+_FAR = 1e6
+
+
 @dataclass(frozen=True)
 class Proof:
     """Fall of −2 log L of held-out logs.
@@ -85,8 +89,9 @@ def proof_of(difference: Array) -> Proof:
     from scipy.stats import norm
 
     if not np.isfinite(difference).all():
-        worse = float(np.nan_to_num(difference, nan=-np.inf).sum())
-        return Proof(worse, 0.0, 1.0 if worse < 0 else 0.0, difference)
+        # one of the two runs away: no sum tells more than which
+        better = bool((difference > 0).all())
+        return Proof(_FAR if better else -_FAR, 0.0, 0.0 if better else 1.0, difference)
     gain = float(difference.sum())
     std = float(np.sqrt(long_run_variance(difference) * len(difference)))
     p = float(norm.sf(gain / std)) if std > 0 else float(gain <= 0)

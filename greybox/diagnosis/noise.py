@@ -242,45 +242,59 @@ def fit_noise(
     start : Noise, optional
         From which the search begins.
     """
-    from scipy.optimize import minimize
-
     found, chosen = [], []
     for g, group in enumerate(groups):
-        k = len(group)
-        parts = [e[:, list(group)] for e in errors]
-        change = np.sqrt(np.mean(np.vstack([np.diff(p, axis=0) ** 2 for p in parts]), axis=0) / 2)
-        # a channel without noise still needs a scale
-        level = np.maximum(change, 1e-12)
-        pole = float(np.clip(poles[group[0]], 0.0, _LONGEST))
-        rest = np.concatenate([level, [pole, sample_time]])
-        padded = []
-        for part in parts:
-            blocks = -(-len(part) // _UNROLLED)
-            series = np.zeros((k + 1, blocks * _UNROLLED))
-            series[:k, : len(part)] = part.T
-            series[k, : len(part)] = 1.0
-            padded.append((_likelihood(k, blocks), series))
-
-        def loss(x: Array) -> tuple[float, Array]:
-            value = _PRIOR_WEIGHT * float(x[1] - _PRIOR) ** 2
-            slope = np.zeros(len(x))
-            slope[1] = 2 * _PRIOR_WEIGHT * (x[1] - _PRIOR)
-            for function, series in padded:
-                v, s = function(x, rest, series)
-                value += float(v)
-                slope += np.array(s).ravel()
-            return value, slope
-
-        bounds = [_SHARE, _MEMORY, *[_LEVEL] * k]
-        firsts = [np.array([*s, *np.zeros(k)]) for s in _STARTS]
-        if start is not None:
-            firsts = [start.parameters[g]]
-        results = [
-            minimize(loss, x0, jac=True, method="L-BFGS-B", bounds=bounds,
-                     options={"maxiter": _MOST_STEPS, "ftol": 1e-6})
-            for x0 in firsts
-        ]  # fmt: skip
-        best = min(results, key=lambda result: float(result.fun))
-        found.append(_innovations_form(group, pole, sample_time, level, best.x))
-        chosen.append(np.asarray(best.x, float))
+        x, colour = _fit_group(
+            [e[:, list(group)] for e in errors], group, float(poles[group[0]]), sample_time,
+            None if start is None else start.parameters[g],
+        )  # fmt: skip
+        found.append(colour)
+        chosen.append(x)
     return Noise(tuple(found), tuple(chosen))
+
+
+def _fit_group(
+    parts: Sequence[Array],
+    group: tuple[int, ...],
+    pole: float,
+    sample_time: float,
+    start: Array | None,
+) -> tuple[Array, Colour]:
+    """Return the logarithms and memory of one group, and its innovations form."""
+    from scipy.optimize import minimize
+
+    k = len(group)
+    change = np.sqrt(np.mean(np.vstack([np.diff(p, axis=0) ** 2 for p in parts]), axis=0) / 2)
+    # a channel without noise still needs a scale
+    level = np.maximum(change, 1e-12)
+    pole = float(np.clip(pole, 0.0, _LONGEST))
+    rest = np.concatenate([level, [pole, sample_time]])
+    padded = []
+    for part in parts:
+        blocks = -(-len(part) // _UNROLLED)
+        series = np.zeros((k + 1, blocks * _UNROLLED))
+        series[:k, : len(part)] = part.T
+        series[k, : len(part)] = 1.0
+        padded.append((_likelihood(k, blocks), series))
+
+    def loss(x: Array) -> tuple[float, Array]:
+        value = _PRIOR_WEIGHT * float(x[1] - _PRIOR) ** 2
+        slope = np.zeros(len(x))
+        slope[1] = 2 * _PRIOR_WEIGHT * (x[1] - _PRIOR)
+        for function, series in padded:
+            v, s = function(x, rest, series)
+            value += float(v)
+            slope += np.array(s).ravel()
+        return value, slope
+
+    bounds = [_SHARE, _MEMORY, *[_LEVEL] * k]
+    firsts = [np.array([*s, *np.zeros(k)]) for s in _STARTS] if start is None else [start]
+    results = [
+        minimize(
+            loss, x0, jac=True, method="L-BFGS-B", bounds=bounds,
+            options={"maxiter": _MOST_STEPS, "ftol": 1e-6},
+        )
+        for x0 in firsts
+    ]  # fmt: skip
+    best = np.asarray(min(results, key=lambda result: float(result.fun)).x, float)
+    return best, _innovations_form(group, pole, sample_time, level, best)

@@ -1,0 +1,230 @@
+"""Simulator, recursion, noise and fitting of the diagnosis, each against something slow."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from greybox.diagnosis.atom import Atom, Parameter
+from greybox.diagnosis.causes import Context, known_causes
+from greybox.diagnosis.fitting import Point, Problem, bounded_step
+from greybox.diagnosis.held_out import long_run_variance, proof_of
+from greybox.diagnosis.noise import fit_noise, white_noise
+from greybox.diagnosis.recursion import propagate
+from greybox.diagnosis.ship import Change, LogRun, Sensors, Ship, shifted, wired
+from greybox.diagnosis.simulator import Simulator, sensitivities
+from greybox.diagnosis.waves import find_waves
+from greybox.model.catalogue import get_structure
+from greybox.model.simulation import simulate
+from greybox.study.blind import draw
+from greybox.study.chapter6 import TRUE
+from greybox.trial.log import TrialLog
+
+BASE = get_structure("thesis").without("Wuu", "Wvv", "Wuv")
+WIDE = BASE.with_terms("N_|r|r", "X_uuu", "Y_u*tauy")
+
+
+@pytest.fixture(scope="module")
+def log() -> TrialLog:
+    return draw(np.random.default_rng([5, 1]), kind="pulses", samples=300).estimation
+
+
+def _theta(structure) -> np.ndarray:
+    return np.array([TRUE.get(n, 0.0) for n in structure.parameters])
+
+
+def _point(run: LogRun, log: TrialLog) -> Point:
+    places = tuple(run.structure.index(n) for n in BASE.parameters)
+    return Point(Ship(_theta(WIDE), np.zeros(2), log.vessel), (run.start(),), places)
+
+
+def test_recursion_equals_a_loop() -> None:
+    rng = np.random.default_rng(1)
+    a = 0.5 * rng.standard_normal((40, 3, 3))
+    b, start = rng.standard_normal((40, 3, 5)), rng.standard_normal((3, 5))
+    expected = [start]
+    for k in range(40):
+        expected.append(a[k] @ expected[-1] + b[k])
+    np.testing.assert_allclose(propagate(a, b, start), expected, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("integrator", ["euler", "rk4"])
+def test_run_equals_the_free_run_and_differences(log: TrialLog, integrator) -> None:
+    run = LogRun(WIDE, log, integrator)
+    ship = Ship(_theta(WIDE), np.array([0.2, -0.1]), log.vessel)
+    start = run.start()
+    shown = run.run(ship, start)
+    d = np.array([0.2, -0.1, 0.0, 0.0])
+    expected = simulate(
+        WIDE, ship.theta, start[:3], log.forces(WIDE.inputs)[:-1], 1.0, psi=log["psi"], d=d,
+        integrator=integrator,
+    ).x[0]  # fmt: skip
+    np.testing.assert_allclose(shown.x, expected, atol=1e-9)
+    places = np.array([0, 5, len(ship.theta) + 1])
+    found = run.columns(ship, run.linearise(ship, shown), places)
+    for k, place in enumerate(places):
+        step = 1e-6
+        full = np.concatenate([ship.theta, ship.current])
+        up, down = (
+            run.run(ship.with_value(int(place), full[place] + s), start).y for s in (step, -step)
+        )
+        slope = (up - down) / (2 * step)
+        np.testing.assert_allclose(found[:, :, k], slope, atol=1e-5 * np.abs(slope).max())
+    # the start's own columns
+    moved = start.copy()
+    moved[1] += 1e-6
+    slope = (run.run(ship, moved).y - shown.y) / 1e-6
+    np.testing.assert_allclose(found[:, :, 4], slope, atol=1e-4)
+
+
+def test_a_change_is_two_runs(log: TrialLog) -> None:
+    run = LogRun(WIDE, log, "euler")
+    k = WIDE.index("Yv")
+    ship = Ship(_theta(WIDE), np.zeros(2), log.vessel, (Change(k, 2.0, 100.0),))
+    x = run.run(ship, run.start()).x
+    tau = log.forces(WIDE.inputs)
+    later = _theta(WIDE)
+    later[k] *= 2
+    first = simulate(WIDE, _theta(WIDE), run.start()[:3], tau[:100], 1.0, psi=log["psi"][:101])
+    then = simulate(WIDE, later, first.x[0, -1], tau[100:-1], 1.0, psi=log["psi"][100:])
+    np.testing.assert_allclose(x, np.vstack([first.x[0], then.x[0, 1:]]), atol=1e-9)
+
+
+def test_sensors_show_what_they_say(log: TrialLog) -> None:
+    run = LogRun(WIDE, log, "euler")
+    x = np.random.default_rng(2).standard_normal((len(log), 4, 1))
+    lever = run.sense(Sensors(lever=(3.0, -2.0)), x)
+    np.testing.assert_allclose(lever[:, 0], x[:, 0] + 2.0 * x[:, 2])
+    np.testing.assert_allclose(lever[:, 1], x[:, 1] + 3.0 * x[:, 2])
+    turned = run.sense(Sensors(turned=0.1), x)
+    np.testing.assert_allclose(turned[:, 0], np.cos(0.1) * x[:, 0] + np.sin(0.1) * x[:, 1])
+    late = run.sense(Sensors(late=(("v", 2.0),)), x)
+    np.testing.assert_allclose(late[2:, 1], x[:-2, 1])
+    np.testing.assert_array_equal(run.sense(Sensors(reversed=("r",)), x)[:, 2], -x[:, 2])
+    np.testing.assert_allclose(shifted(np.arange(5.0), 0.5), [0, 0.5, 1.5, 2.5, 3.5])
+    commands = {"a": np.ones(2), "b": np.zeros(2)}
+    out = wired(commands, (("a", "b", 1.0), ("b", "a", -1.0)))
+    np.testing.assert_array_equal(out["b"], -np.ones(2))
+
+
+def test_noise_is_found_and_whitened() -> None:
+    rng = np.random.default_rng(3)
+    samples = 4000
+    force, e = np.zeros(samples), np.zeros(samples)
+    for k in range(samples - 1):
+        force[k + 1] = 0.9 * force[k] + np.sqrt(1 - 0.9**2) * 0.05 * rng.standard_normal()
+        e[k + 1] = 0.8 * e[k] + force[k]
+    y = (e + 0.1 * rng.standard_normal(samples))[:, None]
+    noise = fit_noise([y], np.array([0.8]), 1.0, [(0,)])
+    (group,) = noise.groups
+    assert group.sensor[0] == pytest.approx(0.1, rel=0.05)
+    assert group.force == pytest.approx(0.05, rel=0.2)
+    assert group.memory == pytest.approx(0.9, abs=0.05)
+    nu = noise.whiten(y[:, :, None])[:, 0, 0]
+    assert nu.std() == pytest.approx(1.0, abs=0.02)
+    for lag in (1, 2, 5):
+        assert abs(np.corrcoef(nu[lag:], nu[:-lag])[0, 1]) < 3.5 / np.sqrt(samples)
+
+
+def test_whitening_equals_its_state_space() -> None:
+    rng = np.random.default_rng(4)
+    y = rng.standard_normal((200, 2))
+    (group,) = fit_noise([y], np.array([0.9, 1.0]), 1.0, [(0, 1)]).groups
+    x, expected = np.zeros(3), []
+    for row in y:
+        nu = row - group.c @ x
+        expected.append(np.linalg.solve(group.root, nu))
+        x = group.closed @ x + group.gain @ row
+    np.testing.assert_allclose(group.whiten(y[:, :, None])[:, :, 0], expected, atol=1e-8)
+
+
+def test_fit_equals_least_squares(log: TrialLog) -> None:
+    from scipy.optimize import least_squares
+
+    run = LogRun(WIDE, log, "rk4")
+    problem = Problem([run])
+    point = _point(run, log)
+    noise = white_noise(np.array([0.014, 0.014, 0.014, 0.01]))
+    fit = problem.fit(point, noise)
+    scale = np.maximum(np.abs(point.vector()), 1e-3)
+
+    def residual(z: np.ndarray) -> np.ndarray:
+        return (problem.errors(point.at(z * scale))[0] / [0.014, 0.014, 0.014, 0.01]).ravel()
+
+    other = least_squares(residual, point.vector() / scale, x_scale="jac")
+    assert fit.converged
+    assert (fit.nu[0] ** 2).sum() == pytest.approx(2 * other.cost, rel=1e-5)
+
+
+def test_bounded_step_equals_a_library() -> None:
+    from scipy.optimize import lsq_linear
+
+    rng = np.random.default_rng(5)
+    rows, target = rng.standard_normal((30, 4)), rng.standard_normal(30)
+    low, high = np.full(4, -0.05), np.full(4, 0.1)
+    found = bounded_step(rows.T @ rows, rows.T @ target, low, high, 0.0)
+    expected = lsq_linear(rows, target, bounds=(low, high)).x
+    loss = [float(((rows @ x - target) ** 2).sum()) for x in (found, expected)]
+    assert loss[0] <= loss[1] * 1.02
+    assert (found >= low).all() and (found <= high).all()
+
+
+def test_adding_and_dropping_an_atom_changes_nothing_else(log: TrialLog) -> None:
+    problem = Problem([LogRun(WIDE, log, "euler")])
+    point = _point(problem.runs[0], log)
+    columns = Atom("quadratic_yaw_damping", "q", (Parameter("N_|r|r", "1", 0.0),), ("N_|r|r",))
+    moved = problem.add(point, columns)
+    assert len(moved.vector()) == len(point.vector()) + 1
+    again = problem.drop(moved, columns)
+    np.testing.assert_array_equal(again.vector(), point.vector())
+
+
+def test_proof_counts_memory() -> None:
+    rng = np.random.default_rng(6)
+    slow = np.convolve(rng.standard_normal(5000), np.ones(10) / 10, "valid")
+    white = rng.standard_normal(5000)
+    assert long_run_variance(white) == pytest.approx(1.0, rel=0.3)
+    assert long_run_variance(slow) == pytest.approx(1.0, rel=0.4)
+    assert proof_of(white + 0.2).p_value < 1e-6
+    assert proof_of(np.full(10, np.inf)).p_value in (0.0, 1.0)
+
+
+def test_waves_are_a_line_and_humps_are_not() -> None:
+    rng = np.random.default_rng(7)
+    samples, t = 1200, np.arange(1200.0)
+    quiet = rng.standard_normal((samples, 3))
+    assert find_waves([quiet], [quiet], ("u", "v", "r"), 1.0) is None
+    line = quiet + 2 * np.sin(2 * np.pi * 0.11 * t)[:, None]
+    found = find_waves([line], [line], ("u", "v", "r"), 1.0)
+    assert found is not None
+    assert found.frequency == pytest.approx(0.11, abs=3 * found.frequency_std + 0.002)
+    assert found.std["u"] == pytest.approx(np.sqrt(2), rel=0.2)
+    hump = np.array([np.convolve(c, np.ones(4), "same") for c in quiet.T]).T
+    assert find_waves([hump], [hump], ("u", "v", "r"), 1.0) is None
+
+
+def test_every_cause_says_what_it_is(log: TrialLog) -> None:
+    context = Context(
+        BASE, log.vessel, ("u", "v", "r", "psi"), True, 1200.0, 1.0,
+        dict.fromkeys(("n1", "n2"), 15.0),
+    )  # fmt: skip
+    keys = []
+    for name, cause in known_causes().items():
+        assert cause.id == name
+        assert cause.title and cause.signature and cause.extension and cause.reference
+        for atom in cause.atoms(context):
+            keys.append(atom.key)
+            told = {p.name: (p.start, 0.1) for p in atom.parameters}
+            sentence = cause.evidence(told or {atom.key.split(":", 1)[1]: (-1.0, 0.0)})
+            assert len(sentence) > 20
+    assert len(keys) == len(set(keys)) > 40
+
+
+def test_sensitivities_of_nothing_are_those_of_the_start(log: TrialLog) -> None:
+    simulator = Simulator(WIDE, len(log), False, "euler")
+    drivers = np.column_stack([log.forces(WIDE.inputs), log["psi"], np.zeros((len(log), 4))])
+    x = simulator(np.array([1.5, 0.5, 0.0]), drivers, _theta(WIDE))
+    linear = simulator.linearise(x)
+    found = sensitivities(linear, np.zeros((len(log) - 1, 3, 0)))
+    np.testing.assert_allclose(found[0], np.eye(3))
+    np.testing.assert_allclose(found[1], linear.a[0])
