@@ -63,6 +63,7 @@ class Case:
         self.kind, self.regime = kind, regime
         self._problems: dict[Integrator, Problem] = {}
         self._held: dict[Integrator, HeldOut] = {}
+        self._rough: Mapping[str, float] | None = None
 
     def problem(self, integrator: Integrator) -> Problem:
         """Return the estimation logs, ready to be run."""
@@ -188,6 +189,29 @@ class Case:
         # errors of a model far off look like a force with a memory, and weigh little as that
         noise = fit_noise(errors, problem.poles(point), problem.sample_time, problem.groups)
         return replace(problem.settle(problem.fit(point, noise), 3), integrator=integrator)
+
+    def anew(self, fit: Fit) -> Fit:
+        """Return the fit from least-squares coefficients, if that ends lower.
+
+        Those of a model that lacked a cause may lie beyond a hill of the likelihood.
+        """
+        if self._rough is None:
+            self._rough = rough(self.structure, self.logs, self.kind, self.regime)[0]
+        problem = self.problem(fit.integrator)
+        base = fit.point.base
+        theta = np.array(
+            [
+                self._rough.get(n, 0.0) if n in self.structure.parameters else base.theta[i]
+                for i, n in enumerate(self.universe.parameters)
+            ]
+        )
+        point = replace(fit.point, base=replace(base, theta=theta))
+        errors = problem.errors(point)
+        if not all(np.isfinite(e).all() for e in errors):
+            return fit
+        noise = fit_noise(errors, problem.poles(point), problem.sample_time, problem.groups)
+        found = problem.settle(problem.fit(point, noise), 3)
+        return found if found.cost < fit.cost - _BETTER else fit
 
     def other_integrator(self, fit: Fit) -> Fit:
         """Return the fit with the other integrator, if that is likelier."""

@@ -19,7 +19,7 @@ from greybox.diagnosis.gain import gains, run_on
 from greybox.diagnosis.held_out import Pair
 from greybox.diagnosis.kinematics import causes_of, kinematic_findings, mended
 from greybox.diagnosis.result import Diagnosis, Found, Gain, Quantity, Ranked, Runs
-from greybox.diagnosis.search import Candidate, Search, search
+from greybox.diagnosis.search import Candidate, Search, instead, search
 from greybox.diagnosis.ship import CURRENTS
 from greybox.diagnosis.symptoms import find_symptoms
 from greybox.diagnosis.verdict import rule
@@ -304,14 +304,16 @@ class _Report:
 
     def _groups(self) -> list[list[Candidate]]:
         out = []
+        causes = self.found.causes
+        ids = {c.atom.cause for c in causes}
         for step in self.found.steps:
-            if step.taken is None:
+            if step.taken is None or not any(c.atom.key == step.taken.atom.key for c in causes):
                 continue
             best = next(c for c in step.candidates if c.atom.key == step.taken.atom.key)
-            if not any(c.atom.key == best.atom.key for c in self.found.causes):
-                continue
-            same = [c for c in step.candidates if c is not best]
-            like = rivals(self.case.problem, self.case.held_out, best, same)
+            others = [c for c in step.candidates if c.atom.cause not in ids]
+            if len(causes) > 1:
+                best, others = instead(self.case, self.found.final, best, others)
+            like = rivals(self.case.problem, self.case.held_out, best, others)
             if like:
                 out.append([best, *like])
         return out

@@ -25,6 +25,7 @@ from greybox.vessel.vessel import Vessel
 # parameters of each cause by the ids of the checks, in the order of a finding's values
 _NAMES = {"lever_arm": ("lever_arm_x", "lever_arm_y"), "heading_bias": ("heading_bias",)}
 _POSITIONS = ("x_n", "y_n")
+_MOTIONS = {"u", "v", "r", "psi"}
 # half a 95 % interval in standard errors
 _HALF = 1.96
 
@@ -39,9 +40,9 @@ def recording_of(log: TrialLog) -> Recording:
 
 
 def kinematic_findings(logs: Sequence[TrialLog]) -> list[Finding]:
-    """Return lever arms, heading biases and late positions that the logs prove themselves.
+    """Return what the logs prove themselves: lever arms, heading biases, reversed motions.
 
-    Clocks and signs of what forces act on are left to the force model, which sees
+    Clocks of what forces act on, and thrusters, are left to the force model, which sees
     them more sharply. Several logs must agree; the first one's values are taken.
     """
     each: list[list[Finding]] = []
@@ -62,6 +63,8 @@ def _kinematic(finding: Finding) -> bool:
     channels = set(finding.channels or (finding.channel,))
     if finding.id == "clock_offset":
         return channels <= {*_POSITIONS, "x", "y"}
+    if finding.id == "sign":
+        return channels <= _MOTIONS
     return finding.id in _NAMES
 
 
@@ -69,7 +72,8 @@ def found_by_checks(finding: Finding, cause: Cause, tried: int) -> Found:
     """Return a finding as a cause."""
     values = finding.value if isinstance(finding.value, tuple) else (finding.value,)
     cis = finding.ci if isinstance(finding.value, tuple) else (finding.ci,)
-    names = _NAMES.get(finding.id, tuple(f"clock_{c}" for c in finding.channels))
+    what = "sign" if finding.id == "sign" else "clock"
+    names = _NAMES.get(finding.id, tuple(f"{what}_{c}" for c in finding.channels))
     parameters = {}
     z = 0.0
     for name, value, ci in zip(names, values, cis, strict=False):
@@ -99,6 +103,9 @@ def mended(vessel: Vessel, findings: Sequence[Finding]) -> Vessel:
             for name in finding.channels or (finding.channel,):
                 clock[name] = clock.get(name, 0.0) + finding.value
             said["clock"] = clock
+        if finding.id == "sign":
+            turned = finding.channels or (finding.channel,)
+            said["reversed"] = tuple(dict.fromkeys([*said.get("reversed", ()), *turned]))
     return replace(vessel, sensors=said)
 
 

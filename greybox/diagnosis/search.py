@@ -27,6 +27,8 @@ _PROMISING = 0.04
 # iterations of a refit before its noise is settled
 _FIRST = 12
 MOST_CAUSES = 4
+# other causes that are tried in the place of one of several
+_INSTEAD = 2
 # rounds of noise and fit for a cause that was taken
 _SETTLE = 4
 # significance after correction, of a cause and of its effect on held-out logs
@@ -198,7 +200,10 @@ def take_step(case: Case, fit: Fit, causes: Sequence[Candidate], atoms: Sequence
         settled = problem if taken.fit.integrator == fit.integrator else case.problem(
             taken.fit.integrator
         )  # fmt: skip
-        taken = replace(taken, fit=case.other_integrator(settled.settle(taken.fit, _SETTLE)))
+        better = settled.settle(taken.fit, _SETTLE)
+        if not any(a.afresh for a in better.point.atoms):
+            better = case.anew(better)
+        taken = replace(taken, fit=case.other_integrator(better))
     return Step(fit, tuple(scores), tuple(candidates), taken)
 
 
@@ -244,3 +249,19 @@ def _backward(
             fit = without
             kept = [c for c in kept if c.atom.key != cause.atom.key]
     return fit, kept
+
+
+def instead(
+    case: Case, fit: Fit, best: Candidate, others: Sequence[Candidate]
+) -> tuple[Candidate, list[Candidate]]:
+    """Return one of several causes, and others in its place, all beside the remaining causes."""
+    problem, held_out = case.problem(fit.integrator), case.held_out(fit.integrator)
+    rest = problem.drop(fit.point, best.atom)
+    without = problem.settle(problem.fit(rest, fit.noise, most=_FIRST), 1)
+    out = []
+    for other in others[:_INSTEAD]:
+        k = [a.key for a in other.fit.point.atoms].index(other.atom.key)
+        value = other.fit.point.values[k]
+        score = Score(other.atom, value, other.gain)
+        out.append(judge(held_out, without, refit(problem, without, score), other.atom, 1))
+    return judge(held_out, without, fit, best.atom, 1), out

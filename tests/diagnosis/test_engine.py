@@ -166,7 +166,8 @@ def test_bounded_step_equals_a_library() -> None:
     expected = lsq_linear(rows, target, bounds=(low, high)).x
     loss = [float(((rows @ x - target) ** 2).sum()) for x in (found, expected)]
     assert loss[0] <= loss[1] * 1.02
-    assert (found >= low).all() and (found <= high).all()
+    assert (found >= low).all()
+    assert (found <= high).all()
 
 
 def test_adding_and_dropping_an_atom_changes_nothing_else(log: TrialLog) -> None:
@@ -211,7 +212,7 @@ def test_every_cause_says_what_it_is(log: TrialLog) -> None:
     keys = []
     for name, cause in known_causes().items():
         assert cause.id == name
-        assert cause.title and cause.signature and cause.extension and cause.reference
+        assert all([cause.title, cause.signature, cause.extension, cause.reference])
         for atom in cause.atoms(context):
             keys.append(atom.key)
             told = {p.name: (p.start, 0.1) for p in atom.parameters}
