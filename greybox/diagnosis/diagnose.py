@@ -278,11 +278,22 @@ class _Report:
         after = self.model(found.final, record) if found.causes else before
         alternatives = {c.atom.cause: self.model(c.fit, record) for c in members}
         shown = [self.cause(c, found.final, tried) for c in named]
-        unexplained = ruling.verdict == "unexplained"
         gain, runs, after = self._gain(before, after, validate, held.pairs(found.final))
+        notes = self._notes(after)
+        verdict = ruling.verdict
+        if found.causes and sum(g.after - g.before for g in gain.values()) < 0:
+            # likelier errors are no better simulation: nothing is extended by them
+            helped = ", ".join(c.atom.cause for c in found.causes)
+            notes.append(
+                f"{helped} made the held-out errors likelier but the free run no better, so the "
+                f"model was not extended."
+            )
+            gain, runs, after = self._gain(before, before, validate, held.pairs(found.base))
+            verdict = "unexplained"
+        unexplained = verdict == "unexplained"
         problem = case.problem(found.base.integrator)
         return Diagnosis(
-            verdict=ruling.verdict,
+            verdict=verdict,
             causes=(*known, *([] if unexplained else shown)),
             groups=tuple(tuple(c.atom.cause for c in pair) for pair in groups),
             gain=gain,
@@ -297,7 +308,7 @@ class _Report:
             next_steps=tuple(ruling.next_steps),
             steps=tuple(_ranked(s.scores, s.candidates) for s in found.steps),
             runs=tuple(runs),
-            notes=tuple(self._notes(after)),
+            notes=tuple(notes),
             tried=tried,
             record=record,
         )

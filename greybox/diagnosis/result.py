@@ -214,6 +214,11 @@ class Diagnosis:
                 f"{VERDICTS['confused']}: {' or '.join(self.groups[0])}. These logs cannot tell "
                 f"them apart."
             )
+        if self.verdict == "none" and self.wrong:
+            return (
+                "Nothing is wrong that would repeat: what moves the ship beside the model does not "
+                "come back in the held-out logs."
+            )
         return f"{VERDICTS[self.verdict][0].upper()}{VERDICTS[self.verdict][1:]}."
 
     def to_dict(self) -> dict[str, Any]:
