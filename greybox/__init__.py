@@ -16,6 +16,10 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from greybox.diagnosis.causes import known_causes
+    from greybox.diagnosis.causes.cause import Cause
+    from greybox.diagnosis.diagnose import DiagnosisOptions, diagnose
+    from greybox.diagnosis.result import Diagnosis
     from greybox.estimation.estimate import estimate_iv, estimate_ls
     from greybox.estimation.output_error import OutputErrorOptions, estimate_oe
     from greybox.estimation.output_setup import output_predictor
@@ -47,6 +51,11 @@ if TYPE_CHECKING:
     from greybox.vessel.vessel import Vessel
 
 _WHERE = {
+    "Cause": "greybox.diagnosis.causes.cause",
+    "Diagnosis": "greybox.diagnosis.result",
+    "DiagnosisOptions": "greybox.diagnosis.diagnose",
+    "diagnose": "greybox.diagnosis.diagnose",
+    "known_causes": "greybox.diagnosis.causes",
     "CheckReport": "greybox.trial.checks.finding",
     "Estimate": "greybox.estimation.result",
     "Finding": "greybox.trial.checks.finding",
@@ -93,7 +102,10 @@ _WHERE = {
 }
 
 __all__ = [
+    "Cause",
     "CheckReport",
+    "Diagnosis",
+    "DiagnosisOptions",
     "Estimate",
     "Finding",
     "ImportOptions",
@@ -112,6 +124,7 @@ __all__ = [
     "compare_models",
     "decimate",
     "describe_recording",
+    "diagnose",
     "estimate_iv",
     "estimate_ls",
     "estimate_model",
@@ -122,6 +135,7 @@ __all__ = [
     "get_structure",
     "import_files",
     "import_recording",
+    "known_causes",
     "load_model",
     "load_vessel",
     "make_log",

@@ -76,7 +76,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _run(options: argparse.Namespace) -> None:
-    from greybox.diagnosis.diagnose import Options, diagnose
+    from greybox.diagnosis.diagnose import DiagnosisOptions, diagnose
     from greybox.files import check_targets, write_json
     from greybox.model.catalogue import get_structure
     from greybox.model.model import load_model
@@ -93,7 +93,7 @@ def _run(options: argparse.Namespace) -> None:
         logs,
         model=model,
         validate=validate,
-        options=Options(
+        options=DiagnosisOptions(
             structure=options.structure,
             causes=options.causes,
             seed=options.seed,

@@ -42,7 +42,7 @@ _WIND_TERMS = ("Wuu", "Wvv", "Wuv")
 
 
 @dataclass(frozen=True)
-class Options:
+class DiagnosisOptions:
     """How a diagnosis is made.
 
     Parameters
@@ -68,7 +68,7 @@ def diagnose(
     *,
     model: ManoeuvringModel | None = None,
     validate: Sequence[TrialLog] = (),
-    options: Options = Options(),
+    options: DiagnosisOptions = DiagnosisOptions(),
 ) -> Diagnosis:
     """Find what a simulation gets wrong, name the cause, and extend the model.
 
@@ -82,7 +82,7 @@ def diagnose(
     validate : sequence of TrialLog
         Where causes prove themselves and the gain is measured; parts of `logs` held out
         in turn by default.
-    options : Options
+    options : DiagnosisOptions
 
     Returns
     -------

@@ -50,7 +50,7 @@ class Omnibus:
 
 
 def features(run: LogRun, fit: Fit, start: Array) -> Array:
-    """Return functions of what is simulated and commanded, (N, G), each of unit size."""
+    """Return functions of what is simulated and commanded, (N, G)."""
     ship = fit.point.ship
     x = run.run(ship, start).x
     tau = run.forces(ship.vessel, ship.wires)
@@ -81,9 +81,7 @@ def features(run: LogRun, fit: Fit, start: Array) -> Array:
     columns += [states[0] * np.cos(psi), states[0] * np.sin(psi)]
     later = run.time > run.time[-1] / 2
     columns += [later * column for column in (*states, *tau.T)]
-    made = np.column_stack(columns)
-    size = np.sqrt((made**2).mean(axis=0))
-    return np.asarray(made[:, size > 0])
+    return np.column_stack(columns)
 
 
 def _pushed(problem: Problem, fit: Fit, scales: Array | None) -> tuple[list[Array], Array]:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from greybox.commands.main import main
-from greybox.diagnosis.diagnose import Options, diagnose
+from greybox.diagnosis.diagnose import DiagnosisOptions, diagnose
 from greybox.diagnosis.gain import gains, run_on
 from greybox.errors import LogError, UsageError
 from greybox.model.catalogue import get_structure
@@ -77,12 +77,14 @@ def test_nothing_wrong_and_no_validation_log() -> None:
 def test_only_the_causes_that_are_asked_for() -> None:
     trial = _draw(3, "thruster_gain", kind="manoeuvres", samples=600)
     found = diagnose(
-        [trial.estimation], validate=[trial.validation], options=Options(causes=["current"])
+        [trial.estimation],
+        validate=[trial.validation],
+        options=DiagnosisOptions(causes=["current"]),
     )
     assert {c.id for c in found.causes} <= {"current"}
     assert found.tried == 1
     with pytest.raises(UsageError, match=r"no cause 'curent'\. Did you mean 'current'"):
-        diagnose([trial.estimation], options=Options(causes=["curent"]))
+        diagnose([trial.estimation], options=DiagnosisOptions(causes=["curent"]))
 
 
 def test_short_logs_are_refused_with_both_numbers() -> None:

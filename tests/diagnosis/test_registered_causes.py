@@ -13,7 +13,7 @@ from virtual import PARAMETERS
 
 from greybox.diagnosis import causes
 from greybox.diagnosis.causes import Context, known_causes
-from greybox.diagnosis.diagnose import Options, diagnose
+from greybox.diagnosis.diagnose import DiagnosisOptions, diagnose
 from greybox.errors import UsageError
 from greybox.model.catalogue import get_structure
 from greybox.model.simulation import simulate
@@ -65,7 +65,7 @@ def drifting_log(seed, drag, samples=700):
 
 def test_registered_cause_is_named(drift_drag):
     logs = [drifting_log(k, -0.02) for k in (1, 2)]
-    found = diagnose(logs[:1], validate=logs[1:], options=Options())
+    found = diagnose(logs[:1], validate=logs[1:], options=DiagnosisOptions())
     assert found.verdict == "named"
     assert [c.id for c in found.causes] == ["drift_drag"]
     value = found.causes[0].parameters["X_vv"]
