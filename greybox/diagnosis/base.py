@@ -128,11 +128,13 @@ class Case:
             No free run of the structure stays bounded.
         """
         found: list[Fit] = []
-        for values, last in self._first(coefficients):
-            # the slow way is for those who have found none
-            if last and any(not self._escapes(f) for f in found):
+        for values, spare in self._first(coefficients):
+            # these ways are for those who have found none
+            if spare and any(not self._escapes(f) for f in found):
                 break
-            fits = [self._fit(values(), current, i) for i in INTEGRATORS]
+            # further starts run with the integrator that the first one preferred
+            tried = [min(found, key=lambda f: f.cost).integrator] if found else INTEGRATORS
+            fits = [self._fit(values(), current, i) for i in tried]
             found += [f for f in fits if f is not None and not f.escaped]
             if any(self._follows(f) for f in found):
                 break
@@ -150,8 +152,9 @@ class Case:
 
     def _follows(self, fit: Fit) -> bool:
         """Whether a fit leaves little more than the sensors' noise, and holds elsewhere."""
-        if self._escapes(fit):
-            return False
+        return not self._escapes(fit) and self._near(fit)
+
+    def _near(self, fit: Fit) -> bool:
         sensor = np.concatenate([g.sensor for g in fit.noise.groups])
         places = np.concatenate([g.outputs for g in fit.noise.groups]).astype(int)
         errors = np.concatenate(fit.errors)[:, places]
@@ -162,7 +165,7 @@ class Case:
     def _first(
         self, coefficients: Mapping[str, float] | None
     ) -> Iterator[tuple[Callable[[], Mapping[str, float]], bool]]:
-        """Yield ways to first coefficients, the quickest first, and whether it is the last."""
+        """Yield ways to first coefficients, the quickest first, and whether it is a spare one."""
         if coefficients is not None:
             given = dict(coefficients)
             yield lambda: given, False
@@ -171,7 +174,7 @@ class Case:
         if self.structure.disturbance == "marine" and self.kind == "basic":
             # columns for a current and a wind, so that they bias the others less
             yield lambda: rough(*case, "augmented", self.regime)[0], False
-        yield lambda: steady(self.structure, self.logs, self.regime), False
+        yield lambda: steady(self.structure, self.logs, self.regime), True
         yield lambda: careful(*case, self.kind, self.regime), True
 
     def _fit(
@@ -205,6 +208,8 @@ class Case:
 
         Those of a model that lacked a cause may lie beyond a hill of the likelihood.
         """
+        if self._near(fit):
+            return fit
         if self._rough is None:
             self._rough = rough(self.structure, self.logs, self.kind, self.regime)[0]
         problem = self.problem(fit.integrator)

@@ -54,6 +54,8 @@ def kinematic_findings(logs: Sequence[TrialLog]) -> list[Finding]:
         except GreyboxError:
             return []
         each.append([f for f in report.findings if _kinematic(f)])
+        if not each[-1]:
+            return []
     ids = [{f.id for f in found} for found in each]
     shared = set.intersection(*ids) if ids else set()
     return [f for f in each[0] if f.id in shared] if each else []

@@ -29,7 +29,8 @@ _SHARE, _MEMORY, _LEVEL = (-7.0, 3.0), (-4.0, 6.0), (-3.0, 3.0)
 _STARTS = ((-3.0, 1.0), (-1.0, 2.5))
 _PRIOR, _PRIOR_WEIGHT = 1.0, 0.02
 _UNROLLED = 10
-_MOST_STEPS = 40
+# iterations of a search, and of one that begins near
+_MOST_STEPS, _NEAR_STEPS = 40, 10
 
 
 @dataclass(frozen=True)
@@ -292,7 +293,7 @@ def _fit_group(
     results = [
         minimize(
             loss, x0, jac=True, method="L-BFGS-B", bounds=bounds,
-            options={"maxiter": _MOST_STEPS, "ftol": 1e-6},
+            options={"maxiter": _MOST_STEPS if start is None else _NEAR_STEPS, "ftol": 1e-6},
         )
         for x0 in firsts
     ]  # fmt: skip
