@@ -19,7 +19,7 @@ from greybox.diagnosis.gain import gains, run_on
 from greybox.diagnosis.held_out import Pair
 from greybox.diagnosis.kinematics import causes_of, kinematic_findings, mended
 from greybox.diagnosis.result import Diagnosis, Found, Gain, Quantity, Ranked, Runs
-from greybox.diagnosis.search import Candidate, Search, instead, search
+from greybox.diagnosis.search import Candidate, Search, backwards, instead, search
 from greybox.diagnosis.ship import CURRENTS
 from greybox.diagnosis.symptoms import find_symptoms
 from greybox.diagnosis.verdict import rule
@@ -378,6 +378,12 @@ class _Report:
             out.append(
                 "the coefficients of the model were estimated anew on these logs before causes "
                 "were judged; 'before' is the model as it was given."
+            )
+        turned = backwards(self.found.final, self.case.universe.parameters)
+        if turned:
+            out.append(
+                f"{', '.join(turned)} came out negative: some thruster's column has the wrong sign "
+                f"or stands in another's place; greybox check tells which."
             )
         for change in after.changes:
             out.append(f"the extended model tells the log's own clock: {change.sentence}.")

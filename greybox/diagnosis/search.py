@@ -27,6 +27,9 @@ _PROMISING = 0.04
 # iterations of a refit before its noise is settled
 _FIRST = 12
 MOST_CAUSES = 4
+# coefficients that are positive where thrusters push as the vessel file says, and the
+# price of a negative one in numbers
+_THRUST, _BACKWARDS = ("Xmu", "Ymu", "Nmu"), 3
 # other causes that are tried in the place of one of several
 _INSTEAD = 2
 # rounds of noise and fit for a cause that was taken
@@ -52,6 +55,8 @@ class Candidate:
         Of that fall, and after correction for the number of causes tried (Holm).
     proof : Proof
         What it does for held-out logs.
+    names : tuple of str
+        Of the coefficients.
     """
 
     atom: Atom
@@ -60,12 +65,14 @@ class Candidate:
     p_value: float
     p_adjusted: float
     proof: Proof
+    names: tuple[str, ...] = ()
 
     @property
     def relevant(self) -> bool:
         """Whether the cause is large enough to matter, and to tell from sampling."""
         numbers = sum(nu.size for nu in self.fit.nu)
-        return self.gain > RELEVANT * numbers and not self.unresolved
+        both = (self.gain + self.proof.gain) / 2
+        return max(self.gain, both) > RELEVANT * numbers and not self.unresolved
 
     @property
     def unresolved(self) -> bool:
@@ -192,9 +199,10 @@ def take_step(case: Case, fit: Fit, causes: Sequence[Candidate], atoms: Sequence
     if not causes:
         fits += case.rewired(fit, left)
     candidates = sorted(
-        (judge(held_out, fit, found, atom, len(left)) for atom, found in fits), key=_merit
+        (judge(held_out, fit, found, atom, len(left), problem.names) for atom, found in fits),
+        key=_merit,
     )
-    taken = next((c for c in candidates[:1] if c.holds), None)
+    taken = next((c for c in candidates if c.holds), None)
     if taken is not None:
         # what the noise had taken for its own until now would pass for more causes
         settled = problem if taken.fit.integrator == fit.integrator else case.problem(
@@ -221,18 +229,33 @@ def _names(atom: Atom) -> list[str]:
 
 
 def _merit(candidate: Candidate) -> float:
-    """Return −2 log L with the price of each number (Schwarz, 1978)."""
+    """Return −2 log L of all logs with the price of each number (Schwarz, 1978).
+
+    What a cause does for held-out logs counts as much as what it was fitted to: there
+    a wrong one falls behind. A thruster that pulls where it should push has a price too:
+    reversed columns may otherwise be taken for each other.
+    """
     samples = sum(len(n) for n in candidate.fit.nu)
-    return candidate.fit.cost + _dof(candidate.atom) * float(np.log(samples))
+    price = _dof(candidate.atom) + _BACKWARDS * len(backwards(candidate.fit, candidate.names))
+    return candidate.fit.cost - candidate.proof.gain + price * float(np.log(samples))
 
 
-def judge(held_out: HeldOut, before: Fit, fit: Fit, atom: Atom, tried: int) -> Candidate:
+def backwards(fit: Fit, names: Sequence[str]) -> list[str]:
+    """Return coefficients of thrust that are negative, as no thruster makes them."""
+    theta = dict(zip(names, fit.point.base.theta, strict=False))
+    return [n for n in _THRUST if theta.get(n, 0.0) < 0]
+
+
+def judge(
+    held_out: HeldOut, before: Fit, fit: Fit, atom: Atom, tried: int, names: tuple[str, ...] = ()
+) -> Candidate:
     """Return a refitted cause with its significance and what it does for held-out logs."""
     from scipy.stats import chi2
 
     gain = before.cost - fit.cost if np.isfinite(fit.cost) else -np.inf
     p = float(chi2.sf(max(gain, 0.0), _dof(atom)))
-    return Candidate(atom, fit, gain, p, min(1.0, p * tried), held_out.prove(before, fit))
+    proof = held_out.prove(before, fit)
+    return Candidate(atom, fit, gain, p, min(1.0, p * tried), proof, names)
 
 
 def _backward(
