@@ -29,6 +29,8 @@ class Parameter:
         Physical bounds.
     null : float
         The value that leaves the model as it is.
+    coarse : float
+        Standard error that sampling leaves at least.
     step : float
         For its derivative by differences, and its scale.
     least : float
@@ -43,6 +45,7 @@ class Parameter:
     null: float = 0.0
     step: float = 1e-4
     least: float = 0.0
+    coarse: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -63,6 +66,8 @@ class Atom:
         ``(ship, values) -> ship``.
     starts : tuple of tuple of float
         Further values to begin from, where the likelihood has several hills.
+    variants : tuple of Atom
+        The same with other conventions of sampling, of which the likeliest is kept.
     afresh : bool
         Whether the coefficients must be sought anew: what it changes is too much for
         derivatives.
@@ -74,6 +79,7 @@ class Atom:
     columns: tuple[str, ...] = ()
     apply: Callable[[Ship, Array], Ship] | None = None
     starts: tuple[tuple[float, ...], ...] = ()
+    variants: tuple[Atom, ...] = ()
     afresh: bool = False
 
     @property

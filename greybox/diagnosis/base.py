@@ -236,6 +236,16 @@ class Case:
         better = not found.escaped and found.cost < fit.cost - _BETTER
         return replace(found, integrator=other) if better else fit
 
+    def likeliest_variant(self, fit: Fit, atom: Atom) -> Fit:
+        """Return the fit with the convention of sampling that the logs ask for."""
+        problem = self.problem(fit.integrator)
+        for variant in atom.variants:
+            atoms = tuple(variant if a.key == atom.key else a for a in fit.point.atoms)
+            found = problem.settle(problem.fit(replace(fit.point, atoms=atoms), fit.noise), 1)
+            if not found.escaped and found.cost < fit.cost - _BETTER:
+                fit = found
+        return fit
+
     def rewired(self, fit: Fit, atoms: Sequence[Atom]) -> list[tuple[Atom, Fit]]:
         """Return fits from first coefficients of their own, for atoms that ask for it.
 

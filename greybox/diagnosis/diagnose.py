@@ -254,7 +254,7 @@ class _Report:
         if not index:
             return {atom.key.split(":", 1)[1]: Quantity(-1.0, 0.0, "1")}
         return {
-            p.name: Quantity(float(values[i]), float(std[i]), p.unit)
+            p.name: Quantity(float(values[i]), float(np.hypot(std[i], p.coarse)), p.unit)
             for p, i in zip(atom.parameters, index, strict=True)
         }
 

@@ -211,7 +211,8 @@ def take_step(case: Case, fit: Fit, causes: Sequence[Candidate], atoms: Sequence
         better = settled.settle(taken.fit, _SETTLE)
         if not any(a.afresh for a in better.point.atoms):
             better = case.anew(better)
-        taken = replace(taken, fit=case.other_integrator(better))
+        better = case.other_integrator(better)
+        taken = replace(taken, fit=case.likeliest_variant(better, taken.atom))
     return Step(fit, tuple(scores), tuple(candidates), taken)
 
 

@@ -141,6 +141,9 @@ class LogRun:
         air = log.air
         self.air_measured = air is not None and structure.uses_air
         self._air = air if air is not None else np.zeros((len(log), 2))
+        if integrator == "rk4":
+            # as the free run of a model does: the ship turns during a step
+            self._psi, self._air = _between(self._psi), _between(self._air)
         self._commands = {c: log[c] for c in log.vessel.commands}
         self._simulator = Simulator(structure, len(log), self.air_measured, integrator)
         self._trapezoid = integrator == "rk4"
@@ -257,6 +260,11 @@ class LogRun:
             first[:, -1] = 1.0
             slope = np.concatenate([slope, first], axis=2)
         return self.sense(ship.sensors, slope)
+
+
+def _between(value: Array) -> Array:
+    """Return what is measured at samples (N, ...) at the middle of each step, the last as it is."""
+    return np.concatenate([(value[1:] + value[:-1]) / 2, value[-1:]])
 
 
 def wired(commands: Mapping[str, Array], wires: Sequence[Wire]) -> dict[str, Array]:

@@ -134,12 +134,17 @@ def simulate(
     series: list[Array] = [np.broadcast_to(tau, (runs, samples, tau.shape[2]))]
     if heading == "measured" and structure.disturbance == "marine":
         measured = np.zeros(samples + 1) if psi is None else np.asarray(psi, float)
+        if integrator == "rk4":
+            measured = _between(measured, samples)
         series.append(np.broadcast_to(measured[..., :samples, None], (runs, samples, 1)))
     if d is not None:
         d = np.asarray(d, float)
         series.append(np.broadcast_to(d, (runs, samples, d.shape[-1])))
     if air is not None:
-        series.append(np.broadcast_to(np.asarray(air, float), (runs, samples, 2)))
+        blow = np.asarray(air, float)
+        if integrator == "rk4":
+            blow = np.moveaxis(_between(np.moveaxis(blow, -1, -2), samples), -2, -1)
+        series.append(np.broadcast_to(blow, (runs, samples, 2)))
     x0 = np.broadcast_to(x0, (runs, nx))
     start = np.broadcast_to(np.asarray(psi0, float), (runs,))
     theta = np.broadcast_to(theta, (runs, theta.shape[1]))
@@ -167,6 +172,17 @@ def simulate(
         outside = np.asarray(~(np.abs(x) <= bound).all(axis=2))
     diverged = np.where(outside.any(axis=1), outside.argmax(axis=1), -1)
     return FreeRun(x, angle, diverged, np.asarray(bound, float))
+
+
+def _between(value: Array, steps: int) -> Array:
+    """Return what is measured at samples (..., N) at the middle of each step, (..., steps).
+
+    The ship turns during a step; the last value stands where no next one is known.
+    """
+    out = value[..., :steps].copy()
+    known = min(steps, value.shape[-1] - 1)
+    out[..., :known] = (value[..., :known] + value[..., 1 : known + 1]) / 2
+    return np.asarray(out)
 
 
 def _few(

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.vessel.force import generalised_force
-from greybox.vessel.vessel import Actuation, Vessel
+from greybox.vessel.vessel import Actuation, LagHeld, Vessel
 
 Array = NDArray[np.float64]
 
@@ -48,12 +48,14 @@ def actuated_force(
     samples = late.lag / sample_time
     if late.lag_on == "force":
         made = generalised_force(vessel, moved)
-        return {name: lagged(value, samples) for name, value in made.items()}
+        return {name: lagged(value, samples, late.lag_held) for name, value in made.items()}
     speeds = {t.speed for t in vessel.thrusters}
     return generalised_force(
         vessel,
         {
-            c: lagged(value, samples) if late.lag_on == "command" or c in speeds else value
+            c: lagged(value, samples, late.lag_held)
+            if late.lag_on == "command" or c in speeds
+            else value
             for c, value in moved.items()
         },
     )
@@ -102,8 +104,11 @@ def delayed(value: Array, samples: float) -> Array:
     return np.asarray((1 - share) * value[..., before] + share * value[..., after])
 
 
-def lagged(value: Array, samples: float) -> Array:
-    """Pass a signal (..., N) through a lag of this many samples, at rest on its first value."""
+def lagged(value: Array, samples: float, held: LagHeld = "start") -> Array:
+    """Pass a signal (..., N) through a lag of this many samples, at rest on its first value.
+
+    Of each sample the value at its start, its mean over the sample, or that at its end.
+    """
     from scipy.signal import lfilter
 
     value = np.asarray(value, float)
@@ -111,4 +116,6 @@ def lagged(value: Array, samples: float) -> Array:
         return value
     a = np.exp(-1.0 / samples)
     out, _ = lfilter([0.0, 1.0 - a], [1.0, -a], value, axis=-1, zi=value[..., :1])
-    return np.asarray(out)
+    if held == "mean":
+        return np.asarray(value + (out - value) * (1 - a) * samples)
+    return np.asarray(out if held == "start" else value + (out - value) * a)

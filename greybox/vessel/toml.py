@@ -313,11 +313,12 @@ def _thruster(table: Any, number: int) -> Thruster:
 
 
 def _actuation(table: Any) -> Actuation:
-    _known_keys(table, ("lag", "lag_on", "delay"), "[actuation]")
+    _known_keys(table, ("lag", "lag_on", "delay", "lag_held"), "[actuation]")
     return Actuation(
         lag=_number(table.get("lag", 0.0), "lag of [actuation]"),
         lag_on=table.get("lag_on", "force"),
         delay=_number(table.get("delay", 0.0), "delay of [actuation]"),
+        lag_held=table.get("lag_held", "start"),
     )
 
 

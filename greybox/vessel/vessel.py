@@ -91,6 +91,7 @@ class Thruster:
 
 
 LagOn = Literal["force", "speed", "command"]
+LagHeld = Literal["start", "mean", "end"]
 
 
 @dataclass(frozen=True)
@@ -106,16 +107,19 @@ class Actuation:
         all commands.
     delay : float
         Pure delay of all commands [s].
+    lag_held : {"start", "mean", "end"}
+        Which value of what follows slowly acts during a sample.
 
     Raises
     ------
     VesselError
-        A time is negative or not finite, or `lag_on` is none of the three.
+        A time is negative or not finite, or `lag_on` or `lag_held` is none of the three.
     """
 
     lag: float = 0.0
     lag_on: LagOn = "force"
     delay: float = 0.0
+    lag_held: LagHeld = "start"
 
     def __post_init__(self) -> None:
         for name, value in (("lag", self.lag), ("delay", self.delay)):
@@ -124,12 +128,15 @@ class Actuation:
                     f"{name} of [actuation] is {value:g} s, it must be zero or positive: "
                     f"correct it."
                 )
-        if self.lag_on not in get_args(LagOn):
-            raise VesselError(
-                f"lag_on of [actuation] is '{self.lag_on}'."
-                f"{suggestion(str(self.lag_on), get_args(LagOn))} "
-                f"Use {', '.join(get_args(LagOn))}."
-            )
+        for key, chosen, known in (
+            ("lag_on", self.lag_on, get_args(LagOn)),
+            ("lag_held", self.lag_held, get_args(LagHeld)),
+        ):
+            if chosen not in known:
+                raise VesselError(
+                    f"{key} of [actuation] is '{chosen}'.{suggestion(str(chosen), known)} "
+                    f"Use {', '.join(known)}."
+                )
 
     def __bool__(self) -> bool:
         return self.lag > 0 or self.delay > 0

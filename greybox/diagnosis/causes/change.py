@@ -43,7 +43,7 @@ class ParameterChange(Cause):
                 Parameter(
                     f"{term.name}_time", "s", 0.5 * context.duration,
                     _EARLIEST * context.duration, _LATEST * context.duration,
-                    step=0.5 * context.sample_time,
+                    step=0.5 * context.sample_time, coarse=0.5 * context.sample_time,
                 ),
             )  # fmt: skip
             out.append(Atom(self.id, f"{self.id}:{term.name}", parameters, (), apply))

@@ -14,7 +14,7 @@ from greybox.diagnosis.causes.cause import Cause, Context
 from greybox.diagnosis.causes.hull import listed, term_atom
 from greybox.diagnosis.causes.sensors import UNRESOLVED
 from greybox.diagnosis.ship import Ship
-from greybox.vessel.vessel import LagOn, Thruster
+from greybox.vessel.vessel import LagHeld, LagOn, Thruster
 
 Array = NDArray[np.float64]
 
@@ -82,22 +82,22 @@ class ThrusterLag(Cause):
     def atoms(self, context: Context) -> Sequence[Atom]:
         """Return a lag of the forces, the propeller speeds, or all commands."""
         longest = min(_LONGEST, _SHARE * context.duration)
-        out = []
-        for on in get_args(LagOn):
+        first = 2 * context.sample_time
+        parameter = Parameter(
+            "lag", "s", first, 1e-3, longest, step=1e-3, least=UNRESOLVED * context.sample_time
+        )
 
-            def apply(ship: Ship, value: Array, on: LagOn = on) -> Ship:
-                late = replace(ship.vessel.actuation, lag=float(value[0]), lag_on=on)
+        def lag(on: LagOn, held: LagHeld, variants: tuple[Atom, ...] = ()) -> Atom:
+            def apply(ship: Ship, value: Array) -> Ship:
+                late = replace(ship.vessel.actuation, lag=float(value[0]), lag_on=on, lag_held=held)
                 return replace(ship, vessel=replace(ship.vessel, actuation=late))
 
-            first = 2 * context.sample_time
-            out.append(
-                Atom(
-                    self.id, f"{self.id}:{on}",
-                    (Parameter("lag", "s", first, 1e-3, longest, step=1e-3,
-                               least=UNRESOLVED * context.sample_time),), (), apply,
-                    starts=((4 * first,),),
-                )
-            )  # fmt: skip
+            return Atom(
+                self.id, f"{self.id}:{on}", (parameter,), (), apply, ((4 * first,),), variants
+            )
+
+        # a simulated trial may hold another value than the mean during a sample
+        out = [lag(on, "mean", (lag(on, "start"), lag(on, "end"))) for on in get_args(LagOn)]
         return out
 
     def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
