@@ -66,6 +66,9 @@ class Atom:
         ``(ship, values) -> ship``.
     starts : tuple of tuple of float
         Further values to begin from, where the likelihood has several hills.
+    beside : tuple of str
+        Coefficients that become free with the cause, because without it others imitate
+        them.
     variants : tuple of Atom
         The same with other conventions of sampling, of which the likeliest is kept.
     afresh : bool
@@ -80,6 +83,7 @@ class Atom:
     apply: Callable[[Ship, Array], Ship] | None = None
     starts: tuple[tuple[float, ...], ...] = ()
     variants: tuple[Atom, ...] = ()
+    beside: tuple[str, ...] = ()
     afresh: bool = False
 
     @property

@@ -188,7 +188,7 @@ def _case(
     logs: Sequence[TrialLog],
     validate: Sequence[TrialLog],
 ) -> Case:
-    names = dict.fromkeys(n for a in atoms for n in a.columns)
+    names = dict.fromkeys(n for a in atoms for n in (*a.columns, *a.beside))
     added = [n for n in names if n not in structure.parameters and n not in CURRENTS]
     universe = structure.with_terms(*added)
     wind = universe.uses_air and all(log.has_wind for log in [*logs, *validate])

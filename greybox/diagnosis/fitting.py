@@ -162,7 +162,7 @@ class Problem:
             return replace(
                 point, atoms=(*point.atoms, atom), values=(*point.values, np.array(value, float))
             )
-        places = [self.place(n) for n in atom.columns]
+        places = [self.place(n) for n in (*atom.columns, *atom.beside)]
         new = [i for i in places if i not in point.places]
         return replace(
             point,
@@ -177,7 +177,7 @@ class Problem:
         base = point.base
         places = point.places
         if atom.apply is None:
-            gone = [self.place(n) for n in atom.columns]
+            gone = [self.place(n) for n in (*atom.columns, *atom.beside)]
             for i in gone:
                 base = base.with_value(i, 0.0)
             places = tuple(i for i in places if i not in gone)

@@ -40,6 +40,8 @@ class Current(Cause):
                     for n in ("current_north", "current_east")
                 ),
                 columns=("current_north", "current_east"),
+                # in still air the hull feels its velocity over ground, not through the water
+                beside=() if context.has_wind else context.lacking("Wuu", "Wvv", "Wuv"),
             ),
         )  # fmt: skip
 
