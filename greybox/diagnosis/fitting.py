@@ -343,7 +343,7 @@ class Problem:
                 return fit
             noise = fit_noise(
                 fit.errors, self.poles(fit.point), self.sample_time, self.groups,
-                fit.noise if fit.noise.estimated else None,
+                fit.noise,
             )  # fmt: skip
             before = self.whitened(noise, fit.errors)[1]
             fit = self.fit(fit.point, noise)

@@ -101,13 +101,10 @@ class Noise:
         Whose outputs together are all channels.
     parameters : tuple of ndarray
         Logarithms and memory that each was made from.
-    estimated : bool
-        Whether they come from errors.
     """
 
     groups: tuple[Colour, ...]
     parameters: tuple[Array, ...]
-    estimated: bool = True
 
     def whiten(self, e: Array) -> Array:
         """Return innovations (N, ny, m) of errors or sensitivities (N, ny, m)."""
@@ -120,22 +117,6 @@ class Noise:
     def log_det(self) -> float:
         """Of all groups."""
         return sum(g.log_det for g in self.groups)
-
-
-def white_noise(sigma: Array) -> Noise:
-    """Return noise without memory of the given deviations (ny,)."""
-    groups = tuple(
-        Colour(
-            (i,),
-            np.ones((1, 1)),
-            np.zeros((1, 1)),
-            np.zeros((1, 1)),
-            np.array([[s]]),
-            np.array([s]),
-        )
-        for i, s in enumerate(sigma)
-    )
-    return Noise(groups, tuple(np.zeros(3) for _ in sigma), estimated=False)
 
 
 def _system(

@@ -9,7 +9,7 @@ from greybox.diagnosis.atom import Atom, Parameter
 from greybox.diagnosis.causes import Context, known_causes
 from greybox.diagnosis.fitting import Point, Problem, bounded_step
 from greybox.diagnosis.held_out import long_run_variance, proof_of
-from greybox.diagnosis.noise import fit_noise, white_noise
+from greybox.diagnosis.noise import Colour, Noise, fit_noise
 from greybox.diagnosis.recursion import propagate
 from greybox.diagnosis.ship import Change, LogRun, Sensors, Ship, shifted, wired
 from greybox.diagnosis.simulator import Simulator, sensitivities
@@ -144,7 +144,10 @@ def test_fit_equals_least_squares(log: TrialLog) -> None:
     run = LogRun(WIDE, log, "rk4")
     problem = Problem([run])
     point = _point(run, log)
-    noise = white_noise(np.array([0.014, 0.014, 0.014, 0.01]))
+    one = np.ones((1, 1))
+    sigma = (0.014, 0.014, 0.014, 0.01)
+    white = (Colour((i,), one, 0 * one, 0 * one, s * one, s * one[0]) for i, s in enumerate(sigma))
+    noise = Noise(tuple(white), ())
     fit = problem.fit(point, noise)
     scale = np.maximum(np.abs(point.vector()), 1e-3)
 
