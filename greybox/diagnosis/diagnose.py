@@ -14,11 +14,11 @@ from greybox.diagnosis.base import FOLDS, Case
 from greybox.diagnosis.causes import Cause, Context, known_causes
 from greybox.diagnosis.confusion import rivals
 from greybox.diagnosis.extension import extended_model
-from greybox.diagnosis.fitting import Fit
+from greybox.diagnosis.fitting import Fit, Problem
 from greybox.diagnosis.gain import gains, run_on
 from greybox.diagnosis.held_out import Pair
 from greybox.diagnosis.kinematics import causes_of, kinematic_findings, mended
-from greybox.diagnosis.result import Diagnosis, Found, Gain, Quantity, Ranked, Runs
+from greybox.diagnosis.result import Diagnosis, Found, Gain, Quantity, Ranked, Runs, Symptom
 from greybox.diagnosis.search import Candidate, Search, backwards, instead, search
 from greybox.diagnosis.ship import CURRENTS
 from greybox.diagnosis.symptoms import find_symptoms
@@ -297,7 +297,7 @@ class _Report:
             causes=(*known, *([] if unexplained else shown)),
             groups=tuple(tuple(c.atom.cause for c in pair) for pair in groups),
             gain=gain,
-            wrong=tuple(find_symptoms(problem, found.base)),
+            wrong=_symptoms(problem, found),
             partial=tuple(shown if unexplained else ()),
             candidates=tuple(self.cause(c, c.fit, tried) for c in members),
             base=before,
@@ -437,6 +437,19 @@ def _as_shown(before: LogFit, after: LogFit) -> dict[str, Array]:
         shown[place] = before.log[state][place] - (after.log[state] - after.x[:, i])
         out[state] = shown
     return out
+
+
+def _symptoms(problem: Problem, found: Search) -> tuple[Symptom, ...]:
+    told = find_symptoms(problem, found.base)
+    if not told and found.causes:
+        told = [
+            Symptom(
+                "at no sample are the errors larger than the noise of the sensors; only all "
+                "samples together show them",
+                "", 0.0,
+            )
+        ]  # fmt: skip
+    return tuple(told)
 
 
 def _held_runs(pairs: Sequence[Pair]) -> list[LogFit]:

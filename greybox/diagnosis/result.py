@@ -211,8 +211,8 @@ class Diagnosis:
             return "; ".join(f"{c.title}: {c.evidence}" for c in self.causes) + "."
         if self.verdict == "confused":
             return (
-                f"{VERDICTS['confused']}: {' or '.join(self.groups[0])}. These logs cannot tell "
-                f"them apart."
+                f"Something is wrong, and these logs cannot tell which it is: "
+                f"{' or '.join(self.groups[0])}."
             )
         if self.verdict == "none" and self.wrong:
             return (
