@@ -235,6 +235,7 @@ def test_a_design_that_excites_nothing_has_no_certificate(ship):
     assert constant.to_dict()["bound"] is None
 
 
+@pytest.mark.long
 def test_tight_limits_do_not_tighten_the_bound_below_the_truth():
     """A search that must keep caps and rates finds little; the bound must not rest on that."""
     limits = TrialLimits(margins={"u": 0.5, "v": 0.4}, speed_cap=2.2, yaw_cap=0.06)

@@ -158,6 +158,7 @@ def test_augmented_design_and_what_it_saves():
         assert design.logdet > predict_precision(longer, [plan]).logdet
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "limits",
     [
@@ -190,6 +191,7 @@ def test_limits_are_kept(limits):
     assert all(x.missed <= 1e-4 for x in design.limits)
 
 
+@pytest.mark.long
 def test_a_plan_keeps_its_margins_under_the_prior():
     """With the stated probability, judged by other draws and another integrator."""
     model = thesis_model(spread=0.1)
@@ -236,6 +238,7 @@ def test_exchange_improves_what_it_is_given():
     assert found.feasible
 
 
+@pytest.mark.long
 def test_a_campaign_determines_what_one_regime_cannot():
     """v·r and |v|·r are one function where v keeps its sign (Remark 4.1)."""
     structure = get_structure("thesis").with_terms("Y_vr")
@@ -295,11 +298,16 @@ def test_least_trial_time():
             "Lengthen the trial|too short",
         ),
         ({"limits": TrialLimits(area=Circle(500.0, 0.0, 50.0))}, "450.0 m outside the sea room"),
-        (
+        pytest.param(
             {"limits": TrialLimits(area=Circle(0.0, 0.0, 12.0)), "start": (1.5, 1.2, 0, 0)},
             "the sea room is 24 m across; the smallest circle|sea room is too small",
+            marks=pytest.mark.long,
         ),
-        ({"limits": TrialLimits(headings=30.0)}, "headings cannot cover 30 rad"),
+        pytest.param(
+            {"limits": TrialLimits(headings=30.0)},
+            "headings cannot cover 30 rad",
+            marks=pytest.mark.long,
+        ),
         ({"limits": TrialLimits(speed_cap=1.0), "start": (0.7, 0.6, 0, 0)}, "speed cap"),
     ],
 )
@@ -309,6 +317,7 @@ def test_what_cannot_be_is_said(wishes, message):
         design_trial(prepare_request(thesis_model(), Wishes(**asked)).request, workers=1)
 
 
+@pytest.mark.long
 def test_the_closest_plan_on_request():
     asked = Wishes(
         150.0, predictor="basic", effort=0.05, limits=TrialLimits(headings=30.0), regime="u+v+"

@@ -235,6 +235,7 @@ def test_margins_forbid_what_the_current_takes(unsure):
     assert [s for _, s in forbidden(unsure, band, "r")] == [1, -1]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("which", ["known", "unsure"])
 def test_sixty_holds_fit_one_page(request, tmp_path, which):
     design = request.getfixturevalue(which)

@@ -162,6 +162,7 @@ def test_mixing_instruments_changes_nothing():
     np.testing.assert_allclose(plain.theta, want, rtol=1e-9)
 
 
+@pytest.mark.long
 def test_standard_errors_cover(thesis, true_theta, nominal_theta):
     """95 % intervals of IV2, and of the current, over independent trials."""
     predictor = build_predictor(thesis, "augmented", REGIME)
@@ -232,6 +233,7 @@ def test_second_measurement_of_the_disturbance():
     assert (np.abs(error) < 4 * iv2.theta.std(axis=0) / np.sqrt(40) + [0.003, 0.002]).all()
 
 
+@pytest.mark.long
 def test_anemometer_noise_does_not_bias_the_wind_terms(thesis, true_theta):
     """Smoothed wind in the instruments; as measured, its noise biases Wuu towards zero."""
     predictor = build_predictor(thesis, "wind", REGIME)

@@ -23,6 +23,7 @@ def draw(rng, centred):
     return xi, phi, e
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("centred", "relative"), [(False, 0.0), (True, 0.1)])
 def test_the_mean_is_that_of_many_draws(centred, relative):
     rng = np.random.default_rng(3)

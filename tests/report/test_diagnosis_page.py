@@ -219,7 +219,7 @@ def test_none(pages):
 
 def test_confused(pages):
     shown = text_of(pages["confused"])
-    assert "current or heading_bias. These logs cannot tell them apart." in shown
+    assert "these logs cannot tell which it is: current or heading_bias." in shown
     assert "greybox design --between" in shown
     assert "heading_bias looks like sway in proportion to surge" in shown
     assert "sway from diverged to 79.3 %" in shown

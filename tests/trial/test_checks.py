@@ -135,6 +135,7 @@ def test_two_defects_at_once(ship):
     assert abs(found["heading_bias"].value - 0.1) < 0.01
 
 
+@pytest.mark.long
 def test_intervals_cover(ship):
     """Twenty logs: of a 95 % interval at least fifteen cover (binomial chance below 1e-3)."""
     late = 0.5
