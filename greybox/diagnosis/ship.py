@@ -190,6 +190,8 @@ class LogRun:
             ]
         )
         x = self._simulator(start[:nx], drivers, self.parameters(ship))
+        if not np.isfinite(x).all():
+            return Shown(x, np.full((self.samples, len(self.outputs)), np.inf))
         full = x
         if self._turns:
             full = np.column_stack([x, start[nx] + self._heading(x[:, self.states.index("r")])])
