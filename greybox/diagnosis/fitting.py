@@ -228,7 +228,9 @@ class Problem:
                 for i in range(len(value)):
                     rows[:, :, k] = self._difference(point, vector, run, start, k, atom, i)
                     k += 1
-            out.append(noise.whiten(rows))
+            # of a run at the edge of stability the derivatives may leave every number's range
+            with np.errstate(over="ignore", invalid="ignore"):
+                out.append(noise.whiten(rows))
         return out
 
     def _difference(
