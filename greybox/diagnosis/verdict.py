@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
+from greybox.diagnosis.fitting import Fit
 from greybox.diagnosis.held_out import HeldOut
 from greybox.diagnosis.omnibus import Omnibus, disagreement, omnibus, with_own_noise
 from greybox.diagnosis.result import Found, Verdict
@@ -18,6 +21,9 @@ _LEFT = 0.1
 # significance of other coefficients on the held-out logs, and the share of the causes' gain
 # that fitting them there may bring beside
 _APART, _BESIDE = 1e-4, 0.25
+# mean squared error, in the sensors' variances, that is large, and the share of it that
+# causes may leave
+_LARGE, _MOST_OF = 3.0, 0.4
 
 
 @dataclass(frozen=True)
@@ -64,6 +70,9 @@ def rule(
     allowed = max(RELEVANT * numbers, _LEFT * explained)
     wrong = left.proof.p_value < _SURE and left.gain > allowed
     apart = other.p_value < _APART and other.fall > RELEVANT * numbers + _BESIDE * explained
+    before, after = _excess(found.base, found.final), _excess(found.final, found.final)
+    # a cause that leaves most of a large error where it was is not what is wrong
+    apart = apart or (bool(found.causes) and after > _LARGE and after > _MOST_OF * before)
     verdict: Verdict
     if wrong or apart:
         verdict = "unexplained"
@@ -74,6 +83,16 @@ def rule(
     else:
         verdict = "none"
     return Ruling(verdict, _remaining(found, left, wrong, apart), _next(verdict, groups), left)
+
+
+def _excess(fit: Fit, final: Fit) -> float:
+    """Return the mean squared error of the states in the sensors' variances, less their own."""
+    sensor, places = [], []
+    for group in final.noise.groups:
+        sensor.append(group.sensor[0])
+        places.append(group.outputs[0])
+    errors = np.concatenate(fit.errors)[:, places]
+    return float(((errors / np.maximum(sensor, 1e-300)) ** 2).mean()) - 1.0
 
 
 def _remaining(found: Search, left: Omnibus, wrong: bool, apart: bool) -> str:
