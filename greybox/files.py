@@ -41,6 +41,24 @@ def check_targets(*paths: str | Path | None) -> None:
             )
 
 
+def make_folder(path: str | Path) -> Path:
+    """Make a folder, and those that it stands in, where they do not exist.
+
+    Raises
+    ------
+    LogError
+        The folder cannot be made.
+    """
+    folder = Path(path)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise LogError(
+            f"cannot make the folder '{folder}': {error.strerror}. Name another with --out."
+        ) from error
+    return folder
+
+
 @contextmanager
 def replacing(path: str | Path, mode: str = "w") -> Iterator[IO[Any]]:
     """Open a file beside `path` and rename it over `path` when the block ends well.

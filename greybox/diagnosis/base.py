@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.diagnosis.atom import Atom
-from greybox.diagnosis.fitting import Fit, Point, Problem
+from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.held_out import Folds, HeldOut, OtherLogs
 from greybox.diagnosis.noise import fit_noise
+from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.ship import LogRun, Ship, wired
 from greybox.errors import ExcitationError
 from greybox.estimation.free_run import fit_free_runs

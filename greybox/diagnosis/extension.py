@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.fitting import Fit, Problem
+from greybox.diagnosis.fitting import Problem
+from greybox.diagnosis.point import Fit
 from greybox.diagnosis.ship import CURRENTS, Sensors, Wire
 from greybox.model.changes import Change
 from greybox.model.model import ManoeuvringModel

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from greybox.diagnosis.atom import Atom
 from greybox.diagnosis.noise import Noise, fit_noise
-from greybox.diagnosis.ship import CURRENTS, LogRun, Ship
-from greybox.model.functions import Integrator
+from greybox.diagnosis.normal import bounded_step, inverse
+from greybox.diagnosis.point import Fit, Point
+from greybox.diagnosis.ship import CURRENTS, LogRun
 
 Array = NDArray[np.float64]
 
@@ -19,108 +20,6 @@ Array = NDArray[np.float64]
 _ENOUGH = 0.02
 _MOST = 25
 _DAMPING_LIMIT = 1e6
-# eigenvalue of the scaled normal matrix below which a direction stays as it is
-_UNKNOWN = 1e-9
-
-
-@dataclass(frozen=True)
-class Point:
-    """A hypothesis with values.
-
-    Parameters
-    ----------
-    base : Ship
-        Coefficients, currents and the vessel before the atoms with `apply`.
-    starts : tuple of ndarray
-        Start of each log.
-    places : tuple of int
-        Free coefficients and currents.
-    atoms : tuple of Atom
-        In force; those with columns have them among `places`.
-    values : tuple of ndarray
-        Of the atoms with `apply`, empty for the others.
-    """
-
-    base: Ship
-    starts: tuple[Array, ...]
-    places: tuple[int, ...]
-    atoms: tuple[Atom, ...] = ()
-    values: tuple[Array, ...] = ()
-
-    @property
-    def ship(self) -> Ship:
-        """The ship with every atom applied."""
-        ship = self.base
-        for atom, value in zip(self.atoms, self.values, strict=True):
-            if atom.apply is not None:
-                ship = atom.apply(ship, value)
-        return ship
-
-    def vector(self) -> Array:
-        """Return all free numbers: coefficients, then the atoms' values, then starts."""
-        full = np.concatenate([self.base.theta, self.base.current])
-        return np.concatenate([full[list(self.places)], *self.values, *self.starts])
-
-    def at(self, vector: Array) -> Point:
-        """Return the point with other free numbers."""
-        m = len(self.places)
-        full = np.concatenate([self.base.theta, self.base.current])
-        full[list(self.places)] = vector[:m]
-        p = len(self.base.theta)
-        base = replace(self.base, theta=full[:p], current=full[p:])
-        values, starts = [], []
-        for old in self.values:
-            values.append(vector[m : m + len(old)])
-            m += len(old)
-        for old in self.starts:
-            starts.append(vector[m : m + len(old)])
-            m += len(old)
-        return replace(self, base=base, values=tuple(values), starts=tuple(starts))
-
-    def bounds(self) -> tuple[Array, Array]:
-        """Return least and largest values of the free numbers."""
-        size = len(self.places) + sum(map(len, self.values)) + sum(map(len, self.starts))
-        low, high = np.full(size, -np.inf), np.full(size, np.inf)
-        m = len(self.places)
-        for atom, value in zip(self.atoms, self.values, strict=True):
-            if atom.apply is not None:
-                for i, parameter in enumerate(atom.parameters):
-                    low[m + i], high[m + i] = parameter.low, parameter.high
-                m += len(value)
-        return low, high
-
-
-@dataclass(frozen=True)
-class Fit:
-    """Where a fit ended.
-
-    Parameters
-    ----------
-    point : Point
-    noise : Noise
-        Colours that the errors were whitened with.
-    cost : float
-        −2 log L, constants apart.
-    nu : tuple of ndarray
-        (N, ny) innovations of each log, of unit variance.
-    errors : tuple of ndarray
-        (N, ny) measured less simulated.
-    converged : bool
-    integrator : {"euler", "rk4"}
-    """
-
-    point: Point
-    noise: Noise
-    cost: float
-    nu: tuple[Array, ...]
-    errors: tuple[Array, ...]
-    converged: bool
-    integrator: Integrator = "euler"
-
-    @property
-    def escaped(self) -> bool:
-        """Whether the run has no bound."""
-        return not np.isfinite(self.cost)
 
 
 def groups_of(run: LogRun) -> list[tuple[int, ...]]:
@@ -320,9 +219,9 @@ class Problem:
         for lag in range(1, lags + 1):
             part = scores[lag:].T @ scores[:-lag]
             middle += (1 - lag / (lags + 1)) * (part + part.T)
-        inverse = _inverse(normal)
-        robust = inverse @ middle @ inverse * samples / max(samples - q, 1)
-        widen = np.sqrt(np.maximum(np.diag(inverse) / np.maximum(np.diag(robust), 1e-300), 1.0))
+        spread = inverse(normal)
+        robust = spread @ middle @ spread * samples / max(samples - q, 1)
+        widen = np.sqrt(np.maximum(np.diag(spread) / np.maximum(np.diag(robust), 1e-300), 1.0))
         full = robust * np.outer(widen, widen)
         free = len(fit.point.places) + sum(map(len, fit.point.values))
         return fit.point.vector()[:free], full[:free, :free]
@@ -352,48 +251,3 @@ class Problem:
             if before - fit.cost < 0.5:
                 break
         return fit
-
-
-def bounded_step(normal: Array, gradient: Array, low: Array, high: Array, damping: float) -> Array:
-    """Minimise ½ δᵀNδ − gᵀδ; numbers that would leave their bounds stop there.
-
-    Parameters
-    ----------
-    normal : ndarray
-        (q, q)
-    gradient : ndarray
-        (q,)
-    low, high : ndarray
-        (q,) of δ.
-    damping : float
-        Levenberg-Marquardt share.
-    """
-    step = np.zeros(len(gradient))
-    free = np.ones(len(gradient), bool)
-    for _ in range(len(gradient)):
-        part = np.ix_(free, free)
-        right = gradient[free] - normal[np.ix_(free, ~free)] @ step[~free]
-        step[free] = _solve(normal[part], right, damping)
-        outside = free & ((step < low) | (step > high))
-        if not outside.any():
-            break
-        step[outside] = np.clip(step, low, high)[outside]
-        free &= ~outside
-    return step
-
-
-def _inverse(normal: Array) -> Array:
-    scale = np.sqrt(np.maximum(np.diag(normal), 0.0))
-    scale[scale == 0] = 1.0
-    values, vectors = np.linalg.eigh(normal / np.outer(scale, scale))
-    # what nothing determines has a spread that no number of the log bounds
-    values = np.maximum(values, _UNKNOWN * max(values[-1], 1e-300))
-    return np.asarray((vectors / values) @ vectors.T / np.outer(scale, scale))
-
-
-def _solve(normal: Array, right: Array, damping: float) -> Array:
-    scale = np.sqrt(np.maximum(np.diag(normal), 0.0))
-    scale[scale == 0] = 1.0
-    values, vectors = np.linalg.eigh(normal / np.outer(scale, scale))
-    inverse = np.where(values > _UNKNOWN, 1 / (np.maximum(values, _UNKNOWN) + damping), 0.0)
-    return np.asarray(vectors @ (inverse * (vectors.T @ (right / scale))) / scale)

@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.fitting import Fit, Point, Problem
+from greybox.diagnosis.fitting import Problem
+from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.ship import Ship
 
 Array = NDArray[np.float64]

@@ -18,8 +18,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.fitting import Fit, Problem
+from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.held_out import Pair, Proof, proof_of
+from greybox.diagnosis.point import Fit
 from greybox.diagnosis.ship import LogRun, shifted, wired
 from greybox.diagnosis.simulator import sensitivities
 

@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.estimation.result import TestResult
 from greybox.model.model import ManoeuvringModel
 from greybox.trial.log import TrialLog
 
@@ -183,6 +184,10 @@ class Diagnosis:
     notes : tuple of str
     tried : int
         Causes that were scored.
+    record : mapping
+        What the model file tells beside.
+    residuals : mapping of str to tuple of TestResult
+        Tests of the free run's errors ``before`` and ``after``.
     """
 
     verdict: Verdict
@@ -203,6 +208,7 @@ class Diagnosis:
     notes: tuple[str, ...] = ()
     tried: int = 0
     record: Mapping[str, Any] = field(default_factory=dict)
+    residuals: Mapping[str, tuple[TestResult, ...]] = field(default_factory=dict)
 
     @property
     def headline(self) -> str:
@@ -230,6 +236,9 @@ class Diagnosis:
             "gain": {k: g.to_dict() for k, g in self.gain.items()},
             "wrong": [s.sentence for s in self.wrong],
             "headline": self.headline,
+            "residuals": {
+                when: {t.name: t.to_dict() for t in tests} for when, tests in self.residuals.items()
+            },
             "partial": [c.to_dict() for c in self.partial],
             "candidates": [c.to_dict() for c in self.candidates],
             "remaining": self.remaining,
@@ -243,6 +252,7 @@ class Diagnosis:
         """Return the diagnosis as text."""
         lines = [f"verdict: {self.verdict}", self.headline, "", "What the simulation gets wrong:"]
         lines += [f"  {s.sentence}" for s in self.wrong] or ["  nothing beyond noise"]
+        lines += [f"  {t.sentence}" for t in self.residuals.get("before", ()) if not t.passed]
         for title, causes in (
             ("Causes", self.causes), ("Helps, but does not explain all", self.partial),
             ("Each would explain it", self.candidates),

@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.diagnosis.atom import Atom
-from greybox.diagnosis.fitting import Fit, Point, Problem
+from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.noise import Noise
+from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.simulator import sensitivities
 
 Array = NDArray[np.float64]

@@ -14,9 +14,11 @@ from numpy.typing import NDArray
 
 from greybox.diagnosis.atom import Atom
 from greybox.diagnosis.base import Case
-from greybox.diagnosis.fitting import Fit, Problem
-from greybox.diagnosis.held_out import HeldOut, Proof
+from greybox.diagnosis.fitting import Problem
+from greybox.diagnosis.held_out import HeldOut, Proof, proof_of
+from greybox.diagnosis.point import Fit
 from greybox.diagnosis.scores import Directions, Score, score_atoms
+from greybox.model.functions import Integrator
 
 Array = NDArray[np.float64]
 
@@ -130,6 +132,12 @@ class Search:
     steps: tuple[Step, ...]
     causes: tuple[Candidate, ...]
     tried: int
+
+    def proof(self, held_out: Callable[[Integrator], HeldOut]) -> float:
+        """Return the fall of −2 log L of held-out logs by all causes, each fit as it is run."""
+        one, two = (held_out(f.integrator).contributions(f) for f in (self.base, self.final))
+        with np.errstate(invalid="ignore"):
+            return proof_of(one - two).gain
 
 
 def _dof(atom: Atom) -> int:

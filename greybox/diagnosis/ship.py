@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 from greybox.diagnosis.simulator import Linear, Simulator, sensitivities
 from greybox.model.functions import Integrator
+from greybox.model.simulation import mid_step
 from greybox.model.structure import Structure
 from greybox.trial.log import TrialLog
-from greybox.vessel.actuation import actuated_force
+from greybox.vessel.actuation import actuated_force, delayed
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
@@ -143,7 +144,7 @@ class LogRun:
         self._air = air if air is not None else np.zeros((len(log), 2))
         if integrator == "rk4":
             # as the free run of a model does: the ship turns during a step
-            self._psi, self._air = _between(self._psi), _between(self._air)
+            self._psi, self._air = mid_step(self._psi), mid_step(self._air.T).T
         self._commands = {c: log[c] for c in log.vessel.commands}
         self._simulator = Simulator(structure, len(log), self.air_measured, integrator)
         self._trapezoid = integrator == "rk4"
@@ -264,11 +265,6 @@ class LogRun:
         return self.sense(ship.sensors, slope)
 
 
-def _between(value: Array) -> Array:
-    """Return what is measured at samples (N, ...) at the middle of each step, the last as it is."""
-    return np.concatenate([(value[1:] + value[:-1]) / 2, value[-1:]])
-
-
 def wired(commands: Mapping[str, Array], wires: Sequence[Wire]) -> dict[str, Array]:
     """Return the commands as they act, where columns stand for others."""
     out = dict(commands)
@@ -278,10 +274,5 @@ def wired(commands: Mapping[str, Array], wires: Sequence[Wire]) -> dict[str, Arr
 
 
 def shifted(value: Array, samples: float) -> Array:
-    """Return value (N, ...) as of `samples` earlier, linearly between, held at the ends."""
-    last = len(value) - 1
-    place = np.clip(np.arange(last + 1) - samples, 0.0, last)
-    before = place.astype(np.intp)
-    share = (place - before).reshape(-1, *[1] * (value.ndim - 1))
-    after = np.minimum(before + 1, last)
-    return np.asarray((1 - share) * value[before] + share * value[after])
+    """Return value (N, ...) as of `samples` earlier, held at the ends."""
+    return np.moveaxis(delayed(np.moveaxis(value, 0, -1), samples), -1, 0)

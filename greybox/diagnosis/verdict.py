@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from greybox.diagnosis.fitting import Fit
 from greybox.diagnosis.held_out import HeldOut
 from greybox.diagnosis.omnibus import Omnibus, disagreement, omnibus, with_own_noise
+from greybox.diagnosis.point import Fit
 from greybox.diagnosis.result import Found, Verdict
 from greybox.diagnosis.search import RELEVANT, Candidate, Search
 from greybox.diagnosis.symptoms import coloured
+from greybox.model.functions import Integrator
 
 # significance of what any force could still explain
 _SURE = 0.005
@@ -35,18 +36,20 @@ class Ruling:
     verdict : {"named", "none", "confused", "unexplained"}
     remaining : str
     next_steps : list of str
-    omnibus : Omnibus
+    before, omnibus : Omnibus
+        Of the model without causes, and of what was found.
     """
 
     verdict: Verdict
     remaining: str
     next_steps: list[str]
+    before: Omnibus
     omnibus: Omnibus
 
 
 def rule(
     found: Search,
-    held: HeldOut,
+    held_out: Callable[[Integrator], HeldOut],
     groups: Sequence[Sequence[Candidate]],
     known: Sequence[Found],
 ) -> Ruling:
@@ -55,26 +58,28 @@ def rule(
     Parameters
     ----------
     found : Search
-    held : HeldOut
-        For the final fit.
+    held_out : callable
+        Of an integrator.
     groups : sequence of sequence of Candidate
         Causes that do equally well.
     known : sequence of Found
         Causes that the log proves without forces.
     """
+    held = held_out(found.final.integrator)
     pairs = with_own_noise(held.pairs(found.final))
+    first = omnibus(with_own_noise(held_out(found.base.integrator).pairs(found.base)))
     left = omnibus(pairs)
     other = disagreement(pairs)
     numbers = sum(nu.size for pair in pairs for nu in pair.held_fit.nu)
-    explained = max(held.prove(found.base, found.final).gain, 0.0) if found.causes else 0.0
+    explained = max(found.proof(held_out), 0.0) if found.causes else 0.0
     allowed = max(RELEVANT * numbers, _LEFT * explained)
     wrong = left.proof.p_value < _SURE and left.gain > allowed
     apart = other.p_value < _APART and other.fall > RELEVANT * numbers + _BESIDE * explained
     before, after = _excess(found.base, found.final), _excess(found.final, found.final)
     # a cause that leaves most of a large error where it was is not what is wrong
-    apart = apart or (bool(found.causes) and after > _LARGE and after > _MOST_OF * before)
+    most = bool(found.causes) and after > _LARGE and after > _MOST_OF * before
     verdict: Verdict
-    if wrong or apart:
+    if wrong or apart or most:
         verdict = "unexplained"
     elif groups and not known and len(groups) == len(found.causes):
         verdict = "confused"
@@ -82,7 +87,21 @@ def rule(
         verdict = "named"
     else:
         verdict = "none"
-    return Ruling(verdict, _remaining(found, left, wrong, apart), _next(verdict, groups), left)
+    why = ""
+    if wrong:
+        why = (
+            f"forces that no cause stands for would explain another "
+            f"{100 * left.explicable:.1f} % of the squared errors of logs that they were not "
+            f"fitted to (p = {left.proof.p_value:.1g})"
+        )
+    elif apart:
+        why = "the coefficients that these logs ask for do not hold for the held-out ones"
+    elif most:
+        why = f"the causes leave {100 * after / before:.0f} % of the squared error"
+    outputs = pairs[0].problem.runs[0].outputs
+    return Ruling(
+        verdict, _remaining(found.final, outputs, why), _next(verdict, groups), first, left
+    )
 
 
 def _excess(fit: Fit, final: Fit) -> float:
@@ -95,21 +114,11 @@ def _excess(fit: Fit, final: Fit) -> float:
     return float(((errors / np.maximum(sensor, 1e-300)) ** 2).mean()) - 1.0
 
 
-def _remaining(found: Search, left: Omnibus, wrong: bool, apart: bool) -> str:
-    outputs = ("u", "v", "r", "psi")[: found.final.errors[0].shape[1]]
-    moved = coloured(found.final, outputs)
+def _remaining(final: Fit, outputs: Sequence[str], why: str) -> str:
+    moved = coloured(final, outputs)
     tail = f" In these logs {moved}." if moved else ""
-    if wrong:
-        return (
-            f"What is left is not noise: forces that no cause stands for would explain another "
-            f"{100 * left.explicable:.1f} % of the squared errors of logs that they were not "
-            f"fitted to (p = {left.proof.p_value:.1g}).{tail}"
-        )
-    if apart:
-        return (
-            "What is left is not noise: the coefficients that these logs ask for do not hold for "
-            f"the held-out ones.{tail}"
-        )
+    if why:
+        return f"What is left is not noise: {why}.{tail}"
     return f"What is left is not told from noise.{tail}"
 
 

@@ -135,7 +135,7 @@ def simulate(
     if heading == "measured" and structure.disturbance == "marine":
         measured = np.zeros(samples + 1) if psi is None else np.asarray(psi, float)
         if integrator == "rk4":
-            measured = _between(measured, samples)
+            measured = mid_step(measured)
         series.append(np.broadcast_to(measured[..., :samples, None], (runs, samples, 1)))
     if d is not None:
         d = np.asarray(d, float)
@@ -143,7 +143,7 @@ def simulate(
     if air is not None:
         blow = np.asarray(air, float)
         if integrator == "rk4":
-            blow = np.moveaxis(_between(np.moveaxis(blow, -1, -2), samples), -2, -1)
+            blow = np.swapaxes(mid_step(np.swapaxes(blow, -1, -2)), -1, -2)
         series.append(np.broadcast_to(blow, (runs, samples, 2)))
     x0 = np.broadcast_to(x0, (runs, nx))
     start = np.broadcast_to(np.asarray(psi0, float), (runs,))
@@ -174,15 +174,24 @@ def simulate(
     return FreeRun(x, angle, diverged, np.asarray(bound, float))
 
 
-def _between(value: Array, steps: int) -> Array:
-    """Return what is measured at samples (..., N) at the middle of each step, (..., steps).
+def mid_step(value: Array) -> Array:
+    """Return what is measured at samples at the middle of the step that follows each.
 
-    The ship turns during a step; the last value stands where no next one is known.
+    The ship turns during a step; the last value stands, since no next one is known.
+
+    Parameters
+    ----------
+    value : ndarray
+        (..., N), time last.
+
+    Returns
+    -------
+    ndarray
+        (..., N)
     """
-    out = value[..., :steps].copy()
-    known = min(steps, value.shape[-1] - 1)
-    out[..., :known] = (value[..., :known] + value[..., 1 : known + 1]) / 2
-    return np.asarray(out)
+    out = np.array(value, float)
+    out[..., :-1] = (out[..., :-1] + out[..., 1:]) / 2
+    return out
 
 
 def _few(

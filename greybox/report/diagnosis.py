@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from greybox.diagnosis.result import Diagnosis, Runs
-from greybox.report.diagnosed_causes import cause_section
+from greybox.report.diagnosed_causes import cause_section, probability
 from greybox.report.diagnosis_figures import (
     LOWEST_FIT,
     gain_figure,
@@ -44,7 +44,7 @@ def diagnosis_page(diagnosis: Diagnosis, record: Mapping[str, Any]) -> Page:
         cause_section(diagnosis),
         _equations(diagnosis),
         _gain(diagnosis),
-        Section("5. What remains", [diagnosis.remaining]),
+        Section("5. What remains", [diagnosis.remaining], tables=_tests(diagnosis, "after")),
         Section("6. What to do next", points=diagnosis.next_steps),
     ]
     if diagnosis.notes:
@@ -112,7 +112,20 @@ def _wrong(diagnosis: Diagnosis) -> Section:
         "1. What the simulation gets wrong",
         sentences,
         pictures,
+        _tests(diagnosis, "before"),
         points=[s.sentence for s in diagnosis.wrong],
+    )
+
+
+def _tests(diagnosis: Diagnosis, when: str) -> list[Table]:
+    """Show the tests of the free run's errors, where there are any."""
+    rows = [
+        [t.null, "" if t.p_value is None else probability(t.p_value), t.sentence]
+        for t in diagnosis.residuals.get(when, ())
+    ]
+    caption = f"Tests of the free run's errors, {when}"
+    return (
+        [Table(caption, ["null hypothesis", "p", "result"], rows, sentences=True)] if rows else []
     )
 
 

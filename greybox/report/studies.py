@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from greybox.errors import LogError
-from greybox.files import write_text
+from greybox.files import make_folder, write_text
 from greybox.report.figures import (
     bias_figure,
     error_histograms,
@@ -45,13 +44,7 @@ def write_output(output: StudyOutput, folder: str | Path) -> None:
     LogError
         The folder cannot be made.
     """
-    folder = Path(folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise LogError(
-            f"cannot make the folder '{folder}': {error.strerror}. Name another with --out."
-        ) from error
+    folder = make_folder(folder)
     write_text(to_csv(output.rows), folder / "tables.csv")
     for name, (figure, _) in output.figures.items():
         save_png(figure, str(folder / f"{name}.png"))

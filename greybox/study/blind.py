@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.errors import LogError, UsageError
-from greybox.files import write_json, write_text
+from greybox.errors import UsageError
+from greybox.files import make_folder, write_json, write_text
 from greybox.study.blind_causes import Effect, Typical
 from greybox.study.blind_conditions import Conditions, blind_vessel, vessel_text
 from greybox.study.blind_effects import act, check_effects, draw_effect
@@ -262,13 +262,7 @@ def write(trial: Trial, folder: str | Path) -> None:
     LogError
         The folder cannot be made.
     """
-    folder = Path(folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise LogError(
-            f"cannot make the folder '{folder}': {error.strerror}. Name another."
-        ) from error
+    folder = make_folder(folder)
     write_text(vessel_text(trial.conditions.single), folder / "vessel.toml")
     for log in (trial.estimation, trial.validation):
         write_log([log], folder / f"{log.name}.csv")

@@ -91,13 +91,14 @@ def with_actuators_of(vessel: Vessel, known: Vessel) -> Vessel:
 def delayed(value: Array, samples: float) -> Array:
     """Delay a signal (..., N) by a number of samples, interpolated linearly.
 
-    The first value is held before the start.
+    The first value is held before the start, the last beyond the end of one that is
+    advanced (negative `samples`).
     """
     value = np.asarray(value, float)
     if samples == 0:
         return value
     last = value.shape[-1] - 1
-    place = np.clip(np.arange(last + 1) - samples, 0.0, None)
+    place = np.clip(np.arange(last + 1) - samples, 0.0, last)
     before = place.astype(np.intp)
     share = place - before
     after = np.minimum(before + 1, last)

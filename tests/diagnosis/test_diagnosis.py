@@ -54,6 +54,12 @@ def test_command_writes_what_the_contract_says(written: Path, capsys) -> None:
         assert gain["ci"][0] <= gain["after"] - gain["before"] <= gain["ci"][1]
     assert found["gain"]["u"]["ci"][0] > 0
     assert any("heading" in text for text in found["wrong"])
+    before, after = found["residuals"]["before"], found["residuals"]["after"]
+    assert not before["whiteness_u"]["passed"]
+    assert before["whiteness_u"]["statistic"] > 10 * after["whiteness_u"]["statistic"]
+    assert before["independence"]["detail"]["explicable"] >= 0
+    page = (written / "d.html").read_text()
+    assert page.count("the free-run error of surge is white") == 2
     model = load_model(written / "m.json")
     assert model.disturbances["current_north"][0] == cause["parameters"]["current_north"]["value"]
     # the extended model is an ordinary one: compare gives the same fit

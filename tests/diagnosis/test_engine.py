@@ -7,9 +7,11 @@ import pytest
 
 from greybox.diagnosis.atom import Atom, Parameter
 from greybox.diagnosis.causes import Context, known_causes
-from greybox.diagnosis.fitting import Point, Problem, bounded_step
+from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.held_out import long_run_variance, proof_of
 from greybox.diagnosis.noise import Colour, Noise, fit_noise
+from greybox.diagnosis.normal import bounded_step
+from greybox.diagnosis.point import Point
 from greybox.diagnosis.recursion import propagate
 from greybox.diagnosis.ship import Change, LogRun, Sensors, Ship, shifted, wired
 from greybox.diagnosis.simulator import Simulator, sensitivities
@@ -232,3 +234,14 @@ def test_sensitivities_of_nothing_are_those_of_the_start(log: TrialLog) -> None:
     found = sensitivities(linear, np.zeros((len(log) - 1, 3, 0)))
     np.testing.assert_allclose(found[0], np.eye(3))
     np.testing.assert_allclose(found[1], linear.a[0])
+
+
+def test_whiteness_equals_statsmodels() -> None:
+    from statsmodels.stats.diagnostic import acorr_ljungbox
+
+    from greybox.diagnosis.residuals import _whiteness
+
+    e = np.convolve(np.random.default_rng(8).standard_normal(600), [1.0, 0.3], "valid")
+    found, expected = _whiteness("u", e), acorr_ljungbox(e, lags=[20])
+    assert found.statistic == pytest.approx(float(expected["lb_stat"].iloc[0]), rel=1e-9)
+    assert found.p_value == pytest.approx(float(expected["lb_pvalue"].iloc[0]), rel=1e-9)

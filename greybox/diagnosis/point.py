@@ -1,0 +1,115 @@
+"""A hypothesis with values, and where a fit of it ended."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.diagnosis.atom import Atom
+from greybox.diagnosis.noise import Noise
+from greybox.diagnosis.ship import Ship
+from greybox.model.functions import Integrator
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Point:
+    """A hypothesis with values.
+
+    Parameters
+    ----------
+    base : Ship
+        Coefficients, currents and the vessel before the atoms with `apply`.
+    starts : tuple of ndarray
+        Start of each log.
+    places : tuple of int
+        Free coefficients and currents.
+    atoms : tuple of Atom
+        In force; those with columns have them among `places`.
+    values : tuple of ndarray
+        Of the atoms with `apply`, empty for the others.
+    """
+
+    base: Ship
+    starts: tuple[Array, ...]
+    places: tuple[int, ...]
+    atoms: tuple[Atom, ...] = ()
+    values: tuple[Array, ...] = ()
+
+    @property
+    def ship(self) -> Ship:
+        """The ship with every atom applied."""
+        ship = self.base
+        for atom, value in zip(self.atoms, self.values, strict=True):
+            if atom.apply is not None:
+                ship = atom.apply(ship, value)
+        return ship
+
+    def vector(self) -> Array:
+        """Return all free numbers: coefficients, then the atoms' values, then starts."""
+        full = np.concatenate([self.base.theta, self.base.current])
+        return np.concatenate([full[list(self.places)], *self.values, *self.starts])
+
+    def at(self, vector: Array) -> Point:
+        """Return the point with other free numbers."""
+        m = len(self.places)
+        full = np.concatenate([self.base.theta, self.base.current])
+        full[list(self.places)] = vector[:m]
+        p = len(self.base.theta)
+        base = replace(self.base, theta=full[:p], current=full[p:])
+        values, starts = [], []
+        for old in self.values:
+            values.append(vector[m : m + len(old)])
+            m += len(old)
+        for old in self.starts:
+            starts.append(vector[m : m + len(old)])
+            m += len(old)
+        return replace(self, base=base, values=tuple(values), starts=tuple(starts))
+
+    def bounds(self) -> tuple[Array, Array]:
+        """Return least and largest values of the free numbers."""
+        size = len(self.places) + sum(map(len, self.values)) + sum(map(len, self.starts))
+        low, high = np.full(size, -np.inf), np.full(size, np.inf)
+        m = len(self.places)
+        for atom, value in zip(self.atoms, self.values, strict=True):
+            if atom.apply is not None:
+                for i, parameter in enumerate(atom.parameters):
+                    low[m + i], high[m + i] = parameter.low, parameter.high
+                m += len(value)
+        return low, high
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Where a fit ended.
+
+    Parameters
+    ----------
+    point : Point
+    noise : Noise
+        Colours that the errors were whitened with.
+    cost : float
+        −2 log L, constants apart.
+    nu : tuple of ndarray
+        (N, ny) innovations of each log, of unit variance.
+    errors : tuple of ndarray
+        (N, ny) measured less simulated.
+    converged : bool
+    integrator : {"euler", "rk4"}
+    """
+
+    point: Point
+    noise: Noise
+    cost: float
+    nu: tuple[Array, ...]
+    errors: tuple[Array, ...]
+    converged: bool
+    integrator: Integrator = "euler"
+
+    @property
+    def escaped(self) -> bool:
+        """Whether the run has no bound."""
+        return not np.isfinite(self.cost)

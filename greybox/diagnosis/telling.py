@@ -1,0 +1,307 @@
+"""From a search to what the user gets: causes, groups, the extended model, its gain."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.diagnosis.base import FOLDS, Case
+from greybox.diagnosis.causes import Cause
+from greybox.diagnosis.confusion import rivals
+from greybox.diagnosis.extension import extended_model
+from greybox.diagnosis.fitting import Problem
+from greybox.diagnosis.gain import gains, run_on
+from greybox.diagnosis.held_out import Pair
+from greybox.diagnosis.point import Fit
+from greybox.diagnosis.residuals import residual_tests
+from greybox.diagnosis.result import Diagnosis, Found, Gain, Quantity, Ranked, Runs, Symptom
+from greybox.diagnosis.search import Candidate, Search, backwards, instead
+from greybox.diagnosis.ship import CURRENTS
+from greybox.diagnosis.symptoms import find_symptoms
+from greybox.diagnosis.verdict import rule
+from greybox.diagnosis.waves import Waves
+from greybox.model.model import ManoeuvringModel
+from greybox.model.structure import Structure
+from greybox.trial.log import TrialLog
+from greybox.validation.fit import LogFit, fit_percent
+
+Array = NDArray[np.float64]
+
+
+class Report:
+    """Turns a search into what the user gets."""
+
+    def __init__(
+        self,
+        case: Case,
+        structure: Structure,
+        causes: Mapping[str, Cause],
+        found: Search,
+        given: ManoeuvringModel | None,
+        seed: int,
+        notes: Sequence[str],
+    ) -> None:
+        self.notes = list(notes)
+        self.case, self.structure, self.causes = case, structure, causes
+        self.found, self.given, self.seed = found, given, seed
+        self.current: dict[str, tuple[float, float]] = {}
+        if given is not None:
+            self.current = {n: v for n, v in given.disturbances.items() if n in CURRENTS}
+
+    def model(self, fit: Fit, record: Mapping[str, Any]) -> ManoeuvringModel:
+        """Return a hypothesis as a model."""
+        problem = self.case.problem(fit.integrator)
+        made = extended_model(self.structure, problem, fit, self.case.logs, record, self.current)
+        if self.found.base is fit and self.given is not None:
+            return self.given
+        return made
+
+    def cause(self, candidate: Candidate, fit: Fit, tried: int) -> Found:
+        """Return a candidate as it stands in a fit."""
+        cause = self.causes[candidate.atom.cause]
+        quantities = self.quantities(candidate, fit)
+        told = {k: (q.value, q.std) for k, q in quantities.items()}
+        return Found(
+            candidate.atom.cause, candidate.atom.key, cause.title, quantities,
+            candidate.p_value, candidate.p_adjusted, cause.evidence(told), cause.extension,
+            cause.reference, candidate.gain, candidate.proof.gain, candidate.proof.std,
+        )  # fmt: skip
+
+    def quantities(self, candidate: Candidate, fit: Fit) -> dict[str, Quantity]:
+        """Return a cause's parameters with standard errors."""
+        problem = self.case.problem(fit.integrator)
+        values, covariance = problem.covariance(fit)
+        std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        atom = candidate.atom
+        if atom.apply is None:
+            index = [fit.point.places.index(problem.place(n)) for n in atom.columns]
+        else:
+            k = [a.key for a in fit.point.atoms].index(atom.key)
+            first = len(fit.point.places) + sum(map(len, fit.point.values[:k]))
+            index = list(range(first, first + len(fit.point.values[k])))
+        if not index:
+            return {atom.key.split(":", 1)[1]: Quantity(-1.0, 0.0, "1")}
+        return {
+            p.name: Quantity(float(values[i]), float(np.hypot(std[i], p.coarse)), p.unit)
+            for p, i in zip(atom.parameters, index, strict=True)
+        }
+
+    def made(
+        self,
+        known: Sequence[Found],
+        validate: Sequence[TrialLog],
+        tried: int,
+        lines: Sequence[Waves | None],
+    ) -> Diagnosis:
+        """Return the diagnosis."""
+        found, case = self.found, self.case
+        held = case.held_out(found.final.integrator)
+        groups = self._groups()
+        ruling = rule(found, case.held_out, groups, known)
+        named = [c for c in found.causes if not _grouped(c, groups)]
+        members = [c for pair in groups for c in pair]
+        record = {
+            "method": "diagnosis",
+            "causes": [c.atom.key for c in found.causes],
+            "logs": [
+                {"name": log.name, "sha256": log.provenance.sha256, "samples": len(log)}
+                for log in case.logs
+            ],
+        }
+        before = self.model(found.base, record | {"causes": []})
+        after = self.model(found.final, record) if found.causes else before
+        alternatives = {c.atom.cause: self.model(c.fit, record) for c in members}
+        shown = [self.cause(c, found.final, tried) for c in named]
+        gain, runs, after = self._gain(before, after, validate, held.pairs(found.final))
+        notes = self._notes(after)
+        verdict = ruling.verdict
+        if found.causes and sum(g.after - g.before for g in gain.values()) < 0:
+            # likelier errors are no better simulation: nothing is extended by them
+            helped = ", ".join(c.atom.cause for c in found.causes)
+            notes.append(
+                f"{helped} made the held-out errors likelier but the free run no better, so the "
+                f"model was not extended."
+            )
+            gain, runs, after = self._gain(before, before, validate, held.pairs(found.base))
+            verdict = "unexplained"
+        unexplained = verdict == "unexplained"
+        problem = case.problem(found.base.integrator)
+        return Diagnosis(
+            verdict=verdict,
+            causes=(*known, *([] if unexplained else shown)),
+            groups=tuple(tuple(c.atom.cause for c in pair) for pair in groups),
+            gain=gain,
+            wrong=_symptoms(problem, found),
+            residuals={
+                "before": residual_tests(problem, found.base, ruling.before, lines[0]),
+                "after": residual_tests(
+                    case.problem(found.final.integrator), found.final, ruling.omnibus, lines[1]
+                ),
+            },
+            partial=tuple(shown if unexplained else ()),
+            candidates=tuple(self.cause(c, c.fit, tried) for c in members),
+            base=before,
+            model=after,
+            alternatives=alternatives,
+            remaining=ruling.remaining,
+            validated_on=self._where(validate),
+            next_steps=tuple(ruling.next_steps),
+            steps=tuple(_ranked(s.scores, s.candidates) for s in found.steps),
+            runs=tuple(runs),
+            notes=tuple(notes),
+            tried=tried,
+            record=record,
+        )
+
+    def _groups(self) -> list[list[Candidate]]:
+        out = []
+        causes = self.found.causes
+        ids = {c.atom.cause for c in causes}
+        for step in self.found.steps:
+            if step.taken is None or not any(c.atom.key == step.taken.atom.key for c in causes):
+                continue
+            best = next(c for c in step.candidates if c.atom.key == step.taken.atom.key)
+            others = [c for c in step.candidates if c.atom.cause not in ids]
+            if len(causes) > 1:
+                best, others = instead(self.case, self.found.final, best, others)
+            like = rivals(self.case.problem, self.case.held_out, best, others)
+            if like:
+                out.append([best, *like])
+        return out
+
+    def _gain(
+        self,
+        before: ManoeuvringModel,
+        after: ManoeuvringModel,
+        validate: Sequence[TrialLog],
+        pairs: Sequence[Pair],
+    ) -> tuple[dict[str, Gain], list[Runs], ManoeuvringModel]:
+        logs = list(validate)
+        if logs:
+            after = _likelier_story(after, logs)
+            one = [run_on(before, log) for log in logs]
+            two = [run_on(after, log) for log in logs]
+        else:
+            one = _held_runs(self.case.held_out(self.found.base.integrator).pairs(self.found.base))
+            two = _held_runs(pairs)
+        runs = [
+            Runs(
+                a.log, held,
+                {s: a.log[s] for s in a.fit},
+                {s: a.x[:, i] for i, s in enumerate(a.fit)},
+                _as_shown(a, b),
+            )
+            for held, ones, twos in (
+                (False, [run_on(before, log) for log in self.case.logs],
+                 [run_on(after, log) for log in self.case.logs]),
+                (True, one, two),
+            )
+            for a, b in zip(ones, twos, strict=True)
+        ]  # fmt: skip
+        return gains(one, two, self.case.logs[0].sample_time, self.seed), runs, after
+
+    def _where(self, validate: Sequence[TrialLog]) -> str:
+        if validate:
+            return f"on {', '.join(log.name for log in validate)}, which took no part in the fit"
+        return (
+            f"on {FOLDS} parts of the logs, each predicted by a fit to the others, for no "
+            f"validation log was given"
+        )
+
+    def _notes(self, after: ManoeuvringModel) -> list[str]:
+        out = list(self.notes)
+        if self.given is not None:
+            out.append(
+                "the coefficients of the model were estimated anew on these logs before causes "
+                "were judged; 'before' is the model as it was given."
+            )
+        turned = backwards(self.found.final, self.case.universe.parameters)
+        if turned:
+            out.append(
+                f"{', '.join(turned)} came out negative: some thruster's column has the wrong sign "
+                f"or stands in another's place; greybox check tells which."
+            )
+        for change in after.changes:
+            out.append(f"the extended model tells the log's own clock: {change.sentence}.")
+        return out
+
+
+def _grouped(candidate: Candidate, groups: Sequence[Sequence[Candidate]]) -> bool:
+    return any(c.atom.key == candidate.atom.key for pair in groups for c in pair)
+
+
+def _ranked(scores: Sequence[Any], candidates: Sequence[Candidate]) -> tuple[Ranked, ...]:
+    promised = {s.atom.key: s.gain for s in scores}
+    fitted = {c.atom.key: c for c in candidates}
+    keys = dict.fromkeys([*fitted, *promised])
+    return tuple(
+        Ranked(
+            key, float(promised.get(key, 0.0)), fitted[key].gain, fitted[key].proof.gain,
+            fitted[key].proof.std,
+        )
+        if key in fitted
+        else Ranked(key, float(promised[key]))
+        for key in keys
+    )  # fmt: skip
+
+
+def _likelier_story(model: ManoeuvringModel, logs: Sequence[TrialLog]) -> ManoeuvringModel:
+    """Return the model with its changes within logs, or made before: whichever fits better."""
+    if not model.changes:
+        return model
+    settled = model.settled()
+
+    def missed(candidate: ManoeuvringModel) -> float:
+        return sum(
+            float(np.square(run.log[s] - run.x[:, i]).sum() / max(np.var(run.log[s]), 1e-12))
+            for run in (run_on(candidate, log) for log in logs)
+            for i, s in enumerate(run.fit)
+        )
+
+    return settled if missed(settled) < missed(model) else model
+
+
+def _as_shown(before: LogFit, after: LogFit) -> dict[str, Array]:
+    """Return a run on a corrected log as its sensors would show it on the log as it is."""
+    if before.log.t[0] == after.log.t[0] and len(before.log) == len(after.log):
+        place = np.arange(len(after.log))
+    else:
+        place = np.searchsorted(before.log.t, after.log.t)
+    out = {}
+    for i, state in enumerate(after.fit):
+        shown = np.full(len(before.log), np.nan)
+        shown[place] = before.log[state][place] - (after.log[state] - after.x[:, i])
+        out[state] = shown
+    return out
+
+
+def _symptoms(problem: Problem, found: Search) -> tuple[Symptom, ...]:
+    told = find_symptoms(problem, found.base)
+    if not told and found.causes:
+        told = [
+            Symptom(
+                "at no sample are the errors larger than the noise of the sensors; only all "
+                "samples together show them",
+                "", 0.0,
+            )
+        ]  # fmt: skip
+    return tuple(told)
+
+
+def _held_runs(pairs: Sequence[Pair]) -> list[LogFit]:
+    out = []
+    for pair in pairs:
+        ship = pair.held_fit.point.ship
+        for run, start in zip(pair.held.runs, pair.held_fit.point.starts, strict=True):
+            x = run.run(ship, start).y[:, : len(run.states)]
+            percent = fit_percent(run.log.states(run.states), x)
+            out.append(
+                LogFit(
+                    run.log, x, run.log["psi"] if "psi" in run.log else np.zeros(len(x)),
+                    {s: float(f) for s, f in zip(run.states, percent, strict=True)}, -1,
+                )
+            )  # fmt: skip
+    return out
