@@ -56,7 +56,8 @@ def residual_tests(
             z,
             left.proof.p_value,
             f"a force of motion, commands, heading or time would explain "
-            f"{100 * left.explicable:.1f} % of the squared errors of the held-out logs{'' if not free else ', which chance does too'}.",
+            f"{100 * left.explicable:.1f} % of the squared errors of the held-out logs"
+            f"{'' if not free else ', which chance does too'}.",
             _LEVEL,
             free,
             detail={"explicable": left.explicable},
