@@ -20,7 +20,7 @@ from greybox.files import make_folder, write_json, write_text
 from greybox.study.blind_causes import Effect, Typical
 from greybox.study.blind_conditions import Conditions, blind_vessel, vessel_text
 from greybox.study.blind_effects import act, check_effects, draw_effect
-from greybox.study.blind_inputs import KINDS
+from greybox.study.blind_inputs import KINDS, steer
 from greybox.study.blind_sensors import gauss_markov, observe, wanted
 from greybox.study.blind_ship import LEAD, NAMES, History, Ship, simulate_ships
 from greybox.study.chapter6 import TRUE
@@ -162,10 +162,70 @@ def draw_many(
     return [trials[i] for i in range(len(rngs))]
 
 
+def sail(
+    rng: np.random.Generator,
+    effects: Sequence[str],
+    plans: Sequence[Array],
+    starts: Sequence[Array],
+    *,
+    size: float = 1.0,
+    spread: float = 0.1,
+    single: bool = False,
+) -> Trial:
+    """Sail planned commands twice with a ship that is drawn near Table 6.1.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        All that is drawn follows from it.
+    effects : sequence of str
+        Ids of what is wrong, as in `draw`.
+    plans : sequence of ndarray
+        Of the estimation and of the validation log: (N, 4) n1, n2, alpha1, alpha2 [rad]
+        wanted at each second. The actuators follow at their rates.
+    starts : sequence of ndarray
+        (4,) u, v [m/s], r [rad/s], ψ [rad] some seconds before each log begins.
+    size : float
+        Scales the effects.
+    spread : float
+        Largest relative distance of a parameter from Table 6.1.
+    single : bool
+        Both propellers run at one speed, in one column ``n``.
+
+    Raises
+    ------
+    UsageError
+        An effect does not exist, or the ship runs away.
+    """
+    conditions = Conditions(kind="pulses", single=single, samples=len(plans[0]))
+    check_effects(tuple(effects), conditions.kind)
+    draft = _Draft(int(rng.integers(2**62)), [])
+    theta = _near_table(draft, spread)
+    for plan, start in zip(plans, starts, strict=True):
+        target = np.vstack([np.repeat(plan[:1], LEAD, axis=0), plan])
+        seconds = len(target)
+        still = np.zeros((seconds, 2))
+        draft.ships.append(Ship(theta, steer(target), start, still, np.zeros((seconds, 3))))
+    history = _sail([draft], conditions, step=1.0)
+    if _bounded(history, _RUNAWAY)[0]:
+        _disturb(draft, Order(tuple(effects), size), history, 0, conditions)
+        history = _sail([draft], conditions)
+        if _bounded(history, _RUNAWAY)[0]:
+            return _logged(draft, history, 0, conditions)
+    raise UsageError(
+        f"the ship runs away on these commands with {', '.join(effects) or 'nothing wrong'}: "
+        f"choose another seed or a smaller effect than {size:g}."
+    )
+
+
+def _near_table(draft: _Draft, spread: float) -> Array:
+    factors = draft.rng(0, 0).uniform(1 - spread, 1 + spread, len(NAMES))
+    return np.array([TRUE[n] for n in NAMES]) * factors
+
+
 def _drafted(rng: np.random.Generator, conditions: Conditions) -> _Draft:
     draft = _Draft(int(rng.integers(2**62)), [])
-    own = draft.rng(0, 0)
-    theta = np.array([TRUE[n] for n in NAMES]) * own.uniform(0.75, 1.25, len(NAMES))
+    theta = _near_table(draft, 0.25)
     seconds = conditions.samples + LEAD
     for log in (1, 2):
         programme = KINDS[conditions.kind](draft.rng(log, 1), seconds, conditions.single)

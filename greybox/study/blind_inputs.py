@@ -41,7 +41,8 @@ class Programme:
     begins: NDArray[np.bool_]
 
 
-def _plain(target: Array) -> Programme:
+def steer(target: Array) -> Programme:
+    """Return the programme of commands that do not depend on the heading, (N, 4)."""
     n = len(target)
     return Programme(target, np.full(n, np.inf), np.ones(n), np.zeros(n, bool))
 
@@ -69,7 +70,7 @@ def pulses(rng: np.random.Generator, samples: int, single: bool) -> Programme:
     speed = draw(11.0, 19.0)
     apart = 0.0 if single else draw(-1.0, 1.0)
     angles = [np.clip(draw(0.65, 1.05) * 0.5 + draw(0.6, 1.1) * 0.5, 0.6, 1.1) for _ in range(2)]
-    return _plain(np.column_stack([speed + apart, speed - apart, *angles]))
+    return steer(np.column_stack([speed + apart, speed - apart, *angles]))
 
 
 def manoeuvres(rng: np.random.Generator, samples: int, single: bool) -> Programme:
@@ -90,7 +91,7 @@ def manoeuvres(rng: np.random.Generator, samples: int, single: bool) -> Programm
             a1, a2 = _turn(rng, n1, n2)
         parts.append(np.tile([n1, n2, a1, a2], (min(length, left), 1)))
         left -= length
-    return _plain(np.vstack(parts))
+    return steer(np.vstack(parts))
 
 
 def _turn(rng: np.random.Generator, n1: float, n2: float) -> tuple[float, float]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from greybox.errors import GreyboxError
@@ -55,22 +55,31 @@ def estimate_model(logs: Sequence[TrialLog], request: Request = _OPEN) -> Estima
 
 
 def _is_trusted(estimate: Estimate) -> bool:
-    return _rank(estimate.verdict)[0] == 0
+    return _rank(estimate)[0] == 0
 
 
-def _rank(verdict: Verdict) -> tuple[int, int]:
-    """Order verdicts, the best first: trust, by the number excepted, do not trust."""
+def _rank(estimate: Estimate) -> tuple[int, int]:
+    """Order estimates, the best first: trust, by the number excepted, do not trust.
+
+    Of those not to be trusted, the one whose free run is worse than a constant in fewest states.
+    """
+    verdict = estimate.verdict
     if verdict.text.startswith("do not trust"):
-        return 2, 0
+        return 2, len(_poor(estimate.fit))
     return (1 if verdict.excepted else 0), len(verdict.excepted)
+
+
+def _poor(fit: Mapping[str, float]) -> list[str]:
+    """Return the states whose free run is worse than a constant."""
+    return [s for s, v in fit.items() if v < 0]
 
 
 def _or_output_error(
     found: Estimate, logs: Sequence[TrialLog], request: Request, notes: Sequence[str]
 ) -> Estimate:
     """Return output error on the same predictor where its verdict is better than `found`'s."""
-    if regression_only(request) or misfit(found.tests):
-        # no other estimator mends what the structure lacks
+    if regression_only(request) or (misfit(found.tests) and not _poor(found.fit)):
+        # no other estimator mends what the structure lacks, but one may simulate
         return found
     before = f"{found.method} of this predictor alone is judged '{found.verdict.text}'"
     way = Alternative(found.predictor.structure, "oe", found.predictor.kind)
@@ -80,9 +89,14 @@ def _or_output_error(
         return _noting(found, f"output error was tried too, and failed: {error}")
     if diverged:
         return _noting(found, "output error was tried too, and its free run diverges.")
-    if _rank(tried.verdict) < _rank(found.verdict):
-        note = f"output error was taken, because it is judged '{tried.verdict.text}' and {before}."
-        return _noting(tried, note)
+    if _rank(tried) < _rank(found):
+        why = f"it is judged '{tried.verdict.text}' and {before}"
+        if _rank(tried)[0] == 2:
+            why = (
+                f"its free run is better than a constant in more of the states, though neither "
+                f"is to be trusted: {before}"
+            )
+        return _noting(tried, f"output error was taken, because {why}.")
     return _noting(
         found, f"output error was tried too, and is judged no better: '{tried.verdict.text}'."
     )
@@ -144,7 +158,7 @@ def _finished(
         )
     fit = average_fit(runs)
     diverged = any(r.diverged >= 0 for r in runs)
-    poor = [s for s, v in fit.items() if v < 0]
+    poor = _poor(fit)
     if poor and not diverged:
         own.append(
             f"the free run of {', '.join(poor)} is worse than a constant on the very logs it "

@@ -1,0 +1,77 @@
+"""`greybox demo`: the whole loop on a virtual ship, with a page at its end."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import textwrap
+
+from greybox.commands.common import CLEAR, add_seed, provenance, say
+
+HELP = (
+    "go once round the loop on a virtual ship: design, sail, estimate, diagnose, extend, redesign"
+)
+EXAMPLES = """examples:
+  greybox demo --open
+  greybox demo --effect current --seed 3 --out mydemo
+"""
+_WIDTH = 92
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument(
+        "--out", default="greybox-demo", metavar="DIR", help="folder of its files (greybox-demo)"
+    )
+    parser.add_argument(
+        "--effect",
+        default="thruster_lag",
+        metavar="ID",
+        help="what is wrong with the ship that its model lacks: current, thruster_lag, "
+        "input_delay, quadratic_thrust, advance_speed, cubic_damping, lever_arm, heading_bias "
+        "or waves (thruster_lag)",
+    )
+    parser.add_argument("--open", action="store_true", help="open the page when it is done")
+    add_seed(parser)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Go round the loop and write the page."""
+    from threadpoolctl import threadpool_limits
+
+    from experiment_design.demo.loop import run_demo
+    from experiment_design.demo.page import demo_page
+    from experiment_design.demo.steps import Step
+    from greybox.report.page import write_page
+
+    count = 0
+
+    def tell(step: Step) -> None:
+        nonlocal count
+        count += 1
+        lines = [f"{count}. {step.title}"]
+        if step.command:
+            lines.append(f"   $ {step.command}")
+        lines += [
+            textwrap.fill(t, _WIDTH, initial_indent="   ", subsequent_indent="   ")
+            for t in step.told
+        ]
+        say("\n".join(lines))
+
+    def show(text: str) -> None:
+        if sys.stderr.isatty():
+            sys.stderr.write(f"{CLEAR}{text} …")
+            sys.stderr.flush()
+
+    with threadpool_limits(1):
+        demo = run_demo(
+            options.out, effect=options.effect, seed=options.seed, tell=tell, progress=show
+        )
+        show("drawing")
+        report = demo.files.report
+        write_page(demo_page(demo, provenance(options)), report)
+    say(f"wrote {report} and the files of each step beside it")
+    if options.open:
+        import webbrowser
+
+        webbrowser.open(report.resolve().as_uri())

@@ -1,0 +1,118 @@
+"""The page of `greybox demo`: the loop as a story, a picture and a command for each step."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from experiment_design.demo.steps import Demo, Step
+from experiment_design.report import design_page
+from experiment_design.result import Design
+from greybox.diagnosis.result import Diagnosis
+from greybox.model.model import ManoeuvringModel
+from greybox.report.comparison import comparison_page
+from greybox.report.diagnosed_causes import cause_section
+from greybox.report.diagnosis import diagnosis_page
+from greybox.report.figures import to_svg
+from greybox.report.log import log_figure
+from greybox.report.model_difference import marked_equations
+from greybox.report.page import Marked, Page, Picture, Section, Table, flatten
+from greybox.validation.comparison import Comparison
+
+
+def demo_page(demo: Demo, record: Mapping[str, Any]) -> Page:
+    """Return the page, its story first.
+
+    Parameters
+    ----------
+    demo : Demo
+    record : mapping
+        How it was computed.
+    """
+    log = Picture(
+        to_svg(log_figure(demo.trial), "trial"),
+        "The trial as its log holds it: track, motion, commands.",
+        f"Track, velocities, heading and commands of {len(demo.trial)} samples.",
+    )
+    diagnosis, model = demo.diagnosis, demo.estimate.model()
+    found = cause_section(diagnosis)
+    wrong = diagnosis_page(diagnosis, {}).sections[0]
+    shown: list[tuple[Sequence[Picture], Sequence[Table], Sequence[Marked], Sequence[str]]] = [
+        (_plan(demo.design), (), (), ()),
+        ((), (), (), ()),
+        ((log,), (), (), ()),
+        ((), (_parameters(demo),), (), ()),
+        (_runs(demo.before, model), (), (), wrong.points[:4]),
+        (
+            found.pictures,
+            found.tables[:1],
+            marked_equations(diagnosis.base, diagnosis.model),
+            diagnosis.next_steps,
+        ),
+        (_runs(demo.after, model, diagnosis.model), (), (), ()),
+        (_plan(demo.next_design), (), (), ()),
+    ]
+    sections = [
+        _section(number, step, *parts)
+        for number, (step, parts) in enumerate(zip(demo.steps, shown, strict=True), 1)
+    ]
+    return Page(
+        title="Once round the loop, on a virtual ship",
+        headline=headline(diagnosis, demo),
+        sentences=[
+            "Each step below shows the command that does it; the files that it reads and writes "
+            "stand beside this page, so that every step can be taken again by hand."
+        ],
+        sections=sections,
+        computed=flatten(dict(record)),
+    )
+
+
+def headline(diagnosis: Diagnosis, demo: Demo) -> str:
+    """Return the story in a sentence."""
+    ids = [c.id for c in diagnosis.causes]
+    hidden = [e.id for e in demo.hidden]
+    asked = f"A ship sailed with {' and '.join(hidden)} hidden in it, which its model lacked"
+    if ids == hidden:
+        return f"{asked}: the trial was designed, the cause found and named, the model mended."
+    return f"{asked}; the verdict of these logs is '{diagnosis.verdict}'" + (
+        f", with {', '.join(ids)} named." if ids else "."
+    )
+
+
+def _section(
+    number: int,
+    step: Step,
+    pictures: Sequence[Picture],
+    tables: Sequence[Table],
+    marked: Sequence[Marked],
+    points: Sequence[str],
+) -> Section:
+    command = (("Command", step.command),) if step.command else ()
+    return Section(
+        f"{number}. {step.title}", step.told, pictures, tables, command, points, marked
+    )  # fmt: skip
+
+
+def _plan(design: Design) -> list[Picture]:
+    """Return track and motion of a plan."""
+    return list(design_page(design, (), {}).pictures[:2])
+
+
+def _runs(comparison: Comparison, *models: ManoeuvringModel) -> Sequence[Picture]:
+    return comparison_page(comparison, models, {}).pictures
+
+
+def _parameters(demo: Demo) -> Table:
+    estimate = demo.estimate
+    model = estimate.model()
+    return Table(
+        "Parameters and their standard errors",
+        ["parameter", "value", "std err", "unit"],
+        [
+            [name, f"{value:.4g}", f"{std:.2g}", unit]
+            for name, value, std, unit in zip(
+                estimate.labels, model.theta, model.std, model.units, strict=True
+            )
+        ],
+    )

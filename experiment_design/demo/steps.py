@@ -1,0 +1,112 @@
+"""What the demo has done so far: steps in words, the files they wrote, what they returned."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from experiment_design.result import Design
+from greybox.diagnosis.result import Diagnosis
+from greybox.estimation.result import Estimate
+from greybox.study.blind_causes import Effect
+from greybox.trial.checks.finding import CheckReport
+from greybox.trial.log import TrialLog
+from greybox.validation.comparison import Comparison
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of the loop.
+
+    Parameters
+    ----------
+    title : str
+    command : str
+        What a user types for it, in the demo's folder; empty for the virtual sea.
+    told : tuple of str
+        What came out, in sentences.
+    """
+
+    title: str
+    command: str
+    told: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Files:
+    """Where each step of the demo leaves its file."""
+
+    folder: Path
+
+    @property
+    def prior(self) -> Path:
+        """The model that the first trial is designed with."""
+        return self.folder / "prior.json"
+
+    @property
+    def plan(self) -> Path:
+        """The designed commands."""
+        return self.folder / "plan.csv"
+
+    @property
+    def trial(self) -> Path:
+        """The log of the designed trial."""
+        return self.folder / "trial.csv"
+
+    @property
+    def other(self) -> Path:
+        """A log that takes no part in any fit."""
+        return self.folder / "other.csv"
+
+    @property
+    def model(self) -> Path:
+        """The estimated model."""
+        return self.folder / "model.json"
+
+    @property
+    def better(self) -> Path:
+        """The model extended by the cause that was found."""
+        return self.folder / "better.json"
+
+    @property
+    def next_plan(self) -> Path:
+        """The commands of the next trial."""
+        return self.folder / "next_plan.csv"
+
+    @property
+    def report(self) -> Path:
+        """The page."""
+        return self.folder / "report.html"
+
+
+@dataclass(frozen=True)
+class Demo:
+    """The whole loop, once round.
+
+    Parameters
+    ----------
+    files : Files
+    steps : tuple of Step
+    design, next_design : Design
+    trial, other : TrialLog
+    hidden : tuple of Effect
+        What was wrong with the ship all along.
+    check : CheckReport
+    estimate : Estimate
+    before, after : Comparison
+        Free runs on the other log: of the estimate, and beside it of the extended model.
+    diagnosis : Diagnosis
+    """
+
+    files: Files
+    steps: tuple[Step, ...]
+    design: Design
+    next_design: Design
+    trial: TrialLog
+    other: TrialLog
+    hidden: tuple[Effect, ...]
+    check: CheckReport
+    estimate: Estimate
+    before: Comparison
+    after: Comparison
+    diagnosis: Diagnosis
