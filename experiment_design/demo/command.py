@@ -28,8 +28,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="thruster_lag",
         metavar="ID",
         help="what is wrong with the ship that its model lacks: current, thruster_lag, "
-        "input_delay, quadratic_thrust, advance_speed, cubic_damping, lever_arm, heading_bias "
-        "or waves (thruster_lag)",
+        "input_delay, quadratic_thrust, cubic_damping, lever_arm, heading_bias or waves "
+        "(thruster_lag)",
     )
     parser.add_argument("--open", action="store_true", help="open the page when it is done")
     add_seed(parser)

@@ -43,7 +43,6 @@ EFFECTS = (
     "thruster_lag",
     "input_delay",
     "quadratic_thrust",
-    "advance_speed",
     "cubic_damping",
     "lever_arm",
     "heading_bias",
@@ -257,7 +256,7 @@ def _compared(comparison: Comparison) -> Step:
 
 def _spelled(cause: Found) -> str:
     return ", ".join(
-        f"{name} = {q.value:.3g} ± {q.std:.2g} {q.unit}".rstrip()
+        f"{name} = {q.value:.3g} ± {q.std:.2g}" + (f" {q.unit}" if q.unit != "1" else "")
         for name, q in cause.parameters.items()
     )
 
