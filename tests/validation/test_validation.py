@@ -156,6 +156,12 @@ def test_output_error_that_is_judged_no_better_is_left(monkeypatch):
     log = virtual_log(4, 1500, spread=0.0)
     doubtful = Verdict("do not trust: a reason")
     monkeypatch.setattr("greybox.validation.choose._verdict", lambda *_: doubtful)
+    # of two that are not to be trusted the one that simulates is taken …
+    e = estimate_model([log])
+    assert e.method == "oe"
+    assert "its free run is better than a constant in more of the states" in e.notes[-1]
+    # … and the first where both do
+    monkeypatch.setattr("greybox.validation.choose._poor", lambda fit: [])
     e = estimate_model([log])
     assert e.method == "iv"
     assert e.notes[-1] == (
