@@ -1,0 +1,114 @@
+"""Models and the runs that their exports must repeat."""
+
+from __future__ import annotations
+
+import csv
+import shutil
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from greybox.export.export import export_model
+from greybox.model.changes import Change
+from greybox.model.model import ManoeuvringModel
+from greybox.model.simulation import mid_step, positions
+from greybox.trial.log import TrialLog
+from greybox.validation.fit import run_model
+from greybox.vessel.thrust import ThrustLaw
+from greybox.vessel.vessel import Actuation
+
+CURRENT = {"current_north": (0.3, 0.01), "current_east": (-0.2, 0.01)}
+CHANGES = (Change("Xu", 3.0, 40.0), Change("Nr", 0.5, 90.2), Change("Xu", 1.5, 120.0))
+
+
+def with_actuation(model: ManoeuvringModel, **late) -> ManoeuvringModel:
+    return replace(model, vessel=replace(model.vessel, actuation=Actuation(**late)))
+
+
+def with_thrusters(model: ManoeuvringModel, *changed: dict) -> ManoeuvringModel:
+    thrusters = [replace(t, **c) for t, c in zip(model.vessel.thrusters, changed, strict=True)]
+    return replace(model, vessel=replace(model.vessel, thrusters=tuple(thrusters)))
+
+
+def variants(model: ManoeuvringModel) -> dict[str, ManoeuvringModel]:
+    """Return every kind of extension that a diagnosis can make of a model."""
+    law = ThrustLaw("linear", (), 0.4, 15.0)
+    table = ThrustLaw("table", ((0.0, 0.0), (12.0, 9.0), (20.0, 25.0)))
+    wide = model.structure.with_terms("N_|r|r", "Y_|r|v", "X_uuu", "Y_0")
+    more = np.array([-0.3, 0.05, -1e-3, 1e-4])
+    return {
+        "plain": model,
+        "rk4": replace(model, integrator="rk4"),
+        "current": replace(model, disturbances=CURRENT),
+        "wind": replace(model, disturbances=CURRENT | {"wind_north": (3.0, 0.1)}),
+        "changes": replace(model, changes=CHANGES),
+        "changes of rk4": replace(model, changes=CHANGES, integrator="rk4", disturbances=CURRENT),
+        "lag": with_actuation(model, lag=4.0),
+        "lag of speeds": with_actuation(model, lag=4.0, lag_on="speed", lag_held="mean"),
+        "lag of commands": with_actuation(model, lag=2.5, lag_on="command", lag_held="end"),
+        "delay": with_actuation(model, delay=2.6),
+        "whole delay": with_actuation(model, delay=3.0),
+        "late": replace(
+            with_actuation(model, lag=3.0, lag_held="mean", delay=0.4),
+            disturbances=CURRENT, integrator="rk4", changes=CHANGES,
+        ),
+        "thrusters": with_thrusters(
+            model, {"thrust": law, "gain": 0.8}, {"thrust": table, "angle_offset": 0.05}
+        ),
+        "terms": replace(
+            model, structure=wide, theta=np.concatenate([model.theta, more]),
+            covariance=np.zeros((22, 22)),
+        ),
+    }  # fmt: skip
+
+
+def wanted(model: ManoeuvringModel, log: TrialLog, heading: str = "simulated") -> np.ndarray:
+    """Return u, v, r, psi, x_n, y_n of greybox's own free run from (10, -5) m, (N, 6)."""
+    run = run_model(model, log, heading=heading)
+    psi = held_heading(model, log["psi"]) if heading == "measured" else run.psi
+    way = positions(run.x, psi, model.sample_time, np.array([10.0, -5.0]))
+    return np.column_stack([run.x, psi, way])
+
+
+def held_heading(model: ManoeuvringModel, psi: np.ndarray) -> np.ndarray:
+    """Return the measured heading as a step of the free run holds it."""
+    return psi if model.integrator == "euler" else mid_step(psi)
+
+
+def held_wind(model: ManoeuvringModel, value: np.ndarray) -> np.ndarray:
+    """Return measured wind as a step holds it; the run reads none after its last step."""
+    return value if model.integrator == "euler" else np.append(mid_step(value[:-1]), value[-1])
+
+
+def calm(model: ManoeuvringModel, log: TrialLog) -> TrialLog:
+    """Return the log of the model's vessel, without wind."""
+    kept = {k: v for k, v in log.channels.items() if k not in ("u_q", "v_q")}
+    return replace(log, vessel=model.vessel, channels=kept)
+
+
+def program(model: ManoeuvringModel, folder: Path, **options) -> Path:
+    """Export C, compile its example, return the program."""
+    export_model(model, "c", folder / "ship.c", **options)
+    out = folder / "ship"
+    words = ["-std=c99", "-Wall", "-Werror", "-O2", "-ffp-contract=off", "-o", out]
+    subprocess.run(
+        [shutil.which("cc"), *words, folder / "ship_example.c", folder / "ship.c", "-lm"],
+        check=True, capture_output=True, text=True,
+    )  # fmt: skip
+    return out
+
+
+def run_program(
+    program: Path, columns: dict[str, np.ndarray], start: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Run the example on columns from a start and return its columns."""
+    rows = zip(*columns.values(), strict=True)
+    text = "\n".join([",".join(columns), *[",".join(f"{v:.17g}" for v in row) for row in rows]])
+    done = subprocess.run(
+        [program, *[f"{v:.17g}" for v in start]], input=text, check=True, capture_output=True,
+        text=True,
+    )  # fmt: skip
+    table = list(csv.reader(done.stdout.splitlines()))
+    return dict(zip(table[0], np.array(table[1:], float).T, strict=True))
