@@ -121,5 +121,5 @@ def unit_factor(unit: str, target: str | None, name: str) -> float:
 
 
 def unit_dimension(unit: str) -> str:
-    """Return the unit that values have once they are read from `unit`, such as ``m/s`` of ``kn``."""
+    """Return the unit that values read in `unit` have afterwards, such as ``m/s`` for ``kn``."""
     return _UNITS[unit][0]

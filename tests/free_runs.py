@@ -10,17 +10,69 @@ from pathlib import Path
 
 import numpy as np
 
+from greybox.estimation.estimate import estimate_ls
 from greybox.export.export import export_model
+from greybox.model.catalogue import structure_for
 from greybox.model.changes import Change
 from greybox.model.model import ManoeuvringModel
+from greybox.model.predictor import build_predictor
 from greybox.model.simulation import mid_step, positions
+from greybox.trial.conditioning import decimate
 from greybox.trial.log import TrialLog
+from greybox.trial.reading import read_log
 from greybox.validation.fit import run_model
+from greybox.vessel.force import force_inputs
 from greybox.vessel.thrust import ThrustLaw
+from greybox.vessel.toml import vessel_from_dict
 from greybox.vessel.vessel import Actuation
 
 CURRENT = {"current_north": (0.3, 0.01), "current_east": (-0.2, 0.01)}
 CHANGES = (Change("Xu", 3.0, 40.0), Change("Nr", 0.5, 90.2), Change("Xu", 1.5, 120.0))
+
+
+REAL = {
+    "esso_osaka": (
+        "zigzag_31-Jul-2020_13_29_19.csv",
+        {"name": "3 m tanker", "length": 3.0,
+         "thruster": [{"type": "propeller_rudder", "x": -1.5, "speed": "n_prop [rps]",
+                       "rudder": "delta_rudder [rad]"}],
+         "columns": {"t [s]": {"name": "t", "unit": "s"},
+                     "x_position_mid [m]": {"name": "x_n", "unit": "m"},
+                     "y_position_mid [m]": {"name": "y_n", "unit": "m"},
+                     "u_velo [m/s]": {"name": "u", "unit": "m/s"},
+                     "vm_velo [m/s]": {"name": "v", "unit": "m/s"},
+                     "psi_hat [rad]": {"name": "psi", "unit": "rad"},
+                     "r_angvelo [rad/s]": {"name": "r", "unit": "rad/s"},
+                     "n_prop [rps]": {"name": "n_prop [rps]", "unit": "rps"},
+                     "wind_velo_relative_mid [m/s]": {"name": "V_q", "unit": "m/s"},
+                     "wind_dir_relative_mid [rad]": {"name": "dir_q", "unit": "rad"}}},
+    ),
+    "kvlcc2": (
+        "hsva_Z_20_05.csv",
+        {"name": "7 m tanker", "length": 7.0,
+         "thruster": [{"type": "propeller_rudder", "x": -3.5, "speed": "n_rps",
+                       "rudder": "delta_deg"}],
+         "columns": {"t_s": {"name": "t", "unit": "s"},
+                     "u_mps": {"name": "u", "unit": "m/s"},
+                     "v_mps": {"name": "v", "unit": "m/s"},
+                     "r_degps": {"name": "r", "unit": "deg/s"},
+                     "psi_deg": {"name": "psi", "unit": "deg"},
+                     "delta_deg": {"name": "delta_deg", "unit": "deg"}}},
+    ),
+}  # fmt: skip
+
+
+def real_model(data_folder: Path, folder: str) -> tuple[ManoeuvringModel, TrialLog]:
+    """Return a model of a real ship by least squares, and the log that it is of."""
+    name, tables = REAL[folder]
+    vessel = vessel_from_dict(tables)
+    log = decimate(read_log(data_folder / folder / name, vessel), 0.5)
+    # a propeller of constant speed leaves these of the tanker apart
+    plain = "linear-X_race_drag-X_|u|u*rudder_drag-Xmu"
+    terms = "linear+Wuu+Wvv+Wuv" if log.has_wind else plain
+    kind = "basic+wind" if log.has_wind else "basic"
+    predictor = build_predictor(structure_for(terms, force_inputs(vessel)), kind)
+    return estimate_ls(predictor, [log], judged=False).model(), log
 
 
 def with_actuation(model: ManoeuvringModel, **late) -> ManoeuvringModel:
@@ -30,6 +82,12 @@ def with_actuation(model: ManoeuvringModel, **late) -> ManoeuvringModel:
 def with_thrusters(model: ManoeuvringModel, *changed: dict) -> ManoeuvringModel:
     thrusters = [replace(t, **c) for t, c in zip(model.vessel.thrusters, changed, strict=True)]
     return replace(model, vessel=replace(model.vessel, thrusters=tuple(thrusters)))
+
+
+KINDS = (
+    "plain", "rk4", "current", "wind", "changes", "changes of rk4", "lag", "lag of speeds",
+    "lag of commands", "delay", "whole delay", "late", "thrusters", "terms",
+)  # fmt: skip
 
 
 def variants(model: ManoeuvringModel) -> dict[str, ManoeuvringModel]:

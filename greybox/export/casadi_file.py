@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ def casadi_functions(sampled: SampledModel) -> dict[str, ca.Function]:
 
     ``step`` is ``(x, u, p) -> (x_next, y)`` over one sample time, ``y`` at its
     start; ``rhs`` is ``(x, u, p) -> (x_dot)``, where the model has a rate; ``begin``
-    is ``(x, u, p) -> (x)``, which puts the thrusters at rest on the first commands,
+    is ``(x, u, p) -> (x_begin)``, which puts the thrusters at rest on the first commands,
     where they remember something. ``p`` are the model's parameters.
 
     Parameters
@@ -39,8 +40,18 @@ def casadi_functions(sampled: SampledModel) -> dict[str, ca.Function]:
         rate = [ca.densify(sampled.rate)]
         functions["rhs"] = ca.Function("rhs", given, rate, names, ["x_dot"], options)
     if len(sampled.states) > sampled.motion:
-        functions["begin"] = ca.Function("begin", given, [sampled.rest], names, ["x"], options)
+        functions["begin"] = ca.Function(
+            "begin", given, [sampled.rest], names, ["x_begin"], options
+        )
     return functions
+
+
+def serialised(function: ca.Function) -> bytes:
+    """Return the bytes of the file that ``casadi.Function.load`` reads."""
+    with tempfile.TemporaryDirectory() as scratch:
+        file = Path(scratch) / "function.casadi"
+        function.save(str(file))
+        return file.read_bytes()
 
 
 def casadi_files(
@@ -62,9 +73,7 @@ def casadi_files(
         "structure": model.structure.name,
         "integrator": model.integrator,
         "sample_time": model.sample_time,
-        "functions": {
-            f.name(): {"file": at.name, "signature": str(f)} for at, f in files.items()
-        },
+        "functions": {f.name(): {"file": at.name, "signature": str(f)} for at, f in files.items()},
         "no_rhs": sampled.no_rate or None,
         "x": port_rows(sampled.states),
         "motion": sampled.motion,

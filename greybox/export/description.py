@@ -44,9 +44,7 @@ class Variables:
             tuple(Port(next(names), p.unit, line(p.meaning), p.value) for p in g) for g in groups
         )
         meanings = [s.meaning for s in sampled.switches]
-        return cls(
-            parameters, starts_, inputs, outputs, tuple(zip(names, meanings, strict=True))
-        )
+        return cls(parameters, starts_, inputs, outputs, tuple(zip(names, meanings, strict=True)))
 
     @property
     def settable(self) -> tuple[Port, ...]:

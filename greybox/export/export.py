@@ -9,7 +9,8 @@ from html import escape
 from pathlib import Path
 
 from greybox.errors import UsageError, suggestion
-from greybox.export.sampled import Heading, SampledModel, Wind, sampled_model
+from greybox.export.motion import Heading, Wind
+from greybox.export.sampled import SampledModel, sampled_model
 from greybox.files import check_targets, replacing, to_json
 from greybox.model.model import ManoeuvringModel
 
@@ -170,11 +171,10 @@ def _c(model: ManoeuvringModel, sampled: SampledModel, path: Path) -> Files:
 
 
 def _casadi(model: ManoeuvringModel, sampled: SampledModel, path: Path) -> Files:
-    from greybox.export.casadi_file import casadi_files
+    from greybox.export.casadi_file import casadi_files, serialised
 
     functions, side = casadi_files(model, sampled, path)
-    # the serialised form is text
-    files = {f: function.serialize().encode() for f, function in functions.items()}
+    files = {f: serialised(function) for f, function in functions.items()}
     return files | {f: to_json(table).encode() for f, table in side.items()}
 
 

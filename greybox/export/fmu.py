@@ -125,7 +125,11 @@ def archive(files: Mapping[str, bytes]) -> bytes:
 
 def _guid(*texts: str) -> str:
     digest = hashlib.sha256("\0".join(texts).encode()).hexdigest()
-    return "{" + "-".join(digest[a:b] for a, b in ((0, 8), (8, 12), (12, 16), (16, 20), (20, 32))) + "}"
+    return (
+        "{"
+        + "-".join(digest[a:b] for a, b in ((0, 8), (8, 12), (12, 16), (16, 20), (20, 32)))
+        + "}"
+    )
 
 
 def _page(model: ManoeuvringModel, sampled: SampledModel) -> str:

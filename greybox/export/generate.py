@@ -12,9 +12,7 @@ from greybox.export.names import comment
 from greybox.export.ports import Port
 
 
-def c_functions(
-    unit: str, arguments: Sequence[ca.SX], expressions: Mapping[str, ca.SX]
-) -> str:
+def c_functions(unit: str, arguments: Sequence[ca.SX], expressions: Mapping[str, ca.SX]) -> str:
     """Return C functions of the same arguments, one an expression.
 
     Each has the signature ``int name(const double **, double **, int *, double *, int)``
@@ -28,7 +26,7 @@ def c_functions(
     expressions : mapping of str to SX
         By the name of the function.
     """
-    options = {"with_header": False, "casadi_int": "int", "casadi_real": "double"}
+    options: dict[str, Any] = {"with_header": False, "casadi_int": "int", "casadi_real": "double"}
     generator = ca.CodeGenerator(unit, options)
     for name, expression in expressions.items():
         generator.add(ca.Function(name, list(arguments), [ca.densify(expression)], {"cse": True}))

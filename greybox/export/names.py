@@ -22,8 +22,8 @@ def identifier(text: str) -> str:
     plain = re.sub(r"[^A-Za-z0-9]+", "_", text).strip("_")[:_MOST]
     # names that begin with an underscore are the compiler's
     if not plain or plain[0].isdigit():
-        plain = f"x{plain}"
-    return f"{plain}_" if plain in _RESERVED else plain
+        plain = f"x_{plain}".rstrip("_")
+    return f"x_{plain}" if plain in _RESERVED else plain
 
 
 def identifiers(names: Iterable[str]) -> list[str]:

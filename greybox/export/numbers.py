@@ -25,9 +25,7 @@ MEANING = (
 
 def port_rows(ports: Sequence[Port]) -> list[dict[str, Any]]:
     """Return ports as rows of JSON."""
-    return [
-        {"name": p.name, "unit": p.unit, "meaning": p.meaning, "value": p.value} for p in ports
-    ]
+    return [{"name": p.name, "unit": p.unit, "meaning": p.meaning, "value": p.value} for p in ports]
 
 
 def signals(model: ManoeuvringModel) -> list[str]:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 from greybox.channels import CHANNELS, unit_dimension
+from greybox.export.names import distinct
 from greybox.vessel.vessel import Vessel
 
 # SI base units of what units are spelled with
@@ -73,6 +75,12 @@ def command_ports(vessel: Vessel) -> list[Port]:
             parts.append(f"without the {late[name]:g} s by which the log's column is late")
         ports.append(Port(name, unit, "; ".join(parts)))
     return ports
+
+
+def distinct_ports(ports: Sequence[Port]) -> tuple[Port, ...]:
+    """Return ports with names that are all different."""
+    names = distinct(p.name for p in ports)
+    return tuple(replace(p, name=n) for n, p in zip(names, ports, strict=True))
 
 
 def base_units(unit: str) -> dict[str, int] | None:
