@@ -121,7 +121,7 @@ class Motion:
     def _psi(self, measured: bool) -> ca.SX:
         if not measured:
             return self.states["psi"]
-        return self.inputs["psi_measured" if self.heading == "either" else "psi"]
+        return self.inputs["psi_measured" if "psi_measured" in self.inputs else "psi"]
 
     def _step(
         self,

@@ -124,10 +124,12 @@ def sampled_model(
             f"structure '{structure.name}' has no yaw rate, so its heading cannot be simulated: "
             f"export it with the measured heading."
         )
+    # an FMU has the heading among its outputs as well
+    label = "psi_measured" if heading == "either" else "psi"
     if heading is None or not turns:
         heading = "simulated" if turns else "measured"
     commands = command_ports(model.vessel)
-    outside, switches = _outside(model, heading, wind)
+    outside, switches = _outside(model, heading, wind, label)
     inputs = [*commands, *outside]
     parameters = parameter_ports(model)
     u, s, p = (
@@ -186,7 +188,7 @@ def sampled_model(
 
 
 def _outside(
-    model: ManoeuvringModel, heading: Heading, wind: Wind
+    model: ManoeuvringModel, heading: Heading, wind: Wind, label: str
 ) -> tuple[list[Port], list[Switch]]:
     """Return what acts on the ship beside its thrusters, and what is left open of it."""
     known = dict(zip(model.structure.disturbances, model.d, strict=True))
@@ -200,10 +202,9 @@ def _outside(
         if wind == "either":
             text = "true: u_q, v_q drive the wind terms; false: wind_north, wind_east do"
             switches.append(Switch("wind_measured", text))
-    if heading == "measured":
-        ports.append(channel_port("psi"))
-    elif heading == "either":
-        ports.append(channel_port("psi", label="psi_measured"))
+    if heading != "simulated":
+        ports.append(channel_port("psi", label=label))
+    if heading == "either":
         text = "true: psi_measured is the heading; false: it is simulated"
         switches.append(Switch("heading_measured", text))
     return ports, switches

@@ -143,6 +143,7 @@ def test_the_example_names_what_is_missing(model, tmp_path):
     assert status == 1
     assert "column 'wind_north', 0 is taken" in error
     assert "row 2 has 2 cells, 3 are needed" in error
+    assert "row 2: 'x' is no number" in said("n,alpha1,alpha2\n1,x,2\n", *start)[1]
     assert said("", "1") == (2, f"usage: {ship} U V R PSI X_N Y_N < LOG > RUN\n")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
 import zipfile
 from contextlib import contextmanager
 from dataclasses import replace
@@ -25,6 +26,7 @@ from greybox.errors import ExportError
 from greybox.export.export import export_model
 from greybox.model.catalogue import get_structure
 from greybox.model.model import ManoeuvringModel
+from greybox.validation.fit import run_model
 from greybox.vessel.toml import vessel_from_dict
 
 fmpy = pytest.importorskip("fmpy", reason="fmpy is not installed")
@@ -151,6 +153,23 @@ def test_coefficients_are_set_and_heading_and_wind_measured(model, plain, log):
     # the recorder reads the outputs before it sets the inputs of that time
     got[1:, 3] = np.append(got[2:, 3], want[-1, 3])
     np.testing.assert_allclose(got, want, rtol=1e-9, atol=1e-9)
+
+
+@needs_compiler
+def test_a_surge_model(ship, log, tmp_path):
+    """Without a yaw rate the heading is always measured, and there is no position."""
+    model = ManoeuvringModel(
+        get_structure("surge"), np.array([-0.05, -0.05, -5e-4, 0.02]), np.zeros((4, 4)), 1.0,
+        ship, disturbances={"current_north": (0.3, 0.0)},
+    )  # fmt: skip
+    export_model(model, "fmu", tmp_path / "ship.fmu")
+    assert validate_fmu(str(tmp_path / "ship.fmu")) == []
+    want = run_model(model, calm(model, log)).x[:, 0]
+    with instance(tmp_path / "ship.fmu", u_start=want[0]) as one:
+        for k in range(len(log) - 1):
+            one.set(psi_measured=log["psi"][k], **{c: log[c][k] for c in ship.commands})
+            one.fmu.doStep(float(k), 1.0)
+            assert one.get("u")[0] == pytest.approx(want[k + 1], rel=1e-9)
 
 
 @needs_compiler
@@ -313,6 +332,23 @@ def test_an_importer_can_compile_the_sources(model, log, tmp_path):
     build_platform_binary(folder, build_dir=tmp_path / "build")
     result = fmpy.simulate_fmu(folder, stop_time=2.0, output_interval=1.0)
     assert len(result) == 3
+
+
+@needs_compiler
+def test_two_models_in_one_program(model, tmp_path):
+    """Compiled into a program, the functions carry the model's name."""
+    for name in ("one", "two"):
+        export_model(model, "fmu", tmp_path / f"{name}.fmu", binary=False)
+        with zipfile.ZipFile(tmp_path / f"{name}.fmu") as archive:
+            archive.extractall(tmp_path / name)
+    (tmp_path / "main.c").write_text("""
+        #include <stdio.h>
+        const char *one_fmi2GetVersion(void), *two_fmi2GetVersion(void);
+        int main(void) { return printf("%s %s", one_fmi2GetVersion(), two_fmi2GetVersion()) < 0; }
+    """)
+    sources = [str(p) for n in ("one", "two") for p in (tmp_path / n / "sources").glob("*.c")]
+    subprocess.run(["cc", "main.c", *sources, "-o", "main", "-lm"], cwd=tmp_path, check=True)
+    assert subprocess.check_output([tmp_path / "main"]) == b"2.0 2.0"
 
 
 @needs_compiler

@@ -79,12 +79,19 @@ int main(int count, char **words)
     printf("\n");
     while (fgets(row, sizeof row, stdin)) {
         columns = cells(row, cell);
+        if (columns == 1 && !*cell[0])
+            continue;
         for (i = 0; i < {{ upper }}_INPUTS; i++) {
+            char *end = 0;
             if (place[i] >= columns) {
                 fprintf(stderr, "row %d has %d cells, %d are needed\n", k + 2, columns, place[i] + 1);
                 return 1;
             }
-            u[i] = place[i] < 0 ? otherwise[i] : strtod(cell[place[i]], 0);
+            u[i] = place[i] < 0 ? otherwise[i] : strtod(cell[place[i]], &end);
+            if (end == cell[place[i] < 0 ? 0 : place[i]]) {
+                fprintf(stderr, "row %d: '%s' is no number\n", k + 2, end);
+                return 1;
+            }
         }
         if (k == 0)
             {{ name }}_begin(&state, &input);
