@@ -17,8 +17,10 @@
 #define REALS (FIRST_OUTPUT + MODEL_OUTPUTS)
 /* an array has at least one element */
 #define BOOLEANS (MODEL_SWITCHES ? MODEL_SWITCHES : 1)
-/* share of a sample by which times of the simulator may differ from the grid */
+/* share of a sample by which times of the simulator may differ from the grid, and share of
+ * themselves to which large times, such as seconds since 1970, are exact */
 #define NEAR 1e-6
+#define EXACT 1e-15
 
 enum { INSTANTIATED, INITIALISING, STEPPING, TERMINATED, FAILED };
 
@@ -76,6 +78,12 @@ static void call(int (*function)(const double **, double **, int *, double *, in
     given[3] = data->real;
     found[0] = result;
     function(given, found, 0, 0, 0);
+}
+
+/* Share of a sample within which two times are the same instant. */
+static double near_at(double time)
+{
+    return NEAR + EXACT * (time < 0 ? -time : time) / MODEL_SAMPLE_TIME;
 }
 
 static void reset(Data *data)
@@ -330,12 +338,12 @@ FMI2(fmi2Status, fmi2DoStep)(fmi2Component c, fmi2Real time, fmi2Real step, fmi2
     Instance *of = c;
     Data *data = &of->data;
     char message[300];
-    double place, last;
+    double place, last, near = near_at(time + step);
     (void)final;
     if (data->phase != STEPPING)
         return refuse(of, "fmi2DoStep", "the instance is not initialised, or has ended");
-    if (!(time - data->time <= NEAR * MODEL_SAMPLE_TIME &&
-            data->time - time <= NEAR * MODEL_SAMPLE_TIME)) {
+    if (!(time - data->time <= near * MODEL_SAMPLE_TIME &&
+            data->time - time <= near * MODEL_SAMPLE_TIME)) {
         sprintf(message, "fmi2DoStep: it begins at %.9g s, but the last step ended at %.9g s", time,
             data->time);
         return tell(of, fmi2Error, message);
@@ -346,7 +354,7 @@ FMI2(fmi2Status, fmi2DoStep)(fmi2Component c, fmi2Real time, fmi2Real step, fmi2
     }
     place = (time + step - data->start) / MODEL_SAMPLE_TIME;
     last = data->instant;
-    while (place - (last + 1) >= -NEAR) {
+    while (place - (last + 1) >= -near) {
         if (!data->ahead && !look_ahead(data)) {
             data->phase = FAILED;
             sprintf(message, "fmi2DoStep: the motion diverged after %.9g s, or an input is no number",
@@ -357,7 +365,7 @@ FMI2(fmi2Status, fmi2DoStep)(fmi2Component c, fmi2Real time, fmi2Real step, fmi2
         data->ahead = 0;
         data->instant = last += 1;
     }
-    data->share = place - last > NEAR ? place - last : 0;
+    data->share = place - last > near ? place - last : 0;
     if (data->share > 0 && !data->ahead && !look_ahead(data)) {
         data->phase = FAILED;
         return refuse(of, "fmi2DoStep", "the motion diverged, or an input is no number");
