@@ -1,5 +1,5 @@
-/* The C interface of FMI 2.0 for co-simulation: types and functions of an FMU.
- * Declared from the specification, FMI 2.0.4 of the Modelica Association, sections 2.1 and 4.2. */
+/* The C interface of FMI 2.0 (Modelica Association) for co-simulation: the types of an FMU, and how
+ * its functions are named. */
 #ifndef GREYBOX_FMI2_H
 #define GREYBOX_FMI2_H
 
