@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from greybox.estimation.output_setup import output_predictor
     from greybox.estimation.refined import estimate_refined_iv
     from greybox.estimation.result import Estimate, Verdict
+    from greybox.export.export import Exported, export_model
     from greybox.model.catalogue import get_structure, structure_names
     from greybox.model.model import ManoeuvringModel, load_model
     from greybox.model.predictor import Predictor, build_predictor
@@ -58,6 +59,7 @@ _WHERE = {
     "known_causes": "greybox.diagnosis.causes",
     "CheckReport": "greybox.trial.checks.finding",
     "Estimate": "greybox.estimation.result",
+    "Exported": "greybox.export.export",
     "Finding": "greybox.trial.checks.finding",
     "ImportOptions": "greybox.trial.options",
     "ManoeuvringModel": "greybox.model.model",
@@ -79,6 +81,7 @@ _WHERE = {
     "estimate_model": "greybox.validation.choose",
     "estimate_oe": "greybox.estimation.output_error",
     "estimate_refined_iv": "greybox.estimation.refined",
+    "export_model": "greybox.export.export",
     "find_manoeuvres": "greybox.trial.manoeuvres",
     "fit_percent": "greybox.validation.fit",
     "get_structure": "greybox.model.catalogue",
@@ -107,6 +110,7 @@ __all__ = [
     "Diagnosis",
     "DiagnosisOptions",
     "Estimate",
+    "Exported",
     "Finding",
     "ImportOptions",
     "ManoeuvringModel",
@@ -130,6 +134,7 @@ __all__ = [
     "estimate_model",
     "estimate_oe",
     "estimate_refined_iv",
+    "export_model",
     "find_manoeuvres",
     "fit_percent",
     "get_structure",

@@ -118,3 +118,8 @@ def unit_factor(unit: str, target: str | None, name: str) -> float:
             f"give a unit of the same dimension in [columns]."
         )
     return factor
+
+
+def unit_dimension(unit: str) -> str:
+    """Return the unit that values read in `unit` have afterwards, such as ``m/s`` for ``kn``."""
+    return _UNITS[unit][0]

@@ -43,6 +43,10 @@ class InfeasibleError(GreyboxError, ValueError):
     """What is asked of a trial cannot be met; the message names the limit and the least change."""
 
 
+class ExportError(GreyboxError, RuntimeError):
+    """A model cannot be written for another program; a compiler failed."""
+
+
 class UsageError(GreyboxError, ValueError):
     """Options that exclude one another, or that need another one beside them."""
 
