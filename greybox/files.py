@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import math
 import os
 import sys
@@ -17,6 +18,7 @@ import numpy as np
 
 from greybox.errors import LogError
 
+_log = logging.getLogger(__name__)
 
 def check_targets(*paths: str | Path | None) -> None:
     """Refuse targets that cannot be written, before anything is computed.
@@ -93,6 +95,7 @@ def replacing(path: str | Path, mode: str = "w") -> Iterator[IO[Any]]:
         os.umask(umask)
         os.chmod(handle.name, 0o666 & ~umask)
         os.replace(handle.name, path)
+        _log.info("wrote %s: %d bytes", path, path.stat().st_size)
     except BaseException:
         Path(handle.name).unlink(missing_ok=True)
         raise

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from math import isfinite
@@ -24,6 +25,7 @@ from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
 
+_log = logging.getLogger(__name__)
 FORMAT = "greybox-model"
 VERSION = 1
 _MAX_BYTES = 50_000_000
@@ -338,4 +340,9 @@ def load_model(path: str | Path) -> ManoeuvringModel:
             f"'{path.name}' is not a model file ({error}): name the file that "
             f"'greybox estimate … --out' wrote."
         ) from error
-    return model_from_dict(data, path.name)
+    model = model_from_dict(data, path.name)
+    _log.info(
+        "read model %s: structure %s, %d parameters, sample time %g s", path, model.structure.name,
+        len(model.names), model.sample_time,
+    )  # fmt: skip
+    return model

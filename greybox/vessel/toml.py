@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import tomllib
 from collections.abc import Iterable, Mapping
@@ -61,6 +62,7 @@ _SENSORS = {
 }
 _CORRECTED = ("x_n", "y_n", "psi", "u", "v", "r", "u_q", "v_q")
 _SIZES = {"antenna": (2, 3), "anemometer": (3,), "velocity_at": (2,)}
+_log = logging.getLogger(__name__)
 _MAX_BYTES = 1_000_000
 
 
@@ -107,7 +109,9 @@ def load_vessel(path: str | Path) -> Vessel:
         raise VesselError(f"'{source}' is not a text file: name a TOML vessel file.") from error
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise VesselError(f"'{source}' is not TOML: {error}. Correct that line.") from error
-    return vessel_from_dict(data)
+    vessel = vessel_from_dict(data)
+    _log.info("read vessel %s: %s, %d thruster(s)", source, vessel.name, len(vessel.thrusters))
+    return vessel
 
 
 def vessel_from_dict(data: dict[str, Any]) -> Vessel:
