@@ -206,7 +206,7 @@ def search_campaign(
                         if progress is not None:
                             progress(done, total)
                     _log.info(
-                        "trial %d, round %d of %d: %d starts, %d evaluations so far, criterion %.6g",
+                        "trial %d, round %d of %d: %d starts, %d evaluations, criterion %.6g",
                         t + 1, round_ + 1, rounds, len(chains), spent, best[t].value,
                     )  # fmt: skip
                     weakest = 0

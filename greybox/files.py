@@ -9,14 +9,17 @@ import math
 import os
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 
-from greybox.errors import LogError
+from greybox.errors import LogError, suggestion
+
+_MOST_NAMES = 10_000
 
 _log = logging.getLogger(__name__)
 
@@ -41,6 +44,23 @@ def check_targets(*paths: str | Path | None) -> None:
                 f"cannot write '{path}': there is no folder '{target.parent}' to write in. "
                 f"Name a file in a folder that exists."
             )
+
+
+def nearest_file(path: str | Path, known: Iterable[str] = ()) -> str:
+    """Return `` Did you mean 'x'?`` for what stands beside a missing `path`, or ``""``.
+
+    Parameters
+    ----------
+    path : str or Path
+    known : iterable of str
+        Names that would do too.
+    """
+    path = Path(path)
+    try:
+        beside = [p.name for p in islice(path.parent.iterdir(), _MOST_NAMES)]
+    except (OSError, ValueError):
+        beside = []
+    return suggestion(path.name, [*known, *beside])
 
 
 def make_folder(path: str | Path) -> Path:

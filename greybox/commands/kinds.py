@@ -46,6 +46,7 @@ _NAMED = {
     "want": Kind.PARAMETER,
 }
 _PATHS = frozenset(_METAVARS.values()) - {Kind.PARAMETER}
+# as greybox.vessel.toml knows them, which takes long to load
 EXAMPLE_VESSELS = ("thesis", "ferry")
 _OUTPUTS = ("out", "json", "report", "sheet")
 

@@ -11,7 +11,7 @@ from importlib import import_module
 from importlib.metadata import entry_points, version
 from pathlib import Path
 
-from greybox.commands.parser import Parser, sub_parsers
+from greybox.commands.parser import Parser, short_usage, sub_parsers
 from greybox.commands.terminal import complain, telling
 from greybox.errors import GreyboxError
 
@@ -81,6 +81,7 @@ def build_parser(only: str | None = None) -> argparse.ArgumentParser:
             name, help=module.HELP, description=module.HELP, epilog=module.EXAMPLES
         )
         module.add_arguments(sub)
+        sub.usage = short_usage(sub)
         _add_shell(sub, after=True)
         sub.set_defaults(run=module.run)
     topic = commands.add_parser("help", help="show the help of a command", add_help=False)

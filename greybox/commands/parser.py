@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import re
+import sys
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
@@ -34,6 +35,19 @@ def long_options(parser: argparse.ArgumentParser) -> list[str]:
     return [o for a in parser._actions for o in a.option_strings if o.startswith("--")]
 
 
+def short_usage(parser: argparse.ArgumentParser) -> str:
+    """Return how a command is typed, its many options in one word."""
+    needed = [a for a in parser._actions if a.required and a.option_strings]
+    words = [parser.prog, *(_typed(a) for a in parser._get_positional_actions())]
+    words += [f"{a.option_strings[-1]} {_typed(a)}" for a in needed]
+    return " ".join([*words, "[OPTION ...]"]).replace("%", "%%")
+
+
+def _typed(action: argparse.Action) -> str:
+    name = action.metavar if isinstance(action.metavar, str) else action.dest.upper()
+    return f"{name} [{name} ...]" if action.nargs == "+" else name
+
+
 def sub_parsers(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
     """Return the parsers of the sub-commands by name."""
     for action in parser._actions:
@@ -48,6 +62,15 @@ class Parser(argparse.ArgumentParser):
     def __init__(self, *given: Any, **named: Any) -> None:
         super().__init__(*given, **{"formatter_class": Formatter} | named)
 
+    _given: Sequence[str] = ()
+
+    def parse_known_args(  # type: ignore[override]
+        self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
+    ) -> tuple[argparse.Namespace, list[str]]:
+        """Parse, and keep what was given: a mistyped option looks like a missing one."""
+        self._given = tuple(sys.argv[1:] if args is None else args)
+        return super().parse_known_args(args, namespace)
+
     def parse_args(  # type: ignore[override]
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
     ) -> argparse.Namespace:
@@ -60,6 +83,11 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Exit with status 2 and one sentence."""
+        if message.startswith("the following arguments are required"):
+            known = long_options(self)
+            typed = [g.split("=")[0] for g in self._given if g.startswith("--") and g != "--"]
+            strange = [t for t in typed if not any(k.startswith(t) for k in known)]
+            message = _unknown(strange[0], known) if strange else message
         if found := _CHOICE.search(message):
             known = found["known"].replace("'", "").split(", ")
             what = message[: found.start()].removeprefix("argument ").rstrip(": ")
