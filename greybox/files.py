@@ -99,7 +99,7 @@ def replacing(path: str | Path, mode: str = "w") -> Iterator[IO[Any]]:
         with open(path, mode, **options) as handle:
             yield handle
         return
-    path = path.resolve()
+    named, path = path, path.resolve()
     try:
         handle = tempfile.NamedTemporaryFile(  # noqa: SIM115 - closed below
             mode, dir=path.parent, prefix=f".{path.name}.", delete=False, **options
@@ -115,7 +115,7 @@ def replacing(path: str | Path, mode: str = "w") -> Iterator[IO[Any]]:
         os.umask(umask)
         os.chmod(handle.name, 0o666 & ~umask)
         os.replace(handle.name, path)
-        _log.info("wrote %s: %d bytes", path, path.stat().st_size)
+        _log.info("wrote %s: %d bytes", named, path.stat().st_size)
     except BaseException:
         Path(handle.name).unlink(missing_ok=True)
         raise

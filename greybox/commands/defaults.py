@@ -70,7 +70,7 @@ class Defaults:
                 return
             names = others or set(known)
             raise ConfigurationError(
-                f"{where}: there is no option '--{key}'.{suggestion(key, sorted(names))} "
+                f"{where}: there is no option '{key}'.{suggestion(key, sorted(names))} "
                 f"Correct the name, or leave it out."
             )
         action = known[key]

@@ -107,8 +107,9 @@ def _parse(given: list[str]) -> argparse.Namespace:
         parser.print_help(sys.stderr)
         parser.exit(2)
     known = sub_parsers(parser)
-    unread = {"--no-config", "-h", "--help", "--version"} & set(given)
-    if command not in known or unread:
+    # options may be abbreviated
+    unread = any(g.startswith("--no-c") and "--no-config".startswith(g) for g in given)
+    if command not in known or unread or {"-h", "--help", "--version"} & set(given):
         return parser.parse_args(given)
     from greybox.commands.configuration import find_configuration, read_configuration
     from greybox.commands.defaults import Defaults

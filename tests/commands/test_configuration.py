@@ -148,8 +148,8 @@ def test_where_the_file_is_looked_for(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("[all]\nvesel = 'x'", "[all], vesel: there is no option '--vesel'. Did you mean 'vessel'"),
-        ("[check]\nmethod = 'x'", "[check], method: there is no option '--method'."),
+        ("[all]\nvesel = 'x'", "[all], vesel: there is no option 'vesel'. Did you mean 'vessel'"),
+        ("[check]\nmethod = 'x'", "[check], method: there is no option 'method'."),
         ("[chek]\n", "has the table [chek], and there is no such command. Did you mean 'check'?"),
         ("vessel = 'x'", "gives 'vessel' outside a table: put it under [all]"),
         ("[all]\nvessel = 3", "cannot read the vessel file '3'"),
@@ -163,7 +163,7 @@ def test_where_the_file_is_looked_for(tmp_path):
         ("[estimate]\nreduce = true\ncompare-structures = ['a']", "exclude one another"),
         ("[estimate]\nout = '../m.json'", "outside the file's own folder"),
         ("[estimate]\nout = '/etc/m.json'", "outside the file's own folder"),
-        ("[estimate]\nverbose = 1", "there is no option '--verbose'"),
+        ("[estimate]\nverbose = 1", "there is no option 'verbose'"),
         ("[design]\nbetween = ['a']\n", None),
         ("[all\n", "is not TOML: "),
         ("#" * (MOST_BYTES + 1), f"has more than {MOST_BYTES} bytes"),
