@@ -23,6 +23,7 @@ _MOST_NAMES = 10_000
 
 _log = logging.getLogger(__name__)
 
+
 def check_targets(*paths: str | Path | None) -> None:
     """Refuse targets that cannot be written, before anything is computed.
 

@@ -19,7 +19,7 @@ __all__ = [
     "read_logs", "say",
 ]  # fmt: skip
 
-SHELL_ONLY = ("run", "verbose", "more_verbose", "quiet", "no_config", "configuration")
+SHELL_ONLY = ("run", "typed", "verbose", "more_verbose", "quiet", "no_config", "configuration")
 
 
 def add_logs(parser: argparse.ArgumentParser) -> None:

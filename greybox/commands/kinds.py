@@ -55,6 +55,9 @@ def kind_of(action: argparse.Action) -> Kind:
     """Return what the values of an argument are."""
     if action.dest in _NAMED:
         return _NAMED[action.dest]
+    if action.type is not None:
+        # a number, whatever letter stands for it
+        return Kind.OTHER
     return _METAVARS.get(action.metavar or "", Kind.OTHER)
 
 

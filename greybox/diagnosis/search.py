@@ -44,6 +44,7 @@ RELEVANT = 0.005
 
 _log = logging.getLogger(__name__)
 
+
 @dataclass(frozen=True)
 class Candidate:
     """One more cause, fitted.

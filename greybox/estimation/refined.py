@@ -55,6 +55,7 @@ _NOISE_ROUNDS = 6
 
 _log = logging.getLogger(__name__)
 
+
 @dataclass(frozen=True)
 class _Point:
     """Coefficients (p,), the constants (nx,) of each log, and the motions that they predict."""

@@ -203,3 +203,14 @@ def test_every_option_of_every_command_can_stand_in_a_file():
     for name, parser in sub_parsers(build_parser()).items():
         if name not in ("help", "completion"):
             assert _configurable(parser), name
+
+
+def test_a_letter_that_stands_for_a_number_is_no_file():
+    import argparse
+
+    from greybox.commands.common import positive
+    from greybox.commands.kinds import Kind, is_path, kind_of
+
+    parser = argparse.ArgumentParser()
+    assert kind_of(parser.add_argument("--vessel", metavar="V")) is Kind.VESSEL
+    assert not is_path(parser.add_argument("--speed", metavar="V", type=positive))
