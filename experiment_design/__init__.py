@@ -6,6 +6,7 @@ ones; each is loaded when it is first used.
 
 from __future__ import annotations
 
+import logging
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +24,9 @@ if TYPE_CHECKING:
     from experiment_design.result import Design
     from experiment_design.timing import least_duration
     from greybox.model.noise import NoiseLevels
+
+# a library is silent until the program that uses it asks to hear
+logging.getLogger(__name__).addHandler(logging.NullHandler())
 
 _WHERE = {
     "Certificate": "certificate",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import pickle
 import time
 from collections.abc import Callable
@@ -57,6 +58,7 @@ class Piece:
     budget: int
 
 
+_log = logging.getLogger(__name__)
 _problems: dict[bytes, TrialProblem] = {}
 
 
@@ -203,6 +205,10 @@ def search_campaign(
                             best[t] = candidate
                         if progress is not None:
                             progress(done, total)
+                    _log.info(
+                        "trial %d, round %d of %d: %d starts, %d evaluations, criterion %.6g",
+                        t + 1, round_ + 1, rounds, len(chains), spent, best[t].value,
+                    )  # fmt: skip
                     weakest = 0
                     for i, candidate in enumerate(found):
                         if found[weakest].beats(candidate, scale):

@@ -75,7 +75,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--sheet", metavar="FILE", help="write the sheet to take on board: .pdf, .html, .svg, .png")
     add("--report", metavar="HTML", help="write a page with pictures and what the plan is worth")
     goal = parser.add_argument_group("what is to be learnt")
-    goal.add_argument("--criterion", choices=("D", "A", "E", "c"), default="D")
+    goal.add_argument(
+        "--criterion",
+        choices=("D", "A", "E", "c"),
+        default="D",
+        help="of the covariance of the wanted parameters: determinant, relative trace, worst "
+        "direction, or one function --of them (D)",
+    )
     goal.add_argument(
         "--want", nargs="+", default=[], metavar="NAME", help="parameters that count (all)"
     )
@@ -88,7 +94,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME=STD",
         help="least trial time for these standard errors, --duration at most",
     )
-    goal.add_argument("--predictor", choices=("basic", "augmented", "wind", "basic+wind"))
+    goal.add_argument(
+        "--predictor",
+        choices=("basic", "augmented", "wind", "basic+wind"),
+        help="that the estimate will use: which disturbances it captures or measures (augmented; "
+        "basic for a model without yaw rate)",
+    )
     goal.add_argument(
         "--estimator",
         choices=("iv", "iv-white", "oe"),
@@ -114,17 +125,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     motion.add_argument("--start", type=_floats, metavar="u,v,r,psi", help="state at the start")
     motion.add_argument(
-        "--trials", type=_whole, default=1, metavar="K", help="trials of a campaign"
+        "--trials", type=_whole, default=1, metavar="K", help="trials of a campaign (1)"
     )
     motion.add_argument("--area", metavar="CSV", help="sea room, a polygon of x_n, y_n [m]")
     motion.add_argument(
         "--circle", type=_floats, metavar="N,E,R", help="round sea room: centre and radius [m]"
     )
     motion.add_argument(
-        "--position", type=_pair, default=(0.0, 0.0), metavar="N,E", help="place of the start [m]"
+        "--position",
+        type=_pair,
+        default=(0.0, 0.0),
+        metavar="N,E",
+        help="place of the start [m] (0,0)",
     )
     motion.add_argument(
-        "--clearance", type=_not_negative, default=0.0, metavar="M", help="kept from the edge [m]"
+        "--clearance",
+        type=_not_negative,
+        default=0.0,
+        metavar="M",
+        help="kept from the edge [m] (0)",
     )
     motion.add_argument("--speed-cap", type=positive, metavar="M", help="largest speed [m/s]")
     motion.add_argument("--yaw-cap", type=positive, metavar="R", help="largest yaw rate [rad/s]")
@@ -155,7 +174,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=count,
         default=0,
         metavar="S",
-        help="expect the criterion over S models drawn from the prior's covariance",
+        help="expect the criterion over S models drawn from the prior's covariance (0)",
     )
     belief.add_argument(
         "--worst-case", action="store_true", help="look at the worst of them instead"
@@ -429,6 +448,7 @@ def read_area(path: str | Path) -> Any:
     import numpy as np
 
     from greybox.errors import LogError
+    from greybox.files import nearest_file
 
     path = Path(path)
     try:
@@ -436,7 +456,12 @@ def read_area(path: str | Path) -> Any:
             raise LogError(f"'{path.name}' is larger than any sea room: is it a log?")
         with open(path, encoding="utf-8-sig", newline="") as handle:
             rows = [r for r in csv.reader(handle) if any(c.strip() for c in r)]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+    except OSError as error:
+        raise LogError(
+            f"cannot read the sea room '{path}': {error.strerror}.{nearest_file(path)} Name a CSV "
+            f"file with columns x_n and y_n [m]."
+        ) from error
+    except (UnicodeDecodeError, csv.Error) as error:
         raise LogError(f"cannot read the sea room '{path}': {error}.") from error
     header = [c.strip() for c in rows[0]] if rows else []
     if "x_n" not in header or "y_n" not in header:

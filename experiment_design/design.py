@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from dataclasses import replace
 
@@ -48,6 +49,8 @@ _TIGHTENINGS = 5
 _NEAR, _POLISH, _PATIENCE = 0.1, 40, 3600.0
 # share of the effort that a design after a tightening gets
 _AGAIN = 0.4
+
+_log = logging.getLogger(__name__)
 
 
 def design_trial(
@@ -108,9 +111,14 @@ def _design(
     began = time.perf_counter()
     require_horizon(request)
     problems = [build_problem(request, t) for t in range(request.trials)]
+    _log.info(
+        "%d trial(s) of %g s, %d levels each, criterion %s", len(problems), request.duration,
+        problems[0].shape[0] * problems[0].shape[1], request.criterion,
+    )  # fmt: skip
     for t, problem in enumerate(problems):
         require_start(problem, request, t)
     reference, kept = random_campaign(problems, request.seed)
+    _log.info("%d random two-level sequences keep the limits", kept)
     if reference is None:
         require_stable(problems[0], request)
     else:
@@ -151,6 +159,7 @@ def _design(
         if again is not None:
             candidates, evaluations = list(again.candidates), evaluations + again.evaluations
             stopped = stopped or again.stopped
+    _log.info("%s; %d evaluations", status, evaluations)
     missing = [t for t, c in enumerate(candidates) if not c.feasible]
     if missing:
         t = missing[0]

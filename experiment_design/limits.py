@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from experiment_design.rollout import Motion, Rollout
 from experiment_design.schedule import Schedule
-from greybox.errors import UsageError
+from greybox.errors import UsageError, suggestion
 from greybox.model.disturbances import rotate_to_body
 from greybox.vectorised import Vectorised
 
@@ -250,7 +250,10 @@ class LimitProgram:
         names, ends = [], []
         for name, (value, tolerance) in limits.end.items():
             if name not in place:
-                raise UsageError(f"the end state names '{name}': it can name {', '.join(place)}.")
+                raise UsageError(
+                    f"the end state names '{name}'.{suggestion(name, place)} It can name "
+                    f"{', '.join(place)}."
+                )
             if not (np.isfinite(value) and 0 < tolerance < np.inf):
                 raise UsageError(
                     f"the end state {name} = {value:g} has the tolerance {tolerance:g}, it must be "

@@ -9,6 +9,7 @@ an augmented Lagrangian, so that a start need not keep them.
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +21,7 @@ from experiment_design.limits import TOLERANCE
 from experiment_design.problem import TrialProblem
 
 Array = NDArray[np.float64]
+_log = logging.getLogger(__name__)
 
 # random sequences that `efficiency_vs_random` is measured against
 REFERENCE = 200
@@ -287,4 +289,8 @@ def climb(
         spent += found.evaluations
         if found.beats(best, scale):
             best = found
+        _log.debug(
+            "start with %d evaluations: criterion %.6g, best %.6g", found.evaluations, found.value,
+            best.value if best is not None else found.value,
+        )  # fmt: skip
     return Candidate(best.unit, best.value, best.missed, spent)

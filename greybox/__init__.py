@@ -12,6 +12,7 @@ Examples
 
 from __future__ import annotations
 
+import logging
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -50,6 +51,9 @@ if TYPE_CHECKING:
     from greybox.validation.request import Request
     from greybox.vessel.toml import load_vessel, vessel_from_dict
     from greybox.vessel.vessel import Vessel
+
+# a library is silent until the program that uses it asks to hear
+logging.getLogger(__name__).addHandler(logging.NullHandler())
 
 _WHERE = {
     "Cause": "greybox.diagnosis.causes.cause",

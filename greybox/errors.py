@@ -51,6 +51,10 @@ class UsageError(GreyboxError, ValueError):
     """Options that exclude one another, or that need another one beside them."""
 
 
+class ConfigurationError(GreyboxError, ValueError):
+    """The configuration file names what does not exist, or gives it a value it cannot have."""
+
+
 def suggestion(name: str, known: Iterable[str]) -> str:
     """Return `` Did you mean 'x'?`` for the known name nearest to `name`, or ``""``."""
     folded = {k.casefold(): k for k in known}

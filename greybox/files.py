@@ -4,18 +4,24 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import math
 import os
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 
-from greybox.errors import LogError
+from greybox.errors import LogError, suggestion
+
+_MOST_NAMES = 10_000
+
+_log = logging.getLogger(__name__)
 
 
 def check_targets(*paths: str | Path | None) -> None:
@@ -39,6 +45,23 @@ def check_targets(*paths: str | Path | None) -> None:
                 f"cannot write '{path}': there is no folder '{target.parent}' to write in. "
                 f"Name a file in a folder that exists."
             )
+
+
+def nearest_file(path: str | Path, known: Iterable[str] = ()) -> str:
+    """Return `` Did you mean 'x'?`` for what stands beside a missing `path`, or ``""``.
+
+    Parameters
+    ----------
+    path : str or Path
+    known : iterable of str
+        Names that would do too.
+    """
+    path = Path(path)
+    try:
+        beside = [p.name for p in islice(path.parent.iterdir(), _MOST_NAMES)]
+    except (OSError, ValueError):
+        beside = []
+    return suggestion(path.name, [*known, *beside])
 
 
 def make_folder(path: str | Path) -> Path:
@@ -77,7 +100,7 @@ def replacing(path: str | Path, mode: str = "w") -> Iterator[IO[Any]]:
         with open(path, mode, **options) as handle:
             yield handle
         return
-    path = path.resolve()
+    named, path = path, path.resolve()
     try:
         handle = tempfile.NamedTemporaryFile(  # noqa: SIM115 - closed below
             mode, dir=path.parent, prefix=f".{path.name}.", delete=False, **options
@@ -93,6 +116,7 @@ def replacing(path: str | Path, mode: str = "w") -> Iterator[IO[Any]]:
         os.umask(umask)
         os.chmod(handle.name, 0o666 & ~umask)
         os.replace(handle.name, path)
+        _log.info("wrote %s: %d bytes", named, path.stat().st_size)
     except BaseException:
         Path(handle.name).unlink(missing_ok=True)
         raise

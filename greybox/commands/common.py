@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import argparse
-import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
+
+from greybox.commands.terminal import complain, progress, say
 
 if TYPE_CHECKING:
     from greybox.trial.log import TrialLog
     from greybox.vessel.vessel import Vessel
 
 
-# back to the first column, and the line erased
-CLEAR = "\r\x1b[K"
+__all__ = [
+    "add_logs", "add_seed", "complain", "count", "positive", "progress", "provenance",
+    "read_logs", "say",
+]  # fmt: skip
+
+SHELL_ONLY = ("run", "typed", "verbose", "more_verbose", "quiet", "no_config", "configuration")
 
 
 def add_logs(parser: argparse.ArgumentParser) -> None:
@@ -39,9 +44,15 @@ def count(text: str) -> int:
     return value
 
 
+positive.__name__ = "positive number"
+count.__name__ = "whole number of at least 0"
+
+
 def add_seed(parser: argparse.ArgumentParser) -> None:
     """Add --seed."""
-    parser.add_argument("--seed", type=count, default=0, help="seed of whatever is random (0)")
+    parser.add_argument(
+        "--seed", type=count, default=0, metavar="N", help="seed of whatever is random (0)"
+    )
 
 
 def read_logs(
@@ -58,39 +69,9 @@ def read_logs(
     return logs if sample_time is None else [decimate(log, sample_time) for log in logs]
 
 
-def progress(title: str) -> Callable[[int, int], None]:
-    """Return a callback that shows progress on a terminal and is silent elsewhere."""
-    if not sys.stderr.isatty():
-        return lambda done, total: None
-
-    def show(done: int, total: int) -> None:
-        text = "" if done >= total else f"{title}: {done} of {total}"
-        sys.stderr.write(CLEAR + text)
-        sys.stderr.flush()
-
-    return show
-
-
-def _clear() -> None:
-    """Erase progress that was broken off."""
-    if sys.stderr.isatty():
-        sys.stderr.write(CLEAR)
-        sys.stderr.flush()
-
-
-def complain(text: str) -> None:
-    """Tell the user what stopped a command."""
-    _clear()
-    sys.stderr.write(text + "\n")
-
-
 def provenance(options: argparse.Namespace) -> dict[str, Any]:
-    """Return how a file was made: version and command, without wall time."""
-    shown = {k: v for k, v in vars(options).items() if k not in ("run",) and v is not None}
-    return {"program": f"greybox-marine {version('greybox-marine')}", "command": shown}
-
-
-def say(text: str) -> None:
-    """Print a result for the user."""
-    _clear()
-    sys.stdout.write(text + "\n")
+    """Return how a file was made: version, command, configuration file, without wall time."""
+    shown = {k: v for k, v in vars(options).items() if k not in SHELL_ONLY and v is not None}
+    record = {"program": f"greybox-marine {version('greybox-marine')}", "command": shown}
+    used = getattr(options, "configuration", None)
+    return record if used is None else record | {"configuration": used}

@@ -6,7 +6,7 @@ import argparse
 
 from greybox.commands.common import add_seed, provenance, say
 
-HELP = "compare free runs of models with logs"
+HELP = "compare free runs of models with logs: fit, errors, bands, plots"
 EXAMPLES = """examples:
   greybox compare model.json --log trial.csv --report compare.html
   greybox compare ls.json iv.json --log day2_a.csv day2_b.csv --json result.json
@@ -21,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--heading",
         choices=("measured", "simulated"),
         default="measured",
-        help="heading of the run",
+        help="heading of the run: that of the log, or simulated too (measured)",
     )
     parser.add_argument("--json", metavar="F", help="write the result as JSON; - is stdout")
     parser.add_argument("--report", metavar="HTML", help="write a page with plots")

@@ -7,15 +7,8 @@ import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from greybox.commands.common import (
-    CLEAR,
-    add_logs,
-    add_seed,
-    positive,
-    provenance,
-    read_logs,
-    say,
-)
+from greybox.commands.common import add_logs, add_seed, positive, provenance, read_logs, say
+from greybox.commands.terminal import CLEAR, shows_progress
 
 if TYPE_CHECKING:
     from greybox.diagnosis.result import Diagnosis
@@ -136,7 +129,7 @@ def _save(diagnosis: Diagnosis, path: str, record: dict[str, Any]) -> None:
 
 
 def _progress() -> Callable[[str], None]:
-    if not sys.stderr.isatty():
+    if not shows_progress():
         return lambda text: None
 
     def show(text: str) -> None:

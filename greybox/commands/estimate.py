@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from greybox.validation.request import Request
     from greybox.validation.structures import StructureChoice
 
-HELP = "estimate a model from logs"
+HELP = "estimate a model from logs, with standard errors and whether to trust them"
 EXAMPLES = """examples:
   greybox estimate trial.csv --vessel ship.toml --out model.json
   greybox estimate a.csv b.csv --vessel ship.toml --method iv --predictor augmented --out m.json
@@ -35,23 +35,34 @@ EXAMPLES = """examples:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_logs(parser)
-    parser.add_argument(
+    parser.add_argument("--out", metavar="MODEL", help="write the model to this JSON file")
+    parser.add_argument("--json", metavar="F", help="write the result as JSON; - is stdout")
+    add_seed(parser)
+    _add_model(parser)
+    _add_data(parser)
+    _add_instruments(parser)
+    _add_output_error(parser)
+
+
+def _add_model(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("what is estimated, and how")
+    group.add_argument(
         "--method",
         choices=("ls", "iv", "oe"),
         help="least squares, instrumental variables, output error; by default chosen, and said why",
     )
-    parser.add_argument(
+    group.add_argument(
         "--predictor",
         choices=("basic", "augmented", "wind", "basic+wind"),
         help="which disturbances are captured or measured; by default chosen",
     )
-    parser.add_argument(
+    group.add_argument(
         "--structure",
         metavar="NAME",
         help="thesis, surge, linear, blanke, modulus, abkowitz; +TERM and -TERM change it; "
         "by default chosen",
     )
-    chosen = parser.add_mutually_exclusive_group()
+    chosen = group.add_mutually_exclusive_group()
     chosen.add_argument(
         "--reduce",
         action="store_true",
@@ -63,60 +74,72 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME",
         help="compare structures by held-out free runs and estimate the one that is chosen",
     )
-    parser.add_argument(
+    group.add_argument(
+        "--covariance",
+        choices=("ma", "hac", "white", "bootstrap"),
+        help="standard errors: moving average (default of iv), robust to coloured residuals "
+        "(default of ls), white, block bootstrap",
+    )
+    group.add_argument(
+        "--mass", type=positive, metavar="KG", help="mass [kg], for physical coefficients"
+    )
+
+
+def _add_data(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("which samples, and how they came about")
+    group.add_argument(
         "--sample-time",
         type=positive,
         metavar="S",
-        help="decimate the logs to this sample time [s]",
+        help="decimate the logs to this sample time [s]; by default that of the logs",
     )
-    parser.add_argument(
-        "--margin-u", type=positive, metavar="M", help="cut out samples with |u| below M [m/s]"
+    group.add_argument(
+        "--margin-u",
+        type=positive,
+        metavar="M",
+        help="cut out samples with |u| below M [m/s]; by default none",
     )
-    parser.add_argument(
-        "--margin-v", type=positive, metavar="M", help="cut out samples with |v| below M [m/s]"
+    group.add_argument(
+        "--margin-v",
+        type=positive,
+        metavar="M",
+        help="cut out samples with |v| below M [m/s]; by default none",
     )
-    parser.add_argument(
+    group.add_argument(
+        "--loop",
+        choices=("auto", "open", "closed"),
+        default="auto",
+        help="whether a controller moved the thrusters; auto: by the vessel file's [closed_loop] "
+        "(auto)",
+    )
+    group.add_argument(
         "--heading",
         choices=("measured", "simulated"),
         help="heading inside the instruments (measured); with oe whether it drives the run, or is "
         "simulated and compared (chosen)",
     )
-    parser.add_argument(
-        "--instruments",
-        choices=("zero-mean", "mean-kept"),
-        default="zero-mean",
-        help="zero-mean instruments (IV2, IV3) or with their mean (IV1)",
-    )
-    parser.add_argument(
-        "--prefilter",
-        choices=("auto", "noise", "none"),
-        default="auto",
-        help="refine instrumental variables by the noise, all equations jointly; auto: where "
-        "nothing speaks against it",
-    )
-    parser.add_argument(
+    group.add_argument(
         "--nominal",
         metavar="MODEL",
         help="model that simulates the first instruments, or starts oe (least squares by default)",
     )
-    parser.add_argument(
-        "--loop",
-        choices=("auto", "open", "closed"),
+
+
+def _add_instruments(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("instrumental variables (--method iv)")
+    group.add_argument(
+        "--instruments",
+        choices=("zero-mean", "mean-kept"),
+        default="zero-mean",
+        help="zero-mean instruments, IV2 and IV3, or with their mean, IV1 (zero-mean)",
+    )
+    group.add_argument(
+        "--prefilter",
+        choices=("auto", "noise", "none"),
         default="auto",
-        help="whether a controller moved the thrusters",
+        help="refine by the noise, all equations jointly; auto: where nothing speaks against it "
+        "(auto)",
     )
-    parser.add_argument(
-        "--covariance",
-        choices=("ma", "hac", "white", "bootstrap"),
-        help="standard errors: moving average (iv), robust (ls), white, block bootstrap",
-    )
-    _add_output_error(parser)
-    parser.add_argument(
-        "--mass", type=positive, metavar="KG", help="mass, for physical coefficients"
-    )
-    parser.add_argument("--out", metavar="MODEL", help="write the model to this JSON file")
-    parser.add_argument("--json", metavar="F", help="write the result as JSON; - is stdout")
-    add_seed(parser)
 
 
 def _add_output_error(parser: argparse.ArgumentParser) -> None:
@@ -133,13 +156,16 @@ def _add_output_error(parser: argparse.ArgumentParser) -> None:
         help="wind that drives the run, or a constant one that is compared (measured)",
     )
     group.add_argument(
-        "--loss", choices=("gaussian", "huber"), default="gaussian", help="huber resists outliers"
+        "--loss",
+        choices=("gaussian", "huber"),
+        default="gaussian",
+        help="how errors are weighed; huber resists outliers (gaussian)",
     )
     group.add_argument(
         "--shooting",
         choices=("auto", "single", "multiple"),
         default="auto",
-        help="whole runs, or segments that join, for long or unstable logs",
+        help="whole runs, or segments that join, for long or unstable logs (auto)",
     )
     group.add_argument(
         "--bound",
@@ -159,7 +185,7 @@ def _add_output_error(parser: argparse.ArgumentParser) -> None:
         "--damping",
         choices=("warn", "enforce"),
         default="warn",
-        help="enforce keeps damping terms from driving the ship",
+        help="tell of damping terms that drive the ship, or keep them from it (warn)",
     )
 
 

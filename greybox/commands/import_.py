@@ -53,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--velocities",
         choices=("central", "savgol"),
         default="central",
-        help="velocities from positions: central differences (3.57), or Savitzky-Golay",
+        help="velocities from positions: central differences (3.57), or Savitzky-Golay (central)",
     )
     parser.add_argument(
         "--window",

@@ -3,42 +3,49 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import os
 import sys
 from collections.abc import Sequence
 from importlib import import_module
 from importlib.metadata import entry_points, version
+from pathlib import Path
 
-from greybox.commands.common import complain
-from greybox.errors import GreyboxError, suggestion
+from greybox.commands.parser import Parser, short_usage, sub_parsers
+from greybox.commands.terminal import complain, telling
+from greybox.errors import GreyboxError
 
 GROUP = "greybox.commands"
+# as the work goes; commands of other packages follow
+ORDER = ("demo", "import", "check", "estimate", "simulate", "compare", "diagnose", "design",
+         "predict", "export", "reproduce", "completion")  # fmt: skip
+EXAMPLES = """examples:
+  greybox check trial.csv --vessel ship.toml
+  greybox estimate trial.csv --vessel ship.toml --out model.json
+  greybox diagnose trial.csv --vessel ship.toml --model model.json
+
+'greybox help COMMAND' shows the options and examples of one command. Options that you
+repeat may stand in greybox.toml; NO_COLOR and GREYBOX_CONFIG are heeded.
+"""
+_log = logging.getLogger(__name__)
 
 
-def _options(parser: argparse.ArgumentParser) -> list[str]:
-    """Return the option strings of a parser and of its sub-commands."""
-    found: list[str] = []
-    for action in parser._actions:
-        found += action.option_strings
-        if isinstance(action, argparse._SubParsersAction):
-            found += [o for sub in action.choices.values() for o in _options(sub)]
-    return found
-
-
-class _Parser(argparse.ArgumentParser):
-    """A parser that suggests the nearest name for a mistyped one."""
-
-    def error(self, message: str) -> None:  # type: ignore[override]
-        if "invalid choice: " in message:
-            typed = message.split("invalid choice: ")[1].split("'")[1]
-            known = message.split("(choose from ")[-1].rstrip(")").replace("'", "").split(", ")
-            message += suggestion(typed, known)
-        if message.startswith("unrecognized arguments: "):
-            typed = message.split(": ")[1].split()[0]
-            known = _options(self)
-            message += suggestion(typed, known)
-        self.print_usage(sys.stderr)
-        self.exit(2, f"{self.prog}: {message}\n")
+def _add_shell(parser: argparse.ArgumentParser, *, after: bool) -> None:
+    """Add what every command takes, before or after its name."""
+    default = argparse.SUPPRESS if after else False
+    group = parser.add_argument_group("what is shown, and what is read") if after else parser
+    group.add_argument(
+        "-v", "--verbose", action="count", dest="more_verbose" if after else "verbose",
+        default=argparse.SUPPRESS if after else 0,
+        help="tell on stderr what is read, chosen and solved, and when; -vv tells more",
+    )  # fmt: skip
+    group.add_argument(
+        "-q", "--quiet", action="store_true", default=default,
+        help="show no results and no progress, errors only; files are written as always",
+    )  # fmt: skip
+    group.add_argument(
+        "--no-config", action="store_true", default=default, help="read no greybox.toml"
+    )
 
 
 def build_parser(only: str | None = None) -> argparse.ArgumentParser:
@@ -49,32 +56,70 @@ def build_parser(only: str | None = None) -> argparse.ArgumentParser:
     only : str, optional
         The sub-command that is going to run: the others are then not imported.
     """
-    parser = _Parser(
+    parser = Parser(
         prog="greybox",
         description="Trustworthy ship models from sea trials: design the trial, read the log, "
         "estimate, show what the simulation gets wrong.",
-        epilog="greybox COMMAND --help tells the options of one command.",
+        epilog=EXAMPLES,
     )
     parser.add_argument(
-        "--version", action="version", version=f"greybox {version('greybox-marine')}"
+        "--version", action="version", version=f"greybox {version('greybox-marine')}",
+        help="show the version",
+    )  # fmt: skip
+    _add_shell(parser, after=False)
+    commands = parser.add_subparsers(
+        dest="command", metavar="COMMAND", required=True, title="commands"
     )
-    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     found = {e.name: e.value for e in entry_points(group=GROUP)}
-    for name in sorted(found):
+    known = [*(n for n in ORDER if n in found), *sorted(found.keys() - set(ORDER))]
+    for name in known:
         if only in found and name != only:
             commands.add_parser(name)
             continue
         module = import_module(found[name])
         sub = commands.add_parser(
-            name,
-            help=module.HELP,
-            description=module.HELP,
-            epilog=module.EXAMPLES,
-            formatter_class=argparse.RawDescriptionHelpFormatter,
+            name, help=module.HELP, description=module.HELP, epilog=module.EXAMPLES
         )
         module.add_arguments(sub)
+        sub.usage = short_usage(sub)
+        _add_shell(sub, after=True)
         sub.set_defaults(run=module.run)
+    topic = commands.add_parser("help", help="show the help of a command", add_help=False)
+    topic.add_argument("topic", nargs="?", choices=known, metavar="COMMAND")
     return parser
+
+
+def _parse(given: list[str]) -> argparse.Namespace:
+    """Return the options of the command line, with those of the configuration file.
+
+    Raises
+    ------
+    ConfigurationError
+        The configuration file is at fault.
+    """
+    command = next((a for a in given if not a.startswith("-")), None)
+    if command == "help":
+        at = given.index(command)
+        given = [*given[at + 1 : at + 2], "--help"]
+        command = given[0]
+    parser = build_parser(command)
+    if not given:
+        parser.print_help(sys.stderr)
+        parser.exit(2)
+    known = sub_parsers(parser)
+    # options may be abbreviated
+    unread = any(g.startswith("--no-c") and "--no-config".startswith(g) for g in given)
+    if command not in known or unread or {"-h", "--help", "--version"} & set(given):
+        return parser.parse_args(given)
+    from greybox.commands.configuration import find_configuration, read_configuration
+    from greybox.commands.defaults import Defaults
+
+    path = find_configuration(Path.cwd(), os.environ)
+    if path is None:
+        return parser.parse_args(given)
+    names = tuple(n for n in known if n != "help")
+    defaults = Defaults(read_configuration(path), command, known[command], names, build_parser)
+    return defaults.fill(parser.parse_args(given))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -90,13 +135,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     int
         0 done, 1 the input is at fault, 2 wrong usage (by SystemExit).
     """
-    given = list(sys.argv[1:] if arguments is None else arguments)
-    parser = build_parser(given[0] if given and not given[0].startswith("-") else None)
-    options = parser.parse_args(given)
+    if "_ARGCOMPLETE" in os.environ:
+        from greybox.commands.completers import offer
+
+        offer(build_parser())
+    name = "greybox"
     try:
-        options.run(options)
+        options = _parse(list(sys.argv[1:] if arguments is None else arguments))
+        name = f"greybox {options.command}"
+        verbose = options.verbose + getattr(options, "more_verbose", 0)
+        with telling(verbose, options.quiet):
+            _run(options)
     except GreyboxError as error:
-        complain(f"greybox {options.command}: {error}")
+        complain(f"{name}: {error}")
         return 1
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -105,6 +156,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         complain("greybox: stopped")
         return 1
     return 0
+
+
+def _run(options: argparse.Namespace) -> None:
+    used = getattr(options, "configuration", None)
+    if used is not None:
+        _log.info("configuration %s gives %s", used["file"], ", ".join(used["options"]))
+    options.run(options)
+    _log.info("done")
 
 
 if __name__ == "__main__":

@@ -21,7 +21,10 @@ EXAMPLES = """examples:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument(
-        "study", choices=("chapter4", "chapter6", "chapter7", "efficiency", "power")
+        "study",
+        choices=("chapter4", "chapter6", "chapter7", "efficiency", "power"),
+        help="a chapter's tables and figures; how near estimators come to the Cramér-Rao bound; "
+        "how often the diagnosis is right",
     )
     parser.add_argument(
         "--runs", type=int, metavar="N",

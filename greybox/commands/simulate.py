@@ -20,7 +20,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("log", metavar="LOG", help="log with the vessel's thruster columns")
     parser.add_argument("--out", required=True, metavar="CSV", help="where to write the run")
     parser.add_argument(
-        "--heading", choices=("measured", "simulated"), help="measured, where the log has it"
+        "--heading",
+        choices=("measured", "simulated"),
+        help="heading of the run; measured by default, where the log has it",
     )
     parser.add_argument(
         "--start",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
@@ -31,6 +32,8 @@ Array = NDArray[np.float64]
 # samples that a diagnosis needs in every log
 _SHORTEST = 120
 _WIND_TERMS = ("Wuu", "Wvv", "Wuv")
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -94,7 +97,11 @@ def diagnose(
     logs = _long_enough(logs)
     validate = _long_enough(validate) if validate else []
     causes = _chosen(options.causes)
-    say = options.progress
+
+    def say(doing: str) -> None:
+        _log.info("%s", doing)
+        options.progress(doing)
+
     say("log checks")
     findings = [f for f in kinematic_findings([*logs, *validate]) if f.id in causes]
     vessel = mended(logs[0].vessel if model is None else model.vessel, findings)
@@ -111,7 +118,7 @@ def diagnose(
         np.zeros(2) if model is None else model.d[:2],
     )
     problem = case.problem(base.integrator)
-    found = search(case, base, atoms, progress=say)
+    found = search(case, base, atoms, progress=options.progress)
     say("what is left")
     names, final = problem.runs[0].outputs, found.final
     lines = [find_waves(f.nu, f.errors, names, problem.sample_time) for f in (base, final)]

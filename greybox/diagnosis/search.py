@@ -6,6 +6,7 @@ correction for all that were tried, and when it predicts logs that it was not fi
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -40,6 +41,8 @@ _SETTLE = 4
 SIGNIFICANT, PROVEN = 0.01, 0.05
 # fall of −2 log L, a measured number, from which on a cause matters
 RELEVANT = 0.005
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -191,6 +194,10 @@ def search(
         step = take_step(case, fit, causes, atoms)
         steps.append(step)
         progress(f"step {len(steps)}: {len(step.scores)} causes scored")
+        _log.info(
+            "step %d: %d causes scored, %s", len(steps), len(step.scores),
+            "none holds" if step.taken is None else f"{step.taken.atom.cause} holds",
+        )  # fmt: skip
         if step.taken is None:
             break
         causes = [*causes, step.taken]

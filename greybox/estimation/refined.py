@@ -8,6 +8,7 @@ instruments are Ω⁻¹ times the noise-free regressors, θ̂ = (Zᵀ Ω⁻¹ Φ
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -51,6 +52,8 @@ _MOST = 30
 _EXACT = 1e-6
 # rounds after which the noise is settled at the latest
 _NOISE_ROUNDS = 6
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -312,6 +315,10 @@ def _refine(
         # a halfway motion settles too, but is not that of an estimate
         halfway = point.theta is not theta
         theta = new
+        _log.debug(
+            "refinement %d: largest move %.3g standard errors", rounds,
+            float((moved / np.maximum(std, 1e-300)).max()),
+        )  # fmt: skip
         near = not halfway and bool((moved < std + rounding).all())
         settling = not settled and (near or rounds >= _NOISE_ROUNDS)
         if settled and not halfway and (moved < _SETTLED * std + rounding).all():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from math import isfinite
@@ -13,19 +14,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import GreyboxError, ModelFileError, StructureError, suggestion
-from greybox.files import plain, write_json
+from greybox.files import nearest_file, plain, write_json
 from greybox.model.changes import Change, factors_at
 from greybox.model.noise import NoiseLevels, noise_from_dict
 from greybox.model.structure import Structure
 from greybox.model.terms import Factor, Term
 from greybox.model.units import parameter_unit
+from greybox.model.versions import VERSION, upgraded
 from greybox.vessel.toml import vessel_from_dict, vessel_to_dict
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
 
+_log = logging.getLogger(__name__)
 FORMAT = "greybox-model"
-VERSION = 1
 _MAX_BYTES = 50_000_000
 
 
@@ -213,17 +215,14 @@ def model_from_dict(data: Any, source: str = "model") -> ManoeuvringModel:
     Raises
     ------
     ModelFileError
-        It is not a model, of a newer version, or inconsistent.
+        It is not a model, of a newer version, or inconsistent. Files of earlier
+        versions are read as they were meant.
     """
     if not isinstance(data, dict) or data.get("format") != FORMAT:
         raise ModelFileError(
             f"'{source}' is not a model file: make one with 'greybox estimate … --out MODEL'."
         )
-    if not isinstance(data.get("version"), int) or data["version"] > VERSION:
-        raise ModelFileError(
-            f"'{source}' has version {data.get('version')!r}, this program reads up to {VERSION}: "
-            f"update the program."
-        )
+    data = upgraded(data, source)
     try:
         s = data["structure"]
         terms = tuple(
@@ -258,8 +257,8 @@ def model_from_dict(data: Any, source: str = "model") -> ManoeuvringModel:
             )
         if not np.isfinite(theta).all():
             raise ModelFileError(f"'{source}' holds a parameter that is not a finite number.")
-        means = len(data.get("disturbances", {}))
-        shared = np.array(data.get("disturbance_covariance", []), float)
+        means = len(data["disturbances"])
+        shared = np.array(data["disturbance_covariance"], float)
         if shared.size and shared.shape != (len(terms) + means, means):
             raise ModelFileError(
                 f"'{source}' has {len(terms)} parameters and {means} disturbances, but a "
@@ -275,12 +274,12 @@ def model_from_dict(data: Any, source: str = "model") -> ManoeuvringModel:
             integrator="rk4" if data["integrator"] == "rk4" else "euler",
             disturbances={
                 k: (float(v["value"]), float(v["std"] or 0.0))
-                for k, v in data.get("disturbances", {}).items()
+                for k, v in data["disturbances"].items()
             },
             disturbance_covariance=shared if shared.size else np.zeros((0, 0)),
-            residual_std=np.array(list(data.get("residual_std", {}).values()), float),
-            noise=(noise_from_dict(data["noise"], structure.states) if data.get("noise") else None),
-            sums={k: tuple(v) for k, v in data.get("sums", {}).items()},
+            residual_std=np.array(list(data["residual_std"].values()), float),
+            noise=(noise_from_dict(data["noise"], structure.states) if data["noise"] else None),
+            sums={k: tuple(v) for k, v in data["sums"].items()},
             record={k: v for k, v in data.items() if k not in _CORE},
             changes=_changes(data.get("changes", []), structure.parameters, source),
         )
@@ -332,10 +331,18 @@ def load_model(path: str | Path) -> ManoeuvringModel:
             raise ModelFileError(f"'{path.name}' is larger than any model file: is it a log?")
         data = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise ModelFileError(f"cannot read '{path}': {error.strerror}.") from error
+        raise ModelFileError(
+            f"cannot read '{path}': {error.strerror}.{nearest_file(path)} Name a file that "
+            f"'greybox estimate … --out' wrote."
+        ) from error
     except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
         raise ModelFileError(
             f"'{path.name}' is not a model file ({error}): name the file that "
             f"'greybox estimate … --out' wrote."
         ) from error
-    return model_from_dict(data, path.name)
+    model = model_from_dict(data, path.name)
+    _log.info(
+        "read model %s: structure %s, %d parameters, sample time %g s", path, model.structure.name,
+        len(model.names), model.sample_time,
+    )  # fmt: skip
+    return model

@@ -6,6 +6,7 @@ by `greybox.trial.importing`; this reader refuses what it would have to mend.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from dataclasses import replace
 from itertools import pairwise
@@ -31,6 +32,7 @@ from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
 
+_log = logging.getLogger(__name__)
 _MIN_SAMPLES = 3
 # share of a sample by which a time step may differ from the others
 _JITTER = 0.2
@@ -135,6 +137,10 @@ def read_segments(
     if not segments:
         raise too_late(vessel, path.name)
     derived = (*known.derived, *segments[0].provenance.derived)
+    _log.info(
+        "read %s: %d rows every %g s in %d segment(s); columns %s%s", path, len(t), sample_time,
+        len(segments), ", ".join(map(str, table.columns)), "".join(f"; {d}" for d in derived),
+    )  # fmt: skip
     known = replace(known, derived=derived, sha256=known.sha256 or sha256(path))
     return [replace(s, provenance=known) for s in segments]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -17,6 +18,7 @@ from greybox.validation.fit import average_fit, run_model
 from greybox.validation.once import estimate_once
 from greybox.validation.request import Request, regression_only
 
+_log = logging.getLogger(__name__)
 _OPEN = Request()
 
 
@@ -48,6 +50,8 @@ def estimate_model(logs: Sequence[TrialLog], request: Request = _OPEN) -> Estima
     common_sample_time(logs)
     notes: list[str] = []
     alternatives = alternatives_for(logs, request, notes)
+    _log.info("%d ways to estimate, first %s", len(alternatives), alternatives[0].label)
+    _log.debug("in this order: %s", "; ".join(a.label for a in alternatives))
     estimate = _first_that_runs(logs, alternatives, request, notes)
     if request.method is None and request.judged and not _is_trusted(estimate):
         return _or_output_error(estimate, logs, request, notes)
@@ -119,6 +123,7 @@ def _first_that_runs(
         try:
             estimate, diverged = _finished(alternative, logs, request, notes)
         except GreyboxError as error:
+            _log.info("%s is left: %s", alternative.label, error)
             failures.append(error)
             notes.append(f"{alternative.label} was left: {error}")
             continue
@@ -174,6 +179,11 @@ def _finished(
             limits=found,
             notes=(*estimate.notes, *lacking),
         )
+    _log.info(
+        "%s: %d iterations, fit %s%s", alternative.label, estimate.iterations,
+        ", ".join(f"{k} {v:.1f} %" for k, v in fit.items()),
+        f"; verdict: {estimate.verdict.text}" if request.judged else "",
+    )  # fmt: skip
     return estimate, diverged
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -46,6 +47,9 @@ def fit_percent(measured: Array, simulated: Array) -> Array:
         return np.asarray(
             np.where(spread > 0, 100 * (1 - error / spread), np.where(error == 0, 100.0, -np.inf))
         )
+
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -128,6 +132,7 @@ def run_model(
     fit = fit_percent(log.states(states), run.x[0])
     if run.diverged[0] >= 0:
         fit = np.full(len(states), -np.inf)
+        _log.info("the free run on %s leaves its bound at sample %d", log.name, run.diverged[0])
     return LogFit(
         log,
         run.x[0],

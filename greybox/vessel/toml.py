@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import tomllib
 from collections.abc import Iterable, Mapping
@@ -11,6 +12,7 @@ from typing import Any
 
 from greybox.channels import CHANNELS, unit_factor
 from greybox.errors import LogError, VesselError, suggestion
+from greybox.files import nearest_file
 from greybox.vessel.thrust import ThrustLaw
 from greybox.vessel.vessel import (
     THRUSTER_TYPES,
@@ -61,6 +63,8 @@ _SENSORS = {
 }
 _CORRECTED = ("x_n", "y_n", "psi", "u", "v", "r", "u_q", "v_q")
 _SIZES = {"antenna": (2, 3), "anemometer": (3,), "velocity_at": (2,)}
+_log = logging.getLogger(__name__)
+EXAMPLES = ("thesis", "ferry")
 _MAX_BYTES = 1_000_000
 
 
@@ -90,7 +94,7 @@ def load_vessel(path: str | Path) -> Vessel:
         (the nearest is suggested), or contradicts itself.
     """
     source = Path(path)
-    if not source.exists() and str(path) in ("thesis", "ferry"):
+    if not source.exists() and str(path) in EXAMPLES:
         source = example_vessel(str(path))
     try:
         if source.stat().st_size > _MAX_BYTES:
@@ -101,13 +105,16 @@ def load_vessel(path: str | Path) -> Vessel:
         data = tomllib.loads(source.read_text(encoding="utf-8"))
     except OSError as error:
         raise VesselError(
-            f"cannot read the vessel file '{source}': {error.strerror}. Name an existing TOML file."
+            f"cannot read the vessel file '{source}': {error.strerror}."
+            f"{nearest_file(source, EXAMPLES)} Name an existing TOML file."
         ) from error
     except UnicodeDecodeError as error:
         raise VesselError(f"'{source}' is not a text file: name a TOML vessel file.") from error
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise VesselError(f"'{source}' is not TOML: {error}. Correct that line.") from error
-    return vessel_from_dict(data)
+    vessel = vessel_from_dict(data)
+    _log.info("read vessel %s: %s, %d thruster(s)", source, vessel.name, len(vessel.thrusters))
+    return vessel
 
 
 def vessel_from_dict(data: dict[str, Any]) -> Vessel:

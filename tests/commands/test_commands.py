@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from schemas import schema
 from virtual import virtual_log, write_csv
 
 from greybox.commands.main import main
@@ -28,6 +29,7 @@ def test_estimate_simulate_compare(noisy_csv, tmp_path, capsys):
     shown = capsys.readouterr().out
     assert "Estimate of Thesis ship" in shown
     data = json.loads(model.read_text())
+    schema("model-2").validate(data)
     assert data["names"][0] == "Xu"
     assert data["sample_time"] == 1.0
     assert data["provenance"]["command"]["vessel"] == "thesis"

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from designs import thesis_model
+from schemas import schema
 
 from greybox.commands.main import main
 from greybox.vessel.toml import vessel_to_dict
@@ -61,6 +62,7 @@ def test_plan_and_json(folder, capsys):
     assert list(table) == ["t", "n", "alpha1", "alpha2"]
     np.testing.assert_allclose(table["t"], np.arange(150))
     data = json.loads(out.read_text())
+    schema("design-1", "experiment_design").validate(data)
     assert data["efficiency_vs_random"] > 0.9
     assert 0 < data["efficiency_lower_bound"] <= 1
     assert data["margins"]["v"] >= 0.4
@@ -123,6 +125,7 @@ def test_between(folder, capsys):
     status, plan = run(folder, "--duration", "100", "--between", *pair, "--json", "-")
     assert status == 0
     data = json.loads(capsys.readouterr().out)
+    schema("design-1", "experiment_design").validate(data)
     assert data["discrimination"]["between"] == ["model", "other"]
     assert plan.exists()
 

@@ -15,13 +15,15 @@ for done in range(1, 4):
 """
 
 
-def on_a_terminal(*arguments: str) -> tuple[int, str]:
+def on_a_terminal(*arguments: str, **environment: str) -> tuple[int, str]:
     """Run Python with its standard error on a pseudo-terminal; its status and what was shown."""
     master, slave = pty.openpty()
+    given = {k: v for k, v in os.environ.items() if k != "NO_COLOR"} | environment
     try:
         done = subprocess.run(
-            [sys.executable, *arguments], stderr=slave, stdout=subprocess.DEVNULL, timeout=120
-        )
+            [sys.executable, *arguments], stderr=slave, stdout=subprocess.DEVNULL, timeout=120,
+            env=given,
+        )  # fmt: skip
         return done.returncode, os.read(master, 10_000).decode()
     finally:
         os.close(slave)
@@ -49,7 +51,7 @@ def test_an_error_takes_the_place_of_progress():
     script = SCRIPT.replace("range(1, 4)", "range(1, 3)") + (
         "from greybox.commands.common import complain\ncomplain('greybox design: it went wrong.')\n"
     )
-    _, shown = on_a_terminal("-c", script)
+    _, shown = on_a_terminal("-c", script, NO_COLOR="1")
     assert on_the_screen(shown).strip() == "greybox design: it went wrong."
 
 

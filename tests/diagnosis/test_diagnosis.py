@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from schemas import schema
 
 from greybox.commands.main import main
 from greybox.diagnosis.diagnose import DiagnosisOptions, diagnose
@@ -40,6 +41,7 @@ def test_command_writes_what_the_contract_says(written: Path, capsys) -> None:
     assert status == 0
     assert "verdict: named" in capsys.readouterr().out
     found = json.loads((written / "d").read_text())
+    schema("diagnose-1").validate(found)
     truth = json.loads((written / "truth.json").read_text())["effects"][0]["parameters"]
     assert found["verdict"] == "named"
     (cause,) = found["causes"]
@@ -60,6 +62,7 @@ def test_command_writes_what_the_contract_says(written: Path, capsys) -> None:
     assert before["independence"]["detail"]["explicable"] >= 0
     page = (written / "d.html").read_text()
     assert page.count("the free-run error of surge is white") == 2
+    schema("model-2").validate(json.loads((written / "m.json").read_text()))
     model = load_model(written / "m.json")
     assert model.disturbances["current_north"][0] == cause["parameters"]["current_north"]["value"]
     # the extended model is an ordinary one: compare gives the same fit

@@ -1,0 +1,335 @@
+"""The shell around the commands: help, completion, suggestions, quiet, verbose, colours."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from virtual import virtual_log, write_csv
+
+from greybox.commands import completers
+from greybox.commands.main import build_parser, main
+from greybox.commands.parser import sub_parsers
+from greybox.vessel.toml import EXAMPLES, example_vessel
+
+SCRIPT = [sys.executable, "-m", "greybox"]
+COMMANDS = {n: p for n, p in sub_parsers(build_parser()).items() if n != "help"}
+SHELL = {"help", "more_verbose", "quiet", "no_config"}
+
+
+def own_actions(parser):
+    return [a for a in parser._actions if a.dest not in SHELL]
+
+
+def examples_of(parser):
+    """Return the command lines among the examples, continuation lines joined."""
+    text = (parser.epilog or "").replace("\\\n", " ")
+    return [" ".join(x.split()) for x in text.splitlines() if x.startswith("  greybox ")]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("shell")
+    write_csv(virtual_log(9, 120), folder / "trial.csv")
+    (folder / "ship.toml").write_text(example_vessel("thesis").read_text())
+    (folder / "model.json").write_text(json.dumps({"names": ["Xu", "Xuuu", "Yv"]}))
+    (folder / "logs").mkdir()
+    return folder
+
+
+def plain_environment(**more):
+    kept = {k: v for k, v in os.environ.items() if k not in ("NO_COLOR", "GREYBOX_CONFIG")}
+    return kept | {"TERM": "xterm"} | more
+
+
+# help
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_has_a_sentence_and_examples_that_parse(name):
+    parser = COMMANDS[name]
+    assert parser.description
+    assert "\n" not in parser.description
+    examples = examples_of(parser)
+    assert len(examples) >= 2
+    for line in examples:
+        given = shlex.split(line)[1:]
+        assert given[0] == name
+        build_parser(name).parse_args(given)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_option_is_explained_with_its_default(name):
+    for action in own_actions(COMMANDS[name]):
+        assert action.help, action.dest
+        if action.option_strings and action.default not in (None, False, []):
+            shown = action.default
+            if isinstance(shown, tuple):
+                shown = ",".join(f"{v:g}" for v in shown)
+            elif isinstance(shown, float):
+                shown = f"{shown:g}"
+            assert f"({shown}" in action.help, f"{action.dest}: {action.help}"
+
+
+def test_help_of_a_command_and_help_help(capsys):
+    for given in (["help", "estimate"], ["estimate", "--help"]):
+        with pytest.raises(SystemExit) as stop:
+            main(given)
+        assert stop.value.code == 0
+        shown = capsys.readouterr().out
+        assert shown.startswith("usage: greybox estimate LOG [LOG ...] --vessel V [OPTION ...]")
+        assert "examples:" in shown
+    with pytest.raises(SystemExit) as stop:
+        main(["help"])
+    assert stop.value.code == 0
+    assert "commands:" in capsys.readouterr().out
+
+
+def test_without_a_command_the_help_goes_to_stderr(capsys):
+    with pytest.raises(SystemExit) as stop:
+        main([])
+    assert stop.value.code == 2
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    assert "commands:" in shown.err
+
+
+def test_the_parser_imports_nothing_heavy():
+    code = (
+        "import sys; from greybox.commands.main import build_parser; build_parser()\n"
+        "heavy = {'casadi', 'numpy', 'pandas', 'matplotlib', 'scipy', 'rich', 'argcomplete'}\n"
+        "assert not heavy & set(sys.modules), heavy & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+
+
+# suggestions
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("estmate", "command 'estmate' is not known. Did you mean 'estimate'?"),
+        ("help estmate", "Did you mean 'estimate'?"),
+        ("estimate trial.csv --vesel s", "there is no option '--vesel'. Did you mean '--vessel'?"),
+        ("estimate trial.csv --vessel s --metod ls", "Did you mean '--method'?"),
+        ("estimate trial.csv --vessel s --method ivv", "Did you mean 'iv'? Known: ls, iv, oe."),
+        ("estimate trial.csv --vessel s --mass heavy", "--mass: 'heavy' is no positive number."),
+        ("estimate trial.csv --vessel s --seed 1.5", "'1.5' is no whole number of at least 0."),
+        ("reproduce chapter8", "study 'chapter8' is not known. Did you mean 'chapter"),
+        ("simulate m.json a.csv b.csv --out c", "'b.csv' is one argument too many."),
+        ("estimate trial.csv", "the following arguments are required: --vessel."),
+        ("completion bsh", "Did you mean 'bash'?"),
+    ],
+)
+def test_wrong_usage_is_one_sentence_with_the_nearest_name(capsys, line, message):
+    with pytest.raises(SystemExit) as stop:
+        main(line.split())
+    assert stop.value.code == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert re.search(r"See 'greybox( \w+)? --help'\.\n$", error)
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("check trail.csv --vessel ship.toml", "Did you mean 'trial.csv'?"),
+        ("check trial.csv --vessel shp.toml", "Did you mean 'ship.toml'?"),
+        ("check trial.csv --vessel thesys", "Did you mean 'thesis'?"),
+        ("simulate modle.json trial.csv --out x.csv", "Did you mean 'model.json'?"),
+        ("compare modle.json --log trial.csv", "Did you mean 'model.json'?"),
+        ("estimate trial.csv --vessel ship.toml --structure thesys", "Did you mean 'thesis'?"),
+        ("diagnose trial.csv --vessel ship.toml --causes curent", "Did you mean 'current'?"),
+    ],
+)
+def test_names_that_nearly_exist_are_suggested(folder, monkeypatch, capsys, line, message):
+    monkeypatch.chdir(folder)
+    assert main(line.split()) == 1
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+
+
+# completion
+
+
+BASH = """
+source ./script
+ask() {
+  COMP_LINE="$1"; COMP_POINT=${#COMP_LINE}; COMP_TYPE=9
+  COMP_WORDS=($COMP_LINE); [[ "$COMP_LINE" == *" " ]] && COMP_WORDS+=("")
+  COMP_CWORD=$((${#COMP_WORDS[@]} - 1)); COMPREPLY=()
+  _python_argcomplete greybox "${COMP_WORDS[COMP_CWORD]}"
+  local IFS=,; echo "${COMPREPLY[*]}"
+}
+while IFS= read -r line; do ask "$line"; done
+"""
+
+
+@pytest.fixture(scope="module")
+def ask(folder):
+    """Return what bash offers for lines that are being typed."""
+    place = folder / "bin"
+    place.mkdir()
+    (place / "greybox").write_text(f'#!/bin/sh\nexec {shlex.join(SCRIPT)} "$@"\n')
+    (place / "greybox").chmod(0o755)
+    made = subprocess.run([*SCRIPT, "completion", "bash"], capture_output=True, text=True,
+                          check=True, cwd=folder)  # fmt: skip
+    (folder / "script").write_text(made.stdout)
+    path = f"{place}{os.pathsep}{os.environ['PATH']}"
+
+    def run(*lines):
+        done = subprocess.run(["bash", "-c", BASH], input="\n".join(lines) + "\n", text=True,
+                              capture_output=True, check=True, cwd=folder,
+                              env=plain_environment(PATH=path))  # fmt: skip
+        return [[w.strip() for w in row.split(",")] for row in done.stdout.splitlines()]
+
+    return run
+
+
+@pytest.mark.skipif(not Path("/bin/bash").exists(), reason="no bash")
+def test_bash_completes(ask):
+    asked = {
+        "greybox es": ["estimate"],
+        "greybox estimate --compare": ["--compare-structures"],
+        "greybox estimate trial.csv --method ": ["ls", "iv", "oe"],
+        "greybox -v help des": ["design"],
+        "greybox estimate trial.csv --structure th": ["thesis"],
+        "greybox diagnose trial.csv --causes current thr": ["thruster_gain", "thruster_lag"],
+        "greybox design --model model.json --want Xuu": ["Xuuu"],
+        "greybox estimate trial.csv --bound Nu": ["Nuv="],
+        "greybox check tr": ["trial.csv"],
+        "greybox compare m": ["model.json"],
+        "greybox check trial.csv --vessel ": ["thesis", "ferry", "bin/", "logs/", "ship.toml"],
+        "greybox reproduce chapter4 --out l": ["logs/"],
+    }
+    assert [set(found) for found in ask(*asked)] == [set(found) for found in asked.values()]
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_the_script_says_how_to_install_it(shell, capsys):
+    assert main(["completion", shell]) == 0
+    shown = capsys.readouterr().out
+    assert "greybox" in shown
+    assert "# in those to come:" in shown.splitlines()[-1]
+
+
+def test_names_that_completion_has_by_heart_are_true():
+    from greybox.commands import kinds
+    from greybox.diagnosis.causes import _OWN
+    from greybox.model.catalogue import get_structure, structure_names
+
+    assert structure_names() == completers.STRUCTURES
+    assert tuple(c.id for c in _OWN) == completers.CAUSES
+    assert get_structure("thesis").parameters == completers.PARAMETERS
+    assert kinds.EXAMPLE_VESSELS == EXAMPLES
+
+
+# quiet, verbose, colours
+
+
+def test_quiet_shows_errors_only(folder, monkeypatch, capsys):
+    monkeypatch.chdir(folder)
+    for given in (["-q", "check"], ["check", "-q"]):
+        assert main([*given, "trial.csv", "--vessel", "ship.toml", "--json", "c.json"]) == 0
+        shown = capsys.readouterr()
+        assert shown.out == shown.err == ""
+        assert json.loads((folder / "c.json").read_text())["findings"] == []
+    assert main(["check", "-q", "trial.csv", "--vessel", "ship.toml", "--json", "-"]) == 0
+    assert json.loads(capsys.readouterr().out)["findings"] == []
+    assert main(["check", "-q", "none.csv", "--vessel", "ship.toml"]) == 1
+    assert "there is no file" in capsys.readouterr().err
+    # and the next command is not quiet any more
+    assert main(["check", "trial.csv", "--vessel", "ship.toml"]) == 0
+    assert capsys.readouterr().out
+
+
+def test_verbose_tells_what_is_read_on_stderr(folder, monkeypatch, capsys):
+    monkeypatch.chdir(folder)
+    given = ["trial.csv", "--vessel", "ship.toml", "--method", "ls", "--predictor", "basic",
+             "--structure", "linear", "--json", "-"]  # fmt: skip
+    texts = {}
+    for words in ("estimate", "-v estimate", "estimate -v", "-v estimate -v", "estimate -vv"):
+        main([*words.split(), *given])
+        shown = capsys.readouterr()
+        json.loads(shown.out)
+        texts[words] = shown.err
+    assert texts["estimate"] == ""
+    told = re.compile(r"\[ +\d+\.\d\d s\] read trial.csv: 120 rows every 1 s")
+    assert told.search(texts["-v estimate"])
+    assert told.search(texts["estimate -v"])
+    assert "read vessel ship.toml: Thesis ship, 2 thruster(s)" in texts["estimate -v"]
+    assert "in this order" not in texts["estimate -v"]
+    for most in ("-v estimate -v", "estimate -vv"):
+        assert "greybox.validation.choose: in this order" in texts[most]
+
+
+def test_verbosity_leaves_no_trace_in_records(folder, monkeypatch, capsys):
+    monkeypatch.chdir(folder)
+    found = []
+    for words in ([], ["-v"], ["-q"], ["--no-config"]):
+        assert main([*words, "check", "trial.csv", "--vessel", "ship.toml", "--json", "-"]) == 0
+        found.append(capsys.readouterr().out)
+    assert len(set(found)) == 1
+
+
+def test_the_library_is_silent_by_itself(folder):
+    code = (
+        "import greybox as gb; v = gb.load_vessel('ship.toml'); gb.read_log('trial.csv', v)\n"
+        "import logging; assert not logging.getLogger().handlers"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True,
+                          cwd=folder)  # fmt: skip
+    assert done.stdout == done.stderr == ""
+
+
+SAY = "from greybox.commands.terminal import complain, say\n"
+
+
+def on_a_terminal(code, **environment):
+    """Run Python with all its output on a pseudo-terminal, and return what was shown."""
+    master, slave = pty.openpty()
+    try:
+        subprocess.run([sys.executable, "-c", SAY + code], stdout=slave, stderr=slave, timeout=60,
+                       env=plain_environment(**environment), check=True)  # fmt: skip
+        return os.read(master, 10_000).decode()
+    finally:
+        os.close(slave)
+        os.close(master)
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("Verdict: trust", "Verdict: \x1b[1;32mtrust\x1b[0m"),
+        ("Verdict: trust except Xu", "Verdict: \x1b[1;33mtrust except\x1b[0m Xu"),
+        ("Verdict: do not trust: x", "Verdict: \x1b[1;31mdo not trust\x1b[0m: x"),
+        ("verdict: named", "verdict: \x1b[1;33mnamed\x1b[0m"),
+        ("verdict: none", "verdict: \x1b[1;32mnone\x1b[0m"),
+        ("no Verdict: trust", "no Verdict: trust"),
+    ],
+)
+def test_a_verdict_is_coloured_on_a_terminal_only(text, shown):
+    code = f"say({text!r})"
+    assert on_a_terminal(code).replace("\r\x1b[K", "").strip() == shown
+    piped = subprocess.run([sys.executable, "-c", SAY + code], capture_output=True, text=True,
+                           env=plain_environment(), check=True)  # fmt: skip
+    assert piped.stdout == text + "\n"
+
+
+def test_no_color_and_dumb_terminals_are_heeded():
+    code = "say('Verdict: trust'); complain('greybox: stopped')"
+    for environment in ({"NO_COLOR": "1"}, {"TERM": "dumb"}):
+        assert "\x1b[1" not in on_a_terminal(code, **environment)
+    assert "\x1b[1;31mgreybox:\x1b[0m stopped" in on_a_terminal(code)
+    # an empty variable asks for nothing
+    assert "\x1b[1;31m" in on_a_terminal(code, NO_COLOR="")
