@@ -1,0 +1,201 @@
+"""What a figure shows, as numbers: the same lines and areas for a drawing that can be zoomed.
+
+The figure that is printed stays the one source; what has no meaning in data
+units (arrows, legends, text beside the axes) is left to it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.colors import to_hex, to_rgba
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from matplotlib.quiver import Quiver
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+_DASHES = {"-": "solid", "--": "dashed", "-.": "dashdot", ":": "dotted"}
+_MARKERS = {
+    "o": "circle", ".": "dot", "s": "square", "^": "triangle", "v": "inverted_triangle",
+    "D": "diamond", "x": "x", "+": "cross",
+}  # fmt: skip
+# in a legend nobody reads
+_HIDDEN = "_"
+
+
+@dataclass(frozen=True)
+class Line:
+    """A line, markers, or both: ``x`` and ``y`` (N,), NaN where it is interrupted."""
+
+    x: Array
+    y: Array
+    label: str
+    colour: str
+    dash: str = "solid"
+    marker: str = ""
+    width: float = 1.0
+    size: float = 5.0
+
+
+@dataclass(frozen=True)
+class Area:
+    """Filled polygons, (n, 2) each."""
+
+    polygons: tuple[Array, ...]
+    label: str
+    colour: str
+    opacity: float
+
+
+@dataclass(frozen=True)
+class Strips:
+    """Spans of x over the whole height, (n, 2)."""
+
+    spans: Array
+    label: str
+    colour: str
+    opacity: float
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One pair of axes.
+
+    Parameters
+    ----------
+    x_label, y_label : str
+    x_range, y_range : tuple of float
+    height : float
+        [inch], as it is printed.
+    together : int
+        The first panel that has the same x axis: itself, or one before it.
+    equal : bool
+        Whether both axes have one scale, as on a map.
+    lines, areas, strips, levels, words
+        ``levels`` are y of horizontal lines, ``words`` x, y and a short text.
+    """
+
+    x_label: str
+    y_label: str
+    x_range: tuple[float, float]
+    y_range: tuple[float, float]
+    height: float
+    together: int
+    equal: bool = False
+    lines: tuple[Line, ...] = ()
+    areas: tuple[Area, ...] = ()
+    strips: tuple[Strips, ...] = ()
+    levels: tuple[float, ...] = ()
+    words: tuple[tuple[float, float, str], ...] = ()
+
+
+@dataclass(frozen=True)
+class Chart:
+    """Panels under one another."""
+
+    panels: tuple[Panel, ...]
+
+
+def chart_of(figure: Figure) -> Chart:
+    """Return what a figure shows in data units.
+
+    Parameters
+    ----------
+    figure : Figure
+        Of linear or logarithmic axes; others are left out.
+    """
+    shown = [
+        ax for ax in figure.axes
+        if ax.get_visible() and {ax.get_xscale(), ax.get_yscale()} == {"linear"} and ax.has_data()
+    ]  # fmt: skip
+    return Chart(tuple(_panel(ax, shown) for ax in shown))
+
+
+def _panel(ax: Any, shown: list[Any]) -> Panel:
+    shared = ax.get_shared_x_axes()
+    lines, levels = [], []
+    for line in ax.get_lines():
+        across, up = line.get_transform().contains_branch_seperately(ax.transData)
+        if across and up:
+            lines.append(_line(line))
+        elif up:
+            levels.append(float(np.atleast_1d(line.get_ydata())[0]))
+    areas, strips = [], []
+    for found in ax.collections:
+        across, up = found.get_transform().contains_branch_seperately(ax.transData)
+        if isinstance(found, Quiver):
+            continue
+        if isinstance(found, LineCollection) and across and up:
+            lines.append(_segments(found))
+        elif isinstance(found, PolyCollection) and across:
+            (areas if up else strips).append(_filled(found, up))
+    for patch in ax.patches:
+        if isinstance(patch, Rectangle) and patch.get_data_transform() == ax.transData:
+            corners = patch.get_patch_transform().transform(patch.get_path().vertices[:4])
+            areas.append(Area((corners,), "", *_paint(patch.get_facecolor())))
+    return Panel(
+        x_label=ax.get_xlabel(),
+        y_label=ax.get_ylabel(),
+        x_range=_pair(ax.get_xlim()),
+        y_range=_pair(ax.get_ylim()),
+        height=float(ax.get_position().height * ax.figure.get_figheight()),
+        together=next(i for i, other in enumerate(shown) if shared.joined(other, ax)),
+        equal=ax.get_aspect() != "auto",
+        lines=tuple(lines),
+        areas=tuple(areas),
+        strips=tuple(strips),
+        levels=tuple(levels),
+        words=tuple(
+            (*map(float, text.get_position()), text.get_text())
+            for text in ax.texts
+            if text.get_transform() == ax.transData and text.get_text()
+        ),
+    )
+
+
+def _pair(limits: Any) -> tuple[float, float]:
+    return float(limits[0]), float(limits[1])
+
+
+def _line(line: Any) -> Line:
+    style, marker = line.get_linestyle(), line.get_marker()
+    return Line(
+        np.asarray(line.get_xdata(orig=False), float),
+        np.asarray(line.get_ydata(orig=False), float),
+        _label(line),
+        to_hex(line.get_color()),
+        _DASHES.get(style, ""),
+        "" if marker in ("None", None, "", " ") else _MARKERS.get(marker, "circle"),
+        float(line.get_linewidth()),
+        float(line.get_markersize()),
+    )
+
+
+def _segments(found: LineCollection) -> Line:
+    gap = np.full((1, 2), np.nan)
+    points = np.concatenate([np.concatenate([s, gap]) for s in found.get_segments()] or [gap])
+    colour = to_hex(found.get_colors()[0])
+    return Line(points[:, 0], points[:, 1], _label(found), colour)
+
+
+def _filled(found: PolyCollection, up: bool) -> Any:
+    paint = _paint(found.get_facecolor()[0])
+    pieces = [np.asarray(p.vertices, float) for p in found.get_paths() if len(p.vertices)]
+    if up:
+        return Area(tuple(pieces), _label(found), *paint)
+    spans = np.array([[p[:, 0].min(), p[:, 0].max()] for p in pieces]).reshape(-1, 2)
+    return Strips(spans, _label(found), paint[0], min(paint[1], 0.3))
+
+
+def _paint(colour: Any) -> tuple[str, float]:
+    return to_hex(colour), float(to_rgba(colour)[3])
+
+
+def _label(artist: Any) -> str:
+    text = str(artist.get_label())
+    return "" if text.startswith(_HIDDEN) else text
