@@ -13,7 +13,6 @@ import numpy as np
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_hex, to_rgba
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 from matplotlib.quiver import Quiver
 from numpy.typing import NDArray
 
@@ -44,12 +43,13 @@ class Line:
 
 @dataclass(frozen=True)
 class Area:
-    """Filled polygons, (n, 2) each."""
+    """Polygons, (n, 2) each, filled and outlined in colours that may be empty."""
 
     polygons: tuple[Array, ...]
     label: str
     colour: str
     opacity: float
+    outline: str = ""
 
 
 @dataclass(frozen=True)
@@ -78,6 +78,8 @@ class Panel:
         Whether both axes have one scale, as on a map.
     lines, areas, strips, levels, words
         ``levels`` are y of horizontal lines, ``words`` x, y and a short text.
+    legend : bool
+        Whether one stands above it.
     """
 
     x_label: str
@@ -92,6 +94,7 @@ class Panel:
     strips: tuple[Strips, ...] = ()
     levels: tuple[float, ...] = ()
     words: tuple[tuple[float, float, str], ...] = ()
+    legend: bool = False
 
 
 @dataclass(frozen=True)
@@ -135,16 +138,16 @@ def _panel(ax: Any, shown: list[Any]) -> Panel:
         elif isinstance(found, PolyCollection) and across:
             (areas if up else strips).append(_filled(found, up))
     for patch in ax.patches:
-        if isinstance(patch, Rectangle) and patch.get_data_transform() == ax.transData:
-            corners = patch.get_patch_transform().transform(patch.get_path().vertices[:4])
-            areas.append(Area((corners,), "", *_paint(patch.get_facecolor())))
+        if patch.get_data_transform() == ax.transData:
+            pieces = patch.get_path().to_polygons(patch.get_patch_transform())
+            areas.append(_area(pieces, patch, [patch.get_facecolor()], [patch.get_edgecolor()]))
     return Panel(
         x_label=ax.get_xlabel(),
         y_label=ax.get_ylabel(),
         x_range=_pair(ax.get_xlim()),
         y_range=_pair(ax.get_ylim()),
         height=float(ax.get_position().height * ax.figure.get_figheight()),
-        together=next(i for i, other in enumerate(shown) if shared.joined(other, ax)),
+        together=next(i for i, other in enumerate(shown) if other is ax or shared.joined(other, ax)),
         equal=ax.get_aspect() != "auto",
         lines=tuple(lines),
         areas=tuple(areas),
@@ -155,6 +158,7 @@ def _panel(ax: Any, shown: list[Any]) -> Panel:
             for text in ax.texts
             if text.get_transform() == ax.transData and text.get_text()
         ),
+        legend=ax.get_legend() is not None or bool(ax.figure.legends and ax is shown[0]),
     )
 
 
@@ -164,9 +168,13 @@ def _pair(limits: Any) -> tuple[float, float]:
 
 def _line(line: Any) -> Line:
     style, marker = line.get_linestyle(), line.get_marker()
+    x = np.asarray(line.get_xdata(orig=False), float)
+    y = np.asarray(line.get_ydata(orig=False), float)
+    if line.get_drawstyle() == "steps-post":
+        x, y = np.repeat(x, 2)[1:], np.repeat(y, 2)[:-1]
     return Line(
-        np.asarray(line.get_xdata(orig=False), float),
-        np.asarray(line.get_ydata(orig=False), float),
+        x,
+        y,
         _label(line),
         to_hex(line.get_color()),
         _DASHES.get(style, ""),
@@ -184,16 +192,30 @@ def _segments(found: LineCollection) -> Line:
 
 
 def _filled(found: PolyCollection, up: bool) -> Any:
-    paint = _paint(found.get_facecolor()[0])
     pieces = [np.asarray(p.vertices, float) for p in found.get_paths() if len(p.vertices)]
+    area = _area(pieces, found, found.get_facecolor(), found.get_edgecolor())
     if up:
-        return Area(tuple(pieces), _label(found), *paint)
+        return area
     spans = np.array([[p[:, 0].min(), p[:, 0].max()] for p in pieces]).reshape(-1, 2)
-    return Strips(spans, _label(found), paint[0], min(paint[1], 0.3))
+    return Strips(spans, area.label, area.colour or area.outline, min(area.opacity, 0.3))
 
 
-def _paint(colour: Any) -> tuple[str, float]:
-    return to_hex(colour), float(to_rgba(colour)[3])
+def _area(pieces: Any, artist: Any, faces: Any, edges: Any) -> Area:
+    colour, opacity = _paint(faces)
+    outline, shown = _paint(edges)
+    drawn = shown and np.max(artist.get_linewidth(), initial=0) > 0
+    return Area(
+        tuple(np.asarray(p, float) for p in pieces), _label(artist), colour, opacity,
+        outline if drawn else "",
+    )  # fmt: skip
+
+
+def _paint(colours: Any) -> tuple[str, float]:
+    """Return the first of some colours and its opacity; none where there is nothing to see."""
+    if not len(colours):
+        return "", 0.0
+    opacity = float(to_rgba(colours[0])[3])
+    return (to_hex(colours[0]), opacity) if opacity else ("", 0.0)
 
 
 def _label(artist: Any) -> str:

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from greybox.errors import GreyboxError, UsageError
 from greybox.report.check_answers import answer_figure, course_figure, wind_figure
+from greybox.report.chart import chart_of
 from greybox.report.check_rows import (
     coarse_figure,
     gap_figure,
@@ -204,7 +205,9 @@ def _section(number: int, report: CheckReport, vessel: Vessel) -> Section:
             sentences.append(f"The log as a whole cannot be drawn: {error}")
         else:
             text = f"The log {report.name} as a whole, as it would be imported, nothing mended."
-            pictures.append(Picture(to_svg(log_figure(log), f"log{number}whole"), text))
+            figure = log_figure(log)
+            svg = to_svg(figure, f"log{number}whole")
+            pictures.append(Picture(svg, text, _seen(log), chart=chart_of(figure)))
     table = Table(
         "All checks",
         ["check", "outcome", "what was seen"],
@@ -213,6 +216,15 @@ def _section(number: int, report: CheckReport, vessel: Vessel) -> Section:
     )
     texts = [("Notes from reading", "\n".join(report.notes))] if report.notes else []
     return Section(report.name, sentences, pictures, [table], texts)
+
+
+def _seen(log: TrialLog) -> str:
+    """Return the text that stands for the picture of a whole log."""
+    drawn = "Track on a map, and" if "x_n" in log and "y_n" in log else "Against time:"
+    ranges = "; ".join(
+        f"{n} from {log[n].min():.3g} to {log[n].max():.3g}" for n in log.channels if len(log[n])
+    )
+    return f"{drawn} states, inputs and wind of {log.name}, as far as it has them. {ranges} (SI)."
 
 
 def _seriousness(finding: Finding) -> int:

@@ -128,7 +128,7 @@ def _plot(panel: Panel, x_range: Any, cursor: Any, last: bool) -> Any:
     )  # fmt: skip
     # on a page that is scrolled, a figure must be asked before it takes a drag or a wheel
     plot.toolbar.active_drag = plot.toolbar.active_scroll = None
-    if legend:
+    if legend and panel.legend:
         items: Any = list(legend.items())
         plot.add_layout(
             Legend(
@@ -175,8 +175,9 @@ def _draw_area(plot: Any, area: Area) -> Any:
         "ys": [_single(p[:, 1]) for p in area.polygons],
     }
     return plot.patches(
-        "xs", "ys", source=data, fill_color=area.colour, fill_alpha=area.opacity, line_color=None
-    )
+        "xs", "ys", source=data, fill_color=area.colour or None, fill_alpha=area.opacity,
+        line_color=area.outline or None, line_width=0.8,
+    )  # fmt: skip
 
 
 def _draw_strips(plot: Any, strips: Strips) -> Any:

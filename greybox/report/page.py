@@ -131,7 +131,7 @@ h2 { font-size: 1.15rem; margin: 1.6rem 0 0.4rem; }
             grid-template-columns: repeat(auto-fill, minmax(min(100%, 26rem), 1fr)); }
 figure { margin: 1rem 0; min-width: 0; grid-column: 1 / -1; }
 figure.narrow { grid-column: auto; }
-figure > svg { width: 100%; height: auto; max-width: 54rem; }
+figure > svg { display: block; width: 100%; height: auto; max-width: 54rem; }
 figcaption { font-size: 0.9rem; color: #444; }
 button { font: inherit; font-size: 0.9rem; margin: 0.2rem 0; padding: 0.3rem 0.8rem;
          color: #005a8e; background: #fff; border: 1px solid #0072B2; border-radius: 4px; }
@@ -142,8 +142,8 @@ th, td { padding: 0.2rem 0.6rem; border-bottom: 1px solid #ddd; text-align: righ
          white-space: nowrap; }
 th:first-child, td:first-child { text-align: left; }
 table.sentences th, table.sentences td { text-align: left; white-space: normal;
-         vertical-align: top; overflow-wrap: anywhere; }
-table.sentences td:first-child { overflow-wrap: normal; }
+         vertical-align: top; }
+table.sentences td:last-child { overflow-wrap: anywhere; }
 caption { text-align: left; font-weight: 600; padding: 0.3rem 0; }
 pre { font-size: 0.8rem; overflow-x: auto; background: #f6f6f6; padding: 0.6rem; }
 pre.marked { white-space: pre-wrap; }
@@ -152,7 +152,12 @@ del { background: #f9ddcc; }
 @page { size: A4; margin: 15mm; }
 @media screen { .open > svg { display: none; } .open > .zoom { display: block; }
   figure.narrow.open { grid-column: 1 / -1; } }
-@media (max-width: 600px) {
+@media screen and (max-width: 600px) {
+  table.sentences, table.sentences tbody { display: block; }
+  table.sentences thead { display: none; }
+  table.sentences tr { display: flex; flex-wrap: wrap; border-bottom: 1px solid #ddd; }
+  table.sentences td { border: 0; } table.sentences td:first-child { font-weight: 600; }
+  table.sentences td:last-child { flex-basis: 100%; }
   table { font-size: 0.8rem; } th, td { white-space: normal; padding: 0.2rem 0.3rem; } }
 @media print { button { display: none; } html { font-size: 11px; } body { max-width: none; font-size: 1rem; }
   figure { break-inside: avoid; }
