@@ -21,7 +21,7 @@ from experiment_design.result import Design
 from experiment_design.search import REFERENCE
 from greybox.report.chart import chart_of
 from greybox.report.figures import BLUE, ORANGE, new_figure, tidy, to_svg
-from greybox.report.page import Page, Picture, Section, Table, flatten
+from greybox.report.page import Page, Picture, Section, Table, computed
 
 Array = NDArray[np.float64]
 
@@ -72,7 +72,7 @@ def design_page(
             *([] if headline else _alternatives(design)),
             _limits(design),
         ],
-        computed=flatten(record),
+        computed=computed(record),
         sections=[] if one else parts,
     )  # fmt: skip
 

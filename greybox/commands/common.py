@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import platform
+import shlex
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from hashlib import file_digest
 from importlib.metadata import version
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -84,10 +88,43 @@ def complain(text: str) -> None:
     sys.stderr.write(text + "\n")
 
 
+# options that name files to read; raw files are hashed as they are imported
+_INPUTS = (
+    "logs", "log", "models", "model", "nominal", "validate", "estimate", "vessel", "prior",
+    "between", "area",
+)  # fmt: skip
+_PACKAGES = ("casadi", "numpy", "scipy")
+
+
 def provenance(options: argparse.Namespace) -> dict[str, Any]:
-    """Return how a file was made: version and command, without wall time."""
-    shown = {k: v for k, v in vars(options).items() if k not in ("run",) and v is not None}
-    return {"program": f"greybox-marine {version('greybox-marine')}", "command": shown}
+    """Return how a result was made, without wall time.
+
+    Returns
+    -------
+    dict
+        ``program``, ``versions`` of what computes, the ``command`` by options and as
+        the ``line`` that was typed, ``inputs``: the SHA-256 of every file that was read.
+    """
+    shown = {k: v for k, v in vars(options).items() if k not in ("run", "typed") and v is not None}
+    return {
+        "program": f"greybox-marine {version('greybox-marine')}",
+        "versions": {n: version(n) for n in _PACKAGES} | {"Python": platform.python_version()},
+        "command": shown,
+        "line": shlex.join(["greybox", *getattr(options, "typed", [])]),
+        "inputs": _hashes(shown),
+    }
+
+
+def _hashes(shown: Mapping[str, Any]) -> dict[str, str]:
+    """Return the SHA-256 of each file that options name to be read; built-in names have none."""
+    found: dict[str, str] = {}
+    for name in _INPUTS:
+        given = shown.get(name) or []
+        for path in [given] if isinstance(given, str) else given:
+            if Path(path).is_file():
+                with open(path, "rb") as handle:
+                    found[path] = file_digest(handle, "sha256").hexdigest()
+    return found
 
 
 def say(text: str) -> None:

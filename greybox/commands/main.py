@@ -93,6 +93,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = list(sys.argv[1:] if arguments is None else arguments)
     parser = build_parser(given[0] if given and not given[0].startswith("-") else None)
     options = parser.parse_args(given)
+    options.typed = given
     try:
         options.run(options)
     except GreyboxError as error:

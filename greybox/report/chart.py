@@ -128,7 +128,8 @@ def _panel(ax: Any, shown: list[Any]) -> Panel:
             lines.append(_line(line))
         elif up:
             levels.append(float(np.atleast_1d(line.get_ydata())[0]))
-    areas, strips = [], []
+    areas: list[Area] = []
+    strips: list[Strips] = []
     for found in ax.collections:
         across, up = found.get_transform().contains_branch_seperately(ax.transData)
         if isinstance(found, Quiver):
@@ -136,7 +137,11 @@ def _panel(ax: Any, shown: list[Any]) -> Panel:
         if isinstance(found, LineCollection) and across and up:
             lines.append(_segments(found))
         elif isinstance(found, PolyCollection) and across:
-            (areas if up else strips).append(_filled(found, up))
+            area = _collected(found)
+            if up:
+                areas.append(area)
+            else:
+                strips.append(_strips(area))
     for patch in ax.patches:
         if patch.get_data_transform() == ax.transData:
             pieces = patch.get_path().to_polygons(patch.get_patch_transform())
@@ -147,7 +152,9 @@ def _panel(ax: Any, shown: list[Any]) -> Panel:
         x_range=_pair(ax.get_xlim()),
         y_range=_pair(ax.get_ylim()),
         height=float(ax.get_position().height * ax.figure.get_figheight()),
-        together=next(i for i, other in enumerate(shown) if other is ax or shared.joined(other, ax)),
+        together=next(
+            i for i, other in enumerate(shown) if other is ax or shared.joined(other, ax)
+        ),
         equal=ax.get_aspect() != "auto",
         lines=tuple(lines),
         areas=tuple(areas),
@@ -191,12 +198,14 @@ def _segments(found: LineCollection) -> Line:
     return Line(points[:, 0], points[:, 1], _label(found), colour)
 
 
-def _filled(found: PolyCollection, up: bool) -> Any:
-    pieces = [np.asarray(p.vertices, float) for p in found.get_paths() if len(p.vertices)]
-    area = _area(pieces, found, found.get_facecolor(), found.get_edgecolor())
-    if up:
-        return area
-    spans = np.array([[p[:, 0].min(), p[:, 0].max()] for p in pieces]).reshape(-1, 2)
+def _collected(found: PolyCollection) -> Area:
+    pieces = [np.asarray(p.vertices, float) for p in found.get_paths()]
+    pieces = [p for p in pieces if len(p)]
+    return _area(pieces, found, found.get_facecolor(), found.get_edgecolor())
+
+
+def _strips(area: Area) -> Strips:
+    spans = np.array([[p[:, 0].min(), p[:, 0].max()] for p in area.polygons]).reshape(-1, 2)
     return Strips(spans, area.label, area.colour or area.outline, min(area.opacity, 0.3))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from greybox.model.model import ManoeuvringModel
 from greybox.report.chart import chart_of
 from greybox.report.figures import comparison_figure, to_svg
-from greybox.report.page import Page, Picture, Table, flatten
+from greybox.report.page import Page, Picture, Table, computed
 from greybox.report.thinning import points_for
 from greybox.validation.bands import LEVEL
 from greybox.validation.comparison import Comparison
@@ -102,14 +102,18 @@ def comparison_page(
     return Page(
         title="Measured against simulated",
         headline=headline(comparison),
-        sentences=[*[t.sentence for t in tests], *_band_sentences(comparison), *_left_out(comparison)],
+        sentences=[
+            *[t.sentence for t in tests],
+            *_band_sentences(comparison),
+            *_left_out(comparison),
+        ],
         pictures=pictures,
         tables=tables,
         texts=[
             (f"Model {name}", model.summary())
             for name, model in zip(comparison.names, models, strict=True)
         ],
-        computed=flatten(record) | {"start": "mean of the log's first 5 samples"},
+        computed=computed(record) | {"start": "mean of the log's first 5 samples"},
     )
 
 
@@ -129,8 +133,7 @@ def _pictures(comparison: Comparison) -> list[Picture]:
         if any(b is not None and b.coverage for b in bands):
             caption += f" Shaded: where {100 * LEVEL:.0f} % of the measurements should lie."
         fits = "; ".join(
-            f"{name} "
-            + ", ".join(f"{_NAMES.get(s, s)} {_percent(v)}" for s, v in run.fit.items())
+            f"{name} " + ", ".join(f"{_NAMES.get(s, s)} {_percent(v)}" for s, v in run.fit.items())
             for name, run in zip(comparison.names, runs, strict=True)
         )
         printed, zoomed = (

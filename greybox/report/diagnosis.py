@@ -23,7 +23,7 @@ from greybox.report.model_difference import (
     marked_equations,
     other_changes,
 )
-from greybox.report.page import Page, Picture, Section, Table, flatten
+from greybox.report.page import Page, Picture, Section, Table, computed
 from greybox.report.thinning import points_for
 
 _NAMES = {"u": "surge", "v": "sway", "r": "yaw rate", "psi": "heading"}
@@ -57,7 +57,7 @@ def diagnosis_page(diagnosis: Diagnosis, record: Mapping[str, Any]) -> Page:
         headline=headline[:1].upper() + headline[1:],
         sentences=_summary(diagnosis),
         sections=sections,
-        computed=flatten(dict(diagnosis.record) | dict(record))
+        computed=computed(dict(diagnosis.record) | dict(record))
         | {
             "causes scored": str(diagnosis.tried),
             "fall of −2 log L": "of the free run's errors, their noise coloured; a cause counts "

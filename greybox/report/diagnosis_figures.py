@@ -63,7 +63,9 @@ def run_figure(run: Runs, points: int = _POINTS) -> Figure:
         measured = run.measured[state]
         spread = float(np.ptp(measured)) or 1.0
         low, high = measured.min() - 0.6 * spread, measured.max() + 0.6 * spread
-        _line(top, t, measured, gaps, points, {"color": BLACK, "linewidth": 0.9, "label": "measured"})
+        _line(
+            top, t, measured, gaps, points, {"color": BLACK, "linewidth": 0.9, "label": "measured"}
+        )
         for name in shown:
             style = {k: v for k, v in _STYLE[name].items() if k != "marker"}
             style |= {"linewidth": 1.2, "label": name}

@@ -23,7 +23,7 @@ from greybox.report.estimation_figures import (
 )
 from greybox.report.figures import comparison_figure, to_svg
 from greybox.report.model_difference import shown_unit
-from greybox.report.page import Page, Picture, Section, Table, flatten
+from greybox.report.page import Page, Picture, Section, Table, computed
 from greybox.report.physical import physical_summary
 from greybox.report.thinning import points_for
 from greybox.trial.log import TrialLog
@@ -81,7 +81,7 @@ def estimation_page(
         headline=headline(estimate),
         sentences=_summary(estimate),
         sections=[s for s in sections if s is not None],
-        computed=flatten(dict(record))
+        computed=computed(dict(record))
         | {
             "standard errors": f"{estimate.covariance_kind}, residuals remembered over "
             f"{estimate.lags} samples",

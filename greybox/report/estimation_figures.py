@@ -187,9 +187,7 @@ def regimes_figure(u: Array, v: Array) -> Figure:
     figure = new_figure(_NARROW, _NARROW)
     ax = figure.subplots()
     every = max(1, -(-len(u) // _DOTS))
-    ax.plot(
-        v[::every], u[::every], ".", color=BLUE, markersize=2.2, alpha=0.4, linestyle="none"
-    )
+    ax.plot(v[::every], u[::every], ".", color=BLUE, markersize=2.2, alpha=0.4, linestyle="none")
     ax.axhline(0, color=BLACK, linewidth=0.8)
     ax.axvline(0, color=BLACK, linewidth=0.8)
     for axis, value in (("x", v), ("y", u)):

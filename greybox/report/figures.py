@@ -276,10 +276,10 @@ def to_svg(figure: Figure, title: str) -> str:
     """Return a figure as an SVG element for a page, with a title for screen readers."""
     import matplotlib as mpl
 
-    for text in figure.findobj(Text):
+    for words in figure.findobj(Text):
         # a name may hold a dollar sign; what a logarithmic axis writes is a formula
-        if text.get_text() and "mathdefault" not in text.get_text():
-            text.set_parse_math(False)
+        if words.get_text() and "mathdefault" not in words.get_text():
+            words.set_parse_math(False)
     out = io.StringIO()
     with mpl.rc_context({"svg.fonttype": "path", "svg.hashsalt": title}):
         figure.savefig(out, format="svg", metadata={"Date": None, "Creator": None})

@@ -20,6 +20,8 @@ _SCALE = 88
 _LEAST, _MOST = 110, 420
 _LEGEND_ROW = 24
 _AXIS = 34
+# how a figure says that its seconds are written as minutes
+_MINUTES = "[min:s]"
 
 
 @cache
@@ -66,7 +68,7 @@ def chart_json(chart: Chart, name: str) -> str:
     )
     item: Any = json_item(grid, name)
     # no script ends, begins or hides inside the text
-    text = serialize_json(_renamed(item, name))
+    text: str = serialize_json(_renamed(item, name))
     for mark in "<>&\u2028\u2029":
         text = text.replace(mark, f"\\u{ord(mark):04x}")
     return text
@@ -74,7 +76,15 @@ def chart_json(chart: Chart, name: str) -> str:
 
 def _plot(panel: Panel, x_range: Any, cursor: Any, last: bool) -> Any:
     from bokeh.models import (
-        BoxZoomTool, CrosshairTool, DataRange1d, Legend, PanTool, Range1d, ResetTool, Span,
+        BoxZoomTool,
+        CrosshairTool,
+        DataRange1d,
+        Legend,
+        NumeralTickFormatter,
+        PanTool,
+        Range1d,
+        ResetTool,
+        Span,
         WheelZoomTool,
     )  # fmt: skip
     from bokeh.plotting import figure
@@ -85,12 +95,13 @@ def _plot(panel: Panel, x_range: Any, cursor: Any, last: bool) -> Any:
     else:
         height = int(np.clip(_SCALE * panel.height, _LEAST, _MOST)) + (_AXIS if last else 0)
         size = {"x_range": x_range, "y_range": Range1d(*panel.y_range), "height": height}
+    clock = panel.x_label.endswith(_MINUTES)
     plot = figure(
         tools=[],
         sizing_mode="stretch_width",
         min_border_left=66,
         min_border_right=12,
-        x_axis_label=_plain(panel.x_label),
+        x_axis_label=_plain(panel.x_label.replace(_MINUTES, "[h:min:s]")),
         y_axis_label=_plain(panel.y_label),
         **size,
     )
@@ -99,6 +110,8 @@ def _plot(panel: Panel, x_range: Any, cursor: Any, last: bool) -> Any:
     plot.axis.axis_label_text_font_style = "normal"
     plot.axis.axis_label_text_font_size = "12px"
     plot.axis.minor_tick_line_color = None
+    if clock:
+        plot.xaxis.formatter = NumeralTickFormatter(format="00:00:00")
     plot.xaxis.visible = last or panel.equal
     plot.yaxis.ticker.desired_num_ticks = 4
     legend: dict[str, list[Any]] = {}
@@ -110,8 +123,8 @@ def _plot(panel: Panel, x_range: Any, cursor: Any, last: bool) -> Any:
         plot.add_layout(Span(location=level, dimension="width", line_color=BLACK, line_alpha=0.6))
     drawn = []
     for line in panel.lines:
-        made = _draw_line(plot, line)
-        drawn += made if line.label else []
+        made = _draw_line(plot, line, line.label or panel.y_label.split("\n")[0])
+        drawn += made
         for glyph in made:
             _note(legend, line.label, glyph)
     if panel.words:
@@ -152,9 +165,8 @@ def _hover(drawn: list[Any], panel: Panel) -> Any:
     )
 
 
-def _draw_line(plot: Any, line: Line) -> list[Any]:
+def _draw_line(plot: Any, line: Line, name: str) -> list[Any]:
     data = {"x": _single(line.x), "y": _single(line.y)}
-    name = _plain(line.label)
     made = []
     if line.dash:
         made.append(plot.line(

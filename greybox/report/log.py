@@ -277,7 +277,7 @@ def _draw_lines(ax: Any, panel: _Panel, clock: _Clock) -> None:
             pick(clock.time, index),
             pick(value, index),
             color=COLOURS[j % 6] if len(panel.lines) > 1 else BLACK,
-            linestyle=STYLES[j // 6 % 4],
+            linestyle=STYLES[j % 4],
             linewidth=0.9,
             label=name,
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from base64 import b64encode
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from hashlib import sha256
 from pathlib import Path
@@ -159,7 +159,8 @@ del { background: #f9ddcc; }
   table.sentences td { border: 0; } table.sentences td:first-child { font-weight: 600; }
   table.sentences td:last-child { flex-basis: 100%; }
   table { font-size: 0.8rem; } th, td { white-space: normal; padding: 0.2rem 0.3rem; } }
-@media print { button { display: none; } html { font-size: 11px; } body { max-width: none; font-size: 1rem; }
+@media print { button { display: none; } html { font-size: 11px; }
+  body { max-width: none; font-size: 1rem; }
   figure { break-inside: avoid; }
   .pictures { grid-template-columns: 1fr 1fr; } h2, h3 { break-after: avoid; }
   .wide { overflow: visible; } th, td { white-space: normal; padding: 0.2rem 0.3rem; }
@@ -196,7 +197,8 @@ def render(page: Page) -> str:
 
     charts: dict[int, tuple[str, str]] = {}
     scripts: list[str] = []
-    zoomable = [p for part in (page, *page.sections) for p in part.pictures if p.chart]
+    shown = [*page.pictures, *(p for section in page.sections for p in section.pictures)]
+    zoomable = [p for p in shown if p.chart]
     if zoomable:
         from greybox.report.interactive import chart_json, library, opener
 
@@ -225,6 +227,29 @@ def _policy(scripts: Sequence[str]) -> str:
 def write_page(page: Page, path: str | Path) -> None:
     """Write the page, replacing the file in one step."""
     write_text(render(page), path)
+
+
+_MACHINES = ("program", "versions", "command", "line", "inputs", "logs", "validate")
+
+
+def computed(record: Mapping[str, Any]) -> dict[str, str]:
+    """Return how a page was computed, one row an item, without wall time.
+
+    Parameters
+    ----------
+    record : mapping
+        As a command records it: ``line``, ``inputs``, ``versions``; what else it
+        holds follows.
+    """
+    if "line" not in record:
+        return flatten(dict(record))
+    rows = {"command": str(record["line"])}
+    if "seed" in record["command"]:
+        rows["seed"] = str(record["command"]["seed"])
+    rows |= {f"read {name}": f"SHA-256 {value}" for name, value in record["inputs"].items()}
+    made = ", ".join(f"{n} {v}" for n, v in record["versions"].items())
+    rows["computed with"] = f"{record['program']}, {made}"
+    return rows | flatten({k: v for k, v in record.items() if k not in _MACHINES})
 
 
 def flatten(record: dict[str, Any]) -> dict[str, str]:
