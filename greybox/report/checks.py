@@ -24,7 +24,7 @@ from greybox.report.check_rows import (
 )
 from greybox.report.check_ties import make_tie, tie_figure
 from greybox.report.figures import to_svg
-from greybox.report.log import log_figure
+from greybox.report.log import facts, page_figures
 from greybox.report.page import Page, Picture, Section, Table, computed, write_page
 from greybox.trial.checks.finding import CheckReport, Finding, size_in_words
 from greybox.trial.importing import import_recording
@@ -210,10 +210,17 @@ def _section(number: int, report: CheckReport, vessel: Vessel) -> Section:
         except GreyboxError as error:
             sentences.append(f"The log as a whole cannot be drawn: {error}")
         else:
-            text = f"The log {report.name} as a whole, as it would be imported, nothing mended."
-            figure = log_figure(log)
-            svg = to_svg(figure, f"log{number}whole")
-            pictures.append(Picture(svg, text, _seen(log), chart=chart_of(figure)))
+            text = f"as it would be imported, nothing mended: {facts(log)}."
+            for part, figure in page_figures(log).items():
+                pictures.append(
+                    Picture(
+                        to_svg(figure, f"log{number}{part}"),
+                        f"The {part} of {report.name}, {text}",
+                        _seen(log, part),
+                        narrow=True,
+                        chart=chart_of(figure),
+                    )
+                )
     table = Table(
         "All checks",
         ["check", "outcome", "what was seen"],
@@ -224,13 +231,17 @@ def _section(number: int, report: CheckReport, vessel: Vessel) -> Section:
     return Section(report.name, sentences, pictures, [table], texts)
 
 
-def _seen(log: TrialLog) -> str:
-    """Return the text that stands for the picture of a whole log."""
-    drawn = "Track on a map, and" if "x_n" in log and "y_n" in log else "Against time:"
+def _seen(log: TrialLog, part: str) -> str:
+    """Return the text that stands for a picture of a whole log."""
+    if part == "track":
+        return (
+            f"Map: the track of {log.name} covers {np.ptp(log['x_n']):.0f} m from south to north "
+            f"and {np.ptp(log['y_n']):.0f} m from west to east."
+        )
     ranges = "; ".join(
-        f"{n} from {log[n].min():.3g} to {log[n].max():.3g}" for n in log.channels if len(log[n])
+        f"{n} from {value.min():.3g} to {value.max():.3g}" for n, value in log.channels.items()
     )
-    return f"{drawn} states, inputs and wind of {log.name}, as far as it has them. {ranges} (SI)."
+    return f"States, inputs and wind of {log.name} against time, as far as it has them: {ranges}."
 
 
 def _seriousness(finding: Finding) -> int:

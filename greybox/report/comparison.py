@@ -145,6 +145,7 @@ def _pictures(comparison: Comparison) -> list[Picture]:
                 to_svg(printed, f"log{i}{first.log.name}"),
                 caption,
                 f"{caption} Fit of the free run: {fits}.",
+                narrow=drawn > 1,
                 chart=chart_of(zoomed),
             )
         )

@@ -149,6 +149,7 @@ def _run(estimate: Estimate, logs: Sequence[TrialLog]) -> Section:
                 to_svg(printed, f"run{i}"),
                 caption,
                 f"{caption} Fit: {fit}.",
+                narrow=len(drawn) > 1,
                 chart=chart_of(zoomed),
             )
         )
@@ -356,7 +357,9 @@ def _margins(estimate: Estimate) -> dict[str, float]:
 
 
 def _sentence(text: str) -> str:
-    return text[:1].upper() + text[1:] + ("" if text.endswith(".") else ".")
+    # a capital of another alphabet would be another symbol
+    first = text[:1].upper() if text[:1].isascii() else text[:1]
+    return first + text[1:] + ("" if text.endswith(".") else ".")
 
 
 def _tests(estimate: Estimate) -> Section:
@@ -390,8 +393,7 @@ def _chosen(estimate: Estimate, choice: StructureChoice | None) -> Section | Non
     if not estimate.notes and choice is None:
         return None
     texts = [("Structures compared", choice.summary())] if choice else []
-    notes = [_sentence(n) for n in estimate.notes]
-    return Section("6. What was chosen, and why", points=notes, texts=texts)
+    return Section("6. What was chosen, and why", points=estimate.notes, texts=texts)
 
 
 def _equations(estimate: Estimate, mass: float | None) -> Section:

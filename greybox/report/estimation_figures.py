@@ -26,7 +26,7 @@ from greybox.report.figures import (
 Array = NDArray[np.float64]
 
 # inches: letters stay legible where the page is 390 px wide
-_WIDTH = 6.0
+_WIDTH = 5.2
 _NARROW = 4.4
 # of the value: an interval that reaches further is drawn to the edge [%]
 REACH = 200.0

@@ -71,7 +71,7 @@ def comparison_figure(
     bands = bands or [None] * len(runs)
     states = list(runs[0].fit)
     # narrow enough that text is legible on a phone
-    figure = new_figure(6.5, 2.2 * len(states) + 0.6)
+    figure = new_figure(5.2, 2.1 * len(states) + 0.6)
     grid = figure.add_gridspec(2 * len(states), 1, height_ratios=[1.6, 1] * len(states))
     t = log.t - log.t[0]
     gaps = find_gaps(log.t, log.sample_time)

@@ -105,7 +105,9 @@ _TEMPLATE = """{% macro parts(of, level) %}
 {% for table in of.tables %}<div class="wide"><table
 {%- if table.sentences %} class="sentences"{% endif %}><caption>{{ table.caption }}</caption>
 <thead><tr>{% for cell in table.header %}<th scope="col">{{ cell }}</th>{% endfor %}</tr></thead>
-<tbody>{% for row in table.rows %}<tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}</tr>
+<tbody>{% for row in table.rows %}<tr>{% for cell in row %}<td
+{%- if table.sentences and 0 < loop.index0 < row | length - 1 %} data-name="
+{{- table.header[loop.index0] }}"{% endif %}>{{ cell }}</td>{% endfor %}</tr>
 {% endfor %}</tbody></table></div>
 {% endfor %}
 {% for heading, text in of.texts %}<{{ level }}>{{ heading }}</{{ level }}><pre>{{ text }}</pre>
@@ -131,7 +133,7 @@ h2 { font-size: 1.15rem; margin: 1.6rem 0 0.4rem; }
             grid-template-columns: repeat(auto-fill, minmax(min(100%, 26rem), 1fr)); }
 figure { margin: 1rem 0; min-width: 0; grid-column: 1 / -1; }
 figure.narrow { grid-column: auto; }
-figure > svg { display: block; width: 100%; height: auto; max-width: 54rem; }
+figure > svg { display: block; width: 100%; height: auto; max-width: 48rem; }
 figcaption { font-size: 0.9rem; color: #444; }
 button { font: inherit; font-size: 0.9rem; margin: 0.2rem 0; padding: 0.3rem 0.8rem;
          color: #005a8e; background: #fff; border: 1px solid #0072B2; border-radius: 4px; }
@@ -153,12 +155,16 @@ del { background: #f9ddcc; }
 @media screen { .open > svg { display: none; } .open > .zoom { display: block; }
   figure.narrow.open { grid-column: 1 / -1; } }
 @media screen and (max-width: 600px) {
-  table.sentences, table.sentences tbody { display: block; }
+  table.sentences, table.sentences tbody, table.sentences caption { display: block;
+    width: auto; }
   table.sentences thead { display: none; }
   table.sentences tr { display: flex; flex-wrap: wrap; border-bottom: 1px solid #ddd; }
   table.sentences td { border: 0; } table.sentences td:first-child { font-weight: 600; }
   table.sentences td:last-child { flex-basis: 100%; }
-  table { font-size: 0.8rem; } th, td { white-space: normal; padding: 0.2rem 0.3rem; } }
+  td[data-name]::before { content: attr(data-name) ": "; color: #444; }
+  td[data-name]:empty { display: none; }
+  table { font-size: 0.8rem; } th, td { padding: 0.2rem 0.3rem; } th { white-space: normal; }
+  td:first-child { position: sticky; left: 0; background: #fff; } }
 @media print { button { display: none; } html { font-size: 11px; }
   body { max-width: none; font-size: 1rem; }
   figure { break-inside: avoid; }
