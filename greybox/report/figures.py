@@ -96,8 +96,9 @@ def comparison_figure(
             }
             shown = f"{run.fit[state]:.1f} %" if run.fit[state] > -1000 else "diverged"
             error = np.clip(measured - x, -spread, spread)
-            label = f"{name}: fit {shown}"
-            for axes, value, told in ((top, np.clip(x, low, high), label), (below, error, name)):
+            short = shorten(name)
+            label = f"{short}: fit {shown}"
+            for axes, value, told in ((top, np.clip(x, low, high), label), (below, error, short)):
                 index = thin(gaps, np.nan_to_num(value), points=points)
                 axes.plot(pick(t, index), pick(value, index), label=told, **style)
         # a wide band must not flatten what it is drawn about
@@ -129,8 +130,13 @@ def comparison_figure(
         if i == len(states) - 1:
             below.set_xlabel("time [s]", fontsize=9)
     figure.align_ylabels()
-    figure.suptitle(f"Free run on {log.name}", fontsize=10)
+    figure.suptitle(f"Free run on {shorten(log.name, 50)}", fontsize=10)
     return figure
+
+
+def shorten(name: str, most: int = 24) -> str:
+    """Return a name that leaves a figure room for what it shows."""
+    return name if len(name) <= most else f"{name[: most - 1]}…"
 
 
 def _shade(

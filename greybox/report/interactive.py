@@ -59,7 +59,7 @@ def chart_json(chart: Chart, name: str) -> str:
             ranges[i] = Range1d(*panel.x_range)
             cursors[i] = Span(dimension="height", line_color=BLACK, line_dash="dotted")
         last = not any(p.together == first for p in chart.panels[i + 1 :])
-        plots.append(_plot(panel, ranges[first], cursors[first], last))
+        plots.append(_plot(panel, ranges[first], cursors[first], last, _tools(chart)))
     grid = gridplot(
         [[p] for p in plots],
         sizing_mode="stretch_width",
@@ -74,19 +74,22 @@ def chart_json(chart: Chart, name: str) -> str:
     return text
 
 
-def _plot(panel: Panel, x_range: Any, cursor: Any, last: bool) -> Any:
-    from bokeh.models import (
-        BoxZoomTool,
-        CrosshairTool,
-        DataRange1d,
-        Legend,
-        NumeralTickFormatter,
-        PanTool,
-        Range1d,
-        ResetTool,
-        Span,
-        WheelZoomTool,
-    )  # fmt: skip
+def _tools(chart: Chart) -> list[Any]:
+    """Return the tools of a panel: alike in all, or one button would not move them all."""
+    from bokeh.models import BoxZoomTool, PanTool, ResetTool, WheelZoomTool
+
+    maps = [panel.equal for panel in chart.panels]
+    wide = "both" if any(maps) else "width"
+    return [
+        PanTool(dimensions=wide),
+        BoxZoomTool(match_aspect=all(maps)),
+        WheelZoomTool(dimensions=wide),
+        ResetTool(),
+    ]
+
+
+def _plot(panel: Panel, x_range: Any, cursor: Any, last: bool, tools: list[Any]) -> Any:
+    from bokeh.models import CrosshairTool, DataRange1d, Legend, NumeralTickFormatter, Range1d, Span
     from bokeh.plotting import figure
 
     if panel.equal:
@@ -131,14 +134,10 @@ def _plot(panel: Panel, x_range: Any, cursor: Any, last: bool) -> Any:
         x, y, words = zip(*panel.words, strict=True)
         plot.text(x=list(x), y=list(y), text=[_plain(w) for w in words], x_offset=5,
                   text_font_size="11px")  # fmt: skip
-    wide = "both" if panel.equal else "width"
-    plot.add_tools(
-        PanTool(dimensions=wide), BoxZoomTool(match_aspect=panel.equal),
-        WheelZoomTool(dimensions=wide), ResetTool(),
-        CrosshairTool(overlay=[cursor, Span(dimension="width", line_color=BLACK,
-                                            line_dash="dotted")]),
-        *([_hover(drawn, panel)] if drawn else []),
-    )  # fmt: skip
+    level = Span(dimension="width", line_color=BLACK, line_dash="dotted")
+    plot.add_tools(*tools, CrosshairTool(overlay=[cursor, level]))
+    if drawn:
+        plot.add_tools(_hover(drawn, panel))
     # on a page that is scrolled, a figure must be asked before it takes a drag or a wheel
     plot.toolbar.active_drag = plot.toolbar.active_scroll = None
     if legend and panel.legend:

@@ -144,7 +144,7 @@ def page_figures(log: TrialLog) -> dict[str, Figure]:
     if panels:
         figures["signals"] = new_figure(_PHONE, 1.25 * len(panels) + 0.6)
         axes = figures["signals"].subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
-        _draw(list(axes), panels, clock)
+        _draw(list(axes), panels, clock, columns=3)
     return figures
 
 
@@ -253,7 +253,7 @@ def _facts(log: TrialLog, clock: _Clock) -> str:
     return ", ".join(found)
 
 
-def _draw(axes: list[Any], panels: Sequence[_Panel], clock: _Clock) -> None:
+def _draw(axes: list[Any], panels: Sequence[_Panel], clock: _Clock, columns: int = 6) -> None:
     for ax, panel in zip(axes, panels, strict=True):
         (_draw_direction if panel.kind == "direction" else _draw_lines)(ax, panel, clock)
         ax.set_ylabel(panel.label, fontsize=8)
@@ -290,7 +290,7 @@ def _draw(axes: list[Any], panels: Sequence[_Panel], clock: _Clock) -> None:
                 loc="lower left",
                 bbox_to_anchor=(0.0, 1.0),
                 borderaxespad=0.1,
-                ncols=6,
+                ncols=columns,
                 frameon=False,
                 handlelength=1.6,
                 columnspacing=1.2,

@@ -123,7 +123,7 @@ _TEMPLATE = """{% macro parts(of, level) %}
 <style>
 :root { color-scheme: light; }
 body { font: 16px/1.5 system-ui, sans-serif; margin: 0 auto; padding: 1rem; max-width: 70rem;
-       color: #1a1a1a; background: #fff; }
+       color: #1a1a1a; background: #fff; overflow-wrap: break-word; }
 h1 { font-size: 1.5rem; line-height: 1.25; margin: 0.5rem 0; }
 section { border-top: 2px solid #ddd; margin-top: 2rem; }
 h3 { font-size: 1rem; margin: 1.2rem 0 0.3rem; }
@@ -146,6 +146,7 @@ th:first-child, td:first-child { text-align: left; }
 table.sentences th, table.sentences td { text-align: left; white-space: normal;
          vertical-align: top; }
 table.sentences td:last-child { overflow-wrap: anywhere; }
+table.sentences td:first-child { max-width: 18rem; overflow-wrap: break-word; }
 caption { text-align: left; font-weight: 600; padding: 0.3rem 0; }
 pre { font-size: 0.8rem; overflow-x: auto; background: #f6f6f6; padding: 0.6rem; }
 pre.marked { white-space: pre-wrap; }
@@ -159,7 +160,8 @@ del { background: #f9ddcc; }
     width: auto; }
   table.sentences thead { display: none; }
   table.sentences tr { display: flex; flex-wrap: wrap; border-bottom: 1px solid #ddd; }
-  table.sentences td { border: 0; } table.sentences td:first-child { font-weight: 600; }
+  table.sentences td { border: 0; } table.sentences td:first-child { font-weight: 600;
+    max-width: 100%; overflow-wrap: anywhere; }
   table.sentences td:last-child { flex-basis: 100%; }
   td[data-name]::before { content: attr(data-name) ": "; color: #444; }
   td[data-name]:empty { display: none; }
