@@ -19,8 +19,9 @@ from experiment_design.regimes import spell_regime
 from experiment_design.request import build_problem
 from experiment_design.result import Design
 from experiment_design.search import REFERENCE
+from greybox.report.chart import chart_of
 from greybox.report.figures import BLUE, ORANGE, new_figure, tidy, to_svg
-from greybox.report.page import Page, Picture, Section, Table, flatten
+from greybox.report.page import Page, Picture, Section, Table, computed
 
 Array = NDArray[np.float64]
 
@@ -71,7 +72,7 @@ def design_page(
             *([] if headline else _alternatives(design)),
             _limits(design),
         ],
-        computed=flatten(record),
+        computed=computed(record),
         sections=[] if one else parts,
     )  # fmt: skip
 
@@ -126,11 +127,13 @@ def _trial(design: Design, band: MotionBand) -> Section:
     if r.limits.speed_cap is not None:
         names.append("speed")
     states = new_figure(_WIDTH, 1.35 * len(names) + 0.4)
-    panels = states.subplots(len(names), 1, squeeze=False)[:, 0]
+    panels = states.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
     draw_states(dict(zip(names, panels, strict=True)), design, band, _SIZE)
     count = len(r.schedule.commands)
     commands = new_figure(_WIDTH, max(0.8, min(1.3, 6 / count)) * count + 0.4)
-    draw_commands(commands.subplots(count, 1, squeeze=False)[:, 0], design, band.trial, _SIZE)
+    draw_commands(
+        commands.subplots(count, 1, sharex=True, squeeze=False)[:, 0], design, band.trial, _SIZE
+    )
     certain = (
         "The model is taken as exactly known and nothing else as moving the vessel, so there is "
         "no band."
@@ -152,18 +155,21 @@ def _trial(design: Design, band: MotionBand) -> Section:
                 f"Expected track, north up, with the time in numbers. {certain}",
                 f"Map: the expected track covers {np.ptp(north):.0f} m from south to north and "
                 f"{np.ptp(east):.0f} m from west to east in {clock(float(band.t[-1]))} minutes.",
+                chart=chart_of(track),
             ),
             Picture(
                 to_svg(states, f"states{tag}"),
                 "Predicted motion with its band; what margins and caps forbid is shaded behind "
                 "dashed lines.",
                 f"Predicted motion against time: {cells} (m/s, rad/s, rad).",
+                chart=chart_of(states),
             ),
             Picture(
                 to_svg(commands, f"commands{tag}"),
                 "Commands against time; dotted lines are the limits of the thrusters. Angles in "
                 "rad, as in the plan's file, and degrees on the right.",
                 f"Steps of {', '.join(r.schedule.commands)} against time.",
+                chart=chart_of(commands),
             ),
         ],
     )

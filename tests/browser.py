@@ -5,19 +5,24 @@ from __future__ import annotations
 import shutil
 import subprocess
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
+
+from greybox.report.interactive import library, opener
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="no browser installed")
 
-_PROBE = (
-    "<script>addEventListener('load',()=>{const e=document.documentElement;"
-    "document.title=JSON.stringify([e.scrollWidth<=e.clientWidth,"
-    "document.querySelector('svg').getBoundingClientRect().width>200,e.clientWidth])})"
-    "</script></body>"
-)
+
+def without_scripts(html: str) -> str:
+    """Return a page without the two scripts that are its own, which hold addresses and markup."""
+    for script in (library(), opener()):
+        html = html.replace(f"<script>{script}</script>", "")
+    return html
 
 
 def require_legible(path: Path, width: int) -> None:
@@ -25,12 +30,14 @@ def require_legible(path: Path, width: int) -> None:
 
     The browser has nothing to complain of.
     """
-    (path.parent / "probe.html").write_text(path.read_text().replace("</body>", _PROBE))
     # an own width needs a frame: a headless window is never narrower than 500 px
     outer = path.parent / "outer.html"
     outer.write_text(
-        f"<iframe id=f src=probe.html width={width} height=800></iframe><script>"
-        "addEventListener('load',()=>{document.title=f.contentDocument.title})</script>"
+        f"<iframe id=f src={path.name} width={width} height=800></iframe><script>"
+        "addEventListener('load',()=>{const d=f.contentDocument,e=d.documentElement;"
+        "document.title=JSON.stringify([e.scrollWidth<=e.clientWidth,"
+        "d.querySelector('svg').getBoundingClientRect().width>200,e.clientWidth])})"
+        "</script>"
     )
     with tempfile.TemporaryDirectory() as profile:
         done = subprocess.run(
@@ -45,3 +52,33 @@ def require_legible(path: Path, width: int) -> None:
         )  # fmt: skip
     assert "<title>[true,true," in done.stdout, done.stdout[:500] + done.stderr[-500:]
     assert "CONSOLE" not in done.stderr, done.stderr[-500:]
+
+
+@contextmanager
+def driven(path: Path, width: int = 1280, *, touch: bool = False) -> Iterator[Any]:
+    """Open a page in a browser that can be clicked, scrolled and dragged.
+
+    Skips where the browser's driver or its client is missing.
+    """
+    webdriver = pytest.importorskip("selenium.webdriver", reason="no selenium installed")
+    driver = shutil.which("chromedriver")
+    if CHROMIUM is None or driver is None:
+        pytest.skip("no browser with chromedriver installed")
+    options = webdriver.ChromeOptions()
+    options.binary_location = CHROMIUM
+    for flag in (
+        "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
+        "--disable-background-networking", "--disable-component-update", "--disable-sync",
+        f"--window-size={width},900",
+    ):  # fmt: skip
+        options.add_argument(flag)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    if touch:
+        metrics = {"width": width, "height": 800, "pixelRatio": 2, "touch": True}
+        options.add_experimental_option("mobileEmulation", {"deviceMetrics": metrics})
+    browser = webdriver.Chrome(options=options, service=webdriver.ChromeService(driver))
+    try:
+        browser.get(f"file://{path}")
+        yield browser
+    finally:
+        browser.quit()

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import sys
 import textwrap
 
-from greybox.commands.common import CLEAR, add_seed, provenance, say
+from greybox.commands.common import add_seed, provenance, say
+from greybox.commands.terminal import activity
 
 HELP = (
     "go once round the loop on a virtual ship: design, sail, estimate, diagnose, extend, redesign"
@@ -58,11 +58,7 @@ def run(options: argparse.Namespace) -> None:
         ]
         say("\n".join(lines))
 
-    def show(text: str) -> None:
-        if sys.stderr.isatty():
-            sys.stderr.write(f"{CLEAR}{text} …")
-            sys.stderr.flush()
-
+    show = activity()
     with threadpool_limits(1):
         demo = run_demo(
             options.out, effect=options.effect, seed=options.seed, tell=tell, progress=show

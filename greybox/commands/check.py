@@ -42,6 +42,7 @@ def run(options: argparse.Namespace) -> None:
         else Contents()
         for r in reports
     ]
+    record = provenance(options)
     if options.json:
         found = [r.to_dict() | s.to_dict() for r, s in zip(reports, contents, strict=True)]
         if len(found) == 1:
@@ -51,11 +52,11 @@ def run(options: argparse.Namespace) -> None:
                 "findings": [{**f, "log": r["log"]} for r in found for f in r["findings"]],
                 "logs": found,
             }
-        write_json({**result, "provenance": provenance(options)}, options.json)
+        write_json({**result, "provenance": record}, options.json)
     if options.report:
         from greybox.report.checks import check_page
 
-        check_page(reports, [Path(p) for p in options.logs], vessel, options.report)
+        check_page(reports, [Path(p) for p in options.logs], vessel, options.report, record)
     if options.json != "-":
         for report, holds in zip(reports, contents, strict=True):
             say(report.summary())

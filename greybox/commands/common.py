@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+import platform
+import shlex
+from collections.abc import Mapping, Sequence
+from hashlib import file_digest
 from importlib.metadata import version
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from greybox.commands.terminal import complain, progress, say
@@ -69,9 +73,43 @@ def read_logs(
     return logs if sample_time is None else [decimate(log, sample_time) for log in logs]
 
 
+# options that name files to read; raw files are hashed as they are imported
+_INPUTS = (
+    "logs", "log", "models", "model", "nominal", "validate", "estimate", "vessel", "prior",
+    "between", "area",
+)  # fmt: skip
+_PACKAGES = ("casadi", "numpy", "scipy")
+
+
 def provenance(options: argparse.Namespace) -> dict[str, Any]:
-    """Return how a file was made: version, command, configuration file, without wall time."""
+    """Return how a result was made, without wall time.
+
+    Returns
+    -------
+    dict
+        ``program``, ``versions`` of what computes, the ``command`` by options and as
+        the ``line`` that was typed, ``inputs``: the SHA-256 of every file that was read,
+        and the ``configuration`` file where one was used.
+    """
     shown = {k: v for k, v in vars(options).items() if k not in SHELL_ONLY and v is not None}
-    record = {"program": f"greybox-marine {version('greybox-marine')}", "command": shown}
     used = getattr(options, "configuration", None)
-    return record if used is None else record | {"configuration": used}
+    return {
+        "program": f"greybox-marine {version('greybox-marine')}",
+        "versions": {n: version(n) for n in _PACKAGES} | {"Python": platform.python_version()},
+        "command": shown,
+        "line": shlex.join(["greybox", *getattr(options, "typed", [])]),
+        "inputs": _hashes(shown),
+        **({} if used is None else {"configuration": used}),
+    }
+
+
+def _hashes(shown: Mapping[str, Any]) -> dict[str, str]:
+    """Return the SHA-256 of each file that options name to be read; built-in names have none."""
+    found: dict[str, str] = {}
+    for name in _INPUTS:
+        given = shown.get(name) or []
+        for path in [given] if isinstance(given, str) else given:
+            if Path(path).is_file():
+                with open(path, "rb") as handle:
+                    found[path] = file_digest(handle, "sha256").hexdigest()
+    return found

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from greybox.commands.common import add_logs, add_seed, positive, provenance, read_logs, say
-from greybox.commands.terminal import CLEAR, shows_progress
+from greybox.commands.terminal import activity
 
 if TYPE_CHECKING:
     from greybox.diagnosis.result import Diagnosis
@@ -90,7 +90,7 @@ def _run(options: argparse.Namespace) -> None:
             structure=options.structure,
             causes=options.causes,
             seed=options.seed,
-            progress=_progress(),
+            progress=activity(),
         ),
     )
     record = provenance(options) | {"logs": _read(logs), "validate": _read(validate)}
@@ -126,14 +126,3 @@ def _save(diagnosis: Diagnosis, path: str, record: dict[str, Any]) -> None:
             target.with_name(f"{target.stem}.{name}{target.suffix or '.json'}")
         )
     replace(diagnosis.model, record={**diagnosis.model.record, **told}).save(target)
-
-
-def _progress() -> Callable[[str], None]:
-    if not shows_progress():
-        return lambda text: None
-
-    def show(text: str) -> None:
-        sys.stderr.write(f"{CLEAR}{text} …")
-        sys.stderr.flush()
-
-    return show

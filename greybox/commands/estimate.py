@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 HELP = "estimate a model from logs, with standard errors and whether to trust them"
 EXAMPLES = """examples:
-  greybox estimate trial.csv --vessel ship.toml --out model.json
+  greybox estimate trial.csv --vessel ship.toml --out model.json --report model.html
   greybox estimate a.csv b.csv --vessel ship.toml --method iv --predictor augmented --out m.json
   greybox estimate trial.csv --vessel ship.toml --method oe --bound Xu=-0.2:0 --out m.json
   greybox estimate trial.csv --vessel ship.toml --structure 'thesis+N_|r|r-Xkappa' --out m.json
@@ -37,6 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_logs(parser)
     parser.add_argument("--out", metavar="MODEL", help="write the model to this JSON file")
     parser.add_argument("--json", metavar="F", help="write the result as JSON; - is stdout")
+    parser.add_argument("--report", metavar="HTML", help="write a page with plots and all tests")
     add_seed(parser)
     _add_model(parser)
     _add_data(parser)
@@ -258,7 +259,7 @@ def _run(options: argparse.Namespace) -> None:
     from greybox.validation.request import Request
     from greybox.vessel.toml import load_vessel
 
-    check_targets(options.out, options.json)
+    check_targets(options.out, options.json, options.report)
     vessel = load_vessel(options.vessel)
     # the vessel's own terms may be changed too: here only the states matter
     named = options.structure or (options.compare_structures or ["thesis"])[0]
@@ -292,18 +293,25 @@ def _run(options: argparse.Namespace) -> None:
     estimate = choice.estimate if choice else estimate_model(logs, request)
     model = estimate.model()
     told = {"structure_choice": choice.to_list()} if choice else {}
-    record = {**model.record, **told, "provenance": provenance(options)}
-    model = replace(model, record=record)
+    made = provenance(options)
+    model = replace(model, record={**model.record, **told, "provenance": made})
+    mass = options.mass if options.mass is not None else vessel.mass
     if options.out:
         model.save(options.out)
     if options.json:
         write_json(model.to_dict(), options.json)
+    if options.report:
+        from greybox.report.estimation import estimation_page
+        from greybox.report.page import write_page
+
+        page = estimation_page(estimate, logs, made, choice=choice, mass=mass)
+        write_page(page, options.report)
     if options.json != "-":
         say(estimate.summary())
         if choice:
             say("\n" + choice.summary())
-        mass = options.mass if options.mass is not None else vessel.mass
         if mass is not None:
             say("\n" + physical_summary(model, mass))
-        if options.out:
-            say(f"\nwrote {options.out}")
+        for path in (options.out, options.report):
+            if path:
+                say(f"\nwrote {path}")

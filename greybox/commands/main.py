@@ -141,7 +141,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         offer(build_parser())
     name = "greybox"
     try:
-        options = _parse(list(sys.argv[1:] if arguments is None else arguments))
+        given = list(sys.argv[1:] if arguments is None else arguments)
+        options = _parse(given)
+        options.typed = given
         name = f"greybox {options.command}"
         verbose = options.verbose + getattr(options, "more_verbose", 0)
         with telling(verbose, options.quiet):

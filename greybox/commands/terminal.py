@@ -77,6 +77,18 @@ def progress(title: str) -> Callable[[int, int], None]:
     return show
 
 
+def activity() -> Callable[[str], None]:
+    """Return a callback that shows what is being done on a terminal and is silent elsewhere."""
+    if not shows_progress():
+        return lambda text: None
+
+    def show(text: str) -> None:
+        sys.stderr.write(f"{CLEAR}{text} …")
+        sys.stderr.flush()
+
+    return show
+
+
 class _Teller(logging.Handler):
     """Writes records to standard error, on a line of their own."""
 

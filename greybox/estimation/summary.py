@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from greybox.model.units import parameter_unit
@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     from greybox.estimation.result import Estimate, TestResult
 
 WIDTH = 100
+# closed intervals, None for an infinite end
+Pieces = Sequence[Sequence[float | None]]
 _GROUPS = {
     "What the log determines": ("excitation", "relevance", "weak_instruments", "anderson_rubin",
                                 "combinations"),
@@ -20,7 +22,7 @@ _GROUPS = {
                               "margin_bias", "closed_loop"),
     "What the model does": ("stability", "damping_signs", "slow_errors"),
 }  # fmt: skip
-_BOUNDS = {
+BOUNDS = {
     "cramer_rao": "Against the Cramér-Rao bound",
     "optimal_iv": "Against the best instruments",
 }
@@ -38,7 +40,7 @@ def summarise(estimate: Estimate) -> str:
         shown = ", ".join(f"{k} {v:.1f} %" for k, v in estimate.fit.items())
         lines.append(f"Free-run fit on the estimation logs: {shown}")
     for name, limit in estimate.limits.items():
-        lines += _wrapped(f"{_BOUNDS[name]}: {limit.sentence}", "  ")
+        lines += _wrapped(f"{BOUNDS[name]}: {limit.sentence}", "  ")
     lines += _tests(estimate.tests)
     if estimate.notes:
         lines += ["", "Notes"]
@@ -67,10 +69,7 @@ def _head(estimate: Estimate) -> list[str]:
 
 
 def _table(estimate: Estimate) -> list[str]:
-    sets: dict[str, Sequence[Sequence[float | None]]] = {}
-    for test in estimate.tests:
-        if test.name.startswith("anderson_rubin"):
-            sets |= test.detail.get("sets", {})
+    sets = weak_safe_sets(estimate.tests)
     # only instruments can be weak
     safe = 24 if sets else 0
     lines = [
@@ -89,16 +88,25 @@ def _table(estimate: Estimate) -> list[str]:
             term = structure.terms[structure.index(column.terms[0])]
             lines.append(
                 f"{column.label:<12}{value:>10.4g}{std:>9.2g}{value - 1.96 * std:>11.4g}"
-                f"{value + 1.96 * std:>11.4g}{_set(sets, column.label):>{safe}}"
+                f"{value + 1.96 * std:>11.4g}{set_in_words(sets.get(column.label)):>{safe}}"
                 f"{value / estimate.sample_time:>11.4g}  {parameter_unit(term, unit)}"
             )
     return lines
 
 
-def _set(sets: Mapping[str, Sequence[Sequence[float | None]]], label: str) -> str:
-    if label not in sets:
+def weak_safe_sets(tests: Sequence[TestResult]) -> dict[str, Pieces]:
+    """Return the sets (95 %) that hold however weak the instruments are, by parameter."""
+    sets: dict[str, Pieces] = {}
+    for test in tests:
+        if test.name.startswith("anderson_rubin"):
+            sets |= test.detail.get("sets", {})
+    return sets
+
+
+def set_in_words(pieces: Pieces | None) -> str:
+    """Return a set as it stands in a table: nothing where there is none."""
+    if not pieces:
         return ""
-    pieces = sets[label]
     if len(pieces) == 2:
         return f"not {pieces[0][1]:.2g} to {pieces[1][0]:.2g}"
     low, high = pieces[0]
@@ -111,18 +119,21 @@ def _set(sets: Mapping[str, Sequence[Sequence[float | None]]], label: str) -> st
     return f"{low:.3g} to {high:.3g}"
 
 
-def _tests(tests: Sequence[TestResult]) -> list[str]:
-    lines: list[str] = []
+def grouped(tests: Sequence[TestResult]) -> list[tuple[str, list[TestResult]]]:
+    """Return the tests under the titles that tell what they ask."""
     left = list(tests)
+    groups = []
     for title, prefixes in _GROUPS.items():
         mine = [t for t in left if t.name.startswith(prefixes)]
-        if mine:
-            lines += ["", title]
+        left = [t for t in left if t not in mine]
+        groups.append((title, mine))
+    return [g for g in [*groups, ("Further", left)] if g[1]]
+
+
+def _tests(tests: Sequence[TestResult]) -> list[str]:
+    lines: list[str] = []
+    for title, mine in grouped(tests):
+        lines += ["", title]
         for test in mine:
-            left.remove(test)
             lines += _wrapped(f"  {_MARKS[test.passed]} {test.name}: {test.sentence}", " " * 7)
-    if left:
-        lines += ["", "Further"]
-    for test in left:
-        lines += _wrapped(f"  {_MARKS[test.passed]} {test.name}: {test.sentence}", " " * 7)
     return lines

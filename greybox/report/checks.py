@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from importlib.metadata import version
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from greybox.errors import GreyboxError, UsageError
+from greybox.report.chart import chart_of
 from greybox.report.check_answers import answer_figure, course_figure, wind_figure
 from greybox.report.check_rows import (
     coarse_figure,
@@ -23,8 +24,8 @@ from greybox.report.check_rows import (
 )
 from greybox.report.check_ties import make_tie, tie_figure
 from greybox.report.figures import to_svg
-from greybox.report.log import log_figure
-from greybox.report.page import Page, Picture, Section, Table, write_page
+from greybox.report.log import facts, page_figures
+from greybox.report.page import Page, Picture, Section, Table, computed, write_page
 from greybox.trial.checks.finding import CheckReport, Finding, size_in_words
 from greybox.trial.importing import import_recording
 from greybox.trial.log import TrialLog
@@ -67,7 +68,11 @@ _DOUBT = (
 
 
 def check_page(
-    reports: Sequence[CheckReport], paths: Sequence[Path], vessel: Vessel, target: str | Path
+    reports: Sequence[CheckReport],
+    paths: Sequence[Path],
+    vessel: Vessel,
+    target: str | Path,
+    record: Mapping[str, Any] | None = None,
 ) -> None:
     """Write one page on what is wrong with some logs.
 
@@ -80,19 +85,21 @@ def check_page(
     vessel : Vessel
     target : str or Path
         HTML file, replaced in one step.
+    record : mapping, optional
+        How it was computed: versions, command, hashes of the files.
     """
     sections = [_section(k, r, vessel) for k, r in enumerate(reports)]
-    computed = {"program": f"greybox-marine {version('greybox-marine')}", "vessel": vessel.name}
+    made = computed(record or {}) | {"vessel": vessel.name}
     for report, path in zip(reports, paths, strict=True):
         files = report.recording.files if report.recording else ()
-        hashes = ", ".join(f"{f.format}, SHA-256 {f.sha256}" for f in files)
-        computed[f"log {report.name}"] = f"{path} ({hashes})" if hashes else str(path)
-    computed["method"] = (
+        formats = ", ".join(dict.fromkeys(f.format for f in files))
+        made[f"log {report.name}"] = f"{path} ({formats})" if formats else str(path)
+    made["method"] = (
         "kinematics before any force model: single signals first, then which reading of the "
         "columns makes positions, heading, velocities and yaw rate agree (likelihood of a "
         "random walk with sensor noise), then clocks, antenna and heading together"
     )
-    computed["pictures"] = (
+    made["pictures"] = (
         "velocities from positions are derivatives after a Gaussian smoothing that the logged "
         "ones are given too; what else was found is mended in both rows; a constant velocity of "
         "the water is allowed for"
@@ -101,7 +108,7 @@ def check_page(
         title="What is wrong with the log" if len(reports) == 1 else "What is wrong with the logs",
         headline=headline(reports),
         sections=sections,
-        computed=computed,
+        computed=made,
     )
     write_page(page, target)
 
@@ -203,8 +210,17 @@ def _section(number: int, report: CheckReport, vessel: Vessel) -> Section:
         except GreyboxError as error:
             sentences.append(f"The log as a whole cannot be drawn: {error}")
         else:
-            text = f"The log {report.name} as a whole, as it would be imported, nothing mended."
-            pictures.append(Picture(to_svg(log_figure(log), f"log{number}whole"), text))
+            text = f"as it would be imported, nothing mended: {facts(log)}."
+            for part, figure in page_figures(log).items():
+                pictures.append(
+                    Picture(
+                        to_svg(figure, f"log{number}{part}"),
+                        f"The {part} of {report.name}, {text}",
+                        _seen(log, part),
+                        narrow=True,
+                        chart=chart_of(figure),
+                    )
+                )
     table = Table(
         "All checks",
         ["check", "outcome", "what was seen"],
@@ -213,6 +229,19 @@ def _section(number: int, report: CheckReport, vessel: Vessel) -> Section:
     )
     texts = [("Notes from reading", "\n".join(report.notes))] if report.notes else []
     return Section(report.name, sentences, pictures, [table], texts)
+
+
+def _seen(log: TrialLog, part: str) -> str:
+    """Return the text that stands for a picture of a whole log."""
+    if part == "track":
+        return (
+            f"Map: the track of {log.name} covers {np.ptp(log['x_n']):.0f} m from south to north "
+            f"and {np.ptp(log['y_n']):.0f} m from west to east."
+        )
+    ranges = "; ".join(
+        f"{n} from {value.min():.3g} to {value.max():.3g}" for n, value in log.channels.items()
+    )
+    return f"States, inputs and wind of {log.name} against time, as far as it has them: {ranges}."
 
 
 def _seriousness(finding: Finding) -> int:

@@ -8,12 +8,16 @@ from typing import Any
 import numpy as np
 
 from greybox.model.model import ManoeuvringModel
+from greybox.report.chart import chart_of
 from greybox.report.figures import comparison_figure, to_svg
-from greybox.report.page import Page, Picture, Table, flatten
+from greybox.report.page import Page, Picture, Table, computed
+from greybox.report.thinning import points_for
 from greybox.validation.bands import LEVEL
 from greybox.validation.comparison import Comparison
 
-_NAMES = {"u": "surge", "v": "sway", "r": "yaw rate"}
+_NAMES = {"u": "surge", "v": "sway", "r": "yaw rate", "psi": "heading"}
+# with more the page grows and tells nothing new
+_MOST_LOGS = 12
 
 
 def headline(comparison: Comparison) -> str:
@@ -34,18 +38,7 @@ def comparison_page(
 ) -> Page:
     """Return the page: one picture a log, the fits, errors ahead, sign tests, equations."""
     states = list(comparison.runs[0][0].fit)
-    pictures = []
-    for i, first in enumerate(comparison.runs[0]):
-        runs = [row[i] for row in comparison.runs]
-        caption = (
-            f"Free run on {first.log.name} ({len(first.log)} samples of "
-            f"{first.log.sample_time:g} s): measured, simulated, and their difference below."
-        )
-        bands = [row[i] for row in comparison.bands]
-        if any(b is not None and b.coverage for b in bands):
-            caption += f" Shaded: where {100 * LEVEL:.0f} % of the measurements should lie."
-        figure = comparison_figure(comparison.names, runs, bands)
-        pictures.append(Picture(to_svg(figure, f"log{i}{first.log.name}"), caption))
+    pictures = _pictures(comparison)
     fit_rows, ahead_rows = [], []
     for name, row, errors, aheads in zip(
         comparison.names, comparison.runs, comparison.rmse, comparison.ahead, strict=True
@@ -109,15 +102,65 @@ def comparison_page(
     return Page(
         title="Measured against simulated",
         headline=headline(comparison),
-        sentences=[*[t.sentence for t in tests], *_band_sentences(comparison)],
+        sentences=[
+            *[t.sentence for t in tests],
+            *_band_sentences(comparison),
+            *_left_out(comparison),
+        ],
         pictures=pictures,
         tables=tables,
         texts=[
             (f"Model {name}", model.summary())
             for name, model in zip(comparison.names, models, strict=True)
         ],
-        computed=flatten(record) | {"start": "mean of the log's first 5 samples"},
+        computed=computed(record) | {"start": "mean of the log's first 5 samples"},
     )
+
+
+def _pictures(comparison: Comparison) -> list[Picture]:
+    """Return one picture a log, as many as a page bears."""
+    drawn = min(len(comparison.runs[0]), _MOST_LOGS)
+    shaded = sum(b is not None and bool(b.coverage) for row in comparison.bands for b in row[:1])
+    curves = drawn * len(comparison.runs[0][0].fit) * (1 + 2 * len(comparison.names) + 4 * shaded)
+    pictures = []
+    for i, first in enumerate(comparison.runs[0][:drawn]):
+        runs = [row[i] for row in comparison.runs]
+        bands = [row[i] for row in comparison.bands]
+        caption = (
+            f"Free run on {first.log.name} ({len(first.log)} samples of "
+            f"{first.log.sample_time:g} s): measured, simulated, and their difference below."
+        )
+        if any(b is not None and b.coverage for b in bands):
+            caption += f" Shaded: where {100 * LEVEL:.0f} % of the measurements should lie."
+        fits = "; ".join(
+            f"{name} " + ", ".join(f"{_NAMES.get(s, s)} {_percent(v)}" for s, v in run.fit.items())
+            for name, run in zip(comparison.names, runs, strict=True)
+        )
+        printed, zoomed = (
+            comparison_figure(comparison.names, runs, bands, points=points_for(curves, **room))
+            for room in ({}, {"most": 10_000, "room": 200_000})
+        )
+        pictures.append(
+            Picture(
+                to_svg(printed, f"log{i}{first.log.name}"),
+                caption,
+                f"{caption} Fit of the free run: {fits}.",
+                narrow=drawn > 1,
+                chart=chart_of(zoomed),
+            )
+        )
+    return pictures
+
+
+def _left_out(comparison: Comparison) -> list[str]:
+    count = len(comparison.runs[0])
+    if count <= _MOST_LOGS:
+        return []
+    return [f"Of {count} logs the first {_MOST_LOGS} are drawn; all are in the tables."]
+
+
+def _percent(fit: float) -> str:
+    return f"{fit:.1f} %" if fit > -1e4 else "diverged"
 
 
 def _band_sentences(comparison: Comparison) -> list[str]:

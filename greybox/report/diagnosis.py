@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from greybox.diagnosis.result import Diagnosis, Runs
+from greybox.report.chart import chart_of
 from greybox.report.diagnosed_causes import cause_section, probability
 from greybox.report.diagnosis_figures import (
     LOWEST_FIT,
@@ -22,7 +23,8 @@ from greybox.report.model_difference import (
     marked_equations,
     other_changes,
 )
-from greybox.report.page import Page, Picture, Section, Table, flatten
+from greybox.report.page import Page, Picture, Section, Table, computed
+from greybox.report.thinning import points_for
 
 _NAMES = {"u": "surge", "v": "sway", "r": "yaw rate", "psi": "heading"}
 _UNITS = {"u": "m/s", "v": "m/s", "r": "rad/s", "psi": "rad"}
@@ -55,7 +57,7 @@ def diagnosis_page(diagnosis: Diagnosis, record: Mapping[str, Any]) -> Page:
         headline=headline[:1].upper() + headline[1:],
         sentences=_summary(diagnosis),
         sections=sections,
-        computed=flatten(dict(diagnosis.record) | dict(record))
+        computed=computed(dict(diagnosis.record) | dict(record))
         | {
             "causes scored": str(diagnosis.tried),
             "fall of −2 log L": "of the free run's errors, their noise coloured; a cause counts "
@@ -168,7 +170,10 @@ def _drawn(runs: Sequence[Runs]) -> list[Runs]:
 
 
 def _run_pictures(runs: Sequence[Runs]) -> Iterator[Picture]:
-    for i, run in enumerate(_drawn(runs)):
+    drawn = _drawn(runs)
+    curves = sum(len(r.measured) * (1 + 2 * len(simulations(r))) for r in drawn)
+    points = points_for(curves, most=10_000, room=150_000)
+    for i, run in enumerate(drawn):
         kind = "held out from the fit" if run.held_out else "estimated on"
         changed = len(simulations(run)) > 1
         shown = "measured, before and after" if changed else "measured and simulated"
@@ -177,8 +182,9 @@ def _run_pictures(runs: Sequence[Runs]) -> Iterator[Picture]:
             f"{run.log.sample_time:g} s): {shown}; below, measured − simulated."
         )
         yield narrow(
-            run_figure(run), f"run{i}", caption, f"{caption} {_rms_sentence(gather([run]))}"
-        )
+            run_figure(run), f"run{i}", caption, f"{caption} {_rms_sentence(gather([run]))}",
+            chart_of(run_figure(run, points)),
+        )  # fmt: skip
 
 
 def _equations(diagnosis: Diagnosis) -> Section:

@@ -11,6 +11,7 @@ from matplotlib.ticker import MaxNLocator, SymmetricalLogLocator
 from numpy.typing import NDArray
 
 from greybox.diagnosis.result import Gain, Ranked, Runs
+from greybox.report.chart import Chart
 from greybox.report.error_profiles import Profile, profile
 from greybox.report.figures import BLACK, BLUE, LABELS, SKY, VERMILION, new_figure, tidy, to_svg
 from greybox.report.free_run_errors import REGIMES, Errors, simulated, simulations
@@ -39,8 +40,15 @@ _STYLE: Mapping[str, dict[str, Any]] = {
 _SHORT = {"u": "surge [m/s]", "v": "sway [m/s]", "r": "yaw rate [rad/s]", "psi": "heading [rad]"}
 
 
-def run_figure(run: Runs) -> Figure:
-    """Draw each state of one log, measured and simulated, with the error below."""
+def run_figure(run: Runs, points: int = _POINTS) -> Figure:
+    """Draw each state of one log, measured and simulated, with the error below.
+
+    Parameters
+    ----------
+    run : Runs
+    points : int
+        About how many a line has.
+    """
     states = list(run.measured)
     shown = simulations(run)
     figure = new_figure(_WIDTH, 2.35 * len(states) + 0.5)
@@ -55,13 +63,15 @@ def run_figure(run: Runs) -> Figure:
         measured = run.measured[state]
         spread = float(np.ptp(measured)) or 1.0
         low, high = measured.min() - 0.6 * spread, measured.max() + 0.6 * spread
-        _line(top, t, measured, gaps, {"color": BLACK, "linewidth": 0.9, "label": "measured"})
+        _line(
+            top, t, measured, gaps, points, {"color": BLACK, "linewidth": 0.9, "label": "measured"}
+        )
         for name in shown:
             style = {k: v for k, v in _STYLE[name].items() if k != "marker"}
             style |= {"linewidth": 1.2, "label": name}
             x = simulated(run, name, state)
-            _line(top, t, np.clip(x, low, high), gaps, style)
-            _line(below, t, np.clip(measured - x, -spread, spread), gaps, style)
+            _line(top, t, np.clip(x, low, high), gaps, points, style)
+            _line(below, t, np.clip(measured - x, -spread, spread), gaps, points, style)
         below.axhline(0, color=BLACK, linewidth=0.6)
         top.set_ylabel(_SHORT.get(state, state), fontsize=9)
         below.set_ylabel("error", fontsize=9)
@@ -75,8 +85,10 @@ def run_figure(run: Runs) -> Figure:
     return figure
 
 
-def _line(axes: Any, t: Array, value: Array, gaps: Index, style: Mapping[str, Any]) -> None:
-    kept = thin(gaps, np.nan_to_num(value), points=_POINTS)
+def _line(
+    axes: Any, t: Array, value: Array, gaps: Index, points: int, style: Mapping[str, Any]
+) -> None:
+    kept = thin(gaps, np.nan_to_num(value), points=points)
     axes.plot(pick(t, kept), pick(value, kept), **style)
 
 
@@ -285,6 +297,8 @@ def _few_decades(ax: Any, values: Array, lows: Array) -> None:
     ax.xaxis.set_major_locator(locator)
 
 
-def narrow(figure: Figure, name: str, caption: str, alternative: str) -> Picture:
+def narrow(
+    figure: Figure, name: str, caption: str, alternative: str, chart: Chart | None = None
+) -> Picture:
     """Return a figure as a picture that stands beside others."""
-    return Picture(to_svg(figure, name), caption, alternative, narrow=True)
+    return Picture(to_svg(figure, name), caption, alternative, narrow=True, chart=chart)

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from greybox.report.figures import COLOURS, new_figure, tidy, to_svg
-from greybox.report.page import Page, Picture, Table, flatten
+from greybox.report.page import Page, Picture, Table, computed
 from greybox.report.studies import StudyOutput
 from greybox.study.efficiency import CaseResult, Efficiency, Share
 
@@ -125,6 +125,6 @@ def efficiency_output(study: Efficiency, record: dict[str, Any]) -> StudyOutput:
         ],
         pictures=[Picture(to_svg(f, n), c) for n, (f, c) in figures.items()],
         tables=tables,
-        computed=flatten(record),
+        computed=computed(record),
     )
     return StudyOutput("\n".join([*lines, headline]), study.rows(), figures, page)

@@ -9,8 +9,11 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.text import Text
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
+from greybox.report.thinning import find_gaps, pick, thin
 from greybox.validation.bands import Bands
 from greybox.validation.fit import LogFit
 
@@ -45,7 +48,11 @@ def tidy(axes: Any) -> None:
 
 
 def comparison_figure(
-    names: Sequence[str], runs: Sequence[LogFit], bands: Sequence[Bands | None] = ()
+    names: Sequence[str],
+    runs: Sequence[LogFit],
+    bands: Sequence[Bands | None] = (),
+    *,
+    points: int = 2000,
 ) -> Figure:
     """Draw measured against simulated states, with residuals and the track.
 
@@ -57,23 +64,30 @@ def comparison_figure(
         One a model, all of one log.
     bands : sequence of Bands, optional
         One a model: where measurements should lie is shaded, about the run and about zero.
+    points : int
+        About how many a line has: longer ones are drawn by their envelopes.
     """
     log = runs[0].log
     bands = bands or [None] * len(runs)
     states = list(runs[0].fit)
-    figure = new_figure(10, 2.7 * len(states) + 0.6)
+    # narrow enough that text is legible on a phone
+    figure = new_figure(5.2, 2.1 * len(states) + 0.6)
     grid = figure.add_gridspec(2 * len(states), 1, height_ratios=[1.6, 1] * len(states))
     t = log.t - log.t[0]
+    gaps = find_gaps(log.t, log.sample_time)
     first: Any = None
     for i, state in enumerate(states):
         top = figure.add_subplot(grid[2 * i], sharex=first)
         first = first or top
         below = figure.add_subplot(grid[2 * i + 1], sharex=first)
         measured = log[state]
-        top.plot(t, measured, color=BLACK, linewidth=1.0, label="measured")
+        index = thin(gaps, measured, points=points)
+        top.plot(
+            pick(t, index), pick(measured, index), color=BLACK, linewidth=1.0, label="measured"
+        )
         spread = float(np.ptp(measured)) or 1.0
         low, high = measured.min() - 0.6 * spread, measured.max() + 0.6 * spread
-        for j, (name, run, band) in enumerate(zip(names, runs, bands, strict=True)):
+        for j, (name, run) in enumerate(zip(names, runs, strict=True)):
             x = np.where(np.isfinite(run.x[:, i]), run.x[:, i], np.nan)
             style: dict[str, Any] = {
                 "color": COLOURS[j % 6],
@@ -81,11 +95,21 @@ def comparison_figure(
                 "linewidth": 1.3,
             }
             shown = f"{run.fit[state]:.1f} %" if run.fit[state] > -1000 else "diverged"
-            top.plot(t, np.clip(x, low, high), label=f"{name}: fit {shown}", **style)
-            error = measured - x
-            below.plot(t, np.clip(error, -spread, spread), **style)
+            error = np.clip(measured - x, -spread, spread)
+            short = shorten(name)
+            label = f"{short}: fit {shown}"
+            for axes, value, told in ((top, np.clip(x, low, high), label), (below, error, short)):
+                index = thin(gaps, np.nan_to_num(value), points=points)
+                axes.plot(pick(t, index), pick(value, index), label=told, **style)
+        # a wide band must not flatten what it is drawn about
+        view, gap = top.get_ylim(), below.get_ylim()
+        for j, (run, band) in enumerate(zip(runs, bands, strict=True)):
             if band is not None and band.coverage:
-                _shade(top, below, t, x, band.measurement[:, :, i], COLOURS[j % 6])
+                limits = band.measurement[:, :, i]
+                index = thin(gaps, *limits, points=points)
+                _shade(top, below, t, run.x[:, i], limits, index, COLOURS[j % 6])
+        top.set_ylim(view)
+        below.set_ylim(gap)
         below.axhline(0, color=BLACK, linewidth=0.6)
         top.set_ylabel(LABELS.get(state, state), fontsize=9)
         below.set_ylabel("measured −\nsimulated", fontsize=8)
@@ -94,28 +118,35 @@ def comparison_figure(
             loc="lower left",
             bbox_to_anchor=(0.0, 1.0),
             borderaxespad=0.2,
-            ncols=4,
+            ncols=3,
             frameon=False,
         )
-        tidy(top)
-        tidy(below)
+        for axes in (top, below):
+            tidy(axes)
+            axes.tick_params(labelsize=8)
+            axes.yaxis.set_major_locator(MaxNLocator(4 if axes is top else 3))
         top.tick_params(labelbottom=False)
         below.tick_params(labelbottom=i == len(states) - 1)
         if i == len(states) - 1:
-            below.set_xlabel("time [s]")
-    figure.suptitle(f"Free run on {log.name}", fontsize=11)
+            below.set_xlabel("time [s]", fontsize=9)
+    figure.align_ylabels()
+    figure.suptitle(f"Free run on {shorten(log.name, 50)}", fontsize=10)
     return figure
 
 
-def _shade(top: Any, below: Any, t: Array, x: Array, limits: Array, colour: str) -> None:
+def shorten(name: str, most: int = 24) -> str:
+    """Return a name that leaves a figure room for what it shows."""
+    return name if len(name) <= most else f"{name[: most - 1]}…"
+
+
+def _shade(
+    top: Any, below: Any, t: Array, x: Array, limits: Array, index: NDArray[np.intp], colour: str
+) -> None:
     """Shade the limits (2, N) of measurements about a run, and of their difference."""
-    view, gap = top.get_ylim(), below.get_ylim()
     shade: dict[str, Any] = {"color": colour, "alpha": 0.18, "linewidth": 0}
-    top.fill_between(t, limits[0], limits[1], **shade)
-    below.fill_between(t, limits[0] - x, limits[1] - x, **shade)
-    # a wide band must not flatten what it is drawn about
-    top.set_ylim(view)
-    below.set_ylim(gap)
+    time = pick(t, index)
+    for axes, edges in ((top, limits), (below, limits - x)):
+        axes.fill_between(time, *(pick(edge, index) for edge in edges), **shade)
 
 
 def fit_figure(
@@ -251,6 +282,10 @@ def to_svg(figure: Figure, title: str) -> str:
     """Return a figure as an SVG element for a page, with a title for screen readers."""
     import matplotlib as mpl
 
+    for words in figure.findobj(Text):
+        # a name may hold a dollar sign; what a logarithmic axis writes is a formula
+        if words.get_text() and "mathdefault" not in words.get_text():
+            words.set_parse_math(False)
     out = io.StringIO()
     with mpl.rc_context({"svg.fonttype": "path", "svg.hashsalt": title}):
         figure.savefig(out, format="svg", metadata={"Date": None, "Creator": None})

@@ -25,6 +25,8 @@ Array = NDArray[np.float64]
 _MOST_SPANS = 300
 _HOURS_FROM = 3 * 3600.0
 _LONG_NAME = 18
+# inches: letters stay legible where the page is 390 px wide
+_PHONE = 4.8
 _DOTS = 1500
 _GREY = "0.82"
 _DEGREES = (1, 2, 5, 10, 15, 30, 45, 90, 180, 360, 720, 1440, 3600, 7200, 36000)
@@ -119,6 +121,36 @@ def overview_figures(log: TrialLog, *, wind_arrows: bool = True) -> dict[str, Fi
     for name, figure in figures.items():
         figure.suptitle(f"{log.name}: {name}", fontsize=11)
     return figures
+
+
+def page_figures(log: TrialLog) -> dict[str, Figure]:
+    """Draw `log_figure` in two parts that are legible on a phone.
+
+    Parameters
+    ----------
+    log : TrialLog
+
+    Returns
+    -------
+    dict of str to Figure
+        ``track`` where the log has positions, and ``signals`` with one time axis.
+    """
+    clock = _clock(log)
+    figures: dict[str, Figure] = {}
+    if "x_n" in log and "y_n" in log:
+        figures["track"] = new_figure(_PHONE, _PHONE)
+        draw_track(figures["track"].subplots(), log, clock.gaps)
+    panels = [*_states(log), *_inputs(log, clock), *_wind(log)]
+    if panels:
+        figures["signals"] = new_figure(_PHONE, 1.25 * len(panels) + 0.6)
+        axes = figures["signals"].subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
+        _draw(list(axes), panels, clock, columns=3)
+    return figures
+
+
+def facts(log: TrialLog) -> str:
+    """Return how long a log is, and its gaps, in words."""
+    return _facts(log, _clock(log))
 
 
 def _room_for_track(log: TrialLog, rows: int, height: float) -> tuple[float, int]:
@@ -221,7 +253,7 @@ def _facts(log: TrialLog, clock: _Clock) -> str:
     return ", ".join(found)
 
 
-def _draw(axes: list[Any], panels: Sequence[_Panel], clock: _Clock) -> None:
+def _draw(axes: list[Any], panels: Sequence[_Panel], clock: _Clock, columns: int = 6) -> None:
     for ax, panel in zip(axes, panels, strict=True):
         (_draw_direction if panel.kind == "direction" else _draw_lines)(ax, panel, clock)
         ax.set_ylabel(panel.label, fontsize=8)
@@ -258,7 +290,7 @@ def _draw(axes: list[Any], panels: Sequence[_Panel], clock: _Clock) -> None:
                 loc="lower left",
                 bbox_to_anchor=(0.0, 1.0),
                 borderaxespad=0.1,
-                ncols=6,
+                ncols=columns,
                 frameon=False,
                 handlelength=1.6,
                 columnspacing=1.2,
@@ -277,7 +309,7 @@ def _draw_lines(ax: Any, panel: _Panel, clock: _Clock) -> None:
             pick(clock.time, index),
             pick(value, index),
             color=COLOURS[j % 6] if len(panel.lines) > 1 else BLACK,
-            linestyle=STYLES[j // 6 % 4],
+            linestyle=STYLES[j % 4],
             linewidth=0.9,
             label=name,
         )

@@ -2,25 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from base64 import b64encode
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from hashlib import sha256
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from greybox.files import write_text
+
+if TYPE_CHECKING:
+    from greybox.report.chart import Chart
 
 
 @dataclass(frozen=True)
 class Picture:
     """An SVG with the text below it, and the one that stands for it (the caption by default).
 
-    Narrow ones stand beside one another where the window has room.
+    Narrow ones stand beside one another where the window has room. One with a
+    chart can be zoomed on screen.
     """
 
     svg: str
     caption: str
     alternative: str = ""
     narrow: bool = False
+    chart: Chart | None = None
 
 
 @dataclass(frozen=True)
@@ -68,6 +75,7 @@ class Page:
     sections: Sequence[Section] = ()
 
 
+_NONE = "'none'"
 _TEMPLATE = """{% macro parts(of, level) %}
 {% for sentence in of.sentences %}<p>{{ sentence }}</p>
 {% endfor %}
@@ -75,9 +83,17 @@ _TEMPLATE = """{% macro parts(of, level) %}
 {% endfor %}</ul>
 {% endif %}
 {% if of.pictures %}<div class="pictures">
-{% for picture in of.pictures %}<figure role="group"{% if picture.narrow %} class="narrow"
-{%- endif %} aria-label="{{ picture.alternative or picture.caption }}">
+{% for picture in of.pictures %}{% set chart = chart_of(picture) %}
+<figure role="group" class="{{ 'narrow ' if picture.narrow }}{{ 'zoomable' if chart }}"
+ aria-label="{{ picture.alternative or picture.caption }}">
 {{ picture.svg | safe }}
+{% if chart %}
+<div class="zoom" id="{{ chart[0] }}" role="group"
+ aria-label="{{ picture.alternative or picture.caption }}"></div>
+<button type="button" hidden aria-expanded="false" aria-controls="{{ chart[0] }}">
+{{- "Zoom and read values" }}</button>
+<script type="application/json">{{ chart[1] | safe }}</script>
+{% endif %}
 <figcaption>{{ picture.caption }}</figcaption></figure>
 {% endfor %}
 </div>
@@ -89,7 +105,9 @@ _TEMPLATE = """{% macro parts(of, level) %}
 {% for table in of.tables %}<div class="wide"><table
 {%- if table.sentences %} class="sentences"{% endif %}><caption>{{ table.caption }}</caption>
 <thead><tr>{% for cell in table.header %}<th scope="col">{{ cell }}</th>{% endfor %}</tr></thead>
-<tbody>{% for row in table.rows %}<tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}</tr>
+<tbody>{% for row in table.rows %}<tr>{% for cell in row %}<td
+{%- if table.sentences and 0 < loop.index0 < row | length - 1 %} data-name="
+{{- table.header[loop.index0] }}"{% endif %}>{{ cell }}</td>{% endfor %}</tr>
 {% endfor %}</tbody></table></div>
 {% endfor %}
 {% for heading, text in of.texts %}<{{ level }}>{{ heading }}</{{ level }}><pre>{{ text }}</pre>
@@ -99,12 +117,13 @@ _TEMPLATE = """{% macro parts(of, level) %}
 <html lang="en">
 <head>
 <meta charset="utf-8">
+<meta http-equiv="Content-Security-Policy" content="{{ policy }}">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <title>{{ page.title }}</title>
 <style>
 :root { color-scheme: light; }
 body { font: 16px/1.5 system-ui, sans-serif; margin: 0 auto; padding: 1rem; max-width: 70rem;
-       color: #1a1a1a; background: #fff; }
+       color: #1a1a1a; background: #fff; overflow-wrap: break-word; }
 h1 { font-size: 1.5rem; line-height: 1.25; margin: 0.5rem 0; }
 section { border-top: 2px solid #ddd; margin-top: 2rem; }
 h3 { font-size: 1rem; margin: 1.2rem 0 0.3rem; }
@@ -114,25 +133,42 @@ h2 { font-size: 1.15rem; margin: 1.6rem 0 0.4rem; }
             grid-template-columns: repeat(auto-fill, minmax(min(100%, 26rem), 1fr)); }
 figure { margin: 1rem 0; min-width: 0; grid-column: 1 / -1; }
 figure.narrow { grid-column: auto; }
-figure svg { width: 100%; height: auto; }
+figure > svg { display: block; width: 100%; height: auto; max-width: 48rem; }
 figcaption { font-size: 0.9rem; color: #444; }
+button { font: inherit; font-size: 0.9rem; margin: 0.2rem 0; padding: 0.3rem 0.8rem;
+         color: #005a8e; background: #fff; border: 1px solid #0072B2; border-radius: 4px; }
+.zoom { display: none; }
 .wide { overflow-x: auto; margin: 1rem 0; }
 table { border-collapse: collapse; font-size: 0.9rem; font-variant-numeric: tabular-nums; }
 th, td { padding: 0.2rem 0.6rem; border-bottom: 1px solid #ddd; text-align: right;
          white-space: nowrap; }
 th:first-child, td:first-child { text-align: left; }
 table.sentences th, table.sentences td { text-align: left; white-space: normal;
-         vertical-align: top; overflow-wrap: anywhere; }
-table.sentences td:first-child { overflow-wrap: normal; }
+         vertical-align: top; }
+table.sentences td:last-child { overflow-wrap: anywhere; }
+table.sentences td:first-child { max-width: 18rem; overflow-wrap: break-word; }
 caption { text-align: left; font-weight: 600; padding: 0.3rem 0; }
 pre { font-size: 0.8rem; overflow-x: auto; background: #f6f6f6; padding: 0.6rem; }
 pre.marked { white-space: pre-wrap; }
 ins { background: #cfe8fc; text-decoration: underline; font-weight: 600; }
 del { background: #f9ddcc; }
 @page { size: A4; margin: 15mm; }
-@media (max-width: 600px) {
-  table { font-size: 0.8rem; } th, td { white-space: normal; padding: 0.2rem 0.3rem; } }
-@media print { html { font-size: 11px; } body { max-width: none; font-size: 1rem; }
+@media screen { .open > svg { display: none; } .open > .zoom { display: block; }
+  figure.narrow.open { grid-column: 1 / -1; } }
+@media screen and (max-width: 600px) {
+  table.sentences, table.sentences tbody, table.sentences caption { display: block;
+    width: auto; }
+  table.sentences thead { display: none; }
+  table.sentences tr { display: flex; flex-wrap: wrap; border-bottom: 1px solid #ddd; }
+  table.sentences td { border: 0; } table.sentences td:first-child { font-weight: 600;
+    max-width: 100%; overflow-wrap: anywhere; }
+  table.sentences td:last-child { flex-basis: 100%; }
+  td[data-name]::before { content: attr(data-name) ": "; color: #444; }
+  td[data-name]:empty { display: none; }
+  table { font-size: 0.8rem; } th, td { padding: 0.2rem 0.3rem; } th { white-space: normal; }
+  td:first-child { position: sticky; left: 0; background: #fff; } }
+@media print { button { display: none; } html { font-size: 11px; }
+  body { max-width: none; font-size: 1rem; }
   figure { break-inside: avoid; }
   .pictures { grid-template-columns: 1fr 1fr; } h2, h3 { break-after: avoid; }
   .wide { overflow: visible; } th, td { white-space: normal; padding: 0.2rem 0.3rem; }
@@ -152,22 +188,76 @@ del { background: #f9ddcc; }
 <div class="wide"><table class="sentences"><tbody>
 {% for key, value in page.computed.items() %}<tr><td>{{ key }}</td><td>{{ value }}</td></tr>
 {% endfor %}</tbody></table></div>
+{% for script in scripts %}<script>{{ script | safe }}</script>
+{% endfor %}
 </body>
 </html>
 """
 
 
 def render(page: Page) -> str:
-    """Return the page as HTML; every value from a log is escaped."""
+    """Return the page as HTML; every value from a log is escaped.
+
+    Its policy forbids the network and every script but its own two, which are
+    there only where a picture can be zoomed.
+    """
     from jinja2 import Environment
 
+    charts: dict[int, tuple[str, str]] = {}
+    scripts: list[str] = []
+    shown = [*page.pictures, *(p for section in page.sections for p in section.pictures)]
+    zoomable = [p for p in shown if p.chart]
+    if zoomable:
+        from greybox.report.interactive import chart_json, library, opener
+
+        for i, picture in enumerate(zoomable):
+            assert picture.chart is not None
+            charts[id(picture)] = (f"zoom{i}", chart_json(picture.chart, f"zoom{i}"))
+        scripts = [library(), opener()]
     template = Environment(autoescape=True, trim_blocks=True).from_string(_TEMPLATE)
-    return template.render(page=page)
+    return template.render(
+        page=page,
+        chart_of=lambda picture: charts.get(id(picture)),
+        scripts=scripts,
+        policy=_policy(scripts),
+    )
+
+
+def _policy(scripts: Sequence[str]) -> str:
+    """Return what a browser may load for the page: its own scripts, by their hashes."""
+    hashes = [f"'sha256-{b64encode(sha256(s.encode()).digest()).decode()}'" for s in scripts]
+    return (
+        "default-src 'none'; base-uri 'none'; form-action 'none'; img-src data:; "
+        f"style-src 'unsafe-inline'; script-src {' '.join(hashes or [_NONE])}"
+    )
 
 
 def write_page(page: Page, path: str | Path) -> None:
     """Write the page, replacing the file in one step."""
     write_text(render(page), path)
+
+
+_MACHINES = ("program", "versions", "command", "line", "inputs", "logs", "validate")
+
+
+def computed(record: Mapping[str, Any]) -> dict[str, str]:
+    """Return how a page was computed, one row an item, without wall time.
+
+    Parameters
+    ----------
+    record : mapping
+        As a command records it: ``line``, ``inputs``, ``versions``; what else it
+        holds follows.
+    """
+    if "line" not in record:
+        return flatten(dict(record))
+    rows = {"command": str(record["line"])}
+    if "seed" in record["command"]:
+        rows["seed"] = str(record["command"]["seed"])
+    rows |= {f"read {name}": f"SHA-256 {value}" for name, value in record["inputs"].items()}
+    made = ", ".join(f"{n} {v}" for n, v in record["versions"].items())
+    rows["computed with"] = f"{record['program']}, {made}"
+    return rows | flatten({k: v for k, v in record.items() if k not in _MACHINES})
 
 
 def flatten(record: dict[str, Any]) -> dict[str, str]:

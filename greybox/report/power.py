@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from greybox.files import write_text
 from greybox.report.figures import COLOURS, new_figure, tidy, to_svg
-from greybox.report.page import Page, Picture, Table, flatten
+from greybox.report.page import Page, Picture, Table, computed
 from greybox.report.studies import StudyOutput, write_output
 from greybox.study.blind_causes import CAUSES
 from greybox.study.power import ANSWERS, Cell, Power
@@ -201,7 +201,7 @@ def power_output(study: Power, record: dict[str, Any]) -> StudyOutput:
         ],
         pictures=[Picture(to_svg(f, n), c) for n, (f, c) in figures.items()],
         tables=tables,
-        computed=flatten(record),
+        computed=computed(record),
     )
     return StudyOutput("\n".join([*lines, *sentences]), study.rows(), figures, page)
 

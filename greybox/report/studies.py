@@ -19,7 +19,7 @@ from greybox.report.figures import (
     save_png,
     to_svg,
 )
-from greybox.report.page import Page, Picture, Table, flatten, write_page
+from greybox.report.page import Page, Picture, Table, computed, write_page
 from greybox.study.chapter4 import SETS, Chapter4
 from greybox.study.chapter6 import Chapter6
 from greybox.study.chapter7 import Chapter7
@@ -128,7 +128,7 @@ def chapter4_output(result: Chapter4, record: dict[str, Any]) -> StudyOutput:
         headline,
         pictures=_pictures(figures),
         tables=[_table("Mean ± sd of (estimate − true)/|true|", rows)],
-        computed=flatten(record),
+        computed=computed(record),
     )
     return StudyOutput(text, rows, figures, page)
 
@@ -192,7 +192,7 @@ def chapter6_output(result: Chapter6, record: dict[str, Any]) -> StudyOutput:
             _table(f"Table {t}: normalised errors, mean ± sd", [r for r in rows if r.table == t])
             for t in sorted({r.table for r in rows})
         ],
-        computed=flatten(record) | {"samples a run": str(result.samples)},
+        computed=computed(record) | {"samples a run": str(result.samples)},
     )
     return StudyOutput(text, rows, figures, page)
 
@@ -260,7 +260,7 @@ def chapter7_output(result: Chapter7, record: dict[str, Any]) -> StudyOutput:
                 ],
             ),
         ],
-        computed=flatten(record)
+        computed=computed(record)
         | {"estimation sets": "; ".join(" + ".join(s) for s in result.sets)},
     )
     return StudyOutput("\n".join(lines), rows, figures, page)

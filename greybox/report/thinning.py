@@ -14,6 +14,21 @@ Index = NDArray[np.intp]
 GAP = 1.5
 
 
+def points_for(curves: int, *, most: int = 2000, room: int = 100_000) -> int:
+    """Return how many points each of a page's curves may have so that the page stays light.
+
+    Parameters
+    ----------
+    curves : int
+        Of all pictures of the page together; both edges of a band count.
+    most : int
+        For a page of few curves.
+    room : int
+        Points of all of them together; every curve has at least 150.
+    """
+    return int(np.clip(room // max(curves, 1), 150, most))
+
+
 def find_gaps(t: Array, sample_time: float) -> Index:
     """Return the samples after which one is missing.
 

@@ -19,7 +19,8 @@ def whiteness(evidence: Evidence, row: int) -> TestResult:
     The autocovariances are scaled by Σ e²(t) e²(t−k), which noise of changing
     size needs, and corrected for the estimated parameters. Residuals of a
     regression on noisy measurements are a moving average by construction, so a
-    rejection asks for robust standard errors, not for another model.
+    rejection asks for robust standard errors, not for another model. The
+    autocorrelation by lag and its 95 % band are in ``detail``.
 
     References
     ----------
@@ -44,7 +45,12 @@ def whiteness(evidence: Evidence, row: int) -> TestResult:
     )
     return TestResult(
         name, null, score.statistic, score.p_value, f"residuals are {found}", LEVEL,
-        detail={"degrees_of_freedom": score.freedom},
+        detail={
+            "degrees_of_freedom": score.freedom,
+            "lags": list(range(1, _LAGS + 1)),
+            "correlation": (score.moments / variance).tolist(),
+            "band": (1.96 * np.sqrt(np.diag(score.covariance)) / variance).tolist(),
+        },
     )  # fmt: skip
 
 

@@ -1,0 +1,410 @@
+"""The page of `greybox estimate`: whether to trust the model, how it moves, what is known of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.estimation.result import Estimate, TestResult
+from greybox.estimation.summary import BOUNDS, grouped, set_in_words, weak_safe_sets
+from greybox.model.units import parameter_unit
+from greybox.report.chart import chart_of
+from greybox.report.estimation_figures import (
+    REACH,
+    correlation_figure,
+    forest_figure,
+    regime_shares,
+    regimes_figure,
+    residual_figure,
+    visited_figure,
+)
+from greybox.report.figures import comparison_figure, to_svg
+from greybox.report.model_difference import shown_unit
+from greybox.report.page import Page, Picture, Section, Table, computed
+from greybox.report.physical import physical_summary
+from greybox.report.thinning import points_for
+from greybox.trial.log import TrialLog
+from greybox.validation.fit import run_model
+from greybox.validation.structures import StructureChoice
+
+Array = NDArray[np.float64]
+
+_NAMES = {"u": "surge", "v": "sway", "r": "yaw rate", "psi": "heading"}
+_METHODS = {
+    "ls": "least squares",
+    "iv": "instrumental variables",
+    "oe": "output error (the free run fitted to the log)",
+}
+_OUTCOMES = {True: "passed", False: "speaks against it", None: "tells"}
+# logs that are drawn against time: with more the page grows and tells nothing new
+_MOST_LOGS = 3
+_MOST_PAIRS = 3
+_WORTH_TELLING = 0.9
+
+
+def estimation_page(
+    estimate: Estimate,
+    logs: Sequence[TrialLog],
+    record: Mapping[str, Any],
+    *,
+    choice: StructureChoice | None = None,
+    mass: float | None = None,
+) -> Page:
+    """Return the page, its story first.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    logs : sequence of TrialLog
+        Those it was estimated on.
+    record : mapping
+        How it was computed: versions, command, hashes of the files, seed.
+    choice : StructureChoice, optional
+        What other structures would have done.
+    mass : float, optional
+        m [kg], for physical coefficients.
+    """
+    sections = [
+        _run(estimate, logs),
+        _parameters(estimate),
+        _residuals(estimate),
+        _visited(estimate, logs),
+        _tests(estimate),
+        _chosen(estimate, choice),
+        _equations(estimate, mass),
+    ]
+    return Page(
+        title=f"How far to trust this model of {estimate.vessel.name}",
+        headline=headline(estimate),
+        sentences=_summary(estimate),
+        sections=[s for s in sections if s is not None],
+        computed=computed(dict(record))
+        | {
+            "standard errors": f"{estimate.covariance_kind}, residuals remembered over "
+            f"{estimate.lags} samples",
+            "free run": "from the mean of the log's first 5 samples, driven by its inputs and "
+            "measured heading",
+        },
+    )
+
+
+def headline(estimate: Estimate) -> str:
+    """Return the verdict as a sentence, with how well the free run follows the logs."""
+    text = estimate.verdict.text.rstrip(".")
+    if text == "trust":
+        told = "Trust this model: no test speaks against it"
+    elif text.startswith("trust except "):
+        told = f"Trust this model, except for {text.removeprefix('trust except ')}"
+    else:
+        told = text[:1].upper() + text[1:]
+    if not estimate.fit:
+        return f"{told}."
+    fit = ", ".join(
+        f"{_NAMES.get(s, s)} {v:.0f} %" if v > -1000 else f"{_NAMES.get(s, s)} diverged"
+        for s, v in estimate.fit.items()
+    )
+    return f"{told}. Its free run fits the logs it was estimated on by {fit} (100 is perfect)."
+
+
+def _summary(estimate: Estimate) -> list[str]:
+    method = _METHODS.get(estimate.method, estimate.method)
+    if estimate.prefilter == "noise":
+        method += ", refined by the noise"
+    logs = len(estimate.logs)
+    told = [
+        f"{len(estimate.names)} parameters of structure '{estimate.predictor.structure.name}' by "
+        f"{method}, predictor '{estimate.predictor.kind}', from {estimate.kept} of "
+        f"{estimate.samples} samples of {estimate.sample_time:g} s in {logs} "
+        f"log{'s' * (logs != 1)}.",
+        *estimate.verdict.reasons,
+    ]
+    if estimate.current:
+        shown = ", ".join(f"{n} {v:.3f} ± {1.96 * s:.3f} m/s" for n, v, s in estimate.current)
+        told.append(f"Current found beside the parameters (± 95 %): {shown}.")
+    return told
+
+
+def _run(estimate: Estimate, logs: Sequence[TrialLog]) -> Section:
+    """Show the free run against the logs of the estimate."""
+    model = estimate.model()
+    drawn = logs[:_MOST_LOGS]
+    curves = 3 * len(drawn) * len(model.structure.states)
+    pictures = []
+    for i, log in enumerate(drawn):
+        run = run_model(model, log)
+        caption = (
+            f"Free run on {log.name} ({len(log)} samples of {log.sample_time:g} s), a log the "
+            f"model was estimated on: measured, simulated, and their difference below."
+        )
+        fit = ", ".join(f"{_NAMES.get(s, s)} {v:.0f} %" for s, v in run.fit.items())
+        printed, zoomed = (
+            comparison_figure(["model"], [run], points=points_for(curves, **room))
+            for room in ({}, {"most": 10_000, "room": 150_000})
+        )
+        pictures.append(
+            Picture(
+                to_svg(printed, f"run{i}"),
+                caption,
+                f"{caption} Fit: {fit}.",
+                narrow=len(drawn) > 1,
+                chart=chart_of(zoomed),
+            )
+        )
+    sentences = [
+        "These are the logs that the model was fitted to, so this shows what it cannot follow, "
+        "not how well it predicts: for that, run greybox compare on logs that took no part."
+    ]
+    if len(logs) > len(drawn):
+        sentences.append(f"Of {len(logs)} logs the first {len(drawn)} are drawn.")
+    return Section("1. Does its free run follow the log?", sentences, pictures)
+
+
+def _parameters(estimate: Estimate) -> Section:
+    """Show intervals, and which estimates hang together."""
+    place = list(estimate.predictor.parameter_columns)
+    theta, std = estimate.theta[place], estimate.std[place]
+    labels, units = list(estimate.labels), _units(estimate)
+    sets = weak_safe_sets(estimate.tests)
+    known = np.isfinite(std)
+    with_unit = [f"{n} [{u}]" if u else n for n, u in zip(labels, units, strict=True)]
+    wide = [
+        n for n, v, s in zip(labels, theta, std, strict=True)
+        if not 1.96 * s * 100 <= REACH * abs(v)
+    ]  # fmt: skip
+    caption = "95 % intervals relative to each value; at −100 % a parameter would be zero."
+    if sets:
+        caption += (
+            " Light: what the instruments alone allow, before any refinement, safe even where "
+            "they are weak."
+        )
+    if wide:
+        caption += f" Wider than drawn: {', '.join(wide)}."
+    worst = "; ".join(
+        f"{n} ± {196 * s / abs(v):.0f} %" if v else f"{n} is 0"
+        for n, v, s in zip(labels, theta, std, strict=True)
+    )
+    pictures = [
+        Picture(
+            to_svg(
+                forest_figure(
+                    with_unit, theta, np.where(known, std, 0.0), sets, estimate.verdict.excepted
+                ),
+                "forest",
+            ),
+            caption,
+            f"Intervals of the parameters relative to their values: {worst}.",
+            narrow=True,
+        )
+    ]
+    told = []
+    covariance = estimate.covariance[np.ix_(place, place)]
+    if len(place) > 1 and known.all() and (std > 0).all():
+        correlation = covariance / np.outer(std, std)
+        told = _pairs(labels, correlation)
+        pictures.append(
+            Picture(
+                to_svg(correlation_figure(labels, correlation), "correlation"),
+                "Which estimates move together: a strong correlation means that the log tells "
+                "the two apart badly. Beyond ±0.9 the sign is written.",
+                f"Map of the correlations between {len(labels)} estimates. {' '.join(told)}",
+                narrow=True,
+            )
+        )
+    told += [f"{BOUNDS[name]}: {limit.sentence}" for name, limit in estimate.limits.items()]
+    return Section(
+        "2. How well is each parameter known?", told, pictures,
+        [_parameter_table(estimate, labels, units, theta, std)],
+    )  # fmt: skip
+
+
+def _units(estimate: Estimate) -> list[str]:
+    structure = estimate.predictor.structure
+    return [
+        shown_unit(
+            parameter_unit(
+                structure.terms[structure.index(estimate.predictor.columns[i].terms[0])],
+                estimate.vessel.force_unit,
+            )
+        )
+        for i in estimate.predictor.parameter_columns
+    ]
+
+
+def _pairs(labels: Sequence[str], correlation: Array) -> list[str]:
+    """Return the strongest correlations in words."""
+    low, high = np.tril_indices(len(labels), -1)
+    order = np.argsort(-np.abs(correlation[low, high]))[:_MOST_PAIRS]
+    pairs = [(labels[high[k]], labels[low[k]], correlation[low[k], high[k]]) for k in order]
+    strong = [p for p in pairs if abs(p[2]) > _WORTH_TELLING]
+    if not strong:
+        one, other, value = pairs[0]
+        return [f"No two estimates hang together; most do {one} and {other} ({value:.2f})."]
+    shown = ", ".join(f"{a} and {b} ({value:.2f})" for a, b, value in strong)
+    return [f"The log tells these pairs apart worst (correlation): {shown}."]
+
+
+def _parameter_table(
+    estimate: Estimate, labels: Sequence[str], units: Sequence[str], theta: Array, std: Array
+) -> Table:
+    sets = weak_safe_sets(estimate.tests)
+    rows = []
+    for name, unit, value, error in zip(labels, units, theta, std, strict=True):
+        row = [
+            name, f"{value:.4g}", f"{error:.2g}",
+            f"{value - 1.96 * error:.4g} to {value + 1.96 * error:.4g}",
+            *([set_in_words(sets.get(name))] if sets else []),
+            f"{value / estimate.sample_time:.4g}", unit,
+            "not to rely on" if name in estimate.verdict.excepted else "",
+        ]  # fmt: skip
+        rows.append([cell.replace("e-", "e−") for cell in row[:-2]] + row[-2:])
+    return Table(
+        f"Parameters per sample of {estimate.sample_time:g} s, and per second",
+        [
+            "parameter", "value", "std error", "95 % interval",
+            *(["safe if weak"] if sets else []), "per second", "unit per sample", "",
+        ],
+        rows,
+    )  # fmt: skip
+
+
+def _by_state(tests: Sequence[TestResult], prefix: str, key: str) -> dict[str, Any]:
+    """Return what one kind of test found, by state; those that do not apply are left out."""
+    return {
+        t.name.removeprefix(prefix): (t.detail if key == "" else t.detail[key])
+        for t in tests
+        if t.name.startswith(prefix) and (t.detail.get(key) if key else "band" in t.detail)
+    }
+
+
+def _residuals(estimate: Estimate) -> Section | None:
+    states = estimate.predictor.structure.states
+    own = _by_state(estimate.tests, "whiteness_", "")
+    inputs = _by_state(estimate.tests, "input_independence_", "inputs")
+    if not own and not inputs:
+        return None
+    told = [
+        _sentence(f"{_NAMES.get(s, s)}: {t.sentence}")
+        for s in states
+        for t in estimate.tests
+        if t.name in (f"whiteness_{s}", f"input_independence_{s}")
+    ]
+    figure = residual_figure(states, own, inputs)
+    caption = (
+        "Correlation of the one-step residuals with themselves and with the inputs; grey holds "
+        "95 % of what chance does, filled marks lie outside it. Neighbours depend on one another: "
+        "the tests weigh all of them together."
+    )
+    sentence = (
+        "Residuals of regressions on noisy measurements have a memory of their own, which is no "
+        "fault; an input that explains them is one, for the model then lacks something."
+    )
+    return Section(
+        "3. What do the residuals say?", [sentence],
+        [Picture(to_svg(figure, "residuals"), caption, f"{caption} {' '.join(told)}")],
+        points=told,
+    )  # fmt: skip
+
+
+def _visited(estimate: Estimate, logs: Sequence[TrialLog]) -> Section:
+    """Show what the logs excite."""
+    states = estimate.predictor.structure.states
+    values = {s: np.concatenate([log[s] for log in logs]) for s in states}
+    ranges = ", ".join(
+        f"{_NAMES.get(s, s)} from {v.min():.2f} to {v.max():.2f}" for s, v in values.items()
+    )
+    margins = _margins(estimate)
+    caption = "How much of the time each value was met, all logs together."
+    if margins:
+        caption += " Shaded: cut out, too near to zero."
+    pictures = [
+        Picture(
+            to_svg(visited_figure(values, margins), "visited"), caption,
+            f"{caption} {ranges} (m/s, rad/s).", narrow=True,
+        )
+    ]  # fmt: skip
+    if "u" in values and "v" in values:
+        shares = ", ".join(
+            f"{n} {100 * s:.0f} %" for n, s in regime_shares(values["u"], values["v"]).items()
+        )
+        caption = (
+            "Surge against sway with the share of the time in each combination of signs: a "
+            "parameter of |u|u or |v|v is only known where the ship was."
+        )
+        pictures.append(
+            Picture(
+                to_svg(regimes_figure(values["u"], values["v"]), "regimes"), caption,
+                f"{caption} {shares}.", narrow=True,
+            )
+        )  # fmt: skip
+    told = [
+        _sentence(f"{_NAMES.get(s, s)}: {t.sentence}")
+        for s in states
+        for t in estimate.tests
+        if t.name == f"excitation_{s}"
+    ]
+    return Section("4. What did the logs excite?", pictures=pictures, points=told)
+
+
+def _margins(estimate: Estimate) -> dict[str, float]:
+    return {
+        t.name.removeprefix("margin_"): float(t.level)
+        for t in estimate.tests
+        if t.name in ("margin_u", "margin_v") and t.level and estimate.kept < estimate.samples
+    }
+
+
+def _sentence(text: str) -> str:
+    # a capital of another alphabet would be another symbol
+    first = text[:1].upper() if text[:1].isascii() else text[:1]
+    return first + text[1:] + ("" if text.endswith(".") else ".")
+
+
+def _tests(estimate: Estimate) -> Section:
+    """List every test with its statistic."""
+    tables = [
+        Table(
+            title,
+            ["test", "statistic", "p-value", "outcome", "what it says"],
+            [
+                [
+                    t.name.replace("_", " "),
+                    "" if t.statistic is None else f"{t.statistic:.3g}".replace("e-", "e−"),
+                    "" if t.p_value is None else f"{t.p_value:.2g}".replace("e-", "e−"),
+                    "does not apply"
+                    if t.sentence.startswith("not applicable")
+                    else _OUTCOMES[t.passed],
+                    _sentence(t.sentence),
+                ]
+                for t in tests
+            ],
+            sentences=True,
+        )
+        for title, tests in grouped(estimate.tests)
+    ]
+    told = () if tables else ("No tests were made.",)
+    return Section("5. All tests", told, tables=tables)
+
+
+def _chosen(estimate: Estimate, choice: StructureChoice | None) -> Section | None:
+    """Tell what was chosen for the user, and why."""
+    if not estimate.notes and choice is None:
+        return None
+    texts = [("Structures compared", choice.summary())] if choice else []
+    return Section("6. What was chosen, and why", points=estimate.notes, texts=texts)
+
+
+def _equations(estimate: Estimate, mass: float | None) -> Section:
+    model = estimate.model()
+    lines = "\n".join(
+        [
+            *model.structure.equations(),
+            "u_r, v_r: velocity through the water; u_q, v_q: through the air",
+        ]
+    )
+    texts = [("Per sample", lines)]
+    if mass is not None:
+        texts.append(("In physical units", physical_summary(model, mass)))
+    return Section("7. The equations", texts=texts)
