@@ -9,6 +9,7 @@ from math import isfinite
 from pathlib import Path
 from typing import Any, Literal
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
@@ -127,6 +128,32 @@ class ManoeuvringModel:
     def label(self, name: str) -> str:
         """Return a parameter's name with the terms it sums, such as ``Xuu+Wuu``."""
         return "+".join(self.sums.get(name, (name,)))
+
+    @property
+    def step_states(self) -> tuple[str, ...]:
+        """Names of ``x`` of `step_function`."""
+        from greybox.model.stepping import state_names
+
+        return state_names(self)
+
+    def step_function(self) -> ca.Function:
+        """Return one sample of the whole ship, ``(x, command[, wind]) -> x_next``.
+
+        For controllers, observers and simulators: see `greybox.model.stepping.whole_step`.
+        The commands are ``vessel.commands``, their limits ``vessel.limits``.
+        """
+        from greybox.model.stepping import whole_step
+
+        return whole_step(self)
+
+    def rhs_function(self) -> ca.Function:
+        """Return the time derivatives ``(x, command[, wind]) -> x_dot``.
+
+        Its Euler step is `step_function`: see `greybox.model.stepping.whole_rate`.
+        """
+        from greybox.model.stepping import whole_rate
+
+        return whole_rate(self)
 
     def summary(self) -> str:
         """Return the equations and the parameters, per sample and per second."""
