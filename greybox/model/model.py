@@ -20,6 +20,7 @@ from greybox.model.noise import NoiseLevels, noise_from_dict
 from greybox.model.structure import Structure
 from greybox.model.terms import Factor, Term
 from greybox.model.units import parameter_unit
+from greybox.notebook import Shown, items, parameters, text
 from greybox.vessel.toml import vessel_from_dict, vessel_to_dict
 from greybox.vessel.vessel import Vessel
 
@@ -30,8 +31,8 @@ VERSION = 1
 _MAX_BYTES = 50_000_000
 
 
-@dataclass(frozen=True)
-class ManoeuvringModel:
+@dataclass(frozen=True, repr=False)
+class ManoeuvringModel(Shown):
     """A model that can be simulated, compared, saved and designed with.
 
     Parameters
@@ -176,10 +177,19 @@ class ManoeuvringModel:
         lines += [f"{c.sentence}, of the log's clock" for c in self.changes]
         return "\n".join(lines)
 
-    def _repr_html_(self) -> str:
-        from html import escape
-
-        return f"<pre>{escape(self.summary())}</pre>"
+    def _parts(self) -> tuple[str, ...]:
+        judged = self.record.get("verdict")
+        said = judged.get("text", "") if isinstance(judged, dict) else ""
+        rows = [
+            (self.label(n), float(v), float(s), unit)
+            for n, v, s, unit in zip(self.names, self.theta, self.std, self.units, strict=True)
+        ]
+        known = [(n, value, std, "m/s") for n, (value, std) in self.disturbances.items()]
+        return (
+            text(f"Verdict of the estimate: {said}" if said else ""),
+            parameters([*rows, *known]),
+            items("Changes", [c.sentence for c in self.changes]),
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return the model as the tables of its JSON file."""

@@ -132,9 +132,12 @@ def whole_rate(model: ManoeuvringModel) -> ca.Function:
     wind = ca.SX.sym("wind", 2)
     slow, tau, slow_after = _lagged(model, command, held=False)
     turn = model.sample_time * s.x[2]
-    f = step_function(model.structure)(
-        s.x, s.psi, tau, _disturbance(model, wind), ca.SX(2, 1), ca.DM(model.theta), 1.0
-    ) - s.x
+    f = (
+        step_function(model.structure)(
+            s.x, s.psi, tau, _disturbance(model, wind), ca.SX(2, 1), ca.DM(model.theta), 1.0
+        )
+        - s.x
+    )
     rate = ca.vertcat(f, turn) / model.sample_time
     x = ca.vertcat(s.x, s.psi, position, slow)
     x_dot = ca.vertcat(rate, _north_east(s.x, s.psi), slow_after)

@@ -8,7 +8,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.channels import CHANNELS
 from greybox.errors import LogError
+from greybox.notebook import Shown, items, number, sparkline, table
 from greybox.vessel.actuation import actuated_force
 from greybox.vessel.vessel import Vessel
 
@@ -44,8 +46,8 @@ class Provenance:
     notes: Mapping[str, str] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class TrialLog:
+@dataclass(frozen=True, repr=False)
+class TrialLog(Shown):
     """Signals of one trial on a uniform clock.
 
     Parameters
@@ -87,6 +89,49 @@ class TrialLog:
 
     def __contains__(self, name: object) -> bool:
         return name in self.channels
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Unit of ``t`` and of each channel; ``as logged`` where any unit is kept."""
+        angles = self.vessel.angle_commands
+        return {
+            n: CHANNELS[n].unit if n in CHANNELS else ("rad" if n in angles else "as logged")
+            for n in ("t", *self.channels)
+        }
+
+    def summary(self) -> str:
+        """Return name, duration, channels with units and ranges, and provenance, as text."""
+        lines = [self._line()]
+        lines += [
+            f"  {n:<10}{unit:<10}{low:>12}{mean:>12}{high:>12}"
+            for n, unit, low, mean, high, _ in self._rows()
+        ]
+        return "\n".join([*lines, *(f"  {x}" for x in self._history())])
+
+    def _line(self) -> str:
+        span = f", t {self.t[0]:g} to {self.t[-1]:g} s" if len(self) else ""
+        return (
+            f"log '{self.name}' of {self.vessel.name}: {len(self)} samples every "
+            f"{self.sample_time:g} s{span}, {len(self.channels)} channels"
+        )
+
+    def _rows(self) -> list[tuple[str, ...]]:
+        units = self.units
+        spans = {n: (f(a) for f in (np.min, np.mean, np.max)) for n, a in self.channels.items()}
+        return [
+            (n, units[n], *(number(float(x)) for x in spans[n]), sparkline(a))
+            for n, a in self.channels.items()
+        ]
+
+    def _history(self) -> list[str]:
+        p = self.provenance
+        loop = float(np.mean(self.closed_loop)) if self.loop_known and len(self) else 0.0
+        closed = [f"a controller moves the thrusters in {100 * loop:.0f} % of it"] if loop else []
+        return [*closed, *(f"derived: {d}" for d in p.derived), *(f"mended: {f}" for f in p.fixed)]
+
+    def _parts(self) -> tuple[str, ...]:
+        head = ("channel", "unit", "least", "mean", "most", "over time")
+        return table(head, self._rows()), items("History", self._history())
 
     def states(self, names: tuple[str, ...]) -> Array:
         """Return the named states as (N, nx)."""
