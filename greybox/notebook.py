@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 _LINE = 100
 _PIXELS = (120, 24)
 _STYLES = ("opacity:0.55", "")
-_LEFT, _RIGHT = ' style="text-align:left"', ' style="text-align:right"'
+_LEFT, _RIGHT = (f' style="text-align:{side};padding:0 0.5em"' for side in ("left", "right"))
 # what no XML document may hold, escaped or not
 _FORBIDDEN = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 

@@ -134,6 +134,9 @@ def test_what_matters_comes_first(results):
     rows = {row[0].text: row for row in log.find("table/tbody")}
     assert rows["psi"][1].text == "rad"
     assert rows["n"][1].text == "as logged"
+    shown = [float(cell.text) for cell in rows["n"][2:5]]
+    n = by_type["TrialLog"]["n"]
+    np.testing.assert_allclose(shown, [n.min(), n.mean(), n.max()], rtol=1e-3)
     assert rows["u"][5][0].tag.endswith("svg")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,10 @@ from greybox.errors import LogError
 from greybox.notebook import Shown, items, number, sparkline, table
 from greybox.vessel.actuation import actuated_force
 from greybox.vessel.vessel import Vessel
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import xarray as xr
 
 Array = NDArray[np.float64]
 
@@ -117,9 +122,8 @@ class TrialLog(Shown):
 
     def _rows(self) -> list[tuple[str, ...]]:
         units = self.units
-        spans = {n: (f(a) for f in (np.min, np.mean, np.max)) for n, a in self.channels.items()}
         return [
-            (n, units[n], *(number(float(x)) for x in spans[n]), sparkline(a))
+            (n, units[n], *(number(float(f(a))) for f in (np.min, np.mean, np.max)), sparkline(a))
             for n, a in self.channels.items()
         ]
 
@@ -156,6 +160,18 @@ class TrialLog(Shown):
         """Velocity through the air (N, 2) [m/s], None where it was not measured."""
         return np.column_stack([self["u_q"], self["v_q"]]) if self.has_wind else None
 
+    def to_pandas(self) -> pd.DataFrame:
+        """Return the log as a DataFrame: see `greybox.trial.dataframe.log_to_pandas`."""
+        from greybox.trial.dataframe import log_to_pandas
+
+        return log_to_pandas(self)
+
+    def to_xarray(self) -> xr.Dataset:
+        """Return the log as a Dataset: see `greybox.trial.dataframe.log_to_xarray`."""
+        from greybox.trial.dataframe import log_to_xarray
+
+        return log_to_xarray(self)
+
     def window(self, start: int, stop: int, name: str | None = None) -> TrialLog:
         """Return samples ``start:stop`` as a log of their own."""
         return replace(
@@ -178,8 +194,9 @@ def make_log(
     Parameters
     ----------
     vessel : Vessel
-    channels : mapping of str to ndarray
-        (N,) each, by canonical name; ``t`` is made when absent.
+    channels : mapping of str to ndarray, or DataFrame
+        (N,) each, by canonical name; ``t`` is made when absent. Of a DataFrame its index
+        is ``t`` where it is called so; what is to be converted goes to `log_from_pandas`.
     sample_time : float
         [s]
 
@@ -189,6 +206,9 @@ def make_log(
         Lengths differ, or a value is not finite.
     """
     arrays = {k: np.asarray(v, float) for k, v in channels.items()}
+    index = getattr(channels, "index", None)
+    if getattr(index, "name", None) == "t":
+        arrays.setdefault("t", np.asarray(index, float))
     lengths = {k: len(v) for k, v in arrays.items()}
     if len(set(lengths.values())) > 1:
         (a, na), (b, nb) = min(lengths.items(), key=_second), max(lengths.items(), key=_second)

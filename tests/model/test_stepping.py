@@ -117,7 +117,7 @@ def test_rate_is_the_step_over_the_sample_time(ship, true_theta, lag_on):
 def test_what_has_no_step_is_refused(ship, true_theta):
     surge = get_structure("surge")
     model = ManoeuvringModel(surge, np.zeros(4), np.zeros((4, 4)), 1.0, ship)
-    with pytest.raises(StructureError, match="has the states u, a ship .* needs u, v, r"):
+    with pytest.raises(StructureError, match=r"has the states u, a ship .* needs u, v, r"):
         model.step_function()
     late = a_model(ship, true_theta, actuation=Actuation(delay=1.5))
     with pytest.raises(UsageError, match=r"act 1\.5 s late, .*: use step_function"):
