@@ -1,5 +1,6 @@
 """The whole ship as one CasADi function is the free run, sample by sample."""
 
+import warnings
 from dataclasses import replace
 
 import casadi as ca
@@ -140,3 +141,33 @@ def test_function_takes_symbols_and_is_differentiable(ship, true_theta):
         np.testing.assert_allclose(exact[:, k], (pair[0] - pair[1]) / 2e-5, atol=1e-8)
     again = ca.Function.deserialize(step.serialize())
     np.testing.assert_array_equal(np.array(again(*at, [0, 0])), np.array(step(*at, [0, 0])))
+
+
+def test_step_drops_into_do_mpc(ship, true_theta):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of what it lacks itself
+        do_mpc = pytest.importorskip("do_mpc")
+    identified = a_model(ship, true_theta)
+    model = do_mpc.model.Model("discrete")
+    x = model.set_variable("_x", "x", (6, 1))
+    command = model.set_variable("_u", "command", (3, 1))
+    model.set_rhs("x", identified.step_function()(x, command, [0, 0]))
+    model.setup()
+    mpc = do_mpc.controller.MPC(model)
+    quiet = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": 0}
+    mpc.set_param(n_horizon=8, t_step=1.0, store_full_solution=False, nlpsol_opts=quiet)
+    wanted = (x[0] - 2.0) ** 2
+    mpc.set_objective(mterm=wanted, lterm=wanted)
+    mpc.set_rterm(command=1e-4)
+    limits = [identified.vessel.limits[c] for c in identified.vessel.commands]
+    mpc.bounds["lower", "_u", "command"] = np.array([b.lower for b in limits])
+    mpc.bounds["upper", "_u", "command"] = np.array([b.upper for b in limits])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        mpc.setup()
+        mpc.x0 = np.array([1.5, 1.2, 0.0, 0.0, 0.0, 0.0])
+        mpc.u0 = np.array([12.0, 0.8, 0.8])
+        mpc.set_initial_guess()
+        first = mpc.make_step(mpc.x0).ravel()
+    assert mpc.solver_stats["success"]
+    assert all(b.lower - 1e-6 <= c <= b.upper + 1e-6 for b, c in zip(limits, first, strict=True))
