@@ -1,6 +1,8 @@
 """Each script in examples/ runs to its end, as a user starts it."""
 
+import doctest
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -57,3 +59,19 @@ def test_track_is_kept_better_in_a_known_current(tmp_path):
     )
     assert known < 0.3 < 0.5 < unknown
     assert (tmp_path / "track.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.long
+def test_page_of_library_use_says_what_happens(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    page = (FOLDER.parent / "docs" / "library.md").read_text(encoding="utf-8")
+    names: dict[str, object] = {}
+    runner = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE)
+    for language, block in re.findall(r"```(\w*)\n(.*?)```", page, re.DOTALL):
+        if language == "python":
+            exec(compile(block, "library.md", "exec"), names)
+        elif block.startswith(">>>"):
+            test = doctest.DocTestParser().get_doctest(block, names, "library.md", None, 0)
+            runner.run(test, clear_globs=False)
+    assert runner.tries > 8
+    assert runner.failures == 0

@@ -171,3 +171,28 @@ def test_step_drops_into_do_mpc(ship, true_theta):
         first = mpc.make_step(mpc.x0).ravel()
     assert mpc.solver_stats["success"]
     assert all(b.lower - 1e-6 <= c <= b.upper + 1e-6 for b, c in zip(limits, first, strict=True))
+
+
+def test_step_drops_into_rockit(ship, true_theta):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of what it needs itself
+        rockit = pytest.importorskip("rockit")
+        identified = a_model(ship, true_theta)
+        ocp = rockit.Ocp(T=8.0)
+        x, command = ocp.state(6), ocp.control(3)
+        ocp.set_next(x, identified.step_function()(x, command, [0, 0]))
+        start = np.array([1.5, 1.2, 0.0, 0.0, 0.0, 0.0])
+        ocp.subject_to(ocp.at_t0(x) == start)
+        limits = [identified.vessel.limits[c] for c in identified.vessel.commands]
+        for k, b in enumerate(limits):
+            ocp.subject_to(b.lower <= (command[k] <= b.upper))
+        ocp.set_initial(x, start)
+        ocp.set_initial(command, [12.0, 0.8, 0.8])
+        ocp.add_objective(ocp.sum((x[0] - 2.0) ** 2 + 1e-6 * ca.sumsqr(command)))
+        ocp.solver("ipopt", {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes"})
+        ocp.method(rockit.MultipleShooting(N=8))
+        found = ocp.solve()
+        _, states = found.sample(x, grid="control")
+        _, commands = found.sample(command, grid="control")
+    moved = identified.step_function()(x=states[0], command=commands[0])["x_next"]
+    np.testing.assert_allclose(states[1], np.array(moved).ravel(), atol=1e-6)
