@@ -140,6 +140,12 @@ def test_what_matters_comes_first(results):
     assert rows["u"][5][0].tag.endswith("svg")
 
 
+def test_a_log_of_no_samples_shows_itself():
+    nothing = virtual_log(1, 20).window(0, 0)
+    assert "0 samples" in repr(nothing)
+    assert ET.fromstring(nothing._repr_html_()).find("table") is not None
+
+
 def test_pieces():
     assert number(None) == number(np.nan) == "–"
     assert interval(1.0, 0.5) == "0.02 to 1.98"

@@ -123,7 +123,7 @@ class TrialLog(Shown):
     def _rows(self) -> list[tuple[str, ...]]:
         units = self.units
         return [
-            (n, units[n], *(number(float(f(a))) for f in (np.min, np.mean, np.max)), sparkline(a))
+            (n, units[n], *(number(x) for x in _range(a)), sparkline(a))
             for n, a in self.channels.items()
         ]
 
@@ -220,6 +220,11 @@ def make_log(
     size = next(iter(lengths.values()))
     t = arrays.pop("t", np.arange(size) * sample_time)
     return TrialLog(name, sample_time, t, arrays, vessel, np.zeros(size, bool))
+
+
+def _range(a: Array) -> tuple[float | None, float | None, float | None]:
+    """Return least, mean and largest value, None where there are no samples."""
+    return (float(a.min()), float(a.mean()), float(a.max())) if len(a) else (None, None, None)
 
 
 def _second(item: tuple[str, int]) -> int:

@@ -84,6 +84,16 @@ def test_parquet_and_frame_are_one(tug, tmp_path):
     )
 
 
+def test_columns_of_any_kind_of_array(tug):
+    frame = pd.DataFrame(columns())
+    kinds = {"v": "double[pyarrow]", "rpm": "Float64", "mode": "category"}
+    equal(gb.log_from_pandas(frame, tug), gb.log_from_pandas(frame.astype(kinds), tug))
+    parts = pd.concat([frame.astype(kinds)[:80], frame.astype(kinds)[80:]])
+    equal(gb.log_from_pandas(frame, tug), gb.log_from_pandas(parts, tug))
+    words = frame.assign(note=[{"a": 1}] * len(frame))
+    equal(gb.log_from_pandas(frame, tug), gb.log_from_pandas(words, tug))
+
+
 @pytest.mark.parametrize("zone", [None, "Europe/Berlin"])
 def test_time_of_day_as_index(tug, zone):
     plain = replace(tug, columns={k: v for k, v in tug.columns.items() if v.name != "t"})

@@ -81,6 +81,8 @@ def open_frame(frame: pd.DataFrame, name: str, any_unit: Collection[str] = ()) -
     for column, values in series.items():
         try:
             array = pa.array(values, from_pandas=True)
+            if isinstance(array, pa.ChunkedArray):
+                array = array.combine_chunks()
         except (pa.ArrowInvalid, pa.ArrowTypeError, pa.ArrowNotImplementedError):
             array = None
         kind = None if array is None else column_kind(array.type)
