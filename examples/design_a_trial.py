@@ -16,7 +16,8 @@ prior = gb.ManoeuvringModel(structure, theta, np.diag((0.1 * theta) ** 2), 1.0, 
 
 # a sea room 400 m square, around the start; the current is captured, not measured
 room = np.array([[-200.0, -200.0], [200.0, -200.0], [200.0, 200.0], [-200.0, 200.0]])
-wishes = Wishes(600.0, regime="u+v+", margin_u=0.5, margin_v=0.4, limits=TrialLimits(area=room))
+limits = TrialLimits(area=room)
+wishes = Wishes(300.0, regime="u+v+", margin_u=0.5, margin_v=0.4, limits=limits, effort=0.1)
 prepared = prepare_request(prior, wishes)
 design = design_trial(prepared.request)
 print(design.summary())

@@ -30,6 +30,7 @@ from experiment_design.moments import Moments
 from experiment_design.problem import TrialProblem
 from experiment_design.search import ascend, draw_two_level, perturb
 from experiment_design.surge_bound import bound_surge, why_not_surge
+from greybox.notebook import Shown, text
 
 Array = NDArray[np.float64]
 
@@ -75,8 +76,8 @@ _SURGE_CHECKED = (
 )
 
 
-@dataclass(frozen=True)
-class Certificate:
+@dataclass(frozen=True, repr=False)
+class Certificate(Shown):
     """At least which fraction of the best possible a design reaches.
 
     Parameters
@@ -131,6 +132,12 @@ class Certificate:
         """Return the sentence with how the bound was found and checked."""
         parts = [self.sentence(), self.method, self.checked]
         return "\n  ".join(p for p in parts if p)
+
+    def _line(self) -> str:
+        return self.sentence()
+
+    def _parts(self) -> tuple[str, ...]:
+        return text(self.method), text(self.checked)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields for JSON, without the wall time; not finite numbers as None."""

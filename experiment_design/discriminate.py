@@ -16,6 +16,7 @@ from experiment_design.request import DesignRequest, Rival, build_problem
 from experiment_design.result import Design
 from experiment_design.search import draw_two_level
 from greybox.errors import UsageError
+from greybox.notebook import Shown, items, number, sparkline, table
 
 Array = NDArray[np.float64]
 
@@ -29,8 +30,8 @@ _SAME = 1e-6
 _REFITS = 2
 
 
-@dataclass(frozen=True)
-class Discrimination:
+@dataclass(frozen=True, repr=False)
+class Discrimination(Shown):
     """A trial between two explanations.
 
     Parameters
@@ -90,6 +91,32 @@ class Discrimination:
                 "probability_right_refitted": self.probability_refitted,
             },
         }
+
+    def _line(self) -> str:
+        a, b = self.names
+        return (
+            f"trial of {self.design.request.duration:g} s between {a} and {b}: the likelihood "
+            f"decides rightly with probability {self.probability_refitted:.4f}"
+        )
+
+    def _parts(self) -> tuple[str, ...]:
+        commands = zip(
+            self.design.request.schedule.commands, self.design.commands[0].T, strict=True
+        )
+        return (
+            table(
+                ("if true", "log-likelihood ratio", "the other fitted anew"),
+                [
+                    (n, number(x, 3), number(y, 3))
+                    for n, x, y in zip(self.names, self.ratio, self.ratio_refitted, strict=True)
+                ],
+            ),
+            table(
+                ("command", "least", "most", "over time"),
+                [(n, number(c.min()), number(c.max()), sparkline(c)) for n, c in commands],
+            ),
+            items("Notes", self.design.notes),
+        )
 
     def summary(self) -> str:
         """Return the result as text."""

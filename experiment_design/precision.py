@@ -13,12 +13,13 @@ from experiment_design.limits import LimitName
 from experiment_design.moments import Moments
 from experiment_design.request import DesignRequest, build_problem, wanted_parameters
 from greybox.errors import ExcitationError, UsageError
+from greybox.notebook import Shown, items, number, table
 
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class PredictedPrecision:
+@dataclass(frozen=True, repr=False)
+class PredictedPrecision(Shown):
     """Predicted precision of given sequences.
 
     Parameters
@@ -51,8 +52,19 @@ class PredictedPrecision:
         """Return the predicted standard errors as text."""
         lines = [f"{n:<12}{s:>12.3g}" for n, s in zip(self.names, self.std, strict=True)]
         lines.append(f"{'−log det':<12}{self.logdet:>12.2f}")
-        lines += [f"{n.name} missed by {m:.3g} {n.unit}" for n, m in self.missed if m > 0]
-        return "\n".join(lines)
+        return "\n".join([*lines, *self._missed()])
+
+    def _missed(self) -> list[str]:
+        return [f"{n.name} missed by {m:.3g} {n.unit}" for n, m in self.missed if m > 0]
+
+    def _line(self) -> str:
+        missed = len(self._missed())
+        kept = f"{missed} limits missed" if missed else "all limits kept"
+        return f"predicted precision of {len(self.names)} parameters, {kept}"
+
+    def _parts(self) -> tuple[str, ...]:
+        rows = [(n, number(s, 3)) for n, s in zip(self.names, self.std, strict=True)]
+        return table(("parameter", "predicted std err"), rows), items("Limits", self._missed())
 
 
 def predict_precision(

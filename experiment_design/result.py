@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,10 @@ from experiment_design.request import DesignRequest
 from experiment_design.robust import Keeping
 from experiment_design.rollout import Motion
 from experiment_design.search import REFERENCE
+from greybox.notebook import Shown, interval, items, number, sparkline, table, text
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Array = NDArray[np.float64]
 
@@ -33,8 +37,8 @@ class LimitReport:
     missed: float
 
 
-@dataclass(frozen=True)
-class Design:
+@dataclass(frozen=True, repr=False)
+class Design(Shown):
     """Sequences for the next trials and what they are worth.
 
     Parameters
@@ -209,10 +213,55 @@ class Design:
         lines += [f"Note: {n}" for n in self.notes]
         return "\n".join(lines)
 
-    def _repr_html_(self) -> str:
-        from html import escape
+    def to_pandas(self) -> pd.DataFrame:
+        """Return the plan as `write_plan` writes it.
 
-        return f"<pre>{escape(self.summary())}</pre>"
+        Returns
+        -------
+        DataFrame
+            Index ``t`` [s], or ``trial``, ``t`` where there are several trials; one column
+            a command. Each row holds until the next.
+        """
+        import pandas as pd
+
+        r = self.request
+        frames = []
+        for trial, commands in enumerate(self.commands):
+            t = np.arange(len(commands)) * r.sample_time
+            frame = pd.DataFrame(commands, columns=list(r.schedule.commands))
+            frames.append(frame.assign(trial=trial + 1, t=t))
+        index = ["trial", "t"] if r.trials > 1 else ["t"]
+        plan = pd.concat(frames).set_index(index)[list(r.schedule.commands)]
+        plan.attrs = {"sample_time": r.sample_time, "vessel": r.vessel.name}
+        return plan
+
+    def _line(self) -> str:
+        return (
+            f"plan for {self.request.vessel.name}: {self.request.trials} of "
+            f"{self.request.duration:g} s; {self.status}"
+        )
+
+    def _parts(self) -> tuple[str, ...]:
+        names = self.request.schedule.commands
+        missed = [f"{x.name}: missed by {x.missed:.3g} {x.unit}" for x in self.limits if x.missed]
+        told = zip(self.names, self.values, self.std, strict=True)
+        return (
+            text(f"{self.certificate.sentence()[0].upper()}{self.certificate.sentence()[1:]}."),
+            items("Limits not kept", missed),
+            table(
+                ("trial", "command", "least", "most", "over time"),
+                [
+                    (k + 1, n, number(c.min()), number(c.max()), sparkline(c))
+                    for k, plan in enumerate(self.commands)
+                    for n, c in zip(names, plan.T, strict=True)
+                ],
+            ),
+            table(
+                ("parameter", "prior", "predicted std err", "95 % of the estimate"),
+                [(n, number(v), number(s, 2), interval(v, s)) for n, v, s in told],
+            ),
+            items("Notes", self.notes),
+        )
 
 
 def logdet_information(covariance: Array) -> float:

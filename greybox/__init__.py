@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from greybox.trial.checks.finding import CheckReport, Finding
     from greybox.trial.conditioning import decimate
     from greybox.trial.contents import describe_recording
+    from greybox.trial.dataframe import log_from_pandas, log_from_xarray, recording_from_pandas
     from greybox.trial.importing import import_recording
     from greybox.trial.log import TrialLog, make_log
     from greybox.trial.manoeuvres import find_manoeuvres
@@ -93,9 +94,12 @@ _WHERE = {
     "import_recording": "greybox.trial.importing",
     "load_model": "greybox.model.model",
     "load_vessel": "greybox.vessel.toml",
+    "log_from_pandas": "greybox.trial.dataframe",
+    "log_from_xarray": "greybox.trial.dataframe",
     "make_log": "greybox.trial.log",
     "read_log": "greybox.trial.reading",
     "read_recording": "greybox.trial.canonical",
+    "recording_from_pandas": "greybox.trial.dataframe",
     "read_segments": "greybox.trial.reading",
     "output_predictor": "greybox.estimation.output_setup",
     "repair": "greybox.trial.repair",
@@ -147,11 +151,14 @@ __all__ = [
     "known_causes",
     "load_model",
     "load_vessel",
+    "log_from_pandas",
+    "log_from_xarray",
     "make_log",
     "output_predictor",
     "read_log",
     "read_recording",
     "read_segments",
+    "recording_from_pandas",
     "repair",
     "run_model",
     "simulate",

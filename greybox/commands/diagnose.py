@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from greybox.commands.common import add_logs, add_seed, positive, provenance, read_logs, say

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from greybox.estimation.result import TestResult
 from greybox.model.model import ManoeuvringModel
+from greybox.notebook import Shown, interval, items, number, table, text
 from greybox.trial.log import TrialLog
 
 Array = NDArray[np.float64]
@@ -149,8 +150,8 @@ class Runs:
     after: Mapping[str, Array]
 
 
-@dataclass(frozen=True)
-class Diagnosis:
+@dataclass(frozen=True, repr=False)
+class Diagnosis(Shown):
     """What the simulation gets wrong, why, and what it gains to mend it.
 
     Parameters
@@ -280,7 +281,25 @@ class Diagnosis:
         lines += [f"note: {n}" for n in self.notes]
         return "\n".join(lines)
 
-    def _repr_html_(self) -> str:
-        from html import escape
+    def _line(self) -> str:
+        return f"{self.verdict}: {self.headline}"
 
-        return f"<pre>{escape(self.summary())}</pre>"
+    def _parts(self) -> tuple[str, ...]:
+        listed = [
+            (c.id, name, number(q.value), interval(q.value, q.std), q.unit, number(c.p_adjusted, 2))
+            for c in (*self.causes, *self.partial, *self.candidates)
+            for name, q in c.parameters.items()
+        ]
+        gained = [
+            (s, number(g.before, 3), number(g.after, 3), f"{g.ci[0]:.1f} to {g.ci[1]:.1f}")
+            for s, g in self.gain.items()
+        ]
+        head = ("cause", "parameter", "value", "95 %", "unit", "adjusted p")
+        fits = ("free run", "fit before [%]", "after", "gain, 95 %")
+        return (
+            table(head, listed),
+            table(fits, gained, f"Fit (6.12), {self.validated_on}"),
+            items("What the simulation gets wrong", [s.sentence for s in self.wrong]),
+            text(self.remaining),
+            items("Next", self.next_steps),
+        )

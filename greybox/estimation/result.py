@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.estimation.summary import summarise
+from greybox.estimation.summary import estimated, summarise
 from greybox.model.model import ManoeuvringModel
 from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import Predictor
+from greybox.notebook import Shown, items, parameters, text
 from greybox.vessel.vessel import Vessel
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Array = NDArray[np.float64]
 
@@ -72,8 +76,8 @@ def not_applicable(name: str, null: str, reason: str) -> TestResult:
     return TestResult(name, null, None, None, f"not applicable: {reason}.")
 
 
-@dataclass(frozen=True)
-class Verdict:
+@dataclass(frozen=True, repr=False)
+class Verdict(Shown):
     """Whether to trust an estimate.
 
     Parameters
@@ -89,6 +93,13 @@ class Verdict:
     text: str
     excepted: tuple[str, ...] = ()
     reasons: tuple[str, ...] = ()
+
+    def summary(self) -> str:
+        """Return the verdict and its reasons as text."""
+        return "\n".join([self.text, *(f"  {r}" for r in self.reasons)])
+
+    def _parts(self) -> tuple[str, ...]:
+        return (items("Because", self.reasons),)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields for JSON."""
@@ -143,8 +154,8 @@ class Limit:
         }
 
 
-@dataclass(frozen=True)
-class Estimate:
+@dataclass(frozen=True, repr=False)
+class Estimate(Shown):
     """Parameters of a predictor, estimated from logs.
 
     Parameters
@@ -307,7 +318,42 @@ class Estimate:
         """Return the result as text: verdict, table, tests."""
         return summarise(self)
 
-    def _repr_html_(self) -> str:
-        from html import escape
+    def to_pandas(self) -> pd.DataFrame:
+        """Return the parameters as a table.
 
-        return f"<pre>{escape(self.summary())}</pre>"
+        Returns
+        -------
+        DataFrame
+            Index ``parameter`` (labels, sums spelled out, then the current's components);
+            columns ``theta`` and ``std``, ``ci_low`` and ``ci_high`` of the 95 % interval,
+            ``unit`` and ``per_second``. Verdict, method and sample time in ``attrs``.
+        """
+        import pandas as pd
+
+        rows = [*estimated(self), *((n, v, s, "m/s") for n, v, s in self.current)]
+        frame = pd.DataFrame(rows, columns=["parameter", "theta", "std", "unit"])
+        frame = frame.set_index("parameter")
+        frame.insert(2, "ci_low", frame["theta"] - 1.96 * frame["std"])
+        frame.insert(3, "ci_high", frame["theta"] + 1.96 * frame["std"])
+        per_second = frame["theta"] / self.sample_time
+        # a current is no rate
+        per_second.iloc[len(self.names) :] = np.nan
+        frame["per_second"] = per_second
+        frame.attrs = {
+            "verdict": self.verdict.text,
+            "method": self.method,
+            "sample_time": self.sample_time,
+        }
+        return frame
+
+    def _line(self) -> str:
+        return f"estimate of {self.vessel.name} ({self.method}): {self.verdict.text}"
+
+    def _parts(self) -> tuple[str, ...]:
+        current = [(n, v, s, "m/s") for n, v, s in self.current]
+        fit = ", ".join(f"{k} {v:.1f} %" for k, v in self.fit.items())
+        return (
+            parameters([*estimated(self), *current]),
+            text(f"Free-run fit on the estimation logs: {fit}" if fit else ""),
+            items("Tests that failed", [t.sentence for t in self.tests if t.passed is False]),
+        )

@@ -49,6 +49,21 @@ def summarise(estimate: Estimate) -> str:
     return "\n".join(lines)
 
 
+def estimated(estimate: Estimate) -> list[tuple[str, float, float, str]]:
+    """Return label, value, standard error and unit of each parameter, biases left out."""
+    unit, structure = estimate.vessel.force_unit, estimate.predictor.structure
+    columns = estimate.predictor.columns
+    return [
+        (
+            columns[i].label,
+            float(estimate.theta[i]),
+            float(estimate.std[i]),
+            parameter_unit(structure.terms[structure.index(columns[i].terms[0])], unit),
+        )
+        for i in estimate.predictor.parameter_columns
+    ]
+
+
 def _wrapped(text: str, indent: str) -> list[str]:
     return textwrap.wrap(
         text, WIDTH, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False

@@ -10,6 +10,7 @@ from math import isfinite
 from pathlib import Path
 from typing import Any, Literal
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,6 +22,7 @@ from greybox.model.structure import Structure
 from greybox.model.terms import Factor, Term
 from greybox.model.units import parameter_unit
 from greybox.model.versions import VERSION, upgraded
+from greybox.notebook import Shown, items, parameters, text
 from greybox.vessel.toml import vessel_from_dict, vessel_to_dict
 from greybox.vessel.vessel import Vessel
 
@@ -31,8 +33,8 @@ FORMAT = "greybox-model"
 _MAX_BYTES = 50_000_000
 
 
-@dataclass(frozen=True)
-class ManoeuvringModel:
+@dataclass(frozen=True, repr=False)
+class ManoeuvringModel(Shown):
     """A model that can be simulated, compared, saved and designed with.
 
     Parameters
@@ -130,6 +132,32 @@ class ManoeuvringModel:
         """Return a parameter's name with the terms it sums, such as ``Xuu+Wuu``."""
         return "+".join(self.sums.get(name, (name,)))
 
+    @property
+    def step_states(self) -> tuple[str, ...]:
+        """Names of ``x`` of `step_function`."""
+        from greybox.model.stepping import state_names
+
+        return state_names(self)
+
+    def step_function(self) -> ca.Function:
+        """Return one sample of the whole ship, ``(x, command[, wind]) -> x_next``.
+
+        For controllers, observers and simulators: see `greybox.model.stepping.whole_step`.
+        The commands are ``vessel.commands``, their limits ``vessel.limits``.
+        """
+        from greybox.model.stepping import whole_step
+
+        return whole_step(self)
+
+    def rhs_function(self) -> ca.Function:
+        """Return the time derivatives ``(x, command[, wind]) -> x_dot``.
+
+        Its Euler step is `step_function`: see `greybox.model.stepping.whole_rate`.
+        """
+        from greybox.model.stepping import whole_rate
+
+        return whole_rate(self)
+
     def summary(self) -> str:
         """Return the equations and the parameters, per sample and per second."""
         lines = [
@@ -151,10 +179,19 @@ class ManoeuvringModel:
         lines += [f"{c.sentence}, of the log's clock" for c in self.changes]
         return "\n".join(lines)
 
-    def _repr_html_(self) -> str:
-        from html import escape
-
-        return f"<pre>{escape(self.summary())}</pre>"
+    def _parts(self) -> tuple[str, ...]:
+        judged = self.record.get("verdict")
+        said = judged.get("text", "") if isinstance(judged, dict) else ""
+        rows = [
+            (self.label(n), float(v), float(s), unit)
+            for n, v, s, unit in zip(self.names, self.theta, self.std, self.units, strict=True)
+        ]
+        known = [(n, value, std, "m/s") for n, (value, std) in self.disturbances.items()]
+        return (
+            text(f"Verdict of the estimate: {said}" if said else ""),
+            parameters([*rows, *known]),
+            items("Changes", [c.sentence for c in self.changes]),
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return the model as the tables of its JSON file."""

@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import UsageError
+from greybox.notebook import Shown, number, table, text
 
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class NoiseLevels:
+@dataclass(frozen=True, repr=False)
+class NoiseLevels(Shown):
     """Standard deviations that a precision or a band rests on.
 
     Parameters
@@ -52,6 +53,25 @@ class NoiseLevels:
                 f"the noise of {worst} is 0, so any trial would give its equation without error: "
                 f"state {worst}_std under [sensors] in the vessel file."
             )
+
+    def summary(self) -> str:
+        """Return the levels as text."""
+        lines = [self._line()]
+        lines += [f"  {n:<10}{m:>10} measured{p:>10} per sample" for n, m, p in self._rows()]
+        return "\n".join(lines)
+
+    def _line(self) -> str:
+        return f"noise of {', '.join(self.states)}{': ' if self.source else ''}{self.source}"
+
+    def _parts(self) -> tuple[str, ...]:
+        return (
+            table(("state", "measurement", "process, per sample"), self._rows()),
+            text(f"heading {number(self.heading)} rad, wind {number(self.wind)} m/s"),
+        )
+
+    def _rows(self) -> list[tuple[str, str, str]]:
+        each = zip(self.states, self.measurement, self.process, strict=True)
+        return [(s, number(m), number(p)) for s, m, p in each]
 
     def to_dict(self) -> dict[str, Any]:
         """Return the levels for JSON [m/s, rad/s, rad]."""

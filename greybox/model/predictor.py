@@ -24,6 +24,7 @@ from greybox.errors import StructureError, suggestion
 from greybox.model.disturbances import CURRENT
 from greybox.model.spelling import atoms, spelled_expression, spellings
 from greybox.model.structure import Structure
+from greybox.notebook import Shown, table
 from greybox.vectorised import Vectorised
 
 Array = NDArray[np.float64]
@@ -75,8 +76,8 @@ class BiasShare:
     shares: tuple[float, ...]
 
 
-@dataclass(frozen=True)
-class Predictor:
+@dataclass(frozen=True, repr=False)
+class Predictor(Shown):
     """The regressors of every equation, in order, and the rule that gave them.
 
     Parameters
@@ -109,6 +110,26 @@ class Predictor:
     def augmented(self) -> bool:
         """Whether bias-capturing regressors are included."""
         return any(c.is_bias for c in self.columns)
+
+    def summary(self) -> str:
+        """Return the regressors of each equation as text."""
+        return "\n".join([self._line(), *(f"{s}⁺: {', '.join(n)}" for s, n in self._spelt())])
+
+    def _line(self) -> str:
+        signs = ", ".join(f"{s} {_SIGNS.get(v, v)}" for s, v in self.regime)
+        where = f", {signs}" if signs else ""
+        return (
+            f"predictor '{self.kind}' of structure '{self.structure.name}': {len(self.columns)} "
+            f"regressors, {len(self.parameter_columns)} of them of parameters{where}"
+        )
+
+    def _parts(self) -> tuple[str, ...]:
+        return (table(("equation", "regressors"), [(s, ", ".join(n)) for s, n in self._spelt()]),)
+
+    def _spelt(self) -> list[tuple[str, list[str]]]:
+        return [
+            (s, [self.columns[i].label for i in self.equation(s)]) for s in self.structure.states
+        ]
 
     def equation(self, state: str) -> list[int]:
         """Return the positions of the columns of one equation."""

@@ -17,6 +17,7 @@ from greybox.model.functions import (
     RunVariant,
 )
 from greybox.model.structure import Structure
+from greybox.notebook import Shown, number, sparkline, table
 
 Array = NDArray[np.float64]
 
@@ -26,8 +27,8 @@ _BATCH_RUNS = 256
 _STEP_RUNS = 16
 
 
-@dataclass(frozen=True)
-class FreeRun:
+@dataclass(frozen=True, repr=False)
+class FreeRun(Shown):
     """What a free run gave.
 
     Parameters
@@ -46,6 +47,28 @@ class FreeRun:
     psi: Array
     diverged: NDArray[np.int64]
     bound: Array
+
+    def summary(self) -> str:
+        """Return the size of the runs, and the range of each state, as text."""
+        rows = [f"  state {k}: {low} to {high}" for k, low, high, _ in self._rows()]
+        return "\n".join([self._line(), *rows])
+
+    def _line(self) -> str:
+        runs, samples = self.x.shape[:2]
+        gone = int((self.diverged >= 0).sum())
+        return (
+            f"{runs} free run{'s'[: runs != 1]} of {samples - 1} steps, "
+            f"{f'{gone} diverged' if gone else 'none diverged'}"
+        )
+
+    def _parts(self) -> tuple[str, ...]:
+        return (table(("state", "least", "most", "first run"), self._rows()),)
+
+    def _rows(self) -> list[tuple[int, str, str, str]]:
+        return [
+            (k, number(float(x.min())), number(float(x.max())), sparkline(x[0]))
+            for k, x in enumerate(np.moveaxis(self.x, 2, 0))
+        ]
 
     def require_bounded(self, states: tuple[str, ...], what: str) -> None:
         """Raise if some run diverged.

@@ -15,6 +15,7 @@ import casadi as ca
 from greybox.errors import StructureError, suggestion
 from greybox.model.disturbances import DisturbanceKind, disturbance_names, disturbed_signals
 from greybox.model.terms import SIGNALS, Term, parse_term
+from greybox.notebook import Shown, items, text
 
 
 @dataclass(frozen=True)
@@ -44,8 +45,8 @@ def _symbols(*names: tuple[str, ...]) -> Symbols:
     return Symbols(states, ca.SX.sym("psi"), inputs, disturbances, air, parameters)
 
 
-@dataclass(frozen=True)
-class Structure:
+@dataclass(frozen=True, repr=False)
+class Structure(Shown):
     """A set of terms over named states, inputs and disturbances.
 
     Parameters
@@ -174,6 +175,20 @@ class Structure:
     def uses_air(self) -> bool:
         """Whether some term sees the velocity through the air."""
         return any(f.signal in ("uq", "vq") for t in self.terms for f in t.factors)
+
+    def summary(self) -> str:
+        """Return name, equations and source as text."""
+        source = [self.reference] if self.reference else []
+        return "\n".join([self._line(), *self.equations(), *source])
+
+    def _line(self) -> str:
+        return (
+            f"structure '{self.name}': {len(self.terms)} terms in the equations of "
+            f"{', '.join(self.states)}"
+        )
+
+    def _parts(self) -> tuple[str, ...]:
+        return items("Increment of a sample", self.equations()), text(self.reference)
 
     def equations(self) -> list[str]:
         """Return the equations as readable lines, such as ``u⁺ = u + Xu·u_r + …``."""

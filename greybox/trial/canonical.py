@@ -67,7 +67,9 @@ def read_recording(
         if record is not None:
             # what greybox wrote is canonical: a mapping would convert it twice
             vessel, guess = replace(vessel, columns={}), False
+        source = SourceFile(raw.path.name, sha256(raw.path), raw.format)
         raw, assigned = table_recording(raw, vessel, guess=guess)
+        raw = replace(raw, files=(source,))
         if record is not None:
             known = recorded_provenance(record)
             epoch = known.epoch if raw.epoch is None else raw.epoch
@@ -93,9 +95,8 @@ def table_recording(
     time = assigned["t"]
     scale = time_scale(batch[time.raw], time, table)
     recording = batch_recording(table, batch, assigned, scale, vessel)
-    files = (SourceFile(table.path.name, sha256(table.path), table.format),)
     notes = (*table.notes, *scale.notes, *recording.notes)
-    return replace(recording, files=files, notes=notes), assigned
+    return replace(recording, notes=notes), assigned
 
 
 def table_columns(table: TableFile, vessel: Vessel, *, guess: bool = True) -> dict[str, Assigned]:

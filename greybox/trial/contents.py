@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from greybox.errors import GreyboxError
+from greybox.notebook import Shown
 from greybox.trial.importing import import_recording
 from greybox.trial.log import TrialLog
 from greybox.trial.manoeuvres import Criterion, Manoeuvre, Quantity, Verdict, find_manoeuvres
@@ -20,8 +21,8 @@ _SHORTEST = 5.0
 _MARGIN = 0.1
 
 
-@dataclass(frozen=True)
-class Contents:
+@dataclass(frozen=True, repr=False)
+class Contents(Shown):
     """What the segments of one trial hold.
 
     Parameters
@@ -51,6 +52,10 @@ class Contents:
             )
             parts.append(f"sign regimes kept for {_SHORTEST:g} s or more: {said}")
         return "\n".join(parts)
+
+    def _line(self) -> str:
+        count = len(self.manoeuvres)
+        return self.note or f"{count} manoeuvre{'s'[: count != 1]} in {self.seconds:g} s"
 
     def to_dict(self) -> dict[str, Any]:
         """Return the contents as plain values, angles in radians."""

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.notebook import Shown, items, table
 from greybox.trial.completing import complete_channels
 from greybox.trial.log import Provenance, TrialLog
 from greybox.trial.options import ImportOptions
@@ -36,8 +37,8 @@ from greybox.vessel.vessel import Vessel
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Imported:
+@dataclass(frozen=True, repr=False)
+class Imported(Shown):
     """The segments of one trial, in order of time.
 
     Parameters
@@ -50,6 +51,26 @@ class Imported:
 
     segments: tuple[TrialLog, ...]
     notes: tuple[str, ...]
+
+    def summary(self) -> str:
+        """Return the segments and notes as text."""
+        rows = [f"  {n}: {t} s, {count} samples" for n, t, count in self._rows()]
+        return "\n".join([self._line(), *rows, *(f"  note: {n}" for n in self.notes)])
+
+    def _line(self) -> str:
+        first = self.segments[0]
+        samples = sum(map(len, self.segments))
+        return (
+            f"{len(self.segments)} segment{'s'[: len(self.segments) != 1]} of {first.vessel.name}: "
+            f"{samples} samples every {first.sample_time:g} s"
+        )
+
+    def _rows(self) -> list[tuple[str, str, int]]:
+        return [(s.name, f"{s.t[0]:.6g} to {s.t[-1]:.6g}", len(s)) for s in self.segments]
+
+    def _parts(self) -> tuple[str, ...]:
+        head = ("segment", "time [s]", "samples")
+        return table(head, self._rows()), items("Notes", self.notes)
 
 
 def import_recording(

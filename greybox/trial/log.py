@@ -4,13 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.channels import CHANNELS
 from greybox.errors import LogError
+from greybox.notebook import Shown, items, number, sparkline, table
 from greybox.vessel.actuation import actuated_force
 from greybox.vessel.vessel import Vessel
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import xarray as xr
 
 Array = NDArray[np.float64]
 
@@ -44,8 +51,8 @@ class Provenance:
     notes: Mapping[str, str] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class TrialLog:
+@dataclass(frozen=True, repr=False)
+class TrialLog(Shown):
     """Signals of one trial on a uniform clock.
 
     Parameters
@@ -88,6 +95,48 @@ class TrialLog:
     def __contains__(self, name: object) -> bool:
         return name in self.channels
 
+    @property
+    def units(self) -> dict[str, str]:
+        """Unit of ``t`` and of each channel; ``as logged`` where any unit is kept."""
+        angles = self.vessel.angle_commands
+        return {
+            n: CHANNELS[n].unit if n in CHANNELS else ("rad" if n in angles else "as logged")
+            for n in ("t", *self.channels)
+        }
+
+    def summary(self) -> str:
+        """Return name, duration, channels with units and ranges, and provenance, as text."""
+        lines = [self._line()]
+        lines += [
+            f"  {n:<10}{unit:<10}{low:>12}{mean:>12}{high:>12}"
+            for n, unit, low, mean, high, _ in self._rows()
+        ]
+        return "\n".join([*lines, *(f"  {x}" for x in self._history())])
+
+    def _line(self) -> str:
+        span = f", t {self.t[0]:g} to {self.t[-1]:g} s" if len(self) else ""
+        return (
+            f"log '{self.name}' of {self.vessel.name}: {len(self)} samples every "
+            f"{self.sample_time:g} s{span}, {len(self.channels)} channels"
+        )
+
+    def _rows(self) -> list[tuple[str, ...]]:
+        units = self.units
+        return [
+            (n, units[n], *(number(x) for x in _range(a)), sparkline(a))
+            for n, a in self.channels.items()
+        ]
+
+    def _history(self) -> list[str]:
+        p = self.provenance
+        loop = float(np.mean(self.closed_loop)) if self.loop_known and len(self) else 0.0
+        closed = [f"a controller moves the thrusters in {100 * loop:.0f} % of it"] if loop else []
+        return [*closed, *(f"derived: {d}" for d in p.derived), *(f"mended: {f}" for f in p.fixed)]
+
+    def _parts(self) -> tuple[str, ...]:
+        head = ("channel", "unit", "least", "mean", "most", "over time")
+        return table(head, self._rows()), items("History", self._history())
+
     def states(self, names: tuple[str, ...]) -> Array:
         """Return the named states as (N, nx)."""
         return np.column_stack([self[n] for n in names])
@@ -111,6 +160,18 @@ class TrialLog:
         """Velocity through the air (N, 2) [m/s], None where it was not measured."""
         return np.column_stack([self["u_q"], self["v_q"]]) if self.has_wind else None
 
+    def to_pandas(self) -> pd.DataFrame:
+        """Return the log as a DataFrame: see `greybox.trial.dataframe.log_to_pandas`."""
+        from greybox.trial.dataframe import log_to_pandas
+
+        return log_to_pandas(self)
+
+    def to_xarray(self) -> xr.Dataset:
+        """Return the log as a Dataset: see `greybox.trial.dataframe.log_to_xarray`."""
+        from greybox.trial.dataframe import log_to_xarray
+
+        return log_to_xarray(self)
+
     def window(self, start: int, stop: int, name: str | None = None) -> TrialLog:
         """Return samples ``start:stop`` as a log of their own."""
         return replace(
@@ -133,8 +194,9 @@ def make_log(
     Parameters
     ----------
     vessel : Vessel
-    channels : mapping of str to ndarray
-        (N,) each, by canonical name; ``t`` is made when absent.
+    channels : mapping of str to ndarray, or DataFrame
+        (N,) each, by canonical name; ``t`` is made when absent. Of a DataFrame its index
+        is ``t`` where it is called so; what is to be converted goes to `log_from_pandas`.
     sample_time : float
         [s]
 
@@ -144,6 +206,9 @@ def make_log(
         Lengths differ, or a value is not finite.
     """
     arrays = {k: np.asarray(v, float) for k, v in channels.items()}
+    index = getattr(channels, "index", None)
+    if getattr(index, "name", None) == "t":
+        arrays.setdefault("t", np.asarray(index, float))
     lengths = {k: len(v) for k, v in arrays.items()}
     if len(set(lengths.values())) > 1:
         (a, na), (b, nb) = min(lengths.items(), key=_second), max(lengths.items(), key=_second)
@@ -155,6 +220,11 @@ def make_log(
     size = next(iter(lengths.values()))
     t = arrays.pop("t", np.arange(size) * sample_time)
     return TrialLog(name, sample_time, t, arrays, vessel, np.zeros(size, bool))
+
+
+def _range(a: Array) -> tuple[float | None, float | None, float | None]:
+    """Return least, mean and largest value, None where there are no samples."""
+    return (float(a.min()), float(a.mean()), float(a.max())) if len(a) else (None, None, None)
 
 
 def _second(item: tuple[str, int]) -> int:

@@ -112,6 +112,29 @@ def read_segments(
     if record is not None:
         # what greybox wrote is canonical already: the raw names were mapped before
         vessel = replace(vessel, columns={})
+    known = Provenance(path.name) if record is None else recorded_provenance(record)
+    segments = table_segments(table, vessel, known, states=states, fill=fill)
+    known = segments[0].provenance
+    known = replace(known, sha256=known.sha256 or sha256(path))
+    return [replace(s, provenance=known) for s in segments]
+
+
+def table_segments(
+    table: TableFile,
+    vessel: Vessel,
+    known: Provenance,
+    *,
+    states: tuple[str, ...] = (),
+    fill: Mapping[str, float] | None = None,
+) -> list[TrialLog]:
+    """Return the segments between the gaps of a table, as `read_segments` does of a file's.
+
+    Parameters
+    ----------
+    known : Provenance
+        Of the table; what is derived here is added to it.
+    """
+    path = table.path
     channels, text = _canonical(table, vessel, path, plan=bool(fill))
     t = channels.pop("t")
     if len(t) < _MIN_SAMPLES:
@@ -119,10 +142,9 @@ def read_segments(
             f"'{path.name}' has {len(t)} samples, at least {_MIN_SAMPLES} are needed: "
             f"use a longer log."
         )
-    stretches, sample_time = _stretches(t, path.name)
+    stretches, sample_time = _stretches(t, table)
     for name in {"psi", "gamma_q", *vessel.angle_commands} & channels.keys():
         channels[name] = np.unwrap(channels[name])
-    known = Provenance(path.name) if record is None else recorded_provenance(record)
     segments: list[TrialLog] = []
     for k, (start, stop) in enumerate(stretches):
         part = {n: v[start:stop] for n, v in channels.items()}
@@ -141,7 +163,7 @@ def read_segments(
         "read %s: %d rows every %g s in %d segment(s); columns %s%s", path, len(t), sample_time,
         len(segments), ", ".join(map(str, table.columns)), "".join(f"; {d}" for d in derived),
     )  # fmt: skip
-    known = replace(known, derived=derived, sha256=known.sha256 or sha256(path))
+    known = replace(known, derived=derived)
     return [replace(s, provenance=known) for s in segments]
 
 
@@ -223,7 +245,7 @@ def _canonical(
         if name in vessel.angle_commands:
             target = "rad"
         factor = a.sign * (unit_factor(a.unit, target, a.raw) if a.unit is not None else 1.0)
-        value = _finite(_floats(batch, a), a.raw, path.name)
+        value = _finite(_floats(batch, a), a.raw, table)
         if a.raw in table.dates and name == "t":
             value = value - value[0]
         channels[name] = value if factor == 1.0 else value * factor
@@ -244,26 +266,33 @@ def _floats(batch: Batch, a: Assigned) -> Array:
     return np.asarray(values, float)
 
 
-def _finite(values: Array, name: str, source: str) -> Array:
+def _finite(values: Array, name: str, table: TableFile) -> Array:
     bad = np.flatnonzero(~np.isfinite(values))
     if len(bad):
         raise LogError(
-            f"column '{name}' of '{source}' holds no finite number in row {int(bad[0]) + 2} and "
-            f"in {len(bad)} of {len(values)} rows: greybox import reads such logs and keeps the "
-            f"holes as gaps."
+            f"column '{name}' of '{table.path.name}' holds no finite number in row "
+            f"{int(bad[0]) + table.first_row} and in {len(bad)} of {len(values)} rows: "
+            f"{_importer(table)} reads such logs and keeps the holes as gaps."
         )
     return values
 
 
-def _stretches(t: Array, name: str) -> tuple[list[tuple[int, int]], float]:
+def _importer(table: TableFile) -> str:
+    """Return what mends a table that is no clean log."""
+    return "recording_from_pandas" if table.format == "DataFrame" else "greybox import"
+
+
+def _stretches(t: Array, table: TableFile) -> tuple[list[tuple[int, int]], float]:
     """Return the stretches between gaps, and the sample time."""
+    name, importer = table.path.name, _importer(table)
     steps = np.diff(t)
     wrong = np.flatnonzero(steps <= 0)
     if len(wrong):
         k = int(wrong[0])
         raise LogError(
-            f"time in '{name}' goes from {t[k]:.6g} to {t[k + 1]:.6g} s in row {k + 3}, "
-            f"it must increase: greybox import sorts the rows and drops repeated ones."
+            f"time in '{name}' goes from {t[k]:.6g} to {t[k + 1]:.6g} s in row "
+            f"{k + 1 + table.first_row}, it must increase: {importer} sorts the rows and drops "
+            f"repeated ones."
         )
     usual = float(np.median(steps))
     multiple = np.round(steps / usual)
@@ -274,7 +303,7 @@ def _stretches(t: Array, name: str) -> tuple[list[tuple[int, int]], float]:
         raise LogError(
             f"'{name}' has two sample times: {usual:.6g} s, but {steps[k]:.6g} s after "
             f"t = {t[k]:.6g} s ({int((off | gaps).sum())} of {len(steps)} steps differ). "
-            f"Resample it to one with greybox import."
+            f"Resample it to one with {importer}."
         )
     edges = [0, *(np.flatnonzero(gaps) + 1).tolist(), len(t)]
     found = [(a, b) for a, b in pairwise(edges) if b - a >= _MIN_SAMPLES]
@@ -291,7 +320,7 @@ def _stretches(t: Array, name: str) -> tuple[list[tuple[int, int]], float]:
             one, two = (t[k] - t[a]) / (k - a), (t[b - 1] - t[k]) / (b - 1 - k)
             raise LogError(
                 f"'{name}' has two sample times: {one:.6g} s on average in its first half and "
-                f"{two:.6g} s in its second. Resample it to one with greybox import."
+                f"{two:.6g} s in its second. Resample it to one with {importer}."
             )
         means.append((b - a, mean))
     return found, round(max(means)[1], 9)

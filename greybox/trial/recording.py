@@ -14,10 +14,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.notebook import Shown, items, number, sparkline, table
+
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Signal:
     """One measured quantity on its own clock.
 
@@ -47,6 +49,9 @@ class Signal:
     def __len__(self) -> int:
         return len(self.t)
 
+    def __repr__(self) -> str:
+        return f"<Signal: {self.name} [{self.unit or 'no unit'}], {len(self)} values>"
+
     def with_value(self, value: Array) -> Signal:
         """Return the signal with other values on the same clock."""
         return replace(self, value=value)
@@ -61,8 +66,8 @@ class SourceFile:
     format: str
 
 
-@dataclass(frozen=True)
-class Recording:
+@dataclass(frozen=True, repr=False)
+class Recording(Shown):
     """All that was read from the files of one trial.
 
     Parameters
@@ -105,6 +110,36 @@ class Recording:
     def names(self) -> tuple[str, ...]:
         """Names of the signals, in the order of the source."""
         return tuple(s.name for s in self.signals)
+
+    def summary(self) -> str:
+        """Return the signals with units, times and ranges, and the notes, as text."""
+        rows = [
+            f"  {n:<12}{unit:<8}{count:>9} values, {times} s, {low} to {high}"
+            for n, unit, count, times, low, high, _, _ in self._rows()
+        ]
+        return "\n".join([self._line(), *rows, *(f"  note: {n}" for n in self.notes)])
+
+    def _line(self) -> str:
+        spans = [s.t[np.isfinite(s.t)] for s in self.signals]
+        spans = [t for t in spans if len(t)]
+        long = max(t.max() for t in spans) - min(t.min() for t in spans) if spans else 0.0
+        return f"recording '{self.name}': {len(self.signals)} signals over {long:.6g} s"
+
+    def _rows(self) -> list[tuple[str, str, int, str, str, str, str, str]]:
+        rows = []
+        for s in self.signals:
+            t, value = s.t[np.isfinite(s.t)], s.value[np.isfinite(s.value)]
+            times = f"{t.min():.6g} to {t.max():.6g}" if len(t) else number(None)
+            low, high = (value.min(), value.max()) if len(value) else (None, None)
+            picture = sparkline(s.value)
+            rows.append(
+                (s.name, s.unit or "", len(s), times, number(low), number(high), picture, s.source)
+            )
+        return rows
+
+    def _parts(self) -> tuple[str, ...]:
+        head = ("signal", "unit", "values", "time [s]", "least", "most", "over time", "from")
+        return table(head, self._rows()), items("Notes", self.notes)
 
     def with_signals(self, signals: Iterable[Signal], *notes: str) -> Recording:
         """Return the recording with other signals and more notes."""

@@ -85,7 +85,7 @@ def write_log(
         "log_sha256": sha256(path),
         "rows": int(sum(s[2] for s in spans)),
         "sample_time": first.sample_time,
-        "units": _units(first, names),
+        "units": {n: first.units[n] for n in names},
         "segments": _merged(spans, first.sample_time)[:1000],
         **asdict(first.provenance if provenance is None else provenance()),
         **(extra or {}),
@@ -185,16 +185,6 @@ def recorded_provenance(record: Mapping[str, Any]) -> Provenance:
 def _columns(log: TrialLog) -> list[str]:
     known = [n for n in LOGGED if n == "t" or n in log]
     return known + [n for n in log.channels if n not in known]
-
-
-def _units(log: TrialLog, names: Sequence[str]) -> dict[str, str]:
-    from greybox.channels import CHANNELS
-
-    angles = log.vessel.angle_commands
-    return {
-        n: CHANNELS[n].unit if n in CHANNELS else ("rad" if n in angles else "as logged")
-        for n in names
-    }
 
 
 def _merged(spans: list[list[float]], sample_time: float) -> list[list[float]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +12,14 @@ from numpy.typing import NDArray
 from greybox.errors import UsageError
 from greybox.model.changes import Change, simulate_changing
 from greybox.model.model import ManoeuvringModel
+from greybox.notebook import Shown, items, number, table
 from greybox.regression.instruments import state_bound
 from greybox.trial.log import TrialLog
 from greybox.validation.bands import LEVEL, Bands, predict_bands
 from greybox.validation.fit import LogFit, run_model
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Array = NDArray[np.float64]
 
@@ -47,8 +51,8 @@ class SignTest:
         )
 
 
-@dataclass(frozen=True)
-class Comparison:
+@dataclass(frozen=True, repr=False)
+class Comparison(Shown):
     """Models (rows) on logs (columns).
 
     Parameters
@@ -163,6 +167,49 @@ class Comparison:
         if len(self.runs[0]) > 1:
             lines += [t.sentence for t in self.sign_tests]
         return "\n".join(lines)
+
+    def to_pandas(self) -> pd.DataFrame:
+        """Return fit and error of each model on each log.
+
+        Returns
+        -------
+        DataFrame
+            Index ``model``, ``log``; columns ``fit_u`` [%], ``rmse_u`` [m/s, rad/s], … a state.
+        """
+        import pandas as pd
+
+        rows = [
+            {"model": name, "log": run.log.name}
+            | {f"fit_{s}": f for s, f in run.fit.items()}
+            | {f"rmse_{s}": e for s, e in rmse.items()}
+            for name, row, errors in zip(self.names, self.runs, self.rmse, strict=True)
+            for run, rmse in zip(row, errors, strict=True)
+        ]
+        return pd.DataFrame(rows).set_index(["model", "log"])
+
+    def _line(self) -> str:
+        fits = [
+            f"{n} {', '.join(f'{s} {v:.1f}' for s, v in fit.items())}"
+            for n, fit in zip(self.names, self.fits(), strict=True)
+        ]
+        return f"mean fit [%]: {'; '.join(fits)}"
+
+    def _parts(self) -> tuple[str, ...]:
+        states = list(self.runs[0][0].fit)
+        rows = [
+            [name, run.log.name]
+            + [number(run.fit[s], 3) for s in states]
+            + [number(rmse[s], 3) for s in states]
+            + [run.picture(states[0])]
+            for name, row, errors in zip(self.names, self.runs, self.rmse, strict=True)
+            for run, rmse in zip(row, errors, strict=True)
+        ]
+        head = ["model", "log", *(f"fit {s} [%]" for s in states), *(f"rmse {s}" for s in states)]
+        several = len(self.runs[0]) > 1
+        return (
+            table([*head, f"{states[0]}: measured, simulated"], rows),
+            items("Sign tests", [t.sentence for t in self.sign_tests] if several else []),
+        )
 
     def _covered(self) -> list[str]:
         """Return a line a model on how many measurements its bands hold."""

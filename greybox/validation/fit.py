@@ -5,16 +5,21 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.channels import CHANNELS
 from greybox.errors import LogError
 from greybox.model.model import ManoeuvringModel
+from greybox.notebook import Shown, number, sparkline, table
 from greybox.regression.instruments import simulate_log
 from greybox.trial.conditioning import decimate
 from greybox.trial.log import TrialLog
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Array = NDArray[np.float64]
 
@@ -52,8 +57,8 @@ def fit_percent(measured: Array, simulated: Array) -> Array:
 _log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class LogFit:
+@dataclass(frozen=True, repr=False)
+class LogFit(Shown):
     """A free run beside its log.
 
     Parameters
@@ -75,6 +80,52 @@ class LogFit:
     psi: Array
     fit: dict[str, float]
     diverged: int
+
+    def to_pandas(self) -> pd.DataFrame:
+        """Return the run beside its log.
+
+        Returns
+        -------
+        DataFrame
+            Index ``t`` [s]; the simulated states and ``psi`` by name, as measured with
+            ``_measured`` behind it. Units and fit in ``attrs``.
+        """
+        import pandas as pd
+
+        run = dict(zip(self.fit, self.x.T, strict=True)) | {"psi": self.psi}
+        measured = {f"{n}_measured": self.log[n] for n in run if n in self.log}
+        frame = pd.DataFrame(run | measured, index=pd.Index(self.log.t, name="t"))
+        units = {n: CHANNELS[n].unit for n in run if n in CHANNELS}
+        units |= {f"{n}_measured": unit for n, unit in units.items() if f"{n}_measured" in measured}
+        frame.attrs = {"units": {"t": "s"} | units, "fit": dict(self.fit)}
+        return frame
+
+    def summary(self) -> str:
+        """Return the fit of each state as text."""
+        rows = [f"  {s}: fit {fit} %, rms error {rmse}" for s, fit, rmse, _ in self._rows()]
+        return "\n".join([self._line(), *rows])
+
+    def _line(self) -> str:
+        end = f", diverged at sample {self.diverged}" if self.diverged >= 0 else ""
+        return f"free run on '{self.log.name}', {len(self.log)} samples{end}"
+
+    def _rows(self) -> list[tuple[str, str, str, str]]:
+        rows = []
+        for (s, fit), x in zip(self.fit.items(), self.x.T, strict=True):
+            measured = self.log[s]
+            with np.errstate(all="ignore"):
+                rmse = float(np.sqrt(np.mean((measured - x) ** 2)))
+            rows.append((s, number(fit, 3), number(rmse, 3), self.picture(s)))
+        return rows
+
+    def picture(self, state: str) -> str:
+        """Return a state as measured and as simulated, as one small picture of a notebook."""
+        x = self.x[:, list(self.fit).index(state)]
+        # a run that escaped would leave nothing else to see
+        return sparkline(self.log[state], x[: self.diverged] if self.diverged >= 0 else x)
+
+    def _parts(self) -> tuple[str, ...]:
+        return (table(("state", "fit [%]", "rms error", "measured, simulated"), self._rows()),)
 
 
 def at_model_rate(log: TrialLog, model: ManoeuvringModel) -> TrialLog:

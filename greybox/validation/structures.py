@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from greybox.errors import GreyboxError, UsageError
 from greybox.estimation.result import Estimate
 from greybox.model.catalogue import structure_for
+from greybox.notebook import Shown
 from greybox.trial.log import TrialLog
 from greybox.validation.choose import estimate_model
 from greybox.validation.criteria import independent_samples, information_criteria
@@ -68,8 +69,8 @@ class StructureRow:
         return {k: list(v) if isinstance(v, tuple) else v for k, v in self.__dict__.items()}
 
 
-@dataclass(frozen=True)
-class StructureChoice:
+@dataclass(frozen=True, repr=False)
+class StructureChoice(Shown):
     """An estimate of the chosen structure, and the table that chose it."""
 
     estimate: Estimate

@@ -8,6 +8,7 @@ from math import inf, isfinite
 from typing import Any, Literal, get_args
 
 from greybox.errors import VesselError, suggestion
+from greybox.notebook import Shown, number, table
 from greybox.vessel.thrust import ThrustLaw
 
 ThrusterType = Literal["azimuth", "fixed", "tunnel", "propeller_rudder"]
@@ -159,8 +160,8 @@ class ColumnMapping:
     sign: int = 1
 
 
-@dataclass(frozen=True)
-class Vessel:
+@dataclass(frozen=True, repr=False)
+class Vessel(Shown):
     """A vessel as its TOML file describes it.
 
     Parameters
@@ -217,6 +218,45 @@ class Vessel:
         """Unit of the generalised force: N, or that of the propeller speed; else ``mixed``."""
         units = {t.thrust.unit for t in self.thrusters}
         return units.pop() if len(units) == 1 else "mixed"
+
+    def summary(self) -> str:
+        """Return thrusters, limits and sensors as text."""
+        mass = "" if self.mass is None else f", {self.mass:g} kg"
+        count = len(self.thrusters)
+        lines = [f"{self.name}: {self.length:g} m{mass}, {count} thruster{'s'[: count != 1]}"]
+        for t in self.thrusters:
+            lines.append(
+                f"  {t.type} at x {t.x:g} m, y {t.y:g} m, moved by {', '.join(t.columns)}; "
+                f"thrust {t.thrust.kind}"
+            )
+        lines += [
+            f"  {name}: {number(x.lower)} to {number(x.upper)}, rate {number(x.rate)} per second"
+            for name, x in self.limits.items()
+        ]
+        if self.actuation:
+            lines.append(f"  thrusters with {self.actuation.sentence}")
+        lines += [f"  {name} {value}" for name, value in self.sensors.items()]
+        return "\n".join(lines)
+
+    def _parts(self) -> tuple[str, ...]:
+        limits = self.limits
+        return (
+            table(
+                ("thruster", "x [m]", "y [m]", "moved by", "thrust"),
+                [
+                    (t.type, number(t.x), number(t.y), ", ".join(t.columns), t.thrust.kind)
+                    for t in self.thrusters
+                ],
+            ),
+            table(
+                ("command", "unit", "least", "most", "per second"),
+                [
+                    (n, "rad" if n in self.angle_commands else "as logged", number(x.lower),
+                     number(x.upper), number(x.rate))
+                    for n, x in limits.items()
+                ],
+            ),
+        )  # fmt: skip
 
     def std(self, channel: str) -> float | None:
         """Return the measurement noise of a channel where the file states it."""

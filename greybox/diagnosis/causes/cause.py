@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from greybox.diagnosis.atom import Atom
 from greybox.model.structure import Structure
+from greybox.notebook import Shown, table
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
@@ -67,7 +68,7 @@ class Context:
         return tuple(out)
 
 
-class Cause(ABC):
+class Cause(Shown):
     """A reason why a simulation may disagree with the sea.
 
     A subclass states the class variables and gives its atoms. It becomes known to
@@ -93,6 +94,23 @@ class Cause(ABC):
     signature: ClassVar[str]
     extension: ClassVar[str]
     reference: ClassVar[str]
+
+    def summary(self) -> str:
+        """Return what it looks like and what mends it, as text."""
+        return "\n".join([self._line(), *(f"  {name}: {said}" for name, said in self._said())])
+
+    def _line(self) -> str:
+        return f"{self.id}: {self.title}"
+
+    def _said(self) -> list[tuple[str, str]]:
+        return [
+            ("signature", self.signature),
+            ("extension", self.extension),
+            ("reference", self.reference),
+        ]
+
+    def _parts(self) -> tuple[str, ...]:
+        return (table(("what", "is"), self._said()),)
 
     @abstractmethod
     def atoms(self, context: Context) -> Sequence[Atom]:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from greybox.notebook import Shown, items, table
 from greybox.trial.recording import Recording
 
 IDS = (
@@ -33,8 +34,8 @@ class Repair:
     values: tuple[float, ...] = ()
 
 
-@dataclass(frozen=True)
-class Finding:
+@dataclass(frozen=True, repr=False)
+class Finding(Shown):
     """One defect of a log.
 
     Parameters
@@ -75,6 +76,13 @@ class Finding:
     safe: bool = False
     picture: Mapping[str, Any] = field(default_factory=dict)
 
+    def summary(self) -> str:
+        """Return channels, size, evidence and fix as text."""
+        return f"{self._line()}\n  {self.evidence}\n  fix: {self.fix}"
+
+    def _line(self) -> str:
+        return f"{self.id} ({', '.join(self.channels or (self.channel,))}): {size_in_words(self)}"
+
     def to_dict(self) -> dict[str, Any]:
         """Return the finding as CONTRACT's JSON, with `channels` and `safe` beside."""
         vector = isinstance(self.value, tuple)
@@ -108,8 +116,8 @@ class Outcome:
     sentence: str
 
 
-@dataclass(frozen=True)
-class CheckReport:
+@dataclass(frozen=True, repr=False)
+class CheckReport(Shown):
     """All findings of one log, and what became of every check.
 
     Parameters
@@ -138,12 +146,24 @@ class CheckReport:
             verdict = f"nothing found, but {untold} of {len(self.outcomes)} checks cannot tell"
         lines = [f"{self.name}: {verdict}"]
         for f in self.findings:
-            lines.append(f"  {f.id} ({', '.join(f.channels or (f.channel,))}): {size_in_words(f)}")
-            lines.append(f"    {f.evidence}")
-            lines.append(f"    fix: {f.fix}")
+            lines += [f"  {line}" for line in f.summary().splitlines()]
         lines += [f"  {o.id}: {o.sentence}" for o in self.outcomes if o.status == "cannot tell"]
         lines += [f"  note: {n}" for n in self.notes]
         return "\n".join(lines)
+
+    def _parts(self) -> tuple[str, ...]:
+        untold = [f"{o.id}: {o.sentence}" for o in self.outcomes if o.status == "cannot tell"]
+        return (
+            table(
+                ("finding", "channels", "size (95 %)", "evidence", "fix"),
+                [
+                    (f.id, ", ".join(f.channels or (f.channel,)), f"{size_in_words(f)}",
+                     f.evidence, f.fix)
+                    for f in self.findings
+                ],
+            ),
+            items("Cannot be told", untold),
+        )  # fmt: skip
 
     def to_dict(self) -> dict[str, Any]:
         """Return the report as CONTRACT's JSON, with `checks` and `notes` beside."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.notebook import Shown
 from greybox.trial.manoeuvres.approach import measure_approach
 from greybox.trial.manoeuvres.local import crossing, fit_at
 from greybox.trial.manoeuvres.quantity import Quantity
@@ -23,8 +24,8 @@ from greybox.trial.manoeuvres.track import make_track, path_length
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Stopping:
+@dataclass(frozen=True, repr=False)
+class Stopping(Shown):
     """A stop as it was measured; None where the ship still moves when the log ends.
 
     Parameters

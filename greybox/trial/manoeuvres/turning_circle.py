@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import LogError
+from greybox.notebook import Shown
 from greybox.trial.manoeuvres.approach import Approach, measure_approach
 from greybox.trial.manoeuvres.local import LocalFit, crossing, fit_at, noise_std, regress
 from greybox.trial.manoeuvres.quantity import Quantity
@@ -31,8 +32,8 @@ _STEADY_FROM, _STEADY_LEAST = math.pi, math.pi / 2
 _DRIFT_RANGE = math.radians(300)
 
 
-@dataclass(frozen=True)
-class TurningCircle:
+@dataclass(frozen=True, repr=False)
+class TurningCircle(Shown):
     """A turning circle as it was measured; None where the log ends before it.
 
     Parameters

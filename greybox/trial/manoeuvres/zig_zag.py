@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import LogError
+from greybox.notebook import Shown
 from greybox.trial.manoeuvres.approach import measure_approach
 from greybox.trial.manoeuvres.local import crossing, fit_at, peak
 from greybox.trial.manoeuvres.quantity import Quantity
@@ -33,8 +34,8 @@ _FIVE = math.radians(5)
 _RUDDER_NEAR, _HEADING_NEAR = math.radians(1.0), math.radians(1.6)
 
 
-@dataclass(frozen=True)
-class ZigZag:
+@dataclass(frozen=True, repr=False)
+class ZigZag(Shown):
     """A zig-zag as it was measured; None where the log ends before it.
 
     Parameters

@@ -41,6 +41,7 @@ class CsvFile:
     clocks: frozenset[str] = frozenset()
     notes: list[str] = field(default_factory=list)
     format: str = "CSV"
+    first_row: int = 2
 
     @property
     def cells(self) -> int:

@@ -40,6 +40,7 @@ class ParquetFile:
     clocks: frozenset[str] = frozenset()
     rows: int = 0
     format: str = "Parquet"
+    first_row: int = 2
 
     @property
     def cells(self) -> int:
@@ -69,33 +70,47 @@ class ParquetFile:
                 for batch in file.iter_batches(
                     batch_size=_BATCH_ROWS, columns=list(columns), use_threads=True
                 ):
-                    yield {c: self._values(batch.column(c), c) for c in columns}
+                    yield {c: column_values(batch.column(c), self.kind(c)) for c in columns}
         except _ERRORS as error:
             raise _unreadable(self.path, error) from None
         except pa.ArrowException as error:
             raise _unreadable(self.path, error) from None
 
-    def _values(self, column: Any, name: str) -> Any:
-        import pyarrow as pa
+    def kind(self, name: str) -> str:
+        """Return what a column holds: text, parsed (dates written as text), date or number."""
+        sets = {"parsed": self.parsed, "text": self.text, "date": self.dates}
+        return next((kind for kind, names in sets.items() if name in names), "number")
 
-        if name in self.text or name in self.parsed:
-            words = cell_text.text(column)
-            if name in self.text:
-                return words
-            return cell_text.dates(pa.array([w or None for w in words], pa.string()))
-        if pa.types.is_dictionary(column.type):
-            column = column.dictionary_decode()
-        if name in self.dates:
-            if pa.types.is_date(column.type):
-                column = column.cast(pa.timestamp("s"))
-            return cell_text.unix_seconds(column.cast(pa.timestamp("ns", column.type.tz)))
-        if pa.types.is_duration(column.type):
-            parts = {"s": 1, "ms": 1_000, "us": 1_000_000, "ns": 1_000_000_000}
-            count = column.cast(pa.int64()).cast(pa.float64(), safe=False)
-            return count.to_numpy(zero_copy_only=False) / parts[column.type.unit]
-        if pa.types.is_boolean(column.type):
-            column = column.cast(pa.int8())
-        return column.cast(pa.float64(), safe=False).to_numpy(zero_copy_only=False)
+
+def column_values(column: Any, kind: str) -> Any:
+    """Return an Arrow array as (n,) float, UNIX time [s] of dates, or str of texts.
+
+    Parameters
+    ----------
+    column : pyarrow.Array
+    kind : {"text", "parsed", "date", "number"}
+        ``parsed`` are dates that are written as text.
+    """
+    import pyarrow as pa
+
+    if kind in ("text", "parsed"):
+        words = cell_text.text(column)
+        if kind == "text":
+            return words
+        return cell_text.dates(pa.array([w or None for w in words], pa.string()))
+    if pa.types.is_dictionary(column.type):
+        column = column.dictionary_decode()
+    if kind == "date":
+        if pa.types.is_date(column.type):
+            column = column.cast(pa.timestamp("s"))
+        return cell_text.unix_seconds(column.cast(pa.timestamp("ns", column.type.tz)))
+    if pa.types.is_duration(column.type):
+        parts = {"s": 1, "ms": 1_000, "us": 1_000_000, "ns": 1_000_000_000}
+        count = column.cast(pa.int64()).cast(pa.float64(), safe=False)
+        return count.to_numpy(zero_copy_only=False) / parts[column.type.unit]
+    if pa.types.is_boolean(column.type):
+        column = column.cast(pa.int8())
+    return column.cast(pa.float64(), safe=False).to_numpy(zero_copy_only=False)
 
 
 def open_parquet(path: Path) -> ParquetFile:
@@ -134,7 +149,7 @@ def open_parquet(path: Path) -> ParquetFile:
     units: dict[str, str] = {}
     dropped: list[str] = []
     for item in schema:
-        kind = _kind(item.type)
+        kind = column_kind(item.type)
         if kind is None or item.name in kinds:
             dropped.append(item.name)
             continue
@@ -169,7 +184,8 @@ def open_parquet(path: Path) -> ParquetFile:
     )
 
 
-def _kind(found: Any) -> str | None:
+def column_kind(found: Any) -> str | None:
+    """Return what an Arrow type holds: number, date, duration or text; None for all else."""
     import pyarrow as pa
 
     is_a = pa.types

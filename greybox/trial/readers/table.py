@@ -23,6 +23,8 @@ class TableFile(Protocol):
     clocks: frozenset[str]
     notes: list[str]
     format: str
+    # number of the first sample's row, as a user counts them
+    first_row: int
 
     @property
     def cells(self) -> int:

@@ -1,0 +1,251 @@
+"""Logs from and to pandas and xarray, by the same reader as files.
+
+A frame that `log_to_pandas` made says so in its ``attrs`` and is canonical: it comes
+back as the same log. Any other is read as a file with its columns would be.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from greybox.channels import CHANNELS
+from greybox.errors import LogError, UsageError
+from greybox.trial.canonical import canonical, table_recording
+from greybox.trial.log import Provenance, TrialLog
+from greybox.trial.readers.frame import open_frame
+from greybox.trial.reading import table_segments
+from greybox.trial.recording import Recording
+from greybox.trial.writing import recorded_provenance
+from greybox.vessel.vessel import Vessel
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import xarray as xr
+
+# where a frame or dataset says that it was a log
+KEY = "greybox_log"
+# a frame that was thinned out has another sample time than it says
+_SAME = 1e-6
+
+
+def log_to_pandas(log: TrialLog) -> pd.DataFrame:
+    """Return a log as a DataFrame.
+
+    Returns
+    -------
+    DataFrame
+        Index ``t`` [s], one column a channel (SI, radians), and the column of the
+        controller's mode where the log has it. ``attrs["units"]`` by column.
+    """
+    import pandas as pd
+
+    frame = pd.DataFrame(dict(log.channels), index=pd.Index(log.t, name="t"))
+    mode = _mode(log)
+    if mode is not None:
+        frame[mode[0]] = mode[1]
+    frame.attrs = {"units": _units(log), KEY: _record(log)}
+    return frame
+
+
+def log_to_xarray(log: TrialLog) -> xr.Dataset:
+    """Return a log as a Dataset over ``t``, with units and meaning of each channel.
+
+    Raises
+    ------
+    UsageError
+        xarray is not installed.
+    """
+    xarray = _xarray()
+    units = _units(log)
+    meaning = {n: c.meaning for n, c in CHANNELS.items()}
+
+    def attrs(name: str) -> dict[str, str]:
+        said = {"units": units.get(name, ""), "long_name": meaning.get(name, "")}
+        return {k: v for k, v in said.items() if v}
+
+    variables = {n: ("t", a, attrs(n)) for n, a in log.channels.items()}
+    mode = _mode(log)
+    if mode is not None:
+        variables[mode[0]] = ("t", mode[1], {})
+    dataset: xr.Dataset = xarray.Dataset(
+        variables,
+        {"t": ("t", log.t, attrs("t"))},
+        # text, so that it can be written to any file
+        {"title": log.name, "vessel": log.vessel.name, KEY: json.dumps(_record(log))},
+    )
+    return dataset
+
+
+def log_from_pandas(
+    frame: pd.DataFrame,
+    vessel: Vessel,
+    *,
+    name: str = "frame",
+    states: tuple[str, ...] = (),
+    fill: Mapping[str, float] | None = None,
+) -> TrialLog:
+    """Return the log that a DataFrame holds.
+
+    Parameters
+    ----------
+    frame : DataFrame
+        One row a sample. Columns by canonical names, thruster columns, or the names in
+        the vessel's ``[columns]``. Time as column ``t`` or the one mapped to it, or as
+        the index: seconds, datetime64 or timedelta64. Units in ``frame.attrs["units"]``
+        are believed.
+    vessel : Vessel
+    name : str
+        Of the log; one that was a log before keeps its own.
+    states, fill
+        As `read_log`.
+
+    Returns
+    -------
+    TrialLog
+        As `read_log` gives of a file with these columns.
+
+    Raises
+    ------
+    LogError
+        As `read_log`, and where the frame is none or has no time.
+    """
+    record = _recorded(frame.attrs.get(KEY) if hasattr(frame, "attrs") else None)
+    own = vessel
+    known = Provenance(name)
+    if record:
+        # it is canonical, and without the sensors' defects
+        own = replace(vessel, columns={}, sensors={})
+        known, name = recorded_provenance(record), str(record.get("name", name))
+    table = open_frame(frame, name, vessel.commands)
+    if not any(n == "t" or ((m := own.columns.get(n)) and m.name == "t") for n in table.columns):
+        raise LogError(
+            f"'{name}' has no time: neither a column 't' nor an index of seconds or dates. "
+            f"Name one with frame.set_index('…').rename_axis('t'), or map it in [columns]. "
+            f"Its columns: {', '.join(table.columns[:30])}."
+        )
+    segments = table_segments(table, own, known, states=states, fill=fill)
+    if len(segments) > 1:
+        raise LogError(
+            f"'{name}' has {len(segments) - 1} gaps in its time, and one run cannot cross them: "
+            f"cut the frame at them, with frame.loc[start:stop]."
+        )
+    stated = record.get("sample_time")
+    log = replace(segments[0], name=name, vessel=vessel)
+    if isinstance(stated, float) and abs(stated - log.sample_time) <= _SAME * stated:
+        log = replace(log, sample_time=stated)
+    return log
+
+
+def log_from_xarray(
+    dataset: xr.Dataset,
+    vessel: Vessel,
+    *,
+    name: str = "dataset",
+    states: tuple[str, ...] = (),
+    fill: Mapping[str, float] | None = None,
+) -> TrialLog:
+    """Return the log that a Dataset over one dimension, its time, holds.
+
+    Units in the ``units`` of its variables are believed. Parameters and errors as
+    `log_from_pandas`.
+
+    Raises
+    ------
+    LogError
+        It is no Dataset, or has not one dimension.
+    UsageError
+        xarray is not installed.
+    """
+    xarray = _xarray()
+    if not isinstance(dataset, xarray.Dataset):
+        raise LogError(
+            f"'{name}' is a {type(dataset).__name__}, a Dataset is needed: use log_from_pandas "
+            f"for a DataFrame, DataArray.to_dataset(dim=…) for a DataArray."
+        )
+    if len(dataset.dims) != 1:
+        sizes = ", ".join(f"{k} {n}" for k, n in dataset.sizes.items()) or "none"
+        raise LogError(
+            f"'{name}' has {len(dataset.dims)} dimensions ({sizes}), a log has time alone: choose "
+            f"one trial with dataset.sel(…) or isel(…)."
+        )
+    dimension = next(iter(dataset.dims))
+    import pandas as pd
+
+    columns = {n: v for n, v in dataset.variables.items() if v.dims and n != dimension}
+    index = dataset.indexes.get(dimension)
+    frame = pd.DataFrame({n: np.asarray(v.values) for n, v in columns.items()}, index=index)
+    frame = frame.rename_axis(dimension if index is not None else None)
+    units = {n: v.attrs["units"] for n, v in dataset.variables.items() if "units" in v.attrs}
+    frame.attrs = {"units": units, KEY: dataset.attrs.get(KEY)}
+    return log_from_pandas(frame, vessel, name=name, states=states, fill=fill)
+
+
+def recording_from_pandas(
+    frame: pd.DataFrame, vessel: Vessel, *, name: str = "frame", guess: bool = True
+) -> Recording:
+    """Return a DataFrame as a recording, to be checked, mended and imported.
+
+    Unlike `log_from_pandas` it may have holes, jitter and gaps in its time, and names
+    that are to be guessed, as `read_recording` reads them from a file.
+
+    Parameters
+    ----------
+    frame : DataFrame
+        As for `log_from_pandas`.
+    vessel : Vessel
+    name : str
+    guess : bool
+        Whether columns that are neither mapped nor canonical are guessed.
+
+    Raises
+    ------
+    LogError
+        It is no DataFrame, or has no time.
+    """
+    raw, assigned = table_recording(open_frame(frame, name, vessel.commands), vessel, guess=guess)
+    return canonical(raw, assigned, vessel)
+
+
+def _mode(log: TrialLog) -> tuple[str, Any] | None:
+    """Return the column of the controller's mode as a written log has it."""
+    loop = log.vessel.closed_loop
+    if loop is None or not log.loop_known:
+        return None
+    return loop[0], np.where(log.closed_loop, loop[1][0], "open").astype(object)
+
+
+def _units(log: TrialLog) -> dict[str, str]:
+    return {n: u for n, u in log.units.items() if u != "as logged"}
+
+
+def _record(log: TrialLog) -> dict[str, Any]:
+    record: dict[str, Any] = asdict(log.provenance)
+    # as JSON would give it back
+    record = json.loads(json.dumps(record | {"notes": dict(log.provenance.notes)}))
+    return {"format": "greybox-log", "name": log.name, "sample_time": log.sample_time} | record
+
+
+def _recorded(said: Any) -> dict[str, Any]:
+    """Return what a frame or dataset says of the log it was; empty where it says nothing."""
+    if isinstance(said, str):
+        try:
+            said = json.loads(said)
+        except ValueError:
+            return {}
+    return said if isinstance(said, dict) and said.get("format") == "greybox-log" else {}
+
+
+def _xarray() -> Any:
+    try:
+        import xarray
+    except ImportError:
+        raise UsageError(
+            "xarray is not installed, which Datasets need: install it with "
+            "pip install 'greybox-marine[notebook]', or use to_pandas()."
+        ) from None
+    return xarray
