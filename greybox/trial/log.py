@@ -137,6 +137,12 @@ def make_log(
         (N,) each, by canonical name; ``t`` is made when absent.
     sample_time : float
         [s]
+    name : str
+
+    Returns
+    -------
+    TrialLog
+        In open loop as far as it tells.
 
     Raises
     ------
