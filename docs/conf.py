@@ -11,7 +11,7 @@ author = "The greybox-marine authors"
 copyright = author
 version = release = installed("greybox-marine")
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "numpydoc", "option_tables"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "numpydoc", "option_tables", "public_names"]
 exclude_patterns = ["_build", "_ext"]
 # single backticks in docstrings are names of code
 default_role = "code"
