@@ -15,13 +15,11 @@ extensions = ["myst_parser", "sphinx.ext.autodoc", "numpydoc", "option_tables", 
 exclude_patterns = ["_build", "_ext"]
 # single backticks in docstrings are names of code
 default_role = "code"
+smartquotes = False
 
 myst_enable_extensions = ["colon_fence", "deflist"]
 # headings down to this level can be linked to
 myst_heading_anchors = 4
-# pages that another part of the project brings are listed where they exist
-suppress_warnings = ["toc.empty_glob"]
-
 # types stand in the Parameters of each docstring
 autodoc_typehints = "none"
 autodoc_member_order = "bysource"
@@ -38,3 +36,17 @@ html_static_path = ["_static"]
 html_css_files = ["manual.css"]
 html_copy_source = False
 html_show_sphinx = False
+
+
+def keep_matches(app, name, source):
+    """Drop the patterns of the contents that no page matches."""
+    if name == "index":
+        lines = source[0].splitlines()
+        folder = Path(__file__).parent
+        kept = [x for x in lines if not x.endswith("*") or any(folder.glob(f"{x}.md"))]
+        source[0] = "\n".join(kept)
+
+
+def setup(app):
+    """Connect what changes sources as they are read."""
+    app.connect("source-read", keep_matches)

@@ -1,6 +1,7 @@
 """Directives that show commands and their options as the parsers have them.
 
-``options NAME`` shows one command, ``commands`` lists all that are installed.
+``options NAME`` shows one command, ``commands`` lists all that are installed, and
+``other-commands`` shows those that have no page under howto.
 """
 
 from __future__ import annotations
@@ -110,8 +111,24 @@ class Commands(SphinxDirective):
         return [_table(("command", "does"), rows, (2, 5))]
 
 
+class OtherCommands(SphinxDirective):
+    """The arguments of every installed command without a page under howto."""
+
+    def run(self) -> list[nodes.Node]:
+        """Return a section a command."""
+        found: list[nodes.Node] = []
+        for name, parser in _commands().items():
+            if f"howto/{name}" in self.env.found_docs:
+                continue
+            section = nodes.section("", nodes.title("", name), ids=[f"greybox-{name}"])
+            section += [nodes.paragraph("", parser.description or ""), *_shown(parser)]
+            found.append(section)
+        return found or [nodes.paragraph("", "There are none.")]
+
+
 def setup(app: Sphinx) -> dict[str, Any]:
     """Register the directives."""
     app.add_directive("options", Options)
     app.add_directive("commands", Commands)
+    app.add_directive("other-commands", OtherCommands)
     return {"parallel_read_safe": True}

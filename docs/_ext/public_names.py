@@ -10,7 +10,6 @@ import re
 from typing import Any
 
 from docutils import nodes
-from docutils.statemachine import StringList
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
@@ -81,9 +80,7 @@ class PublicErrors(SphinxDirective):
         return self.parse_text_to_nodes(text, allow_section_headings=False)
 
 
-def escape(
-    app: Sphinx, what: str, name: str, item: Any, options: Any, lines: list[str]
-) -> None:
+def escape(app: Sphinx, what: str, name: str, item: Any, options: Any, lines: list[str]) -> None:
     """Let a modulus |u| and a shape (p, *S) be read as they are written."""
     for i, line in enumerate(lines):
         parts = line.split("``")
