@@ -167,6 +167,16 @@ def design_between(
     rival : Rival
         The second one.
     names : (str, str)
+    best_effort : bool
+        Whether the closest plan is returned where a limit cannot be kept.
+    progress : callable, optional
+        Called with steps done and steps in all.
+    workers : int, optional
+        Processes.
+
+    Returns
+    -------
+    Discrimination
 
     Raises
     ------

@@ -19,7 +19,21 @@ Array = NDArray[np.float64]
 
 
 def random_two_level(holds: int, commands: int, count: int, rng: np.random.Generator) -> Array:
-    """Draw each command at one of its limits in each hold, (count, K, nc)."""
+    """Draw each command at one of its limits in each hold.
+
+    Parameters
+    ----------
+    holds, commands : int
+        K and nc.
+    count : int
+        Sequences to draw.
+    rng : numpy.random.Generator
+
+    Returns
+    -------
+    ndarray
+        (count, K, nc) 0 at the lower limit, 1 at the upper one.
+    """
     return np.asarray((rng.random((count, holds, commands)) < 0.5).astype(float))
 
 
@@ -29,7 +43,7 @@ def random_pulses(holds: int, commands: int, count: int, rng: np.random.Generato
 
 
 def prbs(holds: int, commands: int, bits: tuple[int, ...] = (4, 5, 6, 7, 8, 9, 10)) -> Array:
-    """Return maximum-length sequences, (len(bits), K, nc), each command with its own shift.
+    """Return maximum-length sequences, each command with its own shift.
 
     Parameters
     ----------
@@ -37,6 +51,11 @@ def prbs(holds: int, commands: int, bits: tuple[int, ...] = (4, 5, 6, 7, 8, 9, 1
         K and nc.
     bits : tuple of int
         Register lengths; the period is 2**bits − 1 holds.
+
+    Returns
+    -------
+    ndarray
+        (len(bits), K, nc) 0 at the lower limit, 1 at the upper one.
 
     References
     ----------
@@ -114,5 +133,9 @@ def to_log(vessel: Vessel, commands: Mapping[str, Array], sample_time: float) ->
         (N,) each command of the vessel.
     sample_time : float
         [s]
+
+    Returns
+    -------
+    TrialLog
     """
     return make_log(vessel, commands, sample_time, "plan")

@@ -31,7 +31,15 @@ _NAMES = {"u": "surge", "v": "sway", "r": "yaw rate"}
 
 @dataclass(frozen=True)
 class Circle:
-    """A round sea room: centre north and east, and radius [m]."""
+    """A round sea room.
+
+    Parameters
+    ----------
+    north, east : float
+        Centre [m].
+    radius : float
+        [m]
+    """
 
     north: float
     east: float

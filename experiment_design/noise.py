@@ -34,6 +34,11 @@ def noise_levels(
     process : ndarray, optional
         (nx,) process noise per sample.
 
+    Returns
+    -------
+    NoiseLevels
+        With a sentence on where they come from.
+
     Raises
     ------
     UsageError

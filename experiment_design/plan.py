@@ -14,6 +14,11 @@ def write_plan(design: Design, path: str | Path) -> None:
     """Write the commands as CSV of ``t`` and the thruster columns, ``trial`` first if several.
 
     Each row holds from its time on until the next.
+
+    Parameters
+    ----------
+    design : Design
+    path : str or Path
     """
     r = design.request
     names = r.schedule.commands

@@ -80,6 +80,10 @@ def predict_precision(
         (N,) each command of each trial, at the sample time: speeds in the unit of
         the log, angles [rad].
 
+    Returns
+    -------
+    PredictedPrecision
+
     Raises
     ------
     UsageError

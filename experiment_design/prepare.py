@@ -57,6 +57,13 @@ class Wishes:
         Initial states and heading.
     trials : int
     predictor : str, optional
+    estimator : {"iv", "iv-white", "oe"}
+        Whose covariance is predicted.
+    criterion : {"D", "A", "E", "c"}
+    wanted : tuple of str
+        Parameters that count; all where empty.
+    combination : mapping of str to float
+        Gradient of the function of the parameters that criterion ``c`` looks at.
     current, wind : (float, float), optional
         Expected means, north and east [m/s].
     gust : float, optional
@@ -69,6 +76,13 @@ class Wishes:
         Whose information is added.
     robust : int
         Prior models drawn from the model's covariance that the criterion is expected over.
+    worst_case : bool
+        Whether the worst of these models counts instead of their mean.
+    probability : float
+        With which limits are kept under the prior's uncertainty.
+    seed : int
+    effort : float
+        Times the usual search.
     """
 
     duration: float
@@ -117,8 +131,15 @@ def prepare_request(
     vessel : Vessel, optional
         With limits and sensors; by default the model's own.
 
+    Returns
+    -------
+    Prepared
+        ``request`` (DesignRequest) and ``notes`` (tuple of str), a sentence for each choice.
+
     Raises
     ------
+    StructureError
+        The model's structure has no surge speed.
     UsageError
         Wishes that exclude one another.
     InfeasibleError

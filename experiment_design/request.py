@@ -38,7 +38,16 @@ _GUST_SECONDS = 20.0
 class Rival:
     """One explanation of the ship's motion: its structure, parameters and disturbances.
 
-    ``vessel`` says how its thrusters act, where that is another than the request's.
+    Parameters
+    ----------
+    name : str
+    structure : Structure
+    theta : ndarray
+        (p,) discrete parameters at the request's sample time.
+    d : ndarray
+        (nd,) disturbance means [m/s].
+    vessel : Vessel, optional
+        How its thrusters act, where that is another than the request's.
     """
 
     name: str
@@ -300,6 +309,10 @@ def build_problem(
     trial : int
     known : tuple of Moments
         Sums of the other trials, one a scenario.
+
+    Returns
+    -------
+    TrialProblem
     """
     predictor = request.build_predictor()
     criterion = build_criterion(request, predictor)

@@ -83,6 +83,10 @@ def least_duration(
         Its duration is the longest that is allowed.
     targets : mapping of str to float
         Wanted standard error of each named parameter, in its unit.
+    progress : callable, optional
+        Called with steps done and steps in all.
+    workers : int, optional
+        Processes.
 
     Returns
     -------

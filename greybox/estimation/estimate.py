@@ -164,6 +164,8 @@ def estimate_iv(
     ------
     ExcitationError
         Some direction is not excited, or even the first simulation diverges.
+    UsageError
+        Instruments keep their mean and the augmented predictor has no constant.
 
     References
     ----------

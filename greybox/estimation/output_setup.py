@@ -24,6 +24,17 @@ def output_predictor(structure: Structure, kind: str, regime: Regime) -> Predict
 
     The mean current stands in the model itself; bias-capturing columns remain
     for what an unmeasured wind does, with a constant in each equation.
+
+    Parameters
+    ----------
+    structure : Structure
+    kind : {"basic", "augmented", "wind", "basic+wind"}
+    regime : sequence of (str, tuple of int)
+        Signs that states keep, as `build_predictor`.
+
+    Returns
+    -------
+    Predictor
     """
     if kind in ("basic", "basic+wind"):
         return build_predictor(structure, kind, regime)

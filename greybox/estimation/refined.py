@@ -181,7 +181,8 @@ def estimate_refined_iv(
     logs : sequence of TrialLog
         One experiment each, in open loop.
     start : ndarray or Estimate, optional
-        A plain IV estimate of the same predictor and logs, or where that one starts.
+        A plain IV estimate of the same predictor and logs, or (p,) parameters of the
+        structure where that one starts.
     heading, wind, margins, seed
         As `estimate_iv`.
     covariance : {"ma", "hac", "white", "bootstrap"}

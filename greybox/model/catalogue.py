@@ -105,7 +105,13 @@ _CATALOGUE = {
 
 
 def structure_names() -> tuple[str, ...]:
-    """Return the names of the published structures."""
+    """Return the names of the published structures.
+
+    Returns
+    -------
+    tuple of str
+        As `get_structure` takes them.
+    """
     return tuple(_CATALOGUE)
 
 
@@ -119,6 +125,10 @@ def get_structure(name: str) -> Structure:
         ``thesis`` (3.51), ``surge`` (3.56), ``linear``, ``blanke``, ``modulus``,
         ``abkowitz`` or ``siso`` (4.58); ``thesis+N_|r|r-Xkappa`` adds and
         removes terms.
+
+    Returns
+    -------
+    Structure
 
     Raises
     ------

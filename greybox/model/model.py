@@ -357,6 +357,15 @@ def _changes(rows: Any, names: tuple[str, ...], source: str) -> tuple[Change, ..
 def load_model(path: str | Path) -> ManoeuvringModel:
     """Read a model file.
 
+    Parameters
+    ----------
+    path : str or Path
+        JSON, as `ManoeuvringModel.save` and ``greybox estimate --out`` write it.
+
+    Returns
+    -------
+    ManoeuvringModel
+
     Raises
     ------
     ModelFileError

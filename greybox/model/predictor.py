@@ -231,6 +231,11 @@ class Predictor(Shown):
         -------
         ndarray
             (p, *S), in the order of `columns`.
+
+        Raises
+        ------
+        StructureError
+            The velocity through the air is needed and was not given.
         """
         if self.air_measured and air is None:
             raise StructureError(

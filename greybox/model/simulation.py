@@ -122,7 +122,7 @@ def simulate(
     psi : ndarray, optional
         (N+1,) or (R, N+1) measured heading [rad]; without it the heading is simulated.
     psi0 : float or ndarray
-        Initial heading of a simulated one [rad].
+        Scalar or (R,) initial heading of a simulated one [rad].
     d : ndarray, optional
         (nd,), (N, nd) or (R, N, nd) disturbances [m/s]: constant, or a series
         such as `stationary_disturbance` gives. None: still water and air.
@@ -293,7 +293,7 @@ def stationary_disturbance(
     mean : ndarray
         (nd,) means [m/s].
     std : float or ndarray
-        Stationary standard deviation of each [m/s].
+        Scalar or (nd,) stationary standard deviation of each [m/s].
     samples, runs : int
         N and R.
     correlation_time : float

@@ -74,6 +74,10 @@ def decimate(log: TrialLog, sample_time: float) -> TrialLog:
     sample_time : float
         A whole multiple of the log's own [s].
 
+    Returns
+    -------
+    TrialLog
+
     Raises
     ------
     LogError

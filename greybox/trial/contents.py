@@ -93,7 +93,18 @@ def describe_logs(segments: Sequence[TrialLog]) -> Contents:
 
 
 def describe_recording(recording: Recording, vessel: Vessel) -> Contents:
-    """Make a log of a mended recording and describe it; say why where none can be made."""
+    """Make a log of a mended recording and describe it; say why where none can be made.
+
+    Parameters
+    ----------
+    recording : Recording
+    vessel : Vessel
+
+    Returns
+    -------
+    Contents
+        Manoeuvres and sign regimes; ``note`` says why where there are none.
+    """
     try:
         return describe_logs(import_recording(recording, vessel).segments)
     except GreyboxError as error:

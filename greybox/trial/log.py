@@ -199,6 +199,12 @@ def make_log(
         is ``t`` where it is called so; what is to be converted goes to `log_from_pandas`.
     sample_time : float
         [s]
+    name : str
+
+    Returns
+    -------
+    TrialLog
+        In open loop as far as it tells.
 
     Raises
     ------

@@ -92,14 +92,23 @@ def read_segments(
 ) -> list[TrialLog]:
     """Read one log file as the segments between its gaps.
 
-    Parameters and errors as `read_log`. A gap is a step of a whole number of
-    sample times, as `write_log` leaves it; segments of fewer than three
-    samples are dropped.
+    A gap is a step of a whole number of sample times, as `write_log` leaves it;
+    segments of fewer than three samples are dropped.
+
+    Parameters
+    ----------
+    path, vessel, states, fill
+        As `read_log`.
 
     Returns
     -------
     list of TrialLog
         In order of time, at least one.
+
+    Raises
+    ------
+    LogError
+        As `read_log`, gaps apart.
     """
     path = Path(path)
     table = open_raw(path)

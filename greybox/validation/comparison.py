@@ -329,11 +329,19 @@ def compare_models(
         The logs as each model reads them (its vessel's columns).
     heading : {"measured", "simulated"}
     bands : bool
-        Whether to draw bands, with the seed.
+        Whether to draw bands.
+    seed : int
+        Of the bands' draws.
 
     Returns
     -------
     Comparison
+        Fit (6.12), errors in units and ahead, sign tests against the first model.
+
+    Raises
+    ------
+    UsageError
+        Models differ in their states.
     """
     states = {model.structure.states for model in models}
     if len(states) > 1:

@@ -15,12 +15,35 @@ from greybox.model.model import ManoeuvringModel
 class Request:
     """What to estimate; None leaves the choice to the data.
 
-    ``margins`` are |u|, |v| [m/s] below which samples are cut out; ``nominal``
-    simulates the first instruments, or starts output error (least squares does
-    without it); ``output_error`` is what only ``oe`` heeds; ``prefilter`` is
-    ``noise`` for refined instrumental variables, ``none`` for plain ones; ``judged``
-    asks for the tests and the verdict; ``without`` are bias-capturing columns to leave
-    out, spelled ``state:function``.
+    Parameters
+    ----------
+    method : {"ls", "iv", "oe"}, optional
+    predictor : {"basic", "augmented", "wind", "basic+wind"}, optional
+    structure : str, optional
+        As `get_structure`.
+    margins : mapping of str to float, optional
+        |u|, |v| [m/s] below which samples are cut out.
+    covariance : {"ma", "hac", "white", "bootstrap"}, optional
+    heading : {"measured", "simulated"}
+        Heading inside the instruments.
+    loop : {"auto", "open", "closed"}
+        Whether a controller moved the thrusters.
+    zero_mean : bool
+        Whether instruments lose their mean (4.63).
+    refine : bool or int
+        Whether, or how many times at most, instruments are simulated again.
+    nominal : ManoeuvringModel, optional
+        Simulates the first instruments, or starts output error; least squares does
+        without it.
+    output_error : OutputErrorOptions
+        What only ``oe`` heeds.
+    seed : int
+    prefilter : {"auto", "noise", "none"}
+        ``noise`` for refined instrumental variables, ``none`` for plain ones.
+    judged : bool
+        Whether tests and verdict are asked for.
+    without : tuple of str
+        Bias-capturing columns to leave out, spelled ``state:function``.
     """
 
     method: str | None = None

@@ -87,6 +87,10 @@ def load_vessel(path: str | Path) -> Vessel:
     path : str or Path
         TOML file, or the name of an example vessel (``thesis``, ``ferry``).
 
+    Returns
+    -------
+    Vessel
+
     Raises
     ------
     VesselError
@@ -119,6 +123,15 @@ def load_vessel(path: str | Path) -> Vessel:
 
 def vessel_from_dict(data: dict[str, Any]) -> Vessel:
     """Build a vessel from the tables of its file.
+
+    Parameters
+    ----------
+    data : dict
+        As ``tomllib`` reads them.
+
+    Returns
+    -------
+    Vessel
 
     Raises
     ------

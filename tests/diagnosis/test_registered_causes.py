@@ -113,3 +113,12 @@ def test_documentation_names_every_reference():
         flat = " ".join(text.split())
         for author in re.findall(r"([A-Z][a-z]+)[^;(]* \(\d{4}\)", cause.reference):
             assert author in flat, (cause.id, author)
+
+
+def test_lacking_terms_have_the_names_that_the_extended_structure_gives_them():
+    linear, vessel = get_structure("linear"), load_vessel("thesis")
+    context = Context(linear, vessel, ("u", "v", "r"), False, 900.0, 1.0, {})
+    for cause in known_causes().values():
+        for atom in cause.atoms(context):
+            terms = [n for n in atom.columns if not n.startswith("current_")]
+            assert set(terms) <= set(linear.with_terms(*terms).parameters), atom.key

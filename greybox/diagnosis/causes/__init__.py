@@ -38,6 +38,10 @@ GROUP = "greybox.causes"
 def known_causes() -> dict[str, Cause]:
     """Return every cause by its id, ours first.
 
+    Returns
+    -------
+    dict of str to Cause
+
     Raises
     ------
     UsageError

@@ -52,7 +52,10 @@ class Context:
     current_known: bool = False
 
     def lacking(self, *terms: str) -> tuple[str, ...]:
-        """Return those of the terms that the structure could have and has not."""
+        """Return those of the terms that the structure could have and has not, by their names.
+
+        A spelling that equals a term of (3.55) comes back by its name there.
+        """
         from greybox.model.terms import parse_term
 
         keys = {t.key for t in self.structure.terms}
@@ -64,7 +67,7 @@ class Context:
                 f.signal in signals for f in term.factors
             )
             if fits and term.key not in keys:
-                out.append(name)
+                out.append(term.name)
         return tuple(out)
 
 

@@ -35,6 +35,11 @@ def check_files(paths: Sequence[str | Path], vessel: Vessel) -> list[CheckReport
     paths : sequence of str or Path
     vessel : Vessel
 
+    Returns
+    -------
+    list of CheckReport
+        One a file, in their order.
+
     Raises
     ------
     LogError

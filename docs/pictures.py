@@ -1,0 +1,253 @@
+"""Draws the pictures of the manual from virtual logs: python docs/pictures.py [FOLDER].
+
+FOLDER holds the files of the tutorial; without it only the catalogues are drawn.
+
+The files in docs/images/causes and docs/images/checks are made by this script and kept
+beside the text. A cause is shown on a log of a virtual ship that has it, beside the free
+run of a model that is right in everything else.
+"""
+
+import sys
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from PIL import Image
+
+import greybox as gb
+from greybox.report.checks import finding_figure
+from greybox.report.diagnosis_figures import ranking_figure
+from greybox.report.figures import new_figure, save_png, tidy
+from greybox.study.blind import draw
+
+FOLDER = Path(__file__).parent / "images"
+GREY, RED, BLUE = "#555555", "#b2182b", "#2166ac"
+UNITS = {"u": "m/s", "v": "m/s", "r": "rad/s"}
+STRUCTURE = gb.get_structure("thesis")
+# forces that push to starboard and turn, per second: what the asymmetry is shown with
+LOPSIDED = {"Y_0": 0.03, "N_0": 0.0012}
+
+
+def change(values):
+    """Return how much a signal (N,) changed in the ten samples before."""
+    return values - np.r_[np.full(10, values[0]), values[:-10]]
+
+
+def push(log, along=np.cos):
+    """Return the force of both thrusters along the bow, or across it."""
+    return sum(log[f"n{i}"] * along(log[f"alpha{i}"]) for i in (1, 2))
+
+
+# cause: seed of the trial, channel that errs, what the error follows, and how that is called
+CAUSES = {
+    "current": (1, "u", lambda g, run: np.degrees(g["psi"]) % 360, "heading [deg]"),
+    "wind": (5, "v", lambda g, run: np.abs(g["v_q"]) * g["v_q"], "|v_q| v_q [m²/s²]"),
+    "thruster_gain": (6, "u", lambda g, run: g["n2"] * np.cos(g["alpha2"]), "n2 cos(alpha2)"),
+    "thruster_lag": (2, "u", lambda g, run: change(push(g)), "change of the force in 10 s"),
+    "input_delay": (3, "u", lambda g, run: change(push(g)), "change of the force in 10 s"),
+    "quadratic_thrust": (3, "u", lambda g, run: push(g), "force along the bow"),
+    "advance_speed": (3, "v", lambda g, run: g["u"] * push(g, np.sin), "u times the side force"),
+    "angle_offset": (1, "r", lambda g, run: g["n1"] * np.cos(g["alpha1"]), "n1 cos(alpha1)"),
+    "cubic_damping": (1, "u", lambda g, run: g["u"], "surge [m/s]"),
+    "quadratic_yaw_damping": (4, "r", lambda g, run: run[:, 2], "simulated yaw rate [rad/s]"),
+    "crossflow": (5, "v", lambda g, run: np.abs(g["r"]) * g["v"], "|r| v [m rad/s²]"),
+    "asymmetry": (2, "v", lambda g, run: np.degrees(g["psi"]) % 360, "heading [deg]"),
+    "heading_bias": (1, "v", lambda g, run: g["u"], "surge [m/s]"),
+    "lever_arm": (6, "v", lambda g, run: g["r"], "yaw rate [rad/s]"),
+    "clock_offset": (3, "u", lambda g, run: change(g["u"]) / 10, "mean rate of u in 10 s [m/s²]"),
+    "sign": (6, "r", lambda g, run: g["r"], "yaw rate as logged [rad/s]"),
+    "waves": (2, "v", None, "frequency [Hz]"),
+    "parameter_change": (2, "v", lambda g, run: g.t, "time [s]"),
+}
+
+
+def afflicted(cause, seed):
+    """Return a trial's log, the free run (N, 3) of the model without the cause, and its size."""
+    options = {"kind": "manoeuvres", "samples": 900, "anemometer": cause == "wind"}
+    effects = () if cause == "asymmetry" else (cause,)
+    trial = draw(np.random.default_rng(seed), effects, **options)
+    theta = np.array([trial.ship[n] for n in STRUCTURE.parameters])
+    model = gb.ManoeuvringModel(
+        STRUCTURE, theta, np.zeros((theta.size,) * 2), 1.0, trial.vessel, integrator="rk4"
+    )
+    log = trial.estimation
+    told = dict(trial.truth[0].parameters) if trial.truth else LOPSIDED
+    if cause == "asymmetry":
+        extended = STRUCTURE.with_terms(*LOPSIDED)
+        both = np.append(theta, list(LOPSIDED.values()))
+        ship = replace(model, structure=extended, theta=both, covariance=np.zeros((20, 20)))
+        run = gb.run_model(ship, log, heading="simulated")
+        noisy = run.x + 0.014 * np.random.default_rng(seed).standard_normal(run.x.shape)
+        channels = dict(log.channels) | dict(zip("uvr", noisy.T, strict=True)) | {"psi": run.psi}
+        log = replace(log, channels=channels)
+    still = {k: x for k, x in log.channels.items() if k not in ("u_q", "v_q")}
+    return log, gb.run_model(model, replace(log, channels=still)).x, told
+
+
+def cause_figure(cause):
+    """Draw the part of the log that errs most, and what its error follows."""
+    seed, channel, follows, label = CAUSES[cause]
+    log, run, told = afflicted(cause, seed)
+    simulated = run[:, "uvr".index(channel)]
+    error = log[channel] - simulated
+    figure = new_figure(7.2, 2.6)
+    left, right = figure.subplots(1, 2, width_ratios=(3, 2))
+    worst = int(np.argmax(np.convolve(error**2, np.ones(300), "valid")))
+    part = slice(0, 900) if cause == "parameter_change" else slice(worst, worst + 300)
+    left.plot(log.t[part], log[channel][part], ".", ms=2.5, color=GREY, label="logged")
+    left.plot(log.t[part], simulated[part], color=RED, lw=1.2, label="model without the cause")
+    left.set(xlabel="time [s]", ylabel=f"{channel} [{UNITS[channel]}]")
+    figure.legend(*left.get_legend_handles_labels(), loc="outside lower left", ncols=2, fontsize=8)
+    if follows is None:
+        frequency = np.fft.rfftfreq(len(error), 1.0)
+        right.semilogy(
+            frequency[5:], np.abs(np.fft.rfft(error))[5:] / len(error), color=BLUE, lw=0.8
+        )
+        right.set(xlabel=label, ylabel=f"spectrum of the error of {channel}")
+    else:
+        follow(right, follows(log, run), error)
+        right.set(xlabel=label, ylabel=f"logged − model [{UNITS[channel]}]")
+    for axes in (left, right):
+        tidy(axes)
+    said = ", ".join(f"{k} {v:.3g}" for k, v in told.items() if not isinstance(v, str))
+    figure.suptitle(f"{cause}: {said}" if said else cause, fontsize=9)
+    return figure
+
+
+def follow(axes, x, error):
+    """Draw an error (N,) against x (N,), with means of groups of equal number."""
+    axes.plot(x, error, ".", ms=2, color="#bbbbbb")
+    groups = np.array_split(np.argsort(x), 12)
+    mean = np.array([error[g].mean() for g in groups])
+    axes.plot([x[g].mean() for g in groups], mean, "o-", ms=3, color=BLUE)
+    axes.axhline(0, color="black", lw=0.6)
+    reach = 2 * np.abs(mean).max()
+    axes.set_ylim(-reach, reach)
+
+
+def defective(check, columns):
+    """Return a log's columns (N,) each with one defect."""
+    c = {k: v.copy() for k, v in columns.items()}
+    if check == "gap":
+        return {k: np.delete(v, np.r_[300:360]) for k, v in c.items()}
+    if check == "duplicate_time":
+        return {k: v[np.r_[0:400, 396 : len(v)]] for k, v in c.items()}
+    if check == "nan":
+        c["u"][200:240] = np.nan
+    if check == "outlier":
+        c["v"][[150, 420]] += [1.5, -2.0]
+    if check == "stuck":
+        c["psi"][300:360] = c["psi"][300]
+    if check == "quantised":
+        c["v"] = np.round(c["v"], 1)
+    if check == "unit":
+        c["u"], c["v"] = c["u"] * 3600 / 1852, c["v"] * 3600 / 1852
+    if check == "frame":
+        cos, sin = np.cos(c["psi"]), np.sin(c["psi"])
+        c["u"], c["v"] = cos * c["u"] - sin * c["v"], sin * c["u"] + cos * c["v"]
+    if check == "sign":
+        c["r"] = -c["r"]
+    if check == "clock_offset":
+        for name in ("u", "v"):
+            c[name] = np.r_[np.full(3, c[name][0]), c[name][:-3]]
+    if check == "lever_arm":
+        c["x_n"] = c["x_n"] + 6 * np.cos(c["psi"])
+        c["y_n"] = c["y_n"] + 6 * np.sin(c["psi"])
+    if check == "heading_bias":
+        c["psi"] = c["psi"] + np.radians(6)
+    return c
+
+
+CHECKS = (
+    "gap", "duplicate_time", "nan", "outlier", "stuck", "quantised", "unit", "frame", "sign",
+    "clock_offset", "lever_arm", "heading_bias",
+)  # fmt: skip
+
+
+def check_figure(check):
+    """Plant one defect in a clean log, run the checks, and draw what they find."""
+    trial = draw(np.random.default_rng(3), (), kind="manoeuvres", samples=900)
+    columns = {"t": trial.estimation.t, **trial.estimation.channels}
+    columns = defective(check, columns)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "trial.csv"
+        pd.DataFrame(columns).to_csv(path, index=False)
+        (report,) = gb.check_files([path], trial.vessel)
+    (found,) = report.findings
+    return finding_figure(found, report, trial.vessel)
+
+
+def plan_figure(folder):
+    """Draw the commands of the plan and the motion that they made."""
+    log = gb.read_log(folder / "trial.csv", gb.load_vessel("thesis"))
+    figure = new_figure(7.2, 3.6)
+    rows = figure.subplots(3, 1, sharex=True)
+    rows[0].step(log.t, log["n"], where="post", color=BLUE, lw=1)
+    rows[0].set_ylabel("n")
+    for name, colour in (("alpha1", BLUE), ("alpha2", RED)):
+        rows[1].step(log.t, log[name], where="post", color=colour, lw=1, label=name)
+    rows[1].set_ylabel("[rad]")
+    for name, colour in (("u", BLUE), ("v", RED)):
+        rows[2].plot(log.t, log[name], color=colour, lw=0.8, label=name)
+    rows[2].set(ylabel="[m/s]", xlabel="time [s]")
+    for axes in rows:
+        tidy(axes)
+        if axes is not rows[0]:
+            axes.legend(fontsize=8, loc="upper right", ncols=2)
+    return figure
+
+
+def runs_figure(folder, names):
+    """Draw free runs of models on the other trial beside what was logged."""
+    models = {n: gb.load_model(folder / f"{n}.json") for n in names}
+    runs = {
+        n: gb.run_model(m, gb.read_log(folder / "other.csv", m.vessel)) for n, m in models.items()
+    }
+    figure = new_figure(7.2, 3.6)
+    rows = figure.subplots(3, 1, sharex=True)
+    for i, (axes, state) in enumerate(zip(rows, "uvr", strict=True)):
+        for (name, run), colour in zip(runs.items(), (RED, BLUE), strict=False):
+            if colour == RED:
+                axes.plot(run.log.t, run.log[state], ".", ms=2, color="#999999", label="logged")
+            axes.plot(run.log.t, run.x[:, i], color=colour, lw=1, label=name)
+        axes.set_ylabel(f"{state} [{UNITS[state]}]")
+        tidy(axes)
+    rows[2].set_xlabel("time [s]")
+    figure.legend(
+        *rows[0].get_legend_handles_labels(), loc="outside lower left", ncols=3, fontsize=8
+    )
+    return figure
+
+
+def search_figure(folder):
+    """Draw how the causes did at the first step of the search."""
+    ship = gb.load_vessel("thesis")
+    found = gb.diagnose(
+        [gb.read_log(folder / "trial.csv", ship)],
+        validate=[gb.read_log(folder / "other.csv", ship)],
+    )
+    return ranking_figure(found.steps[0], [c.key for c in found.causes])
+
+
+def save(figure, path):
+    """Write a PNG of 64 colours."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    save_png(figure, str(path))
+    with Image.open(path) as image:
+        image.convert("RGB").quantize(64).save(path, optimize=True)
+
+
+if __name__ == "__main__":
+    if len(sys.argv) > 1:
+        files = Path(sys.argv[1])
+        save(plan_figure(files), FOLDER / "tutorial" / "plan.png")
+        save(runs_figure(files, ["model"]), FOLDER / "tutorial" / "model.png")
+        save(runs_figure(files, ["model", "better"]), FOLDER / "tutorial" / "better.png")
+        save(search_figure(files), FOLDER / "tutorial" / "search.png")
+        sys.exit()
+    for name in CAUSES:
+        save(cause_figure(name), FOLDER / "causes" / f"{name}.png")
+    for name in CHECKS:
+        save(check_figure(name), FOLDER / "checks" / f"{name}.png")
