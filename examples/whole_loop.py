@@ -28,7 +28,9 @@ def sail(commands, path):
     return gb.read_log(path, ship)
 
 
-wishes = Wishes(300.0, trials=2, regime="u+v+", margin_u=0.3, margin_v=0.3, effort=0.05)
+wishes = Wishes(
+    300.0, trials=2, regime="u+v+", margin_u=0.3, margin_v=0.3, predictor="basic", effort=0.05
+)
 plan = design_trial(prepare_request(guess, wishes).request, alternatives=False)
 with tempfile.TemporaryDirectory() as folder:
     first, second = (sail(c, Path(folder) / f"{k}.csv") for k, c in enumerate(plan.commands))
@@ -40,5 +42,5 @@ print(gb.compare_models(models, ["guess", "estimate"], [[second], [second]]).sum
 found = gb.diagnose([first], validate=[second])
 print(found.summary())
 
-again = replace(wishes, trials=1, prior=found.model, predictor="basic")
+again = replace(wishes, trials=1, prior=found.model)
 print(design_trial(prepare_request(found.model, again).request, alternatives=False).summary())

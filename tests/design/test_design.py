@@ -88,7 +88,7 @@ def test_a_design_shows_itself(basic):
     text = basic.summary()
     assert "times the information of the best of 200 random two-level sequences" in text
     assert "zig-zag" in text
-    assert basic._repr_html_().startswith("<pre>")
+    assert "<pre>Plan for Thesis ship" in basic._repr_html_()
     data = json.loads(json.dumps(plain(basic.to_dict())))
     for key in ("status", "criterion", "logdet", "efficiency_vs_random", "efficiency_lower_bound",
                 "predicted_std", "margins", "wall_s"):  # fmt: skip
