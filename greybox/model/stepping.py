@@ -42,15 +42,14 @@ class _Commands:
 def state_names(model: ManoeuvringModel) -> tuple[str, ...]:
     """Return the names of ``x`` of `whole_step`.
 
-    ``u, v, r, psi, x_n, y_n``; then ``lagged_…`` of what follows slowly and
-    ``…_before_k`` of commands that still are to act, where the vessel's thrusters are late.
+    ``u, v, r, psi, x_n, y_n``; then ``…_before_k`` of commands that still are to act and
+    ``…_lagged`` of what follows slowly, where the vessel's thrusters are late.
     """
-    late = model.vessel.actuation
     names = [*model.structure.states, "psi", "x_n", "y_n"]
-    if late.lag:
-        names += [f"lagged_{n}" for n in _slow(model)]
     count = _held(model)
-    names += [f"{c}_before_{k + 1}" for k in range(count) for c in model.vessel.commands]
+    names += [f"{c}_before_{k + 1}" for c in model.vessel.commands for k in range(count)]
+    if model.vessel.actuation.lag:
+        names += [f"{n}_lagged" for n in _slow(model)]
     return tuple(names)
 
 
@@ -90,8 +89,8 @@ def whole_step(model: ManoeuvringModel) -> ca.Function:
          ca.DM(model.sample_time)]
     )  # fmt: skip
     moved = position + model.sample_time * _north_east(s.x, s.psi)
-    x = ca.vertcat(s.x, s.psi, position, slow, late.memory)
-    after = ca.vertcat(x_next, psi_next, moved, slow_after, late.after)
+    x = ca.vertcat(s.x, s.psi, position, late.memory, slow)
+    after = ca.vertcat(x_next, psi_next, moved, late.after, slow_after)
     return _function("step", model, x, command, wind, after, "x_next")
 
 
@@ -210,7 +209,7 @@ def _delayed(model: ManoeuvringModel, command: ca.SX) -> _Commands:
     share = count - model.vessel.actuation.delay / model.sample_time
     share = 0.0 if share < _WHOLE else share
     acting = share * every[:, count - 1] + (1 - share) * every[:, count]
-    return _Commands(acting, ca.vec(past), ca.vec(every[:, :count]))
+    return _Commands(acting, ca.vec(past.T), ca.vec(every[:, :count].T))
 
 
 def _lagged(

@@ -50,7 +50,7 @@ def rolled(model, log, **inputs):
     forces = log.forces(model.structure.inputs)[0]
     at_rest |= dict(zip(model.structure.inputs, forces, strict=True))
     start |= {"x_n": 0.0, "y_n": 0.0}
-    before = [n.removeprefix("lagged_").rsplit("_before_", 1)[0] for n in names]
+    before = [n.removesuffix("_lagged").rsplit("_before_", 1)[0] for n in names]
     states = [np.array([(start | at_rest)[n] for n in before])]
     for command in commands[:-1]:
         states.append(np.array(step(x=states[-1], command=command, **inputs)["x_next"]).ravel())
