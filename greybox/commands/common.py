@@ -78,6 +78,8 @@ _INPUTS = (
     "logs", "log", "models", "model", "nominal", "validate", "estimate", "vessel", "prior",
     "between", "area",
 )  # fmt: skip
+# what is typed for the terminal's sake, and changes no result
+_TALK = ("-v", "-vv", "--verbose", "-q", "--quiet", "--no-config")
 _PACKAGES = ("casadi", "numpy", "scipy")
 
 
@@ -92,12 +94,12 @@ def provenance(options: argparse.Namespace) -> dict[str, Any]:
         and the ``configuration`` file where one was used.
     """
     shown = {k: v for k, v in vars(options).items() if k not in SHELL_ONLY and v is not None}
-    used = getattr(options, "configuration", None)
+    used, typed = getattr(options, "configuration", None), getattr(options, "typed", [])
     return {
         "program": f"greybox-marine {version('greybox-marine')}",
         "versions": {n: version(n) for n in _PACKAGES} | {"Python": platform.python_version()},
         "command": shown,
-        "line": shlex.join(["greybox", *getattr(options, "typed", [])]),
+        "line": shlex.join(["greybox", *(t for t in typed if t not in _TALK)]),
         "inputs": _hashes(shown),
         **({} if used is None else {"configuration": used}),
     }

@@ -70,6 +70,14 @@ class Problem:
             places=(*point.places, *new),
         )
 
+    def numbers_of(self, point: Point, atom: Atom) -> list[int]:
+        """Return where an atom's own numbers stand among the free ones of a point."""
+        if atom.apply is None:
+            return [point.places.index(self.place(n)) for n in atom.columns]
+        k = [a.key for a in point.atoms].index(atom.key)
+        first = len(point.places) + sum(map(len, point.values[:k]))
+        return list(range(first, first + len(point.values[k])))
+
     def drop(self, point: Point, atom: Atom) -> Point:
         """Return the point without an atom, its coefficients at zero."""
         k = [a.key for a in point.atoms].index(atom.key)

@@ -202,6 +202,8 @@ def search(
             break
         causes = [*causes, step.taken]
         fit, causes = _backward(case, step.taken.fit, causes, len(atoms))
+        # what a better noise would gain must not count for the next cause
+        fit = case.problem(fit.integrator).settle(fit, _SETTLE)
     return Search(base, fit, tuple(steps), tuple(causes), len(atoms))
 
 
@@ -217,7 +219,7 @@ def take_step(case: Case, fit: Fit, causes: Sequence[Candidate], atoms: Sequence
         (judge(held_out, fit, found, atom, len(left), problem.names) for atom, found in fits),
         key=_merit,
     )
-    taken = next((c for c in candidates if c.holds), None)
+    taken = next((c for c in candidates if c.holds and _stands_out(case, c)), None)
     if taken is not None:
         # what the noise had taken for its own until now would pass for more causes
         settled = problem if taken.fit.integrator == fit.integrator else case.problem(
@@ -226,9 +228,32 @@ def take_step(case: Case, fit: Fit, causes: Sequence[Candidate], atoms: Sequence
         better = settled.settle(taken.fit, _SETTLE)
         if not any(a.afresh for a in better.point.atoms):
             better = case.anew(better)
-        better = case.other_integrator(better)
-        taken = replace(taken, fit=case.likeliest_variant(better, taken.atom))
+        better = case.likeliest_variant(case.other_integrator(better), taken.atom)
+        # what a sample holds decides how it is best stepped, too
+        taken = replace(taken, fit=case.other_integrator(better))
+        if not _stands_out(case, taken):
+            taken = None
     return Step(fit, tuple(scores), tuple(candidates), taken)
+
+
+def _stands_out(case: Case, candidate: Candidate) -> bool:
+    """Whether a cause's numbers are away from their null values (Wald).
+
+    Where they are not, the likelihood fell for another reason: the fit without the cause
+    had stopped early.
+    """
+    from scipy.stats import chi2
+
+    atom, fit = candidate.atom, candidate.fit
+    problem = case.problem(fit.integrator)
+    where = problem.numbers_of(fit.point, atom)
+    if not where:
+        return True
+    numbers, covariance = problem.covariance(fit)
+    null = [p.null for p in atom.parameters] if atom.apply is not None else [0.0] * len(where)
+    away = numbers[where] - null
+    wald = float(away @ np.linalg.pinv(covariance[np.ix_(where, where)]) @ away)
+    return float(chi2.sf(wald, len(where))) < PROVEN
 
 
 def _taken(atom: Atom, causes: Sequence[Candidate]) -> bool:
