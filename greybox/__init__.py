@@ -30,6 +30,8 @@ if TYPE_CHECKING:
     from greybox.model.predictor import Predictor, build_predictor
     from greybox.model.simulation import simulate, stationary_disturbance
     from greybox.model.structure import Structure
+    from greybox.prediction.predict import predict_manoeuvre
+    from greybox.prediction.result import ManoeuvrePrediction
     from greybox.trial.canonical import read_recording
     from greybox.trial.checks.check import check_files, check_recording
     from greybox.trial.checks.finding import CheckReport, Finding
@@ -60,6 +62,7 @@ _WHERE = {
     "Estimate": "greybox.estimation.result",
     "Finding": "greybox.trial.checks.finding",
     "ImportOptions": "greybox.trial.options",
+    "ManoeuvrePrediction": "greybox.prediction.result",
     "ManoeuvringModel": "greybox.model.model",
     "OutputErrorOptions": "greybox.estimation.output_error",
     "Predictor": "greybox.model.predictor",
@@ -87,6 +90,7 @@ _WHERE = {
     "load_model": "greybox.model.model",
     "load_vessel": "greybox.vessel.toml",
     "make_log": "greybox.trial.log",
+    "predict_manoeuvre": "greybox.prediction.predict",
     "read_log": "greybox.trial.reading",
     "read_recording": "greybox.trial.canonical",
     "read_segments": "greybox.trial.reading",
@@ -109,6 +113,7 @@ __all__ = [
     "Estimate",
     "Finding",
     "ImportOptions",
+    "ManoeuvrePrediction",
     "ManoeuvringModel",
     "OutputErrorOptions",
     "Predictor",
@@ -140,6 +145,7 @@ __all__ = [
     "load_vessel",
     "make_log",
     "output_predictor",
+    "predict_manoeuvre",
     "read_log",
     "read_recording",
     "read_segments",

@@ -184,6 +184,8 @@ class Estimate:
         Free-run fit (6.12) on the estimation logs [%].
     logs : tuple of dict
         Name, hash and length of each log.
+    ranges : dict of str to (float, float)
+        Least and greatest value of each state and command in the logs.
     noise : NoiseLevels, optional
         What was found of measurement and process noise.
     limits : dict of str to Limit
@@ -212,6 +214,7 @@ class Estimate:
     notes: tuple[str, ...] = ()
     fit: dict[str, float] = field(default_factory=dict)
     logs: tuple[dict[str, Any], ...] = ()
+    ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     noise: NoiseLevels | None = None
     limits: Mapping[str, Limit] = field(default_factory=dict)
     prefilter: str = "none"
@@ -301,6 +304,7 @@ class Estimate:
                 "std": self.std[biases],
             },
             "logs": list(self.logs),
+            "ranges": dict(self.ranges),
         }
 
     def summary(self) -> str:

@@ -1,0 +1,517 @@
+"""Predicts standard manoeuvres of a model, with the intervals that its covariance gives."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.errors import InfeasibleError, LogError, UsageError
+from greybox.model.model import ManoeuvringModel
+from greybox.prediction.conditions import (
+    Conditions,
+    Task,
+    check,
+    driven,
+    stop_speed,
+    stop_throttle,
+    tasks,
+)
+from greybox.prediction.drawn import Drawn, drawn
+from greybox.prediction.extrapolation import extrapolation
+from greybox.prediction.helm import Helm, find_helm
+from greybox.prediction.measuring import measure, quantities
+from greybox.prediction.orders import Orders, Stop, Turn, ZigZagOrders
+from greybox.prediction.result import (
+    CRITERIA,
+    Bundle,
+    Kind,
+    ManoeuvrePrediction,
+    PredictedManoeuvre,
+    Side,
+)
+from greybox.prediction.running import Runs, sail
+from greybox.prediction.steady import Steady, straight_run
+from greybox.prediction.trial import compare, end_again, found_in_trial
+from greybox.trial.log import TrialLog, make_log
+from greybox.trial.manoeuvres import Criterion, Quantity, Verdict
+from greybox.trial.manoeuvres.finding import Manoeuvre
+from greybox.trial.manoeuvres.standards import judge
+from greybox.validation.bands import draw_parameters, process_noise
+
+Array = NDArray[np.float64]
+Progress = Callable[[int, int], None]
+
+# times of one ship length after which a manoeuvre that is not complete stays so
+_LONGEST = 200.0
+# samples and tracks that pictures hold
+_SHOWN_SAMPLES, _SHOWN_TRACKS = 400, 40
+# steps of process noise drawn at once
+_STEPS = 1024
+
+
+def predict_manoeuvre(
+    model: ManoeuvringModel,
+    manoeuvre: Kind,
+    *,
+    angles: Sequence[float | tuple[float, float]] = (),
+    side: Side = "",
+    speed: float | None = None,
+    command: float | Mapping[str, float] | None = None,
+    thrusters: Sequence[str] = (),
+    share: float | None = None,
+    astern: float | None = None,
+    until: float | None = None,
+    limited: bool = True,
+    current: bool = False,
+    course: float = 0.0,
+    disturbed: bool = False,
+    scale: float = 1.0,
+    draws: int = 256,
+    seed: int = 0,
+    trial: TrialLog | None = None,
+    progress: Progress = lambda done, total: None,
+) -> ManoeuvrePrediction:
+    """Predict a standard manoeuvre from an identified model.
+
+    The ship sails straight at the approach speed, is given the orders of the manoeuvre by
+    the model's own simulation, and its run is measured as that of a trial is. Intervals are
+    quantiles over draws of the model's parameters, of which each sails on its own.
+
+    Parameters
+    ----------
+    model : ManoeuvringModel
+    manoeuvre : {"turning", "zigzag", "stopping", "crash"}
+        A stop takes the thrust off, a crash stop runs full astern.
+    angles : sequence of float or (float, float)
+        Steering angles; of a zig-zag also the heading at which it is reversed, which is the
+        same angle unless given [rad]. By default 35 degrees, and 10/10 and 20/20.
+    side : {"", "port", "starboard"}
+        Of the first turn; both where empty.
+    speed : float, optional
+        Approach speed over ground [m/s]; the propeller speed that holds it is solved for.
+    command : float or mapping of str to float, optional
+        Propeller speeds of the approach instead, in the unit of the log. By default the
+        greatest of the logs that the model was estimated on.
+    thrusters : sequence of str
+        Columns that steer, instead of rudders or the azimuth thrusters aft.
+    share : float, optional
+        Where speeds steer: by which those on either side differ from the approach's (0.5), or
+        of the greatest speed of tunnel thrusters (1).
+    astern : float, optional
+        Propeller speed of a crash stop, positive; the vessel file's least speed by default.
+    until : float, optional
+        Share of the approach speed at which a stop ends: 0.2 without thrust, 0 astern.
+    limited : bool
+        Whether commands keep the ranges of the vessel file; rates hold anyway.
+    current : bool
+        Whether the model's current and wind act; still water and air by default.
+    course : float
+        Heading of the approach, which matters in a current [rad].
+    disturbed : bool
+        Whether draws hold the model's process noise too: where one trial would lie.
+    scale : float
+        Length of the full-scale ship over that of the vessel, for the limits of the IMO.
+    draws, seed : int
+    trial : TrialLog, optional
+        The same manoeuvres are looked for there, predicted at their approach speeds and
+        angles, and compared.
+    progress : callable
+        Told how many manoeuvres of how many are done.
+
+    Returns
+    -------
+    ManoeuvrePrediction
+
+    Raises
+    ------
+    UsageError
+        What is asked contradicts itself, the vessel or its limits.
+    InfeasibleError
+        The model does not hold the approach.
+    LogError
+        The trial holds no such manoeuvre.
+
+    References
+    ----------
+    IMO MSC.137(76); ITTC 7.5-02-06-05 on the uncertainty of predicted manoeuvres.
+    """
+    if command is None:
+        given: Mapping[str, float] = {}
+    else:
+        given = command if isinstance(command, Mapping) else {"": float(command)}
+    asked = Conditions(
+        tuple((a, None) if isinstance(a, int | float) else (a[0], a[1]) for a in angles),
+        side,
+        speed,
+        given,
+        tuple(thrusters),
+        share,
+        astern,
+        until,
+        limited,
+        current,
+        course,
+        disturbed,
+        scale,
+        draws,
+        seed,
+    )
+    check(manoeuvre, model, asked)
+    model = model.settled()
+    helm = find_helm(model.vessel, asked.thrusters, limited=limited)
+    found: list[Manoeuvre | None] = []
+    if trial is None:
+        helm = driven(helm, model, asked)
+        todo = tasks(manoeuvre, helm, model, asked)
+        found = [None] * len(todo)
+    else:
+        pairs = found_in_trial(manoeuvre, trial, helm, asked)
+        if asked.command:
+            helm = driven(helm, model, asked)
+        found, todo = [m for m, _ in pairs], [task for _, task in pairs]
+    theta, d = _draws(model, asked)
+    made = []
+    for i, (task, measured) in enumerate(zip(todo, found, strict=True)):
+        progress(i, len(todo))
+        predicted = _one(manoeuvre, model, helm, asked, task, theta, d)
+        if measured is not None and trial is not None:
+            share_left = stop_speed(manoeuvre, asked)
+            again = end_again(measured, trial, share_left)
+            agreement = compare(model, again, trial, predicted.quantities)
+            told = _trial_notes(helm, predicted, measured, trial, asked)
+            predicted = replace(predicted, agreement=agreement, notes=(*predicted.notes, *told))
+        made.append(predicted)
+    progress(len(todo), len(todo))
+    shared = [n for n in made[0].notes if all(n in m.notes for m in made)]
+    made = [replace(m, notes=tuple(n for n in m.notes if n not in shared)) for m in made]
+    return ManoeuvrePrediction(
+        manoeuvre,
+        model.vessel.name,
+        helm.sentence if manoeuvre in ("turning", "zigzag") else helm.sentence.split(", ")[-1],
+        tuple(made),
+        asked.draws,
+        (*_notes(model, helm, asked), *shared),
+    )
+
+
+def _draws(model: ManoeuvringModel, asked: Conditions) -> tuple[Array, Array]:
+    """Return parameters (1 + R, p) and disturbances (1 + R, nd), those of the estimate first."""
+    rng = np.random.default_rng([137, asked.seed])
+    theta, d = draw_parameters(model, rng, asked.draws)
+    size = len(model.structure.disturbances)
+    acting = np.zeros((asked.draws + 1, size))
+    if asked.current and d is not None:
+        acting = np.vstack([model.d, d[:, 0]])
+    return np.vstack([model.theta, theta]), acting
+
+
+def _one(
+    kind: Kind,
+    model: ManoeuvringModel,
+    helm: Helm,
+    asked: Conditions,
+    task: Task,
+    theta: Array,
+    d: Array,
+) -> PredictedManoeuvre:
+    steady = straight_run(model, helm, theta, d, task.course, task.speed)
+    kept = np.flatnonzero(steady.found)
+    unheld = len(steady.found) - len(kept)
+    theta, d = theta[kept], d[kept]
+    steady = Steady(
+        steady.x[:, kept],
+        steady.throttle[kept],
+        steady.trim[kept],
+        steady.commands[:, kept],
+        steady.speed[kept],
+        steady.found[kept],
+    )
+    orders, end = _orders(kind, helm, asked, task, steady)
+    longest = _LONGEST * model.vessel.length / float(steady.speed[0])
+    noise = _process(model, asked, len(kept)) if asked.disturbed else None
+    runs = sail(model, helm, steady, theta, d, task.course, orders, longest, noise)
+    if runs.diverged[0]:
+        raise InfeasibleError(
+            f"the run of the estimate itself diverges {runs.t[-1] - runs.t[runs.order]:.3g} s after "
+            f"the order of the {kind} manoeuvre at {steady.speed[0]:.3g} m/s: this model cannot "
+            f"predict it. Estimate a smaller structure, or on a log with such motion."
+        )
+    executes = orders.executes if isinstance(orders, ZigZagOrders) else None
+    angular = helm.angular and task.order is not None
+
+    def measured(run: int) -> Manoeuvre | None:
+        if runs.diverged[run]:
+            return None
+        return measure(
+            runs,
+            run,
+            model.vessel.length,
+            rudder=task.order if angular else None,
+            full_rudder=helm.greatest if angular else None,
+            executes=None if executes is None else executes[run],
+            end_speed=None if end is None else float(end[run]),
+            reversed_thrust=kind == "crash",
+            scale=asked.scale,
+        )
+
+    own = measured(0)
+    if own is None:
+        raise LogError(
+            f"the estimate itself never swings back in the {_label(kind, helm, task, asked)} "
+            f"within {longest:.3g} s: give another --angle."
+        )
+    tables = [quantities(m) if m else {} for m in map(measured, range(1, len(kept)))]
+    # draws without an approach reach nothing
+    tables += [{}] * unheld
+    values = {n: drawn(v, [t.get(n) for t in tables]) for n, v in quantities(own).items()}
+    commands = {
+        name: drawn(
+            Quantity(float(steady.commands[i, 0]), 0.0, "1"),
+            [Quantity(float(c), 0.0, "1") for c in steady.commands[i, 1:]],
+        )
+        for i, name in enumerate(helm.columns)
+    }
+    log = _log(runs, 0, model, helm)
+    return PredictedManoeuvre(
+        kind,
+        task.side,
+        None if task.order is None else task.sign * task.order,
+        task.heading,
+        _label(kind, helm, task, asked),
+        {n: q for n, q in commands.items() if q is not None},
+        values,
+        _criteria(own, values, model.vessel.length),
+        asked.draws,
+        int(runs.diverged[1:].sum()),
+        int(((runs.complete[1:] < 0) & ~runs.diverged[1:]).sum()),
+        unheld,
+        _run_notes(kind, model, own, runs, unheld, values, log, helm, steady, longest),
+        log,
+        float(runs.t[runs.order]),
+        _bundle(runs, helm, task.course),
+    )
+
+
+def _orders(
+    kind: Kind, helm: Helm, asked: Conditions, task: Task, steady: Steady
+) -> tuple[Orders, Array | None]:
+    """Return what is ordered, and the surge velocity at which a stop ends."""
+    if task.order is None:
+        end = stop_speed(kind, asked) * steady.speed
+        astern = stop_throttle(kind, helm, asked)
+        return Stop(np.full(len(steady.speed), astern), end), end
+    order = task.sign * task.order
+    wanted = helm.commands(steady.throttle[:1], order)
+    outside = helm.outside(wanted)[:, 0]
+    for i in np.flatnonzero(outside):
+        limit = helm.limits[i]
+        raise UsageError(
+            f"this needs {helm.columns[i]} = {wanted[i, 0]:.4g}, and the vessel file keeps it "
+            f"from {limit.lower} to {limit.upper}: give a smaller --angle or --share, a lower "
+            f"--speed, or --no-limits."
+        )
+    if task.heading is None:
+        return Turn(order, steady.throttle), None
+    return ZigZagOrders(order, task.heading, steady.throttle), None
+
+
+def _process(model: ManoeuvringModel, asked: Conditions, runs: int) -> Iterator[Array]:
+    """Yield process noise (nx, R) of each sample; none of the estimate's own run."""
+    noise = model.noise
+    rng = np.random.default_rng([138, asked.seed])
+    nx = len(model.structure.states)
+    size = np.zeros(nx) if noise is None else noise.process
+    memory = np.zeros(nx) if noise is None or not noise.memory.size else noise.memory
+    drive = size * np.sqrt(1 - memory**2)
+    push = size * rng.standard_normal((runs, nx))
+    while True:
+        pushes, push = process_noise(rng, push, memory, drive, _STEPS)
+        pushes[0] = 0.0
+        yield from pushes.transpose(1, 2, 0)
+
+
+def _criteria(
+    own: Manoeuvre, values: Mapping[str, Drawn | None], length: float
+) -> tuple[Criterion, ...]:
+    """Judge the limits that apply by the intervals of the draws."""
+    made = []
+    for criterion in own.criteria:
+        value = values.get(CRITERIA.get(criterion.name, ""))
+        if criterion.limit is None:
+            reason = criterion.reason.replace("the log has no rudder angle", "no angle steers")
+            made.append(replace(criterion, reason=reason))
+            continue
+        if value is None:
+            made.append(
+                replace(criterion, verdict=Verdict.OPEN, reason="the run does not reach it")
+            )
+            continue
+        lengths = criterion.measured is None or criterion.measured.unit == "1"
+        shown = value.scaled(1 / length, "1") if lengths else value
+        judged = judge(criterion.name, shown, criterion.limit, criterion.reason)
+        if judged.verdict is Verdict.PASS and not value.certain:
+            reason = f"{value.reached} of {value.draws} draws reach it"
+            judged = replace(judged, verdict=Verdict.OPEN, reason=reason)
+        made.append(judged)
+    return tuple(made)
+
+
+def _label(kind: Kind, helm: Helm, task: Task, asked: Conditions) -> str:
+    if task.order is None:
+        share = stop_speed(kind, asked)
+        what = "stop with full astern" if kind == "crash" else "stop without thrust"
+        return what + (f", to {100 * share:g} % of the approach speed" if share else "")
+    amount = {
+        "rudder": f"rudder {math.degrees(task.order):.3g} deg",
+        "azimuth": f"azimuths {math.degrees(task.order):.3g} deg",
+        "difference": f"speeds {100 * task.order:.3g} % apart",
+        "tunnel": f"tunnel speed {task.order:.4g}",
+    }[helm.kind]
+    if task.heading is None:
+        return f"turning circle to {task.side}, {amount}"
+    heading = f"{math.degrees(task.heading):.3g} deg"
+    return f"zig-zag, first to {task.side}, {amount}, reversed at {heading} of heading"
+
+
+def _log(runs: Runs, run: int, model: ManoeuvringModel, helm: Helm) -> TrialLog:
+    stop = int(runs.complete[run]) + 1 if runs.complete[run] >= 0 else len(runs.t)
+    x_n, y_n = runs.track(run, stop)
+    channels = {"t": runs.t[:stop], "x_n": x_n, "y_n": y_n, "psi": runs.psi[:stop, run]}
+    channels |= {n: runs.states[:stop, i, run] for i, n in enumerate(("u", "v", "r"))}
+    channels |= {n: runs.commands[:stop, i, run] for i, n in enumerate(helm.columns)}
+    return make_log(model.vessel, channels, model.sample_time, "prediction")
+
+
+def _bundle(runs: Runs, helm: Helm, course: float) -> Bundle:
+    stop = int(runs.complete[0]) + 1 if runs.complete[0] >= 0 else len(runs.t)
+    k = np.arange(0, stop, max(1, stop // _SHOWN_SAMPLES))
+    good = np.flatnonzero(~runs.diverged)
+    signals = {
+        "heading": runs.psi[k][:, good] - course,
+        "r": runs.states[k][:, 2, good],
+        "speed": np.hypot(runs.states[k][:, 0, good], runs.states[k][:, 1, good]),
+    }
+    moved = np.flatnonzero(helm.steer if helm.angular else helm.drive)
+    sign = float(np.sign(helm.steer[moved[0]])) if helm.angular else 1.0
+    signals["steering"] = sign * runs.commands[k][:, moved[0]][:, good]
+    tail = {n: np.quantile(v, [0.025, 0.975], axis=1) for n, v in signals.items()}
+    c, s = math.cos(course), math.sin(course)
+    tracks = []
+    for run in good[:_SHOWN_TRACKS]:
+        last = int(runs.complete[run]) + 1 if runs.complete[run] >= 0 else stop
+        north, east = runs.track(int(run), last)
+        north, east = north - north[runs.order], east - east[runs.order]
+        thin = slice(None, None, max(1, last // _SHOWN_SAMPLES))
+        tracks.append(((c * north + s * east)[thin], (-s * north + c * east)[thin]))
+    return Bundle(
+        runs.t[k] - runs.t[runs.order],
+        {n: v[:, 0] for n, v in signals.items()},
+        {n: v[0] for n, v in tail.items()},
+        {n: v[1] for n, v in tail.items()},
+        tuple(tracks),
+    )
+
+
+def _run_notes(
+    kind: Kind,
+    model: ManoeuvringModel,
+    own: Manoeuvre,
+    runs: Runs,
+    unheld: int,
+    values: Mapping[str, Drawn | None],
+    log: TrialLog,
+    helm: Helm,
+    steady: Steady,
+    longest: float,
+) -> tuple[str, ...]:
+    told = []
+    total = len(runs.diverged) - 1
+    if unheld:
+        told.append(
+            f"{unheld} of {total + unheld} draws do not hold the approach speed within the limits "
+            f"of the commands and were left out: intervals are too narrow by them."
+        )
+    diverged = int(runs.diverged[1:].sum())
+    if diverged:
+        told.append(
+            f"{diverged} of {total} draws diverge and count in no interval: estimate a smaller "
+            f"structure, or on a longer log."
+        )
+    short = int(((runs.complete[1:] < 0) & ~runs.diverged[1:]).sum())
+    if runs.complete[0] < 0:
+        told.append(
+            f"the estimate itself does not complete the manoeuvre within {longest:.3g} s: what it "
+            f"does not reach is said so."
+        )
+    if short:
+        worst = min((v for v in values.values() if v is not None), key=lambda v: v.reached)
+        told.append(
+            f"{short} of {total} draws do not complete the manoeuvre within {longest:.3g} s; "
+            f"intervals are of those that reach the quantity, {worst.reached} at least."
+        )
+    if kind in ("turning", "zigzag"):
+        names = [n for n, s in zip(helm.columns, helm.steer, strict=True) if s != 0]
+    else:
+        names = [n for n, v in zip(helm.columns, helm.drive, strict=True) if v != 0]
+    instant = [n for n in names if model.vessel.limits[n].rate is None]
+    if instant:
+        told.append(
+            f"the vessel file states no rate of {', '.join(instant)}, so orders are carried out "
+            f"at once: add it where the trial's helm takes time."
+        )
+    if abs(float(steady.trim[0])) > 1e-6:
+        trim = math.degrees(steady.trim[0]) if helm.angular else float(steady.trim[0])
+        unit = " deg" if helm.angular else ""
+        told.append(f"the straight approach needs a steering order of {trim:.3g}{unit}.")
+    told += [n for n in own.notes if n.startswith(("the yaw rate changes", "the ship still moves"))]
+    return (*told, *extrapolation(model, log))
+
+
+def _notes(model: ManoeuvringModel, helm: Helm, asked: Conditions) -> tuple[str, ...]:
+    told = []
+    verdict = str(model.record.get("verdict", {}).get("text", ""))
+    if verdict.startswith(("do not trust", "trust except")):
+        told.append(f"the estimate's own verdict is '{verdict}'.")
+    if not model.covariance.any():
+        told.append("the model has no covariance, so its parameters were taken as exact.")
+    if asked.disturbed and model.noise is None:
+        told.append(
+            "the model has no noise levels, so --disturbed adds nothing: estimate it with "
+            "--method iv or oe."
+        )
+    elif not asked.disturbed:
+        told.append(
+            "intervals hold what is uncertain of the parameters"
+            + (" and of the current" if asked.current and model.disturbances else "")
+            + ", not what waves and gusts do to one trial (--disturbed adds it)."
+        )
+    if asked.current and not model.disturbances:
+        told.append("the model has no current, so --current adds nothing.")
+    if not asked.limited:
+        told.append("the ranges of the commands in the vessel file were not kept.")
+    return tuple(told)
+
+
+def _trial_notes(
+    helm: Helm, predicted: PredictedManoeuvre, found: Manoeuvre, log: TrialLog, asked: Conditions
+) -> list[str]:
+    """Say with what commands the trial sailed, where they are not the predicted ones."""
+    run = found.length / max(found.approach_speed.value, 1e-9)
+    k = (log.t >= found.start - run) & (log.t < found.start)
+    if not k.any() or asked.command:
+        return []
+    told = []
+    for name, drive in zip(helm.columns, helm.drive, strict=True):
+        if drive == 0 or name not in log:
+            continue
+        real, own = float(np.median(log[name][k])), predicted.commands[name]
+        if not min(own.low, own.value * 0.99) <= real <= max(own.high, own.value * 1.01):
+            told.append(
+                f"the model needs {name} = {own.value:.4g} to hold the trial's approach speed of "
+                f"{found.approach_speed.value:.3g} m/s, the trial ran at {real:.4g}: try --command."
+            )
+    return told
