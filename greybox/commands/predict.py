@@ -203,7 +203,7 @@ def _command(texts: list[str]) -> float | dict[str, float] | None:
             f"--command is '{' '.join(texts)}': write one number for all propellers, or NAME=N "
             f"each, such as n1=300 n2=300."
         )
-    return named[""] if "" in named else named
+    return named.get("", named)
 
 
 def _write_runs(made: ManoeuvrePrediction, path: str) -> list[str]:
@@ -218,7 +218,7 @@ def _write_runs(made: ManoeuvrePrediction, path: str) -> list[str]:
     for i, manoeuvre in enumerate(made.manoeuvres):
         name = target
         if len(made.manoeuvres) > 1:
-            parts = [manoeuvre.side]
+            parts: list[str] = [manoeuvre.side]
             if manoeuvre.order is not None and abs(manoeuvre.order) < math.pi:
                 parts.append(f"{math.degrees(abs(manoeuvre.order)):.0f}")
             name = target.with_stem("_".join([target.stem, *parts]))

@@ -146,7 +146,7 @@ def check(kind: Kind, model: ManoeuvringModel, asked: Conditions) -> None:
             )
     if asked.until is not None and not 0 <= asked.until < 1:
         raise UsageError(
-            f"--until is {asked.until:g}, a share of the approach speed from 0 to below 1 is needed."
+            f"--until is {asked.until:g}, it is a share of the approach speed: give 0 to below 1."
         )
     if kind == "turning" and any(h is not None for _, h in asked.angles):
         raise UsageError(

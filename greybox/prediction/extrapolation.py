@@ -11,8 +11,8 @@ from greybox.model.model import ManoeuvringModel
 from greybox.trial.log import TrialLog
 
 _NAMES = {"u": "surge", "v": "sway", "r": "yaw rate"}
-# share of a range's width by which a value may be outside it
-_SLACK = 0.05
+# shares of a range's width, and of its values, by which one may be outside it
+_SLACK, _NEAR = 0.05, 0.01
 
 
 def extrapolation(model: ManoeuvringModel, log: TrialLog) -> tuple[str, ...]:
@@ -42,7 +42,7 @@ def extrapolation(model: ManoeuvringModel, log: TrialLog) -> tuple[str, ...]:
         if name not in log:
             continue
         least, most = float(np.min(log[name])), float(np.max(log[name]))
-        slack = _SLACK * (high - low)
+        slack = max(_SLACK * (high - low), _NEAR * max(abs(low), abs(high)))
         if least >= low - slack and most <= high + slack:
             continue
         factor = 180 / math.pi if name in angles else 1.0

@@ -10,7 +10,6 @@ import numpy as np
 from greybox.prediction.running import Runs
 from greybox.trial.manoeuvres import (
     Quantity,
-    Stopping,
     TurningCircle,
     ZigZag,
     measure_stopping,
@@ -19,8 +18,8 @@ from greybox.trial.manoeuvres import (
 )
 from greybox.trial.manoeuvres.finding import Manoeuvre
 
-# samples in the time of one ship length that are enough to measure by
-_DENSE = 40
+# samples in the time of one ship length, and in all, that are enough to measure by
+_DENSE, _MOST = 25, 1200
 
 LABELS: Mapping[str, str] = {
     "approach_speed": "approach speed",
@@ -129,13 +128,10 @@ def measure(
     start = float(runs.t[runs.order])
     speed = max(float(np.hypot(*states[0, :2])), 1e-9)
     sample_time = float(runs.t[1] - runs.t[0])
-    thin = max(1, math.floor(length / speed / sample_time / _DENSE))
+    thin = max(1, math.floor(length / speed / sample_time / _DENSE), stop // _MOST)
     # counted from the end, so that the last sample stays
     kept = np.arange(stop - 1, -1, -thin)[::-1]
-    arrays = (
-        runs.t[kept], x_n[kept], y_n[kept], psi[kept], states[kept, 0], states[kept, 1]
-    )  # fmt: skip
-    exact = {"heading_std": 0.0, "position_std": 0.0}
+    arrays = runs.t[kept], x_n[kept], y_n[kept], psi[kept], states[kept, 0], states[kept, 1]
     if end_speed is not None:
         return measure_stopping(
             *arrays,
@@ -143,11 +139,18 @@ def measure(
             length=length,
             reversed_thrust=reversed_thrust,
             end_speed=end_speed,
-            **exact,
+            heading_std=0.0,
+            position_std=0.0,
         )
     if executes is None:
         return measure_turning_circle(
-            *arrays, start=start, length=length, rudder=rudder, full_rudder=full_rudder, **exact
+            *arrays,
+            start=start,
+            length=length,
+            rudder=rudder,
+            full_rudder=full_rudder,
+            heading_std=0.0,
+            position_std=0.0,
         )
     made = runs.t[runs.order] + sample_time * executes[executes >= 0]
     if len(made) < 2:
@@ -160,5 +163,6 @@ def measure(
         length=length,
         stop=float(runs.t[stop - 1]),
         scale=scale,
-        **exact,
+        heading_std=0.0,
+        position_std=0.0,
     )

@@ -34,8 +34,8 @@ from greybox.prediction.result import (
     Side,
 )
 from greybox.prediction.running import Runs, sail
-from greybox.prediction.steady import Steady, straight_run
-from greybox.prediction.trial import compare, end_again, found_in_trial
+from greybox.prediction.steady import Steady, require_straight, straight_run
+from greybox.prediction.trial import compare, end_again, found_in_trial, with_rates
 from greybox.trial.log import TrialLog, make_log
 from greybox.trial.manoeuvres import Criterion, Quantity, Verdict
 from greybox.trial.manoeuvres.finding import Manoeuvre
@@ -163,13 +163,16 @@ def predict_manoeuvre(
     check(manoeuvre, model, asked)
     model = model.settled()
     helm = find_helm(model.vessel, asked.thrusters, limited=limited)
+    require_straight(helm)
     found: list[Manoeuvre | None] = []
+    told_rates: list[str] = []
     if trial is None:
         helm = driven(helm, model, asked)
         todo = tasks(manoeuvre, helm, model, asked)
         found = [None] * len(todo)
     else:
         pairs = found_in_trial(manoeuvre, trial, helm, asked)
+        helm, told_rates = with_rates(helm, trial, [m for m, _ in pairs])
         if asked.command:
             helm = driven(helm, model, asked)
         found, todo = [m for m, _ in pairs], [task for _, task in pairs]
@@ -181,7 +184,7 @@ def predict_manoeuvre(
         if measured is not None and trial is not None:
             share_left = stop_speed(manoeuvre, asked)
             again = end_again(measured, trial, share_left)
-            agreement = compare(model, again, trial, predicted.quantities)
+            agreement = compare(model, helm, again, trial, predicted)
             told = _trial_notes(helm, predicted, measured, trial, asked)
             predicted = replace(predicted, agreement=agreement, notes=(*predicted.notes, *told))
         made.append(predicted)
@@ -194,7 +197,7 @@ def predict_manoeuvre(
         helm.sentence if manoeuvre in ("turning", "zigzag") else helm.sentence.split(", ")[-1],
         tuple(made),
         asked.draws,
-        (*_notes(model, helm, asked), *shared),
+        (*_notes(model, helm, asked), *told_rates, *shared),
     )
 
 
@@ -236,9 +239,9 @@ def _one(
     runs = sail(model, helm, steady, theta, d, task.course, orders, longest, noise)
     if runs.diverged[0]:
         raise InfeasibleError(
-            f"the run of the estimate itself diverges {runs.t[-1] - runs.t[runs.order]:.3g} s after "
-            f"the order of the {kind} manoeuvre at {steady.speed[0]:.3g} m/s: this model cannot "
-            f"predict it. Estimate a smaller structure, or on a log with such motion."
+            f"the run of the estimate itself diverges within {runs.t[-1] - runs.t[runs.order]:.3g} "
+            f"s of the order of the {kind} manoeuvre at {steady.speed[0]:.3g} m/s: this model "
+            f"cannot predict it. Estimate a smaller structure, or on a log with such motion."
         )
     executes = orders.executes if isinstance(orders, ZigZagOrders) else None
     angular = helm.angular and task.order is not None
@@ -292,7 +295,7 @@ def _one(
         _run_notes(kind, model, own, runs, unheld, values, log, helm, steady, longest),
         log,
         float(runs.t[runs.order]),
-        _bundle(runs, helm, task.course),
+        _bundle(runs, helm, task.course, model.vessel.length),
     )
 
 
@@ -386,9 +389,11 @@ def _log(runs: Runs, run: int, model: ManoeuvringModel, helm: Helm) -> TrialLog:
     return make_log(model.vessel, channels, model.sample_time, "prediction")
 
 
-def _bundle(runs: Runs, helm: Helm, course: float) -> Bundle:
+def _bundle(runs: Runs, helm: Helm, course: float, length: float) -> Bundle:
     stop = int(runs.complete[0]) + 1 if runs.complete[0] >= 0 else len(runs.t)
-    k = np.arange(0, stop, max(1, stop // _SHOWN_SAMPLES))
+    sailed = length / float(np.hypot(*runs.states[0, :2, 0]))
+    near = int(np.searchsorted(runs.t, runs.t[runs.order] - sailed))
+    k = np.arange(near, stop, max(1, stop // _SHOWN_SAMPLES))
     good = np.flatnonzero(~runs.diverged)
     signals = {
         "heading": runs.psi[k][:, good] - course,
@@ -405,7 +410,7 @@ def _bundle(runs: Runs, helm: Helm, course: float) -> Bundle:
         last = int(runs.complete[run]) + 1 if runs.complete[run] >= 0 else stop
         north, east = runs.track(int(run), last)
         north, east = north - north[runs.order], east - east[runs.order]
-        thin = slice(None, None, max(1, last // _SHOWN_SAMPLES))
+        thin = slice(near, None, max(1, last // _SHOWN_SAMPLES))
         tracks.append(((c * north + s * east)[thin], (-s * north + c * east)[thin]))
     return Bundle(
         runs.t[k] - runs.t[runs.order],
@@ -457,7 +462,8 @@ def _run_notes(
         names = [n for n, s in zip(helm.columns, helm.steer, strict=True) if s != 0]
     else:
         names = [n for n, v in zip(helm.columns, helm.drive, strict=True) if v != 0]
-    instant = [n for n in names if model.vessel.limits[n].rate is None]
+    rates = dict(zip(helm.columns, (x.rate for x in helm.limits), strict=True))
+    instant = [n for n in names if rates[n] is None]
     if instant:
         told.append(
             f"the vessel file states no rate of {', '.join(instant)}, so orders are carried out "

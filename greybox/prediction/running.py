@@ -145,7 +145,7 @@ def sail(
                 state[:nx] += next(process)
     complete = np.where((orders.complete >= 0) & ~diverged, orders.complete + before, -1)
     return Runs(
-        np.arange(len(psi)) * step,
+        np.asarray(np.arange(len(psi)) * step, float),
         np.stack(states),
         np.stack(psi),
         np.stack(commands),

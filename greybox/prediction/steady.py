@@ -21,7 +21,7 @@ _SPEEDS = np.geomspace(1e-3, 100.0, _POINTS)
 # throttles tried where no limits are stated: in the unit of the log, whatever it is
 _THROTTLES = np.geomspace(1e-4, 1e6, _POINTS)
 _STEPS = 40
-_TOLERANCE = 1e-9
+_TOLERANCE = 1e-13
 
 
 @dataclass(frozen=True)
@@ -79,11 +79,10 @@ def straight_run(
     Raises
     ------
     UsageError
-        Limits forbid to steer straight ahead.
+        Nothing pushes ahead.
     InfeasibleError
         The model does not hold the speed, or none at all.
     """
-    _require_straight(helm)
     states = model.structure.states
     problem = _Problem(model, helm, theta, d, heading, speed)
     start = _first(model, helm, theta[:1], d[:1], heading, speed)
@@ -247,7 +246,14 @@ def _crossing(x: Array, y: Array) -> float | None:
     return float(x[k] - y[k] * (x[k + 1] - x[k]) / (y[k + 1] - y[k]))
 
 
-def _require_straight(helm: Helm) -> None:
+def require_straight(helm: Helm) -> None:
+    """Refuse limits that forbid to steer straight ahead.
+
+    Raises
+    ------
+    UsageError
+        The command and its limits are named.
+    """
     straight = np.zeros(len(helm.columns))
     outside = helm.outside(straight) & (helm.drive == 0)
     for i in np.flatnonzero(outside):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +15,16 @@ from greybox.prediction.conditions import Conditions, Task
 from greybox.prediction.drawn import Drawn
 from greybox.prediction.helm import Helm
 from greybox.prediction.measuring import LABELS, quantities
-from greybox.prediction.result import Agreement, Compared, Kind, Side
+from greybox.prediction.result import Agreement, Compared, Kind, PredictedManoeuvre, Side
 from greybox.trial.log import TrialLog
-from greybox.trial.manoeuvres import Quantity, Stopping, TurningCircle, ZigZag, find_manoeuvres
+from greybox.trial.manoeuvres import (
+    Quantity,
+    Stopping,
+    TurningCircle,
+    ZigZag,
+    find_manoeuvres,
+    steering_angle,
+)
 from greybox.trial.manoeuvres.finding import Manoeuvre
 from greybox.trial.manoeuvres.stopping import measure_stopping
 from greybox.trial.manoeuvres.track import make_track, without_antenna
@@ -25,6 +34,8 @@ Array = NDArray[np.float64]
 # how far angles may be from those asked for, to be the same manoeuvre [rad]
 _NEAR = math.radians(2.5)
 _POINTS = 1500
+# quantile of a helm's moves that is taken for its full speed
+_FASTEST = 0.99
 
 
 def found_in_trial(
@@ -100,6 +111,28 @@ def _speeds(found: Manoeuvre, log: TrialLog, helm: Helm) -> float:
     return abs(float(np.mean([helm.steer[i] * n for i, n in speed.items()])))
 
 
+def with_rates(helm: Helm, log: TrialLog, found: Sequence[Manoeuvre]) -> tuple[Helm, list[str]]:
+    """Return a helm whose steering moves as fast as in the trial, where no rate is stated."""
+    limits, told = list(helm.limits), []
+    for i, name in enumerate(helm.columns):
+        if helm.steer[i] == 0 or limits[i].rate is not None or name not in log:
+            continue
+        steps = [np.abs(np.diff(log[name][(log.t >= m.start) & (log.t <= m.stop)])) for m in found]
+        moves = np.concatenate(steps)
+        # single steps are faults of the sensor, small ones its noise
+        fast = float(np.quantile(moves, _FASTEST)) if len(moves) else 0.0
+        if fast <= 0:
+            continue
+        rate = float(np.median(moves[moves > fast / 2])) / log.sample_time
+        limits[i] = replace(limits[i], rate=rate)
+        unit, factor = (" deg", 180 / math.pi) if helm.angular else ("", 1.0)
+        told.append(
+            f"the vessel file states no rate of {name}; it moves at {rate * factor:.3g}{unit} per "
+            f"second here, as in the trial."
+        )
+    return replace(helm, limits=tuple(limits)), told
+
+
 def end_again(found: Manoeuvre, log: TrialLog, share: float) -> Manoeuvre:
     """Measure a stop again until the share of the approach speed that was asked for."""
     if not isinstance(found, Stopping) or share == 0:
@@ -115,9 +148,10 @@ def end_again(found: Manoeuvre, log: TrialLog, share: float) -> Manoeuvre:
 
 def compare(
     model: ManoeuvringModel,
+    helm: Helm,
     found: Manoeuvre,
     log: TrialLog,
-    predicted: dict[str, Drawn | None],
+    predicted: PredictedManoeuvre,
 ) -> Agreement:
     """Put predicted and measured quantities side by side.
 
@@ -125,7 +159,7 @@ def compare(
     """
     rows = []
     for name, value in quantities(found).items():
-        beside = predicted.get(name)
+        beside = predicted.quantities.get(name)
         if value is None or beside is None or name == "approach_speed":
             continue
         low, high = value.interval
@@ -135,14 +169,19 @@ def compare(
         difference = Drawn(
             gap, (below + above) / 2 / 1.96, value.unit, math.inf, gap - below, gap + above
         )
-        rows.append(Compared(name, beside, value, difference, -below <= -gap <= above))
+        rows.append(Compared(name, beside, value, difference, -above <= gap <= below))
+    # as long as the predicted one, from one ship length before the order
+    run = found.length / max(found.approach_speed.value, 1e-9)
+    last = min(found.stop, found.start + float(predicted.bundle.t[-1]))
+    k = np.flatnonzero((log.t >= found.start - run) & (log.t <= last))
+    k = k[:: max(1, len(k) // _POINTS)]
     return Agreement(
         log.name,
         found,
         tuple(rows),
         _sentence(model, log, rows, found.length),
-        _track(found, log),
-        _history(found, log),
+        _track(found, log, k),
+        _history(found, log, helm, k),
     )
 
 
@@ -152,7 +191,7 @@ def _sentence(model: ManoeuvringModel, log: TrialLog, rows: list[Compared], leng
     off = [r for r in rows if not r.agrees]
     known = [str(entry.get("sha256", "")) for entry in model.record.get("logs", ())]
     own = log.provenance.sha256
-    told = ", on which the model was estimated" if own and own in known else ""
+    told = ", on which the model was estimated," if own and own in known else ""
     if not off:
         return (
             f"prediction and '{log.name}'{told} agree: all {len(rows)} differences lie within "
@@ -166,7 +205,7 @@ def _sentence(model: ManoeuvringModel, log: TrialLog, rows: list[Compared], leng
     )
     return (
         f"prediction and '{log.name}'{told} agree in {len(rows) - len(off)} of {len(rows)} "
-        f"quantities within both intervals; beyond: {names}; clearest {shown}."
+        f"quantities within both intervals; beyond: {names}. Clearest: {shown}."
     )
 
 
@@ -181,27 +220,24 @@ def _positions(log: TrialLog) -> tuple[Array | None, Array | None]:
     return without_antenna(log["x_n"], log["y_n"], log["psi"], antenna)
 
 
-def _track(found: Manoeuvre, log: TrialLog) -> tuple[Array, Array]:
+def _track(found: Manoeuvre, log: TrialLog, k: NDArray[np.intp]) -> tuple[Array, Array]:
     x_n, y_n = _positions(log)
     track = make_track(log.t, x_n, y_n, log["psi"], log["u"], log["v"])
-    k = _during(found, log)
     north = track.x_n[k] - np.interp(found.start, log.t, track.x_n)
     east = track.y_n[k] - np.interp(found.start, log.t, track.y_n)
     c, s = math.cos(found.approach_heading.value), math.sin(found.approach_heading.value)
     return c * north + s * east, -s * north + c * east
 
 
-def _history(found: Manoeuvre, log: TrialLog) -> dict[str, Array]:
-    k = _during(found, log)
+def _history(found: Manoeuvre, log: TrialLog, helm: Helm, k: NDArray[np.intp]) -> dict[str, Array]:
     made = {
         "t": log.t[k] - found.start,
         "heading": log["psi"][k] - found.approach_heading.value,
         "speed": np.hypot(log["u"][k], log["v"][k]),
     }
-    return made | ({"r": log["r"][k]} if "r" in log else {})
-
-
-def _during(found: Manoeuvre, log: TrialLog) -> NDArray[np.intp]:
-    run = found.length / max(found.approach_speed.value, 1e-9)
-    k = np.flatnonzero((log.t >= found.start - 2 * run) & (log.t <= found.stop))
-    return k[:: max(1, len(k) // _POINTS)]
+    if "r" in log:
+        made["r"] = log["r"][k]
+    steering = steering_angle(log) if helm.angular else None
+    if steering is not None:
+        made["steering"] = steering[0][k] / helm.seen
+    return made

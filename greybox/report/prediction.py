@@ -85,6 +85,8 @@ def _section(made: PredictedManoeuvre, key: str) -> Section:
     sentences = [] if made.agreement is None else [_capital(made.agreement.sentence)]
     figure = _figure(made)
     caption = "The estimate's own run, and where 95 % of the draws are (shaded; thin tracks)."
+    if made.kind == "zigzag":
+        caption += " The scales of the track differ."
     if made.agreement is not None:
         caption += f" Black: measured in {made.agreement.log}."
     tables = [_values(made)]
@@ -152,13 +154,13 @@ def _beside(made: PredictedManoeuvre) -> Table:
 
 def _figure(made: PredictedManoeuvre) -> Any:
     turns = made.order is not None
-    figure = new_figure(10, 5.2 if turns else 4.2)
+    figure = new_figure(10, 6.0 if turns else 4.2)
     panels = [("speed", "speed [m/s]", 1.0), ("steering", "propeller speed", 1.0)]
     if turns:
         angle = bool(made.log.vessel.angle_commands) and made.bundle.nominal["steering"].any()
         panels = [
-            ("heading", "heading change [deg]", _DEGREES),
-            ("r", "yaw rate [deg/s]", _DEGREES),
+            ("heading", "heading [deg]", _DEGREES),
+            ("r", "yaw [deg/s]", _DEGREES),
             ("speed", "speed [m/s]", 1.0),
         ]
         if angle:
@@ -210,7 +212,8 @@ def _track(axes: Any, made: PredictedManoeuvre) -> None:
         along, across = made.agreement.track
         axes.plot(across, along, color=BLACK, linewidth=1.2, label="measured")
     axes.plot(0, 0, "o", color=VERMILION, markersize=6, markeredgecolor="white", label="order")
-    axes.set_aspect("equal", adjustable="datalim")
+    if made.kind == "turning":
+        axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel("to starboard of the approach [m]", fontsize=9)
     axes.set_ylabel("along the approach [m]", fontsize=9)
     axes.tick_params(labelsize=8)
