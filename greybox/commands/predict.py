@@ -118,7 +118,7 @@ def run(options: argparse.Namespace) -> None:
     from greybox.files import check_targets, write_json
     from greybox.model.model import load_model
     from greybox.prediction.predict import predict_manoeuvre
-    from greybox.trial.reading import read_log
+    from greybox.trial.reading import read_segments
 
     check_targets(options.json, options.report, options.out)
     angles = [_angle(text) for text in options.angle]
@@ -126,7 +126,7 @@ def run(options: argparse.Namespace) -> None:
     model = load_model(options.model)
     trial = None
     if options.trial is not None:
-        trial = read_log(options.trial, model.vessel, states=model.structure.states)
+        trial = read_segments(options.trial, model.vessel, states=model.structure.states)
     made = predict_manoeuvre(
         model,
         options.manoeuvre,

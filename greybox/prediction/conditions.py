@@ -193,22 +193,22 @@ def driven(helm: Helm, model: ManoeuvringModel, asked: Conditions) -> Helm:
 
 
 def _usual(helm: Helm, model: ManoeuvringModel, moved: Sequence[str]) -> dict[str, float]:
+    """Return the greatest speeds in common of the model's logs, or of the vessel file."""
     ranges = model.record.get("ranges", {})
     low, high = bounds(helm.limits)
-    made = {}
+    throttle = math.inf
     for name in moved:
         i = helm.columns.index(name)
-        ends = ranges.get(name)
-        sign = math.copysign(1.0, helm.drive[i])
-        most = max(sign * float(e) for e in ends) if ends else sign * (high if sign > 0 else low)[i]
-        value = float(np.clip(sign * most, low[i], high[i]))
-        if not math.isfinite(value) or sign * value <= 0:
+        drive = helm.drive[i]
+        most = max(e / drive for e in ranges[name]) if name in ranges else math.inf
+        most = min(most, max(low[i] / drive, high[i] / drive))
+        if not math.isfinite(most) or most <= 0:
             raise UsageError(
                 f"neither the model's logs nor the vessel file tell a speed of {name} ahead: "
                 f"give --speed in m/s, or --command in the unit of {name}."
             )
-        made[name] = value
-    return made
+        throttle = min(throttle, most)
+    return {n: throttle * float(helm.drive[helm.columns.index(n)]) for n in moved}
 
 
 def tasks(kind: Kind, helm: Helm, model: ManoeuvringModel, asked: Conditions) -> list[Task]:

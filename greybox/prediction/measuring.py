@@ -18,8 +18,9 @@ from greybox.trial.manoeuvres import (
 )
 from greybox.trial.manoeuvres.finding import Manoeuvre
 
-# samples in the time of one ship length, and in all, that are enough to measure by
-_DENSE, _MOST = 25, 1200
+# samples in the time of one ship length, and in all, that are enough to measure by, and the
+# fewest in a manoeuvre
+_DENSE, _MOST, _LEAST = 25, 1200, 200
 
 LABELS: Mapping[str, str] = {
     "approach_speed": "approach speed",
@@ -128,7 +129,8 @@ def measure(
     start = float(runs.t[runs.order])
     speed = max(float(np.hypot(*states[0, :2])), 1e-9)
     sample_time = float(runs.t[1] - runs.t[0])
-    thin = max(1, math.floor(length / speed / sample_time / _DENSE), stop // _MOST)
+    dense = math.floor(length / speed / sample_time / _DENSE)
+    thin = max(1, min(dense, (stop - runs.order) // _LEAST), stop // _MOST)
     # counted from the end, so that the last sample stays
     kept = np.arange(stop - 1, -1, -thin)[::-1]
     arrays = runs.t[kept], x_n[kept], y_n[kept], psi[kept], states[kept, 0], states[kept, 1]

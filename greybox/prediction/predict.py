@@ -37,7 +37,7 @@ from greybox.prediction.running import Runs, sail
 from greybox.prediction.steady import Steady, require_straight, straight_run
 from greybox.prediction.trial import compare, end_again, found_in_trial, with_rates
 from greybox.trial.log import TrialLog, make_log
-from greybox.trial.manoeuvres import Criterion, Quantity, Verdict
+from greybox.trial.manoeuvres import Criterion, Quantity, TurningCircle, Verdict, ZigZag
 from greybox.trial.manoeuvres.finding import Manoeuvre
 from greybox.trial.manoeuvres.standards import judge
 from greybox.validation.bands import draw_parameters, process_noise
@@ -72,7 +72,7 @@ def predict_manoeuvre(
     scale: float = 1.0,
     draws: int = 256,
     seed: int = 0,
-    trial: TrialLog | None = None,
+    trial: TrialLog | Sequence[TrialLog] | None = None,
     progress: Progress = lambda done, total: None,
 ) -> ManoeuvrePrediction:
     """Predict a standard manoeuvre from an identified model.
@@ -116,7 +116,7 @@ def predict_manoeuvre(
     scale : float
         Length of the full-scale ship over that of the vessel, for the limits of the IMO.
     draws, seed : int
-    trial : TrialLog, optional
+    trial : TrialLog or sequence of TrialLog, optional
         The same manoeuvres are looked for there, predicted at their approach speeds and
         angles, and compared.
     progress : callable
@@ -164,28 +164,28 @@ def predict_manoeuvre(
     model = model.settled()
     helm = find_helm(model.vessel, asked.thrusters, limited=limited)
     require_straight(helm)
-    found: list[Manoeuvre | None] = []
+    found: list[tuple[Task, Manoeuvre, TrialLog]] = []
     told_rates: list[str] = []
     if trial is None:
         helm = driven(helm, model, asked)
         todo = tasks(manoeuvre, helm, model, asked)
-        found = [None] * len(todo)
     else:
-        pairs = found_in_trial(manoeuvre, trial, helm, asked)
-        helm, told_rates = with_rates(helm, trial, [m for m, _ in pairs])
+        logs = [trial] if isinstance(trial, TrialLog) else list(trial)
+        found = found_in_trial(manoeuvre, logs, helm, asked)
+        helm, told_rates = with_rates(helm, found)
         if asked.command:
             helm = driven(helm, model, asked)
-        found, todo = [m for m, _ in pairs], [task for _, task in pairs]
+        todo = [task for task, _, _ in found]
     theta, d = _draws(model, asked)
     made = []
-    for i, (task, measured) in enumerate(zip(todo, found, strict=True)):
+    for i, task in enumerate(todo):
         progress(i, len(todo))
         predicted = _one(manoeuvre, model, helm, asked, task, theta, d)
-        if measured is not None and trial is not None:
-            share_left = stop_speed(manoeuvre, asked)
-            again = end_again(measured, trial, share_left)
-            agreement = compare(model, helm, again, trial, predicted)
-            told = _trial_notes(helm, predicted, measured, trial, asked)
+        if found:
+            _, measured, log = found[i]
+            again = end_again(measured, log, stop_speed(manoeuvre, asked))
+            agreement = compare(model, helm, again, log, predicted)
+            told = _trial_notes(helm, predicted, measured, log, asked)
             predicted = replace(predicted, agreement=agreement, notes=(*predicted.notes, *told))
         made.append(predicted)
     progress(len(todo), len(todo))
@@ -292,7 +292,7 @@ def _one(
         int(runs.diverged[1:].sum()),
         int(((runs.complete[1:] < 0) & ~runs.diverged[1:]).sum()),
         unheld,
-        _run_notes(kind, model, own, runs, unheld, values, log, helm, steady, longest),
+        _run_notes(kind, task, model, own, runs, unheld, values, log, helm, steady, longest),
         log,
         float(runs.t[runs.order]),
         _bundle(runs, helm, task.course, model.vessel.length),
@@ -423,6 +423,7 @@ def _bundle(runs: Runs, helm: Helm, course: float, length: float) -> Bundle:
 
 def _run_notes(
     kind: Kind,
+    task: Task,
     model: ManoeuvringModel,
     own: Manoeuvre,
     runs: Runs,
@@ -468,6 +469,11 @@ def _run_notes(
         told.append(
             f"the vessel file states no rate of {', '.join(instant)}, so orders are carried out "
             f"at once: add it where the trial's helm takes time."
+        )
+    if isinstance(own, TurningCircle | ZigZag) and own.direction * task.sign < 0:
+        told.append(
+            f"the estimate turns against the order to {task.side}: the sign of its steering is "
+            f"wrong, in the vessel file or in the log."
         )
     if abs(float(steady.trim[0])) > 1e-6:
         trim = math.degrees(steady.trim[0]) if helm.angular else float(steady.trim[0])

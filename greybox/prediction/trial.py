@@ -34,28 +34,31 @@ Array = NDArray[np.float64]
 # how far angles may be from those asked for, to be the same manoeuvre [rad]
 _NEAR = math.radians(2.5)
 _POINTS = 1500
-# quantile of a helm's moves that is taken for its full speed
-_FASTEST = 0.99
+# largest moves of a helm that are left out, as the two of one wrong sample
+_FAULTS = 2
+# share of an order in one sample that is no motion of a helm but a logged command
+_JUMP = 0.5
 
 
 def found_in_trial(
-    kind: Kind, log: TrialLog, helm: Helm, asked: Conditions
-) -> list[tuple[Manoeuvre, Task]]:
-    """Return the manoeuvres of a kind in a log, and what to sail to predict each.
+    kind: Kind, logs: Sequence[TrialLog], helm: Helm, asked: Conditions
+) -> list[tuple[Task, Manoeuvre, TrialLog]]:
+    """Return what to sail to predict each manoeuvre of a kind in the logs of a trial.
 
     Raises
     ------
     LogError
         There is none; what there is instead is named.
     """
-    there = find_manoeuvres(log, scale=asked.scale)
-    made = [(m, _task(m, log, helm, asked)) for m in there if _is(kind, m)]
-    kept = [(m, task) for m, task in made if _wanted(task, asked)]
+    there = [(m, log) for log in logs for m in find_manoeuvres(log, scale=asked.scale)]
+    made = [(_task(m, log, helm, asked), m, log) for m, log in there if _is(kind, m)]
+    kept = [entry for entry in made if _wanted(entry[0], asked)]
     if not kept:
-        found = "; ".join(m.label for m in there) or "no manoeuvre"
+        names = ", ".join(f"'{log.name}'" for log in logs)
+        found = "; ".join(m.label for m, _ in there) or "no manoeuvre"
         more = " of that side or angle" if made else ""
         raise LogError(
-            f"there is no {kind} manoeuvre{more} in '{log.name}', but {found}: name another log, "
+            f"there is no {kind} manoeuvre{more} in {names}, but {found}: name another log, "
             f"or predict without --trial."
         )
     return kept
@@ -111,19 +114,33 @@ def _speeds(found: Manoeuvre, log: TrialLog, helm: Helm) -> float:
     return abs(float(np.mean([helm.steer[i] * n for i, n in speed.items()])))
 
 
-def with_rates(helm: Helm, log: TrialLog, found: Sequence[Manoeuvre]) -> tuple[Helm, list[str]]:
+def with_rates(
+    helm: Helm, found: Sequence[tuple[Task, Manoeuvre, TrialLog]]
+) -> tuple[Helm, list[str]]:
     """Return a helm whose steering moves as fast as in the trial, where no rate is stated."""
     limits, told = list(helm.limits), []
     for i, name in enumerate(helm.columns):
-        if helm.steer[i] == 0 or limits[i].rate is not None or name not in log:
+        if helm.steer[i] == 0 or limits[i].rate is not None or found[0][0].order is None:
             continue
-        steps = [np.abs(np.diff(log[name][(log.t >= m.start) & (log.t <= m.stop)])) for m in found]
-        moves = np.concatenate(steps)
+        steps = [
+            np.abs(np.diff(log[name][(log.t >= m.start - log.sample_time) & (log.t <= m.stop)]))
+            / log.sample_time
+            for _, m, log in found
+            if name in log
+        ]
+        moves = np.sort(np.concatenate([*steps, np.zeros(_FAULTS + 1)]))
         # single steps are faults of the sensor, small ones its noise
-        fast = float(np.quantile(moves, _FASTEST)) if len(moves) else 0.0
+        fast = float(moves[-1 - _FAULTS])
         if fast <= 0:
             continue
-        rate = float(np.median(moves[moves > fast / 2])) / log.sample_time
+        rate = float(np.median(moves[moves > fast / 2]))
+        smallest = min(abs(task.order) for task, _, _ in found if task.order is not None)
+        if rate * found[0][2].sample_time > _JUMP * smallest:
+            limits[i] = replace(limits[i], rate=math.inf)
+            told.append(
+                f"the vessel file states no rate of {name}; it moves at once, as in the trial."
+            )
+            continue
         limits[i] = replace(limits[i], rate=rate)
         unit, factor = (" deg", 180 / math.pi) if helm.angular else ("", 1.0)
         told.append(

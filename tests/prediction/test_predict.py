@@ -307,6 +307,15 @@ def test_what_a_crash_stop_needs():
         predict_manoeuvre(rudder_model(speed_limits=[4.0, 20.0]), "stopping", command=12.0)
 
 
+def test_steering_of_the_wrong_sign_is_said():
+    model = rudder_model(step=0.25)
+    theta = model.theta.copy()
+    for name in ("N_|u|u*rudder", "Y_|u|u*rudder"):
+        theta[model.names.index(name)] *= -1
+    made = predict_manoeuvre(replace(model, theta=theta), "turning", side="port", **FEW)
+    assert "turns against the order to port" in made.summary()
+
+
 def test_a_model_that_diverges_predicts_nothing():
     model = rudder_model()
     theta = model.theta.copy()
