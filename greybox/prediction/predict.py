@@ -400,9 +400,11 @@ def _bundle(runs: Runs, helm: Helm, course: float, length: float) -> Bundle:
         "r": runs.states[k][:, 2, good],
         "speed": np.hypot(runs.states[k][:, 0, good], runs.states[k][:, 1, good]),
     }
-    moved = np.flatnonzero(helm.steer if helm.angular else helm.drive)
-    sign = float(np.sign(helm.steer[moved[0]])) if helm.angular else 1.0
-    signals["steering"] = sign * runs.commands[k][:, moved[0]][:, good]
+    propeller = int(np.flatnonzero(helm.drive)[0])
+    signals["propeller"] = runs.commands[k][:, propeller][:, good]
+    if helm.angular:
+        helms = int(np.flatnonzero(helm.steer)[0])
+        signals["steering"] = np.sign(helm.steer[helms]) * runs.commands[k][:, helms][:, good]
     tail = {n: np.quantile(v, [0.025, 0.975], axis=1) for n, v in signals.items()}
     c, s = math.cos(course), math.sin(course)
     tracks = []

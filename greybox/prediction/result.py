@@ -96,8 +96,8 @@ class Bundle:
     t : ndarray
         (N,) from the order [s].
     nominal : dict of str to ndarray
-        ``heading`` from the original one [rad], ``r`` [rad/s], ``speed`` [m/s], and
-        ``steering`` [rad, or as the order], (N,).
+        ``heading`` from the original one [rad], ``r`` [rad/s], ``speed`` [m/s], ``propeller``
+        in the unit of the log, and ``steering`` [rad] where an angle steers, (N,).
     low, high : dict of str to ndarray
         (N,) 95 % limits of the draws still under way, nan where half of them are not.
     tracks : tuple of (ndarray, ndarray)

@@ -83,19 +83,13 @@ def _points(notes: tuple[str, ...]) -> list[str]:
 
 def _section(made: PredictedManoeuvre, key: str) -> Section:
     sentences = [] if made.agreement is None else [_capital(made.agreement.sentence)]
-    figure = _figure(made)
-    caption = "The estimate's own run, and where 95 % of the draws are (shaded; thin tracks)."
-    if made.kind == "zigzag":
-        caption += " The scales of the track differ."
-    if made.agreement is not None:
-        caption += f" Black: measured in {made.agreement.log}."
     tables = [_values(made)]
     if made.agreement is not None and made.agreement.rows:
         tables.append(_beside(made))
     return Section(
         _capital(made.label),
         sentences=sentences,
-        pictures=[Picture(to_svg(figure, key), caption)],
+        pictures=_pictures(made, key),
         tables=tables,
         points=[*[_capital(f"IMO {verdict_line(c)}.") for c in made.criteria],
                 *_points(made.notes)],
@@ -152,28 +146,37 @@ def _beside(made: PredictedManoeuvre) -> Table:
     )
 
 
-def _figure(made: PredictedManoeuvre) -> Any:
-    turns = made.order is not None
-    figure = new_figure(10, 6.0 if turns else 4.2)
-    panels = [("speed", "speed [m/s]", 1.0), ("steering", "propeller speed", 1.0)]
-    if turns:
-        angle = bool(made.log.vessel.angle_commands) and made.bundle.nominal["steering"].any()
-        panels = [
-            ("heading", "heading [deg]", _DEGREES),
-            ("r", "yaw [deg/s]", _DEGREES),
-            ("speed", "speed [m/s]", 1.0),
-        ]
-        if angle:
-            panels.append(("steering", "steering [deg]", _DEGREES))
-        grid = figure.add_gridspec(len(panels), 2, width_ratios=[1.0, 1.1])
-        _track(figure.add_subplot(grid[:, 0]), made)
-        places = [grid[i, 1] for i in range(len(panels))]
-    else:
-        grid = figure.add_gridspec(2, 1)
-        places = [grid[i, 0] for i in range(2)]
+def _pictures(made: PredictedManoeuvre, key: str) -> list[Picture]:
+    note = "The estimate's own run, and where 95 % of the draws are (shaded)."
+    if made.agreement is not None:
+        note += f" Black: measured in {made.agreement.log}."
+    if made.order is None:
+        panels = [("speed", "speed [m/s]", 1.0), ("propeller", "propeller speed", 1.0)]
+        return [Picture(to_svg(_histories(made, panels, 10, 4.2), key), note)]
+    panels = [
+        ("heading", "heading [deg]", _DEGREES),
+        ("r", "yaw [deg/s]", _DEGREES),
+        ("speed", "speed [m/s]", 1.0),
+    ]
+    if "steering" in made.bundle.nominal:
+        panels.append(("steering", "steering [deg]", _DEGREES))
+    drawn = "The track of the estimate's own run, and of some draws."
+    if made.kind == "zigzag":
+        drawn += " Its scales along and across differ."
+    return [
+        Picture(to_svg(_track(made), f"{key}track"), drawn, narrow=True),
+        Picture(to_svg(_histories(made, panels, 5.4, 5.6), key), note, narrow=True),
+    ]
+
+
+def _histories(
+    made: PredictedManoeuvre, panels: list[tuple[str, str, float]], width: float, height: float
+) -> Any:
+    figure = new_figure(width, height)
+    grid = figure.add_gridspec(len(panels), 1)
     first: Any = None
     for i, (name, label, factor) in enumerate(panels):
-        axes = figure.add_subplot(places[i], sharex=first)
+        axes = figure.add_subplot(grid[i, 0], sharex=first)
         first = first or axes
         _history(axes, made, name, factor)
         axes.set_ylabel(label, fontsize=9)
@@ -202,7 +205,9 @@ def _history(axes: Any, made: PredictedManoeuvre, name: str, factor: float) -> N
         axes.set_ylim(min(view[0], measured.min()), max(view[1], measured.max()))
 
 
-def _track(axes: Any, made: PredictedManoeuvre) -> None:
+def _track(made: PredictedManoeuvre) -> Any:
+    figure = new_figure(5.4, 5.6)
+    axes = figure.add_subplot()
     tracks = made.bundle.tracks
     for north, east in tracks[:0:-1]:
         axes.plot(east, north, color=BLUE, alpha=0.15, linewidth=0.7)
@@ -220,3 +225,4 @@ def _track(axes: Any, made: PredictedManoeuvre) -> None:
     axes.legend(fontsize=8, loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.1,
                 ncols=4, frameon=False, columnspacing=1.2)  # fmt: skip
     tidy(axes)
+    return figure

@@ -12,6 +12,7 @@ from scipy.stats import norm
 
 from greybox.errors import InfeasibleError, LogError, UsageError
 from greybox.model.catalogue import get_structure
+from greybox.model.noise import NoiseLevels
 from greybox.prediction.measuring import quantities
 from greybox.prediction.predict import predict_manoeuvre
 from greybox.trial.log import make_log
@@ -344,3 +345,18 @@ def test_intervals_cover():
     # three standard errors of a share of 120, and what curvature leaves
     for name in names:
         assert inside[name] / runs == pytest.approx(0.95, abs=0.07), name
+
+
+def test_process_noise_widens_the_draws_only():
+    model = rudder_model(step=0.25, spread=0.01)
+    noise = NoiseLevels(("u", "v", "r"), np.full(3, 0.01), np.array([0.0, 0.0, 1e-3]))
+    model = replace(model, noise=noise)
+    asked = {"side": "port", "angles": [math.radians(10)], **FEW}
+    plain, rough = (
+        predict_manoeuvre(model, "zigzag", disturbed=disturbed, **asked)
+        for disturbed in (False, True)
+    )
+    for name in ("first_overshoot", "period"):
+        one, two = (m.manoeuvres[0].quantities[name] for m in (plain, rough))
+        assert one.value == two.value
+        assert two.std > 2 * one.std

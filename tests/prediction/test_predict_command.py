@@ -46,7 +46,7 @@ def test_a_turn_is_predicted_written_and_shown(model, tmp_path, capsys):
     assert rows["port", "steady_yaw_rate"]["value"] < 0
     assert row["steering"] == pytest.approx(math.radians(35))
     html = page.read_text()
-    assert html.count("<svg") == 2
+    assert html.count("<svg") == 4
     assert "Limits of IMO MSC.137(76): 4 of 4 met." in html
     assert "<script" not in html
     logs = sorted(tmp_path.glob("t_*.csv"))
