@@ -40,6 +40,7 @@ from greybox.trial.log import TrialLog, make_log
 from greybox.trial.manoeuvres import Criterion, Quantity, TurningCircle, Verdict, ZigZag
 from greybox.trial.manoeuvres.finding import Manoeuvre
 from greybox.trial.manoeuvres.standards import judge
+from greybox.trial.wind import true_wind
 from greybox.validation.bands import draw_parameters, process_noise
 
 Array = NDArray[np.float64]
@@ -516,9 +517,14 @@ def _trial_notes(
     """Say with what commands the trial sailed, where they are not the predicted ones."""
     run = found.length / max(found.approach_speed.value, 1e-9)
     k = (log.t >= found.start - run) & (log.t < found.start)
-    if not k.any() or asked.command:
-        return []
     told = []
+    if log.has_wind:
+        north, east = true_wind(log["u_q"], log["v_q"], log["psi"], log["u"], log["v"])
+        during = (log.t >= found.start) & (log.t <= found.stop)
+        wind = math.hypot(float(north[during].mean()), float(east[during].mean()))
+        told.append(f"the trial had {wind:.2g} m/s of mean wind, the prediction is in still air.")
+    if not k.any() or asked.command:
+        return told
     for name, drive in zip(helm.columns, helm.drive, strict=True):
         if drive == 0 or name not in log:
             continue
