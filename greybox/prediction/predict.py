@@ -21,26 +21,25 @@ from greybox.prediction.conditions import (
     tasks,
 )
 from greybox.prediction.drawn import Drawn, drawn
-from greybox.prediction.extrapolation import extrapolation
 from greybox.prediction.helm import Helm, find_helm
 from greybox.prediction.measuring import measure, quantities
+from greybox.prediction.notes import model_notes, run_notes, trial_notes
 from greybox.prediction.orders import Orders, Stop, Turn, ZigZagOrders
 from greybox.prediction.result import (
     CRITERIA,
-    Bundle,
     Kind,
     ManoeuvrePrediction,
     PredictedManoeuvre,
     Side,
 )
-from greybox.prediction.running import Runs, sail
+from greybox.prediction.running import sail
+from greybox.prediction.showing import bundle_of, log_of
 from greybox.prediction.steady import Steady, require_straight, straight_run
 from greybox.prediction.trial import compare, end_again, found_in_trial, with_rates
-from greybox.trial.log import TrialLog, make_log
-from greybox.trial.manoeuvres import Criterion, Quantity, TurningCircle, Verdict, ZigZag
+from greybox.trial.log import TrialLog
+from greybox.trial.manoeuvres import Criterion, Quantity, Verdict
 from greybox.trial.manoeuvres.finding import Manoeuvre
 from greybox.trial.manoeuvres.standards import judge
-from greybox.trial.wind import true_wind
 from greybox.validation.bands import draw_parameters, process_noise
 
 Array = NDArray[np.float64]
@@ -48,8 +47,6 @@ Progress = Callable[[int, int], None]
 
 # times of one ship length after which a manoeuvre that is not complete stays so
 _LONGEST = 200.0
-# samples and tracks that pictures hold
-_SHOWN_SAMPLES, _SHOWN_TRACKS = 400, 40
 # steps of process noise drawn at once
 _STEPS = 1024
 
@@ -186,7 +183,7 @@ def predict_manoeuvre(
             _, measured, log = found[i]
             again = end_again(measured, log, stop_speed(manoeuvre, asked))
             agreement = compare(model, helm, again, log, predicted)
-            told = _trial_notes(helm, predicted, measured, log, asked)
+            told = trial_notes(helm, predicted, measured, log, asked)
             predicted = replace(predicted, agreement=agreement, notes=(*predicted.notes, *told))
         made.append(predicted)
     progress(len(todo), len(todo))
@@ -198,7 +195,7 @@ def predict_manoeuvre(
         helm.sentence if manoeuvre in ("turning", "zigzag") else helm.sentence.split(", ")[-1],
         tuple(made),
         asked.draws,
-        (*_notes(model, helm, asked), *told_rates, *shared),
+        (*model_notes(model, helm, asked), *told_rates, *shared),
     )
 
 
@@ -279,7 +276,7 @@ def _one(
         )
         for i, name in enumerate(helm.columns)
     }
-    log = _log(runs, 0, model, helm)
+    log = log_of(runs, 0, model, helm)
     return PredictedManoeuvre(
         kind,
         task.side,
@@ -293,10 +290,10 @@ def _one(
         int(runs.diverged[1:].sum()),
         int(((runs.complete[1:] < 0) & ~runs.diverged[1:]).sum()),
         unheld,
-        _run_notes(kind, task, model, own, runs, unheld, values, log, helm, steady, longest),
+        run_notes(kind, task, model, own, runs, unheld, values, log, helm, steady, longest),
         log,
         float(runs.t[runs.order]),
-        _bundle(runs, helm, task.course, model.vessel.length),
+        bundle_of(runs, helm, task.course, model.vessel.length),
     )
 
 
@@ -379,159 +376,3 @@ def _label(kind: Kind, helm: Helm, task: Task, asked: Conditions) -> str:
         return f"turning circle to {task.side}, {amount}"
     heading = f"{math.degrees(task.heading):.3g} deg"
     return f"zig-zag, first to {task.side}, {amount}, reversed at {heading} of heading"
-
-
-def _log(runs: Runs, run: int, model: ManoeuvringModel, helm: Helm) -> TrialLog:
-    stop = int(runs.complete[run]) + 1 if runs.complete[run] >= 0 else len(runs.t)
-    x_n, y_n = runs.track(run, stop)
-    channels = {"t": runs.t[:stop], "x_n": x_n, "y_n": y_n, "psi": runs.psi[:stop, run]}
-    channels |= {n: runs.states[:stop, i, run] for i, n in enumerate(("u", "v", "r"))}
-    channels |= {n: runs.commands[:stop, i, run] for i, n in enumerate(helm.columns)}
-    return make_log(model.vessel, channels, model.sample_time, "prediction")
-
-
-def _bundle(runs: Runs, helm: Helm, course: float, length: float) -> Bundle:
-    stop = int(runs.complete[0]) + 1 if runs.complete[0] >= 0 else len(runs.t)
-    sailed = length / float(np.hypot(*runs.states[0, :2, 0]))
-    near = int(np.searchsorted(runs.t, runs.t[runs.order] - sailed))
-    k = np.arange(near, stop, max(1, stop // _SHOWN_SAMPLES))
-    good = np.flatnonzero(~runs.diverged)
-    signals = {
-        "heading": runs.psi[k][:, good] - course,
-        "r": runs.states[k][:, 2, good],
-        "speed": np.hypot(runs.states[k][:, 0, good], runs.states[k][:, 1, good]),
-    }
-    propeller = int(np.flatnonzero(helm.drive)[0])
-    signals["propeller"] = runs.commands[k][:, propeller][:, good]
-    if helm.angular:
-        helms = int(np.flatnonzero(helm.steer)[0])
-        signals["steering"] = np.sign(helm.steer[helms]) * runs.commands[k][:, helms][:, good]
-    tail = {n: np.quantile(v, [0.025, 0.975], axis=1) for n, v in signals.items()}
-    c, s = math.cos(course), math.sin(course)
-    tracks = []
-    for run in good[:_SHOWN_TRACKS]:
-        last = int(runs.complete[run]) + 1 if runs.complete[run] >= 0 else stop
-        north, east = runs.track(int(run), last)
-        north, east = north - north[runs.order], east - east[runs.order]
-        thin = slice(near, None, max(1, last // _SHOWN_SAMPLES))
-        tracks.append(((c * north + s * east)[thin], (-s * north + c * east)[thin]))
-    return Bundle(
-        runs.t[k] - runs.t[runs.order],
-        {n: v[:, 0] for n, v in signals.items()},
-        {n: v[0] for n, v in tail.items()},
-        {n: v[1] for n, v in tail.items()},
-        tuple(tracks),
-    )
-
-
-def _run_notes(
-    kind: Kind,
-    task: Task,
-    model: ManoeuvringModel,
-    own: Manoeuvre,
-    runs: Runs,
-    unheld: int,
-    values: Mapping[str, Drawn | None],
-    log: TrialLog,
-    helm: Helm,
-    steady: Steady,
-    longest: float,
-) -> tuple[str, ...]:
-    told = []
-    total = len(runs.diverged) - 1
-    if unheld:
-        told.append(
-            f"{unheld} of {total + unheld} draws do not hold the approach speed within the limits "
-            f"of the commands and were left out: intervals are too narrow by them."
-        )
-    diverged = int(runs.diverged[1:].sum())
-    if diverged:
-        told.append(
-            f"{diverged} of {total} draws diverge and count in no interval: estimate a smaller "
-            f"structure, or on a longer log."
-        )
-    short = int(((runs.complete[1:] < 0) & ~runs.diverged[1:]).sum())
-    if runs.complete[0] < 0:
-        told.append(
-            f"the estimate itself does not complete the manoeuvre within {longest:.3g} s: what it "
-            f"does not reach is said so."
-        )
-    if short:
-        worst = min((v for v in values.values() if v is not None), key=lambda v: v.reached)
-        told.append(
-            f"{short} of {total} draws do not complete the manoeuvre within {longest:.3g} s; "
-            f"intervals are of those that reach the quantity, {worst.reached} at least."
-        )
-    if kind in ("turning", "zigzag"):
-        names = [n for n, s in zip(helm.columns, helm.steer, strict=True) if s != 0]
-    else:
-        names = [n for n, v in zip(helm.columns, helm.drive, strict=True) if v != 0]
-    rates = dict(zip(helm.columns, (x.rate for x in helm.limits), strict=True))
-    instant = [n for n in names if rates[n] is None]
-    if instant:
-        told.append(
-            f"the vessel file states no rate of {', '.join(instant)}, so orders are carried out "
-            f"at once: add it where the trial's helm takes time."
-        )
-    if isinstance(own, TurningCircle | ZigZag) and own.direction * task.sign < 0:
-        told.append(
-            f"the estimate turns against the order to {task.side}: the sign of its steering is "
-            f"wrong, in the vessel file or in the log."
-        )
-    if abs(float(steady.trim[0])) > 1e-6:
-        trim = math.degrees(steady.trim[0]) if helm.angular else float(steady.trim[0])
-        unit = " deg" if helm.angular else ""
-        told.append(f"the straight approach needs a steering order of {trim:.3g}{unit}.")
-    told += [n for n in own.notes if n.startswith(("the yaw rate changes", "the ship still moves"))]
-    return (*told, *extrapolation(model, log))
-
-
-def _notes(model: ManoeuvringModel, helm: Helm, asked: Conditions) -> tuple[str, ...]:
-    told = []
-    verdict = str(model.record.get("verdict", {}).get("text", ""))
-    if verdict.startswith(("do not trust", "trust except")):
-        told.append(f"the estimate's own verdict is '{verdict}'.")
-    if not model.covariance.any():
-        told.append("the model has no covariance, so its parameters were taken as exact.")
-    if asked.disturbed and model.noise is None:
-        told.append(
-            "the model has no noise levels, so --disturbed adds nothing: estimate it with "
-            "--method iv or oe."
-        )
-    elif not asked.disturbed:
-        told.append(
-            "intervals hold what is uncertain of the parameters"
-            + (" and of the current" if asked.current and model.disturbances else "")
-            + ", not what waves and gusts do to one trial (--disturbed adds it)."
-        )
-    if asked.current and not model.disturbances:
-        told.append("the model has no current, so --current adds nothing.")
-    if not asked.limited:
-        told.append("the ranges of the commands in the vessel file were not kept.")
-    return tuple(told)
-
-
-def _trial_notes(
-    helm: Helm, predicted: PredictedManoeuvre, found: Manoeuvre, log: TrialLog, asked: Conditions
-) -> list[str]:
-    """Say with what commands the trial sailed, where they are not the predicted ones."""
-    run = found.length / max(found.approach_speed.value, 1e-9)
-    k = (log.t >= found.start - run) & (log.t < found.start)
-    told = []
-    if log.has_wind:
-        north, east = true_wind(log["u_q"], log["v_q"], log["psi"], log["u"], log["v"])
-        during = (log.t >= found.start) & (log.t <= found.stop)
-        wind = math.hypot(float(north[during].mean()), float(east[during].mean()))
-        told.append(f"the trial had {wind:.2g} m/s of mean wind, the prediction is in still air.")
-    if not k.any() or asked.command:
-        return told
-    for name, drive in zip(helm.columns, helm.drive, strict=True):
-        if drive == 0 or name not in log:
-            continue
-        real, own = float(np.median(log[name][k])), predicted.commands[name]
-        if not min(own.low, own.value * 0.99) <= real <= max(own.high, own.value * 1.01):
-            told.append(
-                f"the model needs {name} = {own.value:.4g} to hold the trial's approach speed of "
-                f"{found.approach_speed.value:.3g} m/s, the trial ran at {real:.4g}: try --command."
-            )
-    return told
