@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from greybox.model.predictor import Predictor, build_predictor
     from greybox.model.simulation import simulate, stationary_disturbance
     from greybox.model.structure import Structure
+    from greybox.prediction.predict import predict_manoeuvre
+    from greybox.prediction.result import ManoeuvrePrediction
     from greybox.trial.canonical import read_recording
     from greybox.trial.checks.check import check_files, check_recording
     from greybox.trial.checks.finding import CheckReport, Finding
@@ -67,6 +69,7 @@ _WHERE = {
     "Exported": "greybox.export.export",
     "Finding": "greybox.trial.checks.finding",
     "ImportOptions": "greybox.trial.options",
+    "ManoeuvrePrediction": "greybox.prediction.result",
     "ManoeuvringModel": "greybox.model.model",
     "OutputErrorOptions": "greybox.estimation.output_error",
     "Predictor": "greybox.model.predictor",
@@ -97,6 +100,7 @@ _WHERE = {
     "log_from_pandas": "greybox.trial.dataframe",
     "log_from_xarray": "greybox.trial.dataframe",
     "make_log": "greybox.trial.log",
+    "predict_manoeuvre": "greybox.prediction.predict",
     "read_log": "greybox.trial.reading",
     "read_recording": "greybox.trial.canonical",
     "recording_from_pandas": "greybox.trial.dataframe",
@@ -121,6 +125,7 @@ __all__ = [
     "Exported",
     "Finding",
     "ImportOptions",
+    "ManoeuvrePrediction",
     "ManoeuvringModel",
     "OutputErrorOptions",
     "Predictor",
@@ -155,6 +160,7 @@ __all__ = [
     "log_from_xarray",
     "make_log",
     "output_predictor",
+    "predict_manoeuvre",
     "read_log",
     "read_recording",
     "read_segments",

@@ -26,6 +26,7 @@ from greybox.diagnosis.waves import Waves
 from greybox.model.model import ManoeuvringModel
 from greybox.model.structure import Structure
 from greybox.trial.log import TrialLog
+from greybox.trial.ranges import ranges
 from greybox.validation.fit import LogFit, fit_percent
 
 Array = NDArray[np.float64]
@@ -110,6 +111,7 @@ class Report:
                 {"name": log.name, "sha256": log.provenance.sha256, "samples": len(log)}
                 for log in case.logs
             ],
+            "ranges": ranges(case.logs, self.structure.states),
         }
         before = self.model(found.base, record | {"causes": []})
         after = self.model(found.final, record) if found.causes else before

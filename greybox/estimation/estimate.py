@@ -23,6 +23,7 @@ from greybox.model.predictor import Predictor
 from greybox.regression.instruments import Instruments, build_instruments
 from greybox.regression.regression import Regression, build_regression
 from greybox.trial.log import TrialLog
+from greybox.trial.ranges import ranges
 
 Array = NDArray[np.float64]
 Covariance = Literal["hac", "ma", "white", "bootstrap"]
@@ -451,6 +452,7 @@ def _result(
         logs=tuple(
             {"name": log.name, "sha256": log.provenance.sha256, "samples": len(log)} for log in logs
         ),
+        ranges=ranges(logs, predictor.structure.states),
     )
     if evidence is None:
         return estimate

@@ -44,6 +44,7 @@ from greybox.model.output import OutputModel, Role, Simulator
 from greybox.model.predictor import Predictor
 from greybox.regression.regression import common_sample_time
 from greybox.trial.log import TrialLog
+from greybox.trial.ranges import ranges
 
 Array = NDArray[np.float64]
 Damping = Literal["warn", "enforce"]
@@ -429,6 +430,7 @@ def _result(fitted: _Fitted, logs: Sequence[TrialLog], options: OutputErrorOptio
         logs=tuple(
             {"name": log.name, "sha256": log.provenance.sha256, "samples": len(log)} for log in logs
         ),
+        ranges=ranges(logs, predictor.structure.states),
     )
 
 

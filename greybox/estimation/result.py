@@ -195,6 +195,8 @@ class Estimate(Shown):
         Free-run fit (6.12) on the estimation logs [%].
     logs : tuple of dict
         Name, hash and length of each log.
+    ranges : dict of str to (float, float)
+        Least and greatest value of each state and command in the logs.
     noise : NoiseLevels, optional
         What was found of measurement and process noise.
     limits : dict of str to Limit
@@ -223,6 +225,7 @@ class Estimate(Shown):
     notes: tuple[str, ...] = ()
     fit: dict[str, float] = field(default_factory=dict)
     logs: tuple[dict[str, Any], ...] = ()
+    ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     noise: NoiseLevels | None = None
     limits: Mapping[str, Limit] = field(default_factory=dict)
     prefilter: str = "none"
@@ -312,6 +315,7 @@ class Estimate(Shown):
                 "std": self.std[biases],
             },
             "logs": list(self.logs),
+            "ranges": dict(self.ranges),
         }
 
     def summary(self) -> str:

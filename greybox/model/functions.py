@@ -278,11 +278,26 @@ def _step_over_runs(
     variant: RunVariant,
     runs: int,
 ) -> ca.Function:
-    """Return one step of `runs` ships, ``(x, w, theta, dt) -> x⁺``, each an (R, ·) matrix.
+    """Return one step of `runs` ships, ``(x, w, theta, dt) -> x⁺``, each an (R, ·) matrix."""
+    return over_runs(_unrolled(structure, variant, steps=1), runs)
+
+
+def over_runs(step: ca.Function, runs: int) -> ca.Function:
+    """Return a scalar step of one ship as one of many.
 
     The instructions of the scalar step are replayed on vectors over the runs.
+
+    Parameters
+    ----------
+    step : Function
+        SX, ``(x, w, theta, dt) -> x⁺``; outputs beyond the first are left out.
+    runs : int
+
+    Returns
+    -------
+    Function
+        The same of (R, ·) matrices; ``dt`` stays a scalar.
     """
-    step = _unrolled(structure, variant, steps=1)
     inputs = [
         ca.MX.sym(step.name_in(i), 1 if i == 3 else runs, step.numel_in(i))
         for i in range(step.n_in())

@@ -219,7 +219,7 @@ def _pieces(
         if marine
         else np.column_stack([log[n] for n in structure.inputs])
     )
-    theta, d = _parameters(model, rng, runs)
+    theta, d = draw_parameters(model, rng, runs)
     zeros = np.zeros(nx)
     # the run starts from a mean, which a ship that gathers way has not reached yet; a plan
     # holds its start alone, which is stated and not measured
@@ -241,7 +241,7 @@ def _pieces(
         last = min(first + _STEPS, len(log) - 1)
         n = last - first
         if process.any():
-            pushes, push = _remembering(rng, push, memory, drive, n)
+            pushes, push = process_noise(rng, push, memory, drive, n)
         run = simulate_changing(
             structure,
             theta,
@@ -261,10 +261,23 @@ def _pieces(
         yield first + 1, run.x[:, 1:]
 
 
-def _parameters(
+def draw_parameters(
     model: ManoeuvringModel, rng: np.random.Generator, runs: int
 ) -> tuple[Array, Array | None]:
-    """Draw parameters (R, p) and disturbance means (R, 1, nd), errors of both together."""
+    """Draw parameters (R, p) and disturbance means (R, 1, nd), errors of both together.
+
+    Parameters
+    ----------
+    model : ManoeuvringModel
+    rng : numpy.random.Generator
+    runs : int
+        R.
+
+    Returns
+    -------
+    tuple
+        The second is None where the model knows no disturbance [m/s].
+    """
     p, known = len(model.theta), list(model.disturbances)
     if not known:
         return _normal(rng, model.theta, model.covariance, runs), None
@@ -300,7 +313,7 @@ def _noisy(rng: np.random.Generator, value: Array, std: float, runs: int) -> Arr
     return np.asarray(value - std * rng.standard_normal((runs, *value.shape)))
 
 
-def _remembering(
+def process_noise(
     rng: np.random.Generator, state: Array, memory: Array, drive: Array, steps: int
 ) -> tuple[Array, Array]:
     """Draw process noise (R, n, nx) that continues from `state` (R, nx), and its last value."""

@@ -20,7 +20,7 @@ from greybox.model.simulation import simulate, stationary_disturbance
 from greybox.study.chapter6 import TRUE
 from greybox.study.inputs import smoothed_pulses
 from greybox.trial.log import make_log
-from greybox.validation.bands import _parameters, predict_bands
+from greybox.validation.bands import draw_parameters, predict_bands
 from greybox.validation.choose import estimate_model
 from greybox.validation.comparison import compare_models
 from greybox.validation.request import Request
@@ -129,12 +129,12 @@ def test_errors_of_parameters_and_current_are_drawn_together(tmp_path):
     )
     model.save(tmp_path / "m.json")
     for m in (model, load_model(tmp_path / "m.json")):
-        theta, d = _parameters(m, np.random.default_rng(0), 4000)
+        theta, d = draw_parameters(m, np.random.default_rng(0), 4000)
         np.testing.assert_allclose(theta[:, 0] - d[:, 0, 0], model.theta[0] - 0.2, atol=1e-9)
         assert (theta[:, 0] + d[:, 0, 1]).std() == pytest.approx(0.001, rel=0.05)
         assert d[:, 0, 0].std() == pytest.approx(0.01, rel=0.05)
     apart = replace(model, disturbance_covariance=np.zeros((0, 0)))
-    theta, d = _parameters(apart, np.random.default_rng(0), 4000)
+    theta, d = draw_parameters(apart, np.random.default_rng(0), 4000)
     assert (theta[:, 0] - d[:, 0, 0]).std() == pytest.approx(0.01 * np.sqrt(2), rel=0.05)
 
 

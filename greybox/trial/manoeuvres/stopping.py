@@ -39,7 +39,7 @@ class Stopping(Shown):
     approach_heading, approach_speed : Quantity
         [rad], [m/s]
     time : Quantity or None
-        From the order until the surge velocity is zero [s].
+        From the order until the surge velocity is zero, or that asked for [s].
     track_reach : Quantity or None
         Distance along the track [m].
     head_reach, lateral_deviation : Quantity or None
@@ -102,6 +102,7 @@ def measure_stopping(
     length: float,
     stop: float | None = None,
     reversed_thrust: bool = True,
+    end_speed: float = 0.0,
     heading_std: float | None = None,
     position_std: float | None = None,
     start_std: float = 0.0,
@@ -127,6 +128,8 @@ def measure_stopping(
         Until when the ship may come to rest [s]; the end of the log by default.
     reversed_thrust : bool
         Whether the thrust was reversed: the limit is for full astern.
+    end_speed : float
+        Surge velocity at which the ship counts as stopped [m/s].
     heading_std, position_std : float, optional
         Known noise of one sample [rad], [m]; taken from the log otherwise.
     start_std : float
@@ -148,10 +151,10 @@ def measure_stopping(
     psi0 = approach.heading
     time = reach = head = lateral = turned = None
     run = approach.duration(length)
-    rest = crossing(t, -u, 0.0, start, stop, run)
+    rest = crossing(t, -u, -end_speed, start, stop, run)
     if rest is not None:
         scale = max((rest[0] - start) / 4, 1e-9)
-        rest = crossing(t, -u, 0.0, start, stop, scale)
+        rest = crossing(t, -u, -end_speed, start, stop, scale)
     if rest is None:
         last = float(np.mean(u[(t <= stop)][-5:]))
         notes.append(f"the ship still moves ahead with {last:.2g} m/s when the log ends")

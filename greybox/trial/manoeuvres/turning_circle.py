@@ -55,7 +55,7 @@ class TurningCircle(Shown):
         positive in the direction of the turn [m].
     tactical_diameter : Quantity or None
         Across, when it has changed by 180 degrees [m].
-    time_90, time_180 : Quantity or None
+    time_90, time_180, time_360 : Quantity or None
         [s] from the order.
     final_diameter : Quantity or None
         Of the steady turn, drift of the whole circle taken off [m].
@@ -88,6 +88,7 @@ class TurningCircle(Shown):
     tactical_diameter: Quantity | None
     time_90: Quantity | None
     time_180: Quantity | None
+    time_360: Quantity | None
     final_diameter: Quantity | None
     yaw_rate: Quantity | None
     speed: Quantity | None
@@ -114,6 +115,7 @@ class TurningCircle(Shown):
             ("tactical diameter", self.tactical_diameter),
             ("time to 90 deg", self.time_90),
             ("time to 180 deg", self.time_180),
+            ("time to 360 deg", self.time_360),
             ("final diameter", self.final_diameter),
             ("steady yaw rate", self.yaw_rate),
             ("steady speed", self.speed),
@@ -215,11 +217,14 @@ def measure_turning_circle(
         scale = max(quarter[0] - start, 1e-9)
     half = crossing(t, own, math.pi, start, stop, scale, std=heading_std)
     frame = _frame(track, approach, start, scale, direction, start_std)
-    advance = transfer = tactical = time_90 = time_180 = None
+    full = crossing(t, own, 2 * math.pi, start, stop, scale, std=heading_std)
+    advance = transfer = tactical = time_90 = time_180 = time_360 = None
     if quarter is not None:
         advance, transfer, time_90 = _at(frame, approach, quarter, scale, start_std)
     if half is not None:
         _, tactical, time_180 = _at(frame, approach, half, scale, start_std)
+    if full is not None:
+        _, _, time_360 = _at(frame, approach, full, scale, start_std)
     steady = _steady(t, psi, own, u, v, track, start, stop, direction, heading_std)
     loss = None
     if steady is not None:
@@ -241,6 +246,7 @@ def measure_turning_circle(
         tactical,
         time_90,
         time_180,
+        time_360,
         steady.diameter if steady else None,
         steady.yaw_rate if steady else None,
         steady.speed if steady else None,

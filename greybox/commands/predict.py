@@ -1,0 +1,229 @@
+"""`greybox predict`: quantities of standard manoeuvres from an identified model."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING
+
+from greybox.commands.common import add_seed, count, positive, progress, provenance, say
+
+if TYPE_CHECKING:
+    from greybox.prediction.result import ManoeuvrePrediction
+
+HELP = "predict standard manoeuvres, with intervals and the IMO limits"
+EXAMPLES = """examples:
+  greybox predict model.json turning --speed 7.5
+  greybox predict model.json zigzag --angle 10 20/10 --side port --json zigzag.json
+  greybox predict model.json crash --astern 80 --report crash.html
+  greybox predict model.json zigzag --trial trial.csv --report beside.html
+
+Angles on the command line are degrees, as manoeuvres are named; files hold radians.
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("model", metavar="MODEL", help="model file of greybox estimate")
+    parser.add_argument(
+        "manoeuvre",
+        choices=("turning", "zigzag", "stopping", "crash"),
+        help="stopping: thrust taken off; crash: full astern",
+    )
+    parser.add_argument("--json", metavar="F", help="write the quantities as JSON; - is stdout")
+    parser.add_argument("--report", metavar="HTML", help="write a page with tracks and histories")
+    parser.add_argument(
+        "--out",
+        metavar="CSV",
+        help="write the run of the estimate itself as a log; of several runs, one file each, "
+        "with side and angle in its name",
+    )
+    how = parser.add_argument_group("manoeuvre")
+    how.add_argument(
+        "--angle",
+        nargs="+",
+        default=[],
+        metavar="DEG",
+        help="steering angles [deg]; of a zig-zag also ANGLE/HEADING, such as 20/10 "
+        "(35; 10/10 and 20/20)",
+    )
+    how.add_argument("--side", choices=("port", "starboard"), help="of the first turn (both)")
+    how.add_argument(
+        "--share",
+        type=float,
+        metavar="S",
+        help="where speeds steer: share by which those on either side differ from the approach's "
+        "(0.5), or of a tunnel thruster's greatest (1)",
+    )
+    how.add_argument(
+        "--thrusters", nargs="+", default=[], metavar="COLUMN", help="columns that steer"
+    )
+    how.add_argument(
+        "--astern", type=positive, metavar="N", help="propeller speed of a crash stop, positive"
+    )
+    how.add_argument(
+        "--until",
+        type=float,
+        metavar="SHARE",
+        help="share of the approach speed at which a stop ends (0.2; crash 0)",
+    )
+    approach = parser.add_argument_group("approach")
+    approach.add_argument(
+        "--speed",
+        type=positive,
+        metavar="V",
+        help="over ground [m/s]; the propeller speed that holds it is solved for",
+    )
+    approach.add_argument(
+        "--command",
+        dest="propellers",
+        nargs="+",
+        default=[],
+        metavar="N",
+        help="propeller speed instead, or NAME=N each; by default the greatest of the logs that "
+        "the model was estimated on",
+    )
+    approach.add_argument(
+        "--course", type=float, default=0.0, metavar="DEG", help="heading in a current [deg] (0)"
+    )
+    approach.add_argument(
+        "--current", action="store_true", help="keep the model's current; still water otherwise"
+    )
+    approach.add_argument(
+        "--no-limits",
+        action="store_true",
+        help="predict as though the vessel file stated no ranges of commands; rates hold",
+    )
+    other = parser.add_argument_group("intervals and trial")
+    other.add_argument("--trial", metavar="LOG", help="compare with the same manoeuvres in a log")
+    other.add_argument(
+        "--disturbed",
+        action="store_true",
+        help="add the model's process noise: where one trial would lie",
+    )
+    other.add_argument(
+        "--scale",
+        type=positive,
+        default=1.0,
+        metavar="S",
+        help="length of the full-scale ship over the vessel's, for IMO limits (1)",
+    )
+    other.add_argument("--draws", type=count, default=256, help="draws of the parameters (256)")
+    add_seed(parser)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Predict, compare, report, write."""
+    import math
+
+    from greybox.files import check_targets, write_json
+    from greybox.model.model import load_model
+    from greybox.prediction.predict import predict_manoeuvre
+    from greybox.trial.reading import read_segments
+
+    check_targets(options.json, options.report, options.out)
+    angles = [_angle(text) for text in options.angle]
+    command = _command(options.propellers)
+    model = load_model(options.model)
+    trial = None
+    if options.trial is not None:
+        trial = read_segments(options.trial, model.vessel, states=model.structure.states)
+    made = predict_manoeuvre(
+        model,
+        options.manoeuvre,
+        angles=angles,
+        side=options.side or "",
+        speed=options.speed,
+        command=command,
+        thrusters=options.thrusters,
+        share=options.share,
+        astern=options.astern,
+        until=options.until,
+        limited=not options.no_limits,
+        current=options.current,
+        course=math.radians(options.course),
+        disturbed=options.disturbed,
+        scale=options.scale,
+        draws=options.draws,
+        seed=options.seed,
+        trial=trial,
+        progress=progress("manoeuvres"),
+    )
+    record = provenance(options)
+    written = []
+    if options.out:
+        written += _write_runs(made, options.out)
+    if options.json:
+        write_json(made.to_dict() | {"provenance": record}, options.json)
+    if options.report:
+        from greybox.report.page import write_page
+        from greybox.report.prediction import prediction_page
+
+        write_page(prediction_page(made, record), options.report)
+        written.append(options.report)
+    if options.json != "-":
+        say(made.summary())
+        for name in written:
+            say(f"wrote {name}")
+
+
+def _angle(text: str) -> float | tuple[float, float]:
+    """Read DEG or DEG/DEG into radians."""
+    import math
+
+    from greybox.errors import UsageError
+
+    try:
+        values = [math.radians(float(part)) for part in text.split("/")]
+    except ValueError:
+        values = []
+    if len(values) not in (1, 2) or not all(0 < v < math.pi for v in values):
+        raise UsageError(
+            f"--angle is '{text}': write degrees above 0, such as 35, or 20/10 for a zig-zag of "
+            f"20 degrees reversed at 10."
+        )
+    return values[0] if len(values) == 1 else (values[0], values[1])
+
+
+def _command(texts: list[str]) -> float | dict[str, float] | None:
+    """Read N, or NAME=N each."""
+    from greybox.errors import UsageError
+
+    if not texts:
+        return None
+    named: dict[str, float] = {}
+    for text in texts:
+        name, _, value = text.rpartition("=")
+        try:
+            named[name.strip()] = float(value)
+        except ValueError:
+            named = {}
+            break
+    if not named or len(named) != len(texts) or ("" in named and len(named) > 1):
+        raise UsageError(
+            f"--command is '{' '.join(texts)}': write one number for all propellers, or NAME=N "
+            f"each, such as n1=300 n2=300."
+        )
+    return named.get("", named)
+
+
+def _write_runs(made: ManoeuvrePrediction, path: str) -> list[str]:
+    """Write each run as a log; return the names of the files."""
+    import math
+    from pathlib import Path
+
+    from greybox.trial.writing import write_log
+
+    target = Path(path)
+    names = []
+    for i, manoeuvre in enumerate(made.manoeuvres):
+        name = target
+        if len(made.manoeuvres) > 1:
+            parts: list[str] = [manoeuvre.side]
+            if manoeuvre.order is not None and abs(manoeuvre.order) < math.pi:
+                parts.append(f"{math.degrees(abs(manoeuvre.order)):.0f}")
+            name = target.with_stem("_".join([target.stem, *parts]))
+            if str(name) in names:
+                name = target.with_stem(f"{name.stem}_{i + 1}")
+        write_log([manoeuvre.log], name)
+        names.append(str(name))
+    return names

@@ -1,0 +1,1 @@
+"""Standard manoeuvres predicted from an identified model, each value with its interval."""

@@ -1,0 +1,136 @@
+"""What a reader of a prediction has to know, one sentence each."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from greybox.model.model import ManoeuvringModel
+from greybox.prediction.conditions import Conditions, Task
+from greybox.prediction.drawn import Drawn
+from greybox.prediction.extrapolation import extrapolation
+from greybox.prediction.helm import Helm
+from greybox.prediction.result import Kind, PredictedManoeuvre
+from greybox.prediction.running import Runs
+from greybox.prediction.steady import Steady
+from greybox.trial.log import TrialLog
+from greybox.trial.manoeuvres import TurningCircle, ZigZag
+from greybox.trial.manoeuvres.finding import Manoeuvre
+from greybox.trial.wind import true_wind
+
+
+def run_notes(
+    kind: Kind,
+    task: Task,
+    model: ManoeuvringModel,
+    own: Manoeuvre,
+    runs: Runs,
+    unheld: int,
+    values: Mapping[str, Drawn | None],
+    log: TrialLog,
+    helm: Helm,
+    steady: Steady,
+    longest: float,
+) -> tuple[str, ...]:
+    """Say what limits one prediction: draws that were lost, rates, trim, extrapolation."""
+    told = []
+    total = len(runs.diverged) - 1
+    if unheld:
+        told.append(
+            f"{unheld} of {total + unheld} draws do not hold the approach speed within the limits "
+            f"of the commands and were left out: intervals are too narrow by them."
+        )
+    diverged = int(runs.diverged[1:].sum())
+    if diverged:
+        told.append(
+            f"{diverged} of {total} draws diverge and count in no interval: estimate a smaller "
+            f"structure, or on a longer log."
+        )
+    short = int(((runs.complete[1:] < 0) & ~runs.diverged[1:]).sum())
+    if runs.complete[0] < 0:
+        told.append(
+            f"the estimate itself does not complete the manoeuvre within {longest:.3g} s: what it "
+            f"does not reach is said so."
+        )
+    if short:
+        worst = min((v for v in values.values() if v is not None), key=lambda v: v.reached)
+        told.append(
+            f"{short} of {total} draws do not complete the manoeuvre within {longest:.3g} s; "
+            f"intervals are of those that reach the quantity, {worst.reached} at least."
+        )
+    if kind in ("turning", "zigzag"):
+        names = [n for n, s in zip(helm.columns, helm.steer, strict=True) if s != 0]
+    else:
+        names = [n for n, v in zip(helm.columns, helm.drive, strict=True) if v != 0]
+    rates = dict(zip(helm.columns, (x.rate for x in helm.limits), strict=True))
+    instant = [n for n in names if rates[n] is None]
+    if instant:
+        told.append(
+            f"the vessel file states no rate of {', '.join(instant)}, so orders are carried out "
+            f"at once: add it where the trial's helm takes time."
+        )
+    if isinstance(own, TurningCircle | ZigZag) and own.direction * task.sign < 0:
+        told.append(
+            f"the estimate turns against the order to {task.side}: the sign of its steering is "
+            f"wrong, in the vessel file or in the log."
+        )
+    if abs(float(steady.trim[0])) > 1e-6:
+        trim = math.degrees(steady.trim[0]) if helm.angular else float(steady.trim[0])
+        unit = " deg" if helm.angular else ""
+        told.append(f"the straight approach needs a steering order of {trim:.3g}{unit}.")
+    told += [n for n in own.notes if n.startswith(("the yaw rate changes", "the ship still moves"))]
+    return (*told, *extrapolation(model, log))
+
+
+def model_notes(model: ManoeuvringModel, helm: Helm, asked: Conditions) -> tuple[str, ...]:
+    """Say what holds for all manoeuvres of a prediction."""
+    told = []
+    verdict = str(model.record.get("verdict", {}).get("text", ""))
+    if verdict.startswith(("do not trust", "trust except")):
+        told.append(f"the estimate's own verdict is '{verdict}'.")
+    if not model.covariance.any():
+        told.append("the model has no covariance, so its parameters were taken as exact.")
+    if asked.disturbed and model.noise is None:
+        told.append(
+            "the model has no noise levels, so --disturbed adds nothing: estimate it with "
+            "--method iv or oe."
+        )
+    elif not asked.disturbed:
+        told.append(
+            "intervals hold what is uncertain of the parameters"
+            + (" and of the current" if asked.current and model.disturbances else "")
+            + ", not what waves and gusts do to one trial (--disturbed adds it)."
+        )
+    if asked.current and not model.disturbances:
+        told.append("the model has no current, so --current adds nothing.")
+    if not asked.limited:
+        told.append("the ranges of the commands in the vessel file were not kept.")
+    return tuple(told)
+
+
+def trial_notes(
+    helm: Helm, predicted: PredictedManoeuvre, found: Manoeuvre, log: TrialLog, asked: Conditions
+) -> list[str]:
+    """Say with what commands the trial sailed, where they are not the predicted ones."""
+    run = found.length / max(found.approach_speed.value, 1e-9)
+    k = (log.t >= found.start - run) & (log.t < found.start)
+    told = []
+    if log.has_wind:
+        north, east = true_wind(log["u_q"], log["v_q"], log["psi"], log["u"], log["v"])
+        during = (log.t >= found.start) & (log.t <= found.stop)
+        wind = math.hypot(float(north[during].mean()), float(east[during].mean()))
+        told.append(f"the trial had {wind:.2g} m/s of mean wind, the prediction is in still air.")
+    if not k.any() or asked.command:
+        return told
+    for name, drive in zip(helm.columns, helm.drive, strict=True):
+        if drive == 0 or name not in log:
+            continue
+        real, own = float(np.median(log[name][k])), predicted.commands[name]
+        if not min(own.low, own.value * 0.99) <= real <= max(own.high, own.value * 1.01):
+            told.append(
+                f"the model needs {name} = {own.value:.4g} to hold the trial's approach speed of "
+                f"{found.approach_speed.value:.3g} m/s, the trial ran at {real:.4g}: try --command."
+            )
+    return told

@@ -1,0 +1,378 @@
+"""Predicts standard manoeuvres of a model, with the intervals that its covariance gives."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.errors import InfeasibleError, LogError, UsageError
+from greybox.model.model import ManoeuvringModel
+from greybox.prediction.conditions import (
+    Conditions,
+    Task,
+    check,
+    driven,
+    stop_speed,
+    stop_throttle,
+    tasks,
+)
+from greybox.prediction.drawn import Drawn, drawn
+from greybox.prediction.helm import Helm, find_helm
+from greybox.prediction.measuring import measure, quantities
+from greybox.prediction.notes import model_notes, run_notes, trial_notes
+from greybox.prediction.orders import Orders, Stop, Turn, ZigZagOrders
+from greybox.prediction.result import (
+    CRITERIA,
+    Kind,
+    ManoeuvrePrediction,
+    PredictedManoeuvre,
+    Side,
+)
+from greybox.prediction.running import sail
+from greybox.prediction.showing import bundle_of, log_of
+from greybox.prediction.steady import Steady, require_straight, straight_run
+from greybox.prediction.trial import compare, end_again, found_in_trial, with_rates
+from greybox.trial.log import TrialLog
+from greybox.trial.manoeuvres import Criterion, Quantity, Verdict
+from greybox.trial.manoeuvres.finding import Manoeuvre
+from greybox.trial.manoeuvres.standards import judge
+from greybox.validation.bands import draw_parameters, process_noise
+
+Array = NDArray[np.float64]
+Progress = Callable[[int, int], None]
+
+# times of one ship length after which a manoeuvre that is not complete stays so
+_LONGEST = 200.0
+# steps of process noise drawn at once
+_STEPS = 1024
+
+
+def predict_manoeuvre(
+    model: ManoeuvringModel,
+    manoeuvre: Kind,
+    *,
+    angles: Sequence[float | tuple[float, float]] = (),
+    side: Side = "",
+    speed: float | None = None,
+    command: float | Mapping[str, float] | None = None,
+    thrusters: Sequence[str] = (),
+    share: float | None = None,
+    astern: float | None = None,
+    until: float | None = None,
+    limited: bool = True,
+    current: bool = False,
+    course: float = 0.0,
+    disturbed: bool = False,
+    scale: float = 1.0,
+    draws: int = 256,
+    seed: int = 0,
+    trial: TrialLog | Sequence[TrialLog] | None = None,
+    progress: Progress = lambda done, total: None,
+) -> ManoeuvrePrediction:
+    """Predict a standard manoeuvre from an identified model.
+
+    The ship sails straight at the approach speed, is given the orders of the manoeuvre by
+    the model's own simulation, and its run is measured as that of a trial is. Intervals are
+    quantiles over draws of the model's parameters, of which each sails on its own.
+
+    Parameters
+    ----------
+    model : ManoeuvringModel
+    manoeuvre : {"turning", "zigzag", "stopping", "crash"}
+        A stop takes the thrust off, a crash stop runs full astern.
+    angles : sequence of float or (float, float)
+        Steering angles; of a zig-zag also the heading at which it is reversed, which is the
+        same angle unless given [rad]. By default 35 degrees, and 10/10 and 20/20.
+    side : {"", "port", "starboard"}
+        Of the first turn; both where empty.
+    speed : float, optional
+        Approach speed over ground [m/s]; the propeller speed that holds it is solved for.
+    command : float or mapping of str to float, optional
+        Propeller speeds of the approach instead, in the unit of the log. By default the
+        greatest of the logs that the model was estimated on.
+    thrusters : sequence of str
+        Columns that steer, instead of rudders or the azimuth thrusters aft.
+    share : float, optional
+        Where speeds steer: by which those on either side differ from the approach's (0.5), or
+        of the greatest speed of tunnel thrusters (1).
+    astern : float, optional
+        Propeller speed of a crash stop, positive; the vessel file's least speed by default.
+    until : float, optional
+        Share of the approach speed at which a stop ends: 0.2 without thrust, 0 astern.
+    limited : bool
+        Whether commands keep the ranges of the vessel file; rates hold anyway.
+    current : bool
+        Whether the model's current and wind act; still water and air by default.
+    course : float
+        Heading of the approach, which matters in a current [rad].
+    disturbed : bool
+        Whether draws hold the model's process noise too: where one trial would lie.
+    scale : float
+        Length of the full-scale ship over that of the vessel, for the limits of the IMO.
+    draws, seed : int
+    trial : TrialLog or sequence of TrialLog, optional
+        The same manoeuvres are looked for there, predicted at their approach speeds and
+        angles, and compared.
+    progress : callable
+        Told how many manoeuvres of how many are done.
+
+    Returns
+    -------
+    ManoeuvrePrediction
+
+    Raises
+    ------
+    UsageError
+        What is asked contradicts itself, the vessel or its limits.
+    InfeasibleError
+        The model does not hold the approach.
+    LogError
+        The trial holds no such manoeuvre.
+
+    References
+    ----------
+    IMO MSC.137(76); ITTC 7.5-02-06-05 on the uncertainty of predicted manoeuvres.
+    """
+    if command is None:
+        given: Mapping[str, float] = {}
+    else:
+        given = command if isinstance(command, Mapping) else {"": float(command)}
+    asked = Conditions(
+        tuple((a, None) if isinstance(a, int | float) else (a[0], a[1]) for a in angles),
+        side,
+        speed,
+        given,
+        tuple(thrusters),
+        share,
+        astern,
+        until,
+        limited,
+        current,
+        course,
+        disturbed,
+        scale,
+        draws,
+        seed,
+    )
+    check(manoeuvre, model, asked)
+    model = model.settled()
+    helm = find_helm(model.vessel, asked.thrusters, limited=limited)
+    require_straight(helm)
+    found: list[tuple[Task, Manoeuvre, TrialLog]] = []
+    told_rates: list[str] = []
+    if trial is None:
+        helm = driven(helm, model, asked)
+        todo = tasks(manoeuvre, helm, model, asked)
+    else:
+        logs = [trial] if isinstance(trial, TrialLog) else list(trial)
+        found = found_in_trial(manoeuvre, logs, helm, asked)
+        helm, told_rates = with_rates(helm, found)
+        if asked.command:
+            helm = driven(helm, model, asked)
+        todo = [task for task, _, _ in found]
+    theta, d = _draws(model, asked)
+    made = []
+    for i, task in enumerate(todo):
+        progress(i, len(todo))
+        predicted = _one(manoeuvre, model, helm, asked, task, theta, d)
+        if found:
+            _, measured, log = found[i]
+            again = end_again(measured, log, stop_speed(manoeuvre, asked))
+            agreement = compare(model, helm, again, log, predicted)
+            told = trial_notes(helm, predicted, measured, log, asked)
+            predicted = replace(predicted, agreement=agreement, notes=(*predicted.notes, *told))
+        made.append(predicted)
+    progress(len(todo), len(todo))
+    shared = [n for n in made[0].notes if all(n in m.notes for m in made)]
+    made = [replace(m, notes=tuple(n for n in m.notes if n not in shared)) for m in made]
+    return ManoeuvrePrediction(
+        manoeuvre,
+        model.vessel.name,
+        helm.sentence if manoeuvre in ("turning", "zigzag") else helm.sentence.split(", ")[-1],
+        tuple(made),
+        asked.draws,
+        (*model_notes(model, helm, asked), *told_rates, *shared),
+    )
+
+
+def _draws(model: ManoeuvringModel, asked: Conditions) -> tuple[Array, Array]:
+    """Return parameters (1 + R, p) and disturbances (1 + R, nd), those of the estimate first."""
+    rng = np.random.default_rng([137, asked.seed])
+    theta, d = draw_parameters(model, rng, asked.draws)
+    size = len(model.structure.disturbances)
+    acting = np.zeros((asked.draws + 1, size))
+    if asked.current and d is not None:
+        acting = np.vstack([model.d, d[:, 0]])
+    return np.vstack([model.theta, theta]), acting
+
+
+def _one(
+    kind: Kind,
+    model: ManoeuvringModel,
+    helm: Helm,
+    asked: Conditions,
+    task: Task,
+    theta: Array,
+    d: Array,
+) -> PredictedManoeuvre:
+    steady = straight_run(model, helm, theta, d, task.course, task.speed)
+    kept = np.flatnonzero(steady.found)
+    unheld = len(steady.found) - len(kept)
+    theta, d = theta[kept], d[kept]
+    steady = Steady(
+        steady.x[:, kept],
+        steady.throttle[kept],
+        steady.trim[kept],
+        steady.commands[:, kept],
+        steady.speed[kept],
+        steady.found[kept],
+    )
+    orders, end = _orders(kind, helm, asked, task, steady)
+    longest = _LONGEST * model.vessel.length / float(steady.speed[0])
+    noise = _process(model, asked, len(kept)) if asked.disturbed else None
+    runs = sail(model, helm, steady, theta, d, task.course, orders, longest, noise)
+    if runs.diverged[0]:
+        raise InfeasibleError(
+            f"the run of the estimate itself diverges within {runs.t[-1] - runs.t[runs.order]:.3g} "
+            f"s of the order of the {kind} manoeuvre at {steady.speed[0]:.3g} m/s: this model "
+            f"cannot predict it. Estimate a smaller structure, or on a log with such motion."
+        )
+    executes = orders.executes if isinstance(orders, ZigZagOrders) else None
+    angular = helm.angular and task.order is not None
+
+    def measured(run: int) -> Manoeuvre | None:
+        if runs.diverged[run]:
+            return None
+        return measure(
+            runs,
+            run,
+            model.vessel.length,
+            rudder=task.order if angular else None,
+            full_rudder=helm.greatest if angular else None,
+            executes=None if executes is None else executes[run],
+            end_speed=None if end is None else float(end[run]),
+            reversed_thrust=kind == "crash",
+            scale=asked.scale,
+        )
+
+    own = measured(0)
+    if own is None:
+        raise LogError(
+            f"the estimate itself never swings back in the {_label(kind, helm, task, asked)} "
+            f"within {longest:.3g} s: give another --angle."
+        )
+    tables = [quantities(m) if m else {} for m in map(measured, range(1, len(kept)))]
+    # draws without an approach reach nothing
+    tables += [{}] * unheld
+    values = {n: drawn(v, [t.get(n) for t in tables]) for n, v in quantities(own).items()}
+    commands = {
+        name: drawn(
+            Quantity(float(steady.commands[i, 0]), 0.0, "1"),
+            [Quantity(float(c), 0.0, "1") for c in steady.commands[i, 1:]],
+        )
+        for i, name in enumerate(helm.columns)
+    }
+    log = log_of(runs, 0, model, helm)
+    return PredictedManoeuvre(
+        kind,
+        task.side,
+        None if task.order is None else task.sign * task.order,
+        task.heading,
+        _label(kind, helm, task, asked),
+        {n: q for n, q in commands.items() if q is not None},
+        values,
+        _criteria(own, values, model.vessel.length),
+        asked.draws,
+        int(runs.diverged[1:].sum()),
+        int(((runs.complete[1:] < 0) & ~runs.diverged[1:]).sum()),
+        unheld,
+        run_notes(kind, task, model, own, runs, unheld, values, log, helm, steady, longest),
+        log,
+        float(runs.t[runs.order]),
+        bundle_of(runs, helm, task.course, model.vessel.length),
+    )
+
+
+def _orders(
+    kind: Kind, helm: Helm, asked: Conditions, task: Task, steady: Steady
+) -> tuple[Orders, Array | None]:
+    """Return what is ordered, and the surge velocity at which a stop ends."""
+    if task.order is None:
+        end = stop_speed(kind, asked) * steady.speed
+        astern = stop_throttle(kind, helm, asked)
+        return Stop(np.full(len(steady.speed), astern), end), end
+    order = task.sign * task.order
+    wanted = helm.commands(steady.throttle[:1], order)
+    outside = helm.outside(wanted)[:, 0]
+    for i in np.flatnonzero(outside):
+        limit = helm.limits[i]
+        raise UsageError(
+            f"this needs {helm.columns[i]} = {wanted[i, 0]:.4g}, and the vessel file keeps it "
+            f"from {limit.lower} to {limit.upper}: give a smaller --angle or --share, a lower "
+            f"--speed, or --no-limits."
+        )
+    if task.heading is None:
+        return Turn(order, steady.throttle), None
+    return ZigZagOrders(order, task.heading, steady.throttle), None
+
+
+def _process(model: ManoeuvringModel, asked: Conditions, runs: int) -> Iterator[Array]:
+    """Yield process noise (nx, R) of each sample; none of the estimate's own run."""
+    noise = model.noise
+    rng = np.random.default_rng([138, asked.seed])
+    nx = len(model.structure.states)
+    size = np.zeros(nx) if noise is None else noise.process
+    memory = np.zeros(nx) if noise is None or not noise.memory.size else noise.memory
+    drive = size * np.sqrt(1 - memory**2)
+    push = size * rng.standard_normal((runs, nx))
+    while True:
+        pushes, push = process_noise(rng, push, memory, drive, _STEPS)
+        pushes[0] = 0.0
+        yield from pushes.transpose(1, 2, 0)
+
+
+def _criteria(
+    own: Manoeuvre, values: Mapping[str, Drawn | None], length: float
+) -> tuple[Criterion, ...]:
+    """Judge the limits that apply by the intervals of the draws."""
+    made = []
+    for criterion in own.criteria:
+        value = values.get(CRITERIA.get(criterion.name, ""))
+        if criterion.limit is None:
+            reason = criterion.reason.replace("the log has no rudder angle", "no angle steers")
+            made.append(replace(criterion, reason=reason))
+            continue
+        if value is None:
+            made.append(
+                replace(criterion, verdict=Verdict.OPEN, reason="the run does not reach it")
+            )
+            continue
+        lengths = criterion.measured is None or criterion.measured.unit == "1"
+        shown = value.scaled(1 / length, "1") if lengths else value
+        judged = judge(criterion.name, shown, criterion.limit, criterion.reason)
+        if judged.verdict is Verdict.PASS and not value.certain:
+            reason = f"{value.reached} of {value.draws} draws reach it"
+            judged = replace(judged, verdict=Verdict.OPEN, reason=reason)
+        made.append(judged)
+    return tuple(made)
+
+
+def _label(kind: Kind, helm: Helm, task: Task, asked: Conditions) -> str:
+    if task.order is None:
+        share = stop_speed(kind, asked)
+        what = "stop with full astern" if kind == "crash" else "stop without thrust"
+        return what + (f", to {100 * share:g} % of the approach speed" if share else "")
+    amount = {
+        "rudder": f"rudder {math.degrees(task.order):.3g} deg",
+        "azimuth": f"azimuths {math.degrees(task.order):.3g} deg",
+        "difference": f"speeds {100 * task.order:.3g} % apart",
+        "tunnel": f"tunnel speed {task.order:.4g}",
+    }[helm.kind]
+    if task.heading is None:
+        return f"turning circle to {task.side}, {amount}"
+    heading = f"{math.degrees(task.heading):.3g} deg"
+    return f"zig-zag, first to {task.side}, {amount}, reversed at {heading} of heading"

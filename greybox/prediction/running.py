@@ -1,0 +1,166 @@
+"""Runs a manoeuvre with all draws at once: orders, rates and limits, delay, lag, motion."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.model.model import ManoeuvringModel
+from greybox.prediction.helm import Helm, bounds
+from greybox.prediction.orders import Orders
+from greybox.prediction.ship import Ship
+from greybox.prediction.steady import Steady
+
+Array = NDArray[np.float64]
+
+# ship lengths sailed before the order
+APPROACH_LENGTHS = 2.5
+_FEWEST = 16
+# how many times the approach speed, and the rate of turn in one ship length, count as diverged
+_DIVERGED = 10.0
+
+
+@dataclass(frozen=True)
+class Runs:
+    """Manoeuvres as they were sailed.
+
+    Parameters
+    ----------
+    t : ndarray
+        (N,) [s]; the order is at ``t[order]``.
+    states : ndarray
+        (N, 3, R) u, v [m/s], r [rad/s]; zero where the structure has none.
+    psi : ndarray
+        (N, R) [rad]
+    commands : ndarray
+        (N, nc, R) in the unit of the log, angles [rad].
+    order : int
+        First sample of the manoeuvre.
+    complete : ndarray of int
+        (R,) last sample of each, −1 where it was not completed.
+    diverged : ndarray of bool
+        (R,)
+    """
+
+    t: Array
+    states: Array
+    psi: Array
+    commands: Array
+    order: int
+    complete: NDArray[np.int64]
+    diverged: NDArray[np.bool_]
+
+    def track(self, run: int, stop: int) -> tuple[Array, Array]:
+        """Return positions north and east (stop,) [m] by the trapezoidal rule."""
+        u, v = self.states[:stop, 0, run], self.states[:stop, 1, run]
+        c, s = np.cos(self.psi[:stop, run]), np.sin(self.psi[:stop, run])
+        steps = np.diff(self.t[:stop])
+        made = []
+        for rate in (c * u - s * v, s * u + c * v):
+            made.append(np.concatenate([[0.0], np.cumsum(steps * (rate[1:] + rate[:-1]) / 2)]))
+        return made[0], made[1]
+
+
+def sail(
+    model: ManoeuvringModel,
+    helm: Helm,
+    steady: Steady,
+    theta: Array,
+    d: Array,
+    heading: float,
+    orders: Orders,
+    longest: float,
+    process: Iterator[Array] | None = None,
+) -> Runs:
+    """Sail from straight runs until all manoeuvres are complete.
+
+    Parameters
+    ----------
+    model : ManoeuvringModel
+    helm : Helm
+    steady : Steady
+        Of the same R draws.
+    theta, d : ndarray
+        (R, p), (R, nd)
+    heading : float
+        Of the approach [rad].
+    orders : Orders
+    longest : float
+        Time from the order after which what is not complete stays so [s].
+    process : iterator of ndarray, optional
+        (nx, R) added to each next state.
+    """
+    step, length = model.sample_time, model.vessel.length
+    ship = Ship(model.structure, model.vessel, step, model.integrator, theta, d)
+    names = model.structure.states
+    where = [names.index(n) if n in names else None for n in ("u", "v", "r")]
+    nx = len(names)
+    speed = float(steady.speed[0])
+    before = max(_FEWEST, math.ceil(APPROACH_LENGTHS * length / (speed * step)))
+    most = before + max(1, math.ceil(longest / step))
+    delay = model.vessel.actuation.delay / step
+    state = ship.start(steady.x, heading, steady.commands)
+    low, high = (b[:, None] for b in bounds(helm.limits))
+    rates = np.array([[math.inf if x.rate is None else x.rate] for x in helm.limits]) * step
+    slow = np.isfinite(rates)
+    limit = _DIVERGED * np.array([speed, speed, speed / length])[:, None]
+    runs = theta.shape[0]
+    diverged = np.zeros(runs, bool)
+    psi = [np.full(runs, heading)] * before
+    start = np.stack([np.zeros(runs) if i is None else steady.x[i] for i in where])
+    states = [start] * before
+    commands = [steady.commands] * before
+    at = steady.commands
+    with np.errstate(all="ignore"):
+        for k in range(before, most):
+            now = np.stack([np.zeros(runs) if i is None else state[i] for i in where])
+            diverged |= ~(np.abs(now) <= limit).all(axis=0)
+            since = k - before
+            own = state[nx] - heading
+            order, throttle = orders.targets(since, own, now[0])
+            wanted = np.clip(helm.commands(throttle, order), low, high)
+            # a command that moves at a rate leaves its place at this sample, others jump
+            moved = np.where(slow, at, wanted)
+            states.append(now)
+            psi.append(state[nx].copy())
+            commands.append(moved)
+            if np.all((orders.complete >= 0) | diverged):
+                break
+            after = ship(state, _earlier(commands, k, delay))
+            at = moved + np.clip(wanted - moved, -rates, rates)
+            share = orders.react(since, own, after[nx] - heading)
+            if share is not None:
+                # the sample is sailed again with the mean of both orders over it
+                order, throttle = orders.targets(since, own, now[0])
+                new = np.clip(helm.commands(throttle, order), low, high)
+                commands[k] = np.where(slow, moved, share * moved + (1 - share) * new)
+                at = share * at + (1 - share) * (moved + np.clip(new - moved, -rates, rates))
+                after = ship(state, _earlier(commands, k, delay))
+            state = after
+            if process is not None:
+                state[:nx] += next(process)
+    complete = np.where((orders.complete >= 0) & ~diverged, orders.complete + before, -1)
+    return Runs(
+        np.asarray(np.arange(len(psi)) * step, float),
+        np.stack(states),
+        np.stack(psi),
+        np.stack(commands),
+        before,
+        complete,
+        diverged,
+    )
+
+
+def _earlier(commands: list[Array], k: int, delay: float) -> Array:
+    """Return the commands some samples before sample `k`, linear between samples."""
+    if delay == 0:
+        return commands[k]
+    place = max(k - delay, 0.0)
+    whole = int(place)
+    share = place - whole
+    after = commands[min(whole + 1, k)]
+    return np.asarray((1 - share) * commands[whole] + share * after)

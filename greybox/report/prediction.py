@@ -1,0 +1,228 @@
+"""The page of `greybox predict`."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.prediction.drawn import Drawn
+from greybox.prediction.measuring import LABELS
+from greybox.prediction.result import (
+    WORDS,
+    ManoeuvrePrediction,
+    PredictedManoeuvre,
+    verdict_line,
+)
+from greybox.report.figures import BLACK, BLUE, VERMILION, new_figure, tidy, to_svg
+from greybox.report.page import Page, Picture, Section, Table, flatten
+from greybox.trial.manoeuvres import Verdict
+
+Array = NDArray[np.float64]
+
+_TITLES = {
+    "turning": "turning circle",
+    "zigzag": "zig-zag",
+    "stopping": "stop without thrust",
+    "crash": "crash stop",
+}
+_DEGREES = 180 / math.pi
+
+
+def prediction_page(made: ManoeuvrePrediction, record: dict[str, Any]) -> Page:
+    """Return the page: verdicts in the headline, a section with pictures for each manoeuvre."""
+    return Page(
+        title=f"{made.vessel}: predicted {_TITLES[made.kind]}",
+        headline=headline(made),
+        sentences=[f"{made.steering[0].upper()}{made.steering[1:]}."],
+        sections=[
+            *[_section(m, f"prediction{i}") for i, m in enumerate(made.manoeuvres)],
+            *([Section("What to know of these numbers", points=_points(made.notes))]
+              if made.notes else []),
+        ],
+        computed=flatten(record),
+    )  # fmt: skip
+
+
+def headline(made: ManoeuvrePrediction) -> str:
+    """Return one sentence on the limits of the IMO, and one on the trial where there is one."""
+    judged = [
+        c for m in made.manoeuvres for c in m.criteria if c.verdict is not Verdict.NOT_APPLICABLE
+    ]
+    count = {v: sum(c.verdict is v for c in judged) for v in Verdict}
+    parts = [
+        f"{count[v]} of {len(judged)} {word}"
+        for v, word in (
+            (Verdict.PASS, "met"),
+            (Verdict.FAIL, "failed"),
+            (Verdict.OPEN, "cannot be told"),
+        )
+        if count[v]
+    ]
+    told = (
+        f"Limits of IMO MSC.137(76): {', '.join(parts)}."
+        if judged
+        else "No limit of IMO MSC.137(76) applies."
+    )
+    trials = [m.agreement for m in made.manoeuvres if m.agreement is not None]
+    if trials:
+        rows = [r for a in trials for r in a.rows]
+        within = sum(r.agrees for r in rows)
+        told = (
+            f"{within} of {len(rows)} measured quantities agree with the prediction within both "
+            f"intervals. {told}"
+        )
+    return told
+
+
+def _points(notes: tuple[str, ...]) -> list[str]:
+    return [n[0].upper() + n[1:] for n in notes]
+
+
+def _section(made: PredictedManoeuvre, key: str) -> Section:
+    sentences = [] if made.agreement is None else [_capital(made.agreement.sentence)]
+    tables = [_values(made)]
+    if made.agreement is not None and made.agreement.rows:
+        tables.append(_beside(made))
+    return Section(
+        _capital(made.label),
+        sentences=sentences,
+        pictures=_pictures(made, key),
+        tables=tables,
+        points=[*[_capital(f"IMO {verdict_line(c)}.") for c in made.criteria],
+                *_points(made.notes)],
+    )  # fmt: skip
+
+
+def _capital(text: str) -> str:
+    return text[0].upper() + text[1:]
+
+
+def _values(made: PredictedManoeuvre) -> Table:
+    rows = []
+    for name, value in made.quantities.items():
+        criterion = made.criterion(name)
+        limit = verdict = ""
+        if criterion is not None:
+            verdict = WORDS[criterion.verdict]
+            if criterion.limit is not None:
+                angle = criterion.measured is not None and criterion.measured.unit == "rad"
+                limit = (
+                    f"{criterion.limit * _DEGREES:.1f} deg" if angle else f"{criterion.limit:g} L"
+                )
+        rows.append([LABELS[name], *_cells(value, made.length), limit, verdict])
+    return Table(
+        "Predicted, with intervals of 95 %",
+        ["quantity", "value", "in lengths", "95 %", "at most", "IMO MSC.137(76)"],
+        rows,
+    )
+
+
+def _cells(value: Drawn | None, length: float) -> list[str]:
+    if value is None:
+        return ["not reached", "", ""]
+    plain, _, interval = value.text().partition(" (95 %: ")
+    lengths = f"{value.value / length:.2f} L" if value.unit == "m" else ""
+    return [plain, lengths, interval.rstrip(")")]
+
+
+def _beside(made: PredictedManoeuvre) -> Table:
+    agreement = made.agreement
+    rows = []
+    for row in agreement.rows if agreement is not None else ():
+        shown = [v.text().partition(" (95 %: ") for v in (row.predicted, row.measured)]
+        gap, _, around = row.difference.text().partition(" (95 %: ")
+        rows.append(
+            [LABELS[row.name]]
+            + [part for plain, _, interval in shown for part in (plain, interval.rstrip(")"))]
+            + [gap, around.rstrip(")"), "agrees" if row.agrees else "differs"]
+        )
+    return Table(
+        "Predicted and measured",
+        ["quantity", "predicted", "95 %", "measured", "95 %", "difference", "95 %", ""],
+        rows,
+    )
+
+
+def _pictures(made: PredictedManoeuvre, key: str) -> list[Picture]:
+    note = "The estimate's own run, and where 95 % of the draws are (shaded)."
+    if made.agreement is not None:
+        note += f" Black: measured in {made.agreement.log}."
+    if made.order is None:
+        panels = [("speed", "speed [m/s]", 1.0), ("propeller", "propeller speed", 1.0)]
+        return [Picture(to_svg(_histories(made, panels, 10, 4.2), key), note)]
+    panels = [
+        ("heading", "heading [deg]", _DEGREES),
+        ("r", "yaw [deg/s]", _DEGREES),
+        ("speed", "speed [m/s]", 1.0),
+    ]
+    if "steering" in made.bundle.nominal:
+        panels.append(("steering", "steering [deg]", _DEGREES))
+    drawn = "The track of the estimate's own run, and of some draws."
+    if made.kind == "zigzag":
+        drawn += " Its scales along and across differ."
+    return [
+        Picture(to_svg(_track(made), f"{key}track"), drawn, narrow=True),
+        Picture(to_svg(_histories(made, panels, 5.4, 5.6), key), note, narrow=True),
+    ]
+
+
+def _histories(
+    made: PredictedManoeuvre, panels: list[tuple[str, str, float]], width: float, height: float
+) -> Any:
+    figure = new_figure(width, height)
+    grid = figure.add_gridspec(len(panels), 1)
+    first: Any = None
+    for i, (name, label, factor) in enumerate(panels):
+        axes = figure.add_subplot(grid[i, 0], sharex=first)
+        first = first or axes
+        _history(axes, made, name, factor)
+        axes.set_ylabel(label, fontsize=9)
+        axes.tick_params(labelsize=8, labelbottom=i == len(panels) - 1)
+        if i == len(panels) - 1:
+            axes.set_xlabel("time from the order [s]", fontsize=9)
+        tidy(axes)
+    return figure
+
+
+def _history(axes: Any, made: PredictedManoeuvre, name: str, factor: float) -> None:
+    bundle = made.bundle
+    axes.fill_between(
+        bundle.t,
+        factor * bundle.low[name],
+        factor * bundle.high[name],
+        color=BLUE,
+        alpha=0.2,
+        linewidth=0,
+    )
+    axes.plot(bundle.t, factor * bundle.nominal[name], color=BLUE, linewidth=1.3)
+    if made.agreement is not None and name in made.agreement.history:
+        view = axes.get_ylim()
+        measured = factor * made.agreement.history[name]
+        axes.plot(made.agreement.history["t"], measured, color=BLACK, linewidth=0.9)
+        axes.set_ylim(min(view[0], measured.min()), max(view[1], measured.max()))
+
+
+def _track(made: PredictedManoeuvre) -> Any:
+    figure = new_figure(5.4, 5.6)
+    axes = figure.add_subplot()
+    tracks = made.bundle.tracks
+    for north, east in tracks[:0:-1]:
+        axes.plot(east, north, color=BLUE, alpha=0.15, linewidth=0.7)
+    axes.plot([], [], color=BLUE, alpha=0.3, linewidth=0.7, label="draws")
+    axes.plot(tracks[0][1], tracks[0][0], color=BLUE, linewidth=1.5, label="predicted")
+    if made.agreement is not None:
+        along, across = made.agreement.track
+        axes.plot(across, along, color=BLACK, linewidth=1.2, label="measured")
+    axes.plot(0, 0, "o", color=VERMILION, markersize=6, markeredgecolor="white", label="order")
+    if made.kind == "turning":
+        axes.set_aspect("equal", adjustable="datalim")
+    axes.set_xlabel("to starboard of the approach [m]", fontsize=9)
+    axes.set_ylabel("along the approach [m]", fontsize=9)
+    axes.tick_params(labelsize=8)
+    axes.legend(fontsize=8, loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.1,
+                ncols=4, frameon=False, columnspacing=1.2)  # fmt: skip
+    tidy(axes)
+    return figure
