@@ -209,12 +209,13 @@ def test_a_finger_scrolls_the_page(tmp_path):
         assert browser.execute_script(sizes) == [390, 390]
         browser.execute_script("arguments[0].scrollIntoView()", place)
         before, view = browser.execute_script("return scrollY"), browser.execute_script(_VIEW)
-        box = browser.execute_script(
-            "const b = arguments[0].getBoundingClientRect(); return [b.x + b.width / 2, b.y]", place
-        )
-        browser.execute_cdp_cmd(
-            "Input.synthesizeScrollGesture",
-            {"x": box[0], "y": box[1] + 240, "yDistance": -200, "gestureSourceType": "touch"},
-        )
+        for step in range(11):
+            point = [{"x": 195, "y": 500 - 20 * step}]
+            kind = "touchMove" if step else "touchStart"
+            browser.execute_cdp_cmd(
+                "Input.dispatchTouchEvent", {"type": kind, "touchPoints": point}
+            )
+        browser.execute_cdp_cmd("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+        time.sleep(0.5)
         assert browser.execute_script("return scrollY") > before + 100
         assert browser.execute_script(_VIEW) == view
