@@ -17,7 +17,7 @@ from greybox.validation.comparison import Comparison
 
 _NAMES = {"u": "surge", "v": "sway", "r": "yaw rate", "psi": "heading"}
 # with more the page grows and tells nothing new
-_MOST_LOGS = 12
+_MOST_LOGS = 8
 
 
 def headline(comparison: Comparison) -> str:
@@ -138,7 +138,7 @@ def _pictures(comparison: Comparison) -> list[Picture]:
         )
         printed, zoomed = (
             comparison_figure(comparison.names, runs, bands, points=points_for(curves, **room))
-            for room in ({}, {"most": 10_000, "room": 200_000})
+            for room in ({}, {"most": 10_000, "room": 120_000})
         )
         pictures.append(
             Picture(

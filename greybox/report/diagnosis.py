@@ -172,7 +172,7 @@ def _drawn(runs: Sequence[Runs]) -> list[Runs]:
 def _run_pictures(runs: Sequence[Runs]) -> Iterator[Picture]:
     drawn = _drawn(runs)
     curves = sum(len(r.measured) * (1 + 2 * len(simulations(r))) for r in drawn)
-    points = points_for(curves, most=10_000, room=150_000)
+    points = points_for(curves, most=10_000, room=120_000)
     for i, run in enumerate(drawn):
         kind = "held out from the fit" if run.held_out else "estimated on"
         changed = len(simulations(run)) > 1

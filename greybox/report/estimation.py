@@ -142,7 +142,7 @@ def _run(estimate: Estimate, logs: Sequence[TrialLog]) -> Section:
         fit = ", ".join(f"{_NAMES.get(s, s)} {v:.0f} %" for s, v in run.fit.items())
         printed, zoomed = (
             comparison_figure(["model"], [run], points=points_for(curves, **room))
-            for room in ({}, {"most": 10_000, "room": 150_000})
+            for room in ({}, {"most": 10_000, "room": 120_000})
         )
         pictures.append(
             Picture(

@@ -162,8 +162,8 @@ def fit_figure(
     fits : dict of str to ndarray
         estimator -> (lengths, runs, states) [%].
     """
-    figure = new_figure(10, 3.4)
-    axes = figure.subplots(1, len(states), sharey=True)
+    figure = new_figure(5.2, 1.8 * len(states) + 0.9)
+    axes = figure.subplots(len(states), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
     for i, state in enumerate(states):
         for j, (name, value) in enumerate(fits.items()):
             low, middle, high = np.percentile(
@@ -182,13 +182,18 @@ def fit_figure(
                 linewidth=1.1,
                 label=name,
             )
-        axes[i].set_title(LABELS.get(state, state).split(" [")[0], fontsize=10)
-        axes[i].set_xlabel("N [samples]")
+        word = LABELS.get(state, state).split(" [")[0]
+        axes[i].set_ylabel(f"{word}\nfit (6.12) [%]", fontsize=8.5)
         axes[i].set_ylim(0, 105)
         tidy(axes[i])
-    axes[0].set_ylabel("fit (6.12) [%]")
+    axes[-1].set_xlabel("N [samples]", fontsize=9)
     figure.legend(
-        *axes[0].get_legend_handles_labels(), loc="outside right center", fontsize=8, frameon=False
+        *axes[0].get_legend_handles_labels(),
+        loc="outside lower center",
+        ncols=6,
+        fontsize=8,
+        frameon=False,
+        columnspacing=1.0,
     )
     figure.suptitle(title, fontsize=11)
     return figure
@@ -230,7 +235,7 @@ def bias_figure(rows: Sequence[Any], title: str) -> Figure:
     rows : sequence of greybox.study.tables.Row
         Of one estimator.
     """
-    figure = new_figure(9, 2.6)
+    figure = new_figure(6.2, 2.8)
     ax = figure.subplots()
     position = np.arange(len(rows))
     scale = np.array([max(r.published_sd or r.sd, 1e-12) for r in rows])
@@ -259,7 +264,7 @@ def bias_figure(rows: Sequence[Any], title: str) -> Figure:
     ax.axhline(0, color=BLACK, linewidth=0.8)
     ax.set_xticks(position, [r.parameter for r in rows], rotation=40, ha="right", fontsize=8)
     ax.set_ylabel("error / published sd")
-    ax.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+    figure.legend(loc="outside lower center", ncols=2, fontsize=8, frameon=False)
     tidy(ax)
     ax.set_title(title, fontsize=10)
     return figure
@@ -267,7 +272,7 @@ def bias_figure(rows: Sequence[Any], title: str) -> Figure:
 
 def overview_figure(signals: dict[str, Array], title: str, sample_time: float = 1.0) -> Figure:
     """Draw signals of one log under one another (Figure 6.1)."""
-    figure = new_figure(9, 1.25 * len(signals) + 0.6)
+    figure = new_figure(5.6, 1.25 * len(signals) + 0.6)
     axes = figure.subplots(len(signals), 1, sharex=True, squeeze=False)[:, 0]
     for ax, (name, value) in zip(axes, signals.items(), strict=True):
         ax.plot(np.arange(len(value)) * sample_time, value, color=BLUE, linewidth=0.7)

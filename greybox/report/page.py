@@ -168,7 +168,7 @@ del { background: #f9ddcc; }
   table { font-size: 0.8rem; } th, td { padding: 0.2rem 0.3rem; } th { white-space: normal; }
   td:first-child { position: sticky; left: 0; background: #fff; } }
 @media print { button { display: none; } html { font-size: 11px; }
-  body { max-width: none; font-size: 1rem; }
+  figure > svg { max-width: 150mm; } body { max-width: none; font-size: 1rem; }
   figure { break-inside: avoid; }
   .pictures { grid-template-columns: 1fr 1fr; } h2, h3 { break-after: avoid; }
   .wide { overflow: visible; } th, td { white-space: normal; padding: 0.2rem 0.3rem; }

@@ -14,7 +14,7 @@ Index = NDArray[np.intp]
 GAP = 1.5
 
 
-def points_for(curves: int, *, most: int = 2000, room: int = 100_000) -> int:
+def points_for(curves: int, *, most: int = 2000, room: int = 60_000) -> int:
     """Return how many points each of a page's curves may have so that the page stays light.
 
     Parameters

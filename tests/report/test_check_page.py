@@ -291,7 +291,7 @@ def test_page_says_all_and_escapes_it(tmp_path):
     assert "leave &lt;them&gt; out" in html
     assert "column &lt;x&gt; taken for u" in html
     assert "a&amp;b.csv" in html
-    assert without_scripts(html).count("<svg") == 2
+    assert without_scripts(html).count("<svg") == 3
     assert html.index("1 finding in 1 log") < html.index("<svg")
     for kind in IDS:
         assert f"<td>{kind}</td>" in html

@@ -146,6 +146,14 @@ _CANVASES = """
     look(document.querySelector(".zoom"));
     return found;
 """
+_TOLD = """
+    const found = [];
+    const look = (root) => root.querySelectorAll("*").forEach((e) => {
+      if (e.shadowRoot) { found.push(e.shadowRoot.textContent); look(e.shadowRoot); }
+    });
+    look(document);
+    return found;
+"""
 _ACTIVE = """
     return Bokeh.documents[0].roots()[0].toolbar.tools
       .filter((t) => t.active).map((t) => (t.tools ? t.tools[0] : t).type);
@@ -192,6 +200,9 @@ def test_zoom_in_a_browser(tmp_path):
         time.sleep(0.5)
         boxed = browser.execute_script(_VIEW)
         assert boxed[1][1] - boxed[1][0] < 0.5 * (zoomed[1][1] - zoomed[1][0])
+        ActionChains(browser).move_to_element_with_offset(place, 60, rise).perform()
+        time.sleep(0.5)
+        assert any(HOSTILE.replace("$$", "$\u200b$") in t for t in browser.execute_script(_TOLD))
         assert browser.title == HOSTILE
         assert browser.execute_script("return document.images.length") == 0
         assert [e["message"] for e in browser.get_log("browser")] == []
@@ -209,12 +220,13 @@ def test_a_finger_scrolls_the_page(tmp_path):
         assert browser.execute_script(sizes) == [390, 390]
         browser.execute_script("arguments[0].scrollIntoView()", place)
         before, view = browser.execute_script("return scrollY"), browser.execute_script(_VIEW)
-        box = browser.execute_script(
-            "const b = arguments[0].getBoundingClientRect(); return [b.x + b.width / 2, b.y]", place
-        )
-        browser.execute_cdp_cmd(
-            "Input.synthesizeScrollGesture",
-            {"x": box[0], "y": box[1] + 240, "yDistance": -200, "gestureSourceType": "touch"},
-        )
+        for step in range(11):
+            point = [{"x": 195, "y": 500 - 20 * step}]
+            kind = "touchMove" if step else "touchStart"
+            browser.execute_cdp_cmd(
+                "Input.dispatchTouchEvent", {"type": kind, "touchPoints": point}
+            )
+        browser.execute_cdp_cmd("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+        time.sleep(0.5)
         assert browser.execute_script("return scrollY") > before + 100
         assert browser.execute_script(_VIEW) == view

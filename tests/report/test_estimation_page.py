@@ -1,0 +1,135 @@
+"""The page of an estimate: the verdict first, every test told, escaped, the same every time."""
+
+from __future__ import annotations
+
+import html
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from browser import needs_browser, require_legible, without_scripts
+from virtual import virtual_log
+
+from greybox.commands.main import main
+from greybox.estimation.result import Verdict
+from greybox.report.estimation import estimation_page, headline
+from greybox.report.estimation_figures import regime_shares
+from greybox.report.page import computed, render
+from greybox.validation.choose import estimate_model
+from greybox.validation.request import Request
+
+HOSTILE = '<script>alert("x")</script> & $x^$'
+
+
+@pytest.fixture(scope="module")
+def log():
+    return virtual_log(1, 800, name=HOSTILE)
+
+
+@pytest.fixture(scope="module")
+def estimate(log):
+    return estimate_model([log], Request(method="iv", predictor="augmented"))
+
+
+@pytest.fixture(scope="module")
+def page(estimate, log):
+    return estimation_page(estimate, [log], {"program": "p"}, mass=1e5)
+
+
+def test_all_is_told(estimate, page):
+    shown = html.unescape(without_scripts(render(page)))
+    for test in estimate.tests:
+        assert test.name.replace("_", " ") in shown
+        assert test.sentence[1:] in shown
+    for label, value in zip(estimate.labels, estimate.structure_theta(), strict=False):
+        assert label in shown
+        assert f"{value:.4g}".replace("e-", "e−") in shown or value == 0
+    for note in estimate.notes:
+        assert note in shown
+    assert "Physical quantities for m = 100000 kg" in shown
+    assert "a log the model was estimated on" in shown
+
+
+def test_every_picture_says_what_it_shows(page):
+    pictures = [p for s in page.sections for p in s.pictures]
+    assert len(pictures) == 6
+    assert all(len(p.alternative) > len(p.caption) for p in pictures if p.alternative != p.caption)
+    assert all(p.alternative for p in pictures)
+    assert [p.chart is not None for p in pictures] == [True] + 5 * [False]
+
+
+def test_names_are_text(page):
+    shown = without_scripts(render(page))
+    assert "<script>" not in shown
+    assert "&lt;script&gt;alert" in shown
+    assert len(render(page)) < 5_000_000
+
+
+def test_same_estimate_same_bytes(estimate, log, page):
+    again = estimation_page(estimate, [log], {"program": "p"}, mass=1e5)
+    assert render(again) == render(page)
+
+
+@pytest.mark.parametrize(
+    ("text", "first"),
+    [
+        ("trust", "Trust this model: no test speaks against it."),
+        ("trust except Xu, Nr", "Trust this model, except for Xu, Nr."),
+        ("do not trust: it diverges", "Do not trust: it diverges."),
+    ],
+)
+def test_the_verdict_stands_first(estimate, text, first):
+    told = headline(replace(estimate, verdict=Verdict(text)))
+    assert told.startswith(first)
+    assert "(100 is perfect)" in told
+    assert headline(replace(estimate, verdict=Verdict(text), fit={})) == first
+
+
+def test_without_tests_the_page_stands(estimate, log):
+    bare = estimation_page(replace(estimate, tests=(), notes=(), limits={}), [log], {})
+    shown = render(bare)
+    assert "No tests were made." in shown
+    assert "What do the residuals say?" not in shown
+
+
+def test_shares_of_regimes():
+    shares = regime_shares(np.array([1.0, 1, -1, 1]), np.array([1.0, -1, -1, 1]))
+    assert shares == {"u+ v+": 0.5, "u+ v−": 0.25, "u− v+": 0.0, "u− v−": 0.25}
+
+
+def test_how_it_was_computed():
+    record = {
+        "program": "greybox-marine 1", "versions": {"numpy": "2", "Python": "3"},
+        "command": {"seed": 4, "logs": ["a.csv"]}, "line": "greybox estimate a.csv",
+        "inputs": {"a.csv": "ab12"}, "further": 3,
+    }  # fmt: skip
+    assert computed(record) == {
+        "command": "greybox estimate a.csv",
+        "seed": "4",
+        "read a.csv": "SHA-256 ab12",
+        "computed with": "greybox-marine 1, numpy 2, Python 3",
+        "further": "3",
+    }
+
+
+def test_by_command(noisy_csv, tmp_path, capsys):
+    path = tmp_path / "page.html"
+    arguments = ["estimate", str(noisy_csv), "--vessel", "thesis", "--method", "ls", "--predictor",
+                 "basic", "--report", str(path)]  # fmt: skip
+    pages = []
+    for _ in range(2):
+        assert main(arguments) == 0
+        pages.append(path.read_bytes())
+    assert f"wrote {path}" in capsys.readouterr().out
+    assert pages[0] == pages[1]
+    shown = without_scripts(pages[0].decode())
+    assert "casadi" in shown
+    assert f"read {noisy_csv}" in shown
+    assert "SHA-256 " in shown
+
+
+@needs_browser
+def test_in_a_browser(tmp_path, page):
+    path = tmp_path / "page.html"
+    path.write_text(render(page))
+    require_legible(path, 390)
