@@ -151,13 +151,26 @@ def log_from_xarray(
 ) -> TrialLog:
     """Return the log that a Dataset over one dimension, its time, holds.
 
-    Units in the ``units`` of its variables are believed. Parameters and errors as
-    `log_from_pandas`.
+    Parameters
+    ----------
+    dataset : Dataset
+        One variable a channel, each (N,) over the time; units in their ``units``
+        attributes are believed.
+    vessel : Vessel
+    name : str
+        Of the log; one that was a log before keeps its own.
+    states, fill
+        As `read_log`.
+
+    Returns
+    -------
+    TrialLog
+        As `log_from_pandas` gives of the same columns.
 
     Raises
     ------
     LogError
-        It is no Dataset, or has not one dimension.
+        As `log_from_pandas`, and where it is no Dataset, or has not one dimension.
     UsageError
         xarray is not installed.
     """
@@ -201,6 +214,11 @@ def recording_from_pandas(
     name : str
     guess : bool
         Whether columns that are neither mapped nor canonical are guessed.
+
+    Returns
+    -------
+    Recording
+        SI and radians, as `read_recording` gives of a file with these columns.
 
     Raises
     ------
