@@ -2,6 +2,7 @@
 
 import xml.etree.ElementTree as ET
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -91,6 +92,8 @@ def results(ship, thesis, true_theta):
         ed.predict_precision(prepared.request, [plan]),
         ed.Discrimination(design, (HOSTILE, "b"), (3.0, 4.0), (1.0, np.nan), False, np.nan),
         replace(prepared.request.noise, source=HOSTILE),
+        gb.predict_manoeuvre(clean, "turning", limited=False, draws=40),
+        gb.Exported("c", (Path(HOSTILE.replace("\0", "")),), (HOSTILE,), (HOSTILE,), (HOSTILE,)),
     ]
 
 

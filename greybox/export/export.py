@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
-from html import escape
 from pathlib import Path
 
 from greybox.errors import UsageError, suggestion
@@ -13,13 +12,14 @@ from greybox.export.motion import Heading, Wind
 from greybox.export.sampled import SampledModel, sampled_model
 from greybox.files import check_targets, replacing, to_json
 from greybox.model.model import ManoeuvringModel
+from greybox.notebook import Shown, items
 
 TARGETS = ("c", "fmu", "casadi", "mat", "json")
 _OPTIONS = {"heading": ("simulated", "measured"), "wind": ("earth", "relative")}
 
 
-@dataclass(frozen=True)
-class Exported:
+@dataclass(frozen=True, repr=False)
+class Exported(Shown):
     """What was written.
 
     Parameters
@@ -46,8 +46,11 @@ class Exported:
         lines += [f"in:  {', '.join(self.inputs)}", f"out: {', '.join(self.outputs)}"]
         return "\n".join([*lines, *[f"note: {n}" for n in self.notes]])
 
-    def _repr_html_(self) -> str:
-        return f"<pre>{escape(self.summary())}</pre>"
+    def _parts(self) -> Iterator[str]:
+        yield items("Files", self.files)
+        yield items("In", self.inputs)
+        yield items("Out", self.outputs)
+        yield items("Notes", self.notes)
 
 
 def export_model(

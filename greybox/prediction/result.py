@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from html import escape
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.notebook import Shown, items, number, table
 from greybox.prediction.drawn import Drawn
 from greybox.prediction.measuring import LABELS
 from greybox.trial.log import TrialLog
@@ -235,8 +236,12 @@ class PredictedManoeuvre:
         return rows
 
 
-@dataclass(frozen=True)
-class ManoeuvrePrediction:
+def _range(ci: Sequence[float | None]) -> str:
+    return " to ".join(number(x) for x in ci)
+
+
+@dataclass(frozen=True, repr=False)
+class ManoeuvrePrediction(Shown):
     """What a model predicts of one kind of manoeuvre.
 
     Parameters
@@ -273,8 +278,12 @@ class ManoeuvrePrediction:
         ]
         return "\n\n".join(["\n".join(lines), *[m.summary() for m in self.manoeuvres]])
 
-    def _repr_html_(self) -> str:
-        return f"<pre>{escape(self.summary())}</pre>"
+    def _parts(self) -> Iterator[str]:
+        for m in self.manoeuvres:
+            rows = [(r["name"], number(r["value"]), _range(r["ci"] or ()), r["unit"], r["verdict"] or "")
+                    for r in m.to_list()]  # fmt: skip
+            yield table(("quantity", "value", "95 %", "unit", "IMO"), rows, m.label)
+        yield items("Notes", self.notes)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result for JSON: one row a quantity, SI and radians."""

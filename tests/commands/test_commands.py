@@ -71,6 +71,7 @@ def test_same_input_same_bytes(noisy_csv, tmp_path):
     assert one == two
 
 
+@pytest.mark.long
 def test_a_nominal_model_starts_the_refinement(noisy_csv, tmp_path):
     """From least squares or from a nominal model, the refinement ends at one estimate."""
     iv = ["--method", "iv", "--predictor", "augmented", "--structure", "thesis"]

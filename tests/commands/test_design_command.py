@@ -130,6 +130,7 @@ def test_between(folder, capsys):
     assert plan.exists()
 
 
+@pytest.mark.long
 def test_least_time(folder, capsys):
     status, plan = run(folder, "--duration", "400", "--predictor", "basic", "--target", "Yvv=0.03")
     assert status == 0

@@ -47,6 +47,7 @@ def run(capsys, *arguments):
     return status, *capsys.readouterr()
 
 
+@pytest.mark.long
 def test_a_log_with_a_gap_is_estimated_by_segments(tmp_path, capsys):
     log = virtual_log(1, 1500)
     raw = write_csv(log, tmp_path / "raw.csv")

@@ -97,6 +97,7 @@ def test_a_design_shows_itself(basic):
     assert data["margins"]["u"] >= 0.5
 
 
+@pytest.mark.long
 def test_the_same_seed_gives_the_same_plan():
     request = make_request(duration=120.0, effort=0.1)
     one = design_trial(request, workers=1, alternatives=False)
@@ -261,6 +262,7 @@ def test_a_campaign_determines_what_one_regime_cannot():
     assert "Y_vr" in design.names
 
 
+@pytest.mark.long
 def test_earlier_trials_add_their_information():
     request = make_request(duration=150.0, effort=0.05)
     first = design_trial(request, workers=1, alternatives=False)
@@ -273,6 +275,7 @@ def test_earlier_trials_add_their_information():
     assert second.logdet > first.logdet + 15 * np.log(2)
 
 
+@pytest.mark.long
 def test_least_trial_time():
     request = make_request(duration=600.0, effort=0.1)
     shorter = least_duration(request, {"Yvv": 0.02, "Yur": 0.045}, workers=1)

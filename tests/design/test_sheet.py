@@ -273,6 +273,7 @@ def test_a_long_table_goes_on(ship, thesis, true_theta):
     assert [t for t in written if t in set(times)] == list(times)
 
 
+@pytest.mark.long
 def test_several_trials_are_several_pages(ship, thesis, true_theta, tmp_path):
     design = made(prior(ship, thesis, true_theta, 0), ship, duration=120.0, trials=2)
     for kind in ("pdf", "svg", "png", "html"):
@@ -295,6 +296,7 @@ def test_same_design_same_bytes(short, tmp_path):
         assert (tmp_path / f"a.{kind}").read_bytes() == (tmp_path / f"b.{kind}").read_bytes()
 
 
+@pytest.mark.long
 def test_a_name_cannot_break_a_sheet(short, tmp_path):
     vessel = replace(short.request.vessel, name=HOSTILE)
     design = replace(short, request=replace(short.request, vessel=vessel))
@@ -322,7 +324,7 @@ def test_the_page_says_what_is_saved(unsure):
     assert "This plan saves 150 s of trial" in html
     assert "at least 0.7 of the best possible" in html
     assert html.count("<svg") == 4
-    assert html.count('role="group"') == 4
+    assert html.count("<figure ") == 4
     assert "tells nothing" in html
     assert "(breaks limits)" in html
     reference = random_std(unsure)

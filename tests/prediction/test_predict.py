@@ -63,6 +63,7 @@ def test_head_reach_without_thrust():
     assert made.manoeuvres[0].criteria[0].verdict is Verdict.NOT_APPLICABLE
 
 
+@pytest.mark.long
 def test_intervals_are_those_of_the_parameters():
     """Head reach goes with 1/|Xu|, whose quantiles are known."""
     model = linear_ship(step=0.25)

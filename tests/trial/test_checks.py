@@ -76,6 +76,7 @@ def test_a_clean_log_gives_no_finding(rate, ship):
     assert all(o.status == "clean" for o in report.outcomes)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("channels", "late", "rate"),
     [
@@ -266,6 +267,7 @@ def found_ids(recording: Recording, ship):
     return [f.id for f in check_recording(recording, ship).findings]
 
 
+@pytest.mark.long
 def test_coarse_values(ship):
     d = recorded(4, 10.0)
     d["psi"] = np.radians(np.round(np.degrees(d["psi"]) / 5) * 5)
@@ -338,6 +340,7 @@ def real(folder, vessel, name):
     return report
 
 
+@pytest.mark.long
 def test_velocities_of_the_tanker_model_are_late(data_folder):
     report = real(data_folder, ESSO, "esso_osaka/turn_14-Sep-2020_14_16_04.csv")
     late = next(f for f in report.findings if f.id == "clock_offset")
@@ -354,6 +357,7 @@ def test_velocities_of_the_benchmark_are_earth_fixed(data_folder):
     assert {"t", "x_n"} <= {f.channel for f in report.findings if f.id == "quantised"}
 
 
+@pytest.mark.long
 def test_thrusters_of_the_catamaran_are_swapped(data_folder):
     for number in (220, 230, 235):
         report = real(data_folder, BLUEBOAT, f"blueboat/fixed_00000{number}.csv")

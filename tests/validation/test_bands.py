@@ -219,6 +219,7 @@ def test_a_ship_that_changed_leaves_its_band():
     assert "the model lacks" in c.sentence
 
 
+@pytest.mark.long
 def test_commands_write_bands(tmp_path, capsys):
     log, _ = pushed(7, 900)
     trial, model = write_csv(log, tmp_path / "a.csv"), tmp_path / "m.json"

@@ -118,6 +118,7 @@ def test_least_earning_columns_are_jointly_insignificant(quiet):
     assert all(estimate.predictor.columns[c].name not in STRONG for c in found[0].columns)
 
 
+@pytest.mark.long
 def test_what_the_ship_lacks_is_left_out(quiet):
     choice = reduce_structure([quiet], LS)
     kept = set(choice.estimate.names)
@@ -133,6 +134,7 @@ def test_what_the_ship_lacks_is_left_out(quiet):
     assert any("within one standard error of the best" in n for n in choice.estimate.notes)
 
 
+@pytest.mark.long
 def test_comparison_prefers_the_smaller_of_equals(quiet):
     smaller = "thesis-" + "-".join(ABSENT)
     names = ["thesis", smaller, smaller + "-Xvr"]
@@ -168,6 +170,7 @@ def test_reduced_predictors_of_the_thesis_are_candidates():
     assert set(REDUCED_BIASES) <= candidates
 
 
+@pytest.mark.long
 def test_commands_choose_a_structure(quiet, tmp_path, capsys):
     trial, out = write_csv(quiet, tmp_path / "a.csv"), tmp_path / "m.json"
     base = ["estimate", str(trial), "--vessel", "thesis", "--method", "ls",

@@ -180,6 +180,7 @@ def test_output_error_that_fails_is_told(monkeypatch):
     assert e.notes[-1] == "output error was tried too, and failed: the run leaves every bound."
 
 
+@pytest.mark.long
 def test_held_out_runs_choose_elsewhere():
     log = virtual_log(4, 900)
     straight = make_log(log.vessel, {**log.channels, "psi": log["psi"] * 0.01}, 1.0, "straight")
@@ -216,6 +217,7 @@ def test_whole_turns_between_logs_are_no_coverage(noisy_log):
     assert heading_range([noisy_log]) > 6
 
 
+@pytest.mark.long
 def test_rare_signs_make_no_regime_of_their_own(noisy_log, thesis):
     """A few measured v < 0 would add sgn(v), which the simulated v never changes."""
     v = noisy_log["v"].copy()
