@@ -92,7 +92,7 @@ def results(ship, thesis, true_theta):
         ed.predict_precision(prepared.request, [plan]),
         ed.Discrimination(design, (HOSTILE, "b"), (3.0, 4.0), (1.0, np.nan), False, np.nan),
         replace(prepared.request.noise, source=HOSTILE),
-        gb.predict_manoeuvre(clean, "turning", limited=False, draws=40),
+        gb.predict_manoeuvre(clean, "turning", limited=False, command=15.0, draws=40),
         gb.Exported("c", (Path(HOSTILE.replace("\0", "")),), (HOSTILE,), (HOSTILE,), (HOSTILE,)),
     ]
 
