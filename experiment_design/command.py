@@ -207,7 +207,6 @@ def run(options: argparse.Namespace) -> None:
     from greybox.vessel.toml import load_vessel
 
     check_targets(options.out, options.json, options.sheet, options.report)
-    _require_apart(options)
     if options.sheet:
         from experiment_design.sheet import sheet_kind
 
@@ -251,30 +250,6 @@ def run(options: argparse.Namespace) -> None:
         for path in (options.out, options.sheet, options.report):
             if path:
                 say(f"wrote {path}")
-
-
-def _require_apart(options: argparse.Namespace) -> None:
-    """Raise where an output would replace an input or another output."""
-    from greybox.errors import UsageError
-
-    taken: dict[Path, str] = {}
-    inputs = {"--vessel": options.vessel, "--model": options.model, "--prior": options.prior}
-    inputs |= {"--area": options.area}
-    inputs |= {f"--between {p}": p for p in options.between or ()}
-    for name, given in inputs.items():
-        if given is not None:
-            taken[Path(given).resolve()] = name
-    outputs = {"--out": options.out, "--json": options.json, "--sheet": options.sheet}
-    for name, given in (outputs | {"--report": options.report}).items():
-        if given is None or given == "-":
-            continue
-        place = Path(given).resolve()
-        if place in taken:
-            raise UsageError(
-                f"{name} would write over '{given}', which {taken[place]} names too: name another "
-                f"file."
-            )
-        taken[place] = name
 
 
 def _run_between(options: argparse.Namespace, request: Any, notes: tuple[str, ...]) -> None:

@@ -73,11 +73,14 @@ def read_logs(
     return logs if sample_time is None else [decimate(log, sample_time) for log in logs]
 
 
-# options that name files to read; raw files are hashed as they are imported
+# options that name files to read, and to write
 _INPUTS = (
     "logs", "log", "models", "model", "nominal", "validate", "estimate", "vessel", "prior",
-    "between", "area",
+    "between", "area", "raw", "trial",
 )  # fmt: skip
+_OUTPUTS = ("out", "json", "report", "sheet")
+# raw files are hashed as they are imported
+_HASHED = tuple(n for n in _INPUTS if n != "raw")
 # what is typed for the terminal's sake, and changes no result
 _TALK = ("-v", "-vv", "--verbose", "-q", "--quiet", "--no-config")
 _PACKAGES = ("casadi", "numpy", "scipy")
@@ -108,10 +111,40 @@ def provenance(options: argparse.Namespace) -> dict[str, Any]:
 def _hashes(shown: Mapping[str, Any]) -> dict[str, str]:
     """Return the SHA-256 of each file that options name to be read; built-in names have none."""
     found: dict[str, str] = {}
-    for name in _INPUTS:
-        given = shown.get(name) or []
-        for path in [given] if isinstance(given, str) else given:
+    for name in _HASHED:
+        for path in _paths(shown.get(name)):
             if Path(path).is_file():
                 with open(path, "rb") as handle:
                     found[path] = file_digest(handle, "sha256").hexdigest()
     return found
+
+
+def _paths(given: Any) -> list[str]:
+    """Return what an option names as files."""
+    several = given if isinstance(given, (list, tuple)) else [given]
+    return [g for g in several if isinstance(g, str) and g != "-"]
+
+
+def require_apart(options: argparse.Namespace) -> None:
+    """Raise where an output would replace an input or another output.
+
+    Raises
+    ------
+    UsageError
+        Names the file and both options.
+    """
+    from greybox.errors import UsageError
+
+    taken: dict[Path, str] = {}
+    for name in _INPUTS:
+        taken |= {Path(p).resolve(): name for p in _paths(getattr(options, name, None))}
+    for name in _OUTPUTS:
+        for path in _paths(getattr(options, name, None)):
+            place = Path(path).resolve()
+            # a device takes everything
+            if place in taken and (place.is_file() or not place.exists()):
+                raise UsageError(
+                    f"--{name} would write over '{path}', which {taken[place]} names too: name "
+                    f"another file."
+                )
+            taken[place] = name

@@ -11,6 +11,7 @@ from importlib import import_module
 from importlib.metadata import entry_points, version
 from pathlib import Path
 
+from greybox.commands.common import require_apart
 from greybox.commands.parser import Parser, short_usage, sub_parsers
 from greybox.commands.terminal import complain, telling
 from greybox.errors import GreyboxError
@@ -164,6 +165,7 @@ def _run(options: argparse.Namespace) -> None:
     used = getattr(options, "configuration", None)
     if used is not None:
         _log.info("configuration %s gives %s", used["file"], ", ".join(used["options"]))
+    require_apart(options)
     options.run(options)
     _log.info("done")
 

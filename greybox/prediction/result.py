@@ -236,8 +236,8 @@ class PredictedManoeuvre:
         return rows
 
 
-def _range(ci: Sequence[float | None]) -> str:
-    return " to ".join(number(x) for x in ci)
+def _range(ci: Sequence[float | None] | None) -> str:
+    return " to ".join(number(x) for x in ci or ())
 
 
 @dataclass(frozen=True, repr=False)
@@ -280,8 +280,16 @@ class ManoeuvrePrediction(Shown):
 
     def _parts(self) -> Iterator[str]:
         for m in self.manoeuvres:
-            rows = [(r["name"], number(r["value"]), _range(r["ci"] or ()), r["unit"], r["verdict"] or "")
-                    for r in m.to_list()]  # fmt: skip
+            rows = [
+                (
+                    r["name"],
+                    number(r["value"]),
+                    _range(r["ci"] or ()),
+                    r["unit"],
+                    r["verdict"] or "",
+                )
+                for r in m.to_list()
+            ]
             yield table(("quantity", "value", "95 %", "unit", "IMO"), rows, m.label)
         yield items("Notes", self.notes)
 

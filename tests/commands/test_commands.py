@@ -211,3 +211,15 @@ def test_physical_quantities_when_a_mass_is_given(noisy_csv, capsys):
     assert "Physical quantities for m = 150000 kg" in shown
     assert "assumed added mass" in shown
     assert "Xvr·Yur = −Ts²" in shown
+
+
+def test_no_command_writes_over_what_it_reads(tmp_path, capsys):
+    write_csv(virtual_log(1, 200), tmp_path / "trial.csv")
+    kept = (tmp_path / "trial.csv").read_bytes()
+    path = str(tmp_path / "trial.csv")
+    assert main(["estimate", path, "--vessel", "thesis", "--out", path]) == 1
+    assert "--out would write over" in capsys.readouterr().err
+    assert (tmp_path / "trial.csv").read_bytes() == kept
+    same = str(tmp_path / "same")
+    assert main(["estimate", path, "--vessel", "thesis", "--out", same, "--json", same]) == 1
+    assert "which out names too" in capsys.readouterr().err

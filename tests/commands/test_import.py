@@ -190,7 +190,7 @@ def test_a_file_is_not_written_over_itself(tmp_path, capsys):
     before = raw.read_bytes()
     status, _, err = run(capsys, "import", raw, "--vessel", "thesis", "--out", raw)
     assert status == 1
-    assert "raw.csv' is also the log to write" in err
+    assert "--out would write over" in err
     assert raw.read_bytes() == before
 
 
