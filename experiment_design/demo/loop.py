@@ -274,7 +274,7 @@ def truth_sentence(hidden: Sequence[Effect]) -> str:
 
 
 def _diagnosed(diagnosis: Diagnosis, hidden: Sequence[Effect]) -> Step:
-    said = [f"Verdict: {diagnosis.verdict}. {diagnosis.headline}"]
+    said = [f"Verdict: {diagnosis.verdict}; {diagnosis.headline}"]
     said += [f"{c.id}: {_spelled(c)}." for c in diagnosis.causes]
     return Step(
         "Name the cause and extend the model",

@@ -10,11 +10,12 @@ from experiment_design.report import design_page
 from experiment_design.result import Design
 from greybox.diagnosis.result import Diagnosis
 from greybox.model.model import ManoeuvringModel
+from greybox.report.chart import chart_of
 from greybox.report.comparison import comparison_page
 from greybox.report.diagnosed_causes import cause_section
 from greybox.report.diagnosis import diagnosis_page
 from greybox.report.figures import to_svg
-from greybox.report.log import log_figure
+from greybox.report.log import page_figures
 from greybox.report.model_difference import marked_equations
 from greybox.report.page import Marked, Page, Picture, Section, Table, flatten
 from greybox.validation.comparison import Comparison
@@ -29,18 +30,22 @@ def demo_page(demo: Demo, record: Mapping[str, Any]) -> Page:
     record : mapping
         How it was computed.
     """
-    log = Picture(
-        to_svg(log_figure(demo.trial), "trial"),
-        "The trial as its log holds it: track, motion, commands.",
-        f"Track, velocities, heading and commands of {len(demo.trial)} samples.",
-    )
+    log = [
+        Picture(
+            to_svg(figure, f"trial{part}"),
+            f"The trial as its log holds it: {part}.",
+            f"{part} of {len(demo.trial)} samples of {demo.trial.sample_time:g} s",
+            chart=chart_of(figure),
+        )
+        for part, figure in page_figures(demo.trial).items()
+    ]
     diagnosis, model = demo.diagnosis, demo.estimate.model()
     found = cause_section(diagnosis)
     wrong = diagnosis_page(diagnosis, {}).sections[0]
     shown: list[tuple[Sequence[Picture], Sequence[Table], Sequence[Marked], Sequence[str]]] = [
         (_plan(demo.design), (), (), ()),
         ((), (), (), ()),
-        ((log,), (), (), ()),
+        (log, (), (), ()),
         ((), (_parameters(demo),), (), ()),
         (_runs(demo.before, model), (), (), wrong.points[:4]),
         (
@@ -88,10 +93,9 @@ def _section(
     marked: Sequence[Marked],
     points: Sequence[str],
 ) -> Section:
-    command = (("Command", step.command),) if step.command else ()
     return Section(
-        f"{number}. {step.title}", step.told, pictures, tables, command, points, marked
-    )  # fmt: skip
+        f"{number}. {step.title}", step.told, pictures, tables, (), points, marked, step.command
+    )
 
 
 def _plan(design: Design) -> list[Picture]:

@@ -17,7 +17,8 @@ Pieces = Sequence[Sequence[float | None]]
 _GROUPS = {
     "What the log determines": ("excitation", "relevance", "weak_instruments", "anderson_rubin",
                                 "combinations"),
-    "Whether the model explains it": ("input_independence", "overidentification", "whiteness"),
+    "Whether the model explains it": ("input_independence", "heading_independence",
+                                      "overidentification", "whiteness"),
     "What noise does to it": ("endogeneity", "many_instruments", "margin_u", "margin_v",
                               "margin_bias", "closed_loop"),
     "What the model does": ("stability", "damping_signs", "slow_errors"),

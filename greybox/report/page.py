@@ -50,7 +50,10 @@ class Marked:
 
 @dataclass(frozen=True)
 class Section:
-    """A part of a page under a heading of its own, such as one log of several."""
+    """A part of a page under a heading of its own, such as one log of several.
+
+    ``command`` is what a user types for it.
+    """
 
     title: str
     sentences: Sequence[str] = ()
@@ -59,6 +62,7 @@ class Section:
     texts: Sequence[tuple[str, str]] = ()
     points: Sequence[str] = ()
     marked: Sequence[Marked] = ()
+    command: str = ""
 
 
 @dataclass(frozen=True)
@@ -77,6 +81,8 @@ class Page:
 
 _NONE = "'none'"
 _TEMPLATE = """{% macro parts(of, level) %}
+{% if of.command %}<pre class="marked">{{ of.command }}</pre>
+{% endif %}
 {% for sentence in of.sentences %}<p>{{ sentence }}</p>
 {% endfor %}
 {% if of.points %}<ul>{% for point in of.points %}<li>{{ point }}</li>

@@ -87,6 +87,7 @@ def test_surge_model(folder, capsys):
     assert plan.exists()
 
 
+@pytest.mark.long
 def test_campaign_has_a_trial_column(folder):
     status, plan = run(folder, "--duration", "100", "--predictor", "basic", "--trials", "2")
     assert status == 0

@@ -91,6 +91,7 @@ def test_no_short_trial_in_three_degrees_beats_its_bound(ship, name, holds):
     assert found.bound >= best
 
 
+@pytest.mark.long
 def test_surge_design_of_200_s_is_certified(ship):
     problem = make_problem(ship, "surge", 200.0)
     starts = draw_two_level(problem, np.random.default_rng(0), 6)

@@ -82,7 +82,7 @@ def test_its_page_is_legible(demo):
 def test_the_commands_it_shows_work(demo, monkeypatch, capsys):
     shown = [
         line.split("</pre>")[0]
-        for line in (demo / "report.html").read_text().split("<pre>greybox ")[1:]
+        for line in (demo / "report.html").read_text().split('<pre class="marked">greybox ')[1:]
     ]
     assert len(shown) == 7
     monkeypatch.chdir(demo)

@@ -120,6 +120,7 @@ def test_how_sure_one_will_be():
     assert first.shape == second.shape
 
 
+@pytest.mark.long
 def test_a_designed_trial_tells_more_than_a_random_one():
     request = make_request(duration=150.0, effort=0.4)
     rival = _rival(request, current=(0.15, 0.1))

@@ -26,6 +26,8 @@ from greybox.model.predictor import build_predictor
 from greybox.model.terms import parse_term
 from greybox.regression.instruments import build_instruments
 from greybox.regression.regression import build_regression
+from greybox.validation.choose import estimate_model
+from greybox.validation.request import Request
 
 REGIME = (("u", (1,)), ("v", (1,)))
 
@@ -196,7 +198,7 @@ def sizes(case, kind, runs, samples, seed):
 def test_sizes(case, kind):
     """Rejections of a correct model lie in the binomial band about 3 to 7 %."""
     # measurement noise makes least squares biased and the residuals coloured
-    under_null = ("input_independence", "overidentification")
+    under_null = ("input_independence", "overidentification", "heading_independence")
     if case == "process":
         under_null += ("endogeneity", "whiteness")
     for name, (hits, runs) in sizes(case, kind, 60, 1500, 7000).items():
@@ -428,3 +430,32 @@ def test_bands_of_single_delays_cover(true_theta):
                 inside += list(value[band > 1e-9] <= band[band > 1e-9])
     # delays of one run are related: a run counts as some six independent draws
     assert abs(np.mean(inside) - 0.95) < 3 * np.sqrt(0.95 * 0.05 / 600)
+
+
+def test_a_current_that_is_not_captured_is_found_by_the_heading():
+    log = virtual_log(1, 2000, current=(0.1, -0.05), wind=0.0)
+    for method in ("iv", "oe"):
+        estimate = estimate_model([log], Request(method=method, predictor="basic"))
+        found = by_name(estimate)["heading_independence_u"]
+        assert found.p_value < 1e-3
+        assert "a current or wind" in found.sentence
+        assert "the heading still explains" in estimate.verdict.text
+    caught = by_name(estimate_model([log], Request(method="iv", predictor="augmented")))
+    assert "captures the disturbance" in caught["heading_independence_u"].sentence
+    straight = replace(log, channels={**log.channels, "psi": 0.01 * log["psi"]})
+    told = by_name(estimate_model([straight], Request(method="ls", predictor="basic")))
+    assert "the heading spreads by" in told["heading_independence_u"].sentence
+
+
+def test_a_missing_current_is_said_in_the_verdict():
+    names = ("Xu",)
+    heading = result("heading_independence_u", False, p=1e-6)
+    assert judge([heading], names, "iv").text == (
+        "do not trust: the heading still explains the residuals of u, so the model lacks a current "
+        "or wind"
+    )
+    both = judge([heading, result("input_independence_v", False, p=1e-6)], names, "iv").text
+    assert both == (
+        "do not trust: the heading still explains the residuals of u and the inputs still explain "
+        "the residuals of v, so the model lacks something"
+    )

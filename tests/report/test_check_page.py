@@ -299,6 +299,7 @@ def test_page_says_all_and_escapes_it(tmp_path):
     assert not re.search(r'(src|href)="(?!#)', without_scripts(html))
 
 
+@pytest.mark.long
 def test_identifiers_of_several_logs_do_not_collide(tmp_path):
     path = tmp_path / "check.html"
     check_page([row_case("gap"), row_case("stuck")], [Path("a"), Path("b")], SHIP, path)

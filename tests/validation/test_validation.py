@@ -140,6 +140,7 @@ def test_the_theory_chooses_where_its_conditions_hold(noisy_log):
     assert e.fit["u"] > 50
 
 
+@pytest.mark.long
 def test_output_error_takes_over_where_it_is_trusted_and_instruments_are_not():
     """Constant measured wind: its terms move instruments little, the free run enough."""
     log = virtual_log(4, 1500, spread=0.0)
@@ -152,6 +153,7 @@ def test_output_error_takes_over_where_it_is_trusted_and_instruments_are_not():
     assert kept.method != "oe"
 
 
+@pytest.mark.long
 def test_output_error_that_is_judged_no_better_is_left(monkeypatch):
     log = virtual_log(4, 1500, spread=0.0)
     doubtful = Verdict("do not trust: a reason")

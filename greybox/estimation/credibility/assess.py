@@ -9,6 +9,7 @@ from greybox.estimation.credibility.combinations import combinations
 from greybox.estimation.credibility.endogeneity import endogeneity
 from greybox.estimation.credibility.evidence import Equation, Evidence
 from greybox.estimation.credibility.excitation import excitation
+from greybox.estimation.credibility.heading import heading_independence
 from greybox.estimation.credibility.independence import input_independence
 from greybox.estimation.credibility.many import many_instruments
 from greybox.estimation.credibility.margins import margin_bias, sign_margins
@@ -64,7 +65,7 @@ def assess(evidence: Evidence) -> tuple[TestResult, ...]:
 def _of_equation(evidence: Evidence, equation: Equation) -> list[TestResult]:
     if evidence.method == "oe":
         # a free run needs no instruments: only what speaks of the model is asked
-        return [input_independence(evidence, equation)]
+        return [input_independence(evidence, equation), *_still_water(evidence, equation)]
     biases = frozenset(c.label for c in evidence.predictor.columns if c.is_bias)
     if not len(equation.columns) or not np.isfinite(equation.solution.theta).all():
         reason = "its instruments leave a direction free"
@@ -78,6 +79,14 @@ def _of_equation(evidence: Evidence, equation: Equation) -> list[TestResult]:
         anderson_rubin(equation, biases)[0],
         overidentification(equation, biases),
         input_independence(evidence, equation),
+        *_still_water(evidence, equation),
         many_instruments(equation, biases),
         endogeneity(equation, evidence.method),
     ]
+
+
+def _still_water(evidence: Evidence, equation: Equation) -> list[TestResult]:
+    """Ask for a current where the structure may feel one."""
+    if evidence.predictor.structure.disturbance != "marine":
+        return []
+    return [heading_independence(evidence, equation)]

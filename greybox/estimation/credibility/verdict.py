@@ -14,7 +14,7 @@ _OF_PARAMETERS = (
     "relevance_", "weak_instruments_", "many_instruments_", "anderson_rubin_", "damping_signs",
     "margin_bias",
 )  # fmt: skip
-_OF_THE_MODEL = ("input_independence_", "overidentification_")
+_OF_THE_MODEL = ("input_independence_", "overidentification_", "heading_independence_")
 
 
 def judge(
@@ -94,12 +94,19 @@ def misfit(tests: Sequence[TestResult]) -> list[str]:
         return []
     family = [t for t in tests if t.name.startswith(_OF_THE_MODEL) and t.p_value is not None]
     found = [family[i] for i in holm([t.p_value or 0.0 for t in family], _FAMILY)]
-    states = list(dict.fromkeys(t.name.rsplit("_", 1)[1] for t in family if t in found))
-    if not states:
-        return []
-    return [
-        f"the inputs still explain the residuals of {listed(states)}, so the model lacks something"
-    ]
+    told = []
+    for moved, by in ((True, "the heading"), (False, "the inputs")):
+        states = dict.fromkeys(
+            t.name.rsplit("_", 1)[1] for t in found if t.name.startswith("heading_") is moved
+        )
+        if states:
+            told.append(f"{by} still explain{'s' * moved} the residuals of {listed([*states])}")
+    lacks = (
+        " lacks a current or wind"
+        if len(told) == 1 and "heading" in told[0]
+        else (" lacks something")
+    )
+    return [f"{' and '.join(told)}, so the model{lacks}"] if told else []
 
 
 def _of_least_squares(tests: Sequence[TestResult], method: str) -> list[str]:
