@@ -195,7 +195,8 @@ def driven(helm: Helm, model: ManoeuvringModel, asked: Conditions) -> Helm:
 def _usual(helm: Helm, model: ManoeuvringModel, moved: Sequence[str]) -> dict[str, float]:
     """Return the greatest speeds in common of the model's logs, or of the vessel file."""
     ranges = model.record.get("ranges", {})
-    low, high = bounds(helm.limits)
+    # also where limits are not kept: no ship is faster than her engines
+    low, high = bounds([model.vessel.limits[c] for c in helm.columns])
     throttle = math.inf
     for name in moved:
         i = helm.columns.index(name)

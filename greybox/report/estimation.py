@@ -119,7 +119,8 @@ def _summary(estimate: Estimate) -> list[str]:
         f"{method}, predictor '{estimate.predictor.kind}', from {estimate.kept} of "
         f"{estimate.samples} samples of {estimate.sample_time:g} s in {logs} "
         f"log{'s' * (logs != 1)}.",
-        *estimate.verdict.reasons,
+        # the headline has the others
+        *(r for r in estimate.verdict.reasons if r not in estimate.verdict.text),
     ]
     if estimate.current:
         shown = ", ".join(f"{n} {v:.3f} ± {1.96 * s:.3f} m/s" for n, v, s in estimate.current)

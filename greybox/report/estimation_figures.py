@@ -125,7 +125,7 @@ def residual_figure(
             tidy(ax)
     for ax, title, below in zip(
         axes[0], ("residuals with themselves", "residuals with inputs"),
-        ("samples between them", "samples by which the input is earlier"), strict=True,
+        ("samples between them", "samples since the input"), strict=True,
     ):  # fmt: skip
         ax.set_title(title, fontsize=9)
         axes[-1][int(ax is axes[0][1])].set_xlabel(below, fontsize=8.5)

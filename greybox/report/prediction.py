@@ -74,7 +74,12 @@ def headline(made: ManoeuvrePrediction) -> str:
             f"{within} of {len(rows)} measured quantities agree with the prediction within both "
             f"intervals. {told}"
         )
-    return told
+    doubts = [
+        *["the estimate is not to be trusted"] * any("do not trust" in n for n in made.notes),
+        *["the model is used beyond the motion that it was estimated on"]
+        * any(n.startswith("extrapolated") for m in made.manoeuvres for n in m.notes),
+    ]
+    return f"{told} But {' and '.join(doubts)}." if doubts else told
 
 
 def _points(notes: tuple[str, ...]) -> list[str]:
