@@ -12,8 +12,11 @@ from free_runs import CURRENT, KINDS, calm, variants, wanted
 from scipy.io import loadmat
 from virtual import virtual_log
 
+from greybox.export.casadi_file import casadi_functions
 from greybox.export.export import export_model
+from greybox.export.sampled import sampled_model
 from greybox.model.model import ManoeuvringModel
+from greybox.vessel.vessel import Actuation
 
 NAMES = ("u", "v", "r", "psi", "x_n", "y_n")
 
@@ -195,3 +198,25 @@ def test_the_json_is_flat_and_documented(model, tmp_path):
     }  # fmt: skip
     assert np.shape(table["covariance"]) == (18, 18)
     assert table["inputs"][1]["unit"] == "rad"
+
+
+@pytest.mark.parametrize(
+    "actuation",
+    [Actuation(), Actuation(lag=4.0, lag_on="force", delay=2.3), Actuation(lag=4.0)],
+    ids=["prompt", "late", "slow"],
+)
+def test_the_file_steps_as_the_function_for_controllers(ship, thesis, true_theta, actuation):
+    late = replace(ship, actuation=actuation)
+    model = ManoeuvringModel(
+        thesis, true_theta, np.zeros((18, 18)), 1.0, late,
+        disturbances={"current_north": (0.2, 0.01), "current_east": (-0.1, 0.01)},
+    )  # fmt: skip
+    sampled = sampled_model(model, heading="simulated", wind="earth")
+    written, own = casadi_functions(sampled)["step"], model.step_function()
+    rng = np.random.default_rng(3)
+    for _ in range(5):
+        x = rng.uniform(0.5, 1.5, own.size1_in(0))
+        command, wind = rng.uniform(0.6, 1.1, 3), rng.uniform(-3, 3, 2)
+        one = own(x, command, wind)
+        other = written(x, np.concatenate([command, wind]), [p.value for p in sampled.parameters])
+        assert np.allclose(np.array(one), np.array(other[0]), rtol=1e-12, atol=1e-12)
