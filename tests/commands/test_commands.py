@@ -60,6 +60,7 @@ def test_estimate_simulate_compare(noisy_csv, tmp_path, capsys):
     assert "<script>" not in html
 
 
+@pytest.mark.long
 def test_same_input_same_bytes(noisy_csv, tmp_path):
     for name in ("a", "b"):
         (tmp_path / name).mkdir()

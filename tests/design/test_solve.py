@@ -214,6 +214,7 @@ def test_infeasible_start_ends_within_all_limits(ship, thesis, true_theta):
     assert (np.abs(np.diff(levels, axis=0)) <= p.schedule.reach + 1e-6).all()
 
 
+@pytest.mark.long
 def test_polish_gains_and_says_how_it_ended(ship, thesis, true_theta):
     p = problem(ship, thesis, true_theta)
     unit = draw_two_level(p, np.random.default_rng(3), 1)[0]

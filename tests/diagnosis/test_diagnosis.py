@@ -73,6 +73,7 @@ def test_command_writes_what_the_contract_says(written: Path, capsys) -> None:
         assert fit[state] == pytest.approx(gain["after"], abs=1e-6)
 
 
+@pytest.mark.long
 def test_nothing_wrong_and_no_validation_log() -> None:
     found = diagnose([_draw(2, kind="pulses", samples=600).estimation])
     assert found.verdict == "none"
@@ -83,6 +84,7 @@ def test_nothing_wrong_and_no_validation_log() -> None:
     json.dumps(found.to_dict(), allow_nan=False)
 
 
+@pytest.mark.long
 def test_only_the_causes_that_are_asked_for() -> None:
     trial = _draw(3, "thruster_gain", kind="manoeuvres", samples=600)
     found = diagnose(

@@ -432,6 +432,7 @@ def test_bands_of_single_delays_cover(true_theta):
     assert abs(np.mean(inside) - 0.95) < 3 * np.sqrt(0.95 * 0.05 / 600)
 
 
+@pytest.mark.long
 def test_a_current_that_is_not_captured_is_found_by_the_heading():
     log = virtual_log(1, 2000, current=(0.1, -0.05), wind=0.0)
     for method in ("iv", "oe"):

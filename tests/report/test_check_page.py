@@ -337,6 +337,7 @@ def write(path, c):
     return path
 
 
+@pytest.mark.long
 def test_command_on_several_logs(tmp_path, capsys):
     bad = columns()
     bad["r"] *= -1

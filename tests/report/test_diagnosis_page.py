@@ -250,6 +250,7 @@ def test_logs_without_runs_or_gain():
     assert "<svg" not in render(diagnosis_page(bare, RECORD))
 
 
+@pytest.mark.long
 def test_runs_that_run_away_are_left_out_and_said_so():
     diagnosis = diagnosis_of("named")
     run = diagnosis.runs[0]

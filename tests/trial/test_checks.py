@@ -128,6 +128,7 @@ def test_heading_bias_is_not_taken_for_the_current(degrees, ship):
     assert abs(np.degrees(found.value) - degrees) < 0.5
 
 
+@pytest.mark.long
 def test_two_defects_at_once(ship):
     log = recorded(90, 5.0, late={"u": 0.7, "v": 0.7}, heading_bias=0.1)
     found = {f.id: f for f in check_recording(as_recording(negate(log, "r")), ship).findings}
@@ -348,6 +349,7 @@ def test_velocities_of_the_tanker_model_are_late(data_folder):
     assert 0.5 < late.value < 1.3
 
 
+@pytest.mark.long
 def test_velocities_of_the_benchmark_are_earth_fixed(data_folder):
     for name in ("hsva_Z_10_05", "hsva_Z_20_10_P"):
         report = real(data_folder, TANKER, f"kvlcc2/{name}.csv")
