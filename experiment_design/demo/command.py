@@ -65,7 +65,8 @@ def run(options: argparse.Namespace) -> None:
         )
         show("drawing")
         report = demo.files.report
-        write_page(demo_page(demo, provenance(options)), report)
+        record = provenance(options) | {"files": demo.files.hashes()}
+        write_page(demo_page(demo, record), report)
     say(f"wrote {report} and the files of each step beside it")
     if options.open:
         import webbrowser

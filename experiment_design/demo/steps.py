@@ -8,6 +8,7 @@ from pathlib import Path
 from experiment_design.result import Design
 from greybox.diagnosis.result import Diagnosis
 from greybox.estimation.result import Estimate
+from greybox.files import sha256
 from greybox.study.blind_causes import Effect
 from greybox.trial.checks.finding import CheckReport
 from greybox.trial.log import TrialLog
@@ -77,6 +78,13 @@ class Files:
     def report(self) -> Path:
         """The page."""
         return self.folder / "report.html"
+
+    def hashes(self) -> dict[str, str]:
+        """Return the SHA-256 of each step's file by its name."""
+        written = (
+            self.prior, self.plan, self.trial, self.other, self.model, self.better, self.next_plan
+        )  # fmt: skip
+        return {path.name: sha256(path) for path in written}
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """The demo: its virtual sea, its page, and that the commands it shows do what it says."""
 
+import hashlib
 import json
 import shlex
 from pathlib import Path
@@ -69,6 +70,7 @@ def test_the_demo_goes_once_round(demo):
     assert "the cause found and named" in page
     assert len(page) < 5_000_000
     assert page.count("<svg") >= 8
+    assert hashlib.sha256((demo / "plan.csv").read_bytes()).hexdigest() in page
 
 
 @pytest.mark.long

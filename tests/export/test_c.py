@@ -35,11 +35,6 @@ pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="there is no 
 
 
 @pytest.fixture(scope="module")
-def model(thesis, ship, true_theta):
-    return ManoeuvringModel(thesis, true_theta, np.zeros((18, 18)), 1.0, ship)
-
-
-@pytest.fixture(scope="module")
 def log():
     return virtual_log(3, 200, wind=2.0)
 

@@ -39,11 +39,6 @@ needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="there is
 
 
 @pytest.fixture(scope="module")
-def model(thesis, ship, true_theta):
-    return ManoeuvringModel(thesis, true_theta, np.zeros((18, 18)), 1.0, ship)
-
-
-@pytest.fixture(scope="module")
 def log():
     return virtual_log(3, 120, wind=2.0)
 
