@@ -31,6 +31,8 @@ class Parameter:
         The value that leaves the model as it is.
     coarse : float
         Standard error that sampling leaves at least.
+    reach : float
+        Distance within which its likelihood has several hills; 0 where it has one.
     step : float
         For its derivative by differences, and its scale.
     least : float
@@ -46,6 +48,7 @@ class Parameter:
     step: float = 1e-4
     least: float = 0.0
     coarse: float = 0.0
+    reach: float = 0.0
 
 
 @dataclass(frozen=True)

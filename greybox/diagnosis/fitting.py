@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.diagnosis.atom import Atom
+from greybox.diagnosis.linear import NOWHERE
 from greybox.diagnosis.noise import Noise, fit_noise
 from greybox.diagnosis.normal import bounded_step, inverse
 from greybox.diagnosis.point import Fit, Point
@@ -20,6 +21,8 @@ Array = NDArray[np.float64]
 _ENOUGH = 0.02
 _MOST = 25
 _DAMPING_LIMIT = 1e6
+# values at which hills of a likelihood are looked for
+_HILLS = 25
 
 
 def groups_of(run: LogRun) -> list[tuple[int, ...]]:
@@ -71,9 +74,9 @@ class Problem:
         )
 
     def numbers_of(self, point: Point, atom: Atom) -> list[int]:
-        """Return where an atom's own numbers stand among the free ones of a point."""
+        """Return where the numbers that an atom brings stand among the free ones of a point."""
         if atom.apply is None:
-            return [point.places.index(self.place(n)) for n in atom.columns]
+            return [point.places.index(self.place(n)) for n in (*atom.columns, *atom.beside)]
         k = [a.key for a in point.atoms].index(atom.key)
         first = len(point.places) + sum(map(len, point.values[:k]))
         return list(range(first, first + len(point.values[k])))
@@ -124,7 +127,7 @@ class Problem:
         before = 0
         for run, start in zip(self.runs, point.starts, strict=True):
             shown = run.run(ship, start)
-            slopes = run.columns(ship, run.linearise(ship, shown), places)
+            slopes = run.columns(ship, shown, places)
             rows = np.zeros((run.samples, slopes.shape[1], own + inner + starts))
             rows[:, :, :own] = slopes[:, :, :own]
             first = own + inner + before
@@ -195,6 +198,36 @@ class Problem:
                 converged = True
         return Fit(point, noise, cost, tuple(nu), tuple(errors), converged, self.runs[0].integrator)
 
+    def scan(self, fit: Fit, atom: Atom) -> Fit:
+        """Return the fit with the numbers of an atom moved over the hills of their likelihood.
+
+        At each value tried the other numbers follow to first order.
+        """
+        for k, parameter in zip(self.numbers_of(fit.point, atom), atom.parameters, strict=False):
+            if parameter.reach == 0 or fit.escaped:
+                continue
+            rows = np.concatenate(
+                [r.reshape(-1, r.shape[2]) for r in self.rows(fit.point, fit.noise)]
+            )
+            basis = np.linalg.qr(np.delete(rows, k, axis=1))[0]
+            vector = fit.point.vector()
+            tried = vector[k] + np.linspace(-parameter.reach, parameter.reach, _HILLS)
+            best, chosen = np.inf, vector
+            for value in np.clip(tried, parameter.low, parameter.high):
+                moved = vector.copy()
+                moved[k] = value
+                nu, cost = self.whitened(fit.noise, self.errors(fit.point.at(moved)))
+                if not np.isfinite(cost):
+                    continue
+                stacked = np.concatenate([n.ravel() for n in nu])
+                own = basis.T @ stacked
+                left = float(stacked @ stacked - own @ own)
+                if left < best:
+                    best, chosen = left, moved
+            found = self.fit(fit.point.at(chosen), fit.noise)
+            fit = found if found.cost < fit.cost else fit
+        return fit
+
     def fit_starts(self, point: Point, noise: Noise) -> Fit:
         """Fit the starts alone, as a held-out log asks."""
         frozen = replace(
@@ -241,9 +274,17 @@ class Problem:
         found = []
         for run, start in zip(self.runs, point.starts, strict=True):
             shown = run.run(ship, start)
-            found.append(run.linearise(ship, shown).a.mean(axis=0))
+            found.append(run.linearise(ship, shown, NOWHERE).a.mean(axis=0))
         mean = np.mean(found, axis=0)
         return np.array([mean[i, i] if i < nx else 1.0 for i in range(len(self.runs[0].outputs))])
+
+    def forgetful(self, fit: Fit, longest: float) -> Fit:
+        """Return the fit with errors whose colour forgets, whatever they look like."""
+        noise = fit_noise(
+            fit.errors, self.poles(fit.point), self.sample_time, self.groups, longest=longest
+        )
+        nu, cost = self.whitened(noise, fit.errors)
+        return replace(fit, noise=noise, nu=tuple(nu), cost=cost)
 
     def settle(self, fit: Fit, rounds: int = 2) -> Fit:
         """Alternate between the noise and the fit."""

@@ -29,8 +29,10 @@ _SHARE, _MEMORY, _LEVEL = (-7.0, 3.0), (-4.0, 6.0), (-3.0, 3.0)
 _STARTS = ((-3.0, 1.0), (-1.0, 2.5))
 _PRIOR, _PRIOR_WEIGHT = 1.0, 0.02
 _UNROLLED = 10
+# how far each number of a colour commonly moves in a search, which makes its hills round
+_SCALE, _LEVEL_SCALE = (0.1, 0.3), 0.02
 # iterations of a search, and of one that begins near
-_MOST_STEPS, _NEAR_STEPS = 40, 10
+_MOST_STEPS, _NEAR_STEPS = 40, 20
 
 
 @dataclass(frozen=True)
@@ -84,6 +86,16 @@ class Colour:
             denominator[power] = -np.trace(moved) / power
             term = moved + denominator[power] * np.eye(n)
         return numerators + inverse[:, :, None] * denominator, denominator
+
+    @property
+    def remembered(self) -> float:
+        """Samples for which what moves the ship beside the model is remembered."""
+        return float(-1 / np.log(self.memory)) if self.memory > 0 else 0.0
+
+    @property
+    def share(self) -> float:
+        """Deviation of what moves the ship beside the model, in that of the sensor."""
+        return self.force / max(float(self.sensor[0]), 1e-300)
 
     @property
     def log_det(self) -> float:
@@ -208,6 +220,7 @@ def fit_noise(
     sample_time: float,
     groups: Sequence[tuple[int, ...]],
     start: Noise | None = None,
+    longest: float = np.inf,
 ) -> Noise:
     """Fit the colours by maximum likelihood.
 
@@ -223,12 +236,14 @@ def fit_noise(
         Channels that share a state: a yaw rate and its heading, or one alone.
     start : Noise, optional
         From which the search begins.
+    longest : float
+        Samples that what moves the ship beside the model is remembered at most.
     """
     found, chosen = [], []
     for g, group in enumerate(groups):
         x, colour = _fit_group(
             [e[:, list(group)] for e in errors], group, float(poles[group[0]]), sample_time,
-            None if start is None else start.parameters[g],
+            None if start is None else start.parameters[g], longest,
         )  # fmt: skip
         found.append(colour)
         chosen.append(x)
@@ -241,6 +256,7 @@ def _fit_group(
     pole: float,
     sample_time: float,
     start: Array | None,
+    longest: float,
 ) -> tuple[Array, Colour]:
     """Return the logarithms and memory of one group, and its innovations form."""
     from scipy.optimize import minimize
@@ -259,7 +275,10 @@ def _fit_group(
         series[k, : len(part)] = 1.0
         padded.append((_likelihood(k, blocks), series))
 
-    def loss(x: Array) -> tuple[float, Array]:
+    scale = np.array([*_SCALE, *[_LEVEL_SCALE] * k])
+
+    def loss(scaled: Array) -> tuple[float, Array]:
+        x = scaled * scale
         value = _PRIOR_WEIGHT * float(x[1] - _PRIOR) ** 2
         slope = np.zeros(len(x))
         slope[1] = 2 * _PRIOR_WEIGHT * (x[1] - _PRIOR)
@@ -267,16 +286,20 @@ def _fit_group(
             v, s = function(x, rest, series)
             value += float(v)
             slope += np.array(s).ravel()
-        return value, slope
+        return value, slope * scale
 
-    bounds = [_SHARE, _MEMORY, *[_LEVEL] * k]
+    memory = _MEMORY
+    if np.isfinite(longest):
+        rho = float(np.exp(-1 / longest))
+        memory = (_MEMORY[0], min(_MEMORY[1], float(np.log(rho / (_LONGEST - rho)))))
+    bounds = np.array([_SHARE, memory, *[_LEVEL] * k]) / scale[:, None]
     firsts = [np.array([*s, *np.zeros(k)]) for s in _STARTS] if start is None else [start]
     results = [
         minimize(
-            loss, x0, jac=True, method="L-BFGS-B", bounds=bounds,
+            loss, x0 / scale, jac=True, method="L-BFGS-B", bounds=bounds,
             options={"maxiter": _MOST_STEPS if start is None else _NEAR_STEPS, "ftol": 1e-6},
         )
         for x0 in firsts
     ]  # fmt: skip
-    best = np.asarray(min(results, key=lambda result: float(result.fun)).x, float)
+    best = scale * np.asarray(min(results, key=lambda result: float(result.fun)).x, float)
     return best, _innovations_form(group, pole, sample_time, level, best)

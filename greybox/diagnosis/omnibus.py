@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.held_out import Pair, Proof, proof_of
+from greybox.diagnosis.linear import NOWHERE, sensitivities
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.ship import LogRun, shifted, wired
-from greybox.diagnosis.simulator import sensitivities
 
 Array = NDArray[np.float64]
 
@@ -96,13 +96,15 @@ def _pushed(problem: Problem, fit: Fit, scales: Array | None) -> tuple[list[Arra
     out = []
     for run, start, g in zip(problem.runs, point.starts, made, strict=True):
         shown = run.run(ship, start)
-        linear = run.linearise(ship, shown)
+        linear = run.linearise(ship, shown, NOWHERE)
         nx = shown.x.shape[1]
         unit = g[:-1] / scales
         driven = np.zeros((len(unit), nx, nx * unit.shape[1]))
         for i in range(nx):
             driven[:, i, i * unit.shape[1] : (i + 1) * unit.shape[1]] = unit
-        out.append(run.seen(ship, sensitivities(linear, driven))[:, :, : driven.shape[2]])
+        out.append(
+            run.seen(ship, sensitivities(replace(linear, driven=driven)))[:, :, : driven.shape[2]]
+        )
     return out, scales
 
 

@@ -8,16 +8,16 @@ along it ranks the causes.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from greybox.diagnosis.atom import Atom
 from greybox.diagnosis.fitting import Problem
+from greybox.diagnosis.linear import sensitivities
 from greybox.diagnosis.noise import Noise
 from greybox.diagnosis.point import Fit, Point
-from greybox.diagnosis.simulator import sensitivities
 
 Array = NDArray[np.float64]
 
@@ -125,7 +125,7 @@ def _score_columns(directions: Directions, atoms: Sequence[Atom]) -> list[Score]
     slopes = []
     for run, start in zip(problem.runs, point.starts, strict=True):
         shown = run.run(ship, start)
-        slopes.append(run.columns(ship, run.linearise(ship, shown), places)[:, :, : len(names)])
+        slopes.append(run.columns(ship, shown, places)[:, :, : len(names)])
     cleared, before = directions.clear(slopes)
     out = []
     for atom in atoms:
@@ -185,15 +185,16 @@ def _score_changes(directions: Directions, atoms: Sequence[Atom]) -> list[Score]
     ship = point.ship
     least = min(run.time[-1] for run in problem.runs)
     moments = np.linspace(0.05, 0.95, _MOMENTS) * least
-    index = [problem.structure.index(a.parameters[0].name.removesuffix("_factor")) for a in atoms]
+    names = [a.parameters[0].name.removesuffix("_factor") for a in atoms]
+    index = np.array([problem.structure.index(n) for n in names])
     columns = []
     for run, start in zip(problem.runs, point.starts, strict=True):
         shown = run.run(ship, start)
-        linear = run.linearise(ship, shown)
+        linear = run.linearise(ship, shown, index)
         after = run.time[:-1, None] >= moments
-        driven = linear.theta[:, :, index] * ship.theta[index]
+        driven = linear.driven * ship.theta[index]
         both = (driven[:, :, :, None] * after[:, None, None, :]).reshape(*driven.shape[:2], -1)
-        slope = sensitivities(linear, both)
+        slope = sensitivities(replace(linear, driven=both))
         columns.append(run.seen(ship, slope)[:, :, : both.shape[2]])
     cleared, before = directions.clear(columns)
     squares = (cleared**2).sum(axis=0)

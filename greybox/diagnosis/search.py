@@ -27,6 +27,9 @@ Array = NDArray[np.float64]
 _SHORTLIST, _LEAST_GAIN = 7, 9.0
 # share of the best promise from which on an atom is worth a refit
 _PROMISING = 0.04
+# errors remembered for more samples than this, larger than this share of the sensors', may
+# be a cause's; they are then looked at with so short a memory, so many causes more tried
+_SLOW, _SHARE, _FORGOTTEN, _SECOND = 30.0, 0.2, 3.0, 4
 # iterations of a refit before its noise is settled
 _FIRST = 12
 MOST_CAUSES = 4
@@ -151,7 +154,7 @@ def refit(problem: Problem, fit: Fit, score: Score) -> Fit:
     """Return the fit with one more atom, its noise settled."""
     point = problem.add(fit.point, score.atom, score.value if len(score.value) else None)
     first = problem.fit(point, fit.noise, most=_FIRST)
-    return problem.settle(first, 1)
+    return problem.settle(problem.scan(first, score.atom), 1)
 
 
 def shortlist(scores: Sequence[Score]) -> list[Score]:
@@ -211,8 +214,11 @@ def take_step(case: Case, fit: Fit, causes: Sequence[Candidate], atoms: Sequence
     """Score what is left, refit the best, and take the likeliest if it holds."""
     left = [a for a in atoms if not _taken(a, causes)]
     problem, held_out = case.problem(fit.integrator), case.held_out(fit.integrator)
-    scores = score_atoms(Directions(problem, fit), [a for a in left if not a.afresh])
+    near = [a for a in left if not a.afresh]
+    scores = score_atoms(Directions(problem, fit), near)
     fits = [(s.atom, refit(problem, fit, s)) for s in shortlist(scores)]
+    if _slow(fit):
+        fits = _likelier(fits, _seen_as_slow(problem, fit, near))
     if not causes:
         fits += case.rewired(fit, left)
     candidates = sorted(
@@ -234,6 +240,33 @@ def take_step(case: Case, fit: Fit, causes: Sequence[Candidate], atoms: Sequence
         if not _stands_out(case, taken):
             taken = None
     return Step(fit, tuple(scores), tuple(candidates), taken)
+
+
+def _slow(fit: Fit) -> bool:
+    """Whether the errors' own colour could be a cause's: slow, and larger than the sensors'."""
+    return any(g.remembered > _SLOW and g.share > _SHARE for g in fit.noise.groups)
+
+
+def _seen_as_slow(problem: Problem, fit: Fit, atoms: Sequence[Atom]) -> list[tuple[Atom, Fit]]:
+    """Return refits that begin with errors that forget, judged with their likeliest colour.
+
+    A force with a long memory imitates most causes; where it was taken for one, what
+    a cause promises is hidden, and its search ends where it began.
+    """
+    plain = problem.forgetful(fit, _FORGOTTEN)
+    promising = shortlist(score_atoms(Directions(problem, plain), atoms))
+    return [(s.atom, refit(problem, plain, s)) for s in promising[:_SECOND]]
+
+
+def _likelier(
+    fits: Sequence[tuple[Atom, Fit]], others: Sequence[tuple[Atom, Fit]]
+) -> list[tuple[Atom, Fit]]:
+    """Return the likeliest fit of each atom."""
+    best: dict[str, tuple[Atom, Fit]] = {}
+    for atom, fit in (*fits, *others):
+        if atom.key not in best or fit.cost < best[atom.key][1].cost:
+            best[atom.key] = (atom, fit)
+    return list(best.values())
 
 
 def _stands_out(case: Case, candidate: Candidate) -> bool:

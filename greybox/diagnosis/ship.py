@@ -12,7 +12,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.simulator import Linear, Simulator, sensitivities
+from greybox.diagnosis.linear import Linear, sensitivities
+from greybox.diagnosis.simulator import Simulator
 from greybox.model.functions import Integrator
 from greybox.model.simulation import mid_step
 from greybox.model.structure import Structure
@@ -229,30 +230,36 @@ class LogRun:
             y[:, i] = -y[:, i]
         return y
 
-    def linearise(self, ship: Ship, shown: Shown) -> Linear:
-        """Return the derivatives along the run that was made last."""
-        return self._simulator.linearise(shown.x)
-
-    def columns(self, ship: Ship, linear: Linear, places: Array) -> Array:
-        """Return ∂y of coefficients and currents at `places`, then of the start.
+    def linearise(self, ship: Ship, shown: Shown, places: Array) -> Linear:
+        """Return the derivatives along the run that was made last.
 
         Parameters
         ----------
         places : ndarray of int
             (m,) coefficients, and past them the current north and east.
+        """
+        linear = self._simulator.linearise(shown.x, places)
+        for change in ship.changes:
+            here = places == change.index
+            if here.any():
+                factor = 1 + (change.factor - 1) * self.weights(change)[:-1]
+                linear.driven[:, :, here] *= factor[:, None, None]
+        return linear
+
+    def columns(self, ship: Ship, shown: Shown, places: Array) -> Array:
+        """Return ∂y of coefficients and currents at `places`, then of the start.
+
+        Parameters
+        ----------
+        places : ndarray of int
+            (m,)
 
         Returns
         -------
         ndarray
             (N, ny, m + nx [+ 1])
         """
-        driven = np.concatenate([linear.theta, linear.current], axis=2)[:, :, places]
-        for change in ship.changes:
-            here = places == change.index
-            if here.any():
-                factor = 1 + (change.factor - 1) * self.weights(change)[:-1]
-                driven[:, :, here] *= factor[:, None, None]
-        return self.seen(ship, sensitivities(linear, driven))
+        return self.seen(ship, sensitivities(self.linearise(ship, shown, places)))
 
     def seen(self, ship: Ship, slope: Array) -> Array:
         """Return ∂y (N, ny, m [+ 1]) of motions' derivatives ∂x (N, nx, m)."""

@@ -1,19 +1,14 @@
-"""Free runs of one structure with parameters that may change along the way, linearised.
-
-The step is the structure's own expression. Its derivatives along a run give every
-sensitivity by one linear recursion, however many parameters there are.
-"""
+"""Free runs of one structure with parameters that may change along the way."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.recursion import propagate
+from greybox.diagnosis.linear import Linear, slopes_of
 from greybox.model.functions import Integrator, bind, step_function
 from greybox.model.structure import Structure
 
@@ -23,25 +18,6 @@ Array = NDArray[np.float64]
 _UNROLLED = 10
 # a state past this has escaped
 _ESCAPED = 1e3
-
-
-@dataclass(frozen=True)
-class Linear:
-    """Derivatives of each step along a run.
-
-    Parameters
-    ----------
-    a : ndarray
-        (N−1, nx, nx) in the state before.
-    theta : ndarray
-        (N−1, nx, p) in the parameters at that step.
-    current : ndarray
-        (N−1, nx, 2) in the current, north and east.
-    """
-
-    a: Array
-    theta: Array
-    current: Array
 
 
 @lru_cache(maxsize=32)
@@ -70,19 +46,6 @@ def _run(
         states.append(x)
     several = ca.Function("steps", [x0, w], [x, ca.horzcat(*states)])
     return several.mapaccum("run", blocks, [0], [0])
-
-
-@lru_cache(maxsize=64)
-def _linear(
-    structure: Structure, air_measured: bool, integrator: Integrator, steps: int
-) -> ca.Function:
-    step = _step(structure, air_measured, integrator)
-    nu = len(structure.inputs)
-    x, w = ca.SX.sym("x", step.size1_in(0)), ca.SX.sym("w", step.size1_in(1))
-    after = step(x, w)
-    slopes = [ca.jacobian(after, v) for v in (x, w[nu + 3 : nu + 5], w[nu + 5 :])]
-    one = ca.Function("slopes", [x, w], [ca.densify(v) for v in slopes], {"cse": True})
-    return one.map(steps)
 
 
 class Simulator:
@@ -117,15 +80,8 @@ class Simulator:
         bind(buffer.set_res, 0, self._last)
         bind(buffer.set_res, 1, self._history)
         self._buffer = buffer
-        slopes = _linear(*key, samples - 1)
-        nu = len(structure.inputs)
-        self._before = np.zeros((samples - 1, nx))
-        self._slopes = [np.zeros((samples - 1, m, nx)) for m in (nx, 2, width - nu - 5)]
-        self._linear, self._linearise = slopes.buffer()
-        bind(self._linear.set_arg, 0, self._before)
-        bind(self._linear.set_arg, 1, self._w[: samples - 1])
-        for i, slope in enumerate(self._slopes):
-            bind(self._linear.set_res, i, slope)
+        self._slopes = slopes_of(*key)
+        self._theta, self._drivers = np.zeros(0), np.zeros((0, width))
 
     def __call__(self, x0: Array, drivers: Array, theta: Array) -> Array:
         """Run from x0.
@@ -145,6 +101,7 @@ class Simulator:
         ndarray
             (N, nx); infinite where the run escaped.
         """
+        self._drivers, self._theta = drivers, theta
         steps = self.samples - 1
         split = drivers.shape[1]
         self._w[:steps, :split] = drivers[:steps]
@@ -158,29 +115,14 @@ class Simulator:
                 out = np.full_like(out, np.inf)
         return out
 
-    def linearise(self, x: Array) -> Linear:
-        """Return the derivatives along the run that was made last, x (N, nx)."""
-        self._before[:] = x[:-1]
-        self._linearise()
-        a, current, theta = (slope.transpose(0, 2, 1).copy() for slope in self._slopes)
-        return Linear(a, theta, current)
+    def linearise(self, x: Array, places: Array) -> Linear:
+        """Return the derivatives along the run that was made last.
 
-
-def sensitivities(linear: Linear, driven: Array) -> Array:
-    """Return ∂x of every column and of the initial state.
-
-    Parameters
-    ----------
-    linear : Linear
-    driven : ndarray
-        (N−1, nx, m) what a unit of each column adds to a step.
-
-    Returns
-    -------
-    ndarray
-        (N, nx, m + nx), the initial state last.
-    """
-    steps, nx, columns = driven.shape
-    full = np.concatenate([driven, np.zeros((steps, nx, nx))], axis=2)
-    start = np.hstack([np.zeros((nx, columns)), np.eye(nx)])
-    return propagate(linear.a, full, start)
+        Parameters
+        ----------
+        x : ndarray
+            (N, nx)
+        places : ndarray of int
+            (m,) coefficients, and past them the current north and east.
+        """
+        return self._slopes(x, self._drivers, self._theta, places)

@@ -128,9 +128,8 @@ def coloured(fit: Fit, outputs: Sequence[str]) -> str | None:
     """Return what moves the ship beside the model, in words; None where little does."""
     found = []
     for group in fit.noise.groups:
-        share = group.force / max(float(group.sensor[0]), 1e-300)
-        if share > 0.2:
-            memory = -1 / np.log(max(group.memory, 1e-9)) if group.memory > 0 else 0.0
+        if group.share > 0.2:
+            memory = group.remembered
             tail = f" with a memory of {memory:.0f} samples" if memory > 2 else ""
             found.append(f"{word(outputs[group.outputs[0]])}{tail}")
     if not found:

@@ -9,12 +9,13 @@ from greybox.diagnosis.atom import Atom, Parameter
 from greybox.diagnosis.causes import Context, known_causes
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.held_out import long_run_variance, proof_of
+from greybox.diagnosis.linear import NOWHERE, sensitivities
 from greybox.diagnosis.noise import Colour, Noise, fit_noise
 from greybox.diagnosis.normal import bounded_step
 from greybox.diagnosis.point import Point
 from greybox.diagnosis.recursion import propagate
 from greybox.diagnosis.ship import Change, LogRun, Sensors, Ship, shifted, wired
-from greybox.diagnosis.simulator import Simulator, sensitivities
+from greybox.diagnosis.simulator import Simulator
 from greybox.diagnosis.waves import find_waves
 from greybox.model.catalogue import get_structure
 from greybox.model.simulation import simulate
@@ -63,7 +64,7 @@ def test_run_equals_the_free_run_and_differences(log: TrialLog, integrator) -> N
     ).x[0]  # fmt: skip
     np.testing.assert_allclose(shown.x, expected, atol=1e-9)
     places = np.array([0, 5, len(ship.theta) + 1])
-    found = run.columns(ship, run.linearise(ship, shown), places)
+    found = run.columns(ship, shown, places)
     for k, place in enumerate(places):
         step = 1e-6
         full = np.concatenate([ship.theta, ship.current])
@@ -230,8 +231,8 @@ def test_sensitivities_of_nothing_are_those_of_the_start(log: TrialLog) -> None:
     simulator = Simulator(WIDE, len(log), False, "euler")
     drivers = np.column_stack([log.forces(WIDE.inputs), log["psi"], np.zeros((len(log), 4))])
     x = simulator(np.array([1.5, 0.5, 0.0]), drivers, _theta(WIDE))
-    linear = simulator.linearise(x)
-    found = sensitivities(linear, np.zeros((len(log) - 1, 3, 0)))
+    linear = simulator.linearise(x, NOWHERE)
+    found = sensitivities(linear)
     np.testing.assert_allclose(found[0], np.eye(3))
     np.testing.assert_allclose(found[1], linear.a[0])
 

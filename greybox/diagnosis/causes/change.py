@@ -17,6 +17,8 @@ Array = NDArray[np.float64]
 # the change lies between these shares of the log, and multiplies by less
 _EARLIEST, _LATEST = 0.05, 0.95
 _FACTORS = (0.05, 20.0)
+# distance of the moments that are tried first, as a share of the log
+_REACH = 0.05
 
 
 class ParameterChange(Cause):
@@ -44,6 +46,7 @@ class ParameterChange(Cause):
                     f"{term.name}_time", "s", 0.5 * context.duration,
                     _EARLIEST * context.duration, _LATEST * context.duration,
                     step=0.5 * context.sample_time, coarse=0.5 * context.sample_time,
+                    reach=_REACH * context.duration,
                 ),
             )  # fmt: skip
             out.append(Atom(self.id, f"{self.id}:{term.name}", parameters, (), apply))

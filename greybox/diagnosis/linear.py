@@ -1,0 +1,141 @@
+"""Derivatives of every step along a run, in the state and in chosen numbers.
+
+Those of the rate come from the structure's own expression, on all samples at once;
+a step of several stages follows from them by the chain rule.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.diagnosis.recursion import propagate
+from greybox.model.functions import Integrator
+from greybox.model.structure import Structure
+from greybox.vectorised import Vectorised
+
+Array = NDArray[np.float64]
+
+# share of a stage's slope at which the next stage looks: the classical Runge-Kutta rule
+_AHEAD = (0.5, 0.5, 1.0)
+_WEIGHTS = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
+# no number but the state
+NOWHERE = np.zeros(0, int)
+
+
+@dataclass(frozen=True)
+class Linear:
+    """Derivatives of each step along a run.
+
+    Parameters
+    ----------
+    a : ndarray
+        (N−1, nx, nx) in the state before.
+    driven : ndarray
+        (N−1, nx, m) in the numbers that were asked for.
+    """
+
+    a: Array
+    driven: Array
+
+
+class Slopes:
+    """Derivatives of the steps of one structure.
+
+    Parameters
+    ----------
+    structure : Structure
+    air_measured : bool
+        Whether terms see a measured velocity through the air.
+    integrator : {"euler", "rk4"}
+    """
+
+    def __init__(self, structure: Structure, air_measured: bool, integrator: Integrator) -> None:
+        s = structure.symbols
+        self._increment = structure.increment
+        self._states, unknown = s.x.numel(), s.d.numel()
+        current = ca.SX.sym("current", 2)
+        # the wind's mean is no disturbance here: it is measured, or there is none
+        means = ca.vertcat(current, ca.SX.zeros(max(unknown - 2, 0)))[:unknown]
+        rate = ca.substitute(structure.increment_expression(air_measured=air_measured), s.d, means)
+        others = (s.tau, s.psi, s.air, current, s.theta)
+        of_state = ca.Function("rate", [s.x, *others], [rate])
+        slopes = ca.jacobian(rate, ca.vertcat(s.x, s.theta, current))
+        of_slopes = ca.Function("slopes", [s.x, *others], [ca.densify(slopes)])
+        points = [s.x]
+        if integrator == "rk4":
+            for share in _AHEAD:
+                points.append(s.x + share * of_state(points[-1], *others))
+        stages = [of_slopes(point, *others) for point in points]
+        self._shape = (len(stages), *slopes.shape)
+        flat = ca.vertcat(*[ca.vec(stage.T) for stage in stages])
+        self._program = Vectorised(ca.vertsplit(flat), ca.vertsplit(ca.vertcat(s.x, *others)))
+
+    def __call__(self, x: Array, drivers: Array, theta: Array, places: Array) -> Linear:
+        """Return the derivatives along a run.
+
+        Parameters
+        ----------
+        x : ndarray
+            (N, nx)
+        drivers : ndarray
+            (N, nu + 5) generalised inputs, heading, velocity through the air,
+            current north and east.
+        theta : ndarray
+            (p,) or (N, p)
+        places : ndarray of int
+            (m,) coefficients, and past them the current north and east.
+        """
+        steps, nx = len(x) - 1, self._states
+        values: list[Array | float] = [*x[:-1].T.copy(), *drivers[:-1].T.copy()]
+        values += list(map(float, theta)) if theta.ndim == 1 else list(theta[:-1].T.copy())
+        out = self._program(values, np.empty((int(np.prod(self._shape)), steps)))
+        stages = out.reshape(*self._shape, steps)
+        wanted = np.concatenate([np.arange(nx), nx + np.asarray(places, int)])
+        total = self._chained(stages[:, :, wanted])
+        return Linear(
+            np.ascontiguousarray(total[:, :nx].transpose(2, 0, 1)),
+            np.ascontiguousarray(total[:, nx:].transpose(2, 0, 1)),
+        )
+
+    def _chained(self, stages: Array) -> Array:
+        """Return ∂x⁺ (nx, nx + m, N−1) from the rate's derivatives at each stage."""
+        nx = self._states
+        own = np.arange(nx)
+        slope = stages[0].copy()
+        total = slope.copy()
+        if len(stages) > 1:
+            total *= _WEIGHTS[0]
+            for share, weight, stage in zip(_AHEAD, _WEIGHTS[1:], stages[1:], strict=True):
+                slope *= share
+                slope[own, own] += 1.0
+                slope = np.einsum("ijn,jmn->imn", stage[:, :nx], slope)
+                slope[:, nx:] += stage[:, nx:]
+                total += weight * slope
+        if self._increment:
+            total[own, own] += 1.0
+        return np.asarray(total)
+
+
+@lru_cache(maxsize=32)
+def slopes_of(structure: Structure, air_measured: bool, integrator: Integrator) -> Slopes:
+    """Return the derivatives of a structure's steps, built once."""
+    return Slopes(structure, air_measured, integrator)
+
+
+def sensitivities(linear: Linear) -> Array:
+    """Return ∂x of every column and of the initial state.
+
+    Returns
+    -------
+    ndarray
+        (N, nx, m + nx), the initial state last.
+    """
+    steps, nx, columns = linear.driven.shape
+    full = np.concatenate([linear.driven, np.zeros((steps, nx, nx))], axis=2)
+    start = np.hstack([np.zeros((nx, columns)), np.eye(nx)])
+    return propagate(linear.a, full, start)
