@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.atom import Atom
+from greybox.diagnosis.atom import Atom, Parameter
 from greybox.diagnosis.linear import NOWHERE
 from greybox.diagnosis.noise import Noise, fit_noise
 from greybox.diagnosis.normal import bounded_step, inverse
@@ -198,35 +198,55 @@ class Problem:
                 converged = True
         return Fit(point, noise, cost, tuple(nu), tuple(errors), converged, self.runs[0].integrator)
 
-    def scan(self, fit: Fit, atom: Atom) -> Fit:
-        """Return the fit with the numbers of an atom moved over the hills of their likelihood.
+    def profile(self, fit: Fit, k: int, values: Array) -> Array:
+        """Return −2 log L at values (m,) of the free number k, the others following to first order.
 
-        At each value tried the other numbers follow to first order.
+        Constants apart; infinite where a run escapes.
         """
-        for k, parameter in zip(self.numbers_of(fit.point, atom), atom.parameters, strict=False):
-            if parameter.reach == 0 or fit.escaped:
-                continue
-            rows = np.concatenate(
-                [r.reshape(-1, r.shape[2]) for r in self.rows(fit.point, fit.noise)]
-            )
-            basis = np.linalg.qr(np.delete(rows, k, axis=1))[0]
-            vector = fit.point.vector()
-            tried = vector[k] + np.linspace(-parameter.reach, parameter.reach, _HILLS)
-            best, chosen = np.inf, vector
-            for value in np.clip(tried, parameter.low, parameter.high):
-                moved = vector.copy()
-                moved[k] = value
-                nu, cost = self.whitened(fit.noise, self.errors(fit.point.at(moved)))
-                if not np.isfinite(cost):
-                    continue
+        parts = self.rows(fit.point, fit.noise)
+        rows = np.concatenate([r.reshape(-1, r.shape[2]) for r in parts])
+        basis = np.linalg.qr(np.delete(rows, k, axis=1))[0]
+        vector = fit.point.vector()
+        out = np.full(len(values), np.inf)
+        for i, value in enumerate(values):
+            vector[k] = value
+            nu, cost = self.whitened(fit.noise, self.errors(fit.point.at(vector)))
+            if np.isfinite(cost):
                 stacked = np.concatenate([n.ravel() for n in nu])
                 own = basis.T @ stacked
-                left = float(stacked @ stacked - own @ own)
-                if left < best:
-                    best, chosen = left, moved
-            found = self.fit(fit.point.at(chosen), fit.noise)
+                out[i] = float(stacked @ stacked - own @ own)
+        return out
+
+    def scan(self, fit: Fit, atom: Atom) -> Fit:
+        """Return the fit with the numbers of an atom moved over the hills of their likelihood."""
+        for k, parameter in self._hilly(fit, atom):
+            vector = fit.point.vector()
+            tried = np.linspace(-parameter.reach, parameter.reach, _HILLS) + vector[k]
+            tried = np.clip(tried, parameter.low, parameter.high)
+            vector[k] = tried[int(np.argmin(self.profile(fit, k, tried)))]
+            found = self.fit(fit.point.at(vector), fit.noise)
             fit = found if found.cost < fit.cost else fit
         return fit
+
+    def spread(self, fit: Fit, atom: Atom) -> dict[str, float]:
+        """Return standard errors of an atom's numbers whose likelihood has hills.
+
+        A third of the distance within which −2 log L rises by nine.
+        """
+        out = {}
+        for k, parameter in self._hilly(fit, atom):
+            now = fit.point.vector()[k]
+            tried = now + np.linspace(-parameter.reach, parameter.reach, 2 * _HILLS - 1)
+            inside = (tried >= parameter.low) & (tried <= parameter.high)
+            rise = self.profile(fit, k, tried[inside])
+            near = tried[inside][rise < rise.min() + 9.0]
+            out[parameter.name] = float(np.abs(near - now).max()) / 3
+        return out
+
+    def _hilly(self, fit: Fit, atom: Atom) -> list[tuple[int, Parameter]]:
+        places = self.numbers_of(fit.point, atom)
+        found = zip(places, atom.parameters, strict=False)
+        return [] if fit.escaped else [(k, p) for k, p in found if p.reach > 0]
 
     def fit_starts(self, point: Point, noise: Noise) -> Fit:
         """Fit the starts alone, as a held-out log asks."""

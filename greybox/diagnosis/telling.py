@@ -85,8 +85,13 @@ class Report:
             index = list(range(first, first + len(fit.point.values[k])))
         if not index:
             return {atom.key.split(":", 1)[1]: Quantity(-1.0, 0.0, "1")}
+        wide = problem.spread(fit, atom)
         return {
-            p.name: Quantity(float(values[i]), float(np.hypot(std[i], p.coarse)), p.unit)
+            p.name: Quantity(
+                float(values[i]),
+                float(np.hypot(max(std[i], wide.get(p.name, 0.0)), p.coarse)),
+                p.unit,
+            )
             for p, i in zip(atom.parameters, index, strict=True)
         }
 
