@@ -9,7 +9,7 @@ instruments are Ω⁻¹ times the noise-free regressors, θ̂ = (Zᵀ Ω⁻¹ Φ
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -221,21 +221,16 @@ def estimate_refined_iv(
     work = _Refinement(regression, logs, heading, wind)
     states = predictor.structure.states
     keep = [e.keep for e in regression.experiments]
-    theta = plain.theta
-    point = work.start(theta, keep)
-    if point.diverged >= 0:
-        # plain instruments may fail on a short log where refined ones do not
-        theta = estimate_ls(predictor, logs, margins=margins, covariance="white").theta
-        point = work.start(theta, keep)
-    if point.diverged >= 0:
-        log, motion = logs[point.diverged], point.motions[point.diverged]
-        raise ExcitationError(
-            f"the motion that the estimate predicts for '{log.name}' left its bound at sample "
-            f"{motion.diverged} of {len(log)}: estimate without --prefilter."
-        )
-    # rows are cut once, by simulated states, which do not select on the noise
-    keep = [within_margins(m.x, states, margins) for m in point.motions]
-    found = _refine(work, point, theta, keep)
+    found = _from_a_start(
+        work,
+        [
+            lambda: plain.theta,
+            # plain instruments may fail on a short log where refined ones do not
+            lambda: estimate_ls(predictor, logs, margins=margins, covariance="white").theta,
+        ],
+        keep,
+        margins,
+    )
     theta, kept = found.theta, sum(b.rows for b in found.bands)
     matrix, lags = white_covariance(
         found.rows,
@@ -243,7 +238,7 @@ def estimate_refined_iv(
         theta,
         found.inverse,
         covariance,
-        samples=[len(k) for k in keep],
+        samples=[len(k) for k in found.keep],
         seed=seed,
     )
     vessel = logs[0].vessel
@@ -251,7 +246,7 @@ def estimate_refined_iv(
         plain,
         theta=theta,
         covariance=matrix,
-        residual_std=_spread(work.errors(theta), keep),
+        residual_std=_spread(work.errors(theta), found.keep),
         kept=kept,
         covariance_kind=covariance,
         lags=lags,
@@ -283,6 +278,47 @@ class _Refined:
     fit: NoiseFit
     rounds: int
     status: str
+    converged: bool
+    keep: Sequence[NDArray[np.bool_]]
+
+
+def _from_a_start(
+    work: _Refinement,
+    starts: Sequence[Callable[[], Array]],
+    keep: Sequence[NDArray[np.bool_]],
+    margins: dict[str, float] | None,
+) -> _Refined:
+    """Return where the rounds ended from the first start that they converge from.
+
+    Where they converge from none, that of the first whose motion stays bounded.
+
+    Raises
+    ------
+    ExcitationError
+        No start predicts a bounded motion, or some direction is not excited.
+    """
+    states = work.predictor.structure.states
+    unfinished: _Refined | None = None
+    point: _Point | None = None
+    for start in starts:
+        theta = start()
+        point = work.start(theta, keep)
+        if point.diverged >= 0:
+            continue
+        # rows are cut once, by simulated states, which do not select on the noise
+        cut = [within_margins(m.x, states, margins) for m in point.motions]
+        found = _refine(work, point, theta, cut)
+        if found.converged:
+            return found
+        unfinished = unfinished or found
+    if unfinished is not None:
+        return unfinished
+    assert point is not None
+    log, motion = work.logs[point.diverged], point.motions[point.diverged]
+    raise ExcitationError(
+        f"the motion that the estimate predicts for '{log.name}' left its bound at sample "
+        f"{motion.diverged} of {len(log)}: estimate without --prefilter."
+    )
 
 
 def _refine(
@@ -291,7 +327,7 @@ def _refine(
     """Find noise, coefficients and motions in turn until the coefficients settle."""
     status = f"still moving after {_MOST} rounds"
     fit = work.first_levels(work.bands(point, keep), theta)
-    settling, settled = False, False
+    settling, settled, converged = False, False, False
     for rounds in range(1, _MOST + 1):
         bands = work.bands(point, keep)
         if settling:
@@ -323,7 +359,7 @@ def _refine(
         near = not halfway and bool((moved < std + rounding).all())
         settling = not settled and (near or rounds >= _NOISE_ROUNDS)
         if settled and not halfway and (moved < _SETTLED * std + rounding).all():
-            status = f"converged after {rounds} rounds"
+            status, converged = f"converged after {rounds} rounds", True
             break
         following = work.towards(theta, work.constants(theta, keep), point)
         if following.diverged >= 0:
@@ -334,7 +370,7 @@ def _refine(
             )
             break
         point = following
-    return _Refined(theta, inverse, rows, bands, fit, rounds, status)
+    return _Refined(theta, inverse, rows, bands, fit, rounds, status, converged, keep)
 
 
 def _spread(errors: Sequence[Array], keep: Sequence[NDArray[np.bool_]]) -> Array:
