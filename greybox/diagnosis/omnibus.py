@@ -29,6 +29,8 @@ Array = NDArray[np.float64]
 # prior deviations of a direction's share, in innovations' deviations, that are tried
 _STRENGTHS = np.geomspace(0.05, 100.0, 24)
 _LAGS = (2.0, 5.0, 10.0)
+# quantiles of a state's size from which on a force may begin
+_KNOTS = (0.3, 0.6, 0.85)
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,14 @@ class Omnibus:
     explicable: float
 
 
-def features(run: LogRun, fit: Fit, start: Array) -> Array:
+def knots_of(problem: Problem) -> Array:
+    """Return sizes of each state from which on a force may begin, (nx, K)."""
+    nx = len(problem.runs[0].states)
+    size = np.abs(np.concatenate([run.y[:, :nx] for run in problem.runs]))
+    return np.asarray(np.quantile(size, _KNOTS, axis=0).T)
+
+
+def features(run: LogRun, fit: Fit, start: Array, knots: Array) -> Array:
     """Return functions of what is simulated and commanded, (N, G)."""
     ship = fit.point.ship
     x = run.run(ship, start).x
@@ -65,6 +74,9 @@ def features(run: LogRun, fit: Fit, start: Array) -> Array:
             if two is not one:
                 columns.append(one * np.abs(two))
         columns.append(one**3)
+        for knot in knots[i]:
+            beyond = np.maximum(np.abs(one) - knot, 0.0)
+            columns += [beyond, beyond * np.sign(one)]
     commands = wired({c: log[c] for c in log.vessel.commands}, ship.wires)
     for thruster in log.vessel.thrusters:
         n = commands[thruster.speed]
@@ -85,11 +97,13 @@ def features(run: LogRun, fit: Fit, start: Array) -> Array:
     return np.column_stack(columns)
 
 
-def _pushed(problem: Problem, fit: Fit, scales: Array | None) -> tuple[list[Array], Array]:
+def _pushed(
+    problem: Problem, fit: Fit, knots: Array, scales: Array | None
+) -> tuple[list[Array], Array]:
     """Return ∂y of every feature in every equation, and the features' sizes."""
     point = fit.point
     ship = point.ship
-    made = [features(r, fit, s) for r, s in zip(problem.runs, point.starts, strict=True)]
+    made = [features(r, fit, s, knots) for r, s in zip(problem.runs, point.starts, strict=True)]
     if scales is None:
         scales = np.sqrt(np.mean(np.concatenate([m**2 for m in made]), axis=0))
         scales = np.where(scales > 0, scales, 1.0)
@@ -149,7 +163,8 @@ def _predicted(pair: Pair) -> tuple[Array, Array]:
     left, values, right = np.linalg.svd(nuisance / scale, full_matrices=False)
     kept = values > 1e-8 * values[0]
     left = left[:, kept]
-    pushed, scales = _pushed(problem, fit, None)
+    knots = knots_of(problem)
+    pushed, scales = _pushed(problem, fit, knots, None)
     raw = _rows(problem, fit, pushed)
     size = np.sqrt((raw**2).sum(axis=0))
     size[size == 0] = 1.0
@@ -161,7 +176,7 @@ def _predicted(pair: Pair) -> tuple[Array, Array]:
     delta = _ridge(cleared, nu)
     # what the coefficients give back, where they can imitate
     back = -((right[kept].T / values[kept]) @ (along @ delta)) / scale
-    moved, _ = _pushed(held, held_fit, scales)
+    moved, _ = _pushed(held, held_fit, knots, scales)
     predicted = _rows(held, held_fit, moved) / size @ delta
     predicted = predicted + _coefficients(held, fit, held_fit) @ back[:free]
     starts = np.concatenate(

@@ -22,9 +22,9 @@ _LEFT = 0.1
 # significance of other coefficients on the held-out logs, and the share of the causes' gain
 # that fitting them there may bring beside
 _APART, _BESIDE = 1e-4, 0.25
-# mean squared error, in the sensors' variances, that is large, and the share of it that
-# causes may leave
-_LARGE, _MOST_OF = 3.0, 0.4
+# mean squared error, in the sensors' variances, that is worth a word, and the share of what
+# was there that causes may leave
+_LARGE, _MOST_OF = 0.3, 0.35
 
 
 @dataclass(frozen=True)
@@ -76,10 +76,10 @@ def rule(
     wrong = left.proof.p_value < _SURE and left.gain > allowed
     apart = other.p_value < _APART and other.fall > RELEVANT * numbers + _BESIDE * explained
     before, after = _excess(found.base, found.final), _excess(found.final, found.final)
-    # a cause that leaves most of a large error where it was is not what is wrong
-    most = bool(found.causes) and after > _LARGE and after > _MOST_OF * before
+    # a cause that leaves much of the error where it was is not what is wrong, or not alone
+    much = bool(found.causes) and after > _LARGE and after > _MOST_OF * before
     verdict: Verdict
-    if wrong or apart or most:
+    if wrong or apart or much:
         verdict = "unexplained"
     elif groups and not known and len(groups) == len(found.causes):
         verdict = "confused"
@@ -96,7 +96,7 @@ def rule(
         )
     elif apart:
         why = "the coefficients that these logs ask for do not hold for the held-out ones"
-    elif most:
+    elif much:
         why = f"the causes leave {100 * after / before:.0f} % of the squared error"
     outputs = pairs[0].problem.runs[0].outputs
     return Ruling(
