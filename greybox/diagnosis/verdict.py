@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from greybox.diagnosis.held_out import HeldOut
+from greybox.diagnosis.held_out import HeldOut, Pair
 from greybox.diagnosis.omnibus import Omnibus, disagreement, omnibus, with_own_noise
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.result import Found, Verdict
@@ -25,6 +25,9 @@ _APART, _BESIDE = 1e-4, 0.25
 # mean squared error, in the sensors' variances, that is worth a word, and the share of what
 # was there that causes may leave
 _LARGE, _MOST_OF = 0.3, 0.35
+# seconds for which gusts are remembered at most, and the fall of −2 log L of each log by a
+# longer memory from which on what moves the ship is no gust
+_GUST, _LONGER = 30.0, 10.0
 
 
 @dataclass(frozen=True)
@@ -78,8 +81,9 @@ def rule(
     before, after = _excess(found.base, found.final), _excess(found.final, found.final)
     # a cause that leaves much of the error where it was is not what is wrong, or not alone
     much = bool(found.causes) and after > _LARGE and after > _MOST_OF * before
+    drifts = not found.causes and before > _LARGE and _drifts(pairs)
     verdict: Verdict
-    if wrong or apart or much:
+    if wrong or apart or much or drifts:
         verdict = "unexplained"
     elif groups and not known and len(groups) == len(found.causes):
         verdict = "confused"
@@ -98,10 +102,28 @@ def rule(
         why = "the coefficients that these logs ask for do not hold for the held-out ones"
     elif much:
         why = f"the causes leave {100 * after / before:.0f} % of the squared error"
+    elif drifts:
+        why = (
+            f"a force moves the ship in all logs that is remembered for longer than gusts "
+            f"({_GUST:g} s): a current that changes, or something that no cause stands for"
+        )
     outputs = pairs[0].problem.runs[0].outputs
     return Ruling(
         verdict, _remaining(found.final, outputs, why), _next(verdict, groups), first, left
     )
+
+
+def _drifts(pairs: Sequence[Pair]) -> bool:
+    """Whether what moves the ship beside the model is slower than gusts, in every log."""
+    every = [one for p in pairs for one in ((p.problem, p.fit), (p.held, p.held_fit))]
+    for problem, fit in every:
+        longest = _GUST / problem.sample_time
+        if fit.escaped or not any(g.remembered > longest for g in fit.noise.groups):
+            return False
+        short, free = (problem.forgetful(fit, memory) for memory in (longest, np.inf))
+        if short.cost - free.cost < _LONGER:
+            return False
+    return True
 
 
 def _excess(fit: Fit, final: Fit) -> float:
