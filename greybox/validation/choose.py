@@ -17,6 +17,7 @@ from greybox.regression.regression import common_sample_time
 from greybox.trial.log import TrialLog
 from greybox.validation.alternatives import Alternative, alternatives_for
 from greybox.validation.fit import average_fit, run_model
+from greybox.validation.held_out import FLOOR
 from greybox.validation.once import estimate_once
 from greybox.validation.request import Request, regression_only
 from greybox.validation.simulating import Way, compare_ways
@@ -174,12 +175,23 @@ def _by_held_out_runs(
             return _noting(found, f"{way.label} failed on the whole logs: {error}")
     if diverged and not _diverges(found):
         return _noting(found, f"{way.label} diverges on the whole logs, and was left.")
-    lacks = misfit(found.tests)
+    if way.method == "oe" and _level(other) < _level(found):
+        # the free run is what it fits, so this is no optimum to speak of
+        return _noting(
+            found,
+            f"{way.label} follows the whole logs less well than {found.method}, and was left.",
+        )
+    lacks = misfit(found.tests) or (misfit(spare.tests) if spare else [])
     if lacks and _rank(other)[0] < 2:
         # output error hides a misfit that the regression's tests have found
         text = f"do not trust: {'; '.join(lacks)}"
         other = replace(other, verdict=replace(other.verdict, text=text, reasons=tuple(lacks)))
     return _noting(other, compared.sentence())
+
+
+def _level(estimate: Estimate) -> float:
+    """Return the free-run fit on the estimation logs, mean over the states and cut [%]."""
+    return float(np.mean([max(v, FLOOR) for v in estimate.fit.values()]))
 
 
 def _diverges(estimate: Estimate) -> bool:

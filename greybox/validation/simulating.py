@@ -117,8 +117,9 @@ class Comparison:
         kept = "" if self.chosen or not i else ", which stays: a gain must exceed its error"
         constant = " None predicts better than a constant." if np.nanmax(mean) < 0 else ""
         return (
-            f"the model misfits, and the estimators were compared by free runs on parts of the "
-            f"logs that were left out in turn (mean fit in %, cut at {FLOOR:.0f}, which is what a "
+            f"tests or free runs speak against {first}, so the estimators were compared by free "
+            f"runs on parts of the logs that were left out in turn (mean fit in %, cut at "
+            f"{FLOOR:.0f}, which is what a "
             f"run that diverges counts): {shown}; {told}{kept}.{constant}"
         )
 
