@@ -346,10 +346,11 @@ def log_rows(at: Linearised, segments: Segments, q: int) -> list[tuple[Array, Ar
         own[:q] += at.rows[j, :q]
         rows.append(own[:, : samples * width])
         residuals.append(at.r[j, :samples].ravel())
-        slope = link @ at.slope[j, q:]
-        slope[:q] += at.slope[j, :q]
-        link = slope
-        if not segments.joined[j]:
+        if segments.joined[j]:
+            slope = link @ at.slope[j, q:]
+            slope[:q] += at.slope[j, :q]
+            link = slope
+        else:
             found.append((np.hstack(rows), np.concatenate(residuals)))
             rows, residuals = [], []
     return found
