@@ -162,8 +162,9 @@ def test_output_error_that_is_judged_no_better_is_left(monkeypatch):
     e = estimate_model([log])
     assert e.method == "oe"
     assert "its free run is better than a constant in more of the states" in e.notes[-1]
-    # … and the first where both do
+    # … and the first where both do and nothing speaks against the model
     monkeypatch.setattr("greybox.validation.choose._poor", lambda fit: [])
+    monkeypatch.setattr("greybox.validation.choose._at_fault", lambda *_: False)
     e = estimate_model([log])
     assert e.method == "iv"
     assert e.notes[-1] == (
