@@ -180,7 +180,7 @@ def test_output_error_that_fails_is_told(monkeypatch):
     monkeypatch.setattr("greybox.validation.once._estimate_oe", fail)
     e = estimate_model([log])
     assert e.method == "iv"
-    assert e.notes[-1] == "output error was tried too, and failed: the run leaves every bound."
+    assert "output error was tried too, and failed: the run leaves every bound." in e.notes
 
 
 @pytest.mark.long
