@@ -12,7 +12,8 @@ state on measured ones: equation error, which cannot hold the current as one unk
 
 Part two: models estimated on some logs of $GREYBOX_DATA, run freely on others (6.12),
 which start from their first samples and know nothing else of the motion. SciPy is
-given our weights, and, as one would without them, the deviation of each output.
+given our weights, and, as one would without them, the deviation of each output. Our own
+choice is what `greybox estimate` without --method ends with.
 
 Times are medians of `--repeats` runs after a first one, whose time with compilation
 stands beside them.
@@ -60,8 +61,10 @@ from greybox.trial.conditioning import decimate
 from greybox.trial.log import TrialLog
 from greybox.trial.reading import read_segments
 from greybox.trial.writing import write_log
+from greybox.validation.choose import estimate_model
 from greybox.validation.fit import average_fit, run_model
 from greybox.validation.informative import regime_of
+from greybox.validation.request import Request
 from greybox.vessel.force import force_inputs
 
 Array = NDArray[np.float64]
@@ -461,6 +464,13 @@ def with_theta(model: ManoeuvringModel, problem: Problem, p: Array) -> Manoeuvri
     return replace(model, theta=np.array([values.get(n, 0.0) for n in model.names]))
 
 
+def chosen(logs: list[TrialLog], request: Request) -> ManoeuvringModel:
+    """Return the model whose method is left open, and say how it was chosen."""
+    estimate = estimate_model(logs, request)
+    print(f"\nown choice: {estimate.method}, {estimate.status}; {estimate.notes[-1]}")
+    return estimate.model()
+
+
 def held_out(folder: str, base: str, logs: list[TrialLog], others: list[TrialLog]) -> None:
     """Print the free-run fits of all tools' models on logs not used."""
     structure = structure_for(base, force_inputs(logs[0].vessel))
@@ -502,6 +512,8 @@ def held_out(folder: str, base: str, logs: list[TrialLog], others: list[TrialLog
         return with_theta(mine, problem, fit.x)
 
     size = np.concatenate([d.y for d in problem.data]).std(axis=0)
+    asked = Request(structure=base, predictor=kind)
+    take("this package, own choice", lambda: chosen(logs, asked))
     take("this package, iv", lambda: estimate_iv(linear, logs).model())
     take("this package, ls", lambda: estimate_ls(linear, logs).model())
     problem.residuals(problem.first(start))

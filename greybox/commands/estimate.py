@@ -163,6 +163,13 @@ def _add_output_error(parser: argparse.ArgumentParser) -> None:
         help="how errors are weighed; huber resists outliers (gaussian)",
     )
     group.add_argument(
+        "--weights",
+        choices=("noise", "deviation"),
+        default="noise",
+        help="errors in units of the outputs' noise, or of their deviation where a model misfits "
+        "(noise)",
+    )
+    group.add_argument(
         "--shooting",
         choices=("auto", "single", "multiple"),
         default="auto",
@@ -282,6 +289,7 @@ def _run(options: argparse.Namespace) -> None:
             bounds=_pairs(options.bound, "bound"),
             priors=_pairs(options.prior, "prior"),
             damping=options.damping,
+            weights=options.weights,
         ),
         loop=options.loop,
         zero_mean=options.instruments == "zero-mean",

@@ -8,9 +8,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.estimation.free_run import noise_of
 from greybox.estimation.innovations import FilterRuns, first_noise, fit_noise
 from greybox.estimation.output_setup import measured, turns
-from greybox.estimation.shooting import FreeRuns, Measured, cut
+from greybox.estimation.shooting import FreeRuns, Loss, Measured, cut
 from greybox.model.output import OutputModel
 from greybox.trial.log import TrialLog
 
@@ -22,6 +23,14 @@ _BESIDE = 0.1
 _GRID = (3e-3, 1.0, 12)
 # samples of each log that noise levels are sought in
 _NOISE_SAMPLES = 1500
+# least noise of an output, in its weight of the fit
+_LEAST = 1e-9
+
+
+def residual_noise(runs: FreeRuns, p: Array, nodes: Array, loss: Loss) -> FreeRuns:
+    """Return the runs weighed by what they leave, whatever they were fitted with."""
+    r, _, _ = runs.value(p, nodes)
+    return runs.with_sigma(noise_of(r, runs.sigma, runs.segments.use, loss, _LEAST * runs.sigma))
 
 
 def noise_of_sensors(runs: FreeRuns) -> tuple[OutputModel, Array, str]:

@@ -23,9 +23,9 @@ from greybox.estimation.free_run_errors import (
     shared_score_covariance,
     slow_errors,
 )
-from greybox.estimation.free_run_noise import noise_of_run, noise_of_sensors
+from greybox.estimation.free_run_noise import noise_of_run, noise_of_sensors, residual_noise
 from greybox.estimation.innovations import FilterRuns, fit_innovations
-from greybox.estimation.output_setup import measured, output_model, turns
+from greybox.estimation.output_setup import deviations, measured, output_model, turns
 from greybox.estimation.result import Estimate, TestResult
 from greybox.estimation.shooting import (
     RANK,
@@ -48,6 +48,7 @@ from greybox.trial.ranges import ranges
 
 Array = NDArray[np.float64]
 Damping = Literal["warn", "enforce"]
+Weights = Literal["noise", "deviation"]
 
 # sensitivities beyond this are no numbers to compute with
 _LARGEST = 1e100
@@ -94,6 +95,14 @@ class OutputErrorOptions:
     covariance : {"ma", "hac", "white"}
         ``ma``: residuals with a memory of their own, independent of the inputs;
         ``hac``: robust also to a variance that changes; ``white``: none.
+    weights : {"noise", "deviation"}
+        What an output's error is measured in: its noise, as found with the fit, which is
+        the likelihood; or its own deviation over the logs, as the fit (6.12) does. The
+        latter is for a model that leaves more than noise; the measured heading then
+        drives the run unless it is asked for as an output.
+    search : bool
+        Whether other ways are tried where errors stay large, and noise levels are sought;
+        without, the fit ends at the optimum that is nearest to its start.
     """
 
     process_noise: bool = False
@@ -105,6 +114,8 @@ class OutputErrorOptions:
     priors: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     damping: Damping = "warn"
     covariance: Literal["ma", "hac", "white"] = "ma"
+    weights: Weights = "noise"
+    search: bool = True
 
 
 def estimate_oe(
@@ -204,6 +215,9 @@ def _fit(
 ) -> _Fitted:
     sample_time = common_sample_time(logs)
 
+    # other optima are sought by likelihood
+    near = not options.search or (options.weights == "deviation" and start is not None)
+
     def free_run(heading: Role, p: Array | None = None) -> _Fitted:
         model = output_model(predictor, sample_time, heading, options.wind)
         data = [measured(model, log) for log in logs]
@@ -212,13 +226,15 @@ def _fit(
         fit, runs = fit_free_runs(
             model, data, _first(model, start) if p is None else p,
             restrictions=restrictions, loss=options.loss, shooting=options.shooting,
-            near=p is not None,
+            sigma=deviations(data) if options.weights == "deviation" else None,
+            near=p is not None or near,
         )  # fmt: skip
         return _Fitted(model, data, fit, runs, restrictions, options.loss)
 
-    heading = options.heading
-    if heading != "auto":
-        found = free_run(heading)
+    if options.heading != "auto":
+        found = free_run(options.heading)
+    elif options.weights == "deviation" or not options.search:
+        found = free_run("input")
     else:
         found = free_run("input")
         if turns(predictor.structure, logs) and found.fit.converged:
@@ -330,10 +346,11 @@ def log_rows(at: Linearised, segments: Segments, q: int) -> list[tuple[Array, Ar
         own[:q] += at.rows[j, :q]
         rows.append(own[:, : samples * width])
         residuals.append(at.r[j, :samples].ravel())
-        slope = link @ at.slope[j, q:]
-        slope[:q] += at.slope[j, :q]
-        link = slope
-        if not segments.joined[j]:
+        if segments.joined[j]:
+            slope = link @ at.slope[j, q:]
+            slope[:q] += at.slope[j, :q]
+            link = slope
+        else:
             found.append((np.hstack(rows), np.concatenate(residuals)))
             rows, residuals = [], []
     return found
@@ -393,6 +410,8 @@ def _result(fitted: _Fitted, logs: Sequence[TrialLog], options: OutputErrorOptio
         if fit.converged
         else f"no longer improved after {fit.iterations} iterations"
     )
+    if options.weights == "deviation":
+        status += ", errors weighed by the deviation of each output"
     if len(runs.segments.use) > len(data):
         status += (
             f", {len(runs.segments.use)} segments joined within {fit.gap:.1g} noise deviations"
@@ -421,11 +440,11 @@ def _result(fitted: _Fitted, logs: Sequence[TrialLog], options: OutputErrorOptio
         status=status,
         current=tuple((n, float(v), float(s)) for n, (v, s) in means.items() if n in CURRENT),
         current_covariance=covariance[np.ix_([*range(count), *flow], flow)],
-        noise=_noise_levels(fitted, logs),
+        noise=_noise_levels(fitted, logs, options.weights) if options.search else None,
         notes=tuple(notes),
         tests=(
             *_excitation_tests(model, fitted.hessian, bound),
-            *(() if options.process_noise else _slow_tests(fitted.slow)),
+            *(_slow_tests(fitted.slow) if options.search and not options.process_noise else ()),
         ),
         logs=tuple(
             {"name": log.name, "sha256": log.provenance.sha256, "samples": len(log)} for log in logs
@@ -553,12 +572,14 @@ def one_step_errors(model: OutputModel, log: Measured, p: Array) -> Array:
     return np.asarray(log.y[1:, :nz] - end)
 
 
-def _noise_levels(fitted: _Fitted, logs: Sequence[TrialLog]) -> NoiseLevels:
+def _noise_levels(fitted: _Fitted, logs: Sequence[TrialLog], weights: Weights) -> NoiseLevels:
     model, runs = fitted.model, fitted.runs
     states = model.predictor.structure.states
     if isinstance(runs, FilterRuns):
         variances, source = runs.noise, "likelihood of the innovations"
     else:
+        if weights == "deviation":
+            runs = residual_noise(runs, fitted.fit.p, fitted.fit.nodes, fitted.loss)
         found = (
             noise_of_run(runs, fitted.fit.p, fitted.fit.nodes, logs)
             if fitted.loss == "gaussian"

@@ -91,6 +91,12 @@ def measured(model: OutputModel, log: TrialLog) -> Measured:
     )
 
 
+def deviations(data: Sequence[Measured]) -> Array:
+    """Return the standard deviation of each output over all logs, (ny,); 1 of what rests."""
+    found = np.concatenate([log.y for log in data]).std(axis=0)
+    return np.where(found > 0, found, 1.0)
+
+
 def turns(structure: Structure, logs: Sequence[TrialLog]) -> bool:
     """Whether the structure turns the ship and every log has the heading."""
     turning = "r" in structure.states and structure.disturbance == "marine"

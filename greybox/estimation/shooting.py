@@ -393,7 +393,11 @@ def fit_segments(
         taken += 1
         if not all(np.isfinite(a).all() for a in (at.r, at.rows, at.slope)):
             break
-        reduced = _reduce(at, segments, nodes, len(p), loss)
+        try:
+            reduced = _reduce(at, segments, nodes, len(p), loss)
+        except RuntimeError:
+            # a run that forgets its start at once leaves the start unknown
+            break
         hessian = reduced.hessian + np.diag(restrictions.precision)
         gradient = reduced.gradient - restrictions.precision * (p - restrictions.mean)
         accepted = False

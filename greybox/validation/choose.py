@@ -6,17 +6,21 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from greybox.errors import GreyboxError
 from greybox.estimation.credibility import judge
-from greybox.estimation.credibility.verdict import misfit
+from greybox.estimation.credibility.verdict import misfit, motion
 from greybox.estimation.limits import limits_of
 from greybox.estimation.result import Estimate, Verdict
 from greybox.regression.regression import common_sample_time
 from greybox.trial.log import TrialLog
 from greybox.validation.alternatives import Alternative, alternatives_for
 from greybox.validation.fit import average_fit, run_model
+from greybox.validation.held_out import FLOOR
 from greybox.validation.once import estimate_once
 from greybox.validation.request import Request, regression_only
+from greybox.validation.simulating import Way, compare_ways
 
 _log = logging.getLogger(__name__)
 _OPEN = Request()
@@ -26,8 +30,9 @@ def estimate_model(logs: Sequence[TrialLog], request: Request = _OPEN) -> Estima
     """Estimate a model, choosing what the request leaves open.
 
     Where the method is open and the tests speak against the estimate that theory or
-    held-out runs prefer, output error is tried on the same predictor, and the one with
-    the better verdict is kept.
+    held-out runs prefer, output error is tried on the same predictor, and kept if it can
+    be trusted. Where the model itself is at fault, all estimators are compared by free
+    runs on parts of the logs that are left out in turn.
 
     Parameters
     ----------
@@ -52,14 +57,52 @@ def estimate_model(logs: Sequence[TrialLog], request: Request = _OPEN) -> Estima
     alternatives = alternatives_for(logs, request, notes)
     _log.info("%d ways to estimate, first %s", len(alternatives), alternatives[0].label)
     _log.debug("in this order: %s", "; ".join(a.label for a in alternatives))
-    estimate = _first_that_runs(logs, alternatives, request, notes)
-    if request.method is None and request.judged and not _is_trusted(estimate):
-        return _or_output_error(estimate, logs, request, notes)
+    try:
+        estimate = _first_that_runs(logs, alternatives, request, notes)
+    except GreyboxError as error:
+        if request.method is not None or regression_only(request):
+            raise
+        estimate = _without_regression(logs, alternatives, request, notes, error)
+    if request.method is not None or not request.judged or regression_only(request):
+        return estimate
+    if _rank(estimate)[0] == 0:
+        return estimate
+    tried: Estimate | None = None
+    if estimate.method != "oe" and not misfit(estimate.tests):
+        # what the structure lacks no other estimator mends
+        estimate, tried = _or_output_error(estimate, logs, request, notes)
+    if _at_fault(estimate, tried):
+        return _by_held_out_runs(estimate, tried, logs, request, notes)
     return estimate
 
 
-def _is_trusted(estimate: Estimate) -> bool:
-    return _rank(estimate)[0] == 0
+def _without_regression(
+    logs: Sequence[TrialLog],
+    alternatives: Sequence[Alternative],
+    request: Request,
+    notes: list[str],
+    error: GreyboxError,
+) -> Estimate:
+    """Return output error where no regression can be solved, else raise what stopped that.
+
+    A free run may tell apart what is nearly one regressor: it feels its own noise-free states.
+    """
+    reason = "no regression could be solved, and a free run tells the parameters apart"
+    ways = {
+        a.structure.name: Alternative(a.structure, "oe", a.kind, reason)
+        for a in reversed(alternatives)
+    }
+    try:
+        return _first_that_runs(logs, list(reversed(ways.values())), request, notes)
+    except GreyboxError:
+        raise error from None
+
+
+def _at_fault(estimate: Estimate, tried: Estimate | None) -> bool:
+    """Whether an estimate is not to be trusted because of the model, as far as tests tell."""
+    if _rank(estimate)[0] < 2:
+        return False
+    return any(misfit(e.tests) or motion(e.tests, e.fit) for e in (estimate, tried) if e)
 
 
 def _rank(estimate: Estimate) -> tuple[int, int]:
@@ -80,19 +123,19 @@ def _poor(fit: Mapping[str, float]) -> list[str]:
 
 def _or_output_error(
     found: Estimate, logs: Sequence[TrialLog], request: Request, notes: Sequence[str]
-) -> Estimate:
-    """Return output error on the same predictor where its verdict is better than `found`'s."""
-    if regression_only(request) or (misfit(found.tests) and not _poor(found.fit)):
-        # no other estimator mends what the structure lacks, but one may simulate
-        return found
+) -> tuple[Estimate, Estimate | None]:
+    """Return output error on the same predictor where its verdict is better than `found`'s.
+
+    Beside it output error's own estimate, if its free run stays bounded.
+    """
     before = f"{found.method} of this predictor alone is judged '{found.verdict.text}'"
     way = Alternative(found.predictor.structure, "oe", found.predictor.kind)
     try:
         tried, diverged = _finished(way, logs, request, notes)
     except GreyboxError as error:
-        return _noting(found, f"output error was tried too, and failed: {error}")
+        return _noting(found, f"output error was tried too, and failed: {error}"), None
     if diverged:
-        return _noting(found, "output error was tried too, and its free run diverges.")
+        return _noting(found, "output error was tried too, and its free run diverges."), None
     if _rank(tried) < _rank(found):
         why = f"it is judged '{tried.verdict.text}' and {before}"
         if _rank(tried)[0] == 2:
@@ -100,10 +143,59 @@ def _or_output_error(
                 f"its free run is better than a constant in more of the states, though neither "
                 f"is to be trusted: {before}"
             )
-        return _noting(tried, f"output error was taken, because {why}.")
-    return _noting(
-        found, f"output error was tried too, and is judged no better: '{tried.verdict.text}'."
-    )
+        return _noting(tried, f"output error was taken, because {why}."), tried
+    note = f"output error was tried too, and is judged no better: '{tried.verdict.text}'."
+    return _noting(found, note), tried
+
+
+def _by_held_out_runs(
+    found: Estimate,
+    spare: Estimate | None,
+    logs: Sequence[TrialLog],
+    request: Request,
+    notes: Sequence[str],
+) -> Estimate:
+    """Return the way to estimate whose runs on parts left out are best, `found` in doubt."""
+    try:
+        compared = compare_ways(found, logs, request, spare)
+    except GreyboxError as error:
+        return _noting(found, f"estimators were not compared by held-out runs: {error}")
+    found = _noting(found, compared.sentence())
+    way = compared.ways[compared.chosen]
+    if not compared.chosen:
+        return found
+    if spare is not None and way == Way("oe"):
+        other, diverged = spare, False
+    else:
+        start = spare if _diverges(found) else found
+        asked = Alternative(found.predictor.structure, way.method, found.predictor.kind)
+        try:
+            other, diverged = _finished(asked, logs, way.asked(request, start), notes, start)
+        except GreyboxError as error:
+            return _noting(found, f"{way.label} failed on the whole logs: {error}")
+    if diverged and not _diverges(found):
+        return _noting(found, f"{way.label} diverges on the whole logs, and was left.")
+    if way.method == "oe" and _level(other) < _level(found):
+        # the free run is what it fits, so this is no optimum to speak of
+        return _noting(
+            found,
+            f"{way.label} follows the whole logs less well than {found.method}, and was left.",
+        )
+    lacks = misfit(found.tests) or (misfit(spare.tests) if spare else [])
+    if lacks and _rank(other)[0] < 2:
+        # output error hides a misfit that the regression's tests have found
+        text = f"do not trust: {'; '.join(lacks)}"
+        other = replace(other, verdict=replace(other.verdict, text=text, reasons=tuple(lacks)))
+    return _noting(other, compared.sentence())
+
+
+def _level(estimate: Estimate) -> float:
+    """Return the free-run fit on the estimation logs, mean over the states and cut [%]."""
+    return float(np.mean([max(v, FLOOR) for v in estimate.fit.values()]))
+
+
+def _diverges(estimate: Estimate) -> bool:
+    return any(v == -np.inf for v in estimate.fit.values())
 
 
 def _noting(estimate: Estimate, note: str) -> Estimate:
@@ -141,11 +233,15 @@ def _first_that_runs(
 
 
 def _finished(
-    alternative: Alternative, logs: Sequence[TrialLog], request: Request, notes: Sequence[str]
+    alternative: Alternative,
+    logs: Sequence[TrialLog],
+    request: Request,
+    notes: Sequence[str],
+    start: Estimate | None = None,
 ) -> tuple[Estimate, bool]:
     """Return an estimate with fit, verdict, bounds and notes, and whether its free run diverges."""
     estimate = estimate_once(
-        logs, alternative.structure, alternative.method, alternative.kind, request
+        logs, alternative.structure, alternative.method, alternative.kind, request, start
     )
     model = estimate.model()
     runs = [run_model(model, log) for log in logs]

@@ -66,9 +66,14 @@ def _nominal_theta(
 
 
 def estimate_once(
-    logs: Sequence[TrialLog], structure: Structure, method: str, kind: str, request: Request
+    logs: Sequence[TrialLog],
+    structure: Structure,
+    method: str,
+    kind: str,
+    request: Request,
+    start: Estimate | None = None,
 ) -> Estimate:
-    """Estimate with one method and predictor.
+    """Estimate with one method and predictor; output error from `start` where it is given.
 
     Raises
     ------
@@ -79,7 +84,7 @@ def estimate_once(
     """
     require_informative(logs, kind)
     if method == "oe":
-        return _estimate_oe(logs, structure, kind, request)
+        return _estimate_oe(logs, structure, kind, request, start)
     closed, loop_test = assess_loop(logs, request.loop, method)
     common: dict[str, Any] = {
         "margins": request.margins,
@@ -149,7 +154,11 @@ def estimate_once(
 
 
 def _estimate_oe(
-    logs: Sequence[TrialLog], structure: Structure, kind: str, request: Request
+    logs: Sequence[TrialLog],
+    structure: Structure,
+    kind: str,
+    request: Request,
+    given: Estimate | None = None,
 ) -> Estimate:
     """Fit free runs, from the nominal model, else from an estimate by IV or least squares."""
     if request.margins:
@@ -169,7 +178,9 @@ def _estimate_oe(
     predictor = _less(predictor, request.without)
     start: Estimate | NDArray[np.float64] | None = _nominal_theta(request.nominal, structure)
     notes = ["it started from the nominal model."]
-    if start is None:
+    if start is None and given is not None:
+        start, notes = given, [f"it started from the estimate by {given.method}."]
+    elif start is None:
         start, said = _quick_start(logs, structure, kind)
         notes = [said]
     while True:

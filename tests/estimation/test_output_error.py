@@ -565,3 +565,44 @@ def test_intervals_cover(predictor, memory):
     # runs are independent, parameters within one are not
     error = np.std(np.mean(inside, axis=1)) / np.sqrt(len(inside))
     assert share == pytest.approx(0.95, abs=0.02 + 2 * error)
+
+
+def test_weights_by_deviation_minimise_the_errors_in_their_own_measure(noisy):
+    """On a structure too small: no other start or weight leaves less of Σ (e/spread)²."""
+    small = output_predictor(get_structure("linear"), "basic", REGIME)
+    y = np.column_stack([noisy[s] for s in "uvr"])
+
+    def left(estimate, first):
+        model = output_model(estimate.predictor, estimate.sample_time)
+        log = measured(model, noisy)
+        runs, _ = Simulator(model, cut([log], len(noisy)).w)(first[None], estimate.theta)
+        return float((((y - runs[0]) / y.std(axis=0)) ** 2).sum())
+
+    options = OutputErrorOptions(heading="input", weights="deviation")
+    found = estimate_oe(small, [noisy], options=options)
+    assert "weighed by the deviation" in found.status
+    usual = estimate_oe(small, [noisy], options=OutputErrorOptions(heading="input"))
+    model = output_model(small, 1.0)
+    data = [measured(model, noisy)]
+    fit, _ = fit_free_runs(model, data, found.theta, sigma=y.std(axis=0), near=True)
+    first = fit.nodes[0]
+    least = left(found, first)
+    assert 2 * fit.cost == pytest.approx(least, rel=1e-5)
+    assert least < left(usual, first)
+    rng = np.random.default_rng(0)
+    std = np.sqrt(np.diag(found.covariance))
+    for _ in range(5):
+        moved = replace(found, theta=found.theta + 0.1 * std * rng.standard_normal(len(std)))
+        assert least < left(moved, first)
+
+
+def test_weights_say_nothing_of_the_noise(predictor, noisy):
+    """Where the model is right both find the truth, and the same noise."""
+    common = {"heading": "input", "covariance": "white"}
+    found = estimate_oe(
+        predictor, [noisy], options=OutputErrorOptions(weights="deviation", **common)
+    )
+    usual = estimate_oe(predictor, [noisy], options=OutputErrorOptions(**common))
+    np.testing.assert_allclose(found.noise.measurement, usual.noise.measurement, rtol=0.05)
+    errors = (found.theta - truth(predictor)) / np.sqrt(np.diag(found.covariance))
+    assert np.sqrt((errors**2).mean()) < 2.0

@@ -47,7 +47,7 @@ def judge(
     diverged : bool
         Whether the free run on the estimation logs diverges.
     """
-    fatal = [*misfit(tests), *_of_least_squares(tests, method), *_motion(tests, fit, diverged)]
+    fatal = [*misfit(tests), *_of_least_squares(tests, method), *motion(tests, fit, diverged)]
     excepted: list[str] = []
     reasons: list[str] = []
     for test in tests:
@@ -125,9 +125,10 @@ def _of_least_squares(tests: Sequence[TestResult], method: str) -> list[str]:
     return [f"noise in the regressors of {listed(states)} biases least squares (--method iv)"]
 
 
-def _motion(
-    tests: Sequence[TestResult], fit: Mapping[str, float] | None, diverged: bool
+def motion(
+    tests: Sequence[TestResult], fit: Mapping[str, float] | None, diverged: bool = False
 ) -> list[str]:
+    """Return what speaks against simulating with the model; empty if nothing."""
     out = []
     if diverged:
         out.append("its free run diverges on the estimation logs")

@@ -1,0 +1,257 @@
+"""Which estimator simulates best where the model is too small, by runs on parts left out.
+
+Where the structure fits, theory says which estimator is right. Where it does not, each
+ends at parameters of its own, none of them true, and what is left to ask is how well
+they predict a motion that they were not fitted to.
+"""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr, stdtrit
+
+from greybox.errors import GreyboxError
+from greybox.estimation.output_error import Weights
+from greybox.estimation.result import Estimate
+from greybox.trial.log import TrialLog
+from greybox.validation.fit import run_model
+from greybox.validation.held_out import FLOOR, folds, score_runs, spread_of
+from greybox.validation.once import estimate_once
+from greybox.validation.request import Request
+
+Array = NDArray[np.float64]
+_log = logging.getLogger(__name__)
+
+# parts that are left out in turn, scores that are wanted, and that a standard error needs
+_FOLDS, _WANTED, _LEAST = 4, 4, 3
+# refinements of the instruments of a part
+_REFINEMENTS = 4
+
+
+@dataclass(frozen=True)
+class Way:
+    """An estimator: its method, and what output error measures its errors in."""
+
+    method: str
+    weights: Weights = "noise"
+
+    @property
+    def label(self) -> str:
+        """The way in words."""
+        return self.method + (" weighed by deviation" if self.weights == "deviation" else "")
+
+    def asked(self, request: Request, start: Estimate | None = None) -> Request:
+        """Return the request with this way's weights.
+
+        From a start that stays bounded, whole runs are fitted: segments would hold up a
+        model that no run follows. The likelihood is sought in all ways.
+        """
+        options = replace(request.output_error, weights=self.weights)
+        nearest = self.weights == "deviation" or not options.search
+        if start is not None and nearest and options.shooting == "auto":
+            options = replace(options, shooting="single")
+        return replace(request, output_error=options)
+
+
+_WAYS = (Way("iv"), Way("ls"), Way("oe"), Way("oe", "deviation"))
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Ways after their held-out runs.
+
+    Parameters
+    ----------
+    ways : tuple of Way
+        The one that stands first.
+    scores : ndarray
+        (W, parts) [%]; no number where a part did not do for an estimate.
+    """
+
+    ways: tuple[Way, ...]
+    scores: Array
+
+    @cached_property
+    def gains(self) -> tuple[tuple[float, float], ...]:
+        """Mean gain on the way that stands, and its one-sided 84 % limit [%], by way.
+
+        The limit is a standard error that allows for the number of parts.
+        """
+        return tuple(_gain(row - self.scores[0]) for row in self.scores)
+
+    @property
+    def best(self) -> int:
+        """The way of largest gain."""
+        return max(range(len(self.ways)), key=lambda i: self.gains[i][0])
+
+    @property
+    def chosen(self) -> int:
+        """The best way of those that gain more than a standard error, else the first."""
+        sure = [i for i, (gain, se) in enumerate(self.gains) if gain > se]
+        return max(sure, key=lambda i: self.gains[i][0], default=0)
+
+    def sentence(self) -> str:
+        """Return what was compared, and each way's score."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)
+            mean = np.nanmean(self.scores, axis=1)
+        shown = ", ".join(
+            f"{w.label} {m:.1f}" if np.isfinite(m) else f"{w.label} refused"
+            for w, m in zip(self.ways, mean, strict=True)
+        )
+        i = self.chosen or self.best
+        gain, se = self.gains[i]
+        first = self.ways[0].label
+        told = (
+            f"{self.ways[i].label} is {gain:.1f} ± {se:.1f} better than {first}"
+            if i
+            else f"none is better than {first}"
+        )
+        kept = "" if self.chosen or not i else ", which stays: a gain must exceed its error"
+        constant = " None predicts better than a constant." if np.nanmax(mean) < 0 else ""
+        return (
+            f"tests or free runs speak against {first}, so the estimators were compared by free "
+            f"runs on parts of the logs that were left out in turn (mean fit in %, cut at "
+            f"{FLOOR:.0f}, which is what a "
+            f"run that diverges counts): {shown}; {told}{kept}.{constant}"
+        )
+
+
+def _gain(difference: Array) -> tuple[float, float]:
+    known = difference[np.isfinite(difference)]
+    n = len(known)
+    if 2 * n < len(difference) or n < _LEAST:
+        return -np.inf, 0.0
+    # as sure as one standard error of many
+    factor = float(stdtrit(n - 1, ndtr(1.0)))
+    return float(known.mean()), factor * float(known.std(ddof=1)) / float(np.sqrt(n))
+
+
+def parts_of(logs: Sequence[TrialLog]) -> list[tuple[list[TrialLog], list[TrialLog]]]:
+    """Return (to estimate on, held out): groups of logs in turn, or parts of a single log.
+
+    Raises
+    ------
+    UsageError
+        A single log is too short.
+    """
+    if len(logs) == 1:
+        return folds(logs, _FOLDS)
+    groups: list[list[int]] = [[] for _ in range(min(len(logs), _FOLDS))]
+    for i in sorted(range(len(logs)), key=lambda i: -len(logs[i])):
+        min(groups, key=lambda g: sum(len(logs[j]) for j in g)).append(i)
+    return [
+        ([log for i, log in enumerate(logs) if i not in group], [logs[i] for i in group])
+        for group in groups
+    ]
+
+
+def compare_ways(
+    found: Estimate, logs: Sequence[TrialLog], request: Request, spare: Estimate | None = None
+) -> Comparison:
+    """Compare the ways to estimate the model of `found`, its own first.
+
+    Parameters
+    ----------
+    found : Estimate
+        Its predictor and structure are kept; its way stays unless another is better by
+        more than one standard error of the difference.
+    logs : sequence of TrialLog
+        Those it was estimated on.
+    request : Request
+    spare : Estimate, optional
+        Where output error starts if no regression of a part can be run freely.
+
+    Raises
+    ------
+    UsageError
+        A single log is too short to be parted.
+    """
+    ways = list(dict.fromkeys([Way(found.method), *_WAYS]))
+    spread = spread_of(logs, found.predictor.structure.states) if len(logs) == 1 else None
+    parts = parts_of(logs)
+    blocks = -(-_WANTED // max(len(logs), len(parts)))
+    scores = []
+    for fitting, held in parts:
+        estimates = _estimates(ways, fitting, found, request, spare)
+        scores.append(
+            np.array(
+                [
+                    np.full(len(held) * blocks, np.nan) if e is None
+                    else np.concatenate([_score(e, log, spread, blocks) for log in held])
+                    for e in estimates
+                ]
+            )
+        )  # fmt: skip
+        _log.info("a part left out: %s", ", ".join(
+            f"{w.label} {s.mean():.1f}" for w, s in zip(ways, scores[-1], strict=True)
+        ))  # fmt: skip
+    return Comparison(tuple(ways), np.concatenate(scores, axis=1))
+
+
+def _estimates(
+    ways: Sequence[Way],
+    logs: Sequence[TrialLog],
+    like: Estimate,
+    request: Request,
+    spare: Estimate | None,
+) -> list[Estimate | None]:
+    """Estimate in each way, output error from the regression that follows the logs best."""
+    request = replace(
+        request,
+        covariance="white",
+        refine=_REFINEMENTS if request.refine else False,
+        judged=False,
+        output_error=replace(request.output_error, search=False, process_noise=False),
+    )
+    found: dict[Way, Estimate | None] = {}
+    start: Estimate | None = None
+    most = -np.inf
+    # regressions first: output error starts from one of them
+    for way in sorted(ways, key=lambda w: w.method == "oe"):
+        from_here = start or (spare if way.method == "oe" else None)
+        try:
+            found[way] = estimate_way(way, logs, like, request, from_here)
+        except GreyboxError as error:
+            _log.info("%s on a part: %s", way.label, error)
+            found[way] = None
+        estimate = found[way]
+        if estimate is not None and way.method != "oe":
+            runs = [run_model(estimate.model(), log) for log in logs]
+            level = float(np.mean([v for run in runs for v in run.fit.values()]))
+            if level > most and all(run.diverged < 0 for run in runs):
+                start, most = estimate, level
+    return [found[way] for way in ways]
+
+
+def estimate_way(
+    way: Way,
+    logs: Sequence[TrialLog],
+    like: Estimate,
+    request: Request,
+    start: Estimate | None = None,
+) -> Estimate:
+    """Estimate the model of `like` in one way, output error from `start`.
+
+    Raises
+    ------
+    GreyboxError
+        The logs do not do for it.
+    """
+    predictor = like.predictor
+    return estimate_once(
+        logs, predictor.structure, way.method, predictor.kind, way.asked(request, start), start
+    )
+
+
+def _score(found: Estimate, log: TrialLog, spread: dict[str, float] | None, blocks: int) -> Array:
+    """Return the fit of a free run, cut, against the log's own spread or a given one [%]."""
+    run = run_model(found.model(), log)
+    return score_runs([run], spread or spread_of([log], tuple(run.fit)), blocks)
