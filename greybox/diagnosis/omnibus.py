@@ -197,7 +197,9 @@ class Disagreement:
     fall : float
         Of −2 log L of the held-out logs when the coefficients are fitted to them.
     p_value : float
-        Of coefficients that are the same (Wald), both covariances robust.
+        Of coefficients that are the same (Wald), both covariances robust. Were they the
+        same, `fall` would be twice that statistic where both logs tell as much; where it is
+        less, covariances are too small, and half of it counts.
     """
 
     fall: float
@@ -233,7 +235,7 @@ def disagreement(pairs: Sequence[Pair]) -> Disagreement:
         away = (after - before) / size
         distance += float(away @ np.linalg.pinv(spread / np.outer(size, size), 1e-10) @ away)
         count += m
-    return Disagreement(fall, float(chi2.sf(distance, count)))
+    return Disagreement(fall, float(chi2.sf(min(distance, fall / 2), count)))
 
 
 def with_own_noise(pairs: Sequence[Pair]) -> list[Pair]:

@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 CHANGE = "parameter_change"
 # moments at which a change is tried
-_MOMENTS = 19
+MOMENTS = 19
 # share of a direction that must be left when the nuisance is taken out
 _OWN = 1e-6
 # factor at which a change's search begins, at least so far from one
@@ -184,7 +184,7 @@ def _score_changes(directions: Directions, atoms: Sequence[Atom]) -> list[Score]
         return []
     ship = point.ship
     least = min(run.time[-1] for run in problem.runs)
-    moments = np.linspace(0.05, 0.95, _MOMENTS) * least
+    moments = np.linspace(0.05, 0.95, MOMENTS) * least
     names = [a.parameters[0].name.removesuffix("_factor") for a in atoms]
     index = np.array([problem.structure.index(n) for n in names])
     columns = []

@@ -18,7 +18,7 @@ from greybox.diagnosis.base import Case
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.held_out import HeldOut, Proof, proof_of
 from greybox.diagnosis.point import Fit
-from greybox.diagnosis.scores import Directions, Score, score_atoms
+from greybox.diagnosis.scores import MOMENTS, Directions, Score, score_atoms
 from greybox.model.functions import Integrator
 
 Array = NDArray[np.float64]
@@ -331,6 +331,8 @@ def judge(
     gain = before.cost - fit.cost if np.isfinite(fit.cost) else -np.inf
     p = float(chi2.sf(max(gain, 0.0), _dof(atom)))
     proof = held_out.prove(before, fit)
+    # the best of many moments is likelier than any one
+    tried *= MOMENTS if any(parameter.reach > 0 for parameter in atom.parameters) else 1
     return Candidate(atom, fit, gain, p, min(1.0, p * tried), proof, names)
 
 

@@ -21,13 +21,13 @@ _SURE = 0.005
 _LEFT = 0.1
 # significance of other coefficients on the held-out logs, and the share of the causes' gain
 # that fitting them there may bring beside
-_APART, _BESIDE = 1e-4, 0.25
+_APART, _BESIDE = 1e-8, 0.25
 # mean squared error, in the sensors' variances, that is worth a word, and the share of what
 # was there that causes may leave
 _LARGE, _MOST_OF = 0.3, 0.35
-# seconds for which gusts are remembered at most, and the fall of −2 log L of each log by a
-# longer memory from which on what moves the ship is no gust
-_GUST, _LONGER = 30.0, 10.0
+# seconds for which gusts are remembered at most, and the fall of −2 log L of all logs, and of
+# each, by a longer memory from which on what moves the ship is no gust
+_GUST, _LONGER, _EACH = 30.0, 18.0, 4.0
 
 
 @dataclass(frozen=True)
@@ -116,14 +116,14 @@ def rule(
 def _drifts(pairs: Sequence[Pair]) -> bool:
     """Whether what moves the ship beside the model is slower than gusts, in every log."""
     every = [one for p in pairs for one in ((p.problem, p.fit), (p.held, p.held_fit))]
+    falls = []
     for problem, fit in every:
         longest = _GUST / problem.sample_time
         if fit.escaped or not any(g.remembered > longest for g in fit.noise.groups):
             return False
         short, free = (problem.forgetful(fit, memory) for memory in (longest, np.inf))
-        if short.cost - free.cost < _LONGER:
-            return False
-    return True
+        falls.append(short.cost - free.cost)
+    return min(falls) > _EACH and sum(falls) > _LONGER * len(pairs)
 
 
 def _excess(fit: Fit, final: Fit) -> float:
