@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -190,7 +191,7 @@ class Report:
         if logs:
             after = _likelier_story(after, logs)
             one = [run_on(before, log) for log in logs]
-            two = [run_on(after, log) for log in logs]
+            two = [self._as_seen(run_on(after, log), log) for log in logs]
         else:
             one = _held_runs(self.case.held_out(self.found.base.integrator).pairs(self.found.base))
             two = _held_runs(pairs)
@@ -209,6 +210,23 @@ class Report:
             for a, b in zip(ones, twos, strict=True)
         ]  # fmt: skip
         return gains(one, two, self.case.logs[0].sample_time, self.seed), runs, after
+
+    def _as_seen(self, run: LogFit, log: TrialLog) -> LogFit:
+        """Return a run as sensors away from the origin show it, beside the log as it is.
+
+        A log that is carried to the origin has the noise of the yaw rate, times the lever,
+        in its velocities; a run that is carried to the sensors has none.
+        """
+        sensors = self.found.final.point.ship.sensors
+        if not any(sensors.lever) or len(run.log) != len(log):
+            return run
+        seen = self.case.problem(self.found.final.integrator).runs[0]
+        outputs = np.column_stack([run.x, run.psi])[:, : len(seen.outputs)]
+        x = seen.sense(sensors, outputs[..., None])[:, : len(seen.states), 0]
+        percent = fit_percent(log.states(seen.states), x)
+        return replace(
+            run, log=log, x=x, fit=dict(zip(seen.states, map(float, percent), strict=True))
+        )
 
     def _where(self, validate: Sequence[TrialLog]) -> str:
         if validate:
@@ -230,6 +248,12 @@ class Report:
             out.append(
                 f"{', '.join(turned)} came out negative: some thruster's column has the wrong sign "
                 f"or stands in another's place; greybox check tells which."
+            )
+        if any(self.found.final.point.ship.sensors.lever):
+            out.append(
+                "the gain is that of the log as its sensors show it: compare carries the log to "
+                "the origin, which puts the noise of the yaw rate, times the lever arm, into u "
+                "and v."
             )
         for change in after.changes:
             out.append(f"the extended model tells the log's own clock: {change.sentence}.")
