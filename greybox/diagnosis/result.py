@@ -25,6 +25,11 @@ VERDICTS: Mapping[Verdict, str] = {
 }
 
 
+def _shown(p: float) -> str:
+    """Return a p-value with its sign of relation; what underflows is no zero."""
+    return f"= {p:.2g}" if p > 0 else "< 1e-300"
+
+
 @dataclass(frozen=True)
 class Quantity:
     """An estimate with its standard error."""
@@ -267,7 +272,7 @@ class Diagnosis(Shown):
                     for name, q in c.parameters.items()
                 ]
                 lines.append(
-                    f"    adjusted p = {c.p_adjusted:.2g} ({self.tried} causes tried); held-out "
+                    f"    adjusted p {_shown(c.p_adjusted)} ({self.tried} causes tried); held-out "
                     f"−2 log L falls by {c.held_out:.0f} ± {c.held_out_std:.0f}"
                 )
         if self.gain:
