@@ -10,8 +10,9 @@ from scipy.linalg import block_diag
 from virtual import virtual_log
 
 from greybox.errors import DivergenceError, ExcitationError, UsageError
+from greybox.estimation import refined as refinement
 from greybox.estimation.bound import iv_bound
-from greybox.estimation.estimate import estimate_iv
+from greybox.estimation.estimate import estimate_iv, estimate_ls
 from greybox.estimation.noise import (
     ErrorLikelihood,
     constant_rows,
@@ -299,6 +300,31 @@ def test_a_prediction_that_diverges_is_an_error(basic, still_log, refined, monke
     monkeypatch.setattr("greybox.estimation.refined.estimate_ls", lambda *_, **__: wild)
     with pytest.raises(ExcitationError, match="left its bound at sample"):
         estimate_refined_iv(basic, [still_log], start=wild)
+
+
+@pytest.mark.parametrize("converging", [1, 2, 3])
+def test_rounds_that_do_not_converge_begin_again_from_least_squares(
+    basic, still_log, refined, monkeypatch, converging
+):
+    tried = []
+    rounds = refinement._refine
+
+    def only_some(work, point, theta, keep):
+        found = rounds(work, point, theta, keep)
+        tried.append((point.theta, found))
+        return replace(found, converged=len(tried) >= converging)
+
+    monkeypatch.setattr(refinement, "_refine", only_some)
+    again = estimate_refined_iv(basic, [still_log])
+    assert len(tried) == min(converging, 2)
+    # where no start converges the first one's estimate is given, else the converged one
+    kept = 1 if converging == 2 else 0
+    np.testing.assert_array_equal(again.theta, tried[kept][1].theta)
+    # both starts end at one estimate here: the choice of the start is no choice of the result
+    np.testing.assert_allclose(again.theta, refined.theta, atol=0.05 * refined.std.max())
+    if converging > 1:
+        ls = estimate_ls(basic, [still_log], covariance="white").theta
+        np.testing.assert_array_equal(tried[1][0], ls)
 
 
 def test_singular_instruments_are_an_error(basic, still_log):

@@ -1,0 +1,171 @@
+"""Errors that a slow force imitates, and likelihoods with many hills."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from greybox.diagnosis.atom import Atom
+from greybox.diagnosis.causes import Context, known_causes
+from greybox.diagnosis.diagnose import diagnose
+from greybox.diagnosis.fitting import Problem
+from greybox.diagnosis.noise import fit_noise
+from greybox.diagnosis.omnibus import features, knots_of
+from greybox.diagnosis.point import Fit, Point
+from greybox.diagnosis.scores import MOMENTS
+from greybox.diagnosis.search import judge
+from greybox.diagnosis.ship import LogRun, Ship
+from greybox.model.catalogue import get_structure
+from greybox.study.blind import draw
+from greybox.study.chapter6 import TRUE
+from greybox.trial.log import TrialLog
+
+BASE = get_structure("thesis").without("Wuu", "Wvv", "Wuv")
+MOMENT, FACTOR = 210.0, 1.8
+
+
+@pytest.fixture(scope="module")
+def changed() -> TrialLog:
+    """A pulse trial whose sway damping grows at a moment, as the model itself would run it."""
+    from dataclasses import replace
+
+    log = draw(np.random.default_rng([9, 1]), kind="pulses", samples=400).estimation
+    run = LogRun(BASE, log, "rk4")
+    theta = np.array([TRUE[n] for n in BASE.parameters])
+    ship = _change(log).apply(
+        Ship(theta, np.zeros(2), log.vessel), np.array([FACTOR, MOMENT])
+    )  # fmt: skip
+    shown = run.run(ship, run.start()).y
+    noise = np.array([0.014, 0.014, 0.014, 0.01]) * np.random.default_rng(3).standard_normal(
+        shown.shape
+    )
+    return replace(
+        log, channels=log.channels | dict(zip(run.outputs, (shown + noise).T, strict=True))
+    )
+
+
+def _change(log: TrialLog) -> Atom:
+    context = Context(
+        BASE, log.vessel, ("u", "v", "r", "psi"), False, float(log.t[-1]), 1.0,
+        dict.fromkeys(("n1", "n2"), 15.0),
+    )  # fmt: skip
+    atoms = known_causes()["parameter_change"].atoms(context)
+    return next(a for a in atoms if a.key.endswith(":Yv"))
+
+
+def _fitted(log: TrialLog, moment: float) -> tuple[Problem, Atom, Fit]:
+    problem = Problem([LogRun(BASE, log, "rk4")])
+    atom = _change(log)
+    theta = np.array([TRUE[n] for n in BASE.parameters])
+    point = Point(
+        Ship(theta, np.zeros(2), log.vessel), (problem.runs[0].start(),), tuple(range(len(theta)))
+    )
+    point = problem.add(point, atom, np.array([1.4, moment]))
+    noise = fit_noise(problem.errors(point), problem.poles(point), 1.0, problem.groups, longest=3.0)
+    return problem, atom, problem.fit(point, noise, most=12)
+
+
+def test_a_moment_far_off_is_found_by_scanning(changed: TrialLog) -> None:
+    problem, atom, fit = _fitted(changed, MOMENT - 18.0)
+    found = problem.settle(problem.scan(fit, atom), 2)
+    factor, moment = problem.scan(found, atom).point.values[0]
+    assert moment == pytest.approx(MOMENT, abs=2.0)
+    assert factor == pytest.approx(FACTOR, rel=0.1)
+
+
+def test_the_profile_is_the_least_squares_of_the_other_numbers(changed: TrialLog) -> None:
+    problem, atom, fit = _fitted(changed, MOMENT)
+    k = problem.numbers_of(fit.point, atom)[1]
+    vector = fit.point.vector()
+    rows = np.concatenate([r.reshape(-1, r.shape[2]) for r in problem.rows(fit.point, fit.noise)])
+    others = np.delete(rows, k, axis=1)
+    values = vector[k] + np.array([-20.0, 0.0, 7.0])
+    expected = []
+    for value in values:
+        vector[k] = value
+        nu, _ = problem.whitened(fit.noise, problem.errors(fit.point.at(vector)))
+        stacked = np.concatenate([n.ravel() for n in nu])
+        scale = np.sqrt((others**2).sum(axis=0))
+        solved = np.linalg.lstsq(others / scale, stacked, rcond=None)[0]
+        expected.append(float(((stacked - others / scale @ solved) ** 2).sum()))
+    np.testing.assert_allclose(problem.profile(fit, k, values), expected, rtol=1e-6)
+
+
+def test_the_interval_of_a_moment_holds_it_and_reaches_no_further_than_was_looked(
+    changed: TrialLog,
+) -> None:
+    problem, atom, fit = _fitted(changed, MOMENT)
+    found = problem.settle(problem.scan(fit, atom), 2)
+    spread = problem.spread(found, atom)
+    assert set(spread) == {"Yv_time"}
+    reach = atom.parameters[1].reach
+    assert 0 <= spread["Yv_time"] <= reach / 3
+    assert abs(found.point.values[0][1] - MOMENT) <= 3 * spread["Yv_time"] + 1.5
+
+
+def test_a_colour_that_forgets_remembers_no_longer_than_asked(changed: TrialLog) -> None:
+    problem, _, fit = _fitted(changed, MOMENT)
+    slow = 0.3 * np.sin(np.arange(len(changed)) / 60)
+    errors = [np.asarray(fit.errors[0]) + slow[:, None]]
+    poles = problem.poles(fit.point)
+    free = fit_noise(errors, poles, 1.0, problem.groups)
+    short = fit_noise(errors, poles, 1.0, problem.groups, longest=3.0)
+    assert max(g.remembered for g in free.groups) > 30
+    assert max(g.remembered for g in short.groups) <= 3.0 + 1e-6
+    # no colour under a bound is likelier than the likeliest of all
+    assert problem.whitened(free, errors)[1] <= problem.whitened(short, errors)[1] + 1e-6
+
+
+def test_a_change_counts_for_as_many_causes_as_moments_were_tried(changed: TrialLog) -> None:
+    class Nowhere:
+        def prove(self, before, after):
+            return None
+
+    _, atom, fit = _fitted(changed, MOMENT)
+    from dataclasses import replace
+
+    worse = replace(fit, cost=fit.cost + 20.0)
+    found = judge(Nowhere(), worse, fit, atom, 10)
+    assert found.p_adjusted == pytest.approx(found.p_value * 10 * MOMENTS)
+    plain = replace(atom, parameters=tuple(replace(p, reach=0.0) for p in atom.parameters))
+    assert judge(Nowhere(), worse, fit, plain, 10).p_adjusted == pytest.approx(10 * found.p_value)
+
+
+def test_forces_that_begin_at_a_speed_are_among_the_features(changed: TrialLog) -> None:
+    problem, _, fit = _fitted(changed, MOMENT)
+    knots = knots_of(problem)
+    assert knots.shape == (3, 3)
+    assert (np.diff(knots, axis=1) > 0).all()
+    run, start = problem.runs[0], fit.point.starts[0]
+    made = features(run, fit, start, knots)
+    surge = np.abs(run.run(fit.point.ship, start).x[:, 0])
+    wanted = np.maximum(surge - knots[0, 1], 0.0)
+    assert wanted.any()
+    assert min(np.abs(made - wanted[:, None]).max(axis=0)) < 1e-12
+
+
+@pytest.mark.long
+def test_a_force_slower_than_gusts_is_not_nothing() -> None:
+    trial = draw(np.random.default_rng([46, 1]), ("slow_force",), kind="manoeuvres")
+    found = diagnose([trial.estimation], validate=[trial.validation])
+    assert found.verdict == "unexplained"
+    assert "remembered for longer than gusts" in found.remaining
+
+
+@pytest.mark.long
+def test_the_gain_of_a_lever_arm_is_that_of_the_sensors_frame() -> None:
+    # the arm of some metres carries 0.1 m/s of the yaw rate's noise into a corrected log
+    trial = draw(np.random.default_rng([46, 3]), ("lever_arm",), kind="pulses", positions=False)
+    found = diagnose([trial.estimation], validate=[trial.validation])
+    assert [c.id for c in found.causes] == ["lever_arm"]
+    assert all(found.gain[s].after > found.gain[s].before for s in ("u", "v"))
+    assert any("as its sensors show it" in note for note in found.notes)
+    held = [r for r in found.runs if r.held_out]
+    assert held
+
+
+@pytest.mark.long
+def test_a_current_beside_a_lag_stands_out_with_the_terms_that_it_frees() -> None:
+    trial = draw(np.random.default_rng([46, 2]), ("current", "thruster_lag"), kind="pulses")
+    found = diagnose([trial.estimation], validate=[trial.validation])
+    assert {c.id for c in found.causes} == {"current", "thruster_lag"}
