@@ -264,6 +264,16 @@ class Problem:
         """Return what each sample adds to −2 log L, (N,) a log."""
         return [(nu**2).sum(axis=1) + fit.noise.log_det for nu in fit.nu]
 
+    def costs(self, fit: Fit) -> Array:
+        """Return −2 log L of each group of channels, (groups,)."""
+        nu = np.concatenate(fit.nu)
+        return np.array(
+            [
+                float((nu[:, group.outputs] ** 2).sum()) + group.log_det * len(nu)
+                for group in fit.noise.groups
+            ]
+        )
+
     def covariance(self, fit: Fit) -> tuple[Array, Array]:
         """Return the estimate's free numbers but the starts, and their covariance.
 

@@ -82,7 +82,12 @@ class HeldOut(ABC):
         """Return what the second hypothesis gains on the first."""
         one, two = self.contributions(before), self.contributions(after)
         with np.errstate(invalid="ignore"):
-            return proof_of(one - two)
+            proof = proof_of(one - two)
+        return replace(proof, p_value=min(1.0, proof.p_value * self._ways(after)))
+
+    def _ways(self, fit: Fit) -> int:
+        """Return among how many readings of a hypothesis the likeliest was taken."""
+        return 1
 
 
 def proof_of(difference: Array) -> Proof:
@@ -135,6 +140,9 @@ class OtherLogs(HeldOut):
             (self.problem.fit_starts(p, fit.noise) for p in points), key=lambda found: found.cost
         )
         return [Pair(self.fitting, fit, self.problem, best)]
+
+    def _ways(self, fit: Fit) -> int:
+        return len(stories(fit.point))
 
 
 def stories(point: Point) -> list[Ship]:

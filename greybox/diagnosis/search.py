@@ -65,6 +65,8 @@ class Candidate:
         What it does for held-out logs.
     names : tuple of str
         Of the coefficients.
+    tried : int
+        Causes that the p-value is corrected for.
     """
 
     atom: Atom
@@ -74,6 +76,7 @@ class Candidate:
     p_adjusted: float
     proof: Proof
     names: tuple[str, ...] = ()
+    tried: int = 1
 
     @property
     def relevant(self) -> bool:
@@ -225,7 +228,8 @@ def take_step(case: Case, fit: Fit, causes: Sequence[Candidate], atoms: Sequence
         (judge(held_out, fit, found, atom, len(left), problem.names) for atom, found in fits),
         key=_merit,
     )
-    taken = next((c for c in candidates if c.holds and _stands_out(case, c)), None)
+    sure = (_sure(case, c) for c in candidates if c.holds)
+    taken = next((c for c in sure if c.holds), None)
     if taken is not None:
         # what the noise had taken for its own until now would pass for more causes
         settled = problem if taken.fit.integrator == fit.integrator else case.problem(
@@ -238,8 +242,9 @@ def take_step(case: Case, fit: Fit, causes: Sequence[Candidate], atoms: Sequence
         # what a sample holds decides how it is best stepped, too
         better = case.other_integrator(better)
         # with errors as small as they are now, its hills are steeper
-        taken = replace(taken, fit=case.problem(better.integrator).scan(better, taken.atom))
-        if not _stands_out(case, taken):
+        better = case.problem(better.integrator).scan(better, taken.atom)
+        taken = _sure(case, replace(taken, fit=better))
+        if not taken.holds:
             taken = None
     return Step(fit, tuple(scores), tuple(candidates), taken)
 
@@ -271,24 +276,30 @@ def _likelier(
     return list(best.values())
 
 
-def _stands_out(case: Case, candidate: Candidate) -> bool:
-    """Whether a cause's numbers are away from their null values (Wald).
+def _sure(case: Case, candidate: Candidate) -> Candidate:
+    """Return the candidate with p-values that its robust covariance bears out, too (Wald).
 
-    Where they are not, the likelihood fell for another reason: the fit without the cause
-    had stopped early.
+    Where errors have another colour than theirs, or come in bursts, the likelihood falls
+    by chance for more than χ²; where it fell because the fit without the cause had stopped
+    early, the cause's numbers stand at their null. A number with many hills has no null.
     """
     from scipy.stats import chi2
 
     atom, fit = candidate.atom, candidate.fit
     problem = case.problem(fit.integrator)
     where = problem.numbers_of(fit.point, atom)
+    if atom.apply is None:
+        null = [0.0] * len(where)
+    else:
+        tested = [(k, p.null) for k, p in zip(where, atom.parameters, strict=True) if not p.reach]
+        where, null = [k for k, _ in tested], [value for _, value in tested]
     if not where:
-        return True
+        return candidate
     numbers, covariance = problem.covariance(fit)
-    null = [p.null for p in atom.parameters] if atom.apply is not None else [0.0] * len(where)
     away = numbers[where] - null
     wald = float(away @ np.linalg.pinv(covariance[np.ix_(where, where)]) @ away)
-    return float(chi2.sf(wald, len(where))) < PROVEN
+    p = max(candidate.p_value, float(chi2.sf(wald, len(where))))
+    return replace(candidate, p_value=p, p_adjusted=min(1.0, p * candidate.tried))
 
 
 def _taken(atom: Atom, causes: Sequence[Candidate]) -> bool:
@@ -333,7 +344,7 @@ def judge(
     proof = held_out.prove(before, fit)
     # the best of many moments is likelier than any one
     tried *= MOMENTS if any(parameter.reach > 0 for parameter in atom.parameters) else 1
-    return Candidate(atom, fit, gain, p, min(1.0, p * tried), proof, names)
+    return Candidate(atom, fit, gain, p, min(1.0, p * tried), proof, names, tried)
 
 
 def _backward(

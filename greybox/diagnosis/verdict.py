@@ -21,7 +21,7 @@ _SURE = 0.005
 _LEFT = 0.1
 # significance of other coefficients on the held-out logs, and the share of the causes' gain
 # that fitting them there may bring beside
-_APART, _BESIDE = 1e-8, 0.25
+_APART, _BESIDE = 1e-4, 0.25
 # mean squared error, in the sensors' variances, that is worth a word, and the share of what
 # was there that causes may leave
 _LARGE, _MOST_OF = 0.3, 0.35
@@ -114,16 +114,18 @@ def rule(
 
 
 def _drifts(pairs: Sequence[Pair]) -> bool:
-    """Whether what moves the ship beside the model is slower than gusts, in every log."""
+    """Whether what moves a channel beside the model is slower than gusts, in every log."""
     every = [one for p in pairs for one in ((p.problem, p.fit), (p.held, p.held_fit))]
     falls = []
     for problem, fit in every:
-        longest = _GUST / problem.sample_time
-        if fit.escaped or not any(g.remembered > longest for g in fit.noise.groups):
+        if fit.escaped:
             return False
+        longest = _GUST / problem.sample_time
         short, free = (problem.forgetful(fit, memory) for memory in (longest, np.inf))
-        falls.append(short.cost - free.cost)
-    return min(falls) > _EACH and sum(falls) > _LONGER * len(pairs)
+        falls.append(problem.costs(short) - problem.costs(free))
+    of_channels = np.array(falls)
+    slow = (of_channels.min(axis=0) > _EACH) & (of_channels.sum(axis=0) > _LONGER * len(pairs))
+    return bool(slow.any())
 
 
 def _excess(fit: Fit, final: Fit) -> float:

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from greybox.diagnosis.atom import Atom
 from greybox.diagnosis.causes import Context, known_causes
 from greybox.diagnosis.diagnose import diagnose
 from greybox.diagnosis.fitting import Problem
+from greybox.diagnosis.held_out import OtherLogs, Pair, proof_of
 from greybox.diagnosis.noise import fit_noise
 from greybox.diagnosis.omnibus import features, knots_of
 from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.scores import MOMENTS
-from greybox.diagnosis.search import judge
+from greybox.diagnosis.search import Candidate, _sure, judge
 from greybox.diagnosis.ship import LogRun, Ship
+from greybox.diagnosis.verdict import _drifts
 from greybox.model.catalogue import get_structure
 from greybox.study.blind import draw
 from greybox.study.chapter6 import TRUE
@@ -27,8 +32,6 @@ MOMENT, FACTOR = 210.0, 1.8
 @pytest.fixture(scope="module")
 def changed() -> TrialLog:
     """A pulse trial whose sway damping grows at a moment, as the model itself would run it."""
-    from dataclasses import replace
-
     log = draw(np.random.default_rng([9, 1]), kind="pulses", samples=400).estimation
     run = LogRun(BASE, log, "rk4")
     theta = np.array([TRUE[n] for n in BASE.parameters])
@@ -122,8 +125,6 @@ def test_a_change_counts_for_as_many_causes_as_moments_were_tried(changed: Trial
             return None
 
     _, atom, fit = _fitted(changed, MOMENT)
-    from dataclasses import replace
-
     worse = replace(fit, cost=fit.cost + 20.0)
     found = judge(Nowhere(), worse, fit, atom, 10)
     assert found.p_adjusted == pytest.approx(found.p_value * 10 * MOMENTS)
@@ -142,6 +143,80 @@ def test_forces_that_begin_at_a_speed_are_among_the_features(changed: TrialLog) 
     wanted = np.maximum(surge - knots[0, 1], 0.0)
     assert wanted.any()
     assert min(np.abs(made - wanted[:, None]).max(axis=0)) < 1e-12
+
+
+class _OneProblem:
+    """A case that knows one problem."""
+
+    def __init__(self, problem: Problem) -> None:
+        self._problem = problem
+
+    def problem(self, integrator: str) -> Problem:
+        return self._problem
+
+
+def _candidate(problem: Problem, atom: Atom, fit: Fit, tried: int = 50) -> Candidate:
+    proof = proof_of(np.full(100, 1.0) + 0.1 * np.sin(np.arange(100)))
+    return Candidate(atom, fit, 400.0, 1e-80, 1e-78, proof, problem.names, tried)
+
+
+def test_the_robust_covariance_must_bear_a_cause_out(changed: TrialLog) -> None:
+    problem, atom, fit = _fitted(changed, MOMENT)
+    found = problem.settle(problem.scan(fit, atom), 2)
+    real = _sure(_OneProblem(problem), _candidate(problem, atom, found))
+    k = problem.numbers_of(found.point, atom)[0]
+    numbers, covariance = problem.covariance(found)
+    expected = chi2.sf((numbers[k] - 1.0) ** 2 / covariance[k, k], 1)
+    assert real.holds
+    assert real.p_value == pytest.approx(max(expected, 1e-80), rel=1e-9)
+    assert real.p_adjusted == pytest.approx(50 * real.p_value)
+    # the moment is far from zero, which is no null; the factor is 1: nothing has changed
+    vector = found.point.vector()
+    vector[k] = 1.0 + 0.5 * np.sqrt(covariance[k, k])
+    point = found.point.at(vector)
+    errors = problem.errors(point)
+    nu, cost = problem.whitened(found.noise, errors)
+    still = replace(found, point=point, cost=cost, nu=tuple(nu), errors=tuple(errors))
+    none = _sure(_OneProblem(problem), _candidate(problem, atom, still))
+    assert none.p_value > 0.3
+    assert not none.holds
+
+
+def test_the_likelier_of_two_stories_counts_twice(changed: TrialLog) -> None:
+    problem, atom, fit = _fitted(changed, MOMENT)
+    plain = problem.fit(problem.drop(fit.point, atom), fit.noise)
+    # two models alike on the held-out log but for a little: neither proves much
+    held = OtherLogs(problem, problem)
+    close = problem.fit(fit.point.at(fit.point.vector()), fit.noise)
+    once = proof_of(held.contributions(plain) - held.contributions(close))
+    assert held.prove(plain, close).p_value == pytest.approx(min(1.0, 2 * once.p_value))
+    back = proof_of(held.contributions(close) - held.contributions(plain))
+    assert held.prove(close, plain).p_value == pytest.approx(back.p_value)
+
+
+def test_costs_of_channels_sum_to_that_of_all(changed: TrialLog) -> None:
+    problem, _, fit = _fitted(changed, MOMENT)
+    costs = problem.costs(fit)
+    assert costs.shape == (len(problem.groups),)
+    assert costs.sum() == pytest.approx(fit.cost)
+
+
+@pytest.mark.parametrize(("other", "expected"), [(0, True), (1, False)])
+def test_a_slow_force_moves_the_same_channel_in_every_log(
+    changed: TrialLog, other: int, expected: bool
+) -> None:
+    problem, _, fit = _fitted(changed, MOMENT)
+    poles = problem.poles(fit.point)
+
+    def pushed(channel: int) -> Fit:
+        errors = np.array(fit.errors[0])
+        errors[:, channel] += 0.3 * np.sin(np.arange(len(errors)) / 50)
+        noise = fit_noise([errors], poles, 1.0, problem.groups)
+        nu, cost = problem.whitened(noise, [errors])
+        return replace(fit, errors=(errors,), noise=noise, nu=tuple(nu), cost=cost)
+
+    pair = Pair(problem, pushed(0), problem, pushed(other))
+    assert _drifts([pair]) is expected
 
 
 @pytest.mark.long
