@@ -172,7 +172,10 @@ class Problem:
             if not np.isfinite(rows).all():
                 break
             residual = np.concatenate([n.ravel() for n in nu])
-            normal, gradient = rows.T @ rows, rows.T @ residual
+            with np.errstate(over="ignore", invalid="ignore"):
+                normal, gradient = rows.T @ rows, rows.T @ residual
+            if not np.isfinite(normal).all():
+                break
             accepted = False
             while damping <= _DAMPING_LIMIT:
                 step = bounded_step(normal, gradient, low - vector, high - vector, damping)

@@ -196,7 +196,10 @@ def search(
     steps: list[Step] = []
     fit = base
     causes: list[Candidate] = []
-    while len(causes) < most:
+    known: set[frozenset[str]] = set()
+    while len(causes) < most and frozenset(c.atom.key for c in causes) not in known:
+        # causes that take each other's place would go round for ever
+        known.add(frozenset(c.atom.key for c in causes))
         step = take_step(case, fit, causes, atoms)
         steps.append(step)
         progress(f"step {len(steps)}: {len(step.scores)} causes scored")
@@ -322,7 +325,7 @@ def _merit(candidate: Candidate) -> float:
     a wrong one falls behind. A thruster that pulls where it should push has a price too:
     reversed columns may otherwise be taken for each other.
     """
-    samples = sum(len(n) for n in candidate.fit.nu)
+    samples = sum(len(e) for e in candidate.fit.errors)
     price = _dof(candidate.atom) + _BACKWARDS * len(backwards(candidate.fit, candidate.names))
     return candidate.fit.cost - candidate.proof.gain + price * float(np.log(samples))
 

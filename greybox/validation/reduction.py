@@ -15,6 +15,7 @@ import numpy as np
 from greybox.errors import ExcitationError
 from greybox.estimation.result import Estimate
 from greybox.model.catalogue import structure_for
+from greybox.model.disturbances import CURRENT, WIND
 from greybox.model.predictor import Column
 from greybox.trial.log import TrialLog
 from greybox.validation.choose import estimate_model
@@ -39,16 +40,22 @@ from greybox.vessel.force import force_inputs
 _CLEAR = 0.3
 # p-value below which a column is not tried
 _SIGNIFICANT = 0.01
+# share of a derivative below which a column does not carry it
+_SHARE = 1e-6
 # growth of AIC from which on the smaller structure has no support (Burnham and Anderson, 2002)
 _NO_SUPPORT = 10.0
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """Columns of a predictor that may be left out together, with their Wald test."""
+    """Columns of a predictor that may be left out together, with their Wald test.
+
+    `absent` where nothing but a disturbance that may not be there asks for them.
+    """
 
     columns: tuple[int, ...]
     p_value: float
+    absent: bool = False
 
 
 def wald(estimate: Estimate, columns: Sequence[int]) -> float:
@@ -90,6 +97,30 @@ def least_earning(estimate: Estimate, missed: Collection[str] = ()) -> list[Cand
     while batch:
         found.append(Candidate(tuple(batch), wald(estimate, batch)))
         batch = batch[: len(batch) // 2]
+    return [c for c in found if c.p_value >= _SIGNIFICANT]
+
+
+def of_absent(estimate: Estimate, missed: Collection[str] = ()) -> list[Candidate]:
+    """Return the bias-capturing columns that still water, or still air, would leave without use.
+
+    Where there is no current all derivatives in its means are multiplied by zero; what is
+    left of (5.61), (5.70), (5.85) are then (7.1)-(7.3), of (5.64), (5.75), (5.88) (7.4)-(7.6).
+    Together these columns may be needless where one by one each seems to earn something.
+    """
+    predictor = estimate.predictor
+    found = []
+    for means in (CURRENT, WIND):
+        gone = {i for i, n in enumerate(predictor.structure.disturbances) if n in means}
+        columns: list[int] = []
+        for state in predictor.structure.states:
+            shares = [b for b in predictor.biases if b.state == state]
+            for position, i in enumerate(predictor.equation(state)):
+                uses = [b.monomial for b in shares if abs(b.shares[position]) > _SHARE]
+                if predictor.columns[i].is_bias and uses and all(gone & set(m) for m in uses):
+                    columns.append(i)
+        spelled = {_spelled(predictor.columns[i]) for i in columns}
+        if len(columns) > 1 and not spelled <= set(missed):
+            found.append(Candidate(tuple(columns), wald(estimate, columns), absent=True))
     return [c for c in found if c.p_value >= _SIGNIFICANT]
 
 
@@ -166,20 +197,27 @@ def reduce_structure(
     return StructureChoice(told(estimate, found), rows_of(tried, found))
 
 
+def _candidates(estimate: Estimate, missed: Collection[str]) -> list[Candidate]:
+    return [*of_absent(estimate, missed), *least_earning(estimate, missed)]
+
+
 def _step(bench: Bench, tried: list[Tried], current: Tried, missed: set[str]) -> Tried | None:
     """Leave out what the held-out runs do not miss; None where they miss all that is tried.
 
     A column that they miss is not tried again.
     """
     assert current.estimate is not None
-    while candidates := least_earning(current.estimate, missed):
+    while candidates := _candidates(current.estimate, missed):
         for candidate in candidates:
             request, dropped = _without(current.estimate, current.request, candidate)
+            if candidate.absent and any(t.note and t.dropped == tuple(dropped) for t in tried):
+                continue
             found = bench.tried(request, full=True, dropped=tuple(dropped))
             rows = [*(t for t in tried if not t.note), found]
             ranking = rank([t.scores for t in rows], [t.size for t in rows])
             near = found.scores is not None and ranking.behind[-1] <= ranking.se[-1]
-            if near and _supported(rows):
+            # AIC weighs terms one by one; that a disturbance is absent is one hypothesis
+            if near and (candidate.absent or _supported(rows)):
                 tried.append(found)
                 return found
             reason = "kept: AIC misses it" if near else "kept: held-out runs miss it"

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from greybox.diagnosis import search as searching
 from greybox.diagnosis.atom import Atom
 from greybox.diagnosis.causes import Context, known_causes
 from greybox.diagnosis.diagnose import diagnose
@@ -17,7 +18,7 @@ from greybox.diagnosis.noise import fit_noise
 from greybox.diagnosis.omnibus import features, knots_of
 from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.scores import MOMENTS
-from greybox.diagnosis.search import Candidate, _sure, judge
+from greybox.diagnosis.search import Candidate, Step, _sure, judge
 from greybox.diagnosis.ship import LogRun, Ship
 from greybox.diagnosis.verdict import _drifts
 from greybox.model.catalogue import get_structure
@@ -217,6 +218,41 @@ def test_a_slow_force_moves_the_same_channel_in_every_log(
 
     pair = Pair(problem, pushed(0), problem, pushed(other))
     assert _drifts([pair]) is expected
+
+
+def test_causes_that_take_each_others_place_end_the_search(
+    changed: TrialLog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem, atom, fit = _fitted(changed, MOMENT)
+    one, two = (
+        replace(_candidate(problem, atom, fit), atom=replace(atom, key=key)) for key in ("a", "b")
+    )
+    steps = []
+
+    def take(case, fit, causes, atoms):
+        steps.append([c.atom.key for c in causes])
+        taken = two if causes and causes[0].atom.key == "a" else one
+        return Step(fit, (), (taken,), taken)
+
+    def newest_alone(case, fit, causes, tried):
+        return fit, causes[-1:]
+
+    monkeypatch.setattr(searching, "take_step", take)
+    monkeypatch.setattr(searching, "_backward", newest_alone)
+    found = searching.search(_OneProblem(problem), fit, [])
+    assert steps == [[], ["a"], ["b"]]
+    assert [c.atom.key for c in found.causes] == ["a"]
+
+
+def test_a_run_whose_squares_leave_every_number_ends_the_fit(
+    changed: TrialLog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem, _, fit = _fitted(changed, MOMENT)
+    rows = problem.rows(fit.point, fit.noise)
+    monkeypatch.setattr(Problem, "rows", lambda *_: [1e200 * r for r in rows])
+    found = problem.fit(fit.point, fit.noise)
+    assert not found.converged
+    np.testing.assert_array_equal(found.point.vector(), fit.point.vector())
 
 
 @pytest.mark.long

@@ -7,20 +7,23 @@ import json
 import numpy as np
 import pytest
 import statsmodels.api as sm
-from virtual import virtual_log, write_csv
+from virtual import PARAMETERS, virtual_log, write_csv
 
 from greybox.commands.main import main
 from greybox.errors import ExcitationError, UsageError
-from greybox.model.catalogue import get_structure
+from greybox.model.catalogue import get_structure, structure_for
 from greybox.model.predictor import build_predictor
 from greybox.study.chapter7 import REDUCED_BIASES
+from greybox.trial.log import TrialLog
 from greybox.validation.choose import estimate_model
 from greybox.validation.criteria import independent_samples, information_criteria
 from greybox.validation.fit import run_model
 from greybox.validation.held_out import folds, rank, score_runs, spread_of
-from greybox.validation.reduction import least_earning, reduce_structure, wald
+from greybox.validation.once import estimate_once
+from greybox.validation.reduction import _step, least_earning, of_absent, reduce_structure, wald
 from greybox.validation.request import Request
-from greybox.validation.structures import compare_structures
+from greybox.validation.structures import Tried, compare_structures
+from greybox.vessel.force import force_inputs
 
 ABSENT = ("Xkappa", "Yvr", "Nvv", "Wvv", "Wuv")
 STRONG = {"Xvr", "Xmu", "Yur", "Ymu", "Nr", "Nmu"}
@@ -198,3 +201,65 @@ def test_reduction_drops_what_is_absent_and_never_what_is_strong():
         assert kept >= STRONG
         absent += len(set(ABSENT) - kept)
     assert absent > 0.7 * runs * len(ABSENT)
+
+
+def _in_wind_alone(seed: int, current: tuple[float, float] = (0.0, 0.0)) -> list[TrialLog]:
+    return [
+        virtual_log(seed + k, 2500, current=current, wind=1.0, spread=0.0, wind_spread=0.5)
+        for k in range(2)
+    ]
+
+
+@pytest.mark.parametrize("predictor", ["wind", "augmented"])
+def test_without_a_current_the_reduced_predictors_of_the_thesis_are_left(predictor):
+    """What (7.1)-(7.6) keep follows from the derivatives alone, and the joint test agrees."""
+    found = {}
+    for current in ((0.0, 0.0), (0.2, -0.2)):
+        logs = _in_wind_alone(20, current)
+        structure = structure_for("thesis", force_inputs(logs[0].vessel))
+        request = Request(method="iv", predictor=predictor, structure="thesis")
+        estimate = estimate_once(logs, structure, "iv", predictor, request)
+        found[current] = of_absent(estimate)
+    (still,) = found[0.0, 0.0]
+    columns = estimate.predictor.columns
+    left = {f"{c.state}:{c.name}" for i, c in enumerate(columns)
+            if c.is_bias and i not in still.columns}  # fmt: skip
+    # section 7.2 says why it put cos, sin for |v| cos, |v| sin: (7.2) as the theory has it
+    theory = {b.replace("v:cos(", "v:v*cos(").replace("v:sin(psi", "v:v*sin(psi")
+              for b in REDUCED_BIASES}  # fmt: skip
+    assert left == (theory if predictor == "augmented" else set())
+    assert still.p_value > 0.01
+    assert found[0.2, -0.2] == []
+
+
+@pytest.mark.long
+def test_a_reduction_without_a_current_ends_at_the_equations_of_the_thesis():
+    """(7.4)-(7.6): the terms with the wind's, and nothing that captures a bias."""
+    request = Request(method="iv", predictor="wind", structure="thesis")
+    choice = reduce_structure(_in_wind_alone(20), request)
+    predictor = choice.estimate.predictor
+    assert not predictor.augmented
+    # a term may be lost where it earns nothing, none of another kind may come
+    assert set(PARAMETERS) - set(choice.estimate.names) <= {"Wuv"}
+    assert "u:cos(psi)" in choice.rows[1].dropped
+
+
+def test_what_was_refused_together_is_not_tried_together_again():
+    logs = _in_wind_alone(20)[:1]
+    request = Request(method="iv", predictor="wind", structure="thesis", covariance="white")
+    structure = structure_for("thesis", force_inputs(logs[0].vessel))
+    estimate = estimate_once(logs, structure, "iv", "wind", request)
+
+    class Refusing:
+        """A bench on which whatever lacks a column runs badly."""
+
+        def tried(self, request, *, full, dropped):
+            return Tried(request, estimate, np.zeros(5), None, dropped)
+
+    tried = [Tried(request, estimate, np.full(5, 80.0), None)]
+    assert _step(Refusing(), tried, tried[0], set()) is None
+    together = [t for t in tried if len(t.dropped) == len(of_absent(estimate)[0].columns)]
+    assert len(together) == 1
+    assert together[0].note == "kept: held-out runs miss it"
+    # its columns were tried one by one after it
+    assert any(len(t.dropped) == 1 for t in tried)
