@@ -19,7 +19,8 @@ Times are medians of `--repeats` runs after a first one, whose time with compila
 stands beside them.
 
     pip install ".[bench-output-error]"
-    python benchmarks/output_error.py [--samples 5000] [--repeats 3] [--held-out-only]
+    python benchmarks/output_error.py [--samples 5000] [--repeats 3]
+    python benchmarks/output_error.py --held-out-only [--logs esso_osaka ...]
 """
 
 from __future__ import annotations
@@ -42,6 +43,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
+from scipy.stats import t as student
 
 import greybox as gb
 from greybox.errors import GreyboxError
@@ -471,6 +473,21 @@ def chosen(logs: list[TrialLog], request: Request) -> ManoeuvringModel:
     return estimate.model()
 
 
+def of_logs(model: ManoeuvringModel, logs: Sequence[TrialLog]) -> Array:
+    """Return the fit of each log's free run, mean over u, v and r (len(logs),) [%]."""
+    return np.array([np.mean([run_model(model, log).fit[n] for n in "uvr"]) for log in logs])
+
+
+def difference(one: Array, other: Array) -> str:
+    """Return the mean paired difference over logs, and its 95 % interval by Student's t."""
+    apart = one - other
+    if len(apart) < 2 or not np.isfinite(apart).all():
+        return ""
+    half = float(student.ppf(0.975, len(apart) - 1) * apart.std(ddof=1) / np.sqrt(len(apart)))
+    middle = float(apart.mean())
+    return f"{middle:.1f} ({middle - half:.1f} to {middle + half:.1f}), {len(apart)} logs"
+
+
 def held_out(folder: str, base: str, logs: list[TrialLog], others: list[TrialLog]) -> None:
     """Print the free-run fits of all tools' models on logs not used."""
     structure = structure_for(base, force_inputs(logs[0].vessel))
@@ -528,7 +545,12 @@ def held_out(folder: str, base: str, logs: list[TrialLog], others: list[TrialLog
         f"{sum(map(len, logs))} samples of {len(logs)} logs to estimate from, "
         f"{sum(map(len, others))} of {len(others)} held out; ours {estimate.status}"
     )
-    print(f"{'':<30}{'u':>9}{'v':>9}{'r':>9}{'mean':>9}{'median':>9}{'seconds':>10}  diverged")
+    print(
+        f"{'':<30}{'u':>9}{'v':>9}{'r':>9}{'mean':>9}{'median':>9}{'seconds':>10}  diverged  "
+        f"own choice less it, 95 %"
+    )
+    own = found["this package, own choice"][1]
+    best = None if isinstance(own, str) else of_logs(own, others)
     for label, (seconds, model) in found.items():
         if isinstance(model, str):
             print(f"{label:<30} {model}")
@@ -541,6 +563,7 @@ def held_out(folder: str, base: str, logs: list[TrialLog], others: list[TrialLog
         print(
             f"{label:<30}{''.join(f'{v:>9.1f}' for v in values)}{seconds:>10.2f}"
             f"  {sum(f.diverged >= 0 for f in fits)} of {len(fits)}"
+            f"    {'' if best is None else difference(best, of_logs(model, others))}"
         )
     ratios = ", ".join(f"{c / least - 1:.1e}" for c in found_costs)
     print(f"cost of SciPy's models by our weights, over ours, less 1: {ratios}")
@@ -551,10 +574,11 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=5000)
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--held-out-only", action="store_true")
+    parser.add_argument("--logs", nargs="+", choices=sorted(_TRIALS), default=list(_TRIALS))
     options = parser.parse_args()
     if not options.held_out_only:
         speed(options.samples, options.repeats)
-    for folder in _TRIALS:
+    for folder in options.logs:
         if not (DATA / folder).exists():
             print(f"no logs at {DATA / folder}: set GREYBOX_DATA")
             continue

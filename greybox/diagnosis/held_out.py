@@ -62,10 +62,20 @@ class HeldOut(ABC):
         """Return the hypothesis on everything that is held out."""
 
     def pairs(self, fit: Fit) -> list[Pair]:
-        """Return the hypothesis on everything that is held out; computed once a fit."""
+        """Return the hypothesis on everything that is held out; computed once a fit.
+
+        The colour of the held-out errors is estimated on them: gusts and seas differ from day
+        to day, which is no fault of a model, and where another cause still acts a better
+        model with smaller errors must not pay more for it than a worse one.
+        """
         known = self._known.get(id(fit))
         if known is None or known[0] is not fit:
-            self._known[id(fit)] = known = (fit, self._pairs(fit))
+            pairs = [
+                pair if pair.held_fit.escaped
+                else replace(pair, held_fit=pair.held.settle(pair.held_fit))
+                for pair in self._pairs(fit)
+            ]  # fmt: skip
+            self._known[id(fit)] = known = (fit, pairs)
         return known[1]
 
     def contributions(self, fit: Fit) -> Array:

@@ -238,18 +238,6 @@ def disagreement(pairs: Sequence[Pair]) -> Disagreement:
     return Disagreement(fall, float(chi2.sf(min(distance, fall / 2), count)))
 
 
-def with_own_noise(pairs: Sequence[Pair]) -> list[Pair]:
-    """Return the pairs with the colour of the held-out errors estimated on them.
-
-    Gusts and seas differ from day to day; that alone is no fault of a model.
-    """
-    return [
-        pair if pair.held_fit.escaped
-        else replace(pair, held_fit=pair.held.settle(pair.held_fit))
-        for pair in pairs
-    ]  # fmt: skip
-
-
 def _ridge(rows: Array, nu: Array) -> Array:
     """Return coefficients (m,) by the strength that makes the innovations likeliest."""
     left, values, right = np.linalg.svd(rows, full_matrices=False)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from greybox.diagnosis.held_out import HeldOut, Pair
-from greybox.diagnosis.omnibus import Omnibus, disagreement, omnibus, with_own_noise
+from greybox.diagnosis.omnibus import Omnibus, disagreement, omnibus
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.result import Found, Verdict
 from greybox.diagnosis.search import RELEVANT, Candidate, Search
@@ -69,8 +69,8 @@ def rule(
         Causes that the log proves without forces.
     """
     held = held_out(found.final.integrator)
-    pairs = with_own_noise(held.pairs(found.final))
-    first = omnibus(with_own_noise(held_out(found.base.integrator).pairs(found.base)))
+    pairs = held.pairs(found.final)
+    first = omnibus(held_out(found.base.integrator).pairs(found.base))
     left = omnibus(pairs)
     other = disagreement(pairs)
     numbers = sum(nu.size for pair in pairs for nu in pair.held_fit.nu)

@@ -195,6 +195,19 @@ def test_the_likelier_of_two_stories_counts_twice(changed: TrialLog) -> None:
     assert held.prove(close, plain).p_value == pytest.approx(back.p_value)
 
 
+def test_held_out_errors_have_a_colour_of_their_own(changed: TrialLog) -> None:
+    problem, _, fit = _fitted(changed, MOMENT)
+    rough = replace(
+        changed,
+        channels=changed.channels
+        | {"u": changed["u"] + 0.1 * np.random.default_rng(4).standard_normal(len(changed))},
+    )
+    (pair,) = OtherLogs(problem, Problem([LogRun(BASE, rough, "rk4")])).pairs(fit)
+    before, after = (noise.groups[0].sensor[0] for noise in (fit.noise, pair.held_fit.noise))
+    assert before == pytest.approx(0.014, rel=0.2)
+    assert after == pytest.approx(0.101, rel=0.1)
+
+
 def test_costs_of_channels_sum_to_that_of_all(changed: TrialLog) -> None:
     problem, _, fit = _fitted(changed, MOMENT)
     costs = problem.costs(fit)
