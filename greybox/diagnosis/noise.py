@@ -31,6 +31,8 @@ _PRIOR, _PRIOR_WEIGHT = 1.0, 0.02
 _UNROLLED = 10
 # how far each number of a colour commonly moves in a search, which makes its hills round
 _SCALE, _LEVEL_SCALE = (0.1, 0.3), 0.02
+# share of the sensors' deviation from which on what moves the ship beside the model is seen
+SEEN = 0.2
 # iterations of a search, and of one that begins near
 _MOST_STEPS, _NEAR_STEPS = 40, 20
 

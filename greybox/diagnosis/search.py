@@ -17,6 +17,7 @@ from greybox.diagnosis.atom import Atom
 from greybox.diagnosis.base import Case
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.held_out import HeldOut, Proof, proof_of
+from greybox.diagnosis.noise import SEEN
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.scores import MOMENTS, Directions, Score, score_atoms
 from greybox.model.functions import Integrator
@@ -27,9 +28,9 @@ Array = NDArray[np.float64]
 _SHORTLIST, _LEAST_GAIN = 7, 9.0
 # share of the best promise from which on an atom is worth a refit
 _PROMISING = 0.04
-# errors remembered for more samples than this, larger than this share of the sensors', may
-# be a cause's; they are then looked at with so short a memory, so many causes more tried
-_SLOW, _SHARE, _FORGOTTEN, _SECOND = 30.0, 0.2, 3.0, 4
+# errors that are seen and remembered for more samples than this may be a cause's; they are
+# then looked at with so short a memory, so many causes more tried
+_SLOW, _FORGOTTEN, _SECOND = 30.0, 3.0, 4
 # iterations of a refit before its noise is settled
 _FIRST = 12
 MOST_CAUSES = 4
@@ -254,7 +255,7 @@ def take_step(case: Case, fit: Fit, causes: Sequence[Candidate], atoms: Sequence
 
 def _slow(fit: Fit) -> bool:
     """Whether the errors' own colour could be a cause's: slow, and larger than the sensors'."""
-    return any(g.remembered > _SLOW and g.share > _SHARE for g in fit.noise.groups)
+    return any(g.remembered > _SLOW and g.share > SEEN for g in fit.noise.groups)
 
 
 def _seen_as_slow(problem: Problem, fit: Fit, atoms: Sequence[Atom]) -> list[tuple[Atom, Fit]]:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from greybox.channels import CHANNELS
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.held_out import long_run_variance
+from greybox.diagnosis.noise import SEEN
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.result import Symptom
 from greybox.diagnosis.ship import LogRun
@@ -128,7 +129,7 @@ def coloured(fit: Fit, outputs: Sequence[str]) -> str | None:
     """Return what moves the ship beside the model, in words; None where little does."""
     found = []
     for group in fit.noise.groups:
-        if group.share > 0.2:
+        if group.share > SEEN:
             memory = group.remembered
             tail = f" with a memory of {memory:.0f} samples" if memory > 2 else ""
             found.append(f"{word(outputs[group.outputs[0]])}{tail}")

@@ -136,8 +136,8 @@ def _delayed(ship: Ship, effect: Effect, later: bool) -> Ship:
 
 def _quadratic(rng: np.random.Generator, size: float, typical: Typical) -> dict[str, Value]:
     speed = np.abs(typical.commands[:, :2])
-    # the linear law that fits n|n| best over the speeds of the trial has this slope
-    return {"quadratic_share": size, "reference": float((speed**3).sum() / (speed**2).sum())}
+    # the share is counted at the propellers' middle speed, as the cause counts it
+    return {"quadratic_share": size, "reference": float(np.median(speed, axis=0).mean())}
 
 
 def _squared(ship: Ship, effect: Effect, later: bool) -> Ship:
