@@ -281,13 +281,18 @@ class Problem:
         """Return the estimate's free numbers but the starts, and their covariance.
 
         Robust to what memory the innovations have left (Newey and West, 1987), and
-        never less than what white innovations would give.
+        never less than what white innovations would give; infinite where the derivatives of a
+        run at the edge of stability leave every number's range.
         """
         rows = np.concatenate(self.rows(fit.point, fit.noise))
         nu = np.concatenate(fit.nu)
         samples, _, q = rows.shape
-        normal = np.einsum("kic,kid->cd", rows, rows)
-        scores = np.einsum("kic,ki->kc", rows, nu)
+        free = len(fit.point.places) + sum(map(len, fit.point.values))
+        with np.errstate(over="ignore", invalid="ignore"):
+            normal = np.einsum("kic,kid->cd", rows, rows)
+            scores = np.einsum("kic,ki->kc", rows, nu)
+        if not (np.isfinite(normal).all() and np.isfinite(scores).all()):
+            return fit.point.vector()[:free], np.full((free, free), np.inf)
         middle = scores.T @ scores
         lags = round(samples ** (1 / 3))
         for lag in range(1, lags + 1):
@@ -295,9 +300,12 @@ class Problem:
             middle += (1 - lag / (lags + 1)) * (part + part.T)
         spread = inverse(normal)
         robust = spread @ middle @ spread * samples / max(samples - q, 1)
+        # rounding may leave nothing of a variance beside numbers that are hardly known
+        lost = np.diag(robust) <= 0
+        robust[lost], robust[:, lost] = 0.0, 0.0
+        robust[lost, lost] = np.diag(spread)[lost]
         widen = np.sqrt(np.maximum(np.diag(spread) / np.maximum(np.diag(robust), 1e-300), 1.0))
         full = robust * np.outer(widen, widen)
-        free = len(fit.point.places) + sum(map(len, fit.point.values))
         return fit.point.vector()[:free], full[:free, :free]
 
     def poles(self, point: Point) -> Array:

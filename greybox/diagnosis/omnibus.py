@@ -230,11 +230,15 @@ def disagreement(pairs: Sequence[Pair]) -> Disagreement:
         m = len(places)
         before = np.concatenate([point.base.theta, point.base.current])[list(places)]
         after = np.concatenate([own.point.base.theta, own.point.base.current])[list(places)]
+        count += m
         spread = here[:m, :m] + there[:m, :m]
+        if not np.isfinite(spread).all():
+            # a run at the edge of stability has no covariance: the fall alone decides
+            distance = np.inf
+            continue
         size = np.sqrt(np.diag(spread))
         away = (after - before) / size
         distance += float(away @ np.linalg.pinv(spread / np.outer(size, size), 1e-10) @ away)
-        count += m
     return Disagreement(fall, float(chi2.sf(min(distance, fall / 2), count)))
 
 

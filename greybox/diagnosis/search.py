@@ -239,7 +239,7 @@ def take_step(case: Case, fit: Fit, causes: Sequence[Candidate], atoms: Sequence
         settled = problem if taken.fit.integrator == fit.integrator else case.problem(
             taken.fit.integrator
         )  # fmt: skip
-        better = settled.settle(taken.fit, _SETTLE)
+        better = _loosened(settled, settled.settle(taken.fit, _SETTLE))
         if not any(a.afresh for a in better.point.atoms):
             better = case.anew(better)
         better = case.likeliest_variant(case.other_integrator(better), taken.atom)
@@ -256,6 +256,18 @@ def take_step(case: Case, fit: Fit, causes: Sequence[Candidate], atoms: Sequence
 def _slow(fit: Fit) -> bool:
     """Whether the errors' own colour could be a cause's: slow, and larger than the sensors'."""
     return any(g.remembered > _SLOW and g.share > SEEN for g in fit.noise.groups)
+
+
+def _loosened(problem: Problem, fit: Fit) -> Fit:
+    """Return the likelier of a fit and of one that began with errors that forget.
+
+    Where the colour holds slow errors for its own, coefficients stay where they are.
+    """
+    if fit.escaped or not _slow(fit):
+        return fit
+    plain = problem.forgetful(fit, _FORGOTTEN)
+    found = problem.settle(problem.fit(fit.point, plain.noise), _SETTLE)
+    return found if found.cost < fit.cost else fit
 
 
 def _seen_as_slow(problem: Problem, fit: Fit, atoms: Sequence[Atom]) -> list[tuple[Atom, Fit]]:
@@ -300,8 +312,9 @@ def _sure(case: Case, candidate: Candidate) -> Candidate:
     if not where:
         return candidate
     numbers, covariance = problem.covariance(fit)
+    own = covariance[np.ix_(where, where)]
     away = numbers[where] - null
-    wald = float(away @ np.linalg.pinv(covariance[np.ix_(where, where)]) @ away)
+    wald = float(away @ np.linalg.pinv(own) @ away) if np.isfinite(own).all() else 0.0
     p = max(candidate.p_value, float(chi2.sf(wald, len(where))))
     return replace(candidate, p_value=p, p_adjusted=min(1.0, p * candidate.tried))
 

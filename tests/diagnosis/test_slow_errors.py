@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import replace
 
 import numpy as np
@@ -15,10 +16,10 @@ from greybox.diagnosis.diagnose import diagnose
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.held_out import OtherLogs, Pair, proof_of
 from greybox.diagnosis.noise import fit_noise
-from greybox.diagnosis.omnibus import features, knots_of
+from greybox.diagnosis.omnibus import disagreement, features, knots_of
 from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.scores import MOMENTS
-from greybox.diagnosis.search import Candidate, Step, _sure, judge
+from greybox.diagnosis.search import Candidate, Step, _loosened, _sure, judge
 from greybox.diagnosis.ship import LogRun, Ship
 from greybox.diagnosis.verdict import _drifts
 from greybox.model.catalogue import get_structure
@@ -269,6 +270,38 @@ def test_a_run_whose_squares_leave_every_number_ends_the_fit(
 
 
 @pytest.mark.long
+def test_a_strong_wind_is_not_left_to_the_colour_of_the_errors() -> None:
+    # taken with errors that were believed slow, its sway coefficient had stayed where it was
+    rng = np.random.default_rng([904, zlib.crc32(b"windzigzag"), 0])
+    trial = draw(rng, ("wind",), kind="zigzag")
+    found = diagnose([trial.estimation], validate=[trial.validation])
+    assert found.verdict == "named"
+    (wind,) = found.causes
+    truth = trial.truth[0].parameters
+    for name in ("Wuu", "Wvv", "Wuv"):
+        quantity = wind.parameters[name]
+        assert abs(quantity.value - truth[name]) < 4 * quantity.std
+
+
+def test_a_fit_that_is_held_by_slow_errors_is_loosened(changed: TrialLog) -> None:
+    problem, atom, fit = _fitted(changed, MOMENT)
+    good = problem.settle(problem.scan(fit, atom), 2)
+    assert _loosened(problem, good) is good
+    slow = 0.5 * np.sin(np.arange(len(changed)) / 60)
+    wrong = [np.asarray(e) + slow[:, None] for e in good.errors]
+    noise = fit_noise(wrong, problem.poles(good.point), 1.0, problem.groups)
+    vector = good.point.vector()
+    vector[problem.names.index("Yv")] *= 1.3
+    point = good.point.at(vector)
+    errors = problem.errors(point)
+    nu, cost = problem.whitened(noise, errors)
+    held = replace(good, point=point, noise=noise, nu=tuple(nu), errors=tuple(errors), cost=cost)
+    found = _loosened(problem, held)
+    assert found.cost < held.cost
+    assert found.cost == pytest.approx(good.cost, abs=10)
+
+
+@pytest.mark.long
 def test_a_force_slower_than_gusts_is_not_nothing() -> None:
     trial = draw(np.random.default_rng([46, 1]), ("slow_force",), kind="manoeuvres")
     found = diagnose([trial.estimation], validate=[trial.validation])
@@ -293,3 +326,30 @@ def test_a_current_beside_a_lag_stands_out_with_the_terms_that_it_frees() -> Non
     trial = draw(np.random.default_rng([46, 2]), ("current", "thruster_lag"), kind="pulses")
     found = diagnose([trial.estimation], validate=[trial.validation])
     assert {c.id for c in found.causes} == {"current", "thruster_lag"}
+
+
+def test_a_run_without_a_covariance_is_judged_without_it(
+    changed: TrialLog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem, atom, fit = _fitted(changed, MOMENT)
+    rows = problem.rows(fit.point, fit.noise)
+    monkeypatch.setattr(Problem, "rows", lambda *_: [1e200 * r for r in rows])
+    numbers, covariance = problem.covariance(fit)
+    assert covariance.shape == (len(numbers),) * 2
+    assert np.isinf(covariance).all()
+    # nothing speaks for a cause whose numbers have no covariance
+    assert _sure(_OneProblem(problem), _candidate(problem, atom, fit)).p_value == 1.0
+    monkeypatch.setattr(Problem, "settle", lambda self, fit, rounds=2: replace(fit, cost=0.0))
+    pair = Pair(problem, fit, problem, replace(fit, cost=60.0))
+    found = disagreement([pair])
+    assert found.fall == 60.0
+    assert found.p_value == pytest.approx(chi2.sf(30.0, len(fit.point.places)))
+
+
+@pytest.mark.long
+def test_variances_stay_positive_where_numbers_are_hardly_known() -> None:
+    # a run at the edge of stability: rounding had left a negative variance, and no verdict
+    rng = np.random.default_rng([907, zlib.crc32(b"dead_bandpulses"), 2])
+    trial = draw(rng, ("dead_band",), kind="pulses")
+    found = diagnose([trial.estimation], validate=[trial.validation])
+    assert found.verdict == "unexplained"
