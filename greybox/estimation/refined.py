@@ -38,7 +38,7 @@ from greybox.estimation.white_rows import (
 )
 from greybox.estimation.whitening import ErrorBand
 from greybox.model.predictor import Predictor
-from greybox.regression.motion import Motion, further_channels, predicted_motion
+from greybox.regression.motion import Motion, further_channels, predicted_motion, smoothed_heading
 from greybox.regression.regression import Regression, build_regression, within_margins
 from greybox.trial.log import TrialLog
 
@@ -90,12 +90,26 @@ class _Refinement:
 
     def point(self, theta: Array, constants: Sequence[Array]) -> _Point:
         motions = [
-            predicted_motion(
-                self.predictor, log, theta, own, heading=self._heading, wind=self._wind
-            )
-            for log, own in zip(self.logs, constants, strict=True)
+            self._motion(log, theta, own) for log, own in zip(self.logs, constants, strict=True)
         ]
         return _Point(theta, tuple(constants), tuple(motions))
+
+    def _motion(self, log: TrialLog, theta: Array, constants: Array) -> Motion:
+        found = predicted_motion(
+            self.predictor, log, theta, constants, heading=self._heading, wind=self._wind
+        )
+        structure = self.predictor.structure
+        states = structure.states
+        told = structure.disturbance == "marine" and "r" in states
+        if self._heading == "simulated" or not told or found.diverged >= 0:
+            return found
+        # a measured heading is no instrument for itself: its noise is the regressors' too
+        turning = found.x[:, states.index("r")]
+        course = smoothed_heading(log["psi"][:-1], turning, log.sample_time)
+        return predicted_motion(
+            self.predictor, log, theta, constants, heading="measured", wind=self._wind,
+            course=course,
+        )  # fmt: skip
 
     def errors(self, theta: Array) -> list[Array]:
         """Return y − Φᵀθ of each log, (N, nx)."""

@@ -23,6 +23,10 @@ from greybox.vectorised import Vectorised
 
 Array = NDArray[np.float64]
 
+# samples over which a drift is seen beside a heading's noise, and the least that a sample
+# adds to its variance, in that of the noise
+_DRIFT, _LEAST_WALK = 20, 1e-4
+
 
 @dataclass(frozen=True)
 class Motion:
@@ -109,6 +113,39 @@ def _slopes(predictor: Predictor) -> Vectorised:
     )
 
 
+def smoothed_heading(measured: Array, yaw_rate: Array, sample_time: float) -> Array:
+    """Return a measured heading (N,) freed of its sensor's noise by a predicted yaw rate (N,).
+
+    The integral of the rate drifts from the truth slowly; a local-level smoother takes
+    the drift from the measurement, so hardly any of a sample's noise is left in it.
+
+    References
+    ----------
+    Rauch, Tung and Striebel (1965); Durbin and Koopman (2012), section 2.4.
+    """
+    turned = np.concatenate([[0.0], np.cumsum(yaw_rate[:-1])]) * sample_time
+    drift = measured - turned
+    change = np.diff(drift)
+    if len(change) <= _DRIFT or not np.isfinite(drift).all():
+        return measured
+    # differences of white noise are opposed to their neighbours; what grows with time drifts
+    noise = max(-float(np.mean(change[1:] * change[:-1])), 0.0)
+    if noise <= 0:
+        return measured
+    grown = drift[_DRIFT:] - drift[:-_DRIFT]
+    walk = max((float(np.mean(grown**2)) - 2 * noise) / _DRIFT, _LEAST_WALK * noise)
+    level, variance = np.empty(len(drift)), np.empty(len(drift))
+    level[0], variance[0] = drift[0], noise
+    for k in range(1, len(drift)):
+        ahead = variance[k - 1] + walk
+        gain = ahead / (ahead + noise)
+        level[k] = level[k - 1] + gain * (drift[k] - level[k - 1])
+        variance[k] = gain * noise
+    for k in range(len(drift) - 2, -1, -1):
+        level[k] += variance[k] / (variance[k] + walk) * (level[k + 1] - level[k])
+    return np.asarray(turned + level)
+
+
 def predicted_motion(
     predictor: Predictor,
     log: TrialLog,
@@ -117,6 +154,7 @@ def predicted_motion(
     *,
     heading: Literal["measured", "simulated"] = "measured",
     wind: Literal["smoothed", "measured"] = "smoothed",
+    course: Array | None = None,
 ) -> Motion:
     """Feed a predictor's own prediction back along a log's inputs.
 
@@ -130,6 +168,8 @@ def predicted_motion(
         (nx,) what zero-mean instruments leave to each equation of this log.
     heading, wind : str
         As in `build_instruments`.
+    course : ndarray, optional
+        (N−1,) heading [rad] in place of the measured one.
 
     Returns
     -------
@@ -140,6 +180,7 @@ def predicted_motion(
     marine = structure.disturbance == "marine"
     samples, nx = len(log) - 1, len(structure.states)
     psi = np.asarray(log["psi"][:-1], float) if marine else np.zeros(samples)
+    psi = psi if course is None else course
     tau = (
         log.forces(structure.inputs)[:-1]
         if marine

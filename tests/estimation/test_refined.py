@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.linalg import block_diag
+from statsmodels.tsa.statespace.structural import UnobservedComponents
 from virtual import virtual_log
 
 from greybox.errors import DivergenceError, ExcitationError, UsageError
@@ -22,12 +23,15 @@ from greybox.estimation.noise import (
 from greybox.estimation.refined import estimate_refined_iv, with_noise
 from greybox.estimation.white_rows import solve_white, spread_columns, white_rows
 from greybox.estimation.whitening import ErrorBand, ErrorNoise
+from greybox.model.catalogue import get_structure
 from greybox.model.model import model_from_dict
 from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import build_predictor
 from greybox.model.simulation import stationary_disturbance
-from greybox.regression.motion import predicted_motion
+from greybox.regression.motion import predicted_motion, smoothed_heading
 from greybox.regression.regression import build_regression
+from greybox.study.chapter6 import TRUE
+from greybox.study.efficiency import CASES, virtual_trial
 from greybox.validation.once import estimate_once
 from greybox.validation.request import Request
 
@@ -383,3 +387,53 @@ def test_intervals_cover_and_the_bound_is_reached(thesis, true_theta, basic, cor
     empirical = np.linalg.slogdet(np.cov(np.array(theta).T))[1] - shift
     efficiency = np.exp((np.linalg.slogdet(bound)[1] - empirical) / p)
     assert efficiency > 0.9 * (1 - 3 * np.sqrt(2 / (runs * p)))
+
+
+@pytest.mark.parametrize(("walk", "left"), [(0.0, 0.3), (2e-3, 0.75)])
+def test_a_heading_is_freed_of_its_noise_as_far_as_it_drifts(walk, left):
+    rng = np.random.default_rng(3)
+    rate = 0.02 * np.sin(np.arange(1500) / 40)
+    true = np.concatenate([[0.3], 0.3 + np.cumsum(rate[:-1] + walk * rng.standard_normal(1499))])
+    noise = 0.01 * rng.standard_normal(1500)
+    found = smoothed_heading(true + noise, rate, 1.0)
+    error = found - true
+    assert error.std() < left * noise.std()
+    # little of a sample's own noise is left in it
+    assert np.corrcoef(error, noise)[0, 1] < 0.6
+    # without noise, or on a short log, it is what was measured
+    np.testing.assert_array_equal(smoothed_heading(0.3 + 0 * rate, 0 * rate, 1.0), 0.3 + 0 * rate)
+    np.testing.assert_array_equal(smoothed_heading(true[:15], rate[:15], 1.0), true[:15])
+
+
+def test_the_smoothed_heading_equals_that_of_statsmodels():
+    rng = np.random.default_rng(8)
+    drift = np.cumsum(2e-3 * rng.standard_normal(400))
+    measured = drift + 0.01 * rng.standard_normal(400)
+    found = smoothed_heading(measured, np.zeros(400), 1.0)
+    change, grown = np.diff(measured), measured[20:] - measured[:-20]
+    noise = -np.mean(change[1:] * change[:-1])
+    walk = max((np.mean(grown**2) - 2 * noise) / 20, 1e-4 * noise)
+    model = UnobservedComponents(measured, "llevel", use_exact_diffuse=True)
+    expected = model.smooth([noise, walk]).smoothed_state[0]
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+@pytest.mark.long
+def test_a_measured_heading_is_no_instrument_for_itself():
+    """With its noise in the instruments `Ymu` was 0.6 of its standard error off."""
+    names = get_structure("thesis").parameters
+    structure = get_structure("thesis")
+    regime = (("u", (1,)), ("v", (1,)), ("r", (1, -1)))
+    predictor = build_predictor(structure, "wind", regime)
+    off = []
+    for k in range(40):
+        log = virtual_trial(np.random.default_rng([5, k]), CASES[0])
+        plain = estimate_iv(predictor, [log], wind="measured", judged=False)
+        found = estimate_refined_iv(predictor, [log], start=plain, wind="measured").model()
+        order = [found.names.index(n) for n in names]
+        true = np.array([TRUE[n] for n in names])
+        off.append((found.theta[order] - true) / found.std[order])
+    mean = np.mean(off, axis=0)
+    # means of 40 have a standard error of 0.16
+    assert np.abs(mean).max() < 0.16 * 3.5
+    assert abs(mean[names.index("Ymu")]) < 0.2 + 0.16 * 1.5
