@@ -15,6 +15,7 @@ from greybox.diagnosis.diagnose import diagnose
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.held_out import OtherLogs, Pair, proof_of
 from greybox.diagnosis.omnibus import disagreement
+from greybox.diagnosis.recursion import propagate
 from greybox.diagnosis.scores import MOMENTS
 from greybox.diagnosis.search import Step, _sure, judge
 from greybox.diagnosis.ship import LogRun
@@ -155,3 +156,9 @@ def test_a_current_beside_a_lag_stands_out_with_the_terms_that_it_frees() -> Non
     trial = draw(np.random.default_rng([46, 2]), ("current", "thruster_lag"), kind="pulses")
     found = diagnose([trial.estimation], validate=[trial.validation])
     assert {c.id for c in found.causes} == {"current", "thruster_lag"}
+
+
+def test_derivatives_that_no_number_holds_are_infinite() -> None:
+    found = propagate(np.full((5, 2, 2), np.nan), np.ones((5, 2, 3)), np.zeros((2, 3)))
+    assert found.shape == (6, 2, 3)
+    assert not np.isfinite(found[1:]).any()
