@@ -198,7 +198,8 @@ def estimate_refined_iv(
         A plain IV estimate of the same predictor and logs, or (p,) parameters of the
         structure where that one starts.
     heading, wind, margins, seed
-        As `estimate_iv`.
+        As `estimate_iv`; a measured heading is smoothed along the predicted yaw rate, so that
+        its noise does not stand in the instruments too.
     covariance : {"ma", "hac", "white", "bootstrap"}
         ``white`` believes the noise model, which is then as efficient as it says;
         the others allow for innovations that keep some colour.

@@ -114,36 +114,50 @@ def _slopes(predictor: Predictor) -> Vectorised:
 
 
 def smoothed_heading(measured: Array, yaw_rate: Array, sample_time: float) -> Array:
-    """Return a measured heading (N,) freed of its sensor's noise by a predicted yaw rate (N,).
+    """Free a measured heading of its sensor's noise by a predicted yaw rate.
 
-    The integral of the rate drifts from the truth slowly; a local-level smoother takes
+    The integral of the rate drifts from the truth slowly; the smoother of a local level takes
     the drift from the measurement, so hardly any of a sample's noise is left in it.
+
+    Parameters
+    ----------
+    measured : ndarray
+        (N,) [rad]
+    yaw_rate : ndarray
+        (N,) [rad/s]
+    sample_time : float
+        [s]
+
+    Returns
+    -------
+    ndarray
+        (N,) [rad]; `measured` itself where it is too short to tell noise from drift, or
+        has no noise.
 
     References
     ----------
-    Rauch, Tung and Striebel (1965); Durbin and Koopman (2012), section 2.4.
+    Durbin and Koopman (2012), section 2.4, with a diffuse start; Hodrick and Prescott (1997)
+    for the smoother as penalised least squares.
     """
+    from scipy.linalg import solveh_banded
+
     turned = np.concatenate([[0.0], np.cumsum(yaw_rate[:-1])]) * sample_time
     drift = measured - turned
     change = np.diff(drift)
     if len(change) <= _DRIFT or not np.isfinite(drift).all():
         return measured
     # differences of white noise are opposed to their neighbours; what grows with time drifts
-    noise = max(-float(np.mean(change[1:] * change[:-1])), 0.0)
+    noise = -float(np.mean(change[1:] * change[:-1]))
     if noise <= 0:
         return measured
     grown = drift[_DRIFT:] - drift[:-_DRIFT]
     walk = max((float(np.mean(grown**2)) - 2 * noise) / _DRIFT, _LEAST_WALK * noise)
-    level, variance = np.empty(len(drift)), np.empty(len(drift))
-    level[0], variance[0] = drift[0], noise
-    for k in range(1, len(drift)):
-        ahead = variance[k - 1] + walk
-        gain = ahead / (ahead + noise)
-        level[k] = level[k - 1] + gain * (drift[k] - level[k - 1])
-        variance[k] = gain * noise
-    for k in range(len(drift) - 2, -1, -1):
-        level[k] += variance[k] / (variance[k] + walk) * (level[k + 1] - level[k])
-    return np.asarray(turned + level)
+    # the least Σ (drift − level)² / noise + Σ (steps of the level)² / walk
+    stiff = noise / walk
+    band = np.full((2, len(drift)), -stiff)
+    band[1] = 1.0 + 2.0 * stiff
+    band[1, [0, -1]] -= stiff
+    return np.asarray(turned + solveh_banded(band, drift))
 
 
 def predicted_motion(
