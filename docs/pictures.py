@@ -26,8 +26,6 @@ FOLDER = Path(__file__).parent / "images"
 GREY, RED, BLUE = "#555555", "#b2182b", "#2166ac"
 UNITS = {"u": "m/s", "v": "m/s", "r": "rad/s"}
 STRUCTURE = gb.get_structure("thesis")
-# forces that push to starboard and turn, per second: what the asymmetry is shown with
-LOPSIDED = {"Y_0": 0.03, "N_0": 0.0012}
 
 
 def change(values):
@@ -66,22 +64,13 @@ CAUSES = {
 def afflicted(cause, seed):
     """Return a trial's log, the free run (N, 3) of the model without the cause, and its size."""
     options = {"kind": "manoeuvres", "samples": 900, "anemometer": cause == "wind"}
-    effects = () if cause == "asymmetry" else (cause,)
-    trial = draw(np.random.default_rng(seed), effects, **options)
+    trial = draw(np.random.default_rng(seed), (cause,), **options)
     theta = np.array([trial.ship[n] for n in STRUCTURE.parameters])
     model = gb.ManoeuvringModel(
         STRUCTURE, theta, np.zeros((theta.size,) * 2), 1.0, trial.vessel, integrator="rk4"
     )
     log = trial.estimation
-    told = dict(trial.truth[0].parameters) if trial.truth else LOPSIDED
-    if cause == "asymmetry":
-        extended = STRUCTURE.with_terms(*LOPSIDED)
-        both = np.append(theta, list(LOPSIDED.values()))
-        ship = replace(model, structure=extended, theta=both, covariance=np.zeros((20, 20)))
-        run = gb.run_model(ship, log, heading="simulated")
-        noisy = run.x + 0.014 * np.random.default_rng(seed).standard_normal(run.x.shape)
-        channels = dict(log.channels) | dict(zip("uvr", noisy.T, strict=True)) | {"psi": run.psi}
-        log = replace(log, channels=channels)
+    told = dict(trial.truth[0].parameters)
     still = {k: x for k, x in log.channels.items() if k not in ("u_q", "v_q")}
     return log, gb.run_model(model, replace(log, channels=still)).x, told
 

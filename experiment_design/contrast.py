@@ -19,6 +19,7 @@ from scipy.linalg import solve_discrete_are
 
 from experiment_design.rollout import Rollout, step_expression
 from experiment_design.schedule import Schedule
+from greybox.model.functions import accumulate
 from greybox.model.noise import NoiseLevels
 
 Array = NDArray[np.float64]
@@ -168,7 +169,7 @@ class Pair:
             {"cse": True},
         )
         n = self.samples
-        run = step.mapaccum("run", n)
+        run = accumulate(step, n)
         mx = ca.MX.sym("commands", commands.numel(), n)
         parameters = ca.MX.sym("theta", sum(t.numel() for t in theta))
         start = np.concatenate(

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from greybox.commands.common import add_logs, add_seed, positive, provenance, read_logs, say
 from greybox.commands.terminal import activity
+from greybox.one_thread import one_thread
 
 if TYPE_CHECKING:
     from greybox.diagnosis.result import Diagnosis
@@ -56,17 +57,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_seed(parser)
 
 
+@one_thread
 def run(options: argparse.Namespace) -> None:
     """Read, diagnose, report, write."""
-    import scipy.linalg  # noqa: F401
-    from threadpoolctl import threadpool_limits
-
-    # matrices are small: threads would only wait for one another; loaded libraries can be told so
-    with threadpool_limits(1):
-        _run(options)
-
-
-def _run(options: argparse.Namespace) -> None:
     from greybox.diagnosis.diagnose import DiagnosisOptions, diagnose
     from greybox.files import check_targets, write_json
     from greybox.model.catalogue import get_structure

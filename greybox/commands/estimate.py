@@ -15,6 +15,7 @@ from greybox.commands.common import (
     read_logs,
     say,
 )
+from greybox.one_thread import one_thread
 
 if TYPE_CHECKING:
     from greybox.trial.log import TrialLog
@@ -246,17 +247,9 @@ def _choose(
     )
 
 
+@one_thread
 def run(options: argparse.Namespace) -> None:
     """Read, estimate, report, write."""
-    import scipy.linalg  # noqa: F401
-    from threadpoolctl import threadpool_limits
-
-    # matrices are small: threads would only wait for one another; loaded libraries can be told so
-    with threadpool_limits(1):
-        _run(options)
-
-
-def _run(options: argparse.Namespace) -> None:
     from greybox.estimation.output_error import OutputErrorOptions
     from greybox.files import check_targets, write_json
     from greybox.model.catalogue import get_structure

@@ -17,6 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cholesky, solve_discrete_are, solve_triangular
 
+from greybox.model.functions import accumulate
+
 Array = NDArray[np.float64]
 
 # share of an error that is left after a sample, beyond which it does not tell from a drift
@@ -187,7 +189,7 @@ def _likelihood(k: int, blocks: int) -> ca.Function:
         cov = a @ cov @ a.T + q
         now = ca.vertcat(a @ z, ca.vec((cov + cov.T) / 2), total)
     step = ca.Function("step", [state, data, constants], [ca.densify(now)], {"cse": True})
-    run = step.mapaccum("run", blocks)
+    run = accumulate(step, blocks)
     first = ca.SX.zeros(n + n * n + 1)
     first[n + n * n - 1] = force
     begin = ca.Function("begin", [constants], [ca.densify(first)])

@@ -15,32 +15,29 @@ from numpy.typing import NDArray
 
 from greybox.diagnosis.atom import Atom
 from greybox.diagnosis.base import Case
-from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.held_out import HeldOut, Proof, proof_of
-from greybox.diagnosis.noise import SEEN
 from greybox.diagnosis.point import Fit
+from greybox.diagnosis.refitting import (
+    FIRST,
+    SETTLE,
+    likelier,
+    polished,
+    refit,
+    seen_as_slow,
+    shortlist,
+    slow,
+)
 from greybox.diagnosis.scores import MOMENTS, Directions, Score, score_atoms
 from greybox.model.functions import Integrator
 
 Array = NDArray[np.float64]
 
-# atoms that are refitted at a step, and promised fall of −2 log L below which none is
-_SHORTLIST, _LEAST_GAIN = 7, 9.0
-# share of the best promise from which on an atom is worth a refit
-_PROMISING = 0.04
-# errors that are seen and remembered for more samples than this may be a cause's; they are
-# then looked at with so short a memory, so many causes more tried
-_SLOW, _FORGOTTEN, _SECOND = 30.0, 3.0, 4
-# iterations of a refit before its noise is settled
-_FIRST = 12
 MOST_CAUSES = 4
 # coefficients that are positive where thrusters push as the vessel file says, and the
 # price of a negative one in numbers
 _THRUST, _BACKWARDS = ("Xmu", "Ymu", "Nmu"), 3
 # other causes that are tried in the place of one of several
 _INSTEAD = 2
-# rounds of noise and fit for a cause that was taken
-_SETTLE = 4
 # significance after correction, of a cause and of its effect on held-out logs
 SIGNIFICANT, PROVEN = 0.01, 0.05
 # fall of −2 log L, a measured number, from which on a cause matters
@@ -154,25 +151,6 @@ def _dof(atom: Atom) -> int:
     return max(len(atom.parameters), 1)
 
 
-def refit(problem: Problem, fit: Fit, score: Score) -> Fit:
-    """Return the fit with one more atom, its noise settled."""
-    point = problem.add(fit.point, score.atom, score.value if len(score.value) else None)
-    first = problem.fit(point, fit.noise, most=_FIRST)
-    return problem.settle(problem.scan(first, score.atom), 1)
-
-
-def shortlist(scores: Sequence[Score]) -> list[Score]:
-    """Return the atoms worth a refit."""
-    best = scores[0].gain if scores else 0.0
-    worth = [s for s in scores if s.gain > max(_LEAST_GAIN, _PROMISING * best)]
-    # several moments and variants of one kind must not crowd out the other kinds
-    out: list[Score] = []
-    for score in worth:
-        if sum(s.atom.cause == score.atom.cause for s in out) < 3 and len(out) < _SHORTLIST:
-            out.append(score)
-    return out
-
-
 def search(
     case: Case,
     base: Fit,
@@ -213,7 +191,7 @@ def search(
         causes = [*causes, step.taken]
         fit, causes = _backward(case, step.taken.fit, causes, len(atoms))
         # what a better noise would gain must not count for the next cause
-        fit = case.problem(fit.integrator).settle(fit, _SETTLE)
+        fit = case.problem(fit.integrator).settle(fit, SETTLE)
     return Search(base, fit, tuple(steps), tuple(causes), len(atoms))
 
 
@@ -224,8 +202,8 @@ def take_step(case: Case, fit: Fit, causes: Sequence[Candidate], atoms: Sequence
     near = [a for a in left if not a.afresh]
     scores = score_atoms(Directions(problem, fit), near)
     fits = [(s.atom, refit(problem, fit, s)) for s in shortlist(scores)]
-    if _slow(fit):
-        fits = _likelier(fits, _seen_as_slow(problem, fit, near))
+    if slow(fit):
+        fits = likelier(fits, seen_as_slow(problem, fit, near))
     if not causes:
         fits += case.rewired(fit, left)
     candidates = sorted(
@@ -235,61 +213,11 @@ def take_step(case: Case, fit: Fit, causes: Sequence[Candidate], atoms: Sequence
     sure = (_sure(case, c) for c in candidates if c.holds)
     taken = next((c for c in sure if c.holds), None)
     if taken is not None:
-        # what the noise had taken for its own until now would pass for more causes
-        settled = problem if taken.fit.integrator == fit.integrator else case.problem(
-            taken.fit.integrator
-        )  # fmt: skip
-        better = _loosened(settled, settled.settle(taken.fit, _SETTLE))
-        if not any(a.afresh for a in better.point.atoms):
-            better = case.anew(better)
-        better = case.likeliest_variant(case.other_integrator(better), taken.atom)
-        # what a sample holds decides how it is best stepped, too
-        better = case.other_integrator(better)
-        # with errors as small as they are now, its hills are steeper
-        better = case.problem(better.integrator).scan(better, taken.atom)
+        better = polished(case, taken.fit, taken.atom)
         taken = _sure(case, replace(taken, fit=better))
         if not taken.holds:
             taken = None
     return Step(fit, tuple(scores), tuple(candidates), taken)
-
-
-def _slow(fit: Fit) -> bool:
-    """Whether the errors' own colour could be a cause's: slow, and larger than the sensors'."""
-    return any(g.remembered > _SLOW and g.share > SEEN for g in fit.noise.groups)
-
-
-def _loosened(problem: Problem, fit: Fit) -> Fit:
-    """Return the likelier of a fit and of one that began with errors that forget.
-
-    Where the colour holds slow errors for its own, coefficients stay where they are.
-    """
-    if fit.escaped or not _slow(fit):
-        return fit
-    plain = problem.forgetful(fit, _FORGOTTEN)
-    found = problem.settle(problem.fit(fit.point, plain.noise), _SETTLE)
-    return found if found.cost < fit.cost else fit
-
-
-def _seen_as_slow(problem: Problem, fit: Fit, atoms: Sequence[Atom]) -> list[tuple[Atom, Fit]]:
-    """Return refits that begin with errors that forget, judged with their likeliest colour.
-
-    A force with a long memory imitates most causes; where it was taken for one, what
-    a cause promises is hidden, and its search ends where it began.
-    """
-    plain = problem.forgetful(fit, _FORGOTTEN)
-    promising = shortlist(score_atoms(Directions(problem, plain), atoms))
-    return [(s.atom, refit(problem, plain, s)) for s in promising[:_SECOND]]
-
-
-def _likelier(
-    fits: Sequence[tuple[Atom, Fit]], others: Sequence[tuple[Atom, Fit]]
-) -> list[tuple[Atom, Fit]]:
-    """Return the likeliest fit of each atom."""
-    best: dict[str, tuple[Atom, Fit]] = {}
-    for atom, fit in (*fits, *others):
-        if atom.key not in best or fit.cost < best[atom.key][1].cost:
-            best[atom.key] = (atom, fit)
-    return list(best.values())
 
 
 def _sure(case: Case, candidate: Candidate) -> Candidate:
@@ -372,7 +300,7 @@ def _backward(
     problem, held_out = case.problem(fit.integrator), case.held_out(fit.integrator)
     for cause in causes[:-1]:
         without = problem.settle(
-            problem.fit(problem.drop(fit.point, cause.atom), fit.noise, most=_FIRST), 2
+            problem.fit(problem.drop(fit.point, cause.atom), fit.noise, most=FIRST), 2
         )
         if not judge(held_out, without, fit, cause.atom, tried).holds:
             fit = without
@@ -386,7 +314,7 @@ def instead(
     """Return one of several causes, and others in its place, all beside the remaining causes."""
     problem, held_out = case.problem(fit.integrator), case.held_out(fit.integrator)
     rest = problem.drop(fit.point, best.atom)
-    without = problem.settle(problem.fit(rest, fit.noise, most=_FIRST), 1)
+    without = problem.settle(problem.fit(rest, fit.noise, most=FIRST), 1)
     out = []
     for other in others[:_INSTEAD]:
         k = [a.key for a in other.fit.point.atoms].index(other.atom.key)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.diagnosis.linear import Linear, slopes_of
-from greybox.model.functions import Integrator, bind, step_function
+from greybox.model.functions import Integrator, accumulate, bind, step_function
 from greybox.model.structure import Structure
 
 Array = NDArray[np.float64]
@@ -45,7 +45,7 @@ def _run(
         x = step(x, w[:, k])
         states.append(x)
     several = ca.Function("steps", [x0, w], [x, ca.horzcat(*states)])
-    return several.mapaccum("run", blocks, [0], [0])
+    return accumulate(several, blocks)
 
 
 class Simulator:

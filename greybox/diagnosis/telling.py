@@ -123,7 +123,7 @@ class Report:
         after = self.model(found.final, record) if found.causes else before
         alternatives = {c.atom.cause: self.model(c.fit, record) for c in members}
         shown = [self.cause(c, found.final, tried) for c in named]
-        gain, runs, after = self._gain(before, after, validate, held.pairs(found.final))
+        gain, runs, after = self.gain(before, after, validate, held.pairs(found.final))
         notes = self._notes(after)
         verdict = ruling.verdict
         if found.causes and sum(g.after - g.before for g in gain.values()) < 0:
@@ -133,7 +133,7 @@ class Report:
                 f"{helped} made the held-out errors likelier but the free run no better, so the "
                 f"model was not extended."
             )
-            gain, runs, after = self._gain(before, before, validate, held.pairs(found.base))
+            gain, runs, after = self.gain(before, before, validate, held.pairs(found.base))
             verdict = "unexplained"
         unexplained = verdict == "unexplained"
         problem = case.problem(found.base.integrator)
@@ -180,13 +180,14 @@ class Report:
                 out.append([best, *like])
         return out
 
-    def _gain(
+    def gain(
         self,
         before: ManoeuvringModel,
         after: ManoeuvringModel,
         validate: Sequence[TrialLog],
         pairs: Sequence[Pair],
     ) -> tuple[dict[str, Gain], list[Runs], ManoeuvringModel]:
+        """Return the gain on what is held out, all runs, and the model as those logs saw it."""
         logs = list(validate)
         if logs:
             after = _likelier_story(after, logs)

@@ -20,6 +20,7 @@ from greybox.estimation.disturbance import estimate_current
 from greybox.estimation.moments import Solution, solve_stacked
 from greybox.estimation.result import Estimate
 from greybox.model.predictor import Predictor
+from greybox.one_thread import one_thread
 from greybox.regression.instruments import Instruments, build_instruments
 from greybox.regression.regression import Regression, build_regression
 from greybox.trial.log import TrialLog
@@ -45,6 +46,7 @@ class UnexcitedBiasError(ExcitationError):
         self.column = column
 
 
+@one_thread
 def estimate_ls(
     predictor: Predictor,
     logs: Sequence[TrialLog],
@@ -108,6 +110,7 @@ def estimate_ls(
     )
 
 
+@one_thread
 def estimate_iv(
     predictor: Predictor,
     logs: Sequence[TrialLog],

@@ -23,6 +23,8 @@ _BESIDE = 0.1
 _GRID = (3e-3, 1.0, 12)
 # samples of each log that noise levels are sought in
 _NOISE_SAMPLES = 1500
+# what −log L rises by where a level has no weight left
+_UNLIKELY = 25.0
 # least noise of an output, in its weight of the fit
 _LEAST = 1e-9
 
@@ -86,12 +88,16 @@ def mean_variance(
     from scipy.interpolate import PchipInterpolator
 
     steps = np.unique(np.append(unit * np.geomspace(*_GRID), np.sqrt(noise[i])))
-    loss = []
+    loss: list[float] = []
     for step in steps:
         trial = noise.copy()
         trial[i] = step**2
         r, levels = runs.filtered(p, nodes, trial)
         loss.append((float((r**2).sum()) + float(levels.sum())) / 2)
+        if step > np.sqrt(noise[i]) and loss[-1] > min(loss) + _UNLIKELY:
+            # larger ones are less likely still
+            break
+    steps = steps[: len(loss)]
     fine = np.geomspace(steps[0], steps[-1], 400)
     values = np.array(loss)
     values = np.where(np.isfinite(values), values, np.nanmax(values[np.isfinite(values)]))

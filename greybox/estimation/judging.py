@@ -19,6 +19,7 @@ from greybox.estimation.output_error import one_step_errors
 from greybox.estimation.output_setup import measured, output_model
 from greybox.estimation.result import Estimate, TestResult, Verdict
 from greybox.model.predictor import Predictor, build_predictor
+from greybox.one_thread import one_thread
 from greybox.regression.instruments import build_instruments
 from greybox.regression.regression import Regression, build_regression
 from greybox.trial.log import TrialLog
@@ -26,6 +27,7 @@ from greybox.trial.log import TrialLog
 Array = NDArray[np.float64]
 
 
+@one_thread
 def judge_estimate(
     estimate: Estimate,
     logs: Sequence[TrialLog],

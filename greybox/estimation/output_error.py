@@ -42,6 +42,7 @@ from greybox.model.disturbances import CURRENT, WIND
 from greybox.model.noise import NoiseLevels
 from greybox.model.output import OutputModel, Role, Simulator
 from greybox.model.predictor import Predictor
+from greybox.one_thread import one_thread
 from greybox.regression.regression import common_sample_time
 from greybox.trial.log import TrialLog
 from greybox.trial.ranges import ranges
@@ -118,6 +119,7 @@ class OutputErrorOptions:
     search: bool = True
 
 
+@one_thread
 def estimate_oe(
     predictor: Predictor,
     logs: Sequence[TrialLog],

@@ -38,6 +38,7 @@ from greybox.estimation.white_rows import (
 )
 from greybox.estimation.whitening import ErrorBand
 from greybox.model.predictor import Predictor
+from greybox.one_thread import one_thread
 from greybox.regression.motion import Motion, further_channels, predicted_motion, smoothed_heading
 from greybox.regression.regression import Regression, build_regression, within_margins
 from greybox.trial.log import TrialLog
@@ -171,6 +172,7 @@ class _Refinement:
         )
 
 
+@one_thread
 def estimate_refined_iv(
     predictor: Predictor,
     logs: Sequence[TrialLog],

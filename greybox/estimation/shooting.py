@@ -156,16 +156,22 @@ class FreeRuns:
         (ny,) noise of each output.
     """
 
-    def __init__(self, model: OutputModel, segments: Segments, sigma: Array) -> None:
+    def __init__(
+        self,
+        model: OutputModel,
+        segments: Segments,
+        sigma: Array,
+        simulator: Simulator | None = None,
+    ) -> None:
         self.model = model
         self.segments = segments
         self.sigma = sigma
-        self._simulator = Simulator(model, segments.w)
+        self._simulator = Simulator(model, segments.w) if simulator is None else simulator
         self._bound = _ESCAPED * np.abs(segments.y).max(axis=(0, 1), initial=0.0) + _ESCAPED * sigma
 
     def with_sigma(self, sigma: Array) -> FreeRuns:
         """Return the same runs with other weights."""
-        return FreeRuns(self.model, self.segments, sigma)
+        return FreeRuns(self.model, self.segments, sigma, self._simulator)
 
     def _weighted(self, y: Array) -> Array:
         use = self.segments.use[..., None] > 0
@@ -178,7 +184,7 @@ class FreeRuns:
         """Return residuals and derivatives at parameters (q,) and starts (M, nz)."""
         y, rows, end, slope = self._simulator.sensitivities(nodes, p)
         with np.errstate(over="ignore", invalid="ignore"):
-            used = np.divide(rows, self.sigma, out=rows)
+            used = rows / self.sigma
             if not self.segments.use.all():
                 used[self.segments.use == 0] = 0.0
         runs, _, columns, _ = used.shape

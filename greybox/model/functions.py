@@ -10,7 +10,8 @@ mapaccum of the step.) NumPy buffers go in and out without conversion.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal
@@ -27,6 +28,8 @@ Integrator = Literal["euler", "rk4"]
 Heading = Literal["measured", "simulated"]
 
 _UNROLLED = 25
+# steps in the inner of two nested loops at least
+_LEAST_BASE = 10
 # from so many runs on the form over runs is the faster one
 MANY_RUNS = 24
 # steps of that form in one call, so that the call itself costs little
@@ -198,6 +201,26 @@ def _unrolled(
     )
 
 
+def accumulate(
+    step: ca.Function, count: int, carried: Sequence[int] = (0,), name: str = "run"
+) -> ca.Function:
+    """Return a step taken many times, as two nested loops of about equal length.
+
+    No other nesting is built in less time, nor run in less.
+
+    Parameters
+    ----------
+    step : casadi.Function
+    count : int
+        How often.
+    carried : sequence of int
+        Arguments that a step hands to the next one, first among its results too.
+    name : str
+    """
+    base = max(_LEAST_BASE, math.isqrt(max(count - 1, 0)) + 1)
+    return step.mapaccum(name, count, list(carried), list(range(len(carried))), {"base": base})
+
+
 @lru_cache(maxsize=32)
 def _free_run(
     structure: Structure,
@@ -206,7 +229,7 @@ def _free_run(
     runs: int,
 ) -> ca.Function:
     steps = _unrolled(structure, variant)
-    run = steps.mapaccum("run", blocks, [0], [0])
+    run = accumulate(steps, blocks)
     x0 = ca.MX.sym("x0", steps.size1_in(0))
     w = ca.MX.sym("w", steps.size1_in(1), blocks * _UNROLLED)
     theta = ca.MX.sym("theta", steps.size1_in(2))

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from greybox.errors import StructureError
 from greybox.model.disturbances import CURRENT, WIND, rotate_to_body
-from greybox.model.functions import bind
+from greybox.model.functions import accumulate, bind
 from greybox.model.predictor import Column, Predictor
 
 Array = NDArray[np.float64]
@@ -192,7 +192,7 @@ def _over(step: ca.Function, carried: int, steps: int, runs: int) -> ca.Function
     Arguments are the carried ones, then one that changes with the sample, then
     constants.
     """
-    accumulated = step.mapaccum("run", steps, list(range(carried)), list(range(carried)))
+    accumulated = accumulate(step, steps, range(carried))
     given = [
         ca.MX.sym(f"a{i}", step.size1_in(i), step.size2_in(i) * (steps if i == carried else 1))
         for i in range(step.n_in())
@@ -299,6 +299,7 @@ class Simulator:
         self.nz, self.ny = len(model.states), len(model.outputs)
         self.q = len(model.parameters)
         self._w = np.ascontiguousarray(w, float)
+        self._last: tuple[Array, Array, tuple[Array, Array, Array, Array]] | None = None
 
     def __call__(self, z0: Array, p: Array) -> tuple[Array, Array]:
         """Return outputs (M, m, ny) and the states after the last step (M, nz)."""
@@ -319,10 +320,17 @@ class Simulator:
         -------
         tuple of ndarray
             Outputs (M, m, ny); their derivatives (M, m, q + nz, ny); states after
-            the last step (M, nz) and their derivatives (M, q + nz, nz).
+            the last step (M, nz) and their derivatives (M, q + nz, nz). Not to be written
+            to: the latest are kept, for the same point is asked for with other weights.
         """
-        end, slope, y, rows = self._call(z0, p, sensitivities=True)
-        return y, rows, end[:, -1], slope[:, -1]
+        last = self._last
+        if last is None or not (np.array_equal(last[0], z0) and np.array_equal(last[1], p)):
+            end, slope, y, rows = self._call(z0, p, sensitivities=True)
+            last = (z0.copy(), p.copy(), (y, rows, end[:, -1], slope[:, -1]))
+            for part in last[2]:
+                part.flags.writeable = False
+            self._last = last
+        return last[2]
 
     def _call(
         self, z0: Array, p: Array, *, sensitivities: bool

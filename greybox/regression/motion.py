@@ -16,6 +16,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.model.functions import accumulate
 from greybox.model.predictor import Predictor
 from greybox.regression.instruments import initial_state, smoothed_wind, state_bound
 from greybox.trial.log import TrialLog
@@ -85,7 +86,7 @@ def _step(predictor: Predictor, samples: int, heading: str, relative: bool) -> c
         [ca.vertcat(after, own + turn)],
         {"cse": True},
     )
-    return one.mapaccum("motion", samples, [0], [0])
+    return accumulate(one, samples, name="motion")
 
 
 def predicted(predictor: Predictor, coefficients: ca.SX) -> list[ca.SX]:

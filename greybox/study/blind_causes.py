@@ -172,6 +172,15 @@ def _relative(*names: str) -> Draw:
     return draw
 
 
+def _aside(rng: np.random.Generator, size: float, typical: Typical) -> dict[str, Value]:
+    # shares of what damps the sway and the turn
+    side, turn = (size * _signed(rng, 0.1, 0.3) for _ in range(2))
+    return {
+        "Y_0": side * typical.value("Yv") * typical.v,
+        "N_0": turn * typical.value("Nr") * typical.r,
+    }
+
+
 def _with_terms(ship: Ship, effect: Effect, later: bool) -> Ship:
     return replace(ship, extra=tuple(float(effect.parameters.get(n, 0.0)) for n in EXTRA))
 
@@ -232,6 +241,7 @@ CAUSES: dict[str, Kind] = {
     "cubic_damping": Kind(_relative("X_uuu", "Y_vvv", "N_rrr"), _with_terms),
     "quadratic_yaw_damping": Kind(_relative("N_|r|r"), _with_terms),
     "crossflow": Kind(_relative("Y_|r|r", "Y_|r|v", "N_|r|v"), _with_terms),
+    "asymmetry": Kind(_aside, _with_terms),
     "heading_bias": Kind(_heading_bias),
     "lever_arm": Kind(_lever_arm),
     "angle_offset": Kind(_angle_offset),

@@ -58,8 +58,8 @@ def _swelled(ship: Ship, effect: Effect, later: bool) -> Ship:
     return replace(ship, swell=(amplitude, period, towards, phase))
 
 
-def _lopsided(ship: Ship, effect: Effect, later: bool) -> Ship:
-    return replace(ship, asymmetry=effect.number("asymmetry"))
+def _uneven(ship: Ship, effect: Effect, later: bool) -> Ship:
+    return replace(ship, unevenness=effect.number("unevenness"))
 
 
 def _shallow(rng: np.random.Generator, size: float, typical: Typical) -> dict[str, Value]:
@@ -81,16 +81,18 @@ UNKNOWN: dict[str, Kind] = {
     "interaction": Kind(_interaction, _in_race),
     "backlash": Kind(_backlash, _slack),
     "slow_force": Kind(_slow_force, _swelled),
-    "asymmetry": Kind(uniform("asymmetry", 0.5, 1.5), _lopsided),
+    "uneven_damping": Kind(uniform("unevenness", 0.5, 1.5), _uneven),
     "shallow": Kind(_shallow, _over_shoal),
 }
 EFFECTS = CAUSES | UNKNOWN
+# those that add terms to the equations, so that several may stand together
+_TERMS = ("cubic_damping", "quadratic_yaw_damping", "crossflow", "asymmetry")
 
 
 def shows(name: str, kind: str) -> bool:
     """Return whether an effect can show in trials of a kind of inputs."""
     # pulses push to starboard only: sway never changes its sign
-    return not (name == "asymmetry" and kind == "pulses")
+    return not (name == "uneven_damping" and kind == "pulses")
 
 
 def check_effects(ids: tuple[str, ...], kind: str) -> None:
@@ -109,7 +111,7 @@ def check_effects(ids: tuple[str, ...], kind: str) -> None:
             )
     if not all(shows(name, kind) for name in ids):
         raise UsageError(
-            "asymmetry needs sway to both sides, and pulses push to starboard only: draw "
+            "uneven_damping needs sway to both sides, and pulses push to starboard only: draw "
             "manoeuvres or zigzag."
         )
     if len(set(ids)) < len(ids):
@@ -126,7 +128,7 @@ def act(ship: Ship, effects: tuple[Effect, ...], *, later: bool) -> Ship:
     """Return the ship under the effects; `later` on a trial after they came to stay."""
     for effect in effects:
         changed = EFFECTS[effect.id].act(ship, effect, later)
-        if effect.id in ("cubic_damping", "quadratic_yaw_damping", "crossflow"):
+        if effect.id in _TERMS:
             both = tuple(a + b for a, b in zip(ship.extra, changed.extra, strict=True))
             changed = replace(changed, extra=both)
         ship = changed

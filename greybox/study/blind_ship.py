@@ -21,7 +21,9 @@ NAMES = (
     "Xu", "Xvr", "Xuu", "Wuu", "Xmu", "Xkappa", "Yv", "Yur", "Yvv", "Yvr", "Wvv", "Ymu",
     "Nr", "Nuv", "Nvv", "Nvr", "Wuv", "Nmu",
 )  # fmt: skip
-EXTRA = ("X_uuu", "Y_vvv", "N_rrr", "N_|r|r", "Y_|r|r", "Y_|r|v", "N_|r|v")
+EXTRA = (
+    "X_uuu", "Y_vvv", "N_rrr", "N_|r|r", "Y_|r|r", "Y_|r|v", "N_|r|v", "Y_0", "N_0",
+)  # fmt: skip
 STEP = 0.1
 # seconds that a ship runs before its log begins: late sensors and commands have a past
 LEAD = 10
@@ -48,7 +50,7 @@ class Ship:
     current : (float, float)
         North and east [m/s].
     extra : tuple of float
-        (7,) coefficients of `EXTRA`.
+        (9,) coefficients of `EXTRA`.
     gain : (float, float)
         Of each thruster.
     speed_lag, force_lag, delay : float
@@ -65,7 +67,7 @@ class Ship:
         Largest loss of thruster 2, centre and width of the angles of thruster 1 [rad].
     backlash : float
         Half the play of the azimuths [rad].
-    asymmetry : float
+    unevenness : float
         Share by which sway damping is larger to starboard.
     shallow : (float, float)
         Coefficient of (|u| − u0)² and u0 [m/s].
@@ -91,7 +93,7 @@ class Ship:
     dead_band: float = 0.0
     interaction: tuple[float, float, float] = (0.0, 0.0, 1.0)
     backlash: float = 0.0
-    asymmetry: float = 0.0
+    unevenness: float = 0.0
     shallow: tuple[float, float] = (0.0, 0.0)
     swell: tuple[float, float, float, float] = (0.0, 1.0, 0.0, 0.0)
 
@@ -139,12 +141,11 @@ class _Fleet:
         self.reference, self.advance = stack("reference"), stack("advance")
         self.change, self.dead_band = stack("change"), stack("dead_band")
         self.interaction, self.backlash = stack("interaction"), stack("backlash")
-        self.asymmetry, self.shallow, self.swell = (
-            stack("asymmetry"), stack("shallow"), stack("swell")
+        self.unevenness, self.shallow, self.swell = (
+            stack("unevenness"), stack("shallow"), stack("swell")
         )  # fmt: skip
-        self.peculiar = bool(
-            self.extra.any() or self.asymmetry.any() or self.shallow[0].any() or self.swell[0].any()
-        )
+        own = (self.extra, self.unevenness, self.shallow[0], self.swell[0])
+        self.peculiar = any(part.any() for part in own)
 
     def decay(self, lag: Array, step: float) -> Array:
         """Return what remains of a lagged value at the start, middle and end of a step."""
@@ -193,9 +194,9 @@ class _Fleet:
             push = self.swell[0] * np.cos(2 * np.pi * t / self.swell[1] + self.swell[3])
             du += e[0] * ur**3 + self.shallow[0] * beyond**2 * np.sign(ur)
             du += push * np.cos(self.swell[2] - psi)
-            dv += e[1] * vr**3 + e[4] * turn * r + e[5] * turn * vr
-            dv += self.asymmetry * Yv * np.maximum(vr, 0.0) + push * np.sin(self.swell[2] - psi)
-            dr += e[2] * r**3 + e[3] * turn * r + e[6] * turn * vr
+            dv += e[1] * vr**3 + e[4] * turn * r + e[5] * turn * vr + e[7]
+            dv += self.unevenness * Yv * np.maximum(vr, 0.0) + push * np.sin(self.swell[2] - psi)
+            dr += e[2] * r**3 + e[3] * turn * r + e[6] * turn * vr + e[8]
         return np.array([du, dv, dr, r])
 
 

@@ -15,6 +15,7 @@ from functools import partial
 import numpy as np
 
 from greybox.diagnosis.diagnose import diagnose
+from greybox.diagnosis.given import fit_given
 from greybox.errors import GreyboxError, UsageError
 from greybox.study.blind import Order, Trial, draw_many
 from greybox.study.blind_causes import CAUSES, Effect
@@ -26,6 +27,8 @@ from greybox.study.tables import Row
 ANSWERS = ("detected", "right", "group", "part", "wrong", "unexplained", "none", "failed")
 VERDICTS = ("named", "none", "confused", "unexplained")
 SINGLE = tuple((name,) for name in (*CAUSES, *UNKNOWN))
+# share of the free-run errors from which on an effect has to be found
+LEAST_FALL = 0.05
 # ships sailed side by side: enough to hide the cost of a step, few enough to share the work
 _PIECE = 32
 
@@ -54,7 +57,30 @@ class Judgement:
     gain: Mapping[str, float] = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
+class Oracle:
+    """What a model with the true causes, estimated on the same log, would make of a trial.
+
+    Parameters
+    ----------
+    fall : float
+        Share by which they lower the squared free-run errors of the estimation log, each
+        state in its sensor's variance.
+    gain : mapping of str to float
+        Fit (6.12) on the validation log after less before [%]: u, v, r.
+    """
+
+    fall: float
+    gain: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def matters(self) -> bool:
+        """Whether the effects lower the errors by as much as a diagnosis has to see."""
+        return self.fall >= LEAST_FALL
+
+
 Judge = Callable[[Trial], Judgement]
+Knows = Callable[[Trial], Oracle]
 
 
 def judge_by_diagnosis(trial: Trial) -> Judgement:
@@ -67,6 +93,13 @@ def judge_by_diagnosis(trial: Trial) -> Judgement:
         {name: (q.value, q.std) for c in found.causes for name, q in c.parameters.items()},
         {state: g.after - g.before for state, g in found.gain.items()},
     )
+
+
+def oracle_by_fit(trial: Trial) -> Oracle:
+    """Fit the causes that act to the estimation log, and measure them on the other."""
+    ids = [e.id for e in trial.truth]
+    given = fit_given([trial.estimation], ids, validate=[trial.validation])
+    return Oracle(given.fall, {state: g.after - g.before for state, g in given.gain.items()})
 
 
 @dataclass(frozen=True)
@@ -96,6 +129,8 @@ class Outcome:
         None where the judge failed.
     failure : str
         Its message.
+    oracle : Oracle or None
+        None where it was not asked, or where the effects have no name.
     """
 
     cell: Cell
@@ -103,6 +138,7 @@ class Outcome:
     truth: tuple[Effect, ...]
     judgement: Judgement | None
     failure: str = ""
+    oracle: Oracle | None = None
 
     @property
     def detected(self) -> bool:
@@ -229,6 +265,18 @@ class Power:
                     out.setdefault(name, []).append(value)
         return out
 
+    def lost(self, cell: Cell) -> list[float]:
+        """Return the fit lost against the oracle's model where causes were named [%].
+
+        Of each trial the state that loses most; negative where every state gains.
+        """
+        out = []
+        for o in self.of(cell):
+            if o.oracle is not None and o.judgement is not None and o.judgement.ids:
+                gain = o.judgement.gain
+                out.append(max(o.oracle.gain[s] - gain[s] for s in o.oracle.gain))
+        return out
+
     def rows(self) -> list[Row]:
         """Return shares with their binomial standard errors, confusion, errors and gains."""
         rows = []
@@ -268,7 +316,11 @@ def _moments(values: Sequence[float]) -> tuple[float, float]:
 
 
 def _piece(
-    piece: Sequence[tuple[Cell, int]], judge: Judge, seed: int, conditions: Conditions
+    piece: Sequence[tuple[Cell, int]],
+    judge: Judge,
+    oracle: Knows | None,
+    seed: int,
+    conditions: Conditions,
 ) -> list[Outcome]:
     rngs, orders = [], []
     for cell, run in piece:
@@ -277,9 +329,14 @@ def _piece(
         rngs.append(np.random.default_rng([seed, key, run]))
         orders.append(Order(cell.effects, cell.size))
     trials = draw_many(rngs, orders, replace(conditions, kind=piece[0][0].kind))
-    return [
-        _judged(cell, run, trial, judge) for (cell, run), trial in zip(piece, trials, strict=True)
-    ]
+    out = []
+    for (cell, run), trial in zip(piece, trials, strict=True):
+        outcome = _judged(cell, run, trial, judge)
+        # the truth is looked at only now that the verdict is in
+        if oracle is not None and cell.effects and set(cell.effects) <= set(CAUSES):
+            outcome = replace(outcome, oracle=oracle(trial))
+        out.append(outcome)
+    return out
 
 
 def _judged(cell: Cell, run: int, trial: Trial, judge: Judge) -> Outcome:
@@ -299,6 +356,7 @@ def _judged(cell: Cell, run: int, trial: Trial, judge: Judge) -> Outcome:
 def run_power(
     judge: Judge,
     *,
+    oracle: Knows | None = None,
     effects: Sequence[tuple[str, ...]] = SINGLE,
     sizes: Sequence[float] = (0.25, 0.5, 1.0),
     kinds: Sequence[str] = ("manoeuvres",),
@@ -316,6 +374,8 @@ def run_power(
     judge : callable
         Trial -> Judgement; a module-level function where there are several workers. It
         gets trials without truth. An error of this package counts as a failure.
+    oracle : callable, optional
+        Trial -> Oracle; asked, after the judge, about trials whose effects have a name.
     effects : sequence of tuple of str
         What is wrong: one id or more each.
     sizes : sequence of float
@@ -350,7 +410,7 @@ def run_power(
     if not pieces:
         raise UsageError("the study has 0 trials: ask for runs, none_runs and at least one kind.")
     total, outcomes = sum(map(len, pieces)), list[Outcome]()
-    work = partial(_piece, judge=judge, seed=seed, conditions=conditions)
+    work = partial(_piece, judge=judge, oracle=oracle, seed=seed, conditions=conditions)
     for found in map_pieces(work, pieces, workers=workers):
         outcomes += found
         progress(len(outcomes), total)

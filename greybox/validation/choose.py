@@ -13,6 +13,7 @@ from greybox.estimation.credibility import judge
 from greybox.estimation.credibility.verdict import misfit, motion
 from greybox.estimation.limits import limits_of
 from greybox.estimation.result import Estimate, Verdict
+from greybox.one_thread import one_thread
 from greybox.regression.regression import common_sample_time
 from greybox.trial.log import TrialLog
 from greybox.validation.alternatives import Alternative, alternatives_for
@@ -26,6 +27,7 @@ _log = logging.getLogger(__name__)
 _OPEN = Request()
 
 
+@one_thread
 def estimate_model(logs: Sequence[TrialLog], request: Request = _OPEN) -> Estimate:
     """Estimate a model, choosing what the request leaves open.
 

@@ -13,6 +13,7 @@ from greybox.errors import UsageError
 from greybox.model.changes import Change, simulate_changing
 from greybox.model.model import ManoeuvringModel
 from greybox.notebook import Shown, items, number, table
+from greybox.one_thread import one_thread
 from greybox.regression.instruments import state_bound
 from greybox.trial.log import TrialLog
 from greybox.validation.bands import LEVEL, Bands, predict_bands
@@ -310,6 +311,7 @@ def _alike(changes: Sequence[Change], starts: Array, horizon: float) -> list[NDA
     return [g for g in groups if len(g)] + [np.array([k]) for k in np.flatnonzero(crossing)]
 
 
+@one_thread
 def compare_models(
     models: Sequence[ManoeuvringModel],
     names: Sequence[str],

@@ -17,6 +17,7 @@ from greybox.estimation.result import Estimate
 from greybox.model.catalogue import structure_for
 from greybox.model.disturbances import CURRENT, WIND
 from greybox.model.predictor import Column
+from greybox.one_thread import one_thread
 from greybox.trial.log import TrialLog
 from greybox.validation.choose import estimate_model
 from greybox.validation.criteria import independent_samples
@@ -142,6 +143,7 @@ def _without(
     return replace(request, structure=name, without=tuple(biases)), dropped
 
 
+@one_thread
 def reduce_structure(
     logs: Sequence[TrialLog],
     request: Request = CHOOSE,

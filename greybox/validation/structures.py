@@ -13,6 +13,7 @@ from greybox.errors import GreyboxError, UsageError
 from greybox.estimation.result import Estimate
 from greybox.model.catalogue import structure_for
 from greybox.notebook import Shown
+from greybox.one_thread import one_thread
 from greybox.trial.log import TrialLog
 from greybox.validation.choose import estimate_model
 from greybox.validation.criteria import independent_samples, information_criteria
@@ -226,6 +227,7 @@ def settle(logs: Sequence[TrialLog], request: Request) -> Request:
     )
 
 
+@one_thread
 def compare_structures(
     logs: Sequence[TrialLog],
     names: Sequence[str],

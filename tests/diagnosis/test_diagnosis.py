@@ -15,10 +15,8 @@ from greybox.diagnosis.gain import gains, run_on
 from greybox.errors import LogError, UsageError
 from greybox.model.catalogue import get_structure
 from greybox.model.model import ManoeuvringModel, load_model
-from greybox.study.blind import Order, Trial, draw, draw_many, write
-from greybox.study.blind_conditions import Conditions
+from greybox.study.blind import Trial, draw, write
 from greybox.study.chapter6 import TRUE
-from greybox.study.power import judge_by_diagnosis
 
 
 def _draw(seed: int, *effects: str, **conditions) -> Trial:
@@ -114,67 +112,3 @@ def test_gain_of_a_model_on_itself_is_nothing() -> None:
     for gain in gains([run], [run], 1.0, 0).values():
         assert gain.before == gain.after
         assert gain.ci == (0.0, 0.0)
-
-
-# effects with a name, two of each kind of input where they show
-_NAMED = (
-    "current", "wind", "thruster_gain", "thruster_lag", "input_delay", "quadratic_thrust",
-    "advance_speed", "crossflow", "heading_bias", "lever_arm", "angle_offset", "clock_offset",
-    "parameter_change", "waves", "sign",
-)  # fmt: skip
-
-
-def _answers(
-    effects: list[tuple[str, ...]], seed: int, kind: str, **conditions
-) -> list[tuple[set[str], Trial, object]]:
-    trials = draw_many(
-        [np.random.default_rng([seed, i]) for i in range(len(effects))],
-        [Order(e) for e in effects],
-        Conditions(kind=kind, **conditions),
-    )
-    judged = [judge_by_diagnosis(t) for t in trials]
-    return [(set(e), t, j) for e, t, j in zip(effects, trials, judged, strict=True)]
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("kind", ["manoeuvres", "pulses"])
-def test_named_effects_are_named(kind: str) -> None:
-    right = wrong = within = told = 0
-    answers = _answers([(n,) for n in _NAMED], 41, kind)
-    for true, trial, judged in answers:
-        grouped = any(true & set(g) for g in judged.groups)
-        right += judged.ids == tuple(true) or grouped
-        wrong += bool(set(judged.ids) - true)
-        for name, value in trial.truth[0].parameters.items():
-            if name in judged.parameters and not isinstance(value, str):
-                found, std = judged.parameters[name]
-                told += 1
-                within += abs(found - value) <= 3 * std
-    # 15 trials: binomial room of two standard errors around 95 % and 2 %
-    assert right >= 0.95 * len(answers) - 2
-    assert wrong <= 1
-    assert within >= 0.95 * told - 2
-
-
-@pytest.mark.long
-def test_nothing_is_named_where_nothing_is_wrong() -> None:
-    cases = [("pulses", {}), ("manoeuvres", {"colour": "memory"}), ("zigzag", {"gusts": True})]
-    verdicts = []
-    for kind, conditions in cases:
-        verdicts += [j.verdict for _, _, j in _answers([()] * 4, 42, kind, **conditions)]
-    assert verdicts.count("none") >= len(verdicts) - 1
-
-
-@pytest.mark.long
-def test_two_effects_are_both_named() -> None:
-    pairs = [("current", "thruster_gain"), ("thruster_lag", "current"), ("wind", "current"),
-             ("heading_bias", "thruster_gain"), ("lever_arm", "current")]  # fmt: skip
-    answers = _answers(pairs, 43, "manoeuvres")
-    both = sum(true == set(j.ids) for true, _, j in answers)
-    assert both >= 0.8 * len(answers) - 1
-
-
-@pytest.mark.long
-def test_effects_without_a_name_get_none() -> None:
-    answers = _answers([(n,) for n in ("dead_band", "backlash", "interaction")] * 2, 44, "zigzag")
-    assert sum(bool(j.ids) and j.verdict == "named" for _, _, j in answers) <= 1

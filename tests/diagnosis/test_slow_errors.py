@@ -14,7 +14,7 @@ from greybox.diagnosis.held_out import Pair
 from greybox.diagnosis.noise import fit_noise
 from greybox.diagnosis.omnibus import features, knots_of
 from greybox.diagnosis.point import Fit
-from greybox.diagnosis.search import _loosened
+from greybox.diagnosis.refitting import loosened
 from greybox.diagnosis.verdict import _drifts
 from greybox.study.blind import draw
 from greybox.trial.log import TrialLog
@@ -129,10 +129,10 @@ def test_a_strong_wind_is_not_left_to_the_colour_of_the_errors() -> None:
         assert abs(quantity.value - truth[name]) < 4 * quantity.std
 
 
-def test_a_fit_that_is_held_by_slow_errors_is_loosened(changed: TrialLog) -> None:
+def test_a_fit_that_is_held_by_slow_errors_isloosened(changed: TrialLog) -> None:
     problem, atom, fit = fitted(changed, MOMENT)
     good = problem.settle(problem.scan(fit, atom), 2)
-    assert _loosened(problem, good) is good
+    assert loosened(problem, good) is good
     slow = 0.5 * np.sin(np.arange(len(changed)) / 60)
     wrong = [np.asarray(e) + slow[:, None] for e in good.errors]
     noise = fit_noise(wrong, problem.poles(good.point), 1.0, problem.groups)
@@ -142,7 +142,7 @@ def test_a_fit_that_is_held_by_slow_errors_is_loosened(changed: TrialLog) -> Non
     errors = problem.errors(point)
     nu, cost = problem.whitened(noise, errors)
     held = replace(good, point=point, noise=noise, nu=tuple(nu), errors=tuple(errors), cost=cost)
-    found = _loosened(problem, held)
+    found = loosened(problem, held)
     assert found.cost < held.cost
     assert found.cost == pytest.approx(good.cost, abs=10)
 

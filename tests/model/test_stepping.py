@@ -10,6 +10,7 @@ from virtual import virtual_log
 
 from greybox.errors import StructureError, UsageError
 from greybox.model.catalogue import get_structure
+from greybox.model.functions import accumulate
 from greybox.model.model import ManoeuvringModel
 from greybox.model.simulation import positions
 from greybox.validation.fit import run_model
@@ -196,3 +197,18 @@ def test_step_drops_into_rockit(ship, true_theta):
         _, commands = found.sample(command, grid="control")
     moved = identified.step_function()(x=states[0], command=commands[0])["x_next"]
     np.testing.assert_allclose(states[1], np.array(moved).ravel(), atol=1e-6)
+
+
+@pytest.mark.parametrize("count", [1, 2, 10, 11, 97, 120, 1000])
+def test_accumulated_steps_are_those_of_a_loop(count):
+    x, w = ca.SX.sym("x", 2), ca.SX.sym("w")
+    step = ca.Function("step", [x, w], [ca.vertcat(0.9 * x[0] + w, ca.sin(x[0]) + x[1]), x[0] * w])
+    rng = np.random.default_rng(count)
+    given = rng.standard_normal(count)
+    states, seen = accumulate(step, count)(np.ones(2), given[None])
+    now = np.ones(2)
+    for k in range(count):
+        after, out = step(now, given[k])
+        now = np.array(after).ravel()
+        np.testing.assert_allclose(np.array(states)[:, k], now, rtol=1e-13)
+        assert float(seen[k]) == pytest.approx(float(out), rel=1e-13)

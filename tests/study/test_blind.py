@@ -116,7 +116,7 @@ def corrected(name, trial):
             ("N_u*taun", -loss * trial.ship["Nmu"]),
         )
         return one_step(trial, terms=terms)
-    if name in ("cubic_damping", "quadratic_yaw_damping", "crossflow"):
+    if name in ("cubic_damping", "quadratic_yaw_damping", "crossflow", "asymmetry"):
         return one_step(trial, terms=tuple(p.items()))
     if name == "parameter_change":
         (key,) = (k for k in p if k.endswith("_factor"))
@@ -149,8 +149,8 @@ def corrected(name, trial):
         north, east = push * np.cos(p["towards"]), push * np.sin(p["towards"])
         left[:, 0] -= (c * north + s * east)[:-1]
         left[:, 1] -= (c * east - s * north)[:-1]
-    if name == "asymmetry":
-        left[:, 1] -= (trial.ship["Yv"] * p["asymmetry"] * np.maximum(v, 0))[:-1]
+    if name == "uneven_damping":
+        left[:, 1] -= (trial.ship["Yv"] * p["unevenness"] * np.maximum(v, 0))[:-1]
     if name == "shallow":
         beyond = np.maximum(np.abs(u) - p["threshold"], 0)
         left[:, 0] -= (p["coefficient"] * beyond**2 * np.sign(u))[:-1]
@@ -389,7 +389,7 @@ def test_a_change_that_came_to_stay_or_comes_again():
     ("effects", "conditions", "words"),
     [
         (("curent",), {}, "Did you mean 'current'"),
-        (("asymmetry",), {"kind": "pulses"}, "sway to both sides"),
+        (("uneven_damping",), {"kind": "pulses"}, "sway to both sides"),
         (("current", "current"), {}, "stands twice"),
         (("thruster_gain",), {"single": True}, "1 speed column"),
         ((), {"kind": "zigzags"}, "Did you mean 'zigzag'"),

@@ -72,7 +72,7 @@ def seesaw(trial, *, threshold):
 def study():
     return run_power(
         partial(seesaw, threshold=0.0235),
-        effects=[("waves",), ("asymmetry",), ("current",)],
+        effects=[("waves",), ("uneven_damping",), ("current",)],
         sizes=(0.25, 1.0),
         kinds=("manoeuvres", "pulses"),
         runs=4,
@@ -85,7 +85,7 @@ def study():
 
 def test_every_trial_is_drawn_and_none_that_cannot_show(study):
     assert len(study.outcomes) == 2 * 6 + 2 * 4 * (3 + 2)
-    assert Cell(("asymmetry",), 1.0, "pulses") not in study.cells
+    assert Cell(("uneven_damping",), 1.0, "pulses") not in study.cells
     whole = Cell(("waves",), 1.0, "manoeuvres")
     assert study.share(whole, "right").value == 1.0
     assert study.share(Cell(("waves",), 0.25, "manoeuvres"), "right").value < 1.0

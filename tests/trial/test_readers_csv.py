@@ -466,3 +466,11 @@ def test_bad_parquet(tmp_path):
     parquet.write_table(twice, tmp_path / "t.parquet")
     with pytest.raises(LogError, match="2 columns called 't'"):
         read(tmp_path / "t.parquet")
+
+
+@pytest.mark.parametrize("part", [slice(None), slice(1, None), slice(3, 10), slice(5, 5)])
+@pytest.mark.parametrize("values", [[1.5, None, -3.0] * 9, [None] * 12, [0.25] * 11, []])
+def test_numbers_are_those_that_arrow_itself_gives(values, part):
+    column = pa.array([None if v is None else str(v) for v in values], pa.string())[part]
+    expected = column.cast(pa.float64()).to_numpy(zero_copy_only=False)
+    np.testing.assert_array_equal(cells.numbers(column, ".", "u", {}), expected)

@@ -94,7 +94,7 @@ def numbers(column: Any, decimal: str, name: str, words: Counter[str]) -> NDArra
     if decimal == ",":
         column = compute.replace_substring(column, ",", ".")
     try:
-        return np.asarray(column.cast(pa.float64()).to_numpy(zero_copy_only=False))
+        return _floats(column.cast(pa.float64()))
     except pa.ArrowInvalid:
         pass
     # RE2 refuses text with damaged characters: one such cell must not cost the others
@@ -112,6 +112,17 @@ def numbers(column: Any, decimal: str, name: str, words: Counter[str]) -> NDArra
         words[name] += count
     kept = compute.if_else(plain, raw, pa.scalar(None, pa.string()))
     return np.asarray(kept.cast(pa.float64()).to_numpy(zero_copy_only=False))
+
+
+def _floats(column: Any) -> NDArray[np.float64]:
+    """Return an array of doubles, (n,), NaN where missing; Arrow's own way loads pandas."""
+    valid, data = column.buffers()
+    n, first = len(column), column.offset
+    values = np.frombuffer(data, np.float64, first + n)[first:].copy()
+    if valid is not None:
+        bits = np.frombuffer(valid, np.uint8, -(-(first + n) // 8))
+        values[np.unpackbits(bits, bitorder="little")[first : first + n] == 0] = np.nan
+    return values
 
 
 def _ascii(cell: str) -> str | None:

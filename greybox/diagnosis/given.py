@@ -1,0 +1,126 @@
+"""Causes that are known to act: the model with them, whether or not they prove themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.diagnosis.atom import Atom
+from greybox.diagnosis.base import Case
+from greybox.diagnosis.point import Fit
+from greybox.diagnosis.preparing import prepare
+from greybox.diagnosis.refitting import likelier, polished, refit, seen_as_slow, slow
+from greybox.diagnosis.result import Gain
+from greybox.diagnosis.scores import Directions, score_atoms
+from greybox.diagnosis.search import Search
+from greybox.diagnosis.telling import Report
+from greybox.model.model import ManoeuvringModel
+from greybox.one_thread import one_thread
+from greybox.trial.log import TrialLog
+
+Array = NDArray[np.float64]
+
+# forms of a cause that are fitted: moments, thrusters, coefficients
+_FORMS = 3
+
+
+@dataclass(frozen=True)
+class Given:
+    """What causes that are taken for granted do.
+
+    Parameters
+    ----------
+    before, after : ManoeuvringModel
+        Without and with them, estimated on the same logs.
+    fall : float
+        Share by which they lower the free runs' squared errors of the states, each in
+        its sensor's variance, on the logs of the estimate.
+    gain : dict of str to Gain
+        On the logs that are held out.
+    """
+
+    before: ManoeuvringModel
+    after: ManoeuvringModel
+    fall: float
+    gain: dict[str, Gain]
+
+
+@one_thread
+def fit_given(
+    logs: Sequence[TrialLog],
+    ids: Sequence[str],
+    *,
+    validate: Sequence[TrialLog] = (),
+    structure: str = "thesis",
+    seed: int = 0,
+) -> Given:
+    """Estimate the model with causes that are taken for granted, in their likeliest forms.
+
+    Parameters
+    ----------
+    logs : sequence of TrialLog
+    ids : sequence of str
+        Causes; those that these logs cannot show, or that kinematics have mended, change
+        nothing.
+    validate : sequence of TrialLog
+        Where the gain is measured; parts of `logs` held out in turn by default.
+    structure : str
+    seed : int
+        Of the bootstrap.
+
+    Raises
+    ------
+    ExcitationError
+        The logs do not determine the model.
+    LogError
+        A log is too short, lacks a channel, or has another sample time.
+    UsageError
+        A cause does not exist.
+    """
+    ready = prepare(logs, validate, None, structure, ids)
+    case, base = ready.case, ready.base()
+    final = base
+    left = {a.cause for a in ready.atoms}
+    while left:
+        found = _likeliest(case, final, [a for a in ready.atoms if a.cause in left])
+        if found is None:
+            break
+        final = found[1]
+        left.discard(found[0].cause)
+    search = Search(base, final, (), (), ready.tried)
+    report = Report(case, ready.structure, ready.causes, search, None, seed, ())
+    record = {"method": "given causes", "causes": list(ids)}
+    before, after = (report.model(f, record) for f in (base, final))
+    pairs = case.held_out(final.integrator).pairs(final)
+    gain, _, after = report.gain(before, after, ready.validate, pairs)
+    return Given(before, after, 1.0 - _squares(final) / _squares(base), gain)
+
+
+def _likeliest(case: Case, fit: Fit, atoms: Sequence[Atom]) -> tuple[Atom, Fit] | None:
+    problem = case.problem(fit.integrator)
+    near = [a for a in atoms if not a.afresh]
+    scores = score_atoms(Directions(problem, fit), near)
+    fits = [(s.atom, refit(problem, fit, s)) for s in scores[:_FORMS]]
+    if slow(fit):
+        fits = likelier(fits, seen_as_slow(problem, fit, near))
+    fits = [(a, f) for a, f in (*fits, *case.rewired(fit, atoms)) if not f.escaped]
+    if not fits:
+        return None
+    samples = sum(len(e) for e in fit.errors)
+    atom, best = min(
+        fits, key=lambda f: f[1].cost + max(len(f[0].parameters), 1) * float(np.log(samples))
+    )
+    return atom, polished(case, best, atom)
+
+
+def _squares(fit: Fit) -> float:
+    """Return the states' squared errors in their sensors' variances."""
+    total = 0.0
+    errors = np.concatenate(fit.errors)
+    for group in fit.noise.groups:
+        # the first of a group is its state; a heading beside the yaw rate drifts by itself
+        total += float(((errors[:, group.outputs[0]] / group.sensor[0]) ** 2).sum())
+    return total

@@ -1,0 +1,182 @@
+"""What a diagnosis begins with: logs long enough and mended, a structure, and its causes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from greybox.diagnosis.atom import Atom
+from greybox.diagnosis.base import Case
+from greybox.diagnosis.causes import Cause, Context, known_causes
+from greybox.diagnosis.kinematics import kinematic_findings, mended
+from greybox.diagnosis.point import Fit
+from greybox.diagnosis.ship import CURRENTS
+from greybox.errors import LogError, UsageError, suggestion
+from greybox.model.catalogue import for_inputs, get_structure, structure_for
+from greybox.model.model import ManoeuvringModel
+from greybox.model.structure import Structure
+from greybox.regression.regression import common_sample_time
+from greybox.trial.checks.finding import Finding
+from greybox.trial.correcting import correct_log
+from greybox.trial.log import TrialLog
+from greybox.vessel.force import force_inputs
+
+# samples that a diagnosis needs in every log
+SHORTEST = 120
+_WIND_TERMS = ("Wuu", "Wvv", "Wuv")
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A case with the causes to look for.
+
+    Parameters
+    ----------
+    case : Case
+    structure : Structure
+        Without any cause.
+    causes : mapping of str to Cause
+    atoms : tuple of Atom
+        Of those causes, as far as these logs can show them.
+    findings : tuple of Finding
+        What the kinematics of the logs tell already; the logs are mended by them.
+    validate : tuple of TrialLog
+    short : tuple of str
+        Names of logs left out.
+    model : ManoeuvringModel or None
+        As it was given.
+    """
+
+    case: Case
+    structure: Structure
+    causes: Mapping[str, Cause]
+    atoms: tuple[Atom, ...]
+    findings: tuple[Finding, ...]
+    validate: tuple[TrialLog, ...]
+    short: tuple[str, ...]
+    model: ManoeuvringModel | None
+
+    @property
+    def tried(self) -> int:
+        """How many hypotheses are tried, for which p-values are corrected."""
+        return len(self.atoms) + len(self.findings)
+
+    def base(self) -> Fit:
+        """Return the fit without causes."""
+        model = self.model
+        if model is None:
+            return self.case.base(None, np.zeros(2))
+        known = dict(zip(model.names, map(float, model.theta), strict=True))
+        return self.case.base(known, model.d[:2])
+
+
+def prepare(
+    logs: Sequence[TrialLog],
+    validate: Sequence[TrialLog],
+    model: ManoeuvringModel | None,
+    structure: str,
+    ids: Sequence[str] | None,
+) -> Prepared:
+    """Set up the case of a diagnosis.
+
+    Parameters
+    ----------
+    logs, validate : sequence of TrialLog
+    model : ManoeuvringModel or None
+    structure : str
+        Where no model is given.
+    ids : sequence of str or None
+        Causes to look for; None for all.
+
+    Raises
+    ------
+    LogError
+        No log is long enough, one lacks a channel, or sample times differ.
+    UsageError
+        A cause does not exist.
+    """
+    common_sample_time([*logs, *validate])
+    short = [log.name for log in (*logs, *validate) if len(log) < SHORTEST]
+    logs = _long_enough(logs)
+    validate = _long_enough(validate) if validate else []
+    causes = _chosen(ids)
+    findings = [f for f in kinematic_findings([*logs, *validate]) if f.id in causes]
+    vessel = mended(logs[0].vessel if model is None else model.vessel, findings)
+    logs = [correct_log(log, vessel) for log in logs]
+    validate = [correct_log(log, vessel) for log in validate]
+    start = _structure(structure, logs, model)
+    context = _context(start, [*logs, *validate], model)
+    atoms = [a for c in causes.values() for a in c.atoms(context)]
+    case = _case(start, atoms, logs, validate)
+    return Prepared(
+        case, start, causes, tuple(atoms), tuple(findings), tuple(validate), tuple(short), model
+    )
+
+
+def _long_enough(logs: Sequence[TrialLog]) -> list[TrialLog]:
+    kept = [log for log in logs if len(log) >= SHORTEST]
+    if not kept:
+        longest = max(logs, key=len)
+        raise LogError(
+            f"'{longest.name}' has {len(longest)} samples, a diagnosis needs at least {SHORTEST}: "
+            f"give a longer log."
+        )
+    return kept
+
+
+def _chosen(ids: Sequence[str] | None) -> dict[str, Cause]:
+    known = known_causes()
+    for name in ids or ():
+        if name not in known:
+            raise UsageError(
+                f"there is no cause '{name}'.{suggestion(name, known)} Known: {', '.join(known)}."
+            )
+    return {k: c for k, c in known.items() if ids is None or k in ids}
+
+
+def _structure(name: str, logs: Sequence[TrialLog], model: ManoeuvringModel | None) -> Structure:
+    if model is not None:
+        return model.structure
+    inputs = force_inputs(logs[0].vessel)
+    # also where a name takes terms away or adds some
+    get_structure(name)
+    structure = structure_for(name, inputs)
+    still = [t for t in _WIND_TERMS if t in structure.parameters]
+    return for_inputs(structure.without(*still), inputs) if still else structure
+
+
+def _context(
+    structure: Structure, logs: Sequence[TrialLog], model: ManoeuvringModel | None
+) -> Context:
+    first = logs[0]
+    turns = "r" in structure.states and all("psi" in log for log in logs)
+    return Context(
+        structure=structure,
+        vessel=first.vessel,
+        outputs=(*structure.states, "psi") if turns else structure.states,
+        has_wind=all(log.has_wind for log in logs),
+        duration=min(float(log.t[-1] - log.t[0]) for log in logs),
+        sample_time=first.sample_time,
+        speeds={t.speed: float(np.median(np.abs(first[t.speed]))) for t in first.vessel.thrusters},
+        current_known=model is not None and any(model.d[:2]),
+    )
+
+
+def _case(
+    structure: Structure,
+    atoms: Sequence[Atom],
+    logs: Sequence[TrialLog],
+    validate: Sequence[TrialLog],
+) -> Case:
+    names = dict.fromkeys(n for a in atoms for n in (*a.columns, *a.beside))
+    added = [n for n in names if n not in structure.parameters and n not in CURRENTS]
+    universe = structure.with_terms(*added)
+    wind = universe.uses_air and all(log.has_wind for log in [*logs, *validate])
+    both: tuple[int, ...] = (1, -1)
+    return Case(
+        structure, universe, logs, validate,
+        "basic+wind" if wind and structure.uses_air else "basic",
+        tuple((s, both) for s in structure.states),
+    )  # fmt: skip

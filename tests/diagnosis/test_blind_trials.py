@@ -1,0 +1,114 @@
+"""The rates of right, wrong and no answers on a fixed set of blind trials.
+
+An oracle, asked after each verdict, says what the true causes would have gained. Limits
+are the asked rates less what chance takes from so many trials (binomial, 2.5 %).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import pytest
+from scipy.stats import binom
+
+from greybox.study.blind_causes import CAUSES
+from greybox.study.blind_conditions import Conditions
+from greybox.study.blind_effects import UNKNOWN
+from greybox.study.power import Outcome, judge_by_diagnosis, oracle_by_fit, run_power
+
+pytestmark = pytest.mark.long
+
+KINDS = ("manoeuvres", "pulses", "zigzag")
+PAIRS = (
+    ("current", "thruster_gain"), ("thruster_lag", "current"), ("wind", "current"),
+    ("heading_bias", "thruster_gain"), ("lever_arm", "current"), ("input_delay", "crossflow"),
+    ("quadratic_thrust", "clock_offset"), ("parameter_change", "current"),
+    ("angle_offset", "quadratic_yaw_damping"),
+)  # fmt: skip
+
+
+def judged(
+    effects: Sequence[tuple[str, ...]], kinds: Sequence[str], *, runs: int = 1, none_runs: int = 0,
+    oracle: bool = True, **conditions,
+) -> list[Outcome]:  # fmt: skip
+    study = run_power(
+        judge_by_diagnosis, oracle=oracle_by_fit if oracle else None, effects=effects,
+        sizes=(1.0,), kinds=kinds, runs=runs, none_runs=none_runs, seed=2027,
+        conditions=Conditions(**conditions), workers=1,
+    )  # fmt: skip
+    for o in study.outcomes:
+        said = o.judgement
+        print(
+            o.cell.kind, o.cell.label, o.answer, *(() if said is None else (said.ids, said.groups)),
+            *(() if o.oracle is None else (f"{o.oracle.fall:.3f}", dict(o.oracle.gain))),
+            *(() if said is None else (dict(said.gain),)),
+        )  # fmt: skip
+    assert not [o.failure for o in study.outcomes if o.failure]
+    return list(study.outcomes)
+
+
+def at_least(rate: float, trials: Sequence[object]) -> int:
+    """The fewest of so many trials that a rate leaves to chance."""
+    return int(binom.ppf(0.025, len(trials), rate))
+
+
+def at_most(rate: float, trials: Sequence[object]) -> int:
+    return int(binom.ppf(0.975, len(trials), rate))
+
+
+def size_of_group(o: Outcome) -> int:
+    return max((len(g) for g in o.judgement.groups), default=0)
+
+
+def truths(o: Outcome) -> list[tuple[float, float]]:
+    """Errors and standard errors of the parameters of causes that are named rightly."""
+    true = {k: v for e in o.truth for k, v in e.parameters.items() if isinstance(v, float)}
+    return [(v - true[k], s) for k, (v, s) in o.judgement.parameters.items() if k in true]
+
+
+def assert_told_and_gained(right: Sequence[Outcome]) -> None:
+    """Numbers lie within 3 standard errors, fits within 2 points of the true structure's."""
+    numbers = [pair for o in right for pair in truths(o)]
+    assert sum(abs(e) <= 3 * s for e, s in numbers) >= at_least(0.95, numbers)
+    channels = [(o.oracle.gain[s], o.judgement.gain[s]) for o in right for s in o.oracle.gain]
+    assert sum(mine >= best - 2.0 for best, mine in channels) >= at_least(0.95, channels)
+
+
+def test_one_effect_is_named_and_measured() -> None:
+    outcomes = judged([(name,) for name in CAUSES], KINDS)
+    assert len(outcomes) == len(KINDS) * len(CAUSES)
+    # what kinematics mend beforehand shows in no free run
+    matters = [o for o in outcomes if o.oracle.matters or o.answer == "right"]
+    assert len(matters) > 0.75 * len(outcomes)
+    right = [o for o in matters if o.answer == "right"]
+    grouped = [o for o in matters if o.answer == "group" and size_of_group(o) == 2]
+    assert len(right) >= at_least(0.90, matters)
+    assert len(right) + len(grouped) >= at_least(0.95, matters)
+    wrong = [o for o in outcomes if set(o.judgement.ids) - set(o.cell.effects)]
+    assert len(wrong) <= at_most(0.02, outcomes)
+    assert_told_and_gained(right)
+
+
+@pytest.mark.parametrize(
+    ("kind", "conditions"),
+    [("pulses", {}), ("manoeuvres", {"colour": "memory"}), ("zigzag", {"gusts": True})],
+)
+def test_nothing_is_named_where_nothing_is_wrong(kind: str, conditions: dict) -> None:
+    outcomes = judged([], (kind,), none_runs=12, **conditions)
+    none = [o for o in outcomes if o.judgement.verdict == "none"]
+    assert len(none) >= at_least(0.95, outcomes)
+
+
+def test_two_effects_are_both_named() -> None:
+    outcomes = judged(PAIRS, ("manoeuvres", "zigzag"))
+    assert len(outcomes) == 2 * len(PAIRS)
+    right = [o for o in outcomes if set(o.judgement.ids) == set(o.cell.effects)]
+    assert len(right) >= at_least(0.80, outcomes)
+    assert_told_and_gained(right)
+
+
+def test_effects_without_a_name_get_none() -> None:
+    outcomes = judged([(name,) for name in UNKNOWN], KINDS, oracle=False)
+    assert len(outcomes) == len(KINDS) * len(UNKNOWN) - 1
+    named = [o for o in outcomes if o.judgement.verdict == "named"]
+    assert len(named) <= at_most(0.10, outcomes)

@@ -1,0 +1,43 @@
+"""Causes that are taken for granted: the same model as where they were found."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from greybox.diagnosis.diagnose import diagnose
+from greybox.diagnosis.gain import run_on
+from greybox.diagnosis.given import fit_given
+from greybox.study.blind import draw
+
+
+def squares(model, log) -> float:
+    """Squared free-run errors of the states in their sensors' variances."""
+    run = run_on(model, log)
+    sigma = [log.vessel.sensors[f"{s}_std"] for s in run.fit]
+    error = (log.states(tuple(run.fit)) - run.x) / sigma
+    return float((error**2).sum())
+
+
+@pytest.mark.long
+def test_a_cause_that_is_given_is_fitted_as_one_that_was_found() -> None:
+    trial = draw(np.random.default_rng([31, 1]), ("current",), kind="manoeuvres", samples=600)
+    given = fit_given([trial.estimation], ["current"], validate=[trial.validation])
+    found = diagnose([trial.estimation], validate=[trial.validation])
+    assert [c.id for c in found.causes] == ["current"]
+    assert given.after.names == found.model.names
+    std = np.sqrt(np.diag(found.model.covariance))
+    assert (np.abs(given.after.theta - found.model.theta) < 0.1 * std).all()
+    for state, gain in given.gain.items():
+        assert gain.after == pytest.approx(found.gain[state].after, abs=0.5)
+    # its first states are measured there, fitted here
+    before, after = (squares(m, trial.estimation) for m in (given.before, given.after))
+    assert given.fall == pytest.approx(1 - after / before, abs=0.03)
+    assert given.fall > 0.5
+
+
+def test_a_cause_that_does_not_act_lowers_little() -> None:
+    trial = draw(np.random.default_rng([31, 2]), (), kind="pulses", samples=400)
+    given = fit_given([trial.estimation], ["quadratic_yaw_damping"], validate=[trial.validation])
+    assert "N_|r|r" in given.after.names
+    assert abs(given.fall) < 0.05
