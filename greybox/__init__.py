@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from greybox.diagnosis.causes import known_causes
     from greybox.diagnosis.causes.cause import Cause
     from greybox.diagnosis.diagnose import DiagnosisOptions, diagnose
+    from greybox.diagnosis.given import Given, fit_given
     from greybox.diagnosis.result import Diagnosis
     from greybox.estimation.estimate import estimate_iv, estimate_ls
     from greybox.estimation.output_error import OutputErrorOptions, estimate_oe
@@ -62,7 +63,9 @@ _WHERE = {
     "Cause": "greybox.diagnosis.causes.cause",
     "Diagnosis": "greybox.diagnosis.result",
     "DiagnosisOptions": "greybox.diagnosis.diagnose",
+    "Given": "greybox.diagnosis.given",
     "diagnose": "greybox.diagnosis.diagnose",
+    "fit_given": "greybox.diagnosis.given",
     "known_causes": "greybox.diagnosis.causes",
     "CheckReport": "greybox.trial.checks.finding",
     "Estimate": "greybox.estimation.result",
@@ -124,6 +127,7 @@ __all__ = [
     "Estimate",
     "Exported",
     "Finding",
+    "Given",
     "ImportOptions",
     "ManoeuvrePrediction",
     "ManoeuvringModel",
@@ -149,6 +153,7 @@ __all__ = [
     "estimate_refined_iv",
     "export_model",
     "find_manoeuvres",
+    "fit_given",
     "fit_percent",
     "get_structure",
     "import_files",

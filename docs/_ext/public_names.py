@@ -26,7 +26,7 @@ STEPS = {
     "estimate": "estimate_model Request estimate_ls estimate_iv estimate_refined_iv estimate_oe "
     "OutputErrorOptions Estimate Verdict",
     "compare": "run_model compare_models fit_percent",
-    "diagnose": "diagnose DiagnosisOptions Diagnosis known_causes Cause",
+    "diagnose": "diagnose DiagnosisOptions Diagnosis fit_given Given known_causes Cause",
     "design": "prepare_request Wishes TrialLimits Circle DesignRequest build_problem noise_levels "
     "NoiseLevels design_trial Design write_plan certify Certificate predict_precision "
     "PredictedPrecision design_between Rival Discrimination least_duration prbs random_two_level "
