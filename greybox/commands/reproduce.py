@@ -103,11 +103,12 @@ def run(options: argparse.Namespace) -> None:
 
 def _power(options: argparse.Namespace, record: dict[str, Any]) -> None:
     from greybox.report.power import power_output, write_power
-    from greybox.study.power import judge_by_diagnosis, run_power
+    from greybox.study.power import judge_by_diagnosis, oracle_by_fit, run_power
 
     study = run_power(
-        judge_by_diagnosis, runs=options.runs, none_runs=5 * options.runs, seed=options.seed,
-        workers=options.workers, progress=progress("power"),
+        judge_by_diagnosis, oracle=oracle_by_fit, runs=options.runs,
+        none_runs=5 * options.runs, seed=options.seed, workers=options.workers,
+        progress=progress("power"),
     )  # fmt: skip
     say(power_output(study, record).text)
     if options.out:

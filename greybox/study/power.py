@@ -236,6 +236,17 @@ class Power:
         hits = sum(o.answer in answers or ("detected" in answers and o.detected) for o in mine)
         return Share(hits, len(mine))
 
+    def visible(self, cell: Cell) -> list[Outcome]:
+        """Return the trials whose effects lower the errors by as much as has to be found.
+
+        Those that were named rightly too, because what kinematics have mended before
+        shows in no free run; and all where no oracle was asked.
+        """
+        return [
+            o for o in self.of(cell)
+            if o.oracle is None or o.oracle.matters or o.answer == "right"
+        ]  # fmt: skip
+
     def confusion(self, kind: str, size: float) -> dict[str, Counter[str]]:
         """Return for each truth how often each thing was found; ``none`` has one size."""
         return {

@@ -14,7 +14,7 @@ from greybox.errors import ExcitationError, UsageError
 from greybox.report.power import shares_csv, write_power
 from greybox.study.blind_causes import Effect
 from greybox.study.blind_conditions import Conditions
-from greybox.study.power import Cell, Judgement, Outcome, Power, Share, run_power
+from greybox.study.power import Cell, Judgement, Oracle, Outcome, Power, Share, run_power
 
 QUICK = Conditions(euler=True, samples=60)
 
@@ -139,6 +139,31 @@ def test_tables_figures_and_page(study, tmp_path):
     page = (tmp_path / "report.html").read_text()
     for words in ("named rightly", "Parameters of the causes", "95 % intervals hold"):
         assert words in page
+
+
+def knows(trial):
+    """An oracle that needs the truth: half of the ships are hardly moved by their effect."""
+    assert trial.truth
+    large = trial.ship["Xu"] < -0.05
+    return Oracle(0.3 if large else 0.01, {"u": 3.0})
+
+
+def test_an_oracle_says_which_trials_count_and_what_was_lost(tmp_path):
+    study = run_power(
+        partial(seesaw, threshold=0.0235), oracle=knows, effects=[("waves",), ("current",)],
+        sizes=(1.0,), runs=8, none_runs=2, seed=1, conditions=QUICK, workers=1,
+    )  # fmt: skip
+    waves, current = (Cell((n,), 1.0, "manoeuvres") for n in ("waves", "current"))
+    assert all(o.oracle is None for o in study.of(Cell((), 1.0, "manoeuvres")))
+    large = [o for o in study.of(current) if o.oracle.matters]
+    assert 0 < len(large) < 8
+    assert study.visible(current) == large
+    # what is named rightly was to be found
+    assert study.visible(waves) == study.of(waves)
+    assert study.lost(waves) == [2.0] * 8
+    output = write_power(study, {"program": "test"}, tmp_path)
+    share = Share(8, 8 + len(large))
+    assert f"by at least 5 %, it was named in {share} of {8 + len(large)} trials" in output.text
 
 
 def test_shares_of_a_cell_add_to_one(study):
