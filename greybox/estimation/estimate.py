@@ -17,6 +17,7 @@ from greybox.estimation.covariance import (
 )
 from greybox.estimation.credibility import Evidence, assess, judge
 from greybox.estimation.disturbance import estimate_current
+from greybox.estimation.error_shape import ErrorShape, error_shapes
 from greybox.estimation.moments import Solution, solve_stacked
 from greybox.estimation.result import Estimate
 from greybox.model.predictor import Predictor
@@ -375,6 +376,7 @@ def _covariance(
     kind: Covariance,
     seed: int,
     centred: bool,
+    shapes: Sequence[Sequence[ErrorShape]],
 ) -> tuple[Array, int]:
     predictor = regression.predictor
     p = len(predictor.columns)
@@ -393,7 +395,7 @@ def _covariance(
             total[np.ix_(mine, mine)] = np.cov(draws.T).reshape(len(mine), len(mine))
         return total, 0
     robust: CovarianceKind = kind
-    middle, lags = score_covariance(projected, residuals, robust)
+    middle, lags = score_covariance(projected, residuals, robust, shapes=shapes)
     inverse = np.zeros((p, p))
     for state, solution in zip(predictor.structure.states, solutions, strict=True):
         mine = predictor.equation(state)
@@ -422,9 +424,14 @@ def _result(
     """Collect what was found; `evidence` are the simulated instruments to test it with."""
     predictor = regression.predictor
     projected, residuals = _masked(solutions, regression, instruments, centred=centred)
-    covariance, lags = _covariance(solutions, regression, projected, residuals, kind, seed, centred)
     kept = sum(int(k.sum()) for k in instruments.keep)
     theta = _coefficients(solutions)
+    shapes = (
+        error_shapes(predictor, logs, theta, residuals, instruments.keep) if kind == "ma" else ()
+    )
+    covariance, lags = _covariance(
+        solutions, regression, projected, residuals, kind, seed, centred, shapes
+    )
     residual_std = np.array(
         [np.sqrt(sum(float(e @ e) for e in equation) / max(kept, 1)) for equation in residuals]
     )

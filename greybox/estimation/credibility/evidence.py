@@ -13,7 +13,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.estimation.colour import Colour, fit_colour
+from greybox.estimation.colour import Colour
+from greybox.estimation.error_shape import ErrorShape, error_shapes, fit_shaped_colour
 from greybox.estimation.moments import Solution, solve_stacked
 from greybox.model.predictor import Predictor
 from greybox.regression.instruments import Instruments
@@ -44,6 +45,8 @@ class Equation:
         (N,) rows that take part.
     centred : bool
         Whether the mean of each experiment was removed.
+    shapes : tuple of ErrorShape
+        How measurement noise changes along each log; empty where it is alike everywhere.
     """
 
     state: str
@@ -54,6 +57,7 @@ class Equation:
     z: tuple[Array, ...]
     keep: tuple[NDArray[np.bool_], ...]
     centred: bool
+    shapes: tuple[ErrorShape, ...] = ()
 
     @property
     def rows(self) -> int:
@@ -79,13 +83,13 @@ class Equation:
     @cached_property
     def colour(self) -> Colour:
         """Noise model of those residuals."""
-        return fit_colour(self.residuals, self.keep)
+        return fit_shaped_colour(self.residuals, self.keep, self.shapes, self.solution.projected)
 
     @cached_property
     def std(self) -> Array:
         """Standard errors of that estimate, (p,)."""
-        weights = [self.colour.adjoint(h) for h in self.solution.projected]
-        innovations = [self.colour.innovations(e) for e in self.residuals]
+        weights = [self.colour.adjoint(h, k) for k, h in enumerate(self.solution.projected)]
+        innovations = [self.colour.innovations(e, k) for k, e in enumerate(self.residuals)]
         scores = [w * i for w, i in zip(weights, innovations, strict=True)]
         middle = sum(s @ s.T for s in scores) * self.rows / max(self.freedom - len(self.labels), 1)
         inverse = np.linalg.pinv(self.solution.information, rcond=1e-15)
@@ -166,12 +170,17 @@ class Evidence:
         """One regression a state; empty where there are no instruments."""
         if self.instruments.diverged or not self.instruments.z:
             return ()
+        shapes = error_shapes(
+            self.predictor, self.logs, self.theta, self.residuals, self.instruments.keep
+        )
+        states = self.predictor.structure.states
         return tuple(
-            _equation(self, row, state) for row, state in enumerate(self.predictor.structure.states)
+            _equation(self, row, state, shape)
+            for row, (state, shape) in enumerate(zip(states, shapes, strict=True))
         )
 
 
-def _equation(evidence: Evidence, row: int, state: str) -> Equation:
+def _equation(evidence: Evidence, row: int, state: str, shapes: tuple[ErrorShape, ...]) -> Equation:
     predictor = evidence.predictor
     mine = predictor.equation(state)
     constants = set(predictor.constants)
@@ -196,6 +205,7 @@ def _equation(evidence: Evidence, row: int, state: str) -> Equation:
         tuple(z),
         evidence.instruments.keep,
         centred,
+        shapes,
     )
 
 
