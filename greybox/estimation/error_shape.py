@@ -42,7 +42,10 @@ class ErrorShape:
         """Return the factor with steady noise of a share of the mean variance added."""
         from scipy.linalg.lapack import dpttrf
 
-        d, low, info = dpttrf(self.same + share * self.same.mean(), self.tie[1:])
+        whole = self.same + share * self.same.mean()
+        if len(whole) < 2:
+            return Factor(np.sqrt(whole), np.zeros(len(whole)))
+        d, low, info = dpttrf(whole, self.tie[1:])
         return Factor(np.sqrt(d), np.append(0.0, low)) if info == 0 else None
 
 

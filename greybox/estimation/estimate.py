@@ -159,8 +159,9 @@ def estimate_iv(
     -------
     Estimate
         ``status`` says whether the refinement converged. Where an instrument
-        simulation diverges, the step is halved; where that does not help, the
-        last estimate with bounded instruments is returned and the status says so.
+        simulation diverges, the step is halved. Where that does not help, or the
+        estimates never settle, an estimate spoils the model of the next instruments:
+        the one whose instruments explain most of the regressors is returned.
 
     Raises
     ------
@@ -203,6 +204,7 @@ def estimate_iv(
         )
     solutions = _solve(regression, instruments, metric)
     status, iterations = "one step, instruments not refined", 0
+    strongest = (_strength(solutions), theta, instruments, solutions)
     if refine:
         most = _MAX_REFINEMENTS if refine is True else int(refine)
         status = f"the refinement still moved after {most} steps"
@@ -220,17 +222,25 @@ def estimate_iv(
             if fresh.diverged:
                 status = (
                     f"stopped after {iterations - 1} refinements: {fresh.diverged}; "
-                    f"the last estimate with bounded instruments is given"
+                    f"the estimate of the strongest instruments is given"
                 )
+                _, theta, instruments, solutions = strongest
                 break
             theta, instruments = candidate, fresh
             solutions = _solve(regression, instruments, metric)
+            strength = _strength(solutions)
+            if strength > strongest[0]:
+                strongest = (strength, theta, instruments, solutions)
             moved = np.abs(_coefficients(solutions) - previous)
             scale = np.abs(previous) + 1e-12
             # a halfway model settles too, but not at an estimate that can be simulated
             if candidate is target and (moved < _REFINE_TOLERANCE * scale).all():
                 status = f"converged after {iterations} refinements"
                 break
+        else:
+            if refine is True:
+                status += "; the estimate of the strongest instruments is given"
+                _, theta, instruments, solutions = strongest
     return _result(
         "iv",
         regression,
@@ -268,6 +278,12 @@ def _structure_theta(predictor: Predictor, coefficients: Array) -> Array:
     for i in predictor.parameter_columns:
         theta[predictor.structure.index(predictor.columns[i].terms[0])] = coefficients[i]
     return theta
+
+
+def _strength(solutions: Sequence[Solution]) -> float:
+    """Return half the log determinant of what the instruments explain of the regressors."""
+    with np.errstate(divide="ignore"):
+        return float(sum(np.log(s.singular_values).sum() for s in solutions))
 
 
 def _coefficients(solutions: Sequence[Solution]) -> Array:

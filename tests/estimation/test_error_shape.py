@@ -52,6 +52,9 @@ def test_the_factor_makes_the_covariance_white():
     factor = shape.factor(0.1)
     inverse = factor.solve(np.eye(60)).T
     np.testing.assert_allclose(inverse @ dense(shape, 0.1) @ inverse.T, np.eye(60), atol=1e-10)
+    # a log of one row has no neighbours
+    one = ErrorShape(np.array([4.0]), np.zeros(1)).factor(0.0)
+    np.testing.assert_allclose(one.solve(np.array([6.0])), [3.0])
 
 
 def test_adjoint_and_innovations_are_one_operator_on_every_log():

@@ -7,7 +7,7 @@ properties of that regression.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -170,17 +170,18 @@ class Evidence:
         """One regression a state; empty where there are no instruments."""
         if self.instruments.diverged or not self.instruments.z:
             return ()
-        shapes = error_shapes(
-            self.predictor, self.logs, self.theta, self.residuals, self.instruments.keep
-        )
         states = self.predictor.structure.states
-        return tuple(
-            _equation(self, row, state, shape)
-            for row, (state, shape) in enumerate(zip(states, shapes, strict=True))
-        )
+        plain = [_equation(self, row, state) for row, state in enumerate(states)]
+        # of that regression's own estimate, as all that is asked of it
+        theta = np.zeros(len(self.predictor.columns))
+        for equation in plain:
+            theta[list(equation.columns)] = equation.solution.theta
+        residuals = [e.residuals for e in plain]
+        shapes = error_shapes(self.predictor, self.logs, theta, residuals, self.instruments.keep)
+        return tuple(replace(e, shapes=s) for e, s in zip(plain, shapes, strict=True))
 
 
-def _equation(evidence: Evidence, row: int, state: str, shapes: tuple[ErrorShape, ...]) -> Equation:
+def _equation(evidence: Evidence, row: int, state: str) -> Equation:
     predictor = evidence.predictor
     mine = predictor.equation(state)
     constants = set(predictor.constants)
@@ -205,7 +206,6 @@ def _equation(evidence: Evidence, row: int, state: str, shapes: tuple[ErrorShape
         tuple(z),
         evidence.instruments.keep,
         centred,
-        shapes,
     )
 
 
