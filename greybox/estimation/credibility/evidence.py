@@ -47,6 +47,8 @@ class Equation:
         Whether the mean of each experiment was removed.
     shapes : tuple of ErrorShape
         How measurement noise changes along each log; empty where it is alike everywhere.
+    states : tuple of ndarray
+        (nx, N) simulated states an experiment, in every row; empty where there are none.
     """
 
     state: str
@@ -58,6 +60,7 @@ class Equation:
     keep: tuple[NDArray[np.bool_], ...]
     centred: bool
     shapes: tuple[ErrorShape, ...] = ()
+    states: tuple[Array, ...] = ()
 
     @property
     def rows(self) -> int:
@@ -206,6 +209,7 @@ def _equation(evidence: Evidence, row: int, state: str) -> Equation:
         tuple(z),
         evidence.instruments.keep,
         centred,
+        states=tuple(x.T for x in evidence.instruments.x),
     )
 
 
