@@ -27,8 +27,38 @@ _LEAST_FREEDOM = 8.0
 
 
 @dataclass(frozen=True)
+class Factor:
+    """What makes one log's errors alike: e(k) = root(k) ν(k) + tie(k) root(k−1) ν(k−1).
+
+    Parameters
+    ----------
+    root, tie : ndarray
+        (N,) of the Cholesky factor L √D of a covariance with one neighbour.
+    """
+
+    root: Array
+    tie: Array
+
+    def solve(self, e: Array) -> Array:
+        """Return ν along the last axis."""
+        from scipy.linalg import solve_banded
+
+        band = np.ones((2, len(self.root)))
+        band[1, :-1] = self.tie[1:]
+        flat = e.reshape(-1, e.shape[-1]).T
+        found = solve_banded((1, 0), band, flat, check_finite=False).T.reshape(e.shape)
+        return np.asarray(found / self.root)
+
+    def adjoint(self, z: Array) -> Array:
+        """Return what ν is multiplied by in Σ z e, along the last axis."""
+        out = z.copy()
+        out[..., :-1] += self.tie[1:] * z[..., 1:]
+        return np.asarray(out * self.root)
+
+
+@dataclass(frozen=True)
 class Colour:
-    """e = C(q)/D(q) ε.
+    """e = C(q)/D(q) ε, behind a factor of each log where the noise changes along it.
 
     Parameters
     ----------
@@ -36,15 +66,18 @@ class Colour:
         (m+1,) and (n+1,) coefficients of C and D in delays, each led by 1.
     neighbours : tuple of Colour
         Models one standard error away along each principal axis of the fit.
+    factors : tuple of Factor
+        Of each experiment; empty where the noise is alike everywhere.
     """
 
     moving_average: Array
     autoregression: Array
     neighbours: tuple[Colour, ...] = ()
+    factors: tuple[Factor, ...] = ()
 
     @property
     def white(self) -> bool:
-        """Whether there is no memory."""
+        """Whether there is no memory, beside that of the factors."""
         return len(self.moving_average) == 1 and len(self.autoregression) == 1
 
     @property
@@ -52,17 +85,24 @@ class Colour:
         """Samples until the impulse response of H stays below one hundredth."""
         pulse = np.zeros(400)
         pulse[-1] = 1.0
-        above = np.flatnonzero(np.abs(self.adjoint(pulse)[::-1]) > 0.01)
-        return int(above[-1])
+        back = _filtered(self.moving_average, self.autoregression, pulse[::-1])
+        return int(np.flatnonzero(np.abs(back) > 0.01)[-1]) + (len(self.factors) > 0)
 
-    def innovations(self, e: Array) -> Array:
-        """Return ε = D/C e along the last axis."""
-        return _filtered(self.autoregression, self.moving_average, e)
+    def innovations(self, e: Array, log: int = 0) -> Array:
+        """Return ε along the last axis, of one of the logs."""
+        alike = self.factors[log].solve(e) if self.factors else e
+        return _filtered(self.autoregression, self.moving_average, alike)
 
-    def adjoint(self, z: Array) -> Array:
+    def adjoint(self, z: Array, log: int = 0) -> Array:
         """Return Hᵀz along the last axis, with Σ z e = Σ (Hᵀz) ε."""
+        z = self.factors[log].adjoint(z) if self.factors else z
         back = _filtered(self.moving_average, self.autoregression, z[..., ::-1])
         return np.asarray(back[..., ::-1])
+
+    def beside(self, factors: tuple[Factor, ...]) -> Colour:
+        """Return this model with one more neighbour, of other factors."""
+        other = replace(self, neighbours=(), factors=factors)
+        return replace(self, neighbours=(*self.neighbours, other))
 
     def freedom_of(self, z: Sequence[Array], *, together: bool = False) -> Array:
         """Return the degrees of freedom of the variance of Σ z e, for each row of z.
@@ -78,7 +118,9 @@ class Colour:
         """
 
         def variance(colour: Colour) -> Array:
-            each = np.asarray(sum((colour.adjoint(x) ** 2).sum(axis=1) for x in z))
+            each = np.asarray(
+                sum((colour.adjoint(x, log) ** 2).sum(axis=1) for log, x in enumerate(z))
+            )
             return each.sum(keepdims=True) if together else each
 
         base = np.maximum(variance(self), 1e-300)
@@ -110,7 +152,11 @@ def _filtered(numerator: Array, denominator: Array, rows: Array) -> Array:
     return np.asarray(solve_banded((order, 0), band, flat, check_finite=False).T.reshape(out.shape))
 
 
-def fit_colour(residuals: Sequence[Array], keep: Sequence[NDArray[np.bool_]]) -> Colour:
+def fit_colour(
+    residuals: Sequence[Array],
+    keep: Sequence[NDArray[np.bool_]],
+    factors: tuple[Factor, ...] = (),
+) -> Colour:
     """Fit the noise model by least squares of the innovations, its order by BIC.
 
     Parameters
@@ -119,26 +165,35 @@ def fit_colour(residuals: Sequence[Array], keep: Sequence[NDArray[np.bool_]]) ->
         (N,) an experiment, zero in rows that do not take part.
     keep : sequence of ndarray of bool
         Only uninterrupted stretches are used; too few rows give white noise.
+    factors : tuple of Factor
+        What makes the errors of each log alike; none where they are.
 
     References
     ----------
     Box and Jenkins (1976), section 7.1; Schwarz (1978).
     """
-    stretches = [r for e, k in zip(residuals, keep, strict=True) for r in _stretches(e, k)]
+    alike = list(residuals)
+    if factors:
+        alike = [f.solve(e) for f, e in zip(factors, residuals, strict=True)]
+    stretches = [r for e, k in zip(alike, keep, strict=True) for r in _stretches(e, k)]
     rows = sum(len(r) for r in stretches)
     scale = np.sqrt(sum(float(r @ r) for r in stretches) / max(rows, 1))
     if rows < _LEAST_ROWS or not scale > 0:
-        return WHITE
+        return replace(WHITE, factors=factors)
     # a gap of zeros between stretches lets one filter call serve them all
     series = np.concatenate([np.append(r / scale, np.zeros(30)) for r in stretches])
     inside = np.concatenate([np.append(np.ones(len(r)), np.zeros(30)) for r in stretches]) > 0
     best, least = WHITE, np.inf
     for ar, ma in _ORDERS:
+        if factors and ar > 1 and best is WHITE:
+            # what a factor leaves is most often white, and two orders fit that slowly
+            continue
         candidate, squares = _fit(series, inside, ar, ma)
         criterion = rows * np.log(squares / rows) + (ar + ma) * np.log(rows)
         if criterion < least:
             best, least = candidate, criterion
-    return best
+    behind = tuple(replace(n, factors=factors) for n in best.neighbours)
+    return replace(best, neighbours=behind, factors=factors)
 
 
 def _stretches(e: Array, keep: NDArray[np.bool_]) -> list[Array]:

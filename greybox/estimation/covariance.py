@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.estimation.colour import fit_colour
+from greybox.estimation.error_shape import ErrorShape, fit_shaped_colour
 
 Array = NDArray[np.float64]
 CovarianceKind = Literal["hac", "ma", "white"]
@@ -70,6 +70,7 @@ def score_covariance(
     residuals: Sequence[Sequence[Array]],
     kind: CovarianceKind = "hac",
     lags: int | None = None,
+    shapes: Sequence[Sequence[ErrorShape]] = (),
 ) -> tuple[Array, int]:
     """Estimate the covariance of the summed scores Σ ẑ e, equations together.
 
@@ -86,6 +87,9 @@ def score_covariance(
     lags : int, optional
         Memory in samples; by default found from the residuals. Given with
         ``ma``, R holds the residuals' own autocovariance up to there.
+    shapes : sequence over equations of sequence over experiments of ErrorShape
+        How measurement noise changes along each log, for ``ma``; empty where it
+        is alike everywhere.
 
     Returns
     -------
@@ -97,7 +101,7 @@ def score_covariance(
     Ljungberg (2020), eq. 2.21; Newey and West (1987); Politis (2003).
     """
     if kind == "ma" and lags is None:
-        return _coloured(projected, residuals)
+        return _coloured(projected, residuals, shapes)
     if lags is None:
         lags = 0
         if kind != "white":
@@ -120,17 +124,23 @@ def score_covariance(
 
 
 def _coloured(
-    projected: Sequence[Sequence[Array]], residuals: Sequence[Sequence[Array]]
+    projected: Sequence[Sequence[Array]],
+    residuals: Sequence[Sequence[Array]],
+    shapes: Sequence[Sequence[ErrorShape]],
 ) -> tuple[Array, int]:
     """Return Σ s sᵀ with s = (Hᵀ ẑ) ε of all equations, and the longest memory of a model."""
     keep = [np.asarray(hat.any(axis=0)) for hat in projected[0]]
-    colours = [fit_colour(equation, keep) for equation in residuals]
+    shapes = shapes or [()] * len(residuals)
+    colours = [
+        fit_shaped_colour(equation, keep, shape, hats)
+        for equation, shape, hats in zip(residuals, shapes, projected, strict=True)
+    ]
     sizes = sum(equation[0].shape[0] for equation in projected)
     total = np.zeros((sizes, sizes))
     for e in range(len(keep)):
         scores = np.vstack(
             [
-                c.adjoint(hats[e]) * c.innovations(errors[e])
+                c.adjoint(hats[e], e) * c.innovations(errors[e], e)
                 for c, hats, errors in zip(colours, projected, residuals, strict=True)
             ]
         )

@@ -17,6 +17,7 @@ from greybox.estimation.covariance import (
 )
 from greybox.estimation.credibility import Evidence, assess, judge
 from greybox.estimation.disturbance import estimate_current
+from greybox.estimation.error_shape import ErrorShape, error_shapes
 from greybox.estimation.moments import Solution, solve_stacked
 from greybox.estimation.result import Estimate
 from greybox.model.predictor import Predictor
@@ -161,8 +162,9 @@ def estimate_iv(
     -------
     Estimate
         ``status`` says whether the refinement converged. Where an instrument
-        simulation diverges, the step is halved; where that does not help, the
-        last estimate with bounded instruments is returned and the status says so.
+        simulation diverges, the step is halved. Where that does not help, or the
+        estimates never settle, an estimate spoils the model of the next instruments:
+        the one whose instruments explain most of the regressors is returned.
 
     Raises
     ------
@@ -205,6 +207,7 @@ def estimate_iv(
         )
     solutions = _solve(regression, instruments, metric)
     status, iterations = "one step, instruments not refined", 0
+    strongest = (_strength(solutions), theta, instruments, solutions)
     if refine:
         most = _MAX_REFINEMENTS if refine is True else int(refine)
         status = f"the refinement still moved after {most} steps"
@@ -222,17 +225,25 @@ def estimate_iv(
             if fresh.diverged:
                 status = (
                     f"stopped after {iterations - 1} refinements: {fresh.diverged}; "
-                    f"the last estimate with bounded instruments is given"
+                    f"the estimate of the strongest instruments is given"
                 )
+                _, theta, instruments, solutions = strongest
                 break
             theta, instruments = candidate, fresh
             solutions = _solve(regression, instruments, metric)
+            strength = _strength(solutions)
+            if strength > strongest[0]:
+                strongest = (strength, theta, instruments, solutions)
             moved = np.abs(_coefficients(solutions) - previous)
             scale = np.abs(previous) + 1e-12
             # a halfway model settles too, but not at an estimate that can be simulated
             if candidate is target and (moved < _REFINE_TOLERANCE * scale).all():
                 status = f"converged after {iterations} refinements"
                 break
+        else:
+            if refine is True:
+                status += "; the estimate of the strongest instruments is given"
+                _, theta, instruments, solutions = strongest
     return _result(
         "iv",
         regression,
@@ -270,6 +281,12 @@ def _structure_theta(predictor: Predictor, coefficients: Array) -> Array:
     for i in predictor.parameter_columns:
         theta[predictor.structure.index(predictor.columns[i].terms[0])] = coefficients[i]
     return theta
+
+
+def _strength(solutions: Sequence[Solution]) -> float:
+    """Return half the log determinant of what the instruments explain of the regressors."""
+    with np.errstate(divide="ignore"):
+        return float(sum(np.log(s.singular_values).sum() for s in solutions))
 
 
 def _coefficients(solutions: Sequence[Solution]) -> Array:
@@ -378,6 +395,7 @@ def _covariance(
     kind: Covariance,
     seed: int,
     centred: bool,
+    shapes: Sequence[Sequence[ErrorShape]],
 ) -> tuple[Array, int]:
     predictor = regression.predictor
     p = len(predictor.columns)
@@ -396,7 +414,7 @@ def _covariance(
             total[np.ix_(mine, mine)] = np.cov(draws.T).reshape(len(mine), len(mine))
         return total, 0
     robust: CovarianceKind = kind
-    middle, lags = score_covariance(projected, residuals, robust)
+    middle, lags = score_covariance(projected, residuals, robust, shapes=shapes)
     inverse = np.zeros((p, p))
     for state, solution in zip(predictor.structure.states, solutions, strict=True):
         mine = predictor.equation(state)
@@ -425,9 +443,14 @@ def _result(
     """Collect what was found; `evidence` are the simulated instruments to test it with."""
     predictor = regression.predictor
     projected, residuals = _masked(solutions, regression, instruments, centred=centred)
-    covariance, lags = _covariance(solutions, regression, projected, residuals, kind, seed, centred)
     kept = sum(int(k.sum()) for k in instruments.keep)
     theta = _coefficients(solutions)
+    shapes = (
+        error_shapes(predictor, logs, theta, residuals, instruments.keep) if kind == "ma" else ()
+    )
+    covariance, lags = _covariance(
+        solutions, regression, projected, residuals, kind, seed, centred, shapes
+    )
     residual_std = np.array(
         [np.sqrt(sum(float(e @ e) for e in equation) / max(kept, 1)) for equation in residuals]
     )

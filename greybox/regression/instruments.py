@@ -45,11 +45,14 @@ class Instruments:
         which, unlike measured ones, do not select on the noise.
     diverged : str
         Empty, or which simulation left its bound and where.
+    x : tuple of ndarray
+        (N, nx) simulated states, where they come from a simulation.
     """
 
     z: tuple[Array, ...]
     keep: tuple[NDArray[np.bool_], ...]
     diverged: str = ""
+    x: tuple[Array, ...] = ()
 
 
 def initial_state(log: TrialLog, states: tuple[str, ...]) -> Array:
@@ -191,7 +194,7 @@ def build_instruments(
     Instruments
     """
     structure = predictor.structure
-    zs, keeps = [], []
+    zs, keeps, xs = [], [], []
     for i, log in enumerate(logs):
         run = simulate_log(structure, theta, log, heading=heading)
         if run.diverged[0] >= 0:
@@ -228,4 +231,5 @@ def build_instruments(
             z[varying] -= z[np.ix_(varying, np.flatnonzero(rows))].mean(axis=1, keepdims=True)
         zs.append(z)
         keeps.append(rows)
-    return Instruments(tuple(zs), tuple(keeps))
+        xs.append(x)
+    return Instruments(tuple(zs), tuple(keeps), x=tuple(xs))

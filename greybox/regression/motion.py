@@ -246,3 +246,27 @@ def regressors_along(
     slopes = np.empty((nx * channels, len(x)))
     _slopes(predictor)([*states, psi, *inputs, *pair, *map(float, theta)], slopes)
     return z, np.ascontiguousarray(slopes.T).reshape(len(x), nx, channels)
+
+
+def measured_slopes(predictor: Predictor, log: TrialLog, theta: Array) -> Array:
+    """Return the slopes (N−1, nx, nx + m) of a `Motion` at the measured states of a log.
+
+    Parameters
+    ----------
+    theta : ndarray
+        (p,) coefficients of all columns, which the slopes depend on.
+    """
+    structure = predictor.structure
+    marine = structure.disturbance == "marine"
+    samples = len(log) - 1
+    tau = (
+        log.forces(structure.inputs)
+        if marine
+        else np.column_stack([log[n] for n in structure.inputs])
+    )
+    psi = log["psi"] if "psi" in log else np.zeros(len(log))
+    air = np.zeros((samples, 2))
+    if predictor.air_measured:
+        air = np.column_stack([log["u_q"], log["v_q"]])[:-1]
+    x = log.states(structure.states)[:-1]
+    return regressors_along(predictor, x, psi[:-1], tau[:-1], air, theta)[1]

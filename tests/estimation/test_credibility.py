@@ -97,6 +97,18 @@ def test_a_missing_effect_is_noticed(thesis, true_theta):
     assert by_name(estimate)["input_independence_v"].p_value < 1e-3
 
 
+@pytest.mark.parametrize("seed", [902, 903, 905])
+def test_a_missing_product_of_states_is_noticed_in_a_current(seed):
+    """The Coriolis force again: bias terms take most of it, and no input alone tells it."""
+    p = build_predictor(get_structure("thesis-Yur"), "augmented", REGIME)
+    estimate = estimate_iv(p, [virtual_log(seed, 2000)], refine=2)
+    assert "so the model lacks something" in estimate.verdict.text
+    assert by_name(estimate)["overidentification_v"].p_value < 1e-3
+    full = build_predictor(get_structure("thesis"), "augmented", REGIME)
+    right = estimate_iv(full, [virtual_log(seed, 2000)], refine=2)
+    assert "lacks" not in right.verdict.text
+
+
 @pytest.mark.parametrize("kind", ["pulses", "binary", "sine"])
 @pytest.mark.parametrize("samples", [1000, 5000])
 def test_a_narrow_range_of_speeds_is_weak(kind, samples):

@@ -22,6 +22,8 @@ from greybox.model.catalogue import get_structure
 from greybox.model.predictor import build_predictor
 from greybox.regression.instruments import build_instruments
 from greybox.regression.regression import build_regression
+from greybox.study.chapter6 import TRUE as STUDY
+from greybox.study.efficiency import CASES, virtual_trial
 from greybox.trial.log import make_log
 
 REGIME = (("u", (1,)), ("v", (1,)))
@@ -297,3 +299,20 @@ def test_summary_names_everything(thesis, noisy_log, nominal_theta):
     text = estimate_iv(predictor, [noisy_log], start=nominal_theta).summary()
     for name in ("Xuu+Wuu", "Nmu", "current_north", "excitation_u", "per second", "[0.025"):
         assert name in text
+
+
+@pytest.mark.parametrize(("run", "ends"), [(138, "stopped after"), (24, "the refinement still")])
+def test_a_refinement_that_runs_off_gives_what_its_best_instruments_gave(thesis, run, ends):
+    """The last estimates of these logs were off by thousands of standard errors."""
+    regime = (("u", (1,)), ("v", (1,)), ("r", (1, -1)))
+    predictor = build_predictor(thesis, "wind", regime)
+    log = virtual_trial(np.random.default_rng([23, 0, run]), CASES[0])
+    model = (found := estimate_iv(predictor, [log], wind="measured", judged=False)).model()
+    assert found.status.startswith(ends)
+    assert found.status.endswith("the estimate of the strongest instruments is given")
+    true = np.array([STUDY[n] for n in model.names])
+    # 18 intervals that hold their value in 999 of 1000 logs each
+    assert (np.abs(model.theta - true) < 3.3 * model.std).all()
+    # neither are the standard errors those of an estimate that says nothing
+    bound = estimate_iv(predictor, [log], start=true, refine=False, wind="measured", judged=False)
+    assert np.median(model.std / bound.model().std) < 3

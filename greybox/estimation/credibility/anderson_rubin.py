@@ -116,11 +116,11 @@ def confidence_sets(equation: Equation, level: float = 0.95) -> list[ConfidenceS
     # residuals move by δ·b as θ_i is held off its estimate and the others follow
     shift = [follow.T @ (f - h) for f, h in zip(equation.phi, explained, strict=True)]
     colour = equation.colour
-    errors = [colour.innovations(e) for e in _unexplained(equation)]
-    shift = [colour.innovations(b) for b in shift]
+    errors = [colour.innovations(e, log) for log, e in enumerate(_unexplained(equation))]
+    shift = [colour.innovations(b, log) for log, b in enumerate(shift)]
     freedom = max(equation.freedom - p * len(equation.phi), 1)
     known = np.minimum(colour.freedom_of(weights), freedom)
-    weights = [colour.adjoint(w) for w in weights]
+    weights = [colour.adjoint(w, log) for log, w in enumerate(weights)]
     lost = equation.rows / freedom
     v00 = lost * sum(((w * e) ** 2).sum(axis=1) for w, e in zip(weights, errors, strict=True))
     v01, v11 = _of_shift(equation, weights, errors, shift, lost)

@@ -7,13 +7,14 @@ properties of that regression.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.estimation.colour import Colour, fit_colour
+from greybox.estimation.colour import Colour
+from greybox.estimation.error_shape import ErrorShape, error_shapes, fit_shaped_colour
 from greybox.estimation.moments import Solution, solve_stacked
 from greybox.model.predictor import Predictor
 from greybox.regression.instruments import Instruments
@@ -44,6 +45,10 @@ class Equation:
         (N,) rows that take part.
     centred : bool
         Whether the mean of each experiment was removed.
+    shapes : tuple of ErrorShape
+        How measurement noise changes along each log; empty where it is alike everywhere.
+    states : tuple of ndarray
+        (nx, N) simulated states an experiment, in every row; empty where there are none.
     """
 
     state: str
@@ -54,6 +59,8 @@ class Equation:
     z: tuple[Array, ...]
     keep: tuple[NDArray[np.bool_], ...]
     centred: bool
+    shapes: tuple[ErrorShape, ...] = ()
+    states: tuple[Array, ...] = ()
 
     @property
     def rows(self) -> int:
@@ -79,13 +86,13 @@ class Equation:
     @cached_property
     def colour(self) -> Colour:
         """Noise model of those residuals."""
-        return fit_colour(self.residuals, self.keep)
+        return fit_shaped_colour(self.residuals, self.keep, self.shapes, self.solution.projected)
 
     @cached_property
     def std(self) -> Array:
         """Standard errors of that estimate, (p,)."""
-        weights = [self.colour.adjoint(h) for h in self.solution.projected]
-        innovations = [self.colour.innovations(e) for e in self.residuals]
+        weights = [self.colour.adjoint(h, k) for k, h in enumerate(self.solution.projected)]
+        innovations = [self.colour.innovations(e, k) for k, e in enumerate(self.residuals)]
         scores = [w * i for w, i in zip(weights, innovations, strict=True)]
         middle = sum(s @ s.T for s in scores) * self.rows / max(self.freedom - len(self.labels), 1)
         inverse = np.linalg.pinv(self.solution.information, rcond=1e-15)
@@ -166,9 +173,15 @@ class Evidence:
         """One regression a state; empty where there are no instruments."""
         if self.instruments.diverged or not self.instruments.z:
             return ()
-        return tuple(
-            _equation(self, row, state) for row, state in enumerate(self.predictor.structure.states)
-        )
+        states = self.predictor.structure.states
+        plain = [_equation(self, row, state) for row, state in enumerate(states)]
+        # of that regression's own estimate, as all that is asked of it
+        theta = np.zeros(len(self.predictor.columns))
+        for equation in plain:
+            theta[list(equation.columns)] = equation.solution.theta
+        residuals = [e.residuals for e in plain]
+        shapes = error_shapes(self.predictor, self.logs, theta, residuals, self.instruments.keep)
+        return tuple(replace(e, shapes=s) for e, s in zip(plain, shapes, strict=True))
 
 
 def _equation(evidence: Evidence, row: int, state: str) -> Equation:
@@ -196,6 +209,7 @@ def _equation(evidence: Evidence, row: int, state: str) -> Equation:
         tuple(z),
         evidence.instruments.keep,
         centred,
+        states=tuple(x.T for x in evidence.instruments.x),
     )
 
 

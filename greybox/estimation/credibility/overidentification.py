@@ -22,7 +22,8 @@ _QUESTION = Question(
 def overidentification(equation: Equation, biases: frozenset[str]) -> TestResult:
     """Test that all instruments are valid (Sargan-Hansen).
 
-    Robust to the moving average and to noise that changes its size.
+    Robust to the moving average and to noise that changes its size. The simulated
+    states and their products stand for terms that the structure may lack.
     Several logs bring more equations than parameters by their own instruments;
     to these, and to a single log, the parameters' instruments delayed by five
     samples are added.
@@ -35,6 +36,12 @@ def overidentification(equation: Equation, biases: frozenset[str]) -> TestResult
     def score() -> Score:
         wanted = [i for i, n in enumerate(equation.labels) if n not in biases]
         xi = [delayed(z[wanted], k, _DELAY) for z, k in zip(equation.z, equation.keep, strict=True)]
+        if equation.states:
+            further = [
+                delayed(_products(x), k, 0)
+                for x, k in zip(equation.states, equation.keep, strict=True)
+            ]
+            xi = [np.vstack([d, f]) for d, f in zip(xi, further, strict=True)]
         if len(equation.z) > 1:
             xi = [np.vstack([s, d]) for s, d in zip(equation.stacked, xi, strict=True)]
         return score_test(
@@ -46,6 +53,12 @@ def overidentification(equation: Equation, biases: frozenset[str]) -> TestResult
         )
 
     return _QUESTION.answer(equation, score, _finding)
+
+
+def _products(x: Array) -> Array:
+    """Return states (nx, N) and their products in pairs."""
+    first, second = np.triu_indices(len(x))
+    return np.vstack([x, x[first] * x[second]])
 
 
 def _finding(score: Score, agree: bool) -> Finding:

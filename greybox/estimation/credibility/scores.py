@@ -115,7 +115,10 @@ def score_test(
         statistic, freedom, _ = quadratic_form(moments, covariance, _LEAST)
     else:
         h = colour if memory == "coloured" else WHITE
-        scores = [h.adjoint(x) * h.innovations(e) for x, e in zip(tilde, errors, strict=True)]
+        scores = [
+            h.adjoint(x, log) * h.innovations(e, log)
+            for log, (x, e) in enumerate(zip(tilde, errors, strict=True))
+        ]
         covariance = lagged_products(scores, scores, 0)
         statistic, freedom, whitening = quadratic_form(moments, covariance, _LEAST)
         # Σ h² of the leverages: what a few large scores take from the variance 2k of χ²
