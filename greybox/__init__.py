@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from greybox.diagnosis.causes import known_causes
     from greybox.diagnosis.causes.cause import Cause
     from greybox.diagnosis.diagnose import DiagnosisOptions, diagnose
-    from greybox.diagnosis.given import Given, fit_given
-    from greybox.diagnosis.result import Diagnosis
+    from greybox.diagnosis.given import fit_given
+    from greybox.diagnosis.result import Diagnosis, Given
     from greybox.estimation.estimate import estimate_iv, estimate_ls
     from greybox.estimation.output_error import OutputErrorOptions, estimate_oe
     from greybox.estimation.output_setup import output_predictor
@@ -63,7 +63,7 @@ _WHERE = {
     "Cause": "greybox.diagnosis.causes.cause",
     "Diagnosis": "greybox.diagnosis.result",
     "DiagnosisOptions": "greybox.diagnosis.diagnose",
-    "Given": "greybox.diagnosis.given",
+    "Given": "greybox.diagnosis.result",
     "diagnose": "greybox.diagnosis.diagnose",
     "fit_given": "greybox.diagnosis.given",
     "known_causes": "greybox.diagnosis.causes",

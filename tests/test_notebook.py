@@ -81,6 +81,7 @@ def results(ship, thesis, true_theta):
         segments,
         Contents(note=HOSTILE),
         diagnosis,
+        gb.Given((HOSTILE,), model, model, 0.5, diagnosis.gain, HOSTILE),
         run,
         replace(run, diverged=7),
         gb.simulate(thesis, true_theta, np.zeros(3), np.ones((20, 3)), 1.0),

@@ -13,7 +13,7 @@ from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.held_out import Folds, HeldOut, OtherLogs
 from greybox.diagnosis.noise import fit_noise
 from greybox.diagnosis.point import Fit, Point
-from greybox.diagnosis.ship import LogRun, Ship, wired
+from greybox.diagnosis.ship import LogRun, Ship, shifted, wired
 from greybox.errors import ExcitationError
 from greybox.estimation.free_run import fit_free_runs
 from greybox.estimation.output_setup import measured, output_model, output_predictor
@@ -30,6 +30,8 @@ INTEGRATORS: tuple[Integrator, ...] = ("euler", "rk4")
 _BETTER = 6.0
 # fall of the one-step errors' −2 log L from which on a rewired log is worth a fit
 _REWIRED = 20.0
+# and atoms, of those whose runs leave every bound, that get one
+_RESCUED = 2
 # free-run errors, in the sensors' deviations, up to which a first fit needs no second
 _NEAR = 3.0
 # damping a sample of a run that must stay bounded
@@ -66,7 +68,6 @@ class Case:
         self.kind, self.regime = kind, regime
         self._problems: dict[Integrator, Problem] = {}
         self._held: dict[Integrator, HeldOut] = {}
-        self._rough: Mapping[str, float] | None = None
 
     def problem(self, integrator: Integrator) -> Problem:
         """Return the estimation logs, ready to be run."""
@@ -207,17 +208,18 @@ class Case:
     def anew(self, fit: Fit) -> Fit:
         """Return the fit from least-squares coefficients, if that ends lower.
 
-        Those of a model that lacked a cause may lie beyond a hill of the likelihood.
+        Those of a model that lacked a cause may lie beyond a hill of the likelihood; these
+        are of the logs as they would be without what the fit knows of sensors and thrusters.
         """
         if self._near(fit):
             return fit
-        if self._rough is None:
-            self._rough = rough(self.structure, self.logs, self.kind, self.regime)[0]
+        logs = [_as_it_should_be(log, fit.point.ship) for log in self.logs]
+        first = rough(self.structure, logs, self.kind, self.regime)[0]
         problem = self.problem(fit.integrator)
         base = fit.point.base
         theta = np.array(
             [
-                self._rough.get(n, 0.0) if n in self.structure.parameters else base.theta[i]
+                first.get(n, 0.0) if n in self.structure.parameters else base.theta[i]
                 for i, n in enumerate(self.universe.parameters)
             ]
         )
@@ -247,25 +249,43 @@ class Case:
                 fit = found
         return fit
 
-    def rewired(self, fit: Fit, atoms: Sequence[Atom]) -> list[tuple[Atom, Fit]]:
-        """Return fits from first coefficients of their own, for atoms that ask for it.
+    def begun_again(
+        self, fit: Fit, atoms: Sequence[Atom], escaped: Sequence[Atom] = ()
+    ) -> list[tuple[Atom, Fit]]:
+        """Return fits from first coefficients of their own, for atoms that need them.
 
         Only those whose one-step errors by least squares are clearly smaller than
         those of the log as it stands.
+
+        Parameters
+        ----------
+        fit : Fit
+            Without any cause.
+        atoms : sequence of Atom
+            Of which those count that ask for it.
+        escaped : sequence of Atom
+            With which the run of these coefficients leaves every bound, however likely
+            they are with others; the most promising of them are tried.
         """
         asked = [a for a in atoms if a.afresh]
-        if not asked:
+        moved = [a for a in escaped if a.apply is not None and not a.afresh]
+        if not asked and not moved:
             return []
         level = rough(self.structure, self.logs, self.kind, self.regime)[1]
-        out = []
-        for atom in asked:
+        ranked: list[tuple[float, Atom, Mapping[str, float]]] = []
+        for atom in (*asked, *moved):
             ship = self.problem(fit.integrator).add(fit.point, atom).ship
             logs = [_as_it_should_be(log, ship) for log in self.logs]
             values, own = rough(self.structure, logs, self.kind, self.regime)
-            if level - own < _REWIRED:
-                continue
+            if level - own >= _REWIRED:
+                ranked.append((own, atom, values))
+        ranked.sort(key=lambda item: item[0])
+        worth = [item for item in ranked if item[1].afresh]
+        worth += [item for item in ranked if not item[1].afresh][:_RESCUED]
+        out = []
+        for _, atom, first in worth:
             current = fit.point.base.current
-            found = [self._fit(values, current, i, atom) for i in INTEGRATORS]
+            found = [self._fit(first, current, i, atom) for i in INTEGRATORS]
             bounded = [f for f in found if f is not None and not f.escaped]
             if bounded:
                 out.append((atom, min(bounded, key=lambda f: f.cost)))
@@ -275,9 +295,19 @@ class Case:
 def _as_it_should_be(log: TrialLog, ship: Ship) -> TrialLog:
     channels = dict(log.channels)
     channels |= wired({c: log[c] for c in log.vessel.commands}, ship.wires)
-    for name in ship.sensors.reversed:
+    sensors = ship.sensors
+    for name in sensors.reversed:
         channels[name] = -log[name]
-    return replace(log, channels=channels)
+    for name, seconds in sensors.late:
+        channels[name] = shifted(channels[name], -seconds / log.sample_time)
+    if "u" in channels and "v" in channels:
+        c, s = np.cos(sensors.turned), np.sin(sensors.turned)
+        u, v = channels["u"], channels["v"]
+        channels["u"], channels["v"] = c * u - s * v, s * u + c * v
+        if "r" in channels:
+            channels["u"] = channels["u"] + sensors.lever[1] * channels["r"]
+            channels["v"] = channels["v"] - sensors.lever[0] * channels["r"]
+    return replace(log, channels=channels, vessel=ship.vessel)
 
 
 def rough(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,11 +12,10 @@ from greybox.diagnosis.base import Case
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.preparing import prepare
 from greybox.diagnosis.refitting import likelier, polished, refit, seen_as_slow, slow
-from greybox.diagnosis.result import Gain
+from greybox.diagnosis.result import Given
 from greybox.diagnosis.scores import Directions, score_atoms
 from greybox.diagnosis.search import Search
 from greybox.diagnosis.telling import Report
-from greybox.model.model import ManoeuvringModel
 from greybox.one_thread import one_thread
 from greybox.trial.log import TrialLog
 
@@ -25,27 +23,6 @@ Array = NDArray[np.float64]
 
 # forms of a cause that are fitted: moments, thrusters, coefficients
 _FORMS = 3
-
-
-@dataclass(frozen=True)
-class Given:
-    """What causes that are taken for granted do.
-
-    Parameters
-    ----------
-    before, after : ManoeuvringModel
-        Without and with them, estimated on the same logs.
-    fall : float
-        Share by which they lower the free runs' squared errors of the states, each in
-        its sensor's variance, on the logs of the estimate.
-    gain : dict of str to Gain
-        On the logs that are held out.
-    """
-
-    before: ManoeuvringModel
-    after: ManoeuvringModel
-    fall: float
-    gain: dict[str, Gain]
 
 
 @one_thread
@@ -70,6 +47,10 @@ def fit_given(
     structure : str
     seed : int
         Of the bootstrap.
+
+    Returns
+    -------
+    Given
 
     Raises
     ------
@@ -96,7 +77,8 @@ def fit_given(
     before, after = (report.model(f, record) for f in (base, final))
     pairs = case.held_out(final.integrator).pairs(final)
     gain, _, after = report.gain(before, after, ready.validate, pairs)
-    return Given(before, after, 1.0 - _squares(final) / _squares(base), gain)
+    fall = 1.0 - _squares(final) / _squares(base)
+    return Given(tuple(ids), before, after, fall, gain, report.where(ready.validate))
 
 
 def _likeliest(case: Case, fit: Fit, atoms: Sequence[Atom]) -> tuple[Atom, Fit] | None:
@@ -104,9 +86,11 @@ def _likeliest(case: Case, fit: Fit, atoms: Sequence[Atom]) -> tuple[Atom, Fit] 
     near = [a for a in atoms if not a.afresh]
     scores = score_atoms(Directions(problem, fit), near)
     fits = [(s.atom, refit(problem, fit, s)) for s in scores[:_FORMS]]
+    # coefficients of their own for what these run away with; beside other causes there are none
+    escaped = [s.atom for s in scores if s.gain == -np.inf] if not fit.point.atoms else []
     if slow(fit):
         fits = likelier(fits, seen_as_slow(problem, fit, near))
-    fits = [(a, f) for a, f in (*fits, *case.rewired(fit, atoms)) if not f.escaped]
+    fits = [(a, f) for a, f in (*fits, *case.begun_again(fit, atoms, escaped)) if not f.escaped]
     if not fits:
         return None
     samples = sum(len(e) for e in fit.errors)

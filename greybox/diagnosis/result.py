@@ -276,12 +276,7 @@ class Diagnosis(Shown):
                     f"−2 log L falls by {c.held_out:.0f} ± {c.held_out_std:.0f}"
                 )
         if self.gain:
-            lines += ["", f"Fit of the free run (6.12) [%], {self.validated_on}:"]
-            lines += [
-                f"  {state:<3}{g.before:>8.1f} -> {g.after:.1f}   (gain {g.ci[0]:.1f} to "
-                f"{g.ci[1]:.1f})"
-                for state, g in self.gain.items()
-            ]
+            lines += ["", *_gain_lines(self.gain, self.validated_on)]
         lines += ["", self.remaining, *(f"next: {n}" for n in self.next_steps)]
         lines += [f"note: {n}" for n in self.notes]
         return "\n".join(lines)
@@ -295,16 +290,69 @@ class Diagnosis(Shown):
             for c in (*self.causes, *self.partial, *self.candidates)
             for name, q in c.parameters.items()
         ]
-        gained = [
-            (s, number(g.before, 3), number(g.after, 3), f"{g.ci[0]:.1f} to {g.ci[1]:.1f}")
-            for s, g in self.gain.items()
-        ]
         head = ("cause", "parameter", "value", "95 %", "unit", "adjusted p")
-        fits = ("free run", "fit before [%]", "after", "gain, 95 %")
         return (
             table(head, listed),
-            table(fits, gained, f"Fit (6.12), {self.validated_on}"),
+            _gain_table(self.gain, self.validated_on),
             items("What the simulation gets wrong", [s.sentence for s in self.wrong]),
             text(self.remaining),
             items("Next", self.next_steps),
         )
+
+
+@dataclass(frozen=True, repr=False)
+class Given(Shown):
+    """What causes do that are taken for granted.
+
+    Parameters
+    ----------
+    ids : tuple of str
+    before, after : ManoeuvringModel
+        Without and with them, estimated on the same logs.
+    fall : float
+        Share by which they lower the free runs' squared errors of the states, each in
+        its sensor's variance, on the logs of the estimate.
+    gain : dict of str to Gain
+        On what is held out.
+    validated_on : str
+        What that is.
+    """
+
+    ids: tuple[str, ...]
+    before: ManoeuvringModel
+    after: ManoeuvringModel
+    fall: float
+    gain: dict[str, Gain]
+    validated_on: str
+
+    def summary(self) -> str:
+        """Return the fall and the gain as text."""
+        return "\n".join([self._line(), "", *_gain_lines(self.gain, self.validated_on)])
+
+    def _line(self) -> str:
+        return (
+            f"with {', '.join(self.ids)} the squared free-run errors fall by "
+            f"{100 * self.fall:.1f} %"
+        )
+
+    def _parts(self) -> tuple[str, ...]:
+        return (_gain_table(self.gain, self.validated_on),)
+
+
+def _gain_lines(gain: Mapping[str, Gain], where: str) -> list[str]:
+    return [
+        f"Fit of the free run (6.12) [%], {where}:",
+        *(
+            f"  {state:<3}{g.before:>8.1f} -> {g.after:.1f}   (gain {g.ci[0]:.1f} to {g.ci[1]:.1f})"
+            for state, g in gain.items()
+        ),
+    ]
+
+
+def _gain_table(gain: Mapping[str, Gain], where: str) -> str:
+    rows = [
+        (s, number(g.before, 3), number(g.after, 3), f"{g.ci[0]:.1f} to {g.ci[1]:.1f}")
+        for s, g in gain.items()
+    ]
+    head = ("free run", "fit before [%]", "after", "gain, 95 %")
+    return table(head, rows, f"Fit (6.12), {where}")

@@ -205,7 +205,7 @@ def take_step(case: Case, fit: Fit, causes: Sequence[Candidate], atoms: Sequence
     if slow(fit):
         fits = likelier(fits, seen_as_slow(problem, fit, near))
     if not causes:
-        fits += case.rewired(fit, left)
+        fits += case.begun_again(fit, left, [s.atom for s in scores if s.gain == -np.inf])
     candidates = sorted(
         (judge(held_out, fit, found, atom, len(left), problem.names) for atom, found in fits),
         key=_merit,

@@ -197,7 +197,25 @@ class LogRun:
         full = x
         if self._turns:
             full = np.column_stack([x, start[nx] + self._heading(x[:, self.states.index("r")])])
-        return Shown(x, self.sense(ship.sensors, full[..., None])[..., 0])
+        y = self.sense(ship.sensors, full[..., None])[..., 0]
+        if ship.sensors.late:
+            # a run tells nothing of what was before its first sample
+            y = self.y + self.within(ship.sensors) * (y - self.y)
+        return Shown(x, y)
+
+    def within(self, sensors: Sensors) -> Array:
+        """Return the share of each measurement that shows a time within the log, (N, ny).
+
+        A late channel begins with the motion before the log, an early one ends with that
+        after it.
+        """
+        out = np.ones((self.samples, len(self.outputs)))
+        index = np.arange(self.samples)
+        for name, seconds in sensors.late:
+            shows = index - seconds / self.sample_time
+            beyond = np.maximum(-shows, shows - (self.samples - 1))
+            out[:, self.outputs.index(name)] = 1.0 - np.clip(beyond, 0.0, 1.0)
+        return out
 
     def _heading(self, r: Array) -> Array:
         """Integrate a yaw rate (N, ...) from zero."""
@@ -269,7 +287,8 @@ class LogRun:
             first = np.zeros((self.samples, slope.shape[1], 1))
             first[:, -1] = 1.0
             slope = np.concatenate([slope, first], axis=2)
-        return self.sense(ship.sensors, slope)
+        y = self.sense(ship.sensors, slope)
+        return y * self.within(ship.sensors)[:, :, None] if ship.sensors.late else y
 
 
 def wired(commands: Mapping[str, Array], wires: Sequence[Wire]) -> dict[str, Array]:

@@ -155,7 +155,7 @@ class Report:
             model=after,
             alternatives=alternatives,
             remaining=ruling.remaining,
-            validated_on=self._where(validate),
+            validated_on=self.where(validate),
             next_steps=tuple(ruling.next_steps),
             steps=tuple(_ranked(s.scores, s.candidates) for s in found.steps),
             runs=tuple(runs),
@@ -229,7 +229,8 @@ class Report:
             run, log=log, x=x, fit=dict(zip(seen.states, map(float, percent), strict=True))
         )
 
-    def _where(self, validate: Sequence[TrialLog]) -> str:
+    def where(self, validate: Sequence[TrialLog]) -> str:
+        """Say what is held out."""
         if validate:
             return f"on {', '.join(log.name for log in validate)}, which took no part in the fit"
         return (
@@ -266,7 +267,8 @@ def _grouped(candidate: Candidate, groups: Sequence[Sequence[Candidate]]) -> boo
 
 
 def _ranked(scores: Sequence[Any], candidates: Sequence[Candidate]) -> tuple[Ranked, ...]:
-    promised = {s.atom.key: s.gain for s in scores}
+    # a cause whose run leaves every bound at first promises nothing that can be drawn
+    promised = {s.atom.key: max(float(s.gain), 0.0) for s in scores}
     fitted = {c.atom.key: c for c in candidates}
     keys = dict.fromkeys([*fitted, *promised])
     return tuple(

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from greybox.diagnosis.atom import Atom, Parameter
+from greybox.diagnosis.base import _as_it_should_be
 from greybox.diagnosis.causes import Context, known_causes
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.held_out import long_run_variance, proof_of
@@ -78,6 +81,48 @@ def test_run_equals_the_free_run_and_differences(log: TrialLog, integrator) -> N
     moved[1] += 1e-6
     slope = (run.run(ship, moved).y - shown.y) / 1e-6
     np.testing.assert_allclose(found[:, :, 4], slope, atol=1e-4)
+
+
+@pytest.mark.parametrize("late", [2.5, -1.25, 0.5])
+def test_a_late_channel_is_asked_only_for_what_the_log_holds(log: TrialLog, late: float) -> None:
+    run = LogRun(WIDE, log, "rk4")
+    plain = Ship(_theta(WIDE), np.zeros(2), log.vessel)
+    ship = replace(plain, sensors=Sensors(late=(("u", late),)))
+    start = run.start() + np.array([0.4, 0.0, 0.0, 0.0])
+    shown, true = run.run(ship, start), run.run(plain, start)
+    error = run.y - shown.y
+    np.testing.assert_allclose(shown.y[:, 1:], true.y[:, 1:], atol=1e-14)
+    u = np.interp(np.arange(len(log)) - late, np.arange(len(log)), true.y[:, 0])
+    whole = run.y[:, 0] - u
+    if late > 2:
+        # samples 0 and 1 show the motion before the log, of sample 2 half
+        np.testing.assert_array_equal(error[:2, 0], 0.0)
+        np.testing.assert_allclose(error[2, 0], 0.5 * whole[2])
+        np.testing.assert_allclose(error[3:, 0], whole[3:], atol=1e-12)
+    elif late < 0:
+        np.testing.assert_array_equal(error[-1, 0], 0.0)
+        np.testing.assert_allclose(error[-2, 0], 0.75 * whole[-2])
+        np.testing.assert_allclose(error[:-2, 0], whole[:-2], atol=1e-12)
+    else:
+        np.testing.assert_allclose(error[0, 0], 0.5 * whole[0])
+        np.testing.assert_allclose(error[1:, 0], whole[1:], atol=1e-12)
+    slope = run.columns(ship, shown, np.array([0]))[:, :, 0]
+    step = 1e-6
+    up, down = (run.run(ship.with_value(0, ship.theta[0] + s), start).y for s in (step, -step))
+    np.testing.assert_allclose(slope, (up - down) / (2 * step), atol=1e-5 * np.abs(slope).max())
+
+
+def test_a_log_as_it_should_be_is_what_better_sensors_had_shown(log: TrialLog) -> None:
+    run = LogRun(WIDE, log, "rk4")
+    sensors = Sensors(lever=(3.0, -2.0), turned=0.1, late=(("v", 2.0),), reversed=("r",))
+    ship = Ship(_theta(WIDE), np.zeros(2), log.vessel, sensors=sensors)
+    x = run.y[:, :, None]
+    seen = run.sense(sensors, x)[:, :, 0]
+    channels = dict(log.channels) | {n: seen[:, i] for i, n in enumerate(run.outputs)}
+    mended = _as_it_should_be(replace(log, channels=channels), ship)
+    for i, name in enumerate(("u", "v", "r")):
+        # the last samples of a channel that is two seconds late are not in the log
+        np.testing.assert_allclose(mended[name][:-2], run.y[:-2, i], atol=1e-12)
 
 
 def test_a_change_is_two_runs(log: TrialLog) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import zlib
+
 import numpy as np
 import pytest
 
@@ -41,3 +43,19 @@ def test_a_cause_that_does_not_act_lowers_little() -> None:
     given = fit_given([trial.estimation], ["quadratic_yaw_damping"], validate=[trial.validation])
     assert "N_|r|r" in given.after.names
     assert abs(given.fall) < 0.05
+
+
+@pytest.mark.long
+def test_a_thrust_law_whose_run_leaves_every_bound_gets_coefficients_of_its_own() -> None:
+    # a zig-zag at several speeds: with the coefficients of a linear law, a share of n|n| runs away
+    rng = np.random.default_rng([2027, zlib.crc32(b"quadratic_thrust zigzag"), 0])
+    trial = draw(rng, ("quadratic_thrust",), kind="zigzag")
+    found = diagnose([trial.estimation], validate=[trial.validation])
+    assert found.steps[0][0].key == "quadratic_thrust"
+    assert found.steps[0][0].promise == 0.0
+    assert [c.id for c in found.causes] == ["quadratic_thrust"]
+    share = found.causes[0].parameters["quadratic_share"]
+    assert abs(share.value - 1.0) < 3 * share.std
+    assert all(g.ci[0] > 0 for g in found.gain.values())
+    given = fit_given([trial.estimation], ["quadratic_thrust"], validate=[trial.validation])
+    assert given.fall > 0.9
