@@ -472,3 +472,18 @@ def test_a_missing_current_is_said_in_the_verdict():
         "do not trust: the heading still explains the residuals of u and the inputs still explain "
         "the residuals of v, so the model lacks something"
     )
+
+
+def test_the_verdict_says_by_what_residuals_are_explained():
+    names = ("Yv",)
+    further = [result(f"overidentification_{s}", False, p=1e-6) for s in "vr"]
+    assert judge(further, names, "iv").text == (
+        "do not trust: the simulated motion still explains the residuals of v, r, so the model "
+        "lacks something"
+    )
+    # what the inputs move moves the motion too: said once
+    inputs = result("input_independence_v", False, p=1e-6)
+    assert judge([inputs, *further], names, "iv").text == (
+        "do not trust: the inputs still explain the residuals of v and the simulated motion still "
+        "explains the residuals of r, so the model lacks something"
+    )

@@ -14,7 +14,14 @@ _OF_PARAMETERS = (
     "relevance_", "weak_instruments_", "many_instruments_", "anderson_rubin_", "damping_signs",
     "margin_bias",
 )  # fmt: skip
-_OF_THE_MODEL = ("input_independence_", "overidentification_", "heading_independence_")
+# tests of the structure: by what they explain the residuals
+_LAST = "overidentification_"
+_EXPLAIN = {
+    "heading_independence_": "the heading still explains",
+    "input_independence_": "the inputs still explain",
+    _LAST: "the simulated motion still explains",
+}
+_OF_THE_MODEL = tuple(_EXPLAIN)
 
 
 def judge(
@@ -95,17 +102,16 @@ def misfit(tests: Sequence[TestResult]) -> list[str]:
     family = [t for t in tests if t.name.startswith(_OF_THE_MODEL) and t.p_value is not None]
     found = [family[i] for i in holm([t.p_value or 0.0 for t in family], _FAMILY)]
     told = []
-    for moved, by in ((True, "the heading"), (False, "the inputs")):
-        states = dict.fromkeys(
-            t.name.rsplit("_", 1)[1] for t in found if t.name.startswith("heading_") is moved
-        )
+    for test, explain in _EXPLAIN.items():
+        states = dict.fromkeys(t.name.rsplit("_", 1)[1] for t in found if t.name.startswith(test))
+        if test == _LAST:
+            # what is moved by inputs moves the motion too
+            moved = {t.name.rsplit("_", 1)[1] for t in found if not t.name.startswith(_LAST)}
+            states = {s: None for s in states if s not in moved}
         if states:
-            told.append(f"{by} still explain{'s' * moved} the residuals of {listed([*states])}")
-    lacks = (
-        " lacks a current or wind"
-        if len(told) == 1 and "heading" in told[0]
-        else (" lacks something")
-    )
+            told.append(f"{explain} the residuals of {listed([*states])}")
+    only = told and all("heading" in t for t in told)
+    lacks = " lacks a current or wind" if only else " lacks something"
     return [f"{' and '.join(told)}, so the model{lacks}"] if told else []
 
 
