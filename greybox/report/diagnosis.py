@@ -10,8 +10,10 @@ from greybox.report.chart import chart_of
 from greybox.report.diagnosed_causes import cause_section, probability
 from greybox.report.diagnosis_figures import (
     LOWEST_FIT,
+    command_figure,
     gain_figure,
     heading_figure,
+    most_followed,
     narrow,
     regime_figure,
     run_figure,
@@ -132,7 +134,7 @@ def _tests(diagnosis: Diagnosis, when: str) -> list[Table]:
 
 
 def _followed(errors: Errors) -> Iterator[Picture]:
-    """Yield what the error goes with: heading, speed, signs."""
+    """Yield what the error goes with: heading, speed, a command, signs."""
     means = (
         "Mean of measured − simulated with its 95 % interval (none where too little of the logs "
         "is there to say)"
@@ -147,6 +149,13 @@ def _followed(errors: Errors) -> Iterator[Picture]:
         yield narrow(
             speed_figure(errors), "speed", f"{means}, by speed.",
             f"Mean error of each state against the speed. {told}",
+        )  # fmt: skip
+    command = most_followed(errors)
+    if command is not None:
+        yield narrow(
+            command_figure(errors, command), "command",
+            f"{means}, by the command that it goes with most, {command}.",
+            f"Mean error of each state against the command {command}. {told}",
         )  # fmt: skip
     if len(errors.regimes) > 1:
         yield narrow(

@@ -108,14 +108,49 @@ def heading_figure(errors: Errors) -> Figure:
 def speed_figure(errors: Errors) -> Figure:
     """Draw the mean error of each state by speed, as many samples in each bin."""
     assert errors.speed is not None
-    edges = np.nanquantile(errors.speed, np.linspace(0, 1, _SPEEDS + 1)[1:-1])
-    group = np.where(np.isfinite(errors.speed), np.searchsorted(edges, errors.speed), -1)
-    place = np.array(
-        [errors.speed[group == g].mean() if (group == g).any() else np.nan for g in range(_SPEEDS)]
-    )
+    group, place = _bins(errors.speed)
     figure, axes = _profiles(errors, group, place, float(np.nanmin(np.diff(place), initial=1.0)))
     axes[-1].set_xlabel("simulated speed over ground [m/s]", fontsize=9)
     return figure
+
+
+def command_figure(errors: Errors, name: str) -> Figure:
+    """Draw the mean error of each state by a command, as many samples in each bin."""
+    group, place = _bins(errors.commands[name])
+    figure, axes = _profiles(errors, group, place, float(np.nanmin(np.diff(place), initial=1.0)))
+    axes[-1].set_xlabel(f"command {name}, as logged", fontsize=9, parse_math=False)
+    return figure
+
+
+def most_followed(errors: Errors) -> str | None:
+    """Return the command whose bins' means have the largest share of the squared errors."""
+    first = next(iter(errors.error.values()))
+
+    def share(value: Array) -> float:
+        group, place = _bins(value)
+        total = 0.0
+        for error in first.values():
+            known = np.isfinite(error)
+            count = np.bincount(group[known], minlength=len(place))
+            sums = np.bincount(group[known], error[known], minlength=len(place))
+            squares = float((error[known] ** 2).sum())
+            total += float((sums**2 / np.maximum(count, 1)).sum()) / max(squares, 1e-300)
+        return total
+
+    shares = {name: share(value) for name, value in errors.commands.items()}
+    return max(shares, key=shares.__getitem__, default=None)
+
+
+def _bins(value: Array) -> tuple[Index, Array]:
+    """Return the bin of each sample (N,), −1 where it is no number, and the bins' means."""
+    known = np.isfinite(value)
+    edges = np.unique(np.quantile(value[known], np.linspace(0, 1, _SPEEDS + 1)[1:-1]))
+    found = np.searchsorted(edges, value)
+    # of a command with few values some bins stay empty
+    used, dense = np.unique(found[known], return_inverse=True)
+    group = np.full(len(value), -1)
+    group[known] = dense
+    return group, np.array([value[group == g].mean() for g in range(len(used))])
 
 
 def _profiles(errors: Errors, group: Index, place: Array, step: float) -> tuple[Figure, list[Any]]:
@@ -263,7 +298,10 @@ def ranking_figure(step: Sequence[Ranked], kept: Sequence[str]) -> Figure:
     figure = new_figure(_WIDTH, 0.42 * len(rows) + 1.5)
     ax = figure.subplots()
     place = np.arange(len(rows))
-    gains = np.array([np.nan if r.gain is None else r.gain for r in rows])
+    # a fit that left every bound has no bar
+    gains = np.array(
+        [np.nan if r.gain is None or not np.isfinite(r.gain) else r.gain for r in rows]
+    )
     proofs = np.array([np.nan if r.held_out is None else r.held_out for r in rows])
     spread = np.array([0.0 if r.held_out_std is None else 1.96 * r.held_out_std for r in rows])
     ax.barh(place - 0.2, [r.promise for r in rows], 0.3, color="0.75", label="promised")

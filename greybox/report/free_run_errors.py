@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +36,8 @@ class Errors:
         the noise of the error in it.
     regime : ndarray of int or None
         (N,) place in `REGIMES`, by the simulated signs, −1 where it ran away.
+    commands : mapping of str to ndarray
+        (N,) of each thruster column that all logs have and that moves.
     """
 
     error: Mapping[str, Mapping[str, Array]]
@@ -43,6 +45,7 @@ class Errors:
     heading: Array | None
     speed: Array | None
     regime: Index | None
+    commands: Mapping[str, Array] = field(default_factory=dict)
 
     @property
     def states(self) -> tuple[str, ...]:
@@ -115,7 +118,13 @@ def gather(runs: Sequence[Runs]) -> Errors:
         u, v = (np.concatenate([simulated(r, "after", s) for r in runs]) for s in ("u", "v"))
         speed = np.hypot(u, v)
         regime = np.where(np.isfinite(speed), 2 * (u < 0) + (v < 0), -1)
-    return Errors(error, blocks, heading, speed, regime)
+    return Errors(error, blocks, heading, speed, regime, _commands(runs))
+
+
+def _commands(runs: Sequence[Runs]) -> dict[str, Array]:
+    names = [c for c in runs[0].log.vessel.commands if all(c in r.log for r in runs)]
+    found = {c: np.concatenate([r.log[c] for r in runs]) for c in names}
+    return {c: value for c, value in found.items() if np.ptp(value) > 0}
 
 
 def _error(run: Runs, name: str, state: str) -> Array:

@@ -17,6 +17,7 @@ from greybox.model.changes import Change
 from greybox.model.model import ManoeuvringModel
 from greybox.report.diagnosed_causes import probability
 from greybox.report.diagnosis import diagnosis_page
+from greybox.report.diagnosis_figures import command_figure, most_followed
 from greybox.report.error_profiles import block_ids, memory, profile
 from greybox.report.free_run_errors import gather
 from greybox.report.model_difference import (
@@ -260,6 +261,26 @@ def test_runs_that_run_away_are_left_out_and_said_so():
     assert errors.lost == 100
     assert np.isfinite(errors.rms("before", "u"))
     assert "runs away at 100 of 1200 samples" in text_of(diagnosis_page(diagnosis, RECORD))
+
+
+def test_the_command_that_errors_follow_is_shown(pages):
+    run = runs_of(("one",), False)[0]
+    n = run.log["n"]
+    # commands are held for long: an error that follows one of them, and a little of all else
+    pushed = {s: run.measured[s] - 0.01 * (n - n.mean()) for s in run.measured}
+    errors = gather([replace(run, before=pushed, after=dict(run.measured))])
+    assert set(errors.commands) == {c for c in run.log.vessel.commands if np.ptp(run.log[c]) > 0}
+    assert most_followed(errors) == "n"
+    figure = command_figure(errors, "n")
+    line = figure.axes[0].get_lines()[0]
+    place, mean = line.get_xdata(), line.get_ydata()
+    slope = np.polyfit(place, mean, 1)[0]
+    assert slope == pytest.approx(0.01, rel=1e-6)
+    # a command with two values has two bins
+    two = replace(errors, commands={"n": np.where(n > np.median(n), 5.0, 3.0)})
+    assert len(command_figure(two, "n").axes[0].get_lines()[0].get_xdata()) == 2
+    assert most_followed(replace(errors, commands={})) is None
+    assert "by the command that it goes with most" in text_of(pages["named"])
 
 
 def test_runs_that_end_before_their_log():
