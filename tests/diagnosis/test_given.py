@@ -59,3 +59,15 @@ def test_a_thrust_law_whose_run_leaves_every_bound_gets_coefficients_of_its_own(
     assert all(g.ci[0] > 0 for g in found.gain.values())
     given = fit_given([trial.estimation], ["quadratic_thrust"], validate=[trial.validation])
     assert given.fall > 0.9
+
+
+@pytest.mark.long
+def test_a_wrong_sign_that_is_given_stays_beside_other_causes() -> None:
+    effects = ("current", "sign")
+    trial = draw(np.random.default_rng([31, 5]), effects, kind="manoeuvres", samples=600)
+    given = fit_given([trial.estimation], effects, validate=[trial.validation])
+    true = trial.truth[0].parameters
+    for name, value in true.items():
+        found, std = given.after.disturbances[name]
+        assert abs(found - float(value)) < 4 * std + 0.005
+    assert all(g.after > 50 for g in given.gain.values())
