@@ -41,13 +41,13 @@ class Factor:
 
     def solve(self, e: Array) -> Array:
         """Return ν along the last axis."""
-        from scipy.linalg import solve_banded
+        from scipy.linalg.lapack import dtbtrs
 
-        band = np.ones((2, len(self.root)))
+        band = np.zeros((2, len(self.root)))
         band[1, :-1] = self.tie[1:]
         flat = e.reshape(-1, e.shape[-1]).T
-        found = solve_banded((1, 0), band, flat, check_finite=False).T.reshape(e.shape)
-        return np.asarray(found / self.root)
+        found, _ = dtbtrs(band, flat, uplo="L", diag="U")
+        return np.asarray(found.T.reshape(e.shape) / self.root)
 
     def adjoint(self, z: Array) -> Array:
         """Return what ν is multiplied by in Σ z e, along the last axis."""

@@ -18,7 +18,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.estimation.innovations import FixedGains
+from greybox.estimation.observed import ObservedRuns
 from greybox.estimation.shooting import (
     FreeRuns,
     Loss,
@@ -87,6 +87,7 @@ def fit_free_runs(
     sigma: Array | None = None,
     shooting: Shooting = "auto",
     near: bool = False,
+    once: bool = False,
 ) -> tuple[ShootingFit, FreeRuns]:
     """Fit parameters and initial states to logs; the noise of each output with them.
 
@@ -111,6 +112,8 @@ def fit_free_runs(
         ``multiple`` ends with segments, ``single`` begins with whole runs.
     near : bool
         Whether `p` is near already, such as that of another heading.
+    once : bool
+        Whether the first end of whole runs is returned, however it is.
 
     Returns
     -------
@@ -119,19 +122,18 @@ def fit_free_runs(
     restrictions = unrestricted(len(p)) if restrictions is None else restrictions
     size = np.sqrt(np.mean([(log.y**2).mean(axis=0) for log in logs], axis=0))
     floor = _FLOOR * np.maximum(size, _FLOOR)
-    change = np.sqrt(np.mean([(np.diff(log.y, axis=0) ** 2).mean(axis=0) for log in logs], axis=0))
+    change = changes(logs)
     weights = np.maximum(change, floor) if sigma is None else sigma
     whole = cut(logs, max(len(log.y) for log in logs))
     starts = measured_starts(whole, len(model.states))
+    uncut = FreeRuns(model, whole, weights)
 
     def attempt(
         p: Array, starts: Array, shooting: Shooting = shooting
     ) -> tuple[ShootingFit, FreeRuns]:
         single: ShootingFit | None = None
         if shooting != "multiple":
-            single, runs = _settle(
-                FreeRuns(model, whole, weights), p, starts, restrictions, loss, sigma is None, floor
-            )
+            single, runs = _settle(uncut, p, starts, restrictions, loss, sigma is None, floor)
             if single.converged or shooting == "single":
                 return single, runs
         segments = cut(logs, segment_length(logs))
@@ -147,17 +149,20 @@ def fit_free_runs(
         return attempt(p, starts)
 
     def doubtful(pair: tuple[ShootingFit, FreeRuns]) -> bool:
-        return not pair[0].converged or bool((pair[1].sigma > _DOUBTFUL * change).any())
+        return in_doubt(pair[0], pair[1].sigma, change)
 
     noise = np.maximum(change, floor)
     found: list[tuple[ShootingFit, FreeRuns]] = []
-    r, _, _ = FreeRuns(model, whole, noise).value(p, starts)
+    # with derivatives, which a fit from here begins with
+    r = uncut.with_sigma(noise).linearise(p, starts).r
     if p.any() and np.isfinite(r).all() and float((r**2).mean()) < _NEARBY**2:
-        found.append(attempt(p, starts))
-        if not doubtful(found[0]):
+        found.append(attempt(p, starts, "single" if once else shooting))
+        if once or not doubtful(found[0]):
             return found[0]
     part = [Measured(log.w[:_PART], log.y[:_PART]) for log in logs]
     begun = [approach(model, part, p, starts, restrictions, noise)]
+    if once:
+        return attempt(*begun[0], "single")
     found.append(attempt(*begun[0]))
     if doubtful(found[-1]):
         # more error than the sensors show: another way may end elsewhere
@@ -174,6 +179,26 @@ def fit_free_runs(
         bounded = [pair for pair in (attempt(*b, "single") for b in begun) if level(pair) < np.inf]
         return min(bounded, key=level, default=best)
     return best
+
+
+def changes(logs: Sequence[Measured]) -> Array:
+    """Return the root mean square of each output's change from sample to sample, (ny,)."""
+    squares = [(np.diff(log.y, axis=0) ** 2).mean(axis=0) for log in logs]
+    return np.asarray(np.sqrt(np.mean(squares, axis=0)))
+
+
+def in_doubt(fit: ShootingFit, sigma: Array, change: Array) -> bool:
+    """Whether a fit did not converge, or leaves more than sensors do.
+
+    Parameters
+    ----------
+    fit : ShootingFit
+    sigma : ndarray
+        (ny,) noise of each output that it leaves.
+    change : ndarray
+        (ny,) of `changes`.
+    """
+    return not fit.converged or bool((sigma > _DOUBTFUL * change).any())
 
 
 def _follows(pair: tuple[ShootingFit, FreeRuns], whole: Segments, starts: Array) -> bool:
@@ -207,20 +232,16 @@ def approach(
     """
     whole = cut(logs, max(len(log.y) for log in logs))
     variance = change**2 / 2
-    nz = starts.shape[1]
-
-    def gains(ratio: float) -> FixedGains:
-        return FixedGains(model, whole, np.concatenate([variance, ratio * variance[:nz]]))
-
-    first = gains(ratios[0])
+    first = ObservedRuns(model, whole, variance, ratios[0])
     best, least = p, np.inf
     for candidate in (p, np.zeros_like(p)):
-        r, _, level = first.value(candidate, starts)
-        cost = loss_value(r, "gaussian") + level
+        r, _, _ = first.value(candidate, starts)
+        cost = loss_value(r, "gaussian")
         if cost < least:
             best, least = candidate, cost
     for ratio in ratios:
-        fit = fit_segments(gains(ratio), best, starts, restrictions, most=_STEPS, tolerance=_NEAR)
+        runs = ObservedRuns(model, whole, variance, ratio)
+        fit = fit_segments(runs, best, starts, restrictions, most=_STEPS, tolerance=_NEAR)
         if not np.isfinite(fit.cost):
             break
         best, starts = fit.p, fit.nodes

@@ -98,18 +98,6 @@ class FilterRuns:
         return FilterRuns(self.model, self.segments, noise)
 
 
-class FixedGains(FilterRuns):
-    """Innovations whose gains do not count as functions of the parameters.
-
-    Their squares have the derivatives that `rows` gives, which is all that a start
-    needs.
-    """
-
-    def linearise(self, p: Array, nodes: Array) -> Linearised:
-        """Return innovations and their derivatives at fixed gains."""
-        return self.rows(p, nodes)
-
-
 def fit_noise(runs: FilterRuns, p: Array, nodes: Array, known: NDArray[np.bool_]) -> Array:
     """Maximise the likelihood over the variances.
 

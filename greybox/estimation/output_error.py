@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from greybox.errors import ExcitationError, UsageError, suggestion
 from greybox.estimation.covariance import correlation_lags
 from greybox.estimation.estimate import UnexcitedBiasError
-from greybox.estimation.free_run import Shooting, fit_free_runs
+from greybox.estimation.free_run import Shooting, changes, fit_free_runs, in_doubt
 from greybox.estimation.free_run_errors import (
     memory_correction,
     shared_score_covariance,
@@ -180,6 +180,16 @@ class _Fitted:
     loss: Loss
 
     @property
+    def sigma(self) -> Array:
+        """Noise of each output that weighs the free run, (ny,)."""
+        runs = self.runs
+        return (
+            runs.sigma
+            if isinstance(runs, FreeRuns)
+            else np.sqrt(runs.noise[: len(self.model.outputs)])
+        )
+
+    @property
     def bounded(self) -> bool:
         """Whether the run and all its derivatives are finite numbers."""
         at = self.runs.linearise(self.fit.p, self.fit.nodes)
@@ -220,7 +230,7 @@ def _fit(
     # other optima are sought by likelihood
     near = not options.search or (options.weights == "deviation" and start is not None)
 
-    def free_run(heading: Role, p: Array | None = None) -> _Fitted:
+    def free_run(heading: Role, p: Array | None = None, *, once: bool = False) -> _Fitted:
         model = output_model(predictor, sample_time, heading, options.wind)
         data = [measured(model, log) for log in logs]
         _require_rows(model, data)
@@ -229,23 +239,35 @@ def _fit(
             model, data, _first(model, start) if p is None else p,
             restrictions=restrictions, loss=options.loss, shooting=options.shooting,
             sigma=deviations(data) if options.weights == "deviation" else None,
-            near=p is not None or near,
+            near=p is not None or near, once=once,
         )  # fmt: skip
         return _Fitted(model, data, fit, runs, restrictions, options.loss)
+
+    def holds(compared: _Fitted) -> bool:
+        if not (compared.fit.converged and np.isfinite(compared.fit.cost)):
+            return False
+        return options.process_noise or all(compared.slow[n][0] < _DRIFTS for n in ("r", "psi"))
+
+    def suited() -> _Fitted:
+        compare = turns(predictor.structure, logs)
+        if compare and options.shooting != "multiple":
+            # a run that leaves what sensors leave, heading and all, needs no other beside it
+            found = free_run("output", once=True)
+            if holds(found) and not in_doubt(found.fit, found.sigma, changes(found.data)):
+                return found
+        found = free_run("input")
+        if compare and found.fit.converged:
+            compared = free_run("output", found.fit.p)
+            if holds(compared):
+                return compared
+        return found
 
     if options.heading != "auto":
         found = free_run(options.heading)
     elif options.weights == "deviation" or not options.search:
         found = free_run("input")
     else:
-        found = free_run("input")
-        if turns(predictor.structure, logs) and found.fit.converged:
-            compared = free_run("output", found.fit.p)
-            steady = compared.fit.converged and np.isfinite(compared.fit.cost)
-            if steady and (
-                options.process_noise or max(compared.slow[n][0] for n in ("r", "psi")) < _DRIFTS
-            ):
-                found = compared
+        found = suited()
     if not options.process_noise:
         return found
     fit, runs = fit_innovations(

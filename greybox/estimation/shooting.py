@@ -423,12 +423,19 @@ def fit_segments(
                 break
             now = merit(at.r, at.end, at.level, p, nodes)
             for share in (1.0, 0.5, 0.25, 0.1):
-                r, end, level = runs.value(p + share * step, nodes + share * shift)
-                if merit(r, end, level, p + share * step, nodes + share * shift) < now:
+                moved = p + share * step, nodes + share * shift
+                ahead = None
+                if share == 1.0 and damping == 0.0:
+                    # most full steps are taken: their derivatives are needed next
+                    ahead = runs.linearise(*moved)
+                    r, end, level = ahead.r, ahead.end, ahead.level
+                else:
+                    r, end, level = runs.value(*moved)
+                if merit(r, end, level, *moved) < now:
                     accepted = True
                     break
             if accepted:
-                p, nodes = p + share * step, nodes + share * shift
+                p, nodes = moved
                 damping = 0.0 if share == 1.0 and damping < 1e-6 else damping / 10
                 break
             # nothing to gain beyond rounding
@@ -438,7 +445,7 @@ def fit_segments(
             damping = max(10 * damping, 1e-6)
         if done or not accepted:
             break
-        at = runs.linearise(p, nodes)
+        at = runs.linearise(p, nodes) if ahead is None else ahead
     with np.errstate(over="ignore", invalid="ignore"):
         gap = float(np.abs((at.end - np.roll(nodes, -1, axis=0))[links] / scale).max(initial=0.0))
     cost = loss_value(at.r, loss) + at.level + restrictions.penalty(p)

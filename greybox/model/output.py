@@ -10,9 +10,10 @@ covariance of an extended Kalman filter beside it, the innovations.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
+from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
@@ -161,6 +162,82 @@ def _step(model: OutputModel) -> _Step:
     return _Step(z, w, p, ca.densify(after), ca.densify(seen))
 
 
+@dataclass(frozen=True)
+class _Slope:
+    """Derivatives of an expression in the carried states and in the parameters."""
+
+    by_z: ca.SX
+    by_p: ca.SX
+
+    @classmethod
+    def of(cls, expression: ca.SX, s: _Step) -> _Slope:
+        return cls(ca.jacobian(expression, s.z), ca.jacobian(expression, s.p))
+
+    @property
+    def parts(self) -> tuple[ca.SX, ca.SX]:
+        """Both."""
+        return self.by_z, self.by_p
+
+    def after(self, before: _Slope) -> _Slope:
+        """Chain: this slope taken where the states have another already."""
+        return _Slope(self.by_z @ before.by_z, self.by_z @ before.by_p + self.by_p)
+
+
+def _with_slopes(
+    given: Sequence[ca.SX],
+    carried: Sequence[ca.SX],
+    found: Sequence[ca.SX],
+    after: _Slope,
+    seen: _Slope,
+    sensitivities: bool,
+) -> ca.Function:
+    """Return a step that carries the derivatives of the states along.
+
+    The scalar instructions give the slopes of one step; their product with the
+    derivatives so far is one of dense matrices, at half the time of scalars.
+
+    Parameters
+    ----------
+    given : sequence of SX
+        States, what else is carried, then what the step reads.
+    carried, found : sequence of SX
+        Next values of what is carried, and results; the derivatives stand after the
+        carried ones and after the first result.
+    after, seen : _Slope
+        Of the next states and of the first result.
+    sensitivities : bool
+        Without, the derivatives have no columns.
+    """
+    nz, q = given[0].numel(), after.by_p.size2()
+    ny = seen.by_z.size1()
+    k = len(carried)
+    if not sensitivities:
+        none = ca.SX.sym("S", nz, 0)
+        return ca.Function(
+            "step",
+            [*given[:k], none, *given[k:]],
+            [*carried, ca.SX(nz, 0), found[0], ca.SX(ny, 0), *found[1:]],
+            {"cse": True},
+        )
+    slopes = [after.by_z, after.by_p, seen.by_z, seen.by_p]
+    one = ca.Function("one", list(given), [*carried, *found, *slopes], {"cse": True})
+    symbols = [ca.MX.sym(f"a{i}", x.sparsity()) for i, x in enumerate(given)]
+    sens = ca.MX.sym("S", nz, q + nz)
+    out = one.call(symbols)
+    values, (a, b, h, d) = out[: k + len(found)], out[k + len(found) :]
+
+    def moved(by_z: ca.MX, by_p: ca.MX) -> ca.MX:
+        return ca.densify(by_z @ sens + ca.horzcat(by_p, ca.MX(by_z.size1(), nz)))
+
+    # sensors that show the states themselves show their derivatives
+    same = seen.by_z.is_eye() and not seen.by_p.nnz()
+    return ca.Function(
+        "step",
+        [*symbols[:k], sens, *symbols[k:]],
+        [*values[:k], moved(a, b), values[k], sens if same else moved(h, d), *values[k + 1 :]],
+    )
+
+
 @lru_cache(maxsize=32)
 def _run(model: OutputModel, steps: int, runs: int, sensitivities: bool) -> ca.Function:
     """Return ``(z0, S0, W, p) -> z after each step, S, y before each step, ∂y``, runs side by side.
@@ -168,20 +245,30 @@ def _run(model: OutputModel, steps: int, runs: int, sensitivities: bool) -> ca.F
     Parameters are the same for all runs of a call.
     """
     s = _step(model)
-    nz, q = s.z.numel(), s.p.numel()
-    columns = q + nz if sensitivities else 0
-    a, h = ca.jacobian(s.after, s.z), ca.jacobian(s.seen, s.z)
-    sens = ca.SX.sym("S", nz, columns)
-    after, seen = ca.SX(nz, columns), ca.SX(s.seen.numel(), columns)
-    if sensitivities:
-        rest = nz
-        after = a @ sens + ca.horzcat(ca.jacobian(s.after, s.p), ca.SX(nz, rest))
-        seen = h @ sens + ca.horzcat(ca.jacobian(s.seen, s.p), ca.SX(s.seen.numel(), rest))
-    step = ca.Function(
-        "step",
-        [s.z, sens, s.w, s.p],
-        [s.after, ca.densify(after), s.seen, ca.densify(seen)],
-        {"cse": True},
+    after, seen = _Slope.of(s.after, s), _Slope.of(s.seen, s)
+    step = _with_slopes([s.z, s.w, s.p], [s.after], [s.seen], after, seen, sensitivities)
+    return _over(step, 2, steps, runs)
+
+
+@lru_cache(maxsize=32)
+def _observed(model: OutputModel, steps: int, runs: int, sensitivities: bool) -> ca.Function:
+    """Return ``(z, S, [w; y; use], p, gain) -> z⁺, S⁺, y − h(z), ∂h``, measured states corrected.
+
+    Each step is taken from z + gain (y − z); S and ∂h are as those of `_run`.
+    """
+    s = _step(model)
+    nz, ny = s.z.numel(), s.seen.numel()
+    y, use, gain = ca.SX.sym("y", ny), ca.SX.sym("use"), ca.SX.sym("gain")
+    kept = 1 - use * gain
+    corrected = kept * s.z + use * gain * y[:nz]
+    after = ca.substitute(s.after, s.z, corrected)
+    step = _with_slopes(
+        [s.z, ca.vertcat(s.w, y, use), s.p, gain],
+        [after],
+        [use * (y - s.seen)],
+        _Slope.of(after, s),
+        _Slope.of(s.seen, s),
+        sensitivities,
     )
     return _over(step, 2, steps, runs)
 
@@ -216,54 +303,43 @@ def _filter(model: OutputModel, steps: int, runs: int, sensitivities: bool) -> c
     innovations one channel after another, each divided by its deviation √v.
     """
     s = _step(model)
-    nz, q, ny = s.z.numel(), s.p.numel(), s.seen.numel()
-    columns = q + nz if sensitivities else 0
+    nz, ny = s.z.numel(), s.seen.numel()
     y, use = ca.SX.sym("y", ny), ca.SX.sym("use")
     noise = ca.SX.sym("noise", ny + nz)
-    cov = ca.SX.sym("P", nz, nz)
-    sens = ca.SX.sym("S", nz, columns)
-    seen = ca.Function("seen", [s.z, s.w, s.p], [s.seen, ca.jacobian(s.seen, s.z),
-                                                 ca.jacobian(s.seen, s.p)])  # fmt: skip
-    z, spread, slope = s.z, cov, sens
-    innovations, derivatives, levels = [], [], []
+    # a covariance is carried by its lower triangle: half of what follows is never computed
+    cov = ca.SX.sym("P", nz * (nz + 1) // 2)
+    at = ca.Function("seen", [s.z, s.w, s.p], [s.seen, *_Slope.of(s.seen, s).parts])
+    z, spread = s.z, ca.tril2symm(ca.SX(ca.Sparsity.lower(nz), cov))
+    slope = _Slope(ca.SX.eye(nz), ca.SX(nz, s.p.numel()))
+    innovations, rows, levels = [], [], []
     for i in range(ny):
-        shown, by_z, by_p = seen(z, s.w, s.p)
+        shown, by_z, by_p = at(z, s.w, s.p)
         h = ca.densify(by_z[i, :])
         gain_row = spread @ h.T
         variance = h @ gain_row + noise[i]
         # rows beyond the log's end change nothing
         gain = use * gain_row / variance
         error = y[i] - shown[i]
-        row = h @ slope
-        if sensitivities:
-            row = row + ca.horzcat(ca.densify(by_p[i, :]), ca.SX.zeros(1, nz))
-        innovations.append(use * error / ca.sqrt(variance))
-        derivatives.append(use * row / ca.sqrt(variance))
+        row = _Slope(by_z[i, :], by_p[i, :]).after(slope)
+        weight = use / ca.sqrt(variance)
+        innovations.append(weight * error)
+        rows.append(_Slope(weight * row.by_z, weight * row.by_p))
         levels.append(use * ca.log(variance))
         z = z + gain * error
-        slope = slope - gain @ row
-        spread = spread - gain @ gain_row.T
-    after = ca.Function("after", [s.z, s.w, s.p], [s.after, ca.jacobian(s.after, s.z),
-                                                   ca.jacobian(s.after, s.p)])  # fmt: skip
-    z_next, a, b = after(z, s.w, s.p)
-    slope = a @ slope
-    if sensitivities:
-        slope = slope + ca.horzcat(ca.densify(b), ca.SX.zeros(nz, nz))
+        slope = _Slope(slope.by_z - gain @ row.by_z, slope.by_p - gain @ row.by_p)
+        spread = ca.tril2symm(ca.tril(spread - gain @ gain_row.T))
+    step = ca.Function("after", [s.z, s.w, s.p], [s.after, *_Slope.of(s.after, s).parts])
+    z_next, a, b = step(z, s.w, s.p)
     spread = a @ spread @ a.T + ca.diag(noise[ny:])
-    step = ca.Function(
-        "step",
-        [s.z, cov, sens, ca.vertcat(s.w, y, use), s.p, noise],
-        [
-            z_next,
-            ca.densify((spread + spread.T) / 2),
-            ca.densify(slope),
-            ca.vertcat(*innovations),
-            ca.densify(ca.vertcat(*derivatives)),
-            ca.vertcat(*levels),
-        ],
-        {"cse": True},
+    full = _with_slopes(
+        [s.z, cov, ca.vertcat(s.w, y, use), s.p, noise],
+        [z_next, ca.tril(ca.densify(spread)).nz[:]],
+        [ca.vertcat(*innovations), ca.vertcat(*levels)],
+        _Slope(a, b).after(slope),
+        _Slope(ca.vertcat(*[r.by_z for r in rows]), ca.vertcat(*[r.by_p for r in rows])),
+        sensitivities,
     )
-    return _over(step, 3, steps, runs)
+    return _over(full, 3, steps, runs)
 
 
 @lru_cache(maxsize=16)
@@ -273,10 +349,32 @@ def _likelihood(model: OutputModel, steps: int, runs: int) -> ca.Function:
     nz = run.size1_in(0)
     z0, w = ca.MX.sym("z0", nz, runs), ca.MX.sym("w", run.size1_in(3), runs * steps)
     p, noise = ca.MX.sym("p", run.size1_in(4)), ca.MX.sym("noise", run.size1_in(5))
-    out = run.call([z0, ca.MX.zeros(nz, nz * runs), ca.MX(nz, 0), w, p, noise])
+    out = run.call([z0, ca.MX.zeros(nz * (nz + 1) // 2, runs), ca.MX(nz, 0), w, p, noise])
     value = (ca.sumsqr(out[3]) + ca.sum2(ca.sum1(out[5]))) / 2
     slopes = [ca.gradient(value, v) for v in (z0, p)]
     return ca.Function("likelihood", [z0, w, p, noise], [value, *slopes])
+
+
+class _Evaluator:
+    """Evaluates functions on NumPy arrays, in memory that each is given once."""
+
+    def __init__(self) -> None:
+        self._buffers: dict[int, tuple[ca.Function, Any, Callable[[], None]]] = {}
+
+    def __call__(
+        self, function: ca.Function, arguments: tuple[Array, ...], out: tuple[Array, ...]
+    ) -> None:
+        if id(function) not in self._buffers:
+            self._buffers[id(function)] = (function, *function.buffer())
+        _, buffer, trigger = self._buffers[id(function)]
+        held = [np.ascontiguousarray(a, float) for a in arguments]
+        for i, a in enumerate(held):
+            if a.size:
+                bind(buffer.set_arg, i, a)
+        for i, a in enumerate(out):
+            if a.size:
+                bind(buffer.set_res, i, a)
+        trigger()
 
 
 class Simulator:
@@ -299,10 +397,21 @@ class Simulator:
         self.nz, self.ny = len(model.states), len(model.outputs)
         self.q = len(model.parameters)
         self._w = np.ascontiguousarray(w, float)
+        self._evaluate = _Evaluator()
         self._last: tuple[Array, Array, tuple[Array, Array, Array, Array]] | None = None
+
+    def _kept(self, z0: Array, p: Array) -> tuple[Array, Array, Array, Array] | None:
+        """Return the latest run with derivatives, if it was of this point."""
+        if self._last is None:
+            return None
+        same = np.array_equal(self._last[0], z0) and np.array_equal(self._last[1], p)
+        return self._last[2] if same else None
 
     def __call__(self, z0: Array, p: Array) -> tuple[Array, Array]:
         """Return outputs (M, m, ny) and the states after the last step (M, nz)."""
+        kept = self._kept(z0, p)
+        if kept is not None:
+            return kept[0], kept[2]
         end, _, y, _ = self._call(z0, p, sensitivities=False)
         return y, end[:, -1]
 
@@ -323,14 +432,14 @@ class Simulator:
             the last step (M, nz) and their derivatives (M, q + nz, nz). Not to be written
             to: the latest are kept, for the same point is asked for with other weights.
         """
-        last = self._last
-        if last is None or not (np.array_equal(last[0], z0) and np.array_equal(last[1], p)):
+        kept = self._kept(z0, p)
+        if kept is None:
             end, slope, y, rows = self._call(z0, p, sensitivities=True)
-            last = (z0.copy(), p.copy(), (y, rows, end[:, -1], slope[:, -1]))
-            for part in last[2]:
+            kept = (y, rows, end[:, -1], slope[:, -1])
+            for part in kept:
                 part.flags.writeable = False
-            self._last = last
-        return last[2]
+            self._last = (z0.copy(), p.copy(), kept)
+        return kept
 
     def _call(
         self, z0: Array, p: Array, *, sensitivities: bool
@@ -347,8 +456,65 @@ class Simulator:
             np.empty((runs, steps, ny)),
             np.empty((runs, steps, columns, ny)),
         )
-        _evaluate(function, (z0, first, self._w, p), out)
+        self._evaluate(function, (z0, first, self._w, p), out)
         return out
+
+
+class Observer:
+    """Runs whose measured states are drawn towards the measurements at every step.
+
+    Parameters
+    ----------
+    model : OutputModel
+    w, y, use : ndarray
+        As a `Filter` takes them.
+    """
+
+    def __init__(self, model: OutputModel, w: Array, y: Array, use: Array) -> None:
+        self.model = model
+        self.runs, self.steps = w.shape[:2]
+        self.nz, self.ny = len(model.states), len(model.outputs)
+        self.q = len(model.parameters)
+        self._w = np.ascontiguousarray(np.concatenate([w, y, use[..., None]], axis=2), float)
+        self._evaluate = _Evaluator()
+        self._use = use[..., None] > 0
+
+    def __call__(
+        self, z0: Array, p: Array, gain: float, *, sensitivities: bool = True
+    ) -> tuple[Array, Array]:
+        """Run from initial states, each step beginning at z + gain (y − z).
+
+        Parameters
+        ----------
+        z0 : ndarray
+            (M, nz)
+        p : ndarray
+            (q,)
+        gain : float
+            0 is the free run, 1 begins each step at the measurement.
+
+        Returns
+        -------
+        tuple
+            Errors y − h(z) before each correction (M, m, ny), and the derivatives of h(z)
+            (M, m, q + nz, ny).
+        """
+        runs, steps, nz, ny = self.runs, self.steps, self.nz, self.ny
+        columns = self.q + nz if sensitivities else 0
+        function = _observed(self.model, steps, runs, sensitivities)
+        first = np.zeros((runs, columns, nz))
+        if columns:
+            first[:, self.q :] = np.eye(nz)
+        out = (
+            np.empty((runs, steps, nz)),
+            np.empty((runs, steps, columns, nz)),
+            np.empty((runs, steps, ny)),
+            np.empty((runs, steps, columns, ny)),
+        )
+        self._evaluate(function, (z0, first, self._w, p, np.array([gain])), out)
+        if columns and not self._use.all():
+            out[3][~self._use[..., 0]] = 0.0
+        return out[2], out[3]
 
 
 class Filter:
@@ -371,6 +537,7 @@ class Filter:
         self.nz, self.ny = len(model.states), len(model.outputs)
         self.q = len(model.parameters)
         self._w = np.ascontiguousarray(np.concatenate([w, y, use[..., None]], axis=2), float)
+        self._evaluate = _Evaluator()
 
     def __call__(
         self, z0: Array, p: Array, noise: Array, *, sensitivities: bool = True
@@ -401,13 +568,14 @@ class Filter:
             first[:, self.q :] = np.eye(nz)
         out = (
             np.empty((runs, steps, nz)),
-            np.empty((runs, steps, nz, nz)),
+            np.empty((runs, steps, nz * (nz + 1) // 2)),
             np.empty((runs, steps, columns, nz)),
             np.empty((runs, steps, ny)),
             np.empty((runs, steps, columns, ny)),
             np.empty((runs, steps, ny)),
         )
-        _evaluate(function, (z0, np.zeros((runs, nz, nz)), first, self._w, p, noise), out)
+        certain = np.zeros((runs, nz * (nz + 1) // 2))
+        self._evaluate(function, (z0, certain, first, self._w, p, noise), out)
         return out[3], out[4], out[5]
 
     def likelihood(self, z0: Array, p: Array, noise: Array) -> tuple[float, Array, Array]:
@@ -429,20 +597,8 @@ class Filter:
         """
         function = _likelihood(self.model, self.steps, self.runs)
         out = (np.empty(1), np.empty((self.runs, self.nz)), np.empty(self.q))
-        _evaluate(function, (z0, self._w, p, noise), out)
+        self._evaluate(function, (z0, self._w, p, noise), out)
         return float(out[0][0]), out[1], out[2]
-
-
-def _evaluate(function: ca.Function, arguments: tuple[Array, ...], out: tuple[Array, ...]) -> None:
-    buffer, trigger = function.buffer()
-    held = [np.ascontiguousarray(a, float) for a in arguments]
-    for i, a in enumerate(held):
-        if a.size:
-            bind(buffer.set_arg, i, a)
-    for i, a in enumerate(out):
-        if a.size:
-            bind(buffer.set_res, i, a)
-    trigger()
 
 
 def current_means(predictor: Predictor) -> tuple[str, ...]:

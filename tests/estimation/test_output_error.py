@@ -11,7 +11,7 @@ from virtual import virtual_log, write_csv
 
 from greybox.commands.main import main
 from greybox.errors import ExcitationError, StructureError, UsageError
-from greybox.estimation import free_run, free_run_noise
+from greybox.estimation import free_run, free_run_noise, output_error
 from greybox.estimation.free_run import _follows, fit_free_runs
 from greybox.estimation.free_run_errors import (
     autocovariance,
@@ -32,7 +32,7 @@ from greybox.estimation.shooting import (
 )
 from greybox.model.catalogue import get_structure
 from greybox.model.noise import NoiseLevels
-from greybox.model.output import Filter, OutputModel, Simulator
+from greybox.model.output import Filter, Observer, OutputModel, Simulator
 from greybox.study.chapter6 import TRUE
 from greybox.study.efficiency import CASES, determinant_efficiency, virtual_trial
 
@@ -148,6 +148,62 @@ class TestSensitivities:
         np.testing.assert_allclose(r, (data.y - y) / np.sqrt(sigma2), atol=1e-9)
         np.testing.assert_allclose(derivatives, rows / np.sqrt(2e-4), rtol=1e-9, atol=1e-7)
         np.testing.assert_allclose(levels, np.log(2e-4), rtol=1e-12)
+
+    def test_an_observer_without_gain_is_the_free_run(self, predictor, noisy):
+        model, data, p = problem(predictor, noisy)
+        y, rows, _, _ = Simulator(model, data.w[None]).sensitivities(data.y[:1], p)
+        observer = Observer(model, data.w[None], data.y[None], np.ones((1, len(data.y))))
+        error, derivatives = observer(data.y[:1], p, 0.0)
+        np.testing.assert_allclose(error, data.y - y, atol=1e-11)
+        np.testing.assert_allclose(derivatives, rows, rtol=1e-9, atol=1e-7)
+
+    def test_an_observer_of_full_gain_predicts_one_step(self, predictor, noisy):
+        model, data, p = problem(predictor, noisy)
+        n = len(data.y)
+        observer = Observer(model, data.w[None], data.y[None], np.ones((1, n)))
+        error, _ = observer(data.y[:1], p, 1.0, sensitivities=False)
+        each = Simulator(model, data.w[:, None])
+        _, after = each(data.y, p)
+        np.testing.assert_allclose(
+            error[0, 1:], (data.y - np.roll(after, 1, axis=0))[1:], atol=1e-12
+        )
+
+    def test_those_of_an_observer_equal_finite_differences(self, predictor, noisy):
+        model, data, p = problem(predictor, noisy)
+        use = np.ones((1, 200))
+        use[:, 150:] = 0
+        observer = Observer(model, data.w[None, :200], data.y[None, :200], use)
+        z0 = data.y[:1]
+        rows = observer(z0, p, 0.3)[1]
+        assert (rows[:, 150:] == 0).all()
+        for j in range(len(p)):
+            h = 1e-6 * max(abs(p[j]), 1e-3)
+            up, down = p.copy(), p.copy()
+            up[j] += h
+            down[j] -= h
+            expected = (observer(z0, down, 0.3)[0] - observer(z0, up, 0.3)[0]) / (2 * h)
+            np.testing.assert_allclose(rows[:, :, j], expected, atol=1e-5 * np.abs(expected).max())
+
+    def test_an_observer_of_more_sensors_than_states(self, predictor):
+        """A constant wind is compared too: its derivatives are in no state."""
+        log = virtual_log(3, 120, spread=0.0, wind=3.0)
+        model = output_model(predictor, 1.0, "output", "output")
+        data = measured(model, log)
+        p = np.array([*truth(predictor), *CURRENT, 2.0, -1.0])
+        observer = Observer(model, data.w[None], data.y[None], np.ones((1, 120)))
+        z0 = data.y[:1, : len(model.states)]
+        runs = Simulator(model, data.w[None])
+        np.testing.assert_allclose(
+            observer(z0, p, 0.0)[1], runs.sensitivities(z0, p)[1], rtol=1e-9, atol=1e-9
+        )
+        for j in (0, len(p) - 1):
+            h = 1e-6 * max(abs(p[j]), 1e-3)
+            up, down = p.copy(), p.copy()
+            up[j] += h
+            down[j] -= h
+            expected = (observer(z0, down, 0.5)[0] - observer(z0, up, 0.5)[0]) / (2 * h)
+            found = observer(z0, p, 0.5)[1][:, :, j]
+            np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
 
     def test_the_likelihood_has_its_exact_gradient(self, predictor, noisy):
         model, data, p = problem(predictor, noisy)
@@ -332,6 +388,31 @@ class TestFit:
         ten, _ = fit_free_runs(model, [Measured(w, data.y)], 0 * p)
         i = [c.name for c in predictor.columns].index("Xmu")
         assert ten.p[i] == pytest.approx(one.p[i] / 10, rel=1e-4)
+
+
+class TestHeading:
+    def test_a_good_run_of_both_is_the_only_one(self, predictor, noisy, monkeypatch):
+        """What leaves no more than sensors do was fitted once, and is what two fits end with."""
+        alone = estimate_oe(predictor, [noisy])
+        asked = []
+        cautious = output_error.fit_free_runs
+
+        def fitted(model, *rest, once=False, **more):
+            asked.append((model.heading, once))
+            fit, runs = cautious(model, *rest, once=once, **more)
+            return (replace(fit, converged=False) if once else fit), runs
+
+        monkeypatch.setattr(output_error, "fit_free_runs", fitted)
+        both = estimate_oe(predictor, [noisy])
+        assert asked == [("output", True), ("input", False), ("output", False)]
+        np.testing.assert_allclose((both.theta - alone.theta) / alone.std, 0.0, atol=1e-4)
+        np.testing.assert_allclose(both.std, alone.std, rtol=1e-4)
+
+    def test_a_heading_that_drifts_drives_the_run(self, predictor, noisy):
+        walk = 0.02 * np.cumsum(np.random.default_rng(1).standard_normal(len(noisy)))
+        turned = replace(noisy, channels={**noisy.channels, "psi": noisy["psi"] + walk})
+        found = estimate_oe(predictor, [turned])
+        assert not any("heading was simulated" in n for n in found.notes)
 
 
 class TestExcitation:

@@ -217,8 +217,6 @@ def _worth(name: str, value: Array) -> float:
 
 def _spikes(value: Array) -> tuple[NDArray[np.int64], float, Array]:
     """Return indices, robust scatter, and each sample's distance from its neighbours."""
-    from scipy.ndimage import median_filter
-
     # each pair of distances predicts a sample from its neighbours to third order; of the
     # five predictions three do not touch a spike of up to three samples
     padded = np.pad(value, 4, mode="reflect", reflect_type="odd")
@@ -230,9 +228,12 @@ def _spikes(value: Array) -> tuple[NDArray[np.int64], float, Array]:
     scale = 1.4826 * float(np.median(np.abs(gap)))
     step = _quantum(value)
     scale = max(scale, step / np.sqrt(12), 1e-12 * max(float(np.abs(value).max()), 1e-300))
-    local = 1.4826 * median_filter(np.abs(gap), size=51, mode="nearest")
-    limit = np.maximum(_SPIKE * scale, _LOCAL_SPIKE * local) + 2 * step
-    out = np.abs(gap) > limit
+    out = np.abs(gap) > _SPIKE * scale + 2 * step
+    if out.any():
+        from scipy.ndimage import median_filter
+
+        local = 1.4826 * median_filter(np.abs(gap), size=51, mode="nearest")
+        out &= np.abs(gap) > _LOCAL_SPIKE * local + 2 * step
     wide = [
         k
         for a, b in runs(out)
