@@ -15,7 +15,7 @@ from greybox.estimation.covariance import (
     block_bootstrap,
     score_covariance,
 )
-from greybox.estimation.credibility import Evidence, assess, judge
+from greybox.estimation.credibility import Evidence, assess, convergence, judge
 from greybox.estimation.disturbance import estimate_current
 from greybox.estimation.error_shape import ErrorShape, error_shapes
 from greybox.estimation.moments import Solution, solve_stacked
@@ -206,11 +206,11 @@ def estimate_iv(
             f"give a nominal model that is stable, or use --method ls."
         )
     solutions = _solve(regression, instruments, metric)
-    status, iterations = "one step, instruments not refined", 0
+    status, iterations, converged = "one step, instruments not refined", 0, True
     strongest = (_strength(solutions), theta, instruments, solutions)
     if refine:
         most = _MAX_REFINEMENTS if refine is True else int(refine)
-        status = f"the refinement still moved after {most} steps"
+        status, converged = f"the refinement still moved after {most} steps", False
         for iterations in range(1, most + 1):
             previous = _coefficients(solutions)
             target = _structure_theta(predictor, previous)
@@ -238,7 +238,7 @@ def estimate_iv(
             scale = np.abs(previous) + 1e-12
             # a halfway model settles too, but not at an estimate that can be simulated
             if candidate is target and (moved < _REFINE_TOLERANCE * scale).all():
-                status = f"converged after {iterations} refinements"
+                status, converged = f"converged after {iterations} refinements", True
                 break
         else:
             if refine is True:
@@ -258,6 +258,7 @@ def estimate_iv(
         margins=margins,
         heading=heading,
         evidence=instruments if judged else None,
+        converged=converged,
     )
 
 
@@ -439,6 +440,7 @@ def _result(
     margins: dict[str, float] | None = None,
     heading: str = "measured",
     evidence: Instruments | None = None,
+    converged: bool = True,
 ) -> Estimate:
     """Collect what was found; `evidence` are the simulated instruments to test it with."""
     predictor = regression.predictor
@@ -468,6 +470,7 @@ def _result(
         lags=lags,
         iterations=iterations,
         status=status,
+        converged=converged,
         current=estimate_current(
             predictor,
             theta,
@@ -482,7 +485,7 @@ def _result(
     )
     if evidence is None:
         return estimate
-    tests = assess(
+    tests = convergence(estimate) + assess(
         Evidence(
             predictor,
             regression,

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import ExcitationError
-from greybox.estimation.credibility import Evidence, assess, judge
+from greybox.estimation.credibility import Evidence, assess, convergence, judge
 from greybox.estimation.output_error import one_step_errors
 from greybox.estimation.output_setup import measured, output_model
 from greybox.estimation.result import Estimate, TestResult, Verdict
@@ -83,6 +83,7 @@ def judge_estimate(
     )
     own = {t.name: t for t in estimate.tests}
     tests: list[TestResult] = [own.pop(t.name, t) for t in assess(evidence)]
+    tests += [t for t in convergence(estimate) if t.name not in own]
     tests += own.values()
     return replace(
         estimate, tests=tuple(tests), verdict=judge(tests, estimate.labels, estimate.method)

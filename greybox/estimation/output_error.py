@@ -462,6 +462,7 @@ def _result(fitted: _Fitted, logs: Sequence[TrialLog], options: OutputErrorOptio
         lags=lags,
         iterations=fit.iterations,
         status=status,
+        converged=fit.converged,
         current=tuple((n, float(v), float(s)) for n, (v, s) in means.items() if n in CURRENT),
         current_covariance=covariance[np.ix_([*range(count), *flow], flow)],
         noise=_noise_levels(fitted, logs, options.weights) if options.search else None,

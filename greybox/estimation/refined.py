@@ -269,6 +269,7 @@ def estimate_refined_iv(
         lags=lags,
         iterations=plain.iterations + found.rounds,
         status=f"prefiltered by the noise, {found.status}",
+        converged=found.converged,
         current=estimate_current(
             predictor,
             theta,

@@ -181,6 +181,8 @@ class Estimate(Shown):
         Refinements of the instruments.
     status : str
         A sentence on how the estimation ended.
+    converged : bool
+        Whether its iteration, if it has one, ended where it no longer moves.
     current : tuple
         (name, value, standard error) of each current component; empty where the
         predictor cannot tell it.
@@ -218,6 +220,7 @@ class Estimate(Shown):
     lags: int
     iterations: int = 0
     status: str = "solved"
+    converged: bool = True
     current: tuple[tuple[str, float, float], ...] = ()
     current_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
     tests: tuple[TestResult, ...] = ()

@@ -21,6 +21,7 @@ _GROUPS = {
                                       "overidentification", "whiteness"),
     "What noise does to it": ("endogeneity", "many_instruments", "margin_u", "margin_v",
                               "margin_bias", "closed_loop"),
+    "How it was found": ("convergence",),
     "What the model does": ("stability", "damping_signs", "slow_errors"),
 }  # fmt: skip
 BOUNDS = {

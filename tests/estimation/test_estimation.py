@@ -17,6 +17,7 @@ from greybox.estimation.covariance import (
 )
 from greybox.estimation.disturbance import estimate_current
 from greybox.estimation.estimate import estimate_iv, estimate_ls
+from greybox.estimation.judging import judge_estimate
 from greybox.estimation.moments import solve_stacked
 from greybox.model.catalogue import get_structure
 from greybox.model.predictor import build_predictor
@@ -316,3 +317,19 @@ def test_a_refinement_that_runs_off_gives_what_its_best_instruments_gave(thesis,
     # neither are the standard errors those of an estimate that says nothing
     bound = estimate_iv(predictor, [log], start=true, refine=False, wind="measured", judged=False)
     assert np.median(model.std / bound.model().std) < 3
+
+
+@pytest.mark.parametrize(("run", "settles"), [(24, False), (0, True)])
+def test_a_refinement_that_does_not_settle_is_told(thesis, run, settles):
+    regime = (("u", (1,)), ("v", (1,)), ("r", (1, -1)))
+    predictor = build_predictor(thesis, "wind", regime)
+    log = virtual_trial(np.random.default_rng([23, 0, run]), CASES[0])
+    found = estimate_iv(predictor, [log], wind="measured")
+    (told,) = [t for t in found.tests if t.name == "convergence"]
+    assert (found.converged, told.passed) == (settles, settles)
+    assert told.statistic == found.iterations > 0
+    assert any("95 % intervals of such" in r for r in found.verdict.reasons) == (not settles)
+    again = judge_estimate(found, [log], wind="measured")
+    assert [t.sentence for t in again.tests if t.name == "convergence"] == [told.sentence]
+    once = estimate_iv(predictor, [log], refine=False, wind="measured")
+    assert not any(t.name == "convergence" for t in once.tests)

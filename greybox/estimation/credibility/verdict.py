@@ -61,6 +61,9 @@ def judge(
         if test.passed is False and test.name.startswith(_OF_PARAMETERS):
             excepted += [n for n in test.parameters if n in parameters]
             reasons.append(f"{test.name}: {test.sentence}")
+    reasons += [
+        f"{t.name}: {t.sentence}" for t in tests if t.name == "convergence" and not t.passed
+    ]
     for name in contaminated:
         label = next((p for p in parameters if p.split("+")[0] == name), name)
         excepted.append(label)
