@@ -14,15 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.diagnosis.recursion import propagate
-from greybox.model.functions import Integrator
+from greybox.model.functions import RK4_AHEAD, RK4_WEIGHTS, Integrator
 from greybox.model.structure import Structure
 from greybox.vectorised import Vectorised
 
 Array = NDArray[np.float64]
 
-# share of a stage's slope at which the next stage looks: the classical Runge-Kutta rule
-_AHEAD = (0.5, 0.5, 1.0)
-_WEIGHTS = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
 # no number but the state
 NOWHERE = np.zeros(0, int)
 
@@ -68,7 +65,7 @@ class Slopes:
         of_slopes = ca.Function("slopes", [s.x, *others], [ca.densify(slopes)])
         points = [s.x]
         if integrator == "rk4":
-            for share in _AHEAD:
+            for share in RK4_AHEAD:
                 points.append(s.x + share * of_state(points[-1], *others))
         stages = [of_slopes(point, *others) for point in points]
         self._shape = (len(stages), *slopes.shape)
@@ -109,8 +106,8 @@ class Slopes:
         slope = stages[0].copy()
         total = slope.copy()
         if len(stages) > 1:
-            total *= _WEIGHTS[0]
-            for share, weight, stage in zip(_AHEAD, _WEIGHTS[1:], stages[1:], strict=True):
+            total *= RK4_WEIGHTS[0]
+            for share, weight, stage in zip(RK4_AHEAD, RK4_WEIGHTS[1:], stages[1:], strict=True):
                 slope *= share
                 slope[own, own] += 1.0
                 slope = np.einsum("ijn,jmn->imn", stage[:, :nx], slope)
