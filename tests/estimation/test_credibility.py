@@ -109,6 +109,26 @@ def test_a_missing_product_of_states_is_noticed_in_a_current(seed):
     assert "lacks" not in right.verdict.text
 
 
+@pytest.mark.parametrize("seed", [902, 905])
+def test_a_free_run_that_hides_it_is_not_trusted_either(seed):
+    """Fitted to the log, the run without the term is as good as with it, and was trusted."""
+    logs = [virtual_log(seed, 2000)]
+    wrong, right = (
+        estimate_model(logs, Request(method="oe", structure=s)) for s in ("thesis-Yur", "thesis")
+    )
+    assert all(wrong.fit[s] > right.fit[s] - 2 for s in "uvr")
+    assert "the simulated motion still explains the residuals of v" in wrong.verdict.text
+    assert right.verdict.text == "trust"
+
+
+def test_many_logs_are_no_evidence_against_a_free_run():
+    """Their own instruments would reject a correct model; free runs do not rest on them."""
+    logs = [virtual_log(600 + k, 300) for k in range(8)]
+    found = by_name(estimate_model(logs, Request(method="oe", structure="thesis")))
+    for state in "uvr":
+        assert found[f"overidentification_{state}"].p_value > 1e-3
+
+
 @pytest.mark.parametrize("kind", ["pulses", "binary", "sine"])
 @pytest.mark.parametrize("samples", [1000, 5000])
 def test_a_narrow_range_of_speeds_is_weak(kind, samples):

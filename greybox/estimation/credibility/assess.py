@@ -63,10 +63,14 @@ def assess(evidence: Evidence) -> tuple[TestResult, ...]:
 
 
 def _of_equation(evidence: Evidence, equation: Equation) -> list[TestResult]:
+    biases = frozenset(c.label for c in evidence.predictor.columns if c.is_bias)
     if evidence.method == "oe":
         # a free run needs no instruments: only what speaks of the model is asked
-        return [input_independence(evidence, equation), *_still_water(evidence, equation)]
-    biases = frozenset(c.label for c in evidence.predictor.columns if c.is_bias)
+        return [
+            overidentification(equation, biases, each_log=False),
+            input_independence(evidence, equation),
+            *_still_water(evidence, equation),
+        ]
     if not len(equation.columns) or not np.isfinite(equation.solution.theta).all():
         reason = "its instruments leave a direction free"
         return [

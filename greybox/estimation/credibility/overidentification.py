@@ -6,6 +6,7 @@ import numpy as np
 
 from greybox.estimation.credibility.evidence import Equation
 from greybox.estimation.credibility.kernel import Array
+from greybox.estimation.credibility.many import surplus_moments
 from greybox.estimation.credibility.question import Finding, Question
 from greybox.estimation.credibility.scores import Score, score_test
 from greybox.estimation.result import TestResult
@@ -19,7 +20,9 @@ _QUESTION = Question(
 )
 
 
-def overidentification(equation: Equation, biases: frozenset[str]) -> TestResult:
+def overidentification(
+    equation: Equation, biases: frozenset[str], *, each_log: bool = True
+) -> TestResult:
     """Test that all instruments are valid (Sargan-Hansen).
 
     Robust to the moving average and to noise that changes its size. The simulated
@@ -27,6 +30,15 @@ def overidentification(equation: Equation, biases: frozenset[str]) -> TestResult
     Several logs bring more equations than parameters by their own instruments;
     to these, and to a single log, the parameters' instruments delayed by five
     samples are added.
+
+    Parameters
+    ----------
+    equation : Equation
+    biases : frozenset of str
+        Labels of columns that only capture a disturbance.
+    each_log : bool
+        Whether each log's own instruments are asked too. Without, as for an estimate that
+        does not rest on them, the bias that many logs bring is taken off.
 
     References
     ----------
@@ -42,7 +54,7 @@ def overidentification(equation: Equation, biases: frozenset[str]) -> TestResult
                 for x, k in zip(equation.states, equation.keep, strict=True)
             ]
             xi = [np.vstack([d, f]) for d, f in zip(xi, further, strict=True)]
-        if len(equation.z) > 1:
+        if each_log and len(equation.z) > 1:
             xi = [np.vstack([s, d]) for s, d in zip(equation.stacked, xi, strict=True)]
         return score_test(
             xi,
@@ -50,6 +62,7 @@ def overidentification(equation: Equation, biases: frozenset[str]) -> TestResult
             equation.solution.projected,
             equation.residuals,
             colour=equation.colour,
+            mean=None if each_log else surplus_moments(xi, equation),
         )
 
     return _QUESTION.answer(equation, score, _finding)
