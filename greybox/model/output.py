@@ -295,13 +295,27 @@ def _over(step: ca.Function, carried: int, steps: int, runs: int) -> ca.Function
     return many
 
 
-@lru_cache(maxsize=32)
-def _filter(model: OutputModel, steps: int, runs: int, sensitivities: bool) -> ca.Function:
-    """Return the extended Kalman filter with sensitivities at its gains.
+@dataclass(frozen=True)
+class _Update:
+    """One sample of an extended Kalman filter in symbols.
 
-    ``(z, P, S, [w; y; use], p, noise) -> z⁺, P⁺, S⁺, ν, ∂ν, log v`` with ν the
-    innovations one channel after another, each divided by its deviation √v.
+    Arguments are the states, their covariance (its lower triangle), what the sample
+    reads (drivers, measurements, whether they count), parameters and variances; results
+    the next states and covariance, innovations of unit variance and the logarithms of
+    their variances.
     """
+
+    given: tuple[ca.SX, ca.SX, ca.SX, ca.SX, ca.SX]
+    after: ca.SX
+    spread: ca.SX
+    innovations: ca.SX
+    levels: ca.SX
+    slope_after: _Slope
+    slope_seen: _Slope
+
+
+@lru_cache(maxsize=32)
+def _update(model: OutputModel) -> _Update:
     s = _step(model)
     nz, ny = s.z.numel(), s.seen.numel()
     y, use = ca.SX.sym("y", ny), ca.SX.sym("use")
@@ -331,28 +345,70 @@ def _filter(model: OutputModel, steps: int, runs: int, sensitivities: bool) -> c
     step = ca.Function("after", [s.z, s.w, s.p], [s.after, *_Slope.of(s.after, s).parts])
     z_next, a, b = step(z, s.w, s.p)
     spread = a @ spread @ a.T + ca.diag(noise[ny:])
-    full = _with_slopes(
-        [s.z, cov, ca.vertcat(s.w, y, use), s.p, noise],
-        [z_next, ca.tril(ca.densify(spread)).nz[:]],
-        [ca.vertcat(*innovations), ca.vertcat(*levels)],
+    return _Update(
+        (s.z, cov, ca.vertcat(s.w, y, use), s.p, noise),
+        z_next,
+        ca.tril(ca.densify(spread)).nz[:],
+        ca.vertcat(*innovations),
+        ca.vertcat(*levels),
         _Slope(a, b).after(slope),
         _Slope(ca.vertcat(*[r.by_z for r in rows]), ca.vertcat(*[r.by_p for r in rows])),
+    )
+
+
+@lru_cache(maxsize=32)
+def _filter(model: OutputModel, steps: int, runs: int, sensitivities: bool) -> ca.Function:
+    """Return the extended Kalman filter with sensitivities at its gains.
+
+    ``(z, P, S, [w; y; use], p, noise) -> z⁺, P⁺, S⁺, ν, ∂ν, log v`` with ν the
+    innovations one channel after another, each divided by its deviation √v.
+    """
+    u = _update(model)
+    step = _with_slopes(
+        u.given,
+        [u.after, u.spread],
+        [u.innovations, u.levels],
+        u.slope_after,
+        u.slope_seen,
         sensitivities,
     )
-    return _over(full, 3, steps, runs)
+    return _over(step, 3, steps, runs)
 
 
 @lru_cache(maxsize=16)
 def _likelihood(model: OutputModel, steps: int, runs: int) -> ca.Function:
-    """Return ``(z0, [w; y; use], p, noise) -> −log L`` and its derivatives in z0 and p."""
-    run = _filter(model, steps, runs, sensitivities=False)
-    nz = run.size1_in(0)
-    z0, w = ca.MX.sym("z0", nz, runs), ca.MX.sym("w", run.size1_in(3), runs * steps)
-    p, noise = ca.MX.sym("p", run.size1_in(4)), ca.MX.sym("noise", run.size1_in(5))
-    out = run.call([z0, ca.MX.zeros(nz * (nz + 1) // 2, runs), ca.MX(nz, 0), w, p, noise])
-    value = (ca.sumsqr(out[3]) + ca.sum2(ca.sum1(out[5]))) / 2
-    slopes = [ca.gradient(value, v) for v in (z0, p)]
-    return ca.Function("likelihood", [z0, w, p, noise], [value, *slopes])
+    """Return ``(z0, [w; y; use], p, noise) -> −log L`` and its derivatives in z0 and p.
+
+    The adjoint runs back over the samples by a step of its own; differentiating the whole
+    accumulated filter would take four times as long.
+    """
+    u = _update(model)
+    z, cov, w, p, noise = u.given
+    by_z, by_cov, by_p = (ca.SX.sym(f"by_{i}", x.numel()) for i, x in enumerate((z, cov, p)))
+    own = (ca.sumsqr(u.innovations) + ca.sum1(u.levels)) / 2
+    onward = own + ca.dot(by_z, u.after) + ca.dot(by_cov, u.spread)
+    back = ca.Function(
+        "back",
+        [by_z, by_cov, by_p, z, cov, w, p, noise],
+        [ca.gradient(onward, z), ca.gradient(onward, cov), by_p + ca.gradient(onward, p)],
+        {"cse": True},
+    )
+    forth = ca.Function("forth", list(u.given), [u.after, u.spread, own], {"cse": True})
+    given = [ca.MX.sym("z0", z.numel()), ca.MX.sym("w", w.numel(), steps)]
+    given += [ca.MX.sym("p", p.numel()), ca.MX.sym("noise", noise.numel())]
+    start, read, *constant = given
+    constants = [ca.repmat(c, 1, steps) for c in constant]
+    certain = ca.MX.zeros(cov.numel())
+    states, spreads, losses = accumulate(forth, steps, range(2)).call(
+        [start, certain, read, *constants]
+    )
+    before = [ca.horzcat(start, states[:, :-1]), ca.horzcat(certain, spreads[:, :-1])]
+    backwards = [x[:, ::-1] for x in (*before, read)]
+    nothing = [ca.MX.zeros(x.numel()) for x in (by_z, by_cov, by_p)]
+    found = accumulate(back, steps, range(3)).call([*nothing, *backwards, *constants])
+    one = ca.Function("likelihood", given, [ca.sum2(losses), found[0][:, -1], found[2][:, -1]])
+    # values and the parameters' derivatives add over the runs
+    return one if runs == 1 else one.map("runs", "serial", runs, [2, 3], [0, 2])
 
 
 class _Evaluator:

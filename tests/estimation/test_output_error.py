@@ -220,6 +220,24 @@ class TestSensitivities:
             assert by_p[j] == pytest.approx(slope, rel=1e-4, abs=1e-3 * np.abs(by_p).max())
         assert np.isfinite(by_start).all()
 
+    def test_likelihoods_of_several_logs_add(self, predictor, noisy):
+        """Also where one is padded: rows beyond its end count for nothing."""
+        model, data, p = problem(predictor, noisy)
+        noise = np.array([2e-4, 2e-4, 2e-4, 1e-4, 1e-5, 1e-5, 1e-6, 1e-8])
+        parts = [Measured(data.w[:80], data.y[:80]), Measured(data.w[200:250], data.y[200:250])]
+        both = cut(parts, 80)
+        starts = np.array([part.y[0] for part in parts])
+        value, by_start, by_p = Filter(model, both.w, both.y, both.use).likelihood(starts, p, noise)
+        each = [
+            Filter(model, d.w[None], d.y[None], np.ones((1, len(d.y)))).likelihood(
+                z[None], p, noise
+            )
+            for d, z in zip(parts, starts, strict=True)
+        ]
+        assert value == pytest.approx(sum(e[0] for e in each), rel=1e-12)
+        np.testing.assert_allclose(by_start, np.vstack([e[1] for e in each]), rtol=1e-9)
+        np.testing.assert_allclose(by_p, sum(e[2] for e in each), rtol=1e-9)
+
     def test_the_likelihood_of_a_linear_model_is_that_of_a_gaussian(self):
         from scipy.stats import multivariate_normal
 
