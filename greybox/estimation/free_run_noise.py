@@ -18,7 +18,7 @@ from greybox.trial.log import TrialLog
 Array = NDArray[np.float64]
 
 # process noise to start from, in deviations of the measurements
-_BESIDE = 0.01
+_BESIDE = 0.1
 # least and largest process noise that is tried, likewise, and how many
 _GRID = (3e-3, 1.0, 12)
 # samples of each log that noise levels are sought in

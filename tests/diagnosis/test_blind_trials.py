@@ -44,7 +44,7 @@ def judged(
     study = run_power(
         judge_by_diagnosis, oracle=oracle_by_fit if oracle else None, effects=effects,
         sizes=(1.0,), kinds=kinds, runs=runs, none_runs=none_runs, seed=2027,
-        conditions=Conditions(**conditions), workers=1,
+        conditions=Conditions(**conditions),
     )  # fmt: skip
     for o in study.outcomes:
         said = o.judgement
