@@ -21,7 +21,7 @@ from greybox.study.blind import Order, Trial, draw_many
 from greybox.study.blind_causes import CAUSES, Effect
 from greybox.study.blind_conditions import Conditions
 from greybox.study.blind_effects import UNKNOWN, shows
-from greybox.study.parallel import map_pieces
+from greybox.study.parallel import map_pieces, processors
 from greybox.study.tables import Row
 
 ANSWERS = ("detected", "right", "group", "part", "wrong", "unexplained", "none", "failed")
@@ -417,7 +417,9 @@ def run_power(
             if all(shows(name, kind) for name in ids):
                 cells = [Cell(tuple(ids), size, kind) for size in sizes]
                 wanted += [(cell, run) for cell in cells for run in range(runs)]
-        pieces += [wanted[k : k + _PIECE] for k in range(0, len(wanted), _PIECE)]
+        # few trials are shared out all the same
+        size = max(1, min(_PIECE, -(-len(wanted) // (workers or processors()))))
+        pieces += [wanted[k : k + size] for k in range(0, len(wanted), size)]
     if not pieces:
         raise UsageError("the study has 0 trials: ask for runs, none_runs and at least one kind.")
     total, outcomes = sum(map(len, pieces)), list[Outcome]()
