@@ -13,9 +13,9 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.recursion import propagate
 from greybox.model.functions import RK4_AHEAD, RK4_WEIGHTS, Integrator
 from greybox.model.structure import Structure
+from greybox.recursion import propagate
 from greybox.vectorised import Vectorised
 
 Array = NDArray[np.float64]

@@ -24,6 +24,7 @@ from greybox.estimation.shooting import (
     Restrictions,
     Segments,
     ShootingFit,
+    by_sample,
     cut,
     fit_segments,
     solve_step,
@@ -64,7 +65,7 @@ class FilterRuns:
         """Return innovations, their derivatives at fixed gains, and the exact gradient."""
         found = self.rows(p, nodes)
         _, by_start, by_p = self._filter.likelihood(nodes, p, self.noise)
-        downhill = np.zeros(found.rows.shape[:2])
+        downhill = np.zeros((len(nodes), found.rows.shape[2]))
         # the parameters are common to all logs: their gradient is counted once
         downhill[0, : len(p)] = -by_p
         downhill[:, len(p) :] = -by_start
@@ -73,15 +74,9 @@ class FilterRuns:
     def rows(self, p: Array, nodes: Array) -> Linearised:
         """Return innovations and their derivatives at fixed gains alone."""
         r, rows, levels = self._filter(nodes, p, self.noise)
-        runs, _, columns, _ = rows.shape
-        nz = nodes.shape[1]
-        return Linearised(
-            r,
-            rows.transpose(0, 2, 1, 3).reshape(runs, columns, -1),
-            np.zeros((runs, nz)),
-            np.zeros((runs, columns, nz)),
-            float(levels.sum()) / 2,
-        )
+        none = np.zeros((*nodes.shape, rows.shape[3]))
+        level = float(levels.sum()) / 2
+        return Linearised(r, by_sample(rows), np.zeros_like(nodes), none, level)
 
     def value(self, p: Array, nodes: Array) -> tuple[Array, Array, float]:
         """Return the innovations and half the sum of the logarithms of their variances."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.estimation.shooting import Linearised, Segments
+from greybox.estimation.shooting import Linearised, Segments, by_sample
 from greybox.model.output import Observer, OutputModel
 
 Array = NDArray[np.float64]
@@ -39,15 +39,10 @@ class ObservedRuns:
     def linearise(self, p: Array, nodes: Array) -> Linearised:
         """Return errors and their derivatives at parameters (q,) and starts (M, nz)."""
         error, rows = self._observer(nodes, p, self.gain)
-        runs, _, columns, _ = rows.shape
-        nz = nodes.shape[1]
+        none = np.zeros((*nodes.shape, rows.shape[3]))
         with np.errstate(over="ignore", invalid="ignore"):
-            return Linearised(
-                error / self.sigma,
-                (rows / self.sigma).transpose(0, 2, 1, 3).reshape(runs, columns, -1),
-                np.zeros((runs, nz)),
-                np.zeros((runs, columns, nz)),
-            )
+            weighted = by_sample(rows / self.sigma[:, None])
+            return Linearised(error / self.sigma, weighted, np.zeros_like(nodes), none)
 
     def value(self, p: Array, nodes: Array) -> tuple[Array, Array, float]:
         """Return errors, without ends and level."""

@@ -357,7 +357,7 @@ def log_rows(at: Linearised, segments: Segments, q: int) -> list[tuple[Array, Ar
         and (N·ny,) residuals, channels of one sample together.
     """
     found = []
-    nz = at.rows.shape[1] - q
+    nz = at.rows.shape[2] - q
     link = np.zeros((q + nz, nz))
     rows: list[Array] = []
     residuals: list[Array] = []
@@ -366,13 +366,14 @@ def log_rows(at: Linearised, segments: Segments, q: int) -> list[tuple[Array, Ar
             link = np.vstack([np.zeros((q, nz)), np.eye(nz)])
         samples = int(segments.use[j].sum())
         width = at.r.shape[2]
-        own = link @ at.rows[j, q:]
-        own[:q] += at.rows[j, :q]
-        rows.append(own[:, : samples * width])
+        used = at.rows[j, : samples * width].T
+        own = link @ used[q:]
+        own[:q] += used[:q]
+        rows.append(own)
         residuals.append(at.r[j, :samples].ravel())
         if segments.joined[j]:
-            slope = link @ at.slope[j, q:]
-            slope[:q] += at.slope[j, :q]
+            slope = link @ at.slope[j, :, q:].T
+            slope[:q] += at.slope[j, :, :q].T
             link = slope
         else:
             found.append((np.hstack(rows), np.concatenate(residuals)))

@@ -118,11 +118,11 @@ def unrestricted(q: int) -> Restrictions:
 class Linearised:
     """Weighted residuals and rows of every segment at one point.
 
-    ``r`` (M, m, ny) residuals in noise deviations; ``rows`` (M, q + nz, m·ny)
+    ``r`` (M, m, ny) residuals in noise deviations; ``rows`` (M, m·ny, q + nz)
     derivatives of the outputs in the same units; ``end`` (M, nz) and ``slope``
-    (M, q + nz, nz) of the states after each segment; ``level`` what the
+    (M, nz, q + nz) of the states after each segment; ``level`` what the
     likelihood adds beside the squares; ``downhill`` (M, q + nz) the negative
-    gradient where it is not ``rows @ r``.
+    gradient where it is not ``rowsᵀ r``.
     """
 
     r: Array
@@ -131,6 +131,12 @@ class Linearised:
     slope: Array
     level: float = 0.0
     downhill: Array | None = None
+
+
+def by_sample(rows: Array) -> Array:
+    """Return derivatives (M, m, ny, q + nz) with the outputs of a sample below one another."""
+    runs, samples, outputs, columns = rows.shape
+    return rows.reshape(runs, samples * outputs, columns)
 
 
 class Runs(Protocol):
@@ -184,13 +190,10 @@ class FreeRuns:
         """Return residuals and derivatives at parameters (q,) and starts (M, nz)."""
         y, rows, end, slope = self._simulator.sensitivities(nodes, p)
         with np.errstate(over="ignore", invalid="ignore"):
-            used = rows / self.sigma
+            used = rows / self.sigma[:, None]
             if not self.segments.use.all():
                 used[self.segments.use == 0] = 0.0
-        runs, _, columns, _ = used.shape
-        return Linearised(
-            self._weighted(y), used.transpose(0, 2, 1, 3).reshape(runs, columns, -1), end, slope
-        )
+        return Linearised(self._weighted(y), by_sample(used), end, slope)
 
     def value(self, p: Array, nodes: Array) -> tuple[Array, Array, float]:
         """Return residuals, ends and level without derivatives."""
@@ -260,21 +263,22 @@ class _Reduced:
 def _reduce(at: Linearised, segments: Segments, nodes: Array, q: int, loss: Loss) -> _Reduced:
     runs, nz = nodes.shape
     flat = at.r.reshape(runs, -1)
-    weighted = at.rows * loss_weights(flat, loss)[:, None, :]
-    normal = weighted @ at.rows.transpose(0, 2, 1)
-    right = (weighted @ flat[..., None])[..., 0] if at.downhill is None else at.downhill
+    # weights of one are not multiplied with
+    weighted = at.rows if loss == "gaussian" else at.rows * loss_weights(flat, loss)[..., None]
+    normal = weighted.transpose(0, 2, 1) @ at.rows
+    right = (flat[:, None] @ weighted)[:, 0] if at.downhill is None else at.downhill
     own = block_diag(list(normal[:, q:, q:]), format="csc")
     cross = normal[:, q:, :q].reshape(runs * nz, q)
     links = np.flatnonzero(segments.joined)
     gap = (at.end - np.roll(nodes, -1, axis=0))[links]
     size = len(links) * nz
-    by_p = at.slope[links][:, :q].transpose(0, 2, 1).reshape(size, q)
+    by_p = at.slope[links][:, :, :q].reshape(size, q)
     matrix = own
     if size:
         place = np.arange(size).reshape(len(links), nz)
         rows = np.repeat(place[:, :, None], nz, axis=2).ravel()
         before = (links[:, None] * nz + np.arange(nz))[:, None, :].repeat(nz, axis=1).ravel()
-        values = at.slope[links][:, q:].transpose(0, 2, 1).ravel()
+        values = at.slope[links][:, :, q:].ravel()
         after = ((links + 1)[:, None] * nz + np.arange(nz)).ravel()
         join = csc_matrix((values, (rows, before)), shape=(size, runs * nz)) - csc_matrix(
             (np.ones(size), (place.ravel(), after)), shape=(size, runs * nz)
@@ -384,8 +388,9 @@ def fit_segments(
     links = np.flatnonzero(segments.joined)
     scale = _scales(runs, nodes.shape[1])
     weight, damping, done = 0.0, 0.0, False
-    taken = 0
+    taken, before = 0, np.inf
     at = runs.linearise(p, nodes)
+    shown = at.r, at.end, at.level
     hessian = np.zeros((len(p), len(p)))
 
     def merit(r: Array, end: Array, level: float, p: Array, nodes: Array) -> float:
@@ -421,21 +426,26 @@ def fit_segments(
             if length < tolerance and gap < _JOINED:
                 done = True
                 break
-            now = merit(at.r, at.end, at.level, p, nodes)
+            # steps that shrink fast leave less than this one's share of the one before
+            last = length < 0.1 * before < np.inf and length**2 < tolerance * before
+            last = last and gap < _JOINED and damping == 0.0
+            now = merit(*shown, p, nodes)
             for share in (1.0, 0.5, 0.25, 0.1):
                 moved = p + share * step, nodes + share * shift
                 ahead = None
-                if share == 1.0 and damping == 0.0:
+                if share == 1.0 and damping == 0.0 and not last:
                     # most full steps are taken: their derivatives are needed next
                     ahead = runs.linearise(*moved)
-                    r, end, level = ahead.r, ahead.end, ahead.level
+                    found = ahead.r, ahead.end, ahead.level
                 else:
-                    r, end, level = runs.value(*moved)
-                if merit(r, end, level, *moved) < now:
+                    found = runs.value(*moved)
+                if merit(*found, *moved) < now:
                     accepted = True
                     break
             if accepted:
-                p, nodes = moved
+                (p, nodes), shown = moved, found
+                before = length if share == 1.0 else np.inf
+                done = last and share == 1.0
                 damping = 0.0 if share == 1.0 and damping < 1e-6 else damping / 10
                 break
             # nothing to gain beyond rounding
@@ -446,9 +456,10 @@ def fit_segments(
         if done or not accepted:
             break
         at = runs.linearise(p, nodes) if ahead is None else ahead
+    r, end, level = shown
     with np.errstate(over="ignore", invalid="ignore"):
-        gap = float(np.abs((at.end - np.roll(nodes, -1, axis=0))[links] / scale).max(initial=0.0))
-    cost = loss_value(at.r, loss) + at.level + restrictions.penalty(p)
+        gap = float(np.abs((end - np.roll(nodes, -1, axis=0))[links] / scale).max(initial=0.0))
+    cost = loss_value(r, loss) + level + restrictions.penalty(p)
     return ShootingFit(p, nodes, hessian, cost, gap, taken, done)
 
 

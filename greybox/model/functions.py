@@ -209,6 +209,36 @@ def _unrolled(
     )
 
 
+def unrolled(step: ca.Function, carried: int, steps: int) -> ca.Function:
+    """Return several steps as one scalar function: less is spent between them.
+
+    Parameters
+    ----------
+    step : casadi.Function
+        SX. Arguments are what it hands to the next one, then a column that changes with
+        the step, then constants; results begin with what is handed on.
+    carried : int
+        How many arguments are handed on.
+    steps : int
+
+    Returns
+    -------
+    casadi.Function
+        With a matrix of `steps` columns as what changes. Results are what is handed on at
+        the end, then every result of every step, a column each.
+    """
+    given = [ca.SX.sym(step.name_in(i), step.sparsity_in(i)) for i in range(step.n_in())]
+    read = ca.SX.sym("read", step.size1_in(carried), steps)
+    found: list[list[ca.SX]] = []
+    current = given[:carried]
+    for k in range(steps):
+        found.append(step.call([*current, read[:, k], *given[carried + 1 :]]))
+        current = found[-1][:carried]
+    columns = [ca.horzcat(*[f[i] for f in found]) for i in range(step.n_out())]
+    arguments = [*given[:carried], read, *given[carried + 1 :]]
+    return ca.Function("steps", arguments, [*current, *columns])
+
+
 def accumulate(
     step: ca.Function, count: int, carried: Sequence[int] = (0,), name: str = "run"
 ) -> ca.Function:

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import casadi as ca
 import numpy as np
@@ -21,10 +21,17 @@ from numpy.typing import NDArray
 
 from greybox.errors import StructureError
 from greybox.model.disturbances import CURRENT, WIND, rotate_to_body
-from greybox.model.functions import accumulate, bind
+from greybox.model.functions import accumulate, bind, unrolled
 from greybox.model.predictor import Column, Predictor
+from greybox.recursion import propagate
+from greybox.vectorised import Vectorised
 
 Array = NDArray[np.float64]
+
+# samples whose derivatives are computed at once: a long log needs no more memory than these
+_BLOCK = 8192
+# steps that are one scalar function, and the instructions that it has at most
+_UNROLLED, _INSTRUCTIONS = 16, 2000
 Role = Literal["input", "output"]
 
 
@@ -183,78 +190,49 @@ class _Slope:
         return _Slope(self.by_z @ before.by_z, self.by_z @ before.by_p + self.by_p)
 
 
-def _with_slopes(
-    given: Sequence[ca.SX],
-    carried: Sequence[ca.SX],
-    found: Sequence[ca.SX],
-    after: _Slope,
-    seen: _Slope,
-    sensitivities: bool,
-) -> ca.Function:
-    """Return a step that carries the derivatives of the states along.
-
-    The scalar instructions give the slopes of one step; their product with the
-    derivatives so far is one of dense matrices, at half the time of scalars.
+@dataclass(frozen=True)
+class _Walk:
+    """A step in symbols, what is found at it, and the derivatives of both.
 
     Parameters
     ----------
-    given : sequence of SX
-        States, what else is carried, then what the step reads.
-    carried, found : sequence of SX
-        Next values of what is carried, and results; the derivatives stand after the
-        carried ones and after the first result.
-    after, seen : _Slope
-        Of the next states and of the first result.
-    sensitivities : bool
-        Without, the derivatives have no columns.
+    carried : tuple of SX
+        What a step hands to the next one, first the states.
+    read : SX
+        What changes with the sample.
+    constant : tuple of SX
+        What does not, first the parameters.
+    after, found : tuple of SX
+        Next values of what is carried, and results.
+    slope_after, slope_found : _Slope
+        Of the next states, and of the first result.
     """
-    nz, q = given[0].numel(), after.by_p.size2()
-    ny = seen.by_z.size1()
-    k = len(carried)
-    if not sensitivities:
-        none = ca.SX.sym("S", nz, 0)
-        return ca.Function(
-            "step",
-            [*given[:k], none, *given[k:]],
-            [*carried, ca.SX(nz, 0), found[0], ca.SX(ny, 0), *found[1:]],
-            {"cse": True},
-        )
-    slopes = [after.by_z, after.by_p, seen.by_z, seen.by_p]
-    one = ca.Function("one", list(given), [*carried, *found, *slopes], {"cse": True})
-    symbols = [ca.MX.sym(f"a{i}", x.sparsity()) for i, x in enumerate(given)]
-    sens = ca.MX.sym("S", nz, q + nz)
-    out = one.call(symbols)
-    values, (a, b, h, d) = out[: k + len(found)], out[k + len(found) :]
 
-    def moved(by_z: ca.MX, by_p: ca.MX) -> ca.MX:
-        return ca.densify(by_z @ sens + ca.horzcat(by_p, ca.MX(by_z.size1(), nz)))
+    carried: tuple[ca.SX, ...]
+    read: ca.SX
+    constant: tuple[ca.SX, ...]
+    after: tuple[ca.SX, ...]
+    found: tuple[ca.SX, ...]
+    slope_after: _Slope
+    slope_found: _Slope
 
-    # sensors that show the states themselves show their derivatives
-    same = seen.by_z.is_eye() and not seen.by_p.nnz()
-    return ca.Function(
-        "step",
-        [*symbols[:k], sens, *symbols[k:]],
-        [*values[:k], moved(a, b), values[k], sens if same else moved(h, d), *values[k + 1 :]],
-    )
+
+Walk = Callable[[OutputModel], _Walk]
 
 
 @lru_cache(maxsize=32)
-def _run(model: OutputModel, steps: int, runs: int, sensitivities: bool) -> ca.Function:
-    """Return ``(z0, S0, W, p) -> z after each step, S, y before each step, ∂y``, runs side by side.
-
-    Parameters are the same for all runs of a call.
-    """
+def _free(model: OutputModel) -> _Walk:
+    """Return the free run, which shows its outputs before each step."""
     s = _step(model)
     after, seen = _Slope.of(s.after, s), _Slope.of(s.seen, s)
-    step = _with_slopes([s.z, s.w, s.p], [s.after], [s.seen], after, seen, sensitivities)
-    return _over(step, 2, steps, runs)
+    return _Walk((s.z,), s.w, (s.p,), (s.after,), (s.seen,), after, seen)
 
 
 @lru_cache(maxsize=32)
-def _observed(model: OutputModel, steps: int, runs: int, sensitivities: bool) -> ca.Function:
-    """Return ``(z, S, [w; y; use], p, gain) -> z⁺, S⁺, y − h(z), ∂h``, measured states corrected.
+def _observed(model: OutputModel) -> _Walk:
+    """Return a run whose steps begin at z + gain (y − z), and which shows y − h(z).
 
-    Each step is taken from z + gain (y − z); S and ∂h are as those of `_run`.
+    The derivatives of what is found are those of h.
     """
     s = _step(model)
     nz, ny = s.z.numel(), s.seen.numel()
@@ -262,60 +240,45 @@ def _observed(model: OutputModel, steps: int, runs: int, sensitivities: bool) ->
     kept = 1 - use * gain
     corrected = kept * s.z + use * gain * y[:nz]
     after = ca.substitute(s.after, s.z, corrected)
-    step = _with_slopes(
-        [s.z, ca.vertcat(s.w, y, use), s.p, gain],
-        [after],
-        [use * (y - s.seen)],
-        _Slope.of(after, s),
-        _Slope.of(s.seen, s),
-        sensitivities,
-    )
-    return _over(step, 2, steps, runs)
+    read = ca.vertcat(s.w, y, use)
+    error = use * (y - s.seen)
+    slopes = _Slope.of(after, s), _Slope.of(s.seen, s)
+    return _Walk((s.z,), read, (s.p, gain), (after,), (error,), *slopes)
 
 
 def _over(step: ca.Function, carried: int, steps: int, runs: int) -> ca.Function:
     """Accumulate a step over samples, its last arguments constant, and over runs side by side.
 
     Arguments are the carried ones, then one that changes with the sample, then
-    constants.
+    constants; results are those of every sample.
     """
-    accumulated = accumulate(step, steps, range(carried))
+    size = max(1, min(_UNROLLED, _INSTRUCTIONS // step.n_instructions(), steps))
+    blocks = -(-steps // size)
+    several = accumulate(unrolled(step, carried, size), blocks, range(carried))
     given = [
-        ca.MX.sym(f"a{i}", step.size1_in(i), step.size2_in(i) * (steps if i == carried else 1))
+        ca.MX.sym(step.name_in(i), step.size1_in(i), steps if i == carried else 1)
         for i in range(step.n_in())
     ]
-    spread = [
-        value if i <= carried else ca.repmat(value, 1, steps) for i, value in enumerate(given)
-    ]
-    one = ca.Function("run", given, accumulated.call(spread))
+    read = given[carried]
+    padding = ca.repmat(read[:, -1], 1, blocks * size - steps)
+    constants = [ca.repmat(c, 1, blocks) for c in given[carried + 1 :]]
+    found = several.call([*given[:carried], ca.horzcat(read, padding), *constants])[carried:]
+    one = ca.Function("run", given, [x[:, :steps] for x in found])
     if runs == 1:
         return one
     # the constants are given once
-    many = one.map("runs", "serial", runs, list(range(carried + 1, step.n_in())), [])
-    return many
-
-
-@dataclass(frozen=True)
-class _Update:
-    """One sample of an extended Kalman filter in symbols.
-
-    Arguments are the states, their covariance (its lower triangle), what the sample
-    reads (drivers, measurements, whether they count), parameters and variances; results
-    the next states and covariance, innovations of unit variance and the logarithms of
-    their variances.
-    """
-
-    given: tuple[ca.SX, ca.SX, ca.SX, ca.SX, ca.SX]
-    after: ca.SX
-    spread: ca.SX
-    innovations: ca.SX
-    levels: ca.SX
-    slope_after: _Slope
-    slope_seen: _Slope
+    return one.map("runs", "serial", runs, list(range(carried + 1, step.n_in())), [])
 
 
 @lru_cache(maxsize=32)
-def _update(model: OutputModel) -> _Update:
+def _filtered(model: OutputModel) -> _Walk:
+    """Return one sample of an extended Kalman filter.
+
+    It carries the states and their covariance (its lower triangle), reads drivers,
+    measurements and whether they count, and shows innovations of unit variance and the
+    logarithms of their variances. Derivatives are at its gains, and of what is taken
+    from the innovations.
+    """
     s = _step(model)
     nz, ny = s.z.numel(), s.seen.numel()
     y, use = ca.SX.sym("y", ny), ca.SX.sym("use")
@@ -345,34 +308,57 @@ def _update(model: OutputModel) -> _Update:
     step = ca.Function("after", [s.z, s.w, s.p], [s.after, *_Slope.of(s.after, s).parts])
     z_next, a, b = step(z, s.w, s.p)
     spread = a @ spread @ a.T + ca.diag(noise[ny:])
-    return _Update(
-        (s.z, cov, ca.vertcat(s.w, y, use), s.p, noise),
-        z_next,
-        ca.tril(ca.densify(spread)).nz[:],
-        ca.vertcat(*innovations),
-        ca.vertcat(*levels),
+    return _Walk(
+        (s.z, cov),
+        ca.vertcat(s.w, y, use),
+        (s.p, noise),
+        (z_next, ca.tril(ca.densify(spread)).nz[:]),
+        (ca.vertcat(*innovations), ca.vertcat(*levels)),
         _Slope(a, b).after(slope),
         _Slope(ca.vertcat(*[r.by_z for r in rows]), ca.vertcat(*[r.by_p for r in rows])),
     )
 
 
 @lru_cache(maxsize=32)
-def _filter(model: OutputModel, steps: int, runs: int, sensitivities: bool) -> ca.Function:
-    """Return the extended Kalman filter with sensitivities at its gains.
-
-    ``(z, P, S, [w; y; use], p, noise) -> z⁺, P⁺, S⁺, ν, ∂ν, log v`` with ν the
-    innovations one channel after another, each divided by its deviation √v.
-    """
-    u = _update(model)
-    step = _with_slopes(
-        u.given,
-        [u.after, u.spread],
-        [u.innovations, u.levels],
-        u.slope_after,
-        u.slope_seen,
-        sensitivities,
+def _pass(walk: Walk, model: OutputModel, steps: int, runs: int) -> ca.Function:
+    """Return the walk over samples of runs side by side, without derivatives."""
+    of = walk(model)
+    step = ca.Function(
+        "step", [*of.carried, of.read, *of.constant], [*of.after, *of.found], {"cse": True}
     )
-    return _over(step, 3, steps, runs)
+    return _over(step, len(of.carried), steps, runs)
+
+
+@dataclass(frozen=True)
+class _Table:
+    """Derivatives of one step, at any number of samples at once.
+
+    Parameters
+    ----------
+    program : Vectorised
+        Of the rows [∂z⁺/∂z, ∂z⁺/∂p, 0], and below them those of what is found unless
+        `same`.
+    shape : tuple of int
+    same : bool
+        What is found are the states themselves.
+    """
+
+    program: Vectorised
+    shape: tuple[int, int]
+    same: bool
+
+
+@lru_cache(maxsize=32)
+def _table(walk: Walk, model: OutputModel) -> _Table:
+    of = walk(model)
+    after, found = of.slope_after, of.slope_found
+    same = bool(found.by_z.is_eye()) and not found.by_p.nnz()
+    nz = after.by_z.size1()
+    rows = [ca.horzcat(s.by_z, s.by_p, ca.SX(s.by_z.size1(), nz)) for s in (after, found)]
+    matrix = rows[0] if same else ca.vertcat(*rows)
+    symbols = ca.vertcat(*of.carried, of.read, *of.constant)
+    program = Vectorised(ca.vertsplit(ca.vec(ca.densify(matrix).T)), ca.vertsplit(symbols))
+    return _Table(program, matrix.shape, same)
 
 
 @lru_cache(maxsize=16)
@@ -382,18 +368,19 @@ def _likelihood(model: OutputModel, steps: int, runs: int) -> ca.Function:
     The adjoint runs back over the samples by a step of its own; differentiating the whole
     accumulated filter would take four times as long.
     """
-    u = _update(model)
-    z, cov, w, p, noise = u.given
+    u = _filtered(model)
+    (z, cov), w, (p, noise) = u.carried, u.read, u.constant
+    innovations, levels = u.found
     by_z, by_cov, by_p = (ca.SX.sym(f"by_{i}", x.numel()) for i, x in enumerate((z, cov, p)))
-    own = (ca.sumsqr(u.innovations) + ca.sum1(u.levels)) / 2
-    onward = own + ca.dot(by_z, u.after) + ca.dot(by_cov, u.spread)
+    own = (ca.sumsqr(innovations) + ca.sum1(levels)) / 2
+    onward = own + ca.dot(by_z, u.after[0]) + ca.dot(by_cov, u.after[1])
     back = ca.Function(
         "back",
         [by_z, by_cov, by_p, z, cov, w, p, noise],
         [ca.gradient(onward, z), ca.gradient(onward, cov), by_p + ca.gradient(onward, p)],
         {"cse": True},
     )
-    forth = ca.Function("forth", list(u.given), [u.after, u.spread, own], {"cse": True})
+    forth = ca.Function("forth", [z, cov, w, p, noise], [*u.after, own], {"cse": True})
     given = [ca.MX.sym("z0", z.numel()), ca.MX.sym("w", w.numel(), steps)]
     given += [ca.MX.sym("p", p.numel()), ca.MX.sym("noise", noise.numel())]
     start, read, *constant = given
@@ -433,6 +420,107 @@ class _Evaluator:
         trigger()
 
 
+class _Runs:
+    """A walk along runs side by side, with derivatives and buffers.
+
+    Parameters
+    ----------
+    walk : callable
+    model : OutputModel
+    read : ndarray
+        (M, m, nr) what each step reads.
+    """
+
+    def __init__(self, walk: Walk, model: OutputModel, read: Array) -> None:
+        self._walk, self._model = walk, model
+        self.runs, self.steps = read.shape[:2]
+        self._read = np.ascontiguousarray(read, float)
+        self._evaluate = _Evaluator()
+        self._blocks: list[tuple[slice, list[Array], dict[int, Any]]] | None = None
+
+    def __call__(
+        self, carried: Sequence[Array], constant: Sequence[Array]
+    ) -> tuple[list[Array], list[Array]]:
+        """Return what is carried after each step, and what is found, each (M, m, ·)."""
+        of = self._walk(self._model)
+        function = _pass(self._walk, self._model, self.steps, self.runs)
+        out = [np.empty((self.runs, self.steps, x.numel())) for x in (*of.after, *of.found)]
+        self._evaluate(function, (*carried, self._read, *constant), tuple(out))
+        return out[: len(carried)], out[len(carried) :]
+
+    def _prepared(
+        self, table: _Table, first: int
+    ) -> list[tuple[slice, list[Array], dict[int, Any]]]:
+        """Return, of blocks of samples, what is read and all that depends on it alone."""
+        if self._blocks is None:
+            flat = self._read.reshape(self.runs * self.steps, self._read.shape[2]).T
+            self._blocks = []
+            for begin in range(0, flat.shape[1], _BLOCK):
+                block = slice(begin, begin + _BLOCK)
+                read = [np.ascontiguousarray(x[block]) for x in flat]
+                known = table.program.prepare({first + i: x for i, x in enumerate(read)})
+                self._blocks.append((block, read, known))
+        return self._blocks
+
+    def slopes(
+        self, carried: Sequence[Array], constant: Sequence[Array], after: Sequence[Array]
+    ) -> tuple[Array, Array]:
+        """Return derivatives in the parameters, then in the run's own first states.
+
+        Parameters
+        ----------
+        carried, constant : sequence of ndarray
+            As a call took them.
+        after : sequence of ndarray
+            What was carried after each step.
+
+        Returns
+        -------
+        tuple of ndarray
+            Of what is found first, (M, m, ny, q + nz), and of the states after the last
+            step, (M, nz, q + nz).
+        """
+        table = _table(self._walk, self._model)
+        rows, columns = table.shape
+        runs, steps, nz = after[0].shape
+        before = [
+            np.concatenate([x[:, None], y[:, :-1]], axis=1)
+            for x, y in zip(carried, after, strict=True)
+        ]
+        states = np.concatenate([x.reshape(runs * steps, x.shape[2]).T for x in before])
+        fixed = [float(x) for c in constant for x in c]
+        matrix = np.empty((runs * steps, rows * columns))
+        start = np.zeros((runs, nz, columns - nz))
+        start[:, :, columns - 2 * nz :] = np.eye(nz)
+        with np.errstate(all="ignore"):
+            for block, read, known in self._prepared(table, len(states)):
+                table.program([*states[:, block], *read, *fixed], matrix[block].T, known)
+            by = matrix.reshape(runs, steps, rows, columns)
+            slopes = propagate(by[:, :, :nz, :nz], by[:, :, :nz, nz:], start)
+            if table.same:
+                return slopes[:, :-1], slopes[:, -1]
+            shown = by[:, :, nz:, :nz] @ slopes[:, :-1]
+            shown += by[:, :, nz:, nz:]
+        return shown, slopes[:, -1]
+
+
+_Found = TypeVar("_Found", bound=tuple[Array, ...])
+
+
+def _kept(last: tuple[Array, Array, _Found] | None, z0: Array, p: Array) -> _Found | None:
+    """Return what was found last, if it was at this point."""
+    if last is None:
+        return None
+    return last[2] if np.array_equal(last[0], z0) and np.array_equal(last[1], p) else None
+
+
+def _fixed(*arrays: Array) -> Any:
+    """Return arrays that nothing can write to."""
+    for array in arrays:
+        array.flags.writeable = False
+    return arrays
+
+
 class Simulator:
     """Free runs of equal length side by side, with sensitivities and buffers.
 
@@ -449,27 +537,27 @@ class Simulator:
 
     def __init__(self, model: OutputModel, w: Array) -> None:
         self.model = model
-        self.runs, self.steps = w.shape[:2]
-        self.nz, self.ny = len(model.states), len(model.outputs)
-        self.q = len(model.parameters)
-        self._w = np.ascontiguousarray(w, float)
-        self._evaluate = _Evaluator()
+        self._runs = _Runs(_free, model, w)
+        # the latest run, and the latest whose derivatives were asked for
+        self._ran: tuple[Array, Array, tuple[Array, Array]] | None = None
         self._last: tuple[Array, Array, tuple[Array, Array, Array, Array]] | None = None
 
-    def _kept(self, z0: Array, p: Array) -> tuple[Array, Array, Array, Array] | None:
-        """Return the latest run with derivatives, if it was of this point."""
-        if self._last is None:
-            return None
-        same = np.array_equal(self._last[0], z0) and np.array_equal(self._last[1], p)
-        return self._last[2] if same else None
+    def _run(self, z0: Array, p: Array) -> tuple[Array, Array]:
+        """Return outputs and the states after each step, not to be written to."""
+        found = _kept(self._ran, z0, p)
+        if found is None:
+            (states,), (y,) = self._runs([z0], [p])
+            found = _fixed(y, states)
+            self._ran = (z0.copy(), p.copy(), found)
+        return found
 
     def __call__(self, z0: Array, p: Array) -> tuple[Array, Array]:
         """Return outputs (M, m, ny) and the states after the last step (M, nz)."""
-        kept = self._kept(z0, p)
+        kept = _kept(self._last, z0, p)
         if kept is not None:
             return kept[0], kept[2]
-        end, _, y, _ = self._call(z0, p, sensitivities=False)
-        return y, end[:, -1]
+        y, states = self._run(z0, p)
+        return y, states[:, -1]
 
     def sensitivities(self, z0: Array, p: Array) -> tuple[Array, Array, Array, Array]:
         """Run with derivatives.
@@ -484,36 +572,17 @@ class Simulator:
         Returns
         -------
         tuple of ndarray
-            Outputs (M, m, ny); their derivatives (M, m, q + nz, ny); states after
-            the last step (M, nz) and their derivatives (M, q + nz, nz). Not to be written
+            Outputs (M, m, ny); their derivatives (M, m, ny, q + nz); states after
+            the last step (M, nz) and their derivatives (M, nz, q + nz). Not to be written
             to: the latest are kept, for the same point is asked for with other weights.
         """
-        kept = self._kept(z0, p)
+        kept = _kept(self._last, z0, p)
         if kept is None:
-            end, slope, y, rows = self._call(z0, p, sensitivities=True)
-            kept = (y, rows, end[:, -1], slope[:, -1])
-            for part in kept:
-                part.flags.writeable = False
+            y, states = self._run(z0, p)
+            rows, slope = self._runs.slopes([z0], [p], [states])
+            kept = _fixed(y, rows, states[:, -1], slope)
             self._last = (z0.copy(), p.copy(), kept)
         return kept
-
-    def _call(
-        self, z0: Array, p: Array, *, sensitivities: bool
-    ) -> tuple[Array, Array, Array, Array]:
-        runs, steps, nz, ny = self.runs, self.steps, self.nz, self.ny
-        columns = self.q + nz if sensitivities else 0
-        function = _run(self.model, steps, runs, sensitivities)
-        first = np.zeros((runs, columns, nz))
-        if columns:
-            first[:, self.q :] = np.eye(nz)
-        out = (
-            np.empty((runs, steps, nz)),
-            np.empty((runs, steps, columns, nz)),
-            np.empty((runs, steps, ny)),
-            np.empty((runs, steps, columns, ny)),
-        )
-        self._evaluate(function, (z0, first, self._w, p), out)
-        return out
 
 
 class Observer:
@@ -528,12 +597,8 @@ class Observer:
 
     def __init__(self, model: OutputModel, w: Array, y: Array, use: Array) -> None:
         self.model = model
-        self.runs, self.steps = w.shape[:2]
-        self.nz, self.ny = len(model.states), len(model.outputs)
-        self.q = len(model.parameters)
-        self._w = np.ascontiguousarray(np.concatenate([w, y, use[..., None]], axis=2), float)
-        self._evaluate = _Evaluator()
-        self._use = use[..., None] > 0
+        self._runs = _Runs(_observed, model, np.concatenate([w, y, use[..., None]], axis=2))
+        self._unused = use == 0
 
     def __call__(
         self, z0: Array, p: Array, gain: float, *, sensitivities: bool = True
@@ -553,24 +618,16 @@ class Observer:
         -------
         tuple
             Errors y − h(z) before each correction (M, m, ny), and the derivatives of h(z)
-            (M, m, q + nz, ny).
+            (M, m, ny, q + nz), without columns where they are not asked for.
         """
-        runs, steps, nz, ny = self.runs, self.steps, self.nz, self.ny
-        columns = self.q + nz if sensitivities else 0
-        function = _observed(self.model, steps, runs, sensitivities)
-        first = np.zeros((runs, columns, nz))
-        if columns:
-            first[:, self.q :] = np.eye(nz)
-        out = (
-            np.empty((runs, steps, nz)),
-            np.empty((runs, steps, columns, nz)),
-            np.empty((runs, steps, ny)),
-            np.empty((runs, steps, columns, ny)),
-        )
-        self._evaluate(function, (z0, first, self._w, p, np.array([gain])), out)
-        if columns and not self._use.all():
-            out[3][~self._use[..., 0]] = 0.0
-        return out[2], out[3]
+        constant = [p, np.array([gain])]
+        states, (error,) = self._runs([z0], constant)
+        if not sensitivities:
+            return error, np.empty((*error.shape, 0))
+        rows, _ = self._runs.slopes([z0], constant, states)
+        if self._unused.any():
+            rows[self._unused] = 0.0
+        return error, rows
 
 
 class Filter:
@@ -589,10 +646,8 @@ class Filter:
 
     def __init__(self, model: OutputModel, w: Array, y: Array, use: Array) -> None:
         self.model = model
-        self.runs, self.steps = w.shape[:2]
-        self.nz, self.ny = len(model.states), len(model.outputs)
-        self.q = len(model.parameters)
         self._w = np.ascontiguousarray(np.concatenate([w, y, use[..., None]], axis=2), float)
+        self._runs = _Runs(_filtered, model, self._w)
         self._evaluate = _Evaluator()
 
     def __call__(
@@ -613,26 +668,17 @@ class Filter:
         -------
         tuple
             Innovations of unit variance (M, m, ny); their sensitivities with the
-            gains held (M, m, q + nz, ny), negative derivatives of the innovations;
-            and the logarithms of their variances (M, m, ny).
+            gains held (M, m, ny, q + nz), negative derivatives of the innovations,
+            without columns where they are not asked for; and the logarithms of their
+            variances (M, m, ny).
         """
-        runs, steps, nz, ny = self.runs, self.steps, self.nz, self.ny
-        columns = self.q + nz if sensitivities else 0
-        function = _filter(self.model, steps, runs, sensitivities)
-        first = np.zeros((runs, columns, nz))
-        if columns:
-            first[:, self.q :] = np.eye(nz)
-        out = (
-            np.empty((runs, steps, nz)),
-            np.empty((runs, steps, nz * (nz + 1) // 2)),
-            np.empty((runs, steps, columns, nz)),
-            np.empty((runs, steps, ny)),
-            np.empty((runs, steps, columns, ny)),
-            np.empty((runs, steps, ny)),
-        )
-        certain = np.zeros((runs, nz * (nz + 1) // 2))
-        self._evaluate(function, (z0, certain, first, self._w, p, noise), out)
-        return out[3], out[4], out[5]
+        nz = z0.shape[1]
+        carried = [z0, np.zeros((len(z0), nz * (nz + 1) // 2))]
+        after, (innovations, levels) = self._runs(carried, [p, noise])
+        if not sensitivities:
+            return innovations, np.empty((*innovations.shape, 0)), levels
+        rows, _ = self._runs.slopes(carried, [p, noise], after)
+        return innovations, rows, levels
 
     def likelihood(self, z0: Array, p: Array, noise: Array) -> tuple[float, Array, Array]:
         """Return the negative log-likelihood and its derivatives, gains included.
@@ -651,8 +697,8 @@ class Filter:
         ----------
         Ljung (1999), section 7.4; Åström (1980), eq. 4.6.
         """
-        function = _likelihood(self.model, self.steps, self.runs)
-        out = (np.empty(1), np.empty((self.runs, self.nz)), np.empty(self.q))
+        function = _likelihood(self.model, *self._w.shape[1::-1])
+        out = (np.empty(1), np.empty(z0.shape), np.empty(p.shape))
         self._evaluate(function, (z0, self._w, p, noise), out)
         return float(out[0][0]), out[1], out[2]
 

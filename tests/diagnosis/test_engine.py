@@ -16,7 +16,6 @@ from greybox.diagnosis.linear import NOWHERE, sensitivities
 from greybox.diagnosis.noise import Colour, Noise, fit_noise
 from greybox.diagnosis.normal import bounded_step
 from greybox.diagnosis.point import Point
-from greybox.diagnosis.recursion import propagate
 from greybox.diagnosis.ship import Change, LogRun, Sensors, Ship, shifted, wired
 from greybox.diagnosis.simulator import Simulator
 from greybox.diagnosis.waves import find_waves
@@ -42,16 +41,6 @@ def _theta(structure) -> np.ndarray:
 def _point(run: LogRun, log: TrialLog) -> Point:
     places = tuple(run.structure.index(n) for n in BASE.parameters)
     return Point(Ship(_theta(WIDE), np.zeros(2), log.vessel), (run.start(),), places)
-
-
-def test_recursion_equals_a_loop() -> None:
-    rng = np.random.default_rng(1)
-    a = 0.5 * rng.standard_normal((40, 3, 3))
-    b, start = rng.standard_normal((40, 3, 5)), rng.standard_normal((3, 5))
-    expected = [start]
-    for k in range(40):
-        expected.append(a[k] @ expected[-1] + b[k])
-    np.testing.assert_allclose(propagate(a, b, start), expected, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("integrator", ["euler", "rk4"])

@@ -15,10 +15,10 @@ from greybox.diagnosis.diagnose import diagnose
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.held_out import OtherLogs, Pair, proof_of
 from greybox.diagnosis.omnibus import disagreement
-from greybox.diagnosis.recursion import propagate
 from greybox.diagnosis.scores import MOMENTS
 from greybox.diagnosis.search import Step, _sure, judge
 from greybox.diagnosis.ship import LogRun
+from greybox.recursion import propagate
 from greybox.study.blind import draw
 from greybox.trial.log import TrialLog
 

@@ -64,9 +64,9 @@ def test_a_point_is_run_once_for_all_weights(predictor, clean, monkeypatch):
     p[: len(predictor.columns)] = truth(predictor)
     runs = FreeRuns(model, whole, np.ones(3))
     first = runs.linearise(p, starts)
-    monkeypatch.setattr(Simulator, "_call", None)
+    monkeypatch.setattr(runs._simulator, "_runs", None)
     again = runs.with_sigma(np.array([0.5, 2.0, 4.0])).linearise(p, starts)
-    weights = np.tile([2.0, 0.5, 0.25], len(data[0].y))
+    weights = np.tile([2.0, 0.5, 0.25], len(data[0].y))[:, None]
     np.testing.assert_allclose(again.rows[0], first.rows[0] * weights, rtol=1e-13)
     monkeypatch.undo()
     moved = runs.linearise(p * 1.01, starts)
@@ -123,9 +123,11 @@ class TestSensitivities:
             (y1, end1), (y0, end0) = runs(z0, up), runs(z0, down)
             expected = (y1 - y0) / (2 * h)
             size = np.abs(expected).max()
-            np.testing.assert_allclose(rows[:, :, j], expected, atol=1e-5 * size)
+            np.testing.assert_allclose(rows[..., j], expected, atol=1e-5 * size)
             np.testing.assert_allclose(
-                slope[:, j], (end1 - end0) / (2 * h), atol=1e-5 * np.abs(slope[:, j]).max() + 1e-9
+                slope[..., j],
+                (end1 - end0) / (2 * h),
+                atol=1e-5 * np.abs(slope[..., j]).max() + 1e-9,
             )
 
     def test_of_the_initial_state_too(self, predictor, noisy):
@@ -137,7 +139,7 @@ class TestSensitivities:
             shift = np.zeros((1, 4))
             shift[0, j] = 1e-6
             expected = (runs(z0 + shift, p)[0] - runs(z0 - shift, p)[0]) / 2e-6
-            np.testing.assert_allclose(rows[:, :, len(p) + j], expected, atol=1e-6)
+            np.testing.assert_allclose(rows[..., len(p) + j], expected, atol=1e-6)
 
     def test_a_filter_without_process_noise_is_the_free_run(self, predictor, noisy):
         model, data, p = problem(predictor, noisy)
@@ -182,7 +184,7 @@ class TestSensitivities:
             up[j] += h
             down[j] -= h
             expected = (observer(z0, down, 0.3)[0] - observer(z0, up, 0.3)[0]) / (2 * h)
-            np.testing.assert_allclose(rows[:, :, j], expected, atol=1e-5 * np.abs(expected).max())
+            np.testing.assert_allclose(rows[..., j], expected, atol=1e-5 * np.abs(expected).max())
 
     def test_an_observer_of_more_sensors_than_states(self, predictor):
         """A constant wind is compared too: its derivatives are in no state."""
@@ -202,7 +204,7 @@ class TestSensitivities:
             up[j] += h
             down[j] -= h
             expected = (observer(z0, down, 0.5)[0] - observer(z0, up, 0.5)[0]) / (2 * h)
-            found = observer(z0, p, 0.5)[1][:, :, j]
+            found = observer(z0, p, 0.5)[1][..., j]
             np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
 
     def test_the_likelihood_has_its_exact_gradient(self, predictor, noisy):
@@ -444,8 +446,8 @@ class TestExcitation:
         p = np.append(found.theta, [v for _, v, _ in found.current])
         runs = Simulator(model, data.w[None])
         fit, free = fit_free_runs(model, [data], p, near=True)
-        rows = runs.sensitivities(fit.nodes, fit.p)[1][0] / free.sigma
-        flat = rows.transpose(1, 0, 2).reshape(rows.shape[1], -1)
+        rows = runs.sensitivities(fit.nodes, fit.p)[1][0] / free.sigma[:, None]
+        flat = rows.reshape(-1, rows.shape[2]).T
         for state, name in (("u", "Xuu"), ("r", "Nvr")):
             i = list(model.parameters).index(name)
             # initial states are eliminated from both, then the other parameters

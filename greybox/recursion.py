@@ -1,0 +1,97 @@
+"""Linear recursions over samples, all columns and all runs at once.
+
+S(k+1) = A(k) S(k) + B(k) is linear in S(0): stretches of samples are followed side by
+side from nothing, and what each begins with is added afterwards. With few columns the
+recursion is one banded triangular system in all samples, which a library solves sooner.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg.lapack import dtbtrs
+
+Array = NDArray[np.float64]
+
+# up to this many columns the banded system is the faster way
+_FEW = 8
+# runs enough to fill a step without cutting them
+_MANY = 64
+
+
+def propagate(a: Array, b: Array, start: Array) -> Array:
+    """Return S with S(0) = start and S(k+1) = A(k) S(k) + B(k).
+
+    Parameters
+    ----------
+    a : ndarray
+        (..., N−1, n, n)
+    b : ndarray
+        (..., N−1, n, m)
+    start : ndarray
+        (..., n, m)
+
+    Returns
+    -------
+    ndarray
+        (..., N, n, m), infinite where it leaves the numbers' range.
+    """
+    lead, (steps, n, columns) = b.shape[:-3], b.shape[-3:]
+    runs = math.prod(lead)
+    out = np.empty((runs, steps + 1, n, columns))
+    out[:, 0] = start.reshape(runs, n, columns)
+    if out.size and steps:
+        a, b = a.reshape(runs, steps, n, n), b.reshape(runs, steps, n, columns)
+        with np.errstate(over="ignore", invalid="ignore"):
+            if columns <= _FEW and runs < _MANY:
+                for each in zip(a, b, out, strict=True):
+                    _banded(*each)
+            else:
+                _stretched(a, b, out)
+        # what has left the range does not come back
+        if not np.isfinite(out[:, -1]).all():
+            out[~np.isfinite(out)] = np.inf
+    return out.reshape(*lead, steps + 1, n, columns)
+
+
+def _banded(a: Array, b: Array, out: Array) -> None:
+    """Fill out (N, n, m) of one run behind its first sample."""
+    steps, n, columns = b.shape
+    out[1:] = b
+    out[1] += a[0] @ out[0]
+    band = np.zeros((2 * n, steps * n))
+    # row (k, i) and column (k−1, j) lie n + i − j below the diagonal of ones
+    for i in range(n):
+        for j in range(n):
+            band[n + i - j, j : (steps - 1) * n : n] = -a[1:, i, j]
+    solved, _ = dtbtrs(band, out[1:].reshape(steps * n, columns), uplo="L", diag="U")
+    out[1:] = solved.reshape(steps, n, columns)
+
+
+def _stretched(a: Array, b: Array, out: Array) -> None:
+    """Fill out (M, N, n, m) behind the first sample of each run."""
+    runs, steps, n, columns = b.shape
+    length = steps if runs >= _MANY else math.isqrt(steps)
+    count = steps // length
+    whole = count * length
+
+    def cut(x: Array) -> Array:
+        return x[:, :whole].reshape(runs, count, length, n, -1)
+
+    after, own, filled = cut(a), cut(b), cut(out[:, 1:])
+    # what the first state of a stretch becomes along it
+    carried = np.empty((runs, count, length, n, n))
+    carried[:, :, 0], filled[:, :, 0] = after[:, :, 0], own[:, :, 0]
+    for k in range(1, length):
+        np.matmul(after[:, :, k], filled[:, :, k - 1], out=filled[:, :, k])
+        filled[:, :, k] += own[:, :, k]
+        np.matmul(after[:, :, k], carried[:, :, k - 1], out=carried[:, :, k])
+    first = out[:, 0]
+    for c in range(count):
+        begun = carried[:, c].reshape(runs, length * n, n) @ first
+        filled[:, c] += begun.reshape(runs, length, n, columns)
+        first = filled[:, c, -1]
+    for k in range(whole, steps):
+        out[:, k + 1] = a[:, k] @ out[:, k] + b[:, k]
