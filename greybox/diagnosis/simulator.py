@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.diagnosis.linear import Linear, slopes_of
-from greybox.model.functions import Integrator, accumulate, bind, step_function
+from greybox.model.functions import Integrator, accumulate, bind, step_function, unrolled
 from greybox.model.structure import Structure
 
 Array = NDArray[np.float64]
@@ -37,15 +37,7 @@ def _run(
     structure: Structure, air_measured: bool, integrator: Integrator, blocks: int
 ) -> ca.Function:
     step = _step(structure, air_measured, integrator)
-    x0 = ca.SX.sym("x", step.size1_in(0))
-    w = ca.SX.sym("w", step.size1_in(1), _UNROLLED)
-    states = []
-    x = x0
-    for k in range(_UNROLLED):
-        x = step(x, w[:, k])
-        states.append(x)
-    several = ca.Function("steps", [x0, w], [x, ca.horzcat(*states)])
-    return accumulate(several, blocks)
+    return accumulate(unrolled(step, 1, _UNROLLED), blocks)
 
 
 class Simulator:

@@ -29,7 +29,8 @@ from greybox.estimation.shooting import (
     fit_segments,
     solve_step,
 )
-from greybox.model.output import Filter, OutputModel
+from greybox.model.output import OutputModel
+from greybox.model.output_runs import Filter
 
 Array = NDArray[np.float64]
 

@@ -25,7 +25,8 @@ from greybox.estimation.output_setup import measured, output_model, output_predi
 from greybox.estimation.result import Estimate, Limit
 from greybox.estimation.shooting import Measured, Segments, cut
 from greybox.model.noise import NoiseLevels
-from greybox.model.output import OutputModel, Simulator
+from greybox.model.output import OutputModel
+from greybox.model.output_runs import Simulator
 from greybox.trial.log import TrialLog
 
 Array = NDArray[np.float64]

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.estimation.shooting import Linearised, Segments, by_sample
-from greybox.model.output import Observer, OutputModel
+from greybox.model.output import OutputModel
+from greybox.model.output_runs import Observer
 
 Array = NDArray[np.float64]
 

@@ -40,7 +40,8 @@ from greybox.estimation.shooting import (
 )
 from greybox.model.disturbances import CURRENT, WIND
 from greybox.model.noise import NoiseLevels
-from greybox.model.output import OutputModel, Role, Simulator
+from greybox.model.output import OutputModel, Role
+from greybox.model.output_runs import Simulator
 from greybox.model.predictor import Predictor
 from greybox.one_thread import one_thread
 from greybox.regression.regression import common_sample_time

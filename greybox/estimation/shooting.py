@@ -26,7 +26,8 @@ from numpy.typing import NDArray
 from scipy.sparse import block_diag, bmat, csc_matrix
 from scipy.sparse.linalg import splu
 
-from greybox.model.output import OutputModel, Simulator
+from greybox.model.output import OutputModel
+from greybox.model.output_runs import Simulator
 
 Array = NDArray[np.float64]
 Loss = Literal["gaussian", "huber"]

@@ -32,7 +32,8 @@ from greybox.estimation.shooting import (
 )
 from greybox.model.catalogue import get_structure
 from greybox.model.noise import NoiseLevels
-from greybox.model.output import Filter, Observer, OutputModel, Simulator
+from greybox.model.output import OutputModel
+from greybox.model.output_runs import Filter, Observer, Simulator
 from greybox.study.chapter6 import TRUE
 from greybox.study.efficiency import CASES, determinant_efficiency, virtual_trial
 

@@ -1,0 +1,265 @@
+"""One step of an output model in symbols, with its derivatives.
+
+The same step, differentiated once, gives the free run (output error), a run that an
+observer corrects and, with the covariance of an extended Kalman filter beside it, the
+innovations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+
+import casadi as ca
+
+from greybox.model.disturbances import WIND, rotate_to_body
+from greybox.model.functions import accumulate, unrolled
+from greybox.model.output import OutputModel
+
+# steps that are one scalar function, and the instructions that it has at most
+_UNROLLED, _INSTRUCTIONS = 16, 2000
+
+
+@dataclass(frozen=True)
+class _Step:
+    """Symbols and expressions of one step."""
+
+    z: ca.SX
+    w: ca.SX
+    p: ca.SX
+    after: ca.SX
+    seen: ca.SX
+
+
+@lru_cache(maxsize=64)
+def _step(model: OutputModel) -> _Step:
+    predictor = model.predictor
+    structure = predictor.structure
+    s = structure.symbols
+    names = structure.states
+    z = ca.SX.sym("z", len(model.states))
+    w = ca.SX.sym("w", len(model.drivers))
+    p = ca.SX.sym("p", len(model.parameters))
+    given = {name: w[i] for i, name in enumerate(model.drivers)}
+    heading = z[len(names)] if model.heading == "output" else given.get("psi", ca.SX(0))
+    count = len(predictor.columns)
+    d = [ca.SX(0)] * len(structure.disturbances)
+    for i, name in enumerate(model.means):
+        d[structure.disturbances.index(name)] = p[count + i]
+    air = ca.vertcat(given.get("u_q", ca.SX(0)), given.get("v_q", ca.SX(0)))
+    if model.wind == "output":
+        state = {name: z[i] for i, name in enumerate(names)}
+        u_w, v_w = rotate_to_body(heading, *[d[structure.disturbances.index(n)] for n in WIND])
+        air = ca.vertcat(state["u"] - u_w, state.get("v", ca.SX(0)) - v_w)
+    regressors = structure.regressors(air_measured=predictor.air_measured)
+    at_zero = predictor.expressions
+    # biases capture what the means do not; wind that is not measured is in them
+    unknown_wind = (
+        [] if predictor.air_measured else [n for n in WIND if n in structure.disturbances]
+    )
+    calm = [s.d[structure.disturbances.index(n)] for n in unknown_wind]
+    rows = [ca.SX(0)] * len(names)
+    for i, column in enumerate(predictor.columns):
+        expression = at_zero[i] if column.is_bias else regressors[structure.index(column.terms[0])]
+        if calm:
+            expression = ca.substitute(expression, ca.vertcat(*calm), ca.SX.zeros(len(calm)))
+        rows[names.index(column.state)] += p[i] * expression
+    change = ca.substitute(
+        ca.vertcat(*rows),
+        ca.vertcat(s.x, s.psi, s.tau, s.d, s.air),
+        ca.vertcat(z[: len(names)], heading, *[given[n] for n in structure.inputs], *d, air),
+    )
+    after = z[: len(names)] + change if structure.increment else change
+    if model.heading == "output":
+        after = ca.vertcat(after, heading + model.sample_time * z[names.index("r")])
+    seen = ca.vertcat(z, air) if model.wind == "output" else z
+    return _Step(z, w, p, ca.densify(after), ca.densify(seen))
+
+
+@dataclass(frozen=True)
+class Slope:
+    """Derivatives of an expression in the carried states and in the parameters."""
+
+    by_z: ca.SX
+    by_p: ca.SX
+
+    @classmethod
+    def of(cls, expression: ca.SX, s: _Step) -> Slope:
+        """Differentiate."""
+        return cls(ca.jacobian(expression, s.z), ca.jacobian(expression, s.p))
+
+    @property
+    def parts(self) -> tuple[ca.SX, ca.SX]:
+        """Both."""
+        return self.by_z, self.by_p
+
+    def after(self, before: Slope) -> Slope:
+        """Chain: this slope taken where the states have another already."""
+        return Slope(self.by_z @ before.by_z, self.by_z @ before.by_p + self.by_p)
+
+
+@dataclass(frozen=True)
+class Walk:
+    """A step in symbols, what is found at it, and the derivatives of both.
+
+    Parameters
+    ----------
+    carried : tuple of SX
+        What a step hands to the next one, first the states.
+    read : SX
+        What changes with the sample.
+    constant : tuple of SX
+        What does not, first the parameters.
+    after, found : tuple of SX
+        Next values of what is carried, and results.
+    slope_after, slope_found : Slope
+        Of the next states, and of the first result.
+    """
+
+    carried: tuple[ca.SX, ...]
+    read: ca.SX
+    constant: tuple[ca.SX, ...]
+    after: tuple[ca.SX, ...]
+    found: tuple[ca.SX, ...]
+    slope_after: Slope
+    slope_found: Slope
+
+
+Walking = Callable[[OutputModel], Walk]
+
+
+@lru_cache(maxsize=32)
+def free(model: OutputModel) -> Walk:
+    """Return the free run, which shows its outputs before each step."""
+    s = _step(model)
+    after, seen = Slope.of(s.after, s), Slope.of(s.seen, s)
+    return Walk((s.z,), s.w, (s.p,), (s.after,), (s.seen,), after, seen)
+
+
+@lru_cache(maxsize=32)
+def observed(model: OutputModel) -> Walk:
+    """Return a run whose steps begin at z + gain (y − z), and which shows y − h(z).
+
+    The derivatives of what is found are those of h.
+    """
+    s = _step(model)
+    nz, ny = s.z.numel(), s.seen.numel()
+    y, use, gain = ca.SX.sym("y", ny), ca.SX.sym("use"), ca.SX.sym("gain")
+    kept = 1 - use * gain
+    corrected = kept * s.z + use * gain * y[:nz]
+    after = ca.substitute(s.after, s.z, corrected)
+    read = ca.vertcat(s.w, y, use)
+    error = use * (y - s.seen)
+    slopes = Slope.of(after, s), Slope.of(s.seen, s)
+    return Walk((s.z,), read, (s.p, gain), (after,), (error,), *slopes)
+
+
+def over(step: ca.Function, carried: int, steps: int, runs: int) -> ca.Function:
+    """Accumulate a step over samples, its last arguments constant, and over runs side by side.
+
+    Arguments are the carried ones, then one that changes with the sample, then
+    constants; results are those of every sample.
+    """
+    size = max(1, min(_UNROLLED, _INSTRUCTIONS // step.n_instructions(), steps))
+    blocks = -(-steps // size)
+    several = accumulate(unrolled(step, carried, size), blocks, range(carried))
+    given = [
+        ca.MX.sym(step.name_in(i), step.size1_in(i), steps if i == carried else 1)
+        for i in range(step.n_in())
+    ]
+    read = given[carried]
+    padding = ca.repmat(read[:, -1], 1, blocks * size - steps)
+    constants = [ca.repmat(c, 1, blocks) for c in given[carried + 1 :]]
+    found = several.call([*given[:carried], ca.horzcat(read, padding), *constants])[carried:]
+    one = ca.Function("run", given, [x[:, :steps] for x in found])
+    if runs == 1:
+        return one
+    # the constants are given once
+    return one.map("runs", "serial", runs, list(range(carried + 1, step.n_in())), [])
+
+
+@lru_cache(maxsize=32)
+def filtered(model: OutputModel) -> Walk:
+    """Return one sample of an extended Kalman filter.
+
+    It carries the states and their covariance (its lower triangle), reads drivers,
+    measurements and whether they count, and shows innovations of unit variance and the
+    logarithms of their variances. Derivatives are at its gains, and of what is taken
+    from the innovations.
+    """
+    s = _step(model)
+    nz, ny = s.z.numel(), s.seen.numel()
+    y, use = ca.SX.sym("y", ny), ca.SX.sym("use")
+    noise = ca.SX.sym("noise", ny + nz)
+    # a covariance is carried by its lower triangle: half of what follows is never computed
+    cov = ca.SX.sym("P", nz * (nz + 1) // 2)
+    at = ca.Function("seen", [s.z, s.w, s.p], [s.seen, *Slope.of(s.seen, s).parts])
+    z, spread = s.z, ca.tril2symm(ca.SX(ca.Sparsity.lower(nz), cov))
+    slope = Slope(ca.SX.eye(nz), ca.SX(nz, s.p.numel()))
+    innovations, rows, levels = [], [], []
+    for i in range(ny):
+        shown, by_z, by_p = at(z, s.w, s.p)
+        h = ca.densify(by_z[i, :])
+        gain_row = spread @ h.T
+        variance = h @ gain_row + noise[i]
+        # rows beyond the log's end change nothing
+        gain = use * gain_row / variance
+        error = y[i] - shown[i]
+        row = Slope(by_z[i, :], by_p[i, :]).after(slope)
+        weight = use / ca.sqrt(variance)
+        innovations.append(weight * error)
+        rows.append(Slope(weight * row.by_z, weight * row.by_p))
+        levels.append(use * ca.log(variance))
+        z = z + gain * error
+        slope = Slope(slope.by_z - gain @ row.by_z, slope.by_p - gain @ row.by_p)
+        spread = ca.tril2symm(ca.tril(spread - gain @ gain_row.T))
+    step = ca.Function("after", [s.z, s.w, s.p], [s.after, *Slope.of(s.after, s).parts])
+    z_next, a, b = step(z, s.w, s.p)
+    spread = a @ spread @ a.T + ca.diag(noise[ny:])
+    return Walk(
+        (s.z, cov),
+        ca.vertcat(s.w, y, use),
+        (s.p, noise),
+        (z_next, ca.tril(ca.densify(spread)).nz[:]),
+        (ca.vertcat(*innovations), ca.vertcat(*levels)),
+        Slope(a, b).after(slope),
+        Slope(ca.vertcat(*[r.by_z for r in rows]), ca.vertcat(*[r.by_p for r in rows])),
+    )
+
+
+@lru_cache(maxsize=16)
+def likelihood(model: OutputModel, steps: int, runs: int) -> ca.Function:
+    """Return ``(z0, [w; y; use], p, noise) -> −log L`` and its derivatives in z0 and p.
+
+    The adjoint runs back over the samples by a step of its own; differentiating the whole
+    accumulated filter would take four times as long.
+    """
+    u = filtered(model)
+    (z, cov), w, (p, noise) = u.carried, u.read, u.constant
+    innovations, levels = u.found
+    by_z, by_cov, by_p = (ca.SX.sym(f"by_{i}", x.numel()) for i, x in enumerate((z, cov, p)))
+    own = (ca.sumsqr(innovations) + ca.sum1(levels)) / 2
+    onward = own + ca.dot(by_z, u.after[0]) + ca.dot(by_cov, u.after[1])
+    back = ca.Function(
+        "back",
+        [by_z, by_cov, by_p, z, cov, w, p, noise],
+        [ca.gradient(onward, z), ca.gradient(onward, cov), by_p + ca.gradient(onward, p)],
+        {"cse": True},
+    )
+    forth = ca.Function("forth", [z, cov, w, p, noise], [*u.after, own], {"cse": True})
+    given = [ca.MX.sym("z0", z.numel()), ca.MX.sym("w", w.numel(), steps)]
+    given += [ca.MX.sym("p", p.numel()), ca.MX.sym("noise", noise.numel())]
+    start, read, *constant = given
+    constants = [ca.repmat(c, 1, steps) for c in constant]
+    certain = ca.MX.zeros(cov.numel())
+    states, spreads, losses = accumulate(forth, steps, range(2)).call(
+        [start, certain, read, *constants]
+    )
+    before = [ca.horzcat(start, states[:, :-1]), ca.horzcat(certain, spreads[:, :-1])]
+    backwards = [x[:, ::-1] for x in (*before, read)]
+    nothing = [ca.MX.zeros(x.numel()) for x in (by_z, by_cov, by_p)]
+    found = accumulate(back, steps, range(3)).call([*nothing, *backwards, *constants])
+    one = ca.Function("likelihood", given, [ca.sum2(losses), found[0][:, -1], found[2][:, -1]])
+    # values and the parameters' derivatives add over the runs
+    return one if runs == 1 else one.map("runs", "serial", runs, [2, 3], [0, 2])
