@@ -7,7 +7,7 @@ measurement noise of covariance Σe and no process noise, the information is
 
 S = ∂x/∂θ, A = ∂x⁺/∂x and B = ∂x⁺/∂θ along the noise-free motion. Unknown initial
 states enter through S(0), unknown disturbance means through B; both are
-nuisance. The recursion is one banded linear system, and so is its adjoint.
+nuisance. The adjoint of the recursion is one banded linear system.
 
 Process noise would need the innovations form, with the gains of a Kalman filter
 and their sensitivities; `NoiseLevels.process` is left out here, so that F is
@@ -30,12 +30,10 @@ from experiment_design.moments import Moments
 from greybox.errors import UsageError
 from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import Predictor
+from greybox.recursion import propagate
 from greybox.vectorised import Vectorised
 
 Array = NDArray[np.float64]
-
-# runs up to which each is solved by itself
-_FEW = 4
 
 
 class SensitivityProgram:
@@ -180,37 +178,13 @@ class SensitivityProgram:
         n = self.size
         return out[: n * n].reshape(n, n, *shape), out[n * n :].reshape(n, self._driven, *shape)
 
-    def _recursion(self, a: Array, b: Array) -> Array:
-        """Return S (N+1, n, columns) of one run, A (n, n, N) and B (n, q, N)."""
-        n, samples = self.size, a.shape[-1]
-        right = np.zeros((samples + 1, n, self.columns))
-        right[1:, :, : self._driven] = b.transpose(2, 0, 1)
-        right[0] = self.first
-        band = np.zeros((2 * n, n * (samples + 1)))
-        band[0] = 1.0
-        for i in range(n):
-            for j in range(n):
-                # row (k+1)n + i, column kn + j
-                band[n + i - j, j : n * samples : n] = -a[i, j]
-        # last sample first the system is upper triangular, and LAPACK does not pivot
-        flat = right.reshape(n * (samples + 1), -1)
-        solved = solve_banded((0, 2 * n - 1), band[::-1, ::-1], flat[::-1], check_finite=False)
-        return np.asarray(solved[::-1].reshape(samples + 1, n, -1))
-
     def _recursions(self, a: Array, b: Array) -> Array:
-        """Return S (R, N+1, n, columns) of many runs, driven columns first."""
+        """Return S (R, N+1, n, columns) of runs with A (n, n, R, N) and B (n, q, R, N)."""
         runs, samples = a.shape[2:]
-        if runs <= _FEW:
-            return np.array([self._recursion(a[:, :, r], b[:, :, r]) for r in range(runs)])
-        # many runs step by step together cost less than one banded system each
-        forward = np.ascontiguousarray(a.transpose(3, 2, 0, 1))
-        entry = np.ascontiguousarray(b.transpose(3, 2, 0, 1))
-        out = np.empty((samples + 1, runs, self.size, self.columns))
-        out[0] = self.first
-        for k in range(samples):
-            np.matmul(forward[k], out[k], out=out[k + 1])
-            out[k + 1, ..., : self._driven] += entry[k]
-        return out.transpose(1, 0, 2, 3)
+        driven = np.zeros((runs, samples, self.size, self.columns))
+        driven[..., : self._driven] = b.transpose(2, 3, 0, 1)
+        start = np.tile(self.first, (runs, 1, 1))
+        return propagate(np.ascontiguousarray(a.transpose(2, 3, 0, 1)), driven, start)
 
     def _adjoint(self, a: Array, seed: Array) -> Array:
         """Return Λ(k) = seed(k) + Aᵀ(k) Λ(k+1), (N+1, n, columns)."""
@@ -272,8 +246,8 @@ class SensitivityProgram:
         """
         signals = self._signals(x[None], psi[None], tau[None])
         a, b = self._slopes(signals)
-        a, b = a[:, :, 0], b[:, :, 0]
-        s = self._recursion(a, b)
+        s = self._recursions(a, b)[0]
+        a = a[:, :, 0]
         back_to = np.argsort(self.order)
         d_f = (d_gram + d_score)[np.ix_(back_to, back_to)]
         costate = self._adjoint(a, 2.0 * self.weight[:, None] * (s @ d_f))[1:]

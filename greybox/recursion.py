@@ -17,8 +17,8 @@ Array = NDArray[np.float64]
 
 # up to this many columns the banded system is the faster way
 _FEW = 8
-# runs enough to fill a step without cutting them
-_MANY = 64
+# from this many runs on a step of all of them together is work enough
+_MANY = 16
 
 
 def propagate(a: Array, b: Array, start: Array) -> Array:
@@ -40,20 +40,31 @@ def propagate(a: Array, b: Array, start: Array) -> Array:
     """
     lead, (steps, n, columns) = b.shape[:-3], b.shape[-3:]
     runs = math.prod(lead)
-    out = np.empty((runs, steps + 1, n, columns))
-    out[:, 0] = start.reshape(runs, n, columns)
-    if out.size and steps:
-        a, b = a.reshape(runs, steps, n, n), b.reshape(runs, steps, n, columns)
+    a, b = a.reshape(runs, steps, n, n), b.reshape(runs, steps, n, columns)
+    out = np.empty((steps + 1, runs, n, columns)) if runs >= _MANY else None
+    found = np.empty((runs, steps + 1, n, columns)) if out is None else out.swapaxes(0, 1)
+    found[:, 0] = start.reshape(runs, n, columns)
+    if found.size and steps:
         with np.errstate(over="ignore", invalid="ignore"):
-            if columns <= _FEW and runs < _MANY:
-                for each in zip(a, b, out, strict=True):
+            if out is not None:
+                _stepped(a, b, out)
+            elif columns <= _FEW:
+                for each in zip(a, b, found, strict=True):
                     _banded(*each)
             else:
-                _stretched(a, b, out)
+                _stretched(a, b, found)
         # what has left the range does not come back
-        if not np.isfinite(out[:, -1]).all():
-            out[~np.isfinite(out)] = np.inf
-    return out.reshape(*lead, steps + 1, n, columns)
+        if not np.isfinite(found[:, -1]).all():
+            found[~np.isfinite(found)] = np.inf
+    return found.reshape(*lead, steps + 1, n, columns)
+
+
+def _stepped(a: Array, b: Array, out: Array) -> None:
+    """Fill out (N, M, n, m) behind the first sample of all runs."""
+    after, own = (np.ascontiguousarray(x.swapaxes(0, 1)) for x in (a, b))
+    for k in range(len(after)):
+        np.matmul(after[k], out[k], out=out[k + 1])
+        out[k + 1] += own[k]
 
 
 def _banded(a: Array, b: Array, out: Array) -> None:
@@ -73,7 +84,7 @@ def _banded(a: Array, b: Array, out: Array) -> None:
 def _stretched(a: Array, b: Array, out: Array) -> None:
     """Fill out (M, N, n, m) behind the first sample of each run."""
     runs, steps, n, columns = b.shape
-    length = steps if runs >= _MANY else math.isqrt(steps)
+    length = math.isqrt(steps)
     count = steps // length
     whole = count * length
 
