@@ -78,6 +78,25 @@ class Equation:
         return solve_stacked(self.z, self.phi, self.y)
 
     @cached_property
+    def pooled(self) -> Solution:
+        """The estimate whose instruments are summed over the experiments, as many as parameters.
+
+        Nothing is left over that could fit the noise, so its moments have no bias.
+        """
+        if len(self.z) == 1:
+            return self.solution
+        whole = [np.hstack(x) for x in (self.z, self.phi)]
+        found = solve_stacked([whole[0]], [whole[1]], [np.concatenate(self.y)])
+        ends = np.cumsum([len(y) for y in self.y])[:-1]
+        return replace(found, projected=tuple(np.split(found.projected[0], ends, axis=1)))
+
+    @cached_property
+    def pooled_residuals(self) -> tuple[Array, ...]:
+        """Residuals of that estimate, (N,) an experiment."""
+        theta = self.pooled.theta
+        return tuple(y - theta @ f for y, f in zip(self.y, self.phi, strict=True))
+
+    @cached_property
     def residuals(self) -> tuple[Array, ...]:
         """Residuals of the plain instrumental-variable estimate, (N,) an experiment."""
         theta = self.solution.theta

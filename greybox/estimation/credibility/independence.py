@@ -10,7 +10,6 @@ import numpy as np
 
 from greybox.estimation.credibility.evidence import Equation, Evidence
 from greybox.estimation.credibility.kernel import Array
-from greybox.estimation.credibility.many import surplus_moments
 from greybox.estimation.credibility.overidentification import delayed
 from greybox.estimation.credibility.question import Finding, Question
 from greybox.estimation.credibility.scores import Score, score_test
@@ -42,10 +41,9 @@ def input_independence(evidence: Evidence, equation: Equation) -> TestResult:
         return score_test(
             xi,
             equation.phi,
-            equation.solution.projected,
-            equation.residuals,
+            equation.pooled.projected,
+            equation.pooled_residuals,
             colour=equation.colour,
-            mean=surplus_moments(xi, equation),
         )
 
     def finding(score: Score, fine: bool) -> Finding:
@@ -83,7 +81,7 @@ def _correlations(
 ) -> dict[str, dict[str, list[float]]]:
     """Return each input's correlation with the residuals, and its 95 % band, by delay."""
     size = np.sqrt(
-        sum((x**2).sum(axis=1) for x in xi) * sum(float(e @ e) for e in equation.residuals)
+        sum((x**2).sum(axis=1) for x in xi) * sum(float(e @ e) for e in equation.pooled_residuals)
     )
     size = np.where(size > 0, size, 1.0)
     return {

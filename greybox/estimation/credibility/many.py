@@ -7,13 +7,10 @@ estimate (4.5) drifts towards least squares by the surplus.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 
 from greybox.estimation.credibility.evidence import Equation
-from greybox.estimation.credibility.kernel import lagged_products
 from greybox.estimation.credibility.words import listed
 from greybox.estimation.result import TestResult, not_applicable
 
@@ -30,7 +27,9 @@ def surplus_bias(equation: Equation) -> Array:
     """Return the bias of the stacked estimate that surplus instruments cause, (p,).
 
     E Σ ẑ e = Σ_k Σ_t P(t, t+k) γ_ve(k) with P the projection on the instruments
-    of a log; the share (q − p)/q of it is the surplus.
+    of a log; the share (q − p)/q of it is the surplus. Residuals of a biased estimate
+    show less of γ_ve than the errors themselves: it is taken at the estimate that is left
+    when the bias is gone, which is linear in it.
 
     References
     ----------
@@ -39,7 +38,9 @@ def surplus_bias(equation: Equation) -> Array:
     p = len(equation.labels)
     q = 0
     traces = np.zeros(2 * _REACH + 1)
+    # of the noise of the regressors with the residuals, and with the regressors themselves
     meeting = np.zeros((2 * _REACH + 1, p))
+    itself = np.zeros((2 * _REACH + 1, p, p))
     for z, f, hat, e in zip(
         equation.z, equation.phi, equation.solution.projected, equation.residuals, strict=True
     ):
@@ -52,21 +53,12 @@ def surplus_bias(equation: Equation) -> Array:
         for k in range(-_REACH, _REACH + 1):
             first, later = _shifted(basis, k)
             traces[k + _REACH] += float((first * later).sum())
-            noise, error = _shifted(f - hat, k)[0], _shifted(e[None], k)[1]
-            meeting[k + _REACH] += (noise * error).sum(axis=1)
-    moved = traces @ meeting / max(equation.freedom - q, 1)
-    inverse = np.linalg.pinv(equation.solution.information, rcond=1e-15)
-    return np.asarray(inverse @ moved * max(q - p, 0) / max(q, 1))
-
-
-def surplus_moments(xi: Sequence[Array], equation: Equation) -> Array | None:
-    """Return E Σ ξ ê that the bias of surplus instruments leaves, (k,); None of one log.
-
-    ξ are free of the errors: Σ ξ ê moves by −Σ ξ φᵀ times the bias.
-    """
-    if len(equation.z) == 1:
-        return None
-    return np.asarray(-lagged_products(xi, equation.phi, 0) @ surplus_bias(equation))
+            noise = _shifted(f - hat, k)[0]
+            meeting[k + _REACH] += noise @ _shifted(e[None], k)[1][0]
+            itself[k + _REACH] += noise @ _shifted(f, k)[1].T
+    weights = traces / max(equation.freedom - q, 1) * max(q - p, 0) / max(q, 1)
+    left = equation.solution.information - np.tensordot(weights, itself, 1)
+    return np.asarray(np.linalg.pinv(left, rcond=1e-15) @ (weights @ meeting))
 
 
 def _shifted(rows: Array, k: int) -> tuple[Array, Array]:

@@ -6,7 +6,6 @@ import numpy as np
 
 from greybox.estimation.credibility.evidence import Equation
 from greybox.estimation.credibility.kernel import Array
-from greybox.estimation.credibility.many import surplus_moments
 from greybox.estimation.credibility.question import Finding, Question
 from greybox.estimation.credibility.scores import Score, score_test
 from greybox.estimation.result import TestResult
@@ -37,8 +36,8 @@ def overidentification(
     biases : frozenset of str
         Labels of columns that only capture a disturbance.
     each_log : bool
-        Whether each log's own instruments are asked too. Without, as for an estimate that
-        does not rest on them, the bias that many logs bring is taken off.
+        Whether each log's own instruments are asked too: not where the estimate does not
+        rest on them.
 
     References
     ----------
@@ -59,10 +58,9 @@ def overidentification(
         return score_test(
             xi,
             equation.phi,
-            equation.solution.projected,
-            equation.residuals,
+            equation.pooled.projected,
+            equation.pooled_residuals,
             colour=equation.colour,
-            mean=None if each_log else surplus_moments(xi, equation),
         )
 
     return _QUESTION.answer(equation, score, _finding)
