@@ -59,10 +59,10 @@ from greybox.model.output import OutputModel
 from greybox.model.predictor import build_predictor
 from greybox.study.chapter6 import TRUE
 from greybox.study.efficiency import CASES, CURRENT, virtual_trial
-from greybox.trial.conditioning import decimate
+from greybox.trial.convert.read import read_segments
+from greybox.trial.kinematics import decimate
 from greybox.trial.log import TrialLog
-from greybox.trial.reading import read_segments
-from greybox.trial.writing import write_log
+from greybox.trial.store import write_log
 from greybox.validation.choose import estimate_model
 from greybox.validation.fit import average_fit, run_model
 from greybox.validation.informative import regime_of

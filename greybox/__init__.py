@@ -35,20 +35,20 @@ if TYPE_CHECKING:
     from greybox.model.structure import Structure
     from greybox.prediction.predict import predict_manoeuvre
     from greybox.prediction.result import ManoeuvrePrediction
-    from greybox.trial.canonical import read_recording
     from greybox.trial.checks.check import check_files, check_recording
     from greybox.trial.checks.finding import CheckReport, Finding
-    from greybox.trial.conditioning import decimate
-    from greybox.trial.contents import describe_recording
+    from greybox.trial.convert.channel_mapping import read_recording
+    from greybox.trial.convert.convert import import_recording
+    from greybox.trial.convert.read import read_log, read_segments
+    from greybox.trial.convert.two_pass_import import import_files
     from greybox.trial.dataframe import log_from_pandas, log_from_xarray, recording_from_pandas
-    from greybox.trial.importing import import_recording
+    from greybox.trial.kinematics import decimate
     from greybox.trial.log import TrialLog, make_log
     from greybox.trial.manoeuvres import find_manoeuvres
-    from greybox.trial.reading import read_log, read_segments
-    from greybox.trial.recording import Recording
+    from greybox.trial.raw_log import Recording
     from greybox.trial.repair import repair
-    from greybox.trial.stream import import_files
-    from greybox.trial.writing import write_log
+    from greybox.trial.store import write_log
+    from greybox.trial.trial_summary import describe_recording
     from greybox.validation.choose import estimate_model
     from greybox.validation.comparison import compare_models
     from greybox.validation.fit import fit_percent, run_model
@@ -71,12 +71,12 @@ _WHERE = {
     "Estimate": "greybox.estimation.result",
     "Exported": "greybox.export.export",
     "Finding": "greybox.trial.checks.finding",
-    "ImportOptions": "greybox.trial.options",
+    "ImportOptions": "greybox.trial.convert.options",
     "ManoeuvrePrediction": "greybox.prediction.result",
     "ManoeuvringModel": "greybox.model.model",
     "OutputErrorOptions": "greybox.estimation.output_error",
     "Predictor": "greybox.model.predictor",
-    "Recording": "greybox.trial.recording",
+    "Recording": "greybox.trial.raw_log",
     "Request": "greybox.validation.request",
     "Structure": "greybox.model.structure",
     "TrialLog": "greybox.trial.log",
@@ -86,7 +86,7 @@ _WHERE = {
     "check_files": "greybox.trial.checks.check",
     "check_recording": "greybox.trial.checks.check",
     "compare_models": "greybox.validation.comparison",
-    "decimate": "greybox.trial.conditioning",
+    "decimate": "greybox.trial.kinematics",
     "estimate_iv": "greybox.estimation.estimate",
     "estimate_ls": "greybox.estimation.estimate",
     "estimate_model": "greybox.validation.choose",
@@ -96,27 +96,27 @@ _WHERE = {
     "find_manoeuvres": "greybox.trial.manoeuvres",
     "fit_percent": "greybox.validation.fit",
     "get_structure": "greybox.model.catalogue",
-    "import_files": "greybox.trial.stream",
-    "import_recording": "greybox.trial.importing",
+    "import_files": "greybox.trial.convert.two_pass_import",
+    "import_recording": "greybox.trial.convert.convert",
     "load_model": "greybox.model.model",
     "load_vessel": "greybox.vessel.toml",
     "log_from_pandas": "greybox.trial.dataframe",
     "log_from_xarray": "greybox.trial.dataframe",
     "make_log": "greybox.trial.log",
     "predict_manoeuvre": "greybox.prediction.predict",
-    "read_log": "greybox.trial.reading",
-    "read_recording": "greybox.trial.canonical",
+    "read_log": "greybox.trial.convert.read",
+    "read_recording": "greybox.trial.convert.channel_mapping",
     "recording_from_pandas": "greybox.trial.dataframe",
-    "read_segments": "greybox.trial.reading",
+    "read_segments": "greybox.trial.convert.read",
     "output_predictor": "greybox.estimation.output_setup",
     "repair": "greybox.trial.repair",
     "run_model": "greybox.validation.fit",
     "simulate": "greybox.model.simulation",
     "stationary_disturbance": "greybox.model.simulation",
     "structure_names": "greybox.model.catalogue",
-    "describe_recording": "greybox.trial.contents",
+    "describe_recording": "greybox.trial.trial_summary",
     "vessel_from_dict": "greybox.vessel.toml",
-    "write_log": "greybox.trial.writing",
+    "write_log": "greybox.trial.store",
 }
 
 __all__ = [

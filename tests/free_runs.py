@@ -17,9 +17,9 @@ from greybox.model.changes import Change
 from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor import build_predictor
 from greybox.model.simulation import mid_step, positions
-from greybox.trial.conditioning import decimate
+from greybox.trial.convert.read import read_log
+from greybox.trial.kinematics import decimate
 from greybox.trial.log import TrialLog
-from greybox.trial.reading import read_log
 from greybox.validation.fit import run_model
 from greybox.vessel.force import force_inputs
 from greybox.vessel.thrust import ThrustLaw

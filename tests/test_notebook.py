@@ -13,8 +13,8 @@ import greybox as gb
 from greybox.diagnosis.result import Diagnosis, Found, Gain, Quantity, Symptom
 from greybox.notebook import interval, number, sparkline, table
 from greybox.trial.checks.finding import Outcome
-from greybox.trial.contents import Contents
-from greybox.trial.recording import Signal
+from greybox.trial.raw_log import Signal
+from greybox.trial.trial_summary import Contents
 from greybox.validation.structures import StructureChoice, StructureRow
 
 HOSTILE = "<script>alert('x')</script>&\0\"]]>"

@@ -134,7 +134,7 @@ def recorded(
 def as_recording(columns: dict[str, np.ndarray], vessel=None):
     """Columns of a log as canonical signals on one clock."""
     from greybox.channels import CHANNELS
-    from greybox.trial.recording import Recording, Signal
+    from greybox.trial.raw_log import Recording, Signal
 
     t = np.asarray(columns["t"], float)
     return Recording(

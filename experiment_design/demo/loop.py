@@ -26,8 +26,8 @@ from greybox.study.blind_inputs import pulses
 from greybox.study.chapter6 import TRUE
 from greybox.trial.checks.check import check_files
 from greybox.trial.checks.finding import CheckReport
-from greybox.trial.reading import read_log
-from greybox.trial.writing import write_log
+from greybox.trial.convert.read import read_log
+from greybox.trial.store import write_log
 from greybox.validation.choose import estimate_model
 from greybox.validation.comparison import Comparison, compare_models
 from greybox.validation.request import Request

@@ -29,8 +29,8 @@ def run(options: argparse.Namespace) -> None:
 
     from greybox.files import check_targets, write_json
     from greybox.trial.checks.check import check_files
-    from greybox.trial.contents import Contents, describe_recording
     from greybox.trial.repair import apply_repairs
+    from greybox.trial.trial_summary import Contents, describe_recording
     from greybox.vessel.toml import load_vessel
 
     check_targets(options.json, options.report)

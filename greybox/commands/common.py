@@ -66,8 +66,8 @@ def read_logs(
     states: tuple[str, ...] = (),
 ) -> list[TrialLog]:
     """Read log files as the segments between gaps, decimated where a sample time is asked for."""
-    from greybox.trial.conditioning import decimate
-    from greybox.trial.reading import read_segments
+    from greybox.trial.convert.read import read_segments
+    from greybox.trial.kinematics import decimate
 
     logs = [s for path in paths for s in read_segments(path, vessel, states=states)]
     return logs if sample_time is None else [decimate(log, sample_time) for log in logs]

@@ -37,7 +37,7 @@ def run(options: argparse.Namespace) -> None:
 
     from greybox.files import check_targets, write_json
     from greybox.model.model import load_model
-    from greybox.trial.reading import read_log
+    from greybox.trial.convert.read import read_log
     from greybox.validation.comparison import compare_models
 
     check_targets(options.json, options.report)

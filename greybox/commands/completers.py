@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 from importlib.metadata import entry_points
 from pathlib import Path
 
-from greybox.commands.kinds import EXAMPLE_VESSELS, Kind, kind_of
+from greybox.commands.argument_types import EXAMPLE_VESSELS, Kind, kind_of
 from greybox.commands.parser import sub_parsers
 
 # written out, since loading them takes longer than one waits for Tab; tests hold them to the truth

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from greybox.commands.argument_types import EXAMPLE_VESSELS, Kind, is_output, is_path, kind_of
 from greybox.commands.configuration import EVERYWHERE, Configuration, from_here
-from greybox.commands.kinds import EXAMPLE_VESSELS, Kind, is_output, is_path, kind_of
 from greybox.commands.parser import long_options, sub_parsers
 from greybox.errors import ConfigurationError, suggestion
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from greybox.commands.common import positive, provenance, say
 
 if TYPE_CHECKING:
-    from greybox.trial.options import ImportOptions
+    from greybox.trial.convert.options import ImportOptions
 
 HELP = "make a log of raw files: CSV, Parquet, NMEA 0183, MATLAB, ROS bags, MCAP"
 EXAMPLES = """examples:
@@ -104,8 +104,8 @@ def run(options: argparse.Namespace) -> None:
 
     from greybox.errors import UsageError
     from greybox.files import check_targets, write_json
-    from greybox.trial.stream import import_files
-    from greybox.trial.writing import read_record, record_path
+    from greybox.trial.convert.two_pass_import import import_files
+    from greybox.trial.store import read_record, record_path
     from greybox.vessel.toml import load_vessel
 
     if Path(options.out).suffix.lower() not in ("", ".csv", ".parquet", ".pq"):
@@ -135,7 +135,7 @@ def run(options: argparse.Namespace) -> None:
 
 def import_options(options: argparse.Namespace) -> ImportOptions:
     """Return the options of the import, checked."""
-    from greybox.trial.options import ImportOptions
+    from greybox.trial.convert.options import ImportOptions
 
     return ImportOptions(
         sample_time=options.sample_time,

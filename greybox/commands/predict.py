@@ -118,7 +118,7 @@ def run(options: argparse.Namespace) -> None:
     from greybox.files import check_targets, write_json
     from greybox.model.model import load_model
     from greybox.prediction.predict import predict_manoeuvre
-    from greybox.trial.reading import read_segments
+    from greybox.trial.convert.read import read_segments
 
     check_targets(options.json, options.report, options.out)
     angles = [_angle(text) for text in options.angle]
@@ -211,7 +211,7 @@ def _write_runs(made: ManoeuvrePrediction, path: str) -> list[str]:
     import math
     from pathlib import Path
 
-    from greybox.trial.writing import write_log
+    from greybox.trial.store import write_log
 
     target = Path(path)
     names = []

@@ -46,7 +46,7 @@ def run(options: argparse.Namespace) -> None:
     from greybox.files import check_targets, replacing
     from greybox.model.model import load_model
     from greybox.model.simulation import positions
-    from greybox.trial.reading import read_log
+    from greybox.trial.convert.read import read_log
     from greybox.validation.bands import predict_bands
     from greybox.validation.fit import run_model
 

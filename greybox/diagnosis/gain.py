@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from greybox.diagnosis.result import Gain
 from greybox.model.model import ManoeuvringModel
-from greybox.trial.correcting import correct_log
+from greybox.trial.convert.sensor_corrections import correct_log
 from greybox.trial.log import TrialLog
 from greybox.validation.fit import LogFit, run_model
 

@@ -19,7 +19,7 @@ from greybox.errors import GreyboxError
 from greybox.trial.checks.check import check_recording
 from greybox.trial.checks.finding import Finding
 from greybox.trial.log import TrialLog
-from greybox.trial.recording import Recording, Signal
+from greybox.trial.raw_log import Recording, Signal
 from greybox.vessel.vessel import Vessel
 
 # parameters of each cause by the ids of the checks, in the order of a finding's values

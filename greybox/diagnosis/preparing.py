@@ -19,7 +19,7 @@ from greybox.model.model import ManoeuvringModel
 from greybox.model.structure import Structure
 from greybox.regression.regression import common_sample_time
 from greybox.trial.checks.finding import Finding
-from greybox.trial.correcting import correct_log
+from greybox.trial.convert.sensor_corrections import correct_log
 from greybox.trial.log import TrialLog
 from greybox.vessel.force import force_inputs
 

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from greybox.report.figures import BLACK, BLUE, GREEN, LABELS, VERMILION, new_figure, tidy
 from greybox.report.thinning import find_gaps, pick, thin
 from greybox.trial.checks.finding import Finding
-from greybox.trial.checks.rows import MOTION
-from greybox.trial.deriving import continuous
-from greybox.trial.recording import Recording, Signal
-from greybox.trial.resampling import clock, runs
+from greybox.trial.checks.signal_quality import MOTION
+from greybox.trial.convert.derived_signals import continuous
+from greybox.trial.convert.resample import clock, runs
+from greybox.trial.raw_log import Recording, Signal
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
@@ -229,7 +229,7 @@ def range_figure(finding: Finding) -> Figure:
     value: Array = finding.picture["value"]
     limit = float(finding.picture["limit"])
     keep = np.isfinite(t) & np.isfinite(value)
-    factor = finding.repair[0].values[0] if finding.repair else 1.0
+    factor = finding.repair[0].number("factor") if finding.repair else 1.0
     figure = new_figure(10, 4.6)
     above, below = figure.subplots(2, 1, sharex=True)
     for ax, x, title in (

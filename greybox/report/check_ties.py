@@ -27,10 +27,11 @@ from greybox.report.agreement import (
 from greybox.report.check_rows import label_of
 from greybox.report.figures import BLACK, BLUE, GREEN, ORANGE, VERMILION, new_figure, tidy
 from greybox.report.thinning import find_gaps, pick, thin
-from greybox.trial.checks.finding import CheckReport, Finding, Repair
+from greybox.trial.checks.finding import CheckReport, Finding
 from greybox.trial.checks.motion import NAMES, Motion, make_motion
-from greybox.trial.recording import Recording
+from greybox.trial.raw_log import Recording
 from greybox.trial.repair import apply_repairs
+from greybox.trial.steps import Step
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
@@ -140,7 +141,9 @@ def _motion(recording: Recording, findings: Sequence[Finding]) -> Motion | None:
 
 def _reaches(f: Finding) -> bool:
     """Whether a finding changes what velocities and positions say, beyond single samples."""
-    return any(s.kind not in ("drop", "order") and set(s.channels) & set(NAMES) for s in f.repair)
+    return any(
+        s.operation not in ("drop", "order") and set(s.channels) & set(NAMES) for s in f.repair
+    )
 
 
 def _touched(finding: Finding, before: Agreement, after: Agreement) -> tuple[str, ...]:
@@ -210,26 +213,28 @@ def title_of(finding: Finding) -> str:
     return f"{words.get(finding.id, finding.id)} of {names}"
 
 
-def mended_in_words(steps: Sequence[Repair]) -> str:
+def mended_in_words(steps: Sequence[Step]) -> str:
     """Return what repairs do, in a few words."""
     said = []
     for s in steps:
         names = ", ".join(s.channels)
-        if s.kind == "shift":
-            said.append(f"{names} shifted by {-s.values[0]:+.2f} s")
-        elif s.kind == "scale":
+        if s.operation == "shift":
+            said.append(f"{names} shifted by {-s.number('late'):+.2f} s")
+        elif s.operation == "scale":
             said.append(
-                f"{names} reversed" if s.values[0] == -1 else f"{names} times {s.values[0]:.4g}"
+                f"{names} reversed"
+                if s.number("factor") == -1
+                else f"{names} times {s.number('factor'):.4g}"
             )
-        elif s.kind == "move":
+        elif s.operation == "exchange":
             said.append(f"{' and '.join(s.channels)} exchanged")
-        elif s.kind == "rotate":
+        elif s.operation == "earth_to_body":
             said.append("turned into body axes")
-        elif s.kind == "turn":
-            said.append(f"heading turned by {-np.degrees(s.values[0]):+.1f} deg")
-        elif s.kind == "offset":
-            said.append(f"{np.degrees(s.values[0]):+.0f} deg added to {names}")
-        elif s.kind == "lever":
+        elif s.operation == "turn_heading":
+            said.append(f"heading turned by {-np.degrees(s.number('angle')):+.1f} deg")
+        elif s.operation == "offset":
+            said.append(f"{np.degrees(s.number('offset')):+.0f} deg added to {names}")
+        elif s.operation == "move_antenna":
             said.append("positions moved by the arm")
     return signed(", ".join(said)) or "mended"
 
@@ -353,7 +358,7 @@ def _draw_curve(ax: Any, finding: Finding, tie: Tie) -> None:
 def _draw_slopes(cells: Sequence[Sequence[Any]], finding: Finding, tie: Tie) -> None:
     """Draw the disagreement against the rate of turn: an arm is a slope."""
     assert isinstance(finding.value, tuple)
-    arm = np.array(finding.repair[0].values)
+    arm = np.array([finding.repair[0].number("x"), finding.repair[0].number("y")])
     for row, agreement, words in zip(
         cells, (tie.before, tie.after), ("as logged", "mended"), strict=True
     ):

@@ -27,9 +27,9 @@ from greybox.report.figures import to_svg
 from greybox.report.log import facts, page_figures
 from greybox.report.page import Page, Picture, Section, Table, computed, write_page
 from greybox.trial.checks.finding import CheckReport, Finding, size_in_words
-from greybox.trial.importing import import_recording
+from greybox.trial.convert.convert import import_recording
 from greybox.trial.log import TrialLog
-from greybox.trial.recording import Recording
+from greybox.trial.raw_log import Recording
 from greybox.vessel.vessel import Vessel
 
 # what makes a force model wrong before what it only has to do without

@@ -25,7 +25,7 @@ from greybox.study.blind_sensors import gauss_markov, observe, wanted
 from greybox.study.blind_ship import LEAD, NAMES, History, Ship, simulate_ships
 from greybox.study.chapter6 import TRUE
 from greybox.trial.log import TrialLog, make_log
-from greybox.trial.writing import write_log
+from greybox.trial.store import write_log
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]

@@ -25,7 +25,7 @@ from greybox.model.structure import Structure
 from greybox.study.chapter6 import TRUE
 from greybox.study.inputs import smoothed_pulses, zig_zag
 from greybox.study.tables import Row
-from greybox.trial.conditioning import velocities_from_positions
+from greybox.trial.kinematics import velocities_from_positions
 from greybox.trial.log import TrialLog, make_log
 from greybox.validation.comparison import SignTest, sign_test
 from greybox.validation.fit import run_model

@@ -15,12 +15,12 @@ import numpy as np
 
 from greybox.channels import CHANNELS
 from greybox.errors import LogError, UsageError
-from greybox.trial.canonical import canonical, table_recording
+from greybox.trial.convert.channel_mapping import canonical, table_recording
+from greybox.trial.convert.read import table_segments
 from greybox.trial.log import Provenance, TrialLog
+from greybox.trial.raw_log import Recording
 from greybox.trial.readers.frame import open_frame
-from greybox.trial.reading import table_segments
-from greybox.trial.recording import Recording
-from greybox.trial.writing import recorded_provenance
+from greybox.trial.store import recorded_provenance
 from greybox.vessel.vessel import Vessel
 
 if TYPE_CHECKING:

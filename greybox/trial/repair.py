@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import UsageError, suggestion
-from greybox.trial.checks.finding import IDS, CheckReport, Finding, Repair
-from greybox.trial.deriving import continuous, derive_signals
-from greybox.trial.recording import Recording, Signal
+from greybox.trial.checks.finding import IDS, CheckReport, Finding
+from greybox.trial.convert.derived_signals import continuous, derive_signals
+from greybox.trial.raw_log import Recording, Signal
+from greybox.trial.steps import Step, mend
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
@@ -65,15 +66,14 @@ def repair(
 def apply_repairs(recording: Recording, findings: Iterable[Finding]) -> Recording:
     """Return the recording with the repairs of the findings applied in order."""
     steps = [step for f in findings for step in f.repair]
-    if any(s.kind in ("rotate", "lever", "shift", "turn") for s in steps):
-        # these act on positions and unwrapped headings
+    if any(s.operation in _ON_DERIVED for s in steps):
         recording = derive_signals(recording)
     for step in steps:
-        recording = _ACTIONS[step.kind](recording, step)
+        recording = _ACTIONS[step.operation](recording, step)
     return recording
 
 
-def _order(recording: Recording, step: Repair) -> Recording:
+def _order(recording: Recording, step: Step) -> Recording:
     clocks: dict[int, tuple[NDArray[np.int64], Array]] = {}
     out = []
     for s in recording.signals:
@@ -89,9 +89,9 @@ def _order(recording: Recording, step: Repair) -> Recording:
     return recording.with_signals(out)
 
 
-def _drop(recording: Recording, step: Repair) -> Recording:
+def _drop(recording: Recording, step: Step) -> Recording:
     out = []
-    times = np.array(step.values)
+    times = np.array(step.numbers("times"))
     shared: dict[tuple[int, bytes], Array] = {}
     for s in recording.signals:
         if s.name in step.channels:
@@ -105,29 +105,29 @@ def _drop(recording: Recording, step: Repair) -> Recording:
     return recording.with_signals(out)
 
 
-def _scale(recording: Recording, step: Repair) -> Recording:
+def _scale(recording: Recording, step: Step) -> Recording:
     return recording.with_signals(
-        s.with_value(s.value * step.values[0]) if s.name in step.channels else s
+        s.with_value(s.value * step.number("factor")) if s.name in step.channels else s
         for s in recording.signals
     )
 
 
-def _offset(recording: Recording, step: Repair) -> Recording:
+def _offset(recording: Recording, step: Step) -> Recording:
     return recording.with_signals(
-        s.with_value(s.value + step.values[0]) if s.name in step.channels else s
+        s.with_value(s.value + step.number("offset")) if s.name in step.channels else s
         for s in recording.signals
     )
 
 
-def _move(recording: Recording, step: Repair) -> Recording:
+def _exchange(recording: Recording, step: Step) -> Recording:
     new = dict(zip(step.channels, (*step.channels[1:], step.channels[0]), strict=True))
     return recording.with_signals(
         replace(s, name=new.get(s.name, s.name)) for s in recording.signals
     )
 
 
-def _shift(recording: Recording, step: Repair) -> Recording:
-    late = step.values[0]
+def _shift(recording: Recording, step: Step) -> Recording:
+    late = step.number("late")
     shared: dict[int, Array] = {}
     out = []
     for s in recording.signals:
@@ -137,11 +137,11 @@ def _shift(recording: Recording, step: Repair) -> Recording:
     return recording.with_signals(out)
 
 
-def _turn(recording: Recording, step: Repair) -> Recording:
-    return _offset(recording, Repair("offset", ("psi",), (-step.values[0],)))
+def _turn_heading(recording: Recording, step: Step) -> Recording:
+    return _offset(recording, mend("offset", ("psi",), offset=-step.number("angle")))
 
 
-def _rotate(recording: Recording, step: Repair) -> Recording:
+def _earth_to_body(recording: Recording, step: Step) -> Recording:
     north, east = (recording[n] for n in step.channels)
     psi = _heading_at(recording, north.t)
     c, s = np.cos(psi), np.sin(psi)
@@ -156,8 +156,8 @@ def _rotate(recording: Recording, step: Repair) -> Recording:
     )
 
 
-def _lever(recording: Recording, step: Repair) -> Recording:
-    x, y = step.values
+def _move_antenna(recording: Recording, step: Step) -> Recording:
+    x, y = step.number("x"), step.number("y")
     out: list[Signal] = []
     for s in recording.signals:
         if s.name in ("x_n", "y_n"):
@@ -176,6 +176,9 @@ def _heading_at(recording: Recording, t: Array) -> Array:
 
 
 _ACTIONS = {
-    "order": _order, "drop": _drop, "scale": _scale, "offset": _offset, "move": _move,
-    "shift": _shift, "turn": _turn, "rotate": _rotate, "lever": _lever,
+    "order": _order, "drop": _drop, "scale": _scale, "offset": _offset, "exchange": _exchange,
+    "shift": _shift, "turn_heading": _turn_heading, "earth_to_body": _earth_to_body,
+    "move_antenna": _move_antenna,
 }  # fmt: skip
+# these act on positions and unwrapped headings
+_ON_DERIVED = frozenset({"earth_to_body", "move_antenna", "shift", "turn_heading"})

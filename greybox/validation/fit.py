@@ -15,7 +15,7 @@ from greybox.errors import LogError
 from greybox.model.model import ManoeuvringModel
 from greybox.notebook import Shown, number, sparkline, table
 from greybox.regression.instruments import simulate_log
-from greybox.trial.conditioning import decimate
+from greybox.trial.kinematics import decimate
 from greybox.trial.log import TrialLog
 
 if TYPE_CHECKING:

@@ -208,8 +208,8 @@ def test_every_option_of_every_command_can_stand_in_a_file():
 def test_a_letter_that_stands_for_a_number_is_no_file():
     import argparse
 
+    from greybox.commands.argument_types import Kind, is_path, kind_of
     from greybox.commands.common import positive
-    from greybox.commands.kinds import Kind, is_path, kind_of
 
     parser = argparse.ArgumentParser()
     assert kind_of(parser.add_argument("--vessel", metavar="V")) is Kind.VESSEL

@@ -204,7 +204,7 @@ def test_devices_and_full_disks(tmp_path, capsys, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("greybox.trial.writing._write_tables", full)
+    monkeypatch.setattr("greybox.trial.store._write_tables", full)
     out = tmp_path / "log.csv"
     status, _, err = run(capsys, "import", raw, "--vessel", "thesis", "--out", out)
     assert status == 1
@@ -325,7 +325,7 @@ def test_a_log_that_is_imported_again_is_the_same(tmp_path, capsys, monkeypatch,
     ship.write_text(MAST_SHIP)
     (tmp_path / "all.nmea").write_bytes(turning()[0])
     if cells is not None:
-        monkeypatch.setattr("greybox.trial.stream._LARGE_CELLS", cells)
+        monkeypatch.setattr("greybox.trial.convert.two_pass_import._LARGE_CELLS", cells)
     source = "all.nmea"
     records = []
     for name in ("a.csv", "b.csv", "c.csv"):
@@ -413,8 +413,8 @@ def test_topics_of_a_bag_are_chosen_and_named(tmp_path, capsys):
 @pytest.mark.parametrize("cells", [None, 0], ids=["memory", "blocks"])
 def test_channels_are_smoothed_where_asked(tmp_path, capsys, monkeypatch, cells):
     if cells is not None:
-        monkeypatch.setattr("greybox.trial.stream._LARGE_CELLS", cells)
-        monkeypatch.setattr("greybox.trial.stream._BLOCK_ROWS", 50)
+        monkeypatch.setattr("greybox.trial.convert.two_pass_import._LARGE_CELLS", cells)
+        monkeypatch.setattr("greybox.trial.convert.two_pass_import._BLOCK_ROWS", 50)
         monkeypatch.setattr("greybox.trial.readers.csv._BLOCK_BYTES", 1 << 12)
     rng = np.random.default_rng(5)
     table = data(300).drop(columns=["r"])
@@ -470,7 +470,7 @@ def test_channels_are_smoothed_where_asked(tmp_path, capsys, monkeypatch, cells)
 )  # fmt: skip
 def test_windows_that_cannot_be(tmp_path, capsys, monkeypatch, cells, given, words):
     if cells is not None:
-        monkeypatch.setattr("greybox.trial.stream._LARGE_CELLS", cells)
+        monkeypatch.setattr("greybox.trial.convert.two_pass_import._LARGE_CELLS", cells)
     table = data()
     (table.drop(index=range(30, 36)) if given == "r=25" else table).to_csv(
         tmp_path / "raw.csv", index=False

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from greybox.commands.main import main
-from greybox.trial.reading import read_log
+from greybox.trial.convert.read import read_log
 from greybox.vessel.toml import load_vessel
 
 BLUEBOAT = """

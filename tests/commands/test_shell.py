@@ -224,14 +224,14 @@ def test_the_script_says_how_to_install_it(shell, capsys):
 
 
 def test_names_that_completion_has_by_heart_are_true():
-    from greybox.commands import kinds
+    from greybox.commands import argument_types
     from greybox.diagnosis.causes import _OWN
     from greybox.model.catalogue import get_structure, structure_names
 
     assert structure_names() == completers.STRUCTURES
     assert tuple(c.id for c in _OWN) == completers.CAUSES
     assert get_structure("thesis").parameters == completers.PARAMETERS
-    assert kinds.EXAMPLE_VESSELS == EXAMPLES
+    assert argument_types.EXAMPLE_VESSELS == EXAMPLES
 
 
 # quiet, verbose, colours

@@ -13,8 +13,8 @@ from manoeuvring import rudder_model
 from greybox.commands.main import main
 from greybox.model.model import load_model
 from greybox.prediction.predict import predict_manoeuvre
+from greybox.trial.convert.read import read_log
 from greybox.trial.manoeuvres import find_manoeuvres
-from greybox.trial.reading import read_log
 
 
 def run(*arguments):

@@ -18,11 +18,10 @@ from greybox.report.check_ties import make_tie, mended_in_words
 from greybox.report.checks import alternative, caption, check_page, finding_figure, headline
 from greybox.report.figures import to_svg
 from greybox.trial.checks.course import course_findings
-from greybox.trial.checks.finding import IDS, CheckReport, Finding, Outcome, Repair
-from greybox.trial.checks.frames import _PSI, _RATE, _VELOCITY, Reading, reading_findings
+from greybox.trial.checks.finding import IDS, CheckReport, Finding, Outcome
+from greybox.trial.checks.frame_sign_unit import _PSI, _RATE, _VELOCITY, Reading, reading_findings
 from greybox.trial.checks.motion import make_motion
-from greybox.trial.checks.response import response_findings
-from greybox.trial.checks.rows import (
+from greybox.trial.checks.signal_quality import (
     angle_unit_findings,
     coarse_findings,
     missing_findings,
@@ -30,8 +29,10 @@ from greybox.trial.checks.rows import (
     stuck_findings,
     time_findings,
 )
-from greybox.trial.checks.windage import wind_findings
-from greybox.trial.recording import Recording, Signal
+from greybox.trial.checks.thruster_response import response_findings
+from greybox.trial.checks.wind_convention import wind_findings
+from greybox.trial.raw_log import Recording, Signal
+from greybox.trial.steps import mend
 from greybox.vessel.toml import load_vessel
 
 SHIP = load_vessel("thesis")
@@ -54,23 +55,23 @@ def tie_case(name):
     options, kind, channels, value, ci, repair = {
         "clock of u, v": (
             {"late": {"u": 1.0, "v": 1.0}}, "clock_offset", ("u", "v"), 1.0, (0.9, 1.1),
-            Repair("shift", ("u", "v"), (1.0,)),
+            mend("shift", ("u", "v"), late=1.0),
         ),
         "clock of psi": (
             {"late": {"psi": 1.0}}, "clock_offset", ("psi",), 1.0, (0.9, 1.1),
-            Repair("shift", ("psi",), (1.0,)),
+            mend("shift", ("psi",), late=1.0),
         ),
         "clock of r": (
             {"late": {"r": 2.0}}, "clock_offset", ("r",), 2.0, (1.8, 2.2),
-            Repair("shift", ("r",), (2.0,)),
+            mend("shift", ("r",), late=2.0),
         ),
         "lever arm": (
             {"arm": (3.0, 1.0)}, "lever_arm", ("x_n", "y_n"), (3.0, 1.0), ((2.9, 3.1), (0.8, 1.2)),
-            Repair("lever", ("x_n", "y_n"), (3.0, 1.0)),
+            mend("move_antenna", ("x_n", "y_n"), x=3.0, y=1.0),
         ),
         "heading bias": (
             {"heading_bias": 0.1}, "heading_bias", ("psi",), 0.1, (0.09, 0.11),
-            Repair("turn", ("psi",), (0.1,)),
+            mend("turn_heading", ("psi",), angle=0.1),
         ),
     }[name]  # fmt: skip
     finding = Finding(
@@ -211,7 +212,7 @@ def test_a_repair_that_does_not_help_is_doubted(tmp_path):
     assert "judge it before you apply it" not in path.read_text()
     wrong = replace(
         report.findings[0], value=-1.0, ci=(-1.1, -0.9),
-        repair=(Repair("shift", ("u", "v"), (-1.0,)),),
+        repair=(mend("shift", ("u", "v"), late=-1.0),),
     )  # fmt: skip
     check_page([replace(report, findings=(wrong,))], [Path("a.csv")], SHIP, path)
     assert "judge it before you apply it" in path.read_text()
@@ -259,9 +260,9 @@ def test_other_findings_are_mended_in_both_rows():
 
 
 def test_repairs_in_words():
-    assert mended_in_words([Repair("shift", ("u", "v"), (0.6,))]) == "u, v shifted by −0.60 s"
-    assert mended_in_words([Repair("scale", ("v",), (-1.0,))]) == "v reversed"
-    assert mended_in_words([Repair("move", ("u", "v"))]) == "u and v exchanged"
+    assert mended_in_words([mend("shift", ("u", "v"), late=0.6)]) == "u, v shifted by −0.60 s"
+    assert mended_in_words([mend("scale", ("v",), factor=-1.0)]) == "v reversed"
+    assert mended_in_words([mend("exchange", ("u", "v"))]) == "u and v exchanged"
     assert mended_in_words([]) == "mended"
 
 

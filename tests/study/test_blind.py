@@ -20,7 +20,7 @@ from greybox.study.blind_inputs import KINDS
 from greybox.study.blind_sensors import gauss_markov, narrow_band
 from greybox.study.blind_ship import LEAD, NAMES, Ship, simulate_ships
 from greybox.study.chapter6 import TRUE
-from greybox.trial.reading import read_log
+from greybox.trial.convert.read import read_log
 from greybox.vessel.force import generalised_force
 
 STILL = Conditions(euler=True, noise=0.0, process=0.0, samples=400)

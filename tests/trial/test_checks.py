@@ -9,7 +9,7 @@ from virtual import as_recording, recorded
 from greybox.errors import UsageError
 from greybox.trial.checks.check import check_files, check_recording
 from greybox.trial.checks.finding import IDS
-from greybox.trial.recording import Recording, Signal
+from greybox.trial.raw_log import Recording, Signal
 from greybox.trial.repair import apply_repairs, repair
 from greybox.vessel.toml import load_vessel, vessel_from_dict
 
@@ -425,6 +425,6 @@ def test_planted_offsets_are_found(ship):
 
 @pytest.mark.parametrize("late", [{}, {"u": 2.0, "v": 2.0}])
 def test_readings_of_long_logs_are_judged_on_parts_of_them(ship, monkeypatch, late):
-    monkeypatch.setattr("greybox.trial.checks.frames._EXCERPT", 400)
+    monkeypatch.setattr("greybox.trial.checks.frame_sign_unit._EXCERPT", 400)
     report = check_recording(as_recording(recorded(4, rate=2.0, seconds=600, late=late)), ship)
     assert {f.id for f in report.findings} == ({"clock_offset"} if late else set())

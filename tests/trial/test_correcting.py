@@ -9,11 +9,11 @@ import pandas as pd
 import pytest
 
 from greybox.errors import LogError, VesselError
-from greybox.trial.correcting import correct_log
+from greybox.trial.convert.read import read_log
+from greybox.trial.convert.sensor_corrections import correct_log
+from greybox.trial.convert.two_pass_import import import_files
 from greybox.trial.log import make_log
-from greybox.trial.reading import read_log
-from greybox.trial.stream import import_files
-from greybox.trial.writing import write_log
+from greybox.trial.store import write_log
 from greybox.vessel.toml import vessel_from_dict, vessel_to_dict
 
 STEP = 0.1
@@ -192,7 +192,7 @@ def test_a_plan_has_nothing_to_correct(tmp_path):
 
 def test_segments_shorter_than_the_clock_are_left_out(tmp_path):
     """Each stretch between gaps has its own ends."""
-    from greybox.trial.reading import read_segments
+    from greybox.trial.convert.read import read_segments
 
     columns = {"t": np.arange(600) * STEP} | signals({"u": 0.5})
     gone = np.r_[100:120, 126:140]

@@ -12,13 +12,13 @@ import pytest
 from virtual import as_recording, recorded
 
 from greybox.errors import LogError
-from greybox.trial import stream
-from greybox.trial.canonical import merge, read_recording
-from greybox.trial.importing import import_recording
-from greybox.trial.options import ImportOptions
+from greybox.trial.convert import two_pass_import as stream
+from greybox.trial.convert.channel_mapping import merge, read_recording
+from greybox.trial.convert.convert import import_recording
+from greybox.trial.convert.options import ImportOptions
+from greybox.trial.convert.read import read_segments
+from greybox.trial.raw_log import Recording, Signal
 from greybox.trial.readers import csv as csv_reader
-from greybox.trial.reading import read_segments
-from greybox.trial.recording import Recording, Signal
 from greybox.vessel.toml import load_vessel, vessel_from_dict
 
 VESSEL = load_vessel("thesis")
@@ -310,7 +310,7 @@ def test_a_large_file_whose_time_starts_again(tmp_path, monkeypatch):
     table = large("plain")
     pd.concat([table, table]).to_csv(tmp_path / "raw.csv", index=False)
     monkeypatch.setattr(stream, "_LARGE_CELLS", 0)
-    monkeypatch.setattr("greybox.trial.scan._MAX_BACK_ROWS", 1000)
+    monkeypatch.setattr("greybox.trial.convert.first_pass._MAX_BACK_ROWS", 1000)
     with pytest.raises(LogError, match=r"goes back by 899.9 s, at most 100 s"):
         stream.import_files([tmp_path / "raw.csv"], VESSEL, tmp_path / "a.csv")
     assert not (tmp_path / "a.csv").exists()

@@ -14,7 +14,7 @@ import pytest
 from pyarrow import parquet
 
 from greybox.errors import LogError
-from greybox.trial.canonical import read_recording
+from greybox.trial.convert.channel_mapping import read_recording
 from greybox.trial.readers import cells
 from greybox.trial.readers.csv import open_csv
 from greybox.trial.readers.formats import open_raw

@@ -7,7 +7,7 @@ import pynmea2
 import pytest
 
 from greybox.errors import LogError
-from greybox.trial.canonical import read_recording
+from greybox.trial.convert.channel_mapping import read_recording
 from greybox.trial.readers.nmea import read_nmea
 from greybox.vessel.toml import vessel_from_dict
 

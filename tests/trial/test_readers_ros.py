@@ -20,9 +20,9 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from greybox.errors import LogError
-from greybox.trial.readers import bagparts, inflating, ros, rosmessages
-from greybox.trial.readers.bagparts import Channel
+from greybox.trial.readers import decompress, ros, rosmessages, storage
 from greybox.trial.readers.ros import read_bag
+from greybox.trial.readers.storage import Channel
 
 ROS1 = get_typestore(Stores.ROS1_NOETIC)
 ROS2 = get_typestore(Stores.ROS2_HUMBLE)
@@ -506,7 +506,7 @@ def chunk1(kind, stated, data):
 def test_a_chunk_that_states_too_much_is_refused_before_it_is_inflated(tmp_path):
     file = tmp_path / "a.bag"
     file.write_bytes(chunk1(b"lz4", 2**31, b"x"))
-    with pytest.raises(LogError, match=f"chunk of {2**31} bytes, at most {bagparts.MAX_CHUNK}"):
+    with pytest.raises(LogError, match=f"chunk of {2**31} bytes, at most {storage.MAX_CHUNK}"):
         read_bag(file)
 
 
@@ -532,8 +532,8 @@ def test_a_chunk_that_holds_more_than_it_states_is_refused(tmp_path, kind):
 def test_many_chunks_exhaust_the_budget(tmp_path, monkeypatch):
     import lz4.frame
 
-    monkeypatch.setattr(bagparts, "MAX_BYTES", 10**6)
-    monkeypatch.setattr(bagparts, "MAX_RATIO", 1)
+    monkeypatch.setattr(storage, "MAX_BYTES", 10**6)
+    monkeypatch.setattr(storage, "MAX_RATIO", 1)
     message = record1({b"op": b"\x04"}, bytes(10**5))
     chunk = chunk1(b"lz4", len(message), lz4.frame.compress(message))
     file = tmp_path / "a.bag"
@@ -543,9 +543,9 @@ def test_many_chunks_exhaust_the_budget(tmp_path, monkeypatch):
 
 
 def test_a_compressed_file_or_message_that_is_a_bomb_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(bagparts, "MAX_BYTES", 10**5)
-    monkeypatch.setattr(bagparts, "MAX_RATIO", 1)
-    monkeypatch.setattr(inflating, "_BLOCK", 10**4)
+    monkeypatch.setattr(storage, "MAX_BYTES", 10**5)
+    monkeypatch.setattr(storage, "MAX_RATIO", 1)
+    monkeypatch.setattr(decompress, "_BLOCK", 10**4)
     file = tmp_path / "a.db3.zstd"
     file.write_bytes(zstandard.compress(bytes(10**7)))
     with pytest.raises(LogError, match="inflates to more than 100000 bytes"):
@@ -565,7 +565,7 @@ def test_bounds_on_messages_and_numbers(tmp_path, monkeypatch):
     with pytest.raises(LogError, match="more than 20 numbers"):
         read_bag(bag)
     monkeypatch.undo()
-    monkeypatch.setattr(bagparts, "MAX_MESSAGES", 5)
+    monkeypatch.setattr(storage, "MAX_MESSAGES", 5)
     with pytest.raises(LogError, match="more than 5 messages"):
         read_bag(bag)
 

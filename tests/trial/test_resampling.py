@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import firwin
 
-from greybox.trial.resampling import (
+from greybox.trial.convert.resample import (
     clock,
     covered,
     hold,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from greybox.errors import LogError
-from greybox.trial.conditioning import velocities_from_positions
+from greybox.trial.kinematics import velocities_from_positions
 from greybox.trial.smoothing import derivative_noise, savgol_velocities, smooth
 
 TS = 0.1

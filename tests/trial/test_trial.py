@@ -7,9 +7,9 @@ import pandas as pd
 import pytest
 
 from greybox.errors import LogError
-from greybox.trial.conditioning import decimate, velocities_from_positions
+from greybox.trial.convert.read import read_log
+from greybox.trial.kinematics import decimate, velocities_from_positions
 from greybox.trial.log import make_log
-from greybox.trial.reading import read_log
 from greybox.trial.wind import relative_wind
 from greybox.vessel.toml import vessel_from_dict
 

@@ -5,14 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from greybox.trial.canonical import read_recording
 from greybox.trial.checks.course import course_findings
 from greybox.trial.checks.finding import IDS, CheckReport, Finding, Outcome
-from greybox.trial.checks.frames import find_reading, frame_outcomes, read, reading_findings
+from greybox.trial.checks.frame_sign_unit import (
+    find_reading,
+    frame_outcomes,
+    read,
+    reading_findings,
+)
 from greybox.trial.checks.motion import make_motion
-from greybox.trial.checks.offsets import find_offsets
-from greybox.trial.checks.response import response_findings
-from greybox.trial.checks.rows import (
+from greybox.trial.checks.sensor_offsets.find import find_offsets
+from greybox.trial.checks.signal_quality import (
     angle_unit_findings,
     coarse_findings,
     missing_findings,
@@ -20,9 +23,11 @@ from greybox.trial.checks.rows import (
     stuck_findings,
     time_findings,
 )
-from greybox.trial.checks.windage import wind_findings
-from greybox.trial.deriving import derive_signals
-from greybox.trial.recording import Recording
+from greybox.trial.checks.thruster_response import response_findings
+from greybox.trial.checks.wind_convention import wind_findings
+from greybox.trial.convert.channel_mapping import read_recording
+from greybox.trial.convert.derived_signals import derive_signals
+from greybox.trial.raw_log import Recording
 from greybox.trial.repair import apply_repairs
 from greybox.vessel.vessel import Vessel
 

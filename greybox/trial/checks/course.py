@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.trial.checks.finding import Finding, Outcome, Repair
+from greybox.trial.checks.finding import Finding, Outcome
 from greybox.trial.checks.motion import make_motion
-from greybox.trial.recording import Recording
+from greybox.trial.raw_log import Recording
+from greybox.trial.steps import mend
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
@@ -80,7 +81,7 @@ def course_findings(recording: Recording, vessel: Vessel) -> tuple[list[Finding]
         f"subtract {bias:.3f} rad from psi once its mounting is known (import --fix-also "
         f"heading_bias does)",
         ("psi",),
-        (Repair("turn", ("psi",), (bias,)),),
+        (mend("turn_heading", ("psi",), angle=bias),),
         False,
         {"t": motion.t[rows], "drift": np.angle(drift)},
     )

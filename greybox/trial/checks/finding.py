@@ -7,31 +7,14 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from greybox.notebook import Shown, items, table
-from greybox.trial.recording import Recording
+from greybox.trial.raw_log import Recording
+from greybox.trial.steps import Step
 
 IDS = (
     "gap", "duplicate_time", "nan", "outlier", "stuck", "quantised", "unit", "frame", "sign",
     "clock_offset", "lever_arm", "heading_bias",
+    "heading_wrap", "position_jump", "position_hold", "time_format", "external_force", "actuator",
 )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Repair:
-    """What would mend a finding, for `greybox.trial.repair`.
-
-    Parameters
-    ----------
-    kind : str
-        ``order``, ``drop``, ``scale``, ``move`` (columns change places), ``rotate``
-        (earth-fixed to body axes), ``shift`` (in time), ``lever``, ``turn``.
-    channels : tuple of str
-    values : tuple of float
-        Factor, seconds, metres, radians or times of samples, as `kind` needs.
-    """
-
-    kind: Literal["order", "drop", "scale", "move", "rotate", "shift", "lever", "turn", "offset"]
-    channels: tuple[str, ...]
-    values: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, repr=False)
@@ -56,7 +39,7 @@ class Finding(Shown):
         What to do.
     channels : tuple of str
         All channels at fault.
-    repair : tuple of Repair
+    repair : tuple of Step
         What ``import --fix`` does; empty where nothing can be done.
     safe : bool
         Whether the repair needs no judgement.
@@ -72,7 +55,7 @@ class Finding(Shown):
     evidence: str
     fix: str
     channels: tuple[str, ...] = ()
-    repair: tuple[Repair, ...] = ()
+    repair: tuple[Step, ...] = ()
     safe: bool = False
     picture: Mapping[str, Any] = field(default_factory=dict)
 

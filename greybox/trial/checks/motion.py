@@ -17,9 +17,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.trial.deriving import continuous
-from greybox.trial.recording import Recording, Signal
-from greybox.trial.resampling import clock, covered, runs
+from greybox.trial.convert.derived_signals import continuous
+from greybox.trial.convert.resample import clock, covered, runs
+from greybox.trial.raw_log import Recording, Signal
 
 Array = NDArray[np.float64]
 

@@ -15,11 +15,11 @@ from typing import Any
 
 from greybox.errors import LogError
 from greybox.trial.readers import mcapfile, rosdatabase
-from greybox.trial.readers.bagparts import MAX_CHUNK, Budget, CutError, Message, Wanted
-from greybox.trial.readers.inflating import inflate_file, inflate_zstd
+from greybox.trial.readers.decompress import inflate_file, inflate_zstd
 from greybox.trial.readers.mcapfile import read_mcap
 from greybox.trial.readers.rosbag1 import read_bag1
 from greybox.trial.readers.rosdatabase import read_database
+from greybox.trial.readers.storage import MAX_CHUNK, Budget, CutError, Message, Wanted
 
 _MAX_METADATA = 4 * 2**20
 

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any, cast
 
 from greybox.errors import LogError, suggestion
+from greybox.trial.raw_log import Recording
 from greybox.trial.readers.table import TableFile
-from greybox.trial.recording import Recording
 
 # third parties add theirs: an entry point named after the ending, without the dot
 GROUP = "greybox.readers"

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from greybox.errors import LogError
-from greybox.trial.names import spelled_unit
+from greybox.trial.convert.column_names import spelled_unit
 from greybox.trial.readers import cells
 from greybox.trial.readers.parquet import column_kind, column_values
 from greybox.trial.readers.table import Batch

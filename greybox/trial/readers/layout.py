@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from greybox.errors import LogError
-from greybox.trial.names import spelled_unit
+from greybox.trial.convert.column_names import spelled_unit
 from greybox.trial.readers import cells
 
 _FIRST_BYTES = 1 << 16

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from greybox.channels import unit_factor
 from greybox.errors import LogError, suggestion
 from greybox.files import sha256
+from greybox.trial.raw_log import Array, Recording, Signal, SourceFile
 from greybox.trial.readers.matfile import Tree, Unreadable, load_tree
-from greybox.trial.recording import Array, Recording, Signal, SourceFile
 
 MAX_COLUMNS = 64
 MAX_NOTES = 60

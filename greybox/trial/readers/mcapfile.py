@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from io import BytesIO
 from typing import IO
 
-from greybox.trial.readers.bagparts import (
+from greybox.trial.readers.decompress import inflate
+from greybox.trial.readers.storage import (
     Budget,
     Channel,
     CutError,
@@ -20,7 +21,6 @@ from greybox.trial.readers.bagparts import (
     skip,
     take,
 )
-from greybox.trial.readers.inflating import inflate
 
 MAGIC = b"\x89MCAP0\r\n"
 

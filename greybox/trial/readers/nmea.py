@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from greybox.errors import LogError
 from greybox.files import sha256
-from greybox.trial.recording import Recording, Signal, SourceFile
+from greybox.trial.raw_log import Recording, Signal, SourceFile
 
 Array = NDArray[np.float64]
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from greybox.channels import CHANNELS
 from greybox.errors import LogError, suggestion
 from greybox.files import sha256
-from greybox.trial.readers.bagparts import Budget, Channel
+from greybox.trial.raw_log import Array, Recording, Signal, SourceFile
 from greybox.trial.readers.bags import read_messages, storage_files
 from greybox.trial.readers.rosmessages import (
     Decoded,
@@ -30,7 +30,7 @@ from greybox.trial.readers.rosmessages import (
     decoder,
     numbers,
 )
-from greybox.trial.recording import Array, Recording, Signal, SourceFile
+from greybox.trial.readers.storage import Budget, Channel
 
 # numbers kept in memory over all topics, 1 GiB of them
 MAX_VALUES = 2**27

@@ -9,7 +9,8 @@ from io import BytesIO
 from typing import IO
 
 from greybox.errors import LogError
-from greybox.trial.readers.bagparts import (
+from greybox.trial.readers.decompress import inflate
+from greybox.trial.readers.storage import (
     Budget,
     Channel,
     CutError,
@@ -20,7 +21,6 @@ from greybox.trial.readers.bagparts import (
     skip,
     take,
 )
-from greybox.trial.readers.inflating import inflate
 
 
 def _fields(header: bytes) -> dict[str, bytes]:

@@ -9,7 +9,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from greybox.errors import LogError
-from greybox.trial.readers.bagparts import (
+from greybox.trial.readers.storage import (
     MAX_CHUNK,
     Budget,
     Channel,

@@ -12,7 +12,7 @@ import struct
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from greybox.trial.readers.bagparts import Channel
+from greybox.trial.readers.storage import Channel
 
 # longer arrays are covariances, ranges or images: noted, not signals
 MAX_ELEMENTS = 16

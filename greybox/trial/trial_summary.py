@@ -8,10 +8,10 @@ from typing import Any
 
 from greybox.errors import GreyboxError
 from greybox.notebook import Shown
-from greybox.trial.importing import import_recording
+from greybox.trial.convert.convert import import_recording
 from greybox.trial.log import TrialLog
 from greybox.trial.manoeuvres import Criterion, Manoeuvre, Quantity, Verdict, find_manoeuvres
-from greybox.trial.recording import Recording
+from greybox.trial.raw_log import Recording
 from greybox.trial.segments import by_sign
 from greybox.vessel.vessel import Vessel
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.trial.checks.finding import Finding, Repair
+from greybox.trial.checks.finding import Finding
 from greybox.trial.checks.motion import (
     Motion,
     Profile,
@@ -26,9 +26,10 @@ from greybox.trial.checks.motion import (
     solve,
     whiten,
 )
-from greybox.trial.recording import Recording
-from greybox.trial.resampling import clock as make_clock
-from greybox.trial.resampling import hold, runs
+from greybox.trial.convert.resample import clock as make_clock
+from greybox.trial.convert.resample import hold, runs
+from greybox.trial.raw_log import Recording
+from greybox.trial.steps import Step, mend
 from greybox.vessel.force import generalised_force
 from greybox.vessel.vessel import Vessel
 
@@ -51,7 +52,7 @@ class _Alternative:
     channels: tuple[str, ...]
     words: str
     fix: str
-    repair: tuple[Repair, ...]
+    repair: tuple[Step, ...]
 
 
 def response_findings(
@@ -270,7 +271,7 @@ def _alternatives(vessel: Vessel, commands: list[str]) -> list[_Alternative]:
             _Alternative(
                 (name,), f"{name} were reversed",
                 f"look at the sign of {name}: map it with sign = -1, or import --fix-also sign",
-                (Repair("scale", (name,), (-1.0,)),),
+                (mend("scale", (name,), factor=-1.0),),
             )
         )  # fmt: skip
     if len(angles) > 1:
@@ -278,7 +279,7 @@ def _alternatives(vessel: Vessel, commands: list[str]) -> list[_Alternative]:
             _Alternative(
                 tuple(angles), "all angles were reversed",
                 "map the angles with sign = -1, or import --fix-also sign",
-                (Repair("scale", tuple(angles), (-1.0,)),),
+                (mend("scale", tuple(angles), factor=-1.0),),
             )
         )  # fmt: skip
     for group in (speeds, angles):
@@ -288,7 +289,7 @@ def _alternatives(vessel: Vessel, commands: list[str]) -> list[_Alternative]:
                     (a, b), f"{a} and {b} were swapped",
                     f"look at which column belongs to which thruster: exchange {a} and {b} in the "
                     f"vessel file, or import --fix-also sign",
-                    (Repair("move", (a, b)),),
+                    (mend("exchange", (a, b)),),
                 )
             )  # fmt: skip
     for one, two in combinations(vessel.thrusters, 2):
@@ -303,7 +304,7 @@ def _alternatives(vessel: Vessel, commands: list[str]) -> list[_Alternative]:
                         f"swapped",
                         "exchange both columns of the two thrusters in the vessel file, or import "
                         "--fix-also sign",
-                        tuple(Repair("move", p) for p in pairs),
+                        tuple(mend("exchange", p) for p in pairs),
                     )
                 )  # fmt: skip
     return found
@@ -312,8 +313,8 @@ def _alternatives(vessel: Vessel, commands: list[str]) -> list[_Alternative]:
 def _as_read(inputs: dict[str, Array], alternative: _Alternative) -> dict[str, Array]:
     out = dict(inputs)
     for step in alternative.repair:
-        if step.kind == "scale":
-            out |= {c: out[c] * step.values[0] for c in step.channels}
+        if step.operation == "scale":
+            out |= {c: out[c] * step.number("factor") for c in step.channels}
         else:
             a, b = step.channels
             out |= {a: out[b], b: out[a]}

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.trial.recording import Recording, Signal
+from greybox.trial.raw_log import Recording, Signal
 
 Array = NDArray[np.float64]
 

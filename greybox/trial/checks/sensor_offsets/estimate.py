@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.trial.checks.motion import GAINS, profile, solve, whiten
-from greybox.trial.checks.offset_tie import Candidate, State, Tie, size
+from greybox.trial.checks.sensor_offsets.model import Candidate, State, Tie, size
 
 Array = NDArray[np.float64]
 

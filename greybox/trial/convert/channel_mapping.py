@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from greybox.channels import CHANNELS, unit_factor
 from greybox.errors import LogError, suggestion
 from greybox.files import sha256
-from greybox.trial.completing import wind_state
-from greybox.trial.names import Assigned, assign
+from greybox.trial.convert.column_names import Assigned, assign
+from greybox.trial.convert.derived_channels import wind_state
+from greybox.trial.raw_log import Recording, Signal, SourceFile
 from greybox.trial.readers.formats import open_raw
 from greybox.trial.readers.table import Batch, TableFile, read_columns
-from greybox.trial.recording import Recording, Signal, SourceFile
-from greybox.trial.writing import read_record, recorded_provenance
+from greybox.trial.store import read_record, recorded_provenance
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import LogError
-from greybox.trial.deriving import derive_signals
-from greybox.trial.recording import Recording, Signal
-from greybox.trial.resampling import usual_step
+from greybox.trial.convert.derived_signals import derive_signals
+from greybox.trial.convert.resample import usual_step
+from greybox.trial.raw_log import Recording, Signal
 
 Array = NDArray[np.float64]
 

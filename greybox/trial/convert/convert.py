@@ -10,20 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.notebook import Shown, items, table
-from greybox.trial.completing import complete_channels
-from greybox.trial.log import Provenance, TrialLog
-from greybox.trial.options import ImportOptions
-from greybox.trial.ordering import clean_signals
-from greybox.trial.planning import (
-    MIN_SEGMENT,
-    Plan,
-    extent,
-    gap_notes,
-    plan_import,
-    too_short,
-)
-from greybox.trial.recording import Recording, Signal
-from greybox.trial.resampling import (
+from greybox.trial.convert.deduplicate import clean_signals
+from greybox.trial.convert.derived_channels import complete_channels
+from greybox.trial.convert.options import ImportOptions
+from greybox.trial.convert.resample import (
     Clock,
     clock,
     covered,
@@ -32,6 +22,16 @@ from greybox.trial.resampling import (
     interpolate,
     runs,
 )
+from greybox.trial.convert.time_grid import (
+    MIN_SEGMENT,
+    Plan,
+    extent,
+    gap_notes,
+    plan_import,
+    too_short,
+)
+from greybox.trial.log import Provenance, TrialLog
+from greybox.trial.raw_log import Recording, Signal
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]

@@ -14,9 +14,10 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.trial.checks.finding import Finding, Outcome, Repair
+from greybox.trial.checks.finding import Finding, Outcome
 from greybox.trial.checks.motion import Motion, integrate, levels, profile, turn
-from greybox.trial.deriving import continuous
+from greybox.trial.convert.derived_signals import continuous
+from greybox.trial.steps import Step, mend
 
 Array = NDArray[np.float64]
 Values = dict[str, Array]
@@ -44,7 +45,7 @@ class Change:
     channels : tuple of str
     apply : callable
         Values -> values, on the grid.
-    repair : tuple of Repair
+    repair : tuple of Step
     words : str
         What the log holds, for the evidence.
     fix : str
@@ -58,7 +59,7 @@ class Change:
     group: str
     channels: tuple[str, ...]
     apply: Callable[[Values], Values]
-    repair: tuple[Repair, ...]
+    repair: tuple[Step, ...]
     words: str
     fix: str
     value: float = -1.0
@@ -77,7 +78,7 @@ def _permuted(names: tuple[str, ...]) -> Callable[[Values], Values]:
 
 def _sign(*names: str, group: str, cost: float = 1.0) -> Change:
     return Change(
-        "sign", group, names, _scaled(names, -1.0), (Repair("scale", names, (-1.0,)),),
+        "sign", group, names, _scaled(names, -1.0), (mend("scale", names, factor=-1.0),),
         f"{' and '.join(names)} {'is' if len(names) == 1 else 'are'} reversed",
         f"change the sign of {' and '.join(names)} (import --fix does), or map it with sign = -1",
         cost=cost,
@@ -86,7 +87,7 @@ def _sign(*names: str, group: str, cost: float = 1.0) -> Change:
 
 def _unit(names: tuple[str, ...], group: str, factor: float, said: str, held: str) -> Change:
     return Change(
-        "unit", group, names, _scaled(names, factor), (Repair("scale", names, (factor,)),),
+        "unit", group, names, _scaled(names, factor), (mend("scale", names, factor=factor),),
         f"{' and '.join(names)} {'holds' if len(names) == 1 else 'hold'} {held} under a {said} "
         f"name",
         f"multiply by {factor:.5g} (import --fix does), or map with unit = \"{held}\"",
@@ -96,7 +97,7 @@ def _unit(names: tuple[str, ...], group: str, factor: float, said: str, held: st
 
 def _swap(a: str, b: str, *, group: str, words: str = "") -> Change:
     return Change(
-        "sign", group, (a, b), _permuted((a, b)), (Repair("move", (a, b)),),
+        "sign", group, (a, b), _permuted((a, b)), (mend("exchange", (a, b)),),
         f"{a} and {b} are swapped{words}",
         f"exchange {a} and {b} (import --fix does), or correct [columns]",
         0.0,
@@ -110,7 +111,7 @@ def _earth(names: tuple[str, str], words: str) -> Change:
         return {**x, "u": c * north + s * east, "v": c * east - s * north}
 
     return Change(
-        "frame", "velocity", ("u", "v"), apply, (Repair("rotate", names),),
+        "frame", "velocity", ("u", "v"), apply, (mend("earth_to_body", names),),
         f"u and v are velocities {words}, not along the body's axes",
         "turn them by the heading into body axes (import --fix does), or map them to "
         f"{'v_n and v_e' if names[0] == 'u' else 'v_e and v_n'} in [columns]",
@@ -126,19 +127,19 @@ _PSI = (
     _sign("psi", group="psi"),
     Change(
         "frame", "psi", ("psi",), lambda x: {**x, "psi": np.pi / 2 - x["psi"]},
-        (Repair("scale", ("psi",), (-1.0,)), Repair("offset", ("psi",), (np.pi / 2,))),
+        (mend("scale", ("psi",), factor=-1.0), mend("offset", ("psi",), offset=np.pi / 2)),
         "psi counts from east, anticlockwise, not from north, clockwise",
         "replace psi by pi/2 - psi (import --fix does)", 0.0, "1",
     ),
     Change(
-        "unit", "psi", ("psi",), _degrees, (Repair("scale", ("psi",), (_DEG,)),),
+        "unit", "psi", ("psi",), _degrees, (mend("scale", ("psi",), factor=_DEG),),
         "psi holds degrees under a radian name",
         "multiply psi by pi/180 (import --fix does), or map it with unit = \"deg\" in [columns]",
         180 / np.pi, "deg per rad",
     ),
     Change(
         "sign", "psi", ("psi",), lambda x: {**x, "psi": x["psi"] + np.pi},
-        (Repair("offset", ("psi",), (np.pi,)),),
+        (mend("offset", ("psi",), offset=np.pi),),
         "psi points astern",
         "add half a turn to psi", np.pi, "rad", cost=1.1,
     ),

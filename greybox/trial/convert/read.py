@@ -1,7 +1,7 @@
 """Reading a clean log from CSV or Parquet, with the vessel's column names and units.
 
-Logs that may hold defects are read by `greybox.trial.canonical` and made clean
-by `greybox.trial.importing`; this reader refuses what it would have to mend.
+Logs that may hold defects are read by `greybox.trial.convert.channel_mapping` and made clean
+by `greybox.trial.convert.convert`; this reader refuses what it would have to mend.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from numpy.typing import NDArray
 from greybox.channels import CHANNELS, unit_factor
 from greybox.errors import LogError, suggestion
 from greybox.files import sha256
-from greybox.trial.conditioning import velocities_from_positions
-from greybox.trial.correcting import correct_channels, said_antenna, too_late
+from greybox.trial.convert.column_names import Assigned, assign
+from greybox.trial.convert.sensor_corrections import correct_channels, said_antenna, too_late
+from greybox.trial.kinematics import velocities_from_positions
 from greybox.trial.log import Provenance, TrialLog
-from greybox.trial.names import Assigned, assign
+from greybox.trial.raw_log import Recording
 from greybox.trial.readers.formats import open_raw
 from greybox.trial.readers.table import Batch, TableFile, read_columns
-from greybox.trial.recording import Recording
+from greybox.trial.store import read_record, recorded_provenance
 from greybox.trial.wind import relative_wind, relative_wind_from_direction
-from greybox.trial.writing import read_record, recorded_provenance
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]

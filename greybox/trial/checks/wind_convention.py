@@ -7,9 +7,10 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.trial.checks.finding import Finding, Repair
+from greybox.trial.checks.finding import Finding
 from greybox.trial.checks.motion import make_motion, smooth, turn
-from greybox.trial.recording import Recording
+from greybox.trial.raw_log import Recording
+from greybox.trial.steps import Step, mend
 
 Array = NDArray[np.float64]
 
@@ -18,9 +19,9 @@ _RATIO = 3.0
 _LEAST_TURN = np.radians(60)
 _BLOCK_SECONDS = 20.0
 
-Convention = tuple[str, str, str, tuple[Repair, ...], Callable[[Array, Array, Array], Array]]
+Convention = tuple[str, str, str, tuple[Step, ...], Callable[[Array, Array, Array], Array]]
 
-_NEGATED = (Repair("scale", ("u_q", "v_q"), (-1.0,)),)
+_NEGATED = (mend("scale", ("u_q", "v_q"), factor=-1.0),)
 _CONVENTIONS: tuple[Convention, ...] = (
     (
         "sign", "u_q and v_q are the wind, not the velocity of the ship through the air",
@@ -28,17 +29,17 @@ _CONVENTIONS: tuple[Convention, ...] = (
     ),
     (
         "sign", "v_q is reversed (the wind's direction counts anticlockwise)",
-        "change the sign of v_q (import --fix does)", (Repair("scale", ("v_q",), (-1.0,)),),
+        "change the sign of v_q (import --fix does)", (mend("scale", ("v_q",), factor=-1.0),),
         lambda u, v, psi: u - 1j * v,
     ),
     (
         "sign", "u_q is reversed",
-        "change the sign of u_q (import --fix does)", (Repair("scale", ("u_q",), (-1.0,)),),
+        "change the sign of u_q (import --fix does)", (mend("scale", ("u_q",), factor=-1.0),),
         lambda u, v, psi: -u + 1j * v,
     ),
     (
         "sign", "u_q and v_q are swapped",
-        "exchange u_q and v_q (import --fix does)", (Repair("move", ("u_q", "v_q")),),
+        "exchange u_q and v_q (import --fix does)", (mend("exchange", ("u_q", "v_q")),),
         lambda u, v, psi: v + 1j * u,
     ),
     (

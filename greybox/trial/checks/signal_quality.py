@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.channels import ANGLES
-from greybox.trial.checks.finding import Finding, Repair
-from greybox.trial.deriving import continuous
-from greybox.trial.recording import Recording, Signal
-from greybox.trial.resampling import HOLE, clock, runs
+from greybox.trial.checks.finding import Finding
+from greybox.trial.convert.derived_signals import continuous
+from greybox.trial.convert.resample import HOLE, clock, runs
+from greybox.trial.raw_log import Recording, Signal
+from greybox.trial.steps import mend
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
@@ -65,7 +66,7 @@ def time_findings(recording: Recording) -> list[Finding]:
                     "sort the rows by time and keep the first of those that repeat "
                     "(import --fix does)",
                     ("t",),
-                    (Repair("order", names),),
+                    (mend("order", names),),
                     True,
                     {"t": finite, "steps": steps, "names": names},
                 )
@@ -150,7 +151,7 @@ def missing_findings(recording: Recording) -> list[Finding]:
                 f"{len(stretches)} stretch{'es' if len(stretches) > 1 else ''}, {where}",
                 "leave them out: import does, and keeps longer stretches as gaps",
                 names,
-                (Repair("drop", names),),
+                (mend("drop", names),),
                 True,
                 {"t": t, "bad": bad},
             )
@@ -195,7 +196,7 @@ def spike_findings(recording: Recording) -> list[Finding]:
                 "leave those samples out (import --fix does; what is missing is bridged where "
                 "one sample is, else a gap)",
                 (s.name,),
-                (Repair("drop", (s.name,), tuple(float(x) for x in t[spikes])),),
+                (mend("drop", (s.name,), times=tuple(float(x) for x in t[spikes])),),
                 True,
                 {"t": t, "value": value, "spikes": spikes, "worst": int(worst), "distance": gap},
             )
@@ -423,7 +424,7 @@ def stuck_findings(recording: Recording, vessel: Vessel) -> list[Finding]:
                 f"t = {t[a]:.6g} s ({b - a} samples), while the other channels move",
                 "leave that stretch out (import --fix makes it a gap) and look at the sensor",
                 (s.name,),
-                (Repair("drop", (s.name,), tuple(float(x) for x in t[a + 1 : b])),),
+                (mend("drop", (s.name,), times=tuple(float(x) for x in t[a + 1 : b])),),
                 True,
                 {"t": t, "value": value, "stretch": (float(t[a]), float(t[b - 1]))},
             )
@@ -494,7 +495,7 @@ def angle_unit_findings(recording: Recording, vessel: Vessel) -> list[Finding]:
                     f"multiply {s.name} by pi/180 (import --fix does), or map it with "
                     f'unit = "deg" in [columns]',
                     (s.name,),
-                    (Repair("scale", (s.name,), (factor,)),),
+                    (mend("scale", (s.name,), factor=factor),),
                     True,
                     {"t": s.t, "value": s.value, "limit": float(limit)},
                 )

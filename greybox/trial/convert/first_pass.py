@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from greybox.channels import CHANNELS
 from greybox.errors import LogError
-from greybox.trial.canonical import (
+from greybox.trial.convert.channel_mapping import (
     TimeScale,
     angle_reach,
     angle_unit,
@@ -19,14 +19,14 @@ from greybox.trial.canonical import (
     time_scale,
     unused_mappings,
 )
-from greybox.trial.deriving import derive_signals
-from greybox.trial.names import Assigned
-from greybox.trial.options import ImportOptions
-from greybox.trial.planning import Extent, Plan, extent, plan_import
+from greybox.trial.convert.column_names import Assigned
+from greybox.trial.convert.derived_signals import derive_signals
+from greybox.trial.convert.options import ImportOptions
+from greybox.trial.convert.resample import clock
+from greybox.trial.convert.time_grid import Extent, Plan, extent, plan_import
+from greybox.trial.raw_log import Recording, Signal
 from greybox.trial.readers.table import Batch, TableFile
-from greybox.trial.recording import Recording, Signal
-from greybox.trial.resampling import clock
-from greybox.trial.writing import read_record, recorded_provenance
+from greybox.trial.store import read_record, recorded_provenance
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]

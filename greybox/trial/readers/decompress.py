@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import IO
 
 from greybox.errors import LogError
-from greybox.trial.readers.bagparts import Budget
+from greybox.trial.readers.storage import Budget
 
 # a window of 128 MiB is what the zstd tool itself accepts without being asked
 _ZSTD_WINDOW = 2**27

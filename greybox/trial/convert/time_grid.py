@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import LogError
-from greybox.trial.options import ImportOptions
-from greybox.trial.resampling import Clock, nice_period
+from greybox.trial.convert.options import ImportOptions
+from greybox.trial.convert.resample import Clock, nice_period
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from greybox.channels import LOGGED
 from greybox.errors import LogError, suggestion
-from greybox.trial.conditioning import velocities_from_positions
-from greybox.trial.correcting import said_antenna
-from greybox.trial.deriving import earth_to_body
-from greybox.trial.options import ImportOptions
+from greybox.trial.convert.derived_signals import earth_to_body
+from greybox.trial.convert.options import ImportOptions
+from greybox.trial.convert.sensor_corrections import said_antenna
+from greybox.trial.kinematics import velocities_from_positions
 from greybox.trial.wind import move_anemometer, wind_at_height
 from greybox.vessel.vessel import Vessel
 

@@ -13,25 +13,25 @@ from numpy.typing import NDArray
 
 from greybox.errors import LogError
 from greybox.files import sha256
-from greybox.trial.canonical import (
+from greybox.trial.checks.check import check_recording
+from greybox.trial.convert.channel_mapping import (
     batch_recording,
     canonical,
     merge,
     read_recording,
     unused_mappings,
 )
-from greybox.trial.checks.check import check_recording
-from greybox.trial.importing import cut_segments, import_recording, make_provenance
+from greybox.trial.convert.convert import cut_segments, import_recording, make_provenance
+from greybox.trial.convert.deduplicate import clean_signals
+from greybox.trial.convert.first_pass import Scan, scan_table
+from greybox.trial.convert.options import ImportOptions
+from greybox.trial.convert.time_grid import gap_notes, too_short
 from greybox.trial.log import Provenance, TrialLog
-from greybox.trial.options import ImportOptions
-from greybox.trial.ordering import clean_signals
-from greybox.trial.planning import gap_notes, too_short
+from greybox.trial.raw_log import Recording, SourceFile
 from greybox.trial.readers.formats import open_raw
 from greybox.trial.readers.table import Batch, TableFile
-from greybox.trial.recording import Recording, SourceFile
 from greybox.trial.repair import repair
-from greybox.trial.scan import Scan, scan_table
-from greybox.trial.writing import record_path, write_log
+from greybox.trial.store import record_path, write_log
 from greybox.vessel.vessel import Vessel
 
 # tables that may hold more numbers are imported in blocks

@@ -11,8 +11,8 @@ from dataclasses import replace
 import numpy as np
 
 from greybox.trial.checks.motion import Motion
-from greybox.trial.checks.offset_fit import Fit, estimate_gain, fit, scan
-from greybox.trial.checks.offset_tie import Candidate, State, Tie, size
+from greybox.trial.checks.sensor_offsets.estimate import Fit, estimate_gain, fit, scan
+from greybox.trial.checks.sensor_offsets.model import Candidate, State, Tie, size
 from greybox.vessel.vessel import Vessel
 
 # what is too small to matter, and how many standard errors prove it

@@ -10,9 +10,9 @@ from __future__ import annotations
 
 from greybox.trial.checks.finding import Finding, Outcome
 from greybox.trial.checks.motion import Motion
-from greybox.trial.checks.offset_findings import IDS, offset_findings, offset_outcomes
-from greybox.trial.checks.offset_selection import select_candidates, usable_candidates
-from greybox.trial.checks.offset_tie import State, Tie
+from greybox.trial.checks.sensor_offsets.findings import IDS, offset_findings, offset_outcomes
+from greybox.trial.checks.sensor_offsets.model import State, Tie
+from greybox.trial.checks.sensor_offsets.select import select_candidates, usable_candidates
 from greybox.vessel.vessel import Vessel
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import LogError
-from greybox.trial.deriving import earth_to_body
+from greybox.trial.convert.derived_signals import earth_to_body
 from greybox.trial.log import TrialLog
 from greybox.vessel.vessel import Vessel
 

@@ -7,16 +7,17 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.trial.checks.finding import Finding, Outcome, Repair
+from greybox.trial.checks.finding import Finding, Outcome
 from greybox.trial.checks.motion import Motion
-from greybox.trial.checks.offset_fit import Fit, fit
-from greybox.trial.checks.offset_selection import (
+from greybox.trial.checks.sensor_offsets.estimate import Fit, fit
+from greybox.trial.checks.sensor_offsets.model import Candidate, Tie, size
+from greybox.trial.checks.sensor_offsets.select import (
     NEARLY,
     net_likelihood,
     sample_inflation,
     significance,
 )
-from greybox.trial.checks.offset_tie import Candidate, Tie, size
+from greybox.trial.steps import mend
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
@@ -120,7 +121,7 @@ def _clock_finding(c: Candidate, value: float, std: float, motion: Motion) -> Fi
         f"shift {names} by {-value:+.2f} s (import --fix does), and look for the delay in the "
         f"logger or a filter",
         channels,
-        (Repair("shift", channels, (value,)),),
+        (mend("shift", channels, late=value),),
         True,
     )
 
@@ -144,7 +145,7 @@ def _heading_finding(value: float, std: float) -> Finding:
         f"subtract {value:.4f} rad from psi if the compass is misaligned (import --fix-also "
         f"heading_bias does), or turn u, v by as much if the velocity sensor is",
         ("psi",),
-        (Repair("turn", ("psi",), (value,)),),
+        (mend("turn_heading", ("psi",), angle=value),),
         False,
     )
 
@@ -165,10 +166,11 @@ def _arm_finding(arm: Array, std: Array, antenna: tuple[float, ...]) -> Finding:
         f"the positions to where the vessel file has them",
         ("x_n", "y_n"),
         (
-            Repair(
-                "lever",
+            mend(
+                "move_antenna",
                 ("x_n", "y_n"),
-                tuple(float(a - d) for a, d in zip(arm, antenna, strict=True)),
+                x=float(arm[0] - antenna[0]),
+                y=float(arm[1] - antenna[1]),
             ),
         ),
         True,

@@ -1,0 +1,1 @@
+"""From raw signals to a log: mapping, time grid, resampling, derived channels, corrections."""
