@@ -6,7 +6,8 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from greybox.channels import CHANNELS
+from greybox.channels import CHANNELS, unit_factor
+from greybox.errors import LogError
 from greybox.vessel.vessel import Vessel
 
 _UNIT_WORDS = {
@@ -154,12 +155,27 @@ def assign(
     -------
     dict of str to Assigned
         By canonical name; each at most once.
+
+    Raises
+    ------
+    LogError
+        ``[columns]`` maps two of the columns to one name.
     """
     columns, units, defined = list(columns), units or {}, set(canonical)
     found: dict[str, Assigned] = {}
     for raw, mapping in vessel.columns.items():
-        if raw in columns:
-            found[mapping.name] = Assigned(raw, mapping.name, mapping.unit, mapping.sign, "mapped")
+        name = mapping.name
+        if raw not in columns:
+            continue
+        if name in found:
+            raise LogError(
+                f"columns '{found[name].raw}' and '{raw}' are both there, and [columns] maps both "
+                f"to '{name}': remove one of the two lines from the vessel file."
+            )
+        unit = mapping.unit or _mapped_unit(raw, vessel.unit(name), units)
+        # without a unit it promises what the canonical name does
+        how = "mapped" if mapping.unit else "exact"
+        found[name] = Assigned(raw, name, unit, mapping.sign, how)
     taken = {a.raw for a in found.values()}
     loop = [vessel.closed_loop[0]] if vessel.closed_loop else []
     for raw in columns:
@@ -193,6 +209,14 @@ def assign(
     return found
 
 
+def _mapped_unit(raw: str, target: str | None, units: Mapping[str, str]) -> str | None:
+    """Return the unit of a column that is mapped without one: as it states itself, or SI."""
+    unit = units.get(raw, split_unit(raw)[1])
+    if unit == "ms" and target == "m/s":
+        return "m/s"
+    return unit if unit is not None and target is not None and _fits(unit, target) else target
+
+
 def _pointless(name: str, found: Mapping[str, Assigned]) -> bool:
     """Whether a guess would only repeat what is there in a better form."""
     mapped = {n for n, a in found.items() if a.how != "guessed"}
@@ -215,9 +239,6 @@ def _rank(stem: str, spellings: tuple[str, ...]) -> int | None:
 
 
 def _fits(unit: str, target: str) -> bool:
-    from greybox.channels import unit_factor
-    from greybox.errors import LogError
-
     try:
         unit_factor(unit, target, "")
     except LogError:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.channels import CHANNELS, unit_factor
+from greybox.channels import unit_factor
 from greybox.errors import LogError, suggestion
 from greybox.files import sha256
 from greybox.trial.convert.column_names import Assigned, assign
@@ -254,10 +254,9 @@ def _canonical(
         if beside in assigned and not np.isfinite(_floats(batch, assigned[beside])).all():
             assigned.pop(beside)
     for name, a in assigned.items():
-        target = CHANNELS[name].unit if name in CHANNELS else None
-        if name in vessel.recorded_angles:
-            target = "rad"
-        factor = a.sign * (unit_factor(a.unit, target, a.raw) if a.unit is not None else 1.0)
+        factor = a.sign * (
+            unit_factor(a.unit, vessel.unit(name), a.raw) if a.unit is not None else 1.0
+        )
         value = _finite(_floats(batch, a), a.raw, table)
         if a.raw in table.dates and name == "t":
             value = value - value[0]
