@@ -259,7 +259,7 @@ def test_bad_thrusters(change, message):
         ({"length": 10**5000}, "length is an integer too large to be read, a finite number"),
         ({"name": ["long"] * 100}, "name is \\['long', .{1,60}…, a word in quotes"),
         ({"columns": {"x": {"name": "psy", "unit": "deg"}}}, "Did you mean 'psi'"),
-        ({"columns": {"x": {"name": "psi", "unit": "degree"}}}, "unknown unit 'degree'"),
+        ({"columns": {"x": {"name": "psi", "unit": "degre"}}}, "unknown unit 'degre'"),
         ({"columns": {"x": {"name": "psi", "unit": "m"}}}, "of the same dimension"),
         ({"sensors": {"heding_std": 1}}, "Did you mean 'heading_std'"),
         ({"sensors": {"antenna": [1]}}, "needs 2 numbers"),
