@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from greybox.model.structure import Structure
     from greybox.prediction.predict import predict_manoeuvre
     from greybox.prediction.result import ManoeuvrePrediction
-    from greybox.trial.checks.check import check_files, check_recording
+    from greybox.trial.checks.check import check_files, check_recording, check_recordings
     from greybox.trial.checks.finding import CheckReport, Finding
     from greybox.trial.convert.channel_mapping import read_recording
     from greybox.trial.convert.convert import import_recording
@@ -85,6 +85,7 @@ _WHERE = {
     "build_predictor": "greybox.model.predictor",
     "check_files": "greybox.trial.checks.check",
     "check_recording": "greybox.trial.checks.check",
+    "check_recordings": "greybox.trial.checks.check",
     "compare_models": "greybox.validation.comparison",
     "decimate": "greybox.trial.kinematics",
     "estimate_iv": "greybox.estimation.estimate",
@@ -142,6 +143,7 @@ __all__ = [
     "build_predictor",
     "check_files",
     "check_recording",
+    "check_recordings",
     "compare_models",
     "decimate",
     "describe_recording",
