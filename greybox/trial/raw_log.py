@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from greybox.notebook import Shown, items, number, sparkline, table
+from greybox.trial.steps import Step
 
 Array = NDArray[np.float64]
 
@@ -84,8 +84,9 @@ class Recording(Shown):
         What was guessed, skipped or recovered while reading, one sentence each.
     guessed : frozenset of str
         Signals whose meaning was guessed: another file that states it is preferred.
-    derived : tuple of str
-        What was derived before, where the file is a log that greybox wrote.
+    steps : tuple of Step
+        What was done to the signals, in order; also before, where the file is a log that
+        greybox wrote.
     """
 
     name: str
@@ -95,7 +96,7 @@ class Recording(Shown):
     files: tuple[SourceFile, ...] = ()
     notes: tuple[str, ...] = ()
     guessed: frozenset[str] = frozenset()
-    derived: tuple[str, ...] = ()
+    steps: tuple[Step, ...] = ()
 
     def __contains__(self, name: object) -> bool:
         return any(s.name == name for s in self.signals)
@@ -145,5 +146,6 @@ class Recording(Shown):
         """Return the recording with other signals and more notes."""
         return replace(self, signals=tuple(signals), notes=(*self.notes, *notes))
 
-
-Kind = Literal["motion", "input", "wind", "other"]
+    def with_steps(self, *steps: Step) -> Recording:
+        """Return the recording with more steps done."""
+        return replace(self, steps=(*self.steps, *steps))
