@@ -11,8 +11,9 @@ import pytest
 from greybox.errors import LogError, VesselError
 from greybox.trial.convert.read import read_log
 from greybox.trial.convert.sensor_corrections import correct_log
-from greybox.trial.convert.two_pass_import import import_files
+from greybox.trial.import_files import import_files
 from greybox.trial.log import make_log
+from greybox.trial.steps import mend
 from greybox.trial.store import write_log
 from greybox.vessel.toml import vessel_from_dict, vessel_to_dict
 
@@ -59,9 +60,11 @@ def test_reversed_channels_and_heading(tmp_path):
     log = read(wrong, tmp_path, ship(reversed=["r", "a"], heading_bias=0.08))
     for name, value in true.items():
         np.testing.assert_allclose(log[name], value, atol=1e-12)
-    said = log.provenance.derived
-    assert any(d.startswith('[sensors] reversed = ["a","r"]') for d in said)
-    assert any(d.startswith("[sensors] heading_bias = 0.08: psi turned back") for d in said)
+    done = {s.operation: s for s in log.provenance.steps}
+    assert set(done["scale"].channels) == {"r", "a"}
+    assert done["turn_heading"].parameters == {"angle": 0.08}
+    assert {s.decided_by for s in done.values()} == {"vessel"}
+    assert "heading turned back by 0.08 rad, as the vessel file states" in log.provenance.derived
 
 
 def test_velocities_that_were_made_with_the_heading_keep_their_course(tmp_path):
@@ -166,18 +169,19 @@ def test_a_corrected_log_is_not_corrected_again(tmp_path):
             np.testing.assert_allclose(log[name], once[name], atol=1e-12)
     more = read_log(tmp_path / "once.csv", ship(heading_bias=0.1))
     np.testing.assert_allclose(more["psi"], once["psi"] - 0.02, atol=1e-12)
-    assert any("heading_bias = 0.1:" in d for d in more.provenance.derived)
+    assert [s.parameters["angle"] for s in more.provenance.steps
+            if s.operation == "turn_heading"] == pytest.approx([0.08, 0.02])  # fmt: skip
 
 
 def test_what_import_mended_is_left_to_it(tmp_path):
     from dataclasses import replace
 
     log = make_log(ship(), signals(), STEP)
-    mended = replace(log.provenance, fixed=("heading_bias of psi: the heading is off",))
+    mended = replace(log.provenance, steps=(mend("turn_heading", ("psi",), angle=0.1),))
     write_log([replace(log, provenance=mended)], tmp_path / "log.csv")
     got = read_log(tmp_path / "log.csv", ship(heading_bias=0.1))
     np.testing.assert_allclose(got["psi"], log["psi"])
-    assert any("heading_bias is not applied: it was mended" in d for d in got.provenance.derived)
+    assert any("heading_bias is not applied: it was mended" in n for n in got.provenance.read)
 
 
 def test_a_plan_has_nothing_to_correct(tmp_path):

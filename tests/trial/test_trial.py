@@ -112,9 +112,8 @@ def test_heading_noise_is_divided_out():
 
 
 def test_polar_wind():
-    """(5.41), (5.42), and the sign of CONTRACT: wind from starboard gives v_q > 0."""
-    from_starboard = np.pi / 2
-    u_q, v_q = relative_wind(np.array([3.0]), np.array([-from_starboard]))
+    """(5.41), (5.42): wind from starboard gives v_q > 0."""
+    u_q, v_q = relative_wind(np.array([3.0]), np.array([np.pi / 2]))
     np.testing.assert_allclose([u_q[0], v_q[0]], [0, 3], atol=1e-12)
 
 
