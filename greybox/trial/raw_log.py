@@ -86,6 +86,8 @@ class Recording(Shown):
         Signals whose meaning was guessed: another file that states it is preferred.
     derived : tuple of str
         What was derived before, where the file is a log that greybox wrote.
+    mapped : mapping of str to str
+        Signal or column of words -> column that ``[columns]`` takes for it.
     """
 
     name: str
@@ -96,6 +98,7 @@ class Recording(Shown):
     notes: tuple[str, ...] = ()
     guessed: frozenset[str] = frozenset()
     derived: tuple[str, ...] = ()
+    mapped: Mapping[str, str] = field(default_factory=dict)
 
     def __contains__(self, name: object) -> bool:
         return any(s.name == name for s in self.signals)

@@ -120,16 +120,31 @@ def assign(
     -------
     dict of str to Assigned
         By canonical name; each at most once.
+
+    Raises
+    ------
+    LogError
+        ``[columns]`` maps two of the columns to one name.
     """
     columns, units, defined = list(columns), units or {}, set(canonical)
     found: dict[str, Assigned] = {}
     for raw, mapping in vessel.columns.items():
-        if raw in columns:
-            found[mapping.name] = Assigned(raw, mapping.name, mapping.unit, mapping.sign, "mapped")
+        name = mapping.name
+        if raw not in columns:
+            continue
+        if name in found:
+            raise LogError(
+                f"columns '{found[name].raw}' and '{raw}' are both there, and [columns] maps both "
+                f"to '{name}': remove one of the two lines from the vessel file."
+            )
+        unit = mapping.unit or _mapped_unit(raw, vessel.unit(name), units)
+        # without a unit it promises what the canonical name does
+        how = "mapped" if mapping.unit else "exact"
+        found[name] = Assigned(raw, name, unit, mapping.sign, how)
     taken = {a.raw for a in found.values()}
     loop = [vessel.closed_loop[0]] if vessel.closed_loop else []
     for raw in columns:
-        known = raw in CHANNELS or raw in vessel.commands or raw in loop
+        known = raw in CHANNELS or raw in vessel.recorded_columns or raw in loop
         if known and raw not in found and raw not in taken:
             # a canonical name promises its SI unit; a unit written beside it is believed
             unit = units.get(raw, CHANNELS[raw].unit if raw in CHANNELS else None)
@@ -157,6 +172,14 @@ def assign(
             found[name] = Assigned(raw, name, unit, 1, "guessed")
             taken.add(raw)
     return found
+
+
+def _mapped_unit(raw: str, target: str | None, units: Mapping[str, str]) -> str | None:
+    """Return the unit of a column that is mapped without one: as it states itself, or SI."""
+    unit = units.get(raw, split_unit(raw)[1])
+    if unit == "ms" and target == "m/s":
+        return "m/s"
+    return unit if unit is not None and target is not None and _fits(unit, target) else target
 
 
 def _pointless(name: str, found: Mapping[str, Assigned]) -> bool:
