@@ -70,7 +70,9 @@ def load_by_scipy(path: Path) -> Tree:
             raise LogError(str(answer["refused"]))
         if "damaged" in answer:
             raise MalformedError(str(answer["damaged"]))
-        numbers = bytearray((Path(folder) / _NUMBERS).read_bytes())
+        with open(Path(folder) / _NUMBERS, "rb") as handle:
+            numbers = bytearray(os.fstat(handle.fileno()).st_size)
+            handle.readinto(numbers)
         return {name: _unpacked(node, numbers) for name, node in answer["tree"].items()}
 
 
