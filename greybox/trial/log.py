@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from greybox.errors import LogError
 from greybox.notebook import Shown, items, number, sparkline, table
 from greybox.vessel.actuation import actuated_force
+from greybox.vessel.conditions import Conditions
 from greybox.vessel.vessel import Vessel
 
 if TYPE_CHECKING:
@@ -37,7 +38,10 @@ class Provenance:
     epoch : float, optional
         UNIX time [s] of ``t = 0``.
     notes : mapping of str to str
-        Draught, loading, depth, sea state and what else was noted of the trial.
+        What was noted of the trial, word for word.
+    conditions : Conditions
+        What the trial states of draught, trim, loading, water depth and sea state, and the
+        vessel file where the trial does not.
     """
 
     source: str = ""
@@ -48,6 +52,7 @@ class Provenance:
     read: tuple[str, ...] = ()
     epoch: float | None = None
     notes: Mapping[str, str] = field(default_factory=dict)
+    conditions: Conditions = field(default_factory=Conditions)
 
 
 @dataclass(frozen=True, repr=False)
@@ -99,6 +104,11 @@ class TrialLog(Shown):
         """Unit of ``t`` and of each channel; ``as logged`` where any unit is kept."""
         return {n: self.vessel.unit(n) or "as logged" for n in ("t", *self.channels)}
 
+    @property
+    def conditions(self) -> Conditions:
+        """Draught, trim, loading, water depth and sea state, as far as they are known."""
+        return self.provenance.conditions
+
     def summary(self) -> str:
         """Return name, duration, channels with units and ranges, and provenance, as text."""
         lines = [self._line()]
@@ -126,6 +136,7 @@ class TrialLog(Shown):
         p = self.provenance
         loop = float(np.mean(self.closed_loop)) if self.loop_known and len(self) else 0.0
         closed = [f"a controller moves the thrusters in {100 * loop:.0f} % of it"] if loop else []
+        closed += [f"conditions: {self.conditions.sentence}"] if self.conditions else []
         return [*closed, *(f"derived: {d}" for d in p.derived), *(f"mended: {f}" for f in p.fixed)]
 
     def _parts(self) -> tuple[str, ...]:
@@ -220,7 +231,8 @@ def make_log(
             raise LogError(f"'{key}' is not finite at sample {k}: cut or repair the log there.")
     size = next(iter(lengths.values()))
     t = arrays.pop("t", np.arange(size) * sample_time)
-    return TrialLog(name, sample_time, t, arrays, vessel, np.zeros(size, bool))
+    known = Provenance(conditions=vessel.conditions)
+    return TrialLog(name, sample_time, t, arrays, vessel, np.zeros(size, bool), provenance=known)
 
 
 def _range(a: Array) -> tuple[float | None, float | None, float | None]:

@@ -18,6 +18,7 @@ from greybox.errors import LogError
 from greybox.files import check_targets, replacing, sha256, write_json
 from greybox.trial.log import Provenance, TrialLog
 from greybox.trial.readers.limits import limits
+from greybox.vessel.conditions import Conditions
 
 _ROWS = 1 << 17
 
@@ -78,6 +79,7 @@ def write_log(
             f"cannot write '{path}': {error.strerror or error}. Nothing was written: make room, or "
             f"name a file elsewhere."
         ) from None
+    known = first.provenance if provenance is None else provenance()
     record = {
         "format": "greybox-log",
         "version": 1,
@@ -87,7 +89,8 @@ def write_log(
         "sample_time": first.sample_time,
         "units": {n: first.units[n] for n in names},
         "segments": _merged(spans, first.sample_time)[:1000],
-        **asdict(first.provenance if provenance is None else provenance()),
+        **asdict(known),
+        "conditions": known.conditions.to_dict(),
         **(extra or {}),
     }
     write_json(record, record_path(path))
@@ -179,6 +182,7 @@ def recorded_provenance(record: Mapping[str, Any]) -> Provenance:
         words("read"),
         float(epoch) if isinstance(epoch, int | float) else None,
         {str(k): str(v) for k, v in notes.items()} if isinstance(notes, dict) else {},
+        Conditions.recorded(record),
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from greybox.trial.readers.formats import open_raw
 from greybox.trial.readers.table import Batch, TableFile, read_columns
 from greybox.trial.store import read_record, recorded_provenance
 from greybox.units import is_unix_time, time_unit, unit_factor, unix_unit
+from greybox.vessel.conditions import Conditions
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
@@ -70,7 +72,7 @@ def read_recording(
         if record is not None:
             known = recorded_provenance(record)
             epoch = known.epoch if raw.epoch is None else raw.epoch
-            raw = replace(raw, epoch=epoch, derived=known.derived)
+            raw = replace(raw, epoch=epoch, derived=known.derived, conditions=known.conditions)
     else:
         assigned = assign(
             raw.names,
@@ -393,6 +395,7 @@ def merge(recordings: list[Recording]) -> Recording:
         tuple(f for r in recordings for f in r.files),
         tuple(notes),
         derived=tuple(dict.fromkeys(d for r in recordings for d in r.derived)),
+        conditions=reduce(Conditions.over, (r.conditions for r in recordings)),
     )
 
 

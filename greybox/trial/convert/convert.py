@@ -32,6 +32,7 @@ from greybox.trial.convert.time_grid import (
 )
 from greybox.trial.log import Provenance, TrialLog
 from greybox.trial.raw_log import Recording, Signal
+from greybox.vessel.conditions import Conditions
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
@@ -118,16 +119,25 @@ def import_recording(
     if not segments:
         raise too_short(plan)
     origin_notes = [n for n in notes if n not in recording.notes]
-    provenance = make_provenance(recording, options, (*recording.notes, *origin_notes), derived)
+    provenance = make_provenance(
+        recording, options, (*recording.notes, *origin_notes), derived, vessel.conditions
+    )
     provenance = replace(provenance, fixed=fixed)
     segments = [replace(s, provenance=provenance) for s in segments]
     return Imported(tuple(segments), (*recording.notes, *origin_notes, *derived))
 
 
 def make_provenance(
-    recording: Recording, options: ImportOptions, notes: Sequence[str], derived: Sequence[str]
+    recording: Recording,
+    options: ImportOptions,
+    notes: Sequence[str],
+    derived: Sequence[str],
+    default: Conditions,
 ) -> Provenance:
-    """Return where a log came from; what was derived before is kept."""
+    """Return where a log came from; what was derived before is kept.
+
+    `default` are the conditions where neither the recording nor the options state any.
+    """
     first = recording.files[0] if recording.files else None
     return Provenance(
         source=", ".join(f.name for f in recording.files) or recording.name,
@@ -137,6 +147,7 @@ def make_provenance(
         read=tuple(notes),
         epoch=recording.epoch,
         notes=dict(options.notes),
+        conditions=options.conditions.over(recording.conditions).over(default),
     )
 
 

@@ -172,7 +172,7 @@ def table_segments(
         "read %s: %d rows every %g s in %d segment(s); columns %s%s", path, len(t), sample_time,
         len(segments), ", ".join(map(str, table.columns)), "".join(f"; {d}" for d in derived),
     )  # fmt: skip
-    known = replace(known, derived=derived)
+    known = replace(known, derived=derived, conditions=known.conditions.over(vessel.conditions))
     return [replace(s, provenance=known) for s in segments]
 
 

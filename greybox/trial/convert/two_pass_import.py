@@ -186,7 +186,9 @@ class _Stream:
             self.table.path.stem, (), epoch=self.scan.scale.epoch, files=(self.file,),
             derived=self.scan.derived,
         )  # fmt: skip
-        return make_provenance(whole, self.options, list(notes), list(self.derived))
+        return make_provenance(
+            whole, self.options, list(notes), list(self.derived), self.vessel.conditions
+        )
 
     def segments(self) -> Iterator[TrialLog]:
         """Yield the pieces of the log in order of time.
