@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from greybox.notebook import Shown, items, number, sparkline, table
 from greybox.trial.steps import Step
+from greybox.vessel.conditions import Conditions
 
 Array = NDArray[np.float64]
 
@@ -89,6 +90,8 @@ class Recording(Shown):
         greybox wrote.
     mapped : mapping of str to str
         Signal or column of words -> column that ``[columns]`` takes for it.
+    conditions : Conditions
+        As stated before, where the file is a log that greybox wrote.
     """
 
     name: str
@@ -100,6 +103,7 @@ class Recording(Shown):
     guessed: frozenset[str] = frozenset()
     steps: tuple[Step, ...] = ()
     mapped: Mapping[str, str] = field(default_factory=dict)
+    conditions: Conditions = field(default_factory=Conditions)
 
     def __contains__(self, name: object) -> bool:
         return any(s.name == name for s in self.signals)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from greybox.trial.readers.table import Batch, TableFile, read_columns
 from greybox.trial.steps import Step, new_steps
 from greybox.trial.store import read_record, recorded_provenance
 from greybox.units import is_unix_time, time_unit, unit_factor, unix_unit
+from greybox.vessel.conditions import Conditions
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
@@ -71,7 +73,7 @@ def read_recording(
         if record is not None:
             known = recorded_provenance(record)
             epoch = known.epoch if raw.epoch is None else raw.epoch
-            raw = replace(raw, epoch=epoch, steps=known.steps)
+            raw = replace(raw, epoch=epoch, steps=known.steps, conditions=known.conditions)
     else:
         assigned = assign(
             raw.names,
@@ -394,6 +396,7 @@ def merge(recordings: list[Recording]) -> Recording:
         tuple(f for r in recordings for f in r.files),
         tuple(notes),
         steps=new_steps((), (step for r in recordings for step in r.steps)),
+        conditions=reduce(Conditions.over, (r.conditions for r in recordings)),
     )
 
 
