@@ -10,6 +10,7 @@ import json
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from typing import Any
 
 from greybox.trial.steps import RECORDED, Step, Value
@@ -44,6 +45,14 @@ def steps_of_sentences(derived: Iterable[str], fixed: Iterable[str]) -> tuple[St
             steps += _corrections(sentence, stated[1], stated[2], whole)
         else:
             steps.append(_derived(sentence))
+    polynomials = next((s for s in steps if s.operation == "local_polynomials"), None)
+    if polynomials is not None:
+        # they made the yaw rate too, whatever the sentence says
+        steps = [
+            replace(s, operation="local_polynomials", parameters={**s.parameters, "window":
+                    polynomials.number("window")})
+            if s.operation == "difference" and s.channels == ("r",) else s for s in steps
+        ]  # fmt: skip
     return tuple(steps)
 
 
@@ -62,8 +71,7 @@ def _mend(sentence: str) -> Step:
     operation, parameters = _MENDS.get(match[1] if match else "", ("recorded", {}))
     channels = tuple(match[2].split(", ")) if match else ()
     return Step(
-        operation, channels, (), {**parameters, RECORDED: sentence}, decided_by="check",
-        reason=sentence if operation == "recorded" else "",
+        operation, channels, (), {**parameters, RECORDED: sentence}, decided_by="check"
     )  # fmt: skip
 
 
@@ -75,7 +83,7 @@ def _derived(sentence: str) -> Step:
                 return make(sentence, match)
             except ValueError:
                 break
-    return Step("recorded", (), reason=sentence)
+    return _step(sentence, "recorded", ())
 
 
 def _corrections(sentence: str, key: str, text: str, whole: dict[str, Any]) -> list[Step]:
@@ -84,7 +92,7 @@ def _corrections(sentence: str, key: str, text: str, whole: dict[str, Any]) -> l
         value = json.loads(text)
         steps = list(_REMOVED[key](value, whole.get(key)))
     except (KeyError, ValueError, TypeError, AttributeError, IndexError):
-        return [Step("recorded", (), reason=sentence)]
+        return [_step(sentence, "recorded", ())]
     whole[key] = value
     return [
         Step(op, channels, (), {**parameters, RECORDED: sentence}, decided_by="vessel")

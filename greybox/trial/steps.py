@@ -12,6 +12,8 @@ DecidedBy = Literal["format", "vessel", "user", "check", "default"]
 Value = float | str | tuple[float, ...]
 # the parameter under which a step keeps how an older record tells of it
 RECORDED = "recorded"
+# numbers of a sequence that a record keeps: thousands of times would burst it
+_LONGEST = 1000
 _OF_MOTION = frozenset({"difference", "local_polynomials", "earth_to_body"})
 
 
@@ -81,14 +83,17 @@ class Step:
         return f"{said}: {self.reason}" if self.reason else said
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the step as JSON values."""
+        """Return the step as JSON values; of long sequences the beginning and the count."""
+        parameters: dict[str, Any] = {}
+        for name, value in self.parameters.items():
+            parameters[name] = list(value[:_LONGEST]) if isinstance(value, tuple) else value
+            if isinstance(value, tuple) and len(value) > _LONGEST:
+                parameters[f"{name}_count"] = len(value)
         return {
             "operation": self.operation,
             "channels": list(self.channels),
             "source": list(self.source),
-            "parameters": {
-                k: list(v) if isinstance(v, tuple) else v for k, v in self.parameters.items()
-            },
+            "parameters": parameters,
             "interval": None if self.interval is None else list(self.interval),
             "decided_by": self.decided_by,
             "reason": self.reason,
@@ -205,5 +210,5 @@ OPERATIONS: dict[str, Callable[[Step], str]] = {
         f"decimated from {s.number('measured'):g} s to {s.number('sample_time'):g} s"
     ),
     # what a record of an older version tells and this version has no operation for
-    "recorded": lambda s: s.reason,
+    "recorded": lambda s: f"{_names(s)} changed, as an older record tells",
 }
