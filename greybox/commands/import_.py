@@ -105,7 +105,7 @@ def run(options: argparse.Namespace) -> None:
 
     from greybox.errors import UsageError
     from greybox.files import check_targets, write_json
-    from greybox.trial.convert.two_pass_import import import_files
+    from greybox.trial.import_files import import_files
     from greybox.trial.store import read_record, record_path
     from greybox.vessel.toml import load_vessel
 

@@ -109,7 +109,7 @@ def extended_vessel(
         said["velocities_from_heading"] = True
     if any(sensors.lever):
         # velocities that follow from positions are those of the antenna
-        derived = any(d.startswith("u, v") for d in log.provenance.derived)
+        derived = any(s.derives_motion and "u" in s.channels for s in log.provenance.steps)
         key = "antenna" if derived else "velocity_at"
         before = tuple(said.get(key, (0.0, 0.0)))
         said[key] = (before[0] + sensors.lever[0], before[1] + sensors.lever[1], *before[2:])

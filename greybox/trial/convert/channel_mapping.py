@@ -15,10 +15,11 @@ from greybox.channels import CHANNELS
 from greybox.errors import LogError, suggestion
 from greybox.files import sha256
 from greybox.trial.convert.column_names import Assigned, assign
-from greybox.trial.convert.derived_channels import wind_state
+from greybox.trial.convert.derived_signals import wind_state
 from greybox.trial.raw_log import Recording, Signal, SourceFile
 from greybox.trial.readers.formats import open_raw
 from greybox.trial.readers.table import Batch, TableFile, read_columns
+from greybox.trial.steps import Step, new_steps
 from greybox.trial.store import read_record, recorded_provenance
 from greybox.units import is_unix_time, time_unit, unit_factor, unix_unit
 from greybox.vessel.conditions import Conditions
@@ -72,7 +73,7 @@ def read_recording(
         if record is not None:
             known = recorded_provenance(record)
             epoch = known.epoch if raw.epoch is None else raw.epoch
-            raw = replace(raw, epoch=epoch, derived=known.derived, conditions=known.conditions)
+            raw = replace(raw, epoch=epoch, steps=known.steps, conditions=known.conditions)
     else:
         assigned = assign(
             raw.names,
@@ -364,8 +365,8 @@ def merge(recordings: list[Recording]) -> Recording:
             )
     signals = []
     clocks: dict[tuple[int, ...], Array] = {}
-    derived = {r.name: r.derived for r in recordings}
     mapped = {(r.name, n): raw for r in recordings for n, raw in r.mapped.items()}
+    steps = {r.name: r.steps for r in recordings}
     for name, parts in found.items():
         kept = [parts[0]]
         for part in parts[1:]:
@@ -385,7 +386,7 @@ def merge(recordings: list[Recording]) -> Recording:
             else:
                 kept.append(part)
         if name in ("u_q", "v_q"):
-            _refuse_two_winds([(n, derived[n]) for n, _ in kept])
+            _refuse_two_winds([(n, steps[n]) for n, _ in kept])
         kept.sort(key=lambda p: _span(p[1])[0])
         # columns of one table go on sharing their clock
         key = tuple(id(p[1].t) for p in kept)
@@ -400,18 +401,18 @@ def merge(recordings: list[Recording]) -> Recording:
         epoch,
         tuple(f for r in recordings for f in r.files),
         tuple(notes),
-        derived=tuple(dict.fromkeys(d for r in recordings for d in r.derived)),
+        steps=new_steps((), (step for r in recordings for step in r.steps)),
         conditions=reduce(Conditions.over, (r.conditions for r in recordings)),
     )
 
 
-def _refuse_two_winds(parts: list[tuple[str, tuple[str, ...]]]) -> None:
+def _refuse_two_winds(parts: list[tuple[str, tuple[Step, ...]]]) -> None:
     """Refuse winds of several files that are not of one place and height."""
-    (first, derived), *others = parts
+    (first, steps), *others = parts
     for name, more in others:
-        if wind_state(more) != wind_state(derived):
+        if wind_state(more) != wind_state(steps):
             raise LogError(
-                f"the wind of '{first}' is {wind_state(derived)}, that of '{name}' is "
+                f"the wind of '{first}' is {wind_state(steps)}, that of '{name}' is "
                 f"{wind_state(more)}: they cannot be merged. Import both from their raw files."
             )
 
