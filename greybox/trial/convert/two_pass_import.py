@@ -7,7 +7,7 @@ the second goes the way of every import (`greybox.trial.convert.convert`) block 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import chain
 from typing import Any
 
@@ -40,6 +40,7 @@ from greybox.trial.raw_log import Recording, Signal, SourceFile
 from greybox.trial.readers.table import Batch, TableFile
 from greybox.trial.steps import Step, new_steps
 from greybox.trial.store import read_record, recorded_provenance
+from greybox.vessel.conditions import Conditions
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
@@ -70,6 +71,8 @@ class Scan:
     notes : tuple of str
     before : tuple of Step
         What was done before, where the table is a log that greybox wrote.
+    conditions : Conditions
+        As stated before, where it is.
     """
 
     assigned: dict[str, Assigned]
@@ -79,6 +82,7 @@ class Scan:
     plan: Plan
     notes: tuple[str, ...]
     before: tuple[Step, ...] = ()
+    conditions: Conditions = field(default_factory=Conditions)
 
 
 def scan_table(table: TableFile, vessel: Vessel, options: ImportOptions) -> Scan:
@@ -132,8 +136,9 @@ def scan_table(table: TableFile, vessel: Vessel, options: ImportOptions) -> Scan
             f"the first is kept"
         )
     return Scan(
-        decided, found.scale, found.origin, found.back, plan, (*notes, *plan.notes), before.steps
-    )
+        decided, found.scale, found.origin, found.back, plan, (*notes, *plan.notes), before.steps,
+        before.conditions,
+    )  # fmt: skip
 
 
 class _Parts:
@@ -312,6 +317,7 @@ class Stream:
         whole = Recording(
             self.table.path.stem, (), epoch=self.scan.scale.epoch, files=(self.file,),
             notes=tuple(notes), steps=(*self.scan.before, *self.steps),
+            conditions=self.scan.conditions,
         )  # fmt: skip
         return make_provenance(whole, self.options, self.vessel.conditions)
 
