@@ -10,9 +10,10 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from greybox.channels import CHANNELS, unit_factor
+from greybox.channels import CHANNELS
 from greybox.errors import LogError, VesselError, suggestion
 from greybox.files import nearest_file
+from greybox.units import unit_factor
 from greybox.vessel.thrust import ThrustLaw
 from greybox.vessel.vessel import (
     THRUSTER_TYPES,

@@ -244,7 +244,7 @@ def test_bad_thrusters(change, message):
     [
         ({"columns": {"psi [deg]": {"name": "psi"}}}, 'without a unit: add unit = "rad"'),
         ({"columns": {"x": {"name": "psy", "unit": "deg"}}}, "Did you mean 'psi'"),
-        ({"columns": {"x": {"name": "psi", "unit": "degree"}}}, "unknown unit 'degree'"),
+        ({"columns": {"x": {"name": "psi", "unit": "degre"}}}, "unknown unit 'degre'"),
         ({"columns": {"x": {"name": "psi", "unit": "m"}}}, "of the same dimension"),
         ({"sensors": {"heding_std": 1}}, "Did you mean 'heading_std'"),
         ({"sensors": {"antenna": [1]}}, "needs 2 numbers"),

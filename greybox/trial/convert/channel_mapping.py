@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.channels import CHANNELS, unit_factor
+from greybox.channels import CHANNELS
 from greybox.errors import LogError, suggestion
 from greybox.files import sha256
 from greybox.trial.convert.column_names import Assigned, assign
@@ -19,16 +19,13 @@ from greybox.trial.raw_log import Recording, Signal, SourceFile
 from greybox.trial.readers.formats import open_raw
 from greybox.trial.readers.table import Batch, TableFile, read_columns
 from greybox.trial.store import read_record, recorded_provenance
+from greybox.units import is_unix_time, time_unit, unit_factor, unix_unit
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
 
 MOTION = frozenset({"x_n", "y_n", "psi", "u", "v", "r", "v_n", "v_e", "lat", "lon", "sog"})
 
-# UNIX time is past 1e8 s since 1973, a log's own clock hardly ever is
-_EPOCH = 1e8
-# seconds past it are the year 5138: it is in milliseconds
-_LATEST = 1e11
 _HEAD = 10_000
 # files that overlap for less than this share of the shorter one follow one another
 _OVERLAP = 0.05
@@ -170,27 +167,20 @@ def time_scale(raw: Array, time: Assigned, table: TableFile) -> TimeScale:
             f"rows, it cannot be the time: map another column to 't' in [columns]."
         )
     head = finite[:_HEAD]
-    # one damaged value must not decide
     size = float(np.median(np.abs(head)))
     date, unit = time.raw in table.dates, time.unit
     notes: list[str] = []
-    stated = unit is not None and not (unit == "s" and time.how == "exact" and size > _LATEST)
+    # the name 't' alone promises seconds, which numbers of that size cannot be
+    stated = unit is not None and not (unit == "s" and time.how == "exact" and unix_unit(size))
     if not stated and not date:
-        for limit, spelled in ((1e17, "ns"), (1e14, "us"), (_LATEST, "ms")):
-            if size > limit:
-                unit = spelled
-                break
-        else:
-            steps = np.diff(head)
-            # nobody logs a manoeuvre every ten seconds, milliseconds are common
-            unit = "ms" if len(steps) and np.median(np.abs(steps)) >= 10 else "s"
+        unit = time_unit(head)
     if time.how == "guessed" or not stated:
         notes.append(f"column '{time.raw}' taken for time in {unit or 's'}")
     if date or time.raw in table.clocks:
         unit = "s"
     factor = unit_factor(unit or "s", "s", time.raw)
     first = float(finite[0])
-    if size * factor < _EPOCH and not date:
+    if not is_unix_time(size * factor) and not date:
         return TimeScale(factor, 0.0, None, tuple(notes))
     return TimeScale(factor, first, first * factor, tuple(notes))
 

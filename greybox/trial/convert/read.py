@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.channels import CHANNELS, unit_factor
+from greybox.channels import CHANNELS
 from greybox.errors import LogError, suggestion
 from greybox.files import sha256
 from greybox.trial.convert.column_names import Assigned, assign
@@ -28,6 +28,7 @@ from greybox.trial.readers.formats import open_raw
 from greybox.trial.readers.table import Batch, TableFile, read_columns
 from greybox.trial.store import read_record, recorded_provenance
 from greybox.trial.wind import relative_wind, relative_wind_from_direction
+from greybox.units import unit_factor
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from greybox.errors import LogError
-from greybox.trial.convert.column_names import spelled_unit
 from greybox.trial.readers import cells
+from greybox.units import spelled_unit
 
 _FIRST_BYTES = 1 << 16
 _MAX_HEAD = 1 << 22

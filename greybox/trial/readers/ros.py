@@ -31,6 +31,7 @@ from greybox.trial.readers.rosmessages import (
     numbers,
 )
 from greybox.trial.readers.storage import Budget, Channel
+from greybox.units import is_unix_time
 
 # numbers kept in memory over all topics, 1 GiB of them
 MAX_VALUES = 2**27
@@ -38,8 +39,6 @@ MAX_TOPICS = 2000
 MAX_FIELDS = 200
 # beyond this a header was stamped by another clock than the recorder's
 _CLOCKS = 3600.0
-# earlier than 1973 a time counts from a start, not from 1970
-_UNIX = 1e8
 
 _UNITS = {"lat": "deg", "lon": "deg", "altitude": "m"} | {
     name: CHANNELS[name].unit for name in ("x_n", "y_n", "psi", "u", "v", "r")
@@ -436,7 +435,7 @@ def _recording(
     clocks = [t.clock(notes) for t in full]
     first = min(int(c.min()) for c in clocks)
     epoch: float | None = first * 1e-9
-    if first * 1e-9 < _UNIX:
+    if not is_unix_time(first * 1e-9):
         notes.append(f"times begin at {first * 1e-9:.6g} s, so the clock does not count from 1970.")
         epoch = None
     keepers = _keepers(full)
