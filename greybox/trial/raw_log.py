@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.notebook import Shown, items, number, sparkline, table
+from greybox.trial.steps import Step
 
 Array = NDArray[np.float64]
 
@@ -86,6 +87,8 @@ class Recording(Shown):
         Signals whose meaning was guessed: another file that states it is preferred.
     derived : tuple of str
         What was derived before, where the file is a log that greybox wrote.
+    steps : tuple of Step
+        What was done to the signals, in order.
     """
 
     name: str
@@ -96,6 +99,7 @@ class Recording(Shown):
     notes: tuple[str, ...] = ()
     guessed: frozenset[str] = frozenset()
     derived: tuple[str, ...] = ()
+    steps: tuple[Step, ...] = ()
 
     def __contains__(self, name: object) -> bool:
         return any(s.name == name for s in self.signals)
@@ -144,6 +148,10 @@ class Recording(Shown):
     def with_signals(self, signals: Iterable[Signal], *notes: str) -> Recording:
         """Return the recording with other signals and more notes."""
         return replace(self, signals=tuple(signals), notes=(*self.notes, *notes))
+
+    def with_steps(self, *steps: Step) -> Recording:
+        """Return the recording with more steps done."""
+        return replace(self, steps=(*self.steps, *steps))
 
 
 Kind = Literal["motion", "input", "wind", "other"]

@@ -18,6 +18,7 @@ from greybox.trial.convert.derived_channels import wind_state
 from greybox.trial.raw_log import Recording, Signal, SourceFile
 from greybox.trial.readers.formats import open_raw
 from greybox.trial.readers.table import Batch, TableFile, read_columns
+from greybox.trial.steps import Step
 from greybox.trial.store import read_record, recorded_provenance
 from greybox.units import is_unix_time, time_unit, unit_factor, unix_unit
 from greybox.vessel.vessel import Vessel
@@ -93,7 +94,16 @@ def table_recording(
     scale = time_scale(batch[time.raw], time, table)
     recording = batch_recording(table, batch, assigned, scale, vessel)
     notes = (*table.notes, *scale.notes, *recording.notes)
-    return replace(recording, notes=notes), assigned
+    steps = tuple(_moved(s, -scale.zero) for s in table.steps)
+    return replace(recording, notes=notes, steps=steps), assigned
+
+
+def _moved(step: Step, shift: float) -> Step:
+    """Return a step with the places that it names on another zero of time."""
+    if "times" not in step.parameters:
+        return step
+    times = tuple(t + shift for t in step.numbers("times"))
+    return replace(step, parameters={**step.parameters, "times": times})
 
 
 def table_columns(table: TableFile, vessel: Vessel, *, guess: bool = True) -> dict[str, Assigned]:
@@ -385,6 +395,7 @@ def merge(recordings: list[Recording]) -> Recording:
         tuple(f for r in recordings for f in r.files),
         tuple(notes),
         derived=tuple(dict.fromkeys(d for r in recordings for d in r.derived)),
+        steps=tuple(s for r in recordings for s in r.steps),
     )
 
 

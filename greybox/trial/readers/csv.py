@@ -15,6 +15,7 @@ from greybox.errors import LogError
 from greybox.trial.readers import cells as cell_text
 from greybox.trial.readers.layout import find_layout
 from greybox.trial.readers.table import Batch
+from greybox.trial.steps import Step
 
 _BLOCK_BYTES = 1 << 23
 # what Arrow says of its blocks, in words about the file
@@ -42,6 +43,7 @@ class CsvFile:
     notes: list[str] = field(default_factory=list)
     format: str = "CSV"
     first_row: int = 2
+    steps: tuple[Step, ...] = ()
 
     @property
     def cells(self) -> int:
@@ -68,7 +70,11 @@ class CsvFile:
             return "skip"
 
         words: Counter[str] = Counter()
-        days = {c: cell_text.DayClock() for c in columns if c in self.clocks}
+        stamps = {
+            c: cell_text.Stamps(c, days=c in self.clocks)
+            for c in columns
+            if c in self.clocks or c in self.dates
+        }
         rows = 0
         try:
             clean = _Clean(self.path, self.encoding, blanks=self.delimiter == " ")
@@ -92,7 +98,7 @@ class CsvFile:
             )
             for batch in reader:
                 rows += batch.num_rows
-                yield {c: self._values(batch.column(c), c, words, days) for c in columns}
+                yield {c: self._values(batch.column(c), c, words, stamps) for c in columns}
         except (pa.ArrowException, OSError, UnicodeError, ValueError) as error:
             if isinstance(error, LogError):
                 raise
@@ -116,6 +122,10 @@ class CsvFile:
                 f"{count} row{'s' if count > 1 else ''} with another number of fields than the "
                 f"{len(self.columns)} of the header left out"
             )
+        # the file may be read twice
+        self.steps = tuple(s for s in (stamp.step for stamp in stamps.values()) if s is not None)
+        for step in self.steps:
+            self._note(f"{step.source[0]}: {step.sentence}")
         for name, lost in words.items():
             self._note(
                 f"column '{name}' holds words in {lost} row{'s' if lost > 1 else ''}: "
@@ -128,14 +138,12 @@ class CsvFile:
             self.notes.append(note)
 
     def _values(
-        self, column: Any, name: str, words: Counter[str], days: dict[str, cell_text.DayClock]
+        self, column: Any, name: str, words: Counter[str], stamps: dict[str, cell_text.Stamps]
     ) -> Any:
         if name in self.text:
             return cell_text.text(column)
-        if name in self.dates:
-            return cell_text.dates(column)
-        if name in days:
-            return days[name].seconds(column)
+        if name in stamps:
+            return stamps[name].seconds(column)
         return cell_text.numbers(column, self.decimal, name, words)
 
 

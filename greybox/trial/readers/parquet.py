@@ -11,6 +11,7 @@ from typing import Any
 from greybox.errors import LogError
 from greybox.trial.readers import cells as cell_text
 from greybox.trial.readers.table import Batch
+from greybox.trial.steps import Step
 
 _BATCH_ROWS = 1 << 17
 # a page is decoded as a whole, and a row group may be one page a column
@@ -41,6 +42,7 @@ class ParquetFile:
     rows: int = 0
     format: str = "Parquet"
     first_row: int = 2
+    steps: tuple[Step, ...] = ()
 
     @property
     def cells(self) -> int:

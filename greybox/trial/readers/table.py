@@ -9,6 +9,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.trial.steps import Step
+
 Batch = dict[str, NDArray[Any]]
 
 
@@ -25,6 +27,8 @@ class TableFile(Protocol):
     format: str
     # number of the first sample's row, as a user counts them
     first_row: int
+    # what had to be done to read the times, known once the rows have been read
+    steps: tuple[Step, ...]
 
     @property
     def cells(self) -> int:
