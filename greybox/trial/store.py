@@ -17,8 +17,8 @@ from greybox.channels import LOGGED
 from greybox.errors import LogError
 from greybox.files import check_targets, replacing, sha256, write_json
 from greybox.trial.log import Provenance, TrialLog
+from greybox.trial.readers.limits import limits
 
-_MAX_RECORD = 4_000_000
 _ROWS = 1 << 17
 
 
@@ -148,7 +148,7 @@ def read_record(path: Path) -> dict[str, Any] | None:
     """Return the record beside a log, None where there is none or it is of another file."""
     beside = record_path(path)
     try:
-        if not beside.is_file() or beside.stat().st_size > _MAX_RECORD:
+        if not beside.is_file() or beside.stat().st_size > limits().sidecar_bytes:
             return None
         record = json.loads(beside.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):

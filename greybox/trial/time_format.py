@@ -27,6 +27,10 @@ _EVENER = 0.5
 # without time going back, a stamp must be that far from even, against the clock's own scatter
 _OUTLYING = 8.0
 _FITTING = 3.0
+# steps from which on one second may have but one wrong time, behind which nothing goes back [s]
+_SLOW = 0.09
+# seconds that make it the habit of a file
+_ESTABLISHED = 5
 # decimals that seconds since 1970 still have as doubles
 _MOST_DECIMALS = 6
 
@@ -138,18 +142,19 @@ def unpadded_numbers(t: Array) -> Unpadded:
     scatter = 1.4826 * float(np.median(np.abs(steps - usual)))
     for k in _out_of_step(x, starts, stops, usual, scatter):
         last.setdefault(k, int(starts[k]))
+    # no nearer than stamps are rounded
+    near = max(_FITTING * scatter, 0.05 * usual, 0.0 if grid is None else 2 * 10.0**-grid)
+    found = _search(x, last, starts, stops, grid, usual, near)
+    if _ESTABLISHED <= len(found) and len(found) > 0.5 * len(last):
+        # the whole file is so: a late sample may then lie anywhere between its neighbours
+        found |= _search(x, last, starts, stops, grid, usual, np.inf)
     rows: list[int] = []
     means: list[float] = []
-    for k, fall in sorted(last.items()):
+    for k, meant in sorted(found.items()):
         start = int(starts[k])
-        if fall + 1 >= stops[k] or not start:
-            continue
-        before = means[-1] if rows and rows[-1] == start - 1 else float(x[start - 1])
-        found = _chain(x, start, fall + 1, before, grid, usual, scatter)
-        if found is not None and _even(x, start, found, usual):
-            changed = np.flatnonzero(np.abs(found - x[start : fall + 1]) > 1e-9)
-            rows += (start + changed).tolist()
-            means += found[changed].tolist()
+        changed = np.flatnonzero(np.abs(meant - x[start : start + len(meant)]) > 1e-9)
+        rows += (start + changed).tolist()
+        means += meant[changed].tolist()
     back = len(falls)
     repaired = x.copy()
     repaired[rows] = means
@@ -159,16 +164,48 @@ def unpadded_numbers(t: Array) -> Unpadded:
     return Unpadded(finite[rows], np.array(means, float))
 
 
+def _search(
+    x: Array,
+    last: dict[int, int],
+    starts: Rows,
+    stops: Rows,
+    grid: int | None,
+    usual: float,
+    near: float,
+) -> dict[int, Array]:
+    """Return by second what its first times mean, where zeros put them in order.
+
+    `last` gives by second the row behind which time goes back for the last time.
+    """
+    found: dict[int, Array] = {}
+    for k, fall in sorted(last.items()):
+        start = int(starts[k])
+        if fall + 1 >= stops[k] or not start:
+            continue
+        before = float(x[start - 1])
+        if k - 1 in found and starts[k - 1] + len(found[k - 1]) == start:
+            before = float(found[k - 1][-1])
+        meant = _chain(x, start, fall + 1, before, grid, usual, near)
+        if meant is not None and _even(x, start, meant, usual):
+            found[k] = meant
+    return found
+
+
 def _out_of_step(x: Array, starts: Rows, stops: Rows, usual: float, scatter: float) -> list[int]:
     """Return the seconds whose first time alone is far from the middle of its neighbours."""
-    first = starts[(starts > 0) & (stops - starts > 1)]
-    which = np.flatnonzero((starts > 0) & (stops - starts > 1))
-    middle = 0.5 * (x[first - 1] + x[first + 1])
-    off = np.abs(x[first] - middle)
-    # one step is missing or doubled at most: what lies between is a hole
-    near = np.abs(x[first + 1] - x[first - 1] - 2 * usual) < max(_FITTING * scatter, 0.2 * usual)
-    far = near & (off > max(_OUTLYING * scatter, 0.25 * usual))
-    return [int(k) for k in which[far]]
+    if usual < _SLOW:
+        return []
+    off = np.zeros(len(x))
+    off[1:-1] = x[1:-1] - 0.5 * (x[:-2] + x[2:])
+    around = np.zeros(len(x))
+    around[1:-1] = x[2:] - x[:-2]
+    # no step is missing there: what lies beside a hole is out of step too
+    whole = np.abs(around - 2 * usual) < max(_FITTING * scatter, 0.2 * usual)
+    far = whole & (off > max(_OUTLYING * scatter, 0.25 * usual))
+    which = np.flatnonzero((starts > 0) & (stops - starts > 1) & far[starts])
+    others = int(far.sum()) - len(which)
+    # a clock that is late now and then at any place needs no other reason
+    return [] if others > 0.1 * len(which) else [int(k) for k in which]
 
 
 def _decimals(x: Array) -> int | None:
@@ -187,7 +224,7 @@ def _chain(
     before: float,
     grid: int | None,
     usual: float,
-    scatter: float,
+    near: float,
 ) -> Array | None:
     """Return what the times of rows start to stop mean, None where no zeros put them in order."""
     low, high = before, float(x[stop])
@@ -195,8 +232,6 @@ def _chain(
     whole = np.floor(x[start] + 1e-7)
     if count > 0.1 / usual + 3:
         return None
-    # no nearer than stamps are rounded, no farther than the next
-    near = max(_FITTING * scatter, 0.05 * usual, 0.0 if grid is None else 2 * 10.0**-grid)
     places = 10.0 ** -np.arange(_MOST_ZEROS + 1.0)
     meant = []
     for i in range(count):

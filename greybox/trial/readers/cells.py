@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.trial.readers.limits import limits
 from greybox.trial.steps import Step
 from greybox.trial.time_format import unpadded_text
 
@@ -28,8 +29,6 @@ _FRACTION = r":\d\d[.,](\d+)"
 _CLOCK = re.compile(r"\d\d?:\d\d:\d\d([.,]\d+)?")
 # RE2, on bytes
 _PLAIN = r"^-?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?$"
-# bytes of a word: the mode of a controller or a date is shorter
-_MAX_WORD = 256
 _MOST_DIGITS = 9
 # wrong times of which the place is kept
 _MOST_PLACES = 100
@@ -150,7 +149,7 @@ def text(column: Any) -> NDArray[Any]:
     large = pa.types.is_large_string(column.type) or pa.types.is_large_binary(column.type)
     # NumPy gives every word of an array the room of the longest
     cut = compute.binary_slice(
-        column.cast(pa.large_binary() if large else pa.binary()), 0, _MAX_WORD
+        column.cast(pa.large_binary() if large else pa.binary()), 0, limits().text
     )
     raw = cut.to_pylist()
     return np.array(["" if c is None else c.decode("utf-8", "replace") for c in raw], object)

@@ -23,13 +23,11 @@ from numpy.typing import NDArray
 from greybox.errors import LogError
 from greybox.files import sha256
 from greybox.trial.raw_log import Recording, Signal, SourceFile
+from greybox.trial.readers.limits import limits
 from greybox.units import UNITS
 
 Array = NDArray[np.float64]
 
-# the standard allows 82 characters; receivers and tag blocks take more
-_MAX_LINE = 1024
-_BLOCK = 1 << 22
 _DAY = 86400.0
 _SPEED_UNITS = {b"K": "km/h", b"N": "kn", b"M": "m/s", b"S": "mph"}
 _STAMP = re.compile(
@@ -387,14 +385,14 @@ def looks_like_nmea(head: bytes) -> bool:
 
 
 def _lines(path: Path) -> Iterator[bytes]:
-    rest = b""
+    rest, most = b"", limits().line_bytes
     with open(path, "rb") as handle:
-        while block := handle.read(_BLOCK):
+        while block := handle.read(limits().block_bytes):
             lines = (rest + block).replace(b"\r", b"\n").split(b"\n")
             # a line without end is cut here, and fails as a sentence
-            rest = lines.pop()[-_MAX_LINE:]
+            rest = lines.pop()[-most:]
             for line in lines:
-                yield line if len(line) <= _MAX_LINE else line[-_MAX_LINE:]
+                yield line if len(line) <= most else line[-most:]
     if rest:
         yield rest
 
