@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from greybox.channels import CHANNELS
@@ -18,7 +18,7 @@ _QUALIFIERS = {
 }  # fmt: skip
 # most telling spelling first: where two columns match, the earlier one is taken
 _GUESSES: dict[str, tuple[str, ...]] = {
-    "t": ("t", "time", "times", "timestamp", "t_rel", "elapsed", "elapsed_time", "seconds",
+    "t": ("header_stamp", "t", "time", "times", "timestamp", "t_rel", "elapsed", "elapsed_time", "seconds",
           "original_timestamp", "unix", "unix_time", "unix_utc", "utc", "datetime", "date_time",
           "epoch", "gps_time", "time_unix", "utc_time", "time_utc", "uhrzeit", "stamp",
           "zeit", "tid", "clock"),
@@ -53,6 +53,8 @@ _GUESSES: dict[str, tuple[str, ...]] = {
     "V_w": ("tws", "true_wind_speed", "wind_speed_true", "wind_velo_true"),
     "dir_w": ("twd", "true_wind_direction", "wind_direction_true", "wind_dir_true"),
 }  # fmt: skip
+# the field of messages that hold one value
+_ALONE = "data"
 
 
 @dataclass(frozen=True)
@@ -99,6 +101,8 @@ def assign(
     units: Mapping[str, str] | None = None,
     canonical: Iterable[str] = (),
     guess: bool = True,
+    stem: str = "",
+    parts: Collection[str] = (),
 ) -> dict[str, Assigned]:
     """Say which column is which signal.
 
@@ -115,6 +119,11 @@ def assign(
         Names that the format itself defines.
     guess : bool
         Whether to guess what is left from well-known spellings.
+    stem : str
+        Name of the file, by which the vessel file may qualify a column
+        (``az1.data``, ``az1/data``, or ``az1`` where ``data`` is all it holds).
+    parts : collection of str
+        Columns that mean something only with others: never guessed.
 
     Returns
     -------
@@ -123,8 +132,10 @@ def assign(
     """
     columns, units, defined = list(columns), units or {}, set(canonical)
     found: dict[str, Assigned] = {}
-    for raw, mapping in vessel.columns.items():
-        if raw in columns:
+    qualified = _qualified(columns, stem)
+    for name, mapping in vessel.columns.items():
+        raw = name if name in columns else qualified.get(name, "")
+        if raw:
             found[mapping.name] = Assigned(raw, mapping.name, mapping.unit, mapping.sign, "mapped")
     taken = {a.raw for a in found.values()}
     loop = [vessel.closed_loop[0]] if vessel.closed_loop else []
@@ -136,8 +147,14 @@ def assign(
             how = "exact" if raw not in defined else "defined"
             found[raw] = Assigned(raw, raw, unit, 1, how)
             taken.add(raw)
+    for name in (*vessel.commands, *loop):
+        raw = qualified.get(name, "")
+        if raw and name not in found and raw not in taken:
+            found[name] = Assigned(raw, name, units.get(raw), 1, "mapped")
+            taken.add(raw)
     if not guess:
         return found
+    taken |= set(parts)
     stems = {raw: split_unit(raw.rsplit(".", 1)[-1]) for raw in columns if raw not in taken}
     for name, spellings in _GUESSES.items():
         if name in found or _pointless(name, found):
@@ -156,6 +173,14 @@ def assign(
         if unit is None or _fits(unit, CHANNELS[name].unit):
             found[name] = Assigned(raw, name, unit, 1, "guessed")
             taken.add(raw)
+    return found
+
+
+def _qualified(columns: Sequence[str], stem: str) -> dict[str, str]:
+    """Return the columns by the names that tell the file too."""
+    found = {f"{stem}{mark}{c}": c for c in columns for mark in "./"} if stem else {}
+    if stem and _ALONE in columns and stem not in columns:
+        found[stem] = _ALONE
     return found
 
 
