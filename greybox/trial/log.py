@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.channels import CHANNELS
 from greybox.errors import LogError
 from greybox.notebook import Shown, items, number, sparkline, table
 from greybox.vessel.actuation import actuated_force
@@ -98,11 +97,7 @@ class TrialLog(Shown):
     @property
     def units(self) -> dict[str, str]:
         """Unit of ``t`` and of each channel; ``as logged`` where any unit is kept."""
-        angles = self.vessel.angle_commands
-        return {
-            n: CHANNELS[n].unit if n in CHANNELS else ("rad" if n in angles else "as logged")
-            for n in ("t", *self.channels)
-        }
+        return {n: self.vessel.unit(n) or "as logged" for n in ("t", *self.channels)}
 
     def summary(self) -> str:
         """Return name, duration, channels with units and ranges, and provenance, as text."""

@@ -89,6 +89,8 @@ class Recording(Shown):
         What was derived before, where the file is a log that greybox wrote.
     steps : tuple of Step
         What was done to the signals, in order.
+    mapped : mapping of str to str
+        Signal or column of words -> column that ``[columns]`` takes for it.
     """
 
     name: str
@@ -100,6 +102,7 @@ class Recording(Shown):
     guessed: frozenset[str] = frozenset()
     derived: tuple[str, ...] = ()
     steps: tuple[Step, ...] = ()
+    mapped: Mapping[str, str] = field(default_factory=dict)
 
     def __contains__(self, name: object) -> bool:
         return any(s.name == name for s in self.signals)

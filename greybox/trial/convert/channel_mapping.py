@@ -258,16 +258,15 @@ def canonical(
         source = signal.source if a.raw == name else (signal.source or f"'{a.raw}'")
         signals.append(Signal(name, signal.t, value, target, source, True))
     guessed = frozenset(n for n, a in assigned.items() if a.how == "guessed")
-    return replace(raw.with_signals(signals, *notes), guessed=guessed)
+    mapped = {n: a.raw for n, a in assigned.items() if a.raw in vessel.columns}
+    return replace(raw.with_signals(signals, *notes), guessed=guessed, mapped=mapped)
 
 
 def _factor(
     a: Assigned, signal: Signal, vessel: Vessel, known: tuple[float, float] | None = None
 ) -> tuple[str | None, float, str]:
     """Return unit, factor to SI and, where the unit was guessed, why."""
-    target = CHANNELS[a.name].unit if a.name in CHANNELS else None
-    if a.name in vessel.angle_commands:
-        target = "rad"
+    target = vessel.unit(a.name)
     if a.unit is not None:
         return a.unit, unit_factor(a.unit, target, a.raw), ""
     if target is None or a.how == "exact":
@@ -331,7 +330,8 @@ def merge(recordings: list[Recording]) -> Recording:
     ------
     LogError
         Some have a UNIX time and some not; or one wind was moved or brought to
-        another height before, and the other not.
+        another height before, and the other not; or two columns that ``[columns]`` maps
+        to one signal tell of the same times.
     """
     if len(recordings) == 1:
         return recordings[0]
@@ -367,11 +367,19 @@ def merge(recordings: list[Recording]) -> Recording:
     signals = []
     clocks: dict[tuple[int, ...], Array] = {}
     derived = {r.name: r.derived for r in recordings}
+    mapped = {(r.name, n): raw for r in recordings for n, raw in r.mapped.items()}
     for name, parts in found.items():
         kept = [parts[0]]
         for part in parts[1:]:
             same = next((k[0] for k in kept if _overlap(part[1], k[1])), None)
             if same is not None:
+                one, two = mapped.get((same, name)), mapped.get((part[0], name))
+                if one is not None and two is not None and one != two:
+                    raise LogError(
+                        f"columns '{one}' of '{same}' and '{two}' of '{part[0]}' tell of the same "
+                        f"times, and [columns] maps both to '{name}': remove one of the two lines "
+                        f"from the vessel file."
+                    )
                 notes.append(
                     f"{name} stands in '{same}' and '{part[0]}' at the same times: "
                     f"that of '{same}' is used"
@@ -424,10 +432,10 @@ def _overlap(a: Signal, b: Signal) -> bool:
 
 def unused_mappings(recordings: Iterable[Recording], vessel: Vessel) -> list[str]:
     """Say which columns the vessel file maps and no file has."""
-    used = {s.source for r in recordings for s in r.signals}
-    names = {s.name for r in recordings for s in r.signals}
+    recordings = list(recordings)
+    names = {n for r in recordings for n in (*r.names, *r.mapped)}
     return [
         f"[columns] maps '{raw}' to '{m.name}', which no file has"
         for raw, m in vessel.columns.items()
-        if m.name not in names and m.name != "t" and f"column '{raw}'" not in used
+        if m.name not in names and m.name != "t"
     ]

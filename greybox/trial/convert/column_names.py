@@ -18,16 +18,16 @@ _QUALIFIERS = {
 }  # fmt: skip
 # most telling spelling first: where two columns match, the earlier one is taken
 _GUESSES: dict[str, tuple[str, ...]] = {
-    "t": ("header_stamp", "t", "time", "times", "timestamp", "t_rel", "elapsed", "elapsed_time", "seconds",
-          "original_timestamp", "unix", "unix_time", "unix_utc", "utc", "datetime", "date_time",
+    "t": ("header_stamp", "t", "time", "times", "timestamp", "t_rel", "elapsed", "elapsed_time",
+          "seconds", "original_timestamp", "unix", "unix_time", "unix_utc", "utc", "datetime", "date_time",
           "epoch", "gps_time", "time_unix", "utc_time", "time_utc", "uhrzeit", "stamp",
           "zeit", "tid", "clock"),
     "psi": ("psi", "heading", "hdg", "true_heading", "heading_true", "yaw", "yaw_angle", "head",
             "hdt"),
-    "x_n": ("x_n", "x_ned", "north", "n", "northing", "pos_n", "pos_north", "position_north",
+    "x_n": ("x_n", "x_ned", "north", "northing", "pos_n", "pos_north", "position_north",
             "north_position", "p_n", "pn", "x_north", "x0", "x_earth", "x_position", "x_pos",
             "pos_x", "position_x", "x"),
-    "y_n": ("y_n", "y_ned", "east", "e", "easting", "pos_e", "pos_east", "position_east",
+    "y_n": ("y_n", "y_ned", "east", "easting", "pos_e", "pos_east", "position_east",
             "east_position", "p_e", "pe", "y_east", "y0", "y_earth", "y_position", "y_pos",
             "pos_y", "position_y", "y"),
     "u": ("u", "surge", "surge_velocity", "surge_speed", "surge_vel", "velocity_surge",
@@ -129,25 +129,39 @@ def assign(
     -------
     dict of str to Assigned
         By canonical name; each at most once.
+
+    Raises
+    ------
+    LogError
+        ``[columns]`` maps two of the columns to one name.
     """
     columns, units, defined = list(columns), units or {}, set(canonical)
     found: dict[str, Assigned] = {}
     qualified = _qualified(columns, stem)
-    for name, mapping in vessel.columns.items():
-        raw = name if name in columns else qualified.get(name, "")
-        if raw:
-            found[mapping.name] = Assigned(raw, mapping.name, mapping.unit, mapping.sign, "mapped")
+    for called, mapping in vessel.columns.items():
+        raw, name = called if called in columns else qualified.get(called, ""), mapping.name
+        if not raw:
+            continue
+        if name in found and found[name].raw != raw:
+            raise LogError(
+                f"columns '{found[name].raw}' and '{raw}' are both there, and [columns] maps both "
+                f"to '{name}': remove one of the two lines from the vessel file."
+            )
+        unit = mapping.unit or _mapped_unit(raw, vessel.unit(name), units)
+        # without a unit it promises what the canonical name does
+        how = "mapped" if mapping.unit else "exact"
+        found[name] = Assigned(raw, name, unit, mapping.sign, how)
     taken = {a.raw for a in found.values()}
     loop = [vessel.closed_loop[0]] if vessel.closed_loop else []
     for raw in columns:
-        known = raw in CHANNELS or raw in vessel.commands or raw in loop
+        known = raw in CHANNELS or raw in vessel.recorded_columns or raw in loop
         if known and raw not in found and raw not in taken:
             # a canonical name promises its SI unit; a unit written beside it is believed
             unit = units.get(raw, CHANNELS[raw].unit if raw in CHANNELS else None)
             how = "exact" if raw not in defined else "defined"
             found[raw] = Assigned(raw, raw, unit, 1, how)
             taken.add(raw)
-    for name in (*vessel.commands, *loop):
+    for name in (*vessel.recorded_columns, *loop):
         raw = qualified.get(name, "")
         if raw and name not in found and raw not in taken:
             found[name] = Assigned(raw, name, units.get(raw), 1, "mapped")
@@ -173,7 +187,27 @@ def assign(
         if unit is None or _fits(unit, CHANNELS[name].unit):
             found[name] = Assigned(raw, name, unit, 1, "guessed")
             taken.add(raw)
+    if not {"x_n", "y_n", "lat", "lon"} & found.keys():
+        found |= _short_pair(stems, taken, units)
     return found
+
+
+def _short_pair(
+    stems: Mapping[str, tuple[str, str | None]], taken: Collection[str], units: Mapping[str, str]
+) -> dict[str, Assigned]:
+    """Return north and east where columns ``n`` and ``e`` stand together.
+
+    Alone, ``n`` is a shaft speed.
+    """
+    found = {}
+    for name, short in (("x_n", "n"), ("y_n", "e")):
+        for raw, (stem, spelled) in stems.items():
+            unit = units.get(raw, spelled)
+            fits = unit is None or _fits(unit, "m")
+            if raw not in taken and _rank(stem, (short,)) is not None and fits:
+                found[name] = Assigned(raw, name, unit, 1, "guessed")
+                break
+    return found if len(found) == 2 else {}
 
 
 def _qualified(columns: Sequence[str], stem: str) -> dict[str, str]:
@@ -182,6 +216,14 @@ def _qualified(columns: Sequence[str], stem: str) -> dict[str, str]:
     if stem and _ALONE in columns and stem not in columns:
         found[stem] = _ALONE
     return found
+
+
+def _mapped_unit(raw: str, target: str | None, units: Mapping[str, str]) -> str | None:
+    """Return the unit of a column that is mapped without one: as it states itself, or SI."""
+    unit = units.get(raw, split_unit(raw)[1])
+    if unit == "ms" and target == "m/s":
+        return "m/s"
+    return unit if unit is not None and target is not None and _fits(unit, target) else target
 
 
 def _pointless(name: str, found: Mapping[str, Assigned]) -> bool:

@@ -23,11 +23,14 @@ _NOTHING = {n.lower() for n in NULLS} | {"inf", "-inf", "+inf"}
 _BLANK = {"", "-", "--"}
 _POINT = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?")
 _COMMA = re.compile(r"[+-]?(\d+,\d*|,\d+)([eEdD][+-]?\d+)?")
+# points between thousands, before a decimal comma
+_THOUSANDS = re.compile(r"[+-]?\d{1,3}(\.\d{3})+,\d+")
 _DATE = re.compile(r"\d{4}([-/])\d\d\1\d\d[T ]\d\d:\d\d|\d\d\.\d\d\.\d{4}[T ]\d\d:\d\d")
 # behind the seconds of a time of day
 _FRACTION = r":\d\d[.,](\d+)"
 _CLOCK = re.compile(r"\d\d?:\d\d:\d\d([.,]\d+)?")
 # RE2, on bytes
+_GROUPED = r"^\s*[-+]?(\d{1,3}(\.\d{3})*|\d+)(,\d+)?\s*$"
 _PLAIN = r"^-?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?$"
 _MOST_DIGITS = 9
 # wrong times of which the place is kept
@@ -61,7 +64,8 @@ def is_number(cell: str, *, comma: bool) -> bool:
 
 def has_comma(cell: str) -> bool:
     """Whether a cell is a number with a decimal comma."""
-    return bool(_COMMA.fullmatch(cell.strip()))
+    bare = cell.strip()
+    return bool(_COMMA.fullmatch(bare) or _THOUSANDS.fullmatch(bare))
 
 
 def kind(cells: Iterable[str], *, comma: bool) -> str:
@@ -74,6 +78,18 @@ def kind(cells: Iterable[str], *, comma: bool) -> str:
     if filled and sum(is_number(c, comma=comma) for c in filled) < 0.5 * len(filled):
         return "text"
     return "number"
+
+
+def grouped(column: Any) -> bool:
+    """Whether a column of text holds points between thousands, and every cell fits that."""
+    import pyarrow as pa
+    from pyarrow import compute
+
+    if not compute.any(compute.match_substring_regex(column, _THOUSANDS.pattern)).as_py():
+        return False
+    missing = compute.is_in(compute.ascii_lower(column), pa.array(sorted(_NOTHING)))
+    fits = compute.or_(compute.match_substring_regex(column, _GROUPED), missing)
+    return bool(compute.all(fits).as_py())
 
 
 def numbers(column: Any, decimal: str, name: str, words: Counter[str]) -> NDArray[np.float64]:

@@ -39,6 +39,7 @@ class CsvFile:
     format: str = "CSV"
     first_row: int = 2
     steps: tuple[Step, ...] = ()
+    _grouped: set[str] = field(default_factory=set)
 
     @property
     def cells(self) -> int:
@@ -137,7 +138,20 @@ class CsvFile:
             return cell_text.text(column)
         if name in stamps:
             return stamps[name].seconds(column)
-        return cell_text.numbers(column, self.decimal, name, words)
+        return cell_text.numbers(self._without_groups(column, name), self.decimal, name, words)
+
+    def _without_groups(self, column: Any, name: str) -> Any:
+        """Return cells without the points between thousands."""
+        if self.decimal != ",":
+            return column
+        from pyarrow import compute
+
+        if name not in self._grouped:
+            if not cell_text.grouped(column):
+                return column
+            self._grouped.add(name)
+            self._note(f"column '{name}' has points between thousands: 1.234,5 read as 1234.5")
+        return compute.replace_substring(column, ".", "")
 
 
 def _reason(error: Exception) -> str:
