@@ -91,6 +91,11 @@ class Recording(Shown):
         What was done to the signals, in order.
     mapped : mapping of str to str
         Signal or column of words -> column that ``[columns]`` takes for it.
+    ahead : float, optional
+        How far the clock of the program that wrote the file is ahead of the times of the
+        samples [s], where the file holds both.
+    unsure : frozenset of str
+        Signals of which the file does not tell the axes: read as REP 103 has it.
     """
 
     name: str
@@ -103,6 +108,8 @@ class Recording(Shown):
     derived: tuple[str, ...] = ()
     steps: tuple[Step, ...] = ()
     mapped: Mapping[str, str] = field(default_factory=dict)
+    ahead: float | None = None
+    unsure: frozenset[str] = frozenset()
 
     def __contains__(self, name: object) -> bool:
         return any(s.name == name for s in self.signals)

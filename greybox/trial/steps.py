@@ -104,6 +104,11 @@ OPERATIONS: dict[str, Callable[[Step], str]] = {
         f"{_names(s)} moved by ({s.number('x'):.4g}, {s.number('y'):.4g}) m to the body origin"
     ),
     "turn_heading": lambda s: f"heading turned back by {s.number('angle'):.5g} rad",
+    "time_zone": lambda s: (
+        f"clock of {', '.join(s.source)} is {s.number('ahead') / 3600:+g} h ahead of "
+        f"{s.parameters['against']}: put on that"
+    ),
+    "read_axes": lambda s: f"{_names(s)} read in axes {s.parameters['axes']}",
     "pad_fractions": lambda s: (
         f"{s.number('count'):.0f} times of {_names(s)} lack leading zeros in their fraction of a "
         f"second, such as {s.parameters['written']} for {s.parameters['meant']}: read as meant"

@@ -77,7 +77,7 @@ def unpadded_text(
         Digits of a full fraction.
     """
     finite = np.flatnonzero(np.isfinite(t))
-    t, digits, length, zero_ends = (x[finite] for x in (t, digits, length, zero_ends))
+    t, digits, length, zero_ends = t[finite], digits[finite], length[finite], zero_ends[finite]
     # the first digit of a fraction that lost its zeros is none
     short = (length > 0) & (length < width) & (digits * 10.0 ** (1 - length) >= 1)
     nothing = Unpadded(np.empty(0, np.int64), np.empty(0))
@@ -93,11 +93,11 @@ def unpadded_text(
     usual = float(np.median(np.abs(np.diff(means))))
 
     def per_run(value: Array) -> Array:
-        return np.bincount(of_step, value, count)
+        return np.asarray(np.bincount(of_step, value, count), float)
 
     written, meant = np.diff(t), np.diff(means)
     back = per_run((written < 0) * 1.0), per_run((meant < 0) * 1.0)
-    uneven = per_run(np.abs(written - usual)), per_run(np.abs(meant - usual))
+    uneven = per_run(_off(written, usual)), per_run(_off(meant, usual))
     if keeps_zeros:
         good = (back[1] < back[0]) | ((back[1] == back[0]) & (uneven[1] < _BETTER * uneven[0]))
     else:
@@ -109,6 +109,10 @@ def unpadded_text(
         return nothing
     rows = np.flatnonzero(lost)
     return Unpadded(finite[rows], means[rows])
+
+
+def _off(steps: Array, usual: float) -> Array:
+    return np.asarray(np.abs(steps - usual), float)
 
 
 def unpadded_numbers(t: Array) -> Unpadded:
@@ -145,7 +149,7 @@ def unpadded_numbers(t: Array) -> Unpadded:
     # no nearer than stamps are rounded
     near = max(_FITTING * scatter, 0.05 * usual, 0.0 if grid is None else 2 * 10.0**-grid)
     found = _search(x, last, starts, stops, grid, usual, near)
-    if _ESTABLISHED <= len(found) and len(found) > 0.5 * len(last):
+    if len(found) >= _ESTABLISHED and len(found) > 0.5 * len(last):
         # the whole file is so: a late sample may then lie anywhere between its neighbours
         found |= _search(x, last, starts, stops, grid, usual, np.inf)
     rows: list[int] = []

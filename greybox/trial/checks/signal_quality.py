@@ -524,6 +524,7 @@ def clocks(recording: Recording) -> list[tuple[tuple[str, ...], Array]]:
 
 
 def listed(names: Iterable[str]) -> str:
+    """Return names for a sentence; of many, the first three and how many more."""
     names = list(names)
     if len(names) > 4:
         return f"{', '.join(names[:3])} and {len(names) - 3} more"

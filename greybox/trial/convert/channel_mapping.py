@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,9 +15,12 @@ from greybox.errors import LogError, suggestion
 from greybox.files import sha256
 from greybox.trial.convert.column_names import Assigned, assign
 from greybox.trial.convert.derived_channels import wind_state
+from greybox.trial.convert.file_clocks import on_one_clock
+from greybox.trial.convert.settle_axes import settle_axes
 from greybox.trial.raw_log import Recording, Signal, SourceFile
 from greybox.trial.readers.formats import open_raw
 from greybox.trial.readers.table import Batch, TableFile, read_columns
+from greybox.trial.readers.topic_files import STAMP, TopicTable
 from greybox.trial.steps import Step
 from greybox.trial.store import read_record, recorded_provenance
 from greybox.units import is_unix_time, time_unit, unit_factor, unix_unit
@@ -28,6 +31,7 @@ Array = NDArray[np.float64]
 MOTION = frozenset({"x_n", "y_n", "psi", "u", "v", "r", "v_n", "v_e", "lat", "lon", "sog"})
 
 _HEAD = 10_000
+_NO_MOTION = "no position, heading or velocity was recognised: map their columns in [columns]"
 # files that overlap for less than this share of the shorter one follow one another
 _OVERLAP = 0.05
 
@@ -59,6 +63,57 @@ def read_recording(
     LogError
         The file cannot be read, or has no time.
     """
+    return settle_axes(_read(path, vessel, guess=guess, **options), vessel)
+
+
+def read_trial(paths: Sequence[str | Path], vessel: Vessel, **options: Any) -> Recording:
+    """Read the raw files of one trial and merge them on their clocks.
+
+    Parameters
+    ----------
+    paths : sequence of str or Path
+        In any order. Columns of several files may be qualified by their file
+        (``az1.data``).
+    vessel : Vessel
+        Its ``[columns]`` rename and convert.
+    **options
+        Handed to the readers.
+
+    Returns
+    -------
+    Recording
+        As `read_recording`.
+
+    Raises
+    ------
+    LogError
+        A file cannot be read, or has no time; none tells anything that is known; or the
+        files are not of one trial.
+    """
+    if len(paths) == 1:
+        recording = read_recording(paths[0], vessel, **options)
+        return recording.with_signals(recording.signals, *unused_mappings([recording], vessel))
+    recordings = [_read(p, vessel, alone=False, **options) for p in paths]
+    notes = unused_mappings(recordings, vessel)
+    kept = [r for r in recordings if r.signals or r.text]
+    if not kept:
+        raise LogError(
+            f"no column of the {len(paths)} files but their times is known: map them in the "
+            f"vessel file's [columns], qualified as in '{recordings[0].name}.column'."
+        )
+    notes += [f"{r.name}: no column but its time is known" for r in recordings if r not in kept]
+    kept, moved = on_one_clock(kept, MOTION)
+    notes += [s.sentence for s in moved]
+    recording = settle_axes(merge(kept).with_steps(*moved), vessel)
+    if not MOTION & set(recording.names):
+        notes.append(_NO_MOTION)
+    return recording.with_signals(recording.signals, *notes)
+
+
+def _read(
+    path: str | Path, vessel: Vessel, *, guess: bool = True, alone: bool = True, **options: Any
+) -> Recording:
+    """Read one file; `alone` where no other belongs to it, so that it must tell something."""
     raw = open_raw(path, **options)
     if not isinstance(raw, Recording):
         record = read_record(Path(path))
@@ -66,7 +121,7 @@ def read_recording(
             # what greybox wrote is canonical: a mapping would convert it twice
             vessel, guess = replace(vessel, columns={}), False
         source = SourceFile(raw.path.name, sha256(raw.path), raw.format)
-        raw, assigned = table_recording(raw, vessel, guess=guess)
+        raw, assigned = table_recording(raw, vessel, guess=guess, alone=alone)
         raw = replace(raw, files=(source,))
         if record is not None:
             known = recorded_provenance(record)
@@ -85,14 +140,18 @@ def read_recording(
 
 
 def table_recording(
-    table: TableFile, vessel: Vessel, *, guess: bool = True
+    table: TableFile, vessel: Vessel, *, guess: bool = True, alone: bool = True
 ) -> tuple[Recording, dict[str, Assigned]]:
     """Read the columns of a table that mean something into a recording."""
-    assigned = table_columns(table, vessel, guess=guess)
+    assigned = table_columns(table, vessel, guess=guess, alone=alone)
     batch = read_columns(table, [a.raw for a in assigned.values()])
     time = assigned["t"]
     scale = time_scale(batch[time.raw], time, table)
-    recording = batch_recording(table, batch, assigned, scale, vessel)
+    recording = batch_recording(table, batch, assigned, scale, vessel, alone=alone)
+    if isinstance(table, TopicTable):
+        stamped = assigned["t"].raw == STAMP
+        unsure = frozenset(n for n, a in assigned.items() if a.raw in table.unsure)
+        recording = replace(recording, unsure=unsure, ahead=table.ahead if stamped else None)
     notes = (*table.notes, *scale.notes, *recording.notes)
     steps = tuple(_moved(s, -scale.zero) for s in table.steps)
     return replace(recording, notes=notes, steps=steps), assigned
@@ -106,7 +165,9 @@ def _moved(step: Step, shift: float) -> Step:
     return replace(step, parameters={**step.parameters, "times": times})
 
 
-def table_columns(table: TableFile, vessel: Vessel, *, guess: bool = True) -> dict[str, Assigned]:
+def table_columns(
+    table: TableFile, vessel: Vessel, *, guess: bool = True, alone: bool = True
+) -> dict[str, Assigned]:
     """Say which columns of a table to read.
 
     Raises
@@ -114,7 +175,14 @@ def table_columns(table: TableFile, vessel: Vessel, *, guess: bool = True) -> di
     LogError
         There is no time among them, or it is written in words.
     """
-    assigned = assign(table.columns, vessel, units=table.units, guess=guess)
+    parts = _parts(table)
+    assigned = assign(
+        table.columns, vessel, units=table.units, guess=guess, stem=table.path.stem,
+        parts={c for of in parts.values() for c in of},
+    )  # fmt: skip
+    own = {a.raw for a in assigned.values()}
+    # what the vessel file maps itself is not made of the same columns once more
+    assigned = {n: a for n, a in assigned.items() if not own & set(parts.get(a.raw, ()))}
     if "t" not in assigned:
         raise LogError(
             f"'{table.path.name}' has no column 't'.{suggestion('t', table.columns)} "
@@ -128,12 +196,21 @@ def table_columns(table: TableFile, vessel: Vessel, *, guess: bool = True) -> di
             f"write seconds, UNIX time or ISO 8601 (2024-05-01T12:00:00Z), or map another column "
             f"to 't' in [columns]."
         )
-    if len(assigned) == 1:
+    if len(assigned) == 1 and alone:
         raise LogError(
             f"no column of '{table.path.name}' but its time '{time}' is known: map them in the "
             f"vessel file's [columns]. Its columns: {', '.join(table.columns[:30])}."
         )
     return assigned
+
+
+def _parts(table: TableFile) -> dict[str, tuple[str, ...]]:
+    """Return the columns of the file behind each column that is made of others."""
+    return table.parts if isinstance(table, TopicTable) else {}
+
+
+def _listed(columns: Sequence[str]) -> str:
+    return ", ".join(f"'{c}'" for c in columns)
 
 
 @dataclass(frozen=True)
@@ -184,7 +261,9 @@ def time_scale(raw: Array, time: Assigned, table: TableFile) -> TimeScale:
     stated = unit is not None and not (unit == "s" and time.how == "exact" and unix_unit(size))
     if not stated and not date:
         unit = time_unit(head)
-    if time.how == "guessed" or not stated:
+    if time.raw == STAMP:
+        notes.append("times are the header stamps")
+    elif time.how == "guessed" or not stated:
         notes.append(f"column '{time.raw}' taken for time in {unit or 's'}")
     if date or time.raw in table.clocks:
         unit = "s"
@@ -201,11 +280,17 @@ def batch_recording(
     assigned: dict[str, Assigned],
     scale: TimeScale,
     vessel: Vessel,
+    *,
+    alone: bool = True,
 ) -> Recording:
-    """Return columns of a table as a recording, names as in the source."""
+    """Return columns of a table as a recording, names as in the source.
+
+    Motion is missed only where the file stands `alone`.
+    """
     t = scale.seconds(batch[assigned["t"].raw])
     signals, text, notes = [], {}, []
     loop = vessel.closed_loop[0] if vessel.closed_loop else None
+    parts = _parts(table)
     for name, a in assigned.items():
         if name == "t":
             continue
@@ -214,16 +299,18 @@ def batch_recording(
         elif a.raw in table.text or a.raw in table.dates:
             notes.append(f"column '{a.raw}' holds words or dates, not numbers: left out")
         else:
-            signals.append(Signal(a.raw, t, batch[a.raw], a.unit, f"column '{a.raw}'"))
+            source = (
+                f"column '{a.raw}'" if a.raw not in parts else f"columns {_listed(parts[a.raw])}"
+            )
+            signals.append(Signal(a.raw, t, batch[a.raw], a.unit, source))
     used = {a.raw for a in assigned.values()}
+    used |= {c for made, of in parts.items() if made in used for c in of}
     ignored = [c for c in table.columns if c not in used]
     if ignored:
         more = f" and {len(ignored) - 12} more" if len(ignored) > 12 else ""
         notes.append(f"columns not used: {', '.join(ignored[:12])}{more}")
-    if not set(assigned) & MOTION:
-        notes.append(
-            "no position, heading or velocity was recognised: map their columns in [columns]"
-        )
+    if alone and not set(assigned) & MOTION:
+        notes.append(_NO_MOTION)
     return Recording(table.path.stem, tuple(signals), text, scale.epoch, notes=tuple(notes))
 
 
@@ -347,9 +434,11 @@ def merge(recordings: list[Recording]) -> Recording:
     stated: dict[str, int] = {}
     text: dict[str, tuple[Array, NDArray[Any]]] = {}
     notes: list[str] = []
+    steps: list[Step] = []
     for r in recordings:
         shift = r.epoch - epoch if epoch is not None and r.epoch is not None else 0.0
         notes += [f"{r.name}: {n}" for n in r.notes]
+        steps += [_moved(s, shift) for s in r.steps]
         moved: dict[int, Array] = {}
         for s in r.signals:
             t = moved.setdefault(id(s.t), s.t + shift)
@@ -366,6 +455,8 @@ def merge(recordings: list[Recording]) -> Recording:
             )
     signals = []
     clocks: dict[tuple[int, ...], Array] = {}
+    unsure = {(r.name, n) for r in recordings for n in r.unsure}
+    still: set[str] = set()
     derived = {r.name: r.derived for r in recordings}
     mapped = {(r.name, n): raw for r in recordings for n, raw in r.mapped.items()}
     for name, parts in found.items():
@@ -388,6 +479,7 @@ def merge(recordings: list[Recording]) -> Recording:
                 kept.append(part)
         if name in ("u_q", "v_q"):
             _refuse_two_winds([(n, derived[n]) for n, _ in kept])
+        still |= {name for n, _ in kept if (n, name) in unsure}
         kept.sort(key=lambda p: _span(p[1])[0])
         # columns of one table go on sharing their clock
         key = tuple(id(p[1].t) for p in kept)
@@ -403,7 +495,8 @@ def merge(recordings: list[Recording]) -> Recording:
         tuple(f for r in recordings for f in r.files),
         tuple(notes),
         derived=tuple(dict.fromkeys(d for r in recordings for d in r.derived)),
-        steps=tuple(s for r in recordings for s in r.steps),
+        steps=tuple(steps),
+        unsure=frozenset(still),
     )
 
 

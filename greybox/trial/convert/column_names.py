@@ -19,8 +19,8 @@ _QUALIFIERS = {
 # most telling spelling first: where two columns match, the earlier one is taken
 _GUESSES: dict[str, tuple[str, ...]] = {
     "t": ("header_stamp", "t", "time", "times", "timestamp", "t_rel", "elapsed", "elapsed_time",
-          "seconds", "original_timestamp", "unix", "unix_time", "unix_utc", "utc", "datetime", "date_time",
-          "epoch", "gps_time", "time_unix", "utc_time", "time_utc", "uhrzeit", "stamp",
+          "seconds", "original_timestamp", "unix", "unix_time", "unix_utc", "utc", "datetime",
+          "date_time", "epoch", "gps_time", "time_unix", "utc_time", "time_utc", "uhrzeit", "stamp",
           "zeit", "tid", "clock"),
     "psi": ("psi", "heading", "hdg", "true_heading", "heading_true", "yaw", "yaw_angle", "head",
             "hdt"),

@@ -110,9 +110,7 @@ def _order(
     return rows, t[rows]
 
 
-def _refuse_two_runs(
-    t: Array, back: NDArray[np.int64], signal: str, name: str, cause: str
-) -> None:
+def _refuse_two_runs(t: Array, back: NDArray[np.int64], signal: str, name: str, cause: str) -> None:
     """Refuse times that go back far, over times that are there already."""
     usual = usual_step(np.sort(t)) or float(np.median(np.abs(np.diff(t))))
     far = back[t[back] - t[back + 1] > _FAR * usual]

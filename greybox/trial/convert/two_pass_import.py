@@ -17,9 +17,7 @@ from greybox.trial.checks.check import check_recording
 from greybox.trial.convert.channel_mapping import (
     batch_recording,
     canonical,
-    merge,
-    read_recording,
-    unused_mappings,
+    read_trial,
 )
 from greybox.trial.convert.convert import cut_segments, import_recording, make_provenance
 from greybox.trial.convert.deduplicate import clean_signals
@@ -87,11 +85,7 @@ def import_files(
         table = open_raw(paths[0], **(reader or {}))
         if not isinstance(table, Recording) and table.cells > _LARGE_CELLS:
             return _in_blocks(table, vessel, out, options, extra)
-    recordings = [read_recording(p, vessel, **(reader or {})) for p in paths]
-    unused = unused_mappings(recordings, vessel)
-    recording = merge(recordings)
-    recording = recording.with_signals(recording.signals, *unused)
-    del recordings
+    recording = read_trial(paths, vessel, **(reader or {}))
     fixed: tuple[str, ...] = ()
     left: list[str] = []
     if fix or fix_also:

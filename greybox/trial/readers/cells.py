@@ -257,9 +257,9 @@ class Stamps:
             return value
         words = pd.Series(text(column))
         part = words.str.extract(_FRACTION)[0].fillna("").astype(str)
-        length = part.str.len().to_numpy(dtype=np.int64)
+        length = part.str.len().to_numpy(dtype=np.int64, copy=True)
         # nanoseconds are the finest that anybody writes
-        length = np.where(length > _MOST_DIGITS, 0, length)
+        length[length > _MOST_DIGITS] = 0
         self._width = max(self._width, int(length.max(initial=0)))
         digits = np.array([int(d) if 0 < len(d) <= _MOST_DIGITS else 0 for d in part], float)
         zero_ends = part.str.endswith("0").to_numpy(dtype=bool)

@@ -194,7 +194,9 @@ def as_topic(table: TableFile) -> TableFile:
     if recorder in table.text:
         recorder = None
     wanted = list(
-        dict.fromkeys([*frames, *(stamp or ()), *found.all_parts, *([recorder] if recorder else [])])
+        dict.fromkeys(
+            [*frames, *(stamp or ()), *found.all_parts, *([recorder] if recorder else [])]
+        )
     )
     first = next(iter(islice(table.batches(wanted), 1)), {c: np.empty(0) for c in wanted})
     found.frames = {_path(f): _first_word(first[f]) for f in frames}
@@ -332,9 +334,7 @@ class _Messages:
             self._add("r", (rate,), lambda b: starboard(b[rate], frd=sign), "rad/s")
         self._add_fix()
 
-    def _add_twist(
-        self, twist: tuple[str, str], frame: str, ned: bool, first: Batch
-    ) -> None:
+    def _add_twist(self, twist: tuple[str, str], frame: str, ned: bool, first: Batch) -> None:
         if is_world(frame):
             north = is_ned(frame)
             self._add("v_n", twist, lambda b: north_east(*_two(b, twist), ned=north)[0], "m/s")
