@@ -96,7 +96,7 @@ def unpadded_text(
         return np.asarray(np.bincount(of_step, value, count), float)
 
     written, meant = np.diff(t), np.diff(means)
-    back = per_run((written < 0) * 1.0), per_run((meant < 0) * 1.0)
+    back = per_run((written < 0).astype(float)), per_run((meant < 0).astype(float))
     uneven = per_run(_off(written, usual)), per_run(_off(meant, usual))
     if keeps_zeros:
         good = (back[1] < back[0]) | ((back[1] == back[0]) & (uneven[1] < _BETTER * uneven[0]))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from greybox.channels import CHANNELS
 from greybox.errors import LogError, suggestion
 from greybox.files import sha256
-from greybox.trial.convert.column_names import Assigned, assign
+from greybox.trial.convert.column_names import Assigned, assign, is_short_pair
 from greybox.trial.convert.derived_channels import wind_state
 from greybox.trial.convert.file_clocks import on_one_clock
 from greybox.trial.convert.settle_axes import settle_axes
@@ -31,6 +31,8 @@ Array = NDArray[np.float64]
 MOTION = frozenset({"x_n", "y_n", "psi", "u", "v", "r", "v_n", "v_e", "lat", "lon", "sog"})
 
 _HEAD = 10_000
+# a position changes from row to row by less than this share of what it spreads over
+_SMOOTH = 0.2
 _NO_MOTION = "no position, heading or velocity was recognised: map their columns in [columns]"
 # files that overlap for less than this share of the shorter one follow one another
 _OVERLAP = 0.05
@@ -145,6 +147,10 @@ def table_recording(
     """Read the columns of a table that mean something into a recording."""
     assigned = table_columns(table, vessel, guess=guess, alone=alone)
     batch = read_columns(table, [a.raw for a in assigned.values()])
+    if is_short_pair(assigned) and not all(
+        _travelled(batch[assigned[n].raw]) for n in ("x_n", "y_n")
+    ):
+        assigned = {n: a for n, a in assigned.items() if n not in ("x_n", "y_n")}
     time = assigned["t"]
     scale = time_scale(batch[time.raw], time, table)
     recording = batch_recording(table, batch, assigned, scale, vessel, alone=alone)
@@ -202,6 +208,16 @@ def table_columns(
             f"vessel file's [columns]. Its columns: {', '.join(table.columns[:30])}."
         )
     return assigned
+
+
+def _travelled(value: NDArray[Any]) -> bool:
+    """Whether values change as positions do: all the time, and little from row to row."""
+    if value.dtype == object or not np.isfinite(value).any():
+        return False
+    value = value[np.isfinite(value)]
+    steps = np.diff(value)
+    smooth = float(np.sqrt(np.mean(steps**2))) < _SMOOTH * float(np.std(value)) if len(steps) else 0
+    return bool(smooth) and float(np.mean(steps == 0)) < 0.5
 
 
 def _parts(table: TableFile) -> dict[str, tuple[str, ...]]:

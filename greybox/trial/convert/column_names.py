@@ -53,6 +53,8 @@ _GUESSES: dict[str, tuple[str, ...]] = {
     "V_w": ("tws", "true_wind_speed", "wind_speed_true", "wind_velo_true"),
     "dir_w": ("twd", "true_wind_direction", "wind_direction_true", "wind_dir_true"),
 }  # fmt: skip
+# north and east where both stand together; alone, n is a shaft speed
+_SHORT = {"x_n": "n", "y_n": "e"}
 # the field of messages that hold one value
 _ALONE = "data"
 
@@ -200,7 +202,7 @@ def _short_pair(
     Alone, ``n`` is a shaft speed.
     """
     found = {}
-    for name, short in (("x_n", "n"), ("y_n", "e")):
+    for name, short in _SHORT.items():
         for raw, (stem, spelled) in stems.items():
             unit = units.get(raw, spelled)
             fits = unit is None or _fits(unit, "m")
@@ -208,6 +210,15 @@ def _short_pair(
                 found[name] = Assigned(raw, name, unit, 1, "guessed")
                 break
     return found if len(found) == 2 else {}
+
+
+def is_short_pair(assigned: Mapping[str, Assigned]) -> bool:
+    """Whether north and east were guessed from columns ``n`` and ``e``, which may be others."""
+    pair = [(assigned[n], short) for n, short in _SHORT.items() if n in assigned]
+    return len(pair) == 2 and all(
+        a.how == "guessed" and _rank(split_unit(a.raw)[0], (short,)) is not None
+        for a, short in pair
+    )
 
 
 def _qualified(columns: Sequence[str], stem: str) -> dict[str, str]:

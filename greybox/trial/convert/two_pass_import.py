@@ -28,6 +28,7 @@ from greybox.trial.log import Provenance, TrialLog
 from greybox.trial.raw_log import Recording, SourceFile
 from greybox.trial.readers.formats import open_raw
 from greybox.trial.readers.table import Batch, TableFile
+from greybox.trial.readers.topic_files import TopicTable
 from greybox.trial.repair import repair
 from greybox.trial.store import record_path, write_log
 from greybox.vessel.vessel import Vessel
@@ -83,7 +84,9 @@ def import_files(
     _keep_sources(paths, out)
     if len(paths) == 1 and not fix and not fix_also and Path(paths[0]).is_file():
         table = open_raw(paths[0], **(reader or {}))
-        if not isinstance(table, Recording) and table.cells > _LARGE_CELLS:
+        # axes that only the other signals tell need all of them
+        unsure = isinstance(table, TopicTable) and bool(table.unsure)
+        if not isinstance(table, Recording) and table.cells > _LARGE_CELLS and not unsure:
             return _in_blocks(table, vessel, out, options, extra)
     recording = read_trial(paths, vessel, **(reader or {}))
     fixed: tuple[str, ...] = ()

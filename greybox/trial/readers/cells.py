@@ -257,7 +257,7 @@ class Stamps:
             return value
         words = pd.Series(text(column))
         part = words.str.extract(_FRACTION)[0].fillna("").astype(str)
-        length = part.str.len().to_numpy(dtype=np.int64, copy=True)
+        length = np.array([len(d) for d in part], np.int64)
         # nanoseconds are the finest that anybody writes
         length[length > _MOST_DIGITS] = 0
         self._width = max(self._width, int(length.max(initial=0)))
