@@ -402,10 +402,16 @@ def angle_unit(reach: tuple[float, float]) -> str:
 
 def _guess_commands(raw: Recording, assigned: dict[str, Assigned], vessel: Vessel) -> None:
     """Give rudders and shafts of NMEA 0183 to the vessel's columns where only one fit exists."""
-    missing = [c for c in vessel.commands if c not in assigned]
+    # sensors tell what was measured, also where the command drives the model
+    measured = {
+        (kind, column if t.drive == "feedback" else other)
+        for t in vessel.thrusters
+        for kind, column, other, _ in t.movements
+    }
+    missing = [c for c in vessel.recorded_columns if c not in assigned]
     # azimuths are not what RSA tells of: their sign and range differ from a rudder's
-    rudders = [c for c in missing if c in {t.rudder for t in vessel.thrusters}]
-    speeds = [c for c in missing if c not in vessel.angle_commands]
+    rudders = [c for c in missing if ("rudder", c) in measured]
+    speeds = [c for c in missing if ("speed", c) in measured]
     shafts = sorted((n for n in raw.names if n.startswith("rpm_")), key=_shaft)
     of_kind = [n for n in shafts if n.startswith("rpm_shaft")]
     # an engine and its shaft turn together: one of each kind is enough
