@@ -87,6 +87,8 @@ class Recording(Shown):
     steps : tuple of Step
         What was done to the signals, in order; also before, where the file is a log that
         greybox wrote.
+    mapped : mapping of str to str
+        Signal or column of words -> column that ``[columns]`` takes for it.
     """
 
     name: str
@@ -97,6 +99,7 @@ class Recording(Shown):
     notes: tuple[str, ...] = ()
     guessed: frozenset[str] = frozenset()
     steps: tuple[Step, ...] = ()
+    mapped: Mapping[str, str] = field(default_factory=dict)
 
     def __contains__(self, name: object) -> bool:
         return any(s.name == name for s in self.signals)

@@ -18,9 +18,9 @@ from greybox.files import check_targets, replacing, sha256, write_json
 from greybox.trial.gaps import joined_spans
 from greybox.trial.log import RECORD_FORMAT, RECORD_VERSION, Provenance, TrialLog
 from greybox.trial.old_records import steps_of_sentences
+from greybox.trial.readers.limits import limits
 from greybox.trial.steps import Step, step_from_dict
 
-_MAX_RECORD = 4_000_000
 _ROWS = 1 << 17
 
 
@@ -153,7 +153,7 @@ def read_record(path: Path) -> dict[str, Any] | None:
     """Return the record beside a log, None where there is none or it is of another file."""
     beside = record_path(path)
     try:
-        if not beside.is_file() or beside.stat().st_size > _MAX_RECORD:
+        if not beside.is_file() or beside.stat().st_size > limits().sidecar_bytes:
             return None
         record = json.loads(beside.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):

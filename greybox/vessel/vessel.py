@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from math import inf, isfinite
 from typing import Any, Literal, get_args
 
+from greybox.channels import CHANNELS
 from greybox.errors import VesselError, suggestion
 from greybox.notebook import Shown, number, table
 from greybox.vessel.thrust import ThrustLaw
@@ -280,6 +281,12 @@ class Vessel(Shown):
         """Those of `recorded_columns` that are angles [rad]."""
         pairs = (c for a in self.actuators if a.angular for c in (a.command, a.feedback))
         return self.angle_commands | frozenset(pairs)
+
+    def unit(self, name: str) -> str | None:
+        """Return the SI unit of a channel or thruster column, None where any unit is kept."""
+        if name in self.recorded_angles:
+            return "rad"
+        return CHANNELS[name].unit if name in CHANNELS else None
 
     @property
     def limits(self) -> dict[str, Limits]:

@@ -196,7 +196,7 @@ def test_an_anemometer_is_moved_by_the_corrected_yaw_rate(tmp_path):
         np.testing.assert_allclose(log["v_q"], 3, atol=1e-12)
 
 
-def test_blocks_are_corrected_as_the_whole(tmp_path, monkeypatch):
+def test_blocks_are_corrected_as_the_whole(tmp_path, monkeypatch, limited):
     late = {"u": 0.7, "psi": -1.3, "n": 0.25}
     columns = {"t": np.arange(600) * STEP} | signals(late)
     frame = pd.DataFrame(columns).drop(index=range(200, 240))
@@ -206,7 +206,7 @@ def test_blocks_are_corrected_as_the_whole(tmp_path, monkeypatch):
     import_files([tmp_path / "raw.csv"], vessel, tmp_path / "whole.csv")
     monkeypatch.setattr("greybox.trial.convert.two_pass_import._LARGE_CELLS", 0)
     monkeypatch.setattr("greybox.trial.convert.two_pass_import._BLOCK_ROWS", 50)
-    monkeypatch.setattr("greybox.trial.readers.csv._BLOCK_BYTES", 1 << 12)
+    limited(block_bytes=1 << 12)
     import_files([tmp_path / "raw.csv"], vessel, tmp_path / "blocks.csv")
     one, two = (pd.read_csv(tmp_path / f"{n}.csv") for n in ("whole", "blocks"))
     pd.testing.assert_frame_equal(one, two, rtol=1e-9, atol=1e-9)

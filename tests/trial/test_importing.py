@@ -19,7 +19,6 @@ from greybox.trial.convert.options import ImportOptions
 from greybox.trial.convert.read import read_segments
 from greybox.trial.import_files import import_files
 from greybox.trial.raw_log import Recording, Signal
-from greybox.trial.readers import csv as csv_reader
 from greybox.vessel.toml import load_vessel, vessel_from_dict
 
 VESSEL = load_vessel("thesis")
@@ -275,7 +274,9 @@ def large(case, n=9000):
     ids=["plain", "slower", "savgol", "smooth", "smooth-savgol"],
 )  # fmt: skip
 @pytest.mark.parametrize("ending", ["csv", "parquet"])
-def test_blocks_give_the_log_that_memory_gives(tmp_path, monkeypatch, case, options, ending):
+def test_blocks_give_the_log_that_memory_gives(
+    tmp_path, monkeypatch, limited, case, options, ending
+):
     loop = {"closed_loop": {"column": "mode", "values": ["dp"]}}
     thrusters = [
         {"type": "azimuth", "x": x, "speed": "n", "angle": a}
@@ -292,8 +293,7 @@ def test_blocks_give_the_log_that_memory_gives(tmp_path, monkeypatch, case, opti
     first = import_files([raw], vessel, tmp_path / "a.csv", chosen)
     monkeypatch.setattr(stream, "_LARGE_CELLS", 0)
     monkeypatch.setattr(stream, "_BLOCK_ROWS", 700)
-    monkeypatch.setattr(csv_reader, "_BLOCK_BYTES", 1 << 15)
-    monkeypatch.setattr("greybox.trial.readers.parquet._BATCH_ROWS", 450)
+    limited(block_bytes=1 << 15, block_rows=450)
     second = import_files([raw], vessel, tmp_path / "b.csv", chosen)
     one, two = (pd.read_csv(tmp_path / f"{x}.csv") for x in "ab")
     # UNIX times are known to 0.2 µs, and filters begin where a block does

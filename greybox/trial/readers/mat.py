@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.channels import unit_factor
 from greybox.errors import LogError, suggestion
 from greybox.files import sha256
 from greybox.trial.raw_log import Array, Recording, Signal, SourceFile
 from greybox.trial.readers.matfile import Tree, Unreadable, load_tree
+from greybox.units import UNITS, find_unit, is_unix_time, spelled_unit, time_unit, unix_unit
 
 MAX_COLUMNS = 64
 MAX_NOTES = 60
@@ -28,25 +28,12 @@ _MAX_TEXT = 200
 # days since the year 0 and since 1970, as MATLAB's datenum counts
 _DATENUM = (7e5, 8e5)
 _DATENUM_1970 = 719529.0
-_UNIX = 1e8
 _RISING = 0.9
 
 _TIME = re.compile(
     r"(?:.*[_.])?(?:t|time|times|tout|timestamps?|time_?stamps?|unix_?time|posix_?time|utc|"
     r"date_?time|datenum|sim_?time|elapsed|row_?times)(?:[_.]?(?P<unit>s|sec|seconds|ms|us|ns|min))?"
 )
-_TIME_UNITS = {
-    "s": 1.0, "sec": 1.0, "secs": 1.0, "second": 1.0, "seconds": 1.0,
-    "ms": 1e-3, "milliseconds": 1e-3, "us": 1e-6, "microseconds": 1e-6,
-    "ns": 1e-9, "nanoseconds": 1e-9, "min": 60.0, "minutes": 60.0,
-    "h": 3600.0, "hours": 3600.0, "days": 86400.0,
-}  # fmt: skip
-_UNITS = {
-    "degrees": "deg", "degree": "deg", "°": "deg", "radians": "rad", "radian": "rad",
-    "knot": "kn", "kt": "kn", "kts": "kn", "mps": "m/s", "metres": "m", "meters": "m",
-    "seconds": "s", "°/s": "deg/s", "deg/sec": "deg/s", "rad/sec": "rad/s", "meter": "m",
-    "m/sec": "m/s", "rpm": "rpm", "newton": "N", "newtons": "N",
-}  # fmt: skip
 # the one column of a timeseries has the name of the series
 _BARE = frozenset({"data", "values", "value"})
 _LABELS = ("variablenames", "columns", "names", "labels", "channels", "header", "headers")
@@ -144,13 +131,13 @@ class _Reader:
     def collect(self, tree: Tree, name: str = "", outer: _Scope | None = None) -> None:
         """Take in one struct and those inside it."""
         scope = _Scope(name, [], outer)
-        units = _time_units(tree)
+        stated = _stated_time_unit(tree)
         for key, value in tree.items():
             match = _TIME.fullmatch(key.casefold())
             if match is None:
                 continue
-            factor = _TIME_UNITS.get(match["unit"] or "", units)
-            time = _time(_join(name, key), value, factor)
+            unit = spelled_unit(match["unit"]) if match["unit"] else stated
+            time = _time(_join(name, key), value, unit)
             if time is not None:
                 scope.times.append(time)
                 self.times.append(time)
@@ -319,13 +306,11 @@ class _Reader:
         stated = stated.strip()
         if not stated:
             return None
-        unit = _UNITS.get(stated.casefold(), stated)
-        try:
-            unit_factor(unit, None, name)
-        except LogError:
+        unit = find_unit(stated)
+        if unit is None:
             self.note(f"the unit '{stated}' of '{name}' is unknown and was left out.")
             return None
-        return unit
+        return unit.symbol
 
     def _objects(self) -> str:
         if not self.unreadable:
@@ -422,10 +407,12 @@ def _labels(tree: Tree, key: str) -> tuple[list[str], list[str]]:
     return labels, units
 
 
-def _time_units(tree: Tree) -> float:
+def _stated_time_unit(tree: Tree) -> str | None:
+    """Return the unit of time that a timeseries states, None where it states none."""
     info = _child(tree, "timeinfo")
     stated = _child(info, "units") if isinstance(info, dict) else None
-    return _TIME_UNITS.get(stated.casefold(), 1.0) if isinstance(stated, str) else 1.0
+    unit = find_unit(stated) if isinstance(stated, str) else None
+    return unit.symbol if unit is not None and unit.si == "s" else None
 
 
 def _records(items: list[Any]) -> Tree:
@@ -447,8 +434,8 @@ def _records(items: list[Any]) -> Tree:
     return columns if times else {}
 
 
-def _time(name: str, value: Any, factor: float) -> _Time | None:
-    """Return a time column, None where the value cannot be one."""
+def _time(name: str, value: Any, stated: str | None) -> _Time | None:
+    """Return a time column in its stated or guessed unit, None where the value cannot be one."""
     if isinstance(value, list):
         return _dates(name, value)
     if not isinstance(value, np.ndarray) or value.size < 2 or max(value.shape) != value.size:
@@ -469,15 +456,10 @@ def _time(name: str, value: Any, factor: float) -> _Time | None:
         note = f"'{name}' was taken as MATLAB datenum (days), for it is near {middle:.0f}."
         t = np.asarray((raw - start) * 86400.0, float)
         return _Time(name, t, (start - _DATENUM_1970) * 86400.0, note)
-    if middle * factor > _UNIX:
-        # seconds in 1973 are as many as milliseconds in 1970: each unit has its decades
-        scale = next(
-            (s for limit, s in ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3)) if middle > limit), factor
-        )
-        word = {1e-9: "nanoseconds", 1e-6: "microseconds", 1e-3: "milliseconds"}.get(
-            scale, "seconds"
-        )
-        note = f"'{name}' was taken as UNIX {word}, for it is near {middle:.6g}."
+    unit = unix_unit(middle) or stated or time_unit(known)
+    factor = UNITS[unit].factor
+    if is_unix_time(middle * factor):
+        note = f"'{name}' was taken as UNIX time in {unit}, for it is near {middle:.6g}."
         start_raw = known[0]
         # integers are subtracted as integers: a float of nanoseconds is 0.2 us coarse
         t = (
@@ -485,10 +467,10 @@ def _time(name: str, value: Any, factor: float) -> _Time | None:
                 (raw - start_raw).astype(np.int64) if raw.dtype.kind in "iu" else raw - start_raw,
                 float,
             )
-            * scale
+            * factor
         )
-        return _Time(name, t, float(start_raw) * scale, note)
-    note = f"'{name}' was taken as {factor:g} s a unit." if factor != 1.0 else ""
+        return _Time(name, t, float(start_raw) * factor, note)
+    note = f"'{name}' was taken as time in {unit}." if unit != "s" else ""
     return _Time(name, np.asarray(raw, float) * factor, None, note)
 
 

@@ -23,14 +23,13 @@ from numpy.typing import NDArray
 from greybox.errors import LogError
 from greybox.files import sha256
 from greybox.trial.raw_log import Recording, Signal, SourceFile
+from greybox.trial.readers.limits import limits
+from greybox.units import UNITS
 
 Array = NDArray[np.float64]
 
-# the standard allows 82 characters; receivers and tag blocks take more
-_MAX_LINE = 1024
-_BLOCK = 1 << 22
 _DAY = 86400.0
-_SPEED_UNITS = {b"K": 1 / 3.6, b"N": 1852 / 3600, b"M": 1.0, b"S": 1609.344 / 3600}
+_SPEED_UNITS = {b"K": "km/h", b"N": "kn", b"M": "m/s", b"S": "mph"}
 _STAMP = re.compile(
     rb"(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d(?:[.,]\d+)?)(Z|[+-]\d\d:?\d\d)?"
     rb"|(?<![\d.])(\d{9,10}(?:\.\d+)?|\d{13})(?![\d.])"
@@ -246,7 +245,7 @@ def _mwv(s: _Stream, f: Fields) -> None:
     if len(f) > 5 and f[5] == b"V":
         s.skipped["MWV marked invalid"] += 1
         return
-    angle, speed = radians(float(f[1])), float(f[3]) * _SPEED_UNITS[f[4]]
+    angle, speed = radians(float(f[1])), float(f[3]) * UNITS[_SPEED_UNITS[f[4]]].factor
     true = f[2] == b"T"
     s.give("dir_t" if true else "dir_q", angle)
     s.give("V_w" if true else "V_q", speed)
@@ -386,14 +385,14 @@ def looks_like_nmea(head: bytes) -> bool:
 
 
 def _lines(path: Path) -> Iterator[bytes]:
-    rest = b""
+    rest, most = b"", limits().line_bytes
     with open(path, "rb") as handle:
-        while block := handle.read(_BLOCK):
+        while block := handle.read(limits().block_bytes):
             lines = (rest + block).replace(b"\r", b"\n").split(b"\n")
             # a line without end is cut here, and fails as a sentence
-            rest = lines.pop()[-_MAX_LINE:]
+            rest = lines.pop()[-most:]
             for line in lines:
-                yield line if len(line) <= _MAX_LINE else line[-_MAX_LINE:]
+                yield line if len(line) <= most else line[-most:]
     if rest:
         yield rest
 
