@@ -222,6 +222,22 @@ def test_clocks_that_leave_nothing_are_refused_by_the_import(tmp_path):
     assert not (tmp_path / "log.csv").exists()
 
 
+def test_a_corrected_log_is_not_merged_with_a_raw_one(tmp_path):
+    """The record of the one would speak for the other."""
+    whole = pd.DataFrame({"t": np.arange(600) * STEP} | signals())
+    whole[:300].to_csv(tmp_path / "first.csv", index=False)
+    whole[300:].to_csv(tmp_path / "later.csv", index=False)
+    vessel, out = ship(heading_bias=0.08), tmp_path / "both.csv"
+    import_files([tmp_path / "first.csv"], vessel, tmp_path / "log.csv")
+    with pytest.raises(
+        LogError, match=r"psi of 'log' is corrected \(heading turned back .*'later'"
+    ):
+        import_files([tmp_path / "log.csv", tmp_path / "later.csv"], vessel, out)
+    import_files([tmp_path / "later.csv"], vessel, tmp_path / "log2.csv")
+    import_files([tmp_path / "log.csv", tmp_path / "log2.csv"], vessel, out)
+    np.testing.assert_allclose(read_log(out, vessel)["psi"], signals()["psi"] - 0.08, atol=1e-12)
+
+
 def test_only_the_signs_that_import_mended_are_left_to_it(tmp_path):
     from dataclasses import replace
 
