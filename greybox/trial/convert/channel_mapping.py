@@ -503,8 +503,7 @@ def merge(recordings: list[Recording]) -> Recording:
                 )
             else:
                 kept.append(part)
-        if name in ("u_q", "v_q"):
-            _refuse_two_winds([(n, done[n]) for n, _ in kept])
+        _refuse_two_states(name, [(n, done[n]) for n, _ in kept])
         still |= {name for n, _ in kept if (n, name) in unsure}
         kept.sort(key=lambda p: _span(p[1])[0])
         # columns of one table go on sharing their clock
@@ -526,15 +525,29 @@ def merge(recordings: list[Recording]) -> Recording:
     )
 
 
-def _refuse_two_winds(parts: list[tuple[str, tuple[Step, ...]]]) -> None:
-    """Refuse winds of several files that are not of one place and height."""
-    (first, steps), *others = parts
-    for name, more in others:
-        if wind_state(more) != wind_state(steps):
+def _refuse_two_states(name: str, parts: list[tuple[str, tuple[Step, ...]]]) -> None:
+    """Refuse a signal of several files of which one was corrected or moved and the other not."""
+    (first, before), *others = parts
+    for other, steps in others:
+        if name in ("u_q", "v_q") and wind_state(steps) != wind_state(before):
             raise LogError(
-                f"the wind of '{first}' is {wind_state(steps)}, that of '{name}' is "
-                f"{wind_state(more)}: they cannot be merged. Import both from their raw files."
+                f"the wind of '{first}' is {wind_state(before)}, that of '{other}' is "
+                f"{wind_state(steps)}: they cannot be merged. Import both from their raw files."
             )
+        one, two = (_corrections(of, name) for of in (before, steps))
+        if one != two:
+            raise LogError(
+                f"{name} of '{first}' is {_in_words(one)}, that of '{other}' is {_in_words(two)}: "
+                f"they cannot be merged. Import both from their raw files."
+            )
+
+
+def _corrections(steps: Iterable[Step], name: str) -> list[Step]:
+    return [s for s in steps if s.decided_by == "vessel" and name in s.channels]
+
+
+def _in_words(steps: list[Step]) -> str:
+    return f"corrected ({'; '.join(s.sentence for s in steps)})" if steps else "as recorded"
 
 
 def _span(signal: Signal) -> tuple[float, float]:
