@@ -33,7 +33,7 @@ _CLEAR = 0.5
 # log-likelihood by which the thrusters must prefer one heading
 _LEAST_GAIN = 10.0
 # mean cosine between course and heading of a ship that sails ahead, and by how much it must win
-_AHEAD, _AHEAD_GAIN = 0.7, 0.4
+_AHEAD, _AHEAD_GAIN = 0.7, 0.2
 _ENU, _NED = "east-north-up", "north-east-down"
 _FLU, _FRD = "forward-left-up", "forward-right-down"
 

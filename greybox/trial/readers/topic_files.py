@@ -162,7 +162,10 @@ class TopicTable:
         needed = list(dict.fromkeys([*plain, *(p for m in made for p in m.parts)]))
         for batch in self.table.batches(needed):
             found = {c: batch[c] for c in plain}
-            yield found | {m.name: m.make(batch) for m in made}
+            # damaged numbers may be too large to be multiplied
+            with np.errstate(over="ignore", invalid="ignore"):
+                found |= {m.name: m.make(batch) for m in made}
+            yield found
 
 
 def as_topic(table: TableFile) -> TableFile:
@@ -201,8 +204,9 @@ def as_topic(table: TableFile) -> TableFile:
     first = next(iter(islice(table.batches(wanted), 1)), {c: np.empty(0) for c in wanted})
     found.frames = {_path(f): _first_word(first[f]) for f in frames}
     ahead = None
-    if stamp is not None:
-        made = _stamp_column(stamp)
+    made = None if stamp is None else _stamp_column(stamp)
+    # headers that nobody stamps hold zero
+    if made is not None and np.isfinite(made.make(first)).any():
         ahead = _ahead(first, made, recorder, table) if recorder else None
         if ahead is not None and abs(ahead) > _OTHER_CLOCK and zone_of(ahead) is None:
             found.remarks.append(
@@ -255,7 +259,6 @@ def _stamp_column(columns: tuple[str, ...]) -> _Column:
             value = value * 1e-9 if size > 1e14 else value
         else:
             value = value + 1e-9 * np.asarray(batch[columns[1]], float)
-        # a header that nobody stamped holds zero
         return np.where(value > 0, value, np.nan)
 
     return _Column(STAMP, columns, make, "s")
