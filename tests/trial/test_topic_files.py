@@ -256,7 +256,9 @@ def test_the_header_stamp_is_the_time_however_it_is_spelled(tmp_path, how):
     named = dict(zip(("header_stamp_secs", "header_stamp_nsecs"), SPELLED[how], strict=True))
     (path,) = written(tmp_path, {"fix": table.rename(columns=named)})
     recording = read_recording(path, VESSEL)
-    np.testing.assert_allclose(recording["lat"].t + recording.epoch, EPOCH + SHIP_RUN["t"], atol=1e-5)
+    np.testing.assert_allclose(
+        recording["lat"].t + recording.epoch, EPOCH + SHIP_RUN["t"], atol=1e-5
+    )
 
 
 def test_rows_as_rostopic_echoes_them(tmp_path):
