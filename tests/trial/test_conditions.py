@@ -92,7 +92,7 @@ def test_a_vessel_file_states_those_of_logs_that_state_none(tmp_path, monkeypatc
     assert "draught 3.6576 m" in ship.summary()
     with pytest.raises(VesselError, match=r"unknown key 'draft'\. Did you mean 'draught'"):
         vessel_from_dict(SHIP | {"conditions": {"draft": 1}})
-    with pytest.raises(VesselError, match=r"\[conditions\] is 3, not a table"):
+    with pytest.raises(VesselError, match=r"\[conditions\] is not a table but 3"):
         vessel_from_dict(SHIP | {"conditions": 3})
     raw = tmp_path / "raw.csv"
     raw.write_text("t,u,v,r,psi,n\n" + "".join(f"{k},1,0,0,0,5\n" for k in range(9)))
