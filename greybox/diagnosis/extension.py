@@ -17,6 +17,7 @@ from greybox.model.model import ManoeuvringModel
 from greybox.model.noise import NoiseLevels
 from greybox.model.structure import Structure
 from greybox.trial.log import TrialLog
+from greybox.trial.validity import pooled_conditions
 from greybox.vessel.vessel import Thruster, Vessel
 
 Array = NDArray[np.float64]
@@ -93,6 +94,7 @@ def extended_model(
         noise=_noise(problem, fit),
         sums=summed,
         changes=tuple(Change(names[c.index], c.factor, c.time) for c in ship.changes),
+        conditions=pooled_conditions(logs).values,
         record=dict(record),
     )
 

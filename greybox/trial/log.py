@@ -15,6 +15,7 @@ from greybox.errors import LogError, UsageError
 from greybox.notebook import Shown, items, number, sparkline, table
 from greybox.trial.steps import Step
 from greybox.vessel.actuation import actuated_force
+from greybox.vessel.conditions import Conditions
 from greybox.vessel.vessel import Vessel
 
 if TYPE_CHECKING:
@@ -46,7 +47,10 @@ class Provenance:
     epoch : float, optional
         UNIX time [s] of ``t = 0``.
     notes : mapping of str to str
-        Draught, loading, depth, sea state and what else was noted of the trial.
+        What was noted of the trial, word for word.
+    conditions : Conditions
+        What the trial states of draught, trim, loading, water depth and sea state, and the
+        vessel file where the trial does not.
     """
 
     source: str = ""
@@ -56,6 +60,7 @@ class Provenance:
     read: tuple[str, ...] = ()
     epoch: float | None = None
     notes: Mapping[str, str] = field(default_factory=dict)
+    conditions: Conditions = field(default_factory=Conditions)
 
     @property
     def derived(self) -> tuple[str, ...]:
@@ -79,6 +84,7 @@ class Provenance:
             "read": list(self.read),
             "epoch": self.epoch,
             "notes": dict(self.notes),
+            "conditions": self.conditions.to_dict(),
         }
 
 
@@ -131,6 +137,11 @@ class TrialLog(Shown):
         """Unit of ``t`` and of each channel; ``as logged`` where any unit is kept."""
         return {n: self.vessel.unit(n) or "as logged" for n in ("t", *self.channels)}
 
+    @property
+    def conditions(self) -> Conditions:
+        """Draught, trim, loading, water depth and sea state, as far as they are known."""
+        return self.provenance.conditions
+
     def summary(self) -> str:
         """Return name, duration, channels with units and ranges, and provenance, as text."""
         lines = [self._line()]
@@ -158,6 +169,7 @@ class TrialLog(Shown):
         p = self.provenance
         loop = float(np.mean(self.closed_loop)) if self.loop_known and len(self) else 0.0
         closed = [f"a controller moves the thrusters in {100 * loop:.0f} % of it"] if loop else []
+        closed += [f"conditions: {self.conditions.sentence}"] if self.conditions else []
         return [*closed, *(f"derived: {d}" for d in p.derived), *(f"mended: {f}" for f in p.fixed)]
 
     def _parts(self) -> tuple[str, ...]:
@@ -302,7 +314,8 @@ def make_log(
             raise LogError(f"'{key}' is not finite at sample {k}: cut or repair the log there.")
     size = next(iter(lengths.values()))
     t = arrays.pop("t", np.arange(size) * sample_time)
-    return TrialLog(name, sample_time, t, arrays, vessel, np.zeros(size, bool))
+    known = Provenance(conditions=vessel.conditions)
+    return TrialLog(name, sample_time, t, arrays, vessel, np.zeros(size, bool), provenance=known)
 
 
 def require_xarray() -> Any:

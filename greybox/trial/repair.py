@@ -14,6 +14,7 @@ from greybox.trial.checks.finding import IDS, CheckReport, Finding
 from greybox.trial.convert.derived_signals import continuous, derive_signals
 from greybox.trial.raw_log import Recording, Signal
 from greybox.trial.steps import Step, mend
+from greybox.trial.time_format import unpadded_numbers
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
@@ -106,6 +107,22 @@ def _drop(recording: Recording, step: Step) -> Recording:
     return recording.with_signals(out)
 
 
+def _pad_fractions(recording: Recording, step: Step) -> Recording:
+    zero = recording.epoch or 0.0
+    shared: dict[int, Array] = {}
+    out = []
+    for s in recording.signals:
+        if s.name in step.channels:
+            if id(s.t) not in shared:
+                wrong = unpadded_numbers(s.t + zero)
+                t = s.t.copy()
+                t[wrong.rows] = wrong.times - zero
+                shared[id(s.t)] = t
+            s = replace(s, t=shared[id(s.t)])
+        out.append(s)
+    return recording.with_signals(out)
+
+
 def _scale(recording: Recording, step: Step) -> Recording:
     return recording.with_signals(
         s.with_value(s.value * step.number("factor")) if s.name in step.channels else s
@@ -173,7 +190,7 @@ def _heading_at(recording: Recording, t: Array) -> Array:
 _ACTIONS = {
     "order": _order, "drop": _drop, "scale": _scale, "offset": _offset, "exchange": _exchange,
     "shift": _shift, "turn_heading": _turn_heading, "earth_to_body": _earth_to_body,
-    "move_antenna": _move_antenna,
+    "move_antenna": _move_antenna, "pad_fractions": _pad_fractions,
 }  # fmt: skip
 # these act on positions and unwrapped headings
 _ON_DERIVED = frozenset({"earth_to_body", "move_antenna", "shift", "turn_heading"})

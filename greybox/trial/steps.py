@@ -211,4 +211,13 @@ OPERATIONS: dict[str, Callable[[Step], str]] = {
     ),
     # what a record of an older version tells and this version has no operation for
     "recorded": lambda s: f"{_names(s)} changed, as an older record tells",
+    "time_zone": lambda s: (
+        f"clock of {', '.join(s.source)} is {s.number('ahead') / 3600:+g} h ahead of "
+        f"{s.parameters['against']}: put on that"
+    ),
+    "read_axes": lambda s: f"{_names(s)} read in axes {s.parameters['axes']}",
+    "pad_fractions": lambda s: (
+        f"{s.number('count'):.0f} times of {_names(s)} lack leading zeros in their fraction of a "
+        f"second, such as {s.parameters['written']} for {s.parameters['meant']}: read as meant"
+    ),
 }

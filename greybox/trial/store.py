@@ -20,6 +20,7 @@ from greybox.trial.log import RECORD_FORMAT, RECORD_VERSION, Provenance, TrialLo
 from greybox.trial.old_records import steps_of_sentences
 from greybox.trial.readers.limits import limits
 from greybox.trial.steps import Step, step_from_dict
+from greybox.vessel.conditions import Conditions
 
 _ROWS = 1 << 17
 
@@ -183,6 +184,7 @@ def recorded_provenance(record: Mapping[str, Any]) -> Provenance:
         words("read"),
         float(epoch) if isinstance(epoch, int | float) else None,
         {str(k): str(v) for k, v in notes.items()} if isinstance(notes, dict) else {},
+        Conditions.recorded(record),
     )
 
 

@@ -31,6 +31,7 @@ from greybox.trial.convert.time_grid import (
 from greybox.trial.log import Provenance, TrialLog
 from greybox.trial.raw_log import Recording
 from greybox.trial.steps import Step
+from greybox.vessel.conditions import Conditions
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
@@ -157,14 +158,19 @@ def import_recording(
         raise cut.refusal(conversion)
     notes = (*clean.notes, *plan.notes, *gap_notes(spans, cut.short, plan.least), *cut.notes)
     made = replace(clean, notes=notes).with_steps(*cut.steps)
-    provenance = make_provenance(made, options)
+    provenance = make_provenance(made, options, vessel.conditions)
     segments = [replace(s, provenance=provenance) for s in segments]
     done = made.steps[len(recording.steps) :]
     return Imported(tuple(segments), (*notes, *(s.sentence for s in done)))
 
 
-def make_provenance(recording: Recording, options: ImportOptions) -> Provenance:
-    """Return where a log came from and what was done, as its recording says at the end."""
+def make_provenance(
+    recording: Recording, options: ImportOptions, default: Conditions
+) -> Provenance:
+    """Return where a log came from and what was done, as its recording says at the end.
+
+    `default` are the conditions where neither the recording nor the options state any.
+    """
     first = recording.files[0] if recording.files else None
     return Provenance(
         source=", ".join(f.name for f in recording.files) or recording.name,
@@ -174,6 +180,7 @@ def make_provenance(recording: Recording, options: ImportOptions) -> Provenance:
         read=recording.notes,
         epoch=recording.epoch,
         notes=dict(options.notes),
+        conditions=options.conditions.over(recording.conditions).over(default),
     )
 
 

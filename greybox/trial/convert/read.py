@@ -158,7 +158,8 @@ def table_segments(
         raise cut.refusal(conversion)
     steps = (*recording.steps, *cut.steps)
     read = (*known.read, *(n for n in cut.notes if n not in known.read))
-    known = replace(known, steps=steps, read=read)
+    conditions = known.conditions.over(vessel.conditions)
+    known = replace(known, steps=steps, read=read, conditions=conditions)
     columns = [str(c) for c in table.columns]
     segments = []
     for k, log in enumerate(cut.segments):

@@ -313,7 +313,7 @@ class Stream:
             self.table.path.stem, (), epoch=self.scan.scale.epoch, files=(self.file,),
             notes=tuple(notes), steps=(*self.scan.before, *self.steps),
         )  # fmt: skip
-        return make_provenance(whole, self.options)
+        return make_provenance(whole, self.options, self.vessel.conditions)
 
     def segments(self) -> Iterator[TrialLog]:
         """Yield the pieces of the log in order of time.
