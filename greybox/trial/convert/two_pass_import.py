@@ -7,7 +7,7 @@ the second goes the way of every import (`greybox.trial.convert.convert`) block 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import chain
 from typing import Any
 
@@ -23,9 +23,11 @@ from greybox.trial.convert.channel_mapping import (
     angle_unit,
     batch_recording,
     canonical,
+    reading_steps,
     table_columns,
     time_scale,
     unused_mappings,
+    written_log,
 )
 from greybox.trial.convert.column_names import Assigned
 from greybox.trial.convert.convert import Conversion, Cut, cut_segments, make_provenance
@@ -39,7 +41,6 @@ from greybox.trial.log import Provenance, TrialLog
 from greybox.trial.raw_log import Recording, Signal, SourceFile
 from greybox.trial.readers.table import Batch, TableFile
 from greybox.trial.steps import Step, new_steps
-from greybox.trial.store import read_record, recorded_provenance
 from greybox.vessel.conditions import Conditions
 from greybox.vessel.vessel import Vessel
 
@@ -70,9 +71,9 @@ class Scan:
     plan : Plan
     notes : tuple of str
     before : tuple of Step
-        What was done before, where the table is a log that greybox wrote.
+        What was done before, where the table is a log that greybox wrote, and by reading it.
     conditions : Conditions
-        As stated before, where it is.
+        Of the trial, where the record of that log tells.
     """
 
     assigned: dict[str, Assigned]
@@ -81,8 +82,8 @@ class Scan:
     back: float
     plan: Plan
     notes: tuple[str, ...]
-    before: tuple[Step, ...] = ()
-    conditions: Conditions = field(default_factory=Conditions)
+    before: tuple[Step, ...]
+    conditions: Conditions
 
 
 def scan_table(table: TableFile, vessel: Vessel, options: ImportOptions) -> Scan:
@@ -93,11 +94,8 @@ def scan_table(table: TableFile, vessel: Vessel, options: ImportOptions) -> Scan
     LogError
         As `plan_import`; or time goes back too far to be sorted in blocks.
     """
-    record = read_record(table.path)
-    if record is not None:
-        # what greybox wrote is canonical: a mapping would convert it twice
-        vessel = replace(vessel, columns={})
-    assigned = table_columns(table, vessel, guess=record is None)
+    before, vessel = written_log(table.path, vessel)
+    assigned = table_columns(table, vessel, guess=before is None)
     found = _Found(table, vessel, options, assigned)
     for batch in table.batches([a.raw for a in assigned.values()]):
         found.add(batch)
@@ -105,7 +103,7 @@ def scan_table(table: TableFile, vessel: Vessel, options: ImportOptions) -> Scan
         # nothing to measure: the message is that of an empty time column
         time_scale(np.empty(0), assigned["t"], table)
         raise AssertionError
-    before = recorded_provenance(record or {})
+    before = before or Provenance()
     if found.scale.epoch is None:
         found.scale = replace(found.scale, epoch=before.epoch)
     if found.back > _MAX_BACK_ROWS * found.usual:
@@ -117,6 +115,7 @@ def scan_table(table: TableFile, vessel: Vessel, options: ImportOptions) -> Scan
     units = {n: angle_unit(reach) for n, reach in found.reach.items()}
     whole = canonical(found.sample, assigned, vessel, found.reach)
     derived = derive_signals(whole, found.origin)
+    steps = (*before.steps, *reading_steps(table, found.scale))
     decided = {n: replace(a, unit=units[n]) if n in units else a for n, a in assigned.items()}
     extents = {n: parts.extent() for n, parts in found.parts.items()}
     plan = plan_import(extents, vessel, options, table.path.stem)
@@ -136,9 +135,15 @@ def scan_table(table: TableFile, vessel: Vessel, options: ImportOptions) -> Scan
             f"the first is kept"
         )
     return Scan(
-        decided, found.scale, found.origin, found.back, plan, (*notes, *plan.notes), before.steps,
+        decided,
+        found.scale,
+        found.origin,
+        found.back,
+        plan,
+        (*notes, *plan.notes),
+        steps,
         before.conditions,
-    )  # fmt: skip
+    )
 
 
 class _Parts:
