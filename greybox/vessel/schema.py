@@ -149,6 +149,16 @@ class ClosedLoopTable(Table):
     values: list[str | int | float | bool]
 
 
+class ConditionsTable(Table):
+    """Conditions of logs that state none: numbers in SI, or texts with a unit."""
+
+    draught: Any = None
+    trim: Any = None
+    loading: Any = None
+    water_depth: Any = None
+    sea_state: Any = None
+
+
 class VesselTable(Table):
     """The whole file."""
 
@@ -162,12 +172,14 @@ class VesselTable(Table):
     closed_loop: ClosedLoopTable | None = None
     mass: Positive | None = None
     actuation: ActuationTable = ActuationTable()
+    conditions: ConditionsTable = ConditionsTable()
 
 
 _TABLES: dict[str, type[Table]] = {
     "sensors": SensorsTable,
     "actuation": ActuationTable,
     "closed_loop": ClosedLoopTable,
+    "conditions": ConditionsTable,
 }
 _THRUSTERS: dict[str, type[Table]] = dict(zip(THRUSTER_TYPES, get_args(AnyThruster), strict=True))
 _COLUMNS = {"speed": "its propeller speed", "angle": "its angle", "rudder": "its rudder angle"}

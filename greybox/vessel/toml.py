@@ -15,11 +15,12 @@ from greybox.channels import CHANNELS
 from greybox.errors import LogError, VesselError, suggestion
 from greybox.files import nearest_file
 from greybox.units import unit_factor
+from greybox.vessel.conditions import Conditions
 from greybox.vessel.thrust import ThrustLaw
 from greybox.vessel.vessel import Actuation, ColumnMapping, Limits, Thruster, Vessel
 
 if TYPE_CHECKING:
-    from greybox.vessel.schema import AnyThruster, ColumnTable, SensorsTable
+    from greybox.vessel.schema import AnyThruster, ColumnTable, ConditionsTable, SensorsTable
 
 _MOVED = ("angle", "rudder", "speed")
 _CORRECTED = ("x_n", "y_n", "psi", "u", "v", "r", "u_q", "v_q")
@@ -114,6 +115,7 @@ def vessel_from_dict(data: dict[str, Any]) -> Vessel:
         closed_loop=None if loop is None else (loop.column, tuple(map(str, loop.values))),
         mass=table.mass,
         actuation=Actuation(**vars(table.actuation)),
+        conditions=_conditions(table.conditions),
     )
     return replace(
         vessel,
@@ -173,6 +175,8 @@ def vessel_to_dict(vessel: Vessel) -> dict[str, Any]:
         data["mass"] = vessel.mass
     if vessel.actuation != Actuation():
         data["actuation"] = vars(vessel.actuation).copy()
+    if vessel.conditions:
+        data["conditions"] = vessel.conditions.to_dict()
     return data
 
 
@@ -236,6 +240,13 @@ def _column(raw: str, table: ColumnTable, vessel: Vessel) -> ColumnMapping:
     if table.sign not in (1, -1):
         raise VesselError(f"column '{raw}' has sign = {table.sign}: write 1, or -1 to reverse it.")
     return ColumnMapping(table.name, table.unit, table.sign)
+
+
+def _conditions(table: ConditionsTable) -> Conditions:
+    try:
+        return Conditions.read(vars(table))
+    except LogError as error:
+        raise VesselError(f"[conditions] of the vessel file: {error}") from None
 
 
 def _sensors(table: SensorsTable, commands: Iterable[str]) -> dict[str, Any]:

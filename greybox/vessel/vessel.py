@@ -10,6 +10,7 @@ from typing import Any, Literal, get_args
 from greybox.channels import CHANNELS
 from greybox.errors import VesselError, suggestion
 from greybox.notebook import Shown, number, table
+from greybox.vessel.conditions import Conditions
 from greybox.vessel.thrust import ThrustLaw
 
 ThrusterType = Literal["azimuth", "fixed", "tunnel", "propeller_rudder"]
@@ -238,6 +239,8 @@ class Vessel(Shown):
     mass : float, optional
         [kg]
     actuation : Actuation
+    conditions : Conditions
+        Those of a log that does not state its own.
     """
 
     name: str
@@ -248,6 +251,7 @@ class Vessel(Shown):
     closed_loop: tuple[str, tuple[str, ...]] | None = None
     mass: float | None = None
     actuation: Actuation = Actuation()
+    conditions: Conditions = field(default_factory=Conditions)
 
     @property
     def commands(self) -> tuple[str, ...]:
@@ -325,6 +329,8 @@ class Vessel(Shown):
         if self.actuation:
             lines.append(f"  thrusters with {self.actuation.sentence}")
         lines += [f"  {name} {value}" for name, value in self.sensors.items()]
+        if self.conditions:
+            lines.append(f"  conditions: {self.conditions.sentence}")
         return "\n".join(lines)
 
     def _parts(self) -> tuple[str, ...]:

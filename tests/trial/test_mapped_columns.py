@@ -8,7 +8,7 @@ import pytest
 
 from greybox.errors import LogError
 from greybox.trial.convert.read import read_log
-from greybox.trial.convert.two_pass_import import import_files
+from greybox.trial.import_files import import_files
 from greybox.vessel.toml import vessel_from_dict
 
 T = np.arange(100) / 10
@@ -65,7 +65,8 @@ def test_columns_mapped_to_one_signal_are_alternatives(tmp_path):
     other = table(hdg=np.degrees(0.1 * T)).drop(columns="yaw")
     np.testing.assert_allclose(imported(tmp_path, ship, other)["psi"], first["psi"], atol=1e-9)
     other.to_csv(tmp_path / "plain.csv", index=False)
-    np.testing.assert_allclose(read_log(tmp_path / "plain.csv", ship)["psi"], 0.1 * T, atol=1e-9)
+    plain = read_log(tmp_path / "plain.csv", ship)
+    np.testing.assert_allclose(plain["psi"], 0.1 * plain.t, atol=1e-9)
     later = other.assign(tvec=T + 10, hdg=np.degrees(0.1 * T + 1))
     both = imported(tmp_path, ship, table(), later)
     np.testing.assert_allclose(both["psi"], 0.1 * both.t, atol=1e-9)

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from greybox.channels import ANGLES
 from greybox.trial.checks.finding import Finding
 from greybox.trial.convert.derived_signals import continuous
-from greybox.trial.convert.resample import HOLE, clock, runs
+from greybox.trial.convert.resample import clock, runs
+from greybox.trial.gaps import HOLE
 from greybox.trial.raw_log import Recording, Signal
 from greybox.trial.steps import mend
 from greybox.vessel.vessel import Vessel

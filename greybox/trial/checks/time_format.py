@@ -26,7 +26,10 @@ def time_format_findings(recording: Recording) -> list[Finding]:
     list of Finding
         One for each column of text that was read so, and one for each clock of numbers.
     """
-    found = [_of_text(s) for s in recording.steps if s.operation == "pad_fractions"]
+    read = [
+        s for s in recording.steps if s.operation == "pad_fractions" and "times" in s.parameters
+    ]
+    found = [_of_text(s) for s in read]
     for names, t in clocks(recording):
         zero = recording.epoch or 0.0
         wrong = unpadded_numbers(t + zero)
@@ -48,12 +51,17 @@ def time_format_findings(recording: Recording) -> list[Finding]:
                 f"and seem to go back behind",
                 _FIX,
                 ("t",),
-                (mend("pad_fractions", names, count=float(len(wrong)), first=float(meant[0])),),
+                (_mend(names, len(wrong), float(written[0]), float(meant[0])),),
                 True,
                 {"t": t, "rows": wrong.rows, "written": written, "meant": meant, "names": names},
             )
         )
     return found
+
+
+def _mend(names: tuple[str, ...], count: int, written: float, meant: float) -> Step:
+    said = {"written": f"{written:.9g} s", "meant": f"{meant:.9g} s"}
+    return mend("pad_fractions", names, count=float(count), **said)
 
 
 def _of_text(step: Step) -> Finding:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -14,16 +15,17 @@ from greybox.channels import CHANNELS
 from greybox.errors import LogError, suggestion
 from greybox.files import sha256
 from greybox.trial.convert.column_names import Assigned, assign, is_short_pair
-from greybox.trial.convert.derived_channels import wind_state
+from greybox.trial.convert.derived_signals import wind_state
 from greybox.trial.convert.file_clocks import on_one_clock
 from greybox.trial.convert.settle_axes import settle_axes
 from greybox.trial.raw_log import Recording, Signal, SourceFile
 from greybox.trial.readers.formats import open_raw
 from greybox.trial.readers.table import Batch, TableFile, read_columns
 from greybox.trial.readers.topic_files import STAMP, TopicTable
-from greybox.trial.steps import Step
+from greybox.trial.steps import Step, new_steps
 from greybox.trial.store import read_record, recorded_provenance
 from greybox.units import is_unix_time, time_unit, unit_factor, unix_unit
+from greybox.vessel.conditions import Conditions
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
@@ -128,7 +130,9 @@ def _read(
         if record is not None:
             known = recorded_provenance(record)
             epoch = known.epoch if raw.epoch is None else raw.epoch
-            raw = replace(raw, epoch=epoch, derived=known.derived)
+            raw = replace(
+                raw, epoch=epoch, steps=tuple(map(_past, known.steps)), conditions=known.conditions
+            )
     else:
         assigned = assign(
             raw.names,
@@ -159,16 +163,22 @@ def table_recording(
         unsure = frozenset(n for n, a in assigned.items() if a.raw in table.unsure)
         recording = replace(recording, unsure=unsure, ahead=table.ahead if stamped else None)
     notes = (*table.notes, *scale.notes, *recording.notes)
-    steps = tuple(_moved(s, -scale.zero) for s in table.steps)
+    steps = tuple(on_zero(s, -scale.zero) for s in table.steps)
     return replace(recording, notes=notes, steps=steps), assigned
 
 
-def _moved(step: Step, shift: float) -> Step:
-    """Return a step with the places that it names on another zero of time."""
+def on_zero(step: Step, shift: float) -> Step:
+    """Return a step of reading with the places that it names on another zero of time."""
     if "times" not in step.parameters:
         return step
     times = tuple(t + shift for t in step.numbers("times"))
     return replace(step, parameters={**step.parameters, "times": times})
+
+
+def _past(step: Step) -> Step:
+    """Return a step of an earlier reading without its places, which are not in this file."""
+    kept = {k: v for k, v in step.parameters.items() if k not in ("times", "late")}
+    return replace(step, parameters=kept)
 
 
 def table_columns(
@@ -454,7 +464,7 @@ def merge(recordings: list[Recording]) -> Recording:
     for r in recordings:
         shift = r.epoch - epoch if epoch is not None and r.epoch is not None else 0.0
         notes += [f"{r.name}: {n}" for n in r.notes]
-        steps += [_moved(s, shift) for s in r.steps]
+        steps += [on_zero(s, shift) for s in r.steps]
         moved: dict[int, Array] = {}
         for s in r.signals:
             t = moved.setdefault(id(s.t), s.t + shift)
@@ -464,17 +474,17 @@ def merge(recordings: list[Recording]) -> Recording:
             parts.insert(at, (r.name, replace(s, t=t)))
             stated[s.name] = stated.get(s.name, 0) + (s.name not in r.guessed)
         for name, (t, words) in r.text.items():
-            before = text.get(name, (np.empty(0), np.empty(0, dtype=str)))
+            first = text.get(name, (np.empty(0), np.empty(0, dtype=str)))
             text[name] = (
-                np.concatenate([before[0], t + shift]),
-                np.concatenate([before[1], words]),
+                np.concatenate([first[0], t + shift]),
+                np.concatenate([first[1], words]),
             )
     signals = []
     clocks: dict[tuple[int, ...], Array] = {}
     unsure = {(r.name, n) for r in recordings for n in r.unsure}
     still: set[str] = set()
-    derived = {r.name: r.derived for r in recordings}
     mapped = {(r.name, n): raw for r in recordings for n, raw in r.mapped.items()}
+    before = {r.name: r.steps for r in recordings}
     for name, parts in found.items():
         kept = [parts[0]]
         for part in parts[1:]:
@@ -494,7 +504,7 @@ def merge(recordings: list[Recording]) -> Recording:
             else:
                 kept.append(part)
         if name in ("u_q", "v_q"):
-            _refuse_two_winds([(n, derived[n]) for n, _ in kept])
+            _refuse_two_winds([(n, before[n]) for n, _ in kept])
         still |= {name for n, _ in kept if (n, name) in unsure}
         kept.sort(key=lambda p: _span(p[1])[0])
         # columns of one table go on sharing their clock
@@ -510,19 +520,19 @@ def merge(recordings: list[Recording]) -> Recording:
         epoch,
         tuple(f for r in recordings for f in r.files),
         tuple(notes),
-        derived=tuple(dict.fromkeys(d for r in recordings for d in r.derived)),
-        steps=tuple(steps),
+        steps=new_steps((), steps),
+        conditions=reduce(Conditions.over, (r.conditions for r in recordings)),
         unsure=frozenset(still),
     )
 
 
-def _refuse_two_winds(parts: list[tuple[str, tuple[str, ...]]]) -> None:
+def _refuse_two_winds(parts: list[tuple[str, tuple[Step, ...]]]) -> None:
     """Refuse winds of several files that are not of one place and height."""
-    (first, derived), *others = parts
+    (first, steps), *others = parts
     for name, more in others:
-        if wind_state(more) != wind_state(derived):
+        if wind_state(more) != wind_state(steps):
             raise LogError(
-                f"the wind of '{first}' is {wind_state(derived)}, that of '{name}' is "
+                f"the wind of '{first}' is {wind_state(steps)}, that of '{name}' is "
                 f"{wind_state(more)}: they cannot be merged. Import both from their raw files."
             )
 

@@ -16,14 +16,13 @@ from numpy.typing import NDArray
 from greybox.errors import LogError, suggestion
 from greybox.files import sha256
 from greybox.trial.raw_log import Array, Recording, Signal, SourceFile
-from greybox.trial.readers.matfile import Tree, Unreadable, load_tree
+from greybox.trial.readers.limits import limits
+from greybox.trial.readers.mat_tree import Tree, Unreadable
+from greybox.trial.readers.matfile import load_tree
 from greybox.units import UNITS, find_unit, is_unix_time, spelled_unit, time_unit, unix_unit
 
-MAX_COLUMNS = 64
-MAX_NOTES = 60
-MAX_SCALARS = 40
-# characters of a text that are kept, so that one long line does not widen a column of words
-_MAX_TEXT = 200
+# settings among the notes
+_MAX_SCALARS = 40
 
 # days since the year 0 and since 1970, as MATLAB's datenum counts
 _DATENUM = (7e5, 8e5)
@@ -121,9 +120,9 @@ class _Reader:
         self.scalars = 0
 
     def note(self, text: str) -> None:
-        if len(self.notes) < MAX_NOTES:
+        if len(self.notes) < limits().notes:
             self.notes.append(text)
-        elif len(self.notes) == MAX_NOTES:
+        elif len(self.notes) == limits().notes:
             self.notes.append("more was left out than is listed here.")
 
     # first the structure, so that every time is known before signals look for theirs
@@ -167,7 +166,7 @@ class _Reader:
             self._list(path, key, value, scope)
         elif isinstance(value, str):
             if value:
-                self._scalar(path, value[:_MAX_TEXT])
+                self._scalar(path, value[: limits().text])
         elif value.size == 1:
             self._scalar(path, f"{float(value.ravel()[0]):.12g}")
         elif value.size:
@@ -180,7 +179,7 @@ class _Reader:
     def _scalar(self, path: str, value: str) -> None:
         # notes of what was left out must not drown in a struct of settings
         self.scalars += 1
-        if self.scalars <= MAX_SCALARS:
+        if self.scalars <= _MAX_SCALARS:
             self.note(f"{path} = {value}")
 
     def _list(self, path: str, key: str, value: list[Any], scope: _Scope) -> None:
@@ -196,19 +195,21 @@ class _Reader:
             if columns:
                 self.collect(columns, path, scope)
                 return
-            for k, item in enumerate(value[:MAX_COLUMNS], start=1):
+            for k, item in enumerate(value[: limits().matrix_columns], start=1):
                 self.collect(item, f"{path}_{k}", scope)
-            if len(value) > MAX_COLUMNS:
-                self.note(f"of the {len(value)} structs of '{path}' {MAX_COLUMNS} were read.")
+            if len(value) > limits().matrix_columns:
+                self.note(
+                    f"of the {len(value)} structs of '{path}' {limits().matrix_columns} were read."
+                )
             return
-        for k, item in enumerate(value[:MAX_COLUMNS], start=1):
+        for k, item in enumerate(value[: limits().matrix_columns], start=1):
             if isinstance(item, dict):
                 self.collect(item, f"{path}_{k}", scope)
             elif isinstance(item, (Unreadable, np.ndarray)):
                 self._value(f"{path}_{k}", f"{key}_{k}", item, scope, {})
 
     def _simulink(self, signals: list[Tree], scope: _Scope) -> None:
-        for k, item in enumerate(signals[:MAX_COLUMNS], start=1):
+        for k, item in enumerate(signals[: limits().matrix_columns], start=1):
             label = item.get("label")
             if not isinstance(label, str) or not label:
                 block = item.get("blockName")
@@ -248,7 +249,7 @@ class _Reader:
             if isinstance(item.value, list):
                 time = self._own_time(item, (len(item.value),))
                 if time is not None:
-                    words = np.array([w[:_MAX_TEXT] for w in item.value])
+                    words = np.array([w[: limits().text] for w in item.value])
                     text[_free(item.name, used)] = (clocks[id(time)], words)
                 continue
             time = self._own_time(item, item.value.shape)
@@ -291,12 +292,12 @@ class _Reader:
         if value.shape[axis] != count:
             axis = value.shape.index(count)
         table = np.moveaxis(value, axis, 0).reshape(count, -1)
-        width = table.shape[1]
-        if width > MAX_COLUMNS:
-            self.note(f"of the {width} columns of '{item.name}' {MAX_COLUMNS} were read.")
+        width, most = table.shape[1], limits().matrix_columns
+        if width > most:
+            self.note(f"of the {width} columns of '{item.name}' {most} were read.")
         named = len(item.labels) == width
         units = item.units if len(item.units) == width else [""] * width
-        for k in range(min(width, MAX_COLUMNS)):
+        for k in range(min(width, most)):
             name = item.name if width == 1 else f"{item.name}_{k + 1}"
             if named:
                 name = _join(item.scope.name, item.labels[k])
@@ -460,16 +461,11 @@ def _time(name: str, value: Any, stated: str | None) -> _Time | None:
     factor = UNITS[unit].factor
     if is_unix_time(middle * factor):
         note = f"'{name}' was taken as UNIX time in {unit}, for it is near {middle:.6g}."
-        start_raw = known[0]
         # integers are subtracted as integers: a float of nanoseconds is 0.2 us coarse
-        t = (
-            np.asarray(
-                (raw - start_raw).astype(np.int64) if raw.dtype.kind in "iu" else raw - start_raw,
-                float,
-            )
-            * factor
-        )
-        return _Time(name, t, float(start_raw) * factor, note)
+        whole = raw.astype(np.int64) if raw.dtype.kind in "iu" else raw
+        first = whole[np.isfinite(whole)][0]
+        t = np.asarray(whole - first, float) * factor
+        return _Time(name, t, float(first) * factor, note)
     note = f"'{name}' was taken as time in {unit}." if unit != "s" else ""
     return _Time(name, np.asarray(raw, float) * factor, None, note)
 
