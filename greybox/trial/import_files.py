@@ -15,6 +15,7 @@ from greybox.trial.convert.two_pass_import import Stream, is_large
 from greybox.trial.log import TrialLog
 from greybox.trial.raw_log import Recording
 from greybox.trial.readers.formats import open_raw
+from greybox.trial.readers.topic_files import TopicTable
 from greybox.trial.repair import repair
 from greybox.trial.store import record_path, write_log
 from greybox.vessel.vessel import Vessel
@@ -64,7 +65,9 @@ def import_files(
     _keep_sources(paths, out)
     if len(paths) == 1 and not fix and not fix_also and Path(paths[0]).is_file():
         table = open_raw(paths[0], **(reader or {}))
-        if not isinstance(table, Recording) and is_large(table):
+        # axes that only the other signals tell need all of them
+        unsure = isinstance(table, TopicTable) and bool(table.unsure)
+        if not isinstance(table, Recording) and is_large(table) and not unsure:
             stream = Stream(table, vessel, options)
             write_log(stream.segments(), out, extra=extra, provenance=stream.provenance)
             assert stream.first is not None

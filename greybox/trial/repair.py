@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import UsageError, suggestion
+from greybox.rotation import body_to_ned, ned_to_body
 from greybox.trial.checks.finding import IDS, CheckReport, Finding
 from greybox.trial.convert.derived_signals import continuous, derive_signals
 from greybox.trial.raw_log import Recording, Signal
@@ -167,12 +168,8 @@ def _turn_heading(recording: Recording, step: Step) -> Recording:
 def _earth_to_body(recording: Recording, step: Step) -> Recording:
     north, east = (recording[n] for n in step.channels)
     psi = _heading_at(recording, north.t)
-    c, s = np.cos(psi), np.sin(psi)
-    east_value = np.interp(north.t, east.t, east.value)
-    made = {
-        "u": c * north.value + s * east_value,
-        "v": c * east_value - s * north.value,
-    }
+    u, v = ned_to_body(north.value, np.interp(north.t, east.t, east.value), psi)
+    made = {"u": u, "v": v}
     return recording.with_signals(
         replace(x, t=north.t, value=made[x.name]) if x.name in made else x
         for x in recording.signals
@@ -184,10 +181,8 @@ def _move_antenna(recording: Recording, step: Step) -> Recording:
     out: list[Signal] = []
     for s in recording.signals:
         if s.name in ("x_n", "y_n"):
-            psi = _heading_at(recording, s.t)
-            c, si = np.cos(psi), np.sin(psi)
-            arm = c * x - si * y if s.name == "x_n" else si * x + c * y
-            s = s.with_value(s.value - arm)
+            arm = body_to_ned(x, y, _heading_at(recording, s.t))
+            s = s.with_value(s.value - arm[s.name == "y_n"])
         out.append(s)
     return recording.with_signals(out)
 

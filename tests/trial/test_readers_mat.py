@@ -432,7 +432,7 @@ def test_cut_files_are_refused(tmp_path, kind):
 @pytest.mark.long
 @pytest.mark.parametrize("kind", ["five", "packed", "four"])
 def test_files_cut_anywhere_are_refused(tmp_path, kind):
-    check_cut_files(tmp_path, kind, np.linspace(0, 0.999, 30))
+    check_cut_files(tmp_path, kind, np.linspace(0, 0.999, 12))
 
 
 def test_cut_hdf_files_are_refused(tmp_path):
@@ -443,8 +443,8 @@ def test_cut_hdf_files_are_refused(tmp_path):
     ("kind", "copies"),
     [
         (hdf, 80), (five, 5), (packed, 3),
-        pytest.param(five, 40, marks=pytest.mark.long),
-        pytest.param(packed, 40, marks=pytest.mark.long),
+        pytest.param(five, 15, marks=pytest.mark.long),
+        pytest.param(packed, 15, marks=pytest.mark.long),
     ],
 )  # fmt: skip
 def test_flipped_bytes_never_raise_anything_else(tmp_path, kind, copies):

@@ -24,6 +24,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from greybox.errors import LogError
 from greybox.trial.readers.limits import limits
 from greybox.trial.readers.ros import messages as rosmessages
+from greybox.trial.readers.ros.axes import compass_heading
 from greybox.trial.readers.ros.read import read_bag
 from greybox.trial.readers.ros.storage import Channel
 
@@ -438,6 +439,15 @@ print(float(compass_heading(0.0, 0.0, 0.0, 1.0, ned=False)))
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     # the body looks east where it is not turned
     assert float(done.stdout) == pytest.approx(math.pi / 2)
+
+
+def test_headings_of_many_quaternions():
+    yaw = np.array([0.0, 0.3, -2.0])
+    q = (np.zeros(3), np.zeros(3), np.sin(yaw / 2), np.cos(yaw / 2))
+    np.testing.assert_allclose(compass_heading(*q, ned=True), yaw % (2 * np.pi))
+    np.testing.assert_allclose(compass_heading(*q, ned=False), (np.pi / 2 - yaw) % (2 * np.pi))
+    wrong = np.array([0.0, np.nan, np.inf, 1e200])
+    assert np.isnan(compass_heading(wrong, wrong, wrong, wrong, ned=True)).all()
 
 
 # files that are damaged, foreign or hostile

@@ -14,7 +14,7 @@ import pytest
 from greybox.errors import VesselError
 from greybox.trial.log import make_log
 from greybox.vessel.actuation import Actuation, actuated_force
-from greybox.vessel.force import force_function, force_inputs, generalised_force
+from greybox.vessel.force import force_expressions, force_inputs, generalised_force
 from greybox.vessel.thrust import ThrustLaw
 from greybox.vessel.toml import load_vessel, vessel_from_dict, vessel_to_dict
 from greybox.vessel.vessel import ColumnMapping, Thruster
@@ -48,7 +48,10 @@ def test_symbolic_and_array_forces_agree():
     rng = np.random.default_rng(0)
     values = {c: rng.uniform(-900, 900, 20) for c in v.commands}
     got = generalised_force(v, values)
-    function = force_function(v)
+    commands = ca.SX.sym("commands", len(v.commands))
+    function = ca.Function(
+        "force", [commands], [ca.vertcat(*force_expressions(v, commands).values())]
+    )
     want = np.array(
         [np.array(function([values[c][k] for c in v.commands])).ravel() for k in range(20)]
     )

@@ -472,7 +472,8 @@ def _moves(name: str, start: float, stop: float, signals: list[Signal], step: fl
 def angle_unit_findings(recording: Recording, vessel: Vessel) -> list[Finding]:
     """Find degrees under a radian name by range: angles of wind and thrusters."""
     found = []
-    rudders = {t.rudder for t in vessel.thrusters if t.rudder}
+    moved = [m for t in vessel.thrusters for m in t.movements]
+    rudders = {c for kind, *both, _ in moved if kind == "rudder" for c in both}
     for s in recording.signals:
         if s.name not in (ANGLES | vessel.recorded_angles) - {"psi", "cog"}:
             continue

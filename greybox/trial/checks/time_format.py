@@ -76,7 +76,7 @@ def _of_text(read: list[Step]) -> Finding:
         (count, count),
         "1",
         f"{count:.0f} times of {columns} have fewer digits than the others, such as "
-        f"{first.parameters['written']} for {first.parameters['meant']} at t = {times[0]:.6g} s: "
+        f"{first.parameters.get('written')} for {first.parameters.get('meant')} at t = {times[0]:.6g} s: "
         f"their fraction lacks its leading zeros, and would come up to {late[worst]:.3g} s late",
         "none needed: import reads them as they are meant; export times with all their digits",
         ("t",),

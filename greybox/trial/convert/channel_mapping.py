@@ -131,7 +131,11 @@ def _read(
             known = recorded_provenance(record)
             epoch = known.epoch if raw.epoch is None else raw.epoch
             raw = replace(
+<<<<<<< HEAD
                 raw, epoch=epoch, steps=tuple(map(_past, known.steps)), conditions=known.conditions
+=======
+                raw, epoch=epoch, steps=(*known.steps, *raw.steps), conditions=known.conditions
+>>>>>>> main
             )
     else:
         assigned = assign(
@@ -408,10 +412,16 @@ def angle_unit(reach: tuple[float, float]) -> str:
 
 def _guess_commands(raw: Recording, assigned: dict[str, Assigned], vessel: Vessel) -> None:
     """Give rudders and shafts of NMEA 0183 to the vessel's columns where only one fit exists."""
-    missing = [c for c in vessel.commands if c not in assigned]
+    # sensors tell what was measured, also where the command drives the model
+    measured = {
+        (kind, column if t.drive == "feedback" else other)
+        for t in vessel.thrusters
+        for kind, column, other, _ in t.movements
+    }
+    missing = [c for c in vessel.recorded_columns if c not in assigned]
     # azimuths are not what RSA tells of: their sign and range differ from a rudder's
-    rudders = [c for c in missing if c in {t.rudder for t in vessel.thrusters}]
-    speeds = [c for c in missing if c not in vessel.angle_commands]
+    rudders = [c for c in missing if ("rudder", c) in measured]
+    speeds = [c for c in missing if ("speed", c) in measured]
     shafts = sorted((n for n in raw.names if n.startswith("rpm_")), key=_shaft)
     of_kind = [n for n in shafts if n.startswith("rpm_shaft")]
     # an engine and its shaft turn together: one of each kind is enough
@@ -484,7 +494,11 @@ def merge(recordings: list[Recording]) -> Recording:
     unsure = {(r.name, n) for r in recordings for n in r.unsure}
     still: set[str] = set()
     mapped = {(r.name, n): raw for r in recordings for n, raw in r.mapped.items()}
+<<<<<<< HEAD
     before = {r.name: r.steps for r in recordings}
+=======
+    done = {r.name: r.steps for r in recordings}
+>>>>>>> main
     for name, parts in found.items():
         kept = [parts[0]]
         for part in parts[1:]:
@@ -503,8 +517,12 @@ def merge(recordings: list[Recording]) -> Recording:
                 )
             else:
                 kept.append(part)
+<<<<<<< HEAD
         if name in ("u_q", "v_q"):
             _refuse_two_winds([(n, before[n]) for n, _ in kept])
+=======
+        _refuse_two_states(name, [(n, done[n]) for n, _ in kept])
+>>>>>>> main
         still |= {name for n, _ in kept if (n, name) in unsure}
         kept.sort(key=lambda p: _span(p[1])[0])
         # columns of one table go on sharing their clock
@@ -520,21 +538,40 @@ def merge(recordings: list[Recording]) -> Recording:
         epoch,
         tuple(f for r in recordings for f in r.files),
         tuple(notes),
+<<<<<<< HEAD
         steps=new_steps((), steps),
         conditions=reduce(Conditions.over, (r.conditions for r in recordings)),
+=======
+        conditions=reduce(Conditions.over, (r.conditions for r in recordings)),
+        steps=new_steps((), steps),
+>>>>>>> main
         unsure=frozenset(still),
     )
 
 
-def _refuse_two_winds(parts: list[tuple[str, tuple[Step, ...]]]) -> None:
-    """Refuse winds of several files that are not of one place and height."""
-    (first, steps), *others = parts
-    for name, more in others:
-        if wind_state(more) != wind_state(steps):
+def _refuse_two_states(name: str, parts: list[tuple[str, tuple[Step, ...]]]) -> None:
+    """Refuse a signal of several files of which one was corrected or moved and the other not."""
+    (first, before), *others = parts
+    for other, steps in others:
+        if name in ("u_q", "v_q") and wind_state(steps) != wind_state(before):
             raise LogError(
-                f"the wind of '{first}' is {wind_state(steps)}, that of '{name}' is "
-                f"{wind_state(more)}: they cannot be merged. Import both from their raw files."
+                f"the wind of '{first}' is {wind_state(before)}, that of '{other}' is "
+                f"{wind_state(steps)}: they cannot be merged. Import both from their raw files."
             )
+        one, two = (_corrections(of, name) for of in (before, steps))
+        if one != two:
+            raise LogError(
+                f"{name} of '{first}' is {_in_words(one)}, that of '{other}' is {_in_words(two)}: "
+                f"they cannot be merged. Import both from their raw files."
+            )
+
+
+def _corrections(steps: Iterable[Step], name: str) -> list[Step]:
+    return [s for s in steps if s.decided_by == "vessel" and name in s.channels]
+
+
+def _in_words(steps: list[Step]) -> str:
+    return f"corrected ({'; '.join(s.sentence for s in steps)})" if steps else "as recorded"
 
 
 def _span(signal: Signal) -> tuple[float, float]:

@@ -44,9 +44,11 @@ def compass_heading(x: Any, y: Any, z: Any, w: Any, *, ned: bool) -> NDArray[np.
     ndarray
         (N,) [rad], 0 to 2π; NaN where the quaternion gives no direction.
     """
-    ahead, aside = w * w + x * x - y * y - z * z, 2 * (w * z + x * y)
-    yaw = np.arctan2(aside, ahead)
-    heading = (yaw if ned else np.pi / 2 - yaw) % (2 * np.pi)
+    # what is no quaternion gives no heading, and no warning
+    with np.errstate(over="ignore", invalid="ignore"):
+        ahead, aside = w * w + x * x - y * y - z * z, 2 * (w * z + x * y)
+        yaw = np.arctan2(aside, ahead)
+        heading = (yaw if ned else np.pi / 2 - yaw) % (2 * np.pi)
     return np.where((ahead == 0) & (aside == 0), np.nan, heading)
 
 
