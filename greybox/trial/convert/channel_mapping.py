@@ -131,11 +131,10 @@ def _read(
             known = recorded_provenance(record)
             epoch = known.epoch if raw.epoch is None else raw.epoch
             raw = replace(
-<<<<<<< HEAD
-                raw, epoch=epoch, steps=tuple(map(_past, known.steps)), conditions=known.conditions
-=======
-                raw, epoch=epoch, steps=(*known.steps, *raw.steps), conditions=known.conditions
->>>>>>> main
+                raw,
+                epoch=epoch,
+                steps=(*map(_past, known.steps), *raw.steps),
+                conditions=known.conditions,
             )
     else:
         assigned = assign(
@@ -494,11 +493,7 @@ def merge(recordings: list[Recording]) -> Recording:
     unsure = {(r.name, n) for r in recordings for n in r.unsure}
     still: set[str] = set()
     mapped = {(r.name, n): raw for r in recordings for n, raw in r.mapped.items()}
-<<<<<<< HEAD
-    before = {r.name: r.steps for r in recordings}
-=======
     done = {r.name: r.steps for r in recordings}
->>>>>>> main
     for name, parts in found.items():
         kept = [parts[0]]
         for part in parts[1:]:
@@ -517,12 +512,7 @@ def merge(recordings: list[Recording]) -> Recording:
                 )
             else:
                 kept.append(part)
-<<<<<<< HEAD
-        if name in ("u_q", "v_q"):
-            _refuse_two_winds([(n, before[n]) for n, _ in kept])
-=======
         _refuse_two_states(name, [(n, done[n]) for n, _ in kept])
->>>>>>> main
         still |= {name for n, _ in kept if (n, name) in unsure}
         kept.sort(key=lambda p: _span(p[1])[0])
         # columns of one table go on sharing their clock
@@ -538,13 +528,8 @@ def merge(recordings: list[Recording]) -> Recording:
         epoch,
         tuple(f for r in recordings for f in r.files),
         tuple(notes),
-<<<<<<< HEAD
-        steps=new_steps((), steps),
-        conditions=reduce(Conditions.over, (r.conditions for r in recordings)),
-=======
         conditions=reduce(Conditions.over, (r.conditions for r in recordings)),
         steps=new_steps((), steps),
->>>>>>> main
         unsure=frozenset(still),
     )
 

@@ -23,10 +23,7 @@ from greybox.trial.convert.channel_mapping import (
     angle_unit,
     batch_recording,
     canonical,
-<<<<<<< HEAD
     on_zero,
-=======
->>>>>>> main
     table_columns,
     time_scale,
     unused_mappings,
@@ -42,10 +39,7 @@ from greybox.trial.gaps import joined_spans
 from greybox.trial.log import Provenance, TrialLog
 from greybox.trial.raw_log import Recording, Signal, SourceFile
 from greybox.trial.readers.table import Batch, TableFile
-<<<<<<< HEAD
 from greybox.trial.readers.topic_files import TopicTable
-=======
->>>>>>> main
 from greybox.trial.steps import Step, new_steps
 from greybox.trial.store import read_record, recorded_provenance
 from greybox.vessel.vessel import Vessel
@@ -141,14 +135,9 @@ def scan_table(table: TableFile, vessel: Vessel, options: ImportOptions) -> Scan
         )
     read = (on_zero(s, -found.scale.zero) for s in table.steps)
     return Scan(
-<<<<<<< HEAD
         decided, found.scale, found.origin, found.back, plan, (*notes, *plan.notes),
         (*before.steps, *read),
     )  # fmt: skip
-=======
-        decided, found.scale, found.origin, found.back, plan, (*notes, *plan.notes), before.steps
-    )
->>>>>>> main
 
 
 class _Parts:
