@@ -69,6 +69,7 @@ def _of_text(read: list[Step]) -> Finding:
     late = np.array([t for s in read for t in s.numbers("late")])
     columns = listed(x for s in read for x in s.source)
     first, worst = read[0], int(np.argmax(late))
+    said = first.parameters
     return Finding(
         "time_format",
         "t",
@@ -76,7 +77,7 @@ def _of_text(read: list[Step]) -> Finding:
         (count, count),
         "1",
         f"{count:.0f} times of {columns} have fewer digits than the others, such as "
-        f"{first.parameters.get('written')} for {first.parameters.get('meant')} at t = {times[0]:.6g} s: "
+        f"{said.get('written')} for {said.get('meant')} at t = {times[0]:.6g} s: "
         f"their fraction lacks its leading zeros, and would come up to {late[worst]:.3g} s late",
         "none needed: import reads them as they are meant; export times with all their digits",
         ("t",),
