@@ -8,13 +8,14 @@ from typing import Any
 
 from greybox.errors import LogError
 from greybox.trial.checks.check import check_recording
-from greybox.trial.convert.channel_mapping import merge, read_recording, unused_mappings
+from greybox.trial.convert.channel_mapping import read_trial
 from greybox.trial.convert.convert import import_recording
 from greybox.trial.convert.options import ImportOptions
 from greybox.trial.convert.two_pass_import import Stream, is_large
 from greybox.trial.log import TrialLog
 from greybox.trial.raw_log import Recording
 from greybox.trial.readers.formats import open_raw
+from greybox.trial.readers.topic_files import TopicTable
 from greybox.trial.repair import repair
 from greybox.trial.store import record_path, write_log
 from greybox.vessel.vessel import Vessel
@@ -64,7 +65,9 @@ def import_files(
     _keep_sources(paths, out)
     if len(paths) == 1 and not fix and not fix_also and Path(paths[0]).is_file():
         table = open_raw(paths[0], **(reader or {}))
-        if not isinstance(table, Recording) and is_large(table):
+        # axes that only the other signals tell need all of them
+        unsure = isinstance(table, TopicTable) and bool(table.unsure)
+        if not isinstance(table, Recording) and is_large(table) and not unsure:
             stream = Stream(table, vessel, options)
             write_log(stream.segments(), out, extra=extra, provenance=stream.provenance)
             assert stream.first is not None
@@ -77,11 +80,7 @@ def import_files(
                 len(spans),
                 [f"note: {n}" for n in notes],
             )
-    recordings = [read_recording(p, vessel, **(reader or {})) for p in paths]
-    unused = unused_mappings(recordings, vessel)
-    recording = merge(recordings)
-    recording = recording.with_signals(recording.signals, *unused)
-    del recordings
+    recording = read_trial(paths, vessel, **(reader or {}))
     fixed: tuple[str, ...] = ()
     left: list[str] = []
     if fix or fix_also:

@@ -12,11 +12,12 @@ REP 103 (axes and units), REP 145 (IMU), REP 147 (``_ned``, ``_frd``).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+Value = TypeVar("Value", float, NDArray[np.float64])
 Fields = dict[str, float]
 Remarks = dict[str, None]
 
@@ -60,6 +61,11 @@ def frame_name(name: Any) -> str:
     return str(name).strip("/").rsplit("/", 1)[-1].casefold()
 
 
+def is_world(frame: str) -> bool:
+    """Whether a frame has the world's axes by its name."""
+    return frame in WORLD_FRAMES or frame.endswith("_enu")
+
+
 def is_ned(frame: str) -> bool:
     """Whether the world's axes are north-east-down by the name of the frame."""
     return frame == "ned" or frame.endswith("_ned")
@@ -70,6 +76,16 @@ def is_frd(frame: str) -> bool:
     return "frd" in frame or "ned" in frame
 
 
+def north_east(x: Value, y: Value, *, ned: bool) -> tuple[Value, Value]:
+    """Return north and east of a vector along the world's x and y."""
+    return (x, y) if ned else (y, x)
+
+
+def starboard(value: Value, *, frd: bool) -> Value:
+    """Return a component along the body's y, or about its z, as positive to starboard."""
+    return value if frd else -value
+
+
 def pose_fields(pose: Mapping[str, Any], ned: bool, remarks: Remarks) -> Fields:
     """Return ``x_n``, ``y_n`` [m] and ``psi`` [rad] of a pose, and remark on its axes."""
     x, y = float(pose["position"]["x"]), float(pose["position"]["y"])
@@ -78,13 +94,12 @@ def pose_fields(pose: Mapping[str, Any], ned: bool, remarks: Remarks) -> Fields:
         if ned
         else "world frame east-north-up (REP 103): x_n = y, y_n = x, psi = pi/2 - yaw"
     ] = None
-    north, east = (x, y) if ned else (y, x)
+    north, east = north_east(x, y, ned=ned)
     return {"x_n": north, "y_n": east, "psi": _heading(pose["orientation"], ned=ned)}
 
 
 def twist_fields(twist: Mapping[str, Any], frd: bool, remarks: Remarks) -> Fields:
     """Return ``u``, ``v`` [m/s] and ``r`` [rad/s] of a twist in body axes, and remark on them."""
-    sign = 1.0 if frd else -1.0
     remarks[
         "body frame forward-right-down: velocities as they are"
         if frd
@@ -93,8 +108,8 @@ def twist_fields(twist: Mapping[str, Any], frd: bool, remarks: Remarks) -> Field
     linear, angular = twist["linear"], twist["angular"]
     return {
         "u": float(linear["x"]),
-        "v": sign * float(linear["y"]),
-        "r": sign * float(angular["z"]),
+        "v": starboard(float(linear["y"]), frd=frd),
+        "r": starboard(float(angular["z"]), frd=frd),
     }
 
 
@@ -116,7 +131,7 @@ def _twist_stamped(m: Mapping[str, Any], remarks: Remarks) -> Fields:
     twist = m["twist"]
     twist = twist.get("twist", twist)
     frame = frame_name(m["header"]["frame_id"])
-    if frame in WORLD_FRAMES or frame.endswith("_enu"):
+    if is_world(frame):
         remarks[f"its frame '{frame}' is the world's, so its velocities are not u, v"] = None
         return {
             f"{part}.{k}": float(twist[part][k]) for part in ("linear", "angular") for k in "xyz"
@@ -130,7 +145,7 @@ def _imu(m: Mapping[str, Any], remarks: Remarks) -> Fields:
     found: Fields = {}
     # a first covariance of -1 says that the sensor does not measure the quantity
     if m["angular_velocity_covariance"][0] != -1:
-        found["r"] = (1.0 if frd else -1.0) * float(m["angular_velocity"]["z"])
+        found["r"] = starboard(float(m["angular_velocity"]["z"]), frd=frd)
         remarks["yaw rate as it is" if frd else "r = -yaw rate (z up, REP 103)"] = None
     if m["orientation_covariance"][0] != -1:
         found["psi"] = _heading(m["orientation"], ned=frd)
