@@ -14,8 +14,8 @@ from greybox.errors import LogError, VesselError
 from greybox.model.model import ManoeuvringModel, load_model, model_from_dict
 from greybox.trial.convert.options import ImportOptions
 from greybox.trial.convert.read import read_log
-from greybox.trial.convert.two_pass_import import import_files
 from greybox.trial.dataframe import log_from_pandas
+from greybox.trial.import_files import import_files
 from greybox.trial.kinematics import decimate
 from greybox.trial.log import make_log
 from greybox.trial.store import write_log
