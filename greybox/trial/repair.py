@@ -67,7 +67,13 @@ def repair(
 
 def apply_repairs(recording: Recording, findings: Iterable[Finding]) -> Recording:
     """Return the recording with the repairs of the findings applied in order, as its steps."""
-    steps = [replace(step, reason=step.reason or f.evidence) for f in findings for step in f.repair]
+    # what reading did already is not done again
+    steps = [
+        replace(step, reason=step.reason or f.evidence)
+        for f in findings
+        for step in f.repair
+        if step not in recording.steps
+    ]
     if any(s.operation in _ON_DERIVED for s in steps):
         recording = derive_signals(recording)
     for step in steps:

@@ -140,6 +140,11 @@ def mend(operation: str, channels: tuple[str, ...], **parameters: Value) -> Step
     return Step(operation, channels, parameters=parameters, decided_by="check")
 
 
+def _word(step: Step, name: str) -> str:
+    # a record may have been damaged
+    return str(step.parameters.get(name, "?"))
+
+
 def _names(step: Step) -> str:
     return ", ".join(step.channels)
 
@@ -213,11 +218,11 @@ OPERATIONS: dict[str, Callable[[Step], str]] = {
     "recorded": lambda s: f"{_names(s)} changed, as an older record tells",
     "time_zone": lambda s: (
         f"clock of {', '.join(s.source)} is {s.number('ahead') / 3600:+g} h ahead of "
-        f"{s.parameters['against']}: put on that"
+        f"{_word(s, 'against')}: put on that"
     ),
-    "read_axes": lambda s: f"{_names(s)} read in axes {s.parameters['axes']}",
+    "read_axes": lambda s: f"{_names(s)} read in axes {_word(s, 'axes')}",
     "pad_fractions": lambda s: (
         f"{s.number('count'):.0f} times of {_names(s)} lack leading zeros in their fraction of a "
-        f"second, such as {s.parameters['written']} for {s.parameters['meant']}: read as meant"
+        f"second, such as {_word(s, 'written')} for {_word(s, 'meant')}: read as meant"
     ),
 }

@@ -128,7 +128,10 @@ def _read(
         if known is not None:
             epoch = known.epoch if raw.epoch is None else raw.epoch
             raw = replace(
-                raw, epoch=epoch, steps=(*known.steps, *raw.steps), conditions=known.conditions
+                raw,
+                epoch=epoch,
+                steps=(*map(_past, known.steps), *raw.steps),
+                conditions=known.conditions,
             )
     else:
         assigned = assign(
@@ -190,15 +193,23 @@ def whole_recording(
 
 def reading_steps(table: TableFile, scale: TimeScale) -> tuple[Step, ...]:
     """Return what reading the rows of a table took, on the clock of its recording."""
-    return tuple(_moved(s, -scale.zero) for s in table.steps)
+    return tuple(on_zero(s, -scale.zero) for s in table.steps)
 
 
-def _moved(step: Step, shift: float) -> Step:
-    """Return a step with the places that it names on another zero of time."""
+def on_zero(step: Step, shift: float) -> Step:
+    """Return a step of reading with the places that it names on another zero of time."""
     if "times" not in step.parameters:
         return step
     times = tuple(t + shift for t in step.numbers("times"))
     return replace(step, parameters={**step.parameters, "times": times})
+
+
+def _past(step: Step) -> Step:
+    """Return a step of an earlier reading without its places, which are not in this file."""
+    if step.decided_by != "format":
+        return step
+    kept = {k: v for k, v in step.parameters.items() if k not in ("times", "late")}
+    return replace(step, parameters=kept)
 
 
 def table_columns(
@@ -490,7 +501,7 @@ def merge(recordings: list[Recording]) -> Recording:
     for r in recordings:
         shift = r.epoch - epoch if epoch is not None and r.epoch is not None else 0.0
         notes += [f"{r.name}: {n}" for n in r.notes]
-        steps += [_moved(s, shift) for s in r.steps]
+        steps += [on_zero(s, shift) for s in r.steps]
         moved: dict[int, Array] = {}
         for s in r.signals:
             t = moved.setdefault(id(s.t), s.t + shift)
@@ -500,10 +511,10 @@ def merge(recordings: list[Recording]) -> Recording:
             parts.insert(at, (r.name, replace(s, t=t)))
             stated[s.name] = stated.get(s.name, 0) + (s.name not in r.guessed)
         for name, (t, words) in r.text.items():
-            before = text.get(name, (np.empty(0), np.empty(0, dtype=str)))
+            first = text.get(name, (np.empty(0), np.empty(0, dtype=str)))
             text[name] = (
-                np.concatenate([before[0], t + shift]),
-                np.concatenate([before[1], words]),
+                np.concatenate([first[0], t + shift]),
+                np.concatenate([first[1], words]),
             )
     signals = []
     clocks: dict[tuple[int, ...], Array] = {}

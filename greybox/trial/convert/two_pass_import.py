@@ -40,6 +40,7 @@ from greybox.trial.gaps import joined_spans
 from greybox.trial.log import Provenance, TrialLog
 from greybox.trial.raw_log import Recording, Signal, SourceFile
 from greybox.trial.readers.table import Batch, TableFile
+from greybox.trial.readers.topic_files import TopicTable
 from greybox.trial.steps import Step, new_steps
 from greybox.vessel.conditions import Conditions
 from greybox.vessel.vessel import Vessel
@@ -271,8 +272,10 @@ def _first_position(recording: Recording) -> tuple[float, float] | None:
 
 
 def is_large(table: TableFile) -> bool:
-    """Whether a table may not fit in memory."""
-    return table.cells > _LARGE_CELLS
+    """Whether a table may not fit in memory, and can be imported in blocks."""
+    # axes that only the other signals tell need all of them
+    unsure = isinstance(table, TopicTable) and bool(table.unsure)
+    return table.cells > _LARGE_CELLS and not unsure
 
 
 class Stream:
