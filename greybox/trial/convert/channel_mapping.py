@@ -206,6 +206,8 @@ def on_zero(step: Step, shift: float) -> Step:
 
 def _past(step: Step) -> Step:
     """Return a step of an earlier reading without its places, which are not in this file."""
+    if step.decided_by != "format":
+        return step
     kept = {k: v for k, v in step.parameters.items() if k not in ("times", "late")}
     return replace(step, parameters=kept)
 
