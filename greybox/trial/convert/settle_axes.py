@@ -55,6 +55,12 @@ def settle_axes(recording: Recording, vessel: Vessel) -> Recording:
     """
     if not recording.unsure:
         return recording
+    # damaged numbers may be too large to be squared
+    with np.errstate(over="ignore", invalid="ignore"):
+        return _settled(recording, vessel)
+
+
+def _settled(recording: Recording, vessel: Vessel) -> Recording:
     steps: list[Step] = []
     mirrored: bool | None = None
     if {"u", "v"} <= recording.unsure & set(recording.names):
@@ -232,7 +238,7 @@ def _added(change: Array, push: Array, damping: list[Array]) -> float:
     """Return the log-likelihood that a push in its own direction adds to damping."""
     rest = np.column_stack([np.ones(len(change)), *damping])
     both = np.column_stack([rest, push])
-    if np.std(push) == 0:
+    if not np.isfinite(both).all() or not np.isfinite(change).all() or np.std(push) == 0:
         return 0.0
     alone = change - rest @ np.linalg.lstsq(rest, change, rcond=None)[0]
     gains = np.linalg.lstsq(both, change, rcond=None)[0]
