@@ -102,7 +102,7 @@ def _settle_velocity(recording: Recording) -> tuple[Recording, bool | None, Step
     else:
         north, east = (x, y) if axes == _NED else (y, x)
         named = replace(north, name="v_n"), replace(east, name="v_e")
-    others = [s for s in recording.signals if s.name not in ("u", "v", "v_n", "v_e")]
+    others = [s for s in recording.signals if s.name not in ("u", "v")]
     step = Step(
         "read_axes",
         (named[0].name, named[1].name),
@@ -111,7 +111,10 @@ def _settle_velocity(recording: Recording) -> tuple[Recording, bool | None, Step
         decided_by="check" if decided == "check" else "default",
         reason=reason,
     )
-    return replace(recording, signals=(*others, *named)), mirrored, step
+    # what another file states is better than what had to be found out
+    stated = {s.name for s in others}
+    new = [s for s in named if s.name not in stated]
+    return replace(recording, signals=(*others, *new)), mirrored, step
 
 
 def _left_over(recording: Recording) -> dict[tuple[str, bool], float]:
