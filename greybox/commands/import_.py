@@ -103,10 +103,11 @@ def run(options: argparse.Namespace) -> None:
     """Read, merge, mend, resample, write."""
     from pathlib import Path
 
-    from greybox.errors import UsageError
+    from greybox.errors import UsageError, suggestion
     from greybox.files import check_targets, write_json
     from greybox.trial.import_files import import_files
     from greybox.trial.store import read_record, record_path
+    from greybox.vessel.conditions import UNITS
     from greybox.vessel.toml import load_vessel
 
     if Path(options.out).suffix.lower() not in ("", ".csv", ".parquet", ".pq"):
@@ -131,6 +132,9 @@ def run(options: argparse.Namespace) -> None:
         write_json(record, options.json)
     if options.json != "-":
         say(summary)
+        for key in pairs(options.note, "--note"):
+            if key not in UNITS and (near := suggestion(key, UNITS)):
+                say(f"note: '{key}' is kept in words, as no condition.{near}")
         say(f"wrote {options.out} and {record_path(options.out).name}")
 
 

@@ -13,6 +13,7 @@ from greybox.errors import LogError
 from greybox.trial.convert.options import ImportOptions
 from greybox.trial.convert.resample import Clock, covered, nice_period, resampled_by, runs
 from greybox.trial.gaps import split_at_gaps
+from greybox.trial.smoothing import window_samples
 from greybox.trial.steps import Step
 from greybox.vessel.vessel import Vessel
 
@@ -238,8 +239,6 @@ def _resampling(
 
 def _windows(options: ImportOptions, count: int, sample_time: float) -> Iterator[int]:
     """Yield the samples of each window of smoothing."""
-    if options.smooth:
-        from greybox.trial.smoothing import window_samples
     for name, seconds in options.smooth.items():
         try:
             yield window_samples(count, sample_time, seconds)
