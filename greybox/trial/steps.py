@@ -95,6 +95,10 @@ def _names(step: Step) -> str:
 OPERATIONS: dict[str, Callable[[Step], str]] = {
     "order": lambda s: f"rows of {_names(s)} put in order of time, each time once",
     "drop": lambda s: f"samples of {_names(s)} left out",
+    "cut": lambda s: (
+        f"log cut where {_names(s)} jump, at t = {', '.join(f'{x:.6g}' for x in s.numbers('times'))}"
+        " s"
+    ),
     "scale": lambda s: f"{_names(s)} multiplied by {s.number('factor'):.6g}",
     "offset": lambda s: f"{s.number('offset'):+.6g} added to {_names(s)}",
     "exchange": lambda s: f"{_names(s)} exchanged",

@@ -1,4 +1,4 @@
-"""Positions that are held by a late receiver, or jump because their origin moved."""
+"""Positions that are repeated because the receiver's message came late."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from greybox.trial.checks.signal_quality import (
     clean,
     significant_digits,
 )
-from greybox.trial.convert.resample import HOLE, runs, usual_step
+from greybox.trial.convert.resample import HOLE, usual_step
 from greybox.trial.raw_log import Recording
 from greybox.trial.steps import mend
 
@@ -26,24 +26,15 @@ _UNDER_WAY = 5.0
 # time around a sample over which its speed is taken [s], and least samples
 _AROUND, _AROUND_SAMPLES = 2.0, 5
 # steps of a rounded position that a hold must miss
-_MISSED = 3.0
+_MISSED = 3.5
 # chance that as many held samples come of rounding alone
-_CHANCE = 1e-3
+_CHANCE = 0.01
 # share of held messages from which on holding at even intervals is a receiver's own rate
 _OWN_SHARE, _EVEN = 0.1, 0.95
-# samples on both sides of a jump that say what it should have been
-_BESIDE = 8
-# a jump in standard deviations of what the neighbours predict
-_JUMP = 7.0
-# samples after which a position that returns is no outlier any more
-_RETURN = 3
-# share of a jump that falls between two samples, and that lasts
-_AT_ONCE, _LASTS = 0.6, 0.5
-_MOST_JUMPS = 200
 
 
 @dataclass(frozen=True)
-class _Track:
+class Track:
     """Positions at the times that both coordinates share.
 
     Parameters
@@ -61,7 +52,7 @@ class _Track:
     step: tuple[float, float]
 
 
-def _track(recording: Recording) -> _Track | None:
+def position_track(recording: Recording) -> Track | None:
     """Return the positions; None where there are too few, or significant digits are lost."""
     if "x_n" not in recording or "y_n" not in recording:
         return None
@@ -73,7 +64,7 @@ def _track(recording: Recording) -> _Track | None:
         north, east = north[a], east[b]
     if len(t) < 30 or not (np.diff(t) > 0).all():
         return None
-    return _Track(t, np.column_stack([north, east]), (_grid(north), _grid(east)))
+    return Track(t, np.column_stack([north, east]), (_grid(north), _grid(east)))
 
 
 def _grid(value: Array) -> float:
@@ -108,7 +99,7 @@ def hold_findings(recording: Recording) -> list[Finding]:
     list of Finding
         At most one.
     """
-    track = _track(recording)
+    track = position_track(recording)
     if track is None:
         return []
     held = _held(track)
@@ -142,7 +133,7 @@ def hold_findings(recording: Recording) -> list[Finding]:
     ]  # fmt: skip
 
 
-def _held(track: _Track) -> tuple[Rows, tuple[int, int], float] | None:
+def _held(track: Track) -> tuple[Rows, tuple[int, int], float] | None:
     """Return the held rows, first row and length of the longest hold, and what it missed [m]."""
     t, p = track.t, track.p
     period = usual_step(t)
