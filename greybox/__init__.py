@@ -35,13 +35,13 @@ if TYPE_CHECKING:
     from greybox.model.structure import Structure
     from greybox.prediction.predict import predict_manoeuvre
     from greybox.prediction.result import ManoeuvrePrediction
-    from greybox.trial.checks.check import check_files, check_recording
+    from greybox.trial.checks.check import check_files, check_recording, check_recordings
     from greybox.trial.checks.finding import CheckReport, Finding
     from greybox.trial.convert.channel_mapping import read_recording
     from greybox.trial.convert.convert import import_recording
     from greybox.trial.convert.read import read_log, read_segments
-    from greybox.trial.convert.two_pass_import import import_files
     from greybox.trial.dataframe import log_from_pandas, log_from_xarray, recording_from_pandas
+    from greybox.trial.import_files import import_files
     from greybox.trial.kinematics import decimate
     from greybox.trial.log import TrialLog, make_log
     from greybox.trial.manoeuvres import find_manoeuvres
@@ -85,6 +85,7 @@ _WHERE = {
     "build_predictor": "greybox.model.predictor",
     "check_files": "greybox.trial.checks.check",
     "check_recording": "greybox.trial.checks.check",
+    "check_recordings": "greybox.trial.checks.check",
     "compare_models": "greybox.validation.comparison",
     "decimate": "greybox.trial.kinematics",
     "estimate_iv": "greybox.estimation.estimate",
@@ -96,7 +97,7 @@ _WHERE = {
     "find_manoeuvres": "greybox.trial.manoeuvres",
     "fit_percent": "greybox.validation.fit",
     "get_structure": "greybox.model.catalogue",
-    "import_files": "greybox.trial.convert.two_pass_import",
+    "import_files": "greybox.trial.import_files",
     "import_recording": "greybox.trial.convert.convert",
     "load_model": "greybox.model.model",
     "load_vessel": "greybox.vessel.toml",
@@ -142,6 +143,7 @@ __all__ = [
     "build_predictor",
     "check_files",
     "check_recording",
+    "check_recordings",
     "compare_models",
     "decimate",
     "describe_recording",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from greybox.trial.checks.course import course_findings
@@ -13,7 +14,7 @@ from greybox.trial.checks.frame_sign_unit import (
     read,
     reading_findings,
 )
-from greybox.trial.checks.motion import make_motion
+from greybox.trial.checks.motion import Motion, make_motion
 from greybox.trial.checks.sensor_offsets.find import find_offsets
 from greybox.trial.checks.signal_quality import (
     angle_unit_findings,
@@ -24,6 +25,7 @@ from greybox.trial.checks.signal_quality import (
     time_findings,
 )
 from greybox.trial.checks.thruster_response import response_findings
+from greybox.trial.checks.time_format import time_format_findings
 from greybox.trial.checks.wind_convention import wind_findings
 from greybox.trial.convert.channel_mapping import read_recording
 from greybox.trial.convert.derived_signals import derive_signals
@@ -32,8 +34,42 @@ from greybox.trial.repair import apply_repairs
 from greybox.vessel.vessel import Vessel
 
 
+@dataclass
+class _Log:
+    """A log on its way through the checks.
+
+    Parameters
+    ----------
+    recorded : Recording
+        As it was read.
+    findings : list of Finding
+        So far.
+    outcomes : dict of str to Outcome
+        What became of the checks that found nothing.
+    mended : Recording
+        With what was found so far mended, where that is safe.
+    motion : Motion, optional
+        Its motion channels on one grid; None where too few overlap.
+    """
+
+    recorded: Recording
+    findings: list[Finding]
+    outcomes: dict[str, Outcome]
+    mended: Recording
+    motion: Motion | None = None
+
+    def add(self, findings: Sequence[Finding]) -> None:
+        """Keep findings, and mend what is safe to mend."""
+        self.findings += findings
+        self.mended = apply_repairs(self.mended, [f for f in findings if f.safe])
+
+    def say(self, outcomes: Sequence[Outcome]) -> None:
+        """Keep what became of checks."""
+        self.outcomes |= {o.id: o for o in outcomes}
+
+
 def check_files(paths: Sequence[str | Path], vessel: Vessel) -> list[CheckReport]:
-    """Check log or raw files, each by itself.
+    """Check log or raw files of one ship together.
 
     Parameters
     ----------
@@ -50,72 +86,91 @@ def check_files(paths: Sequence[str | Path], vessel: Vessel) -> list[CheckReport
     LogError
         A file cannot be read.
     """
-    reports = []
-    for path in paths:
-        reports.append(check_recording(read_recording(path, vessel), vessel))
-    return reports
+    return check_recordings([read_recording(path, vessel) for path in paths], vessel)
 
 
 def check_recording(recording: Recording, vessel: Vessel) -> CheckReport:
-    """Check one recording.
+    """Check one recording by itself; see `check_recordings`."""
+    return check_recordings([recording], vessel)[0]
+
+
+def check_recordings(recordings: Sequence[Recording], vessel: Vessel) -> list[CheckReport]:
+    """Check recordings of one ship: samples log by log, instruments over all logs together.
 
     Parameters
     ----------
-    recording : Recording
-        Canonical signals as they were recorded; what it says was derived proves nothing.
+    recordings : sequence of Recording
+        Canonical signals as they were recorded; what they say was derived proves nothing.
     vessel : Vessel
 
     Returns
     -------
-    CheckReport
-        Findings by id, and what became of every check.
+    list of CheckReport
+        One a recording, in their order: findings by id, and what became of every check.
     """
-    findings: list[Finding] = []
-    findings += time_findings(recording)
-    findings += missing_findings(recording)
-    findings += angle_unit_findings(recording, vessel)
-    whole = derive_signals(apply_repairs(recording, findings))
-    measured = _independent(whole)
-    rows = [
-        *stuck_findings(measured, vessel),
-        *spike_findings(measured),
-        *coarse_findings(measured),
+    logs = [_signal_quality(recording, vessel) for recording in recordings]
+    _kinematics(logs, vessel)
+    for log in logs:
+        _forces(log, vessel)
+    return [
+        CheckReport(
+            log.recorded.name,
+            tuple(log.findings),
+            _outcomes(log.findings, log.outcomes),
+            log.recorded.notes,
+            log.recorded,
+        )
+        for log in logs
     ]
-    findings += rows
-    steady = apply_repairs(whole, [f for f in rows if f.safe])
-    independent = _independent(steady)
-    motion = make_motion(independent)
-    outcomes = {o.id: o for o in frame_outcomes(motion)}
-    if motion is not None and (motion.positioned or motion.turned):
-        reading = find_reading(motion)
-        findings += reading_findings(reading)
-        motion = read(motion, reading.changes)
-        steady = apply_repairs(steady, reading_findings(reading))
-        found, said = find_offsets(motion, vessel)
-        findings += found
-        outcomes |= {o.id: o for o in said}
-    if motion is None or not motion.positioned:
-        found, said = course_findings(steady, vessel)
-        findings += found
-        outcomes |= {o.id: o for o in said}
-    findings += wind_findings(steady, findings)
-    findings += response_findings(steady, vessel, findings)
-    return CheckReport(
-        recording.name,
-        tuple(findings),
-        _outcomes(findings, outcomes),
-        recording.notes,
-        recording,
+
+
+def _signal_quality(recording: Recording, vessel: Vessel) -> _Log:
+    """Check the samples of one log, each channel by itself."""
+    raw = time_format_findings(recording)
+    raw += time_findings(apply_repairs(recording, raw))
+    raw += missing_findings(recording)
+    raw += angle_unit_findings(recording, vessel)
+    whole = derive_signals(apply_repairs(recording, raw))
+    log = _Log(recording, raw, {}, whole)
+    measured = _independent(whole)
+    log.add(
+        [
+            *stuck_findings(measured, vessel),
+            *spike_findings(measured),
+            *coarse_findings(measured),
+        ]
     )
+    log.motion = make_motion(_independent(log.mended))
+    return log
+
+
+def _kinematics(logs: Sequence[_Log], vessel: Vessel) -> None:
+    """Check what ties positions, heading, velocities and yaw rate of the logs together."""
+    for log in logs:
+        motion = log.motion
+        log.say(frame_outcomes(motion))
+        if motion is not None and (motion.positioned or motion.turned):
+            reading = find_reading(motion)
+            log.add(reading_findings(reading))
+            motion = read(motion, reading.changes)
+            found, said = find_offsets(motion, vessel)
+            log.findings += found
+            log.say(said)
+        if motion is None or not motion.positioned:
+            found, said = course_findings(log.mended, vessel)
+            log.findings += found
+            log.say(said)
+
+
+def _forces(log: _Log, vessel: Vessel) -> None:
+    """Check wind and thrusters of one log against its motion."""
+    log.findings += wind_findings(log.mended, log.findings)
+    log.findings += response_findings(log.mended, vessel, log.findings)
 
 
 def _independent(recording: Recording) -> Recording:
     """Leave out what was derived from other channels."""
-    gone: set[str] = set()
-    for sentence in recording.derived:
-        names, _, source = sentence.partition(" from ")
-        if source.startswith(("positions", "heading", "the velocity over ground")):
-            gone |= {n.strip() for n in names.split(",")}
+    gone = {n for step in recording.steps if step.derives_motion for n in step.channels}
     return recording.with_signals(s for s in recording.signals if s.name not in gone)
 
 

@@ -45,6 +45,8 @@ class Finding(Shown):
         Whether the repair needs no judgement.
     picture : mapping
         Arrays that the report draws.
+    logs : tuple of str
+        Logs whose evidence was pooled for the value; empty where it is this log's own.
     """
 
     id: str
@@ -58,6 +60,7 @@ class Finding(Shown):
     repair: tuple[Step, ...] = ()
     safe: bool = False
     picture: Mapping[str, Any] = field(default_factory=dict)
+    logs: tuple[str, ...] = ()
 
     def summary(self) -> str:
         """Return channels, size, evidence and fix as text."""
@@ -67,8 +70,9 @@ class Finding(Shown):
         return f"{self.id} ({', '.join(self.channels or (self.channel,))}): {size_in_words(self)}"
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the finding as CONTRACT's JSON, with `channels` and `safe` beside."""
+        """Return the finding as CONTRACT's JSON, with `channels`, `safe` and `logs` beside."""
         vector = isinstance(self.value, tuple)
+        pooled = {"logs": list(self.logs)} if len(self.logs) > 1 else {}
         return {
             "id": self.id,
             "channel": self.channel,
@@ -79,6 +83,7 @@ class Finding(Shown):
             "fix": self.fix,
             "channels": list(self.channels or (self.channel,)),
             "safe": self.safe,
+            **pooled,
         }
 
 
