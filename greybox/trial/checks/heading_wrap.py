@@ -145,7 +145,9 @@ def _noise(t: Array, psi: Array) -> float:
     for lag in (1, 2, 4, 8, 16):
         # between samples that were interpolated the noise shows at a longer lag only
         if lag == 1 or lag * usual <= _STEADY:
-            bend = _wrapped(psi[2 * lag :] - psi[lag:-lag]) - _wrapped(psi[lag:-lag] - psi[: -2 * lag])
+            bend = _wrapped(psi[2 * lag :] - psi[lag:-lag]) - _wrapped(
+                psi[lag:-lag] - psi[: -2 * lag]
+            )
             found = max(found, 1.4826 * float(np.median(np.abs(bend))) / np.sqrt(6))
     return found
 
@@ -161,9 +163,7 @@ def _bow(t: Array, psi: Array, low: int, high: int) -> float:
     return float(np.abs(after - before) / apart * (t[high] - t[low]) ** 2 / 8)
 
 
-def _returning(
-    psi: Array, found: list[int], most: int, least: Array
-) -> list[int]:
+def _returning(psi: Array, found: list[int], most: int, least: Array) -> list[int]:
     """Return samples that leave the wrap and come back to the side where they began.
 
     A heading that wavers about the wrap crosses it twice between two samples; at either end

@@ -14,7 +14,7 @@ from greybox.trial.checks.signal_quality import (
     clean,
     significant_digits,
 )
-from greybox.trial.convert.resample import HOLE, usual_step
+from greybox.trial.gaps import HOLE, usual_step
 from greybox.trial.raw_log import Recording
 from greybox.trial.steps import mend
 
@@ -157,11 +157,7 @@ def _held(track: Track) -> tuple[Rows, tuple[int, int], float] | None:
     # at a gap or the log's end nobody knows what came next
     followed = np.append(~gap, False)[last]
     late = (
-        moving
-        & (length >= 2 * usual)
-        & (missed >= _MISSED * max(track.step))
-        & ~stuck
-        & followed
+        moving & (length >= 2 * usual) & (missed >= _MISSED * max(track.step)) & ~stuck & followed
     )
     if not late.any() or _own_rate(late, length, usual, first, p, speed * period):
         return None

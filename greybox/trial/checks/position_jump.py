@@ -11,7 +11,7 @@ from greybox.rotation import body_to_ned, ned_to_body
 from greybox.trial.checks.finding import Finding
 from greybox.trial.checks.position_hold import Track, position_track
 from greybox.trial.checks.signal_quality import clean
-from greybox.trial.convert.resample import HOLE, usual_step
+from greybox.trial.gaps import HOLE, usual_step
 from greybox.trial.raw_log import Recording
 from greybox.trial.steps import mend
 
@@ -385,9 +385,7 @@ def _at_once(way: Array, k: int, size: Array) -> bool:
     return bool((way[k] - beside) @ size > _AT_ONCE * (size @ size))
 
 
-def _steadier(
-    way: Array, rest: Array | None, whole: Mask, window: _Window
-) -> tuple[Array, float]:
+def _steadier(way: Array, rest: Array | None, whole: Mask, window: _Window) -> tuple[Array, float]:
     """Return what predicts positions best over a window, neighbours or velocities, and how well."""
     at = np.linspace(window.half, len(way) - window.half - 1, _TRIED).astype(int)
     best: tuple[Array, float] = (way, np.inf)

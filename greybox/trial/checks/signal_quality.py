@@ -325,7 +325,9 @@ def coarse_findings(recording: Recording) -> list[Finding]:
         step = quantum(value)
         digits = significant_digits(_wrapped(s)) if step <= 0 else 0
         if digits and (digits < 4 or np.mean(np.diff(value) == 0) > 0.3):
-            degrees = s.name in ANGLES | {"r"} and not significant_digits(s.value[np.isfinite(s.value)])
+            degrees = s.name in ANGLES | {"r"} and not significant_digits(
+                s.value[np.isfinite(s.value)]
+            )
             per = np.pi / 180 if degrees else 1.0
             coarse = _rounded_finding(s.name, t, value, s.unit or "1", digits, per)
             if isinstance(coarse.value, float) and coarse.value > _COARSE * np.std(value):
@@ -510,6 +512,7 @@ def _motion(recording: Recording) -> Iterable[Signal]:
 
 
 def clean(s: Signal) -> tuple[Array, Array]:
+    """Return times and values where both are numbers, headings unwrapped."""
     keep = np.isfinite(s.value) & np.isfinite(s.t)
     t, value = (s.t, s.value) if keep.all() else (s.t[keep], s.value[keep])
     if s.name == "psi":
