@@ -121,7 +121,7 @@ def log_from_pandas(
         # it is canonical, and without the sensors' defects
         own = replace(vessel, columns={}, sensors={})
         known, name = recorded_provenance(record), str(record.get("name", name))
-    table = open_frame(frame, name, vessel.commands)
+    table = open_frame(frame, name, vessel.recorded_columns)
     if not any(n == "t" or ((m := own.columns.get(n)) and m.name == "t") for n in table.columns):
         raise LogError(
             f"'{name}' has no time: neither a column 't' nor an index of seconds or dates. "
@@ -225,7 +225,9 @@ def recording_from_pandas(
     LogError
         It is no DataFrame, or has no time.
     """
-    raw, assigned = table_recording(open_frame(frame, name, vessel.commands), vessel, guess=guess)
+    raw, assigned = table_recording(
+        open_frame(frame, name, vessel.recorded_columns), vessel, guess=guess
+    )
     return canonical(raw, assigned, vessel)
 
 

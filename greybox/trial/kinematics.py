@@ -101,7 +101,7 @@ def decimate(log: TrialLog, sample_time: float) -> TrialLog:
         )
     sums = {k: np.concatenate([[0.0], np.cumsum(v)]) for k, v in log.channels.items()}
     channels: dict[str, Array] = {}
-    inputs = set(log.vessel.commands)
+    inputs = set(log.vessel.recorded_columns)
     for name, total in sums.items():
         first = centres if name in inputs else centres - half
         channels[name] = (total[first + step] - total[first]) / step

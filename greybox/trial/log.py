@@ -98,7 +98,7 @@ class TrialLog(Shown):
     @property
     def units(self) -> dict[str, str]:
         """Unit of ``t`` and of each channel; ``as logged`` where any unit is kept."""
-        angles = self.vessel.angle_commands
+        angles = self.vessel.recorded_angles
         return {
             n: CHANNELS[n].unit if n in CHANNELS else ("rad" if n in angles else "as logged")
             for n in ("t", *self.channels)

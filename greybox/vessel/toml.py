@@ -152,9 +152,7 @@ def vessel_from_dict(data: dict[str, Any]) -> Vessel:
         name=str(name),
         length=length,
         thrusters=thrusters,
-        sensors=_sensors(
-            data.get("sensors", {}), dict.fromkeys(c for t in thrusters for c in t.columns)
-        ),
+        sensors=_sensors(data.get("sensors", {}), Vessel("", 1.0, thrusters).recorded_columns),
         closed_loop=_closed_loop(data.get("closed_loop")),
         mass=_number(data["mass"], "mass") if "mass" in data else None,
         actuation=_actuation(data.get("actuation", {})),
@@ -181,6 +179,12 @@ def vessel_to_dict(vessel: Vessel) -> dict[str, Any]:
                 row[f"{key}_limits"] = [limits.lower, limits.upper]
             if limits.rate is not None:
                 row[f"{key}_rate"] = limits.rate
+        for key, column, other, _ in t.movements:
+            if other is not None:
+                measured, commanded = (column, other)[:: 1 if t.drive == "feedback" else -1]
+                row |= {key: measured, f"{key}_command": commanded}
+        if t.drive != "feedback":
+            row["drive"] = t.drive
         row["thrust"] = [list(p) for p in t.thrust.table] or t.thrust.kind
         if t.thrust.quadratic_share or t.thrust.reference != 1:
             row["thrust"] = {k: getattr(t.thrust, k) for k in _MIXED}
@@ -293,13 +297,13 @@ def _thruster(table: Any, number: int) -> Thruster:
             f"Use 'feedback' (measured) or 'command'."
         )
 
-    def column(key: str) -> Any:
+    def column(key: str, *, other: bool = False) -> Any:
         command = table.get(f"{key}_command")
         if drive == "command" and command is None and isinstance(table.get(key), str):
             raise VesselError(
                 f"{where} is driven by its command but has no '{key}_command': name that column."
             )
-        return command if drive == "command" and command is not None else table.get(key)
+        return command if (drive == "command") is not other else table.get(key)
 
     angle: str | float = 0.0
     if kind == "azimuth":
@@ -329,6 +333,10 @@ def _thruster(table: Any, number: int) -> Thruster:
         rudder_limits=_limits(table, "rudder", where),
         gain=_number(table.get("gain", 1.0), f"gain of {where}"),
         angle_offset=_number(table.get("angle_offset", 0.0), f"angle_offset of {where}"),
+        drive=drive,
+        speed_other=column("speed", other=True),
+        angle_other=column("angle", other=True) if kind == "azimuth" else None,
+        rudder_other=column("rudder", other=True) if kind == "propeller_rudder" else None,
     )
 
 
@@ -344,7 +352,7 @@ def _actuation(table: Any) -> Actuation:
 
 def _columns(table: Any, vessel: Vessel) -> dict[str, ColumnMapping]:
     found: dict[str, ColumnMapping] = {}
-    known = [*CHANNELS, *vessel.commands]
+    known = [*CHANNELS, *vessel.recorded_columns]
     if vessel.closed_loop:
         known.append(vessel.closed_loop[0])
     if not isinstance(table, dict):
@@ -359,7 +367,7 @@ def _columns(table: Any, vessel: Vessel) -> dict[str, ColumnMapping]:
             )
         unit = entry.get("unit")
         target = CHANNELS[name].unit if name in CHANNELS else None
-        if name in vessel.angle_commands:
+        if name in vessel.recorded_angles:
             target = "rad"
         if target is not None and unit is None:
             raise VesselError(

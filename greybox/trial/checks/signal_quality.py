@@ -473,7 +473,7 @@ def angle_unit_findings(recording: Recording, vessel: Vessel) -> list[Finding]:
     found = []
     rudders = {t.rudder for t in vessel.thrusters if t.rudder}
     for s in recording.signals:
-        if s.name not in (ANGLES | vessel.angle_commands) - {"psi", "cog"}:
+        if s.name not in (ANGLES | vessel.recorded_angles) - {"psi", "cog"}:
             continue
         _, value = _clean(s)
         if len(value) < 3:

@@ -266,7 +266,7 @@ def _factor(
 ) -> tuple[str | None, float, str]:
     """Return unit, factor to SI and, where the unit was guessed, why."""
     target = CHANNELS[a.name].unit if a.name in CHANNELS else None
-    if a.name in vessel.angle_commands:
+    if a.name in vessel.recorded_angles:
         target = "rad"
     if a.unit is not None:
         return a.unit, unit_factor(a.unit, target, a.raw), ""

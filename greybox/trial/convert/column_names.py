@@ -163,7 +163,7 @@ def assign(
     taken = {a.raw for a in found.values()}
     loop = [vessel.closed_loop[0]] if vessel.closed_loop else []
     for raw in columns:
-        known = raw in CHANNELS or raw in vessel.commands or raw in loop
+        known = raw in CHANNELS or raw in vessel.recorded_columns or raw in loop
         if known and raw not in found and raw not in taken:
             # a canonical name promises its SI unit; a unit written beside it is believed
             unit = units.get(raw, CHANNELS[raw].unit if raw in CHANNELS else None)

@@ -218,10 +218,10 @@ def _resample(
     sample_time: float,
 ) -> dict[str, Array]:
     channels: dict[str, Array] = {}
-    commands = set(vessel.commands)
+    commands = set(vessel.recorded_columns)
     for name, s in signals.items():
         of, value = clocks[name], s.value
-        if name in vessel.angle_commands:
+        if name in vessel.recorded_angles:
             value = np.unwrap(value)
         if len(s.t) == len(grid) and np.abs(s.t - grid).max() < 0.01 * sample_time:
             channels[name] = np.asarray(value, float)

@@ -108,7 +108,7 @@ def complete_channels(
         a channel that the log has not is to be smoothed.
     """
     derived: list[str] = []
-    logged = (*LOGGED, *vessel.commands)
+    logged = (*LOGGED, *vessel.recorded_columns)
     measured = [n for n in options.smooth if n in part and n in logged]
     _smooth(part, measured, sample_time, options, derived)
     antenna = vessel.sensors.get("antenna", (0.0, 0.0))

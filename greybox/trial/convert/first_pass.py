@@ -218,7 +218,7 @@ class _Found:
 
     def _reach(self, raw: Recording) -> None:
         for name, a in self.assigned.items():
-            angle = name in self.vessel.angle_commands or (
+            angle = name in self.vessel.recorded_angles or (
                 name in CHANNELS and CHANNELS[name].unit == "rad"
             )
             if angle and a.unit is None and a.how != "exact" and a.raw in raw:

@@ -152,7 +152,7 @@ def table_segments(
             f"use a longer log."
         )
     stretches, sample_time = _stretches(t, table)
-    for name in {"psi", "gamma_q", *vessel.angle_commands} & channels.keys():
+    for name in {"psi", "gamma_q", *vessel.recorded_angles} & channels.keys():
         channels[name] = np.unwrap(channels[name])
     segments: list[TrialLog] = []
     for k, (start, stop) in enumerate(stretches):
@@ -249,9 +249,13 @@ def _canonical(
         # positions are not needed where velocities were logged: they may have holes
         for place in positions:
             assigned.pop(place)
+    for beside in set(vessel.recorded_columns) - set(vessel.commands):
+        # what moves no model is not needed either
+        if beside in assigned and not np.isfinite(_floats(batch, assigned[beside])).all():
+            assigned.pop(beside)
     for name, a in assigned.items():
         target = CHANNELS[name].unit if name in CHANNELS else None
-        if name in vessel.angle_commands:
+        if name in vessel.recorded_angles:
             target = "rad"
         factor = a.sign * (unit_factor(a.unit, target, a.raw) if a.unit is not None else 1.0)
         value = _finite(_floats(batch, a), a.raw, table)
@@ -260,6 +264,8 @@ def _canonical(
         channels[name] = value if factor == 1.0 else value * factor
     for raw in missing:
         name = vessel.columns[raw].name
+        if name in vessel.recorded_columns and name not in vessel.commands:
+            continue
         if name not in channels and (name in vessel.commands or not plan):
             raise LogError(
                 f"'{path.name}' has no column '{raw}', which [columns] maps to '{name}'."

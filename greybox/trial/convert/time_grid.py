@@ -124,10 +124,13 @@ def plan_import(
         if e.count < MIN_SEGMENT
     ]
     commands = set(vessel.commands)
+    # a command beside its feedback, or the other way round: it moves no model, so its holes
+    # and its ends must not cut the log
+    beside = set(vessel.recorded_columns) - commands
     used = {
         n: e
         for n, e in extents.items()
-        if e.count >= MIN_SEGMENT and n in {*_MOTION, *_WIND, *commands}
+        if e.count >= MIN_SEGMENT and n in {*_MOTION, *_WIND, *commands, *beside}
     }
     motion = [n for n in _MOTION if n in used]
     inputs = [c for c in vessel.commands if c in used]
@@ -146,12 +149,15 @@ def plan_import(
     for n in sorted(brief):
         others = used.keys() - brief
         # a sensor that soon died must not take the others with it, where they do without
-        if n in _WIND or any(pair <= others for pair in _INSTEAD.get(n, ())):
+        if n in beside and not used[n].steady:
+            # recorded where it changes, it holds until it changes again
+            continue
+        if n in beside or n in _WIND or any(pair <= others for pair in _INSTEAD.get(n, ())):
             notes.append(f"{n} covers {used[n].covered:.4g} of {most:.4g} s: left out")
             used.pop(n)
     leading = [n for n in _MOTION if n in used] or inputs
     sample_time = options.sample_time or _sample_time([used[n] for n in leading])
-    held = [n for n in used if n not in leading and used[n].steady]
+    held = [n for n in used if n not in (*leading, *beside) and used[n].steady]
     late = [n for n in inputs if n not in leading and n not in held]
     leading = [*leading, *held]
     start = max(used[n].first for n in (*leading, *late))
@@ -172,7 +178,8 @@ def plan_import(
             f"'{name}' spans {stop - start:.4g} s, {samples:.4g} samples of {sample_time:g} s, but "
             f"holds {values} values: correct its times, or choose a longer sample time."
         )
-    longest = max(e.last for e in used.values()) - min(e.first for e in used.values())
+    shaping = [e for n, e in used.items() if n not in beside]
+    longest = max(e.last for e in shaping) - min(e.first for e in shaping)
     if stop - start < 0.9 * longest:
         one = max((*leading, *late), key=lambda n: used[n].first)
         two = min(leading, key=lambda n: used[n].last)

@@ -278,7 +278,7 @@ class _Stream:
         """Unwrap angles as if the blocks before were there; `start` is where the next begins."""
         out = []
         for s in recording.signals:
-            if s.name in {"psi", *self.vessel.angle_commands}:
+            if s.name in {"psi", *self.vessel.recorded_angles}:
                 order = np.argsort(s.t, kind="stable")
                 rows = order[np.isfinite(s.value[order]) & np.isfinite(s.t[order])]
                 if len(rows):
