@@ -43,6 +43,14 @@ _HUBER = 1.345
 # gain in twice the log-likelihood (of samples that count as independent) and in the size of the
 # residual for which a rate limit or a dead band is taken in
 _LEAST_GAIN, _LEAST_SHARE = 12.0, 0.05
+# loss at the best candidate, over that without, up to which it is fitted
+_PROMISING = 1.0
+# largest dead band of a propeller over its largest command, and how many are tried
+_MOST_BAND, _MOST_LEVELS = 0.5, 48
+# how many quarters of a sample the delay is moved along its ridge with the lag at most
+_RIDGE = 24
+# share of the loss by which a step must lower it for another to follow
+_CONVERGED = 1e-6
 # beyond the noise by this factor something is left that a lag does not explain
 _LEFT_OVER = 1.15
 # what differs from an ideal actuator: response [s] (or one sample), gain, and the gains between
@@ -271,6 +279,13 @@ class _Pair:
         e = self.y - x
         return np.asarray((e + pi) % (2 * pi) - pi) if self.circular else e
 
+    def turns(self) -> Array:
+        """Return the whole turns that the feedback is ahead of the command (N,)."""
+        if not self.circular:
+            return np.zeros_like(self.y)
+        held = self.command[np.clip(np.searchsorted(self.moved, self.t, "right") - 1, 0, None)]
+        return np.asarray(2 * pi * np.round((self.y - held) / (2 * pi)))
+
     def rows(self, keep: NDArray[np.bool_]) -> _Pair:
         """Return the pair with some samples of the feedback only."""
         return replace(self, t=self.t[keep], y=self.y[keep])
@@ -292,9 +307,6 @@ def _pair(recording: Recording, actuator: Actuator) -> _Pair | None:
     if keep.sum() < _FEWEST_SAMPLES or len(change) < _FEWEST_CHANGES:
         return None
     at = np.concatenate([[0], change])
-    if actuator.kind == "angle":
-        held = c[np.clip(np.searchsorted(tc, t[keep], "right") - 1, 0, None)]
-        c = c + 2 * pi * np.round(float(np.median(y[keep] - held)) / (2 * pi))
     circular = actuator.kind == "angle"
     return _Pair(recording.name, tc[at], c[at], t[keep], y[keep], step, circular)
 
@@ -320,14 +332,14 @@ class _Fit:
         (6,) d, T, g, o, R, b; R infinite and b zero where they are not in the model.
     free : tuple of int
         Which were fitted.
-    loss : float
-        Mean of Huber's loss over the squared scale of the residual.
     scale : float
         Robust standard deviation of the residual.
     rest : ndarray
         (N,) residuals of all logs, one log after another.
     covariance : ndarray
         (p, p) of the free ones; empty until it is asked for.
+    alike : tuple of ndarray
+        Other parameters that explain the logs as well.
     """
 
     theta: Array
@@ -335,6 +347,7 @@ class _Fit:
     scale: float
     rest: Array
     covariance: Array
+    alike: tuple[Array, ...] = ()
 
 
 def _respond(theta: Array, pair: _Pair, kind: ActuatorKind) -> Array:
@@ -420,10 +433,10 @@ def _fit(pairs: Sequence[_Pair], kind: ActuatorKind) -> _Fit | None:
     if _G not in free:
         start[_O] += (start[_G] - 1) * float(np.mean([p.command.mean() for p in pairs]))
         start[_G] = 1.0
-    fit = _improve(start, free, pairs, kind)
-    floor = _noise(pairs)
-    if fit.scale > _LEFT_OVER * floor:
+    fit = _along_ridge(_improve(start, free, pairs, kind), pairs, kind)
+    if float(np.sqrt(np.mean(fit.rest**2))) > _LEFT_OVER * _noise(pairs):
         fit = _with_limits(fit, pairs, kind)
+    fit = _least_late(fit, pairs, kind)
     return replace(fit, covariance=_covariance(fit, pairs, kind))
 
 
@@ -437,7 +450,7 @@ def _coarse(pairs: Sequence[_Pair]) -> Array | None:
             grid = np.arange(p.t[0] + _LATEST, p.t[-1] + _EARLIEST, step)
             if len(grid) < _FEWEST_SAMPLES // 2:
                 grid = np.arange(p.t[0], p.t[-1], step)
-            y = np.interp(grid, p.t, p.y)
+            y = np.interp(grid, p.t, p.y - p.turns())
             delays = np.arange(_EARLIEST, _LATEST + 0.1, max(0.1, step))
             wide = np.arange(grid[0] - _LATEST - step, grid[-1] - _EARLIEST + step, step)
             free = replace(p, t=wide, y=wide)
@@ -487,7 +500,7 @@ def _improve(
                 there = _rest(tried, pairs, kind)
                 found = _huber(there, scale)
                 if found < loss:
-                    done = loss - found < 1e-7 * loss
+                    done = loss - found < _CONVERGED * loss
                     theta, rest, loss, damping = tried, there, found, damping / 5
                     break
                 damping *= 8
@@ -495,11 +508,37 @@ def _improve(
                 done = True
             if done:
                 break
-        change = np.abs(theta - before)[list(free)]
-        if np.all(change <= 1e-3 * np.maximum(np.abs(theta[list(free)]), 0.01)):
+        which = list(free)
+        change = np.abs(theta[which] - before[which])
+        if np.all(change <= 1e-3 * np.maximum(np.abs(theta[which]), 0.01)):
             break
     rest = _rest(theta, pairs, kind)
     return _Fit(theta, free, max(_scale(rest), _finest(pairs)), rest, np.empty((0, 0)))
+
+
+def _along_ridge(fit: _Fit, pairs: Sequence[_Pair], kind: ActuatorKind) -> _Fit:
+    """Look for a better minimum where delay and lag have the same sum.
+
+    Where the clocks of command and feedback beat, the loss has a kink at every phase.
+    """
+    total = float(fit.theta[_D] + fit.theta[_T])
+    step = 2 * _resolved(fit.theta, pairs)
+    reach = min(_RIDGE, max(int(fit.theta[_T] / step) + 4, 8))
+    starts = []
+    for k in range(-reach, reach + 1):
+        theta = fit.theta.copy()
+        theta[_D] += k * step
+        theta[_T] = total - theta[_D]
+        if theta[_T] >= 0:
+            starts.append((_huber(_rest(theta, pairs, kind), fit.scale), theta))
+    losses = np.array([np.inf, *(loss for loss, _ in starts), np.inf])
+    low = np.flatnonzero((losses[1:-1] <= losses[:-2]) & (losses[1:-1] <= losses[2:]))
+    best = fit
+    for at in low[np.argsort(losses[1:-1][low])][:2]:
+        found = _improve(starts[at][1], fit.free, pairs, kind)
+        if _huber(found.rest, fit.scale) < _huber(best.rest, fit.scale):
+            best = found
+    return best
 
 
 def _bounded(theta: Array, free: tuple[int, ...], move: Array) -> Array:
@@ -518,10 +557,10 @@ def _slope(
     theta: Array, free: tuple[int, ...], pairs: Sequence[_Pair], kind: ActuatorKind
 ) -> Array:
     """Return the derivative of the model (N, p), central over what the clocks resolve."""
-    step = min(p.step for p in pairs)
+    step = _resolved(theta, pairs)
     spread = max(float(np.std(p.command)) for p in pairs)
     sizes = {
-        _D: 0.25 * step, _T: max(0.02 * theta[_T], 0.1 * step), _G: 1e-3 * abs(theta[_G]),
+        _D: step, _T: max(0.02 * theta[_T], 0.4 * step), _G: 1e-3 * abs(theta[_G]),
         _O: 1e-3 * abs(theta[_G]) * spread, _R: 0.02 * theta[_R], _B: 0.05 * theta[_B],
     }  # fmt: skip
     columns = []
@@ -541,6 +580,15 @@ def _slope(
     return np.column_stack(columns)
 
 
+def _resolved(theta: Array, pairs: Sequence[_Pair]) -> float:
+    """Return the change of a delay over which the model is straight [s].
+
+    An actuator without a lag jumps with its command: then what the samples resolve.
+    """
+    step = 0.25 * min(float(np.median(np.diff(p.t))) for p in pairs)
+    return step if theta[_T] < step else 0.4 * min(step, 0.25 * float(theta[_T]))
+
+
 def _finest(pairs: Sequence[_Pair]) -> float:
     """Return the standard deviation of rounding to the feedback's smallest step."""
     steps = np.concatenate([np.abs(np.diff(p.y)) for p in pairs])
@@ -557,26 +605,48 @@ def _noise(pairs: Sequence[_Pair]) -> float:
 def _with_limits(fit: _Fit, pairs: Sequence[_Pair], kind: ActuatorKind) -> _Fit:
     """Take in a rate limit or a dead band where the likelihood grows enough by it."""
     best = fit
-    for k, candidates in ((_R, _rates(pairs)), (_B, _bands(fit, pairs, kind))):
+    # a dead band may hide a rate limit, so that is tried again behind it
+    for k in (_R, _B, _R):
+        if k in best.free or (k == _B and best.theta[_B]):
+            continue
         tried = []
-        for value in candidates:
+        for value in _rates(pairs) if k == _R else _bands(best, pairs, kind):
             theta = best.theta.copy()
             theta[k] = value
-            starts = [theta]
+            tried.append(theta)
             if k == _R and theta[_T] > 0:
                 # most of a lag may have been the limit
-                short = theta.copy()
-                short[_T] *= 0.2
-                starts.append(short)
-            tried += starts
-        if not tried:
-            continue
+                tried.append(np.where(np.arange(len(theta)) == _T, 0.2 * theta[_T], theta))
         losses = [_huber(_rest(theta, pairs, kind), best.scale) for theta in tried]
+        # what is there already helps before anything else is fitted to it
+        if not tried or min(losses) > _PROMISING * _huber(best.rest, best.scale):
+            continue
         start = tried[int(np.argmin(losses))]
-        more = _improve(start, (*best.free, k), pairs, kind)
+        if k == _B and kind == "speed":
+            more = _with_threshold(start, best.free, pairs)
+        else:
+            more = _improve(start, (*best.free, k), pairs, kind)
         if _gain(best, more, pairs) > _LEAST_GAIN:
             best = more
     return best
+
+
+def _with_threshold(start: Array, free: tuple[int, ...], pairs: Sequence[_Pair]) -> _Fit:
+    """Fit the command below which a propeller stands: a staircase, so every level is tried."""
+    fit = _improve(start, free, pairs, "speed")
+    _, levels = _levels(pairs)
+    tried = [np.where(np.arange(len(start)) == _B, b, fit.theta) for b in levels]
+    losses = [_huber(_rest(theta, pairs, "speed"), fit.scale) for theta in tried]
+    return _improve(tried[int(np.argmin(losses))], free, pairs, "speed")
+
+
+def _levels(pairs: Sequence[_Pair]) -> tuple[Array, Array]:
+    """Return sizes of the command that occur (M,), at most a few dozen, and between (M−1,)."""
+    size = np.unique(np.abs(np.concatenate([p.command for p in pairs])))
+    size = size[size <= _MOST_BAND * size[-1]]
+    if len(size) > _MOST_LEVELS:
+        size = np.unique(np.quantile(size, np.linspace(0, 1, _MOST_LEVELS)))
+    return size, np.asarray(0.5 * (size[1:] + size[:-1]))
 
 
 def _gain(simple: _Fit, more: _Fit, pairs: Sequence[_Pair]) -> float:
@@ -584,15 +654,18 @@ def _gain(simple: _Fit, more: _Fit, pairs: Sequence[_Pair]) -> float:
     ratio = _huber(simple.rest, simple.scale) / _huber(more.rest, simple.scale)
     if ratio < 1 + _LEAST_SHARE:
         return 0.0
-    near, lag = [], 0.0
-    for part in _parts(more.rest, pairs):
-        clipped = np.clip(part, -3 * more.scale, 3 * more.scale)
-        power = float(clipped @ clipped)
-        near.append((float(clipped[1:] @ clipped[:-1]), power))
-    total = sum(p for _, p in near)
-    lag = max(sum(n for n, _ in near) / total, 0.0) if total > 0 else 0.0
-    count = len(more.rest) * (1 - lag) / (1 + lag)
-    return float(count * np.log(ratio))
+    return float(_independent_count(more, pairs) * np.log(ratio))
+
+
+def _independent_count(fit: _Fit, pairs: Sequence[_Pair]) -> float:
+    """Return how many independent samples weigh as much as the residuals, neighbours alike."""
+    near = power = 0.0
+    for part in _parts(fit.rest, pairs):
+        clipped = np.clip(part, -3 * fit.scale, 3 * fit.scale)
+        near += float(clipped[1:] @ clipped[:-1])
+        power += float(clipped @ clipped)
+    alike = max(near / power, 0.0) if power > 0 else 0.0
+    return len(fit.rest) * (1 - alike) / (1 + alike)
 
 
 def _rates(pairs: Sequence[_Pair]) -> list[float]:
@@ -614,9 +687,7 @@ def _rates(pairs: Sequence[_Pair]) -> list[float]:
 def _bands(fit: _Fit, pairs: Sequence[_Pair], kind: ActuatorKind) -> list[float]:
     """Return candidates for half of a dead band."""
     if kind == "speed":
-        size = np.abs(np.concatenate([p.command for p in pairs]))
-        size = size[size > 0]
-        return [float(q) for q in np.quantile(size, (0.05, 0.1, 0.2, 0.35, 0.5))] if len(size) else []
+        return [float(b) for b in _levels(pairs)[1][:: max(1, _MOST_LEVELS // 12)]]
     return [0.7 * fit.scale, 1.5 * fit.scale, 3.0 * fit.scale]
 
 
@@ -627,7 +698,8 @@ def _parts(rest: Array, pairs: Sequence[_Pair]) -> list[Array]:
 def _covariance(fit: _Fit, pairs: Sequence[_Pair], kind: ActuatorKind) -> Array:
     """Return the covariance of the free parameters, robust to coloured uneven residuals.
 
-    Sandwich with Bartlett weights, their reach by Andrews' rule for a first-order process.
+    Sandwich with Bartlett weights that reach twice as far as Andrews' rule for a first-order
+    process says, and critical values for such a reach (Kiefer and Vogelsang, 2005).
     """
     slope = _slope(fit.theta, fit.free, pairs, kind)
     size = np.sqrt(np.mean(slope**2, axis=0))
@@ -638,51 +710,110 @@ def _covariance(fit: _Fit, pairs: Sequence[_Pair], kind: ActuatorKind) -> Array:
     scores = slope * np.clip(fit.rest, -bound, bound)[:, None]
     bread = (slope * inside[:, None]).T @ slope
     meat = np.zeros_like(bread)
+    reached = count = 0
     for s in _parts(scores, pairs):
         n = len(s)
         power = np.sum(s**2, axis=0)
         near = np.sum(s[1:] * s[:-1], axis=0) / np.where(power > 0, power, 1.0)
-        rho = np.clip(near, -0.9, 0.97)
-        alpha = np.max(4 * rho**2 / ((1 - rho) ** 2 * (1 + rho) ** 2))
-        reach = int(min(1.1447 * (alpha * n) ** (1 / 3), n / 4))
-        meat += s.T @ s
-        for k in range(1, reach + 1):
-            cross = s[k:].T @ s[:-k]
-            meat += (1 - k / (reach + 1)) * (cross + cross.T)
-    p, n = len(fit.free), len(fit.rest)
+        rho = np.clip(near, -0.9, 0.995)
+        alpha = float(np.max(4 * rho**2 / ((1 - rho) ** 2 * (1 + rho) ** 2)))
+        reach = 1 + int(min(2 * 1.1447 * (alpha * n) ** (1 / 3), n / 4))
+        # Bartlett weights are the mean square of sums over `reach` neighbours
+        sums = np.vstack([np.zeros((1, s.shape[1])), np.cumsum(s, axis=0)])
+        after = sums[np.minimum(np.arange(1 - reach, n) + reach, n)]
+        window = after - sums[np.maximum(np.arange(1 - reach, n), 0)]
+        meat += window.T @ window / reach
+        reached += reach
+        count += n
+    p = len(fit.free)
     inverse = np.linalg.pinv(bread, rcond=1e-10)
-    return np.asarray(inverse @ meat @ inverse / np.outer(size, size)) * n / max(n - p, 1)
+    # the more of the log the weights reach over, the less certain is the covariance itself
+    share = reached / count
+    wider = (_NORMAL + 2.9694 * share + 0.4160 * share**2 - 0.5324 * share**3) / _NORMAL
+    covariance = inverse @ meat @ inverse / np.outer(size, size)
+    return np.asarray(covariance) * wider**2 * count / max(count - p, 1)
 
 
 def _estimate(fit: _Fit, pairs: Sequence[_Pair], actuator: Actuator) -> ActuatorEstimate:
-    def measured(k: int) -> Measured:
-        value = float(fit.theta[k])
-        at = fit.free.index(k) if k in fit.free else None
-        spread = 0.0 if at is None else _NORMAL * float(np.sqrt(max(fit.covariance[at, at], 0)))
-        low = max(value - spread, 0.0) if k in (_T, _R, _B) else value - spread
-        return Measured(value, (low, value + spread))
-
-    lateness = float(fit.theta[_D] + fit.theta[_T])
-    spread = _NORMAL * float(np.sqrt(max(fit.covariance[:2, :2].sum(), 0.0)))
     hold, new = _renewal(fit, pairs, actuator.kind)
+    delay = _measured(fit, _D, pairs, actuator.kind)
+    lag = _measured(fit, _T, pairs, actuator.kind)
+    response = delay.value + lag.value
+    spread = _NORMAL * float(np.sqrt(max(fit.covariance[:2, :2].sum(), 0.0)))
+    sums = [float(x[_D] + x[_T]) for x in fit.alike]
+    between = min([response - spread, *sums]), max([response + spread, *sums])
+    limited = _R in fit.free
     return ActuatorEstimate(
         actuator.thruster,
         actuator.kind,
         actuator.command,
         actuator.feedback,
-        measured(_D),
-        measured(_T),
-        Measured(lateness, (lateness - spread, lateness + spread)),
-        measured(_G),
-        measured(_O),
-        measured(_R) if _R in fit.free else None,
-        measured(_B) if _B in fit.free else None,
+        delay,
+        lag,
+        Measured(response, between),
+        _measured(fit, _G, pairs, actuator.kind),
+        _measured(fit, _O, pairs, actuator.kind),
+        _measured(fit, _R, pairs, actuator.kind) if limited else None,
+        _measured(fit, _B, pairs, actuator.kind) if fit.theta[_B] else None,
         fit.scale,
         max(p.step for p in pairs),
         hold,
         new,
         tuple(p.log for p in pairs),
     )
+
+
+def _measured(fit: _Fit, k: int, pairs: Sequence[_Pair], kind: ActuatorKind) -> Measured:
+    """Return a parameter with its interval."""
+    value = float(fit.theta[k])
+    if k == _B and k not in fit.free:
+        return Measured(value, _threshold_interval(fit, pairs))
+    at = fit.free.index(k) if k in fit.free else None
+    spread = 0.0 if at is None else _NORMAL * float(np.sqrt(max(fit.covariance[at, at], 0.0)))
+    low, high = value - spread, value + spread
+    if k in (_D, _T):
+        alike = [theta[k] for theta in fit.alike]
+        low, high = min([low, *alike]), max([high, *alike])
+    return Measured(value, (max(low, 0.0) if k in (_T, _R, _B) else low, high))
+
+
+def _least_late(fit: _Fit, pairs: Sequence[_Pair], kind: ActuatorKind) -> _Fit:
+    """Return, of the delays and lags that explain the log alike, the smallest.
+
+    With a lag shorter than a sample the likelihood of the delay is a staircase.
+    """
+    step = min(float(np.median(np.diff(p.t))) for p in pairs)
+    if fit.theta[_T] >= 0.5 * step or (_B in fit.free and kind != "speed"):
+        return fit
+    count = _independent_count(fit, pairs)
+    least = _huber(fit.rest, fit.scale)
+    delays = np.unique([*(fit.theta[_D] + step * np.linspace(-1.2, 1.2, 13)), 0.0])
+    delays = delays[np.abs(delays - fit.theta[_D]) <= 1.2 * step]
+    found = []
+    for d in delays:
+        for lag in step * np.array([0.0, 0.1, 0.25, 0.5, 0.8]):
+            theta = fit.theta.copy()
+            theta[[_D, _T]] = d, lag
+            found.append((_huber(_rest(theta, pairs, kind), fit.scale), theta))
+    least = min(least, min(loss for loss, _ in found))
+    alike = [x for loss, x in found if loss <= least * (1 + _NORMAL**2 / count)]
+    as_good = [x for loss, x in found if loss <= least * (1 + 1 / count)]
+    best = min(as_good, key=lambda x: abs(x[_D]) + x[_T], default=fit.theta)
+    rest = _rest(best, pairs, kind)
+    return replace(fit, theta=best, rest=rest, alike=tuple(alike))
+
+
+def _threshold_interval(fit: _Fit, pairs: Sequence[_Pair]) -> tuple[float, float]:
+    """Return the interval of a propeller's dead band: between sizes of commands that occur."""
+    size, levels = _levels(pairs)
+    bound = _huber(fit.rest, fit.scale) * (1 + _NORMAL**2 / _independent_count(fit, pairs))
+    tried = [np.where(np.arange(len(fit.theta)) == _B, b, fit.theta) for b in levels]
+    good = [
+        k
+        for k, theta in enumerate(tried)
+        if levels[k] == fit.theta[_B] or _huber(_rest(theta, pairs, "speed"), fit.scale) <= bound
+    ]
+    return float(size[good[0]]), float(size[good[-1] + 1])
 
 
 def _renewal(
@@ -692,9 +823,8 @@ def _renewal(
     still = moving = 0
     ages: list[Array] = []
     fresh: list[_Pair] = []
-    quiet = replace(fit, theta=fit.theta)
     for p in pairs:
-        x = _respond(quiet.theta, p, kind)
+        x = _respond(fit.theta, p, kind)
         new = np.concatenate([[True], np.diff(p.y) != 0])
         # between two samples the model moves by more than rounding hides
         must = np.abs(np.diff(x, prepend=x[:1])) > max(2 * _finest([p]), 0.1 * fit.scale)
@@ -709,14 +839,8 @@ def _renewal(
         return float(np.mean(np.concatenate(ages))), None
     again = _improve(fit.theta, fit.free, fresh, kind)
     again = replace(again, covariance=_covariance(again, fresh, kind))
-    found = []
-    for k in (_D, _T):
-        at = again.free.index(k)
-        spread = _NORMAL * float(np.sqrt(max(again.covariance[at, at], 0.0)))
-        value = float(again.theta[k])
-        low = max(value - spread, 0.0) if k == _T else value - spread
-        found.append(Measured(value, (low, value + spread)))
-    return float(np.mean(np.concatenate(ages))), (found[0], found[1])
+    found = (_measured(again, _D, fresh, kind), _measured(again, _T, fresh, kind))
+    return float(np.mean(np.concatenate(ages))), found
 
 
 def _finding(estimate: ActuatorEstimate, fit: _Fit, pairs: Sequence[_Pair]) -> Finding:
