@@ -38,6 +38,8 @@ _START, _START_SHARE = 10.0, 0.1
 _FEWEST_SAMPLES, _FEWEST_CHANGES = 60, 5
 # share of the feedback's variance that the command must explain to be its command
 _LEAST_EXPLAINED = 0.3
+# what of the feedback is no spike: quantiles
+_USUAL = (0.005, 0.995)
 # Huber's bound in robust standard deviations
 _HUBER = 1.345
 # gain in twice the log-likelihood (of samples that count as independent) and in the size of the
@@ -49,6 +51,8 @@ _PROMISING = 1.0
 _MOST_BAND, _MOST_LEVELS = 0.5, 48
 # how many quarters of a sample the delay is moved along its ridge with the lag at most
 _RIDGE = 24
+# loss there over that of the fit up to which it is fitted anew
+_NEAR = 1.5
 # share of the loss by which a step must lower it for another to follow
 _CONVERGED = 1e-6
 # beyond the noise by this factor something is left that a lag does not explain
@@ -340,6 +344,10 @@ class _Fit:
         (p, p) of the free ones; empty until it is asked for.
     alike : tuple of ndarray
         Other parameters that explain the logs as well.
+    hold : float
+        Mean age of a feedback that the recorder repeats while it must move [s]; else 0.
+    fresh : tuple of _Pair
+        The logs where their feedback is new.
     """
 
     theta: Array
@@ -348,6 +356,8 @@ class _Fit:
     rest: Array
     covariance: Array
     alike: tuple[Array, ...] = ()
+    hold: float = 0.0
+    fresh: tuple[_Pair, ...] = ()
 
 
 def _respond(theta: Array, pair: _Pair, kind: ActuatorKind) -> Array:
@@ -434,7 +444,10 @@ def _fit(pairs: Sequence[_Pair], kind: ActuatorKind) -> _Fit | None:
         start[_O] += (start[_G] - 1) * float(np.mean([p.command.mean() for p in pairs]))
         start[_G] = 1.0
     fit = _along_ridge(_improve(start, free, pairs, kind), pairs, kind)
-    if float(np.sqrt(np.mean(fit.rest**2))) > _LEFT_OVER * _noise(pairs):
+    hold, fresh = _held(fit, pairs, kind)
+    fit = replace(fit, hold=hold, fresh=fresh)
+    # values that the recorder repeats look like limits of the actuator
+    if not hold and float(np.sqrt(np.mean(fit.rest**2))) > _LEFT_OVER * _noise(pairs):
         fit = _with_limits(fit, pairs, kind)
     fit = _least_late(fit, pairs, kind)
     return replace(fit, covariance=_covariance(fit, pairs, kind))
@@ -450,7 +463,10 @@ def _coarse(pairs: Sequence[_Pair]) -> Array | None:
             grid = np.arange(p.t[0] + _LATEST, p.t[-1] + _EARLIEST, step)
             if len(grid) < _FEWEST_SAMPLES // 2:
                 grid = np.arange(p.t[0], p.t[-1], step)
-            y = np.interp(grid, p.t, p.y - p.turns())
+            feedback = p.y - p.turns()
+            # spikes count for no more than what is usual
+            feedback = np.clip(feedback, *np.quantile(feedback, _USUAL))
+            y = np.interp(grid, p.t, feedback)
             delays = np.arange(_EARLIEST, _LATEST + 0.1, max(0.1, step))
             wide = np.arange(grid[0] - _LATEST - step, grid[-1] - _EARLIEST + step, step)
             free = replace(p, t=wide, y=wide)
@@ -534,7 +550,8 @@ def _along_ridge(fit: _Fit, pairs: Sequence[_Pair], kind: ActuatorKind) -> _Fit:
     losses = np.array([np.inf, *(loss for loss, _ in starts), np.inf])
     low = np.flatnonzero((losses[1:-1] <= losses[:-2]) & (losses[1:-1] <= losses[2:]))
     best = fit
-    for at in low[np.argsort(losses[1:-1][low])][:2]:
+    near = low[losses[1:-1][low] < _NEAR * _huber(fit.rest, fit.scale)]
+    for at in near[np.argsort(losses[1:-1][near])][:2]:
         found = _improve(starts[at][1], fit.free, pairs, kind)
         if _huber(found.rest, fit.scale) < _huber(best.rest, fit.scale):
             best = found
@@ -564,12 +581,14 @@ def _slope(
         _O: 1e-3 * abs(theta[_G]) * spread, _R: 0.02 * theta[_R], _B: 0.05 * theta[_B],
     }  # fmt: skip
     columns = []
+    linear = _R not in free and (_B not in free or kind == "speed") and theta[_G] != 0
     for k in free:
-        if k in (_G, _O) and _R not in free and (_B not in free or kind == "speed"):
-            # the model is linear in both
-            unit = theta.copy()
-            unit[_G], unit[_O] = (1.0, 0.0) if k == _G else (0.0, 1.0)
-            columns.append(np.concatenate([_respond(unit, p, kind) for p in pairs]))
+        if linear and k == _O:
+            columns.append(np.ones(sum(len(p.t) for p in pairs)))
+            continue
+        if linear and k == _G:
+            model = np.concatenate([_respond(theta, p, kind) for p in pairs])
+            columns.append((model - theta[_O]) / theta[_G])
             continue
         up, down = theta.copy(), theta.copy()
         up[k] += sizes[k]
@@ -735,7 +754,14 @@ def _covariance(fit: _Fit, pairs: Sequence[_Pair], kind: ActuatorKind) -> Array:
 
 
 def _estimate(fit: _Fit, pairs: Sequence[_Pair], actuator: Actuator) -> ActuatorEstimate:
-    hold, new = _renewal(fit, pairs, actuator.kind)
+    new = None
+    if fit.hold and fit.fresh:
+        again = _improve(fit.theta, fit.free, fit.fresh, actuator.kind)
+        again = replace(again, covariance=_covariance(again, fit.fresh, actuator.kind))
+        new = (
+            _measured(again, _D, fit.fresh, actuator.kind),
+            _measured(again, _T, fit.fresh, actuator.kind),
+        )
     delay = _measured(fit, _D, pairs, actuator.kind)
     lag = _measured(fit, _T, pairs, actuator.kind)
     response = delay.value + lag.value
@@ -757,7 +783,7 @@ def _estimate(fit: _Fit, pairs: Sequence[_Pair], actuator: Actuator) -> Actuator
         _measured(fit, _B, pairs, actuator.kind) if fit.theta[_B] else None,
         fit.scale,
         max(p.step for p in pairs),
-        hold,
+        fit.hold,
         new,
         tuple(p.log for p in pairs),
     )
@@ -816,10 +842,10 @@ def _threshold_interval(fit: _Fit, pairs: Sequence[_Pair]) -> tuple[float, float
     return float(size[good[0]]), float(size[good[-1] + 1])
 
 
-def _renewal(
+def _held(
     fit: _Fit, pairs: Sequence[_Pair], kind: ActuatorKind
-) -> tuple[float, tuple[Measured, Measured] | None]:
-    """Return the mean age of a held feedback, and delay and lag where it is new."""
+) -> tuple[float, tuple[_Pair, ...]]:
+    """Return the mean age [s] of a feedback that the recorder repeats, and where it is new."""
     still = moving = 0
     ages: list[Array] = []
     fresh: list[_Pair] = []
@@ -832,15 +858,11 @@ def _renewal(
         still += int((must & ~new).sum())
         since = p.t - p.t[np.maximum.accumulate(np.where(new, np.arange(len(new)), 0))]
         ages.append(since[must])
-        fresh.append(p.rows(new))
+        if new.sum() >= _FEWEST_SAMPLES:
+            fresh.append(p.rows(new))
     if moving < _FEWEST_CHANGES or still < _HELD_SHARE * moving:
-        return 0.0, None
-    if any(len(p.t) < _FEWEST_SAMPLES for p in fresh):
-        return float(np.mean(np.concatenate(ages))), None
-    again = _improve(fit.theta, fit.free, fresh, kind)
-    again = replace(again, covariance=_covariance(again, fresh, kind))
-    found = (_measured(again, _D, fresh, kind), _measured(again, _T, fresh, kind))
-    return float(np.mean(np.concatenate(ages))), found
+        return 0.0, ()
+    return float(np.mean(np.concatenate(ages))), tuple(fresh)
 
 
 def _finding(estimate: ActuatorEstimate, fit: _Fit, pairs: Sequence[_Pair]) -> Finding:
