@@ -93,7 +93,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="KEY=TEXT",
-        help="a note of the trial, such as draught, loading, depth, sea_state (repeat)",
+        help="a condition of the trial (draught, trim, loading, water_depth, sea_state), or a note "
+        "in words (repeat)",
     )
     parser.add_argument("--json", metavar="F", help="write the record as JSON; - is stdout")
 
@@ -102,10 +103,11 @@ def run(options: argparse.Namespace) -> None:
     """Read, merge, mend, resample, write."""
     from pathlib import Path
 
-    from greybox.errors import UsageError
+    from greybox.errors import UsageError, suggestion
     from greybox.files import check_targets, write_json
-    from greybox.trial.convert.two_pass_import import import_files
+    from greybox.trial.import_files import import_files
     from greybox.trial.store import read_record, record_path
+    from greybox.vessel.conditions import UNITS
     from greybox.vessel.toml import load_vessel
 
     if Path(options.out).suffix.lower() not in ("", ".csv", ".parquet", ".pq"):
@@ -130,13 +132,22 @@ def run(options: argparse.Namespace) -> None:
         write_json(record, options.json)
     if options.json != "-":
         say(summary)
+        for key in pairs(options.note, "--note"):
+            if key not in UNITS and (near := suggestion(key, UNITS)):
+                say(f"note: '{key}' is kept in words, as no condition.{near}")
         say(f"wrote {options.out} and {record_path(options.out).name}")
 
 
 def import_options(options: argparse.Namespace) -> ImportOptions:
     """Return the options of the import, checked."""
+    from greybox.errors import LogError, UsageError
     from greybox.trial.convert.options import ImportOptions
+    from greybox.vessel.conditions import Conditions
 
+    try:
+        Conditions.read(notes := pairs(options.note, "--note"))
+    except LogError as error:
+        raise UsageError(f"--note: {error}") from None
     return ImportOptions(
         sample_time=options.sample_time,
         hole=options.hole,
@@ -144,7 +155,7 @@ def import_options(options: argparse.Namespace) -> ImportOptions:
         window=options.window,
         reference_height=options.reference_height,
         origin=_origin(options.origin),
-        notes=pairs(options.note, "--note"),
+        notes=notes,
         smooth=_windows(options.smooth),
     )
 

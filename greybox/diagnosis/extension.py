@@ -17,6 +17,7 @@ from greybox.model.model import ManoeuvringModel
 from greybox.model.noise import NoiseLevels
 from greybox.model.structure import Structure
 from greybox.trial.log import TrialLog
+from greybox.trial.validity import pooled_conditions
 from greybox.vessel.vessel import Thruster, Vessel
 
 Array = NDArray[np.float64]
@@ -93,6 +94,7 @@ def extended_model(
         noise=_noise(problem, fit),
         sums=summed,
         changes=tuple(Change(names[c.index], c.factor, c.time) for c in ship.changes),
+        conditions=pooled_conditions(logs).values,
         record=dict(record),
     )
 
@@ -107,7 +109,7 @@ def extended_vessel(
         said["velocities_from_heading"] = True
     if any(sensors.lever):
         # velocities that follow from positions are those of the antenna
-        derived = any(d.startswith("u, v") for d in log.provenance.derived)
+        derived = any(s.derives_motion and "u" in s.channels for s in log.provenance.steps)
         key = "antenna" if derived else "velocity_at"
         before = tuple(said.get(key, (0.0, 0.0)))
         said[key] = (before[0] + sensors.lever[0], before[1] + sensors.lever[1], *before[2:])

@@ -26,6 +26,7 @@ _MOST_MARKS = 300
 _BESIDE = 1.0
 _BESIDE_SAMPLES = 25
 _ROWS = 8
+_FRACTION_SECONDS = 5.0
 _NAMED = {
     "x_n": "position north x_n [m]", "y_n": "position east y_n [m]",
     "v_n": "velocity north v_n [m/s]", "v_e": "velocity east v_e [m/s]",
@@ -95,6 +96,24 @@ def order_figure(finding: Finding) -> Figure:
     third.set_title("time since the row before; it must be above zero", fontsize=9)
     third.set_ylabel("step [s]", fontsize=9)
     third.set_xlabel("row of the file", fontsize=9)
+    _legend(whole)
+    return figure
+
+
+def fractions_figure(finding: Finding) -> Figure:
+    """Draw how late the times come that lack the zeros of their fraction, and the first closer."""
+    meant: Array = finding.picture["meant"]
+    written: Array = finding.picture["written"]
+    figure, whole, zoom, _ = _axes("Fractions of a second without leading zeros")
+    near = np.abs(meant - meant[0]) <= _FRACTION_SECONDS
+    for ax, part in ((whole, slice(None)), (zoom, near)):
+        late = written[part] - meant[part]
+        ax.vlines(meant[part], 0.0, late, color=BLACK, linewidth=0.6)
+        ax.plot(meant[part], late, "v", color=VERMILION, markersize=5, label="as written")
+        ax.plot(meant[part], 0 * late, ".", color=BLUE, markersize=5, label="as meant")
+        ax.set_ylabel("late [s]", fontsize=9)
+        ax.set_xlabel("time [s]", fontsize=9)
+    zoom.set_title(f"around the first, t = {meant[0]:.6g} s", fontsize=9)
     _legend(whole)
     return figure
 

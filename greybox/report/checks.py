@@ -14,6 +14,7 @@ from greybox.report.chart import chart_of
 from greybox.report.check_answers import answer_figure, course_figure, wind_figure
 from greybox.report.check_rows import (
     coarse_figure,
+    fractions_figure,
     gap_figure,
     missing_figure,
     order_figure,
@@ -34,7 +35,8 @@ from greybox.vessel.vessel import Vessel
 
 # what makes a force model wrong before what it only has to do without
 _SERIOUS = (
-    "frame", "sign", "unit", "clock_offset", "heading_bias", "lever_arm", "duplicate_time",
+    "frame", "sign", "unit", "clock_offset", "heading_bias", "lever_arm", "time_format",
+    "duplicate_time",
     "stuck", "nan", "outlier", "gap", "quantised",
 )  # fmt: skip
 _SHOWN = {
@@ -42,6 +44,8 @@ _SHOWN = {
     "sample to the next.",
     "duplicate_time": "Times by row with the wrong ones marked, closer around the first, and "
     "the time since the row before.",
+    "time_format": "How late the times come that lack the leading zeros of their fraction, and "
+    "the first of them closer.",
     "nan": "The signal with the samples that hold no number shaded, and the longest stretch "
     "closer.",
     "outlier": "The whole signal with its outliers circled, and the largest one closer.",
@@ -165,6 +169,8 @@ def _drawn(finding: Finding, report: CheckReport, vessel: Vessel) -> tuple[Figur
         return gap_figure(finding, recording), ""
     if finding.id == "duplicate_time":
         return order_figure(finding), ""
+    if finding.id == "time_format":
+        return fractions_figure(finding), ""
     if finding.id == "nan":
         return missing_figure(finding, recording), ""
     if finding.id == "outlier":

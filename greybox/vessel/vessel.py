@@ -7,8 +7,10 @@ from dataclasses import dataclass, field
 from math import inf, isfinite
 from typing import Any, Literal, get_args
 
+from greybox.channels import CHANNELS
 from greybox.errors import VesselError, suggestion
 from greybox.notebook import Shown, number, table
+from greybox.vessel.conditions import Conditions
 from greybox.vessel.thrust import ThrustLaw
 
 ThrusterType = Literal["azimuth", "fixed", "tunnel", "propeller_rudder"]
@@ -237,6 +239,8 @@ class Vessel(Shown):
     mass : float, optional
         [kg]
     actuation : Actuation
+    conditions : Conditions
+        Those of a log that does not state its own.
     """
 
     name: str
@@ -247,6 +251,7 @@ class Vessel(Shown):
     closed_loop: tuple[str, tuple[str, ...]] | None = None
     mass: float | None = None
     actuation: Actuation = Actuation()
+    conditions: Conditions = field(default_factory=Conditions)
 
     @property
     def commands(self) -> tuple[str, ...]:
@@ -280,6 +285,12 @@ class Vessel(Shown):
         """Those of `recorded_columns` that are angles [rad]."""
         pairs = (c for a in self.actuators if a.angular for c in (a.command, a.feedback))
         return self.angle_commands | frozenset(pairs)
+
+    def unit(self, name: str) -> str | None:
+        """Return the SI unit of a channel or thruster column, None where any unit is kept."""
+        if name in self.recorded_angles:
+            return "rad"
+        return CHANNELS[name].unit if name in CHANNELS else None
 
     @property
     def limits(self) -> dict[str, Limits]:
@@ -318,6 +329,8 @@ class Vessel(Shown):
         if self.actuation:
             lines.append(f"  thrusters with {self.actuation.sentence}")
         lines += [f"  {name} {value}" for name, value in self.sensors.items()]
+        if self.conditions:
+            lines.append(f"  conditions: {self.conditions.sentence}")
         return "\n".join(lines)
 
     def _parts(self) -> tuple[str, ...]:

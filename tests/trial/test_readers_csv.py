@@ -381,16 +381,16 @@ def test_parquet_bombs(tmp_path):
         open_parquet(path)
 
 
-def test_a_parquet_row_group_that_unpacks_too_far(tmp_path, monkeypatch):
-    monkeypatch.setattr("greybox.trial.readers.parquet._MAX_GROUP_BYTES", 1 << 16)
+def test_a_parquet_row_group_that_unpacks_too_far(tmp_path, limited):
+    limited(held_bytes=1 << 16)
     table = pa.table({"t": np.arange(1 << 16) // 100 * 1.0})
     parquet.write_table(table, tmp_path / "x.parquet", compression="zstd", use_dictionary=False)
     with pytest.raises(LogError, match=r"a row group of .* unpacks to \d+ bytes, at most 65536"):
         read(tmp_path / "x.parquet")
 
 
-def test_a_parquet_row_group_of_long_texts(tmp_path, monkeypatch):
-    monkeypatch.setattr("greybox.trial.readers.parquet._MAX_GROUP_BYTES", 1 << 18)
+def test_a_parquet_row_group_of_long_texts(tmp_path, limited):
+    limited(held_bytes=1 << 18)
     columns = {"t": np.arange(10.0), "u": np.arange(10.0)}
     table = pa.table(columns | {"said": ["x" * 10**5] * 10})
     options = {"compression": "none", "use_dictionary": False}
@@ -429,12 +429,12 @@ def test_long_words_are_cut(kind):
 @pytest.mark.parametrize(
     ("tail", "words"),
     [
-        ("a" * 70000, "a line is longer than 8388608 bytes"),
+        ("a" * 70000, "a line is longer than 16384 bytes"),
         ('1,"' + "a\n" * 40000, "a quoted cell holds line ends, or its quote is never closed"),
     ],
 )
-def test_lines_without_an_end_after_a_good_start(tmp_path, monkeypatch, tail, words):
-    monkeypatch.setattr("greybox.trial.readers.csv._BLOCK_BYTES", 1 << 14)
+def test_lines_without_an_end_after_a_good_start(tmp_path, limited, tail, words):
+    limited(block_bytes=1 << 14)
     path = written(tmp_path / "x.csv", frame().to_csv(index=False) + tail)
     with pytest.raises(LogError, match=words):
         read(path)
@@ -474,3 +474,71 @@ def test_numbers_are_those_that_arrow_itself_gives(values, part):
     column = pa.array([None if v is None else str(v) for v in values], pa.string())[part]
     expected = column.cast(pa.float64()).to_numpy(zero_copy_only=False)
     np.testing.assert_array_equal(cells.numbers(column, ".", "u", {}), expected)
+
+
+# short names of positions, and points between thousands
+
+
+def track(n=200):
+    t = np.arange(n) * 0.5
+    return pd.DataFrame({"t": t, "n": 3 * t, "e": 20 * np.sin(t / 30), "heading": 0.1 * np.sin(t)})
+
+
+UNCLAIMED = vessel_from_dict(
+    {**SHIP, "thruster": [{"type": "azimuth", "speed": "rpm", "angle": "a"}]}
+)
+
+
+def test_north_and_east_may_be_called_n_and_e(tmp_path):
+    track().to_csv(tmp_path / "x.csv", index=False)
+    recording = read_recording(tmp_path / "x.csv", UNCLAIMED)
+    np.testing.assert_array_equal(recording["x_n"].value, track()["n"])
+    np.testing.assert_array_equal(recording["y_n"].value, track()["e"])
+    assert "n taken for x_n in m, no unit being stated" in recording.notes
+
+
+@pytest.mark.parametrize("left_out", ["e", "n"])
+def test_n_or_e_alone_is_no_position(tmp_path, left_out):
+    track().drop(columns=left_out).to_csv(tmp_path / "x.csv", index=False)
+    assert not {"x_n", "y_n"} & set(read_recording(tmp_path / "x.csv", UNCLAIMED).names)
+
+
+def test_a_shaft_speed_that_the_vessel_claims_is_no_position(tmp_path):
+    track().to_csv(tmp_path / "x.csv", index=False)
+    recording = read_recording(tmp_path / "x.csv", VESSEL)
+    assert "n" in recording.names
+    assert not {"x_n", "y_n"} & set(recording.names)
+
+
+@pytest.mark.parametrize("kind", ["held", "noise"])
+def test_n_and_e_that_do_not_travel_are_no_positions(tmp_path, kind):
+    data = track()
+    rng = np.random.default_rng(0)
+    data["n"] = 15.0 + np.arange(len(data)) // 60 if kind == "held" else rng.normal(size=len(data))
+    data.to_csv(tmp_path / "x.csv", index=False)
+    assert not {"x_n", "y_n"} & set(read_recording(tmp_path / "x.csv", UNCLAIMED).names)
+
+
+def german(value):
+    return f"{value:,.3f}".translate(str.maketrans(",.", ".,"))
+
+
+@pytest.mark.parametrize("rows", [50, 5000])
+def test_points_between_thousands_before_a_decimal_comma(tmp_path, rows):
+    data = pd.DataFrame({"t": np.arange(rows) * 0.5, "x_n": 990.0 + np.arange(rows) * 1.25})
+    data["psi"] = -0.5
+    data.map(german).to_csv(tmp_path / "x.csv", sep=";", index=False)
+    found, table = read(tmp_path / "x.csv")
+    pd.testing.assert_frame_equal(found, data, check_exact=True)
+    assert "column 'x_n' has points between thousands: 1.234,5 read as 1234.5" in table.notes
+
+
+def test_points_that_are_no_thousands_stay_decimal(tmp_path):
+    data = pd.DataFrame({"t": np.arange(50) * 0.5, "x_n": np.arange(50) * 1.25})
+    texts = data.map(german)
+    texts.loc[7, "x_n"] = "1.5"
+    texts.loc[9, "x_n"] = "1.234,500"
+    texts.to_csv(tmp_path / "x.csv", sep=";", index=False)
+    found, _ = read(tmp_path / "x.csv")
+    assert found.loc[7, "x_n"] == 1.5
+    assert np.isnan(found.loc[9, "x_n"])

@@ -12,7 +12,7 @@ from greybox.diagnosis.extension import extended_vessel
 from greybox.diagnosis.ship import Sensors
 from greybox.errors import VesselError
 from greybox.trial.convert.read import read_log
-from greybox.trial.convert.two_pass_import import import_files
+from greybox.trial.import_files import import_files
 from greybox.trial.kinematics import decimate
 from greybox.trial.log import make_log
 from greybox.vessel.toml import vessel_from_dict, vessel_to_dict

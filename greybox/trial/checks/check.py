@@ -25,6 +25,7 @@ from greybox.trial.checks.signal_quality import (
     time_findings,
 )
 from greybox.trial.checks.thruster_response import response_findings
+from greybox.trial.checks.time_format import time_format_findings
 from greybox.trial.checks.wind_convention import wind_findings
 from greybox.trial.convert.channel_mapping import read_recording
 from greybox.trial.convert.derived_signals import derive_signals
@@ -125,7 +126,8 @@ def check_recordings(recordings: Sequence[Recording], vessel: Vessel) -> list[Ch
 
 def _signal_quality(recording: Recording, vessel: Vessel) -> _Log:
     """Check the samples of one log, each channel by itself."""
-    raw = time_findings(recording)
+    raw = time_format_findings(recording)
+    raw += time_findings(apply_repairs(recording, raw))
     raw += missing_findings(recording)
     raw += angle_unit_findings(recording, vessel)
     whole = derive_signals(apply_repairs(recording, raw))
@@ -168,11 +170,7 @@ def _forces(log: _Log, vessel: Vessel) -> None:
 
 def _independent(recording: Recording) -> Recording:
     """Leave out what was derived from other channels."""
-    gone: set[str] = set()
-    for sentence in recording.derived:
-        names, _, source = sentence.partition(" from ")
-        if source.startswith(("positions", "heading", "the velocity over ground")):
-            gone |= {n.strip() for n in names.split(",")}
+    gone = {n for step in recording.steps if step.derives_motion for n in step.channels}
     return recording.with_signals(s for s in recording.signals if s.name not in gone)
 
 

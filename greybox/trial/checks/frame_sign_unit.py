@@ -18,6 +18,7 @@ from greybox.trial.checks.finding import Finding, Outcome
 from greybox.trial.checks.motion import Motion, integrate, levels, profile, turn
 from greybox.trial.convert.derived_signals import continuous
 from greybox.trial.steps import Step, mend
+from greybox.units import UNITS
 
 Array = NDArray[np.float64]
 Values = dict[str, Array]
@@ -30,7 +31,7 @@ _TURN_SECONDS = 10.0
 # a gross error shows in a part of a long log
 _EXCERPT = 8000
 _DEG = np.pi / 180
-_KNOT = 1852 / 3600
+_KNOT = UNITS["kn"].factor
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.rotation import body_to_ned
 from greybox.trial.convert.derived_signals import continuous
 from greybox.trial.convert.resample import clock, covered, runs
 from greybox.trial.raw_log import Recording, Signal
@@ -304,5 +305,4 @@ def denoise(value: Array, motion: Motion) -> Array:
 
 def turn(psi: Array, forward: Array, starboard: Array) -> Array:
     """Return north and east (N, 2) of body components."""
-    c, s = np.cos(psi), np.sin(psi)
-    return np.column_stack([c * forward - s * starboard, s * forward + c * starboard])
+    return np.column_stack(body_to_ned(forward, starboard, psi))

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from greybox.channels import ANGLES
 from greybox.trial.checks.finding import Finding
 from greybox.trial.convert.derived_signals import continuous
-from greybox.trial.convert.resample import HOLE, clock, runs
+from greybox.trial.convert.resample import clock, runs
+from greybox.trial.gaps import HOLE
 from greybox.trial.raw_log import Recording, Signal
 from greybox.trial.steps import mend
 from greybox.vessel.vessel import Vessel
@@ -45,7 +46,7 @@ def time_findings(recording: Recording) -> list[Finding]:
         Canonical signals.
     """
     found: list[Finding] = []
-    for names, t in _clocks(recording):
+    for names, t in clocks(recording):
         finite = t[np.isfinite(t)]
         steps = np.diff(finite)
         repeated, back = int((steps == 0).sum()), int((steps < 0).sum())
@@ -61,7 +62,7 @@ def time_findings(recording: Recording) -> list[Finding]:
                     float(count),
                     (float(count), float(count)),
                     "1",
-                    f"of {len(finite)} times of {_listed(names)}, {' and '.join(what)}, the first "
+                    f"of {len(finite)} times of {listed(names)}, {' and '.join(what)}, the first "
                     f"after t = {finite[k]:.6g} s",
                     "sort the rows by time and keep the first of those that repeat "
                     "(import --fix does)",
@@ -98,7 +99,7 @@ def _gaps(names: tuple[str, ...], t: Array) -> list[Finding]:
             size,
             (size, size),
             "s",
-            f"{len(wide)} time{'s' if len(wide) > 1 else ''} {_listed(names)} has no value for "
+            f"{len(wide)} time{'s' if len(wide) > 1 else ''} {listed(names)} has no value for "
             f"more than {HOLE:g} usual steps of {usual:.4g} s, the longest {size:.4g} s after "
             f"t = {t[longest]:.6g} s",
             "none needed: import keeps gaps as gaps, and each stretch becomes a segment",
@@ -147,7 +148,7 @@ def missing_findings(recording: Recording) -> list[Finding]:
                 count,
                 (count, count),
                 "1",
-                f"{int(count)} of {n} samples of {_listed(names)} hold no number, in "
+                f"{int(count)} of {n} samples of {listed(names)} hold no number, in "
                 f"{len(stretches)} stretch{'es' if len(stretches) > 1 else ''}, {where}",
                 "leave them out: import does, and keeps longer stretches as gaps",
                 names,
@@ -311,7 +312,7 @@ def _rounded_finding(
 def coarse_findings(recording: Recording) -> list[Finding]:
     """Find signals, and times, that move in steps coarser than what they measure."""
     found = []
-    for _, t in _clocks(recording):
+    for _, t in clocks(recording):
         times = t[np.isfinite(t)]
         digits = _digits(times)
         steps = np.diff(np.unique(times))
@@ -471,7 +472,8 @@ def _moves(name: str, start: float, stop: float, signals: list[Signal], step: fl
 def angle_unit_findings(recording: Recording, vessel: Vessel) -> list[Finding]:
     """Find degrees under a radian name by range: angles of wind and thrusters."""
     found = []
-    rudders = {t.rudder for t in vessel.thrusters if t.rudder}
+    moved = [m for t in vessel.thrusters for m in t.movements]
+    rudders = {c for kind, *both, _ in moved if kind == "rudder" for c in both}
     for s in recording.signals:
         if s.name not in (ANGLES | vessel.recorded_angles) - {"psi", "cog"}:
             continue
@@ -515,7 +517,7 @@ def _clean(s: Signal) -> tuple[Array, Array]:
     return t, value
 
 
-def _clocks(recording: Recording) -> list[tuple[tuple[str, ...], Array]]:
+def clocks(recording: Recording) -> list[tuple[tuple[str, ...], Array]]:
     """Return the signals that share each clock."""
     groups: dict[int, tuple[list[str], Array]] = {}
     for s in recording.signals:
@@ -523,7 +525,8 @@ def _clocks(recording: Recording) -> list[tuple[tuple[str, ...], Array]]:
     return [(tuple(names), t) for names, t in groups.values()]
 
 
-def _listed(names: Iterable[str]) -> str:
+def listed(names: Iterable[str]) -> str:
+    """Return names for a sentence; of many, the first three and how many more."""
     names = list(names)
     if len(names) > 4:
         return f"{', '.join(names[:3])} and {len(names) - 3} more"

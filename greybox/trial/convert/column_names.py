@@ -3,33 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from greybox.channels import CHANNELS
+from greybox.errors import LogError
+from greybox.units import spelled_unit, suffix_unit, unit_factor
 from greybox.vessel.vessel import Vessel
 
-_UNIT_WORDS = {
-    "°": "deg", "degree": "deg", "degrees": "deg", "radian": "rad", "radians": "rad",
-    "kts": "kn", "kt": "kn", "knot": "kn", "m s-1": "m/s", "ms-1": "m/s", "m*s^-1": "m/s",
-    "m.s-1": "m/s", "meter": "m", "metre": "m", "meters": "m", "metres": "m", "sec": "s",
-    "secs": "s", "second": "s", "seconds": "s", "msec": "ms", "°/s": "deg/s", "dps": "deg/s",
-    "°/min": "deg/min", "rad s-1": "rad/s", "1/s": "rps", "1/min": "rpm", "hz": "rps", "n": "N",
-    "kn/h": "kn", "kmh": "km/h", "kph": "km/h", "newton": "N",
-}  # fmt: skip
-_UNITS = (
-    "s", "ms", "us", "ns", "min", "h", "m", "cm", "mm", "km", "ft", "nmi", "rad", "deg", "m/s",
-    "km/h", "kn", "knots", "rad/s", "deg/s", "deg/min", "rpm", "rps", "N", "kN",
-)  # fmt: skip
-# longest first: '_radps' must not be read as '_s'
-_SUFFIXES = (
-    ("radps", "rad/s"), ("rad_s", "rad/s"), ("rads", "rad/s"), ("degps", "deg/s"),
-    ("deg_s", "deg/s"), ("degs", "deg/s"), ("dps", "deg/s"), ("deg_min", "deg/min"),
-    ("degpm", "deg/min"), ("rad", "rad"), ("deg", "deg"), ("mps", "m/s"), ("m_s", "m/s"),
-    ("knots", "kn"), ("kts", "kn"), ("kn", "kn"), ("kmh", "km/h"), ("kph", "km/h"),
-    ("rpm", "rpm"), ("rps", "rps"), ("ms", "ms"), ("us", "us"), ("ns", "ns"), ("sec", "s"),
-    ("s", "s"), ("m", "m"),
-)  # fmt: skip
 # words that tell how a signal was made, not what it is
 _QUALIFIERS = {
     "hat", "mid", "meas", "measured", "ant", "antenna", "est", "estimated", "filt", "filtered",
@@ -37,16 +18,16 @@ _QUALIFIERS = {
 }  # fmt: skip
 # most telling spelling first: where two columns match, the earlier one is taken
 _GUESSES: dict[str, tuple[str, ...]] = {
-    "t": ("t", "time", "times", "timestamp", "t_rel", "elapsed", "elapsed_time", "seconds",
-          "original_timestamp", "unix", "unix_time", "unix_utc", "utc", "datetime", "date_time",
-          "epoch", "gps_time", "time_unix", "utc_time", "time_utc", "uhrzeit", "stamp",
+    "t": ("header_stamp", "t", "time", "times", "timestamp", "t_rel", "elapsed", "elapsed_time",
+          "seconds", "original_timestamp", "unix", "unix_time", "unix_utc", "utc", "datetime",
+          "date_time", "epoch", "gps_time", "time_unix", "utc_time", "time_utc", "uhrzeit", "stamp",
           "zeit", "tid", "clock"),
     "psi": ("psi", "heading", "hdg", "true_heading", "heading_true", "yaw", "yaw_angle", "head",
             "hdt"),
-    "x_n": ("x_n", "x_ned", "north", "n", "northing", "pos_n", "pos_north", "position_north",
+    "x_n": ("x_n", "x_ned", "north", "northing", "pos_n", "pos_north", "position_north",
             "north_position", "p_n", "pn", "x_north", "x0", "x_earth", "x_position", "x_pos",
             "pos_x", "position_x", "x"),
-    "y_n": ("y_n", "y_ned", "east", "e", "easting", "pos_e", "pos_east", "position_east",
+    "y_n": ("y_n", "y_ned", "east", "easting", "pos_e", "pos_east", "position_east",
             "east_position", "p_e", "pe", "y_east", "y0", "y_earth", "y_position", "y_pos",
             "pos_y", "position_y", "y"),
     "u": ("u", "surge", "surge_velocity", "surge_speed", "surge_vel", "velocity_surge",
@@ -72,6 +53,10 @@ _GUESSES: dict[str, tuple[str, ...]] = {
     "V_w": ("tws", "true_wind_speed", "wind_speed_true", "wind_velo_true"),
     "dir_w": ("twd", "true_wind_direction", "wind_direction_true", "wind_dir_true"),
 }  # fmt: skip
+# north and east where both stand together; alone, n is a shaft speed
+_SHORT = {"x_n": "n", "y_n": "e"}
+# the field of messages that hold one value
+_ALONE = "data"
 
 
 @dataclass(frozen=True)
@@ -98,17 +83,6 @@ class Assigned:
     how: str
 
 
-def spelled_unit(text: str) -> str | None:
-    """Return the unit that a text spells, in the spelling of `greybox.channels`, else None."""
-    bare = text.strip()
-    if bare in _UNITS:
-        return bare
-    low = bare.lower()
-    if low in _UNIT_WORDS:
-        return _UNIT_WORDS[low]
-    return low if low in _UNITS else None
-
-
 def split_unit(raw: str) -> tuple[str, str | None]:
     """Part a column name into its stem, lower case, and the unit that it carries."""
     unit: str | None = None
@@ -119,11 +93,7 @@ def split_unit(raw: str) -> tuple[str, str | None]:
         stem = raw[: bracket.start()]
     stem = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", stem.strip())
     stem = re.sub(r"[^0-9a-zA-Z]+", "_", stem).strip("_").lower()
-    if unit is None:
-        for suffix, spelled in _SUFFIXES:
-            if stem.endswith(f"_{suffix}") and stem != suffix:
-                return stem[: -len(suffix) - 1], spelled
-    return stem, unit
+    return suffix_unit(stem) if unit is None else (stem, unit)
 
 
 def assign(
@@ -133,6 +103,8 @@ def assign(
     units: Mapping[str, str] | None = None,
     canonical: Iterable[str] = (),
     guess: bool = True,
+    stem: str = "",
+    parts: Collection[str] = (),
 ) -> dict[str, Assigned]:
     """Say which column is which signal.
 
@@ -149,17 +121,38 @@ def assign(
         Names that the format itself defines.
     guess : bool
         Whether to guess what is left from well-known spellings.
+    stem : str
+        Name of the file, by which the vessel file may qualify a column
+        (``az1.data``, ``az1/data``, or ``az1`` where ``data`` is all it holds).
+    parts : collection of str
+        Columns that mean something only with others: never guessed.
 
     Returns
     -------
     dict of str to Assigned
         By canonical name; each at most once.
+
+    Raises
+    ------
+    LogError
+        ``[columns]`` maps two of the columns to one name.
     """
     columns, units, defined = list(columns), units or {}, set(canonical)
     found: dict[str, Assigned] = {}
-    for raw, mapping in vessel.columns.items():
-        if raw in columns:
-            found[mapping.name] = Assigned(raw, mapping.name, mapping.unit, mapping.sign, "mapped")
+    qualified = _qualified(columns, stem)
+    for called, mapping in vessel.columns.items():
+        raw, name = called if called in columns else qualified.get(called, ""), mapping.name
+        if not raw:
+            continue
+        if name in found and found[name].raw != raw:
+            raise LogError(
+                f"columns '{found[name].raw}' and '{raw}' are both there, and [columns] maps both "
+                f"to '{name}': remove one of the two lines from the vessel file."
+            )
+        unit = mapping.unit or _mapped_unit(raw, vessel.unit(name), units)
+        # without a unit it promises what the canonical name does
+        how = "mapped" if mapping.unit else "exact"
+        found[name] = Assigned(raw, name, unit, mapping.sign, how)
     taken = {a.raw for a in found.values()}
     loop = [vessel.closed_loop[0]] if vessel.closed_loop else []
     for raw in columns:
@@ -170,8 +163,14 @@ def assign(
             how = "exact" if raw not in defined else "defined"
             found[raw] = Assigned(raw, raw, unit, 1, how)
             taken.add(raw)
+    for name in (*vessel.recorded_columns, *loop):
+        raw = qualified.get(name, "")
+        if raw and name not in found and raw not in taken:
+            found[name] = Assigned(raw, name, units.get(raw), 1, "mapped")
+            taken.add(raw)
     if not guess:
         return found
+    taken |= set(parts)
     stems = {raw: split_unit(raw.rsplit(".", 1)[-1]) for raw in columns if raw not in taken}
     for name, spellings in _GUESSES.items():
         if name in found or _pointless(name, found):
@@ -190,7 +189,52 @@ def assign(
         if unit is None or _fits(unit, CHANNELS[name].unit):
             found[name] = Assigned(raw, name, unit, 1, "guessed")
             taken.add(raw)
+    if not {"x_n", "y_n", "lat", "lon"} & found.keys():
+        found |= _short_pair(stems, taken, units)
     return found
+
+
+def _short_pair(
+    stems: Mapping[str, tuple[str, str | None]], taken: Collection[str], units: Mapping[str, str]
+) -> dict[str, Assigned]:
+    """Return north and east where columns ``n`` and ``e`` stand together.
+
+    Alone, ``n`` is a shaft speed.
+    """
+    found = {}
+    for name, short in _SHORT.items():
+        for raw, (stem, spelled) in stems.items():
+            unit = units.get(raw, spelled)
+            fits = unit is None or _fits(unit, "m")
+            if raw not in taken and _rank(stem, (short,)) is not None and fits:
+                found[name] = Assigned(raw, name, unit, 1, "guessed")
+                break
+    return found if len(found) == 2 else {}
+
+
+def is_short_pair(assigned: Mapping[str, Assigned]) -> bool:
+    """Whether north and east were guessed from columns ``n`` and ``e``, which may be others."""
+    pair = [(assigned[n], short) for n, short in _SHORT.items() if n in assigned]
+    return len(pair) == 2 and all(
+        a.how == "guessed" and _rank(split_unit(a.raw)[0], (short,)) is not None
+        for a, short in pair
+    )
+
+
+def _qualified(columns: Sequence[str], stem: str) -> dict[str, str]:
+    """Return the columns by the names that tell the file too."""
+    found = {f"{stem}{mark}{c}": c for c in columns for mark in "./"} if stem else {}
+    if stem and _ALONE in columns and stem not in columns:
+        found[stem] = _ALONE
+    return found
+
+
+def _mapped_unit(raw: str, target: str | None, units: Mapping[str, str]) -> str | None:
+    """Return the unit of a column that is mapped without one: as it states itself, or SI."""
+    unit = units.get(raw, split_unit(raw)[1])
+    if unit == "ms" and target == "m/s":
+        return "m/s"
+    return unit if unit is not None and target is not None and _fits(unit, target) else target
 
 
 def _pointless(name: str, found: Mapping[str, Assigned]) -> bool:
@@ -215,9 +259,6 @@ def _rank(stem: str, spellings: tuple[str, ...]) -> int | None:
 
 
 def _fits(unit: str, target: str) -> bool:
-    from greybox.channels import unit_factor
-    from greybox.errors import LogError
-
     try:
         unit_factor(unit, target, "")
     except LogError:

@@ -10,25 +10,40 @@ from numpy.typing import NDArray
 
 from greybox.errors import LogError
 from greybox.trial.convert.derived_signals import derive_signals
-from greybox.trial.convert.resample import usual_step
-from greybox.trial.raw_log import Recording, Signal
+from greybox.trial.gaps import usual_step
+from greybox.trial.raw_log import Recording
+from greybox.trial.time_format import unpadded_numbers
 
 Array = NDArray[np.float64]
 
 # usual steps by which time may go back without there being two runs in a file
 _FAR = 50.0
 _MAX_RUNS = 1000
+_TWO_RUNS = ": cut the file there and import each run, or mend it with --fix"
 
 
-def clean_signals(
-    recording: Recording, origin: tuple[float, float] | None, notes: list[str]
-) -> dict[str, Signal]:
-    """Return the signals in order of time, each time once, derived ones among them."""
-    recording = in_order(recording, notes)
-    made = derive_signals(recording, origin)
-    notes += made.notes[len(recording.notes) :]
+def clean_signals(recording: Recording, origin: tuple[float, float] | None = None) -> Recording:
+    """Return the signals in order of time, each time once, derived ones among them.
+
+    Parameters
+    ----------
+    recording : Recording
+    origin : tuple of float, optional
+        As for `derive_signals`.
+
+    Returns
+    -------
+    Recording
+        Its steps and notes tell what was done.
+
+    Raises
+    ------
+    LogError
+        As `in_order`.
+    """
+    made = derive_signals(in_order(recording), origin)
     repeated: dict[int, tuple[str, int]] = {}
-    signals: dict[str, Signal] = {}
+    signals = []
     clocks: dict[tuple[int, bytes], Array] = {}
     for s in made.signals:
         keep = np.isfinite(s.value) & np.isfinite(s.t)
@@ -40,12 +55,12 @@ def clean_signals(
             # signals that keep the same rows go on sharing their clock
             t = clocks.setdefault((id(s.t), np.packbits(keep).tobytes()), s.t[keep])
             s = replace(s, t=t, value=s.value[keep])
-        signals[s.name] = s
-    for name, count in repeated.values():
-        notes.append(
-            f"{count} value{'s' if count > 1 else ''} of {name} repeat a time: the first is kept"
-        )
-    return signals
+        signals.append(s)
+    notes = (
+        f"{count} value{'s' if count > 1 else ''} of {name} repeat a time: the first is kept"
+        for name, count in repeated.values()
+    )
+    return made.with_signals(signals, *notes)
 
 
 def _first_kept(t: Array, keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -56,19 +71,20 @@ def _first_kept(t: Array, keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return first
 
 
-def in_order(recording: Recording, notes: list[str]) -> Recording:
-    """Return the recording with every signal and text in order of time.
+def in_order(recording: Recording) -> Recording:
+    """Return the recording with every signal and text in order of time; its notes tell.
 
     Raises
     ------
     LogError
         Time goes back over what was recorded before: there are two runs in it.
     """
+    notes: list[str] = []
     orders: dict[int, tuple[NDArray[np.int64], Array] | None] = {}
 
     def order(t: Array, name: str) -> tuple[NDArray[np.int64], Array] | None:
         if id(t) not in orders:
-            orders[id(t)] = _order(t, name, recording.name, notes)
+            orders[id(t)] = _order(t, recording.epoch or 0.0, name, recording.name, notes)
         return orders[id(t)]
 
     signals = []
@@ -79,11 +95,11 @@ def in_order(recording: Recording, notes: list[str]) -> Recording:
     for name, (t, words) in recording.text.items():
         found = order(t, name)
         text[name] = (t, words) if found is None else (found[1], words[found[0]])
-    return replace(recording, signals=tuple(signals), text=text)
+    return replace(recording, text=text).with_signals(signals, *notes)
 
 
 def _order(
-    t: Array, signal: str, name: str, notes: list[str]
+    t: Array, epoch: float, signal: str, name: str, notes: list[str]
 ) -> tuple[NDArray[np.int64], Array] | None:
     steps = np.diff(t)
     if (steps >= 0).all() and np.isfinite(t).all():
@@ -92,16 +108,23 @@ def _order(
     ordered = t[rows]
     back = np.flatnonzero(np.diff(ordered) < 0)
     if len(back):
-        _refuse_two_runs(ordered, back, signal, name)
+        wrong = len(unpadded_numbers(ordered + epoch))
+        cause = (
+            f"; {wrong} time{'s lack' if wrong > 1 else ' lacks'} the leading zeros of the "
+            f"fraction of a second: mend with --fix"
+            if wrong
+            else ""
+        )
+        _refuse_two_runs(ordered, back, signal, name, cause)
         notes.append(
             f"time of {signal} goes back {len(back)} time{'s' if len(back) > 1 else ''}, first "
-            f"from {ordered[back[0]]:.6g} to {ordered[back[0] + 1]:.6g} s: put in order"
+            f"from {ordered[back[0]]:.6g} to {ordered[back[0] + 1]:.6g} s: put in order{cause}"
         )
         rows = rows[np.argsort(ordered, kind="stable")]
     return rows, t[rows]
 
 
-def _refuse_two_runs(t: Array, back: NDArray[np.int64], signal: str, name: str) -> None:
+def _refuse_two_runs(t: Array, back: NDArray[np.int64], signal: str, name: str, cause: str) -> None:
     """Refuse times that go back far, over times that are there already."""
     usual = usual_step(np.sort(t)) or float(np.median(np.abs(np.diff(t))))
     far = back[t[back] - t[back + 1] > _FAR * usual]
@@ -114,6 +137,5 @@ def _refuse_two_runs(t: Array, back: NDArray[np.int64], signal: str, name: str) 
             k = int(far[0])
             raise LogError(
                 f"time of {signal} in '{name}' goes back from {t[k]:.6g} to {t[k + 1]:.6g} s, over "
-                f"{min(stop, end) - start:.4g} s that are there twice: cut the file there and "
-                f"import each run, or mend it with --fix."
+                f"{min(stop, end) - start:.4g} s that are there twice{cause or _TWO_RUNS}."
             )

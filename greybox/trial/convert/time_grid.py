@@ -11,7 +11,10 @@ from numpy.typing import NDArray
 
 from greybox.errors import LogError
 from greybox.trial.convert.options import ImportOptions
-from greybox.trial.convert.resample import Clock, nice_period
+from greybox.trial.convert.resample import Clock, covered, nice_period, resampled_by, runs
+from greybox.trial.gaps import split_at_gaps
+from greybox.trial.smoothing import window_samples
+from greybox.trial.steps import Step
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
@@ -90,6 +93,10 @@ class Plan:
     notes : tuple of str
     least : int
         Samples of the shortest stretch that is kept.
+    steps : tuple of Step
+        How signals of other rates are brought to the sample time.
+    times : ndarray, optional
+        (count,) [s] where the samples are those that were recorded, without a change.
     """
 
     name: str
@@ -100,11 +107,24 @@ class Plan:
     leading: tuple[str, ...]
     notes: tuple[str, ...]
     least: int
+    steps: tuple[Step, ...] = ()
+    times: Array | None = None
 
     def grid(self, first: int, stop: int) -> Array:
         """Return the times of some samples [s]."""
+        if self.times is not None:
+            return self.times[first:stop]
         # rounding keeps 0.3 from becoming 0.30000000000000004 in the file
         return np.round(self.start + self.sample_time * np.arange(first, stop), 9)
+
+    def stretches(self, grid: Array, clocks: Mapping[str, Clock]) -> list[tuple[int, int]]:
+        """Return the runs of samples (start, stop) in which every leading signal has values."""
+        if self.times is not None:
+            return split_at_gaps(grid, self.sample_time)
+        keep = np.ones(len(grid), bool)
+        for c in {id(clocks[n]): clocks[n] for n in self.leading}.values():
+            keep &= covered(grid, c)
+        return runs(keep)
 
 
 def plan_import(
@@ -197,13 +217,28 @@ def plan_import(
         tuple(leading),
         tuple(notes),
         max([MIN_SEGMENT, *_windows(options, count, sample_time)]),
+        _resampling({n: e.period for n, e in used.items()}, sample_time, vessel),
+    )
+
+
+def _resampling(
+    periods: Mapping[str, float], sample_time: float, vessel: Vessel
+) -> tuple[Step, ...]:
+    """Return how signals whose rate is not the log's are brought to it."""
+    held = frozenset(vessel.recorded_columns)
+    done: dict[str, list[str]] = {}
+    for name, period in periods.items():
+        how = resampled_by(period, sample_time, held=name in held)
+        if how is not None:
+            done.setdefault(how, []).append(name)
+    return tuple(
+        Step("resample", tuple(names), parameters={"how": how, "sample_time": sample_time})
+        for how, names in done.items()
     )
 
 
 def _windows(options: ImportOptions, count: int, sample_time: float) -> Iterator[int]:
     """Yield the samples of each window of smoothing."""
-    if options.smooth:
-        from greybox.trial.smoothing import window_samples
     for name, seconds in options.smooth.items():
         try:
             yield window_samples(count, sample_time, seconds)

@@ -14,14 +14,10 @@ from typing import Any
 from greybox.errors import LogError
 from greybox.trial.readers import cells as cell_text
 from greybox.trial.readers.layout import find_layout
+from greybox.trial.readers.limits import limits
 from greybox.trial.readers.table import Batch
+from greybox.trial.steps import Step
 
-_BLOCK_BYTES = 1 << 23
-# what Arrow says of its blocks, in words about the file
-_REASONS = {
-    "straddles two block boundaries": f"a line is longer than {_BLOCK_BYTES} bytes",
-    "out of sync with chunker": "a quoted cell holds line ends, or its quote is never closed",
-}
 _BLANKS = re.compile(rb"[ \t]+")
 
 
@@ -42,6 +38,8 @@ class CsvFile:
     notes: list[str] = field(default_factory=list)
     format: str = "CSV"
     first_row: int = 2
+    steps: tuple[Step, ...] = ()
+    _grouped: set[str] = field(default_factory=set)
 
     @property
     def cells(self) -> int:
@@ -68,14 +66,18 @@ class CsvFile:
             return "skip"
 
         words: Counter[str] = Counter()
-        days = {c: cell_text.DayClock() for c in columns if c in self.clocks}
+        stamps = {
+            c: cell_text.Stamps(c, days=c in self.clocks)
+            for c in columns
+            if c in self.clocks or c in self.dates
+        }
         rows = 0
         try:
             clean = _Clean(self.path, self.encoding, blanks=self.delimiter == " ")
             reader = arrow.open_csv(
                 clean,
                 read_options=arrow.ReadOptions(
-                    block_size=_BLOCK_BYTES,
+                    block_size=limits().block_bytes,
                     column_names=list(self.columns),
                     skip_rows=self.skip,
                 ),
@@ -92,14 +94,12 @@ class CsvFile:
             )
             for batch in reader:
                 rows += batch.num_rows
-                yield {c: self._values(batch.column(c), c, words, days) for c in columns}
+                yield {c: self._values(batch.column(c), c, words, stamps) for c in columns}
         except (pa.ArrowException, OSError, UnicodeError, ValueError) as error:
             if isinstance(error, LogError):
                 raise
-            reason = " ".join(str(error).split())[:200].rstrip(".")
-            reason = next((said for sign, said in _REASONS.items() if sign in reason), reason)
             raise LogError(
-                f"cannot read '{self.path.name}' as CSV after {rows} rows: {reason}. "
+                f"cannot read '{self.path.name}' as CSV after {rows} rows: {_reason(error)}. "
                 f"Cut the file before that place, or export it again."
             ) from None
         if clean.unfinished:
@@ -116,6 +116,10 @@ class CsvFile:
                 f"{count} row{'s' if count > 1 else ''} with another number of fields than the "
                 f"{len(self.columns)} of the header left out"
             )
+        # the file may be read twice
+        self.steps = tuple(s for s in (stamp.step for stamp in stamps.values()) if s is not None)
+        for step in self.steps:
+            self._note(f"{step.source[0]}: {step.sentence}")
         for name, lost in words.items():
             self._note(
                 f"column '{name}' holds words in {lost} row{'s' if lost > 1 else ''}: "
@@ -128,15 +132,36 @@ class CsvFile:
             self.notes.append(note)
 
     def _values(
-        self, column: Any, name: str, words: Counter[str], days: dict[str, cell_text.DayClock]
+        self, column: Any, name: str, words: Counter[str], stamps: dict[str, cell_text.Stamps]
     ) -> Any:
         if name in self.text:
             return cell_text.text(column)
-        if name in self.dates:
-            return cell_text.dates(column)
-        if name in days:
-            return days[name].seconds(column)
-        return cell_text.numbers(column, self.decimal, name, words)
+        if name in stamps:
+            return stamps[name].seconds(column)
+        return cell_text.numbers(self._without_groups(column, name), self.decimal, name, words)
+
+    def _without_groups(self, column: Any, name: str) -> Any:
+        """Return cells without the points between thousands."""
+        if self.decimal != ",":
+            return column
+        from pyarrow import compute
+
+        if name not in self._grouped:
+            if not cell_text.grouped(column):
+                return column
+            self._grouped.add(name)
+            self._note(f"column '{name}' has points between thousands: 1.234,5 read as 1234.5")
+        return compute.replace_substring(column, ".", "")
+
+
+def _reason(error: Exception) -> str:
+    """Return what Arrow says, in words about the file where it speaks of its blocks."""
+    said = " ".join(str(error).split())[:200].rstrip(".")
+    if "straddles two block boundaries" in said:
+        return f"a line is longer than {limits().block_bytes} bytes"
+    if "out of sync with chunker" in said:
+        return "a quoted cell holds line ends, or its quote is never closed"
+    return said
 
 
 def open_csv(path: Path) -> CsvFile:
@@ -204,14 +229,14 @@ class _Clean(RawIOBase):
     def read(self, size: int = -1) -> bytes:
         """Return up to `size` bytes, none at the end only."""
         while not len(self._ready):
-            raw = self._file.read(_BLOCK_BYTES)
+            raw = self._file.read(limits().block_bytes)
             block = raw if self._decode is None else self._decode(raw, not raw).encode()
             if not raw and not block:
                 # what has no end may be half a line, and half a number looks like a number
                 self.unfinished = bool(self._rest.strip())
                 return b""
             cut = max(block.rfind(b"\n"), block.rfind(b"\r")) + 1
-            if cut == 0 and len(self._rest) + len(block) < 2 * _BLOCK_BYTES and raw:
+            if cut == 0 and len(self._rest) + len(block) < 2 * limits().block_bytes and raw:
                 self._rest += block
                 continue
             # a line that long fails in the parser, without being held here
