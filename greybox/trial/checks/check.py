@@ -15,7 +15,7 @@ from greybox.trial.checks.frame_sign_unit import (
     reading_findings,
 )
 from greybox.trial.checks.motion import Motion, make_motion
-from greybox.trial.checks.sensor_offsets.find import find_offsets
+from greybox.trial.checks.sensor_offsets.find import Tied, find_offsets
 from greybox.trial.checks.signal_quality import (
     angle_unit_findings,
     coarse_findings,
@@ -144,6 +144,7 @@ def _signal_quality(recording: Recording, vessel: Vessel) -> _Log:
 
 def _kinematics(logs: Sequence[_Log], vessel: Vessel) -> None:
     """Check what ties positions, heading, velocities and yaw rate of the logs together."""
+    motions = []
     for log in logs:
         motion = log.motion
         log.say(frame_outcomes(motion))
@@ -151,9 +152,12 @@ def _kinematics(logs: Sequence[_Log], vessel: Vessel) -> None:
             reading = find_reading(motion)
             log.add(reading_findings(reading))
             motion = read(motion, reading.changes)
-            found, said = find_offsets(motion, vessel)
-            log.findings += found
-            log.say(said)
+        motions.append(motion)
+    tied = [Tied(log.recorded.name, log.mended, m) for log, m in zip(logs, motions, strict=True)]
+    for log, (found, said) in zip(logs, find_offsets(tied, vessel), strict=True):
+        log.findings += found
+        log.say(said)
+    for log, motion in zip(logs, motions, strict=True):
         if motion is None or not motion.positioned:
             found, said = course_findings(log.mended, vessel)
             log.findings += found

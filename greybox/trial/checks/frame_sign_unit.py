@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.trial.checks.finding import Finding, Outcome
-from greybox.trial.checks.motion import Motion, integrate, levels, profile, turn
+from greybox.trial.checks.motion import Motion, integrate, profile, turn
 from greybox.trial.convert.derived_signals import continuous
 from greybox.trial.steps import Step, mend
 
@@ -357,7 +357,6 @@ class _Scorer:
         self.motion = motion.excerpt(_EXCERPT)
         motion = self.motion
         self.cache: dict[tuple[str, tuple[str, ...]], float] = {}
-        self.level = levels(motion)
         # neighbouring samples of a fast log say the same: its likelihood counts them all
         self.inflation = max(1.0, 0.5 / motion.step / 5)
 
@@ -390,7 +389,7 @@ class _Scorer:
         key = (what, tuple(c.words for c in changes if set(c.channels) & relevant))
         if key not in self.cache:
             score = _position_score if what == "position" else _heading_score
-            self.cache[key] = score(as_read, self.level)
+            self.cache[key] = score(as_read)
         return self.cache[key]
 
 
@@ -401,19 +400,19 @@ def _order(change: Change) -> int:
     return 1 if change.id == "frame" and change.group == "velocity" else 0
 
 
-def _position_score(m: Motion, level: Array) -> float:
+def _position_score(m: Motion) -> float:
     walked = integrate(turn(m["psi"], m["u"], m["v"]), m)
     position = np.column_stack([m["x_n"], m["y_n"]])
     drift = (m.t - m.t[0])[:, None]
     # a reading is judged per metre, so that one in kilometres has no advantage
     # the size of all steps together stays the same whatever is reversed or exchanged
     scale = float(np.sqrt(np.mean(np.diff(position, axis=0) ** 2))) or 1.0
-    found = profile((position - walked) / scale, np.hstack([level, drift]), m)
+    found = profile((position - walked) / scale, drift, m)
     return found.loglik
 
 
-def _heading_score(m: Motion, level: Array) -> float:
+def _heading_score(m: Motion) -> float:
     scale = float(np.sqrt(np.mean(np.diff(m["psi"]) ** 2))) or 1.0
     drift = (m.t - m.t[0])[:, None]
     rest = (m["psi"] - integrate(m["r"], m)) / scale
-    return profile(rest, np.hstack([level, drift]), m).loglik
+    return profile(rest, drift, m).loglik

@@ -10,13 +10,13 @@ disagreement as the noises demand; K is estimated by maximum likelihood.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.rotation import body_to_ned
 from greybox.trial.convert.derived_signals import continuous
 from greybox.trial.convert.resample import clock, covered, runs
 from greybox.trial.raw_log import Recording, Signal
@@ -81,6 +81,27 @@ class Motion:
         index = np.concatenate(rows)
         values = {n: v[index] for n, v in self.values.items()}
         return Motion(self.t[index], self.step, values, tuple(stretches))
+
+    def coarser(self, samples: int, step: float) -> Motion:
+        """Return means over blocks: about `samples` of them, or fewer none longer than `step` [s].
+
+        Slow ties do not need every sample of a fast log.
+        """
+        size = int(min(step / self.step + 1e-6, np.ceil(len(self) / samples)))
+        if size < 2:
+            return self
+        rows, stretches, at = [], [], 0
+        for a, b in self.stretches:
+            count = (b - a) // size
+            if count >= _MIN_STRETCH:
+                rows.append(np.arange(a, a + count * size))
+                stretches.append((at, at + count))
+                at += count
+        if not rows:
+            return self
+        index = np.concatenate(rows).reshape(-1, size)
+        values = {n: v[index].mean(axis=1) for n, v in self.values.items()}
+        return Motion(self.t[index].mean(axis=1), size * self.step, values, tuple(stretches))
 
     @property
     def positioned(self) -> bool:
@@ -170,11 +191,18 @@ def whiten(z: Array, gain: float, motion: Motion) -> Array:
     return out
 
 
-def levels(motion: Motion) -> Array:
-    """Return one column of ones for each stretch, (N, S): the unknown start of each."""
-    out = np.zeros((len(motion), len(motion.stretches)))
-    for k, (a, b) in enumerate(motion.stretches):
-        out[a:b, k] = 1.0
+def without_starts(white: Array, gain: float, motion: Motion, weight: Array | None = None) -> Array:
+    """Return whitened columns (N, …) less what the unknown start of each stretch explains.
+
+    A start is a level; whitened it dies out by ``1 - gain`` a sample.
+    """
+    out = white.copy()
+    for a, b in motion.stretches:
+        died = (1.0 - gain) ** np.arange(b - a)
+        if weight is not None:
+            died = died * weight[a:b]
+        share = np.tensordot(died, out[a:b], axes=(0, 0)) / float(died @ died)
+        out[a:b] -= died.reshape(-1, *[1] * (out.ndim - 1)) * share
     return out
 
 
@@ -196,35 +224,22 @@ class Profile:
     std: float
 
 
-def profile(
-    z: Array,
-    nuisance: Array,
-    motion: Motion,
-    gains: Array = GAINS,
-    weigh: Callable[[float], Array] | None = None,
-) -> Profile:
-    """Return the likelihood of a residual, its nuisance fitted, over the gains.
+def profile(z: Array, nuisance: Array, motion: Motion, gains: Array = GAINS) -> Profile:
+    """Return the likelihood of a residual, starts and nuisance fitted, over the gains.
 
     Parameters
     ----------
     z : ndarray
         (N,) or (N, m) residual, m components that share the nuisance's columns.
     nuisance : ndarray
-        (N, q), or (N, m, q) where the columns join the components.
-    weigh : callable, optional
-        Gain -> weights (N,) of the innovations.
+        (N, q).
     """
     best: Profile | None = None
-    joint = nuisance.ndim == 3
+    count = int(z.size / len(z))
+    both = np.column_stack([z, nuisance])
     for gain in gains:
-        e = whiten(z, float(gain), motion)
-        x = whiten(nuisance, float(gain), motion)
-        if weigh is not None:
-            weight = weigh(float(gain))
-            e = e * weight.reshape(-1, *[1] * (e.ndim - 1))
-            x = x * weight.reshape(-1, *[1] * (x.ndim - 1))
-        if joint:
-            e, x = e.reshape(-1), x.reshape(-1, x.shape[-1])
+        white = without_starts(whiten(both, float(gain), motion), float(gain), motion)
+        e, x = white[:, :count], white[:, count:]
         rest = e - x @ solve(x, e)
         variance = float(np.mean(rest**2))
         loglik = -0.5 * rest.size * np.log(max(variance, 1e-300))
@@ -234,20 +249,17 @@ def profile(
     return best
 
 
-def outlier_weights(z: Array, nuisance: Array, gain: float, motion: Motion) -> Array:
+def outlier_weights(size: Array) -> Array:
     """Return weights (N,) that let no innovation count for more than four robust deviations.
 
     Satellite positions jump now and then; one jump would outweigh minutes.
+
+    Parameters
+    ----------
+    size : ndarray
+        (N,) absolute innovations, of several components the largest.
     """
-    e = whiten(z, gain, motion)
-    x = whiten(nuisance, gain, motion)
-    if nuisance.ndim == 3:
-        flat = x.reshape(-1, x.shape[-1])
-        rest = e - (flat @ solve(flat, e.reshape(-1))).reshape(e.shape)
-    else:
-        rest = e - x @ solve(x, e)
-    size = np.abs(rest) if rest.ndim == 1 else np.abs(rest).max(axis=1)
-    scale = float(np.median(np.abs(rest))) * 1.4826
+    scale = float(np.median(size)) * 1.4826
     if scale <= 0:
         return np.ones(len(size))
     return np.asarray(np.minimum(1.0, _ROBUST * scale / np.maximum(size, 1e-300)))
@@ -304,5 +316,4 @@ def denoise(value: Array, motion: Motion) -> Array:
 
 def turn(psi: Array, forward: Array, starboard: Array) -> Array:
     """Return north and east (N, 2) of body components."""
-    c, s = np.cos(psi), np.sin(psi)
-    return np.column_stack([c * forward - s * starboard, s * forward + c * starboard])
+    return np.column_stack(body_to_ned(forward, starboard, psi))
