@@ -82,12 +82,9 @@ class Motion:
         values = {n: v[index] for n, v in self.values.items()}
         return Motion(self.t[index], self.step, values, tuple(stretches))
 
-    def coarser(self, samples: int, step: float) -> Motion:
-        """Return means over blocks: about `samples` of them, or fewer none longer than `step` [s].
-
-        Slow ties do not need every sample of a fast log.
-        """
-        size = int(min(step / self.step + 1e-6, np.ceil(len(self) / samples)))
+    def coarser(self, step: float) -> Motion:
+        """Return means over blocks of at most `step` [s]."""
+        size = int(step / self.step + 1e-6)
         if size < 2:
             return self
         rows, stretches, at = [], [], 0

@@ -22,13 +22,13 @@ _SCAN = (-8.0, -6.0, -4.5, -3.0, -2.0, -1.0, 1.0, 2.0, 3.0, 4.5, 6.0, 8.0)
 _TURNS = (-150, -120, -90, -60, -40, -25, -12, 12, 25, 40, 60, 90, 120, 150, 180)
 _TOGETHER = (("psi",), ("u", "v"), ("r",), ("psi", "u", "v", "r"))
 _ROUNDS = 15
-_SCAN_SAMPLES, _SCAN_STEP = 1500, 1.0
+_SCAN_STEP = 1.4
 # a place found by the scan must fit this much better to be preferred, in log-likelihood
 _LEAST_GAIN = 8.0
 # residuals may be coloured over this time [s]
 _MEMORY = 8.0
-# what whitened residuals have of a log's own: two of a current, a scale; a gyro's bias, a scale
-_OWN = 5
+# columns of what a log has of its own, see `Residuals`, and the place of the velocities' scale
+_OWN, _SCALE = 6, 2
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ class Likelihood:
             at += count
         wide = np.concatenate(own, axis=1).reshape(-1, _OWN)
         if not scaled and self.tie.positioned:
-            wide = np.delete(wide, 2, axis=1)
+            wide = np.delete(wide, _SCALE, axis=1)
         all_y = np.concatenate(y, axis=1)
         both = np.concatenate([all_y[:, :, None], np.concatenate(x, axis=1)], axis=2)
         flat = both.reshape(-1, 1 + SIZE)
@@ -276,5 +276,5 @@ def _embedded(offsets: Array, free: NDArray[np.int64], information: Array, pull:
 
 def coarse_tie(tie: Tie) -> Tie:
     """Return the tie of means over longer blocks, to look for large offsets."""
-    coarser = tie.motion.coarser(_SCAN_SAMPLES, _SCAN_STEP)
+    coarser = tie.motion.coarser(_SCAN_STEP)
     return tie if coarser is tie.motion else Tie(coarser)

@@ -19,12 +19,13 @@ from greybox.trial.checks.sensor_offsets.findings import IDS, Campaign, campaign
 from greybox.trial.checks.sensor_offsets.model import ARM, Tie
 from greybox.trial.checks.sensor_offsets.pool import pool
 from greybox.trial.checks.sensor_offsets.select import judge
-from greybox.trial.checks.sensor_offsets.thresholds import expected, least
+from greybox.trial.checks.sensor_offsets.thresholds import SIGMAS, expected, least
 from greybox.trial.raw_log import Recording
 from greybox.vessel.vessel import Vessel
 
-# ties are slower than samples: means over blocks of at most this time [s] serve as well
-_SAMPLES, _STEP = 2500, 0.5
+# means over blocks of at most this time [s]: ties are slower than samples, and what a receiver's
+# filter does to its noise within a block is no motion
+_STEP = 0.7
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,7 @@ def find_offsets(logs: Sequence[Tied], vessel: Vessel) -> list[tuple[list[Findin
     for i, log in enumerate(logs):
         if log.motion is not None and (log.motion.positioned or log.motion.turned):
             rows.append(i)
-            ties.append(Tie(log.motion.coarser(_SAMPLES, _STEP)))
+            ties.append(Tie(log.motion.coarser(_STEP)))
     # a clock of heading against yaw rate alone is another question
     for positioned in (True, False):
         of_kind = [k for k, tie in enumerate(ties) if tie.positioned == positioned]
@@ -101,7 +102,9 @@ def _campaigns(logs: Sequence[Tied], ties: Sequence[Tie], vessel: Vessel) -> lis
         channels = members[0].motion.values if members[0].positioned else {"psi": 0, "r": 0}
         judged = judge(
             tuple(channels), turned=turned, offsets=campaign.offsets,
-            covariance=campaign.covariance, vessel=vessel, antenna=prior[0][ARM],
+            covariance=campaign.covariance, vessel=vessel,
+            scatter=np.hypot(campaign.scatter, material / SIGMAS),
+            antenna=prior[0][ARM],
         )  # fmt: skip
         found.append(
             Campaign(

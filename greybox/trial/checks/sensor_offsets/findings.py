@@ -324,7 +324,7 @@ def _differs(d: Defect, pooled: Pooled) -> bool:
 
 def _outcomes(campaign: Campaign, told: list[Defect]) -> list[Outcome]:
     """Say for each id what its standard error would allow to see."""
-    information: Array = np.linalg.inv(campaign.pooled.covariance)
+    information = np.asarray(np.linalg.inv(campaign.pooled.covariance), dtype=np.float64)
     basis = campaign.best.hypothesis.basis
     apart = campaign.best.hypothesis.apart
     found = {d.id for d in told}

@@ -33,7 +33,7 @@ Array = NDArray[np.float64]
 
 # delays that are tried [s]
 _DELAYS = np.round(np.arange(-3.0, 6.01, 0.1), 10)
-_SAMPLES, _STEP = 3000, 0.5
+_STEP = 0.3
 # force must explain so much of the motion, in log-likelihood, and its delay be known so well [s]
 _LEAST_GAIN = 30.0
 _MOST_VAGUE = 1.0
@@ -77,7 +77,7 @@ def response_delays(recordings: Sequence[Recording], vessel: Vessel) -> dict[str
         motion = make_motion(recording, ("u", "v", "r"))
         if motion is None or not all(c in recording for c in vessel.commands):
             continue
-        found = _profiles(recording, vessel, motion.coarser(_SAMPLES, _STEP))
+        found = _profiles(recording, vessel, motion.coarser(_STEP))
         for state, (profile, none) in found.items():
             total[state] = total.get(state, np.zeros(len(_DELAYS))) + profile
             gain[state] = gain.get(state, 0.0) + float(profile.max()) - none

@@ -2,8 +2,7 @@
 
 Seven parameters belong to the instruments: the clocks of ψ, u, v, r against that of the positions
 (of r against ψ where there are none), the antenna's lever arm, and the heading bias. Residuals of
-positions and heading, and their derivatives, are taken at given values of all. North and east come
-from one receiver and share its clock.
+positions and heading, and their derivatives, are taken at given values of all.
 """
 
 from __future__ import annotations
@@ -38,9 +37,9 @@ class Residuals:
     heading : ndarray
         (N,) measured heading minus integrated yaw rate [rad].
     position_columns, heading_columns : ndarray
-        (N, 2, `SIZE` + 3) and (N, `SIZE` + 2): minus the derivatives by all offsets, then those by
-        what each log has of its own, a constant velocity of the water and a scale of the
-        velocities, or a bias and a scale of the yaw rate.
+        (N, 2, `SIZE` + 4) and (N, `SIZE` + 2): minus the derivatives by all offsets, then those by
+        what each log has of its own: a constant velocity of the water, a scale of the velocities
+        and a delay of east against north; or a bias and a scale of the yaw rate.
     """
 
     position: Array
@@ -94,7 +93,7 @@ class Tie:
         # and so seem to explain it
         now = {k: m[k] + slow[k] - self.smooth[k] for k in slow}
         rate = {k: self._slope(v) for k, v in slow.items()}
-        position, columns = np.zeros((n, 2)), np.zeros((n, 2, SIZE + 3))
+        position, columns = np.zeros((n, 2)), np.zeros((n, 2, SIZE + 4))
         if self.positioned:
             bias, arm = offsets[BIAS], offsets[ARM]
             psi = slow["psi"] - bias
@@ -116,6 +115,9 @@ class Tie:
             columns[:, :, BIAS] = -ways[:, 6:8] - levered
             columns[:, 0, SIZE] = columns[:, 1, SIZE + 1] = self.drift
             columns[:, :, SIZE + 2] = ways[:, 8:10]
+            # one receiver has one clock, but axes that are not square, as of a local grid, look
+            # like two in a turn: their mean is compared with the other clocks
+            columns[:, :, SIZE + 3] = velocity * np.array([-0.5, 0.5])
         heading, swept = np.zeros(n), np.zeros((n, SIZE + 2))
         if self.turned:
             both = integrate(np.column_stack([now["r"], slow["r"], rate["r"]]), m)

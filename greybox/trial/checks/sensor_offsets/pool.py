@@ -30,6 +30,10 @@ for _k, _names in enumerate((("psi",), ("u", "v"), ("r",)), start=1):
 _DIRECTIONS[4, ARM.start] = _DIRECTIONS[5, ARM.start + 1] = _DIRECTIONS[6, BIAS] = 1.0
 
 _MOST_SPLITS = 3
+# standard errors of a log that a difference between campaigns is worth, if the log is to show it
+_SEEN = 2.0
+# in log-likelihood: a log that prefers the smaller campaign by this belongs to it
+_BELONGS = 1.0
 _ROUNDS = 4
 # by which campaigns must explain the logs better than scatter without a pattern does, in
 # log-likelihood, besides the number of places where a row of logs can be cut
@@ -210,8 +214,8 @@ def _split(logs: Sequence[Evidence], estimate: _Estimate, material: Array) -> Sp
             continue
         apart, weight = _deviations(logs, estimate.offsets, direction)
         least = CAMPAIGN * float(np.min(material[direction != 0]))
-        # a log that cannot tell half of such a difference stays with the others
-        told = np.flatnonzero(weight > (2 * SIGMAS / least) ** 2 / 4)
+        # a log that can hardly see such a difference shows no campaign, but may belong to one
+        told = np.flatnonzero(weight > (_SEEN / least) ** 2)
         if len(told) < 2:
             continue
         order = told[np.argsort(apart[told])]
@@ -219,18 +223,21 @@ def _split(logs: Sequence[Evidence], estimate: _Estimate, material: Array) -> Sp
         alike = _scattered_likelihood(a, s, np.zeros(len(a), int))
         for k in range(1, len(a)):
             label = (np.arange(len(a)) >= k).astype(int)
-            gain = _scattered_likelihood(a, s, label) - alike - np.log(len(a) - 1)
+            gain = _scattered_likelihood(a, s, label) - alike
             low, high = (_mean(a[label == g], s[label == g]) for g in (0, 1))
             gap, error = high[0] - low[0], float(np.hypot(low[1], high[1]))
             # two logs cannot tell scatter from campaigns
-            proof = _LEAST_GAIN if len(a) > 2 else 0.0
-            if (
-                gap > max(least, SIGMAS * error)
-                and gain > proof
-                and (best is None or gain > best[0])
-            ):
-                smaller = order[label == (1 if (label == 1).sum() <= (label == 0).sum() else 0)]
-                best = (gain, Split(direction, frozenset(int(i) for i in smaller)))
+            proof = _LEAST_GAIN + np.log(len(a) - 1) if len(a) > 2 else 0.0
+            apart_by = (gap / error) ** 2
+            if gap <= max(least, SIGMAS * error) or gain <= proof:
+                continue
+            if best is None or apart_by > best[0]:
+                small = int((label == 1).sum() <= (label == 0).sum())
+                mine, theirs = (high, low) if small else (low, high)
+                members = set(order[label == small].tolist())
+                nearer = 0.5 * weight * ((apart - theirs[0]) ** 2 - (apart - mine[0]) ** 2)
+                vague = np.setdiff1d(np.flatnonzero(nearer > _BELONGS), told)
+                best = (apart_by, Split(direction, frozenset(members | set(vague.tolist()))))
     return None if best is None else best[1]
 
 

@@ -149,7 +149,7 @@ def hypotheses(channels: tuple[str, ...], *, turned: bool) -> Iterator[Hypothesi
 
 def judge(
     channels: tuple[str, ...], *, turned: bool, offsets: Array, covariance: Array,
-    vessel: Vessel, antenna: Array,
+    scatter: Array, vessel: Vessel, antenna: Array,
 ) -> list[Judged]:  # fmt: skip
     """Return all hypotheses with their estimates, best first.
 
@@ -161,11 +161,14 @@ def judge(
         (`SIZE`,) estimate of all offsets together.
     covariance : ndarray
         (`SIZE`, `SIZE`) of it.
+    scatter : ndarray
+        (`SIZE`,) standard deviation that offsets may have without mattering, from log to log and
+        between channels of one clock.
     vessel : Vessel
     antenna : ndarray
         (2,) where the vessel file has the antenna [m].
     """
-    information = np.linalg.inv(covariance)
+    information = np.linalg.inv(covariance + np.diag(scatter**2))
     null = np.zeros(SIZE)
     null[ARM] = antenna
     from_null = offsets - null
@@ -178,7 +181,9 @@ def judge(
         if basis.shape[1]:
             inner = np.linalg.inv(basis.T @ information @ basis)
             pull = basis.T @ information @ from_null
-            estimate, spread = basis @ inner @ pull, basis @ inner @ basis.T
+            estimate = basis @ inner @ pull
+            taken = basis @ inner @ basis.T @ information
+            spread = taken @ covariance @ taken.T
             explained = float(pull @ inner @ pull)
         defects = _defects(h, estimate + null, spread)
         score = 0.5 * (explained - whole) - _cost(h, defects, vessel)

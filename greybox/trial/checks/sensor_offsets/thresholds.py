@@ -21,7 +21,7 @@ _MOST_ARM = 0.8
 # a logger or a filter delays by less [s]
 MOST_LATE = 5.0
 # logs that differ by less than so many times what matters may do so by misfit: one campaign
-CAMPAIGN = 4.0
+CAMPAIGN = 5.0
 # what is expected before a log is read, standard deviations: [s], [ship lengths], [rad]; the tie
 # is expanded within the near ones, so that what a log cannot tell stays near nothing
 _PRIOR = (10.0, 2.0, np.pi)
