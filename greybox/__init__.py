@@ -40,8 +40,8 @@ if TYPE_CHECKING:
     from greybox.trial.convert.channel_mapping import read_recording
     from greybox.trial.convert.convert import import_recording
     from greybox.trial.convert.read import read_log, read_segments
-    from greybox.trial.convert.two_pass_import import import_files
     from greybox.trial.dataframe import log_from_pandas, log_from_xarray, recording_from_pandas
+    from greybox.trial.import_files import import_files
     from greybox.trial.kinematics import decimate
     from greybox.trial.log import TrialLog, make_log
     from greybox.trial.manoeuvres import find_manoeuvres
@@ -97,7 +97,7 @@ _WHERE = {
     "find_manoeuvres": "greybox.trial.manoeuvres",
     "fit_percent": "greybox.validation.fit",
     "get_structure": "greybox.model.catalogue",
-    "import_files": "greybox.trial.convert.two_pass_import",
+    "import_files": "greybox.trial.import_files",
     "import_recording": "greybox.trial.convert.convert",
     "load_model": "greybox.model.model",
     "load_vessel": "greybox.vessel.toml",

@@ -16,7 +16,18 @@ from virtual import PARAMETERS, virtual_log, write_csv
 
 from greybox.model.catalogue import get_structure
 from greybox.study.chapter6 import NOMINAL, TRUE
+from greybox.trial.readers.limits import Limits
 from greybox.vessel.toml import load_vessel
+
+
+@pytest.fixture
+def limited(monkeypatch):
+    """Read with other bounds than usual: `limited(values=20)`, the rest as they are."""
+
+    def change(**bounds):
+        monkeypatch.setattr("greybox.trial.readers.limits._LIMITS", Limits(**bounds))
+
+    return change
 
 
 @pytest.fixture(scope="session")

@@ -14,6 +14,7 @@ from greybox.diagnosis.result import Diagnosis, Found, Gain, Quantity, Symptom
 from greybox.notebook import interval, number, sparkline, table
 from greybox.trial.checks.finding import Outcome
 from greybox.trial.raw_log import Signal
+from greybox.trial.steps import Step
 from greybox.trial.trial_summary import Contents
 from greybox.validation.structures import StructureChoice, StructureRow
 
@@ -28,11 +29,12 @@ def hostile(value):
 def results(ship, thesis, true_theta):
     vessel = hostile(ship)
     log = replace(virtual_log(5, 400, name=HOSTILE), vessel=vessel)
+    said = Step("smooth", (HOSTILE,), reason=HOSTILE)
     log = replace(
         log,
         loop_known=True,
         closed_loop=log.t < 50,
-        provenance=replace(log.provenance, derived=(HOSTILE,), fixed=(HOSTILE,)),
+        provenance=replace(log.provenance, steps=(said, replace(said, decided_by="check"))),
     )
     estimate = gb.estimate_model([log], gb.Request(method="ls", predictor="basic"))
     estimate = replace(estimate, notes=(HOSTILE,), current=(("current_north", 0.1, 0.01),))

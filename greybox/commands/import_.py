@@ -93,7 +93,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="KEY=TEXT",
-        help="a note of the trial, such as draught, loading, depth, sea_state (repeat)",
+        help="a condition of the trial (draught, trim, loading, water_depth, sea_state), or a note "
+        "in words (repeat)",
     )
     parser.add_argument("--json", metavar="F", help="write the record as JSON; - is stdout")
 
@@ -104,7 +105,7 @@ def run(options: argparse.Namespace) -> None:
 
     from greybox.errors import UsageError
     from greybox.files import check_targets, write_json
-    from greybox.trial.convert.two_pass_import import import_files
+    from greybox.trial.import_files import import_files
     from greybox.trial.store import read_record, record_path
     from greybox.vessel.toml import load_vessel
 
@@ -135,8 +136,14 @@ def run(options: argparse.Namespace) -> None:
 
 def import_options(options: argparse.Namespace) -> ImportOptions:
     """Return the options of the import, checked."""
+    from greybox.errors import LogError, UsageError
     from greybox.trial.convert.options import ImportOptions
+    from greybox.vessel.conditions import Conditions
 
+    try:
+        Conditions.read(notes := pairs(options.note, "--note"))
+    except LogError as error:
+        raise UsageError(f"--note: {error}") from None
     return ImportOptions(
         sample_time=options.sample_time,
         hole=options.hole,
@@ -144,7 +151,7 @@ def import_options(options: argparse.Namespace) -> ImportOptions:
         window=options.window,
         reference_height=options.reference_height,
         origin=_origin(options.origin),
-        notes=pairs(options.note, "--note"),
+        notes=notes,
         smooth=_windows(options.smooth),
     )
 

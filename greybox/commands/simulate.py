@@ -47,6 +47,7 @@ def run(options: argparse.Namespace) -> None:
     from greybox.model.model import load_model
     from greybox.model.simulation import positions
     from greybox.trial.convert.read import read_log
+    from greybox.trial.validity import other_conditions
     from greybox.validation.bands import predict_bands
     from greybox.validation.fit import run_model
 
@@ -106,7 +107,7 @@ def run(options: argparse.Namespace) -> None:
     ]
     if winds and not result.log.has_wind:
         say(f"note: {', '.join(winds)} act as in still air, because the log has no wind")
-    for note in notes:
+    for note in (*notes, *(d.sentence for d in other_conditions(model.conditions, [log]))):
         say(f"note: {note}")
     if not fill:
         say(f"free run of {len(result.log)} samples, fit {shown}")

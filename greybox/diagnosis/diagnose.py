@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from greybox.diagnosis.kinematics import causes_of
 from greybox.diagnosis.preparing import SHORTEST, prepare
@@ -15,6 +15,7 @@ from greybox.diagnosis.waves import find_waves, found_waves
 from greybox.model.model import ManoeuvringModel
 from greybox.one_thread import one_thread
 from greybox.trial.log import TrialLog
+from greybox.trial.validity import other_conditions, pooled_conditions
 
 _log = logging.getLogger(__name__)
 
@@ -96,8 +97,14 @@ def diagnose(
     if ready.short:
         left_out = ", ".join(ready.short)
         notes.append(f"left out for having fewer than {SHORTEST} samples: {left_out}.")
+    pooled = pooled_conditions(case.logs)
+    known = pooled.values if model is None else model.conditions
+    beside = ready.validate if model is None else (*case.logs, *ready.validate)
+    conditions = (*pooled.differences, *other_conditions(known, beside))
+    notes += [d.sentence for d in conditions]
     report = Report(case, ready.structure, ready.causes, found, model, options.seed, notes)
-    known = causes_of(ready.findings, ready.causes, ready.tried)
+    causes = causes_of(ready.findings, ready.causes, ready.tried)
     if lines[1] is not None and "waves" in ready.causes:
-        known.append(found_waves(lines[1], ready.causes["waves"], ready.tried))
-    return report.made(known, ready.validate, ready.tried, lines)
+        causes.append(found_waves(lines[1], ready.causes["waves"], ready.tried))
+    made = report.made(causes, ready.validate, ready.tried, lines)
+    return replace(made, conditions=conditions)

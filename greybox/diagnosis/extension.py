@@ -17,7 +17,8 @@ from greybox.model.model import ManoeuvringModel
 from greybox.model.noise import NoiseLevels
 from greybox.model.structure import Structure
 from greybox.trial.log import TrialLog
-from greybox.vessel.vessel import Vessel
+from greybox.trial.validity import pooled_conditions
+from greybox.vessel.vessel import Thruster, Vessel
 
 Array = NDArray[np.float64]
 
@@ -93,6 +94,7 @@ def extended_model(
         noise=_noise(problem, fit),
         sums=summed,
         changes=tuple(Change(names[c.index], c.factor, c.time) for c in ship.changes),
+        conditions=pooled_conditions(logs).values,
         record=dict(record),
     )
 
@@ -107,7 +109,7 @@ def extended_vessel(
         said["velocities_from_heading"] = True
     if any(sensors.lever):
         # velocities that follow from positions are those of the antenna
-        derived = any(d.startswith("u, v") for d in log.provenance.derived)
+        derived = any(s.derives_motion and "u" in s.channels for s in log.provenance.steps)
         key = "antenna" if derived else "velocity_at"
         before = tuple(said.get(key, (0.0, 0.0)))
         said[key] = (before[0] + sensors.lever[0], before[1] + sensors.lever[1], *before[2:])
@@ -120,16 +122,24 @@ def extended_vessel(
     if turned:
         said["reversed"] = tuple(dict.fromkeys([*said.get("reversed", ()), *turned]))
     swaps = {a: b for a, b, _ in wires if a != b}
+    # a command goes with its feedback, where the same one of both drives all thrusters
+    alike = len({t.drive for t in vessel.thrusters}) == 1
+    others = {c: other for t in vessel.thrusters for _, c, other, _ in t.movements}
     thrusters = tuple(
-        replace(
-            t,
-            speed=swaps.get(t.speed, t.speed),
-            angle=swaps.get(t.angle, t.angle) if isinstance(t.angle, str) else t.angle,
-            rudder=swaps.get(t.rudder, t.rudder) if t.rudder is not None else None,
-        )
-        for t in vessel.thrusters
+        _rewired(t, swaps, others if alike else None) if swaps else t for t in vessel.thrusters
     )
     return replace(vessel, sensors=said, thrusters=thrusters)
+
+
+def _rewired(
+    thruster: Thruster, swaps: Mapping[str, str], others: Mapping[str, str | None] | None
+) -> Thruster:
+    """Return a thruster with columns exchanged; `others` is None where no pair is known then."""
+    changed: dict[str, Any] = {} if others is not None else {"drive": "feedback"}
+    for kind, column, _, _ in thruster.movements:
+        now = swaps.get(column, column)
+        changed |= {kind: now, f"{kind}_other": None if others is None else others[now]}
+    return replace(thruster, **changed)
 
 
 def _one_step(problem: Problem, fit: Fit) -> Array:

@@ -36,7 +36,7 @@ def recording_of(log: TrialLog) -> Recording:
         Signal(n, log.t, v, CHANNELS[n].unit if n in CHANNELS else None, n, True)
         for n, v in log.channels.items()
     )
-    return replace(Recording(log.name, signals), derived=log.provenance.derived)
+    return Recording(log.name, signals, steps=log.provenance.steps)
 
 
 def kinematic_findings(logs: Sequence[TrialLog]) -> list[Finding]:

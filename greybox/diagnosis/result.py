@@ -13,6 +13,7 @@ from greybox.estimation.result import TestResult
 from greybox.model.model import ManoeuvringModel
 from greybox.notebook import Shown, interval, items, number, table, text
 from greybox.trial.log import TrialLog
+from greybox.trial.validity import ConditionDifference
 
 Array = NDArray[np.float64]
 Verdict = Literal["named", "none", "confused", "unexplained"]
@@ -194,6 +195,8 @@ class Diagnosis(Shown):
         What the model file tells beside.
     residuals : mapping of str to tuple of TestResult
         Tests of the free run's errors ``before`` and ``after``.
+    conditions : tuple of ConditionDifference
+        In what the logs differ from each other, and from those of the model.
     """
 
     verdict: Verdict
@@ -215,6 +218,7 @@ class Diagnosis(Shown):
     tried: int = 0
     record: Mapping[str, Any] = field(default_factory=dict)
     residuals: Mapping[str, tuple[TestResult, ...]] = field(default_factory=dict)
+    conditions: tuple[ConditionDifference, ...] = ()
 
     @property
     def headline(self) -> str:
@@ -252,6 +256,7 @@ class Diagnosis(Shown):
             "next": list(self.next_steps),
             "tried": self.tried,
             "notes": list(self.notes),
+            "condition_differences": [d.to_dict() for d in self.conditions],
         }
 
     def summary(self) -> str:

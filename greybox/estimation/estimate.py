@@ -26,6 +26,7 @@ from greybox.regression.instruments import Instruments, build_instruments
 from greybox.regression.regression import Regression, build_regression
 from greybox.trial.log import TrialLog
 from greybox.trial.ranges import ranges
+from greybox.trial.validity import pooled_conditions
 
 Array = NDArray[np.float64]
 Covariance = Literal["hac", "ma", "white", "bootstrap"]
@@ -482,6 +483,7 @@ def _result(
             {"name": log.name, "sha256": log.provenance.sha256, "samples": len(log)} for log in logs
         ),
         ranges=ranges(logs, predictor.structure.states),
+        conditions=pooled_conditions(logs),
     )
     if evidence is None:
         return estimate

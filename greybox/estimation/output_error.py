@@ -47,6 +47,7 @@ from greybox.one_thread import one_thread
 from greybox.regression.regression import common_sample_time
 from greybox.trial.log import TrialLog
 from greybox.trial.ranges import ranges
+from greybox.trial.validity import pooled_conditions
 
 Array = NDArray[np.float64]
 Damping = Literal["warn", "enforce"]
@@ -477,6 +478,7 @@ def _result(fitted: _Fitted, logs: Sequence[TrialLog], options: OutputErrorOptio
             {"name": log.name, "sha256": log.provenance.sha256, "samples": len(log)} for log in logs
         ),
         ranges=ranges(logs, predictor.structure.states),
+        conditions=pooled_conditions(logs),
     )
 
 

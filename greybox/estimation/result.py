@@ -14,6 +14,7 @@ from greybox.model.model import ManoeuvringModel
 from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import Predictor
 from greybox.notebook import Shown, items, parameters, text
+from greybox.trial.validity import PooledConditions
 from greybox.vessel.vessel import Vessel
 
 if TYPE_CHECKING:
@@ -205,6 +206,8 @@ class Estimate(Shown):
         ``cramer_rao`` and ``optimal_iv`` beside the standard errors.
     prefilter : {"none", "noise"}
         Whether all equations were solved jointly with their error made white.
+    conditions : PooledConditions
+        Draught, depth and the like of the logs, and in what they differ.
     """
 
     predictor: Predictor
@@ -232,6 +235,7 @@ class Estimate(Shown):
     noise: NoiseLevels | None = None
     limits: Mapping[str, Limit] = field(default_factory=dict)
     prefilter: str = "none"
+    conditions: PooledConditions = field(default_factory=PooledConditions)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -287,6 +291,7 @@ class Estimate(Shown):
             residual_std=self.residual_std,
             noise=self.noise,
             sums={c.name: c.terms for c in columns if len(c.terms) > 1},
+            conditions=self.conditions.values,
             record=self.record(),
         )
 
@@ -319,6 +324,7 @@ class Estimate(Shown):
             },
             "logs": list(self.logs),
             "ranges": dict(self.ranges),
+            "condition_differences": [d.to_dict() for d in self.conditions.differences],
         }
 
     def summary(self) -> str:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from greybox.model.units import parameter_unit
+from greybox.trial.validity import in_words
 
 if TYPE_CHECKING:
     from greybox.estimation.result import Estimate, TestResult
@@ -43,6 +44,8 @@ def summarise(estimate: Estimate) -> str:
         lines.append(f"Free-run fit on the estimation logs: {shown}")
     for name, limit in estimate.limits.items():
         lines += _wrapped(f"{BOUNDS[name]}: {limit.sentence}", "  ")
+    if estimate.conditions.values:
+        lines += _wrapped(f"Conditions: {in_words(estimate.conditions.values)}", "  ")
     lines += _tests(estimate.tests)
     if estimate.notes:
         lines += ["", "Notes"]

@@ -6,8 +6,9 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from greybox.channels import CHANNELS, unit_dimension
+from greybox.channels import CHANNELS
 from greybox.export.names import distinct
+from greybox.units import unit_dimension
 from greybox.vessel.vessel import Vessel
 
 # SI base units of what units are spelled with

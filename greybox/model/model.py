@@ -23,6 +23,7 @@ from greybox.model.terms import Factor, Term
 from greybox.model.units import parameter_unit
 from greybox.model.versions import VERSION, upgraded
 from greybox.notebook import Shown, items, parameters, text
+from greybox.trial.validity import Validity, in_words, validity_from_dict, validity_to_dict
 from greybox.vessel.toml import vessel_from_dict, vessel_to_dict
 from greybox.vessel.vessel import Vessel
 
@@ -63,6 +64,9 @@ class ManoeuvringModel(Shown):
         What the estimate reported: fit, tests, method, notes, provenance.
     changes : tuple of Change
         Parameters that change during a log.
+    conditions : mapping of str to tuple
+        Draught, trim, loading, water depth and sea state of the logs that it was estimated
+        on, as far as they state them: see `greybox.trial.validity`.
 
     Raises
     ------
@@ -83,6 +87,7 @@ class ManoeuvringModel(Shown):
     sums: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     record: Mapping[str, Any] = field(default_factory=dict)
     changes: tuple[Change, ...] = ()
+    conditions: Validity = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for change in self.changes:
@@ -177,6 +182,8 @@ class ManoeuvringModel(Shown):
         for name, (value, std) in self.disturbances.items():
             lines.append(f"{name:<16}{value:>13.5g}{std:>12.2g}{'':>13}  m/s")
         lines += [f"{c.sentence}, of the log's clock" for c in self.changes]
+        if self.conditions:
+            lines.append(f"estimated at {in_words(self.conditions)}")
         return "\n".join(lines)
 
     def _parts(self) -> tuple[str, ...]:
@@ -191,6 +198,7 @@ class ManoeuvringModel(Shown):
             text(f"Verdict of the estimate: {said}" if said else ""),
             parameters([*rows, *known]),
             items("Changes", [c.sentence for c in self.changes]),
+            text(f"Estimated at {in_words(self.conditions)}" if self.conditions else ""),
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -231,6 +239,8 @@ class ManoeuvringModel(Shown):
         }
         if self.changes:
             data["changes"] = [vars(c) for c in self.changes]
+        if self.conditions:
+            data["conditions"] = validity_to_dict(self.conditions)
         out: dict[str, Any] = plain(data | dict(self.record))
         return out
 
@@ -243,6 +253,7 @@ _CORE = {
     "format", "version", "sample_time", "integrator", "structure", "names", "theta", "std",
     "units", "theta_per_second", "covariance", "sums", "disturbances",
     "disturbance_covariance", "residual_std", "noise", "vessel", "changes",
+    "conditions",
 }  # fmt: skip
 
 
@@ -319,6 +330,7 @@ def model_from_dict(data: Any, source: str = "model") -> ManoeuvringModel:
             sums={k: tuple(v) for k, v in data["sums"].items()},
             record={k: v for k, v in data.items() if k not in _CORE},
             changes=_changes(data.get("changes", []), structure.parameters, source),
+            conditions=validity_from_dict(data.get("conditions", {})),
         )
     except ModelFileError:
         raise

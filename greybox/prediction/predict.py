@@ -40,6 +40,7 @@ from greybox.trial.log import TrialLog
 from greybox.trial.manoeuvres import Criterion, Quantity, Verdict
 from greybox.trial.manoeuvres.finding import Manoeuvre
 from greybox.trial.manoeuvres.standards import judge
+from greybox.trial.validity import ConditionDifference, other_conditions
 from greybox.validation.bands import draw_parameters, process_noise
 
 Array = NDArray[np.float64]
@@ -164,11 +165,13 @@ def predict_manoeuvre(
     require_straight(helm)
     found: list[tuple[Task, Manoeuvre, TrialLog]] = []
     told_rates: list[str] = []
+    elsewhere: tuple[ConditionDifference, ...] = ()
     if trial is None:
         helm = driven(helm, model, asked)
         todo = tasks(manoeuvre, helm, model, asked)
     else:
         logs = [trial] if isinstance(trial, TrialLog) else list(trial)
+        elsewhere = other_conditions(model.conditions, logs)
         found = found_in_trial(manoeuvre, logs, helm, asked)
         helm, told_rates = with_rates(helm, found)
         if asked.command:
@@ -195,7 +198,13 @@ def predict_manoeuvre(
         helm.sentence if manoeuvre in ("turning", "zigzag") else helm.sentence.split(", ")[-1],
         tuple(made),
         asked.draws,
-        (*model_notes(model, helm, asked), *told_rates, *shared),
+        (
+            *model_notes(model, helm, asked),
+            *(d.sentence for d in elsewhere),
+            *told_rates,
+            *shared,
+        ),
+        elsewhere,
     )
 
 

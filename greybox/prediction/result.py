@@ -16,6 +16,7 @@ from greybox.prediction.measuring import LABELS
 from greybox.trial.log import TrialLog
 from greybox.trial.manoeuvres import Criterion, Quantity, Verdict
 from greybox.trial.manoeuvres.finding import Manoeuvre
+from greybox.trial.validity import ConditionDifference
 
 Array = NDArray[np.float64]
 Kind = Literal["turning", "zigzag", "stopping", "crash"]
@@ -254,6 +255,8 @@ class ManoeuvrePrediction(Shown):
     draws : int
     notes : tuple of str
         What holds for all of them.
+    conditions : tuple of ConditionDifference
+        In what the trial differs from the logs that the model was estimated on.
     """
 
     kind: Kind
@@ -262,6 +265,7 @@ class ManoeuvrePrediction(Shown):
     manoeuvres: tuple[PredictedManoeuvre, ...]
     draws: int
     notes: tuple[str, ...]
+    conditions: tuple[ConditionDifference, ...] = ()
 
     def summary(self) -> str:
         """Return all manoeuvres as text."""
@@ -301,6 +305,7 @@ class ManoeuvrePrediction(Shown):
             "steering": self.steering,
             "draws": self.draws,
             "notes": list(self.notes),
+            "condition_differences": [d.to_dict() for d in self.conditions],
             "quantities": [row for m in self.manoeuvres for row in m.to_list()],
             "runs": [
                 {

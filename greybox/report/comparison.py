@@ -104,6 +104,11 @@ def comparison_page(
         headline=headline(comparison),
         sentences=[
             *[t.sentence for t in tests],
+            *[
+                f"{name}: {d.sentence}"
+                for name, differences in zip(comparison.names, comparison.conditions, strict=True)
+                for d in differences
+            ],
             *_band_sentences(comparison),
             *_left_out(comparison),
         ],

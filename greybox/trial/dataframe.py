@@ -1,6 +1,6 @@
-"""Logs from and to pandas and xarray, by the same reader as files.
+"""Logs from pandas and xarray, by the same reader as files.
 
-A frame that `log_to_pandas` made says so in its ``attrs`` and is canonical: it comes
+A frame that `TrialLog.to_pandas` made says so in its ``attrs`` and is canonical: it comes
 back as the same log. Any other is read as a file with its columns would be.
 """
 
@@ -8,16 +8,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from greybox.channels import CHANNELS
-from greybox.errors import LogError, UsageError
+from greybox.errors import LogError
 from greybox.trial.convert.channel_mapping import canonical, table_recording
 from greybox.trial.convert.read import table_segments
-from greybox.trial.log import Provenance, TrialLog
+from greybox.trial.log import FRAME_KEY, RECORD_FORMAT, Provenance, TrialLog, require_xarray
 from greybox.trial.raw_log import Recording
 from greybox.trial.readers.frame import open_frame
 from greybox.trial.store import recorded_provenance
@@ -27,58 +26,8 @@ if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
 
-# where a frame or dataset says that it was a log
-KEY = "greybox_log"
 # a frame that was thinned out has another sample time than it says
 _SAME = 1e-6
-
-
-def log_to_pandas(log: TrialLog) -> pd.DataFrame:
-    """Return a log as a DataFrame.
-
-    Returns
-    -------
-    DataFrame
-        Index ``t`` [s], one column a channel (SI, radians), and the column of the
-        controller's mode where the log has it. ``attrs["units"]`` by column.
-    """
-    import pandas as pd
-
-    frame = pd.DataFrame(dict(log.channels), index=pd.Index(log.t, name="t"))
-    mode = _mode(log)
-    if mode is not None:
-        frame[mode[0]] = mode[1]
-    frame.attrs = {"units": _units(log), KEY: _record(log)}
-    return frame
-
-
-def log_to_xarray(log: TrialLog) -> xr.Dataset:
-    """Return a log as a Dataset over ``t``, with units and meaning of each channel.
-
-    Raises
-    ------
-    UsageError
-        xarray is not installed.
-    """
-    xarray = _xarray()
-    units = _units(log)
-    meaning = {n: c.meaning for n, c in CHANNELS.items()}
-
-    def attrs(name: str) -> dict[str, str]:
-        said = {"units": units.get(name, ""), "long_name": meaning.get(name, "")}
-        return {k: v for k, v in said.items() if v}
-
-    variables = {n: ("t", a, attrs(n)) for n, a in log.channels.items()}
-    mode = _mode(log)
-    if mode is not None:
-        variables[mode[0]] = ("t", mode[1], {})
-    dataset: xr.Dataset = xarray.Dataset(
-        variables,
-        {"t": ("t", log.t, attrs("t"))},
-        # text, so that it can be written to any file
-        {"title": log.name, "vessel": log.vessel.name, KEY: json.dumps(_record(log))},
-    )
-    return dataset
 
 
 def log_from_pandas(
@@ -114,14 +63,14 @@ def log_from_pandas(
     LogError
         As `read_log`, and where the frame is none or has no time.
     """
-    record = _recorded(frame.attrs.get(KEY) if hasattr(frame, "attrs") else None)
+    record = _recorded(frame.attrs.get(FRAME_KEY) if hasattr(frame, "attrs") else None)
     own = vessel
     known = Provenance(name)
     if record:
         # it is canonical, and without the sensors' defects
         own = replace(vessel, columns={}, sensors={})
         known, name = recorded_provenance(record), str(record.get("name", name))
-    table = open_frame(frame, name, vessel.commands)
+    table = open_frame(frame, name, vessel.recorded_columns)
     if not any(n == "t" or ((m := own.columns.get(n)) and m.name == "t") for n in table.columns):
         raise LogError(
             f"'{name}' has no time: neither a column 't' nor an index of seconds or dates. "
@@ -135,7 +84,9 @@ def log_from_pandas(
             f"cut the frame at them, with frame.loc[start:stop]."
         )
     stated = record.get("sample_time")
-    log = replace(segments[0], name=name, vessel=vessel)
+    log = segments[0]
+    order = [c for c in table.columns if c in log] if record else list(log.channels)
+    log = replace(log, name=name, vessel=vessel, channels={n: log[n] for n in order})
     if isinstance(stated, float) and abs(stated - log.sample_time) <= _SAME * stated:
         log = replace(log, sample_time=stated)
     return log
@@ -174,7 +125,7 @@ def log_from_xarray(
     UsageError
         xarray is not installed.
     """
-    xarray = _xarray()
+    xarray = require_xarray()
     if not isinstance(dataset, xarray.Dataset):
         raise LogError(
             f"'{name}' is a {type(dataset).__name__}, a Dataset is needed: use log_from_pandas "
@@ -194,7 +145,7 @@ def log_from_xarray(
     frame = pd.DataFrame({n: np.asarray(v.values) for n, v in columns.items()}, index=index)
     frame = frame.rename_axis(dimension if index is not None else None)
     units = {n: v.attrs["units"] for n, v in dataset.variables.items() if "units" in v.attrs}
-    frame.attrs = {"units": units, KEY: dataset.attrs.get(KEY)}
+    frame.attrs = {"units": units, FRAME_KEY: dataset.attrs.get(FRAME_KEY)}
     return log_from_pandas(frame, vessel, name=name, states=states, fill=fill)
 
 
@@ -225,27 +176,10 @@ def recording_from_pandas(
     LogError
         It is no DataFrame, or has no time.
     """
-    raw, assigned = table_recording(open_frame(frame, name, vessel.commands), vessel, guess=guess)
+    raw, assigned = table_recording(
+        open_frame(frame, name, vessel.recorded_columns), vessel, guess=guess
+    )
     return canonical(raw, assigned, vessel)
-
-
-def _mode(log: TrialLog) -> tuple[str, Any] | None:
-    """Return the column of the controller's mode as a written log has it."""
-    loop = log.vessel.closed_loop
-    if loop is None or not log.loop_known:
-        return None
-    return loop[0], np.where(log.closed_loop, loop[1][0], "open").astype(object)
-
-
-def _units(log: TrialLog) -> dict[str, str]:
-    return {n: u for n, u in log.units.items() if u != "as logged"}
-
-
-def _record(log: TrialLog) -> dict[str, Any]:
-    record: dict[str, Any] = asdict(log.provenance)
-    # as JSON would give it back
-    record = json.loads(json.dumps(record | {"notes": dict(log.provenance.notes)}))
-    return {"format": "greybox-log", "name": log.name, "sample_time": log.sample_time} | record
 
 
 def _recorded(said: Any) -> dict[str, Any]:
@@ -255,15 +189,4 @@ def _recorded(said: Any) -> dict[str, Any]:
             said = json.loads(said)
         except ValueError:
             return {}
-    return said if isinstance(said, dict) and said.get("format") == "greybox-log" else {}
-
-
-def _xarray() -> Any:
-    try:
-        import xarray
-    except ImportError:
-        raise UsageError(
-            "xarray is not installed, which Datasets need: install it with "
-            "pip install 'greybox-marine[notebook]', or use to_pandas()."
-        ) from None
-    return xarray
+    return said if isinstance(said, dict) and said.get("format") == RECORD_FORMAT else {}

@@ -8,9 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import LogError
+from greybox.rotation import ned_to_body
 from greybox.trial.log import TrialLog
+from greybox.trial.steps import Step
 
 Array = NDArray[np.float64]
+
+# corrections of derived velocities that those of the positions and heading imply
+_FOLLOWED = frozenset({"turn_heading", "move_velocity"})
 
 
 def velocities_from_positions(
@@ -54,19 +59,20 @@ def velocities_from_positions(
         return np.asarray(np.gradient(value, sample_time))
 
     north, east, r = rate(x_n), rate(y_n), rate(psi)
-    c, s = np.cos(psi), np.sin(psi)
     rho = np.exp(-(heading_std**2) / 2)
-    u, v = (c * north + s * east) / rho, (-s * north + c * east) / rho
+    u, v = (w / rho for w in ned_to_body(north, east, psi))
     return u + r * antenna[1], v - r * antenna[0], r
 
 
 def decimate(log: TrialLog, sample_time: float) -> TrialLog:
     """Return the log at a longer sample time.
 
-    Positions, heading and wind are averaged over the interval around each new
-    sample; velocities are taken anew from positions where they were derived,
-    else averaged alike; inputs are averaged over the interval that follows,
-    which is what the ship then feels.
+    Positions, heading, wind and velocities are averaged over the interval around each new
+    sample; inputs are averaged over the interval that follows, which is what the ship then
+    feels. Velocities and yaw rate that central differences made are made anew, of the averaged
+    positions and heading: the average of differences over an interval is the difference of two
+    single samples, with all of their noise. Local polynomials and sensors of velocity have no
+    such loss and are averaged.
 
     Parameters
     ----------
@@ -101,7 +107,7 @@ def decimate(log: TrialLog, sample_time: float) -> TrialLog:
         )
     sums = {k: np.concatenate([[0.0], np.cumsum(v)]) for k, v in log.channels.items()}
     channels: dict[str, Array] = {}
-    inputs = set(log.vessel.commands)
+    inputs = set(log.vessel.recorded_columns)
     for name, total in sums.items():
         first = centres if name in inputs else centres - half
         channels[name] = (total[first + step] - total[first]) / step
@@ -110,25 +116,62 @@ def decimate(log: TrialLog, sample_time: float) -> TrialLog:
             last = centres + half
             value = log.channels[name]
             channels[name] += (value[last] - value[centres - half]) / (2 * step)
-    derived = any(d.startswith("u, v") for d in log.provenance.derived)
-    if derived:
-        channels["u"], channels["v"], r = velocities_from_positions(
-            channels["x_n"],
-            channels["y_n"],
-            channels["psi"],
-            sample_time,
-            heading_std=log.vessel.std("psi") or 0.0,
-            antenna=log.vessel.sensors.get("antenna", (0.0, 0.0)),
-        )
-        if any("r from" in d for d in log.provenance.derived):
-            channels["r"] = r
-    note = f"decimated from {log.sample_time:g} s to {sample_time:g} s"
+    made = [Step("decimate", tuple(channels), parameters={
+        "measured": log.sample_time, "sample_time": sample_time})]  # fmt: skip
+    made += _differences(log, channels, sample_time)
     out = replace(
         log,
         sample_time=sample_time,
         t=log.t[centres],
         channels=channels,
         closed_loop=log.closed_loop[centres],
-        provenance=replace(log.provenance, derived=(*log.provenance.derived, note)),
+        provenance=replace(log.provenance, steps=(*log.provenance.steps, *made)),
     )
-    return replace(out.window(1, len(out) - 1), name=log.name) if derived else out
+    # the first and last sample have only one neighbour (3.57)
+    return replace(out.window(1, len(out) - 1), name=log.name) if len(made) > 1 else out
+
+
+def _differences(log: TrialLog, channels: dict[str, Array], sample_time: float) -> list[Step]:
+    """Make anew, in place, what central differences made; return the steps."""
+    by_difference = {n: s for n in ("u", "v", "r") if (s := _last_made(log, n)) is not None}
+    by_difference = {
+        n: s for n, s in by_difference.items() if n in channels and channels.keys() >= {*s.source}
+    }
+    if not by_difference:
+        return []
+    psi = channels["psi"]
+    positioned = {"x_n", "y_n"} <= channels.keys()
+    u, v, r = velocities_from_positions(
+        channels["x_n"] if positioned else psi,
+        channels["y_n"] if positioned else psi,
+        psi,
+        sample_time,
+        heading_std=log.vessel.std("psi") or 0.0,
+        antenna=_antenna(log),
+    )
+    made: dict[tuple[str, ...], list[str]] = {}
+    for name, value in (("u", u), ("v", v), ("r", r)):
+        if name in by_difference:
+            channels[name] = value
+            made.setdefault(by_difference[name].source, []).append(name)
+    return [
+        Step("difference", tuple(names), source, {"sample_time": sample_time})
+        for source, names in made.items()
+    ]
+
+
+def _antenna(log: TrialLog) -> tuple[float, float]:
+    """Return from where derived velocities were brought to the origin, forward and starboard."""
+    moved = [
+        s for s in log.provenance.steps
+        if s.operation == "move_velocity" and s.parameters.get("sensor") == "antenna"
+    ]  # fmt: skip
+    return sum(s.number("x") for s in moved), sum(s.number("y") for s in moved)
+
+
+def _last_made(log: TrialLog, name: str) -> Step | None:
+    """Return the central differences that made a channel, None where others came after."""
+    for step in reversed(log.provenance.steps):
+        if name in step.channels and step.operation not in ("decimate", *_FOLLOWED):
+            return step if step.operation == "difference" and "psi" in step.source else None
+    return None

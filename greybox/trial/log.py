@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from greybox.channels import CHANNELS
-from greybox.errors import LogError
+from greybox.errors import LogError, UsageError
 from greybox.notebook import Shown, items, number, sparkline, table
+from greybox.trial.steps import Step
 from greybox.vessel.actuation import actuated_force
+from greybox.vessel.conditions import Conditions
 from greybox.vessel.vessel import Vessel
 
 if TYPE_CHECKING:
@@ -20,6 +23,12 @@ if TYPE_CHECKING:
     import xarray as xr
 
 Array = NDArray[np.float64]
+
+# what a record says of itself, beside a file or within a frame
+RECORD_FORMAT = "greybox-log"
+RECORD_VERSION = 2
+# where a frame or dataset holds the record of the log that it was
+FRAME_KEY = "greybox_log"
 
 
 @dataclass(frozen=True)
@@ -30,25 +39,53 @@ class Provenance:
     ----------
     source, sha256 : str
         File and its hash; several files by name, with the hashes in `files`.
-    derived, fixed : tuple of str
-        What was derived and what was mended, one sentence each.
+    steps : tuple of Step
+        What was done to the channels, in order.
     files : tuple of (name, sha256, format)
     read : tuple of str
         What was guessed, skipped or recovered while reading.
     epoch : float, optional
         UNIX time [s] of ``t = 0``.
     notes : mapping of str to str
-        Draught, loading, depth, sea state and what else was noted of the trial.
+        What was noted of the trial, word for word.
+    conditions : Conditions
+        What the trial states of draught, trim, loading, water depth and sea state, and the
+        vessel file where the trial does not.
     """
 
     source: str = ""
     sha256: str = ""
-    derived: tuple[str, ...] = ()
-    fixed: tuple[str, ...] = ()
+    steps: tuple[Step, ...] = ()
     files: tuple[tuple[str, str, str], ...] = ()
     read: tuple[str, ...] = ()
     epoch: float | None = None
     notes: Mapping[str, str] = field(default_factory=dict)
+    conditions: Conditions = field(default_factory=Conditions)
+
+    @property
+    def derived(self) -> tuple[str, ...]:
+        """What was derived, resampled and corrected, one sentence each."""
+        return tuple(s.sentence for s in self.steps if s.decided_by != "check")
+
+    @property
+    def fixed(self) -> tuple[str, ...]:
+        """What findings of the checks mended, one sentence each."""
+        return tuple(s.sentence for s in self.steps if s.decided_by == "check")
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the provenance as JSON values: the steps, and beside them their sentences."""
+        return {
+            "source": self.source,
+            "sha256": self.sha256,
+            "steps": [s.to_dict() for s in self.steps],
+            "derived": list(self.derived),
+            "fixed": list(self.fixed),
+            "files": [list(f) for f in self.files],
+            "read": list(self.read),
+            "epoch": self.epoch,
+            "notes": dict(self.notes),
+            "conditions": self.conditions.to_dict(),
+        }
 
 
 @dataclass(frozen=True, repr=False)
@@ -98,11 +135,12 @@ class TrialLog(Shown):
     @property
     def units(self) -> dict[str, str]:
         """Unit of ``t`` and of each channel; ``as logged`` where any unit is kept."""
-        angles = self.vessel.angle_commands
-        return {
-            n: CHANNELS[n].unit if n in CHANNELS else ("rad" if n in angles else "as logged")
-            for n in ("t", *self.channels)
-        }
+        return {n: self.vessel.unit(n) or "as logged" for n in ("t", *self.channels)}
+
+    @property
+    def conditions(self) -> Conditions:
+        """Draught, trim, loading, water depth and sea state, as far as they are known."""
+        return self.provenance.conditions
 
     def summary(self) -> str:
         """Return name, duration, channels with units and ranges, and provenance, as text."""
@@ -131,6 +169,7 @@ class TrialLog(Shown):
         p = self.provenance
         loop = float(np.mean(self.closed_loop)) if self.loop_known and len(self) else 0.0
         closed = [f"a controller moves the thrusters in {100 * loop:.0f} % of it"] if loop else []
+        closed += [f"conditions: {self.conditions.sentence}"] if self.conditions else []
         return [*closed, *(f"derived: {d}" for d in p.derived), *(f"mended: {f}" for f in p.fixed)]
 
     def _parts(self) -> tuple[str, ...]:
@@ -161,16 +200,66 @@ class TrialLog(Shown):
         return np.column_stack([self["u_q"], self["v_q"]]) if self.has_wind else None
 
     def to_pandas(self) -> pd.DataFrame:
-        """Return the log as a DataFrame: see `greybox.trial.dataframe.log_to_pandas`."""
-        from greybox.trial.dataframe import log_to_pandas
+        """Return the log as a DataFrame.
 
-        return log_to_pandas(self)
+        Returns
+        -------
+        DataFrame
+            Index ``t`` [s], one column a channel (SI, radians), and the column of the
+            controller's mode where the log has it. ``attrs["units"]`` by column.
+        """
+        import pandas as pd
+
+        frame = pd.DataFrame(dict(self.channels), index=pd.Index(self.t, name="t"))
+        for name, words in self._mode().items():
+            frame[name] = words
+        frame.attrs = {"units": self._stated_units(), FRAME_KEY: self._record()}
+        return frame
 
     def to_xarray(self) -> xr.Dataset:
-        """Return the log as a Dataset: see `greybox.trial.dataframe.log_to_xarray`."""
-        from greybox.trial.dataframe import log_to_xarray
+        """Return the log as a Dataset over ``t``, with units and meaning of each channel.
 
-        return log_to_xarray(self)
+        Raises
+        ------
+        UsageError
+            xarray is not installed.
+        """
+        xarray = require_xarray()
+        units = self._stated_units()
+        meaning = {n: c.meaning for n, c in CHANNELS.items()}
+
+        def attrs(name: str) -> dict[str, str]:
+            said = {"units": units.get(name, ""), "long_name": meaning.get(name, "")}
+            return {k: v for k, v in said.items() if v}
+
+        variables = {n: ("t", a, attrs(n)) for n, a in self.channels.items()}
+        variables |= {n: ("t", words, {}) for n, words in self._mode().items()}
+        dataset: xr.Dataset = xarray.Dataset(
+            variables,
+            {"t": ("t", self.t, attrs("t"))},
+            # text, so that it can be written to any file
+            {"title": self.name, "vessel": self.vessel.name, FRAME_KEY: json.dumps(self._record())},
+        )
+        return dataset
+
+    def _mode(self) -> dict[str, Any]:
+        """Return the column of the controller's mode as a written log has it, if it has one."""
+        loop = self.vessel.closed_loop
+        if loop is None or not self.loop_known:
+            return {}
+        return {loop[0]: np.where(self.closed_loop, loop[1][0], "open").astype(object)}
+
+    def _stated_units(self) -> dict[str, str]:
+        return {n: u for n, u in self.units.items() if u != "as logged"}
+
+    def _record(self) -> dict[str, Any]:
+        return {
+            "format": RECORD_FORMAT,
+            "version": RECORD_VERSION,
+            "name": self.name,
+            "sample_time": self.sample_time,
+            **self.provenance.to_dict(),
+        }
 
     def window(self, start: int, stop: int, name: str | None = None) -> TrialLog:
         """Return samples ``start:stop`` as a log of their own."""
@@ -225,7 +314,26 @@ def make_log(
             raise LogError(f"'{key}' is not finite at sample {k}: cut or repair the log there.")
     size = next(iter(lengths.values()))
     t = arrays.pop("t", np.arange(size) * sample_time)
-    return TrialLog(name, sample_time, t, arrays, vessel, np.zeros(size, bool))
+    known = Provenance(conditions=vessel.conditions)
+    return TrialLog(name, sample_time, t, arrays, vessel, np.zeros(size, bool), provenance=known)
+
+
+def require_xarray() -> Any:
+    """Return xarray.
+
+    Raises
+    ------
+    UsageError
+        It is not installed.
+    """
+    try:
+        import xarray
+    except ImportError:
+        raise UsageError(
+            "xarray is not installed, which Datasets need: install it with "
+            "pip install 'greybox-marine[notebook]', or use to_pandas()."
+        ) from None
+    return xarray
 
 
 def _range(a: Array) -> tuple[float | None, float | None, float | None]:

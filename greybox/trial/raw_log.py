@@ -9,12 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from greybox.notebook import Shown, items, number, sparkline, table
+from greybox.trial.steps import Step
+from greybox.vessel.conditions import Conditions
 
 Array = NDArray[np.float64]
 
@@ -84,8 +85,13 @@ class Recording(Shown):
         What was guessed, skipped or recovered while reading, one sentence each.
     guessed : frozenset of str
         Signals whose meaning was guessed: another file that states it is preferred.
-    derived : tuple of str
-        What was derived before, where the file is a log that greybox wrote.
+    steps : tuple of Step
+        What was done to the signals, in order; also before, where the file is a log that
+        greybox wrote.
+    mapped : mapping of str to str
+        Signal or column of words -> column that ``[columns]`` takes for it.
+    conditions : Conditions
+        As stated before, where the file is a log that greybox wrote.
     """
 
     name: str
@@ -95,7 +101,9 @@ class Recording(Shown):
     files: tuple[SourceFile, ...] = ()
     notes: tuple[str, ...] = ()
     guessed: frozenset[str] = frozenset()
-    derived: tuple[str, ...] = ()
+    steps: tuple[Step, ...] = ()
+    mapped: Mapping[str, str] = field(default_factory=dict)
+    conditions: Conditions = field(default_factory=Conditions)
 
     def __contains__(self, name: object) -> bool:
         return any(s.name == name for s in self.signals)
@@ -145,5 +153,6 @@ class Recording(Shown):
         """Return the recording with other signals and more notes."""
         return replace(self, signals=tuple(signals), notes=(*self.notes, *notes))
 
-
-Kind = Literal["motion", "input", "wind", "other"]
+    def with_steps(self, *steps: Step) -> Recording:
+        """Return the recording with more steps done."""
+        return replace(self, steps=(*self.steps, *steps))

@@ -64,13 +64,13 @@ def repair(
 
 
 def apply_repairs(recording: Recording, findings: Iterable[Finding]) -> Recording:
-    """Return the recording with the repairs of the findings applied in order."""
-    steps = [step for f in findings for step in f.repair]
+    """Return the recording with the repairs of the findings applied in order, as its steps."""
+    steps = [replace(step, reason=step.reason or f.evidence) for f in findings for step in f.repair]
     if any(s.operation in _ON_DERIVED for s in steps):
         recording = derive_signals(recording)
     for step in steps:
         recording = _ACTIONS[step.operation](recording, step)
-    return recording
+    return recording.with_steps(*steps)
 
 
 def _order(recording: Recording, step: Step) -> Recording:

@@ -1,4 +1,4 @@
-"""Segments of a log: by the signs of its states, by its gaps, by its manoeuvres."""
+"""Segments of a log in which states keep their signs."""
 
 from __future__ import annotations
 
@@ -6,20 +6,16 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import LogError
+from greybox.trial.gaps import split_at_gaps
 from greybox.trial.log import TrialLog
-from greybox.trial.manoeuvres import find_manoeuvres
 
 Array = NDArray[np.float64]
-SegmentKind = Literal["sign", "piece", "manoeuvre"]
 
-# a step longer than this many sample times is a gap
-_GAP = 1.5
 # standard errors by which a smoothed state must be inside its margin's width
 _SURE = 3.0
 # samples over which a state is averaged at most, where its noise is large beside the margin
@@ -34,16 +30,14 @@ class Segment:
     ----------
     start, stop : int
         First sample, and the one after the last.
-    kind : {"sign", "piece", "manoeuvre"}
     label : str
-        The regime (``u+v+``), the number of the piece, or the manoeuvre in words.
+        The regime, such as ``u+v+``.
     t_start, t_stop : float
         Time of the first and of the last sample [s].
     """
 
     start: int
     stop: int
-    kind: SegmentKind
     label: str
     t_start: float
     t_stop: float
@@ -120,56 +114,9 @@ def by_sign(
             label = "".join(
                 f"{n}{'+' if s > 0 else '-'}" for n, s in zip(margins, signs[:, a], strict=True)
             )
-            made.append(_segment(log, start, stop, "sign", label))
+            span = (float(log.t[start]), float(log.t[stop - 1]))
+            made.append(Segment(start, stop, label, *span))
     return tuple(made)
-
-
-def split_at_gaps(t: Array, sample_time: float) -> list[tuple[int, int]]:
-    """Return the pieces between steps that exceed 1.5 sample times.
-
-    Parameters
-    ----------
-    t : ndarray
-        (N,) [s]
-    sample_time : float
-        [s]
-
-    Returns
-    -------
-    list of (int, int)
-        First sample of each piece, and the one after its last.
-    """
-    if len(t) == 0:
-        return []
-    gaps = np.flatnonzero(np.diff(t) > _GAP * sample_time) + 1
-    edges = [0, *gaps.tolist(), len(t)]
-    return list(pairwise(edges))
-
-
-def by_gaps(log: TrialLog) -> tuple[Segment, ...]:
-    """Return the pieces of a log between its gaps."""
-    pieces = split_at_gaps(log.t, log.sample_time)
-    return tuple(_segment(log, a, b, "piece", f"piece {i + 1}") for i, (a, b) in enumerate(pieces))
-
-
-def by_manoeuvre(log: TrialLog) -> tuple[Segment, ...]:
-    """Return the samples of each standard manoeuvre, from its order to its end.
-
-    Raises
-    ------
-    LogError
-        As `find_manoeuvres`.
-    """
-    made = []
-    for found in find_manoeuvres(log):
-        a = int(np.searchsorted(log.t, found.start))
-        b = int(np.searchsorted(log.t, found.stop, "right"))
-        made.append(_segment(log, a, b, "manoeuvre", found.label))
-    return tuple(made)
-
-
-def _segment(log: TrialLog, start: int, stop: int, kind: SegmentKind, label: str) -> Segment:
-    return Segment(start, stop, kind, label, float(log.t[start]), float(log.t[stop - 1]))
 
 
 def _sign(value: Array, margin: float, std: float | None) -> NDArray[np.int64]:

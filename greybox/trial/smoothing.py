@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.signal import savgol_coeffs, savgol_filter
 
 from greybox.errors import LogError
+from greybox.rotation import ned_to_body
 
 Array = NDArray[np.float64]
 
@@ -89,9 +90,8 @@ def savgol_velocities(
     turned = np.unwrap(psi)
     north, east, r = fitted(x_n, 1), fitted(y_n, 1), fitted(turned, 1)
     heading = fitted(turned, 0)
-    c, s = np.cos(heading), np.sin(heading)
     rho = np.exp(-((heading_std * _kept_noise(len(psi), count, order)) ** 2) / 2)
-    u, v = (c * north + s * east) / rho, (-s * north + c * east) / rho
+    u, v = (w / rho for w in ned_to_body(north, east, heading))
     return u + r * antenna[1], v - r * antenna[0], r
 
 
@@ -123,36 +123,6 @@ def smooth(value: Array, sample_time: float, window_s: float, order: int = 2) ->
     count = window_samples(len(value), sample_time, window_s, order, least_order=0)
     _require_finite("the signal", value)
     return np.asarray(savgol_filter(value, count, order), float)
-
-
-def derivative_noise(sample_time: float, window_s: float, order: int = 2) -> float:
-    """Return the noise of the derivative per unit of white noise in the positions.
-
-    The root of the sum of the squared coefficients; 1/(√2 Ts) for central
-    differences. It holds away from the ends of a log.
-
-    Parameters
-    ----------
-    sample_time : float
-        Ts [s].
-    window_s : float
-        Length of the window [s], as in `savgol_velocities`.
-    order : int
-        Of the polynomials, at least 1.
-
-    Returns
-    -------
-    float
-        Standard deviation [1/s]: m/s of velocity per m of position, rad/s per rad.
-
-    Raises
-    ------
-    LogError
-        The order is below 1, or the window holds fewer than order + 2 samples.
-    """
-    count = window_samples(None, sample_time, window_s, order, least_order=1)
-    weights = savgol_coeffs(count, order, deriv=1, delta=sample_time)
-    return float(np.linalg.norm(weights))
 
 
 def window_samples(

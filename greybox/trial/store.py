@@ -6,7 +6,6 @@ import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import asdict
 from itertools import chain
 from pathlib import Path
 from typing import IO, Any
@@ -16,9 +15,13 @@ import numpy as np
 from greybox.channels import LOGGED
 from greybox.errors import LogError
 from greybox.files import check_targets, replacing, sha256, write_json
-from greybox.trial.log import Provenance, TrialLog
+from greybox.trial.gaps import joined_spans
+from greybox.trial.log import RECORD_FORMAT, RECORD_VERSION, Provenance, TrialLog
+from greybox.trial.old_records import steps_of_sentences
+from greybox.trial.readers.limits import limits
+from greybox.trial.steps import Step, step_from_dict
+from greybox.vessel.conditions import Conditions
 
-_MAX_RECORD = 4_000_000
 _ROWS = 1 << 17
 
 
@@ -68,7 +71,7 @@ def write_log(
     if first is None:
         raise LogError("there is no segment to write: import at least one.")
     names = _columns(first)
-    spans: list[list[float]] = []
+    spans: list[tuple[float, float, int]] = []
     tables = _tables(chain([first], iterator), first, names, spans)
     try:
         with replacing(path, "wb") as handle:
@@ -79,22 +82,25 @@ def write_log(
             f"name a file elsewhere."
         ) from None
     record = {
-        "format": "greybox-log",
-        "version": 1,
+        "format": RECORD_FORMAT,
+        "version": RECORD_VERSION,
         "log": path.name,
         "log_sha256": sha256(path),
-        "rows": int(sum(s[2] for s in spans)),
+        "rows": sum(count for _, _, count in spans),
         "sample_time": first.sample_time,
         "units": {n: first.units[n] for n in names},
-        "segments": _merged(spans, first.sample_time)[:1000],
-        **asdict(first.provenance if provenance is None else provenance()),
+        "segments": [list(s) for s in joined_spans(spans, first.sample_time)[:1000]],
+        **(first.provenance if provenance is None else provenance()).to_dict(),
         **(extra or {}),
     }
     write_json(record, record_path(path))
 
 
 def _tables(
-    segments: Iterable[TrialLog], first: TrialLog, names: Sequence[str], spans: list[list[float]]
+    segments: Iterable[TrialLog],
+    first: TrialLog,
+    names: Sequence[str],
+    spans: list[tuple[float, float, int]],
 ) -> Iterator[Any]:
     """Yield the rows of the log as Arrow tables, and note the spans of its segments."""
     import pyarrow as pa
@@ -105,7 +111,7 @@ def _tables(
         fields.append((loop[0], pa.string()))
     schema = pa.schema(fields)
     for log in segments:
-        spans.append([float(log.t[0]), float(log.t[-1]), len(log)])
+        spans.append((float(log.t[0]), float(log.t[-1]), len(log)))
         for start in range(0, len(log), _ROWS):
             part = slice(start, start + _ROWS)
             arrays = [pa.array((log.t if n == "t" else log[n])[part]) for n in names]
@@ -148,12 +154,12 @@ def read_record(path: Path) -> dict[str, Any] | None:
     """Return the record beside a log, None where there is none or it is of another file."""
     beside = record_path(path)
     try:
-        if not beside.is_file() or beside.stat().st_size > _MAX_RECORD:
+        if not beside.is_file() or beside.stat().st_size > limits().sidecar_bytes:
             return None
         record = json.loads(beside.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
         return None
-    if not isinstance(record, dict) or record.get("format") != "greybox-log":
+    if not isinstance(record, dict) or record.get("format") != RECORD_FORMAT:
         return None
     return record if record.get("log_sha256") == sha256(path) else None
 
@@ -171,28 +177,27 @@ def recorded_provenance(record: Mapping[str, Any]) -> Provenance:
     return Provenance(
         str(record.get("source", "")),
         str(record.get("sha256", "")),
-        words("derived"),
-        words("fixed"),
+        _recorded_steps(record, words),
         tuple((str(f[0]), str(f[1]), str(f[2])) for f in files if len(f) == 3)
         if isinstance(files, list)
         else (),
         words("read"),
         float(epoch) if isinstance(epoch, int | float) else None,
         {str(k): str(v) for k, v in notes.items()} if isinstance(notes, dict) else {},
+        Conditions.recorded(record),
     )
+
+
+def _recorded_steps(
+    record: Mapping[str, Any], words: Callable[[str], tuple[str, ...]]
+) -> tuple[Step, ...]:
+    if record.get("version") == 1 or "steps" not in record:
+        return steps_of_sentences(words("derived"), words("fixed"))
+    steps = record["steps"]
+    made = [step_from_dict(s) for s in steps] if isinstance(steps, list) else []
+    return tuple(s for s in made if s is not None)
 
 
 def _columns(log: TrialLog) -> list[str]:
     known = [n for n in LOGGED if n == "t" or n in log]
     return known + [n for n in log.channels if n not in known]
-
-
-def _merged(spans: list[list[float]], sample_time: float) -> list[list[float]]:
-    """Join spans that follow each other without a gap."""
-    joined: list[list[float]] = []
-    for start, stop, count in spans:
-        if joined and start - joined[-1][1] < 1.5 * sample_time:
-            joined[-1] = [joined[-1][0], stop, joined[-1][2] + count]
-        else:
-            joined.append([start, stop, count])
-    return joined

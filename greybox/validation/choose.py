@@ -267,6 +267,7 @@ def _finished(
             f"the free run of {', '.join(poor)} is worse than a constant on the very logs it "
             f"was estimated on: this model does not explain that motion."
         )
+    own += [d.sentence for d in estimate.conditions.differences]
     estimate = replace(estimate, notes=(*notes, *own), fit=fit)
     if request.judged:
         found, trouble = limits_of(estimate, logs)

@@ -16,6 +16,7 @@ from greybox.notebook import Shown, items, number, table
 from greybox.one_thread import one_thread
 from greybox.regression.instruments import state_bound
 from greybox.trial.log import TrialLog
+from greybox.trial.validity import ConditionDifference, other_conditions
 from greybox.validation.bands import LEVEL, Bands, predict_bands
 from greybox.validation.fit import LogFit, run_model
 
@@ -72,6 +73,8 @@ class Comparison(Shown):
     bands : tuple of tuple of Bands
         Where the motion and its measurement should lie; None where they were not asked
         for, or the run itself diverges.
+    conditions : tuple of tuple of ConditionDifference
+        One row a model: in what the logs differ from those it was estimated on.
     """
 
     names: tuple[str, ...]
@@ -80,6 +83,7 @@ class Comparison(Shown):
     ahead: tuple[tuple[dict[str, dict[str, float]], ...], ...]
     sign_tests: tuple[SignTest, ...]
     bands: tuple[tuple[Bands | None, ...], ...]
+    conditions: tuple[tuple[ConditionDifference, ...], ...]
 
     def fits(self) -> list[dict[str, float]]:
         """Return the mean fit a model [%]."""
@@ -94,6 +98,7 @@ class Comparison(Shown):
                 {
                     "model": name,
                     "fit": fit,
+                    "condition_differences": [d.to_dict() for d in differences],
                     "logs": [
                         {
                             "log": run.log.name,
@@ -110,9 +115,10 @@ class Comparison(Shown):
                         for run, rmse, ahead, band in zip(row, errors, aheads, bands, strict=True)
                     ],
                 }
-                for name, fit, row, errors, aheads, bands in zip(
+                for name, fit, differences, row, errors, aheads, bands in zip(
                     self.names,
                     self.fits(),
+                    self.conditions,
                     self.runs,
                     self.rmse,
                     self.ahead,
@@ -165,6 +171,11 @@ class Comparison(Shown):
                 shown = ", ".join(f"{s} {e:.3g}" for s, e in error.items())
                 lines.append(f"{name[:23]:<24}{horizon} s ahead, rms error: {shown}")
         lines += self._covered()
+        lines += [
+            f"{name[:23]:<24}note: {d.sentence}"
+            for name, differences in zip(self.names, self.conditions, strict=True)
+            for d in differences
+        ]
         if len(self.runs[0]) > 1:
             lines += [t.sentence for t in self.sign_tests]
         return "\n".join(lines)
@@ -387,4 +398,7 @@ def compare_models(
         )
         for model, row in zip(models, runs, strict=True)
     )
-    return Comparison(tuple(names), runs, rmse, ahead, tuple(tests), drawn)
+    elsewhere = tuple(
+        other_conditions(model.conditions, mine) for model, mine in zip(models, logs, strict=True)
+    )
+    return Comparison(tuple(names), runs, rmse, ahead, tuple(tests), drawn, elsewhere)

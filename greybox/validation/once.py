@@ -143,12 +143,14 @@ def estimate_once(
             "wind terms towards zero and, in a nearly steady wind, the current with them. Give "
             "wind_std in [sensors] where there is some; the wind is then averaged."
         )
-    coarse = [d for log in logs for d in log.provenance.derived if "3.57" in d or "decimated" in d]
+    coarse = [
+        s for log in logs for s in log.provenance.steps if s.operation in ("difference", "decimate")
+    ]
     if coarse:
         notes.append(
-            f"the logs were conditioned ({coarse[0]}) and the model steps by Euler: damping and "
-            f"current carry a bias of the order of the damping over one sample, which the "
-            f"standard errors leave out. Compare with a shorter sample time."
+            f"the logs were conditioned ({coarse[0].sentence}) and the model steps by Euler: "
+            f"damping and current carry a bias of the order of the damping over one sample, which "
+            f"the standard errors leave out. Compare with a shorter sample time."
         )
     return replace(estimate, tests=(*estimate.tests, loop_test), notes=tuple(notes))
 

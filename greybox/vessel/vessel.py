@@ -7,12 +7,16 @@ from dataclasses import dataclass, field
 from math import inf, isfinite
 from typing import Any, Literal, get_args
 
+from greybox.channels import CHANNELS
 from greybox.errors import VesselError, suggestion
 from greybox.notebook import Shown, number, table
+from greybox.vessel.conditions import Conditions
 from greybox.vessel.thrust import ThrustLaw
 
 ThrusterType = Literal["azimuth", "fixed", "tunnel", "propeller_rudder"]
-THRUSTER_TYPES: tuple[ThrusterType, ...] = ("azimuth", "fixed", "tunnel", "propeller_rudder")
+THRUSTER_TYPES: tuple[ThrusterType, ...] = get_args(ThrusterType)
+Drive = Literal["feedback", "command"]
+ActuatorKind = Literal["speed", "angle", "rudder"]
 
 
 @dataclass(frozen=True)
@@ -22,6 +26,34 @@ class Limits:
     lower: float | None = None
     upper: float | None = None
     rate: float | None = None
+
+
+@dataclass(frozen=True)
+class Actuator:
+    """One movement of a thruster of which both the command and the feedback are logged.
+
+    Parameters
+    ----------
+    thruster : int
+        Which of the vessel's thrusters, counted from 1; of those that share both
+        columns, the first.
+    kind : {"speed", "angle", "rudder"}
+    command, feedback : str
+        Log columns: what was asked for, and what was measured.
+    limits : Limits
+        In the unit of the column that drives the model.
+    """
+
+    thruster: int
+    kind: ActuatorKind
+    command: str
+    feedback: str
+    limits: Limits
+
+    @property
+    def angular(self) -> bool:
+        """Whether both columns are angles [rad]; speeds may be in a unit each."""
+        return self.kind != "speed"
 
 
 @dataclass(frozen=True)
@@ -46,11 +78,16 @@ class Thruster:
         Share of the thrust law that the thruster gives, 1 for all of it.
     angle_offset : float
         True minus logged direction of an azimuth, or angle of a rudder [rad].
+    drive : {"feedback", "command"}
+        What `speed`, `angle` and `rudder` hold: measured values or commands.
+    speed_other, angle_other, rudder_other : str, optional
+        The command's column where the feedback drives, else the feedback's.
 
     Raises
     ------
     VesselError
-        Gain or offset is not finite, or there is an offset but no logged angle.
+        Gain or offset is not finite, there is an offset but no logged angle, one column
+        is named as command and as feedback, or a command drives without a feedback.
     """
 
     type: ThrusterType
@@ -65,6 +102,10 @@ class Thruster:
     rudder_limits: Limits = field(default_factory=Limits)
     gain: float = 1.0
     angle_offset: float = 0.0
+    drive: Drive = "feedback"
+    speed_other: str | None = None
+    angle_other: str | None = None
+    rudder_other: str | None = None
 
     def __post_init__(self) -> None:
         for name in ("gain", "angle_offset"):
@@ -79,16 +120,35 @@ class Thruster:
                 f"{self.angle_offset:g}, but it is of type {self.type} and its angle is not "
                 f"logged: correct 'angle' or 'type' instead."
             )
+        for kind, column, other, _ in self.movements:
+            if column == other:
+                raise VesselError(
+                    f"the thruster driven by '{self.speed}' has the column '{column}' both as "
+                    f"'{kind}' and as '{kind}_command': name the other column, or leave "
+                    f"'{kind}_command' out."
+                )
+            if self.drive == "command" and other is None:
+                raise VesselError(
+                    f"the thruster driven by '{self.speed}' is driven by its command but has no "
+                    f'column of the measured {kind}: name it, or say drive = "feedback".'
+                )
 
     @property
     def columns(self) -> tuple[str, ...]:
         """Log columns that move this thruster."""
-        names = [self.speed]
+        return tuple(column for _, column, _, _ in self.movements)
+
+    @property
+    def movements(self) -> tuple[tuple[ActuatorKind, str, str | None, Limits], ...]:
+        """What moves: kind, driving column, the other column if any, limits."""
+        found: list[tuple[ActuatorKind, str, str | None, Limits]] = [
+            ("speed", self.speed, self.speed_other, self.speed_limits)
+        ]
         if isinstance(self.angle, str):
-            names.append(self.angle)
+            found.append(("angle", self.angle, self.angle_other, self.angle_limits))
         if self.rudder is not None:
-            names.append(self.rudder)
-        return tuple(names)
+            found.append(("rudder", self.rudder, self.rudder_other, self.rudder_limits))
+        return tuple(found)
 
 
 LagOn = Literal["force", "speed", "command"]
@@ -179,6 +239,8 @@ class Vessel(Shown):
     mass : float, optional
         [kg]
     actuation : Actuation
+    conditions : Conditions
+        Those of a log that does not state its own.
     """
 
     name: str
@@ -189,6 +251,7 @@ class Vessel(Shown):
     closed_loop: tuple[str, tuple[str, ...]] | None = None
     mass: float | None = None
     actuation: Actuation = Actuation()
+    conditions: Conditions = field(default_factory=Conditions)
 
     @property
     def commands(self) -> tuple[str, ...]:
@@ -198,19 +261,44 @@ class Vessel(Shown):
     @property
     def angle_commands(self) -> frozenset[str]:
         """Those of `commands` that are angles [rad]."""
-        names = {t.angle for t in self.thrusters if isinstance(t.angle, str)}
-        return frozenset(names | {t.rudder for t in self.thrusters if t.rudder is not None})
+        return frozenset(c for t in self.thrusters for k, c, _, _ in t.movements if k != "speed")
+
+    @property
+    def actuators(self) -> tuple[Actuator, ...]:
+        """Each movement of which both command and feedback are logged, each pair once."""
+        found: dict[tuple[str, str], Actuator] = {}
+        for place, t in enumerate(self.thrusters, 1):
+            for kind, column, other, limits in t.movements:
+                if other is not None:
+                    pair = (other, column) if t.drive == "feedback" else (column, other)
+                    found.setdefault(pair, Actuator(place, kind, *pair, limits))
+        return tuple(found.values())
+
+    @property
+    def recorded_columns(self) -> tuple[str, ...]:
+        """Log columns of the thrusters: those that move them, then the others."""
+        others = (c for a in self.actuators for c in (a.command, a.feedback))
+        return tuple(dict.fromkeys([*self.commands, *others]))
+
+    @property
+    def recorded_angles(self) -> frozenset[str]:
+        """Those of `recorded_columns` that are angles [rad]."""
+        pairs = (c for a in self.actuators if a.angular for c in (a.command, a.feedback))
+        return self.angle_commands | frozenset(pairs)
+
+    def unit(self, name: str) -> str | None:
+        """Return the SI unit of a channel or thruster column, None where any unit is kept."""
+        if name in self.recorded_angles:
+            return "rad"
+        return CHANNELS[name].unit if name in CHANNELS else None
 
     @property
     def limits(self) -> dict[str, Limits]:
         """Limits of each command; of those that share a column, the tightest."""
         found: dict[str, list[Limits]] = {}
         for t in self.thrusters:
-            found.setdefault(t.speed, []).append(t.speed_limits)
-            if isinstance(t.angle, str):
-                found.setdefault(t.angle, []).append(t.angle_limits)
-            if t.rudder is not None:
-                found.setdefault(t.rudder, []).append(t.rudder_limits)
+            for _, column, _, limits in t.movements:
+                found.setdefault(column, []).append(limits)
         return {name: _tightest(limits) for name, limits in found.items()}
 
     @property
@@ -233,9 +321,16 @@ class Vessel(Shown):
             f"  {name}: {number(x.lower)} to {number(x.upper)}, rate {number(x.rate)} per second"
             for name, x in self.limits.items()
         ]
+        lines += [
+            f"  {a.kind} of thruster {a.thruster}: commanded by {a.command}, measured as "
+            f"{a.feedback}"
+            for a in self.actuators
+        ]
         if self.actuation:
             lines.append(f"  thrusters with {self.actuation.sentence}")
         lines += [f"  {name} {value}" for name, value in self.sensors.items()]
+        if self.conditions:
+            lines.append(f"  conditions: {self.conditions.sentence}")
         return "\n".join(lines)
 
     def _parts(self) -> tuple[str, ...]:

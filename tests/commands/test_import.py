@@ -411,11 +411,11 @@ def test_topics_of_a_bag_are_chosen_and_named(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("cells", [None, 0], ids=["memory", "blocks"])
-def test_channels_are_smoothed_where_asked(tmp_path, capsys, monkeypatch, cells):
+def test_channels_are_smoothed_where_asked(tmp_path, capsys, monkeypatch, limited, cells):
     if cells is not None:
         monkeypatch.setattr("greybox.trial.convert.two_pass_import._LARGE_CELLS", cells)
         monkeypatch.setattr("greybox.trial.convert.two_pass_import._BLOCK_ROWS", 50)
-        monkeypatch.setattr("greybox.trial.readers.csv._BLOCK_BYTES", 1 << 12)
+        limited(block_bytes=1 << 12)
     rng = np.random.default_rng(5)
     table = data(300).drop(columns=["r"])
     table["psi"] = 0.3 + 0.01 * table["t"]

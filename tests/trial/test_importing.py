@@ -17,8 +17,8 @@ from greybox.trial.convert.channel_mapping import merge, read_recording
 from greybox.trial.convert.convert import import_recording
 from greybox.trial.convert.options import ImportOptions
 from greybox.trial.convert.read import read_segments
+from greybox.trial.import_files import import_files
 from greybox.trial.raw_log import Recording, Signal
-from greybox.trial.readers import csv as csv_reader
 from greybox.vessel.toml import load_vessel, vessel_from_dict
 
 VESSEL = load_vessel("thesis")
@@ -274,7 +274,9 @@ def large(case, n=9000):
     ids=["plain", "slower", "savgol", "smooth", "smooth-savgol"],
 )  # fmt: skip
 @pytest.mark.parametrize("ending", ["csv", "parquet"])
-def test_blocks_give_the_log_that_memory_gives(tmp_path, monkeypatch, case, options, ending):
+def test_blocks_give_the_log_that_memory_gives(
+    tmp_path, monkeypatch, limited, case, options, ending
+):
     loop = {"closed_loop": {"column": "mode", "values": ["dp"]}}
     thrusters = [
         {"type": "azimuth", "x": x, "speed": "n", "angle": a}
@@ -288,12 +290,11 @@ def test_blocks_give_the_log_that_memory_gives(tmp_path, monkeypatch, case, opti
     else:
         table.to_parquet(raw, index=False, row_group_size=1000)
     chosen = ImportOptions(**options)
-    first = stream.import_files([raw], vessel, tmp_path / "a.csv", chosen)
+    first = import_files([raw], vessel, tmp_path / "a.csv", chosen)
     monkeypatch.setattr(stream, "_LARGE_CELLS", 0)
     monkeypatch.setattr(stream, "_BLOCK_ROWS", 700)
-    monkeypatch.setattr(csv_reader, "_BLOCK_BYTES", 1 << 15)
-    monkeypatch.setattr("greybox.trial.readers.parquet._BATCH_ROWS", 450)
-    second = stream.import_files([raw], vessel, tmp_path / "b.csv", chosen)
+    limited(block_bytes=1 << 15, block_rows=450)
+    second = import_files([raw], vessel, tmp_path / "b.csv", chosen)
     one, two = (pd.read_csv(tmp_path / f"{x}.csv") for x in "ab")
     # UNIX times are known to 0.2 µs, and filters begin where a block does
     near = 1e-5 if case == "geographic" else 1e-8
@@ -310,9 +311,9 @@ def test_a_large_file_whose_time_starts_again(tmp_path, monkeypatch):
     table = large("plain")
     pd.concat([table, table]).to_csv(tmp_path / "raw.csv", index=False)
     monkeypatch.setattr(stream, "_LARGE_CELLS", 0)
-    monkeypatch.setattr("greybox.trial.convert.first_pass._MAX_BACK_ROWS", 1000)
+    monkeypatch.setattr("greybox.trial.convert.two_pass_import._MAX_BACK_ROWS", 1000)
     with pytest.raises(LogError, match=r"goes back by 899.9 s, at most 100 s"):
-        stream.import_files([tmp_path / "raw.csv"], VESSEL, tmp_path / "a.csv")
+        import_files([tmp_path / "raw.csv"], VESSEL, tmp_path / "a.csv")
     assert not (tmp_path / "a.csv").exists()
 
 
@@ -328,13 +329,13 @@ def test_a_log_is_read_again_as_it_was_written(tmp_path, ending):
         }
     )  # fmt: skip
     log = tmp_path / f"log.{ending}"
-    stream.import_files([raw], mapped, log)
+    import_files([raw], mapped, log)
     segments = read_segments(log, mapped)
     assert [s.provenance.source for s in segments] == ["raw.csv"] * 2
     np.testing.assert_allclose(segments[0]["v"], -data["v"][:100] * 1852 / 3600)
     # imported again it is the same: its columns are not converted twice
     again = tmp_path / f"again.{ending}"
-    stream.import_files([log], mapped, again)
+    import_files([log], mapped, again)
     for one, two in zip(segments, read_segments(again, mapped), strict=True):
         for name in one.channels:
             np.testing.assert_allclose(one[name], two[name], rtol=1e-12, atol=1e-12)

@@ -31,7 +31,6 @@ from greybox.trial.manoeuvres.standards import (
     second_overshoot_limit,
 )
 from greybox.trial.manoeuvres.track import make_track, path_length
-from greybox.trial.segments import by_manoeuvre
 from greybox.vessel.toml import vessel_from_dict
 
 DEG = math.pi / 180
@@ -392,9 +391,7 @@ def test_several_in_one_log(turn_run, zigzag_run, dt):
     one, two = found[0], found[3]
     assert one.tactical_diameter.value == pytest.approx(two.tactical_diameter.value, rel=0.02)
     assert found[1].overshoots[0].value == pytest.approx(found[2].overshoots[0].value, rel=0.2)
-    segments = by_manoeuvre(log)
-    assert [s.kind for s in segments] == ["manoeuvre"] * 4
-    assert segments[0].label == "turning circle to starboard at 20 deg rudder"
+    assert one.label == "turning circle to starboard at 20 deg rudder"
 
 
 def test_uneven_times_and_a_rudder_of_the_wrong_sign(zigzag_run):

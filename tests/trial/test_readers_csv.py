@@ -381,16 +381,16 @@ def test_parquet_bombs(tmp_path):
         open_parquet(path)
 
 
-def test_a_parquet_row_group_that_unpacks_too_far(tmp_path, monkeypatch):
-    monkeypatch.setattr("greybox.trial.readers.parquet._MAX_GROUP_BYTES", 1 << 16)
+def test_a_parquet_row_group_that_unpacks_too_far(tmp_path, limited):
+    limited(held_bytes=1 << 16)
     table = pa.table({"t": np.arange(1 << 16) // 100 * 1.0})
     parquet.write_table(table, tmp_path / "x.parquet", compression="zstd", use_dictionary=False)
     with pytest.raises(LogError, match=r"a row group of .* unpacks to \d+ bytes, at most 65536"):
         read(tmp_path / "x.parquet")
 
 
-def test_a_parquet_row_group_of_long_texts(tmp_path, monkeypatch):
-    monkeypatch.setattr("greybox.trial.readers.parquet._MAX_GROUP_BYTES", 1 << 18)
+def test_a_parquet_row_group_of_long_texts(tmp_path, limited):
+    limited(held_bytes=1 << 18)
     columns = {"t": np.arange(10.0), "u": np.arange(10.0)}
     table = pa.table(columns | {"said": ["x" * 10**5] * 10})
     options = {"compression": "none", "use_dictionary": False}
@@ -429,12 +429,12 @@ def test_long_words_are_cut(kind):
 @pytest.mark.parametrize(
     ("tail", "words"),
     [
-        ("a" * 70000, "a line is longer than 8388608 bytes"),
+        ("a" * 70000, "a line is longer than 16384 bytes"),
         ('1,"' + "a\n" * 40000, "a quoted cell holds line ends, or its quote is never closed"),
     ],
 )
-def test_lines_without_an_end_after_a_good_start(tmp_path, monkeypatch, tail, words):
-    monkeypatch.setattr("greybox.trial.readers.csv._BLOCK_BYTES", 1 << 14)
+def test_lines_without_an_end_after_a_good_start(tmp_path, limited, tail, words):
+    limited(block_bytes=1 << 14)
     path = written(tmp_path / "x.csv", frame().to_csv(index=False) + tail)
     with pytest.raises(LogError, match=words):
         read(path)

@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 import pytest
 from scipy import sparse
-from scipy.io import loadmat, savemat
+from scipy.io import savemat
 
 from greybox.errors import LogError
 from greybox.trial.readers import matfile
@@ -253,23 +253,23 @@ def test_words_as_long_as_the_time_are_text(tmp_path, make):
     t, found = recording.text["mode"]
     np.testing.assert_array_equal(t, T)
     assert found[1] == "auto"
-    assert len(found[0]) == 200
+    assert len(found[0]) == 256
 
 
 @pytest.mark.parametrize(
     ("time", "word"),
     [
-        (START + T, "UNIX seconds"),
-        ((START + T) * 1e3, "UNIX milliseconds"),
-        (np.int64(START * 1e9) + np.round(T * 1e9).astype(np.int64), "UNIX nanoseconds"),
-        (np.uint64(START * 1e6) + np.round(T * 1e6).astype(np.uint64), "UNIX microseconds"),
+        (START + T, "UNIX time in s"),
+        ((START + T) * 1e3, "UNIX time in ms"),
+        (np.int64(START * 1e9) + np.round(T * 1e9).astype(np.int64), "UNIX time in ns"),
+        (np.uint64(START * 1e6) + np.round(T * 1e6).astype(np.uint64), "UNIX time in us"),
         (719529.0 + (START + T) / 86400.0, "datenum"),
     ],
 )
 def test_absolute_times_set_the_epoch(tmp_path, time, word):
     recording = read_mat(five(tmp_path / "a.mat", {"time": column(time), "u": column(U)}))
     assert recording.epoch == pytest.approx(START, abs=2e-5)
-    exact = "nano" in word or "micro" in word
+    exact = word.endswith((" ns", " us"))
     np.testing.assert_allclose(recording["u"].t, T, atol=1e-12 if exact else 2e-5)
     assert any(word in n for n in recording.notes)
 
@@ -283,6 +283,14 @@ def test_dates_as_text_are_a_time(tmp_path, style):
     assert recording.epoch == START
     np.testing.assert_array_equal(recording["u"].t, np.arange(N))
     assert any("UTC" in n for n in recording.notes)
+
+
+def test_unsigned_times_that_go_back_do_not_wrap(tmp_path):
+    stamps = (START + np.round(T)).astype(np.uint32)
+    stamps[20] -= 3
+    stamps[0] += 1
+    recording = read_mat(five(tmp_path / "a.mat", {"time": column(stamps), "u": column(U)}))
+    np.testing.assert_array_equal(recording["u"].t, stamps.astype(float) - stamps[0])
 
 
 def test_two_absolute_times_share_the_earlier_epoch_and_a_relative_one_is_noted(tmp_path):
@@ -397,8 +405,7 @@ def attempt(path):
         return None, str(error)
 
 
-@pytest.mark.parametrize("kind", ["five", "packed", "hdf", "four"])
-def test_cut_files_are_refused(tmp_path, kind):
+def check_cut_files(tmp_path, kind, shares):
     variables = {"t": column(T), "u": column(U), "s": {"v": column(U)}}
     path = tmp_path / "a.mat"
     if kind == "four":
@@ -407,7 +414,7 @@ def test_cut_files_are_refused(tmp_path, kind):
         {"five": five, "packed": packed, "hdf": hdf}[kind](path, variables)
     whole = path.read_bytes()
     complete = len(read_mat(path).signals)
-    for share in np.linspace(0, 0.999, 40):
+    for share in shares:
         path.write_bytes(whole[: int(share * len(whole))])
         recording, message = attempt(path)
         if recording is None:
@@ -417,13 +424,35 @@ def test_cut_files_are_refused(tmp_path, kind):
             assert len(recording.signals) < complete
 
 
-@pytest.mark.parametrize("kind", [five, packed, hdf])
-def test_flipped_bytes_never_raise_anything_else(tmp_path, kind):
+@pytest.mark.parametrize("kind", ["five", "packed", "four"])
+def test_cut_files_are_refused(tmp_path, kind):
+    check_cut_files(tmp_path, kind, [0.0, 0.2, 0.55, 0.9, 0.999])
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("kind", ["five", "packed", "four"])
+def test_files_cut_anywhere_are_refused(tmp_path, kind):
+    check_cut_files(tmp_path, kind, np.linspace(0, 0.999, 30))
+
+
+def test_cut_hdf_files_are_refused(tmp_path):
+    check_cut_files(tmp_path, "hdf", np.linspace(0, 0.999, 40))
+
+
+@pytest.mark.parametrize(
+    ("kind", "copies"),
+    [
+        (hdf, 80), (five, 5), (packed, 3),
+        pytest.param(five, 40, marks=pytest.mark.long),
+        pytest.param(packed, 40, marks=pytest.mark.long),
+    ],
+)  # fmt: skip
+def test_flipped_bytes_never_raise_anything_else(tmp_path, kind, copies):
     variables = {"t": column(T[:9]), "u": column(U[:9]), "s": {"v": column(U[:9]), "w": "hi"}}
     path = kind(tmp_path / "a.mat", variables)
     whole = path.read_bytes()
     chance = np.random.default_rng(5)
-    for _ in range(80):
+    for _ in range(copies):
         data = bytearray(whole)
         low = 0 if kind is hdf else 128
         for position in chance.integers(low, len(data), 3):
@@ -460,16 +489,16 @@ def element(kind, body):
     return struct.pack("<II", kind, len(body)) + body
 
 
-def test_a_bomb_is_refused_before_it_is_loaded(tmp_path, monkeypatch):
-    monkeypatch.setattr(matfile, "MAX_BYTES", 10**6)
+def test_a_bomb_is_refused_before_it_is_loaded(tmp_path, limited):
+    limited(held_bytes=10**6)
     path = packed(tmp_path / "a.mat", {"t": np.zeros((10**6, 1))})
     assert path.stat().st_size < 10**4
     with pytest.raises(LogError, match=r"holds \d+ bytes or more once inflated, at most 1000000"):
         read_mat(path)
 
 
-def test_many_small_numbers_are_counted_as_what_they_become(tmp_path, monkeypatch):
-    monkeypatch.setattr(matfile, "MAX_VALUES", 10**4)
+def test_many_small_numbers_are_counted_as_what_they_become(tmp_path, limited):
+    limited(values=10**4)
     for make in (packed, hdf):
         path = make(tmp_path / "a.mat", {"t": np.zeros((10**5, 1), np.int8)})
         with pytest.raises(LogError, match="holds 100000 numbers, at most 10000"):
@@ -486,70 +515,102 @@ FIELD = struct.pack("<HHi", 5, 4, 8) + struct.pack("<II8s", 1, 8, b"a")
 
 
 @pytest.mark.parametrize(
-    ("kind", "content", "reason"),
+    ("kind", "content"),
     [
-        (1, b"", f"states {2**20} cells or structs in 0 bytes"),
-        (2, FIELD, f"states {2**20} cells or structs in 0 bytes"),
-        (4, struct.pack("<II", 16, 0), f"states a text of {2**20} characters in 0 bytes"),
-        (6, struct.pack("<II", 9, 0), f"states {2**20} numbers in 0 bytes"),
-        (6, struct.pack("<II", 9, 2**31), f"an element of {2**31} bytes where 0 are left"),
-        (6, b"", "ends inside a tag"),
+        (1, b""),
+        (2, FIELD),
+        (4, struct.pack("<II", 16, 0)),
+        (6, struct.pack("<II", 9, 0)),
+        (6, struct.pack("<II", 9, 2**31)),
+        (6, b""),
     ],
+    ids=["cells", "structs", "text", "numbers", "element", "tag"],
 )
-def test_sizes_stated_without_bytes_are_refused(tmp_path, kind, content, reason):
+def test_sizes_stated_without_bytes_are_refused(tmp_path, kind, content):
     path = tmp_path / "a.mat"
     path.write_bytes(stated(kind, 2**10, 2**10, content))
-    with pytest.raises(LogError, match=reason):
+    with pytest.raises(LogError, match=r"is damaged|needs more than the|holds no time"):
         read_mat(path)
 
 
+def test_a_file_that_needs_more_memory_than_it_may_is_refused(tmp_path, limited):
+    limited(process_bytes=2**28)
+    path = five(tmp_path / "a.mat", {"t": column(T), "u": np.zeros((2**24, 1))})
+    with pytest.raises(LogError, match="needs more than the 268435456 bytes of memory"):
+        read_mat(path)
+
+
+def test_a_reader_that_takes_too_long_is_ended(tmp_path, limited):
+    limited(process_seconds=0.01)
+    with pytest.raises(LogError, match=r"was not read within 0.01 s: save only the columns"):
+        read_mat(five(tmp_path / "a.mat", {"t": column(T), "u": column(U)}))
+
+
+def test_a_reader_that_crashes_is_damage(tmp_path, monkeypatch):
+    crash = "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)"
+    monkeypatch.setattr("greybox.trial.readers.mat_process._COMMAND", crash)
+    with pytest.raises(LogError, match="made its reader end with status -11: it is damaged"):
+        read_mat(five(tmp_path / "a.mat", {"t": column(T), "u": column(U)}))
+
+
 @pytest.mark.parametrize("compressed", [False, True])
-def test_trees_agree_with_scipy(tmp_path, compressed):
+def test_every_kind_of_value_arrives_as_it_was_saved(tmp_path, compressed):
     chance = np.random.default_rng(2)
     thin = sparse.random_array((9, 7), density=0.3, rng=chance, format="csc")
     kinds = ["f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8"]
-    numbers = {k: chance.integers(0, 99, (2, 3, 4)).astype(k) for k in kinds}
+    saved = {k: chance.integers(0, 99, (2, 3, 4)).astype(k) for k in kinds}
+    saved |= {"on": np.array([[True, False]]), "nothing": np.empty((0, 3))}
     path = tmp_path / "a.mat"
     savemat(
         path,
-        numbers
+        saved
         | {
             "thin": thin,
             "thin_on": thin.astype(bool),
-            "on": np.array([[True, False]]),
             "rows": np.array(["ab", "cde"]),
             "greek": "\u03b1\u03b2",
-            "nothing": np.empty((0, 3)),
             "cell": np.array([[np.arange(3.0), "x"], [{"a": 1.0}, np.empty((0, 0))]], object),
         },
         do_compression=compressed,
     )
     tree, _ = matfile.load_tree(path)
-    reference = loadmat(path)
-    for name in [*kinds, "on", "nothing"]:
-        assert tree[name].dtype == reference[name].dtype
-        np.testing.assert_array_equal(tree[name], reference[name])
-    for name in ("thin", "thin_on"):
-        np.testing.assert_array_equal(tree[name], reference[name].toarray())
+    for name, value in saved.items():
+        assert tree[name].dtype == (np.uint8 if name == "on" else value.dtype)
+        np.testing.assert_array_equal(tree[name], value)
+    for name, value in {"thin": thin, "thin_on": thin.astype(bool)}.items():
+        np.testing.assert_array_equal(tree[name], value.toarray())
     assert tree["rows"] == ["ab", "cde"]
     assert tree["greek"] == "\u03b1\u03b2"
+    # columns first
     assert [type(v).__name__ for v in tree["cell"]] == ["ndarray", "dict", "str", "ndarray"]
 
 
+def test_several_objects_are_each_named(tmp_path):
+    path = five(tmp_path / "a.mat", {"t": column(T), "u": column(U)})
+    path.write_bytes(path.read_bytes() + opaque() + opaque(b"D", b"datetime"))
+    notes = " ".join(read_mat(path).notes)
+    assert "'T' was left out: it is a MATLAB 'timetable' object" in notes
+    assert "'D' was left out: it is a MATLAB 'datetime' object" in notes
+
+
 def test_deep_nesting_is_refused(tmp_path):
+    value = np.float64(1.0)
+    for _ in range(20):
+        value = {"inner": value}
+    for make in (five, packed, hdf):
+        with pytest.raises(LogError, match="nests structs deeper than 16"):
+            read_mat(make(tmp_path / "a.mat", {"t": column(T), "deep": value}))
     body = b""
-    for _ in range(2000):
+    for _ in range(100_000):
         inner = struct.pack("<IIII", 6, 8, 1, 0) + struct.pack("<IIii", 5, 8, 1, 1)
-        inner += struct.pack("<II", 1, 0)
-        body = element(14, inner + body)
-    path = tmp_path / "a.mat"
-    path.write_bytes(head() + element(15, zlib.compress(body)))
-    with pytest.raises(LogError, match="nests structs deeper than 16"):
-        read_mat(path)
+        body = element(14, inner + struct.pack("<II", 1, 0) + body) if len(body) < 10**5 else body
+    (tmp_path / "a.mat").write_bytes(head() + element(15, zlib.compress(body)))
+    with pytest.raises(LogError, match=r"is damaged|nests structs deeper"):
+        read_mat(tmp_path / "a.mat")
 
 
-def test_too_many_cells(tmp_path, monkeypatch):
-    monkeypatch.setattr(matfile, "MAX_ITEMS", 100)
+def test_too_many_cells(tmp_path, limited):
+    limited(items=100)
     for make in (five, hdf):
         path = make(tmp_path / "a.mat", {"c": [np.float64(k) for k in range(200)]})
         with pytest.raises(LogError, match=r"variables, fields or cells, at most 100"):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from datetime import UTC, datetime
+
 import numpy as np
 import pynmea2
 import pytest
@@ -234,6 +236,42 @@ def test_damage_is_counted_and_the_rest_read(tmp_path):
 def test_ends_of_lines(tmp_path, end):
     lines = [x.replace("\r\n", end) for x in minute(sentence("HEHDT,10.0,T"))]
     assert len(read(tmp_path, *lines)["psi"]) == 60
+
+
+@pytest.mark.parametrize(
+    ("date", "year"), [("060199", 1999), ("060180", 1980), ("060179", 2079), ("060126", 2026)]
+)
+def test_years_of_two_digits_begin_with_gps(tmp_path, date, year):
+    epoch = read(tmp_path, *[rmc(k, date) for k in range(3)]).epoch
+    assert datetime.fromtimestamp(epoch, UTC).year == year
+
+
+def test_proprietary_sentences_are_not_read_as_standard_ones(tmp_path):
+    lines = minute(sentence("HEHDT,50.0,T"), sentence("PFHDT,12"))
+    recording = read(tmp_path, *lines, *[sentence("PGRMC,A,218.8,100,6378137.000")] * 5)
+    np.testing.assert_allclose(recording["psi"].value, np.radians(50))
+    assert recording["psi"].source == "$HEHDT"
+    assert "65 proprietary sentences skipped" in recording.notes
+    assert not any("PGRMC" in n for n in recording.notes)
+    only = read(tmp_path, *minute(sentence("PFHDT,12")))
+    assert "psi" not in only
+
+
+def test_a_sentence_gives_all_its_values_or_none(tmp_path):
+    recording = read(
+        tmp_path,
+        *minute(sentence("WIMWV,30.0,R,7.5,N,A")),
+        *minute(sentence("WIMWV,30.0,R,x,N,A"), start=36060),
+    )
+    assert len(recording["dir_q"]) == len(recording["V_q"]) == 60
+    assert "60 WIMWV with empty or wrong fields skipped" in recording.notes
+
+
+@pytest.mark.parametrize("tail", ["", ",100000", ",100000,A"])
+def test_positions_of_every_version_of_gll(tmp_path, tail):
+    lines = [x for k in range(9) for x in (sentence(f"GPZDA,{clock(36000 + k)},01,06,2024,00,00"),
+             sentence(f"GPGLL,6325.5,N,01024.25,E{tail}"))]  # fmt: skip
+    assert len(read(tmp_path, *lines)["lat"]) > 0
 
 
 def test_a_status_that_warns(tmp_path):

@@ -7,6 +7,8 @@ import math
 import re
 import sqlite3
 import struct
+import subprocess
+import sys
 import zlib
 
 import numpy as np
@@ -20,9 +22,10 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from greybox.errors import LogError
-from greybox.trial.readers import decompress, ros, rosmessages, storage
-from greybox.trial.readers.ros import read_bag
-from greybox.trial.readers.storage import Channel
+from greybox.trial.readers.limits import limits
+from greybox.trial.readers.ros import messages as rosmessages
+from greybox.trial.readers.ros.read import read_bag
+from greybox.trial.readers.ros.storage import Channel
 
 ROS1 = get_typestore(Stores.ROS1_NOETIC)
 ROS2 = get_typestore(Stores.ROS2_HUMBLE)
@@ -401,6 +404,42 @@ def test_fields_that_come_and_go_are_nan(tmp_path):
     assert np.isnan(recording["a.big"].value).all()
 
 
+# the packages that read bags are an extra
+
+BLOCKED = """
+import sys
+sys.modules[{package!r}] = None
+from greybox.commands.main import main
+sys.exit(main(["import", {bag!r}, "--vessel", "thesis", "--out", {out!r}]))
+"""
+
+
+@pytest.mark.parametrize("package", ["rosbags", "ruamel.yaml"])
+def test_without_the_extra_one_sentence_says_how_to_get_it(tmp_path, package):
+    bag = mcap(tmp_path / "a.mcap", [("/a", START, json.dumps({"x": 1}).encode())])
+    script = BLOCKED.format(package=package, bag=str(bag), out=str(tmp_path / "log.csv"))
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+    assert f"the package '{package}'" in done.stderr
+    assert "pip install 'greybox-marine[ros]'" in done.stderr
+    assert not (tmp_path / "log.csv").exists()
+
+
+def test_other_formats_and_the_axes_of_ros_do_without_the_extra():
+    script = """
+import sys
+for name in ("rosbags", "mcap", "lz4", "zstandard", "ruamel"):
+    sys.modules[name] = None
+import greybox.trial.readers.csv, greybox.trial.readers.nmea, greybox.trial.readers.mat
+from greybox.trial.readers.ros.axes import compass_heading
+print(float(compass_heading(0.0, 0.0, 0.0, 1.0, ned=False)))
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    # the body looks east where it is not turned
+    assert float(done.stdout) == pytest.approx(math.pi / 2)
+
+
 # files that are damaged, foreign or hostile
 
 
@@ -506,7 +545,7 @@ def chunk1(kind, stated, data):
 def test_a_chunk_that_states_too_much_is_refused_before_it_is_inflated(tmp_path):
     file = tmp_path / "a.bag"
     file.write_bytes(chunk1(b"lz4", 2**31, b"x"))
-    with pytest.raises(LogError, match=f"chunk of {2**31} bytes, at most {storage.MAX_CHUNK}"):
+    with pytest.raises(LogError, match=f"chunk of {2**31} bytes, at most {limits().held_bytes}"):
         read_bag(file)
 
 
@@ -529,11 +568,10 @@ def test_a_chunk_that_holds_more_than_it_states_is_refused(tmp_path, kind):
         read_bag(file)
 
 
-def test_many_chunks_exhaust_the_budget(tmp_path, monkeypatch):
+def test_many_chunks_exhaust_the_budget(tmp_path, limited):
     import lz4.frame
 
-    monkeypatch.setattr(storage, "MAX_BYTES", 10**6)
-    monkeypatch.setattr(storage, "MAX_RATIO", 1)
+    limited(unpacked_bytes=10**6, unpacked_ratio=1)
     message = record1({b"op": b"\x04"}, bytes(10**5))
     chunk = chunk1(b"lz4", len(message), lz4.frame.compress(message))
     file = tmp_path / "a.bag"
@@ -542,10 +580,8 @@ def test_many_chunks_exhaust_the_budget(tmp_path, monkeypatch):
         read_bag(file)
 
 
-def test_a_compressed_file_or_message_that_is_a_bomb_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(storage, "MAX_BYTES", 10**5)
-    monkeypatch.setattr(storage, "MAX_RATIO", 1)
-    monkeypatch.setattr(decompress, "_BLOCK", 10**4)
+def test_a_compressed_file_or_message_that_is_a_bomb_is_refused(tmp_path, limited):
+    limited(unpacked_bytes=10**5, unpacked_ratio=1, block_bytes=10**4)
     file = tmp_path / "a.db3.zstd"
     file.write_bytes(zstandard.compress(bytes(10**7)))
     with pytest.raises(LogError, match="inflates to more than 100000 bytes"):
@@ -559,13 +595,12 @@ def test_a_compressed_file_or_message_that_is_a_bomb_is_refused(tmp_path, monkey
         read_bag(bag)
 
 
-def test_bounds_on_messages_and_numbers(tmp_path, monkeypatch):
+def test_bounds_on_messages_and_numbers(tmp_path, limited):
     bag = ros2(tmp_path / "b", drive(ROS2))
-    monkeypatch.setattr(ros, "MAX_VALUES", 20)
+    limited(values=20)
     with pytest.raises(LogError, match="more than 20 numbers"):
         read_bag(bag)
-    monkeypatch.undo()
-    monkeypatch.setattr(storage, "MAX_MESSAGES", 5)
+    limited(messages=5)
     with pytest.raises(LogError, match="more than 5 messages"):
         read_bag(bag)
 

@@ -14,8 +14,8 @@ from greybox.trial.convert.resample import (
     interpolate,
     nice_period,
     runs,
-    usual_step,
 )
+from greybox.trial.gaps import usual_step
 
 
 def test_stretches_end_at_holes():

@@ -1,4 +1,4 @@
-"""Segments of a log by sign, by gap, by manoeuvre."""
+"""Segments of a log by sign; none reaches over a gap."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from greybox.errors import LogError
+from greybox.trial.gaps import joined_spans, split_at_gaps
 from greybox.trial.log import make_log
-from greybox.trial.segments import by_gaps, by_sign, split_at_gaps
+from greybox.trial.segments import by_sign
 from greybox.vessel.toml import vessel_from_dict
 
 
@@ -71,9 +72,12 @@ def test_gaps_split_a_log_and_its_runs():
     assert split_at_gaps(t, 0.5) == [(0, 5), (5, 9)]
     assert split_at_gaps(t[:1], 0.5) == [(0, 1)]
     assert split_at_gaps(t[:0], 0.5) == []
+    # spans that were written one after another join by the same rule
+    assert joined_spans([(0.0, 1.0, 3), (1.5, 2.0, 2), (3.0, 4.0, 3)], 0.5) == [
+        (0.0, 2.0, 5), (3.0, 4.0, 3),
+    ]  # fmt: skip
     log = log_of(np.ones(9), np.ones(9), t=t)
     assert [(s.start, s.stop) for s in by_sign(log, {"u": 0.1})] == [(0, 5), (5, 9)]
-    assert [s.label for s in by_gaps(log)] == ["piece 1", "piece 2"]
 
 
 def test_misuse_is_told():

@@ -5,14 +5,19 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 import pytest
+from virtual import recorded
 
 from greybox.errors import LogError
+from greybox.trial.convert.options import ImportOptions
 from greybox.trial.convert.read import read_log
+from greybox.trial.import_files import import_files
 from greybox.trial.kinematics import decimate, velocities_from_positions
 from greybox.trial.log import make_log
 from greybox.trial.wind import relative_wind
-from greybox.vessel.toml import vessel_from_dict
+from greybox.vessel.toml import load_vessel, vessel_from_dict
 
+# ten steps around a sample, half of each end
+KERNEL = np.r_[0.5, np.ones(9), 0.5] / 10
 SHIP = {
     "name": "S",
     "length": 5,
@@ -112,9 +117,8 @@ def test_heading_noise_is_divided_out():
 
 
 def test_polar_wind():
-    """(5.41), (5.42), and the sign of CONTRACT: wind from starboard gives v_q > 0."""
-    from_starboard = np.pi / 2
-    u_q, v_q = relative_wind(np.array([3.0]), np.array([-from_starboard]))
+    """(5.41), (5.42): wind from starboard gives v_q > 0."""
+    u_q, v_q = relative_wind(np.array([3.0]), np.array([np.pi / 2]))
     np.testing.assert_allclose([u_q[0], v_q[0]], [0, 3], atol=1e-12)
 
 
@@ -134,6 +138,78 @@ def test_decimation_averages_what_the_ship_feels(ship):
     np.testing.assert_allclose(slow["n"], [signal[i : i + 4].mean() for i in k])  # ahead
     with pytest.raises(LogError, match=r"1\.5 times"):
         decimate(log, 0.75)
+
+
+def earth_fixed(n=400, dt=0.1):
+    """A weaving ship whose log holds velocities north and east."""
+    t = np.arange(n) * dt
+    psi = 0.4 * np.sin(0.2 * t)
+    u, v = 2 + 0.2 * np.sin(0.3 * t), 0.1 * np.cos(0.2 * t)
+    north, east = np.cos(psi) * u - np.sin(psi) * v, np.sin(psi) * u + np.cos(psi) * v
+    frame = pd.DataFrame({"t": t, "psi": psi, "v_n": north, "v_e": east, "n": t, "a": 0 * t})
+    return frame, u, v, 0.08 * np.cos(0.2 * t)
+
+
+def test_velocities_north_and_east_are_turned_into_body_axes(tmp_path):
+    frame, u, v, r = earth_fixed()
+    log = read(frame, tmp_path)
+    np.testing.assert_allclose(log["u"], u[1:-1], atol=1e-12)
+    np.testing.assert_allclose(log["v"], v[1:-1], atol=1e-12)
+    np.testing.assert_allclose(log["r"], r[1:-1], atol=1e-5)
+    # no position is named where there was none
+    assert list(log.provenance.derived) == [
+        "r from heading by central differences (3.57)",
+        "u, v from the velocity over ground and the heading",
+    ]
+    # the import is the same way
+    import_files([tmp_path / "log.csv"], log.vessel, tmp_path / "imported.csv")
+    imported = read_log(tmp_path / "imported.csv", log.vessel)
+    for name in ("psi", "u", "v", "r", "n", "a"):
+        np.testing.assert_allclose(imported[name], log[name], atol=1e-12)
+    assert imported.provenance.derived == log.provenance.derived
+
+
+def test_velocities_without_positions_are_averaged_at_a_longer_sample_time(tmp_path):
+    frame = earth_fixed()[0]
+    log = read(frame, tmp_path)
+    slow = decimate(log, 1.0)
+    k = np.searchsorted(log.t, slow.t - 1e-6)
+    around = [log["u"][i - 5 : i + 6] for i in k]
+    np.testing.assert_allclose(slow["u"], [(w.sum() - (w[0] + w[-1]) / 2) / 10 for w in around])
+    # the yaw rate was made by differences: it is made anew of the averaged heading
+    np.testing.assert_allclose(slow["r"][1:-1], np.gradient(slow["psi"], 1.0)[1:-1])
+    assert [s.operation for s in slow.provenance.steps] == [
+        "difference", "earth_to_body", "decimate", "difference",
+    ]  # fmt: skip
+    assert slow.provenance.steps[-1].channels == ("r",)
+
+
+@pytest.mark.parametrize("velocities", ["central", "savgol"])
+def test_a_longer_sample_time_keeps_how_velocities_were_made(tmp_path, velocities):
+    """Differences are made anew, since only that gains from averaged positions; the rest not."""
+    rng = np.random.default_rng(3)
+    data = recorded(3, rate=10.0, seconds=120)
+    noisy = data["x_n"] + 0.2 * rng.standard_normal(len(data["t"]))
+    frame = pd.DataFrame({k: v for k, v in data.items() if k not in "uvr"} | {"x_n": noisy})
+    frame.to_csv(tmp_path / "raw.csv", index=False)
+    ship, options = load_vessel("thesis"), ImportOptions(velocities=velocities, window=4.0)
+    import_files([tmp_path / "raw.csv"], ship, tmp_path / "log.csv", options)
+    log = read_log(tmp_path / "log.csv", ship)
+    slow = decimate(log, 1.0)
+    anew = [s for s in slow.provenance.steps if s.operation == "difference"]
+    if velocities == "central":
+        assert [s.channels for s in anew[-2:]] == [("u", "v"), ("r",)]
+        u, v, r = velocities_from_positions(
+            slow["x_n"], slow["y_n"], slow["psi"], 1.0, heading_std=ship.std("psi")
+        )
+        for name, value in (("u", u), ("v", v), ("r", r)):
+            np.testing.assert_allclose(slow[name][1:-1], value[1:-1], atol=1e-12)
+    else:
+        assert anew == []
+        k = np.searchsorted(log.t, slow.t - 1e-6)
+        for name in "uvr":
+            mean = [np.convolve(log[name][i - 5 : i + 6], KERNEL, "valid")[0] for i in k]
+            np.testing.assert_allclose(slow[name], mean, atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -8,11 +8,8 @@ import pytest
 from greybox.errors import LogError
 from greybox.trial.wind import (
     direction_from,
-    height_profile,
     move_anemometer,
     relative_wind,
-    relative_wind_from_direction,
-    relative_wind_from_true,
     true_wind,
     wind_at_height,
 )
@@ -30,24 +27,15 @@ def one(value):
     [(0, 4, 0), (90, 0, 4), (180, -4, 0), (270, 0, -4), (-30, 4 * np.cos(np.pi / 6), -2)],
 )
 def test_apparent_wind_from_ahead_is_forward_and_from_starboard_is_starboard(from_bow, u_q, v_q):
-    got = relative_wind_from_direction(one(4), np.radians(one(from_bow)))
+    got = relative_wind(one(4), np.radians(one(from_bow)))
     np.testing.assert_allclose(np.ravel(got), [u_q, v_q], atol=1e-12)
-    # CONTRACT: γ_q is minus that direction, so γ_q < 0 from starboard
-    same = relative_wind(one(4), -np.radians(one(from_bow)))
-    np.testing.assert_allclose(np.ravel(same), [u_q, v_q], atol=1e-12)
 
 
-def test_noise_of_the_vane_is_divided_out():
-    """(5.44)-(5.46): the mean shrinks by exp(−λ/2) without the correction."""
-    rng = np.random.default_rng(1)
-    n, std = 20000, 0.4
-    vane = np.pi / 3 + std * rng.standard_normal(n)
-    got = np.array(relative_wind_from_direction(np.full(n, 5.0), vane, std))
-    expected = 5 * np.array([np.cos(np.pi / 3), np.sin(np.pi / 3)])
-    error = got.std(axis=1) / np.sqrt(n)
-    assert (np.abs(got.mean(axis=1) - expected) < 4 * error).all()
-    raw = np.array(relative_wind_from_direction(np.full(n, 5.0), vane))
-    assert raw.mean(axis=1)[1] < expected[1] - 10 * error[1]
+def through_the_air(speed, origin, psi, u, v):
+    """(5.3) by complex numbers, north + i east: the ship's velocity less the wind's."""
+    bow = np.exp(1j * psi)
+    air = (u + 1j * v) - -speed * np.exp(1j * origin) / bow
+    return air.real, air.imag
 
 
 @pytest.mark.parametrize(
@@ -63,27 +51,16 @@ def test_noise_of_the_vane_is_divided_out():
     ],
 )
 def test_true_wind_on_a_ship_at_rest(wind_from, heading, u_q, v_q):
-    got = relative_wind_from_true(one(6), one(wind_from), one(heading), STILL, STILL)
-    np.testing.assert_allclose(np.ravel(got), [u_q, v_q], atol=1e-12)
+    speed, origin = direction_from(*true_wind(one(u_q), one(v_q), one(heading), STILL, STILL))
+    np.testing.assert_allclose(speed, 6)
+    np.testing.assert_allclose(np.exp(1j * origin), np.exp(1j * one(wind_from)), atol=1e-12)
 
 
-def test_true_wind_on_a_moving_ship():
-    # north at 5 m/s with 3 m/s from the north: 8 m/s from ahead
-    got = relative_wind_from_true(one(3), one(NORTH), one(NORTH), one(5), STILL)
-    np.testing.assert_allclose(np.ravel(got), [8, 0], atol=1e-12)
-    # with the wind at its own speed: calm on deck
-    got = relative_wind_from_true(one(5), one(SOUTH), one(NORTH), one(5), STILL)
-    np.testing.assert_allclose(np.ravel(got), [0, 0], atol=1e-12)
-    # still air: the velocity through the air is the velocity over ground
-    got = relative_wind_from_true(one(0), one(1.0), one(0.7), one(5), one(-0.4))
-    np.testing.assert_allclose(np.ravel(got), [5, -0.4], atol=1e-12)
-
-
-def test_true_wind_is_the_inverse():
+def test_true_wind_of_a_moving_ship():
     rng = np.random.default_rng(2)
     speed, origin = rng.uniform(0.1, 20, 200), rng.uniform(0, 2 * np.pi, 200)
     psi, u, v = rng.uniform(-20, 20, 200), rng.normal(3, 4, 200), rng.normal(0, 1, 200)
-    north, east = true_wind(*relative_wind_from_true(speed, origin, psi, u, v), psi, u, v)
+    north, east = true_wind(*through_the_air(speed, origin, psi, u, v), psi, u, v)
     np.testing.assert_allclose(north, -speed * np.cos(origin), atol=1e-12)
     np.testing.assert_allclose(east, -speed * np.sin(origin), atol=1e-12)
     again, origin_again = direction_from(north, east)
@@ -126,46 +103,29 @@ def test_an_anemometer_on_the_bow_of_a_ship_that_turns_in_calm_air():
 
 def test_the_profile_scales_the_true_wind_only():
     psi, u, v = one(0.6), one(4), one(-0.5)
-    low = relative_wind_from_true(one(7), one(2.0), psi, u, v)
+    low = through_the_air(one(7), one(2.0), psi, u, v)
     k = (10 / 3) ** (1 / 7)
     np.testing.assert_allclose(
-        wind_at_height(*low, u, v, 3.0, reference_height=10.0),
-        relative_wind_from_true(one(7 * k), one(2.0), psi, u, v),
+        wind_at_height(*low, u, v, 3.0, 10.0), through_the_air(one(7 * k), one(2.0), psi, u, v)
     )
     # still air has no profile, however fast the ship
-    np.testing.assert_allclose(wind_at_height(u, v, u, v, 30.0, reference_height=10.0), [u, v])
-
-
-def test_nothing_is_scaled_unless_asked():
-    u_q, v_q = one(3), one(2)
-    assert wind_at_height(u_q, v_q, one(1), one(0), 25.0) == (u_q, v_q)
-
-
-def test_profiles():
-    assert height_profile(10.0) == 1.0
-    assert height_profile(20.0) == pytest.approx(0.5 ** (1 / 7))
-    assert height_profile(20.0, 5.0, exponent=0.11) == pytest.approx(0.25**0.11)
-    assert height_profile(20.0, roughness=2e-4) == pytest.approx(np.log(5e4) / np.log(1e5))
-    # both laws nearly agree over open water
-    assert height_profile(20.0, roughness=2e-4) == pytest.approx(height_profile(20.0), rel=0.05)
+    np.testing.assert_allclose(wind_at_height(u, v, u, v, 30.0, 10.0), [u, v])
     # there and back
-    assert height_profile(7.0, 12.0) * height_profile(12.0, 7.0) == pytest.approx(1.0)
+    there = wind_at_height(*low, u, v, 7.0, 12.0)
+    np.testing.assert_allclose(wind_at_height(*there, u, v, 12.0, 7.0), low)
 
 
 @pytest.mark.parametrize(
-    ("height", "options", "message"),
+    ("height", "reference", "message"),
     [
-        (0.0, {}, "an anemometer at 0 m and a reference height of 10 m: both must be above the w"),
-        (5.0, {"reference": -1.0}, "reference height of -1 m"),
-        (np.nan, {}, "an anemometer at nan m"),
-        (0.1, {"roughness": 0.2}, r"above the roughness 0\.2 m"),
-        (5.0, {"roughness": 0.0}, "no logarithmic profile: give about 2e-4"),
-        (5.0, {"roughness": -1.0}, "above the roughness -1 m"),
+        (0.0, 10.0, "an anemometer at 0 m and a reference height of 10 m: both must be above"),
+        (5.0, -1.0, "reference height of -1 m"),
+        (np.nan, 10.0, "an anemometer at nan m"),
     ],
 )
-def test_impossible_heights(height, options, message):
+def test_impossible_heights(height, reference, message):
     with pytest.raises(LogError, match=message):
-        height_profile(height, **options)
+        wind_at_height(one(1), one(0), one(1), one(0), height, reference)
 
 
 def test_true_wind_of_a_measured_turn(data_folder):
@@ -174,7 +134,7 @@ def test_true_wind_of_a_measured_turn(data_folder):
 
     table = pd.read_csv(data_folder / "esso_osaka/turn_14-Oct-2020_14_08_51.csv")
     relative = table["wind_velo_relative_mid [m/s]"], table["wind_dir_relative_mid [rad]"]
-    u_q, v_q = relative_wind_from_direction(*(c.to_numpy() for c in relative))
+    u_q, v_q = relative_wind(*(c.to_numpy() for c in relative))
     motion = (table[c].to_numpy() for c in ("psi_hat [rad]", "u_velo [m/s]", "vm_velo [m/s]"))
     speed, origin = direction_from(*true_wind(u_q, v_q, *motion))
     np.testing.assert_allclose(speed, table["wind_velo_true [m/s]"], atol=0.005)

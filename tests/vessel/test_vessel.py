@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import subprocess
+import sys
 
 import casadi as ca
 import numpy as np
@@ -15,7 +17,7 @@ from greybox.vessel.actuation import Actuation, actuated_force
 from greybox.vessel.force import force_function, force_inputs, generalised_force
 from greybox.vessel.thrust import ThrustLaw
 from greybox.vessel.toml import load_vessel, vessel_from_dict, vessel_to_dict
-from greybox.vessel.vessel import Thruster
+from greybox.vessel.vessel import ColumnMapping, Thruster
 
 AZIMUTH = {"type": "azimuth", "x": 2.0, "y": -1.0, "speed": "n", "angle": "a"}
 
@@ -232,6 +234,11 @@ def test_all_that_a_diagnosis_adds_survives_a_round_trip():
         ({"thrust": {"quadratic_share": 1.2}}, "quadratic_share is 1.2, it must be within 0"),
         ({"thrust": {"quadratic_share": 0.2, "reference": 0}}, "is 0, it must be positive"),
         ({"thrust": {"quadratic_shar": 0.2}}, "Did you mean 'quadratic_share'"),
+        ({"thrust": [[1, 2], [2, "x"]]}, "thrust of thruster 1 is 'x', a finite number"),
+        ({"thrust": [[1, 2], [2]]}, "must list [speed, force] pairs"),
+        ({"type": "tunnel"}, "is of type tunnel and cannot have an angle of its own"),
+        ({"speed": 3}, "'speed' must name the column of its propeller speed"),
+        ({"x": True}, "x of thruster 1 is True, a finite number"),
     ],
 )
 def test_bad_thrusters(change, message):
@@ -242,9 +249,17 @@ def test_bad_thrusters(change, message):
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        ({"columns": {"psi [deg]": {"name": "psi"}}}, 'without a unit: add unit = "rad"'),
+        ({"columns": {"gnss": {"heading": "psi"}}}, "A name with a dot is written in quotes"),
+        ({"columns": {"x": "psy"}}, "Did you mean 'psi'"),
+        ({"columns": {"x": {"unit": "deg"}}}, "column 'x' has no 'name'"),
+        ({"columns": {"x": {"name": "psi", "sign": True}}}, "sign = True: write 1, or -1"),
+        ({"columns": {"x": 3}}, "column 'x' is 3, not a table"),
+        ({"sensors": 3}, "\\[sensors\\] is 3, not a table"),
+        ({"mass": -1}, "mass is -1, it must be positive"),
+        ({"length": 10**5000}, "length is an integer too large to be read, a finite number"),
+        ({"name": ["long"] * 100}, "name is \\['long', .{1,60}…, a word in quotes"),
         ({"columns": {"x": {"name": "psy", "unit": "deg"}}}, "Did you mean 'psi'"),
-        ({"columns": {"x": {"name": "psi", "unit": "degree"}}}, "unknown unit 'degree'"),
+        ({"columns": {"x": {"name": "psi", "unit": "degre"}}}, "unknown unit 'degre'"),
         ({"columns": {"x": {"name": "psi", "unit": "m"}}}, "of the same dimension"),
         ({"sensors": {"heding_std": 1}}, "Did you mean 'heading_std'"),
         ({"sensors": {"antenna": [1]}}, "needs 2 numbers"),
@@ -281,5 +296,72 @@ def test_missing_and_foreign_files(tmp_path):
     bad.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(VesselError, match="not a text file"):
         load_vessel(bad)
+    bad.write_text(f"length = {'9' * 5000}")
+    with pytest.raises(VesselError, match="is not TOML"):
+        load_vessel(bad)
+    bad.write_text("#" * 1_000_001)
+    with pytest.raises(VesselError, match="more than 1000000 bytes"):
+        load_vessel(bad)
     with pytest.raises(VesselError, match="has no 'thruster'"):
         vessel_from_dict({"name": "x", "length": 3})
+    with pytest.raises(VesselError, match="the vessel file is 3, not a table"):
+        vessel_from_dict(3)
+
+
+def test_each_wrong_value_is_one_sentence_of_bounded_length():
+    """Any value at any place: an error in a sentence, or a vessel."""
+    whole = {
+        "name": "V", "length": 10.0, "mass": 3.0,
+        "thruster": [
+            {**AZIMUTH, "thrust": [[0.0, 1.0], [1.0, 2.0]], "speed_limits": [0, 1], "gain": 1.0},
+            {"type": "propeller_rudder", "speed": "m", "rudder": "d", "rudder_rate": 1.0,
+             "thrust": {"quadratic_share": 0.5, "reference": 2.0}},
+        ],
+        "columns": {"a.b": {"name": "u", "unit": "kn", "sign": -1}, "c": "t"},
+        "sensors": {"antenna": [0, 1], "clock": {"u": 1.0}, "reversed": ["r"], "u_std": 0.1,
+                    "velocities_from_heading": True},
+        "closed_loop": {"column": "mode", "values": ["auto", 3]},
+        "actuation": {"lag": 1.0, "lag_on": "speed"},
+    }  # fmt: skip
+    vessel_from_dict(whole)
+
+    def places(node, path=()):
+        yield path
+        inside = enumerate(node) if isinstance(node, list) else node.items()
+        for key, inner in inside:
+            if isinstance(inner, dict | list):
+                yield from places(inner, (*path, key))
+            else:
+                yield (*path, key)
+
+    said = []
+    for path in list(places(whole))[1:]:
+        for value in (None, True, -1, 0, math.nan, 10**400, "", "x" * 5000, [], {}, [[]], {"k": 1}):
+            copy = json.loads(json.dumps(whole))
+            node = copy
+            for key in path[:-1]:
+                node = node[key]
+            node[path[-1]] = value
+            try:
+                vessel_from_dict(copy)
+            except VesselError as error:
+                said.append(str(error))
+    assert len(said) > 300
+    # a word stands in full where a suggestion may follow
+    assert max(map(len, said)) < 6000
+    assert not any("\n" in s or "pydantic" in s for s in said)
+
+
+@pytest.mark.parametrize("name", ["u", "n"])
+def test_the_short_form_of_a_column_is_the_long_one_without_a_unit(name):
+    v = vessel(AZIMUTH, columns={"topic.field": name, "b": {"name": "psi"}})
+    assert v.columns["topic.field"] == ColumnMapping(name, None)
+    assert vessel_from_dict(vessel_to_dict(v)) == v
+    assert v == vessel(AZIMUTH, columns={"topic.field": {"name": name}, "b": "psi"})
+
+
+def test_help_and_models_in_code_need_no_schema_library():
+    code = "import sys, greybox.commands.main, greybox.model.model as m; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
+    assert b"greybox.vessel.toml" in loaded.stdout
+    assert b"pydantic" not in loaded.stdout

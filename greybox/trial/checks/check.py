@@ -171,11 +171,7 @@ def _forces(log: _Log, vessel: Vessel) -> None:
 
 def _independent(recording: Recording) -> Recording:
     """Leave out what was derived from other channels."""
-    gone: set[str] = set()
-    for sentence in recording.derived:
-        names, _, source = sentence.partition(" from ")
-        if source.startswith(("positions", "heading", "the velocity over ground")):
-            gone |= {n.strip() for n in names.split(",")}
+    gone = {n for step in recording.steps if step.derives_motion for n in step.channels}
     return recording.with_signals(s for s in recording.signals if s.name not in gone)
 
 

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from greybox.channels import ANGLES
 from greybox.trial.checks.finding import Finding
 from greybox.trial.convert.derived_signals import continuous
-from greybox.trial.convert.resample import HOLE, clock, runs
+from greybox.trial.convert.resample import clock, runs
+from greybox.trial.gaps import HOLE
 from greybox.trial.raw_log import Recording, Signal
 from greybox.trial.steps import mend
 from greybox.vessel.vessel import Vessel
@@ -473,7 +474,7 @@ def angle_unit_findings(recording: Recording, vessel: Vessel) -> list[Finding]:
     found = []
     rudders = {t.rudder for t in vessel.thrusters if t.rudder}
     for s in recording.signals:
-        if s.name not in (ANGLES | vessel.angle_commands) - {"psi", "cog"}:
+        if s.name not in (ANGLES | vessel.recorded_angles) - {"psi", "cog"}:
             continue
         _, value = _clean(s)
         if len(value) < 3:

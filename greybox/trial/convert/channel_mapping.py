@@ -4,31 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.channels import CHANNELS, unit_factor
+from greybox.channels import CHANNELS
 from greybox.errors import LogError, suggestion
 from greybox.files import sha256
 from greybox.trial.convert.column_names import Assigned, assign
-from greybox.trial.convert.derived_channels import wind_state
+from greybox.trial.convert.derived_signals import wind_state
 from greybox.trial.raw_log import Recording, Signal, SourceFile
 from greybox.trial.readers.formats import open_raw
 from greybox.trial.readers.table import Batch, TableFile, read_columns
+from greybox.trial.steps import Step, new_steps
 from greybox.trial.store import read_record, recorded_provenance
+from greybox.units import is_unix_time, time_unit, unit_factor, unix_unit
+from greybox.vessel.conditions import Conditions
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
 
 MOTION = frozenset({"x_n", "y_n", "psi", "u", "v", "r", "v_n", "v_e", "lat", "lon", "sog"})
 
-# UNIX time is past 1e8 s since 1973, a log's own clock hardly ever is
-_EPOCH = 1e8
-# seconds past it are the year 5138: it is in milliseconds
-_LATEST = 1e11
 _HEAD = 10_000
 # files that overlap for less than this share of the shorter one follow one another
 _OVERLAP = 0.05
@@ -73,7 +73,7 @@ def read_recording(
         if record is not None:
             known = recorded_provenance(record)
             epoch = known.epoch if raw.epoch is None else raw.epoch
-            raw = replace(raw, epoch=epoch, derived=known.derived)
+            raw = replace(raw, epoch=epoch, steps=known.steps, conditions=known.conditions)
     else:
         assigned = assign(
             raw.names,
@@ -170,27 +170,20 @@ def time_scale(raw: Array, time: Assigned, table: TableFile) -> TimeScale:
             f"rows, it cannot be the time: map another column to 't' in [columns]."
         )
     head = finite[:_HEAD]
-    # one damaged value must not decide
     size = float(np.median(np.abs(head)))
     date, unit = time.raw in table.dates, time.unit
     notes: list[str] = []
-    stated = unit is not None and not (unit == "s" and time.how == "exact" and size > _LATEST)
+    # the name 't' alone promises seconds, which numbers of that size cannot be
+    stated = unit is not None and not (unit == "s" and time.how == "exact" and unix_unit(size))
     if not stated and not date:
-        for limit, spelled in ((1e17, "ns"), (1e14, "us"), (_LATEST, "ms")):
-            if size > limit:
-                unit = spelled
-                break
-        else:
-            steps = np.diff(head)
-            # nobody logs a manoeuvre every ten seconds, milliseconds are common
-            unit = "ms" if len(steps) and np.median(np.abs(steps)) >= 10 else "s"
+        unit = time_unit(head)
     if time.how == "guessed" or not stated:
         notes.append(f"column '{time.raw}' taken for time in {unit or 's'}")
     if date or time.raw in table.clocks:
         unit = "s"
     factor = unit_factor(unit or "s", "s", time.raw)
     first = float(finite[0])
-    if size * factor < _EPOCH and not date:
+    if not is_unix_time(size * factor) and not date:
         return TimeScale(factor, 0.0, None, tuple(notes))
     return TimeScale(factor, first, first * factor, tuple(notes))
 
@@ -258,16 +251,15 @@ def canonical(
         source = signal.source if a.raw == name else (signal.source or f"'{a.raw}'")
         signals.append(Signal(name, signal.t, value, target, source, True))
     guessed = frozenset(n for n, a in assigned.items() if a.how == "guessed")
-    return replace(raw.with_signals(signals, *notes), guessed=guessed)
+    mapped = {n: a.raw for n, a in assigned.items() if a.raw in vessel.columns}
+    return replace(raw.with_signals(signals, *notes), guessed=guessed, mapped=mapped)
 
 
 def _factor(
     a: Assigned, signal: Signal, vessel: Vessel, known: tuple[float, float] | None = None
 ) -> tuple[str | None, float, str]:
     """Return unit, factor to SI and, where the unit was guessed, why."""
-    target = CHANNELS[a.name].unit if a.name in CHANNELS else None
-    if a.name in vessel.angle_commands:
-        target = "rad"
+    target = vessel.unit(a.name)
     if a.unit is not None:
         return a.unit, unit_factor(a.unit, target, a.raw), ""
     if target is None or a.how == "exact":
@@ -331,7 +323,8 @@ def merge(recordings: list[Recording]) -> Recording:
     ------
     LogError
         Some have a UNIX time and some not; or one wind was moved or brought to
-        another height before, and the other not.
+        another height before, and the other not; or two columns that ``[columns]`` maps
+        to one signal tell of the same times.
     """
     if len(recordings) == 1:
         return recordings[0]
@@ -366,12 +359,20 @@ def merge(recordings: list[Recording]) -> Recording:
             )
     signals = []
     clocks: dict[tuple[int, ...], Array] = {}
-    derived = {r.name: r.derived for r in recordings}
+    mapped = {(r.name, n): raw for r in recordings for n, raw in r.mapped.items()}
+    steps = {r.name: r.steps for r in recordings}
     for name, parts in found.items():
         kept = [parts[0]]
         for part in parts[1:]:
             same = next((k[0] for k in kept if _overlap(part[1], k[1])), None)
             if same is not None:
+                one, two = mapped.get((same, name)), mapped.get((part[0], name))
+                if one is not None and two is not None and one != two:
+                    raise LogError(
+                        f"columns '{one}' of '{same}' and '{two}' of '{part[0]}' tell of the same "
+                        f"times, and [columns] maps both to '{name}': remove one of the two lines "
+                        f"from the vessel file."
+                    )
                 notes.append(
                     f"{name} stands in '{same}' and '{part[0]}' at the same times: "
                     f"that of '{same}' is used"
@@ -379,7 +380,7 @@ def merge(recordings: list[Recording]) -> Recording:
             else:
                 kept.append(part)
         if name in ("u_q", "v_q"):
-            _refuse_two_winds([(n, derived[n]) for n, _ in kept])
+            _refuse_two_winds([(n, steps[n]) for n, _ in kept])
         kept.sort(key=lambda p: _span(p[1])[0])
         # columns of one table go on sharing their clock
         key = tuple(id(p[1].t) for p in kept)
@@ -394,17 +395,18 @@ def merge(recordings: list[Recording]) -> Recording:
         epoch,
         tuple(f for r in recordings for f in r.files),
         tuple(notes),
-        derived=tuple(dict.fromkeys(d for r in recordings for d in r.derived)),
+        steps=new_steps((), (step for r in recordings for step in r.steps)),
+        conditions=reduce(Conditions.over, (r.conditions for r in recordings)),
     )
 
 
-def _refuse_two_winds(parts: list[tuple[str, tuple[str, ...]]]) -> None:
+def _refuse_two_winds(parts: list[tuple[str, tuple[Step, ...]]]) -> None:
     """Refuse winds of several files that are not of one place and height."""
-    (first, derived), *others = parts
+    (first, steps), *others = parts
     for name, more in others:
-        if wind_state(more) != wind_state(derived):
+        if wind_state(more) != wind_state(steps):
             raise LogError(
-                f"the wind of '{first}' is {wind_state(derived)}, that of '{name}' is "
+                f"the wind of '{first}' is {wind_state(steps)}, that of '{name}' is "
                 f"{wind_state(more)}: they cannot be merged. Import both from their raw files."
             )
 
@@ -423,10 +425,10 @@ def _overlap(a: Signal, b: Signal) -> bool:
 
 def unused_mappings(recordings: Iterable[Recording], vessel: Vessel) -> list[str]:
     """Say which columns the vessel file maps and no file has."""
-    used = {s.source for r in recordings for s in r.signals}
-    names = {s.name for r in recordings for s in r.signals}
+    recordings = list(recordings)
+    names = {n for r in recordings for n in (*r.names, *r.mapped)}
     return [
         f"[columns] maps '{raw}' to '{m.name}', which no file has"
         for raw, m in vessel.columns.items()
-        if m.name not in names and m.name != "t" and f"column '{raw}'" not in used
+        if m.name not in names and m.name != "t"
     ]

@@ -7,29 +7,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from greybox.channels import CHANNELS
+from greybox.errors import LogError
+from greybox.units import spelled_unit, suffix_unit, unit_factor
 from greybox.vessel.vessel import Vessel
 
-_UNIT_WORDS = {
-    "°": "deg", "degree": "deg", "degrees": "deg", "radian": "rad", "radians": "rad",
-    "kts": "kn", "kt": "kn", "knot": "kn", "m s-1": "m/s", "ms-1": "m/s", "m*s^-1": "m/s",
-    "m.s-1": "m/s", "meter": "m", "metre": "m", "meters": "m", "metres": "m", "sec": "s",
-    "secs": "s", "second": "s", "seconds": "s", "msec": "ms", "°/s": "deg/s", "dps": "deg/s",
-    "°/min": "deg/min", "rad s-1": "rad/s", "1/s": "rps", "1/min": "rpm", "hz": "rps", "n": "N",
-    "kn/h": "kn", "kmh": "km/h", "kph": "km/h", "newton": "N",
-}  # fmt: skip
-_UNITS = (
-    "s", "ms", "us", "ns", "min", "h", "m", "cm", "mm", "km", "ft", "nmi", "rad", "deg", "m/s",
-    "km/h", "kn", "knots", "rad/s", "deg/s", "deg/min", "rpm", "rps", "N", "kN",
-)  # fmt: skip
-# longest first: '_radps' must not be read as '_s'
-_SUFFIXES = (
-    ("radps", "rad/s"), ("rad_s", "rad/s"), ("rads", "rad/s"), ("degps", "deg/s"),
-    ("deg_s", "deg/s"), ("degs", "deg/s"), ("dps", "deg/s"), ("deg_min", "deg/min"),
-    ("degpm", "deg/min"), ("rad", "rad"), ("deg", "deg"), ("mps", "m/s"), ("m_s", "m/s"),
-    ("knots", "kn"), ("kts", "kn"), ("kn", "kn"), ("kmh", "km/h"), ("kph", "km/h"),
-    ("rpm", "rpm"), ("rps", "rps"), ("ms", "ms"), ("us", "us"), ("ns", "ns"), ("sec", "s"),
-    ("s", "s"), ("m", "m"),
-)  # fmt: skip
 # words that tell how a signal was made, not what it is
 _QUALIFIERS = {
     "hat", "mid", "meas", "measured", "ant", "antenna", "est", "estimated", "filt", "filtered",
@@ -98,17 +79,6 @@ class Assigned:
     how: str
 
 
-def spelled_unit(text: str) -> str | None:
-    """Return the unit that a text spells, in the spelling of `greybox.channels`, else None."""
-    bare = text.strip()
-    if bare in _UNITS:
-        return bare
-    low = bare.lower()
-    if low in _UNIT_WORDS:
-        return _UNIT_WORDS[low]
-    return low if low in _UNITS else None
-
-
 def split_unit(raw: str) -> tuple[str, str | None]:
     """Part a column name into its stem, lower case, and the unit that it carries."""
     unit: str | None = None
@@ -119,11 +89,7 @@ def split_unit(raw: str) -> tuple[str, str | None]:
         stem = raw[: bracket.start()]
     stem = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", stem.strip())
     stem = re.sub(r"[^0-9a-zA-Z]+", "_", stem).strip("_").lower()
-    if unit is None:
-        for suffix, spelled in _SUFFIXES:
-            if stem.endswith(f"_{suffix}") and stem != suffix:
-                return stem[: -len(suffix) - 1], spelled
-    return stem, unit
+    return suffix_unit(stem) if unit is None else (stem, unit)
 
 
 def assign(
@@ -154,16 +120,31 @@ def assign(
     -------
     dict of str to Assigned
         By canonical name; each at most once.
+
+    Raises
+    ------
+    LogError
+        ``[columns]`` maps two of the columns to one name.
     """
     columns, units, defined = list(columns), units or {}, set(canonical)
     found: dict[str, Assigned] = {}
     for raw, mapping in vessel.columns.items():
-        if raw in columns:
-            found[mapping.name] = Assigned(raw, mapping.name, mapping.unit, mapping.sign, "mapped")
+        name = mapping.name
+        if raw not in columns:
+            continue
+        if name in found:
+            raise LogError(
+                f"columns '{found[name].raw}' and '{raw}' are both there, and [columns] maps both "
+                f"to '{name}': remove one of the two lines from the vessel file."
+            )
+        unit = mapping.unit or _mapped_unit(raw, vessel.unit(name), units)
+        # without a unit it promises what the canonical name does
+        how = "mapped" if mapping.unit else "exact"
+        found[name] = Assigned(raw, name, unit, mapping.sign, how)
     taken = {a.raw for a in found.values()}
     loop = [vessel.closed_loop[0]] if vessel.closed_loop else []
     for raw in columns:
-        known = raw in CHANNELS or raw in vessel.commands or raw in loop
+        known = raw in CHANNELS or raw in vessel.recorded_columns or raw in loop
         if known and raw not in found and raw not in taken:
             # a canonical name promises its SI unit; a unit written beside it is believed
             unit = units.get(raw, CHANNELS[raw].unit if raw in CHANNELS else None)
@@ -193,6 +174,14 @@ def assign(
     return found
 
 
+def _mapped_unit(raw: str, target: str | None, units: Mapping[str, str]) -> str | None:
+    """Return the unit of a column that is mapped without one: as it states itself, or SI."""
+    unit = units.get(raw, split_unit(raw)[1])
+    if unit == "ms" and target == "m/s":
+        return "m/s"
+    return unit if unit is not None and target is not None and _fits(unit, target) else target
+
+
 def _pointless(name: str, found: Mapping[str, Assigned]) -> bool:
     """Whether a guess would only repeat what is there in a better form."""
     mapped = {n for n, a in found.items() if a.how != "guessed"}
@@ -215,9 +204,6 @@ def _rank(stem: str, spellings: tuple[str, ...]) -> int | None:
 
 
 def _fits(unit: str, target: str) -> bool:
-    from greybox.channels import unit_factor
-    from greybox.errors import LogError
-
     try:
         unit_factor(unit, target, "")
     except LogError:

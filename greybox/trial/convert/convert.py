@@ -1,27 +1,25 @@
-"""From recordings to logs: one sample time, gaps kept as gaps, provenance kept."""
+"""The one way from a recording to logs: time grid, resampling, corrections, derived channels.
+
+A clean log that is read, the raw files of a trial and the blocks of a large one all go it.
+What was measured is corrected before anything is made of it, so that velocities and wind
+inherit no defect that is known.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.errors import LogError
 from greybox.notebook import Shown, items, table
 from greybox.trial.convert.deduplicate import clean_signals
-from greybox.trial.convert.derived_channels import complete_channels
+from greybox.trial.convert.derived_signals import complete_channels
 from greybox.trial.convert.options import ImportOptions
-from greybox.trial.convert.resample import (
-    Clock,
-    clock,
-    covered,
-    hold,
-    hold_mean,
-    interpolate,
-    runs,
-)
+from greybox.trial.convert.resample import Clock, clock, hold, hold_mean, interpolate
+from greybox.trial.convert.sensor_corrections import correct_channels, too_late
 from greybox.trial.convert.time_grid import (
     MIN_SEGMENT,
     Plan,
@@ -31,7 +29,9 @@ from greybox.trial.convert.time_grid import (
     too_short,
 )
 from greybox.trial.log import Provenance, TrialLog
-from greybox.trial.raw_log import Recording, Signal
+from greybox.trial.raw_log import Recording
+from greybox.trial.steps import Step
+from greybox.vessel.conditions import Conditions
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
@@ -73,12 +73,56 @@ class Imported(Shown):
         return table(head, self._rows()), items("Notes", self.notes)
 
 
+@dataclass(frozen=True)
+class Conversion:
+    """What turns signals of one trial into its log, the same for all of its stretches.
+
+    Parameters
+    ----------
+    vessel : Vessel
+    options : ImportOptions
+    plan : Plan
+    before : tuple of Step
+        What was done to the signals already.
+    """
+
+    vessel: Vessel
+    options: ImportOptions
+    plan: Plan
+    before: tuple[Step, ...] = ()
+
+
+@dataclass(frozen=True)
+class Cut:
+    """Segments of a log that were cut out of its signals.
+
+    Parameters
+    ----------
+    segments : list of TrialLog
+    steps : tuple of Step
+        What was done to their channels.
+    notes : tuple of str
+    short : int
+        Stretches that were too short.
+    late : bool
+        Whether some of them were, since clocks had to be moved.
+    """
+
+    segments: list[TrialLog]
+    steps: tuple[Step, ...] = ()
+    notes: tuple[str, ...] = ()
+    short: int = 0
+    late: bool = False
+
+    def refusal(self, conversion: Conversion) -> LogError:
+        """Return why there is no segment."""
+        if self.late:
+            return too_late(conversion.vessel, conversion.plan.name)
+        return too_short(conversion.plan)
+
+
 def import_recording(
-    recording: Recording,
-    vessel: Vessel,
-    options: ImportOptions | None = None,
-    *,
-    fixed: tuple[str, ...] = (),
+    recording: Recording, vessel: Vessel, options: ImportOptions | None = None
 ) -> Imported:
     """Make a log of a recording.
 
@@ -87,9 +131,8 @@ def import_recording(
     recording : Recording
         Canonical signals, each on its own clock.
     vessel : Vessel
+        The defects that its ``[sensors]`` states are taken out.
     options : ImportOptions
-    fixed : tuple of str
-        What was mended before, for the provenance.
 
     Returns
     -------
@@ -102,126 +145,127 @@ def import_recording(
         Nothing moves in the recording, or no stretch is long enough.
     """
     options = options or ImportOptions()
-    notes: list[str] = []
-    signals = clean_signals(recording, options.origin, notes)
-    clocks = signal_clocks(signals, options)
-    extents = {n: extent(clocks[n]) for n in signals}
-    plan = plan_import(extents, vessel, options, recording.name)
-    span = (0, plan.count)
-    segments, derived, short = cut_segments(
-        signals, recording.text, plan, span, vessel, options, recording.derived
-    )
+    clean = clean_signals(recording, options.origin)
+    clocks = signal_clocks(clean, options)
+    plan = plan_import({n: extent(c) for n, c in clocks.items()}, vessel, options, clean.name)
+    conversion = Conversion(vessel, options, plan, clean.steps)
+    cut = cut_segments(clean, conversion)
+    segments = cut.segments
     if len(segments) > 1:
         segments = [replace(s, name=f"{s.name}[{k + 1}]") for k, s in enumerate(segments)]
     spans = [(float(s.t[0]), float(s.t[-1])) for s in segments]
-    notes += [*plan.notes, *gap_notes(spans, short, plan.least)]
     if not segments:
-        raise too_short(plan)
-    origin_notes = [n for n in notes if n not in recording.notes]
-    provenance = make_provenance(recording, options, (*recording.notes, *origin_notes), derived)
-    provenance = replace(provenance, fixed=fixed)
+        raise cut.refusal(conversion)
+    notes = (*clean.notes, *plan.notes, *gap_notes(spans, cut.short, plan.least), *cut.notes)
+    made = replace(clean, notes=notes).with_steps(*cut.steps)
+    provenance = make_provenance(made, options, vessel.conditions)
     segments = [replace(s, provenance=provenance) for s in segments]
-    return Imported(tuple(segments), (*recording.notes, *origin_notes, *derived))
+    done = made.steps[len(recording.steps) :]
+    return Imported(tuple(segments), (*notes, *(s.sentence for s in done)))
 
 
 def make_provenance(
-    recording: Recording, options: ImportOptions, notes: Sequence[str], derived: Sequence[str]
+    recording: Recording, options: ImportOptions, default: Conditions
 ) -> Provenance:
-    """Return where a log came from; what was derived before is kept."""
+    """Return where a log came from and what was done, as its recording says at the end.
+
+    `default` are the conditions where neither the recording nor the options state any.
+    """
     first = recording.files[0] if recording.files else None
     return Provenance(
         source=", ".join(f.name for f in recording.files) or recording.name,
         sha256=first.sha256 if first and len(recording.files) == 1 else "",
-        derived=(*recording.derived, *derived),
+        steps=recording.steps,
         files=tuple((f.name, f.sha256, f.format) for f in recording.files),
-        read=tuple(notes),
+        read=recording.notes,
         epoch=recording.epoch,
         notes=dict(options.notes),
+        conditions=options.conditions.over(recording.conditions).over(default),
     )
 
 
 def signal_clocks(
-    signals: Mapping[str, Signal],
-    options: ImportOptions,
-    periods: Mapping[str, float] | None = None,
+    recording: Recording, options: ImportOptions, periods: Mapping[str, float] | None = None
 ) -> dict[str, Clock]:
     """Return the clock of each signal; those that share their times share it."""
     found: dict[tuple[int, float | None], Clock] = {}
     clocks = {}
-    for name, s in signals.items():
+    for s in recording.signals:
         if not len(s):
             continue
-        period = None if periods is None else periods[name]
+        period = None if periods is None else periods[s.name]
         key = (id(s.t), period)
         if key not in found:
             found[key] = clock(s.t, options.hole, period)
-        clocks[name] = found[key]
+        clocks[s.name] = found[key]
     return clocks
 
 
 def cut_segments(
-    signals: Mapping[str, Signal],
-    text: Mapping[str, tuple[Array, NDArray[Any]]],
-    plan: Plan,
-    span: tuple[int, int],
-    vessel: Vessel,
-    options: ImportOptions,
-    earlier: Sequence[str] = (),
-) -> tuple[list[TrialLog], tuple[str, ...], int]:
-    """Make the segments among samples `span` of a plan.
+    recording: Recording, conversion: Conversion, span: tuple[int, int] | None = None
+) -> Cut:
+    """Make the segments among some samples of a plan: resample, correct, derive.
 
-    `earlier` is what was derived before, where the source is a log that greybox wrote.
-
-    Returns
-    -------
-    segments : list of TrialLog
-    derived : tuple of str
-        What was derived.
-    short : int
-        Stretches that were too short.
+    Parameters
+    ----------
+    recording : Recording
+        Signals in order of time, each time once.
+    conversion : Conversion
+    span : tuple of int, optional
+        First sample, and the one after the last; all of the plan by default.
     """
-    grid = plan.grid(*span)
-    signals = {n: s for n, s in signals.items() if n in plan.periods and len(s)}
-    if len(signals) < len(plan.periods):
+    vessel, plan = conversion.vessel, conversion.plan
+    grid = plan.grid(*(span or (0, plan.count)))
+    used = recording.with_signals(s for s in recording.signals if s.name in plan.periods and len(s))
+    if len(used.signals) < len(plan.periods):
         # a whole block without one signal is a gap in it
-        return [], (), 0
-    clocks = signal_clocks(signals, options, plan.periods)
-    keep = np.ones(len(grid), bool)
-    for c in {id(clocks[n]): clocks[n] for n in plan.leading}.values():
-        keep &= covered(grid, c)
-    channels = _resample(signals, clocks, vessel, grid, plan.sample_time)
-    everything = runs(keep)
-    stretches = [r for r in everything if r[1] - r[0] >= plan.least]
-    held = {n: (clock(t), words) for n, (t, words) in text.items() if len(t)}
+        return Cut([])
+    clocks = signal_clocks(used, conversion.options, plan.periods)
+    channels = _resample(used, clocks, vessel, grid, plan.sample_time)
+    everything = plan.stretches(grid, clocks)
+    held = {n: (clock(t), words) for n, (t, words) in recording.text.items() if len(t)}
     segments = []
-    derived: tuple[str, ...] = ()
-    for start, stop in stretches:
-        part = {n: v[start:stop] for n, v in channels.items()}
-        part, made, trim = complete_channels(part, vessel, plan.sample_time, options, earlier)
-        derived = tuple(made)
-        closed, known = _loop(held, vessel, grid[start:stop])
+    steps: tuple[Step, ...] = ()
+    notes: tuple[str, ...] = ()
+    late = False
+    for start, stop in everything:
+        if stop - start < plan.least:
+            continue
+        measured = {n: v[start:stop] for n, v in channels.items()}
+        corrected = correct_channels(measured, plan.sample_time, vessel, conversion.before)
+        first, last = start + corrected.before, stop - corrected.after
+        if last - first < plan.least:
+            late = True
+            continue
+        own = slice(corrected.before, stop - start - corrected.after)
+        made = complete_channels(
+            {n: v[own] for n, v in corrected.channels.items()},
+            vessel, plan.sample_time, conversion.options, conversion.before,
+        )  # fmt: skip
+        steps, notes = (*plan.steps, *corrected.steps, *made.steps), corrected.notes
+        closed, known = _loop(held, vessel, grid[first:last])
         log = TrialLog(
-            plan.name, plan.sample_time, grid[start:stop], part, vessel, closed, known,
+            plan.name, plan.sample_time, grid[first:last], made.channels, vessel, closed, known,
             Provenance(plan.name),
         )  # fmt: skip
-        log = log.window(1, len(log) - 1, plan.name) if trim else log
+        log = log.window(1, len(log) - 1, plan.name) if made.trim else log
         if len(log) >= MIN_SEGMENT:
             segments.append(log)
-    return segments, derived, len(everything) - len(segments)
+    return Cut(segments, steps, notes, len(everything) - len(segments), late)
 
 
 def _resample(
-    signals: Mapping[str, Signal],
+    recording: Recording,
     clocks: Mapping[str, Clock],
     vessel: Vessel,
     grid: Array,
     sample_time: float,
 ) -> dict[str, Array]:
     channels: dict[str, Array] = {}
-    commands = set(vessel.commands)
-    for name, s in signals.items():
-        of, value = clocks[name], s.value
-        if name in vessel.angle_commands:
+    commands = set(vessel.recorded_columns)
+    for s in recording.signals:
+        name, of, value = s.name, clocks[s.name], s.value
+        if name in vessel.recorded_angles:
             value = np.unwrap(value)
         if len(s.t) == len(grid) and np.abs(s.t - grid).max() < 0.01 * sample_time:
             channels[name] = np.asarray(value, float)

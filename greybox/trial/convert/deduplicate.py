@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from greybox.errors import LogError
 from greybox.trial.convert.derived_signals import derive_signals
-from greybox.trial.convert.resample import usual_step
-from greybox.trial.raw_log import Recording, Signal
+from greybox.trial.gaps import usual_step
+from greybox.trial.raw_log import Recording
 
 Array = NDArray[np.float64]
 
@@ -20,15 +20,28 @@ _FAR = 50.0
 _MAX_RUNS = 1000
 
 
-def clean_signals(
-    recording: Recording, origin: tuple[float, float] | None, notes: list[str]
-) -> dict[str, Signal]:
-    """Return the signals in order of time, each time once, derived ones among them."""
-    recording = in_order(recording, notes)
-    made = derive_signals(recording, origin)
-    notes += made.notes[len(recording.notes) :]
+def clean_signals(recording: Recording, origin: tuple[float, float] | None = None) -> Recording:
+    """Return the signals in order of time, each time once, derived ones among them.
+
+    Parameters
+    ----------
+    recording : Recording
+    origin : tuple of float, optional
+        As for `derive_signals`.
+
+    Returns
+    -------
+    Recording
+        Its steps and notes tell what was done.
+
+    Raises
+    ------
+    LogError
+        As `in_order`.
+    """
+    made = derive_signals(in_order(recording), origin)
     repeated: dict[int, tuple[str, int]] = {}
-    signals: dict[str, Signal] = {}
+    signals = []
     clocks: dict[tuple[int, bytes], Array] = {}
     for s in made.signals:
         keep = np.isfinite(s.value) & np.isfinite(s.t)
@@ -40,12 +53,12 @@ def clean_signals(
             # signals that keep the same rows go on sharing their clock
             t = clocks.setdefault((id(s.t), np.packbits(keep).tobytes()), s.t[keep])
             s = replace(s, t=t, value=s.value[keep])
-        signals[s.name] = s
-    for name, count in repeated.values():
-        notes.append(
-            f"{count} value{'s' if count > 1 else ''} of {name} repeat a time: the first is kept"
-        )
-    return signals
+        signals.append(s)
+    notes = (
+        f"{count} value{'s' if count > 1 else ''} of {name} repeat a time: the first is kept"
+        for name, count in repeated.values()
+    )
+    return made.with_signals(signals, *notes)
 
 
 def _first_kept(t: Array, keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -56,14 +69,15 @@ def _first_kept(t: Array, keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return first
 
 
-def in_order(recording: Recording, notes: list[str]) -> Recording:
-    """Return the recording with every signal and text in order of time.
+def in_order(recording: Recording) -> Recording:
+    """Return the recording with every signal and text in order of time; its notes tell.
 
     Raises
     ------
     LogError
         Time goes back over what was recorded before: there are two runs in it.
     """
+    notes: list[str] = []
     orders: dict[int, tuple[NDArray[np.int64], Array] | None] = {}
 
     def order(t: Array, name: str) -> tuple[NDArray[np.int64], Array] | None:
@@ -79,7 +93,7 @@ def in_order(recording: Recording, notes: list[str]) -> Recording:
     for name, (t, words) in recording.text.items():
         found = order(t, name)
         text[name] = (t, words) if found is None else (found[1], words[found[0]])
-    return replace(recording, signals=tuple(signals), text=text)
+    return replace(recording, text=text).with_signals(signals, *notes)
 
 
 def _order(

@@ -1,15 +1,42 @@
-"""What a log needs and its source does not hold as such: positions, velocities, wind."""
+"""What a log needs and its source does not hold as such: positions, velocities, wind.
+
+`derive_signals` makes, on the clock of each sensor, what may be interpolated;
+`complete_channels` makes velocities, yaw rate and wind on the clock of the log.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.channels import LOGGED
+from greybox.errors import LogError, suggestion
+from greybox.rotation import ned_to_body
+from greybox.trial.convert.options import ImportOptions
+from greybox.trial.kinematics import velocities_from_positions
 from greybox.trial.raw_log import Recording, Signal
+from greybox.trial.smoothing import savgol_velocities, smooth
+from greybox.trial.steps import Step
+from greybox.trial.wind import move_anemometer, relative_wind, wind_at_height
+from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
+
+# speed and direction, and the components that may be interpolated
+_POLAR = (
+    ("sog", "cog", ("v_n", "v_e")),
+    ("V_q", "gamma_q", ("u_q", "v_q")),
+    ("V_q", "dir_q", ("u_q", "v_q")),
+    ("V_w", "dir_w", ("w_n", "w_e")),
+    ("V_w", "dir_t", ("w_x", "w_y")),
+)
+# order of the polynomials of positions: the velocity may bend within the window
+_ORDER = 3
+_SMOOTHING_ORDER = 2
 
 
 def derive_signals(recording: Recording, origin: tuple[float, float] | None = None) -> Recording:
@@ -31,46 +58,31 @@ def derive_signals(recording: Recording, origin: tuple[float, float] | None = No
     -------
     Recording
         Without ``lat``, ``lon``, ``sog``, ``cog`` and polar winds where their
-        components could be made; the notes tell.
+        components could be made; the steps tell.
     """
     signals = {s.name: s for s in recording.signals}
-    notes: list[str] = []
+    steps: list[Step] = []
     if "lat" in signals and "lon" in signals:
         lat, lon = signals.pop("lat"), signals.pop("lon")
         if not {"x_n", "y_n"} <= signals.keys() and np.isfinite(lat.value).any():
             north, east, zero = local_positions(lat, lon, origin)
             signals["x_n"], signals["y_n"] = north, east
-            notes.append(
-                f"x_n, y_n from {lat.source} north and east of {zero[0]:.8f}, {zero[1]:.8f} deg"
-            )
-    if "sog" in signals and "cog" in signals:
-        sog, cog = signals.pop("sog"), signals.pop("cog")
-        if not {"v_n", "v_e"} <= signals.keys():
-            t, speed, course = _paired(sog, cog)
-            for name, part in (("v_n", np.cos(course)), ("v_e", np.sin(course))):
-                signals[name] = Signal(name, t, speed * part, "m/s", sog.source, True)
-            notes.append(f"v_n, v_e from speed and course over ground of {sog.source}")
-    for speed_name, angle_name, pair in (
-        ("V_q", "gamma_q", ("u_q", "v_q")),
-        ("V_q", "dir_q", ("u_q", "v_q")),
-        ("V_w", "dir_w", ("w_n", "w_e")),
-        ("V_w", "dir_t", ("w_x", "w_y")),
-    ):
-        if speed_name not in signals or angle_name not in signals or pair[0] in signals:
+            place = {"lat": zero[0], "lon": zero[1]}
+            steps.append(Step("tangent_plane", ("x_n", "y_n"), ("lat", "lon"), place))
+    for size, direction, pair in _POLAR:
+        if size not in signals or direction not in signals or pair[0] in signals:
             continue
-        t, speed, angle = _paired(signals[speed_name], signals.pop(angle_name))
-        # gamma_q is minus the direction the wind comes from, and v_q = −V_q sin gamma_q
-        angle = -angle if angle_name == "gamma_q" else angle
-        source = signals[speed_name].source
-        for name, part in zip(pair, (np.cos(angle), np.sin(angle)), strict=True):
-            signals[name] = Signal(name, t, speed * part, "m/s", source, True)
-        if pair[0] == "u_q":
-            notes.append("u_q, v_q from apparent wind speed and direction (5.40)")
-    for name in ("V_q", "V_w", "gamma_q", "dir_q", "dir_w", "dir_t"):
+        t, speed, angle = _paired(signals[size], signals.pop(direction))
+        # gamma_q is minus the direction that the wind comes from
+        parts = relative_wind(speed, -angle if direction == "gamma_q" else angle)
+        for name, part in zip(pair, parts, strict=True):
+            signals[name] = Signal(name, t, part, "m/s", signals[size].source, True)
+        steps.append(Step("polar", pair, (size, direction)))
+    for name in {n for size, direction, _ in _POLAR for n in (size, direction)}:
         signals.pop(name, None)
     if "psi" in signals:
         signals["psi"] = unwrapped(signals["psi"])
-    return recording.with_signals(signals.values(), *notes)
+    return recording.with_signals(signals.values()).with_steps(*steps)
 
 
 def local_positions(
@@ -133,7 +145,201 @@ def _paired(a: Signal, b: Signal) -> tuple[Array, Array, Array]:
     return a.t, a.value, b.value[order][near]
 
 
-def earth_to_body(north: Array, east: Array, psi: Array) -> tuple[Array, Array]:
-    """Return the components along the bow and to starboard of a vector given north and east."""
-    c, s = np.cos(psi), np.sin(psi)
-    return c * north + s * east, c * east - s * north
+@dataclass(frozen=True)
+class WindState:
+    """What was done to a wind before.
+
+    Parameters
+    ----------
+    at_origin : bool
+        Whether it is that of the body origin.
+    height : float, optional
+        Height to which it was brought [m]; None where it is as measured.
+    """
+
+    at_origin: bool = False
+    height: float | None = None
+
+    def __str__(self) -> str:
+        place = "moved to the origin" if self.at_origin else "not moved"
+        height = "at the height of its sensor" if self.height is None else f"at {self.height:g} m"
+        return f"{place} and {height}"
+
+
+def wind_state(steps: Iterable[Step]) -> WindState:
+    """Return what the steps of a log did to its wind."""
+    at_origin, height = False, None
+    for step in steps:
+        if step.operation in ("true_wind", "move_anemometer"):
+            at_origin = True
+        elif step.operation == "wind_height":
+            height = step.number("height")
+    return WindState(at_origin, height)
+
+
+@dataclass(frozen=True)
+class Completed:
+    """Channels of a log, made of those that were measured.
+
+    Parameters
+    ----------
+    channels : dict of str to ndarray
+        (N,) each.
+    steps : tuple of Step
+        What was made, in order.
+    trim : bool
+        Whether the first and last sample have only one neighbour (3.57).
+    """
+
+    channels: dict[str, Array]
+    steps: tuple[Step, ...]
+    trim: bool
+
+
+def complete_channels(
+    part: dict[str, Array],
+    vessel: Vessel,
+    sample_time: float,
+    options: ImportOptions,
+    before: Sequence[Step] = (),
+) -> Completed:
+    """Make the channels of a log of those that were measured.
+
+    Parameters
+    ----------
+    part : dict of str to ndarray
+        (N,) each, on one uniform clock, angles unwrapped.
+    vessel : Vessel
+    sample_time : float
+        Ts [s].
+    options : ImportOptions
+    before : sequence of Step
+        What was done to the channels already.
+
+    Raises
+    ------
+    LogError
+        The wind is to be brought to a height and that of the anemometer is not known;
+        a channel that the log has not is to be smoothed.
+    """
+    logged = (*LOGGED, *vessel.recorded_columns)
+    measured = [n for n in options.smooth if n in part and n in logged]
+    steps = _smooth(part, measured, sample_time, options)
+    motion = _velocities(part, vessel, sample_time, options)
+    steps += motion
+    steps += _wind(part, vessel, options, wind_state(before))
+    channels = {n: part[n] for n in logged if n in part}
+    later = [n for n in options.smooth if n not in measured]
+    steps += _smooth(channels, later, sample_time, options)
+    trim = any(s.operation in ("difference", "local_polynomials") for s in motion)
+    return Completed(channels, tuple(steps), trim)
+
+
+def _smooth(
+    channels: dict[str, Array], names: Sequence[str], sample_time: float, options: ImportOptions
+) -> list[Step]:
+    steps = []
+    for name in names:
+        if name not in channels:
+            raise LogError(
+                f"'{name}' is to be smoothed and the log has no such channel."
+                f"{suggestion(name, channels)} It has: {', '.join(channels)}."
+            )
+        window = options.smooth[name]
+        channels[name] = smooth(channels[name], sample_time, window, _SMOOTHING_ORDER)
+        how = {"window": window, "order": float(_SMOOTHING_ORDER)}
+        steps.append(Step("smooth", (name,), parameters=how, decided_by="user"))
+    return steps
+
+
+def _velocities(
+    part: dict[str, Array], vessel: Vessel, sample_time: float, options: ImportOptions
+) -> list[Step]:
+    """Make u, v and r where nothing measured them; return what was done."""
+    psi = part.get("psi")
+    if psi is None:
+        return []
+    steps = []
+    missing = [n for n in ("u", "v") if n not in part]
+    turning = "r" not in part and len(psi) > 2
+    if turning:
+        part["r"] = np.gradient(psi, sample_time)
+    antenna = vessel.sensors.get("antenna", (0.0, 0.0))
+    differenced = ["r"] if turning else []
+    if missing and {"v_n", "v_e"} <= part.keys():
+        # speed and course are the antenna's, u and v the body origin's
+        u, v = ned_to_body(part["v_n"], part["v_e"], psi)
+        r = part.get("r", np.zeros_like(u))
+        made = {"u": u + r * antenna[1], "v": v - r * antenna[0]}
+        source = ("v_n", "v_e", "psi")
+        steps.append(Step("earth_to_body", tuple(missing), source))
+    elif missing and {"x_n", "y_n"} <= part.keys() and len(psi) > 2:
+        place = part["x_n"], part["y_n"], psi, sample_time
+        std = vessel.std("psi") or 0.0
+        source = ("x_n", "y_n", "psi")
+        if options.velocities == "savgol":
+            u, v, r = savgol_velocities(
+                *place, window_s=options.window, order=_ORDER, heading_std=std, antenna=antenna
+            )
+            how = {"window": options.window, "order": float(_ORDER)}
+            names = (*missing, *differenced)
+            steps.append(Step("local_polynomials", names, source, how, decided_by="user"))
+            if turning:
+                part["r"], differenced = r, []
+        else:
+            u, v, _ = velocities_from_positions(*place, heading_std=std, antenna=antenna)
+            steps.append(Step("difference", tuple(missing), source))
+        made = {"u": u, "v": v}
+    else:
+        missing = []
+    for name in missing:
+        part[name] = made[name]
+    if differenced:
+        steps.insert(0, Step("difference", ("r",), ("psi",)))
+    if missing and any(antenna[:2]):
+        arm = {"x": antenna[0], "y": antenna[1], "sensor": "antenna"}
+        steps.append(Step("move_velocity", tuple(missing), (), arm, decided_by="vessel"))
+    return steps
+
+
+def _wind(
+    part: dict[str, Array], vessel: Vessel, options: ImportOptions, state: WindState
+) -> list[Step]:
+    """Make the velocity through the air at the body origin; return what was done."""
+    psi, u, v = part.get("psi"), part.get("u"), part.get("v")
+    steps = []
+    if "u_q" not in part and psi is not None and u is not None and v is not None:
+        if "w_n" in part:
+            # components of where it comes from: the air moves the other way
+            from_x, from_y = ned_to_body(part["w_n"], part["w_e"], psi)
+        elif "w_x" in part:
+            from_x, from_y = part["w_x"], part["w_y"]
+        else:
+            return []
+        part["u_q"], part["v_q"] = u + from_x, v + from_y
+        source = ("w_n", "w_e") if "w_n" in part else ("w_x", "w_y")
+        steps.append(Step("true_wind", ("u_q", "v_q"), (*source, "psi", "u", "v")))
+    elif {"u_q", "v_q", "r"} <= part.keys() and "anemometer" in vessel.sensors:
+        x, y, _ = vessel.sensors["anemometer"]
+        if (x or y) and not state.at_origin:
+            part["u_q"], part["v_q"] = move_anemometer(part["u_q"], part["v_q"], part["r"], x, y)
+            place = {"x": x, "y": y}
+            moved = Step("move_anemometer", ("u_q", "v_q"), (), place, decided_by="vessel")
+            steps.append(moved)
+    wanted = options.reference_height
+    if wanted is None or "u_q" not in part or u is None or v is None:
+        return steps
+    height = state.height
+    # a record of version 1 holds six digits
+    if height is not None and math.isclose(height, wanted, rel_tol=1e-5):
+        return steps
+    if height is None:
+        if "anemometer" not in vessel.sensors:
+            raise LogError(
+                f"the wind cannot be brought to {wanted:g} m without the height of the "
+                f"anemometer: add anemometer = [x, y, height] to [sensors]."
+            )
+        height = vessel.sensors["anemometer"][2]
+    part["u_q"], part["v_q"] = wind_at_height(part["u_q"], part["v_q"], u, v, height, wanted)
+    between = {"measured": height, "height": wanted}
+    return [*steps, Step("wind_height", ("u_q", "v_q"), (), between, decided_by="user")]

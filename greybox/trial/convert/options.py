@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from greybox.vessel.conditions import Conditions
+
 
 @dataclass(frozen=True)
 class ImportOptions:
@@ -26,10 +28,15 @@ class ImportOptions:
     origin : tuple of float, optional
         Latitude and longitude [deg] of ``x_n = y_n = 0``.
     notes : mapping of str to str
-        Draught, loading, depth, sea state and what else was noted of the trial.
+        What was noted of the trial; fields of `Conditions` by their names.
     smooth : mapping of str to float
         Window [s] of the local polynomials for each channel of the log that is to be
         smoothed; none by default.
+
+    Raises
+    ------
+    LogError
+        A note is of a condition, and none that it can be.
     """
 
     sample_time: float | None = None
@@ -40,6 +47,15 @@ class ImportOptions:
     origin: tuple[float, float] | None = None
     notes: Mapping[str, str] = field(default_factory=dict)
     smooth: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        # a condition that cannot be read is told before any file is
+        Conditions.read(self.notes)
+
+    @property
+    def conditions(self) -> Conditions:
+        """Conditions among `notes`."""
+        return Conditions.read(self.notes)
 
     @property
     def reach(self) -> float:

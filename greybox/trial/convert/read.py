@@ -1,7 +1,7 @@
 """Reading a clean log from CSV or Parquet, with the vessel's column names and units.
 
-Logs that may hold defects are read by `greybox.trial.convert.channel_mapping` and made clean
-by `greybox.trial.convert.convert`; this reader refuses what it would have to mend.
+It goes the way of every import (`greybox.trial.convert.convert`) with its samples as they were
+recorded, guesses nothing, and refuses what would have to be mended.
 """
 
 from __future__ import annotations
@@ -9,35 +9,41 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.channels import CHANNELS, unit_factor
 from greybox.errors import LogError, suggestion
 from greybox.files import sha256
-from greybox.trial.convert.column_names import Assigned, assign
-from greybox.trial.convert.sensor_corrections import correct_channels, said_antenna, too_late
-from greybox.trial.kinematics import velocities_from_positions
+from greybox.trial.convert.channel_mapping import (
+    batch_recording,
+    canonical,
+    table_columns,
+    time_scale,
+)
+from greybox.trial.convert.column_names import Assigned
+from greybox.trial.convert.convert import Conversion, cut_segments
+from greybox.trial.convert.deduplicate import clean_signals
+from greybox.trial.convert.options import ImportOptions
+from greybox.trial.convert.time_grid import MIN_SEGMENT, Plan
+from greybox.trial.gaps import split_at_gaps
 from greybox.trial.log import Provenance, TrialLog
 from greybox.trial.raw_log import Recording
 from greybox.trial.readers.formats import open_raw
 from greybox.trial.readers.table import Batch, TableFile, read_columns
 from greybox.trial.store import read_record, recorded_provenance
-from greybox.trial.wind import relative_wind, relative_wind_from_direction
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
 
 _log = logging.getLogger(__name__)
-_MIN_SAMPLES = 3
 # share of a sample by which a time step may differ from the others
 _JITTER = 0.2
 # samples by which a time may differ from a uniform clock
 _DRIFT = 0.6
+# share of steps past which gaps are another sample time
+_MOST_GAPS = 0.2
 
 
 def read_log(
@@ -141,131 +147,105 @@ def table_segments(
     Parameters
     ----------
     known : Provenance
-        Of the table; what is derived here is added to it.
+        Of the table; what is done here is added to it.
     """
-    path = table.path
-    channels, text = _canonical(table, vessel, path, plan=bool(fill))
-    t = channels.pop("t")
-    if len(t) < _MIN_SAMPLES:
-        raise LogError(
-            f"'{path.name}' has {len(t)} samples, at least {_MIN_SAMPLES} are needed: "
-            f"use a longer log."
-        )
-    stretches, sample_time = _stretches(t, table)
-    for name in {"psi", "gamma_q", *vessel.angle_commands} & channels.keys():
-        channels[name] = np.unwrap(channels[name])
-    segments: list[TrialLog] = []
-    for k, (start, stop) in enumerate(stretches):
-        part = {n: v[start:stop] for n, v in channels.items()}
-        words = {n: v[start:stop] for n, v in text.items()}
-        name = path.stem if len(stretches) == 1 else f"{path.stem}[{k + 1}]"
-        log = _segment(
-            name, path, vessel, t[start:stop], sample_time, part, words, states, fill or {},
-            [str(c) for c in table.columns], known,
-        )  # fmt: skip
-        if log is not None:
-            segments.append(log)
-    if not segments:
-        raise too_late(vessel, path.name)
-    derived = (*known.derived, *segments[0].provenance.derived)
+    name = table.path.name
+    recording, sample_time = _clean_recording(table, vessel, known, plan=bool(fill))
+    plan = _recorded_grid(recording, table, sample_time)
+    conversion = Conversion(vessel, ImportOptions(), plan, recording.steps)
+    cut = cut_segments(recording, conversion)
+    if not cut.segments:
+        raise cut.refusal(conversion)
+    steps = (*recording.steps, *cut.steps)
+    read = (*known.read, *(n for n in cut.notes if n not in known.read))
+    conditions = known.conditions.over(vessel.conditions)
+    known = replace(known, steps=steps, read=read, conditions=conditions)
+    columns = [str(c) for c in table.columns]
+    segments = []
+    for k, log in enumerate(cut.segments):
+        channels = dict(log.channels)
+        for other, value in (fill or {}).items():
+            channels.setdefault(other, np.full(len(log), float(value)))
+        _require(channels, vessel, states or ("u", "v", "r"), name, columns)
+        own = table.path.stem if len(cut.segments) == 1 else f"{table.path.stem}[{k + 1}]"
+        segments.append(replace(log, name=own, channels=channels, provenance=known))
     _log.info(
-        "read %s: %d rows every %g s in %d segment(s); columns %s%s", path, len(t), sample_time,
-        len(segments), ", ".join(map(str, table.columns)), "".join(f"; {d}" for d in derived),
+        "read %s: %d rows every %g s in %d segment(s); columns %s%s", table.path, plan.count,
+        sample_time, len(segments), ", ".join(columns), "".join(f"; {d}" for d in known.derived),
     )  # fmt: skip
-    known = replace(known, derived=derived)
-    return [replace(s, provenance=known) for s in segments]
+    return segments
 
 
-def _segment(
-    name: str,
-    path: Path,
-    vessel: Vessel,
-    t: Array,
-    sample_time: float,
-    channels: dict[str, Array],
-    text: Mapping[str, NDArray[Any]],
-    states: tuple[str, ...],
-    fill: Mapping[str, float],
-    columns: list[str],
-    before: Provenance,
-) -> TrialLog | None:
-    """Return the log of one stretch, None where a late clock leaves too little of it."""
-    derived: list[str] = []
-    if "V_q" in channels and "u_q" not in channels:
-        if "gamma_q" in channels:
-            pair = relative_wind(channels["V_q"], channels["gamma_q"])
-            derived.append("u_q, v_q from V_q, gamma_q (5.41-5.43)")
-            channels["u_q"], channels["v_q"] = pair
-        elif "dir_q" in channels:
-            pair = relative_wind_from_direction(channels["V_q"], channels["dir_q"])
-            derived.append("u_q, v_q from the apparent wind's speed and direction (5.40)")
-            channels["u_q"], channels["v_q"] = pair
-    correction = correct_channels(channels, sample_time, vessel, before.derived, before.fixed)
-    derived += correction.said
-    kept = slice(correction.before, len(t) - correction.after)
-    t = t[kept]
-    if len(t) < _MIN_SAMPLES:
-        return None
-    channels = {n: v[kept] for n, v in correction.channels.items()}
-    text = {n: v[kept] for n, v in text.items()}
-    _derive_velocities(channels, vessel, sample_time, derived)
-    for other, value in fill.items():
-        channels.setdefault(other, np.full(len(t), float(value)))
-    _require(channels, vessel, states or ("u", "v", "r"), path.name, columns)
-    closed, known = np.zeros(len(t), bool), False
-    if vessel.closed_loop is not None and vessel.closed_loop[0] in text:
-        closed = np.isin(text[vessel.closed_loop[0]], vessel.closed_loop[1])
-        known = True
-    log = TrialLog(
-        name, sample_time, t, channels, vessel, closed, known, Provenance(derived=tuple(derived))
-    )
-    if any(d.startswith("u, v") and "(3.57)" in d for d in derived):
-        # the first and last sample have only one neighbour (3.57)
-        log = replace(log.window(1, len(log) - 1), name=name)
-    return log
+def _clean_recording(
+    table: TableFile, vessel: Vessel, known: Provenance, *, plan: bool
+) -> tuple[Recording, float]:
+    """Return the table as a recording that needs no mending, and its sample time [s].
 
-
-def _canonical(
-    table: TableFile, vessel: Vessel, path: Path, *, plan: bool
-) -> tuple[dict[str, Array], dict[str, NDArray[Any]]]:
-    """Return the numeric channels in SI, and the text columns, by canonical name."""
-    assigned = assign(table.columns, vessel, units=table.units, guess=False)
-    missing = [raw for raw in vessel.columns if raw not in table.columns]
-    if "t" not in assigned:
-        raise LogError(
-            f"'{path.name}' has no column 't'.{suggestion('t', table.columns)} "
-            f"Map the time column in the vessel file's [columns] with its unit."
-        )
+    Raises
+    ------
+    LogError
+        It needs mending, or a mapped column is missing.
+    """
+    assigned = table_columns(table, vessel, guess=False)
+    _require_mapped(assigned, vessel, table, plan=plan)
     batch = read_columns(table, [a.raw for a in assigned.values()])
-    channels: dict[str, Array] = {}
-    text: dict[str, NDArray[Any]] = {}
-    loop = vessel.closed_loop[0] if vessel.closed_loop else None
-    if loop is not None and loop in assigned:
-        text[loop] = batch[assigned.pop(loop).raw].astype(str)
-    positions = [n for n in ("x_n", "y_n") if n in assigned]
-    if {"u", "v"} <= assigned.keys() and any(
-        not np.isfinite(_floats(batch, assigned[n])).all() for n in positions
-    ):
-        # positions are not needed where velocities were logged: they may have holes
-        for place in positions:
-            assigned.pop(place)
-    for name, a in assigned.items():
-        target = CHANNELS[name].unit if name in CHANNELS else None
-        if name in vessel.angle_commands:
-            target = "rad"
-        factor = a.sign * (unit_factor(a.unit, target, a.raw) if a.unit is not None else 1.0)
-        value = _finite(_floats(batch, a), a.raw, table)
-        if a.raw in table.dates and name == "t":
-            value = value - value[0]
-        channels[name] = value if factor == 1.0 else value * factor
-    for raw in missing:
-        name = vessel.columns[raw].name
-        if name not in channels and (name in vessel.commands or not plan):
+    _require_finite(assigned, batch, vessel, table)
+    time = assigned["t"]
+    scale = time_scale(batch[time.raw], time, table)
+    if time.raw not in table.dates:
+        # a log's own clock is kept as it is
+        scale = replace(scale, zero=0.0, epoch=None)
+    sample_time = _require_uniform(scale.seconds(batch[time.raw]), table)
+    raw = batch_recording(table, batch, assigned, scale, vessel)
+    recording = replace(canonical(raw, assigned, vessel), steps=known.steps)
+    return clean_signals(recording), sample_time
+
+
+def _recorded_grid(recording: Recording, table: TableFile, sample_time: float) -> Plan:
+    """Return the samples as they were recorded: every signal stands at each of them."""
+    signals = recording.signals
+    t = signals[0].t
+    names = tuple(s.name for s in signals)
+    return Plan(
+        table.path.stem, sample_time, float(t[0]), len(t), dict.fromkeys(names, sample_time),
+        names, (), MIN_SEGMENT, times=t,
+    )  # fmt: skip
+
+
+def _require_mapped(
+    assigned: Mapping[str, Assigned], vessel: Vessel, table: TableFile, *, plan: bool
+) -> None:
+    """Refuse a table without a column that ``[columns]`` maps and that is needed."""
+    for raw, mapping in vessel.columns.items():
+        name = mapping.name
+        if raw in table.columns or name in assigned:
+            continue
+        beside = name in vessel.recorded_columns and name not in vessel.commands
+        if not beside and (name in vessel.commands or not plan):
             raise LogError(
-                f"'{path.name}' has no column '{raw}', which [columns] maps to '{name}'."
+                f"'{table.path.name}' has no column '{raw}', which [columns] maps to '{name}'."
                 f"{suggestion(raw, table.columns)} Correct the name in the vessel file."
             )
-    return channels, text
+
+
+def _require_finite(
+    assigned: dict[str, Assigned], batch: Batch, vessel: Vessel, table: TableFile
+) -> None:
+    """Refuse columns with holes; those that are not needed are left out, in place."""
+    loop = vessel.closed_loop[0] if vessel.closed_loop else None
+    holed = [
+        n for n, a in assigned.items() if n != loop and not np.isfinite(_floats(batch, a)).all()
+    ]
+    # positions are not needed where velocities were logged
+    spare = {"x_n", "y_n"} if {"u", "v"} <= assigned.keys() else set()
+    spare = spare if spare & {*holed} else set()
+    # what moves no model is not needed either
+    beside = set(vessel.recorded_columns) - set(vessel.commands)
+    for name in [n for n in assigned if n in spare or (n in beside and n in holed)]:
+        del assigned[name]
+    for name in holed:
+        if name in assigned:
+            _finite(_floats(batch, assigned[name]), assigned[name].raw, table)
 
 
 def _floats(batch: Batch, a: Assigned) -> Array:
@@ -291,9 +271,13 @@ def _importer(table: TableFile) -> str:
     return "recording_from_pandas" if table.format == "DataFrame" else "greybox import"
 
 
-def _stretches(t: Array, table: TableFile) -> tuple[list[tuple[int, int]], float]:
-    """Return the stretches between gaps, and the sample time."""
+def _require_uniform(t: Array, table: TableFile) -> float:
+    """Return the sample time [s]; refuse a table whose samples would have to be resampled."""
     name, importer = table.path.name, _importer(table)
+    if len(t) < MIN_SEGMENT:
+        raise LogError(
+            f"'{name}' has {len(t)} samples, at least {MIN_SEGMENT} are needed: use a longer log."
+        )
     steps = np.diff(t)
     wrong = np.flatnonzero(steps <= 0)
     if len(wrong):
@@ -304,21 +288,21 @@ def _stretches(t: Array, table: TableFile) -> tuple[list[tuple[int, int]], float
             f"repeated ones."
         )
     usual = float(np.median(steps))
-    multiple = np.round(steps / usual)
-    off = np.abs(steps - multiple * usual) > _JITTER * usual
-    gaps = (multiple > 1) & ~off
-    if off.any() or gaps.sum() > 0.2 * len(steps):
+    found = split_at_gaps(t, usual)
+    gaps = np.zeros(len(steps), bool)
+    gaps[[a - 1 for a, _ in found[1:]]] = True
+    off = np.abs(steps - np.round(steps / usual) * usual) > _JITTER * usual
+    if off.any() or gaps.sum() > _MOST_GAPS * len(steps):
         k = int(np.flatnonzero(off | gaps)[0])
         raise LogError(
             f"'{name}' has two sample times: {usual:.6g} s, but {steps[k]:.6g} s after "
             f"t = {t[k]:.6g} s ({int((off | gaps).sum())} of {len(steps)} steps differ). "
             f"Resample it to one with {importer}."
         )
-    edges = [0, *(np.flatnonzero(gaps) + 1).tolist(), len(t)]
-    found = [(a, b) for a, b in pairwise(edges) if b - a >= _MIN_SAMPLES]
+    found = [(a, b) for a, b in found if b - a >= MIN_SEGMENT]
     if not found:
         raise LogError(
-            f"'{name}' has no {_MIN_SAMPLES} samples between two gaps: use a log with fewer."
+            f"'{name}' has no {MIN_SEGMENT} samples between two gaps: use a log with fewer."
         )
     means = []
     for a, b in found:
@@ -332,34 +316,7 @@ def _stretches(t: Array, table: TableFile) -> tuple[list[tuple[int, int]], float
                 f"{two:.6g} s in its second. Resample it to one with {importer}."
             )
         means.append((b - a, mean))
-    return found, round(max(means)[1], 9)
-
-
-def _derive_velocities(
-    channels: dict[str, Array], vessel: Vessel, sample_time: float, derived: list[str]
-) -> None:
-    wanted = [n for n in ("u", "v", "r") if n not in channels]
-    if not wanted or "psi" not in channels:
-        return
-    positioned = "x_n" in channels and "y_n" in channels
-    if not positioned and wanted != ["r"]:
-        return
-    zeros = np.zeros_like(channels["psi"])
-    u, v, r = velocities_from_positions(
-        channels["x_n"] if positioned else zeros,
-        channels["y_n"] if positioned else zeros,
-        channels["psi"],
-        sample_time,
-        heading_std=vessel.std("psi") or 0.0,
-        antenna=vessel.sensors.get("antenna", (0.0, 0.0)),
-    )
-    for name, value in zip("uvr", (u, v, r), strict=True):
-        if name in wanted:
-            channels[name] = value
-    made = ", ".join(wanted)
-    derived.append(f"{made} from positions and heading by central differences (3.57)")
-    if "u" in wanted:
-        derived += said_antenna(vessel.sensors.get("antenna", (0.0, 0.0)))
+    return round(max(means)[1], 9)
 
 
 def _require(

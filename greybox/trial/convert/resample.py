@@ -7,16 +7,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.trial.gaps import HOLE, pieces, usual_step
+
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-# a step of more than this many usual steps is a hole
-HOLE = 2.5
-# share of steps past a hole's length that makes a clock bursty
-_BURSTY = 0.15
 # low-pass of the signals that are faster than the log: cut-off as a share of its Nyquist rate
 _CUT_OFF = 0.8
 _TAPS_PER_RATIO = 8
+# how a signal of another rate is brought to that of the log
+HELD, FILTERED, AVERAGED = "held", "low-pass filtered", "averaged"
 
 
 @dataclass(frozen=True)
@@ -59,19 +59,6 @@ class Clock:
         return int(np.sum(within & (np.abs(steps - self.period) > 0.33 * self.period)))
 
 
-def usual_step(t: Array) -> float:
-    """Return the usual step of increasing times [s], 0 where there is none."""
-    steps = np.diff(t)
-    period = float(np.median(steps)) if len(steps) else 0.0
-    # merged or bursty clocks have many short steps: the usual one carries half of the time;
-    # holes are few, however long
-    if len(steps) and float(np.mean(steps > HOLE * period)) > _BURSTY:
-        order = np.sort(steps)
-        share = np.cumsum(order)
-        period = float(order[np.searchsorted(share, share[-1] / 2)])
-    return period
-
-
 def clock(t: Array, hole: float | None = None, period: float | None = None) -> Clock:
     """Return the usual step of times and the stretches without a hole.
 
@@ -80,7 +67,7 @@ def clock(t: Array, hole: float | None = None, period: float | None = None) -> C
     t : ndarray
         (N,) [s], increasing, N >= 1.
     hole : float, optional
-        Shortest step that counts as a hole [s]; 2.5 usual steps by default.
+        Shortest step that counts as a hole [s]; `HOLE` usual steps by default.
     period : float, optional
         Usual step [s], where it is known from more than these times.
     """
@@ -90,9 +77,7 @@ def clock(t: Array, hole: float | None = None, period: float | None = None) -> C
     if hole is not None:
         # what the user calls a hole is one, but not every step
         limit = max(hole, 1.01 * min(period, float(np.median(steps)) if len(steps) else period))
-    breaks = np.flatnonzero(steps > limit) + 1
-    starts = np.concatenate([[0], breaks]).astype(np.int64)
-    stops = np.concatenate([breaks, [len(t)]]).astype(np.int64)
+    starts, stops = np.array(pieces(t, limit), np.int64).T
     return Clock(t, period, starts, stops)
 
 
@@ -103,6 +88,23 @@ def covered(grid: Array, of: Clock) -> Mask:
     k = np.searchsorted(first, grid + slack, side="right") - 1
     inside = (k >= 0) & (grid <= last[np.clip(k, 0, None)] + slack)
     return np.asarray(inside)
+
+
+def resampled_by(period: float, sample_time: float, *, held: bool) -> str | None:
+    """Return how a signal is brought to a sample time, None where its own rate is kept.
+
+    Parameters
+    ----------
+    period, sample_time : float
+        Usual step of the signal, and that of the log [s].
+    held : bool
+        Whether it is an input, which keeps its value until the next.
+    """
+    if held:
+        return AVERAGED if 0 < period <= 0.75 * sample_time else None
+    if period > 1.5 * sample_time:
+        return HELD
+    return FILTERED if period > 0 and sample_time >= 1.5 * period else None
 
 
 def interpolate(of: Clock, value: Array, grid: Array, sample_time: float) -> Array:
@@ -127,9 +129,10 @@ def interpolate(of: Clock, value: Array, grid: Array, sample_time: float) -> Arr
     ndarray
         (M,); values outside the clock's stretches are those of their ends.
     """
-    if of.period > 1.5 * sample_time:
+    how = resampled_by(of.period, sample_time, held=False)
+    if how == HELD:
         return hold(of, value, grid)
-    if of.period <= 0 or sample_time < 1.5 * of.period:
+    if how is None:
         return np.interp(grid, of.t, value)
     out = np.interp(grid, of.t, value)
     for start, stop in zip(of.starts, of.stops, strict=True):
@@ -175,7 +178,7 @@ def hold_mean(of: Clock, value: Array, grid: Array, sample_time: float) -> Array
     An input that changes within a sample acts on the ship by its mean; one that
     changes at samples only is held as it is.
     """
-    if len(of.t) < 2 or of.period > 0.75 * sample_time:
+    if len(of.t) < 2 or resampled_by(of.period, sample_time, held=True) is None:
         return hold(of, value, grid)
     area = np.concatenate([[0.0], np.cumsum(value[:-1] * np.diff(of.t))])
 

@@ -1,40 +1,33 @@
 """Taking out of a log what the vessel file's ``[sensors]`` says is wrong with its sensors.
 
-What was done is said in the log's record under the key of ``[sensors]``, so that
-a log that is written and read again, or imported with a vessel file that said
-so already, is only corrected by what is new.
+Each correction is a step that the vessel file decided. What such steps add up to is known of
+a log, so that one that is written and read again, or imported with a vessel file that said so
+already, is only corrected by what is new.
 """
 
 from __future__ import annotations
 
-import json
-import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from math import ceil
-from typing import Any
+from math import ceil, isclose
 
 import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import LogError
-from greybox.trial.convert.derived_signals import earth_to_body
+from greybox.rotation import body_to_ned, ned_to_body
 from greybox.trial.log import TrialLog
+from greybox.trial.steps import Step, Value
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
 Arm = tuple[float, float]
 
-_SAID = re.compile(r"\[sensors\] (\w+) = (\S+): ")
-# velocities that were made with the heading, in the words of the record
-_DERIVED = re.compile(r"(u, v|u|v)\b.* from (positions and heading|the velocity over ground)")
-_TURN_RATE = re.compile(r"(u, v, )?r from (positions and )?heading")
-# how the record begins to tell that a finding was mended, and the key that it makes void
-_MENDED = {
-    "heading_bias": "heading_bias", "lever_arm": "antenna", "clock_offset": "clock",
-    "sign": "reversed",
-}  # fmt: skip
+# keys that a finding made void which mended the same
+_MENDED_BY = {"heading_bias": "turn_heading", "antenna": "move_antenna", "clock": "shift"}
 _MOTION = frozenset({"x_n", "y_n", "psi", "u", "v", "r"})
+# sums of corrections that a record tells differ from what is stated by rounding only
+_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -45,14 +38,17 @@ class Correction:
     ----------
     channels : mapping of str to ndarray
         (N,) each.
-    said : tuple of str
-        What was done, one sentence each.
+    steps : tuple of Step
+        What was done.
+    notes : tuple of str
+        What is stated and was not done, and why.
     before, after : int
         Samples at either end that hold nothing, since a clock was moved.
     """
 
     channels: Mapping[str, Array]
-    said: tuple[str, ...] = ()
+    steps: tuple[Step, ...] = ()
+    notes: tuple[str, ...] = ()
     before: int = 0
     after: int = 0
 
@@ -85,13 +81,10 @@ def correct_log(log: TrialLog, vessel: Vessel | None = None) -> TrialLog:
     """
     vessel = vessel or log.vessel
     known = log.provenance
-    made = correct_channels(log.channels, log.sample_time, vessel, known.derived, known.fixed)
-    out = replace(
-        log,
-        channels=made.channels,
-        vessel=vessel,
-        provenance=replace(known, derived=(*known.derived, *made.said)),
-    )
+    made = correct_channels(log.channels, log.sample_time, vessel, known.steps)
+    read = (*known.read, *(n for n in made.notes if n not in known.read))
+    provenance = replace(known, steps=(*known.steps, *made.steps), read=read)
+    out = replace(log, channels=made.channels, vessel=vessel, provenance=provenance)
     if not made.before and not made.after:
         return out
     if len(log) - made.before - made.after < 3:
@@ -100,11 +93,7 @@ def correct_log(log: TrialLog, vessel: Vessel | None = None) -> TrialLog:
 
 
 def correct_channels(
-    channels: Mapping[str, Array],
-    sample_time: float,
-    vessel: Vessel,
-    derived: Iterable[str] = (),
-    fixed: Iterable[str] = (),
+    channels: Mapping[str, Array], sample_time: float, vessel: Vessel, steps: Iterable[Step] = ()
 ) -> Correction:
     """Take the defects that ``[sensors]`` states out of channels on a uniform clock.
 
@@ -120,22 +109,19 @@ def correct_channels(
     sample_time : float
         [s]
     vessel : Vessel
-    derived, fixed : iterable of str
-        What the record says was derived and mended before.
-
-    Returns
-    -------
-    Correction
+    steps : iterable of Step
+        What was done to the channels before.
     """
-    derived = tuple(derived)
+    steps = tuple(steps)
     if not _MOTION & channels.keys():
         return Correction(channels)
-    before = _said_before(derived)
-    now, said = _wanted(vessel, before, tuple(fixed))
-    was_derived = any(_DERIVED.match(d) for d in derived)
+    before = _removed(steps)
+    now, notes = _wanted(vessel, before, steps)
+    derived = {n for s in steps if s.derives_motion for n in s.channels}
+    was_derived = bool(derived & {"u", "v"})
     late = {c: s - before.clock.get(c, 0.0) for c, s in now.clock.items()}
-    late = {c: s for c, s in late.items() if s and c in channels}
-    if "psi" in late and any(_TURN_RATE.match(d) for d in derived) and "r" in channels:
+    late = {c: s for c, s in late.items() if not _same(s, 0.0) and c in channels}
+    if "psi" in late and "r" in derived and "r" in channels:
         late.setdefault("r", late["psi"])
     turned = [c for c in now.reversed if c in channels and c not in before.reversed]
     with_heading = was_derived or bool(vessel.sensors.get("velocities_from_heading"))
@@ -145,7 +131,7 @@ def correct_channels(
         if name not in ("u", "v"):
             out[name] = _earlier(out[name], seconds / sample_time)
     bias = now.heading_bias - before.heading_bias
-    if bias and "psi" in out:
+    if not _same(bias, 0.0) and "psi" in out:
         out["psi"] = out["psi"] - bias
     if {"u", "v"} <= out.keys():
         arms = (
@@ -156,11 +142,11 @@ def correct_channels(
             for own, place in (("u", "x_n"), ("v", "y_n"))
         ]
         _correct_velocities(channels, out, arms, shifts, sample_time, with_heading=with_heading)
-    said += _sentences(before, now, late, turned, out, was_derived)
     most, least = max(late.values(), default=0.0), min(late.values(), default=0.0)
     return Correction(
         out,
-        tuple(said),
+        _steps(before, now, late, turned, out, was_derived),
+        notes,
         before=ceil(max(-least, 0.0) / sample_time - 1e-9),
         after=ceil(max(most, 0.0) / sample_time - 1e-9),
     )
@@ -175,31 +161,52 @@ def too_late(vessel: Vessel, name: str) -> LogError:
     )
 
 
-def _said_before(derived: tuple[str, ...]) -> _Defects:
-    found: dict[str, Any] = {}
-    for sentence in derived:
-        match = _SAID.match(sentence)
-        if match is None or match[1] not in _Defects.__dataclass_fields__:
-            continue
-        try:
-            value = json.loads(match[2])
-        except ValueError:
-            continue
-        found[match[1]] = tuple(value) if isinstance(value, list) else value
-    return _Defects(**found)
+def _same(a: float, b: float) -> bool:
+    return isclose(a, b, rel_tol=_ROUNDING, abs_tol=_ROUNDING)
 
 
-def _wanted(vessel: Vessel, before: _Defects, fixed: tuple[str, ...]) -> tuple[_Defects, list[str]]:
+def _removed(steps: Iterable[Step]) -> _Defects:
+    """Return what the vessel file's corrections took out of the channels, in all."""
+    clock: dict[str, float] = {}
+    bias, turned = 0.0, set[str]()
+    arms: dict[Value, Arm] = {"antenna": (0.0, 0.0), "velocity_at": (0.0, 0.0)}
+    for step in steps:
+        if step.decided_by != "vessel":
+            continue
+        if step.operation == "shift":
+            for c in step.channels:
+                clock[c] = clock.get(c, 0.0) + step.number("late")
+        elif step.operation == "turn_heading":
+            bias += step.number("angle")
+        elif step.operation == "scale" and step.number("factor") < 0:
+            turned ^= set(step.channels)
+        elif step.operation == "move_velocity":
+            sensor = step.parameters.get("sensor", "velocity_at")
+            x, y = arms.get(sensor, (0.0, 0.0))
+            arms[sensor] = (x + step.number("x"), y + step.number("y"))
+    return _Defects(bias, clock, arms["velocity_at"], arms["antenna"], tuple(sorted(turned)))
+
+
+def _wanted(
+    vessel: Vessel, before: _Defects, steps: Iterable[Step]
+) -> tuple[_Defects, tuple[str, ...]]:
     """Return what the channels must be rid of in all, and what is not to be applied."""
     stated = {k: v for k, v in vessel.sensors.items() if k in _Defects.__dataclass_fields__}
     if "antenna" in stated:
         stated["antenna"] = stated["antenna"][:2]
-    said = []
-    for kind, key in _MENDED.items():
-        if key in stated and any(f.startswith(f"{kind} of") for f in fixed):
-            del stated[key]
-            said.append(f"[sensors] {key} is not applied: it was mended when the log was made")
-    return replace(before, **stated), said
+    mends = [s for s in steps if s.decided_by != "vessel" and not s.source]
+    done = {s.operation for s in mends}
+    void = [k for k, operation in _MENDED_BY.items() if k in stated and operation in done]
+    for key in void:
+        del stated[key]
+    signs = {n for s in mends if s.operation == "scale" and s.number("factor") < 0
+             for n in s.channels}  # fmt: skip
+    mended = signs & set(stated.get("reversed", ()))
+    if mended:
+        stated["reversed"] = tuple(c for c in stated["reversed"] if c not in mended)
+        void.append(f"reversed of {', '.join(sorted(mended))}")
+    notes = (f"[sensors] {k} is not applied: it was mended when the log was made" for k in void)
+    return replace(before, **stated), tuple(notes)
 
 
 def _earlier(value: Array, samples: float) -> Array:
@@ -219,7 +226,7 @@ def _correct_velocities(
 ) -> None:
     """Correct u and v in place, between where they were measured and the origin."""
     (x0, y0), (x1, y1) = arms
-    moved = arms[0] != arms[1]
+    moved = not (_same(x0, x1) and _same(y0, y1))
     heading = with_heading and "psi" in out and out["psi"] is not raw["psi"]
     if not moved and not heading and not any(shifts):
         return
@@ -228,9 +235,8 @@ def _correct_velocities(
         rate = raw["r"] if "r" in raw else np.gradient(raw["psi"], sample_time)
         u, v = u - rate * y0, v + rate * x0
     if heading:
-        c, s = np.cos(raw["psi"]), np.sin(raw["psi"])
-        north, east = _earlier(c * u - s * v, shifts[0]), _earlier(s * u + c * v, shifts[1])
-        u, v = earth_to_body(north, east, out["psi"])
+        north, east = body_to_ned(u, v, raw["psi"])
+        u, v = ned_to_body(_earlier(north, shifts[0]), _earlier(east, shifts[1]), out["psi"])
     elif any(shifts):
         u, v = _earlier(u, shifts[0]), _earlier(v, shifts[1])
     if moved or x0 or y0:
@@ -239,35 +245,27 @@ def _correct_velocities(
     out["u"], out["v"] = u, v
 
 
-def _sentences(
+def _steps(
     before: _Defects,
     now: _Defects,
     late: Mapping[str, float],
     turned: list[str],
     out: Mapping[str, Array],
     was_derived: bool,
-) -> list[str]:
-    said = []
-    if turned:
-        whole = sorted({*before.reversed, *turned})
-        said.append(_say("reversed", whole, f"the sign of {', '.join(turned)} turned"))
-    if late:
-        moved = ", ".join(f"{c} by {s:g} s" for c, s in late.items())
-        said.append(_say("clock", {**before.clock, **now.clock}, f"earlier by it, {moved}"))
-    if now.heading_bias != before.heading_bias and "psi" in out:
-        said.append(_say("heading_bias", now.heading_bias, "psi turned back by it [rad]"))
-    key = "antenna" if was_derived else "velocity_at"
-    arm = getattr(now, key)
-    if arm != getattr(before, key) and {"u", "v"} <= out.keys():
-        said.append(_say(key, list(arm), "u, v brought to the body origin"))
-    return said
+) -> tuple[Step, ...]:
+    """Return what was done, each by how much more than before."""
 
+    def step(operation: str, channels: Iterable[str], **parameters: Value) -> Step:
+        return Step(operation, tuple(channels), (), parameters, decided_by="vessel")
 
-def _say(key: str, value: Any, done: str) -> str:
-    return f"[sensors] {key} = {json.dumps(value, separators=(',', ':'))}: {done}"
-
-
-def said_antenna(antenna: tuple[float, ...]) -> list[str]:
-    """Return what the record says of velocities that were derived with this antenna."""
-    arm = [float(a) for a in antenna[:2]]
-    return [_say("antenna", arm, "u, v are those of the body origin")] if any(arm) else []
+    steps = [step("scale", turned, factor=-1.0)] if turned else []
+    for seconds in dict.fromkeys(late.values()):
+        steps.append(step("shift", (c for c, s in late.items() if s == seconds), late=seconds))
+    bias = now.heading_bias - before.heading_bias
+    if not _same(bias, 0.0) and "psi" in out:
+        steps.append(step("turn_heading", ("psi",), angle=bias))
+    sensor = "antenna" if was_derived else "velocity_at"
+    (x0, y0), (x1, y1) = getattr(before, sensor), getattr(now, sensor)
+    if not (_same(x0, x1) and _same(y0, y1)) and {"u", "v"} <= out.keys():
+        steps.append(step("move_velocity", ("u", "v"), x=x1 - x0, y=y1 - y0, sensor=sensor))
+    return tuple(steps)

@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 
 from greybox.errors import LogError
 from greybox.trial.convert.options import ImportOptions
-from greybox.trial.convert.resample import Clock, nice_period
+from greybox.trial.convert.resample import Clock, covered, nice_period, resampled_by, runs
+from greybox.trial.gaps import split_at_gaps
+from greybox.trial.steps import Step
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
@@ -90,6 +92,10 @@ class Plan:
     notes : tuple of str
     least : int
         Samples of the shortest stretch that is kept.
+    steps : tuple of Step
+        How signals of other rates are brought to the sample time.
+    times : ndarray, optional
+        (count,) [s] where the samples are those that were recorded, without a change.
     """
 
     name: str
@@ -100,11 +106,24 @@ class Plan:
     leading: tuple[str, ...]
     notes: tuple[str, ...]
     least: int
+    steps: tuple[Step, ...] = ()
+    times: Array | None = None
 
     def grid(self, first: int, stop: int) -> Array:
         """Return the times of some samples [s]."""
+        if self.times is not None:
+            return self.times[first:stop]
         # rounding keeps 0.3 from becoming 0.30000000000000004 in the file
         return np.round(self.start + self.sample_time * np.arange(first, stop), 9)
+
+    def stretches(self, grid: Array, clocks: Mapping[str, Clock]) -> list[tuple[int, int]]:
+        """Return the runs of samples (start, stop) in which every leading signal has values."""
+        if self.times is not None:
+            return split_at_gaps(grid, self.sample_time)
+        keep = np.ones(len(grid), bool)
+        for c in {id(clocks[n]): clocks[n] for n in self.leading}.values():
+            keep &= covered(grid, c)
+        return runs(keep)
 
 
 def plan_import(
@@ -124,10 +143,13 @@ def plan_import(
         if e.count < MIN_SEGMENT
     ]
     commands = set(vessel.commands)
+    # a command beside its feedback, or the other way round: it moves no model, so its holes
+    # and its ends must not cut the log
+    beside = set(vessel.recorded_columns) - commands
     used = {
         n: e
         for n, e in extents.items()
-        if e.count >= MIN_SEGMENT and n in {*_MOTION, *_WIND, *commands}
+        if e.count >= MIN_SEGMENT and n in {*_MOTION, *_WIND, *commands, *beside}
     }
     motion = [n for n in _MOTION if n in used]
     inputs = [c for c in vessel.commands if c in used]
@@ -146,12 +168,15 @@ def plan_import(
     for n in sorted(brief):
         others = used.keys() - brief
         # a sensor that soon died must not take the others with it, where they do without
-        if n in _WIND or any(pair <= others for pair in _INSTEAD.get(n, ())):
+        if n in beside and not used[n].steady:
+            # recorded where it changes, it holds until it changes again
+            continue
+        if n in beside or n in _WIND or any(pair <= others for pair in _INSTEAD.get(n, ())):
             notes.append(f"{n} covers {used[n].covered:.4g} of {most:.4g} s: left out")
             used.pop(n)
     leading = [n for n in _MOTION if n in used] or inputs
     sample_time = options.sample_time or _sample_time([used[n] for n in leading])
-    held = [n for n in used if n not in leading and used[n].steady]
+    held = [n for n in used if n not in (*leading, *beside) and used[n].steady]
     late = [n for n in inputs if n not in leading and n not in held]
     leading = [*leading, *held]
     start = max(used[n].first for n in (*leading, *late))
@@ -172,7 +197,8 @@ def plan_import(
             f"'{name}' spans {stop - start:.4g} s, {samples:.4g} samples of {sample_time:g} s, but "
             f"holds {values} values: correct its times, or choose a longer sample time."
         )
-    longest = max(e.last for e in used.values()) - min(e.first for e in used.values())
+    shaping = [e for n, e in used.items() if n not in beside]
+    longest = max(e.last for e in shaping) - min(e.first for e in shaping)
     if stop - start < 0.9 * longest:
         one = max((*leading, *late), key=lambda n: used[n].first)
         two = min(leading, key=lambda n: used[n].last)
@@ -190,6 +216,23 @@ def plan_import(
         tuple(leading),
         tuple(notes),
         max([MIN_SEGMENT, *_windows(options, count, sample_time)]),
+        _resampling({n: e.period for n, e in used.items()}, sample_time, vessel),
+    )
+
+
+def _resampling(
+    periods: Mapping[str, float], sample_time: float, vessel: Vessel
+) -> tuple[Step, ...]:
+    """Return how signals whose rate is not the log's are brought to it."""
+    held = frozenset(vessel.recorded_columns)
+    done: dict[str, list[str]] = {}
+    for name, period in periods.items():
+        how = resampled_by(period, sample_time, held=name in held)
+        if how is not None:
+            done.setdefault(how, []).append(name)
+    return tuple(
+        Step("resample", tuple(names), parameters={"how": how, "sample_time": sample_time})
+        for how, names in done.items()
     )
 
 

@@ -1,192 +1,319 @@
-"""Importing files of any size: what does not fit in memory goes through it in blocks."""
+"""Importing a table of any size in two passes: what does not fit in memory goes in blocks.
+
+The first pass finds clocks, units and origin, from which the samples of the log are planned;
+the second goes the way of every import (`greybox.trial.convert.convert`) block by block.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from itertools import chain
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.channels import CHANNELS
 from greybox.errors import LogError
 from greybox.files import sha256
-from greybox.trial.checks.check import check_recording
 from greybox.trial.convert.channel_mapping import (
+    TimeScale,
+    angle_reach,
+    angle_unit,
     batch_recording,
     canonical,
-    merge,
-    read_recording,
+    table_columns,
+    time_scale,
     unused_mappings,
 )
-from greybox.trial.convert.convert import cut_segments, import_recording, make_provenance
+from greybox.trial.convert.column_names import Assigned
+from greybox.trial.convert.convert import Conversion, Cut, cut_segments, make_provenance
 from greybox.trial.convert.deduplicate import clean_signals
-from greybox.trial.convert.first_pass import Scan, scan_table
+from greybox.trial.convert.derived_signals import derive_signals
 from greybox.trial.convert.options import ImportOptions
-from greybox.trial.convert.time_grid import gap_notes, too_short
+from greybox.trial.convert.resample import clock
+from greybox.trial.convert.time_grid import Extent, Plan, extent, gap_notes, plan_import
+from greybox.trial.gaps import joined_spans
 from greybox.trial.log import Provenance, TrialLog
-from greybox.trial.raw_log import Recording, SourceFile
-from greybox.trial.readers.formats import open_raw
+from greybox.trial.raw_log import Recording, Signal, SourceFile
 from greybox.trial.readers.table import Batch, TableFile
-from greybox.trial.repair import repair
-from greybox.trial.store import record_path, write_log
+from greybox.trial.steps import Step, new_steps
+from greybox.trial.store import read_record, recorded_provenance
 from greybox.vessel.vessel import Vessel
+
+Array = NDArray[np.float64]
 
 # tables that may hold more numbers are imported in blocks
 _LARGE_CELLS = 20_000_000
 _BLOCK_ROWS = 300_000
 # samples on both sides of a block that are made with it and not kept
 _MARGIN = 4
+# time may go back by this share of what a block spans: more cannot be sorted in blocks
+_MAX_BACK_ROWS = 10_000
 
 
-def import_files(
-    paths: Sequence[str | Path],
-    vessel: Vessel,
-    out: str | Path,
-    options: ImportOptions | None = None,
-    *,
-    fix: bool = False,
-    fix_also: tuple[str, ...] = (),
-    reader: Mapping[str, Any] | None = None,
-    extra: Mapping[str, Any] | None = None,
-) -> str:
-    """Import the raw files of one trial into one log file.
+@dataclass(frozen=True)
+class Scan:
+    """What must be known of a table before its first block can be imported.
 
     Parameters
     ----------
-    paths : sequence of str or Path
-        Raw files; several are merged on their clocks.
-    vessel : Vessel
-    out : str or Path
-        CSV or Parquet; its record is written beside it.
-    options : ImportOptions
-    fix : bool
-        Whether to mend what the checks find and what is safe to mend.
-    fix_also : tuple of str
-        Ids of findings to mend although they need judgement.
-    reader : mapping, optional
-        Handed to the readers, such as ``topics``.
-    extra : mapping, optional
-        More entries of the record.
+    assigned : dict of str to Assigned
+        Which column is which signal, units decided.
+    scale : TimeScale
+    origin : tuple of float, optional
+        Latitude and longitude [deg] of the first position.
+    back : float
+        By how much time goes back at most [s].
+    plan : Plan
+    notes : tuple of str
+    before : tuple of Step
+        What was done before, where the table is a log that greybox wrote.
+    """
 
-    Returns
-    -------
-    str
-        What was read, guessed, derived and mended.
+    assigned: dict[str, Assigned]
+    scale: TimeScale
+    origin: tuple[float, float] | None
+    back: float
+    plan: Plan
+    notes: tuple[str, ...]
+    before: tuple[Step, ...] = ()
+
+
+def scan_table(table: TableFile, vessel: Vessel, options: ImportOptions) -> Scan:
+    """Read a table once and decide on the samples of its log.
 
     Raises
     ------
     LogError
-        A file cannot be read, or no log can be made of them.
+        As `plan_import`; or time goes back too far to be sorted in blocks.
     """
-    options = options or ImportOptions()
-    _keep_sources(paths, out)
-    if len(paths) == 1 and not fix and not fix_also and Path(paths[0]).is_file():
-        table = open_raw(paths[0], **(reader or {}))
-        if not isinstance(table, Recording) and table.cells > _LARGE_CELLS:
-            return _in_blocks(table, vessel, out, options, extra)
-    recordings = [read_recording(p, vessel, **(reader or {})) for p in paths]
-    unused = unused_mappings(recordings, vessel)
-    recording = merge(recordings)
-    recording = recording.with_signals(recording.signals, *unused)
-    del recordings
-    fixed: tuple[str, ...] = ()
-    left: list[str] = []
-    if fix or fix_also:
-        report = check_recording(recording, vessel)
-        recording, fixed, left = repair(recording, vessel, report, also=fix_also)
-    imported = import_recording(recording, vessel, options, fixed=fixed)
-    write_log(imported.segments, out, extra=extra)
-    first, last = imported.segments[0], imported.segments[-1]
-    return _summary(
-        first,
-        sum(len(s) for s in imported.segments),
-        float(last.t[-1] - first.t[0]),
-        len(imported.segments),
-        [f"note: {n}" for n in imported.notes]
-        + [f"mended: {n}" for n in fixed]
-        + [f"left as it is: {n}" for n in left],
+    record = read_record(table.path)
+    if record is not None:
+        # what greybox wrote is canonical: a mapping would convert it twice
+        vessel = replace(vessel, columns={})
+    assigned = table_columns(table, vessel, guess=record is None)
+    found = _Found(table, vessel, options, assigned)
+    for batch in table.batches([a.raw for a in assigned.values()]):
+        found.add(batch)
+    if found.scale is None:
+        # nothing to measure: the message is that of an empty time column
+        time_scale(np.empty(0), assigned["t"], table)
+        raise AssertionError
+    before = recorded_provenance(record or {})
+    if found.scale.epoch is None:
+        found.scale = replace(found.scale, epoch=before.epoch)
+    if found.back > _MAX_BACK_ROWS * found.usual:
+        raise LogError(
+            f"time in '{table.path.name}' goes back by {found.back:.6g} s, at most "
+            f"{_MAX_BACK_ROWS * found.usual:.6g} s can be put in order in a file of that size: "
+            f"sort it, or cut it where time goes back."
+        )
+    units = {n: angle_unit(reach) for n, reach in found.reach.items()}
+    whole = canonical(found.sample, assigned, vessel, found.reach)
+    derived = derive_signals(whole, found.origin)
+    decided = {n: replace(a, unit=units[n]) if n in units else a for n, a in assigned.items()}
+    extents = {n: parts.extent() for n, parts in found.parts.items()}
+    plan = plan_import(extents, vessel, options, table.path.stem)
+    notes = [
+        *found.scale.notes,
+        *derived.notes,
+        *unused_mappings([found.raw], vessel),
+    ]
+    if found.backward:
+        notes.append(
+            f"time goes back {found.backward} time{'s' if found.backward > 1 else ''}, by "
+            f"{found.back:.6g} s at most: put in order"
+        )
+    if found.repeated:
+        notes.append(
+            f"{found.repeated} row{'s' if found.repeated > 1 else ''} repeat a time: "
+            f"the first is kept"
+        )
+    return Scan(
+        decided, found.scale, found.origin, found.back, plan, (*notes, *plan.notes), before.steps
     )
 
 
-def _keep_sources(paths: Sequence[str | Path], out: str | Path) -> None:
-    """Refuse to write the log over a raw file: it could not be imported again."""
-    targets = {Path(out).resolve(), record_path(out).resolve()}
-    for path in paths:
-        if Path(path).resolve() in targets:
-            raise LogError(
-                f"'{Path(path).name}' is also the log to write: name another file for the log."
-            )
+class _Parts:
+    """The clock of one signal, from batch to batch."""
+
+    def __init__(self, hole: float | None) -> None:
+        self.hole = hole
+        self.last: float | None = None
+        self.extents: list[Extent] = []
+
+    def add(self, t: Array) -> None:
+        """Add the times of a batch; they begin with the last time of the one before."""
+        if self.last is not None:
+            t = np.concatenate([[self.last], t])
+        if len(t) > 1 and not (np.diff(t) > 0).all():
+            t = np.unique(t)
+        if len(t) > 1:
+            part = extent(clock(t, self.hole))
+            self.extents.append(part if self.last is None else replace(part, count=part.count - 1))
+            self.last = part.last
+        elif len(t) and self.last is None:
+            self.last = float(t[0])
+            self.extents.append(extent(clock(t, self.hole)))
+
+    def extent(self) -> Extent:
+        """Return the whole: the usual step is the median over batches, by their counts."""
+        parts = [e for e in self.extents if e.period > 0] or self.extents
+        order = sorted(parts, key=lambda e: e.period)
+        share = np.cumsum([e.count for e in order])
+        middle = order[int(np.searchsorted(share, share[-1] / 2))]
+        near = [e for e in parts if abs(e.period - middle.period) <= 0.01 * middle.period]
+        return Extent(
+            min(e.first for e in self.extents),
+            max(e.last for e in self.extents),
+            sum(e.count for e in self.extents),
+            middle.period,
+            max(near, key=lambda e: e.covered).mean,
+            sum(e.covered for e in self.extents),
+            sum(e.irregular for e in self.extents),
+        )
 
 
-def _summary(
-    first: TrialLog, samples: int, seconds: float, segments: int, lines: Sequence[str]
-) -> str:
-    return "\n".join(
-        [
-            f"{first.provenance.source}: {samples} samples of {first.sample_time:g} s, "
-            f"{seconds:.6g} s, {segments} segment{'s' if segments > 1 else ''}",
-            f"channels: {', '.join(first.channels)}",
-            *lines,
-        ]
-    )
-
-
-def _in_blocks(
-    table: TableFile,
-    vessel: Vessel,
-    out: str | Path,
-    options: ImportOptions,
-    extra: Mapping[str, Any] | None,
-) -> str:
-    scan = scan_table(table, vessel, options)
-    stream = _Stream(table, vessel, options, scan)
-    write_log(stream.segments(), out, extra=extra, provenance=stream.provenance)
-    assert stream.first is not None
-    notes = [*stream.provenance().read, *stream.derived]
-    return _summary(
-        stream.first,
-        stream.samples,
-        stream.spans[-1][1] - stream.spans[0][0],
-        len(stream.spans),
-        [f"note: {n}" for n in notes],
-    )
-
-
-class _Stream:
-    """The second pass over a table: what one block leaves to the next."""
+class _Found:
+    """What has been seen so far of a table."""
 
     def __init__(
-        self, table: TableFile, vessel: Vessel, options: ImportOptions, scan: Scan
+        self,
+        table: TableFile,
+        vessel: Vessel,
+        options: ImportOptions,
+        assigned: dict[str, Assigned],
     ) -> None:
-        self.table, self.vessel, self.options, self.scan = table, vessel, options, scan
+        self.table, self.vessel, self.options, self.assigned = table, vessel, options, assigned
+        self.scale: TimeScale | None = None
+        self.origin = options.origin
+        self.back, self.backward, self.repeated = 0.0, 0, 0
+        self.usual = 0.0
+        self.newest = -np.inf
+        self.parts: dict[str, _Parts] = {}
+        self.reach: dict[str, tuple[float, float]] = {}
+        self.raw = self.sample = Recording("", ())
+
+    def add(self, batch: Batch) -> None:
+        """Take in one batch."""
+        time = self.assigned["t"]
+        column = batch[time.raw]
+        if self.scale is None:
+            if not np.isfinite(column).any():
+                return
+            self.scale = time_scale(column, time, self.table)
+        raw = batch_recording(self.table, batch, self.assigned, self.scale, self.vessel)
+        t = self.scale.seconds(column)
+        good = np.isfinite(t)
+        self._order(t[good])
+        self._reach(raw)
+        recording = canonical(raw, self.assigned, self.vessel)
+        if not self.sample.signals:
+            self.sample, self.raw = _head(raw), recording
+        if self.origin is None:
+            self.origin = _first_position(recording)
+        keeps: dict[tuple[int, bytes], Array] = {}
+        for s in derive_signals(recording, self.origin).signals:
+            keep = np.isfinite(s.t) & np.isfinite(s.value)
+            t = keeps.setdefault((id(s.t), np.packbits(keep).tobytes()), s.t[keep])
+            self.parts.setdefault(s.name, _Parts(self.options.hole)).add(t)
+
+    def _order(self, t: Array) -> None:
+        if not len(t):
+            return
+        steps = np.diff(t)
+        if len(steps) and not self.usual:
+            self.usual = float(np.median(np.abs(steps)))
+        before = np.maximum.accumulate(np.concatenate([[self.newest], t]))
+        fall = before[:-1] - t
+        fall = fall[np.isfinite(fall)]
+        self.backward += int(np.sum(steps < 0))
+        self.repeated += int(np.sum(steps == 0))
+        self.back = max(self.back, float(fall.max(initial=0.0)))
+        self.newest = float(before[-1])
+
+    def _reach(self, raw: Recording) -> None:
+        for name, a in self.assigned.items():
+            angle = name in self.vessel.recorded_angles or (
+                name in CHANNELS and CHANNELS[name].unit == "rad"
+            )
+            if angle and a.unit is None and a.how != "exact" and a.raw in raw:
+                new, old = angle_reach(raw[a.raw].value), self.reach.get(name, (0.0, 0.0))
+                self.reach[name] = (max(new[0], old[0]), max(new[1], old[1]))
+
+
+def _head(recording: Recording) -> Recording:
+    """Return the first values of a recording, enough to name what is derived of them."""
+    return recording.with_signals(
+        Signal(s.name, s.t[:100], s.value[:100], s.unit, s.source, s.canonical)
+        for s in recording.signals
+    )
+
+
+def _first_position(recording: Recording) -> tuple[float, float] | None:
+    if "lat" not in recording or "lon" not in recording:
+        return None
+    lat, lon = recording["lat"].value, recording["lon"].value
+    good = np.flatnonzero(np.isfinite(lat) & np.isfinite(lon))
+    return (float(lat[good[0]]), float(lon[good[0]])) if len(good) else None
+
+
+def is_large(table: TableFile) -> bool:
+    """Whether a table may not fit in memory."""
+    return table.cells > _LARGE_CELLS
+
+
+class Stream:
+    """The two passes over a table: what is known of it, and what one block leaves to the next.
+
+    Parameters
+    ----------
+    table : TableFile
+    vessel : Vessel
+    options : ImportOptions
+    """
+
+    def __init__(self, table: TableFile, vessel: Vessel, options: ImportOptions) -> None:
+        self.table, self.vessel, self.options = table, vessel, options
+        self.scan = scan_table(table, vessel, options)
         self.first: TrialLog | None = None
-        self.samples = 0
-        self.spans: list[tuple[float, float]] = []
-        self.derived: dict[str, None] = {}
+        self.steps: tuple[Step, ...] = ()
+        self.said: tuple[str, ...] = ()
+        self.late = False
         self.done = 0
         self.anchors: dict[str, float] = {}
         self.file = SourceFile(table.path.name, sha256(table.path), table.format)
+        self._spans: list[tuple[float, float, int]] = []
+
+    @property
+    def reach(self) -> float:
+        """Time over which filters and clocks that are moved see their neighbours [s]."""
+        late = self.vessel.sensors.get("clock", {}).values()
+        return self.options.reach + max((abs(s) for s in late), default=0.0)
 
     @property
     def halo(self) -> float:
         """Time that blocks share, so that no filter sees a block's end [s]."""
         plan = self.scan.plan
         slowest = max(plan.periods.values())
-        return 8 * (plan.sample_time + slowest) + 2 * self.options.reach + self.scan.back
+        return 8 * (plan.sample_time + slowest) + 2 * self.reach + self.scan.back
+
+    @property
+    def spans(self) -> list[tuple[float, float, int]]:
+        """First and last time [s] and samples of each segment so far."""
+        return joined_spans(self._spans, self.scan.plan.sample_time)
 
     def provenance(self) -> Provenance:
         """Return where the log came from, with all that is known by now."""
-        notes = dict.fromkeys(
-            [*self.table.notes, *self.scan.notes, *gap_notes(self.spans, 0, self.scan.plan.least)]
-        )
+        gaps = gap_notes([s[:2] for s in self.spans], 0, self.scan.plan.least)
+        notes = dict.fromkeys([*self.table.notes, *self.scan.notes, *gaps, *self.said])
         whole = Recording(
             self.table.path.stem, (), epoch=self.scan.scale.epoch, files=(self.file,),
-            derived=self.scan.derived,
+            notes=tuple(notes), steps=(*self.scan.before, *self.steps),
         )  # fmt: skip
-        return make_provenance(whole, self.options, list(notes), list(self.derived))
+        return make_provenance(whole, self.options, self.vessel.conditions)
 
     def segments(self) -> Iterator[TrialLog]:
         """Yield the pieces of the log in order of time.
@@ -196,7 +323,7 @@ class _Stream:
         LogError
             A row cannot be read, or there is no piece.
         """
-        scan, plan = self.scan, self.scan.plan
+        scan = self.scan
         columns = [a.raw for a in scan.assigned.values()]
         held: dict[str, list[NDArray[Any]]] = {c: [] for c in columns}
         fresh = 0
@@ -215,7 +342,7 @@ class _Stream:
             yield from pieces
             fresh = 0
         if self.first is None:
-            raise too_short(plan)
+            raise Cut([], late=self.late).refusal(self._conversion())
 
     def _block(self, block: Batch, *, last: bool) -> tuple[int, list[TrialLog]]:
         """Return the first row that the next block needs, and the pieces of this one."""
@@ -241,23 +368,26 @@ class _Stream:
         self.done = stop
         return start, pieces
 
+    def _conversion(self, before: tuple[Step, ...] = ()) -> Conversion:
+        return Conversion(self.vessel, self.options, self.scan.plan, before)
+
     def _pieces(self, recording: Recording, stop: int) -> list[TrialLog]:
         scan, plan = self.scan, self.scan.plan
         if stop <= self.done:
             return []
-        notes: list[str] = []
-        signals = clean_signals(recording, scan.origin, notes)
+        clean = clean_signals(replace(recording, steps=scan.before), scan.origin)
         # samples beside those wanted, so that stretches do not end where the block does
-        margin = _MARGIN + int(np.ceil(self.options.reach / plan.sample_time))
+        margin = _MARGIN + int(np.ceil(self.reach / plan.sample_time))
         span = (max(self.done - margin, 0), min(stop + margin, plan.count))
-        found, derived, _ = cut_segments(
-            signals, recording.text, plan, span, self.vessel, self.options, scan.derived
-        )
-        self.derived.update(dict.fromkeys(derived))
+        cut = cut_segments(clean, self._conversion(clean.steps), span)
+        made = (*clean.steps[len(scan.before) :], *cut.steps)
+        self.steps += new_steps(self.steps, made)
+        self.said = tuple(dict.fromkeys([*self.said, *cut.notes]))
+        self.late |= cut.late
         low, high = plan.grid(self.done, self.done + 1)[0], plan.grid(stop, stop + 1)[0]
         half = 0.5 * plan.sample_time
         pieces = []
-        for log in found:
+        for log in cut.segments:
             inside = np.flatnonzero((log.t > low - half) & (log.t < high - half))
             if not len(inside):
                 continue
@@ -265,12 +395,7 @@ class _Stream:
             if self.first is None:
                 piece = replace(piece, provenance=self.provenance())
                 self.first = piece
-            begin, end = float(piece.t[0]), float(piece.t[-1])
-            if self.spans and begin - self.spans[-1][1] < 1.5 * plan.sample_time:
-                self.spans[-1] = (self.spans[-1][0], end)
-            else:
-                self.spans.append((begin, end))
-            self.samples += len(piece)
+            self._spans.append((float(piece.t[0]), float(piece.t[-1]), len(piece)))
             pieces.append(piece)
         return pieces
 
@@ -278,7 +403,7 @@ class _Stream:
         """Unwrap angles as if the blocks before were there; `start` is where the next begins."""
         out = []
         for s in recording.signals:
-            if s.name in {"psi", *self.vessel.angle_commands}:
+            if s.name in {"psi", *self.vessel.recorded_angles}:
                 order = np.argsort(s.t, kind="stable")
                 rows = order[np.isfinite(s.value[order]) & np.isfinite(s.t[order])]
                 if len(rows):

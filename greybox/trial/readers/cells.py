@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.trial.readers.limits import limits
+
 NULLS = ["", "NaN", "nan", "NAN", "NA", "N/A", "n/a", "null", "NULL", "None", "none", "-", "--"]
 NULLS += ["#N/A", "NaT"]
 DAY = 86400.0
@@ -23,8 +25,6 @@ _DATE = re.compile(r"\d{4}([-/])\d\d\1\d\d[T ]\d\d:\d\d|\d\d\.\d\d\.\d{4}[T ]\d\
 _CLOCK = re.compile(r"\d\d?:\d\d:\d\d([.,]\d+)?")
 # RE2, on bytes
 _PLAIN = r"^-?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?$"
-# bytes of a word: the mode of a controller or a date is shorter
-_MAX_WORD = 256
 
 
 def is_blank(cell: str) -> bool:
@@ -142,7 +142,7 @@ def text(column: Any) -> NDArray[Any]:
     large = pa.types.is_large_string(column.type) or pa.types.is_large_binary(column.type)
     # NumPy gives every word of an array the room of the longest
     cut = compute.binary_slice(
-        column.cast(pa.large_binary() if large else pa.binary()), 0, _MAX_WORD
+        column.cast(pa.large_binary() if large else pa.binary()), 0, limits().text
     )
     raw = cut.to_pylist()
     return np.array(["" if c is None else c.decode("utf-8", "replace") for c in raw], object)

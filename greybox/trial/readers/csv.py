@@ -14,14 +14,9 @@ from typing import Any
 from greybox.errors import LogError
 from greybox.trial.readers import cells as cell_text
 from greybox.trial.readers.layout import find_layout
+from greybox.trial.readers.limits import limits
 from greybox.trial.readers.table import Batch
 
-_BLOCK_BYTES = 1 << 23
-# what Arrow says of its blocks, in words about the file
-_REASONS = {
-    "straddles two block boundaries": f"a line is longer than {_BLOCK_BYTES} bytes",
-    "out of sync with chunker": "a quoted cell holds line ends, or its quote is never closed",
-}
 _BLANKS = re.compile(rb"[ \t]+")
 
 
@@ -75,7 +70,7 @@ class CsvFile:
             reader = arrow.open_csv(
                 clean,
                 read_options=arrow.ReadOptions(
-                    block_size=_BLOCK_BYTES,
+                    block_size=limits().block_bytes,
                     column_names=list(self.columns),
                     skip_rows=self.skip,
                 ),
@@ -96,10 +91,8 @@ class CsvFile:
         except (pa.ArrowException, OSError, UnicodeError, ValueError) as error:
             if isinstance(error, LogError):
                 raise
-            reason = " ".join(str(error).split())[:200].rstrip(".")
-            reason = next((said for sign, said in _REASONS.items() if sign in reason), reason)
             raise LogError(
-                f"cannot read '{self.path.name}' as CSV after {rows} rows: {reason}. "
+                f"cannot read '{self.path.name}' as CSV after {rows} rows: {_reason(error)}. "
                 f"Cut the file before that place, or export it again."
             ) from None
         if clean.unfinished:
@@ -137,6 +130,16 @@ class CsvFile:
         if name in days:
             return days[name].seconds(column)
         return cell_text.numbers(column, self.decimal, name, words)
+
+
+def _reason(error: Exception) -> str:
+    """Return what Arrow says, in words about the file where it speaks of its blocks."""
+    said = " ".join(str(error).split())[:200].rstrip(".")
+    if "straddles two block boundaries" in said:
+        return f"a line is longer than {limits().block_bytes} bytes"
+    if "out of sync with chunker" in said:
+        return "a quoted cell holds line ends, or its quote is never closed"
+    return said
 
 
 def open_csv(path: Path) -> CsvFile:
@@ -204,14 +207,14 @@ class _Clean(RawIOBase):
     def read(self, size: int = -1) -> bytes:
         """Return up to `size` bytes, none at the end only."""
         while not len(self._ready):
-            raw = self._file.read(_BLOCK_BYTES)
+            raw = self._file.read(limits().block_bytes)
             block = raw if self._decode is None else self._decode(raw, not raw).encode()
             if not raw and not block:
                 # what has no end may be half a line, and half a number looks like a number
                 self.unfinished = bool(self._rest.strip())
                 return b""
             cut = max(block.rfind(b"\n"), block.rfind(b"\r")) + 1
-            if cut == 0 and len(self._rest) + len(block) < 2 * _BLOCK_BYTES and raw:
+            if cut == 0 and len(self._rest) + len(block) < 2 * limits().block_bytes and raw:
                 self._rest += block
                 continue
             # a line that long fails in the parser, without being held here

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import stat
+from collections.abc import Callable
 from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -25,7 +26,12 @@ _RECORDINGS = {
     ".nmea": "nmea", ".nmea0183": "nmea", ".log": "nmea", ".mat": "mat", ".bag": "ros",
     ".mcap": "ros", ".db3": "ros",
 }  # fmt: skip
-_READ = {"nmea": "read_nmea", "mat": "read_mat", "ros": "read_bag"}
+_READ = {"nmea": "nmea.read_nmea", "mat": "mat.read_mat", "ros": "ros.read.read_bag"}
+# packages of the extra 'ros', by the name that they are imported by
+_ROS_PACKAGES = {
+    "rosbags": "rosbags", "mcap": "mcap", "lz4": "lz4", "zstandard": "zstandard",
+    "ruamel": "ruamel.yaml",
+}  # fmt: skip
 _MAGIC = (
     (b"PAR1", "parquet", "Parquet"),
     (b"#ROSBAG", "ros", "a ROS bag"),
@@ -80,7 +86,8 @@ def open_raw(path: str | Path, **options: Any) -> Recording | TableFile:
     Raises
     ------
     LogError
-        There is no such file, it is empty, or of no known format.
+        There is no such file, it is empty, or of no known format; or its format is that
+        of an extra that is not installed.
     """
     path = Path(path)
     kind = _kind(path)
@@ -88,11 +95,26 @@ def open_raw(path: str | Path, **options: Any) -> Recording | TableFile:
         module = import_module(f"greybox.trial.readers.{kind}")
         return cast(TableFile, getattr(module, f"open_{kind}")(path))
     if kind in _READ:
-        module = import_module(f"greybox.trial.readers.{kind}")
         given = options if kind == "ros" else {}
-        return cast(Recording, getattr(module, _READ[kind])(path, **given))
+        return cast(Recording, _reader(kind, path)(path, **given))
     found = {e.name: e for e in entry_points(group=GROUP)}
     return cast(Recording, found[kind].load()(path))
+
+
+def _reader(kind: str, path: Path) -> Callable[..., Any]:
+    """Return the function that reads a kind of file; its packages may not be installed."""
+    module, _, function = _READ[kind].rpartition(".")
+    try:
+        found = import_module(f"greybox.trial.readers.{module}")
+    except ModuleNotFoundError as error:
+        package = _ROS_PACKAGES.get((error.name or "").partition(".")[0])
+        if kind != "ros" or package is None:
+            raise
+        raise LogError(
+            f"'{path.name}' is a ROS bag or MCAP file, and the package '{package}' that such files "
+            f"need is not installed: run pip install 'greybox-marine[ros]'."
+        ) from None
+    return cast(Callable[..., Any], getattr(found, function))
 
 
 def _kind(path: Path) -> str:

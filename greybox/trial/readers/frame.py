@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from greybox.errors import LogError
-from greybox.trial.convert.column_names import spelled_unit
 from greybox.trial.readers import cells
 from greybox.trial.readers.parquet import column_kind, column_values
 from greybox.trial.readers.table import Batch
+from greybox.units import spelled_unit
 
 if TYPE_CHECKING:
     import pandas as pd

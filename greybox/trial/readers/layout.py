@@ -12,13 +12,12 @@ from pathlib import Path
 import numpy as np
 
 from greybox.errors import LogError
-from greybox.trial.convert.column_names import spelled_unit
 from greybox.trial.readers import cells
+from greybox.trial.readers.limits import limits
+from greybox.units import spelled_unit
 
 _FIRST_BYTES = 1 << 16
-_MAX_HEAD = 1 << 22
 _HEAD_LINES = 60
-_MAX_COLUMNS = 4096
 _MAX_NOTED = 5
 _DELIMITERS = (",", ";", "\t", "|", " ")
 _END = re.compile(r"\r\n|\r|\n")
@@ -183,7 +182,7 @@ def _head(path: Path) -> tuple[list[str], str]:
     """Return the first lines, and the encoding; a last line that may be cut is left out."""
     with open(path, "rb") as handle:
         raw = handle.read(_FIRST_BYTES)
-        while raw.count(b"\n") <= _HEAD_LINES and len(raw) < _MAX_HEAD:
+        while raw.count(b"\n") <= _HEAD_LINES and len(raw) < limits().head_bytes:
             if raw.count(b"\0") == len(raw) or not (block := handle.read(_FIRST_BYTES)):
                 break
             raw += block
@@ -295,9 +294,9 @@ def _no_header(path: Path, split: _Split) -> LogError:
 
 
 def _unique(names: list[str], notes: list[str]) -> tuple[str, ...]:
-    if len(names) > _MAX_COLUMNS:
+    if len(names) > (most := limits().columns):
         raise LogError(
-            f"the header names {len(names)} columns, at most {_MAX_COLUMNS} are read: export fewer."
+            f"the header names {len(names)} columns, at most {most} are read: export fewer."
         )
     taken: set[str] = set()
     found, renamed = [], []

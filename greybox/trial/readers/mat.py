@@ -13,40 +13,26 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.channels import unit_factor
 from greybox.errors import LogError, suggestion
 from greybox.files import sha256
 from greybox.trial.raw_log import Array, Recording, Signal, SourceFile
-from greybox.trial.readers.matfile import Tree, Unreadable, load_tree
+from greybox.trial.readers.limits import limits
+from greybox.trial.readers.mat_tree import Tree, Unreadable
+from greybox.trial.readers.matfile import load_tree
+from greybox.units import UNITS, find_unit, is_unix_time, spelled_unit, time_unit, unix_unit
 
-MAX_COLUMNS = 64
-MAX_NOTES = 60
-MAX_SCALARS = 40
-# characters of a text that are kept, so that one long line does not widen a column of words
-_MAX_TEXT = 200
+# settings among the notes
+_MAX_SCALARS = 40
 
 # days since the year 0 and since 1970, as MATLAB's datenum counts
 _DATENUM = (7e5, 8e5)
 _DATENUM_1970 = 719529.0
-_UNIX = 1e8
 _RISING = 0.9
 
 _TIME = re.compile(
     r"(?:.*[_.])?(?:t|time|times|tout|timestamps?|time_?stamps?|unix_?time|posix_?time|utc|"
     r"date_?time|datenum|sim_?time|elapsed|row_?times)(?:[_.]?(?P<unit>s|sec|seconds|ms|us|ns|min))?"
 )
-_TIME_UNITS = {
-    "s": 1.0, "sec": 1.0, "secs": 1.0, "second": 1.0, "seconds": 1.0,
-    "ms": 1e-3, "milliseconds": 1e-3, "us": 1e-6, "microseconds": 1e-6,
-    "ns": 1e-9, "nanoseconds": 1e-9, "min": 60.0, "minutes": 60.0,
-    "h": 3600.0, "hours": 3600.0, "days": 86400.0,
-}  # fmt: skip
-_UNITS = {
-    "degrees": "deg", "degree": "deg", "°": "deg", "radians": "rad", "radian": "rad",
-    "knot": "kn", "kt": "kn", "kts": "kn", "mps": "m/s", "metres": "m", "meters": "m",
-    "seconds": "s", "°/s": "deg/s", "deg/sec": "deg/s", "rad/sec": "rad/s", "meter": "m",
-    "m/sec": "m/s", "rpm": "rpm", "newton": "N", "newtons": "N",
-}  # fmt: skip
 # the one column of a timeseries has the name of the series
 _BARE = frozenset({"data", "values", "value"})
 _LABELS = ("variablenames", "columns", "names", "labels", "channels", "header", "headers")
@@ -134,9 +120,9 @@ class _Reader:
         self.scalars = 0
 
     def note(self, text: str) -> None:
-        if len(self.notes) < MAX_NOTES:
+        if len(self.notes) < limits().notes:
             self.notes.append(text)
-        elif len(self.notes) == MAX_NOTES:
+        elif len(self.notes) == limits().notes:
             self.notes.append("more was left out than is listed here.")
 
     # first the structure, so that every time is known before signals look for theirs
@@ -144,13 +130,13 @@ class _Reader:
     def collect(self, tree: Tree, name: str = "", outer: _Scope | None = None) -> None:
         """Take in one struct and those inside it."""
         scope = _Scope(name, [], outer)
-        units = _time_units(tree)
+        stated = _stated_time_unit(tree)
         for key, value in tree.items():
             match = _TIME.fullmatch(key.casefold())
             if match is None:
                 continue
-            factor = _TIME_UNITS.get(match["unit"] or "", units)
-            time = _time(_join(name, key), value, factor)
+            unit = spelled_unit(match["unit"]) if match["unit"] else stated
+            time = _time(_join(name, key), value, unit)
             if time is not None:
                 scope.times.append(time)
                 self.times.append(time)
@@ -180,7 +166,7 @@ class _Reader:
             self._list(path, key, value, scope)
         elif isinstance(value, str):
             if value:
-                self._scalar(path, value[:_MAX_TEXT])
+                self._scalar(path, value[: limits().text])
         elif value.size == 1:
             self._scalar(path, f"{float(value.ravel()[0]):.12g}")
         elif value.size:
@@ -193,7 +179,7 @@ class _Reader:
     def _scalar(self, path: str, value: str) -> None:
         # notes of what was left out must not drown in a struct of settings
         self.scalars += 1
-        if self.scalars <= MAX_SCALARS:
+        if self.scalars <= _MAX_SCALARS:
             self.note(f"{path} = {value}")
 
     def _list(self, path: str, key: str, value: list[Any], scope: _Scope) -> None:
@@ -209,19 +195,21 @@ class _Reader:
             if columns:
                 self.collect(columns, path, scope)
                 return
-            for k, item in enumerate(value[:MAX_COLUMNS], start=1):
+            for k, item in enumerate(value[: limits().matrix_columns], start=1):
                 self.collect(item, f"{path}_{k}", scope)
-            if len(value) > MAX_COLUMNS:
-                self.note(f"of the {len(value)} structs of '{path}' {MAX_COLUMNS} were read.")
+            if len(value) > limits().matrix_columns:
+                self.note(
+                    f"of the {len(value)} structs of '{path}' {limits().matrix_columns} were read."
+                )
             return
-        for k, item in enumerate(value[:MAX_COLUMNS], start=1):
+        for k, item in enumerate(value[: limits().matrix_columns], start=1):
             if isinstance(item, dict):
                 self.collect(item, f"{path}_{k}", scope)
             elif isinstance(item, (Unreadable, np.ndarray)):
                 self._value(f"{path}_{k}", f"{key}_{k}", item, scope, {})
 
     def _simulink(self, signals: list[Tree], scope: _Scope) -> None:
-        for k, item in enumerate(signals[:MAX_COLUMNS], start=1):
+        for k, item in enumerate(signals[: limits().matrix_columns], start=1):
             label = item.get("label")
             if not isinstance(label, str) or not label:
                 block = item.get("blockName")
@@ -261,7 +249,7 @@ class _Reader:
             if isinstance(item.value, list):
                 time = self._own_time(item, (len(item.value),))
                 if time is not None:
-                    words = np.array([w[:_MAX_TEXT] for w in item.value])
+                    words = np.array([w[: limits().text] for w in item.value])
                     text[_free(item.name, used)] = (clocks[id(time)], words)
                 continue
             time = self._own_time(item, item.value.shape)
@@ -304,12 +292,12 @@ class _Reader:
         if value.shape[axis] != count:
             axis = value.shape.index(count)
         table = np.moveaxis(value, axis, 0).reshape(count, -1)
-        width = table.shape[1]
-        if width > MAX_COLUMNS:
-            self.note(f"of the {width} columns of '{item.name}' {MAX_COLUMNS} were read.")
+        width, most = table.shape[1], limits().matrix_columns
+        if width > most:
+            self.note(f"of the {width} columns of '{item.name}' {most} were read.")
         named = len(item.labels) == width
         units = item.units if len(item.units) == width else [""] * width
-        for k in range(min(width, MAX_COLUMNS)):
+        for k in range(min(width, most)):
             name = item.name if width == 1 else f"{item.name}_{k + 1}"
             if named:
                 name = _join(item.scope.name, item.labels[k])
@@ -319,13 +307,11 @@ class _Reader:
         stated = stated.strip()
         if not stated:
             return None
-        unit = _UNITS.get(stated.casefold(), stated)
-        try:
-            unit_factor(unit, None, name)
-        except LogError:
+        unit = find_unit(stated)
+        if unit is None:
             self.note(f"the unit '{stated}' of '{name}' is unknown and was left out.")
             return None
-        return unit
+        return unit.symbol
 
     def _objects(self) -> str:
         if not self.unreadable:
@@ -422,10 +408,12 @@ def _labels(tree: Tree, key: str) -> tuple[list[str], list[str]]:
     return labels, units
 
 
-def _time_units(tree: Tree) -> float:
+def _stated_time_unit(tree: Tree) -> str | None:
+    """Return the unit of time that a timeseries states, None where it states none."""
     info = _child(tree, "timeinfo")
     stated = _child(info, "units") if isinstance(info, dict) else None
-    return _TIME_UNITS.get(stated.casefold(), 1.0) if isinstance(stated, str) else 1.0
+    unit = find_unit(stated) if isinstance(stated, str) else None
+    return unit.symbol if unit is not None and unit.si == "s" else None
 
 
 def _records(items: list[Any]) -> Tree:
@@ -447,8 +435,8 @@ def _records(items: list[Any]) -> Tree:
     return columns if times else {}
 
 
-def _time(name: str, value: Any, factor: float) -> _Time | None:
-    """Return a time column, None where the value cannot be one."""
+def _time(name: str, value: Any, stated: str | None) -> _Time | None:
+    """Return a time column in its stated or guessed unit, None where the value cannot be one."""
     if isinstance(value, list):
         return _dates(name, value)
     if not isinstance(value, np.ndarray) or value.size < 2 or max(value.shape) != value.size:
@@ -469,26 +457,16 @@ def _time(name: str, value: Any, factor: float) -> _Time | None:
         note = f"'{name}' was taken as MATLAB datenum (days), for it is near {middle:.0f}."
         t = np.asarray((raw - start) * 86400.0, float)
         return _Time(name, t, (start - _DATENUM_1970) * 86400.0, note)
-    if middle * factor > _UNIX:
-        # seconds in 1973 are as many as milliseconds in 1970: each unit has its decades
-        scale = next(
-            (s for limit, s in ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3)) if middle > limit), factor
-        )
-        word = {1e-9: "nanoseconds", 1e-6: "microseconds", 1e-3: "milliseconds"}.get(
-            scale, "seconds"
-        )
-        note = f"'{name}' was taken as UNIX {word}, for it is near {middle:.6g}."
-        start_raw = known[0]
+    unit = unix_unit(middle) or stated or time_unit(known)
+    factor = UNITS[unit].factor
+    if is_unix_time(middle * factor):
+        note = f"'{name}' was taken as UNIX time in {unit}, for it is near {middle:.6g}."
         # integers are subtracted as integers: a float of nanoseconds is 0.2 us coarse
-        t = (
-            np.asarray(
-                (raw - start_raw).astype(np.int64) if raw.dtype.kind in "iu" else raw - start_raw,
-                float,
-            )
-            * scale
-        )
-        return _Time(name, t, float(start_raw) * scale, note)
-    note = f"'{name}' was taken as {factor:g} s a unit." if factor != 1.0 else ""
+        whole = raw.astype(np.int64) if raw.dtype.kind in "iu" else raw
+        first = whole[np.isfinite(whole)][0]
+        t = np.asarray(whole - first, float) * factor
+        return _Time(name, t, float(first) * factor, note)
+    note = f"'{name}' was taken as time in {unit}." if unit != "s" else ""
     return _Time(name, np.asarray(raw, float) * factor, None, note)
 
 

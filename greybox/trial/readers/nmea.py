@@ -9,11 +9,11 @@ from __future__ import annotations
 import re
 from array import array
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import reduce
-from math import isfinite, nan, radians
+from math import isfinite, nan
 from operator import xor
 from pathlib import Path
 
@@ -23,33 +23,29 @@ from numpy.typing import NDArray
 from greybox.errors import LogError
 from greybox.files import sha256
 from greybox.trial.raw_log import Recording, Signal, SourceFile
+from greybox.trial.readers.limits import limits
+from greybox.units import UNITS
 
 Array = NDArray[np.float64]
 
-# the standard allows 82 characters; receivers and tag blocks take more
-_MAX_LINE = 1024
-_BLOCK = 1 << 22
 _DAY = 86400.0
-_SPEED_UNITS = {b"K": 1 / 3.6, b"N": 1852 / 3600, b"M": 1.0, b"S": 1609.344 / 3600}
+_SPEED_UNITS = {b"K": "km/h", b"N": "kn", b"M": "m/s", b"S": "mph"}
 _STAMP = re.compile(
     rb"(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d(?:[.,]\d+)?)(Z|[+-]\d\d:?\d\d)?"
     rb"|(?<![\d.])(\d{9,10}(?:\.\d+)?|\d{13})(?![\d.])"
 )
 # a date that jumps further is a receiver that has just woken up
 _MAX_DAYS = 366
-_UNITS = {
-    "lat": "deg", "lon": "deg", "psi": "rad", "r": "rad/s", "sog": "m/s", "cog": "rad",
-    "V_q": "m/s", "dir_q": "rad", "V_w": "m/s", "dir_w": "rad", "dir_t": "rad",
-    "rudder_starboard": "rad", "rudder_port": "rad",
-}  # fmt: skip
+# by unit: factor to SI, and the SI unit
+_FACTORS = {symbol: (unit.factor, unit.si) for symbol, unit in UNITS.items()}
+# sides of the ship, and of the meridian
+_SIGNS = {b"L": -1.0, b"R": 1.0, b"W": -1.0, b"E": 1.0}
 # which sentence to believe where several give one quantity, best first
 _PREFERRED = {
     "lat": ("GGA", "GNS", "RMC", "GLL"), "lon": ("GGA", "GNS", "RMC", "GLL"),
     "sog": ("VTG", "RMC"), "cog": ("VTG", "RMC"), "psi": ("THS", "HDT", "HDG"),
     "V_q": ("MWV", "VWR"), "dir_q": ("MWV", "VWR"), "V_w": ("MWD", "MWV"),
 }  # fmt: skip
-
-_MAGNETIC = "HDG without variation taken for true headings, none"
 
 Fields = list[bytes]
 # a quantity by name and the sentence that gave it
@@ -63,6 +59,7 @@ class _Track:
         self.tag = array("q")
         self.order = array("q")
         self.value = array("d")
+        self.unit = ""
 
 
 class _Stream:
@@ -76,25 +73,19 @@ class _Stream:
         self.first_date: tuple[int, datetime] | None = None
         self.counts: Counter[str] = Counter()
         self.skipped: Counter[str] = Counter()
+        self.remarks: Counter[str] = Counter()
         self.order = 0
         # stamp before each line, by its number; only as long as the last line that has one
         self.stamps = array("d")
         self.sentence = ""
 
-    def give(self, name: str, value: float) -> None:
-        if not isfinite(value):
-            raise ValueError(name)
+    def give(self, name: str, value: float, unit: str) -> None:
+        """Add one value, in `unit`, at the time that was told last."""
         track = self.tracks[name, self.sentence]
+        track.unit = unit
         track.tag.append(len(self.tags) - 1)
         track.order.append(self.order)
         track.value.append(value)
-
-    def place(self, lat: Fields, lon: Fields) -> None:
-        """Give a position of value and hemisphere each; both or none."""
-        north = _degrees(lat[0], lat[1], b"NS", 90)
-        east = _degrees(lon[0], lon[1], b"EW", 180)
-        self.give("lat", north)
-        self.give("lon", east)
 
     def stamp(self, value: float) -> None:
         missing = self.order - len(self.stamps)
@@ -122,7 +113,7 @@ class _Stream:
 
     def idle_time(self, field: bytes) -> None:
         """Note the time that a receiver without a fix tells: its clock goes on once it was set."""
-        if field and self.tags:
+        if self.tags:
             self.time(field)
 
     def date(self, year: int, month: int, day: int, *, sure: bool) -> None:
@@ -140,6 +131,136 @@ class _Stream:
                 self.tags[-1] += days * _DAY
 
 
+@dataclass(frozen=True)
+class _Value:
+    """One quantity of a sentence.
+
+    Parameters
+    ----------
+    name : str
+        Signal that it becomes.
+    offers : tuple of (int, str)
+        Field and its unit, best first: that which is filled is taken. An empty unit
+        stands in the field behind, as a letter.
+    required : bool
+        Whether a sentence is wrong where no field is filled.
+    side : int
+        Field of the letter that gives the sign, 0 for none.
+    added : tuple of int
+        Fields whose values are added, each with its side behind it.
+    status : int
+        Field that holds ``V`` where this value is not valid, 0 for none.
+    number : int
+        Field whose number is part of the signal's name, 0 for none.
+    """
+
+    name: str
+    offers: tuple[tuple[int, str], ...]
+    required: bool = True
+    side: int = 0
+    added: tuple[int, ...] = ()
+    status: int = 0
+    number: int = 0
+
+    def read(self, f: Fields) -> tuple[str, float, str] | None:
+        """Return signal, value and its SI unit; None where it is missing and may be."""
+        if self.status and _field(f, self.status) == b"V":
+            return None
+        found = next((offer for offer in self.offers if _field(f, offer[0])), None)
+        if found is None and not self.required:
+            return None
+        # where all are empty the first fails, as it shall
+        at, unit = found or self.offers[0]
+        value = float(f[at]) * (_SIGNS[f[self.side]] if self.side else 1.0)
+        for k in self.added:
+            if _field(f, k):
+                value += float(f[k]) * _SIGNS[f[k + 1]]
+        factor, si = _FACTORS[unit or _SPEED_UNITS[f[at + 1]]]
+        value *= factor
+        if not isfinite(value):
+            raise ValueError(self.name)
+        return f"{self.name}{int(f[self.number])}" if self.number else self.name, value, si
+
+
+@dataclass(frozen=True)
+class _Sentence:
+    """How one kind of sentence is read: numbers of its fields, 0 for those it has not.
+
+    Parameters
+    ----------
+    values : tuple of _Value
+    time : int
+        Time of day.
+    untimed : bool
+        Whether it may be missing: version 1.5 has GLL without it.
+    date : tuple of int
+        Day, month and year, or one field that holds all three.
+    place : int
+        Latitude; its hemisphere, longitude and hemisphere follow.
+    status : int
+        Field that `good` judges, a missing one as an empty one.
+    good : callable
+    bad : str
+        What a sentence is whose status is not good.
+    variant : int
+        Field whose letter chooses among `variants`.
+    variants : mapping of bytes to tuple of _Value
+    lacking : tuple of (int, str), optional
+        Field, and what is remarked where it is empty.
+    """
+
+    values: tuple[_Value, ...] = ()
+    time: int = 0
+    untimed: bool = False
+    date: tuple[int, ...] = ()
+    place: int = 0
+    status: int = 0
+    good: Callable[[bytes], bool] = bool
+    bad: str = "without a fix"
+    variant: int = 0
+    variants: Mapping[bytes, tuple[_Value, ...]] = field(default_factory=dict)
+    lacking: tuple[int, str] | None = None
+
+    def read(self, s: _Stream, f: Fields) -> None:
+        """Take in what one sentence tells.
+
+        Raises
+        ------
+        ValueError, IndexError, KeyError
+            A field is missing, or makes no sense; none of its values was taken then.
+        """
+        told = _field(f, self.time) if self.time else b""
+        if self.status and not self.good(_field(f, self.status)):
+            s.skipped[f"{s.sentence[2:]} {self.bad}"] += 1
+            if told:
+                s.idle_time(told)
+            return
+        if self.time and (told or not self.untimed):
+            s.time(told)
+        if self.date and (date := _date([_field(f, k) for k in self.date])) is not None:
+            # only a receiver with a fix may move the day
+            s.date(*date, sure=self.status > 0)
+        found = _place(f[self.place : self.place + 4]) if self.place else []
+        for value in self.variants[f[self.variant]] if self.variant else self.values:
+            given = value.read(f)
+            if given is not None:
+                found.append(given)
+        if self.lacking is not None and not _field(f, self.lacking[0]):
+            s.remarks[self.lacking[1]] += 1
+        for name, number, unit in found:
+            s.give(name, number, unit)
+
+
+def _field(f: Fields, k: int) -> bytes:
+    return f[k] if k < len(f) else b""
+
+
+def _place(f: Fields) -> list[tuple[str, float, str]]:
+    """Return latitude and longitude of a position: both or none."""
+    north = _degrees(f[0], f[1], b"NS", 90)
+    return [("lat", north, "deg"), ("lon", _degrees(f[2], f[3], b"EW", 180), "deg")]
+
+
 def _degrees(value: bytes, side: bytes, sides: bytes, most: float) -> float:
     if len(side) != 1 or side not in sides:
         raise ValueError(side)
@@ -152,143 +273,89 @@ def _degrees(value: bytes, side: bytes, sides: bytes, most: float) -> float:
     return -angle if side in b"SW" else angle
 
 
-def _gga(s: _Stream, f: Fields) -> None:
-    if f[6] in (b"", b"0"):
-        s.skipped["GGA without a fix"] += 1
-        s.idle_time(f[1])
-        return
-    s.time(f[1])
-    s.place(f[2:4], f[4:6])
+def _date(parts: Fields) -> tuple[int, int, int] | None:
+    """Return year, month and day of three fields or of one (010624); None where there is none."""
+    if len(parts) == 1 and len(parts[0]) == 6:
+        (joined,) = parts
+        parts = [joined[0:2], joined[2:4], joined[4:6]]
+    if len(parts) != 3 or not all(parts):
+        return None
+    day, month, year = (int(p) for p in parts)
+    if year < 100:
+        # GPS time begins in 1980
+        year += 1900 if year >= 80 else 2000
+    return year, month, day
 
 
-def _gns(s: _Stream, f: Fields) -> None:
-    if not f[6].strip(b"N"):
-        s.skipped["GNS without a fix"] += 1
-        s.idle_time(f[1])
-        return
-    s.time(f[1])
-    s.place(f[2:4], f[4:6])
+def _none_of(*marks: bytes) -> Callable[[bytes], bool]:
+    return lambda status: status not in marks
 
 
-def _gll(s: _Stream, f: Fields) -> None:
-    if len(f) > 6 and f[6] == b"V":
-        s.skipped["GLL without a fix"] += 1
-        s.idle_time(f[5])
-        return
-    # version 1.5 has no time
-    if len(f) > 5 and f[5]:
-        s.time(f[5])
-    s.place(f[1:3], f[3:5])
+def _one_of(*marks: bytes) -> Callable[[bytes], bool]:
+    return lambda status: status in marks
 
 
-def _rmc(s: _Stream, f: Fields) -> None:
-    if f[2] != b"A":
-        s.skipped["RMC without a fix"] += 1
-        s.idle_time(f[1])
-        return
-    s.time(f[1])
-    if len(f[9]) == 6:
-        s.date(2000 + int(f[9][4:6]), int(f[9][2:4]), int(f[9][0:2]), sure=True)
-    s.place(f[3:5], f[5:7])
-    if f[7]:
-        s.give("sog", float(f[7]) * 1852 / 3600)
-    if f[8]:
-        s.give("cog", radians(float(f[8])))
+def _any_system(modes: bytes) -> bool:
+    """Whether one of the systems that GNS names has a fix."""
+    return bool(modes.strip(b"N"))
 
 
-def _zda(s: _Stream, f: Fields) -> None:
-    s.time(f[1])
-    if f[4]:
-        s.date(int(f[4]), int(f[3]), int(f[2]), sure=False)
+def _shaft(kind: str) -> tuple[_Value, ...]:
+    return (
+        _Value(f"rpm_{kind}", ((3, "rpm"),), number=2),
+        _Value(f"pitch_{kind}", ((4, "1"),), number=2, required=False),
+    )
 
 
-def _vtg(s: _Stream, f: Fields) -> None:
-    if len(f) > 9 and f[9] == b"N":
-        s.skipped["VTG without a fix"] += 1
-        return
-    if f[5]:
-        s.give("sog", float(f[5]) * 1852 / 3600)
-    elif f[7]:
-        s.give("sog", float(f[7]) / 3.6)
-    if f[1]:
-        s.give("cog", radians(float(f[1])))
-
-
-def _hdt(s: _Stream, f: Fields) -> None:
-    s.give("psi", radians(float(f[1])))
-
-
-def _ths(s: _Stream, f: Fields) -> None:
-    if len(f) > 2 and f[2] not in (b"A", b""):
-        s.skipped["THS that is not autonomous"] += 1
-        return
-    s.give("psi", radians(float(f[1])))
-
-
-def _hdg(s: _Stream, f: Fields) -> None:
-    angle = float(f[1])
-    if not (len(f) > 4 and f[4]):
-        s.skipped[_MAGNETIC] += 1
-    for value, side in ((f[2], f[3]), (f[4], f[5])):
-        if value:
-            angle += float(value) * (-1 if side == b"W" else 1)
-    s.give("psi", np.radians(angle))
-
-
-def _rot(s: _Stream, f: Fields) -> None:
-    if len(f) > 2 and f[2] == b"V":
-        s.skipped["ROT marked invalid"] += 1
-        return
-    s.give("r", radians(float(f[1])) / 60)
-
-
-def _mwv(s: _Stream, f: Fields) -> None:
-    if len(f) > 5 and f[5] == b"V":
-        s.skipped["MWV marked invalid"] += 1
-        return
-    angle, speed = radians(float(f[1])), float(f[3]) * _SPEED_UNITS[f[4]]
-    true = f[2] == b"T"
-    s.give("dir_t" if true else "dir_q", angle)
-    s.give("V_w" if true else "V_q", speed)
-
-
-def _vwr(s: _Stream, f: Fields) -> None:
-    angle = radians(float(f[1])) * {b"L": -1, b"R": 1}[f[2]]
-    for value, factor in ((f[5], 1.0), (f[3], 1852 / 3600), (f[7] if len(f) > 7 else b"", 1 / 3.6)):
-        if value:
-            s.give("dir_q", angle)
-            s.give("V_q", float(value) * factor)
-            return
-    s.skipped["VWR without a speed"] += 1
-
-
-def _mwd(s: _Stream, f: Fields) -> None:
-    speed = float(f[7]) if f[7] else float(f[5]) * 1852 / 3600
-    s.give("dir_w", radians(float(f[1])))
-    s.give("V_w", speed)
-
-
-def _rpm(s: _Stream, f: Fields) -> None:
-    if len(f) > 5 and f[5] == b"V":
-        s.skipped["RPM marked invalid"] += 1
-        return
-    kind = {b"S": "shaft", b"E": "engine"}[f[1]]
-    s.give(f"rpm_{kind}{int(f[2])}", float(f[3]))
-    if f[4]:
-        s.give(f"pitch_{kind}{int(f[2])}", float(f[4]))
-
-
-def _rsa(s: _Stream, f: Fields) -> None:
-    sides = (("rudder_starboard", 1), ("rudder_port", 3))
-    for name, k in sides:
-        if len(f) > k and f[k] and (len(f) <= k + 1 or f[k + 1] != b"V"):
-            s.give(name, radians(float(f[k])))
-
-
-_HANDLERS: dict[bytes, Callable[[_Stream, Fields], None]] = {
-    b"GGA": _gga, b"GNS": _gns, b"GLL": _gll, b"RMC": _rmc, b"ZDA": _zda, b"VTG": _vtg,
-    b"HDT": _hdt, b"THS": _ths, b"HDG": _hdg, b"ROT": _rot, b"MWV": _mwv, b"VWR": _vwr,
-    b"MWD": _mwd, b"RPM": _rpm, b"RSA": _rsa,
+_SPEED = _Value("sog", ((5, "kn"), (7, "km/h")), required=False)
+_SENTENCES: dict[bytes, _Sentence] = {
+    b"GGA": _Sentence(time=1, place=2, status=6, good=_none_of(b"", b"0")),
+    b"GNS": _Sentence(time=1, place=2, status=6, good=_any_system),
+    b"GLL": _Sentence(time=5, untimed=True, place=1, status=6, good=_none_of(b"V")),
+    b"RMC": _Sentence(
+        (_Value("sog", ((7, "kn"),), required=False), _Value("cog", ((8, "deg"),), required=False)),
+        time=1, date=(9,), place=3, status=2, good=_one_of(b"A"),
+    ),
+    b"ZDA": _Sentence(time=1, date=(2, 3, 4)),
+    b"VTG": _Sentence(
+        (_SPEED, _Value("cog", ((1, "deg"),), required=False)), status=9, good=_none_of(b"N")
+    ),
+    b"HDT": _Sentence((_Value("psi", ((1, "deg"),)),)),
+    b"THS": _Sentence(
+        (_Value("psi", ((1, "deg"),)),),
+        status=2, good=_one_of(b"A", b""), bad="that is not autonomous",
+    ),
+    b"HDG": _Sentence(
+        (_Value("psi", ((1, "deg"),), added=(2, 4)),),
+        lacking=(4, "HDG without variation taken for true headings"),
+    ),
+    b"ROT": _Sentence(
+        (_Value("r", ((1, "deg/min"),)),), status=2, good=_none_of(b"V"), bad="marked invalid"
+    ),
+    b"MWV": _Sentence(
+        status=5, good=_none_of(b"V"), bad="marked invalid", variant=2,
+        variants={
+            b"R": (_Value("dir_q", ((1, "deg"),)), _Value("V_q", ((3, ""),))),
+            b"T": (_Value("dir_t", ((1, "deg"),)), _Value("V_w", ((3, ""),))),
+        },
+    ),
+    b"VWR": _Sentence(
+        (
+            _Value("dir_q", ((1, "deg"),), side=2),
+            _Value("V_q", ((5, "m/s"), (3, "kn"), (7, "km/h"))),
+        )
+    ),
+    b"MWD": _Sentence((_Value("dir_w", ((1, "deg"),)), _Value("V_w", ((7, "m/s"), (5, "kn"))))),
+    b"RPM": _Sentence(
+        status=5, good=_none_of(b"V"), bad="marked invalid", variant=1,
+        variants={b"S": _shaft("shaft"), b"E": _shaft("engine")},
+    ),
+    b"RSA": _Sentence(
+        (
+            _Value("rudder_starboard", ((1, "deg"),), required=False, status=2),
+            _Value("rudder_port", ((3, "deg"),), required=False, status=4),
+        )
+    ),
 }  # fmt: skip
 
 
@@ -367,14 +434,18 @@ def _take(sentence: bytes, stream: _Stream, seen: _Seen) -> None:
             stream.skipped["wrong checksums"] += 1
             return
     fields = body.split(b",")
-    handler = _HANDLERS.get(fields[0][2:])
-    if handler is None:
+    if fields[0][:1] == b"P":
+        # of one maker, whatever its name ends in
+        stream.skipped["proprietary sentences"] += 1
+        return
+    kind = _SENTENCES.get(fields[0][2:])
+    if kind is None:
         return
     stream.sentence = fields[0].decode("ascii", "replace")
     stream.counts[stream.sentence] += 1
     try:
-        handler(stream, fields)
-    except (ValueError, IndexError, KeyError, OverflowError, TypeError):
+        kind.read(stream, fields)
+    except (ValueError, IndexError, KeyError, OverflowError):
         stream.skipped[f"{stream.sentence} with empty or wrong fields"] += 1
 
 
@@ -386,14 +457,14 @@ def looks_like_nmea(head: bytes) -> bool:
 
 
 def _lines(path: Path) -> Iterator[bytes]:
-    rest = b""
+    rest, most = b"", limits().line_bytes
     with open(path, "rb") as handle:
-        while block := handle.read(_BLOCK):
+        while block := handle.read(limits().block_bytes):
             lines = (rest + block).replace(b"\r", b"\n").split(b"\n")
             # a line without end is cut here, and fails as a sentence
-            rest = lines.pop()[-_MAX_LINE:]
+            rest = lines.pop()[-most:]
             for line in lines:
-                yield line if len(line) <= _MAX_LINE else line[-_MAX_LINE:]
+                yield line if len(line) <= most else line[-most:]
     if rest:
         yield rest
 
@@ -426,6 +497,7 @@ def _recording(path: Path, stream: _Stream, seen: _Seen) -> Recording:
             f"(GGA, RMC, GLL, ZDA): record a GNSS receiver beside them."
         )
     notes = [f"{n} {what} skipped" for what, n in sorted(stream.skipped.items())]
+    notes += [f"{n} {what}" for what, n in sorted(stream.remarks.items())]
     tags, tag_order = np.array(stream.tags), np.array(stream.tag_order, dtype=np.int64)
     stamps = np.concatenate([stream.stamps, [nan]])
     offset = 0.0
@@ -445,8 +517,7 @@ def _recording(path: Path, stream: _Stream, seen: _Seen) -> Recording:
         else:
             t = _spread(at, tags)
             keep = at >= 0
-        unit = _UNITS.get(name, "rpm" if name.startswith("rpm") else "1")
-        signals.append(Signal(name, t[keep], value[keep], unit, f"${sentence}", True))
+        signals.append(Signal(name, t[keep], value[keep], track.unit, f"${sentence}", True))
     signals = [s for s in signals if len(s)]
     if not signals:
         raise LogError(

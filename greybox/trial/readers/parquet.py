@@ -10,17 +10,9 @@ from typing import Any
 
 from greybox.errors import LogError
 from greybox.trial.readers import cells as cell_text
+from greybox.trial.readers.limits import limits
 from greybox.trial.readers.table import Batch
 
-_BATCH_ROWS = 1 << 17
-# a page is decoded as a whole, and a row group may be one page a column
-_MAX_GROUP_BYTES = 1 << 29
-_MAX_RATIO = 4
-# of a large row group: a thousand columns of numbers take eight thousand
-_MAX_ROW_BYTES = 1 << 16
-# times are never repeated: even delta coding needs a bit or two for each row
-_MAX_ROWS_PER_BYTE = 8
-_HONEST_ROWS = 1_000_000
 _READ_BYTES = 1 << 20
 # damaged footers and pages surface as any of these, beside Arrow's own
 _ERRORS = (OSError, ValueError, KeyError, MemoryError, StopIteration, OverflowError)
@@ -68,7 +60,7 @@ class ParquetFile:
             ) as file:  # fmt: skip
                 _refuse_bombs(self.path, file.metadata, texts=bool(texts))
                 for batch in file.iter_batches(
-                    batch_size=_BATCH_ROWS, columns=list(columns), use_threads=True
+                    batch_size=limits().block_rows, columns=list(columns), use_threads=True
                 ):
                     yield {c: column_values(batch.column(c), self.kind(c)) for c in columns}
         except _ERRORS as error:
@@ -140,9 +132,9 @@ def open_parquet(path: Path) -> ParquetFile:
     except pa.ArrowException as error:
         raise _unreadable(path, error) from None
     size = path.stat().st_size
-    if rows > max(_HONEST_ROWS, _MAX_ROWS_PER_BYTE * size):
+    if rows > max(limits().sure_rows, limits().rows_per_byte * size):
         raise LogError(
-            f"'{path.name}' states {rows} rows in {size} bytes, at most {_MAX_ROWS_PER_BYTE} a "
+            f"'{path.name}' states {rows} rows in {size} bytes, at most {limits().rows_per_byte} a "
             f"byte are believed: export it again from the recorder."
         )
     kinds: dict[str, str] = {}
@@ -224,23 +216,24 @@ def _written_dates(path: Path, text: Sequence[str]) -> frozenset[str]:
 
 def _refuse_bombs(path: Path, metadata: Any, *, texts: bool) -> None:
     # groups only: asking pyarrow for a damaged column chunk ends the process (26.0)
-    size = path.stat().st_size
+    size, bounds = path.stat().st_size, limits()
+    # a page is decoded as a whole, and a row group may be one page a column
+    most = max(bounds.held_bytes, bounds.held_ratio * size)
     for k in range(metadata.num_row_groups):
         group = metadata.row_group(k)
         unpacked, rows = group.total_byte_size, max(group.num_rows, 1)
         # what hardly shrank is as large as its file, and is cut into pages of a megabyte
-        if unpacked > max(_MAX_GROUP_BYTES, _MAX_RATIO * size):
+        if unpacked > most:
             raise LogError(
                 f"a row group of '{path.name}' ({size} bytes) unpacks to {unpacked} bytes, at most "
-                f"{max(_MAX_GROUP_BYTES, _MAX_RATIO * size)} are read at once: write it with "
-                f"smaller row groups."
+                f"{most} are read at once: write it with smaller row groups."
             )
         # texts that long fill one page, however many rows it holds
-        if texts and unpacked > _MAX_GROUP_BYTES and unpacked > _MAX_ROW_BYTES * rows:
+        if texts and unpacked > bounds.held_bytes and unpacked > bounds.row_bytes * rows:
             raise LogError(
                 f"a row group of '{path.name}' has {unpacked / rows:.0f} bytes a row, more than "
-                f"the {_MAX_ROW_BYTES} of any log: export it without texts, pictures and clouds, "
-                f"or with row groups below {_MAX_GROUP_BYTES} bytes."
+                f"the {bounds.row_bytes} of any log: export it without texts, pictures and clouds, "
+                f"or with row groups below {bounds.held_bytes} bytes."
             )
 
 

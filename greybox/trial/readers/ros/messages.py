@@ -12,13 +12,11 @@ import struct
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from greybox.trial.readers.storage import Channel
+from rosbags.interfaces import Nodetype
+from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
-# longer arrays are covariances, ranges or images: noted, not signals
-MAX_ELEMENTS = 16
-_MAX_DEFINITION = 2**18
-_MAX_TEXT = 256
-_MAX_DEPTH = 16
+from greybox.trial.readers.limits import limits
+from greybox.trial.readers.ros.storage import Channel
 
 _LAYOUTS = {
     "bool": "?", "byte": "B", "char": "B", "octet": "B",
@@ -68,7 +66,7 @@ def decoder(channel: Channel) -> Callable[[bytes], Decoded]:
     -------
     callable
         Bytes to a nested dictionary of fields; arrays longer than
-        `MAX_ELEMENTS` are `Long`. It raises `DecodeError`.
+        `Limits.elements` are `Long`. It raises `DecodeError`.
 
     Raises
     ------
@@ -115,14 +113,12 @@ def _json(data: bytes) -> Decoded:
 
 
 def _definitions(channel: Channel) -> dict[str, list[tuple[str, Any]]]:
-    from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
-
     store = Stores.ROS1_NOETIC if channel.encoding == "ros1" else Stores.ROS2_HUMBLE
     types = {name: fields for name, (_, fields) in get_typestore(store).fielddefs.items()}
     text = channel.definition
     if not text or channel.definition_format != "msg":
         return types
-    if len(text) > _MAX_DEFINITION:
+    if len(text) > limits().definition_bytes:
         raise DecodeError(f"its definition has {len(text)} characters")
     try:
         own = get_types_from_msg(text, channel.msgtype)
@@ -143,7 +139,7 @@ class _Compiler:
     def message(self, name: str, above: tuple[str, ...] = ()) -> _Read:
         if name in self.made:
             return self.made[name]
-        if name in above or len(above) > _MAX_DEPTH:
+        if name in above or len(above) > limits().depth:
             raise DecodeError(f"'{name}' contains itself or is nested too deep")
         if name not in self.types:
             raise DecodeError(f"there is no definition of '{name}'")
@@ -160,8 +156,6 @@ class _Compiler:
         return read
 
     def _field(self, description: Any, above: tuple[str, ...]) -> _Read:
-        from rosbags.interfaces import Nodetype
-
         kind, inner = description
         if kind == Nodetype.BASE:
             return self._string() if inner[0] == "string" else self._scalar(inner[0])
@@ -188,7 +182,7 @@ class _Compiler:
         return read
 
     def _string(self) -> _Read:
-        length, cdr = self.length, self.cdr
+        length, cdr, most = self.length, self.cdr, limits().text
 
         def read(c: _Cursor) -> str:
             size = length(c)
@@ -196,7 +190,7 @@ class _Compiler:
             if start + size > c.end:
                 raise DecodeError(f"a text of {size} bytes where {c.end - start} are left")
             c.pos = start + size
-            raw = c.data[start : start + min(size, _MAX_TEXT)]
+            raw = c.data[start : start + min(size, most)]
             return (raw.rstrip(b"\0") if cdr else raw).decode("utf-8", "replace")
 
         return read
@@ -207,6 +201,7 @@ class _Compiler:
         size = struct.calcsize("<" + _LAYOUTS[name])
         order, code, length = self.order, _LAYOUTS[name], self.length
         mask = size - 1 if self.cdr else 0
+        most = limits().elements
 
         def read(c: _Cursor) -> Any:
             count = length(c) if fixed is None else fixed
@@ -216,14 +211,14 @@ class _Compiler:
             if start + count * size > c.end:
                 raise DecodeError(f"an array of {count} where {c.end - start} bytes are left")
             c.pos = start + count * size
-            if count > MAX_ELEMENTS:
+            if count > most:
                 return Long(count)
             return list(struct.unpack_from(f"{order}{count}{code}", c.data, start))
 
         return read
 
     def _sequence(self, element: _Read, fixed: int | None) -> _Read:
-        length = self.length
+        length, most = self.length, limits().elements
 
         def read(c: _Cursor) -> Any:
             count = length(c) if fixed is None else fixed
@@ -231,9 +226,9 @@ class _Compiler:
             for k in range(count):
                 c.step()
                 value = element(c)
-                if k < MAX_ELEMENTS:
+                if k < most:
                     kept.append(value)
-            return kept if count <= MAX_ELEMENTS else Long(count)
+            return kept if count <= most else Long(count)
 
         return read
 
@@ -261,13 +256,13 @@ def numbers(value: Any, path: str = "", depth: int = 0) -> Iterator[tuple[str, f
             yield path, float("nan")
     elif isinstance(value, Long):
         yield path, value
-    elif depth > _MAX_DEPTH:
+    elif depth > limits().depth:
         return
     elif isinstance(value, dict):
         for name, inner in value.items():
             yield from numbers(inner, f"{path}.{name}" if path else str(name), depth + 1)
     elif isinstance(value, list):
-        if len(value) > MAX_ELEMENTS:
+        if len(value) > limits().elements:
             yield path, Long(len(value))
             return
         for k, inner in enumerate(value):

@@ -13,15 +13,17 @@ from collections.abc import Iterator
 from pathlib import Path, PurePath
 from typing import Any
 
-from greybox.errors import LogError
-from greybox.trial.readers import mcapfile, rosdatabase
-from greybox.trial.readers.decompress import inflate_file, inflate_zstd
-from greybox.trial.readers.mcapfile import read_mcap
-from greybox.trial.readers.rosbag1 import read_bag1
-from greybox.trial.readers.rosdatabase import read_database
-from greybox.trial.readers.storage import MAX_CHUNK, Budget, CutError, Message, Wanted
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
 
-_MAX_METADATA = 4 * 2**20
+from greybox.errors import LogError
+from greybox.trial.readers.limits import limits
+from greybox.trial.readers.ros import database, mcap_file
+from greybox.trial.readers.ros.bag1 import read_bag1
+from greybox.trial.readers.ros.database import read_database
+from greybox.trial.readers.ros.decompress import inflate_file, inflate_zstd
+from greybox.trial.readers.ros.mcap_file import read_mcap
+from greybox.trial.readers.ros.storage import Budget, CutError, Message, Wanted
 
 
 def storage_files(path: Path) -> tuple[list[Path], str, list[str]]:
@@ -86,10 +88,7 @@ def _digits(name: str) -> list[str]:
 
 
 def _metadata(path: Path) -> dict[str, Any]:
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
-
-    if path.stat().st_size > _MAX_METADATA:
+    if path.stat().st_size > limits().sidecar_bytes:
         return {}
     try:
         tree = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
@@ -145,9 +144,9 @@ def read_messages(
         try:
             if magic.startswith(b"#ROSBAG V"):
                 yield from read_bag1(handle, budget, notes, wanted)
-            elif magic.startswith(mcapfile.MAGIC):
+            elif magic.startswith(mcap_file.MAGIC):
                 yield from _counted(read_mcap(handle, budget, notes, wanted), mode, budget, notes)
-            elif magic == rosdatabase.MAGIC:
+            elif magic == database.MAGIC:
                 yield from _counted(read_database(path, budget, wanted), mode, budget, notes)
             else:
                 raise LogError(
@@ -172,7 +171,7 @@ def _counted(
     bad = 0
     for channel, time, data in messages:
         if mode == "message":
-            inflated = inflate_zstd(data, min(MAX_CHUNK, budget.limit - budget.used) + 1)
+            inflated = inflate_zstd(data, min(limits().held_bytes, budget.limit - budget.used) + 1)
             budget.charge(len(inflated))
             bad += not inflated
             yield channel, time, inflated

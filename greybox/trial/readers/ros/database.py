@@ -9,8 +9,8 @@ from pathlib import Path
 from urllib.parse import quote
 
 from greybox.errors import LogError
-from greybox.trial.readers.storage import (
-    MAX_CHUNK,
+from greybox.trial.readers.limits import limits
+from greybox.trial.readers.ros.storage import (
     Budget,
     Channel,
     CutError,
@@ -47,7 +47,7 @@ def read_database(path: Path, budget: Budget, wanted: Wanted) -> Iterator[Messag
     except sqlite3.Error as error:
         raise LogError(f"cannot open '{budget.name}' ({error}): copy the file again.") from None
     try:
-        database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_CHUNK)
+        database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, limits().held_bytes)
         database.text_factory = lambda raw: raw.decode("utf-8", "replace")
         channels = _tables(database, budget)
         chosen = [n for n, c in channels.items() if wanted(c.topic)]

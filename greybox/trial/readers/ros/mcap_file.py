@@ -9,8 +9,13 @@ from dataclasses import dataclass
 from io import BytesIO
 from typing import IO
 
-from greybox.trial.readers.decompress import inflate
-from greybox.trial.readers.storage import (
+from mcap import records
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+
+from greybox.trial.readers.ros.decompress import inflate
+from greybox.trial.readers.ros.storage import (
     Budget,
     Channel,
     CutError,
@@ -35,8 +40,6 @@ class _Mcap:
     damaged: int = 0
 
     def records(self, stream: IO[bytes], end: int, *, top: bool) -> Iterator[Message]:
-        from mcap.opcode import Opcode
-
         while stream.tell() < end:
             kind, length = struct.unpack("<BQ", take(stream, 9, end))
             if kind == Opcode.MESSAGE:
@@ -64,10 +67,6 @@ class _Mcap:
             raise CutError(f"ends at byte {end} without an end record")
 
     def _declare(self, schema: bool, content: bytes) -> None:
-        from mcap import records
-        from mcap.data_stream import ReadDataStream
-        from mcap.exceptions import McapError
-
         stream = ReadDataStream(BytesIO(content))
         try:
             if schema:

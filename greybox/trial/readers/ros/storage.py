@@ -8,15 +8,7 @@ from dataclasses import dataclass
 from typing import IO, Protocol
 
 from greybox.errors import LogError
-
-GIB = 2**30
-# all that compressed chunks or a database may hold together; honest files exceed it
-# only when they are large themselves, hence the factor on the size of the file
-MAX_BYTES = 2 * GIB
-MAX_RATIO = 16
-# one chunk, message or record: it is held in memory as a whole
-MAX_CHUNK = GIB // 2
-MAX_MESSAGES = 20_000_000
+from greybox.trial.readers.limits import limits
 
 
 @dataclass(frozen=True)
@@ -63,7 +55,7 @@ class Budget:
     @property
     def limit(self) -> int:
         """Bytes that may be inflated in all."""
-        return max(MAX_BYTES, MAX_RATIO * self.size)
+        return max(limits().unpacked_bytes, limits().unpacked_ratio * self.size)
 
     def charge(self, count: int) -> None:
         """Count `count` bytes before they are made.
@@ -73,9 +65,9 @@ class Budget:
         LogError
             More than a chunk or the whole file may hold.
         """
-        if count > MAX_CHUNK:
+        if count > (most := limits().held_bytes):
             raise LogError(
-                f"'{self.name}' holds a chunk of {count} bytes, at most {MAX_CHUNK} are read: "
+                f"'{self.name}' holds a chunk of {count} bytes, at most {most} are read: "
                 f"write it again with smaller chunks, or leave out cameras and lidars."
             )
         self.used += count
@@ -91,12 +83,12 @@ class Budget:
         Raises
         ------
         LogError
-            There are more than `MAX_MESSAGES`.
+            There are more than `Limits.messages`.
         """
         self.messages += 1
-        if self.messages > MAX_MESSAGES:
+        if self.messages > (most := limits().messages):
             raise LogError(
-                f"'{self.name}' holds more than {MAX_MESSAGES} messages: "
+                f"'{self.name}' holds more than {most} messages: "
                 f"name the topics that are needed, or split the bag."
             )
 
@@ -120,7 +112,7 @@ def take(stream: IO[bytes], count: int, end: int) -> bytes:
     start = stream.tell()
     if start + count > end:
         raise CutError(f"ends at byte {end} inside a record that begins before byte {start}")
-    if count > MAX_CHUNK:
+    if count > limits().held_bytes:
         raise CutError(f"states a record of {count} bytes at byte {start}")
     data = stream.read(count)
     if len(data) != count:

@@ -1,10 +1,4 @@
-"""Signals out of ROS 1 bags, ROS 2 bags and MCAP files.
-
-ROS states its frames: by REP 103 the world is east-north-up and the body
-forward-left-up, so signs and heading change on the way to north-east-down and
-forward-starboard-down. Frames whose names say ``ned`` or ``frd`` are taken as
-they are.
-"""
+"""Signals out of ROS 1 bags, ROS 2 bags and MCAP files."""
 
 from __future__ import annotations
 
@@ -13,7 +7,6 @@ from array import array
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,36 +15,26 @@ from greybox.channels import CHANNELS
 from greybox.errors import LogError, suggestion
 from greybox.files import sha256
 from greybox.trial.raw_log import Array, Recording, Signal, SourceFile
-from greybox.trial.readers.bags import read_messages, storage_files
-from greybox.trial.readers.rosmessages import (
+from greybox.trial.readers.limits import limits
+from greybox.trial.readers.ros.axes import HANDLERS, Fields, SkippedMessageError
+from greybox.trial.readers.ros.bags import read_messages, storage_files
+from greybox.trial.readers.ros.messages import (
     Decoded,
     DecodeError,
     Long,
     decoder,
     numbers,
 )
-from greybox.trial.readers.storage import Budget, Channel
+from greybox.trial.readers.ros.storage import Budget, Channel
+from greybox.units import is_unix_time
 
-# numbers kept in memory over all topics, 1 GiB of them
-MAX_VALUES = 2**27
-MAX_TOPICS = 2000
-MAX_FIELDS = 200
 # beyond this a header was stamped by another clock than the recorder's
 _CLOCKS = 3600.0
-# earlier than 1973 a time counts from a start, not from 1970
-_UNIX = 1e8
 
 _UNITS = {"lat": "deg", "lon": "deg", "altitude": "m"} | {
     name: CHANNELS[name].unit for name in ("x_n", "y_n", "psi", "u", "v", "r")
 }
 _CANONICAL = frozenset({"lat", "lon", "x_n", "y_n", "psi", "u", "v", "r"})
-_WORLD = frozenset({"map", "odom", "world", "earth", "enu", "ned", "utm"})
-
-Fields = dict[str, float]
-
-
-class _SkipError(Exception):
-    """The message says that it holds no valid measurement; the argument says why."""
 
 
 def read_bag(path: Path, topics: Mapping[str, str] | None = None) -> Recording:
@@ -110,9 +93,9 @@ def read_bag(path: Path, topics: Mapping[str, str] | None = None) -> Recording:
         for channel, time, data in read_messages(file, mode, budget, notes, wanted):
             topic = collected.get(channel.topic)
             if topic is None:
-                if len(collected) >= MAX_TOPICS:
+                if len(collected) >= (most := limits().topics):
                     raise LogError(
-                        f"'{path.name}' holds more than {MAX_TOPICS} topics: name those needed."
+                        f"'{path.name}' holds more than {most} topics: name those needed."
                     )
                 rule = (topics or {}).get(channel.topic, "")
                 topic = collected[channel.topic] = _Topic(channel, rule, stored)
@@ -142,9 +125,9 @@ class _Store:
 
     def charge(self, count: int) -> None:
         self.values += count
-        if self.values > MAX_VALUES:
+        if self.values > (most := limits().values):
             raise LogError(
-                f"the bag holds more than {MAX_VALUES} numbers: name the topics that are needed."
+                f"the bag holds more than {most} numbers: name the topics that are needed."
             )
 
 
@@ -194,7 +177,7 @@ class _Topic:
             return
         try:
             found = self._extract(message)
-        except _SkipError as error:
+        except SkippedMessageError as error:
             self._skip(str(error))
             return
         if not found and not self.words:
@@ -210,7 +193,7 @@ class _Topic:
         kind = self.channel.msgtype
         if kind == "std_msgs/msg/String":
             self.stored.charge(32)
-            self.words.append(str(message.get("data", ""))[:256])
+            self.words.append(str(message.get("data", ""))[: limits().text])
             return {}
         chosen = _rule_fields(self.rule)
         handle = HANDLERS.get(kind)
@@ -232,7 +215,7 @@ class _Topic:
                 elif name not in found:
                     found[name] = value
         if chosen:
-            self.fields.update(dict.fromkeys(list(found)[:MAX_FIELDS]))
+            self.fields.update(dict.fromkeys(list(found)[: limits().topic_fields]))
             return {n: v for n, v in found.items() if n in chosen}
         return found
 
@@ -241,8 +224,8 @@ class _Topic:
         for name, value in found.items():
             column = self.columns.get(name)
             if column is None:
-                if len(self.columns) >= MAX_FIELDS:
-                    self.remarks[f"only its first {MAX_FIELDS} fields were kept"] = None
+                if len(self.columns) >= (most := limits().topic_fields):
+                    self.remarks[f"only its first {most} fields were kept"] = None
                     continue
                 column = self.columns[name] = array("d")
             missing = before - len(column)
@@ -305,117 +288,6 @@ def _stamp(message: Decoded) -> int | None:
     return total if 0 <= total < 2**63 else 0
 
 
-# messages whose meaning ROS defines
-
-
-def _heading(q: Mapping[str, float], *, ned: bool) -> float:
-    """Return the compass direction of the body's x axis, 0 to 2π; NaN without one."""
-    x, y, z, w = (float(q[k]) for k in "xyzw")
-    first, second = w * w + x * x - y * y - z * z, 2 * (w * z + x * y)
-    if not first and not second:
-        return math.nan
-    angle = math.atan2(second, first)
-    return (angle if ned else math.pi / 2 - angle) % (2 * math.pi)
-
-
-def _frame(name: Any) -> str:
-    return str(name).strip("/").rsplit("/", 1)[-1].casefold()
-
-
-def _is_ned(frame: str) -> bool:
-    return frame == "ned" or frame.endswith("_ned")
-
-
-def _is_frd(frame: str) -> bool:
-    return "frd" in frame or "ned" in frame
-
-
-def _pose(pose: Mapping[str, Any], ned: bool, remarks: dict[str, None]) -> Fields:
-    x, y = float(pose["position"]["x"]), float(pose["position"]["y"])
-    remarks[
-        "world frame north-east-down: positions and heading as they are"
-        if ned
-        else "world frame east-north-up (REP 103): x_n = y, y_n = x, psi = pi/2 - yaw"
-    ] = None
-    north, east = (x, y) if ned else (y, x)
-    return {"x_n": north, "y_n": east, "psi": _heading(pose["orientation"], ned=ned)}
-
-
-def _twist(twist: Mapping[str, Any], frd: bool, remarks: dict[str, None]) -> Fields:
-    sign = 1.0 if frd else -1.0
-    remarks[
-        "body frame forward-right-down: velocities as they are"
-        if frd
-        else "body frame forward-left-up (REP 103): u = x, v = -y, r = -yaw rate"
-    ] = None
-    linear, angular = twist["linear"], twist["angular"]
-    return {
-        "u": float(linear["x"]),
-        "v": sign * float(linear["y"]),
-        "r": sign * float(angular["z"]),
-    }
-
-
-def _odometry(m: Decoded, remarks: dict[str, None]) -> Fields:
-    world, body = _frame(m["header"]["frame_id"]), _frame(m["child_frame_id"])
-    ned = _is_ned(world)
-    frd = _is_frd(body) or (ned and "flu" not in body)
-    return _pose(m["pose"]["pose"], ned, remarks) | _twist(m["twist"]["twist"], frd, remarks)
-
-
-def _pose_stamped(m: Decoded, remarks: dict[str, None]) -> Fields:
-    pose = m["pose"]
-    return _pose(pose.get("pose", pose), _is_ned(_frame(m["header"]["frame_id"])), remarks)
-
-
-def _twist_stamped(m: Decoded, remarks: dict[str, None]) -> Fields:
-    twist = m["twist"]
-    twist = twist.get("twist", twist)
-    frame = _frame(m["header"]["frame_id"])
-    if frame in _WORLD or frame.endswith("_enu"):
-        remarks[f"its frame '{frame}' is the world's, so its velocities are not u, v"] = None
-        return dict(_plain(numbers(twist)))
-    return _twist(twist, _is_frd(frame), remarks)
-
-
-def _imu(m: Decoded, remarks: dict[str, None]) -> Fields:
-    frame = _frame(m["header"]["frame_id"])
-    frd = _is_frd(frame)
-    found: Fields = {}
-    # a first covariance of -1 says that the sensor does not measure the quantity
-    if m["angular_velocity_covariance"][0] != -1:
-        found["r"] = (1.0 if frd else -1.0) * float(m["angular_velocity"]["z"])
-        remarks["yaw rate as it is" if frd else "r = -yaw rate (z up, REP 103)"] = None
-    if m["orientation_covariance"][0] != -1:
-        found["psi"] = _heading(m["orientation"], ned=frd)
-        remarks["psi = yaw" if frd else "psi = pi/2 - yaw (REP 103)"] = None
-    return found
-
-
-def _fix(m: Decoded, remarks: dict[str, None]) -> Fields:
-    status, lat, lon = m["status"]["status"], float(m["latitude"]), float(m["longitude"])
-    if status < 0:
-        raise _SkipError("they have no fix (status < 0)")
-    if not (abs(lat) <= 90 and abs(lon) <= 360):
-        raise _SkipError("they hold no position")
-    return {"lat": lat, "lon": lon, "altitude": float(m["altitude"])}
-
-
-def _plain(found: Iterable[tuple[str, float | Long]]) -> Iterable[tuple[str, float]]:
-    return ((n, v) for n, v in found if not isinstance(v, Long))
-
-
-HANDLERS: dict[str, Callable[[Decoded, dict[str, None]], Fields]] = {
-    "sensor_msgs/msg/NavSatFix": _fix,
-    "sensor_msgs/msg/Imu": _imu,
-    "nav_msgs/msg/Odometry": _odometry,
-    "geometry_msgs/msg/PoseStamped": _pose_stamped,
-    "geometry_msgs/msg/PoseWithCovarianceStamped": _pose_stamped,
-    "geometry_msgs/msg/TwistStamped": _twist_stamped,
-    "geometry_msgs/msg/TwistWithCovarianceStamped": _twist_stamped,
-}
-
-
 # from topics to a recording
 
 
@@ -436,7 +308,7 @@ def _recording(
     clocks = [t.clock(notes) for t in full]
     first = min(int(c.min()) for c in clocks)
     epoch: float | None = first * 1e-9
-    if first * 1e-9 < _UNIX:
+    if not is_unix_time(first * 1e-9):
         notes.append(f"times begin at {first * 1e-9:.6g} s, so the clock does not count from 1970.")
         epoch = None
     keepers = _keepers(full)

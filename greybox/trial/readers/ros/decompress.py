@@ -6,24 +6,22 @@ import bz2
 from pathlib import Path
 from typing import IO
 
-from greybox.errors import LogError
-from greybox.trial.readers.storage import Budget
+import lz4.frame
+import zstandard
 
-# a window of 128 MiB is what the zstd tool itself accepts without being asked
-_ZSTD_WINDOW = 2**27
-_BLOCK = 2**20
+from greybox.errors import LogError
+from greybox.trial.readers.limits import limits
+from greybox.trial.readers.ros.storage import Budget
 
 
 def inflate_zstd(data: bytes, limit: int) -> bytes:
     """Return at most `limit` bytes; what comes before the damage where there is some."""
-    import zstandard
-
-    inflater = zstandard.ZstdDecompressor(max_window_size=_ZSTD_WINDOW)
+    inflater = zstandard.ZstdDecompressor(max_window_size=limits().window_bytes)
     parts: list[bytes] = []
     try:
         with inflater.stream_reader(data, read_across_frames=True) as stream:
             # in blocks, for what is asked for is allocated whether it comes or not
-            while limit and (part := stream.read(min(limit, _BLOCK))):
+            while limit and (part := stream.read(min(limit, limits().block_bytes))):
                 parts.append(part)
                 limit -= len(part)
     except zstandard.ZstdError:
@@ -39,12 +37,10 @@ def inflate_file(source: IO[bytes], target: Path, budget: Budget) -> None:
     LogError
         It is damaged, or exceeds the budget.
     """
-    import zstandard
-
-    inflater = zstandard.ZstdDecompressor(max_window_size=_ZSTD_WINDOW)
+    inflater = zstandard.ZstdDecompressor(max_window_size=limits().window_bytes)
     try:
         with inflater.stream_reader(source, closefd=False) as stream, open(target, "wb") as sink:
-            while block := stream.read(_BLOCK):
+            while block := stream.read(limits().block_bytes):
                 budget.charge(len(block))
                 sink.write(block)
     except zstandard.ZstdError as error:
@@ -82,8 +78,6 @@ def inflate(data: bytes, kind: str, stated: int, budget: Budget) -> bytes:
     limit = stated + 1
     try:
         if kind == "lz4":
-            import lz4.frame
-
             raw = bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=limit))
         elif kind == "bz2":
             raw = bz2.BZ2Decompressor().decompress(data, max_length=limit)

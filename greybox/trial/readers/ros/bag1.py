@@ -9,8 +9,8 @@ from io import BytesIO
 from typing import IO
 
 from greybox.errors import LogError
-from greybox.trial.readers.decompress import inflate
-from greybox.trial.readers.storage import (
+from greybox.trial.readers.ros.decompress import inflate
+from greybox.trial.readers.ros.storage import (
     Budget,
     Channel,
     CutError,

@@ -1,0 +1,186 @@
+"""Records of version 1, which told by sentences what was done to a log, as steps.
+
+The only place that knows those sentences. A step keeps the sentence that it was made of, so
+that it is told as it was; what none of them matches is kept as a step without an operation.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
+from typing import Any
+
+from greybox.trial.steps import RECORDED, Step, Value
+
+_NUMBER = r"([-+.\deE]+)"
+_MADE_OF = {
+    "positions and heading": ("x_n", "y_n", "psi"),
+    "heading": ("psi",),
+}
+# operation, channels at least, and parameters of what each finding's mend was
+_MENDS: dict[str, tuple[str, Mapping[str, Value]]] = {
+    "duplicate_time": ("order", {}), "nan": ("drop", {}), "outlier": ("drop", {}),
+    "stuck": ("drop", {}), "sign": ("scale", {"factor": -1.0}), "clock_offset": ("shift", {}),
+    "heading_bias": ("turn_heading", {}), "lever_arm": ("move_antenna", {}),
+}  # fmt: skip
+
+
+def steps_of_sentences(derived: Iterable[str], fixed: Iterable[str]) -> tuple[Step, ...]:
+    """Return what the sentences of a record of version 1 tell as steps.
+
+    Parameters
+    ----------
+    derived, fixed : iterable of str
+        Lists of these names in the record, oldest first. Mends came before the rest.
+    """
+    steps = [_mend(sentence) for sentence in fixed]
+    # the record gave the whole of a correction each time, a step gives what was added to it
+    whole: dict[str, Any] = {}
+    for sentence in derived:
+        stated = _STATED.fullmatch(sentence)
+        if stated:
+            steps += _corrections(sentence, stated[1], stated[2], whole)
+        else:
+            steps.append(_derived(sentence))
+    polynomials = next((s for s in steps if s.operation == "local_polynomials"), None)
+    if polynomials is not None:
+        # they made the yaw rate too, whatever the sentence says
+        steps = [
+            replace(s, operation="local_polynomials", parameters={**s.parameters, "window":
+                    polynomials.number("window")})
+            if s.operation == "difference" and s.channels == ("r",) else s for s in steps
+        ]  # fmt: skip
+    return tuple(steps)
+
+
+def _step(
+    sentence: str,
+    operation: str,
+    channels: Iterable[str],
+    source: Iterable[str] = (),
+    **parameters: Value,
+) -> Step:
+    return Step(operation, tuple(channels), tuple(source), {**parameters, RECORDED: sentence})
+
+
+def _mend(sentence: str) -> Step:
+    match = _FIXED.match(sentence)
+    operation, parameters = _MENDS.get(match[1] if match else "", ("recorded", {}))
+    channels = tuple(match[2].split(", ")) if match else ()
+    return Step(
+        operation, channels, (), {**parameters, RECORDED: sentence}, decided_by="check"
+    )  # fmt: skip
+
+
+def _derived(sentence: str) -> Step:
+    for pattern, make in _PATTERNS:
+        match = pattern.fullmatch(sentence)
+        if match:
+            try:
+                return make(sentence, match)
+            except ValueError:
+                break
+    return _step(sentence, "recorded", ())
+
+
+def _corrections(sentence: str, key: str, text: str, whole: dict[str, Any]) -> list[Step]:
+    """Return the steps of a correction that ``[sensors]`` stated; `whole` is what came before."""
+    try:
+        value = json.loads(text)
+        steps = list(_REMOVED[key](value, whole.get(key)))
+    except (KeyError, ValueError, TypeError, AttributeError, IndexError):
+        return [_step(sentence, "recorded", ())]
+    whole[key] = value
+    return [
+        Step(op, channels, (), {**parameters, RECORDED: sentence}, decided_by="vessel")
+        for op, channels, parameters in steps
+    ]
+
+
+Told = Iterable[tuple[str, tuple[str, ...], Mapping[str, Value]]]
+
+
+def _reversed(now: Any, before: Any) -> Told:
+    turned = tuple(str(c) for c in now if c not in (before or []))
+    return [("scale", turned, {"factor": -1.0})]
+
+
+def _clock(now: Any, before: Any) -> Told:
+    late = {c: _finite(s) - (before or {}).get(c, 0.0) for c, s in now.items()}
+    return [("shift", (str(c),), {"late": s}) for c, s in late.items() if s]
+
+
+def _heading_bias(now: Any, before: Any) -> Told:
+    return [("turn_heading", ("psi",), {"angle": _finite(now) - (before or 0.0)})]
+
+
+def _arm(sensor: str) -> Callable[[Any, Any], Told]:
+    def told(now: Any, before: Any) -> Told:
+        x, y = (_finite(a) - b for a, b in zip(now, before or (0.0, 0.0), strict=True))
+        return [("move_velocity", ("u", "v"), {"x": x, "y": y, "sensor": sensor})]
+
+    return told
+
+
+def _finite(value: Any) -> float:
+    number = float(value)
+    if not math.isfinite(number):
+        raise ValueError(value)
+    return number
+
+
+_REMOVED: dict[str, Callable[[Any, Any], Told]] = {
+    "reversed": _reversed, "clock": _clock, "heading_bias": _heading_bias,
+    "antenna": _arm("antenna"), "velocity_at": _arm("velocity_at"),
+}  # fmt: skip
+_STATED = re.compile(r"\[sensors\] (\w+) = (\S+): .*")
+_FIXED = re.compile(r"(\w+) of ([^:]+): ")
+_PATTERNS: tuple[tuple[re.Pattern[str], Callable[[str, re.Match[str]], Step]], ...] = (
+    (
+        re.compile(r"([urv](?:, [urv])*) from (positions and heading|heading) by central .*"),
+        lambda s, m: _step(s, "difference", m[1].split(", "), _MADE_OF[m[2]]),
+    ),
+    (
+        re.compile(rf"u, v from positions and heading by Savitzky-Golay over {_NUMBER} s"),
+        lambda s, m: _step(
+            s,
+            "local_polynomials",
+            ("u", "v"),
+            _MADE_OF["positions and heading"],
+            window=_finite(m[1]),
+        ),
+    ),
+    (
+        re.compile(r"u, v from the velocity over ground and the heading"),
+        lambda s, m: _step(s, "earth_to_body", ("u", "v"), ("v_n", "v_e", "psi")),
+    ),
+    (
+        re.compile(r"u_q, v_q from (V_q, gamma_q|the apparent wind's speed and direction) .*"),
+        lambda s, m: _step(s, "polar", ("u_q", "v_q"), ("V_q",)),
+    ),
+    (
+        re.compile(r"u_q, v_q from the true wind, .*"),
+        lambda s, m: _step(s, "true_wind", ("u_q", "v_q"), ("psi", "u", "v")),
+    ),
+    (
+        re.compile(rf"u_q, v_q moved from the anemometer at \({_NUMBER}, {_NUMBER}\) m .*"),
+        lambda s, m: _step(s, "move_anemometer", ("u_q", "v_q"), x=_finite(m[1]), y=_finite(m[2])),
+    ),
+    (
+        re.compile(rf"true wind brought from {_NUMBER} to {_NUMBER} m\b.*"),
+        lambda s, m: _step(
+            s, "wind_height", ("u_q", "v_q"), measured=_finite(m[1]), height=_finite(m[2])
+        ),
+    ),
+    (
+        re.compile(rf"(\w+) smoothed over {_NUMBER} s \(local polynomials of order 2\)"),
+        lambda s, m: _step(s, "smooth", (m[1],), window=_finite(m[2]), order=2.0),
+    ),
+    (
+        re.compile(rf"decimated from {_NUMBER} s to {_NUMBER} s"),
+        lambda s, m: _step(s, "decimate", (), measured=_finite(m[1]), sample_time=_finite(m[2])),
+    ),
+)

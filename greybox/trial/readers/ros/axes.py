@@ -1,0 +1,157 @@
+"""The axes of ROS: messages whose meaning ROS defines, as signals of a ship.
+
+By REP 103 the world is east-north-up and the body forward-left-up, so signs and
+heading change on the way to north-east-down and forward-starboard-down. Frames whose
+names say ``ned`` or ``frd`` are taken as they are.
+
+References
+----------
+REP 103 (axes and units), REP 145 (IMU), REP 147 (``_ned``, ``_frd``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Fields = dict[str, float]
+Remarks = dict[str, None]
+
+# frames whose axes are those of the world, whatever the message
+WORLD_FRAMES = frozenset({"map", "odom", "world", "earth", "enu", "ned", "utm"})
+
+
+class SkippedMessageError(Exception):
+    """The message says that it holds no valid measurement; the argument says why."""
+
+
+def compass_heading(x: Any, y: Any, z: Any, w: Any, *, ned: bool) -> NDArray[np.float64]:
+    """Return the compass direction of the body's x axis from quaternions.
+
+    Parameters
+    ----------
+    x, y, z, w : array_like
+        (N,) each, or numbers; of any length but zero.
+    ned : bool
+        Whether the world's axes are north-east-down, else east-north-up.
+
+    Returns
+    -------
+    ndarray
+        (N,) [rad], 0 to 2π; NaN where the quaternion gives no direction.
+    """
+    ahead, aside = w * w + x * x - y * y - z * z, 2 * (w * z + x * y)
+    yaw = np.arctan2(aside, ahead)
+    heading = (yaw if ned else np.pi / 2 - yaw) % (2 * np.pi)
+    return np.where((ahead == 0) & (aside == 0), np.nan, heading)
+
+
+def _heading(q: Mapping[str, Any], *, ned: bool) -> float:
+    return float(compass_heading(*(float(q[k]) for k in "xyzw"), ned=ned))
+
+
+def frame_name(name: Any) -> str:
+    """Return the last part of a frame's name, in lower case."""
+    return str(name).strip("/").rsplit("/", 1)[-1].casefold()
+
+
+def is_ned(frame: str) -> bool:
+    """Whether the world's axes are north-east-down by the name of the frame."""
+    return frame == "ned" or frame.endswith("_ned")
+
+
+def is_frd(frame: str) -> bool:
+    """Whether the body's axes are forward-right-down by the name of the frame."""
+    return "frd" in frame or "ned" in frame
+
+
+def pose_fields(pose: Mapping[str, Any], ned: bool, remarks: Remarks) -> Fields:
+    """Return ``x_n``, ``y_n`` [m] and ``psi`` [rad] of a pose, and remark on its axes."""
+    x, y = float(pose["position"]["x"]), float(pose["position"]["y"])
+    remarks[
+        "world frame north-east-down: positions and heading as they are"
+        if ned
+        else "world frame east-north-up (REP 103): x_n = y, y_n = x, psi = pi/2 - yaw"
+    ] = None
+    north, east = (x, y) if ned else (y, x)
+    return {"x_n": north, "y_n": east, "psi": _heading(pose["orientation"], ned=ned)}
+
+
+def twist_fields(twist: Mapping[str, Any], frd: bool, remarks: Remarks) -> Fields:
+    """Return ``u``, ``v`` [m/s] and ``r`` [rad/s] of a twist in body axes, and remark on them."""
+    sign = 1.0 if frd else -1.0
+    remarks[
+        "body frame forward-right-down: velocities as they are"
+        if frd
+        else "body frame forward-left-up (REP 103): u = x, v = -y, r = -yaw rate"
+    ] = None
+    linear, angular = twist["linear"], twist["angular"]
+    return {
+        "u": float(linear["x"]),
+        "v": sign * float(linear["y"]),
+        "r": sign * float(angular["z"]),
+    }
+
+
+def _odometry(m: Mapping[str, Any], remarks: Remarks) -> Fields:
+    world, body = frame_name(m["header"]["frame_id"]), frame_name(m["child_frame_id"])
+    ned = is_ned(world)
+    frd = is_frd(body) or (ned and "flu" not in body)
+    return pose_fields(m["pose"]["pose"], ned, remarks) | twist_fields(
+        m["twist"]["twist"], frd, remarks
+    )
+
+
+def _pose_stamped(m: Mapping[str, Any], remarks: Remarks) -> Fields:
+    pose = m["pose"]
+    return pose_fields(pose.get("pose", pose), is_ned(frame_name(m["header"]["frame_id"])), remarks)
+
+
+def _twist_stamped(m: Mapping[str, Any], remarks: Remarks) -> Fields:
+    twist = m["twist"]
+    twist = twist.get("twist", twist)
+    frame = frame_name(m["header"]["frame_id"])
+    if frame in WORLD_FRAMES or frame.endswith("_enu"):
+        remarks[f"its frame '{frame}' is the world's, so its velocities are not u, v"] = None
+        return {
+            f"{part}.{k}": float(twist[part][k]) for part in ("linear", "angular") for k in "xyz"
+        }
+    return twist_fields(twist, is_frd(frame), remarks)
+
+
+def _imu(m: Mapping[str, Any], remarks: Remarks) -> Fields:
+    frame = frame_name(m["header"]["frame_id"])
+    frd = is_frd(frame)
+    found: Fields = {}
+    # a first covariance of -1 says that the sensor does not measure the quantity
+    if m["angular_velocity_covariance"][0] != -1:
+        found["r"] = (1.0 if frd else -1.0) * float(m["angular_velocity"]["z"])
+        remarks["yaw rate as it is" if frd else "r = -yaw rate (z up, REP 103)"] = None
+    if m["orientation_covariance"][0] != -1:
+        found["psi"] = _heading(m["orientation"], ned=frd)
+        remarks["psi = yaw" if frd else "psi = pi/2 - yaw (REP 103)"] = None
+    return found
+
+
+def _fix(m: Mapping[str, Any], remarks: Remarks) -> Fields:
+    status, lat, lon = m["status"]["status"], float(m["latitude"]), float(m["longitude"])
+    if status < 0:
+        raise SkippedMessageError("they have no fix (status < 0)")
+    if not (abs(lat) <= 90 and abs(lon) <= 360):
+        raise SkippedMessageError("they hold no position")
+    return {"lat": lat, "lon": lon, "altitude": float(m["altitude"])}
+
+
+# by type of message; each may raise SkippedMessageError, or KeyError where fields are missing
+HANDLERS: dict[str, Callable[[Mapping[str, Any], Remarks], Fields]] = {
+    "sensor_msgs/msg/NavSatFix": _fix,
+    "sensor_msgs/msg/Imu": _imu,
+    "nav_msgs/msg/Odometry": _odometry,
+    "geometry_msgs/msg/PoseStamped": _pose_stamped,
+    "geometry_msgs/msg/PoseWithCovarianceStamped": _pose_stamped,
+    "geometry_msgs/msg/TwistStamped": _twist_stamped,
+    "geometry_msgs/msg/TwistWithCovarianceStamped": _twist_stamped,
+}

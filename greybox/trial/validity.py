@@ -1,0 +1,198 @@
+"""Conditions of several logs, and of a model and a log: what they share, and where they differ.
+
+Every rule of when conditions differ stands here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from greybox.trial.log import TrialLog
+from greybox.vessel.conditions import UNITS, Conditions, Value, spelled, words
+
+# field -> values of the logs of a model, ascending, each once
+Validity = Mapping[str, tuple[Any, ...]]
+
+# share of the draught: the lateral force of a hull goes with its square, so 10 % of that
+_DRAUGHT = 0.05
+# share of the draught: the sway force goes with 1 + 2/3 trim/draught (Inoue, Hirano and Kijima,
+# 1981), so 7 % of that
+_TRIM = 0.1
+# share of the depth, where the bottom is felt
+_DEPTH = 0.2
+# draughts under which the bottom is felt (PIANC, 1992, calls more than three deep)
+_DEEP = 4.0
+# observers differ by one code
+_SEA = 2
+_MOST_NAMED = 3
+
+
+@dataclass(frozen=True)
+class ConditionDifference:
+    """One condition in which logs differ, among themselves or from those of a model.
+
+    Parameters
+    ----------
+    condition : str
+        Field of `Conditions`.
+    logs : tuple of (str, value)
+        Name of each log that states it and what it states; beside a model only those
+        that differ from it.
+    model : tuple of value
+        What the logs of the model stated; empty where logs differ among themselves.
+    """
+
+    condition: str
+    logs: tuple[tuple[str, Value], ...]
+    model: tuple[Value, ...] = ()
+
+    @property
+    def sentence(self) -> str:
+        """What differs, and what follows from it."""
+        name = words(self.condition)
+        by_value: dict[Value, list[str]] = {}
+        for log, value in self.logs:
+            by_value.setdefault(value, []).append(log)
+        shown = "; ".join(
+            f"{spelled(self.condition, v)} in {_some(logs)}" for v, logs in by_value.items()
+        )
+        if not self.model:
+            return (
+                f"the logs differ in {name} ({shown}): parameters that are common to them hold "
+                f"for none of these conditions exactly, so estimate on logs of one {name} too."
+            )
+        known = " and ".join(spelled(self.condition, v) for v in _ends(self.model))
+        return (
+            f"{name} is {shown}, the model was estimated at {known}: its parameters may not hold "
+            f"there."
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the difference for JSON, SI."""
+        return {
+            "condition": self.condition,
+            "unit": UNITS[self.condition] or None,
+            "logs": dict(self.logs),
+            "model": list(self.model) or None,
+            "sentence": self.sentence,
+        }
+
+
+@dataclass(frozen=True)
+class PooledConditions:
+    """Conditions of the logs of one estimate.
+
+    Parameters
+    ----------
+    values : mapping of str to tuple
+        What the logs state, by field of `Conditions`.
+    differences : tuple of ConditionDifference
+        In what they differ by more than the parameters can ignore.
+    """
+
+    values: Validity = field(default_factory=dict)
+    differences: tuple[ConditionDifference, ...] = ()
+
+
+def pooled_conditions(logs: Sequence[TrialLog]) -> PooledConditions:
+    """Return the conditions that logs of one estimate share, and in what they differ."""
+    found: dict[str, tuple[Any, ...]] = {}
+    differences = []
+    draught = max((v for log in logs if (v := log.conditions.draught) is not None), default=None)
+    for name in UNITS:
+        stated = [(log.name, v) for log in logs if (v := getattr(log.conditions, name)) is not None]
+        values = sorted({v for _, v in stated})
+        if not values:
+            continue
+        found[name] = tuple(values)
+        if any(_differ(name, values[0], v, draught) for v in values):
+            differences.append(ConditionDifference(name, tuple(stated)))
+    return PooledConditions(found, tuple(differences))
+
+
+def other_conditions(model: Validity, logs: Sequence[TrialLog]) -> tuple[ConditionDifference, ...]:
+    """Return the conditions in which logs differ from those that a model was estimated on.
+
+    Parameters
+    ----------
+    model : mapping of str to tuple
+        As `PooledConditions.values`. Numbers between its ends are taken to be covered.
+    logs : sequence of TrialLog
+    """
+    differences = []
+    for name, values in model.items():
+        off = []
+        for log in logs:
+            value = getattr(log.conditions, name)
+            if value is None:
+                continue
+            known: Sequence[Any] = values
+            if not isinstance(value, str):
+                # numbers between those of the model's logs are covered by them
+                known = [np.clip(value, values[0], values[-1])]
+            draughts = (*model.get("draught", ()), log.conditions.draught)
+            draught = max((d for d in draughts if d is not None), default=None)
+            if all(_differ(name, value, v, draught) for v in known):
+                off.append((log.name, value))
+        if off:
+            differences.append(ConditionDifference(name, tuple(off), values))
+    return tuple(differences)
+
+
+def validity_to_dict(values: Validity) -> dict[str, Any]:
+    """Return conditions for JSON: a value where the logs agree, a list where they do not."""
+    return {n: v[0] if len(v) == 1 else list(v) for n, v in values.items()}
+
+
+def validity_from_dict(data: Any) -> Validity:
+    """Return the conditions of a model file.
+
+    Raises
+    ------
+    LogError
+        A value is none that the field can have.
+    """
+    found: dict[str, tuple[Any, ...]] = {}
+    for name, given in data.items():
+        if name in UNITS:
+            several = given if isinstance(given, list) else [given]
+            read = {getattr(Conditions.read({name: v}), name) for v in several}
+            found[name] = tuple(sorted(read))
+    return found
+
+
+def in_words(values: Validity) -> str:
+    """Return the conditions of a model in words; empty where none are known."""
+    return ", ".join(
+        f"{words(n)} {' to '.join(spelled(n, x) for x in _ends(v))}" for n, v in values.items()
+    )
+
+
+def _differ(name: str, one: Any, other: Any, draught: float | None) -> bool:
+    """Whether two values of a condition differ by more than parameters can ignore."""
+    if name == "loading":
+        return bool(one.casefold() != other.casefold())
+    if name == "sea_state":
+        return bool(abs(one - other) >= _SEA)
+    if name == "water_depth" and draught is not None:
+        one, other = min(one, _DEEP * draught), min(other, _DEEP * draught)
+    scale = max(abs(one), abs(other))
+    if name == "trim" and draught is not None:
+        scale = draught
+    share = {"draught": _DRAUGHT, "trim": _TRIM, "water_depth": _DEPTH}[name]
+    return bool(abs(one - other) > share * scale)
+
+
+def _ends(values: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Return least and greatest number, or all words."""
+    return values if isinstance(values[0], str) or len(values) < 2 else (values[0], values[-1])
+
+
+def _some(names: list[str]) -> str:
+    more = len(names) - _MOST_NAMED
+    shown = ", ".join(names[:_MOST_NAMED])
+    return f"{shown} and {more} more" if more > 0 else shown

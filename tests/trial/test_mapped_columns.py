@@ -1,0 +1,97 @@
+"""``[columns]``: the short form, units that nobody gives, and alternatives of one signal."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from greybox.errors import LogError
+from greybox.trial.convert.read import read_log
+from greybox.trial.import_files import import_files
+from greybox.vessel.toml import vessel_from_dict
+
+T = np.arange(100) / 10
+
+
+def vessel(columns):
+    thruster = {"type": "fixed", "speed": "n"}
+    return vessel_from_dict({"name": "V", "length": 10, "thruster": [thruster], "columns": columns})
+
+
+def imported(tmp_path, ship, *frames):
+    files = [tmp_path / f"raw{k}.csv" for k in range(len(frames))]
+    for file, frame in zip(files, frames, strict=True):
+        frame.to_csv(file, index=False)
+    import_files(files, ship, tmp_path / "log.csv")
+    return read_log(tmp_path / "log.csv", ship)
+
+
+def table(**columns):
+    moving = {"u": 2 + 0 * T, "v": 0 * T, "n": 5 + 0 * T}
+    return pd.DataFrame({"tvec": T, "yaw": 0.1 * T, **moving} | columns)
+
+
+@pytest.mark.parametrize("long", [False, True])
+def test_si_where_no_unit_is_given(tmp_path, long):
+    """Seconds of ten and headings beyond fifty are seconds and radians still."""
+    short = {"tvec": "t", "yaw": "psi"}
+    ship = vessel({k: {"name": v} for k, v in short.items()} if long else short)
+    frame = table(tvec=20 * T, yaw=60 + 0.1 * T)
+    frame.to_csv(tmp_path / "plain.csv", index=False)
+    for log in (imported(tmp_path, ship, frame), read_log(tmp_path / "plain.csv", ship)):
+        assert log.sample_time == 2.0
+        turns = (log["psi"] - 60 - 0.005 * log.t) / (2 * np.pi)
+        np.testing.assert_allclose(turns, np.round(turns), atol=1e-9)
+
+
+@pytest.mark.parametrize("raw", ["yaw [deg]", "yaw_deg", "bridge.yaw [deg]"])
+def test_a_unit_in_the_name_of_a_column_is_given(tmp_path, raw):
+    frame = table().rename(columns={"yaw": raw})
+    log = imported(tmp_path, vessel({"tvec": "t", raw: "psi"}), frame)
+    np.testing.assert_allclose(log["psi"], np.radians(0.1 * log.t), atol=1e-9)
+
+
+def test_unix_nanoseconds_are_no_seconds(tmp_path):
+    ship = vessel({"tvec": "t", "yaw": "psi"})
+    log = imported(tmp_path, ship, table(tvec=(1.7e18 + 1e9 * T).astype(np.int64)))
+    assert log.sample_time == 0.1
+
+
+def test_columns_mapped_to_one_signal_are_alternatives(tmp_path):
+    """Two loggers, two names: each file holds one of them."""
+    ship = vessel({"tvec": "t", "yaw": "psi", "hdg": {"name": "psi", "unit": "deg"}})
+    first = imported(tmp_path, ship, table())
+    other = table(hdg=np.degrees(0.1 * T)).drop(columns="yaw")
+    np.testing.assert_allclose(imported(tmp_path, ship, other)["psi"], first["psi"], atol=1e-9)
+    other.to_csv(tmp_path / "plain.csv", index=False)
+    plain = read_log(tmp_path / "plain.csv", ship)
+    np.testing.assert_allclose(plain["psi"], 0.1 * plain.t, atol=1e-9)
+    later = other.assign(tvec=T + 10, hdg=np.degrees(0.1 * T + 1))
+    both = imported(tmp_path, ship, table(), later)
+    np.testing.assert_allclose(both["psi"], 0.1 * both.t, atol=1e-9)
+
+
+def test_alternatives_at_the_same_times_are_refused_by_name(tmp_path):
+    ship = vessel({"tvec": "t", "yaw": "psi", "hdg": {"name": "psi", "unit": "deg"}})
+    with pytest.raises(LogError, match="columns 'yaw' and 'hdg' are both there"):
+        imported(tmp_path, ship, table(hdg=0 * T))
+    apart = pd.DataFrame({"tvec": T, "hdg": 0 * T})
+    with pytest.raises(LogError, match="columns 'yaw' of 'raw0' and 'hdg' of 'raw1'"):
+        imported(tmp_path, ship, table(), apart)
+    assert not (tmp_path / "log.csv").exists()
+
+
+def test_a_mapped_column_of_words_is_not_told_unused(tmp_path):
+    ship = vessel_from_dict(
+        {
+            "name": "V", "length": 10, "thruster": [{"type": "fixed", "speed": "n"}],
+            "columns": {"tvec": "t", "yaw": "psi", "state": "mode", "none": "x_n"},
+            "closed_loop": {"column": "mode", "values": ["auto"]},
+        }
+    )  # fmt: skip
+    log = imported(tmp_path, ship, table(state="auto"))
+    assert log.closed_loop.all()
+    notes = log.provenance.read
+    assert "[columns] maps 'none' to 'x_n', which no file has" in notes
+    assert not any("'state'" in n for n in notes)
