@@ -117,7 +117,7 @@ def _base(clocks: list[Defect], campaign: Campaign, vessel: Vessel) -> _Base:
     if not positions or positions == [0]:
         return _Base()
     delays = response_delays(campaign.recordings, vessel)
-    may = [k for k in input_clocks(delays, all_clocks) if k in (0, positions[0])]
+    may = [k for k in input_clocks(delays, all_clocks, vessel) if k in (0, positions[0])]
     seen = _delays_in_words(delays)
     against = _list(_words(clocks[0].against))
     if may == [0]:

@@ -92,7 +92,9 @@ def response_delays(recordings: Sequence[Recording], vessel: Vessel) -> dict[str
 
 
 def input_clocks(
-    delays: Mapping[str, Delay], clocks: Sequence[tuple[tuple[str, ...], float]]
+    delays: Mapping[str, Delay],
+    clocks: Sequence[tuple[tuple[str, ...], float]],
+    vessel: Vessel,
 ) -> list[int]:
     """Return which clocks the inputs may share.
 
@@ -102,15 +104,18 @@ def input_clocks(
         Of u, v, r, as `response_delays` returns them.
     clocks : sequence of (channels, late)
         Channels of each clock, and its lateness [s] against any one of them.
+    vessel : Vessel
+        Its thrusters follow a command some time later, a measured value at once.
     """
     of_state = {s: late for channels, late in clocks for s in delays if s in channels}
+    commanded = any(t.drive == "command" for t in vessel.thrusters)
     possible = []
     for k, (_, late) in enumerate(clocks):
         # the delay that would be left, were the inputs on this clock
         low = [d.ci[0] + late - of_state[s] for s, d in delays.items() if s in of_state]
         high = [d.ci[1] + late - of_state[s] for s, d in delays.items() if s in of_state]
         # no force acts before its command; what is measured acts at once on one velocity at least
-        if high and min(high) >= -_RESOLUTION and min(low) <= _BUILD_UP:
+        if high and min(high) >= -_RESOLUTION and (commanded or min(low) <= _BUILD_UP):
             possible.append(k)
     return possible
 
