@@ -25,7 +25,13 @@ from greybox.trial.checks.sensor_offsets.select import (
     possible,
     separation,
 )
-from greybox.trial.checks.sensor_offsets.thresholds import MOST_LATE, expected, most_arm
+from greybox.trial.checks.sensor_offsets.thresholds import (
+    LEAST_CLOCK,
+    LEAST_HEADING,
+    MOST_LATE,
+    expected,
+    most_arm,
+)
 from greybox.trial.raw_log import Recording
 from greybox.trial.steps import Step, mend
 from greybox.vessel.vessel import Vessel
@@ -237,7 +243,7 @@ def _judged(finding: Finding, d: Defect, campaign: Campaign, vessel: Vessel) -> 
         evidence += f"; {count} logs together say so"
         scatter = _scatter(d, campaign.pooled)
         if scatter:
-            evidence += f", scattering by {scatter}"
+            evidence += f", each within about {scatter}"
         finding = replace(finding, logs=campaign.names)
     if campaign.others and _differs(d, campaign.pooled):
         evidence += (
@@ -305,11 +311,11 @@ def _rows(d: Defect) -> list[int]:
 
 def _scatter(d: Defect, pooled: Pooled) -> str:
     size = float(np.max(pooled.scatter[_rows(d)]))
-    if size == 0:
-        return ""
     if d.id == "heading_bias":
-        return f"{np.degrees(size):.1f} deg from log to log"
-    return f"{size:.2f} {'m' if d.id == 'lever_arm' else 's'} from log to log"
+        return f"{np.degrees(size):.1f} deg" if size > 0.1 * LEAST_HEADING else ""
+    if size < 0.1 * LEAST_CLOCK:
+        return ""
+    return f"{size:.2f} {'m' if d.id == 'lever_arm' else 's'}"
 
 
 def _differs(d: Defect, pooled: Pooled) -> bool:

@@ -58,6 +58,7 @@ class Tie:
             n: denoise(v, motion) for n, v in motion.values.items() if n not in ("x_n", "y_n")
         }
         self.drift = (motion.t - motion.t[0]) / max(float(np.ptp(motion.t)), 1e-9)
+        self._whole: dict[str, int] = {}
         self.align(np.zeros(SIZE))
 
     @property
@@ -69,11 +70,13 @@ class Tie:
         return np.array(found + ([*range(ARM.start, SIZE)] if self.positioned else []))
 
     def align(self, offsets: Array) -> None:
-        """Take the fast part of the noise-free heading from the rate, as late as the heading is.
+        """Take channels as late as they are: by whole samples, and the noise-free heading.
 
-        What is moved in time must not know its own noise, or moving it would seem to explain that
-        noise.
+        What is moved by less must not know its own noise, or moving it would seem to explain that
+        noise: the fast part of the noise-free heading is the rate's.
         """
+        late = self._late(offsets)
+        self._whole = {n: round(late[n] / self.motion.step) for n in self.smooth}
         if not self.turned:
             return
         behind = offsets[CLOCKS.index("psi")] - offsets[CLOCKS.index("r")]
@@ -85,13 +88,9 @@ class Tie:
         """Return residuals and minus their derivatives at some offsets (`SIZE`,)."""
         m = self.motion
         n = len(m)
-        late = dict(zip(CLOCKS, offsets[: len(CLOCKS)], strict=True))
-        if not self.positioned:
-            late["psi"] = 0.0
+        late = self._late(offsets)
         slow = {k: self._moved(self.smooth[k], late[k]) for k in ("psi", "u", "v", "r") if k in m}
-        # only the smooth part is moved: interpolation between samples would shrink the noise
-        # and so seem to explain it
-        now = {k: m[k] + slow[k] - self.smooth[k] for k in slow}
+        now = {k: self._now(k, slow[k]) for k in slow}
         rate = {k: self._slope(v) for k, v in slow.items()}
         position, columns = np.zeros((n, 2)), np.zeros((n, 2, SIZE + 4))
         if self.positioned:
@@ -127,6 +126,24 @@ class Tie:
             swept[:, CLOCKS.index("r")] = both[:, 2]
             swept[:, SIZE], swept[:, SIZE + 1] = self.drift, both[:, 1]
         return Residuals(position, heading, columns, swept)
+
+    def _late(self, offsets: Array) -> dict[str, float]:
+        late = {n: float(x) for n, x in zip(CLOCKS, offsets[: len(CLOCKS)], strict=True)}
+        return late if self.positioned else late | {"psi": 0.0}
+
+    def _now(self, name: str, slow: Array) -> Array:
+        """Return a channel as it would be were it not late, its noise as it was recorded.
+
+        By whole samples with its noise; for the rest only the noise-free part is moved, since
+        interpolation between samples would shrink the noise and so seem to explain it.
+        """
+        out = slow.copy()
+        for a, b in self.motion.stretches:
+            rows = np.arange(a, b) + self._whole[name]
+            inside = (rows >= a) & (rows < b)
+            rows = rows[inside]
+            out[a:b][inside] += self.motion[name][rows] - self.smooth[name][rows]
+        return out
 
     def _walked(self, psi: Array, u: Array, v: Array) -> Array:
         """Return the way made by velocities and heading (N, 2) [m]."""
