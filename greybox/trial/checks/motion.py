@@ -290,9 +290,10 @@ def denoise(value: Array, motion: Motion) -> Array:
     """Return a channel without its noise, for derivatives and regressors only.
 
     The width of the low-pass is chosen by leave-one-out prediction: wide for a
-    noisy rate gyro on a slow ship, narrow for a clean signal.
+    noisy rate gyro on a slow ship, narrow for a clean signal. What it takes from
+    the signal itself is given back by smoothing the rest once more (Tukey's twicing).
     """
-    best, chosen = np.inf, value
+    best, chosen = np.inf, 2.0
     taps = np.arange(-_MOST_TAPS, _MOST_TAPS + 1)
     for width in (1.5, 2.0, 3.0, 4.5, 7.0, 10.0, 15.0, 22.0, 32.0, 45.0):
         # neighbours are left out too: their noise may go along with that of the sample
@@ -304,11 +305,11 @@ def denoise(value: Array, motion: Motion) -> Array:
                 error += float(np.sum((value[a + _MOST_TAPS : b - _MOST_TAPS] - said) ** 2))
                 count += len(said)
         if not count:
-            return smooth(value, motion, 2.0 * motion.step)
+            break
         if error / count < best:
-            best = error / count
-            chosen = smooth(value, motion, width * motion.step)
-    return chosen
+            best, chosen = error / count, width
+    slow = smooth(value, motion, chosen * motion.step)
+    return slow + smooth(value - slow, motion, chosen * motion.step)
 
 
 def turn(psi: Array, forward: Array, starboard: Array) -> Array:

@@ -23,8 +23,6 @@ from greybox.trial.checks.motion import (
     whiten,
     without_starts,
 )
-from greybox.trial.convert.resample import clock as make_clock
-from greybox.trial.convert.resample import hold
 from greybox.trial.raw_log import Recording
 from greybox.vessel.force import generalised_force
 from greybox.vessel.vessel import Vessel
@@ -140,8 +138,8 @@ def _profiles(
         if len(keep) < 2:
             return {}
         keep = keep[np.argsort(s.t[keep], kind="stable")]
-        own = make_clock(s.t[keep])
-        held[c] = hold(own, s.value[keep], np.clip(fine, own.t[0], own.t[-1]))
+        # between samples, not held: a sample says nothing of when the value was taken up
+        held[c] = np.interp(fine, s.t[keep], s.value[keep])
     force = generalised_force(vessel, held)
     found = {}
     for state in states:
