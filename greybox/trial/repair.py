@@ -74,9 +74,10 @@ def apply_repairs(recording: Recording, findings: Iterable[Finding]) -> Recordin
         for step in f.repair
         if step not in recording.steps
     ]
-    if any(s.operation in _ON_DERIVED for s in steps):
-        recording = derive_signals(recording)
     for step in steps:
+        if step.operation in _ON_DERIVED:
+            # not before: what was interpolated across a wrap must go before it is unwrapped
+            recording = derive_signals(recording)
         recording = _ACTIONS[step.operation](recording, step)
     return recording.with_steps(*steps)
 
@@ -97,12 +98,20 @@ def _order(recording: Recording, step: Step) -> Recording:
     return recording.with_signals(out)
 
 
+def _cut(recording: Recording, step: Step) -> Recording:
+    """Return the recording as it is: its steps tell where it is cut."""
+    return recording
+
+
 def _drop(recording: Recording, step: Step) -> Recording:
     out = []
+    names: set[str] = set()
+    for n in step.channels:
+        names |= {n} if n in recording else set(_MEASURED_AS.get(n, ()))
     times = np.array(step.numbers("times"))
     shared: dict[tuple[int, bytes], Array] = {}
     for s in recording.signals:
-        if s.name in step.channels:
+        if s.name in names:
             keep = np.isfinite(s.value) & np.isfinite(s.t)
             if len(times):
                 keep &= ~np.isin(s.t, times)
@@ -193,10 +202,16 @@ def _heading_at(recording: Recording, t: Array) -> Array:
     return np.interp(t, psi.t[keep], continuous(psi.value[keep]))
 
 
+# what a channel is derived from, where a recording does not hold it yet
+_MEASURED_AS = {
+    "x_n": ("lat", "lon"), "y_n": ("lat", "lon"), "v_n": ("sog", "cog"), "v_e": ("sog", "cog"),
+    "u_q": ("V_q", "gamma_q", "dir_q"), "v_q": ("V_q", "gamma_q", "dir_q"),
+}  # fmt: skip
 _ACTIONS = {
-    "order": _order, "drop": _drop, "scale": _scale, "offset": _offset, "exchange": _exchange,
-    "shift": _shift, "turn_heading": _turn_heading, "earth_to_body": _earth_to_body,
-    "move_antenna": _move_antenna, "pad_fractions": _pad_fractions,
+    "order": _order, "drop": _drop, "cut": _cut, "scale": _scale, "offset": _offset,
+    "exchange": _exchange, "shift": _shift, "turn_heading": _turn_heading,
+    "earth_to_body": _earth_to_body, "move_antenna": _move_antenna,
+    "pad_fractions": _pad_fractions,
 }  # fmt: skip
 # these act on positions and unwrapped headings
 _ON_DERIVED = frozenset({"earth_to_body", "move_antenna", "shift", "turn_heading"})

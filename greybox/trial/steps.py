@@ -165,6 +165,10 @@ def _names(step: Step) -> str:
     return ", ".join(step.channels)
 
 
+def _times(step: Step) -> str:
+    return ", ".join(f"{t:.6g}" for t in step.numbers("times"))
+
+
 def _sources(step: Step) -> str:
     places = {"x_n", "y_n"} <= set(step.source)
     words = ["positions"] if places else []
@@ -189,6 +193,7 @@ OPERATIONS: dict[str, Callable[[Step], str]] = {
     # signals on their own clocks
     "order": lambda s: f"rows of {_names(s)} put in order of time, each time once",
     "drop": lambda s: f"samples of {_names(s)} left out",
+    "cut": lambda s: f"log cut where {_names(s)} begin anew, at t = {_times(s)} s",
     "scale": lambda s: f"{_names(s)} multiplied by {s.number('factor'):.6g}",
     "offset": lambda s: f"{s.number('offset'):+.6g} added to {_names(s)}",
     "exchange": lambda s: f"{_names(s)} exchanged",

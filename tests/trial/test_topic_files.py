@@ -322,6 +322,18 @@ def test_messages_without_a_fix_hold_no_position(tmp_path):
     assert np.flatnonzero(np.isnan(recording["lat"].value)).tolist() == list(range(10, 20))
 
 
+def test_what_is_no_place_on_earth_is_no_position(tmp_path):
+    table = topics(SHIP_RUN)["fix"]
+    table.loc[3, "latitude"] = np.inf
+    table.loc[5, "longitude"] = 1e9
+    paths = written(tmp_path, {"fix": table})
+    (log, *_) = import_recording(read_trial(paths, VESSEL), VESSEL).segments
+    assert np.abs(log["x_n"]).max() < 100
+    table["longitude"] = np.nan
+    with pytest.raises(LogError, match="no position"):
+        import_recording(read_trial(written(tmp_path, {"fix": table}), VESSEL), VESSEL)
+
+
 def two_files(folder, apart):
     t = SHIP_RUN["t"]
     motion = pd.DataFrame(

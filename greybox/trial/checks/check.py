@@ -14,7 +14,10 @@ from greybox.trial.checks.frame_sign_unit import (
     read,
     reading_findings,
 )
+from greybox.trial.checks.heading_wrap import wrap_findings
 from greybox.trial.checks.motion import Motion, make_motion
+from greybox.trial.checks.position_hold import hold_findings
+from greybox.trial.checks.position_jump import jump_findings
 from greybox.trial.checks.sensor_offsets.find import find_offsets
 from greybox.trial.checks.signal_quality import (
     angle_unit_findings,
@@ -130,9 +133,12 @@ def _signal_quality(recording: Recording, vessel: Vessel) -> _Log:
     raw += time_findings(apply_repairs(recording, raw))
     raw += missing_findings(recording)
     raw += angle_unit_findings(recording, vessel)
+    # before the heading is unwrapped
+    raw += wrap_findings(apply_repairs(recording, raw))
     whole = derive_signals(apply_repairs(recording, raw))
     log = _Log(recording, raw, {}, whole)
-    measured = _independent(whole)
+    log.add(hold_findings(_independent(whole)))
+    measured = _independent(log.mended)
     log.add(
         [
             *stuck_findings(measured, vessel),
@@ -140,6 +146,7 @@ def _signal_quality(recording: Recording, vessel: Vessel) -> _Log:
             *coarse_findings(measured),
         ]
     )
+    log.add(jump_findings(_independent(log.mended)))
     log.motion = make_motion(_independent(log.mended))
     return log
 
