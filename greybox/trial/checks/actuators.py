@@ -842,9 +842,7 @@ def _threshold_interval(fit: _Fit, pairs: Sequence[_Pair]) -> tuple[float, float
     return float(size[good[0]]), float(size[good[-1] + 1])
 
 
-def _held(
-    fit: _Fit, pairs: Sequence[_Pair], kind: ActuatorKind
-) -> tuple[float, tuple[_Pair, ...]]:
+def _held(fit: _Fit, pairs: Sequence[_Pair], kind: ActuatorKind) -> tuple[float, tuple[_Pair, ...]]:
     """Return the mean age [s] of a feedback that the recorder repeats, and where it is new."""
     still = moving = 0
     ages: list[Array] = []

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.trial.checks.finding import Finding, Outcome
-from greybox.trial.checks.motion import Motion, make_motion
+from greybox.trial.checks.motion import make_motion
 from greybox.trial.convert.resample import clock as make_clock
 from greybox.trial.convert.resample import hold_mean
 from greybox.trial.raw_log import Recording
@@ -282,9 +282,7 @@ class _Scan:
             x = self.phi[s, used]
             gram = x.T @ x + _RIDGE * used.sum() * np.eye(x.shape[1])
             inverse.append(np.linalg.inv(gram))
-            rest[:, s] = self.rate[:, s] - self.phi[s] @ (
-                inverse[s] @ (x.T @ self.rate[used, s])
-            )
+            rest[:, s] = self.rate[:, s] - self.phi[s] @ (inverse[s] @ (x.T @ self.rate[used, s]))
         return rest, np.stack(inverse)
 
     def _half_thrust(self) -> float:
@@ -392,9 +390,7 @@ class _Scan:
         """Return how much the fit adds to the variance of each sum (W,), in rows."""
         found = np.zeros(len(first))
         for s in range(2):
-            total = np.vstack(
-                [np.zeros((1, self.phi.shape[2])), np.cumsum(self.phi[s], axis=0)]
-            )
+            total = np.vstack([np.zeros((1, self.phi.shape[2])), np.cumsum(self.phi[s], axis=0)])
             x = total[last] - total[first]
             found += 0.5 * np.einsum("ij,jk,ik->i", x, inverse[s], x)
         return found
@@ -432,9 +428,7 @@ def _finding(event: _Event, log: _Log, recording: Recording, scan: _Scan) -> Fin
         f"ask what happened from t = {begin:.6g} to {end:.6g} s; leave it out of estimates, or "
         f"import --fix-also external_force",
         _STATES,
-        (
-            Step("drop", recording.names, interval=(begin, end), decided_by="check"),
-        ),
+        (Step("drop", recording.names, interval=(begin, end), decided_by="check"),),
         False,
         _picture(event, log, scan),
     )
