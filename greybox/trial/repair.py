@@ -203,8 +203,9 @@ _MEASURED_AS = {
 }  # fmt: skip
 _ACTIONS = {
     "order": _order, "drop": _drop, "cut": _cut, "scale": _scale, "offset": _offset,
-    "exchange": _exchange, "shift": _shift, "turn_heading": _turn_heading, "earth_to_body": _earth_to_body,
-    "move_antenna": _move_antenna, "pad_fractions": _pad_fractions,
+    "exchange": _exchange, "shift": _shift, "turn_heading": _turn_heading,
+    "earth_to_body": _earth_to_body, "move_antenna": _move_antenna,
+    "pad_fractions": _pad_fractions,
 }  # fmt: skip
 # these act on positions and unwrapped headings
 _ON_DERIVED = frozenset({"earth_to_body", "move_antenna", "shift", "turn_heading"})
