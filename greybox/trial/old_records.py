@@ -91,7 +91,7 @@ def _corrections(sentence: str, key: str, text: str, whole: dict[str, Any]) -> l
     try:
         value = json.loads(text)
         steps = list(_REMOVED[key](value, whole.get(key)))
-    except (KeyError, ValueError, TypeError, AttributeError, IndexError):
+    except (KeyError, ValueError, TypeError, AttributeError, IndexError, RecursionError):
         return [_step(sentence, "recorded", ())]
     whole[key] = value
     return [

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from greybox.errors import LogError
 from greybox.trial.convert.options import ImportOptions
-from greybox.trial.convert.resample import Clock, covered, nice_period, resampled_by, runs
+from greybox.trial.convert.resample import Clock, nice_period, resampled_by, stretches
 from greybox.trial.gaps import split_at_gaps
 from greybox.trial.smoothing import window_samples
 from greybox.trial.steps import Step
@@ -117,14 +117,16 @@ class Plan:
         # rounding keeps 0.3 from becoming 0.30000000000000004 in the file
         return np.round(self.start + self.sample_time * np.arange(first, stop), 9)
 
-    def stretches(self, grid: Array, clocks: Mapping[str, Clock]) -> list[tuple[int, int]]:
-        """Return the runs of samples (start, stop) in which every leading signal has values."""
+    def stretches(
+        self, grid: Array, clocks: Mapping[str, Clock], cuts: Sequence[float] = ()
+    ) -> list[tuple[int, int]]:
+        """Return the runs of samples (start, stop) in which every leading signal has values.
+
+        None reaches over one of `cuts` [s].
+        """
         if self.times is not None:
             return split_at_gaps(grid, self.sample_time)
-        keep = np.ones(len(grid), bool)
-        for c in {id(clocks[n]): clocks[n] for n in self.leading}.values():
-            keep &= covered(grid, c)
-        return runs(keep)
+        return stretches(grid, (clocks[n] for n in self.leading), cuts)
 
 
 def plan_import(
