@@ -24,6 +24,7 @@ from greybox.trial.readers.ros.axes import (
     is_world,
     north_east,
     starboard,
+    tells_axes,
 )
 from greybox.trial.readers.table import Batch, TableFile
 from greybox.trial.steps import Step
@@ -42,8 +43,6 @@ _SECONDS = re.compile(r"^(.*?)(?:secs|sec)$")
 _NANOS = ("nsecs", "nsec", "nanosecs", "nanosec", "nanoseconds")
 _RECORDERS = ("time", "rosbagtimestamp", "timestamp", "recv_time", "log_time")
 _QUATERNION = re.compile(r"^(.*?(?:quaternion|orientation|rotation|q))_?([xyzw])$")
-# what a driver or a body is called: any other frame may have any axes
-_BODIES = ("base_link", "base_footprint", "base", "body")
 
 Made = Callable[[Batch], Array]
 
@@ -327,7 +326,7 @@ class _Messages:
             self._add(
                 "psi", turn, lambda b: compass_heading(*(b[c] for c in turn), ned=as_is), "rad"
             )
-            if not (is_world(header) or ned or child or rate):
+            if not (tells_axes(header) or child or rate):
                 self.unsure.add("psi")
         if twist is not None:
             self._add_twist(twist, child or header, ned and bool(child), first)
@@ -345,7 +344,7 @@ class _Messages:
         frd = is_frd(frame) or (ned and "flu" not in frame)
         self._add("u", twist, lambda b: _two(b, twist)[0], "m/s")
         self._add("v", twist, lambda b: starboard(_two(b, twist)[1], frd=frd), "m/s")
-        if not (is_frd(frame) or "flu" in frame or frame in _BODIES):
+        if not tells_axes(frame):
             self.unsure |= {"u", "v"}
         rate = self._ends("angular_z")
         # drivers that do not measure a turn write zeros
