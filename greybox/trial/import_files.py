@@ -5,13 +5,16 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from greybox.errors import LogError
+from greybox.trial.checks.actuators import measure_actuators
 from greybox.trial.checks.check import check_recordings
 from greybox.trial.convert.channel_mapping import read_trial
-from greybox.trial.convert.convert import import_recording
+from greybox.trial.convert.convert import Imported, import_recording
+from greybox.trial.convert.derived_signals import derive_signals
 from greybox.trial.convert.options import ImportOptions
 from greybox.trial.convert.two_pass_import import Stream, is_large
 from greybox.trial.log import TrialLog
@@ -188,7 +191,7 @@ def _write(
     extra: Mapping[str, Any] | None,
     lines: list[str],
 ) -> str:
-    imported = import_recording(recording, vessel, options)
+    imported = _with_actuators(import_recording(recording, vessel, options), recording, vessel)
     write_log(imported.segments, out, extra=extra)
     first, last = imported.segments[0], imported.segments[-1]
     return _summary(
@@ -206,6 +209,18 @@ def _keep_source(path: str | Path, logs: Sequence[Path]) -> None:
         raise LogError(
             f"'{Path(path).name}' is also the log to write: name another file for the log."
         )
+
+
+def _with_actuators(imported: Imported, recording: Recording, vessel: Vessel) -> Imported:
+    """Return the segments with what command and feedback tell of the actuators."""
+    actuators, _, _ = measure_actuators([derive_signals(recording)], vessel)
+    if not actuators:
+        return imported
+    segments = tuple(
+        replace(s, provenance=replace(s.provenance, actuators=actuators)) for s in imported.segments
+    )
+    told = tuple(f"actuator: {a.sentence}" for a in actuators)
+    return replace(imported, segments=segments, notes=(*imported.notes, *told))
 
 
 def _summary(

@@ -192,6 +192,8 @@ def _drop(recording: Recording, step: Step) -> Recording:
             keep = np.isfinite(s.value) & np.isfinite(s.t)
             if len(times):
                 keep &= ~np.isin(s.t, times)
+            if step.interval is not None:
+                keep &= (s.t < step.interval[0]) | (s.t > step.interval[1])
             # signals that keep the same rows keep sharing one clock
             t = shared.setdefault((id(s.t), np.packbits(keep).tobytes()), s.t[keep])
             s = replace(s, t=t, value=s.value[keep])

@@ -113,7 +113,7 @@ def step_from_dict(data: Any) -> Step | None:
             tuple(map(str, data["channels"])),
             tuple(map(str, data.get("source", ()))),
             {str(k): _value(v) for k, v in parameters.items()},
-            None if interval is None else (_number(interval[0]), _number(interval[1])),
+            None if interval is None else (finite_number(interval[0]), finite_number(interval[1])),
             data.get("decided_by", "default"),
             str(data.get("reason", "")),
         )
@@ -123,11 +123,18 @@ def step_from_dict(data: Any) -> Step | None:
 
 def _value(value: Any) -> Value:
     if isinstance(value, list | tuple):
-        return tuple(_number(v) for v in value)
-    return value if isinstance(value, str) else _number(value)
+        return tuple(finite_number(v) for v in value)
+    return value if isinstance(value, str) else finite_number(value)
 
 
-def _number(value: Any) -> float:
+def finite_number(value: Any) -> float:
+    """Return a number of a record.
+
+    Raises
+    ------
+    ValueError
+        It is none, or none that a log can hold.
+    """
     number = float(value)
     if not abs(number) < _LARGEST:
         raise ValueError(f"{number} is no quantity of a log")

@@ -15,6 +15,7 @@ import numpy as np
 from greybox.channels import LOGGED
 from greybox.errors import LogError
 from greybox.files import check_targets, replacing, sha256, write_json
+from greybox.trial.actuator_estimate import recorded_actuators
 from greybox.trial.gaps import joined_spans
 from greybox.trial.log import RECORD_FORMAT, RECORD_VERSION, Provenance, TrialLog
 from greybox.trial.old_records import steps_of_sentences
@@ -189,6 +190,7 @@ def recorded_provenance(record: Mapping[str, Any]) -> Provenance:
         float(epoch) if isinstance(epoch, int | float) and abs(epoch) < _LATEST else None,
         {str(k): str(v) for k, v in notes.items()} if isinstance(notes, dict) else {},
         Conditions.recorded(record),
+        recorded_actuators(record),
     )
 
 

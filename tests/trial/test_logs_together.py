@@ -101,7 +101,7 @@ def test_frames_and_signs_are_read_over_all_logs(ship):
     ],
 )
 def test_all_channels_end_on_the_clock_of_the_thrusters(late, inputs, words, moved, ship):
-    recordings = logs_of([50, 51], seconds=400.0, late=dict.fromkeys(late, 0.9))
+    recordings = logs_of([50, 51], seconds=400.0, late=dict.fromkeys(late, 0.9), noise=0.3)
     found = offsets(recordings, ship)
     (f,) = found[0].values()
     assert f.channels == ("psi", "u", "v", "r")

@@ -194,6 +194,9 @@ def test_velocities_without_positions_are_averaged_at_a_longer_sample_time(tmp_p
         "difference", "earth_to_body", "decimate", "difference",
     ]  # fmt: skip
     assert slow.provenance.steps[-1].channels == ("r",)
+    # differences take a sample at either end
+    with pytest.raises(LogError, match=r"keeps 2 samples at 8 s, at least 3 are needed"):
+        decimate(log, 8.0)
 
 
 @pytest.mark.parametrize("velocities", ["central", "savgol"])

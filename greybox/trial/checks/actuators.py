@@ -13,7 +13,7 @@ are correlated over time and of unequal size (Newey and West, 1987).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import pi
 from typing import Any
@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.recursion import propagate
+from greybox.trial.actuator_estimate import ActuatorEstimate, Measured
 from greybox.trial.checks.finding import Finding, Outcome
 from greybox.trial.convert.derived_signals import continuous
 from greybox.trial.raw_log import Recording, Signal
@@ -57,165 +58,14 @@ _NEAR = 1.5
 _CONVERGED = 1e-6
 # beyond the noise by this factor something is left that a lag does not explain
 _LEFT_OVER = 1.15
-# what differs from an ideal actuator: response [s] (or one sample), gain, and the gains between
-# which both columns can have one unit
-_RESPONSE, _GAIN_ERROR, _ONE_UNIT = 0.1, 0.02, (0.5, 2.0)
 # feedback that stands still in more than this share of the samples in which it must move is held
 _HELD_SHARE = 0.5
 _NORMAL = 1.96
 
 
-@dataclass(frozen=True)
-class Measured:
-    """A number with its 95 % interval."""
-
-    value: float
-    ci: tuple[float, float]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return value and interval for JSON."""
-        return {"value": self.value, "ci": list(self.ci)}
-
-    def __str__(self) -> str:
-        return f"{self.value:.3g} ({self.ci[0]:.3g} to {self.ci[1]:.3g})"
-
-
-@dataclass(frozen=True)
-class ActuatorEstimate:
-    """How the feedback of one actuator follows its command.
-
-    Parameters
-    ----------
-    thruster : int
-        Which of the vessel's thrusters, counted from 1.
-    kind : {"speed", "angle", "rudder"}
-    command, feedback : str
-        Log columns.
-    delay, time_constant : Measured
-        Dead time d and time constant T of the feedback as it was logged [s].
-    response : Measured
-        d + T [s].
-    gain : Measured
-        g, feedback over command.
-    offset : Measured
-        o, in the unit of the feedback.
-    rate_limit : Measured, optional
-        R, unit of the feedback per second; None where the log shows none.
-    dead_band : Measured, optional
-        Half its width: of the error that an angle leaves standing, or of the commands that a
-        propeller does not answer (unit of the command); None where the log shows none.
-    residual_std : float
-        Robust standard deviation of what remains, unit of the feedback.
-    step : float
-        Usual sample time of the slower of both columns [s].
-    hold : float
-        Mean age of the feedback where the recorder repeats it while it should move [s]; else 0.
-    at_renewal : tuple of Measured, optional
-        Delay and time constant where each value of a held feedback is new [s]: those of the
-        actuator without the recorder's.
-    logs : tuple of str
-        Names of the logs that were fitted together.
-    """
-
-    thruster: int
-    kind: ActuatorKind
-    command: str
-    feedback: str
-    delay: Measured
-    time_constant: Measured
-    response: Measured
-    gain: Measured
-    offset: Measured
-    rate_limit: Measured | None
-    dead_band: Measured | None
-    residual_std: float
-    step: float
-    hold: float = 0.0
-    at_renewal: tuple[Measured, Measured] | None = None
-    logs: tuple[str, ...] = ()
-
-    @property
-    def unit(self) -> str:
-        """Unit of the feedback."""
-        return "as logged" if self.kind == "speed" else "rad"
-
-    @property
-    def one_unit(self) -> bool:
-        """Whether command and feedback can have one unit, so that a gain of 1 is expected."""
-        return self.kind != "speed" or _ONE_UNIT[0] < self.gain.value < _ONE_UNIT[1]
-
-    @property
-    def slow(self) -> bool:
-        """Whether delay and lag exceed a sample and a tenth of a second for certain."""
-        return self.response.ci[0] > max(_RESPONSE, self.step)
-
-    @property
-    def scaled(self) -> bool:
-        """Whether the gain differs for certain from 1 by more than it may."""
-        low, high = self.gain.ci
-        return self.one_unit and (low > 1 + _GAIN_ERROR or high < 1 - _GAIN_ERROR)
-
-    @property
-    def ideal(self) -> bool:
-        """Whether the feedback may be taken for the command."""
-        limited = self.rate_limit is not None or self.dead_band is not None
-        return not (self.slow or self.scaled or limited)
-
-    @property
-    def sentence(self) -> str:
-        """The numbers in words."""
-        unit = "" if self.unit == "as logged" else f" {self.unit}"
-        parts = [
-            f"a delay of {self.delay} s",
-            f"a time constant of {self.time_constant} s",
-            f"a gain of {self.gain}" + ("" if self.one_unit else " (another unit)"),
-        ]
-        if self.rate_limit is not None:
-            parts.append(f"at most {self.rate_limit}{unit} per second")
-        if self.dead_band is not None:
-            where = "commands" if self.kind == "speed" else "errors"
-            parts.append(f"no answer to {where} below {self.dead_band}{unit}")
-        said = f"{self.feedback} follows {self.command} with {', '.join(parts)}"
-        if self.at_renewal is not None:
-            d, lag = self.at_renewal
-            said += (
-                f"; the recorder repeats old values, {self.hold:.2g} s old on average: where "
-                f"they are new, the delay is {d} s and the time constant {lag} s"
-            )
-        return said
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the numbers for JSON, seconds and the columns' units."""
-
-        def shown(x: Measured | None) -> dict[str, Any] | None:
-            return None if x is None else x.to_dict()
-
-        new = self.at_renewal
-        return {
-            "thruster": self.thruster,
-            "kind": self.kind,
-            "command": self.command,
-            "feedback": self.feedback,
-            "unit": self.unit,
-            "delay": shown(self.delay),
-            "time_constant": shown(self.time_constant),
-            "response": shown(self.response),
-            "gain": shown(self.gain),
-            "offset": shown(self.offset),
-            "rate_limit": shown(self.rate_limit),
-            "dead_band": shown(self.dead_band),
-            "residual_std": self.residual_std,
-            "step": self.step,
-            "hold": self.hold,
-            "delay_at_renewal": shown(new[0] if new else None),
-            "time_constant_at_renewal": shown(new[1] if new else None),
-            "logs": list(self.logs),
-        }
-
-
 def measure_actuators(
     recordings: Sequence[Recording], vessel: Vessel
-) -> tuple[tuple[ActuatorEstimate, ...], tuple[Finding, ...], Outcome | None]:
+) -> tuple[tuple[ActuatorEstimate, ...], list[tuple[Finding, tuple[str, ...]]], Outcome | None]:
     """Measure each actuator whose command and feedback are both recorded, all logs together.
 
     Parameters
@@ -227,8 +77,8 @@ def measure_actuators(
     Returns
     -------
     tuple
-        Estimates, a finding for each actuator that is not ideal, and the outcome of the check
-        where there is nothing to measure.
+        Estimates; a finding for each actuator that is not ideal, with the names of its logs; and
+        the outcome of the check where there is nothing to measure.
     """
     estimates, findings, untold = [], [], []
     for actuator in vessel.actuators:
@@ -240,15 +90,15 @@ def measure_actuators(
         estimate = _estimate(fit, pairs, actuator)
         estimates.append(estimate)
         if not estimate.ideal:
-            findings.append(_finding(estimate, fit, pairs))
+            findings.append((_finding(estimate, fit, pairs), estimate.logs))
     if estimates:
-        return tuple(estimates), tuple(findings), None
+        return tuple(estimates), findings, None
     reason = (
         f"too few moves of a command that its feedback follows: {', '.join(untold)}"
         if untold
         else "the vessel file names no actuator by command and feedback"
     )
-    return (), (), Outcome("actuator", "cannot tell", reason)
+    return (), [], Outcome("actuator", "cannot tell", reason)
 
 
 @dataclass(frozen=True)
@@ -456,7 +306,7 @@ def _fit(pairs: Sequence[_Pair], kind: ActuatorKind) -> _Fit | None:
 def _coarse(pairs: Sequence[_Pair]) -> Array | None:
     """Return the start of the fit: the delay and lag of a grid that correlate best."""
     best: tuple[float, Array] | None = None
-    moments = {}
+    moments: dict[tuple[float, float], Array] = {}
     for lag in _LAGS:
         for p in pairs:
             step = min(max(float(np.median(np.diff(p.t))), 0.05), 1.0)
@@ -612,13 +462,13 @@ def _finest(pairs: Sequence[_Pair]) -> float:
     """Return the standard deviation of rounding to the feedback's smallest step."""
     steps = np.concatenate([np.abs(np.diff(p.y)) for p in pairs])
     steps = steps[steps > 1e-9 * max(float(np.ptp(pairs[0].y)), 1e-300)]
-    return max(float(steps.min()) / np.sqrt(12) if len(steps) else 0.0, 1e-9)
+    return max(float(steps.min() / np.sqrt(12)) if len(steps) else 0.0, 1e-9)
 
 
 def _noise(pairs: Sequence[_Pair]) -> float:
     """Return the noise of the feedback, from what three samples leave of a straight line."""
     bend = np.concatenate([np.diff(p.y, 2) for p in pairs])
-    return max(_scale(bend) / np.sqrt(6), _finest(pairs))
+    return max(_scale(bend) / float(np.sqrt(6)), _finest(pairs))
 
 
 def _with_limits(fit: _Fit, pairs: Sequence[_Pair], kind: ActuatorKind) -> _Fit:
@@ -909,13 +759,3 @@ def _picture(fit: _Fit, pairs: Sequence[_Pair], kind: ActuatorKind) -> dict[str,
         "model": _respond(fit.theta, p.rows(seen), kind),
         "unit": "rad" if kind != "speed" else "as logged",
     }
-
-
-# how each value of an estimate is shown: name, attribute, unit
-SHOWN: tuple[tuple[str, Callable[[ActuatorEstimate], Measured | None], str], ...] = (
-    ("delay", lambda e: e.delay, "s"),
-    ("time constant", lambda e: e.time_constant, "s"),
-    ("gain", lambda e: e.gain, "1"),
-    ("rate limit", lambda e: e.rate_limit, "per second"),
-    ("dead band", lambda e: e.dead_band, ""),
-)

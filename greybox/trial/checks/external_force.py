@@ -11,15 +11,16 @@ nothing has to be known of the model's errors but that they are alike throughout
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.rotation import body_to_ned, ned_to_body
 from greybox.trial.checks.finding import Finding, Outcome
-from greybox.trial.checks.motion import make_motion
+from greybox.trial.checks.motion import Motion, make_motion, smooth
 from greybox.trial.convert.resample import clock as make_clock
 from greybox.trial.convert.resample import hold_mean
 from greybox.trial.raw_log import Recording
@@ -30,7 +31,7 @@ from greybox.vessel.vessel import Vessel
 Array = NDArray[np.float64]
 
 _STATES = ("u", "v")
-_CHANNELS = ("u", "v", "r", "psi")
+_EARTH = ("v_n", "v_e")
 _AIR = ("u_q", "v_q")
 # time over which a rate of change is taken, and how long a force acts [s]
 _STEP = 2.0
@@ -52,6 +53,13 @@ _HALF = (0.35, 0.65)
 # how much speed is left where a ship with thrust is held, over the top speed
 _STANDING = 0.1
 _RIDGE = 1e-6
+# variance that the fit may add to that of a stretch: beyond, the rest of the logs does not tell
+# how the ship moves there
+_EXTRAPOLATION = 1.0
+# time beside a force within which a jump of a sensor goes back [s], and which share of it
+_TAKEN_BACK, _TAKEN_SHARE = 16.0, 0.5
+# a force that acts in more than this share of a log cannot be told from a steady one
+_LONGEST_SHARE = 1 / 3
 
 
 def force_findings(
@@ -140,21 +148,24 @@ class _Log:
 
 def _make_log(number: int, recording: Recording, vessel: Vessel) -> _Log | str:
     """Return the rates of a recording, or why it has none."""
-    missing = [c for c in (*_CHANNELS, *vessel.commands) if c not in recording]
+    earth = not all(c in recording for c in _STATES)
+    names = (*(_EARTH if earth else _STATES), "psi", *("r",) * ("r" in recording))
+    missing = [c for c in (*names, *vessel.commands) if c not in recording]
     if missing:
         return f"there is no {', '.join(missing)}"
     airy = all(c in recording for c in _AIR)
-    motion = make_motion(recording, (*_CHANNELS, *_AIR) if airy else _CHANNELS)
+    motion = make_motion(recording, (*names, *_AIR) if airy else names)
     if motion is None:
-        return "too few samples of u, v, r and psi overlap"
+        return f"too few samples of {', '.join(names)} overlap"
+    motion = _body_motion(motion)
     inputs = {}
     for c in vessel.commands:
-        s = recording[c]
-        keep = np.isfinite(s.value) & np.isfinite(s.t)
-        t, first = np.unique(s.t[keep], return_index=True)
+        signal = recording[c]
+        keep = np.isfinite(signal.value) & np.isfinite(signal.t)
+        t, first = np.unique(signal.t[keep], return_index=True)
         if not len(t):
             return f"there is no {c}"
-        inputs[c] = hold_mean(make_clock(t), s.value[keep][first], motion.t, motion.step)
+        inputs[c] = hold_mean(make_clock(t), signal.value[keep][first], motion.t, motion.step)
     forces = list(generalised_force(vessel, inputs).values())
     count = max(1, round(_STEP / motion.step))
     u, v, r = (motion[s] for s in ("u", "v", "r"))
@@ -164,21 +175,24 @@ def _make_log(number: int, recording: Recording, vessel: Vessel) -> _Log | str:
     if airy:
         along, across = motion["u_q"], motion["v_q"]
         known += [along * np.abs(along), across * np.abs(across), along * across]
-    c, s = np.cos(motion["psi"]), np.sin(motion["psi"])
-    one, none = np.ones_like(c), np.zeros_like(c)
+    north, east = np.cos(motion["psi"]), np.sin(motion["psi"])
+    one = np.ones_like(north)
     # thrust falls with the advance of the ship, and its law may be another than the vessel file's
     forces += [f * motion["u"] for f in forces] + [f * np.abs(f) for f in forces]
     parts = {
         "known": np.column_stack(known),
         "thrust": np.column_stack(forces),
         "own": np.stack(
-            [np.column_stack([one, c, s]), np.column_stack([one, -s, c])], axis=1
-        ).reshape(len(c), -1),
+            [np.column_stack([one, north, east]), np.column_stack([one, -east, north])], axis=1
+        ).reshape(len(one), -1),
         "psi": motion["psi"][:, None],
         "speed": u[:, None],
     }
-    rate, blocks, stretches, at = [], {n: [] for n in parts}, [], 0
-    times = []
+    rate: list[Array] = []
+    times: list[Array] = []
+    blocks: dict[str, list[Array]] = {n: [] for n in parts}
+    stretches: list[tuple[int, int]] = []
+    at = 0
     for a, b in motion.stretches:
         m = (b - a) // count
         if m < 4:
@@ -207,6 +221,19 @@ def _make_log(number: int, recording: Recording, vessel: Vessel) -> _Log | str:
         made["psi"][:, 0],
         made["speed"][:, 0],
     )
+
+
+def _body_motion(motion: Motion) -> Motion:
+    """Return the motion with u, v and r, made of what is there."""
+    values = dict(motion.values)
+    if "u" not in motion:
+        values["u"], values["v"] = ned_to_body(motion["v_n"], motion["v_e"], motion["psi"])
+    if "r" not in motion:
+        psi = smooth(motion["psi"], motion, 1.0)
+        values["r"] = np.concatenate(
+            [np.gradient(psi[a:b], motion.step) for a, b in motion.stretches]
+        )
+    return replace(motion, values=values)
 
 
 def _between(x: Array, edges: NDArray[np.int64], count: int) -> Array:
@@ -269,11 +296,9 @@ class _Scan:
         size = np.sqrt(np.mean(self.phi**2, axis=1, keepdims=True))
         self.phi /= np.where(size > 0, size, 1.0)
         self.thrust = slice(logs[0].known.shape[1], shared.shape[1])
-        psi = np.concatenate([x.psi for x in logs])
-        self.turn = np.stack([np.cos(psi), np.sin(psi)])
+        self.psi = np.concatenate([x.psi for x in logs])
         self.used = np.ones(rows, bool)
         self.half = self._half_thrust()
-        self.trace: list[Any] = []
 
     def _fit(self, used: NDArray[np.bool_]) -> tuple[Array, Array]:
         """Return remainders (N, 2) of the fit to some rows, and the inverse moments (2, p, p)."""
@@ -289,7 +314,10 @@ class _Scan:
         """Return what the thrusters do to the surge at half speed [m/s²]."""
         _, inverse = self._fit(self.used)
         theta = inverse[0] @ (self.phi[0].T @ self.rate[:, 0])
-        push = np.abs(self.phi[0][:, self.thrust] @ theta[self.thrust])
+        # what a thrust that never changes does stands in the constant
+        parts = [*range(self.thrust.start, self.thrust.stop)]
+        parts += range(self.thrust.stop, self.phi.shape[2], 3)
+        push = np.abs(self.phi[0][:, parts] @ theta[parts])
         speed = np.abs(np.concatenate([x.speed for x in self.logs]))
         share = speed / max(float(np.quantile(speed, 0.95)), 1e-9)
         half = (share > _HALF[0]) & (share < _HALF[1])
@@ -304,21 +332,43 @@ class _Scan:
     def events(self) -> list[_Event]:
         """Return the stretches with a force of their own, the clearest first."""
         found: list[_Event] = []
-        for _ in range(_MOST_EVENTS):
+        for _ in range(2 * _MOST_EVENTS):
             event = self._clearest()
-            if event is None:
+            if event is None or len(found) == _MOST_EVENTS:
                 break
-            found.append(event)
+            if not self._taken_back(event):
+                found.append(event)
             at = self.ends[event.log]
             margin = 2
             self.used[max(at + event.start - margin, at) : at + event.stop + margin] = False
         return found
+
+    def _taken_back(self, event: _Event) -> bool:
+        """Whether speed that was gained is lost at once: so jump sensors, not ships."""
+        at = self.ends[event.log]
+        a, b = at + event.start, at + event.stop
+        used = self.used.copy()
+        used[a:b] = False
+        rest, _ = self._fit(used)
+        own = self._sums(rest, np.array([a]), np.array([b]), event.fixed)[0]
+        begin, end = next(
+            (at + p, at + q) for p, q in self.logs[event.log].stretches if p <= event.start < q
+        )
+        reach = np.arange(1, max(2, round(_TAKEN_BACK / self.logs[event.log].step)) + 1)
+        after = reach[b + reach <= end]
+        before = reach[a - reach >= begin]
+        first = np.concatenate([np.full(len(after), b), a - before])
+        last = np.concatenate([b + after, np.full(len(before), a)])
+        beside = self._sums(rest, first, last, event.fixed) @ own / float(own @ own)
+        return bool(len(beside)) and float(beside.min()) < -_TAKEN_SHARE
 
     def _windows(self, length: float) -> tuple[Array, Array, Array]:
         """Return log, first and one-past-last row of each stretch of a length."""
         found = []
         for k, log in enumerate(self.logs):
             m = max(round(length / log.step), 2)
+            if m > _LONGEST_SHARE * len(log.t):
+                continue
             for a, b in log.stretches:
                 first = np.arange(a, b - m + 1, max(1, m // 6)) + self.ends[k]
                 found.append(np.column_stack([np.full(len(first), k), first, first + m]))
@@ -328,7 +378,7 @@ class _Scan:
         return table[:, 0], table[:, 1], table[:, 2]
 
     def _clearest(self) -> _Event | None:
-        rest, inverse = self._fit(self.used)
+        rest, _ = self._fit(self.used)
         candidates = []
         for length in _LENGTHS:
             which, first, last = self._windows(length)
@@ -343,10 +393,8 @@ class _Scan:
 
     def _sums(self, rest: Array, first: Array, last: Array, fixed: bool) -> Array:
         """Return the sums of the remainders (W, 2) over stretches, forward, starboard or n, e."""
-        c, s = self.turn
         if fixed:
-            u, v = rest[:, 0], rest[:, 1]
-            rest = np.column_stack([c * u - s * v, s * u + c * v])
+            rest = np.column_stack(body_to_ned(rest[:, 0], rest[:, 1], self.psi))
         total = np.vstack([np.zeros((1, 2)), np.cumsum(rest, axis=0)])
         return np.asarray(total[last] - total[first])
 
@@ -368,8 +416,10 @@ class _Scan:
         yardstick = self._sums(rest, begin, end, fixed)
         lost = self._leverage(inverse, begin, end, fixed) / size
         variance = np.mean(yardstick**2, axis=0) / max(1 - float(np.mean(lost)), 0.1)
-        floor = (_MISFIT * self.half * size) ** 2
         own = self._leverage(inverse, np.array([a]), np.array([b]), fixed)[0] / size
+        if own > _EXTRAPOLATION:
+            return None
+        floor = (_MISFIT * self.half * size) ** 2
         spread = np.sqrt(np.maximum(variance, floor) * (1 + own)) / size
         force = self._sums(rest, np.array([a]), np.array([b]), fixed)[0] / size
         size_of = float(np.hypot(*(force / spread)))
@@ -380,7 +430,6 @@ class _Scan:
         excess = max(float(np.mean(usual[usual > tail] - tail)), _NORMAL_EXCESS)
         excess *= 1 + 1 / np.sqrt(max(independent, 1.0))
         chance = _OVERLAP * independent * float(np.exp(-(size_of - tail) / excess))
-        self.trace.append((length, fixed, force, spread, size_of, tail, excess, clear, chance))
         if chance > _LEVEL or np.hypot(*force) < _LEAST_SHARE * self.half:
             return None
         at = self.ends[log]

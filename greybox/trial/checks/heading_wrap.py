@@ -19,7 +19,7 @@ _CLEAR = 5.0
 # turns that go the long way round: so many times faster than the log's fast turns
 _FASTER = 4.0
 # a hull does not turn faster than this [rad/s]; below it only equal steps are an interpolation
-_FASTEST = np.radians(100.0)
+_FASTEST = np.radians(200.0)
 _EQUAL = 0.2
 # a rate of turn lasts at least this long [s]
 _STEADY = 1.0

@@ -79,8 +79,12 @@ def _grid(value: Array) -> float:
         return 0.0
     least = float(np.quantile(way, 0.01))
     step = float(np.mean(way[way < 1.5 * least]))
-    multiple = way / step
-    return step if np.mean(np.abs(multiple - np.round(multiple)) < 0.15) > 0.9 else 0.0
+    multiple = np.abs(np.diff(value[:20000])) / step
+    whole = np.round(multiple)
+    # at a steady speed all ways are alike: a grid shows in ways of several steps
+    usual = np.mean(whole == np.median(whole))
+    near = np.mean(np.abs(multiple - whole) < 0.15)
+    return step if near > 0.9 and usual < 0.98 else 0.0
 
 
 def hold_findings(recording: Recording) -> list[Finding]:

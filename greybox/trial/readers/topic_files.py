@@ -28,6 +28,7 @@ from greybox.trial.readers.ros.axes import (
 )
 from greybox.trial.readers.table import Batch, TableFile
 from greybox.trial.steps import Step
+from greybox.units import EARLIEST_UNIX, unix_seconds
 
 Array = NDArray[np.float64]
 
@@ -254,8 +255,7 @@ def _stamp_column(columns: tuple[str, ...]) -> _Column:
     def make(batch: Batch) -> Array:
         value = np.asarray(batch[columns[0]], float)
         if len(columns) == 1:
-            size = float(np.nanmedian(np.abs(value))) if np.isfinite(value).any() else 0.0
-            value = value * 1e-9 if size > 1e14 else value
+            value = unix_seconds(value)
         else:
             value = value + 1e-9 * np.asarray(batch[columns[1]], float)
         return np.where(value > 0, value, np.nan)
@@ -267,10 +267,9 @@ def _ahead(batch: Batch, stamp: _Column, recorder: str, table: TableFile) -> flo
     """Return how far the recorder's clock is ahead of the stamps [s], None where none counts."""
     recorded = np.asarray(batch[recorder], float)
     if recorder not in table.dates:
-        size = float(np.nanmedian(recorded)) if np.isfinite(recorded).any() else 0.0
-        recorded = recorded * (1e-9 if size > 1e17 else 1e-6 if size > 1e14 else 1.0)
+        recorded = unix_seconds(recorded)
     difference = recorded - stamp.make(batch)
-    difference = difference[np.isfinite(difference) & (recorded > 1e8)]
+    difference = difference[np.isfinite(difference) & (recorded >= EARLIEST_UNIX)]
     return float(np.median(difference)) if len(difference) else None
 
 

@@ -31,16 +31,21 @@ Array = NDArray[np.float64]
 
 # delays that are tried [s]
 _DELAYS = np.round(np.arange(-3.0, 6.01, 0.1), 10)
-_STEP = 0.3
+# means over so many seconds, of so much of a log, are looked at
+_STEP, _SECONDS = 0.5, 900.0
+# a force that no column stands for (wind, current, hull) is slower than this period [s]
+_SLOW = 20.0
+# quick differences tell a delay: no slower gain than this
+_LEAST_LEVEL = 0.3
 # force must explain so much of the motion, in log-likelihood, and its delay be known so well [s]
 _LEAST_GAIN = 30.0
-_MOST_VAGUE = 1.0
-# how far below the best the likelihood of a delay may lie: 99 %, four times for coloured noise
-_DROP = 4 * 0.5 * 6.63
+_MOST_VAGUE = 0.5
+# how far below the best the likelihood of a delay may lie: 99 %, twice for coloured noise
+_DROP = 2 * 0.5 * 6.63
 # measured thrusters act within this time: the build-up of thrust and inflow [s]
-_BUILD_UP = 0.3
+_BUILD_UP = 0.2
 # step of the delays that are tried, and what the ship's quadratic damping model blurs [s]
-_RESOLUTION = 0.1
+_RESOLUTION = 0.2
 _INPUTS = {"u": ("taux",), "v": ("tauy", "race"), "r": ("taun", "race")}
 
 
@@ -75,7 +80,8 @@ def response_delays(recordings: Sequence[Recording], vessel: Vessel) -> dict[str
         motion = make_motion(recording, ("u", "v", "r"))
         if motion is None or not all(c in recording for c in vessel.commands):
             continue
-        found = _profiles(recording, vessel, motion.coarser(_STEP))
+        motion = motion.coarser(_STEP)
+        found = _profiles(recording, vessel, motion.excerpt(int(_SECONDS / motion.step)))
         for state, (profile, none) in found.items():
             total[state] = total.get(state, np.zeros(len(_DELAYS))) + profile
             gain[state] = gain.get(state, 0.0) + float(profile.max()) - none
@@ -128,7 +134,7 @@ def _profiles(
     rates += [calm[s] for s in states]
     rates += [calm[s] * np.abs(calm[s]) for s in states]
     rates += [calm[a] * calm[b] for a, b in combinations(states, 2)]
-    damping = integrate(np.column_stack(rates), motion)
+    damping = np.column_stack([integrate(np.column_stack(rates), motion), *_slow(motion)])
     start, stop = motion.t[0] + _DELAYS[0] - 7.0, motion.t[-1] - _DELAYS[0] + 1.0
     fine = np.arange(start, stop, 0.1)
     held = {}
@@ -154,13 +160,25 @@ def _profiles(
     return found
 
 
+def _slow(motion: Motion) -> list[Array]:
+    """Return cosines of each stretch with periods longer than `_SLOW`."""
+    found = []
+    for a, b in motion.stretches:
+        at = (np.arange(b - a) + 0.5) / (b - a)
+        for k in range(1, int(2 * (b - a) * motion.step / _SLOW) + 1):
+            column = np.zeros(len(motion))
+            column[a:b] = np.cos(np.pi * k * at)
+            found.append(column)
+    return found
+
+
 def _likelihoods(
     motion: Motion, z: Array, damping: Array, delayed: list[Array]
 ) -> tuple[Array, float]:
     count = delayed[0].shape[1]
     stack = np.column_stack([z, damping, *delayed])
     best: tuple[Array, float] | None = None
-    for gain in GAINS:
+    for gain in GAINS[GAINS >= _LEAST_LEVEL]:
         white = without_starts(whiten(stack, float(gain), motion), float(gain), motion)
         base = white[:, 1 : 1 + damping.shape[1]]
         rest = np.column_stack([white[:, 0], white[:, 1 + damping.shape[1] :]])
