@@ -30,7 +30,7 @@ from greybox.report.check_ties import make_tie, tie_figure
 from greybox.report.figures import to_svg
 from greybox.report.log import facts, page_figures
 from greybox.report.page import Page, Picture, Section, Table, computed, write_page
-from greybox.trial.checks.finding import CheckReport, Finding, size_in_words
+from greybox.trial.checks.finding import CheckReport, Finding, shared_findings, size_in_words
 from greybox.trial.convert.convert import import_recording
 from greybox.trial.log import TrialLog
 from greybox.trial.raw_log import Recording
@@ -110,7 +110,8 @@ def check_page(
     made["method"] = (
         "kinematics before any force model: single signals first, then which reading of the "
         "columns makes positions, heading, velocities and yaw rate agree (likelihood of a "
-        "random walk with sensor noise), then clocks, antenna and heading together"
+        "random walk with sensor noise), then clocks, antenna and heading together; what belongs "
+        "to the instruments is estimated over all logs at once"
     )
     made["pictures"] = (
         "velocities from positions are derivatives after a Gaussian smoothing that the logged "
@@ -135,9 +136,12 @@ def headline(reports: Sequence[CheckReport]) -> str:
         vague = f"; nothing can be said of {', '.join(open_ids)}" if open_ids else ""
         return f"No findings in {logs}{vague}."
     finding, report = min(found, key=_rank)
-    count = f"{len(found)} finding" + "s" * (len(found) != 1)
-    where = f" ({report.name})" if len(reports) > 1 else ""
-    lead = "the most serious" if len(found) > 1 else "namely"
+    several = {f.key for f in shared_findings(reports)}
+    each = sum(f.key not in several for f, _ in found) + len(several)
+    count = f"{each} finding" + "s" * (each != 1)
+    name = f"{len(finding.logs)} logs together" if finding.key in several else report.name
+    where = f" ({name})" if len(reports) > 1 else ""
+    lead = "the most serious" if each > 1 else "namely"
     return f"{count} in {logs}; {lead}{where}: {finding.evidence}."
 
 

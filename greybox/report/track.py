@@ -10,8 +10,9 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from greybox.report.figures import BLACK, BLUE, GREEN, ORANGE, SKY, VERMILION, tidy
-from greybox.report.thinning import GAP, pick, thin
+from greybox.report.thinning import pick, thin
 from greybox.rotation import body_to_ned
+from greybox.trial.gaps import GAP
 from greybox.trial.log import TrialLog
 from greybox.trial.manoeuvres.track import without_antenna
 from greybox.trial.wind import true_wind

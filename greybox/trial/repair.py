@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.errors import UsageError, suggestion
+from greybox.errors import LogError, UsageError, suggestion
 from greybox.rotation import body_to_ned, ned_to_body
 from greybox.trial.checks.finding import IDS, CheckReport, Finding
 from greybox.trial.convert.derived_signals import continuous, derive_signals
@@ -19,9 +19,19 @@ from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
 
+# a velocity is a difference, and its noise another one
+_LEAST_SAMPLES = 3
+# a channel has one clock, a heading one mounting, an antenna one place
+_ONCE = frozenset({"shift", "turn_heading", "move_antenna", "earth_to_body"})
+
 
 def repair(
-    recording: Recording, vessel: Vessel, report: CheckReport, *, also: tuple[str, ...] = ()
+    recording: Recording,
+    vessel: Vessel,
+    report: CheckReport,
+    *,
+    also: tuple[str, ...] = (),
+    without: tuple[str, ...] = (),
 ) -> tuple[Recording, tuple[str, ...], list[str]]:
     """Mend what is safe to mend.
 
@@ -33,6 +43,8 @@ def repair(
     report : CheckReport
     also : tuple of str
         Ids of findings to mend although they need judgement.
+    without : tuple of str
+        Ids of findings to leave although they are safe to mend.
 
     Returns
     -------
@@ -45,29 +57,100 @@ def repair(
     Raises
     ------
     UsageError
-        `also` names no id of a check.
+        `also` or `without` names no id of a check, or both name one.
+    LogError
+        Two mends contradict each other, or too little would be left.
     """
-    for name in also:
-        if name not in IDS:
-            raise UsageError(
-                f"there is no check '{name}'.{suggestion(name, IDS)} Checks: {', '.join(IDS)}."
-            )
-    wanted = [f for f in report.findings if f.repair and (f.safe or f.id in also)]
+    check_ids(also, without)
+    wanted = [
+        f for f in report.findings if f.repair and (f.safe or f.id in also) and f.id not in without
+    ]
     left = [
         f"{f.id} ({', '.join(f.channels or (f.channel,))}): {f.fix}"
         for f in report.findings
         if f not in wanted and f.id != "gap"
     ]
+    _refuse_contradictions(recording.name, wanted)
     mended = apply_repairs(recording, wanted)
+    _refuse_emptied(recording, mended, wanted)
     fixed = tuple(
         f"{f.id} of {', '.join(f.channels or (f.channel,))}: {f.evidence}" for f in wanted
     )
     return mended, fixed, left
 
 
+def check_ids(also: tuple[str, ...], without: tuple[str, ...]) -> None:
+    """Refuse ids of no check, and those that are to be mended and left.
+
+    Raises
+    ------
+    UsageError
+        With the nearest id.
+    """
+    for name in (*also, *without):
+        if name not in IDS:
+            raise UsageError(
+                f"there is no check '{name}'.{suggestion(name, IDS)} Checks: {', '.join(IDS)}."
+            )
+    for name in also:
+        if name in without:
+            raise UsageError(f"'{name}' stands in --fix-also and in --fix-not: keep one of them.")
+
+
+def _refuse_contradictions(name: str, wanted: Sequence[Finding]) -> None:
+    """Refuse two different values of what a channel has one of."""
+    known: dict[tuple[str, str], tuple[Step, Finding]] = {}
+    for finding in wanted:
+        for step in finding.repair:
+            for channel in step.channels if step.operation in _ONCE else ():
+                before = known.setdefault((step.operation, channel), (step, finding))
+                if dict(before[0].parameters) != dict(step.parameters):
+                    ids = " and ".join(dict.fromkeys((before[1].id, finding.id)))
+                    raise LogError(
+                        f"two mends of {channel} in '{name}' contradict each other, "
+                        f"'{before[0].sentence}' and '{step.sentence}': leave one out by "
+                        f"--fix-not with {ids}, or change the log."
+                    )
+
+
+def _refuse_emptied(before: Recording, after: Recording, wanted: Sequence[Finding]) -> None:
+    """Refuse mends that leave a channel fewer samples beside the others than a log needs."""
+    touched = {c: f.id for f in wanted for s in f.repair for c in s.channels}
+    had, have = _beside(before), _beside(after)
+    for channel, count in have.items():
+        if channel in touched and count < _LEAST_SAMPLES <= had.get(channel, 0):
+            raise LogError(
+                f"to mend '{touched[channel]}' would leave {count} of the {had[channel]} samples "
+                f"of {channel} that '{before.name}' has beside its other channels, at least "
+                f"{_LEAST_SAMPLES} are needed: leave it out by --fix-not {touched[channel]}, or "
+                f"look at the log."
+            )
+
+
+def _beside(recording: Recording) -> dict[str, int]:
+    """Return how many samples of each channel lie within the time that all channels cover."""
+    clocks = {}
+    for s in recording.signals:
+        t = s.t[np.isfinite(s.t) & np.isfinite(s.value)]
+        if len(t):
+            clocks[s.name] = t
+    if not clocks:
+        return {}
+    start = max(float(t.min()) for t in clocks.values())
+    stop = min(float(t.max()) for t in clocks.values())
+    found = {n: int(((t >= start) & (t <= stop)).sum()) for n, t in clocks.items()}
+    return found | {s.name: 0 for s in recording.signals if s.name not in clocks}
+
+
 def apply_repairs(recording: Recording, findings: Iterable[Finding]) -> Recording:
     """Return the recording with the repairs of the findings applied in order, as its steps."""
-    steps = [replace(step, reason=step.reason or f.evidence) for f in findings for step in f.repair]
+    # what reading did already is not done again
+    steps = [
+        replace(step, reason=step.reason or f.evidence)
+        for f in findings
+        for step in f.repair
+        if step not in recording.steps
+    ]
     for step in steps:
         if step.operation in _ON_DERIVED:
             # not before: what was interpolated across a wrap must go before it is unwrapped
@@ -109,6 +192,8 @@ def _drop(recording: Recording, step: Step) -> Recording:
             keep = np.isfinite(s.value) & np.isfinite(s.t)
             if len(times):
                 keep &= ~np.isin(s.t, times)
+            if step.interval is not None:
+                keep &= (s.t < step.interval[0]) | (s.t > step.interval[1])
             # signals that keep the same rows keep sharing one clock
             t = shared.setdefault((id(s.t), np.packbits(keep).tobytes()), s.t[keep])
             s = replace(s, t=t, value=s.value[keep])

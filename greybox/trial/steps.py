@@ -14,6 +14,8 @@ Value = float | str | tuple[float, ...]
 RECORDED = "recorded"
 # numbers of a sequence that a record keeps: thousands of times would burst it
 _LONGEST = 1000
+# no time, angle or length in SI is larger, and sums and ratios of such numbers are finite
+_LARGEST = 1e30
 _OF_MOTION = frozenset({"difference", "local_polynomials", "earth_to_body"})
 
 
@@ -111,7 +113,7 @@ def step_from_dict(data: Any) -> Step | None:
             tuple(map(str, data["channels"])),
             tuple(map(str, data.get("source", ()))),
             {str(k): _value(v) for k, v in parameters.items()},
-            None if interval is None else (float(interval[0]), float(interval[1])),
+            None if interval is None else (finite_number(interval[0]), finite_number(interval[1])),
             data.get("decided_by", "default"),
             str(data.get("reason", "")),
         )
@@ -121,8 +123,22 @@ def step_from_dict(data: Any) -> Step | None:
 
 def _value(value: Any) -> Value:
     if isinstance(value, list | tuple):
-        return tuple(float(v) for v in value)
-    return value if isinstance(value, str) else float(value)
+        return tuple(finite_number(v) for v in value)
+    return value if isinstance(value, str) else finite_number(value)
+
+
+def finite_number(value: Any) -> float:
+    """Return a number of a record.
+
+    Raises
+    ------
+    ValueError
+        It is none, or none that a log can hold.
+    """
+    number = float(value)
+    if not abs(number) < _LARGEST:
+        raise ValueError(f"{number} is no quantity of a log")
+    return number
 
 
 def new_steps(known: Iterable[Step], more: Iterable[Step]) -> tuple[Step, ...]:
@@ -138,6 +154,11 @@ def new_steps(known: Iterable[Step], more: Iterable[Step]) -> tuple[Step, ...]:
 def mend(operation: str, channels: tuple[str, ...], **parameters: Value) -> Step:
     """Return a step that a finding of the checks proposes."""
     return Step(operation, channels, parameters=parameters, decided_by="check")
+
+
+def _word(step: Step, name: str) -> str:
+    # a record may have been damaged
+    return str(step.parameters.get(name, "?"))
 
 
 def _names(step: Step) -> str:
@@ -218,11 +239,11 @@ OPERATIONS: dict[str, Callable[[Step], str]] = {
     "recorded": lambda s: f"{_names(s)} changed, as an older record tells",
     "time_zone": lambda s: (
         f"clock of {', '.join(s.source)} is {s.number('ahead') / 3600:+g} h ahead of "
-        f"{s.parameters['against']}: put on that"
+        f"{_word(s, 'against')}: put on that"
     ),
-    "read_axes": lambda s: f"{_names(s)} read in axes {s.parameters['axes']}",
+    "read_axes": lambda s: f"{_names(s)} read in axes {_word(s, 'axes')}",
     "pad_fractions": lambda s: (
         f"{s.number('count'):.0f} times of {_names(s)} lack leading zeros in their fraction of a "
-        f"second, such as {s.parameters['written']} for {s.parameters['meant']}: read as meant"
+        f"second, such as {_word(s, 'written')} for {_word(s, 'meant')}: read as meant"
     ),
 }

@@ -14,8 +14,8 @@ from greybox.errors import LogError, VesselError
 from greybox.model.model import ManoeuvringModel, load_model, model_from_dict
 from greybox.trial.convert.options import ImportOptions
 from greybox.trial.convert.read import read_log
-from greybox.trial.convert.two_pass_import import import_files
 from greybox.trial.dataframe import log_from_pandas
+from greybox.trial.import_files import import_files
 from greybox.trial.kinematics import decimate
 from greybox.trial.log import make_log
 from greybox.trial.store import write_log
@@ -85,14 +85,14 @@ def test_what_no_condition_can_be(values, message):
         ImportOptions(notes=values)
 
 
-def test_a_vessel_file_states_those_of_logs_that_state_none(tmp_path):
+def test_a_vessel_file_states_those_of_logs_that_state_none(tmp_path, monkeypatch):
     ship = vessel_from_dict(SHIP | {"conditions": {"draught": "12 ft"}})
     assert ship.conditions.draught == pytest.approx(3.6576)
     assert vessel_from_dict(json.loads(json.dumps(vessel_to_dict(ship)))) == ship
     assert "draught 3.6576 m" in ship.summary()
     with pytest.raises(VesselError, match=r"unknown key 'draft'\. Did you mean 'draught'"):
         vessel_from_dict(SHIP | {"conditions": {"draft": 1}})
-    with pytest.raises(VesselError, match=r"\[conditions\] is 3, not a table"):
+    with pytest.raises(VesselError, match=r"\[conditions\] is not a table but 3"):
         vessel_from_dict(SHIP | {"conditions": 3})
     raw = tmp_path / "raw.csv"
     raw.write_text("t,u,v,r,psi,n\n" + "".join(f"{k},1,0,0,0,5\n" for k in range(9)))
@@ -111,9 +111,11 @@ def test_a_vessel_file_states_those_of_logs_that_state_none(tmp_path):
     assert "conditions: draught 3.6576 m, water depth 20 m, sea state 2" in log.summary()
     assert decimate(log, 2.0).conditions == known
     assert log_from_pandas(log.to_pandas(), ship).conditions == known
-    # and is kept when the log is imported again
-    import_files([out], later, tmp_path / "again.csv")
-    assert read_log(tmp_path / "again.csv", vessel_from_dict(SHIP)).conditions == known
+    # and is kept when the log is imported again, in one piece or in blocks
+    for cells in (10**9, 1):
+        monkeypatch.setattr("greybox.trial.convert.two_pass_import._LARGE_CELLS", cells)
+        import_files([out], later, tmp_path / "again.csv")
+        assert read_log(tmp_path / "again.csv", vessel_from_dict(SHIP)).conditions == known
 
 
 def test_records_of_released_versions_state_them_as_notes(tmp_path):
@@ -245,11 +247,13 @@ def test_the_shell_tells_them(tmp_path, capsys, logs, estimate):
     assert status != 0
     assert "--note: draught is 'deep'" in error
     assert not log.exists()
-    status, _, error = run(
+    status, out, error = run(
         capsys, "import", raw, "--vessel", "thesis", "--out", log, "--note", "draught=1.8 m",
-        "--note", "sea_state=2", "--note", "pilot=A. B.",
+        "--note", "sea_state=2", "--note", "pilot=A. B.", "--note", "depth=30 m",
     )  # fmt: skip
     assert status == 0, error
+    assert "note: 'depth' is kept in words, as no condition. Did you mean 'water_depth'?" in out
+    assert "pilot" not in out
     assert read_log(log, load_vessel("thesis")).conditions == Conditions(1.8, sea_state=2)
     model = tmp_path / "model.json"
     estimate.model().save(model)

@@ -6,19 +6,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from greybox.trial.actuator_estimate import ActuatorEstimate
+from greybox.trial.checks.actuators import measure_actuators
 from greybox.trial.checks.course import course_findings
+from greybox.trial.checks.external_force import force_findings
 from greybox.trial.checks.finding import IDS, CheckReport, Finding, Outcome
 from greybox.trial.checks.frame_sign_unit import (
-    find_reading,
+    find_readings,
     frame_outcomes,
-    read,
     reading_findings,
 )
 from greybox.trial.checks.heading_wrap import wrap_findings
 from greybox.trial.checks.motion import Motion, make_motion
 from greybox.trial.checks.position_hold import hold_findings
 from greybox.trial.checks.position_jump import jump_findings
-from greybox.trial.checks.sensor_offsets.find import find_offsets
+from greybox.trial.checks.sensor_offsets.find import Tied, find_offsets
 from greybox.trial.checks.signal_quality import (
     angle_unit_findings,
     coarse_findings,
@@ -113,8 +115,8 @@ def check_recordings(recordings: Sequence[Recording], vessel: Vessel) -> list[Ch
     """
     logs = [_signal_quality(recording, vessel) for recording in recordings]
     _kinematics(logs, vessel)
-    for log in logs:
-        _forces(log, vessel)
+    _forces(logs, vessel)
+    actuators = _actuators(logs, vessel)
     return [
         CheckReport(
             log.recorded.name,
@@ -122,6 +124,7 @@ def check_recordings(recordings: Sequence[Recording], vessel: Vessel) -> list[Ch
             _outcomes(log.findings, log.outcomes),
             log.recorded.notes,
             log.recorded,
+            tuple(a for a in actuators if log.recorded.name in a.logs),
         )
         for log in logs
     ]
@@ -153,26 +156,54 @@ def _signal_quality(recording: Recording, vessel: Vessel) -> _Log:
 
 def _kinematics(logs: Sequence[_Log], vessel: Vessel) -> None:
     """Check what ties positions, heading, velocities and yaw rate of the logs together."""
+    motions = [log.motion for log in logs]
     for log in logs:
-        motion = log.motion
-        log.say(frame_outcomes(motion))
-        if motion is not None and (motion.positioned or motion.turned):
-            reading = find_reading(motion)
-            log.add(reading_findings(reading))
-            motion = read(motion, reading.changes)
-            found, said = find_offsets(motion, vessel)
-            log.findings += found
-            log.say(said)
+        log.say(frame_outcomes(log.motion))
+    usable = [i for i, m in enumerate(motions) if m is not None and (m.positioned or m.turned)]
+    readings = find_readings([m for i in usable if (m := motions[i]) is not None])
+    names = [logs[i].recorded.name for i in usable]
+    for i, reading in zip(usable, readings, strict=True):
+        logs[i].add(reading_findings(reading, names))
+        motions[i] = reading.motion
+    tied = [Tied(log.recorded.name, log.mended, m) for log, m in zip(logs, motions, strict=True)]
+    for log, (found, said) in zip(logs, find_offsets(tied, vessel), strict=True):
+        log.findings += found
+        log.say(said)
+    for log, motion in zip(logs, motions, strict=True):
         if motion is None or not motion.positioned:
             found, said = course_findings(log.mended, vessel)
             log.findings += found
             log.say(said)
 
 
-def _forces(log: _Log, vessel: Vessel) -> None:
-    """Check wind and thrusters of one log against its motion."""
-    log.findings += wind_findings(log.mended, log.findings)
-    log.findings += response_findings(log.mended, vessel, log.findings)
+def _forces(logs: Sequence[_Log], vessel: Vessel) -> None:
+    """Check wind and thrusters of the logs against their motion."""
+    for log in logs:
+        log.findings += wind_findings(log.mended, log.findings)
+    pushed, untold = force_findings([log.mended for log in logs], vessel)
+    for log, forces, reason in zip(logs, pushed, untold, strict=True):
+        # what pushes the ship from outside tells nothing of the signs of its thrusters
+        own = apply_repairs(log.mended, forces)
+        signs = response_findings(own, vessel, log.findings)
+        log.findings += signs
+        doubt = next(
+            (f for f in log.findings if f.id in ("sign", "frame", "unit") and not f.safe), None
+        )
+        if doubt is not None:
+            said = f"the {doubt.id} of {', '.join(doubt.channels)} is to be settled first"
+            log.say([Outcome("external_force", "cannot tell", said)])
+            continue
+        log.findings += forces
+        log.say([reason] if reason is not None else [])
+
+
+def _actuators(logs: Sequence[_Log], vessel: Vessel) -> tuple[ActuatorEstimate, ...]:
+    """Measure the actuators from all logs together."""
+    estimates, findings, untold = measure_actuators([log.mended for log in logs], vessel)
+    for log in logs:
+        log.say([untold] if untold is not None else [])
+        log.findings += [finding for finding, names in findings if log.recorded.name in names]
+    return estimates
 
 
 def _independent(recording: Recording) -> Recording:

@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.channels import ANGLES
+from greybox.rotation import body_to_ned
 from greybox.trial.checks.finding import Finding
 from greybox.trial.convert.derived_signals import continuous
 from greybox.trial.convert.resample import clock, runs
-from greybox.trial.gaps import HOLE
+from greybox.trial.gaps import GAP, HOLE
 from greybox.trial.raw_log import Recording, Signal
 from greybox.trial.steps import mend
 from greybox.vessel.vessel import Vessel
@@ -86,7 +87,7 @@ def _gaps(names: tuple[str, ...], t: Array) -> list[Finding]:
     if digits:
         # between times that were rounded there may have been others
         grid = 10.0 ** (np.floor(np.log10(np.maximum(t[1:], 1e-9))) + 1 - digits)
-        limit = np.maximum(limit, 1.5 * grid)
+        limit = np.maximum(limit, GAP * grid)
     wide = np.flatnonzero(steps > limit)
     if not len(wide):
         return []
@@ -453,8 +454,7 @@ def _moves(name: str, start: float, stop: float, signals: list[Signal], step: fl
             u, v = part("v_n"), part("v_e")
         psi = part("psi")
         if u is not None and v is not None and psi is not None and len(u) == len(v) == len(psi):
-            c, s = np.cos(psi), np.sin(psi)
-            rate = c * u - s * v if name == "x_n" else s * u + c * v
+            rate = body_to_ned(u, v, psi)[name == "y_n"]
             return bool(np.ptp(np.cumsum(rate)) * span / len(rate) > max(0.3, 3 * step))
     if name == "psi":
         r = part("r")

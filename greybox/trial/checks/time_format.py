@@ -24,9 +24,10 @@ def time_format_findings(recording: Recording) -> list[Finding]:
     Returns
     -------
     list of Finding
-        One for each column of text that was read so, and one for each clock of numbers.
+        One for all columns of text that were read so, and one for each clock of numbers.
     """
-    found = [_of_text(s) for s in recording.steps if s.operation == "pad_fractions"]
+    read = [s for s in recording.steps if s.operation == "pad_fractions" and s.numbers("times")]
+    found = [_of_text(read)] if read else []
     for names, t in clocks(recording):
         zero = recording.epoch or 0.0
         wrong = unpadded_numbers(t + zero)
@@ -48,7 +49,7 @@ def time_format_findings(recording: Recording) -> list[Finding]:
                 f"and seem to go back behind",
                 _FIX,
                 ("t",),
-                (mend("pad_fractions", names, count=float(len(wrong)), first=float(meant[0])),),
+                (_mend(names, len(wrong), float(written[0]), float(meant[0])),),
                 True,
                 {"t": t, "rows": wrong.rows, "written": written, "meant": meant, "names": names},
             )
@@ -56,21 +57,32 @@ def time_format_findings(recording: Recording) -> list[Finding]:
     return found
 
 
-def _of_text(step: Step) -> Finding:
-    count = step.number("count")
-    times, late = np.array(step.numbers("times")), np.array(step.numbers("late"))
+def _mend(names: tuple[str, ...], count: int, written: float, meant: float) -> Step:
+    said = {"written": f"{written:.9g} s", "meant": f"{meant:.9g} s"}
+    return mend("pad_fractions", names, count=float(count), **said)
+
+
+def _of_text(read: list[Step]) -> Finding:
+    """Return the finding of columns of text that were read as meant; their steps tell where."""
+    count = sum(s.number("count") for s in read)
+    times = np.array([t for s in read for t in s.numbers("times")])
+    late = np.array([t for s in read for t in s.numbers("late")])
+    columns = listed(x for s in read for x in s.source)
+    first, worst = read[0], int(np.argmax(late))
+    said = first.parameters
     return Finding(
         "time_format",
         "t",
         count,
         (count, count),
         "1",
-        f"{', '.join(step.source)}: {step.sentence}; the first stands at t = {times[0]:.6g} s, and "
-        f"would come up to {late.max():.3g} s late",
-        "export the times with all digits; import reads them as they are meant",
+        f"{count:.0f} times of {columns} have fewer digits than the others, such as "
+        f"{said.get('written')} for {said.get('meant')} at t = {times[0]:.6g} s: "
+        f"their fraction lacks its leading zeros, and would come up to {late[worst]:.3g} s late",
+        "none needed: import reads them as they are meant; export times with all their digits",
         ("t",),
         # the times are right already: to pad them again changes nothing
-        (step,),
+        tuple(read),
         True,
-        {"t": times, "meant": times, "written": times + late, "names": step.source},
+        {"t": times, "meant": times, "written": times + late, "names": first.source},
     )

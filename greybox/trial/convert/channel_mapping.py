@@ -18,6 +18,7 @@ from greybox.trial.convert.column_names import Assigned, assign, is_short_pair
 from greybox.trial.convert.derived_signals import wind_state
 from greybox.trial.convert.file_clocks import on_one_clock
 from greybox.trial.convert.settle_axes import settle_axes
+from greybox.trial.log import Provenance
 from greybox.trial.raw_log import Recording, Signal, SourceFile
 from greybox.trial.readers.formats import open_raw
 from greybox.trial.readers.table import Batch, TableFile, read_columns
@@ -120,18 +121,17 @@ def _read(
     """Read one file; `alone` where no other belongs to it, so that it must tell something."""
     raw = open_raw(path, **options)
     if not isinstance(raw, Recording):
-        record = read_record(Path(path))
-        if record is not None:
-            # what greybox wrote is canonical: a mapping would convert it twice
-            vessel, guess = replace(vessel, columns={}), False
+        known, vessel = written_log(Path(path), vessel)
         source = SourceFile(raw.path.name, sha256(raw.path), raw.format)
-        raw, assigned = table_recording(raw, vessel, guess=guess, alone=alone)
+        raw, assigned = table_recording(raw, vessel, guess=guess and known is None, alone=alone)
         raw = replace(raw, files=(source,))
-        if record is not None:
-            known = recorded_provenance(record)
+        if known is not None:
             epoch = known.epoch if raw.epoch is None else raw.epoch
             raw = replace(
-                raw, epoch=epoch, steps=(*known.steps, *raw.steps), conditions=known.conditions
+                raw,
+                epoch=epoch,
+                steps=(*map(_past, known.steps), *raw.steps),
+                conditions=known.conditions,
             )
     else:
         assigned = assign(
@@ -143,6 +143,18 @@ def _read(
         )
         _guess_commands(raw, assigned, vessel)
     return canonical(raw, assigned, vessel)
+
+
+def written_log(path: Path, vessel: Vessel) -> tuple[Provenance | None, Vessel]:
+    """Return the provenance of a log that greybox wrote, None of any other file.
+
+    With it comes the vessel by which the columns are read: what greybox wrote is canonical,
+    and a mapping would convert it twice.
+    """
+    record = read_record(path)
+    if record is None:
+        return None, vessel
+    return recorded_provenance(record), replace(vessel, columns={})
 
 
 def table_recording(
@@ -157,22 +169,47 @@ def table_recording(
         assigned = {n: a for n, a in assigned.items() if n not in ("x_n", "y_n")}
     time = assigned["t"]
     scale = time_scale(batch[time.raw], time, table)
+    return whole_recording(table, batch, assigned, scale, vessel, alone=alone), assigned
+
+
+def whole_recording(
+    table: TableFile,
+    batch: Batch,
+    assigned: dict[str, Assigned],
+    scale: TimeScale,
+    vessel: Vessel,
+    *,
+    alone: bool = True,
+) -> Recording:
+    """Return all columns of a table as a recording that tells what reading them took."""
     recording = batch_recording(table, batch, assigned, scale, vessel, alone=alone)
     if isinstance(table, TopicTable):
         stamped = assigned["t"].raw == STAMP
         unsure = frozenset(n for n, a in assigned.items() if a.raw in table.unsure)
         recording = replace(recording, unsure=unsure, ahead=table.ahead if stamped else None)
     notes = (*table.notes, *scale.notes, *recording.notes)
-    steps = tuple(_moved(s, -scale.zero) for s in table.steps)
-    return replace(recording, notes=notes, steps=steps), assigned
+    return replace(recording, notes=notes, steps=reading_steps(table, scale))
 
 
-def _moved(step: Step, shift: float) -> Step:
-    """Return a step with the places that it names on another zero of time."""
-    if "times" not in step.parameters:
+def reading_steps(table: TableFile, scale: TimeScale) -> tuple[Step, ...]:
+    """Return what reading the rows of a table took, on the clock of its recording."""
+    return tuple(on_zero(s, -scale.zero) for s in table.steps)
+
+
+def on_zero(step: Step, shift: float) -> Step:
+    """Return a step of reading with the places that it names on another zero of time."""
+    if step.operation != "pad_fractions":
         return step
     times = tuple(t + shift for t in step.numbers("times"))
     return replace(step, parameters={**step.parameters, "times": times})
+
+
+def _past(step: Step) -> Step:
+    """Return a step of an earlier reading without its places, which are not in this file."""
+    if step.operation != "pad_fractions":
+        return step
+    kept = {k: v for k, v in step.parameters.items() if k not in ("times", "late")}
+    return replace(step, parameters=kept)
 
 
 def table_columns(
@@ -464,7 +501,7 @@ def merge(recordings: list[Recording]) -> Recording:
     for r in recordings:
         shift = r.epoch - epoch if epoch is not None and r.epoch is not None else 0.0
         notes += [f"{r.name}: {n}" for n in r.notes]
-        steps += [_moved(s, shift) for s in r.steps]
+        steps += [on_zero(s, shift) for s in r.steps]
         moved: dict[int, Array] = {}
         for s in r.signals:
             t = moved.setdefault(id(s.t), s.t + shift)
@@ -474,10 +511,10 @@ def merge(recordings: list[Recording]) -> Recording:
             parts.insert(at, (r.name, replace(s, t=t)))
             stated[s.name] = stated.get(s.name, 0) + (s.name not in r.guessed)
         for name, (t, words) in r.text.items():
-            before = text.get(name, (np.empty(0), np.empty(0, dtype=str)))
+            first = text.get(name, (np.empty(0), np.empty(0, dtype=str)))
             text[name] = (
-                np.concatenate([before[0], t + shift]),
-                np.concatenate([before[1], words]),
+                np.concatenate([first[0], t + shift]),
+                np.concatenate([first[1], words]),
             )
     signals = []
     clocks: dict[tuple[int, ...], Array] = {}
