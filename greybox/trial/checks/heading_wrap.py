@@ -120,7 +120,12 @@ def _between(t: Array, psi: Array) -> NDArray[np.int64]:
         share = (t_new[rows] - t_new[low]) / (t_new[high] - t_new[low])
         short = new[low] + share * _wrapped(new[high] - new[low])
         clear = tolerance + _bow(t_new, new, low, high)
-        rows = rows[np.abs(_wrapped(new[rows] - short)) > clear]
+        off = np.abs(_wrapped(new[rows] - short))
+        # on the long way, and not a heading that jumped from one side to the other
+        way = np.sign(new[d] - new[c])
+        gone = way * (new[rows] - new[c] - _wrapped(new[low] - new[c]))
+        left = way * (new[d] + _wrapped(new[high] - new[d]) - new[rows])
+        rows = rows[(off > clear) & (gone > _LEAST) & (left > _LEAST)]
         if not len(rows) or rows[0] == 0 or rows[-1] == len(new) - 1:
             continue
         c, d = rows[0] - 1, rows[-1] + 1
@@ -134,8 +139,8 @@ def _between(t: Array, psi: Array) -> NDArray[np.int64]:
         reach = np.maximum(tolerance, _FASTER * usual * np.diff(t_new))
         found = sorted({*found, *_returning(new, found, 2 * longest + 2, reach)})
     last = np.concatenate([first[1:], [len(psi)]])
-    held = [np.arange(first[k], last[k]) for k in found]
-    return np.concatenate(held) if held else np.empty(0, np.int64)
+    rows_of = [np.arange(first[k], last[k]) for k in found]
+    return np.concatenate(rows_of) if rows_of else np.empty(0, np.int64)
 
 
 def _noise(t: Array, psi: Array) -> float:

@@ -53,12 +53,10 @@ class Track:
 
 
 def position_track(recording: Recording) -> Track | None:
-    """Return the positions; None where there are too few, or significant digits are lost."""
+    """Return the positions; None where there are too few."""
     if "x_n" not in recording or "y_n" not in recording:
         return None
     (t, north), (t_east, east) = clean(recording["x_n"]), clean(recording["y_n"])
-    if significant_digits(north) or significant_digits(east):
-        return None
     if len(t) != len(t_east) or not np.array_equal(t, t_east):
         t, a, b = np.intersect1d(t, t_east, return_indices=True)
         north, east = north[a], east[b]
@@ -73,6 +71,10 @@ def _grid(value: Array) -> float:
     What was rounded as latitude and longitude lies on a grid that bends: only the ways
     between neighbours are multiples of its step.
     """
+    digits = significant_digits(value)
+    if digits:
+        # the coarsest step, that of the largest values
+        return float(10.0 ** (np.floor(np.log10(np.abs(value).max())) + 1 - digits))
     way = np.abs(np.diff(value[:20000]))
     way = way[way > 1e-6]
     if len(way) < 10:
