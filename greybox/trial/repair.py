@@ -71,8 +71,7 @@ def repair(
         if f not in wanted and f.id != "gap"
     ]
     _refuse_contradictions(recording.name, wanted)
-    mended = apply_repairs(recording, wanted)
-    _refuse_emptied(recording, mended, wanted)
+    mended = _mended_in_turn(recording, wanted)
     fixed = tuple(
         f"{f.id} of {', '.join(f.channels or (f.channel,))}: {f.evidence}" for f in wanted
     )
@@ -113,18 +112,21 @@ def _refuse_contradictions(name: str, wanted: Sequence[Finding]) -> None:
                     )
 
 
-def _refuse_emptied(before: Recording, after: Recording, wanted: Sequence[Finding]) -> None:
-    """Refuse mends that leave a channel fewer samples beside the others than a log needs."""
-    touched = {c: f.id for f in wanted for s in f.repair for c in s.channels}
-    had, have = _beside(before), _beside(after)
-    for channel, count in have.items():
-        if channel in touched and count < _LEAST_SAMPLES <= had.get(channel, 0):
-            raise LogError(
-                f"to mend '{touched[channel]}' would leave {count} of the {had[channel]} samples "
-                f"of {channel} that '{before.name}' has beside its other channels, at least "
-                f"{_LEAST_SAMPLES} are needed: leave it out by --fix-not {touched[channel]}, or "
-                f"look at the log."
-            )
+def _mended_in_turn(recording: Recording, wanted: Sequence[Finding]) -> Recording:
+    """Apply the repairs finding by finding; refuse one that leaves a channel too few samples."""
+    for finding in wanted:
+        had, mended = _beside(recording), apply_repairs(recording, [finding])
+        have = _beside(mended)
+        for channel in dict.fromkeys(c for s in finding.repair for c in s.channels):
+            if have.get(channel, 0) < _LEAST_SAMPLES <= had.get(channel, 0):
+                raise LogError(
+                    f"to mend '{finding.id}' of {channel} in '{recording.name}' would leave "
+                    f"{have.get(channel, 0)} of its {had[channel]} samples beside the other "
+                    f"channels, at least {_LEAST_SAMPLES} are needed: leave it out by --fix-not "
+                    f"{finding.id}, or look at the log."
+                )
+        recording = mended
+    return recording
 
 
 def _beside(recording: Recording) -> dict[str, int]:
