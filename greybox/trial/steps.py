@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, get_args
 
 DecidedBy = Literal["format", "vessel", "user", "check", "default"]
@@ -149,6 +149,14 @@ def new_steps(known: Iterable[Step], more: Iterable[Step]) -> tuple[Step, ...]:
             before.append(step)
             found.append(step)
     return tuple(found)
+
+
+def on_zero(step: Step, shift: float) -> Step:
+    """Return a step of reading with the places that it names on another zero of time."""
+    if step.operation != "pad_fractions":
+        return step
+    times = tuple(t + shift for t in step.numbers("times"))
+    return replace(step, parameters={**step.parameters, "times": times})
 
 
 def mend(operation: str, channels: tuple[str, ...], **parameters: Value) -> Step:
