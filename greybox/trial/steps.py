@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, get_args
@@ -117,7 +118,7 @@ def step_from_dict(data: Any) -> Step | None:
             data.get("decided_by", "default"),
             str(data.get("reason", "")),
         )
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError):
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError):
         return None
 
 
@@ -135,7 +136,10 @@ def finite_number(value: Any) -> float:
     ValueError
         It is none, or none that a log can hold.
     """
-    number = float(value)
+    try:
+        number = float(value)
+    except OverflowError:
+        number = math.inf
     if not abs(number) < _LARGEST:
         raise ValueError(f"{number} is no quantity of a log")
     return number

@@ -244,9 +244,13 @@ def _travelled(value: NDArray[Any]) -> bool:
     if value.dtype == object or not np.isfinite(value).any():
         return False
     value = value[np.isfinite(value)]
-    steps = np.diff(value)
-    smooth = float(np.sqrt(np.mean(steps**2))) < _SMOOTH * float(np.std(value)) if len(steps) else 0
-    return bool(smooth) and float(np.mean(steps == 0)) < 0.5
+    if len(value) < 2:
+        return False
+    # damaged numbers may be too large to be squared
+    with np.errstate(over="ignore", invalid="ignore"):
+        steps = np.diff(value)
+        smooth = float(np.sqrt(np.mean(steps**2))) < _SMOOTH * float(np.std(value))
+    return smooth and float(np.mean(steps == 0)) < 0.5
 
 
 def _parts(table: TableFile) -> dict[str, tuple[str, ...]]:
