@@ -200,6 +200,6 @@ def _recorded(said: Any) -> dict[str, Any]:
     if isinstance(said, str):
         try:
             said = json.loads(said)
-        except ValueError:
+        except (ValueError, RecursionError):
             return {}
     return said if isinstance(said, dict) and said.get("format") == RECORD_FORMAT else {}

@@ -20,7 +20,6 @@ from greybox.trial.convert.two_pass_import import Stream, is_large
 from greybox.trial.log import TrialLog
 from greybox.trial.raw_log import Recording
 from greybox.trial.readers.formats import open_raw
-from greybox.trial.readers.topic_files import TopicTable
 from greybox.trial.repair import check_ids, repair
 from greybox.trial.store import record_path, write_log
 from greybox.vessel.vessel import Vessel
@@ -143,7 +142,13 @@ def _all_or_none(folder: Path | None, logs: Sequence[Path]) -> Iterator[None]:
         )
     made = not folder.exists()
     new = [p for log in logs for p in (log, record_path(log)) if not p.exists()]
-    folder.mkdir(exist_ok=True)
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise LogError(
+            f"cannot make the folder '{folder}': {error.strerror or error}. Name another folder, "
+            f"or one log that ends in .csv or .parquet."
+        ) from None
     try:
         yield
     except BaseException:
@@ -164,9 +169,7 @@ def _import_trial(
 ) -> str:
     if len(paths) == 1 and Path(paths[0]).is_file():
         table = open_raw(paths[0], **(reader or {}))
-        # axes that only the other signals tell need all of them
-        unsure = isinstance(table, TopicTable) and bool(table.unsure)
-        if not isinstance(table, Recording) and is_large(table) and not unsure:
+        if not isinstance(table, Recording) and is_large(table):
             stream = Stream(table, vessel, options)
             write_log(stream.segments(), out, extra=extra, provenance=stream.provenance)
             assert stream.first is not None

@@ -194,6 +194,21 @@ def test_a_file_is_not_written_over_itself(tmp_path, capsys):
     assert raw.read_bytes() == before
 
 
+@pytest.mark.parametrize("out", ["logs", "logs/"])
+def test_a_file_where_the_folder_should_be(tmp_path, capsys, out):
+    for name in ("a.csv", "b.csv"):
+        data().to_csv(tmp_path / name, index=False)
+    (tmp_path / "logs").write_text("mine")
+    status, _, err = run(
+        capsys, "import", tmp_path / "a.csv", tmp_path / "b.csv", "--vessel", "thesis", "--out",
+        f"{tmp_path}/{out}",
+    )  # fmt: skip
+    assert status == 1
+    assert "cannot make the folder" in err
+    assert len(err.splitlines()) == 1
+    assert (tmp_path / "logs").read_text() == "mine"
+
+
 def test_devices_and_full_disks(tmp_path, capsys, monkeypatch):
     raw = tmp_path / "raw.csv"
     data().to_csv(raw, index=False)

@@ -20,6 +20,7 @@ from greybox.trial.convert.options import ImportOptions
 from greybox.trial.convert.read import read_segments
 from greybox.trial.import_files import import_files
 from greybox.trial.raw_log import Recording, Signal
+from greybox.trial.steps import Step
 from greybox.vessel.toml import load_vessel, vessel_from_dict
 
 VESSEL = load_vessel("thesis")
@@ -181,6 +182,16 @@ def test_columns_of_two_files_merge(tmp_path):
         np.testing.assert_allclose(log[name], data[name], atol=1e-12)
     both = merge([read_recording(files[0], VESSEL)] * 2)
     assert any("psi stands in 'a' and 'a' at the same times" in n for n in both.notes)
+
+
+@pytest.mark.parametrize("named", [("a", "b"), ("a", "a")])
+def test_parts_of_which_one_was_corrected_do_not_merge(named):
+    first, second = (as_recording({k: v[part] for k, v in columns().items()})
+                     for part in (slice(0, 200), slice(200, 400)))  # fmt: skip
+    late = Step("shift", ("psi",), parameters={"late": 0.5}, decided_by="vessel")
+    parts = [replace(first, name=named[0]), replace(second, name=named[1]).with_steps(late)]
+    with pytest.raises(LogError, match=f"psi of 'a' is as recorded, that of '{named[1]}' is corr"):
+        merge(parts)
 
 
 def test_clocks_that_cannot_meet(tmp_path):

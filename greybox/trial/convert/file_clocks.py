@@ -87,16 +87,16 @@ def _step(shift: float, of: Sequence[Recording], utc: bool) -> Step:
 
 def _told_zone(recordings: Sequence[Recording]) -> float | None:
     """Return by how much the recorders say they are ahead of UTC [s], None where none says."""
-    told = {r.name: zone_of(r.ahead) or 0.0 for r in recordings if r.ahead is not None}
+    told = [(zone_of(r.ahead) or 0.0, r.name) for r in recordings if r.ahead is not None]
     if not told:
         return None
-    one, two = min(told, key=lambda n: told[n]), max(told, key=lambda n: told[n])
-    if told[one] != told[two]:
+    (least, one), (most, two) = min(told), max(told)
+    if least != most:
         raise LogError(
-            f"the recorder of '{one}' is {told[one] / 3600:g} h ahead of its header stamps and "
-            f"that of '{two}' {told[two] / 3600:g} h: export both in one time zone."
+            f"the recorder of '{one}' is {least / 3600:g} h ahead of its header stamps and "
+            f"that of '{two}' {most / 3600:g} h: export both in one time zone."
         )
-    return told[one]
+    return least
 
 
 def _shift(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 from functools import reduce
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,8 +48,7 @@ def merge(recordings: list[Recording]) -> Recording:
             f"start: they cannot be merged. Give both a UNIX or ISO time, or import them apart."
         )
     epoch = min(r.epoch for r in absolute if r.epoch is not None) if absolute else None
-    found: dict[str, list[tuple[str, Signal]]] = {}
-    stated: dict[str, int] = {}
+    parts: dict[str, list[_Part]] = {}
     text: dict[str, tuple[Array, NDArray[Any]]] = {}
     notes: list[str] = []
     steps: list[Step] = []
@@ -60,50 +59,27 @@ def merge(recordings: list[Recording]) -> Recording:
         moved: dict[int, Array] = {}
         for s in r.signals:
             t = moved.setdefault(id(s.t), s.t + shift)
-            parts = found.setdefault(s.name, [])
-            # what a file states is preferred to what was guessed of another
-            at = len(parts) if s.name in r.guessed else stated.get(s.name, 0)
-            parts.insert(at, (r.name, replace(s, t=t)))
-            stated[s.name] = stated.get(s.name, 0) + (s.name not in r.guessed)
+            parts.setdefault(s.name, []).append(_Part(r, replace(s, t=t)))
         for name, (t, words) in r.text.items():
             first = text.get(name, (np.empty(0), np.empty(0, dtype=str)))
             text[name] = (
                 np.concatenate([first[0], t + shift]),
                 np.concatenate([first[1], words]),
             )
-    signals = []
+    signals, unsure = [], set()
     clocks: dict[tuple[int, ...], Array] = {}
-    unsure = {(r.name, n) for r in recordings for n in r.unsure}
-    still: set[str] = set()
-    mapped = {(r.name, n): raw for r in recordings for n, raw in r.mapped.items()}
-    done = {r.name: r.steps for r in recordings}
-    for name, parts in found.items():
-        kept = [parts[0]]
-        for part in parts[1:]:
-            same = next((k[0] for k in kept if _overlap(part[1], k[1])), None)
-            if same is not None:
-                one, two = mapped.get((same, name)), mapped.get((part[0], name))
-                if one is not None and two is not None and one != two:
-                    raise LogError(
-                        f"columns '{one}' of '{same}' and '{two}' of '{part[0]}' tell of the same "
-                        f"times, and [columns] maps both to '{name}': remove one of the two lines "
-                        f"from the vessel file."
-                    )
-                notes.append(
-                    f"{name} stands in '{same}' and '{part[0]}' at the same times: "
-                    f"that of '{same}' is used"
-                )
-            else:
-                kept.append(part)
-        _refuse_two_states(name, [(n, done[n]) for n, _ in kept])
-        still |= {name for n, _ in kept if (n, name) in unsure}
-        kept.sort(key=lambda p: _span(p[1])[0])
+    for name, offered in parts.items():
+        kept = _one_at_a_time(name, offered, notes)
+        _refuse_two_states(name, kept)
+        if any(name in p.file.unsure for p in kept):
+            unsure.add(name)
+        kept.sort(key=lambda p: _span(p.signal)[0])
         # columns of one table go on sharing their clock
-        key = tuple(id(p[1].t) for p in kept)
+        key = tuple(id(p.signal.t) for p in kept)
         if key not in clocks:
-            clocks[key] = np.concatenate([p[1].t for p in kept])
-        value = np.concatenate([p[1].value for p in kept])
-        signals.append(replace(kept[0][1], t=clocks[key], value=value))
+            clocks[key] = np.concatenate([p.signal.t for p in kept])
+        value = np.concatenate([p.signal.value for p in kept])
+        signals.append(replace(kept[0].signal, t=clocks[key], value=value))
     return Recording(
         recordings[0].name,
         tuple(signals),
@@ -113,24 +89,62 @@ def merge(recordings: list[Recording]) -> Recording:
         tuple(notes),
         conditions=reduce(Conditions.over, (r.conditions for r in recordings)),
         steps=new_steps((), steps),
-        unsure=frozenset(still),
+        unsure=frozenset(unsure),
     )
 
 
-def _refuse_two_states(name: str, parts: list[tuple[str, tuple[Step, ...]]]) -> None:
-    """Refuse a signal of several files of which one was corrected or moved and the other not."""
-    (first, before), *others = parts
-    for other, steps in others:
-        if name in ("u_q", "v_q") and wind_state(steps) != wind_state(before):
+class _Part(NamedTuple):
+    """What one file, whose name another may have too, gives of a signal."""
+
+    file: Recording
+    signal: Signal
+
+
+def _one_at_a_time(name: str, offered: list[_Part], notes: list[str]) -> list[_Part]:
+    """Return the parts of a signal of which no two tell of the same times; add notes on others.
+
+    Raises
+    ------
+    LogError
+        ``[columns]`` maps two columns to the signal, and both tell of the same times.
+    """
+    # what a file states is preferred to what was guessed of another
+    first, *others = sorted(offered, key=lambda p: name in p.file.guessed)
+    kept = [first]
+    for part in others:
+        same = next((k.file for k in kept if _overlap(part.signal, k.signal)), None)
+        if same is None:
+            kept.append(part)
+            continue
+        one, two = same.mapped.get(name), part.file.mapped.get(name)
+        if one is not None and two is not None and one != two:
             raise LogError(
-                f"the wind of '{first}' is {wind_state(before)}, that of '{other}' is "
-                f"{wind_state(steps)}: they cannot be merged. Import both from their raw files."
+                f"columns '{one}' of '{same.name}' and '{two}' of '{part.file.name}' tell of the "
+                f"same times, and [columns] maps both to '{name}': remove one of the two lines "
+                f"from the vessel file."
             )
-        one, two = (_corrections(of, name) for of in (before, steps))
+        notes.append(
+            f"{name} stands in '{same.name}' and '{part.file.name}' at the same times: "
+            f"that of '{same.name}' is used"
+        )
+    return kept
+
+
+def _refuse_two_states(name: str, parts: list[_Part]) -> None:
+    """Refuse a signal of several files of which one was corrected or moved and the other not."""
+    first, *others = (p.file for p in parts)
+    for other in others:
+        if name in ("u_q", "v_q") and wind_state(other.steps) != wind_state(first.steps):
+            raise LogError(
+                f"the wind of '{first.name}' is {wind_state(first.steps)}, that of '{other.name}' "
+                f"is {wind_state(other.steps)}: they cannot be merged. Import both from their raw "
+                f"files."
+            )
+        one, two = (_corrections(of.steps, name) for of in (first, other))
         if one != two:
             raise LogError(
-                f"{name} of '{first}' is {_in_words(one)}, that of '{other}' is {_in_words(two)}: "
-                f"they cannot be merged. Import both from their raw files."
+                f"{name} of '{first.name}' is {_in_words(one)}, that of '{other.name}' is "
+                f"{_in_words(two)}: they cannot be merged. Import both from their raw files."
             )
 
 
