@@ -218,7 +218,7 @@ def recorded_actuators(record: Mapping[str, Any]) -> tuple[ActuatorEstimate, ...
 
 
 def known_actuators(logs: Iterable[Iterable[ActuatorEstimate]]) -> tuple[ActuatorEstimate, ...]:
-    """Return the actuators of several logs, each of the most logs, then surest, estimate."""
+    """Return one estimate an actuator: of the most logs, then of the narrowest interval."""
     best: dict[tuple[str, str], ActuatorEstimate] = {}
     for estimates in logs:
         for e in estimates:

@@ -1,4 +1,4 @@
-"""From what sensors give to what models need: velocities and sample time."""
+"""Body velocities from positions and heading, and decimation to a longer sample time."""
 
 from __future__ import annotations
 

@@ -97,7 +97,7 @@ def check_ids(also: tuple[str, ...], without: tuple[str, ...]) -> None:
 
 
 def _refuse_contradictions(name: str, wanted: Sequence[Finding]) -> None:
-    """Refuse two different values of what a channel has one of."""
+    """Refuse two mends that give one channel different clocks, mountings or places."""
     known: dict[tuple[str, str], tuple[Step, Finding]] = {}
     for finding in wanted:
         for step in finding.repair:

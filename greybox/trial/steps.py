@@ -156,7 +156,7 @@ def new_steps(known: Iterable[Step], more: Iterable[Step]) -> tuple[Step, ...]:
 
 
 def on_zero(step: Step, shift: float) -> Step:
-    """Return a step of reading with the places that it names on another zero of time."""
+    """Return a step with the times that it names counted from another zero, `shift` earlier."""
     if step.operation != "pad_fractions":
         return step
     times = tuple(t + shift for t in step.numbers("times"))

@@ -16,8 +16,6 @@ Rows = NDArray[np.int64]
 
 # zeros that a fraction down to a nanosecond may have lost
 _MOST_ZEROS = 8
-# full fractions of which one must end in a zero if zeros at the end are written at all
-_ENOUGH_FULL = 30
 # what is left of an uneven step by the better reading, as a share
 _BETTER = 0.7
 # the same where neither digits nor order tell

@@ -126,7 +126,7 @@ def _read(
             raw = replace(
                 raw,
                 epoch=epoch,
-                steps=(*map(_past, known.steps), *raw.steps),
+                steps=(*map(_without_times, known.steps), *raw.steps),
                 conditions=known.conditions,
             )
     else:
@@ -156,11 +156,11 @@ def written_log(path: Path, vessel: Vessel) -> tuple[Provenance | None, Vessel]:
 def table_recording(
     table: TableFile, vessel: Vessel, *, guess: bool = True, alone: bool = True
 ) -> tuple[Recording, dict[str, Assigned]]:
-    """Read the columns of a table that mean something into a recording."""
+    """Read the recognised columns of a table into a recording."""
     assigned = table_columns(table, vessel, guess=guess, alone=alone)
     batch = read_columns(table, [a.raw for a in assigned.values()])
     if is_short_pair(assigned) and not all(
-        _travelled(batch[assigned[n].raw]) for n in ("x_n", "y_n")
+        _moves_like_a_position(batch[assigned[n].raw]) for n in ("x_n", "y_n")
     ):
         assigned = {n: a for n, a in assigned.items() if n not in ("x_n", "y_n")}
     time = assigned["t"]
@@ -177,7 +177,7 @@ def whole_recording(
     *,
     alone: bool = True,
 ) -> Recording:
-    """Return all columns of a table as a recording that tells what reading them took."""
+    """Return the recognised columns of a table, with the notes and steps of reading them."""
     recording = batch_recording(table, batch, assigned, scale, vessel, alone=alone)
     if isinstance(table, TopicTable):
         stamped = assigned["t"].raw == STAMP
@@ -188,12 +188,12 @@ def whole_recording(
 
 
 def reading_steps(table: TableFile, scale: TimeScale) -> tuple[Step, ...]:
-    """Return what reading the rows of a table took, on the clock of its recording."""
+    """Return the steps of reading a table, their times counted from the recording's zero."""
     return tuple(on_zero(s, -scale.zero) for s in table.steps)
 
 
-def _past(step: Step) -> Step:
-    """Return a step of an earlier reading without its places, which are not in this file."""
+def _without_times(step: Step) -> Step:
+    """Return a step of an earlier reading without its times, which another file had."""
     if step.operation != "pad_fractions":
         return step
     kept = {k: v for k, v in step.parameters.items() if k not in ("times", "late")}
@@ -239,7 +239,7 @@ def table_columns(
     return assigned
 
 
-def _travelled(value: NDArray[Any]) -> bool:
+def _moves_like_a_position(value: NDArray[Any]) -> bool:
     """Whether values change as positions do: all the time, and little from row to row."""
     if value.dtype == object or not np.isfinite(value).any():
         return False

@@ -1,4 +1,4 @@
-"""What a log needs and its source does not hold as such: positions, velocities, wind.
+"""Channels that are derived from measured ones: local positions, velocities, yaw rate, wind.
 
 `derive_signals` makes, on the clock of each sensor, what may be interpolated;
 `complete_channels` makes velocities, yaw rate and wind on the clock of the log.
@@ -186,7 +186,7 @@ def wind_state(steps: Iterable[Step]) -> WindState:
 
 @dataclass(frozen=True)
 class Completed:
-    """Channels of a log, made of those that were measured.
+    """Channels of a log, measured and derived.
 
     Parameters
     ----------
@@ -210,7 +210,7 @@ def complete_channels(
     options: ImportOptions,
     before: Sequence[Step] = (),
 ) -> Completed:
-    """Make the channels of a log of those that were measured.
+    """Derive the channels of a log from those that were measured.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Axes that a file does not tell, decided by the other signals of the trial.
+"""Resolving axes that a file does not tell by the other signals of the trial.
 
 A driver may give its heading and velocities in a frame named after the receiver. Whether they
 are meant in the world's axes, east-north-up or north-east-down, or in the body's, shows in what
@@ -118,7 +118,7 @@ def _settle_velocity(recording: Recording) -> tuple[Recording, bool | None, Step
 
 
 def _left_over(recording: Recording) -> dict[tuple[str, bool], float]:
-    """Return by axes, and whether ψ is mirrored, the share of the displacement that is left."""
+    """Return the share of displacement left unexplained, by axes and by whether ψ is mirrored."""
     whole = derive_signals(recording)
     if not {"x_n", "y_n"} <= set(whole.names):
         return {}
@@ -208,7 +208,7 @@ def _by_course(recording: Recording) -> tuple[float, float] | None:
 
 
 def _by_thrusters(recording: Recording, vessel: Vessel) -> tuple[float, float] | None:
-    """Return the log-likelihood that the thrusters' push adds with ψ as it is and mirrored."""
+    """Return the log-likelihood gained by the thrusters' force, with ψ as it is and mirrored."""
     commands = list(vessel.commands)
     if not commands or not set(commands) <= set(recording.names):
         return None
@@ -238,7 +238,7 @@ def _by_thrusters(recording: Recording, vessel: Vessel) -> tuple[float, float] |
 
 
 def _added(change: Array, push: Array, damping: list[Array]) -> float:
-    """Return the log-likelihood that a push in its own direction adds to damping."""
+    """Return by how much a force raises the log-likelihood over damping alone, 0 if it brakes."""
     rest = np.column_stack([np.ones(len(change)), *damping])
     both = np.column_stack([rest, push])
     if not np.isfinite(both).all() or not np.isfinite(change).all() or np.std(push) == 0:

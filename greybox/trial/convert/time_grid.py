@@ -1,4 +1,4 @@
-"""The samples of a log: where they begin and end, how far apart they are, what leads."""
+"""The time grid of a log: start, end and sample time, and the channels whose holes are gaps."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ class Plan:
 def plan_import(
     extents: Mapping[str, Extent], vessel: Vessel, options: ImportOptions, name: str
 ) -> Plan:
-    """Decide on the samples of a log.
+    """Choose the time grid of a log, and the signals that it is made of.
 
     Raises
     ------
