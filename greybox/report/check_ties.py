@@ -202,6 +202,10 @@ def title_of(finding: Finding) -> str:
     """Return what a finding is, in a few words."""
     names = ", ".join(finding.channels or (finding.channel,))
     value = finding.value
+    if finding.id == "actuator" and isinstance(value, float):
+        return f"{names.replace(', ', ' after ')}: delay and lag of {value:.2g} s"
+    if finding.id == "external_force" and isinstance(value, float):
+        return f"A force from outside: {100 * value:.0f} % of the thrust at half speed"
     if finding.id == "clock_offset" and isinstance(value, float):
         return f"Clock of {names}: {abs(value):.2f} s {'late' if value > 0 else 'early'}"
     if finding.id == "heading_bias" and isinstance(value, float):

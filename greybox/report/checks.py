@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from greybox.errors import GreyboxError, UsageError
 from greybox.report.chart import chart_of
 from greybox.report.check_answers import answer_figure, course_figure, wind_figure
+from greybox.report.check_inputs import actuator_figure, force_figure
 from greybox.report.check_rows import (
     coarse_figure,
     fractions_figure,
@@ -39,8 +40,8 @@ from greybox.vessel.vessel import Vessel
 # what makes a force model wrong before what it only has to do without
 _SERIOUS = (
     "frame", "sign", "unit", "clock_offset", "heading_bias", "lever_arm", "time_format",
-    "duplicate_time", "position_jump", "heading_wrap", "position_hold",
-    "stuck", "nan", "outlier", "gap", "quantised",
+    "duplicate_time", "position_jump", "heading_wrap", "external_force", "position_hold",
+    "stuck", "nan", "outlier", "gap", "quantised", "actuator",
 )  # fmt: skip
 _SHOWN = {
     "gap": "The signal with its holes shaded, the longest hole closer, and the time from each "
@@ -65,6 +66,10 @@ _SHOWN = {
     "clock_offset": "Velocities as logged and from positions and heading where they differ "
     "most, above as logged and below shifted; beside them their disagreement against the "
     "shift, with the estimate and its interval.",
+    "actuator": "Command, feedback and what was fitted, over the minute in which the command "
+    "moves most.",
+    "external_force": "The speed that thrusters and damping leave unexplained, and the size of the "
+    "thrust, with the stretch shaded.",
     "lever_arm": "Velocities as logged and from positions and heading, above as logged and "
     "below with the positions moved; beside them their disagreement against the rate of turn, "
     "with the slope that the arm makes.",
@@ -198,6 +203,10 @@ def _drawn(finding: Finding, report: CheckReport, vessel: Vessel) -> tuple[Figur
         return stuck_figure(finding, recording), ""
     if finding.id == "quantised":
         return coarse_figure(finding), ""
+    if finding.id == "actuator":
+        return actuator_figure(finding), ""
+    if finding.id == "external_force":
+        return force_figure(finding), ""
     if "limit" in picture:
         return range_figure(finding), ""
     if "air" in picture:

@@ -40,7 +40,7 @@ _LENGTHS = (15.0, 30.0, 60.0, 120.0)
 # left to compare with
 _LEAST_SECONDS, _LEAST_STRETCHES = 240.0, 6.0
 # chance of a false finding that is aimed at, and stretches that count for one of a scan
-_LEVEL, _OVERLAP = 0.005, 3.0
+_LEVEL, _OVERLAP = 5e-4, 3.0
 # part of the stretches below which lies the usual, and mean excess over it of two normal deviates
 _TAIL, _NORMAL_EXCESS = 0.75, 0.5
 # a remainder has longer tails than a normal one: its size is not taken for smaller than this
@@ -153,9 +153,8 @@ def _make_log(number: int, recording: Recording, vessel: Vessel) -> _Log | str:
     missing = [c for c in (*names, *vessel.commands) if c not in recording]
     if missing:
         return f"there is no {', '.join(missing)}"
-    airy = all(c in recording for c in _AIR)
-    motion = make_motion(recording, (*names, *_AIR) if airy else names)
-    if motion is None:
+    motion = make_motion(recording, (*names, *(n for n in _AIR if n in recording)))
+    if motion is None or not all(n in motion for n in names):
         return f"too few samples of {', '.join(names)} overlap"
     motion = _body_motion(motion)
     inputs = {}
@@ -172,7 +171,7 @@ def _make_log(number: int, recording: Recording, vessel: Vessel) -> _Log | str:
     known = [u, v, r, *(a * b for a, b in combinations((u, v, r), 2))]
     known += [x * np.abs(x) for x in (u, v, r)]
     known += [np.abs(v) * r, np.abs(r) * v]
-    if airy:
+    if all(n in motion for n in _AIR):
         along, across = motion["u_q"], motion["v_q"]
         known += [along * np.abs(along), across * np.abs(across), along * across]
     north, east = np.cos(motion["psi"]), np.sin(motion["psi"])

@@ -84,11 +84,11 @@ def find_offsets(logs: Sequence[Tied], vessel: Vessel) -> list[tuple[list[Findin
 
 
 def _campaigns(logs: Sequence[Tied], ties: Sequence[Tie], vessel: Vessel) -> list[Campaign]:
-    prior, near, material = expected(vessel), expected(vessel, near=True), least(vessel)
+    prior, material = expected(vessel), least(vessel)
     first = []
     for tie in ties:
-        first.append(expand(tie, search(tie, coarse_tie(tie), near)))
-    pooled, splits = pool(first, near, material)
+        first.append(expand(tie, search(tie, coarse_tie(tie), prior)))
+    pooled, splits = pool(first, prior, material)
     evidence: list[Evidence] = list(first)
     for campaign in pooled:
         for i in campaign.logs:

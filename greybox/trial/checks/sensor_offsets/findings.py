@@ -39,10 +39,10 @@ from greybox.vessel.vessel import Vessel
 Array = NDArray[np.float64]
 
 IDS = ("clock_offset", "lever_arm", "heading_bias")
-# beyond these nothing can be said
+# beyond these nothing can be said: [rad], [s], [m] and share of the length
 _VAGUE_HEADING = np.radians(1.0)
 _VAGUE_CLOCK = 0.3
-_VAGUE_ARM = 0.5
+_VAGUE_ARM = (0.5, 0.15)
 _OWN_CLOCKS = (("psi",), ("r",), POSITIONS, ("u", "v"))
 # in log-likelihood: a log that prefers one of two rivals by this can tell them apart
 _TELLS = 3.0
@@ -102,7 +102,7 @@ def campaign_findings(campaign: Campaign, vessel: Vessel) -> tuple[list[Finding]
         else:
             finding = _arm_finding(d, antenna)
         findings.append(_judged(finding, d, campaign, vessel))
-    return findings, _outcomes(campaign, told)
+    return findings, _outcomes(campaign, told, vessel)
 
 
 @dataclass(frozen=True)
@@ -328,7 +328,7 @@ def _differs(d: Defect, pooled: Pooled) -> bool:
     return bool(pooled.differing[rows].any())
 
 
-def _outcomes(campaign: Campaign, told: list[Defect]) -> list[Outcome]:
+def _outcomes(campaign: Campaign, told: list[Defect], vessel: Vessel) -> list[Outcome]:
     """Say for each id what its standard error would allow to see."""
     information = np.asarray(np.linalg.inv(campaign.pooled.covariance), dtype=np.float64)
     basis = campaign.best.hypothesis.basis
@@ -352,7 +352,7 @@ def _outcomes(campaign: Campaign, told: list[Defect]) -> list[Outcome]:
     span = np.degrees(campaign.turned_over)
     if "lever_arm" not in found:
         std = _error(information, basis, np.eye(SIZE)[:, ARM])
-        vague = float(np.max(std)) > _VAGUE_ARM
+        vague = float(np.max(std)) > min(_VAGUE_ARM[0], _VAGUE_ARM[1] * vessel.length)
         said = (
             f"the heading turns too little ({span:.0f} deg): standard error "
             f"{float(np.max(std)):.2g} m"

@@ -22,10 +22,9 @@ _MOST_ARM = 0.8
 MOST_LATE = 5.0
 # logs that differ by less than so many times what matters may do so by misfit: one campaign
 CAMPAIGN = 5.0
-# what is expected before a log is read, standard deviations: [s], [ship lengths], [rad]; the tie
-# is expanded within the near ones, so that what a log cannot tell stays near nothing
-_PRIOR = (10.0, 2.0, np.pi)
-_NEAR = (2.0, 0.3, 0.15)
+# what is expected before a log is read, standard deviations: [s], [ship lengths], [rad]; what a
+# log cannot tell stays near nothing, where noise alone would lead it astray
+_PRIOR = (2.0, 0.3, 0.15)
 
 
 def least(vessel: Vessel) -> Array:
@@ -46,11 +45,10 @@ def most_arm(vessel: Vessel) -> float:
     return _MOST_ARM * vessel.length
 
 
-def expected(vessel: Vessel, *, near: bool = False) -> Array:
+def expected(vessel: Vessel) -> Array:
     """Return what is expected of each offset and the inverse variance of that, (2, `SIZE`)."""
-    clock, arm, bias = _NEAR if near else _PRIOR
     std = np.empty(SIZE)
-    std[: len(CLOCKS)], std[ARM], std[BIAS] = clock, arm * vessel.length, bias
+    std[: len(CLOCKS)], std[ARM], std[BIAS] = _PRIOR[0], _PRIOR[1] * vessel.length, _PRIOR[2]
     centre = np.zeros(SIZE)
     centre[ARM] = vessel.sensors.get("antenna", (0.0, 0.0))[:2]
     return np.array([centre, std**-2])

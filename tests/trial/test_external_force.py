@@ -1,0 +1,158 @@
+"""Forces that the thrusters did not give: towed, pushed, held; and nothing on clean logs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from virtual import PARAMETERS
+
+from greybox.channels import CHANNELS
+from greybox.model.catalogue import get_structure
+from greybox.model.simulation import simulate
+from greybox.study.blind_sensors import gauss_markov
+from greybox.study.chapter6 import TRUE
+from greybox.study.inputs import smoothed_pulses
+from greybox.trial.checks.check import check_recording
+from greybox.trial.checks.external_force import force_findings
+from greybox.trial.log import make_log
+from greybox.trial.raw_log import Recording, Signal
+from greybox.trial.repair import apply_repairs
+from greybox.vessel.toml import load_vessel
+
+SECONDS, LENGTH, FINE = 1200, 60, 0.5
+VESSEL = load_vessel("thesis")
+
+
+def sailed(seed, share=0.0, *, fixed=False, gusts=0.0):
+    """One ship of the thesis, pushed for a minute by a share of the thrust at half speed.
+
+    Returns a recording at 2 Hz, and the start of the push [s].
+    """
+    structure, rng = get_structure("thesis"), np.random.default_rng([41, seed])
+    n = round(SECONDS / FINE)
+    hold, edge = (round(15 / FINE), round(60 / FINE)), round(5 / FINE)
+    commands = {
+        name: smoothed_pulses(rng, n, low, high, widths=hold, smoothing=edge)
+        for name, low, high in (("n", 4, 20), ("alpha1", -1.1, 1.1), ("alpha2", -1.1, 1.1))
+    }
+    tau = make_log(VESSEL, commands, FINE).forces(structure.inputs).copy()
+    known = {p: TRUE[p] for p in PARAMETERS}
+    theta = np.array(list(known.values())) * FINE
+    current, wind = rng.uniform(-0.3, 0.3, 2), rng.uniform(-5, 5, 2)
+    d = np.column_stack([np.tile(current, (n, 1)), wind + gauss_markov(rng, n, gusts, 20 / FINE)])
+    start, towards = int(rng.integers(60, SECONDS - LENGTH - 60)), rng.uniform(0, 2 * np.pi)
+
+    def run():
+        return simulate(structure, theta, np.array([1.5, 0.5, 0.0]), tau[:-1], FINE, d=d[:-1])
+
+    if share:
+        free = run()
+        half = 0.5 * np.quantile(np.abs(free.x[0][:, 0]), 0.95)
+        push = share * abs(known["Xu"] + known["Xuu"] * half) * half
+        rows = slice(round(start / FINE), round((start + LENGTH) / FINE))
+        angle = towards - (free.psi[0][rows] if fixed else 0.0)
+        tau[rows, structure.inputs.index("taux")] += push * np.cos(angle) / known["Xmu"]
+        tau[rows, structure.inputs.index("tauy")] += push * np.sin(angle) / known["Ymu"]
+    made = run()
+    noise = dict(zip(("u", "v", "r"), np.sqrt([2e-4] * 3), strict=True))
+    channels = {s: made.x[0][:, k] + noise[s] * rng.standard_normal(n) for k, s in enumerate("uvr")}
+    channels["psi"] = made.psi[0] + 0.01 * rng.standard_normal(n)
+    t = FINE * np.arange(n)
+    return Recording(
+        f"log{seed}",
+        tuple(
+            Signal(name, t, v, CHANNELS[name].unit if name in CHANNELS else None, name, True)
+            for name, v in (channels | commands).items()
+        ),
+    ), start
+
+
+def overlap(finding, start):
+    low, high = finding.repair[0].interval
+    return min(high, start + LENGTH) - max(low, start)
+
+
+@pytest.mark.parametrize("fixed", [False, True])
+def test_a_push_is_found_where_it_acts_and_nowhere_else(fixed):
+    for seed in range(4):
+        recording, start = sailed(seed, 0.2, fixed=fixed)
+        ((finding,),), _ = force_findings([recording], VESSEL)
+        assert finding.id == "external_force"
+        assert not finding.safe
+        assert overlap(finding, start) > 0.5 * LENGTH
+        assert finding.ci[0] < finding.value < finding.ci[1]
+
+
+def test_clean_logs_have_no_finding_alone_and_together():
+    recordings = [sailed(seed)[0] for seed in range(10, 16)]
+    found, told = force_findings(recordings, VESSEL)
+    assert not any(found)
+    assert told == [None] * 6
+    for recording in recordings:
+        assert force_findings([recording], VESSEL) == ([[]], [None])
+
+
+def test_the_stretch_is_left_out_where_the_user_says_so():
+    recording, _ = sailed(2, 0.3)
+    (found,), _ = force_findings([recording], VESSEL)
+    left = apply_repairs(recording, found)
+    low, high = found[0].repair[0].interval
+    assert not ((left["u"].t > low) & (left["u"].t < high)).any()
+    assert len(left["u"]) > 0.85 * len(recording["u"])
+    (again,), _ = force_findings([left], VESSEL)
+    assert not again
+
+
+def test_a_ship_that_is_held_is_told_so():
+    """Aground for 80 s: thrust ahead, and no speed."""
+    log, _ = sailed(20)
+    t, rng = log["u"].t, np.random.default_rng(5)
+    held = (t > 600) & (t < 680)
+    level = {"n": 15.0, "alpha1": 0.0, "alpha2": 0.0}
+    signals = []
+    for s in log.signals:
+        value = s.value.copy()
+        if s.name in ("u", "v", "r"):
+            value[held] = 0.014 * rng.standard_normal(held.sum())
+        value[held] = level.get(s.name, value[held])
+        signals.append(s.with_value(value))
+    (found,), _ = force_findings([Recording("held", tuple(signals))], VESSEL)
+    assert any("aground" in f.evidence and 590 < f.repair[0].interval[0] < 680 for f in found)
+
+
+def test_a_velocity_that_jumps_and_comes_back_is_no_force():
+    log, _ = sailed(21)
+    jump = 0.5 * ((log["u"].t > 500) & (log["u"].t < 506))
+    signals = tuple(s.with_value(s.value + jump) if s.name == "u" else s for s in log.signals)
+    assert force_findings([Recording("jumps", signals)], VESSEL) == ([[]], [None])
+
+
+def test_a_log_without_thrusters_or_too_short_cannot_tell():
+    log, _ = sailed(22)
+    bare = log.with_signals(s for s in log.signals if s.name != "n")
+    _, (told,) = force_findings([bare], VESSEL)
+    assert (told.status, " n" in told.sentence) == ("cannot tell", True)
+    short = log.with_signals(Signal(s.name, s.t[:300], s.value[:300], s.unit) for s in log.signals)
+    _, (told,) = force_findings([short], VESSEL)
+    assert told.status == "cannot tell"
+
+
+def test_a_push_is_not_taken_for_a_sign_or_a_clock():
+    recording, start = sailed(1, 0.3)
+    (found,) = check_recording(recording, VESSEL).findings
+    assert found.id == "external_force"
+    assert overlap(found, start) > 0.5 * LENGTH
+
+
+@pytest.mark.long
+def test_a_fifth_of_the_thrust_is_found_and_clean_logs_are_clean():
+    """60 ships each: at least 95 % found, at most 2 % false, within three standard errors."""
+    hits = false = 0
+    for seed in range(60):
+        recording, start = sailed(100 + seed, 0.2, fixed=bool(seed % 2))
+        (found,), _ = force_findings([recording], VESSEL)
+        hits += any(overlap(f, start) > 0.3 * LENGTH for f in found)
+        (found,), _ = force_findings([sailed(200 + seed, gusts=2.0 * (seed % 2))[0]], VESSEL)
+        false += bool(found)
+    assert hits / 60 > 0.95 - 3 * np.sqrt(0.95 * 0.05 / 60)
+    assert false / 60 < 0.02 + 3 * np.sqrt(0.02 * 0.98 / 60)
