@@ -19,7 +19,7 @@ from greybox.trial.raw_log import Recording, Signal
 from greybox.trial.repair import apply_repairs
 from greybox.vessel.toml import load_vessel
 
-SECONDS, LENGTH, FINE = 1200, 60, 0.5
+SECONDS, LENGTH, FINE, WIND = 1200, 60, 0.5, 5.0
 VESSEL = load_vessel("thesis")
 
 
@@ -33,12 +33,12 @@ def sailed(seed, share=0.0, *, fixed=False, gusts=0.0):
     hold, edge = (round(15 / FINE), round(60 / FINE)), round(5 / FINE)
     commands = {
         name: smoothed_pulses(rng, n, low, high, widths=hold, smoothing=edge)
-        for name, low, high in (("n", 4, 20), ("alpha1", -1.1, 1.1), ("alpha2", -1.1, 1.1))
+        for name, low, high in (("n", 4, 20), ("alpha1", -0.5, 0.5), ("alpha2", -0.5, 0.5))
     }
     tau = make_log(VESSEL, commands, FINE).forces(structure.inputs).copy()
     known = {p: TRUE[p] for p in PARAMETERS}
     theta = np.array(list(known.values())) * FINE
-    current, wind = rng.uniform(-0.3, 0.3, 2), rng.uniform(-5, 5, 2)
+    current, wind = rng.uniform(-0.2, 0.2, 2), WIND * rng.uniform(-1, 1, 2)
     d = np.column_stack([np.tile(current, (n, 1)), wind + gauss_markov(rng, n, gusts, 20 / FINE)])
     start, towards = int(rng.integers(60, SECONDS - LENGTH - 60)), rng.uniform(0, 2 * np.pi)
 
