@@ -57,9 +57,9 @@ _RIDGE = 1e-6
 _OWN = 7
 # variance that the fit may add to that of a stretch: beyond, the rest of the logs does not tell
 # how the ship moves there
-_EXTRAPOLATION = 1.0
+_EXTRAPOLATION = 2.0
 # time beside a force within which a jump of a sensor goes back [s], and which share of it
-_TAKEN_BACK, _TAKEN_SHARE = 16.0, 0.5
+_TAKEN_BACK, _TAKEN_SHARE = 16.0, 0.15
 # a force that acts in more than this share of a log cannot be told from a steady one
 _LONGEST_SHARE = 1 / 3
 
