@@ -16,7 +16,10 @@ EXAMPLES = """examples:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("logs", nargs="+", metavar="LOG", help="logs, or raw files of any format")
+    parser.add_argument(
+        "logs", nargs="+", metavar="LOG",
+        help="logs, or raw files of any format; those of one ship are judged together",
+    )  # fmt: skip
     parser.add_argument("--vessel", required=True, metavar="V", help="vessel file (TOML)")
     parser.add_argument("--json", metavar="F", help="write the findings as JSON; - is stdout")
     parser.add_argument("--report", metavar="HTML", help="write a page with a picture per finding")
@@ -29,6 +32,7 @@ def run(options: argparse.Namespace) -> None:
 
     from greybox.files import check_targets, write_json
     from greybox.trial.checks.check import check_files
+    from greybox.trial.checks.finding import shared_findings
     from greybox.trial.repair import apply_repairs
     from greybox.trial.trial_summary import Contents, describe_recording
     from greybox.vessel.toml import load_vessel
@@ -58,8 +62,12 @@ def run(options: argparse.Namespace) -> None:
 
         check_page(reports, [Path(p) for p in options.logs], vessel, options.report, record)
     if options.json != "-":
+        shared = shared_findings(reports)
+        for finding in shared:
+            say(f"{len(finding.logs)} of {len(reports)} logs: {', '.join(finding.logs)}")
+            say(indent(finding.summary(), "  "))
         for report, holds in zip(reports, contents, strict=True):
-            say(report.summary())
+            say(report.summary_beside(shared))
             if holds.summary():
                 say(indent(holds.summary(), "  "))
         if options.report:

@@ -10,23 +10,32 @@ from greybox.commands.common import positive, provenance, say
 if TYPE_CHECKING:
     from greybox.trial.convert.options import ImportOptions
 
-HELP = "make a log of raw files: CSV, Parquet, NMEA 0183, MATLAB, ROS bags, MCAP"
+HELP = "make logs of raw files: CSV, Parquet, NMEA 0183, MATLAB, ROS bags, MCAP"
 EXAMPLES = """examples:
   greybox import trial.nmea --vessel ship.toml --out trial.csv
   greybox import gnss.nmea thrusters.csv --vessel ship.toml --sample-time 0.5 --out trial.parquet
   greybox import raw.csv --vessel ship.toml --fix --out trial.csv --note draught="1.2 m"
   greybox import raw.csv --vessel ship.toml --smooth r=2 --smooth psi=1 --out trial.csv
+  greybox import trials/*.csv --vessel ship.toml --fix --out logs/
 
-Files of one trial are merged on their clocks. Columns are found by the vessel file's
-[columns], by canonical name, or guessed; every guess is stated. Gaps stay gaps.
+Files of one trial are merged on their clocks; where --out is a folder, each file becomes a log.
+Columns are found by the vessel file's [columns], by canonical name, or guessed; every guess is
+stated. Gaps stay gaps.
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("raw", nargs="+", metavar="RAW", help="raw files of one trial")
+    parser.add_argument(
+        "raw", nargs="+", metavar="RAW", help="raw files of one trial, or of one each: see --out"
+    )
     parser.add_argument("--vessel", required=True, metavar="V", help="vessel file (TOML)")
-    parser.add_argument("--out", required=True, metavar="LOG", help="log, .csv or .parquet")
+    parser.add_argument(
+        "--out",
+        required=True,
+        metavar="LOG",
+        help="log, .csv or .parquet; or a folder, for one log a file, judged together by --fix",
+    )
     parser.add_argument(
         "--sample-time",
         type=positive,
@@ -48,6 +57,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         metavar="ID",
         help="mend this finding too although it needs your judgement, such as heading_bias",
+    )
+    parser.add_argument(
+        "--fix-not",
+        action="append",
+        default=[],
+        metavar="ID",
+        help="leave this finding as it is although --fix would mend it (repeat)",
     )
     parser.add_argument(
         "--velocities",
@@ -105,17 +121,22 @@ def run(options: argparse.Namespace) -> None:
 
     from greybox.errors import UsageError, suggestion
     from greybox.files import check_targets, write_json
-    from greybox.trial.import_files import import_files
+    from greybox.trial.import_files import LOG_SUFFIXES, import_files, is_folder, targets
     from greybox.trial.store import read_record, record_path
     from greybox.vessel.conditions import UNITS
     from greybox.vessel.toml import load_vessel
 
-    if Path(options.out).suffix.lower() not in ("", ".csv", ".parquet", ".pq"):
+    folder = is_folder(options.raw, options.out)
+    if not folder and Path(options.out).suffix.lower() not in ("", *LOG_SUFFIXES):
         raise UsageError(
             f"--out {options.out} ends in '{Path(options.out).suffix}': name a log that ends in "
             f".csv or .parquet."
         )
-    check_targets(options.out, record_path(options.out), options.json)
+    logs = targets(options.raw, options.out) if folder else [Path(options.out)]
+    if folder:
+        check_targets(options.json)
+    else:
+        check_targets(options.out, record_path(options.out), options.json)
     vessel = load_vessel(options.vessel)
     summary = import_files(
         options.raw,
@@ -124,18 +145,21 @@ def run(options: argparse.Namespace) -> None:
         import_options(options),
         fix=options.fix,
         fix_also=tuple(options.fix_also),
+        fix_not=tuple(options.fix_not),
         reader={"topics": pairs(options.topic, "--topic", empty=True)} if options.topic else {},
         extra=provenance(options),
     )
     if options.json:
-        record: Any = read_record(Path(options.out))
-        write_json(record, options.json)
+        records: list[Any] = [read_record(log) for log in logs]
+        write_json({"logs": records} if folder else records[0], options.json)
     if options.json != "-":
         say(summary)
         for key in pairs(options.note, "--note"):
             if key not in UNITS and (near := suggestion(key, UNITS)):
                 say(f"note: '{key}' is kept in words, as no condition.{near}")
-        say(f"wrote {options.out} and {record_path(options.out).name}")
+        written = ", ".join(str(log) for log in logs)
+        beside = "its record" if len(logs) == 1 else "their records"
+        say(f"wrote {written} and {record_path(logs[0]).name if not folder else beside}")
 
 
 def import_options(options: argparse.Namespace) -> ImportOptions:

@@ -16,7 +16,7 @@ from greybox.channels import CHANNELS
 from greybox.diagnosis.causes import Cause
 from greybox.diagnosis.result import Found, Quantity
 from greybox.errors import GreyboxError
-from greybox.trial.checks.check import check_recording
+from greybox.trial.checks.check import check_recordings
 from greybox.trial.checks.finding import Finding
 from greybox.trial.log import TrialLog
 from greybox.trial.raw_log import Recording, Signal
@@ -43,22 +43,18 @@ def kinematic_findings(logs: Sequence[TrialLog]) -> list[Finding]:
     """Return what the logs prove themselves: lever arms, heading biases, reversed motions.
 
     Clocks of what forces act on, and thrusters, are left to the force model, which sees
-    them more sharply. Several logs must agree; the first one's values are taken.
+    them more sharply. Several logs are judged together and must all have it; the first one's
+    values are taken.
     """
-    each: list[list[Finding]] = []
-    for log in logs:
-        if not set(_POSITIONS) <= log.channels.keys():
-            return []
-        try:
-            report = check_recording(recording_of(log), log.vessel)
-        except GreyboxError:
-            return []
-        each.append([f for f in report.findings if _kinematic(f)])
-        if not each[-1]:
-            return []
-    ids = [{f.id for f in found} for found in each]
-    shared = set.intersection(*ids) if ids else set()
-    return [f for f in each[0] if f.id in shared] if each else []
+    if not logs or not all(set(_POSITIONS) <= log.channels.keys() for log in logs):
+        return []
+    try:
+        reports = check_recordings([recording_of(log) for log in logs], logs[0].vessel)
+    except GreyboxError:
+        return []
+    each = [[f for f in report.findings if _kinematic(f)] for report in reports]
+    shared = set.intersection(*({f.id for f in found} for found in each))
+    return [f for f in each[0] if f.id in shared]
 
 
 def _kinematic(finding: Finding) -> bool:

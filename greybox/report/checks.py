@@ -17,18 +17,21 @@ from greybox.report.check_rows import (
     coarse_figure,
     fractions_figure,
     gap_figure,
+    hold_figure,
+    jump_figure,
     missing_figure,
     order_figure,
     range_figure,
     signals_figure,
     spike_figure,
     stuck_figure,
+    wrap_figure,
 )
 from greybox.report.check_ties import make_tie, tie_figure
 from greybox.report.figures import to_svg
 from greybox.report.log import facts, page_figures
 from greybox.report.page import Page, Picture, Section, Table, computed, write_page
-from greybox.trial.checks.finding import CheckReport, Finding, size_in_words
+from greybox.trial.checks.finding import CheckReport, Finding, shared_findings, size_in_words
 from greybox.trial.convert.convert import import_recording
 from greybox.trial.log import TrialLog
 from greybox.trial.raw_log import Recording
@@ -37,8 +40,8 @@ from greybox.vessel.vessel import Vessel
 # what makes a force model wrong before what it only has to do without
 _SERIOUS = (
     "frame", "sign", "unit", "clock_offset", "heading_bias", "lever_arm", "time_format",
-    "duplicate_time",
-    "external_force", "stuck", "nan", "outlier", "gap", "quantised", "actuator",
+    "duplicate_time", "position_jump", "heading_wrap", "external_force", "position_hold",
+    "stuck", "nan", "outlier", "gap", "quantised", "actuator",
 )  # fmt: skip
 _SHOWN = {
     "gap": "The signal with its holes shaded, the longest hole closer, and the time from each "
@@ -50,6 +53,12 @@ _SHOWN = {
     "nan": "The signal with the samples that hold no number shaded, and the longest stretch "
     "closer.",
     "outlier": "The whole signal with its outliers circled, and the largest one closer.",
+    "heading_wrap": "The heading as recorded with the samples between the two sides of its wrap "
+    "circled, closer around the first, and the same without them, unwrapped.",
+    "position_hold": "A coordinate with its repeated samples circled, the longest hold closer, and "
+    "the way from sample to sample.",
+    "position_jump": "The coordinate that jumps most, closer around the jump, and the track before "
+    "and after it.",
     "stuck": "The whole signal, the time in which it repeats one value closer, and a channel "
     "that moves meanwhile.",
     "quantised": "The whole signal, its steps closer, and how many steps it changes by from "
@@ -106,7 +115,8 @@ def check_page(
     made["method"] = (
         "kinematics before any force model: single signals first, then which reading of the "
         "columns makes positions, heading, velocities and yaw rate agree (likelihood of a "
-        "random walk with sensor noise), then clocks, antenna and heading together"
+        "random walk with sensor noise), then clocks, antenna and heading together; what belongs "
+        "to the instruments is estimated over all logs at once"
     )
     made["pictures"] = (
         "velocities from positions are derivatives after a Gaussian smoothing that the logged "
@@ -131,9 +141,12 @@ def headline(reports: Sequence[CheckReport]) -> str:
         vague = f"; nothing can be said of {', '.join(open_ids)}" if open_ids else ""
         return f"No findings in {logs}{vague}."
     finding, report = min(found, key=_rank)
-    count = f"{len(found)} finding" + "s" * (len(found) != 1)
-    where = f" ({report.name})" if len(reports) > 1 else ""
-    lead = "the most serious" if len(found) > 1 else "namely"
+    several = {f.key for f in shared_findings(reports)}
+    each = sum(f.key not in several for f, _ in found) + len(several)
+    count = f"{each} finding" + "s" * (each != 1)
+    name = f"{len(finding.logs)} logs together" if finding.key in several else report.name
+    where = f" ({name})" if len(reports) > 1 else ""
+    lead = "the most serious" if each > 1 else "namely"
     return f"{count} in {logs}; {lead}{where}: {finding.evidence}."
 
 
@@ -180,6 +193,12 @@ def _drawn(finding: Finding, report: CheckReport, vessel: Vessel) -> tuple[Figur
         return missing_figure(finding, recording), ""
     if finding.id == "outlier":
         return spike_figure(finding), ""
+    if finding.id == "heading_wrap":
+        return wrap_figure(finding), ""
+    if finding.id == "position_hold":
+        return hold_figure(finding), ""
+    if finding.id == "position_jump":
+        return jump_figure(finding), ""
     if finding.id == "stuck":
         return stuck_figure(finding, recording), ""
     if finding.id == "quantised":

@@ -1,15 +1,17 @@
-"""Importing the raw files of a trial: read, merged, mended where asked, written as one log."""
+"""Importing raw files: read, merged or judged together, mended where asked, written as logs."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from greybox.errors import LogError
 from greybox.trial.checks.actuators import measure_actuators
-from greybox.trial.checks.check import check_recording
+from greybox.trial.checks.check import check_recordings
 from greybox.trial.convert.channel_mapping import read_trial
 from greybox.trial.convert.convert import Imported, import_recording
 from greybox.trial.convert.derived_signals import derive_signals
@@ -19,9 +21,12 @@ from greybox.trial.log import TrialLog
 from greybox.trial.raw_log import Recording
 from greybox.trial.readers.formats import open_raw
 from greybox.trial.readers.topic_files import TopicTable
-from greybox.trial.repair import repair
+from greybox.trial.repair import check_ids, repair
 from greybox.trial.store import record_path, write_log
 from greybox.vessel.vessel import Vessel
+
+# a log has one of these names; any other is a folder where several files are imported
+LOG_SUFFIXES = (".csv", ".parquet", ".pq")
 
 
 def import_files(
@@ -32,23 +37,29 @@ def import_files(
     *,
     fix: bool = False,
     fix_also: tuple[str, ...] = (),
+    fix_not: tuple[str, ...] = (),
     reader: Mapping[str, Any] | None = None,
     extra: Mapping[str, Any] | None = None,
 ) -> str:
-    """Import the raw files of one trial into one log file.
+    """Import raw files into one log, or each into a log of a folder.
 
     Parameters
     ----------
     paths : sequence of str or Path
-        Raw files; several are merged on their clocks.
+        Raw files: of one trial, merged on their clocks; where `out` is a folder, each
+        of a trial of its own.
     vessel : Vessel
     out : str or Path
-        CSV or Parquet; its record is written beside it.
+        CSV or Parquet, its record is written beside it; or a folder, see `is_folder`, for one
+        log a file, ``<stem>.csv``.
     options : ImportOptions
     fix : bool
-        Whether to mend what the checks find and what is safe to mend.
+        Whether to mend what the checks find and what is safe to mend. The logs of a
+        folder are judged together: what belongs to the instruments is mended alike.
     fix_also : tuple of str
         Ids of findings to mend although they need judgement.
+    fix_not : tuple of str
+        Ids of findings to leave.
     reader : mapping, optional
         Handed to the readers, such as ``topics``.
     extra : mapping, optional
@@ -62,11 +73,96 @@ def import_files(
     Raises
     ------
     LogError
-        A file cannot be read, or no log can be made of them.
+        A file cannot be read, or no log can be made of them; then nothing is written.
     """
+    check_ids(fix_also, fix_not)
     options = options or ImportOptions()
-    _keep_sources(paths, out)
-    if len(paths) == 1 and not fix and not fix_also and Path(paths[0]).is_file():
+    mending = fix or bool(fix_also)
+    folder = Path(out) if is_folder(paths, out) else None
+    if folder is None:
+        trials = [(list(paths), Path(out))]
+    else:
+        trials = [([path], target) for path, target in zip(paths, targets(paths, out), strict=True)]
+    for path in paths:
+        _keep_source(path, [target for _, target in trials])
+    summaries = []
+    with _all_or_none(folder, [target for _, target in trials]):
+        if not mending:
+            for files, target in trials:
+                summaries.append(_import_trial(files, vessel, target, options, reader, extra))
+        else:
+            recordings = [read_trial(files, vessel, **(reader or {})) for files, _ in trials]
+            reports = check_recordings(recordings, vessel)
+            while recordings:
+                recording, (_, target) = recordings.pop(0), trials[len(summaries)]
+                mended, fixed, left = repair(
+                    recording, vessel, reports[len(summaries)], also=fix_also, without=fix_not
+                )
+                lines = [f"mended: {n}" for n in fixed] + [f"left as it is: {n}" for n in left]
+                summaries.append(_write(mended, vessel, target, options, extra, lines))
+    return "\n".join(summaries)
+
+
+def is_folder(paths: Sequence[str | Path], out: str | Path) -> bool:
+    """Whether `out` names a folder: one that exists, ends in a slash, or has several files."""
+    if Path(out).is_dir() or str(out).endswith(("/", os.sep)):
+        return True
+    return len(paths) > 1 and Path(out).suffix.lower() not in LOG_SUFFIXES
+
+
+def targets(paths: Sequence[str | Path], out: str | Path) -> list[Path]:
+    """Return the log of each raw file in a folder.
+
+    Raises
+    ------
+    LogError
+        Two files would make one log.
+    """
+    found: dict[Path, str | Path] = {}
+    for path in paths:
+        target = Path(out) / f"{Path(path).stem}.csv"
+        if target in found:
+            raise LogError(
+                f"'{found[target]}' and '{path}' would both become '{target}': rename one of "
+                f"them, or import them into two folders."
+            )
+        found[target] = path
+    return list(found)
+
+
+@contextmanager
+def _all_or_none(folder: Path | None, logs: Sequence[Path]) -> Iterator[None]:
+    """Make a folder of logs, and take back what is new where one of them cannot be made."""
+    if folder is None:
+        yield
+        return
+    if not folder.absolute().parent.is_dir():
+        raise LogError(
+            f"cannot make the folder '{folder}': there is no folder '{folder.parent}' to make it "
+            f"in. Name a folder in one that exists."
+        )
+    made = not folder.exists()
+    new = [p for log in logs for p in (log, record_path(log)) if not p.exists()]
+    folder.mkdir(exist_ok=True)
+    try:
+        yield
+    except BaseException:
+        for path in new:
+            path.unlink(missing_ok=True)
+        if made:
+            folder.rmdir()
+        raise
+
+
+def _import_trial(
+    paths: Sequence[str | Path],
+    vessel: Vessel,
+    out: Path,
+    options: ImportOptions,
+    reader: Mapping[str, Any] | None,
+    extra: Mapping[str, Any] | None,
+) -> str:
+    if len(paths) == 1 and Path(paths[0]).is_file():
         table = open_raw(paths[0], **(reader or {}))
         # axes that only the other signals tell need all of them
         unsure = isinstance(table, TopicTable) and bool(table.unsure)
@@ -84,11 +180,17 @@ def import_files(
                 [f"note: {n}" for n in notes],
             )
     recording = read_trial(paths, vessel, **(reader or {}))
-    fixed: tuple[str, ...] = ()
-    left: list[str] = []
-    if fix or fix_also:
-        report = check_recording(recording, vessel)
-        recording, fixed, left = repair(recording, vessel, report, also=fix_also)
+    return _write(recording, vessel, out, options, extra, [])
+
+
+def _write(
+    recording: Recording,
+    vessel: Vessel,
+    out: Path,
+    options: ImportOptions,
+    extra: Mapping[str, Any] | None,
+    lines: list[str],
+) -> str:
     imported = _with_actuators(import_recording(recording, vessel, options), recording, vessel)
     write_log(imported.segments, out, extra=extra)
     first, last = imported.segments[0], imported.segments[-1]
@@ -97,10 +199,16 @@ def import_files(
         sum(len(s) for s in imported.segments),
         float(last.t[-1] - first.t[0]),
         len(imported.segments),
-        [f"note: {n}" for n in imported.notes]
-        + [f"mended: {n}" for n in fixed]
-        + [f"left as it is: {n}" for n in left],
+        [f"note: {n}" for n in imported.notes] + lines,
     )
+
+
+def _keep_source(path: str | Path, logs: Sequence[Path]) -> None:
+    """Refuse to write a log over a raw file: it could not be imported again."""
+    if Path(path).resolve() in {p.resolve() for log in logs for p in (log, record_path(log))}:
+        raise LogError(
+            f"'{Path(path).name}' is also the log to write: name another file for the log."
+        )
 
 
 def _with_actuators(imported: Imported, recording: Recording, vessel: Vessel) -> Imported:
@@ -113,16 +221,6 @@ def _with_actuators(imported: Imported, recording: Recording, vessel: Vessel) ->
     )
     told = tuple(f"actuator: {a.sentence}" for a in actuators)
     return replace(imported, segments=segments, notes=(*imported.notes, *told))
-
-
-def _keep_sources(paths: Sequence[str | Path], out: str | Path) -> None:
-    """Refuse to write the log over a raw file: it could not be imported again."""
-    targets = {Path(out).resolve(), record_path(out).resolve()}
-    for path in paths:
-        if Path(path).resolve() in targets:
-            raise LogError(
-                f"'{Path(path).name}' is also the log to write: name another file for the log."
-            )
 
 
 def _summary(

@@ -126,6 +126,17 @@ class Recording(Shown):
         """Names of the signals, in the order of the source."""
         return tuple(s.name for s in self.signals)
 
+    @property
+    def cuts(self) -> tuple[float, ...]:
+        """Times [s] at which positions begin anew: no stretch of the log reaches over them."""
+        times: list[float] = []
+        for step in self.steps:
+            if step.operation == "cut":
+                times += step.numbers("times")
+            elif step.operation == "shift" and "x_n" in step.channels:
+                times = [t - step.number("late") for t in times]
+        return tuple(sorted(set(times)))
+
     def summary(self) -> str:
         """Return the signals with units, times and ranges, and the notes, as text."""
         rows = [

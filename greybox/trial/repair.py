@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.errors import UsageError, suggestion
+from greybox.errors import LogError, UsageError, suggestion
 from greybox.rotation import body_to_ned, ned_to_body
 from greybox.trial.checks.finding import IDS, CheckReport, Finding
 from greybox.trial.convert.derived_signals import continuous, derive_signals
@@ -19,9 +19,19 @@ from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
 
+# a velocity is a difference, and its noise another one
+_LEAST_SAMPLES = 3
+# a channel has one clock, a heading one mounting, an antenna one place
+_ONCE = frozenset({"shift", "turn_heading", "move_antenna", "earth_to_body"})
+
 
 def repair(
-    recording: Recording, vessel: Vessel, report: CheckReport, *, also: tuple[str, ...] = ()
+    recording: Recording,
+    vessel: Vessel,
+    report: CheckReport,
+    *,
+    also: tuple[str, ...] = (),
+    without: tuple[str, ...] = (),
 ) -> tuple[Recording, tuple[str, ...], list[str]]:
     """Mend what is safe to mend.
 
@@ -33,6 +43,8 @@ def repair(
     report : CheckReport
     also : tuple of str
         Ids of findings to mend although they need judgement.
+    without : tuple of str
+        Ids of findings to leave although they are safe to mend.
 
     Returns
     -------
@@ -45,24 +57,91 @@ def repair(
     Raises
     ------
     UsageError
-        `also` names no id of a check.
+        `also` or `without` names no id of a check, or both name one.
+    LogError
+        Two mends contradict each other, or too little would be left.
     """
-    for name in also:
-        if name not in IDS:
-            raise UsageError(
-                f"there is no check '{name}'.{suggestion(name, IDS)} Checks: {', '.join(IDS)}."
-            )
-    wanted = [f for f in report.findings if f.repair and (f.safe or f.id in also)]
+    check_ids(also, without)
+    wanted = [
+        f for f in report.findings if f.repair and (f.safe or f.id in also) and f.id not in without
+    ]
     left = [
         f"{f.id} ({', '.join(f.channels or (f.channel,))}): {f.fix}"
         for f in report.findings
         if f not in wanted and f.id != "gap"
     ]
-    mended = apply_repairs(recording, wanted)
+    _refuse_contradictions(recording.name, wanted)
+    mended = _mended_in_turn(recording, wanted)
     fixed = tuple(
         f"{f.id} of {', '.join(f.channels or (f.channel,))}: {f.evidence}" for f in wanted
     )
     return mended, fixed, left
+
+
+def check_ids(also: tuple[str, ...], without: tuple[str, ...]) -> None:
+    """Refuse ids of no check, and those that are to be mended and left.
+
+    Raises
+    ------
+    UsageError
+        With the nearest id.
+    """
+    for name in (*also, *without):
+        if name not in IDS:
+            raise UsageError(
+                f"there is no check '{name}'.{suggestion(name, IDS)} Checks: {', '.join(IDS)}."
+            )
+    for name in also:
+        if name in without:
+            raise UsageError(f"'{name}' stands in --fix-also and in --fix-not: keep one of them.")
+
+
+def _refuse_contradictions(name: str, wanted: Sequence[Finding]) -> None:
+    """Refuse two different values of what a channel has one of."""
+    known: dict[tuple[str, str], tuple[Step, Finding]] = {}
+    for finding in wanted:
+        for step in finding.repair:
+            for channel in step.channels if step.operation in _ONCE else ():
+                before = known.setdefault((step.operation, channel), (step, finding))
+                if dict(before[0].parameters) != dict(step.parameters):
+                    ids = " and ".join(dict.fromkeys((before[1].id, finding.id)))
+                    raise LogError(
+                        f"two mends of {channel} in '{name}' contradict each other, "
+                        f"'{before[0].sentence}' and '{step.sentence}': leave one out by "
+                        f"--fix-not with {ids}, or change the log."
+                    )
+
+
+def _mended_in_turn(recording: Recording, wanted: Sequence[Finding]) -> Recording:
+    """Apply the repairs finding by finding; refuse one that leaves a channel too few samples."""
+    for finding in wanted:
+        had, mended = _beside(recording), apply_repairs(recording, [finding])
+        have = _beside(mended)
+        for channel in dict.fromkeys(c for s in finding.repair for c in s.channels):
+            if have.get(channel, 0) < _LEAST_SAMPLES <= had.get(channel, 0):
+                raise LogError(
+                    f"to mend '{finding.id}' of {channel} in '{recording.name}' would leave "
+                    f"{have.get(channel, 0)} of its {had[channel]} samples beside the other "
+                    f"channels, at least {_LEAST_SAMPLES} are needed: leave it out by --fix-not "
+                    f"{finding.id}, or look at the log."
+                )
+        recording = mended
+    return recording
+
+
+def _beside(recording: Recording) -> dict[str, int]:
+    """Return how many samples of each channel lie within the time that all channels cover."""
+    clocks = {}
+    for s in recording.signals:
+        t = s.t[np.isfinite(s.t) & np.isfinite(s.value)]
+        if len(t):
+            clocks[s.name] = t
+    if not clocks:
+        return {}
+    start = max(float(t.min()) for t in clocks.values())
+    stop = min(float(t.max()) for t in clocks.values())
+    found = {n: int(((t >= start) & (t <= stop)).sum()) for n, t in clocks.items()}
+    return found | {s.name: 0 for s in recording.signals if s.name not in clocks}
 
 
 def apply_repairs(recording: Recording, findings: Iterable[Finding]) -> Recording:
@@ -74,9 +153,10 @@ def apply_repairs(recording: Recording, findings: Iterable[Finding]) -> Recordin
         for step in f.repair
         if step not in recording.steps
     ]
-    if any(s.operation in _ON_DERIVED for s in steps):
-        recording = derive_signals(recording)
     for step in steps:
+        if step.operation in _ON_DERIVED:
+            # not before: what was interpolated across a wrap must go before it is unwrapped
+            recording = derive_signals(recording)
         recording = _ACTIONS[step.operation](recording, step)
     return recording.with_steps(*steps)
 
@@ -97,12 +177,20 @@ def _order(recording: Recording, step: Step) -> Recording:
     return recording.with_signals(out)
 
 
+def _cut(recording: Recording, step: Step) -> Recording:
+    """Return the recording as it is: its steps tell where it is cut."""
+    return recording
+
+
 def _drop(recording: Recording, step: Step) -> Recording:
     out = []
+    names: set[str] = set()
+    for n in step.channels:
+        names |= {n} if n in recording else set(_MEASURED_AS.get(n, ()))
     times = np.array(step.numbers("times"))
     shared: dict[tuple[int, bytes], Array] = {}
     for s in recording.signals:
-        if s.name in step.channels:
+        if s.name in names:
             keep = np.isfinite(s.value) & np.isfinite(s.t)
             if len(times):
                 keep &= ~np.isin(s.t, times)
@@ -195,10 +283,16 @@ def _heading_at(recording: Recording, t: Array) -> Array:
     return np.interp(t, psi.t[keep], continuous(psi.value[keep]))
 
 
+# what a channel is derived from, where a recording does not hold it yet
+_MEASURED_AS = {
+    "x_n": ("lat", "lon"), "y_n": ("lat", "lon"), "v_n": ("sog", "cog"), "v_e": ("sog", "cog"),
+    "u_q": ("V_q", "gamma_q", "dir_q"), "v_q": ("V_q", "gamma_q", "dir_q"),
+}  # fmt: skip
 _ACTIONS = {
-    "order": _order, "drop": _drop, "scale": _scale, "offset": _offset, "exchange": _exchange,
-    "shift": _shift, "turn_heading": _turn_heading, "earth_to_body": _earth_to_body,
-    "move_antenna": _move_antenna, "pad_fractions": _pad_fractions,
+    "order": _order, "drop": _drop, "cut": _cut, "scale": _scale, "offset": _offset,
+    "exchange": _exchange, "shift": _shift, "turn_heading": _turn_heading,
+    "earth_to_body": _earth_to_body, "move_antenna": _move_antenna,
+    "pad_fractions": _pad_fractions,
 }  # fmt: skip
 # these act on positions and unwrapped headings
 _ON_DERIVED = frozenset({"earth_to_body", "move_antenna", "shift", "turn_heading"})

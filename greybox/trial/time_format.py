@@ -24,8 +24,8 @@ _BETTER = 0.7
 _PLAIN = 0.1
 # by how many steps the better reading must be more even than rows put in order
 _EVENER = 0.5
-# without time going back, a stamp must be that far from even, against the clock's own scatter
-_OUTLYING = 8.0
+# without time going back, a stamp must be that much farther from even than any elsewhere
+_OUTLYING = 1.25
 _FITTING = 3.0
 # steps from which on one second may have but one wrong time, behind which nothing goes back [s]
 _SLOW = 0.09
@@ -144,7 +144,7 @@ def unpadded_numbers(t: Array) -> Unpadded:
     last = dict(zip(group.tolist(), falls.tolist(), strict=True))
     grid = _decimals(x)
     scatter = 1.4826 * float(np.median(np.abs(steps - usual)))
-    for k in _out_of_step(x, starts, stops, usual, scatter):
+    for k in _out_of_step(x, starts, stops, usual, grid):
         last.setdefault(k, int(starts[k]))
     # no nearer than stamps are rounded
     near = max(_FITTING * scatter, 0.05 * usual, 0.0 if grid is None else 2 * 10.0**-grid)
@@ -195,7 +195,7 @@ def _search(
     return found
 
 
-def _out_of_step(x: Array, starts: Rows, stops: Rows, usual: float, scatter: float) -> list[int]:
+def _out_of_step(x: Array, starts: Rows, stops: Rows, usual: float, grid: int | None) -> list[int]:
     """Return the seconds whose first time alone is far from the middle of its neighbours."""
     if usual < _SLOW:
         return []
@@ -204,12 +204,20 @@ def _out_of_step(x: Array, starts: Rows, stops: Rows, usual: float, scatter: flo
     around = np.zeros(len(x))
     around[1:-1] = x[2:] - x[:-2]
     # no step is missing there: what lies beside a hole is out of step too
-    whole = np.abs(around - 2 * usual) < max(_FITTING * scatter, 0.2 * usual)
-    far = whole & (off > max(_OUTLYING * scatter, 0.25 * usual))
+    whole = np.abs(around - 2 * usual) < 0.5 * usual
+    # beside a wrong time the right ones are out of step too
+    beside = np.unique(np.clip(starts[:, None] + np.arange(-1, 2), 0, len(x) - 1))
+    elsewhere = np.delete(np.where(whole, np.abs(off), 0.0), beside)
+    most = float(elsewhere.max(initial=0.0))
+    short = np.zeros(len(x), bool)
+    if grid is not None:
+        scaled = x * 10.0 ** (grid - 1)
+        short = np.abs(scaled - np.round(scaled)) < 1e-6 + np.abs(scaled) * 1e-15
+    # what lost a zero has a digit less than the others
+    times = 2 * _OUTLYING if grid is None else _OUTLYING
+    far = whole & (off > max(times * most, 0.25 * usual)) & (short | (grid is None))
     which = np.flatnonzero((starts > 0) & (stops - starts > 1) & far[starts])
-    others = int(far.sum()) - len(which)
-    # a clock that is late now and then at any place needs no other reason
-    return [] if others > 0.1 * len(which) else [int(k) for k in which]
+    return [int(k) for k in which]
 
 
 def _decimals(x: Array) -> int | None:

@@ -9,8 +9,10 @@ import pandas as pd
 import pytest
 
 from greybox.errors import LogError, VesselError
+from greybox.trial.convert.convert import import_recording
 from greybox.trial.convert.read import read_log, read_segments
 from greybox.trial.convert.sensor_corrections import correct_log
+from greybox.trial.dataframe import recording_from_pandas
 from greybox.trial.import_files import import_files
 from greybox.trial.log import make_log
 from greybox.trial.steps import mend
@@ -236,6 +238,15 @@ def test_a_corrected_log_is_not_merged_with_a_raw_one(tmp_path):
     import_files([tmp_path / "later.csv"], vessel, tmp_path / "log2.csv")
     import_files([tmp_path / "log.csv", tmp_path / "log2.csv"], vessel, out)
     np.testing.assert_allclose(read_log(out, vessel)["psi"], signals()["psi"] - 0.08, atol=1e-12)
+
+
+def test_a_frame_of_a_corrected_log_is_not_corrected_again(tmp_path):
+    vessel = ship(heading_bias=0.08, reversed=["r"])
+    log = read(signals(), tmp_path, vessel)
+    (again,) = import_recording(recording_from_pandas(log.to_pandas(), vessel), vessel).segments
+    for name in log.channels:
+        np.testing.assert_allclose(again[name], log[name], atol=1e-12)
+    assert again.provenance.steps == log.provenance.steps
 
 
 def test_only_the_signs_that_import_mended_are_left_to_it(tmp_path):

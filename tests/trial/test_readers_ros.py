@@ -22,11 +22,13 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from greybox.errors import LogError
+from greybox.trial.convert.channel_mapping import read_recording
 from greybox.trial.readers.limits import limits
 from greybox.trial.readers.ros import messages as rosmessages
 from greybox.trial.readers.ros.axes import compass_heading
 from greybox.trial.readers.ros.read import read_bag
 from greybox.trial.readers.ros.storage import Channel
+from greybox.vessel.toml import load_vessel
 
 ROS1 = get_typestore(Stores.ROS1_NOETIC)
 ROS2 = get_typestore(Stores.ROS2_HUMBLE)
@@ -289,6 +291,28 @@ def test_stamped_poses_and_twists(tmp_path):
         np.testing.assert_allclose(recording[name].value, value, err_msg=name)
     assert recording["gpsvel.linear.x"].value[0] == 4
     assert any("'map' is the world's" in n for n in recording.notes)
+
+
+def test_axes_in_the_frame_of_a_receiver_are_decided_by_the_data(tmp_path):
+    g = ROS2.types
+    speed = g["geometry_msgs/msg/TwistStamped"]
+    turn = g["geometry_msgs/msg/QuaternionStamped"]
+    rows = []
+    for k in range(60):
+        t = START + k
+        stamped = header(ROS2, t, "gnss")
+        # north at 1 m/s, east-north-up; the heading clockwise from north
+        rows += [
+            ("/velocity", t, speed(header=stamped, twist=twist(ROS2, 0.0, 1.0, 0.0))),
+            ("/heading", t, turn(header=stamped, quaternion=quaternion(ROS2, 0.1))),
+            ("/fix", t, fix(ROS2, t, lat=59.0 + k / 111_400)),
+        ]
+    bag = ros2(tmp_path / "b", rows)
+    assert read_bag(bag).unsure == {"u", "v", "psi"}
+    recording = read_recording(bag, load_vessel("thesis"))
+    np.testing.assert_allclose(recording["psi"].value, 0.1)
+    np.testing.assert_allclose(recording["v_n"].value, 1.0)
+    assert {s.parameters["axes"] for s in recording.steps} == {"east-north-up", "north-east-down"}
 
 
 def test_fixes_without_a_fix_are_counted_and_left_out(tmp_path):

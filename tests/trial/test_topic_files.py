@@ -322,6 +322,18 @@ def test_messages_without_a_fix_hold_no_position(tmp_path):
     assert np.flatnonzero(np.isnan(recording["lat"].value)).tolist() == list(range(10, 20))
 
 
+def test_what_is_no_place_on_earth_is_no_position(tmp_path):
+    table = topics(SHIP_RUN)["fix"]
+    table.loc[3, "latitude"] = np.inf
+    table.loc[5, "longitude"] = 1e9
+    paths = written(tmp_path, {"fix": table})
+    (log, *_) = import_recording(read_trial(paths, VESSEL), VESSEL).segments
+    assert np.abs(log["x_n"]).max() < 100
+    table["longitude"] = np.nan
+    with pytest.raises(LogError, match="no position"):
+        import_recording(read_trial(written(tmp_path, {"fix": table}), VESSEL), VESSEL)
+
+
 def two_files(folder, apart):
     t = SHIP_RUN["t"]
     motion = pd.DataFrame(
@@ -439,8 +451,15 @@ def log_of(texts, folder, as_date):
     else:
         times = [f"{w}.{p}" for w, p in texts]
     n = len(times)
-    x = np.cumsum(np.full(n, 0.1))
-    table = pd.DataFrame({"t": times, "x_n": x, "y_n": 0.0, "psi": 0.0, "u": 1.0, "v": 0.0})
+    rng = np.random.default_rng(0)
+    width = max(len(p) for _, p in texts)
+    t = np.array([float(f"{w}.{p:0>{width}}") for w, p in texts])
+    psi, u = 0.3 * np.sin(t / 7), 2 + 0.2 * np.sin(t / 5)
+    dt = np.diff(t, prepend=t[0])
+    columns = {"x_n": np.cumsum(u * np.cos(psi) * dt), "y_n": np.cumsum(u * np.sin(psi) * dt),
+               "psi": psi, "u": u, "v": 0 * t}  # fmt: skip
+    noisy = {c: x + rng.normal(size=n) * 1e-3 for c, x in columns.items()}
+    table = pd.DataFrame({"t": times, **noisy})
     (path,) = written(folder, {"log": table})
     return path
 
@@ -477,8 +496,10 @@ def test_numbers_are_mended_by_fix_and_named_without_it(tmp_path):
     assert "put in order; 2 times lack the leading zeros" in said
     import_files([path], PLAIN, tmp_path / "b.csv", fix=True)
     log = pd.read_csv(tmp_path / "b.csv")
-    assert len(log) == len(t)
-    np.testing.assert_allclose(np.diff(log["x_n"]), 0.1, atol=1e-9)
+    # the rate of turn costs the first and the last
+    assert len(log) == len(t) - 2
+    steps = np.hypot(np.diff(log["x_n"]), np.diff(log["y_n"]))
+    np.testing.assert_allclose(steps, 0.1, atol=0.02)
 
 
 def disturbed(kind, rng):

@@ -12,13 +12,15 @@ from greybox.trial.checks.course import course_findings
 from greybox.trial.checks.external_force import force_findings
 from greybox.trial.checks.finding import IDS, CheckReport, Finding, Outcome
 from greybox.trial.checks.frame_sign_unit import (
-    find_reading,
+    find_readings,
     frame_outcomes,
-    read,
     reading_findings,
 )
+from greybox.trial.checks.heading_wrap import wrap_findings
 from greybox.trial.checks.motion import Motion, make_motion
-from greybox.trial.checks.sensor_offsets.find import find_offsets
+from greybox.trial.checks.position_hold import hold_findings
+from greybox.trial.checks.position_jump import jump_findings
+from greybox.trial.checks.sensor_offsets.find import Tied, find_offsets
 from greybox.trial.checks.signal_quality import (
     angle_unit_findings,
     coarse_findings,
@@ -134,9 +136,12 @@ def _signal_quality(recording: Recording, vessel: Vessel) -> _Log:
     raw += time_findings(apply_repairs(recording, raw))
     raw += missing_findings(recording)
     raw += angle_unit_findings(recording, vessel)
+    # before the heading is unwrapped
+    raw += wrap_findings(apply_repairs(recording, raw))
     whole = derive_signals(apply_repairs(recording, raw))
     log = _Log(recording, raw, {}, whole)
-    measured = _independent(whole)
+    log.add(hold_findings(_independent(whole)))
+    measured = _independent(log.mended)
     log.add(
         [
             *stuck_findings(measured, vessel),
@@ -144,22 +149,27 @@ def _signal_quality(recording: Recording, vessel: Vessel) -> _Log:
             *coarse_findings(measured),
         ]
     )
+    log.add(jump_findings(_independent(log.mended)))
     log.motion = make_motion(_independent(log.mended))
     return log
 
 
 def _kinematics(logs: Sequence[_Log], vessel: Vessel) -> None:
     """Check what ties positions, heading, velocities and yaw rate of the logs together."""
+    motions = [log.motion for log in logs]
     for log in logs:
-        motion = log.motion
-        log.say(frame_outcomes(motion))
-        if motion is not None and (motion.positioned or motion.turned):
-            reading = find_reading(motion)
-            log.add(reading_findings(reading))
-            motion = read(motion, reading.changes)
-            found, said = find_offsets(motion, vessel)
-            log.findings += found
-            log.say(said)
+        log.say(frame_outcomes(log.motion))
+    usable = [i for i, m in enumerate(motions) if m is not None and (m.positioned or m.turned)]
+    readings = find_readings([m for i in usable if (m := motions[i]) is not None])
+    names = [logs[i].recorded.name for i in usable]
+    for i, reading in zip(usable, readings, strict=True):
+        logs[i].add(reading_findings(reading, names))
+        motions[i] = reading.motion
+    tied = [Tied(log.recorded.name, log.mended, m) for log, m in zip(logs, motions, strict=True)]
+    for log, (found, said) in zip(logs, find_offsets(tied, vessel), strict=True):
+        log.findings += found
+        log.say(said)
+    for log, motion in zip(logs, motions, strict=True):
         if motion is None or not motion.positioned:
             found, said = course_findings(log.mended, vessel)
             log.findings += found

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -63,11 +63,18 @@ class Finding(Shown):
     picture: Mapping[str, Any] = field(default_factory=dict)
     logs: tuple[str, ...] = ()
 
+    @property
+    def key(self) -> tuple[Any, ...]:
+        """What a finding that several logs share is known by in each of them."""
+        return (self.id, self.channels, self.value, self.logs)
+
     def summary(self) -> str:
         """Return channels, size, evidence and fix as text."""
-        return f"{self._line()}\n  {self.evidence}\n  fix: {self.fix}"
+        return f"{self.line}\n  {self.evidence}\n  fix: {self.fix}"
 
-    def _line(self) -> str:
+    @property
+    def line(self) -> str:
+        """Id, channels and size in one line."""
         return f"{self.id} ({', '.join(self.channels or (self.channel,))}): {size_in_words(self)}"
 
     def to_dict(self) -> dict[str, Any]:
@@ -131,14 +138,20 @@ class CheckReport(Shown):
 
     def summary(self) -> str:
         """Return the findings as text."""
+        return self.summary_beside(())
+
+    def summary_beside(self, told: Sequence[Finding]) -> str:
+        """Return the findings as text, of those that were told before their size only."""
         count = len(self.findings)
         untold = sum(o.status == "cannot tell" for o in self.outcomes)
         verdict = f"{count} finding{'s' if count > 1 else ''}" if count else "clean"
         if untold and not count:
             verdict = f"nothing found, but {untold} of {len(self.outcomes)} checks cannot tell"
         lines = [f"{self.name}: {verdict}"]
+        known = {f.key for f in told}
         for f in self.findings:
-            lines += [f"  {line}" for line in f.summary().splitlines()]
+            text = f"{f.line}, as above" if f.key in known else f.summary()
+            lines += [f"  {line}" for line in text.splitlines()]
         lines += [f"  {o.id}: {o.sentence}" for o in self.outcomes if o.status == "cannot tell"]
         lines += [f"  actuator: {a.sentence}" for a in self.actuators]
         lines += [f"  note: {n}" for n in self.notes]
@@ -170,6 +183,16 @@ class CheckReport(Shown):
             "notes": list(self.notes),
             "actuators": [a.to_dict() for a in self.actuators],
         }
+
+
+def shared_findings(reports: Sequence[CheckReport]) -> list[Finding]:
+    """Return the findings that several logs share, each once."""
+    found: dict[tuple[Any, ...], Finding] = {}
+    for report in reports:
+        for f in report.findings:
+            if len(f.logs) > 1:
+                found.setdefault(f.key, f)
+    return list(found.values())
 
 
 def size_in_words(f: Finding) -> str:

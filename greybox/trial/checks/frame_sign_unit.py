@@ -7,7 +7,7 @@ the fewest changes win unless the gain is beyond doubt.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.trial.checks.finding import Finding, Outcome
-from greybox.trial.checks.motion import Motion, integrate, levels, profile, turn
+from greybox.trial.checks.motion import Motion, integrate, profile, turn
 from greybox.trial.convert.derived_signals import continuous
 from greybox.trial.steps import Step, mend
 from greybox.units import UNITS
@@ -30,6 +30,8 @@ _LEAST_SHARE = 0.15
 _TURN_SECONDS = 10.0
 # a gross error shows in a part of a long log
 _EXCERPT = 8000
+# and in means over so many seconds of a fast one
+_STEP = 0.5
 _DEG = np.pi / 180
 _KNOT = UNITS["kn"].factor
 
@@ -175,9 +177,12 @@ _ACROSS = (
 )
 
 
+_CHANGES = (*_PSI, *_RATE, *_VELOCITY, *_POSITION, *_ACROSS)
+
+
 @dataclass(frozen=True)
 class Reading:
-    """The reading of the columns that the kinematics agree with.
+    """The reading of a log's columns that the kinematics agree with.
 
     Parameters
     ----------
@@ -186,66 +191,108 @@ class Reading:
     motion : Motion
         Read so.
     gain : float
-        Log-likelihood gained over the names as they are.
+        Log-likelihood gained over the names as they are, by all logs that are read so.
+    logs : tuple of int
+        Which logs are read so together.
+    sure : bool
+        Whether this log follows logs that agree, or tells by itself.
     """
 
     changes: tuple[Change, ...]
     motion: Motion
     gain: float
+    logs: tuple[int, ...] = (0,)
+    sure: bool = True
 
 
-def find_reading(motion: Motion) -> Reading:
-    """Choose among the readings of the columns.
+def find_readings(motions: Sequence[Motion]) -> list[Reading]:
+    """Choose among the readings of the columns, of all logs of one ship together.
 
     Parameters
     ----------
-    motion : Motion
+    motions : sequence of Motion
         As named.
 
     Returns
     -------
-    Reading
+    list of Reading
         Fewest changes first: each must gain 15 in log-likelihood (a chance of
-        1e-7) and shrink the residual by 15 %.
+        1e-7) and shrink the residual by 15 %. A log that contradicts the
+        others by as much is read by itself.
     """
-    scorer = _Scorer(motion)
-    usable = [c for c in (*_PSI, *_RATE, *_VELOCITY, *_POSITION, *_ACROSS) if scorer.applies(c)]
-    base = scorer.score(())
-    ranked: list[tuple[tuple[Change, ...], float, float]] = [((), base, 0.0)]
-    ranked += [((c,), scorer.score((c,)), c.cost) for c in usable]
-    turned = _turned(motion)
-    if motion.positioned:
-        ranked.append(((turned,), scorer.score((turned,)), turned.cost))
-        ranked += [((c,), scorer.score((c,)), c.cost) for c in _late(scorer.motion)]
-    for a, b in combinations(usable, 2):
-        if a.group == b.group or set(a.channels) & set(b.channels):
-            continue
-        ranked.append(((a, b), scorer.score((a, b)), a.cost + b.cost))
-    penalty = _LEAST_GAIN * scorer.inflation
-    worth = [score - penalty * cost for _, score, cost in ranked]
-    changes, score, cost = ranked[int(np.argmax(worth))]
-    gain = score - base
-    samples = scorer.judging(changes)
-    share = 1.0 - np.exp(-2 * gain / samples) if samples else 0.0
-    if not changes or share < _LEAST_SHARE * cost:
-        return Reading((), motion, 0.0)
-    if changes == (turned,):
-        # no frame, sign or unit is at fault but the compass: its bias is estimated later
-        return Reading((), motion, 0.0)
-    if changes[0].group == "late":
-        # a late sensor, which is estimated later
-        return Reading((), motion, 0.0)
+    logs = [_Alternatives(m) for m in motions]
+    together = list(range(len(logs)))
+    apart: list[int] = []
+    shared: Key = ()
+    while together:
+        shared = _decide([logs[i] for i in together])
+        against = [i for i in together if len(together) > 1 and _contradicts(logs[i], shared)]
+        if not against or len(against) == len(together):
+            break
+        apart += against
+        together = [i for i in together if i not in against]
+    chosen = {i: (shared, tuple(together)) for i in together}
+    chosen |= {i: (_decide([logs[i]]), (i,)) for i in apart}
+    return [_reading(i, motions[i], logs, *chosen[i], bool(apart)) for i in range(len(logs))]
+
+
+def _reading(
+    i: int, motion: Motion, logs: Sequence[_Alternatives], key: Key, together: tuple[int, ...],
+    divided: bool,
+) -> Reading:  # fmt: skip
+    mine = logs[i]
+    changes = tuple(c for c in _changes([logs[k] for k in together], key) if mine.applies(c))
+    if not changes:
+        return Reading((), motion, 0.0, together)
+    gain = sum(logs[k].gain(key) for k in together)
+    sure = not divided or mine.gain(key) >= _LEAST_GAIN * mine.inflation
+    return Reading(changes, read(motion, changes), gain, together, sure)
+
+
+def _decide(logs: Sequence[_Alternatives]) -> Key:
+    """Return the reading that these logs prefer together; nothing where it is as named."""
+    costs: dict[Key, float] = {}
+    for log in logs:
+        costs |= {key: cost for key, (_, _, cost) in log.ranked.items()}
+    penalty = _LEAST_GAIN * max(log.inflation for log in logs)
+    worth = {key: sum(log.gain(key) for log in logs) - penalty * c for key, c in costs.items()}
+    key = max(worth, key=lambda k: worth[k])
+    changes = _changes(logs, key)
+    gain = sum(log.gain(key) for log in logs)
+    samples = sum(log.judging(changes) for log in logs)
+    share = 1.0 - float(np.exp(-2 * gain / samples)) if samples else 0.0
+    # a turned compass or a late sensor is no frame, sign or unit: it is estimated later
+    if not changes or changes[0].group in _LATER or share < _LEAST_SHARE * costs[key]:
+        return ()
     kept = []
     for change in changes:
         silent = _silent((change,))
         # whatever shrinks a channel shrinks its noise: it must explain more than nothing would
-        if not silent.channels or score - scorer.score((*changes, silent)) >= _LEAST_GAIN:
+        lost = sum(
+            log.score(changes) - log.score((*changes, silent))
+            for log in logs
+            if log.applies(change)
+        )
+        if not silent.channels or lost >= _LEAST_GAIN:
             kept.append(change)
-    changes = tuple(kept)
-    gain = scorer.score(changes) - base
-    if not changes:
-        return Reading((), motion, 0.0)
-    return Reading(changes, read(motion, changes), float(gain))
+    return tuple(c.words for c in kept)
+
+
+def _changes(logs: Sequence[_Alternatives], key: Key) -> tuple[Change, ...]:
+    for log in logs:
+        if key in log.ranked:
+            return log.ranked[key][0]
+    return ()
+
+
+def _contradicts(log: _Alternatives, key: Key) -> bool:
+    """Whether a log by itself prefers another reading beyond doubt."""
+    own = _decide([log])
+    if own == key:
+        return False
+    penalty = _LEAST_GAIN * log.inflation
+    cost = log.ranked[own][2] - log.ranked[key][2] if key in log.ranked else 0.0
+    return log.gain(own) - log.gain(key) > penalty * (1.0 + cost)
 
 
 def read(motion: Motion, changes: tuple[Change, ...]) -> Motion:
@@ -256,15 +303,26 @@ def read(motion: Motion, changes: tuple[Change, ...]) -> Motion:
     return replace(motion, values=values)
 
 
-def reading_findings(reading: Reading) -> list[Finding]:
-    """Return one finding for each change of a reading."""
+def reading_findings(reading: Reading, names: Sequence[str] = ()) -> list[Finding]:
+    """Return one finding for each change of a reading.
+
+    Parameters
+    ----------
+    reading : Reading
+    names : sequence of str
+        Of all logs that were read together.
+    """
     found = []
+    several = len(reading.logs) > 1
     for c in reading.changes:
         tied = (
             "positions and velocities"
             if c.group in ("velocity", "speed", "position", "length")
             else "heading and the other channels"
         )
+        beside = f" in {len(reading.logs)} logs together" if several else ""
+        doubt = "" if reading.sure else "; other logs of the ship are as named, and this one "
+        doubt += "" if reading.sure else "cannot tell by itself"
         found.append(
             Finding(
                 c.id,
@@ -272,12 +330,14 @@ def reading_findings(reading: Reading) -> list[Finding]:
                 c.value,
                 (c.value, c.value),
                 c.unit,
-                f"{c.words}: only so do {tied} agree (log-likelihood higher by {reading.gain:.0f})",
+                f"{c.words}: only so do {tied} agree (log-likelihood higher by "
+                f"{reading.gain:.0f}{beside}){doubt}",
                 c.fix,
                 c.channels,
                 c.repair,
-                True,
+                reading.sure,
                 {"changes": reading.changes},
+                tuple(names[i] for i in reading.logs) if several and names else (),
             )
         )
     return found
@@ -332,9 +392,12 @@ def _late(motion: Motion) -> list[Change]:
     found = []
     for names in (("psi",), ("u", "v"), ("x_n", "y_n")):
         delays = (-3.0, -2.0, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0, 3.0, 4.5)
-        for steps in sorted({round(late / motion.step) for late in delays} - {0}):
-            late = steps * motion.step
+        for late in delays:
+            # steps of logs differ, what is tried does not
+            steps = round(late / motion.step)
             words = f"{' and '.join(names)} {late:g} s late"
+            if steps == 0:
+                continue
             found.append(
                 Change(
                     "sign", "late", names, shifted(names, steps), (), words, "", late, "s", cost=1.3
@@ -351,16 +414,40 @@ def _silent(changes: tuple[Change, ...]) -> Change:
     )  # fmt: skip
 
 
-class _Scorer:
-    """Log-likelihood of a reading; what does not change between readings is kept."""
+# what a reading is called, in every log: the words of its changes
+Key = tuple[str, ...]
+_LATER = ("turned", "late")
+
+
+class _Alternatives:
+    """Log-likelihoods of the readings of one log; what does not change between them is kept."""
 
     def __init__(self, motion: Motion) -> None:
-        self.motion = motion.excerpt(_EXCERPT)
-        motion = self.motion
-        self.cache: dict[tuple[str, tuple[str, ...]], float] = {}
-        self.level = levels(motion)
+        self.motion = motion = motion.coarser(_STEP).excerpt(_EXCERPT)
+        self.cache: dict[tuple[str, Key], float] = {}
         # neighbouring samples of a fast log say the same: its likelihood counts them all
         self.inflation = max(1.0, 0.5 / motion.step / 5)
+        self.base = self.score(())
+        self.ranked: dict[Key, tuple[tuple[Change, ...], float, float]] = {(): ((), 0.0, 0.0)}
+        usable = [c for c in _CHANGES if self.applies(c)]
+        for c in usable:
+            self._rank((c,))
+        if motion.positioned:
+            self._rank((_turned(motion),), ("turned",))
+            for c in _late(motion):
+                self._rank((c,))
+        for a, b in combinations(usable, 2):
+            if a.group != b.group and not set(a.channels) & set(b.channels):
+                self._rank((a, b))
+
+    def _rank(self, changes: tuple[Change, ...], key: Key | None = None) -> None:
+        words = key or tuple(c.words for c in changes)
+        gain = self.score(changes) - self.base
+        self.ranked[words] = (changes, gain, sum(c.cost for c in changes))
+
+    def gain(self, key: Key) -> float:
+        """Return the log-likelihood that a reading gains; nothing where it does not apply."""
+        return self.ranked[key][1] if key in self.ranked else 0.0
 
     def judging(self, changes: tuple[Change, ...]) -> int:
         """Return how many residuals can tell about these changes."""
@@ -391,7 +478,7 @@ class _Scorer:
         key = (what, tuple(c.words for c in changes if set(c.channels) & relevant))
         if key not in self.cache:
             score = _position_score if what == "position" else _heading_score
-            self.cache[key] = score(as_read, self.level)
+            self.cache[key] = score(as_read)
         return self.cache[key]
 
 
@@ -402,19 +489,19 @@ def _order(change: Change) -> int:
     return 1 if change.id == "frame" and change.group == "velocity" else 0
 
 
-def _position_score(m: Motion, level: Array) -> float:
+def _position_score(m: Motion) -> float:
     walked = integrate(turn(m["psi"], m["u"], m["v"]), m)
     position = np.column_stack([m["x_n"], m["y_n"]])
     drift = (m.t - m.t[0])[:, None]
     # a reading is judged per metre, so that one in kilometres has no advantage
     # the size of all steps together stays the same whatever is reversed or exchanged
     scale = float(np.sqrt(np.mean(np.diff(position, axis=0) ** 2))) or 1.0
-    found = profile((position - walked) / scale, np.hstack([level, drift]), m)
+    found = profile((position - walked) / scale, drift, m)
     return found.loglik
 
 
-def _heading_score(m: Motion, level: Array) -> float:
+def _heading_score(m: Motion) -> float:
     scale = float(np.sqrt(np.mean(np.diff(m["psi"]) ** 2))) or 1.0
     drift = (m.t - m.t[0])[:, None]
     rest = (m["psi"] - integrate(m["r"], m)) / scale
-    return profile(rest, np.hstack([level, drift]), m).loglik
+    return profile(rest, drift, m).loglik

@@ -10,7 +10,6 @@ disagreement as the noises demand; K is estimated by maximum likelihood.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 
 from greybox.rotation import body_to_ned
 from greybox.trial.convert.derived_signals import continuous
-from greybox.trial.convert.resample import clock, covered, runs
+from greybox.trial.convert.resample import clock, stretches
 from greybox.trial.raw_log import Recording, Signal
 
 Array = NDArray[np.float64]
@@ -83,6 +82,24 @@ class Motion:
         values = {n: v[index] for n, v in self.values.items()}
         return Motion(self.t[index], self.step, values, tuple(stretches))
 
+    def coarser(self, step: float) -> Motion:
+        """Return means over blocks of at most `step` [s]."""
+        size = int(step / self.step + 1e-6)
+        if size < 2:
+            return self
+        rows, stretches, at = [], [], 0
+        for a, b in self.stretches:
+            count = (b - a) // size
+            if count >= _MIN_STRETCH:
+                rows.append(np.arange(a, a + count * size))
+                stretches.append((at, at + count))
+                at += count
+        if not rows:
+            return self
+        index = np.concatenate(rows).reshape(-1, size)
+        values = {n: v[index].mean(axis=1) for n, v in self.values.items()}
+        return Motion(self.t[index].mean(axis=1), size * self.step, values, tuple(stretches))
+
     @property
     def positioned(self) -> bool:
         """Whether positions, heading and velocities are all there."""
@@ -108,7 +125,7 @@ def make_motion(recording: Recording, names: tuple[str, ...] = NAMES) -> Motion 
                 signals[name] = s
     if not signals:
         return None
-    clocks = {n: clock(s.t) for n, s in signals.items()}
+    clocks = {n: clock(s.t, cuts=recording.cuts) for n, s in signals.items()}
     step = max(c.period for c in clocks.values())
     start = max(float(c.t[0]) for c in clocks.values())
     stop = min(float(c.t[-1]) for c in clocks.values())
@@ -116,18 +133,16 @@ def make_motion(recording: Recording, names: tuple[str, ...] = NAMES) -> Motion 
         return None
     count = min(int((stop - start) / step + 1e-6) + 1, _MAX_SAMPLES)
     grid = start + step * np.arange(count, dtype=np.float64)
-    keep = np.ones(count, bool)
-    for c in clocks.values():
-        keep &= covered(grid, c)
-    longest = sorted((r for r in runs(keep) if r[1] - r[0] >= _MIN_STRETCH), key=_length)
+    whole = stretches(grid, clocks.values(), recording.cuts)
+    longest = sorted((r for r in whole if r[1] - r[0] >= _MIN_STRETCH), key=_length)
     kept = sorted(longest[-_MAX_STRETCHES:])
     if not kept:
         return None
     rows = np.concatenate([np.arange(a, b) for a, b in kept])
     values = {n: np.interp(grid[rows], s.t, s.value) for n, s in signals.items()}
     edges = np.concatenate([[0], np.cumsum([b - a for a, b in kept])])
-    stretches = tuple((int(a), int(b)) for a, b in pairwise(edges))
-    return Motion(grid[rows], step, values, stretches)
+    kept_as = tuple((int(a), int(b)) for a, b in pairwise(edges))
+    return Motion(grid[rows], step, values, kept_as)
 
 
 def _length(run: tuple[int, int]) -> int:
@@ -171,11 +186,18 @@ def whiten(z: Array, gain: float, motion: Motion) -> Array:
     return out
 
 
-def levels(motion: Motion) -> Array:
-    """Return one column of ones for each stretch, (N, S): the unknown start of each."""
-    out = np.zeros((len(motion), len(motion.stretches)))
-    for k, (a, b) in enumerate(motion.stretches):
-        out[a:b, k] = 1.0
+def without_starts(white: Array, gain: float, motion: Motion, weight: Array | None = None) -> Array:
+    """Return whitened columns (N, …) less what the unknown start of each stretch explains.
+
+    A start is a level; whitened it dies out by ``1 - gain`` a sample.
+    """
+    out = white.copy()
+    for a, b in motion.stretches:
+        died = (1.0 - gain) ** np.arange(b - a)
+        if weight is not None:
+            died = died * weight[a:b]
+        share = np.tensordot(died, out[a:b], axes=(0, 0)) / float(died @ died)
+        out[a:b] -= died.reshape(-1, *[1] * (out.ndim - 1)) * share
     return out
 
 
@@ -197,35 +219,22 @@ class Profile:
     std: float
 
 
-def profile(
-    z: Array,
-    nuisance: Array,
-    motion: Motion,
-    gains: Array = GAINS,
-    weigh: Callable[[float], Array] | None = None,
-) -> Profile:
-    """Return the likelihood of a residual, its nuisance fitted, over the gains.
+def profile(z: Array, nuisance: Array, motion: Motion, gains: Array = GAINS) -> Profile:
+    """Return the likelihood of a residual, starts and nuisance fitted, over the gains.
 
     Parameters
     ----------
     z : ndarray
         (N,) or (N, m) residual, m components that share the nuisance's columns.
     nuisance : ndarray
-        (N, q), or (N, m, q) where the columns join the components.
-    weigh : callable, optional
-        Gain -> weights (N,) of the innovations.
+        (N, q).
     """
     best: Profile | None = None
-    joint = nuisance.ndim == 3
+    count = int(z.size / len(z))
+    both = np.column_stack([z, nuisance])
     for gain in gains:
-        e = whiten(z, float(gain), motion)
-        x = whiten(nuisance, float(gain), motion)
-        if weigh is not None:
-            weight = weigh(float(gain))
-            e = e * weight.reshape(-1, *[1] * (e.ndim - 1))
-            x = x * weight.reshape(-1, *[1] * (x.ndim - 1))
-        if joint:
-            e, x = e.reshape(-1), x.reshape(-1, x.shape[-1])
+        white = without_starts(whiten(both, float(gain), motion), float(gain), motion)
+        e, x = white[:, :count], white[:, count:]
         rest = e - x @ solve(x, e)
         variance = float(np.mean(rest**2))
         loglik = -0.5 * rest.size * np.log(max(variance, 1e-300))
@@ -235,20 +244,17 @@ def profile(
     return best
 
 
-def outlier_weights(z: Array, nuisance: Array, gain: float, motion: Motion) -> Array:
+def outlier_weights(size: Array) -> Array:
     """Return weights (N,) that let no innovation count for more than four robust deviations.
 
     Satellite positions jump now and then; one jump would outweigh minutes.
+
+    Parameters
+    ----------
+    size : ndarray
+        (N,) absolute innovations, of several components the largest.
     """
-    e = whiten(z, gain, motion)
-    x = whiten(nuisance, gain, motion)
-    if nuisance.ndim == 3:
-        flat = x.reshape(-1, x.shape[-1])
-        rest = e - (flat @ solve(flat, e.reshape(-1))).reshape(e.shape)
-    else:
-        rest = e - x @ solve(x, e)
-    size = np.abs(rest) if rest.ndim == 1 else np.abs(rest).max(axis=1)
-    scale = float(np.median(np.abs(rest))) * 1.4826
+    scale = float(np.median(size)) * 1.4826
     if scale <= 0:
         return np.ones(len(size))
     return np.asarray(np.minimum(1.0, _ROBUST * scale / np.maximum(size, 1e-300)))
@@ -282,9 +288,10 @@ def denoise(value: Array, motion: Motion) -> Array:
     """Return a channel without its noise, for derivatives and regressors only.
 
     The width of the low-pass is chosen by leave-one-out prediction: wide for a
-    noisy rate gyro on a slow ship, narrow for a clean signal.
+    noisy rate gyro on a slow ship, narrow for a clean signal. What it takes from
+    the signal itself is given back by smoothing the rest once more (Tukey's twicing).
     """
-    best, chosen = np.inf, value
+    best, chosen = np.inf, 2.0
     taps = np.arange(-_MOST_TAPS, _MOST_TAPS + 1)
     for width in (1.5, 2.0, 3.0, 4.5, 7.0, 10.0, 15.0, 22.0, 32.0, 45.0):
         # neighbours are left out too: their noise may go along with that of the sample
@@ -296,11 +303,11 @@ def denoise(value: Array, motion: Motion) -> Array:
                 error += float(np.sum((value[a + _MOST_TAPS : b - _MOST_TAPS] - said) ** 2))
                 count += len(said)
         if not count:
-            return smooth(value, motion, 2.0 * motion.step)
+            break
         if error / count < best:
-            best = error / count
-            chosen = smooth(value, motion, width * motion.step)
-    return chosen
+            best, chosen = error / count, width
+    slow = smooth(value, motion, chosen * motion.step)
+    return slow + smooth(value - slow, motion, chosen * motion.step)
 
 
 def turn(psi: Array, forward: Array, starboard: Array) -> Array:

@@ -20,11 +20,11 @@ from greybox.trial.checks.motion import (
     Profile,
     denoise,
     integrate,
-    levels,
     make_motion,
     profile,
     solve,
     whiten,
+    without_starts,
 )
 from greybox.trial.convert.resample import clock as make_clock
 from greybox.trial.convert.resample import hold, runs
@@ -215,7 +215,7 @@ class _Problem:
         rates += [x[s] for s in self.states]
         rates += [x[s] * np.abs(x[s]) for s in self.states]
         rates += [x[a] * x[b] for a, b in combinations(self.states, 2)]
-        columns = np.hstack([levels(motion), integrate(np.column_stack(rates), motion)])
+        columns = integrate(np.column_stack(rates), motion)
         size = np.sqrt(np.mean(columns**2, axis=0))
         self.columns = columns / np.where(size > 0, size, 1.0)
         self.without: dict[str, Profile] = {}
@@ -242,13 +242,13 @@ class _Problem:
     def _added(self, state: str, force: Array) -> float:
         pushed = integrate(force / np.std(force), self.motion)
         alone = self.without[state]
-        e = whiten(self.motion[state], alone.gain, self.motion)
-        x = whiten(np.column_stack([self.columns, pushed]), alone.gain, self.motion)
+        joint = np.column_stack([self.columns, pushed])
+        both = np.column_stack([joint, self.motion[state]])
+        white = without_starts(whiten(both, alone.gain, self.motion), alone.gain, self.motion)
         # a negative gain is no gain: a thruster that pulls is the other reading
-        if float(solve(x, e)[-1]) <= 0:
+        if float(solve(white[:, :-1], white[:, -1])[-1]) <= 0:
             return 0.0
         near = np.minimum(alone.gain * np.array([0.1, 0.25, 0.5, 1.0]), 1.0)
-        joint = np.column_stack([self.columns, pushed])
         with_it = profile(self.motion[state], joint, self.motion, near)
         return max(with_it.loglik - alone.loglik, 0.0)
 

@@ -198,7 +198,7 @@ def reading_steps(table: TableFile, scale: TimeScale) -> tuple[Step, ...]:
 
 def on_zero(step: Step, shift: float) -> Step:
     """Return a step of reading with the places that it names on another zero of time."""
-    if "times" not in step.parameters:
+    if step.operation != "pad_fractions":
         return step
     times = tuple(t + shift for t in step.numbers("times"))
     return replace(step, parameters={**step.parameters, "times": times})
@@ -206,6 +206,8 @@ def on_zero(step: Step, shift: float) -> Step:
 
 def _past(step: Step) -> Step:
     """Return a step of an earlier reading without its places, which are not in this file."""
+    if step.operation != "pad_fractions":
+        return step
     kept = {k: v for k, v in step.parameters.items() if k not in ("times", "late")}
     return replace(step, parameters=kept)
 

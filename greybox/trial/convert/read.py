@@ -156,7 +156,8 @@ def table_segments(
     steps = (*recording.steps, *cut.steps)
     read = (*known.read, *(n for n in cut.notes if n not in known.read))
     conditions = known.conditions.over(vessel.conditions)
-    known = replace(known, steps=steps, read=read, conditions=conditions)
+    epoch = recording.epoch if known.epoch is None else known.epoch
+    known = replace(known, steps=steps, read=read, epoch=epoch, conditions=conditions)
     columns = [str(c) for c in table.columns]
     segments = []
     for k, log in enumerate(cut.segments):

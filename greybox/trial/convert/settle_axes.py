@@ -55,6 +55,12 @@ def settle_axes(recording: Recording, vessel: Vessel) -> Recording:
     """
     if not recording.unsure:
         return recording
+    # damaged numbers may be too large to be squared
+    with np.errstate(over="ignore", invalid="ignore"):
+        return _settled(recording, vessel)
+
+
+def _settled(recording: Recording, vessel: Vessel) -> Recording:
     steps: list[Step] = []
     mirrored: bool | None = None
     if {"u", "v"} <= recording.unsure & set(recording.names):
@@ -96,7 +102,7 @@ def _settle_velocity(recording: Recording) -> tuple[Recording, bool | None, Step
     else:
         north, east = (x, y) if axes == _NED else (y, x)
         named = replace(north, name="v_n"), replace(east, name="v_e")
-    others = [s for s in recording.signals if s.name not in ("u", "v", "v_n", "v_e")]
+    others = [s for s in recording.signals if s.name not in ("u", "v")]
     step = Step(
         "read_axes",
         (named[0].name, named[1].name),
@@ -105,7 +111,10 @@ def _settle_velocity(recording: Recording) -> tuple[Recording, bool | None, Step
         decided_by="check" if decided == "check" else "default",
         reason=reason,
     )
-    return replace(recording, signals=(*others, *named)), mirrored, step
+    # what another file states is better than what had to be found out
+    stated = {s.name for s in others}
+    new = [s for s in named if s.name not in stated]
+    return replace(recording, signals=(*others, *new)), mirrored, step
 
 
 def _left_over(recording: Recording) -> dict[tuple[str, bool], float]:
@@ -232,7 +241,7 @@ def _added(change: Array, push: Array, damping: list[Array]) -> float:
     """Return the log-likelihood that a push in its own direction adds to damping."""
     rest = np.column_stack([np.ones(len(change)), *damping])
     both = np.column_stack([rest, push])
-    if np.std(push) == 0:
+    if not np.isfinite(both).all() or not np.isfinite(change).all() or np.std(push) == 0:
         return 0.0
     alone = change - rest @ np.linalg.lstsq(rest, change, rcond=None)[0]
     gains = np.linalg.lstsq(both, change, rcond=None)[0]

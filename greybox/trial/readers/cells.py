@@ -207,14 +207,14 @@ class Stamps:
 
     Parameters
     ----------
-    column : str
-        Name in the source.
+    column, file : str
+        Names of column and file.
     days : bool
         Whether they are times of day, which go on past midnight, and not dates.
     """
 
-    def __init__(self, column: str, *, days: bool) -> None:
-        self.column = column
+    def __init__(self, column: str, file: str, *, days: bool) -> None:
+        self._source = f"column '{column}' of {file}"
         self._days = DayClock() if days else None
         self._width = 0
         self._count = 0
@@ -237,7 +237,7 @@ class Stamps:
         return Step(
             "pad_fractions",
             ("t",),
-            (f"column '{self.column}'",),
+            (self._source,),
             {
                 "count": float(self._count),
                 "written": written,

@@ -67,7 +67,7 @@ class CsvFile:
 
         words: Counter[str] = Counter()
         stamps = {
-            c: cell_text.Stamps(c, days=c in self.clocks)
+            c: cell_text.Stamps(c, self.path.name, days=c in self.clocks)
             for c in columns
             if c in self.clocks or c in self.dates
         }

@@ -24,9 +24,11 @@ from greybox.trial.readers.ros.axes import (
     is_world,
     north_east,
     starboard,
+    tells_axes,
 )
 from greybox.trial.readers.table import Batch, TableFile
 from greybox.trial.steps import Step
+from greybox.units import EARLIEST_UNIX, unix_seconds
 
 Array = NDArray[np.float64]
 
@@ -41,8 +43,6 @@ _SECONDS = re.compile(r"^(.*?)(?:secs|sec)$")
 _NANOS = ("nsecs", "nsec", "nanosecs", "nanosec", "nanoseconds")
 _RECORDERS = ("time", "rosbagtimestamp", "timestamp", "recv_time", "log_time")
 _QUATERNION = re.compile(r"^(.*?(?:quaternion|orientation|rotation|q))_?([xyzw])$")
-# what a driver or a body is called: any other frame may have any axes
-_BODIES = ("base_link", "base_footprint", "base", "body")
 
 Made = Callable[[Batch], Array]
 
@@ -255,8 +255,7 @@ def _stamp_column(columns: tuple[str, ...]) -> _Column:
     def make(batch: Batch) -> Array:
         value = np.asarray(batch[columns[0]], float)
         if len(columns) == 1:
-            size = float(np.nanmedian(np.abs(value))) if np.isfinite(value).any() else 0.0
-            value = value * 1e-9 if size > 1e14 else value
+            value = unix_seconds(value)
         else:
             value = value + 1e-9 * np.asarray(batch[columns[1]], float)
         return np.where(value > 0, value, np.nan)
@@ -268,10 +267,9 @@ def _ahead(batch: Batch, stamp: _Column, recorder: str, table: TableFile) -> flo
     """Return how far the recorder's clock is ahead of the stamps [s], None where none counts."""
     recorded = np.asarray(batch[recorder], float)
     if recorder not in table.dates:
-        size = float(np.nanmedian(recorded)) if np.isfinite(recorded).any() else 0.0
-        recorded = recorded * (1e-9 if size > 1e17 else 1e-6 if size > 1e14 else 1.0)
+        recorded = unix_seconds(recorded)
     difference = recorded - stamp.make(batch)
-    difference = difference[np.isfinite(difference) & (recorded > 1e8)]
+    difference = difference[np.isfinite(difference) & (recorded >= EARLIEST_UNIX)]
     return float(np.median(difference)) if len(difference) else None
 
 
@@ -328,7 +326,7 @@ class _Messages:
             self._add(
                 "psi", turn, lambda b: compass_heading(*(b[c] for c in turn), ned=as_is), "rad"
             )
-            if not (is_world(header) or ned or child or rate):
+            if not (tells_axes(header) or child or rate):
                 self.unsure.add("psi")
         if twist is not None:
             self._add_twist(twist, child or header, ned and bool(child), first)
@@ -346,7 +344,7 @@ class _Messages:
         frd = is_frd(frame) or (ned and "flu" not in frame)
         self._add("u", twist, lambda b: _two(b, twist)[0], "m/s")
         self._add("v", twist, lambda b: starboard(_two(b, twist)[1], frd=frd), "m/s")
-        if not (is_frd(frame) or "flu" in frame or frame in _BODIES):
+        if not tells_axes(frame):
             self.unsure |= {"u", "v"}
         rate = self._ends("angular_z")
         # drivers that do not measure a turn write zeros

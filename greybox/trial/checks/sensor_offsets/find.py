@@ -1,46 +1,122 @@
-"""Clock offsets, lever arm and heading bias, estimated together and named one by one.
+"""Clock offsets, lever arm and heading bias of one ship's instruments, from all its logs together.
 
-Each candidate is one or two parameters of the tie between position, heading,
-velocity and yaw rate; the one that explains most is taken first, the others
-are then judged beside it, so that a late compass is not called a lever arm
-unless the motion cannot tell them apart.
+Each log gives a quadratic likelihood of all offsets at once; they are pooled, by campaign where
+logs differ; then every way to share clocks, with and without lever arm and heading bias, is
+compared, so that a late compass is not called a lever arm unless the motion cannot tell them apart.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
 from greybox.trial.checks.finding import Finding, Outcome
 from greybox.trial.checks.motion import Motion
-from greybox.trial.checks.sensor_offsets.findings import IDS, offset_findings, offset_outcomes
-from greybox.trial.checks.sensor_offsets.model import State, Tie
-from greybox.trial.checks.sensor_offsets.select import select_candidates, usable_candidates
+from greybox.trial.checks.sensor_offsets.evidence import Evidence, coarse_tie, expand, search
+from greybox.trial.checks.sensor_offsets.findings import IDS, Campaign, campaign_findings
+from greybox.trial.checks.sensor_offsets.model import ARM, Tie
+from greybox.trial.checks.sensor_offsets.pool import pool
+from greybox.trial.checks.sensor_offsets.select import judge
+from greybox.trial.checks.sensor_offsets.thresholds import SIGMAS, expected, least
+from greybox.trial.raw_log import Recording
 from greybox.vessel.vessel import Vessel
 
+# means over blocks of at most this time [s]: ties are slower than samples, and what a receiver's
+# filter does to its noise within a block is no motion
+_STEP = 0.7
 
-def find_offsets(motion: Motion, vessel: Vessel) -> tuple[list[Finding], list[Outcome]]:
-    """Find clock offsets, lever arm and heading bias.
+
+@dataclass(frozen=True)
+class Tied:
+    """What `find_offsets` needs of a log.
 
     Parameters
     ----------
-    motion : Motion
-        Columns read as they are meant (see `find_reading`).
+    name : str
+    recording : Recording
+        Mended so far.
+    motion : Motion or None
+        Its columns read as they are meant (see `find_readings`).
+    """
+
+    name: str
+    recording: Recording
+    motion: Motion | None
+
+
+def find_offsets(logs: Sequence[Tied], vessel: Vessel) -> list[tuple[list[Finding], list[Outcome]]]:
+    """Find clock offsets, lever arm and heading bias that logs of one ship share.
+
+    Parameters
+    ----------
+    logs : sequence of Tied
     vessel : Vessel
         Its antenna is where the positions are taken to be measured.
 
     Returns
     -------
-    findings : list of Finding
-    outcomes : list of Outcome
-        What was compared, or why nothing in the log can show it.
+    list of (findings, outcomes)
+        One a log: what was found, and what was compared or why nothing can show it.
     """
-    x, y = vessel.sensors.get("antenna", (0.0, 0.0))[:2]
-    antenna = (float(x), float(y))
-    if not (motion.positioned or motion.turned):
-        why = "needs heading and yaw rate, or positions, heading and velocities of their own sensor"
-        return [], [Outcome(i, "cannot tell", why) for i in IDS]
-    tie = Tie(motion, State(arm=antenna))
-    usable = usable_candidates(motion)
-    found, first = select_candidates(tie, usable, vessel, antenna)
-    return (
-        offset_findings(found, first, motion, vessel, antenna),
-        offset_outcomes(tie, found, usable),
-    )
+    why = "needs heading and yaw rate, or positions, heading and velocities of their own sensor"
+    out: list[tuple[list[Finding], list[Outcome]]] = [
+        ([], [Outcome(i, "cannot tell", why) for i in IDS]) for _ in logs
+    ]
+    rows, ties = [], []
+    for i, log in enumerate(logs):
+        if log.motion is not None and (log.motion.positioned or log.motion.turned):
+            rows.append(i)
+            ties.append(Tie(log.motion.coarser(_STEP)))
+    # a clock of heading against yaw rate alone is another question
+    for positioned in (True, False):
+        of_kind = [k for k, tie in enumerate(ties) if tie.positioned == positioned]
+        if not of_kind:
+            continue
+        for campaign in _campaigns(
+            [logs[rows[k]] for k in of_kind], [ties[k] for k in of_kind], vessel
+        ):
+            found, said = campaign_findings(campaign, vessel)
+            for k in campaign.members:
+                out[rows[of_kind[k]]] = (found, said)
+    return out
+
+
+def _campaigns(logs: Sequence[Tied], ties: Sequence[Tie], vessel: Vessel) -> list[Campaign]:
+    prior, material = expected(vessel), least(vessel)
+    first = []
+    for tie in ties:
+        first.append(expand(tie, search(tie, coarse_tie(tie), prior)))
+    pooled, splits = pool(first, prior, material)
+    evidence: list[Evidence] = list(first)
+    for campaign in pooled:
+        for i in campaign.logs:
+            if len(ties) > 1:
+                evidence[i] = expand(ties[i], campaign.offsets)
+    pooled, _ = pool(evidence, prior, material, splits)
+    found = []
+    for campaign in pooled:
+        members = [ties[i] for i in campaign.logs]
+        turned = any(t.turned for t in members)
+        channels = members[0].motion.values if members[0].positioned else {"psi": 0, "r": 0}
+        judged = judge(
+            tuple(channels), turned=turned, offsets=campaign.offsets,
+            covariance=campaign.covariance, vessel=vessel,
+            scatter=np.hypot(campaign.scatter, material / SIGMAS),
+            antenna=prior[0][ARM],
+        )  # fmt: skip
+        found.append(
+            Campaign(
+                members=campaign.logs,
+                names=tuple(logs[i].name for i in campaign.logs),
+                recordings=tuple(logs[i].recording for i in campaign.logs),
+                evidence=tuple(evidence[i] for i in campaign.logs),
+                pooled=campaign,
+                judged=judged,
+                others=len(ties) - len(campaign.logs),
+                turned_over=max(float(np.ptp(t.motion["psi"])) for t in members),
+                step=max(m.step for i in campaign.logs if (m := logs[i].motion) is not None),
+            )
+        )
+    return found

@@ -1,114 +1,164 @@
-"""Clock offsets, lever arm and heading bias in words."""
+"""Clock offsets, lever arm and heading bias in words, and what mends them."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from greybox.trial.checks.finding import Finding, Outcome
-from greybox.trial.checks.motion import Motion
-from greybox.trial.checks.sensor_offsets.estimate import Fit, fit
-from greybox.trial.checks.sensor_offsets.model import Candidate, Tie, size
-from greybox.trial.checks.sensor_offsets.select import (
-    NEARLY,
-    net_likelihood,
-    sample_inflation,
-    significance,
+from greybox.trial.checks.sensor_offsets.evidence import Evidence
+from greybox.trial.checks.sensor_offsets.input_clock import (
+    Delay,
+    input_clocks,
+    response_delays,
 )
-from greybox.trial.steps import mend
+from greybox.trial.checks.sensor_offsets.model import ARM, BIAS, CLOCKS, SIZE
+from greybox.trial.checks.sensor_offsets.pool import Pooled
+from greybox.trial.checks.sensor_offsets.select import (
+    POSITIONS,
+    SEPARATED,
+    Defect,
+    Judged,
+    matters,
+    possible,
+    separation,
+)
+from greybox.trial.checks.sensor_offsets.thresholds import (
+    LEAST_CLOCK,
+    LEAST_HEADING,
+    MOST_LATE,
+    expected,
+    most_arm,
+)
+from greybox.trial.raw_log import Recording
+from greybox.trial.steps import Step, mend
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
 
 IDS = ("clock_offset", "lever_arm", "heading_bias")
-# beyond these nothing can be said
+# beyond these nothing can be said: [rad], [s], [m] and share of the length
 _VAGUE_HEADING = np.radians(1.0)
 _VAGUE_CLOCK = 0.3
-_OWN_CLOCKS = (("psi",), ("r",), ("x_n", "y_n"), ("u", "v"))
+_VAGUE_ARM = (0.5, 0.15)
+_OWN_CLOCKS = (("psi",), ("r",), POSITIONS, ("u", "v"))
+# in log-likelihood: a log that prefers one of two rivals by this can tell them apart
+_TELLS = 3.0
+_MOST_NAMED = 4
 
 
-def offset_findings(
-    found: Fit,
-    first: list[tuple[float, Fit]],
-    motion: Motion,
-    vessel: Vessel,
-    antenna: tuple[float, ...],
-) -> list[Finding]:
-    """Return a finding for each defect, and what else would explain as much.
+@dataclass(frozen=True)
+class Campaign:
+    """Logs that share their offsets, and what they say together.
 
     Parameters
     ----------
-    found : Fit
-    first : list of tuple of float, Fit
-        Each candidate by itself, as `select_candidates` returns them.
-    motion : Motion
-    vessel : Vessel
-    antenna : tuple of float
-        Where the vessel file has the antenna, forward and starboard [m].
+    members : tuple of int
+        Which of the logs.
+    names : tuple of str
+    recordings : tuple of Recording
+    evidence : tuple of Evidence
+    pooled : Pooled
+    judged : list of Judged
+        All hypotheses, best first.
+    others : int
+        How many logs the ship has in other campaigns.
+    turned_over : float
+        Widest range of headings in a log [rad].
+    step : float
+        Longest sample time [s].
     """
+
+    members: tuple[int, ...]
+    names: tuple[str, ...]
+    recordings: tuple[Recording, ...]
+    evidence: tuple[Evidence, ...]
+    pooled: Pooled
+    judged: list[Judged]
+    others: int
+    turned_over: float
+    step: float
+
+    @property
+    def best(self) -> Judged:
+        """The hypothesis that the logs prefer."""
+        return self.judged[0]
+
+
+def campaign_findings(campaign: Campaign, vessel: Vessel) -> tuple[list[Finding], list[Outcome]]:
+    """Return a finding for each defect that logs share, and what became of the checks."""
+    antenna = expected(vessel)[0][ARM]
+    told = [d for d in campaign.best.defects if matters(d, vessel, antenna)]
     findings = []
-    at = 0
-    for c in found.candidates:
-        k = size(c)
-        std = np.sqrt(np.diag(found.covariance[at : at + k, at : at + k]))
-        at += k
-        if c.id == "clock_offset":
-            late = found.state.late.get(c.channels[0], 0.0)
-            findings.append(_clock_finding(c, late, float(std[0]), motion))
-        elif c.id == "heading_bias":
-            bias = float(np.angle(np.exp(1j * found.state.bias)))
-            findings.append(_heading_finding(bias, float(std[0])))
+    clocks = [d for d in told if d.id == "clock_offset"]
+    base = _base(clocks, campaign, vessel) if clocks else _Base()
+    for d in told:
+        if d.id == "clock_offset":
+            finding = _clock_finding(d, base, campaign)
+        elif d.id == "heading_bias":
+            finding = _heading_finding(d)
         else:
-            findings.append(_arm_finding(np.array(found.state.arm), std, antenna))
-    rivals = _rivals(first, found, vessel, antenna, sample_inflation(motion))
-    if rivals:
-        findings = [replace(f, evidence=f"{f.evidence}; {rivals}") for f in findings]
-    return findings
+            finding = _arm_finding(d, antenna)
+        findings.append(_judged(finding, d, campaign, vessel))
+    return findings, _outcomes(campaign, told, vessel)
 
 
-def _rivals(
-    first: list[tuple[float, Fit]],
-    found: Fit,
-    vessel: Vessel,
-    antenna: tuple[float, ...],
-    inflation: float,
-) -> str:
-    """Say what else would explain as much, where one defect was found."""
-    if len(found.candidates) != 1:
-        return ""
-    mine = net_likelihood(found, inflation)
-    said = []
-    for worth, trial in sorted(first, key=lambda pair: pair[0], reverse=True):
-        c = trial.candidates[0]
-        alike = set(c.channels) & set(found.candidates[0].channels) and c.id == "clock_offset"
-        if c == found.candidates[0] or (alike and found.candidates[0].id == c.id):
-            continue
-        if worth < mine - NEARLY * inflation or significance(trial, 0, vessel, antenna) < 1.0:
-            continue
-        if c.id == "clock_offset":
-            late = trial.state.late[c.channels[0]]
-            said.append(f"{' and '.join(c.channels)} {late:+.2f} s late")
-        elif c.id == "lever_arm":
-            said.append(f"an antenna at ({trial.state.arm[0]:.2f}, {trial.state.arm[1]:.2f}) m")
-        else:
-            said.append(f"a heading bias of {np.degrees(trial.state.bias):.1f} deg")
-    if not said:
-        return ""
-    return f"{' or '.join(said[:2])} would explain nearly as much of this motion"
+@dataclass(frozen=True)
+class _Base:
+    """The clock that all channels end on."""
+
+    late: float = 0.0
+    channels: tuple[str, ...] = ()
+    words: str = ""
 
 
-def _clock_finding(c: Candidate, value: float, std: float, motion: Motion) -> Finding:
-    channels = c.channels
-    if channels == ("x_n", "y_n") and value < 0:
+def _base(clocks: list[Defect], campaign: Campaign, vessel: Vessel) -> _Base:
+    """Return the clock that the thrusters' columns share, against the one most sensors share."""
+    reference = (clocks[0].against, 0.0)
+    all_clocks = [reference, *((d.channels, float(d.value[0])) for d in clocks)]
+    positions = [k for k, (names, _) in enumerate(all_clocks) if "x_n" in names]
+    # forces move velocities: only positions may be on another clock than they are
+    if not positions or positions == [0]:
+        return _Base()
+    delays = response_delays(campaign.recordings, vessel)
+    may = [k for k in input_clocks(delays, all_clocks, vessel) if k in (0, positions[0])]
+    seen = _delays_in_words(delays)
+    against = _list(_words(clocks[0].against))
+    if may == [0]:
+        return _Base(words=f"the thrusters' columns share the clock of {against} ({seen})")
+    if may == positions:
+        names, late = all_clocks[positions[0]]
+        words = f"the thrusters' columns share the clock of the positions ({seen})"
+        return _Base(late, names, words)
+    why = f"{seen}, which fits {'either' if may else 'neither'}" if seen else "no answer is seen"
+    return _Base(
+        words=f"which of these clocks the thrusters' columns share is unknown ({why}), so the "
+        f"positions are moved, which no force depends on"
+    )
+
+
+def _delays_in_words(delays: dict[str, Delay]) -> str:
+    said = [f"{n} answers after {d.value:.1f} s" for n, d in sorted(delays.items())]
+    return ", ".join(said)
+
+
+def _clock_finding(d: Defect, base: _Base, campaign: Campaign) -> Finding:
+    value, std = float(d.value[0]), float(np.sqrt(d.covariance[0, 0]))
+    channels, against = d.channels, d.against
+    late = value - base.late
+    moved = channels
+    if "x_n" in channels and value < 0:
         # a sensor can be late, not early: then all the others are
-        channels, value = tuple(n for n in ("u", "v", "psi", "r") if n in motion), -value
-    names = ", ".join(channels[:-1]) + " and " + channels[-1] if len(channels) > 1 else channels[0]
-    late = "late" if value > 0 else "early"
-    against = [n for n in ("x_n", "psi", "u", "r") if n in motion and n not in channels]
+        channels, against, value = against, channels, -value
+    if base.channels and "x_n" in d.channels:
+        # the positions stand on the inputs' clock: the others are moved to it
+        moved, late = d.against, -base.late
+    steps = _shift(moved, late)
+    names = _list(channels)
     half = ""
-    if "x_n" in channels and abs(value - 0.5 * motion.step) < max(2.5 * std, 0.02):
+    if "x_n" in d.channels and abs(abs(value) - 0.5 * campaign.step) < max(2.5 * std, 0.02):
         half = " (half a sample: a simulation by Euler's rule at this step looks the same)"
     return Finding(
         "clock_offset",
@@ -116,22 +166,35 @@ def _clock_finding(c: Candidate, value: float, std: float, motion: Motion) -> Fi
         value,
         (value - 1.96 * std, value + 1.96 * std),
         "s",
-        f"{names} {'comes' if len(channels) == 1 else 'come'} {abs(value):.2f} s {late} against "
-        f"{_words(against)}: shifted so, positions, velocities and heading agree{half}",
-        f"shift {names} by {-value:+.2f} s (import --fix does), and look for the delay in the "
-        f"logger or a filter",
+        f"{names} {'comes' if len(channels) == 1 else 'come'} {abs(value):.2f} s "
+        f"{'late' if value > 0 else 'early'} against {_list(_words(against))}: shifted so, "
+        f"positions, velocities and heading agree{half}"
+        f"{f'; {base.words}' if base.words and 'x_n' in d.channels else ''}",
+        f"shift {_list(moved)} by {-late:+.2f} s (import --fix does), and look for the delay in "
+        f"the logger or a filter",
         channels,
-        (mend("shift", channels, late=value),),
+        steps,
         True,
     )
 
 
-def _words(names: list[str]) -> str:
+def _shift(channels: tuple[str, ...], late: float) -> tuple[Step, ...]:
+    return (mend("shift", channels, late=late),)
+
+
+def _list(names: tuple[str, ...] | list[str]) -> str:
+    return ", ".join(names[:-1]) + " and " + names[-1] if len(names) > 1 else names[0]
+
+
+def _words(names: tuple[str, ...]) -> list[str]:
     said = {"x_n": "the positions", "psi": "the heading", "u": "the velocities", "r": "the rate"}
-    return " and ".join(said[n] for n in names) or "the rest"
+    if "u" not in names and "v" in names:
+        said["v"] = "the sway velocity"
+    return [said[n] for n in names if n in said]
 
 
-def _heading_finding(value: float, std: float) -> Finding:
+def _heading_finding(d: Defect) -> Finding:
+    value, std = float(d.value[0]), float(np.sqrt(d.covariance[0, 0]))
     return Finding(
         "heading_bias",
         "psi",
@@ -150,9 +213,11 @@ def _heading_finding(value: float, std: float) -> Finding:
     )
 
 
-def _arm_finding(arm: Array, std: Array, antenna: tuple[float, ...]) -> Finding:
+def _arm_finding(d: Defect, antenna: Array) -> Finding:
+    arm, std = d.value, np.sqrt(np.diag(d.covariance))
     ci = tuple((float(a - 1.96 * s), float(a + 1.96 * s)) for a, s in zip(arm, std, strict=True))
     said = f"({antenna[0]:g}, {antenna[1]:g})"
+    off = arm - antenna
     return Finding(
         "lever_arm",
         "x_n",
@@ -164,90 +229,177 @@ def _arm_finding(arm: Array, std: Array, antenna: tuple[float, ...]) -> Finding:
         f"when the ship turns",
         f"write antenna = [{arm[0]:.2f}, {arm[1]:.2f}] in [sensors], or import --fix, which moves "
         f"the positions to where the vessel file has them",
-        ("x_n", "y_n"),
-        (
-            mend(
-                "move_antenna",
-                ("x_n", "y_n"),
-                x=float(arm[0] - antenna[0]),
-                y=float(arm[1] - antenna[1]),
-            ),
-        ),
+        POSITIONS,
+        (mend("move_antenna", POSITIONS, x=float(off[0]), y=float(off[1])),),
         True,
     )
 
 
-def offset_outcomes(tie: Tie, found: Fit, usable: list[Candidate]) -> list[Outcome]:
+def _judged(finding: Finding, d: Defect, campaign: Campaign, vessel: Vessel) -> Finding:
+    """Say on which logs a finding rests, and leave it to the user where they do not decide it."""
+    evidence = finding.evidence
+    count = len(campaign.names)
+    if count > 1:
+        evidence += f"; {count} logs together say so"
+        scatter = _scatter(d, campaign.pooled)
+        if scatter:
+            evidence += f", each within about {scatter}"
+        finding = replace(finding, logs=campaign.names)
+    if campaign.others and _differs(d, campaign.pooled):
+        evidence += (
+            f"; {campaign.others} other log{'s' if campaign.others > 1 else ''} of the ship "
+            f"{'have' if campaign.others > 1 else 'has'} another value"
+        )
+    ask = ""
+    if not possible(d, vessel):
+        size, most = (
+            (f"{np.hypot(*d.value):.1f} m", f"{most_arm(vessel):.1f} m")
+            if d.id == "lever_arm"
+            else (f"{abs(float(d.value[0])):.1f} s", f"{MOST_LATE:g} s")
+        )
+        what = "an antenna stands on the ship" if d.id == "lever_arm" else "a logger delays by less"
+        ask = f"{size} is more than {most}: {what}, so look for another cause"
+    else:
+        margin, rival = separation(campaign.judged, d)
+        if margin < SEPARATED and rival is not None:
+            ask = _rivals(rival, campaign)
+    if ask:
+        evidence += f"; {ask}"
+        finding = replace(
+            finding, safe=False, fix=finding.fix.replace("--fix", f"--fix-also {finding.id}", 1)
+            if "--fix-also" not in finding.fix else finding.fix,
+        )  # fmt: skip
+    return replace(finding, evidence=evidence)
+
+
+def _rivals(rival: Judged, campaign: Campaign) -> str:
+    """Say what else explains as much, and which logs can tell."""
+    said = []
+    for d in rival.defects:
+        if d.id == "clock_offset":
+            said.append(f"{_list(d.channels)} {float(d.value[0]):+.2f} s late")
+        elif d.id == "lever_arm":
+            said.append(f"an antenna at ({d.value[0]:.2f}, {d.value[1]:.2f}) m")
+        else:
+            said.append(f"a heading bias of {np.degrees(float(d.value[0])):.1f} deg")
+    words = f"{' with '.join(said) or 'none of it'} would explain nearly as much of this motion"
+    if len(campaign.names) == 1:
+        return f"{words}: check this log together with others of the ship, which may tell"
+    tells = []
+    for name, e in zip(campaign.names, campaign.evidence, strict=True):
+        gain = _loglik(e, campaign.best.offsets) - _loglik(e, rival.offsets)
+        if abs(gain) > _TELLS:
+            tells.append((abs(gain), name, gain > 0))
+    tells.sort(reverse=True)
+    if not tells:
+        return f"{words}, and no log can tell them apart"
+    named = ", ".join(f"{n} ({'this' if mine else 'that'})" for _, n, mine in tells[:_MOST_NAMED])
+    return f"{words}; what single logs prefer: {named}"
+
+
+def _loglik(e: Evidence, offsets: Array) -> float:
+    return float(e.pull @ offsets - 0.5 * offsets @ e.information @ offsets)
+
+
+def _rows(d: Defect) -> list[int]:
+    if d.id == "lever_arm":
+        return [ARM.start, ARM.start + 1]
+    if d.id == "heading_bias":
+        return [BIAS]
+    return [CLOCKS.index(n) for n in (*d.channels, *d.against) if n in CLOCKS]
+
+
+def _scatter(d: Defect, pooled: Pooled) -> str:
+    size = float(np.max(pooled.scatter[_rows(d)]))
+    if d.id == "heading_bias":
+        return f"{np.degrees(size):.1f} deg" if size > 0.1 * LEAST_HEADING else ""
+    if size < 0.1 * LEAST_CLOCK:
+        return ""
+    return f"{size:.2f} {'m' if d.id == 'lever_arm' else 's'}"
+
+
+def _differs(d: Defect, pooled: Pooled) -> bool:
+    rows = _rows(d)
+    if d.id == "clock_offset":
+        # two channels that differ alike from those of other campaigns keep their distance
+        mine = [CLOCKS.index(n) for n in d.channels if n in CLOCKS]
+        theirs = [CLOCKS.index(n) for n in d.against if n in CLOCKS]
+        return bool(pooled.differing[mine].any() != pooled.differing[theirs].any())
+    return bool(pooled.differing[rows].any())
+
+
+def _outcomes(campaign: Campaign, told: list[Defect], vessel: Vessel) -> list[Outcome]:
     """Say for each id what its standard error would allow to see."""
+    information = np.asarray(np.linalg.inv(campaign.pooled.covariance), dtype=np.float64)
+    basis = campaign.best.hypothesis.basis
+    apart = campaign.best.hypothesis.apart
+    found = {d.id for d in told}
+    together = f", {len(campaign.names)} logs together" if len(campaign.names) > 1 else ""
+    needs = "needs positions, heading and velocities of a sensor of their own"
     outcomes = []
-    m = tie.motion
-    for kind in IDS:
-        members = [c for c in usable if c.id == kind and c not in found.candidates]
-        if not any(c.id == kind for c in usable):
+    if "clock_offset" not in found:
+        if apart:
             outcomes.append(
                 Outcome(
-                    kind, "cannot tell",
-                    "needs positions, heading and velocities of a sensor of their own",
-                )
-            )  # fmt: skip
-            continue
-        if kind == "clock_offset" and not m.positioned:
-            outcomes.append(
-                Outcome(kind, "clean", "heading against yaw rate; no positions to tell which")
-            )
-            continue
-        if kind == "clock_offset":
-            outcomes.append(_clock_outcome(tie, found, usable))
-            continue
-        if not members:
-            outcomes.append(Outcome(kind, "clean", "positions, velocities and heading compared"))
-            continue
-        with_it = fit(tie, (*found.candidates, members[0]), found.state, rounds=1)
-        k = size(members[0])
-        std = np.sqrt(np.diag(with_it.covariance))[-k:]
-        span = np.degrees(np.ptp(m["psi"]))
-        if kind == "heading_bias" and std[0] > _VAGUE_HEADING:
-            outcomes.append(
-                Outcome(
-                    kind, "cannot tell",
-                    f"the heading stays within {span:.0f} deg and the speed nearly constant: a "
-                    f"bias cannot be told from a current (standard error "
-                    f"{np.degrees(std[0]):.1f} deg)",
-                )
-            )  # fmt: skip
-        elif kind == "lever_arm" and float(np.max(std)) > 0.5:
-            outcomes.append(
-                Outcome(
-                    kind, "cannot tell",
-                    f"the heading turns too little ({span:.0f} deg): standard error "
-                    f"{float(np.max(std)):.2g} m",
+                    "clock_offset", "clean",
+                    f"heading against yaw rate; no positions to tell which{together}",
                 )
             )  # fmt: skip
         else:
-            error = (
-                f"{np.degrees(std[0]):.2f} deg"
-                if kind == "heading_bias"
-                else f"{std[0]:.2g} and {std[1]:.2g} m"
-            )
-            outcomes.append(Outcome(kind, "clean", f"standard error {error}"))
+            outcomes.append(_clock_outcome(campaign, information, basis, together))
+    if apart:
+        return [*outcomes, *(Outcome(i, "cannot tell", needs) for i in IDS[1:])]
+    span = np.degrees(campaign.turned_over)
+    if "lever_arm" not in found:
+        std = _error(information, basis, np.eye(SIZE)[:, ARM])
+        vague = float(np.max(std)) > min(_VAGUE_ARM[0], _VAGUE_ARM[1] * vessel.length)
+        said = (
+            f"the heading turns too little ({span:.0f} deg): standard error "
+            f"{float(np.max(std)):.2g} m"
+            if vague
+            else f"standard error {std[0]:.2g} and {std[1]:.2g} m{together}"
+        )
+        outcomes.append(Outcome("lever_arm", "cannot tell" if vague else "clean", said))
+    if "heading_bias" not in found:
+        error = float(_error(information, basis, np.eye(SIZE)[:, [BIAS]])[0])
+        vague = error > _VAGUE_HEADING
+        said = (
+            f"the heading stays within {span:.0f} deg and the speed nearly constant: a bias cannot "
+            f"be told from a current (standard error {np.degrees(error):.1f} deg)"
+            if vague
+            else f"standard error {np.degrees(error):.2f} deg{together}"
+        )
+        outcomes.append(Outcome("heading_bias", "cannot tell" if vague else "clean", said))
     return outcomes
 
 
-def _clock_outcome(tie: Tie, found: Fit, usable: list[Candidate]) -> Outcome:
+def _clock_outcome(campaign: Campaign, information: Array, basis: Array, together: str) -> Outcome:
     """Say how well each clock is known, and which cannot be told."""
     known: list[str] = []
     vague: list[str] = []
-    for c in usable:
-        if c.id != "clock_offset" or c.channels not in _OWN_CLOCKS or c in found.candidates:
+    seen = sum(np.diag(e.information) for e in campaign.evidence) > np.zeros(SIZE)
+    for channels in _OWN_CLOCKS:
+        column = np.zeros((SIZE, 1))
+        names = CLOCKS if channels == POSITIONS else channels
+        rows = [CLOCKS.index(n) for n in names if seen[CLOCKS.index(n)]]
+        if not rows:
             continue
-        fitted = fit(tie, (*found.candidates, c), found.state, rounds=1)
-        std = float(np.sqrt(fitted.covariance[-1, -1]))
-        words = f"{', '.join(c.channels)} {std:.2g} s"
-        (vague if std > _VAGUE_CLOCK else known).append(words)
+        column[rows] = 1.0
+        std = float(_error(information, basis, column)[0])
+        (vague if std > _VAGUE_CLOCK else known).append(f"{', '.join(channels)} {std:.2g} s")
     if not known:
         said = f"this motion tells no clock apart (standard errors: {'; '.join(vague)})"
         return Outcome("clock_offset", "cannot tell", said)
-    said = f"standard errors: {'; '.join(known)}"
+    said = f"standard errors: {'; '.join(known)}{together}"
     if vague:
         said += f"; cannot tell: {'; '.join(vague)}"
     return Outcome("clock_offset", "clean", said)
+
+
+def _error(information: Array, basis: Array, more: Array) -> Array:
+    """Return the standard errors of more offsets beside those that were found."""
+    left = basis - more @ (more.T @ basis) / float(np.sum(more[:, 0]))
+    held = left[:, np.linalg.norm(left, axis=0) > 1e-9]
+    wide = np.hstack([more, held])
+    covariance = np.linalg.pinv(wide.T @ information @ wide)
+    return np.asarray(np.sqrt(np.diag(covariance)[: more.shape[1]]))

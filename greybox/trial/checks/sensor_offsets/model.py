@@ -1,169 +1,156 @@
-"""The tie between position, heading, velocity and yaw rate, and what may be wrong with it.
+"""What ties position, heading, velocity and yaw rate of one log, and what sensors may add to it.
 
-Residuals and their derivatives for given clocks, lever arm and heading bias.
+Seven parameters belong to the instruments: the clocks of ψ, u, v, r against that of the positions
+(of r against ψ where there are none), the antenna's lever arm, and the heading bias. Residuals of
+positions and heading, and their derivatives, are taken at given values of all.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.trial.checks.motion import (
-    Motion,
-    denoise,
-    integrate,
-    levels,
-    outlier_weights,
-    smooth,
-    turn,
-)
+from greybox.trial.checks.motion import Motion, denoise, integrate, smooth, turn
 
 Array = NDArray[np.float64]
+
+# order of the parameters: lateness by channel [s], lever arm [m], heading bias [rad]
+CLOCKS = ("psi", "u", "v", "r")
+ARM = slice(len(CLOCKS), len(CLOCKS) + 2)
+BIAS = len(CLOCKS) + 2
+SIZE = BIAS + 1
 
 # beyond this time the heading's own noise is averaged out
 _HEADING_WINDOW = 5.0
 
 
 @dataclass(frozen=True)
-class Candidate:
-    """One defect as directions of the parameters.
+class Residuals:
+    """Residuals of one log at given offsets, and minus their derivatives.
 
     Parameters
     ----------
-    id : {"clock_offset", "lever_arm", "heading_bias"}
-    channels : tuple of str
-    parameters : tuple of str
-        Names among ``clock`` (its channels late together), ``arm_x``, ``arm_y``, ``bias``.
-    cost : float
-        In log-likelihood: what many columns together must explain more than one.
+    position : ndarray
+        (N, 2) measured minus dead-reckoned position [m]; no rows where the log has none.
+    heading : ndarray
+        (N,) measured heading minus integrated yaw rate [rad].
+    position_columns, heading_columns : ndarray
+        (N, 2, `SIZE` + 4) and (N, `SIZE` + 2): minus the derivatives by all offsets, then those by
+        what each log has of its own: a constant velocity of the water, a scale of the velocities
+        and a delay of east against north; or a bias and a scale of the yaw rate.
     """
 
-    id: str
-    channels: tuple[str, ...]
-    cost: float = 0.0
-
-
-@dataclass(frozen=True)
-class State:
-    """Parameters of the tie.
-
-    Parameters
-    ----------
-    late : dict of str to float
-        By channel: seconds by which it is late.
-    bias : float
-        Measured minus true heading [rad].
-    arm : tuple of float
-        Antenna, forward and starboard of the body origin [m].
-    """
-
-    late: dict[str, float] = field(default_factory=dict)
-    bias: float = 0.0
-    arm: tuple[float, float] = (0.0, 0.0)
-
-    @property
-    def common(self) -> float:
-        """Lateness of both positions: the same as all others being early, and easier to move."""
-        x, y = self.late.get("x_n", 0.0), self.late.get("y_n", 0.0)
-        return x if x == y else 0.0
-
-    def moved(self, candidate: Candidate, step: Array) -> State:
-        """Return the state with a candidate's parameters moved."""
-        if candidate.id == "clock_offset":
-            late = dict(self.late)
-            for c in candidate.channels:
-                late[c] = late.get(c, 0.0) + float(step[0])
-            return replace(self, late=late)
-        if candidate.id == "heading_bias":
-            return replace(self, bias=self.bias + float(step[0]))
-        return replace(self, arm=(self.arm[0] + float(step[0]), self.arm[1] + float(step[1])))
-
-
-def size(candidate: Candidate) -> int:
-    """Return the number of parameters of a candidate."""
-    return 2 if candidate.id == "lever_arm" else 1
+    position: Array
+    heading: Array
+    position_columns: Array
+    heading_columns: Array
 
 
 class Tie:
-    """Residuals of positions and heading for given parameters, and their derivatives."""
+    """Residuals of positions and heading of one log for given offsets."""
 
-    def __init__(self, motion: Motion, start: State | None = None) -> None:
+    def __init__(self, motion: Motion) -> None:
         self.motion = motion
-        self.start = start or State()
-        self._weights: dict[tuple[str, int], Array] = {}
+        self.positioned, self.turned = motion.positioned, motion.turned
         self.smooth = {
             n: denoise(v, motion) for n, v in motion.values.items() if n not in ("x_n", "y_n")
         }
-        self.level = levels(motion)
-        n, s = self.level.shape
         self.drift = (motion.t - motion.t[0]) / max(float(np.ptp(motion.t)), 1e-9)
-        self.columns = 2 * s + 3
-        self.calm = self.smooth.get("psi", np.zeros(len(motion)))
-        self.positioned, self.turned = motion.positioned, motion.turned
-        if self.turned:
-            self.align(self.start)
-        if self.positioned:
-            # what is moved in time must not know the positions' own noise, or moving it would
-            # seem to explain that noise: the way by the other sensors stands in for them
-            way = self.walked(State(), self.smooth)
-            self.smooth["x_n"], self.smooth["y_n"] = way[:, 0], way[:, 1]
-        self.samples = (2 * n if self.positioned else 0) + (n if self.turned else 0)
+        self._whole: dict[str, int] = {}
+        self.align(np.zeros(SIZE))
 
-    def align(self, state: State) -> None:
-        """Take the fast part of the noise-free heading from the rate, as late as the heading is.
+    @property
+    def free(self) -> NDArray[np.int64]:
+        """Parameters that the channels of this log can show."""
+        clocks = ("psi", "u", "v") if self.positioned else ()
+        names = [*clocks, *(["r"] if self.turned else [])]
+        found = [CLOCKS.index(n) for n in names]
+        return np.array(found + ([*range(ARM.start, SIZE)] if self.positioned else []))
 
-        As for the positions: what is moved in time must not know its own noise.
+    def align(self, offsets: Array) -> None:
+        """Take channels as late as they are: by whole samples, and the noise-free heading.
+
+        What is moved by less must not know its own noise, or moving it would seem to explain that
+        noise: the fast part of the noise-free heading is the rate's.
         """
+        late = self._late(offsets)
+        self._whole = {n: round(late[n] / self.motion.step) for n in self.smooth}
         if not self.turned:
             return
-        behind = state.late.get("psi", 0.0) - state.late.get("r", 0.0)
-        swept = integrate(self.smooth["r"], self.motion)
-        for a, b in self.motion.stretches:
-            t = self.motion.t[a:b]
-            swept[a:b] = _beyond(t - behind, t, swept[a:b])
+        behind = offsets[CLOCKS.index("psi")] - offsets[CLOCKS.index("r")]
+        swept = self._moved(integrate(self.smooth["r"], self.motion), -behind)
         seconds = max(_HEADING_WINDOW, 5 * self.motion.step)
         self.smooth["psi"] = swept + smooth(self.motion["psi"] - swept, self.motion, seconds)
-        self.calm = self.smooth["psi"]
 
-    def weigh(self, what: str) -> Callable[[float], Array]:
-        """Return gain -> weights of the innovations of ``position`` or ``heading``.
+    def residuals(self, offsets: Array) -> Residuals:
+        """Return residuals and minus their derivatives at some offsets (`SIZE`,)."""
+        m = self.motion
+        n = len(m)
+        late = self._late(offsets)
+        slow = {k: self._moved(self.smooth[k], late[k]) for k in ("psi", "u", "v", "r") if k in m}
+        now = {k: self._now(k, slow[k]) for k in slow}
+        rate = {k: self._slope(v) for k, v in slow.items()}
+        position, columns = np.zeros((n, 2)), np.zeros((n, 2, SIZE + 4))
+        if self.positioned:
+            bias, arm = offsets[BIAS], offsets[ARM]
+            psi = slow["psi"] - bias
+            lever = turn(psi, np.full(n, arm[0]), np.full(n, arm[1]))
+            walked = self._walked(now["psi"] - bias, now["u"], now["v"])
+            position = np.column_stack([m["x_n"], m["y_n"]]) - walked - lever
+            ahead = turn(psi, rate["u"], np.zeros(n))
+            aside = turn(psi, np.zeros(n), rate["v"])
+            velocity = turn(psi, slow["u"], slow["v"])
+            across = np.column_stack([-velocity[:, 1], velocity[:, 0]])
+            levered = np.column_stack([-lever[:, 1], lever[:, 0]])
+            turning = rate["psi"][:, None]
+            ways = integrate(np.hstack([ahead, aside, across * turning, across, velocity]), m)
+            columns[:, :, CLOCKS.index("u")] = ways[:, 0:2]
+            columns[:, :, CLOCKS.index("v")] = ways[:, 2:4]
+            columns[:, :, CLOCKS.index("psi")] = ways[:, 4:6] + levered * turning
+            columns[:, :, ARM.start] = turn(psi, np.ones(n), np.zeros(n))
+            columns[:, :, ARM.start + 1] = turn(psi, np.zeros(n), np.ones(n))
+            columns[:, :, BIAS] = -ways[:, 6:8] - levered
+            columns[:, 0, SIZE] = columns[:, 1, SIZE + 1] = self.drift
+            columns[:, :, SIZE + 2] = ways[:, 8:10]
+            # one receiver has one clock, but axes that are not square, as of a local grid, look
+            # like two in a turn: their mean is compared with the other clocks
+            columns[:, :, SIZE + 3] = velocity * np.array([-0.5, 0.5])
+        heading, swept = np.zeros(n), np.zeros((n, SIZE + 2))
+        if self.turned:
+            both = integrate(np.column_stack([now["r"], slow["r"], rate["r"]]), m)
+            heading = now["psi"] - both[:, 0]
+            if self.positioned:
+                swept[:, CLOCKS.index("psi")] = -rate["psi"]
+            swept[:, CLOCKS.index("r")] = both[:, 2]
+            swept[:, SIZE], swept[:, SIZE + 1] = self.drift, both[:, 1]
+        return Residuals(position, heading, columns, swept)
 
-        They are taken once, from the log as it is: were they to change from one
-        candidate to the next, their likelihoods could not be compared.
+    def _late(self, offsets: Array) -> dict[str, float]:
+        late = {n: float(x) for n, x in zip(CLOCKS, offsets[: len(CLOCKS)], strict=True)}
+        return late if self.positioned else late | {"psi": 0.0}
+
+    def _now(self, name: str, slow: Array) -> Array:
+        """Return a channel as it would be were it not late, its noise as it was recorded.
+
+        By whole samples with its noise; for the rest only the noise-free part is moved, since
+        interpolation between samples would shrink the noise and so seem to explain it.
         """
-
-        def weight(gain: float) -> Array:
-            key = (what, round(10 * float(np.log(gain))))
-            if key not in self._weights:
-                pos, head = self.nuisance(self.start)
-                values = self.motion.values
-                if what == "position":
-                    z, x = self.position(self.start, values), pos
-                else:
-                    z, x = self.heading(self.start, values), head
-                self._weights[key] = outlier_weights(z, x, gain, self.motion)
-            return self._weights[key]
-
-        return weight
-
-    def _at(self, name: str, state: State, values: dict[str, Array]) -> Array:
-        late = state.late.get(name, 0.0) - state.common
-        if late == 0.0:
-            return values[name]
-        # what is true now is recorded `late` seconds later; only the smooth part is moved,
-        # since interpolation between samples would shrink the noise and so seem to explain it
-        out = values[name].copy()
+        out = slow.copy()
         for a, b in self.motion.stretches:
-            t, slow = self.motion.t[a:b], self.smooth[name][a:b]
-            out[a:b] += _beyond(t + late, t, slow) - slow
+            rows = np.arange(a, b) + self._whole[name]
+            inside = (rows >= a) & (rows < b)
+            rows = rows[inside]
+            out[a:b][inside] += self.motion[name][rows] - self.smooth[name][rows]
         return out
 
-    def _late(self, value: Array, name: str, state: State) -> Array:
+    def _walked(self, psi: Array, u: Array, v: Array) -> Array:
+        """Return the way made by velocities and heading (N, 2) [m]."""
+        return integrate(turn(psi, u, v), self.motion)
+
+    def _moved(self, value: Array, late: float) -> Array:
         """Return a noise-free channel as it would be were it not late."""
-        late = state.late.get(name, 0.0) - state.common
         if late == 0.0:
             return value
         out = np.empty_like(value)
@@ -172,61 +159,11 @@ class Tie:
             out[a:b] = _beyond(t + late, t, value[a:b])
         return out
 
-    def walked(self, state: State, values: dict[str, Array]) -> Array:
-        """Return the way made by velocities and heading (N, 2) [m]."""
-        psi = self._at("psi", state, values) - state.bias
-        return integrate(
-            turn(psi, self._at("u", state, values), self._at("v", state, values)), self.motion
-        )
-
-    def position(
-        self, state: State, values: dict[str, Array], walked: Array | None = None
-    ) -> Array:
-        """Return measured position minus that of velocity, heading and lever arm (N, 2) [m]."""
-        if walked is None:
-            walked = self.walked(state, values)
-        # the heading's noise, a lever long, would count as noise of the positions
-        psi = self._late(self.calm, "psi", state) - state.bias
-        arm = turn(psi, np.full(len(psi), state.arm[0]), np.full(len(psi), state.arm[1]))
-        measured = np.column_stack([self._at("x_n", state, values), self._at("y_n", state, values)])
-        return measured - walked - arm
-
-    def heading(self, state: State, values: dict[str, Array]) -> Array:
-        """Return measured heading minus that of the yaw rate (N,) [rad]."""
-        return self._at("psi", state, values) - integrate(self._at("r", state, values), self.motion)
-
-    def nuisance(self, state: State) -> tuple[Array, Array]:
-        """Return the columns for starts, a constant velocity, and scales, (N, 2, q) and (N, q)."""
-        n, s = self.level.shape
-        pos = np.zeros((n, 2, 2 * s + 3))
-        if self.positioned:
-            pos[:, 0, :s] = self.level
-            pos[:, 1, s : 2 * s] = self.level
-            pos[:, 0, 2 * s] = self.drift
-            pos[:, 1, 2 * s + 1] = self.drift
-            pos[:, :, 2 * s + 2] = self.walked(state, self.smooth)
-        head = np.zeros((n, s + 2))
-        if self.turned:
-            head[:, :s] = self.level
-            head[:, s] = self.drift
-            head[:, s + 1] = integrate(self._at("r", state, self.smooth), self.motion)
-        return pos, head
-
-    def derivative(self, candidate: Candidate, state: State) -> tuple[Array, Array]:
-        """Return minus the derivatives of both residuals, (N, 2, k) and (N, k)."""
-        n, k = len(self.motion), size(candidate)
-        pos, head = np.zeros((n, 2, k)), np.zeros((n, k))
-        for j in range(k):
-            unit = np.zeros(k)
-            unit[j] = 0.5 * {"clock_offset": max(0.2, self.motion.step)}.get(candidate.id, 0.02)
-            plus, minus = state.moved(candidate, unit), state.moved(candidate, -unit)
-            if self.positioned:
-                change = self.position(plus, self.smooth) - self.position(minus, self.smooth)
-                pos[:, :, j] = -change / (2 * unit[j])
-            if self.turned and candidate.id == "clock_offset":
-                turned = self.heading(plus, self.smooth) - self.heading(minus, self.smooth)
-                head[:, j] = -turned / (2 * unit[j])
-        return pos, head
+    def _slope(self, value: Array) -> Array:
+        out = np.empty_like(value)
+        for a, b in self.motion.stretches:
+            out[a:b] = np.gradient(value[a:b], self.motion.step)
+        return out
 
 
 def _beyond(at: Array, t: Array, value: Array) -> Array:

@@ -1,264 +1,289 @@
-"""Which clocks, lever arm and heading bias a log shows: taken one by one, then doubted.
+"""Which clocks the channels share, and whether a lever arm or a heading bias is beside them.
 
-The one that explains most is taken first and the others are judged beside it;
-afterwards each is dropped or exchanged where another makes it needless.
+Every way to put the sensors on common clocks is compared, each with and without lever arm and
+heading bias, by the quadratic likelihood of all offsets: rivals stand side by side, and what
+cannot be separated is seen.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from greybox.trial.checks.motion import Motion
-from greybox.trial.checks.sensor_offsets.estimate import Fit, estimate_gain, fit, scan
-from greybox.trial.checks.sensor_offsets.model import Candidate, State, Tie, size
+from greybox.trial.checks.sensor_offsets.model import ARM, BIAS, CLOCKS, SIZE
+from greybox.trial.checks.sensor_offsets.thresholds import (
+    LEAST_CLOCK,
+    LEAST_HEADING,
+    MOST_LATE,
+    SIGMAS,
+    least_arm,
+    most_arm,
+)
 from greybox.vessel.vessel import Vessel
 
-# what is too small to matter, and how many standard errors prove it
-_LEAST_CLOCK = 0.1
-_LEAST_HEADING = np.radians(0.75)
-_LEAST_ARM = (0.1, 0.02)
-_SIGMAS = 3.3
+Array = NDArray[np.float64]
+Clock = tuple[str, ...]
+
+# all positions stand for one sensor
+POSITIONS = ("x_n", "y_n")
+# in log-likelihood: what one more offset must explain (3.3 standard errors)
 _LEAST_GAIN = 5.5
-_MOST_LATE = 9.0
-# in log-likelihood: what differs by less explains alike
-NEARLY = 10.0
-_FAR_COST = 12.0
-_EARLY_COST = 3.0
-# an antenna stands on the ship, or hardly beyond it [ship lengths]
-_MOST_ARM = 0.8
-_MOST = 3
-
-_CANDIDATES = (
-    Candidate("clock_offset", ("psi",)),
-    # a rate gyro is noisy against what a slow ship turns: the least certain of all
-    Candidate("clock_offset", ("r",), 2.5),
-    Candidate("clock_offset", ("x_n", "y_n")),
-    Candidate("clock_offset", ("u", "v")),
-    Candidate("clock_offset", ("psi", "r"), 8.0),
-    Candidate("clock_offset", ("u", "v", "r"), 6.0),
-    Candidate("clock_offset", ("u",), 3.0),
-    Candidate("clock_offset", ("v",), 3.0),
-    Candidate("clock_offset", ("x_n",), 30.0),
-    Candidate("clock_offset", ("y_n",), 30.0),
-    Candidate("lever_arm", ("x_n", "y_n"), 3.0),
-    Candidate("heading_bias", ("psi",)),
-)
+# velocities of one sensor on two clocks, several sensors on a clock beside that of the others, a
+# yaw rate alone (a gyro is noisy against what a slow ship turns), a sensor that is early, a clock
+# or an antenna far off, a second component of the arm
+_APART, _COMPANY, _RATE, _EARLY, _FAR, _SECOND = 3.0, 6.0, 2.5, 3.0, 12.0, 3.0
+_FAR_CLOCK = 2.0
+# a rival that explains as much but for this cannot be ruled out: odds of 20 to 1
+SEPARATED = 3.0
+# which clock the others are compared with: that of the most sensors
+_WEIGHT = {"x_n": 1.0, "psi": 1.0, "u": 0.55, "v": 0.55, "r": 0.8}
 
 
-def usable_candidates(motion: Motion) -> list[Candidate]:
-    """Return the defects that the channels of a log can show."""
-    return [c for c in _CANDIDATES if _usable(c, motion)]
-
-
-def sample_inflation(motion: Motion) -> float:
-    """Return by what likelihoods of fast samples, which repeat each other, are too large."""
-    return max(1.0, 0.1 / motion.step)
-
-
-def select_candidates(
-    tie: Tie, usable: list[Candidate], vessel: Vessel, antenna: tuple[float, float]
-) -> tuple[Fit, list[tuple[float, Fit]]]:
-    """Find the defects that explain a log best.
+@dataclass(frozen=True)
+class Defect:
+    """One offset that a hypothesis holds.
 
     Parameters
     ----------
-    tie : Tie
-        Aligned anew here as defects are found.
-    usable : list of Candidate
+    id : {"clock_offset", "lever_arm", "heading_bias"}
+    channels : tuple of str
+        Late channels, or those that the offset moves.
+    against : tuple of str
+        Channels on the clock that a late one is compared with.
+    value : ndarray
+        (k,) [s], [m] or [rad].
+    covariance : ndarray
+        (k, k)
+    """
+
+    id: str
+    channels: tuple[str, ...]
+    against: tuple[str, ...]
+    value: Array
+    covariance: Array
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """Clocks, lever arm and heading bias that may be.
+
+    Parameters
+    ----------
+    clocks : tuple of tuple of str
+        Channels by the clock that they share; the first is the one that most sensors share.
+    arm, bias : bool
+    """
+
+    clocks: tuple[Clock, ...]
+    arm: bool
+    bias: bool
+
+    @property
+    def basis(self) -> Array:
+        """Columns (`SIZE`, k) of the offsets that are free."""
+        columns = []
+        for clock in self.clocks:
+            if "x_n" not in clock and not (self.apart and clock == self.clocks[0]):
+                column = np.zeros(SIZE)
+                column[[CLOCKS.index(n) for n in clock]] = 1.0
+                columns.append(column)
+        if self.arm:
+            columns += list(np.eye(SIZE)[ARM])
+        if self.bias:
+            columns.append(np.eye(SIZE)[BIAS])
+        return np.column_stack(columns) if columns else np.zeros((SIZE, 0))
+
+    @property
+    def apart(self) -> bool:
+        """Whether there are no positions that the clocks could be compared with."""
+        return not any("x_n" in c for c in self.clocks)
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A hypothesis with its estimate.
+
+    Parameters
+    ----------
+    hypothesis : Hypothesis
+    score : float
+        Log-likelihood less the cost of its offsets.
+    offsets : ndarray
+        (`SIZE`,)
+    covariance : ndarray
+        (`SIZE`, `SIZE`)
+    defects : tuple of Defect
+        Its offsets, large or small.
+    """
+
+    hypothesis: Hypothesis
+    score: float
+    offsets: Array
+    covariance: Array
+    defects: tuple[Defect, ...]
+
+
+def hypotheses(channels: tuple[str, ...], *, turned: bool) -> Iterator[Hypothesis]:
+    """Yield every way to put the sensors of a log on clocks, with and without arm and bias.
+
+    Parameters
+    ----------
+    channels : tuple of str
+        Motion channels of the log.
+    turned : bool
+        Whether the yaw rate is compared with the heading.
+    """
+    positioned = "x_n" in channels
+    names = [n for n in ("x_n", "psi", "u", "v") if positioned or n == "psi"]
+    names += ["r"] if turned else []
+    flags = (False, True) if positioned else (False,)
+    for parts in _partitions(names):
+        clocks = tuple(sorted((tuple(p) for p in parts), key=_standing, reverse=True))
+        for arm in flags:
+            for bias in flags:
+                yield Hypothesis(clocks, arm, bias)
+
+
+def judge(
+    channels: tuple[str, ...], *, turned: bool, offsets: Array, covariance: Array,
+    scatter: Array, vessel: Vessel, antenna: Array,
+) -> list[Judged]:  # fmt: skip
+    """Return all hypotheses with their estimates, best first.
+
+    Parameters
+    ----------
+    channels : tuple of str
+    turned : bool
+    offsets : ndarray
+        (`SIZE`,) estimate of all offsets together.
+    covariance : ndarray
+        (`SIZE`, `SIZE`) of it.
+    scatter : ndarray
+        (`SIZE`,) standard deviation that offsets may have without mattering, from log to log and
+        between channels of one clock.
     vessel : Vessel
-    antenna : tuple of float
-        Where the vessel file has the antenna, forward and starboard [m].
-
-    Returns
-    -------
-    found : Fit
-        Those that remain, together.
-    first : list of tuple of float, Fit
-        Each candidate by itself, with its log-likelihood less its cost.
+    antenna : ndarray
+        (2,) where the vessel file has the antenna [m].
     """
-    chosen: tuple[Candidate, ...] = ()
-    start = State(arm=antenna)
-    plain = estimate_gain(tie, start, estimate_gain(tie, start))
-    best = Fit(start, (), np.zeros((0, 0)), plain.loglik, np.zeros(0))
-    inflation = sample_inflation(tie.motion)
-    first: list[tuple[float, Fit]] = []
-    for _ in range(_MOST):
-        trials = _trials(tie, usable, chosen, best.state, vessel, inflation)
-        if not trials:
-            break
-        first = first or trials
-        worth, trial = _preferred(trials, vessel, antenna, inflation)
-        if worth - best.loglik < _LEAST_GAIN * inflation:
-            break
-        chosen = trial.candidates
-        tie.align(trial.state)
-        best = fit(tie, chosen, trial.state)
-    best = _without_one(tie, _pruned(tie, best, start, vessel, antenna), start, inflation)
-    best = _exchanged(tie, best, usable, inflation)
-    best = _simplest(tie, best, usable, start, inflation)
-    return _pruned(tie, best, start, vessel, antenna), first
+    information = np.linalg.inv(covariance + np.diag(scatter**2))
+    null = np.zeros(SIZE)
+    null[ARM] = antenna
+    from_null = offsets - null
+    whole = float(from_null @ information @ from_null)
+    found = []
+    for h in hypotheses(channels, turned=turned):
+        basis = h.basis
+        estimate, spread = np.zeros(SIZE), np.zeros((SIZE, SIZE))
+        explained = 0.0
+        if basis.shape[1]:
+            inner = np.linalg.inv(basis.T @ information @ basis)
+            pull = basis.T @ information @ from_null
+            estimate = basis @ inner @ pull
+            taken = basis @ inner @ basis.T @ information
+            spread = taken @ covariance @ taken.T
+            explained = float(pull @ inner @ pull)
+        defects = _defects(h, estimate + null, spread)
+        score = 0.5 * (explained - whole) - _cost(h, defects, vessel)
+        found.append(Judged(h, score, estimate + null, spread, defects))
+    return sorted(found, key=_score, reverse=True)
 
 
-def _trials(
-    tie: Tie,
-    usable: list[Candidate],
-    chosen: tuple[Candidate, ...],
-    near: State,
-    vessel: Vessel,
-    inflation: float,
-) -> list[tuple[float, Fit]]:
-    """Return each candidate fitted beside those chosen, with log-likelihood less cost."""
-    trials: list[tuple[float, Fit]] = []
-    for c in usable:
-        if any(c.id == k.id and set(c.channels) & set(k.channels) for k in chosen):
-            continue
-        trial = fit(tie, (*chosen, c), scan(tie, c, near))
-        if max(map(abs, trial.state.late.values()), default=0.0) > _MOST_LATE:
-            continue
-        # a scan over many seconds finds more by chance than a search around zero
-        late = trial.state.late[c.channels[0]] if c.id == "clock_offset" else 0.0
-        if c.id == "lever_arm" and np.hypot(*trial.state.arm) > _MOST_ARM * vessel.length:
-            continue
-        cost = c.cost + (_FAR_COST if abs(late) > 2.0 else 0.0)
-        # a sensor is late, not early; only all the others can be, and then the positions are
-        cost = cost + (_EARLY_COST if late < 0 and "x_n" not in c.channels else 0.0)
-        cost *= inflation
-        trials.append((trial.loglik - cost, trial))
-    return trials
+def _score(judged: Judged) -> float:
+    return judged.score
 
 
-def _preferred(
-    trials: list[tuple[float, Fit]], vessel: Vessel, antenna: tuple[float, ...], inflation: float
-) -> tuple[float, Fit]:
-    """Return the best trial; of those nearly as good, one that is large enough to report."""
-    best = max(trials, key=_first)
-    large = [
-        t
-        for t in trials
-        if significance(t[1], len(t[1].candidates) - 1, vessel, antenna) >= 1.0
-        and t[0] > best[0] - NEARLY * inflation
-    ]
-    return max(large, key=_first) if large else best
+def matters(defect: Defect, vessel: Vessel, antenna: Array) -> bool:
+    """Whether a defect is large enough to matter, and proven."""
+    if defect.id == "lever_arm":
+        off = defect.value - antenna
+        wald = float(off @ np.linalg.solve(defect.covariance + 1e-12 * np.eye(2), off))
+        return bool(np.hypot(*off) >= least_arm(vessel) and wald >= SIGMAS**2 + 4)
+    value, std = abs(float(defect.value[0])), float(np.sqrt(defect.covariance[0, 0]))
+    least = LEAST_CLOCK if defect.id == "clock_offset" else LEAST_HEADING
+    return value >= least and value >= SIGMAS * std
 
 
-def _exchanged(tie: Tie, found: Fit, usable: list[Candidate], inflation: float) -> Fit:
-    """Exchange one late channel for another where that explains more beside the rest.
-
-    What was taken first was taken alone, and may stand for two defects together.
-    """
-    if len(found.candidates) < 2:
-        return found
-    best, worth = found, net_likelihood(found, inflation)
-    for k, old in enumerate(found.candidates):
-        if old.id != "clock_offset":
-            continue
-        for new in usable:
-            if new.id != "clock_offset" or new in found.candidates:
-                continue
-            others = tuple(c for j, c in enumerate(found.candidates) if j != k)
-            state = _restored(found.state, old, found.state)
-            trial = fit(tie, (*others, new), state)
-            if net_likelihood(trial, inflation) > worth + 2.0 * inflation:
-                best, worth = trial, net_likelihood(trial, inflation)
-    return best
+def separation(judged: list[Judged], defect: Defect) -> tuple[float, Judged | None]:
+    """Return by how much all hypotheses without a defect explain less, and the best of them."""
+    best = judged[0]
+    for other in judged:
+        if not any(_same(defect, d) for d in other.defects):
+            return best.score - other.score, other
+    return np.inf, None
 
 
-def _simplest(tie: Tie, found: Fit, usable: list[Candidate], start: State, inflation: float) -> Fit:
-    """Return one late sensor in place of several defects where it explains nearly as much."""
-    extra = len(found.candidates) - 1
-    if extra < 1:
-        return found
-    best, worth = found, net_likelihood(found, inflation) - extra * NEARLY * inflation
-    for c in usable:
-        if c.id == "clock_offset":
-            trial = fit(tie, (c,), scan(tie, c, start))
-            if net_likelihood(trial, inflation) > worth:
-                best, worth = trial, net_likelihood(trial, inflation)
-    return best
+def possible(defect: Defect, vessel: Vessel) -> bool:
+    """Whether a ship can have it."""
+    if defect.id == "lever_arm":
+        return bool(np.hypot(*defect.value) <= most_arm(vessel))
+    return defect.id != "clock_offset" or abs(float(defect.value[0])) <= MOST_LATE
 
 
-def _without_one(tie: Tie, found: Fit, start: State, inflation: float) -> Fit:
-    """Drop a candidate that another, looked for anew, makes needless."""
-    for old in found.candidates if len(found.candidates) > 1 else ():
-        others = tuple(c for c in found.candidates if c is not old)
-        state = _restored(found.state, old, start)
-        begins = [state]
-        if len(others) == 1:
-            begins.append(scan(tie, others[0], start))
-        for begin in begins:
-            trial = fit(tie, others, begin)
-            if (
-                net_likelihood(trial, inflation)
-                > net_likelihood(found, inflation) - _LEAST_GAIN * inflation
-            ):
-                return _without_one(tie, trial, start, inflation)
-    return found
+def _same(one: Defect, two: Defect) -> bool:
+    return one.id == two.id and one.channels == two.channels
 
 
-def net_likelihood(found: Fit, inflation: float) -> float:
-    """Return the log-likelihood of a fit less the costs of its candidates."""
-    return found.loglik - inflation * sum(c.cost for c in found.candidates)
+def _defects(h: Hypothesis, offsets: Array, covariance: Array) -> tuple[Defect, ...]:
+    found = []
+    for clock in h.clocks[1:]:
+        column = _lateness(clock) - _lateness(h.clocks[0])
+        found.append(
+            Defect(
+                "clock_offset", _channels(clock), _channels(h.clocks[0]),
+                np.array([column @ offsets]), np.array([[column @ covariance @ column]]),
+            )
+        )  # fmt: skip
+    if h.arm:
+        found.append(Defect("lever_arm", POSITIONS, (), offsets[ARM], covariance[ARM, ARM]))
+    if h.bias:
+        bias = np.array([np.angle(np.exp(1j * offsets[BIAS]))])
+        variance = covariance[BIAS : BIAS + 1, BIAS : BIAS + 1]
+        found.append(Defect("heading_bias", ("psi",), (), bias, variance))
+    return tuple(found)
 
 
-def _pruned(tie: Tie, found: Fit, start: State, vessel: Vessel, antenna: tuple[float, ...]) -> Fit:
-    """Drop what is too small or too uncertain, least certain first, and fit the rest anew."""
-    while found.candidates:
-        worth = [significance(found, k, vessel, antenna) for k in range(len(found.candidates))]
-        weakest = int(np.argmin(worth))
-        if worth[weakest] >= 1.0:
-            break
-        kept = tuple(c for k, c in enumerate(found.candidates) if k != weakest)
-        state = _restored(found.state, found.candidates[weakest], start)
-        found = (
-            fit(tie, kept, state)
-            if kept
-            else Fit(start, (), np.zeros((0, 0)), found.loglik, np.zeros(0))
-        )
-    return found
+def _lateness(clock: Clock) -> Array:
+    column = np.zeros(SIZE)
+    known = [n for n in clock if n in CLOCKS]
+    if "x_n" not in clock:
+        column[CLOCKS.index(known[0])] = 1.0
+    return column
 
 
-def _restored(state: State, candidate: Candidate, start: State) -> State:
-    if candidate.id == "clock_offset":
-        return replace(
-            state, late={k: v for k, v in state.late.items() if k not in candidate.channels}
-        )
-    if candidate.id == "heading_bias":
-        return replace(state, bias=start.bias)
-    return replace(state, arm=start.arm)
+def _channels(clock: Clock) -> tuple[str, ...]:
+    return tuple(c for n in clock for c in (POSITIONS if n == "x_n" else (n,)))
 
 
-def significance(found: Fit, k: int, vessel: Vessel, antenna: tuple[float, ...]) -> float:
-    """Return how far a candidate passes both thresholds; below one it is no finding."""
-    c = found.candidates[k]
-    at = sum(size(o) for o in found.candidates[:k])
-    cov = found.covariance[at : at + size(c), at : at + size(c)]
-    if c.id == "lever_arm":
-        off = np.array(found.state.arm) - np.array(antenna)
-        least = _LEAST_ARM[0] + _LEAST_ARM[1] * vessel.length
-        wald = float(off @ np.linalg.solve(cov + 1e-12 * np.eye(2), off))
-        return float(min(np.hypot(*off) / least, np.sqrt(wald / (_SIGMAS**2 + 4))))
-    std = float(np.sqrt(cov[0, 0]))
-    if c.id == "clock_offset":
-        value, least = found.state.late.get(c.channels[0], 0.0), _LEAST_CLOCK
-    else:
-        value, least = float(np.angle(np.exp(1j * found.state.bias))), float(_LEAST_HEADING)
-    return min(abs(value) / least, abs(value) / (_SIGMAS * std))
+def _cost(h: Hypothesis, defects: tuple[Defect, ...], vessel: Vessel) -> float:
+    total = _LEAST_GAIN * len(defects)
+    total += _SECOND * h.arm
+    for clock in h.clocks:
+        total += 0.5 * _APART * (("u" in clock) != ("v" in clock))
+    for d in defects:
+        value = float(d.value[0])
+        if d.id == "clock_offset":
+            sensors = {{"v": "u", "y_n": "x_n"}.get(c, c) for c in d.channels}
+            total += _COMPANY * (len(sensors) > 1) + _RATE * (d.channels == ("r",))
+            total += _EARLY * (value < 0 and "x_n" not in d.channels)
+            total += _FAR * (abs(value) > _FAR_CLOCK)
+        elif not possible(d, vessel):
+            total += _FAR
+    return float(total)
 
 
-def _first(pair: tuple[float, Fit]) -> float:
-    return pair[0]
+def _standing(clock: Clock) -> float:
+    return sum(_WEIGHT[n] for n in clock)
 
 
-def _usable(c: Candidate, motion: Motion) -> bool:
-    if not all(n in motion for n in c.channels):
-        return False
-    if c.id != "clock_offset":
-        return motion.positioned
-    if not motion.positioned:
-        # heading against yaw rate alone: which of the two is late cannot be told
-        return c.channels == ("r",)
-    if c.channels in (("psi", "r"), ("u", "v", "r")):
-        return motion.turned
-    return motion.turned or "r" not in c.channels
+def _partitions(names: list[str]) -> Iterator[list[list[str]]]:
+    if not names:
+        yield []
+        return
+    first, rest = names[0], names[1:]
+    for smaller in _partitions(rest):
+        yield [[first], *smaller]
+        for k in range(len(smaller)):
+            yield [*smaller[:k], [first, *smaller[k]], *smaller[k + 1 :]]

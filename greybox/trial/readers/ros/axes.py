@@ -25,6 +25,10 @@ Remarks = dict[str, None]
 WORLD_FRAMES = frozenset({"map", "odom", "world", "earth", "enu", "ned", "utm"})
 
 
+# what the body is called
+BODY_FRAMES = frozenset({"base_link", "base_footprint", "base", "body"})
+
+
 class SkippedMessageError(Exception):
     """The message says that it holds no valid measurement; the argument says why."""
 
@@ -74,6 +78,12 @@ def is_ned(frame: str) -> bool:
 def is_frd(frame: str) -> bool:
     """Whether the body's axes are forward-right-down by the name of the frame."""
     return "frd" in frame or "ned" in frame
+
+
+def tells_axes(frame: str) -> bool:
+    """Whether the axes of a frame are known by its name; those of a sensor's frame are not."""
+    named = is_ned(frame) or is_frd(frame) or "flu" in frame
+    return named or is_world(frame) or frame in BODY_FRAMES
 
 
 def north_east(x: Value, y: Value, *, ned: bool) -> tuple[Value, Value]:
@@ -136,7 +146,16 @@ def _twist_stamped(m: Mapping[str, Any], remarks: Remarks) -> Fields:
         return {
             f"{part}.{k}": float(twist[part][k]) for part in ("linear", "angular") for k in "xyz"
         }
-    return twist_fields(twist, is_frd(frame), remarks)
+    # of a sensor's frame the other signals of the trial tell
+    return twist_fields(twist, is_frd(frame), remarks if tells_axes(frame) else {})
+
+
+def _quaternion_stamped(m: Mapping[str, Any], remarks: Remarks) -> Fields:
+    frame = frame_name(m["header"]["frame_id"])
+    ned = is_ned(frame)
+    if tells_axes(frame):
+        remarks["psi = yaw" if ned else "psi = pi/2 - yaw (REP 103)"] = None
+    return {"psi": _heading(m["quaternion"], ned=ned)}
 
 
 def _imu(m: Mapping[str, Any], remarks: Remarks) -> Fields:
@@ -169,6 +188,21 @@ HANDLERS: dict[str, Callable[[Mapping[str, Any], Remarks], Fields]] = {
     "nav_msgs/msg/Odometry": _odometry,
     "geometry_msgs/msg/PoseStamped": _pose_stamped,
     "geometry_msgs/msg/PoseWithCovarianceStamped": _pose_stamped,
+    "geometry_msgs/msg/QuaternionStamped": _quaternion_stamped,
     "geometry_msgs/msg/TwistStamped": _twist_stamped,
     "geometry_msgs/msg/TwistWithCovarianceStamped": _twist_stamped,
 }
+# messages that a driver stamps with the frame of its sensor, whatever their axes
+_OF_SENSORS = {
+    "geometry_msgs/msg/QuaternionStamped": frozenset({"psi"}),
+    "geometry_msgs/msg/TwistStamped": frozenset({"u", "v"}),
+    "geometry_msgs/msg/TwistWithCovarianceStamped": frozenset({"u", "v"}),
+}
+
+
+def unsure_fields(kind: str, message: Mapping[str, Any]) -> frozenset[str]:
+    """Return the signals of a message whose axes its frame does not tell."""
+    names = _OF_SENSORS.get(kind, frozenset())
+    if names and tells_axes(frame_name(message["header"]["frame_id"])):
+        return frozenset()
+    return names

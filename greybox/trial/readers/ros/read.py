@@ -17,7 +17,7 @@ from greybox.files import sha256
 from greybox.trial.raw_log import Array, Recording, Signal, SourceFile
 from greybox.trial.readers.limits import limits
 from greybox.trial.readers.names import free_name, shortened
-from greybox.trial.readers.ros.axes import HANDLERS, Fields, SkippedMessageError
+from greybox.trial.readers.ros.axes import HANDLERS, Fields, SkippedMessageError, unsure_fields
 from greybox.trial.readers.ros.bags import read_messages, storage_files
 from greybox.trial.readers.ros.messages import (
     Decoded,
@@ -107,7 +107,7 @@ def read_bag(path: Path, topics: Mapping[str, str] | None = None) -> Recording:
                 f"'{path.name}' has no topic '{name}'.{suggestion(name, seen)} "
                 f"Its topics: {shortened(seen, 20)}."
             )
-    recording = _recording(path, list(collected.values()), notes)
+    signals, text, epoch, unsure = _recording(path, list(collected.values()), notes)
     recorded = [f for f in [path / "metadata.yaml", *files] if path.is_dir()] or [path]
     formats = {".bag": "ROS 1 bag", ".mcap": "MCAP", ".db3": "rosbag2 database"}
     sources = tuple(
@@ -115,7 +115,9 @@ def read_bag(path: Path, topics: Mapping[str, str] | None = None) -> Recording:
         for f in recorded
         if f.is_file()
     )
-    return Recording(path.stem, *recording, files=sources, notes=tuple(notes))
+    return Recording(
+        path.stem, signals, text, epoch, files=sources, notes=tuple(notes), unsure=unsure
+    )
 
 
 @dataclass
@@ -147,6 +149,7 @@ class _Topic:
     remarks: dict[str, None] = field(default_factory=dict)
     fields: dict[str, None] = field(default_factory=dict)
     converted: set[str] = field(default_factory=set)
+    unsure: set[str] = field(default_factory=set)
     unstamped: int = 0
     stamped: bool = False
     _decoders: dict[Channel, Callable[[bytes], Decoded] | DecodeError] = field(default_factory=dict)
@@ -203,6 +206,7 @@ class _Topic:
             try:
                 found = handle(message, self.remarks)
                 self.converted.update(found.keys() & _UNITS.keys())
+                self.unsure |= unsure_fields(kind, message) & found.keys()
             # the definition in the file is not that of the type's name
             except (KeyError, TypeError, ValueError, IndexError):
                 self.remarks["does not have the fields of its type, so it was not converted"] = None
@@ -294,7 +298,9 @@ def _stamp(message: Decoded) -> int | None:
 
 def _recording(
     path: Path, topics: list[_Topic], notes: list[str]
-) -> tuple[tuple[Signal, ...], dict[str, tuple[Array, NDArray[np.str_]]], float | None]:
+) -> tuple[
+    tuple[Signal, ...], dict[str, tuple[Array, NDArray[np.str_]]], float | None, frozenset[str]
+]:
     full = [t for t in topics if len(t.logged)]
     for topic in topics:
         _remark(topic, notes)
@@ -315,6 +321,7 @@ def _recording(
     keepers = _keepers(full)
     signals: list[Signal] = []
     used: set[str] = set()
+    unsure: set[str] = set()
     text: dict[str, tuple[Array, NDArray[np.str_]]] = {}
     for topic, clock in zip(full, clocks, strict=True):
         # the difference is exact in integers, a float of the epoch would round to 0.2 us
@@ -324,6 +331,7 @@ def _recording(
         for name in topic.columns:
             converted = name in topic.converted
             final, canonical = _named(topic, name, converted, keepers, notes)
+            unsure |= {final} if canonical and name in topic.unsure else set()
             signals.append(
                 Signal(
                     free_name(final, used),
@@ -334,7 +342,7 @@ def _recording(
                     canonical,
                 )
             )
-    return tuple(signals), text, epoch
+    return tuple(signals), text, epoch, frozenset(unsure)
 
 
 def _keepers(topics: list[_Topic]) -> dict[str, _Topic]:
