@@ -129,6 +129,16 @@ def defective(check, columns):
         c["v"][[150, 420]] += [1.5, -2.0]
     if check == "stuck":
         c["psi"][300:360] = c["psi"][300]
+    if check == "heading_wrap":
+        c["psi"] = c["psi"] % (2 * np.pi)
+        k = int(np.argmax(np.abs(np.diff(c["psi"]))))
+        c["psi"][k] = 0.5 * (c["psi"][k - 1] + c["psi"][k + 1])
+    if check == "position_hold":
+        for k in (200, 201, 420, 610):
+            c["x_n"][k], c["y_n"][k] = c["x_n"][k - 1], c["y_n"][k - 1]
+    if check == "position_jump":
+        c["x_n"][450:] += 8.0
+        c["y_n"][450:] -= 5.0
     if check == "quantised":
         c["v"] = np.round(c["v"], 1)
     if check == "unit":
@@ -150,8 +160,9 @@ def defective(check, columns):
 
 
 CHECKS = (
-    "gap", "duplicate_time", "nan", "outlier", "stuck", "quantised", "unit", "frame", "sign",
-    "clock_offset", "lever_arm", "heading_bias",
+    "gap", "duplicate_time", "nan", "outlier", "stuck", "quantised", "heading_wrap",
+    "position_hold", "position_jump", "unit", "frame", "sign", "clock_offset", "lever_arm",
+    "heading_bias",
 )  # fmt: skip
 
 

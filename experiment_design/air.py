@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from experiment_design.request import DesignRequest, draw_gusts
 from experiment_design.rollout import Motion
+from greybox.rotation import ned_to_body
 
 Array = NDArray[np.float64]
 
@@ -33,9 +34,7 @@ def air_velocity(velocity: Array, psi: Array, wind: Array) -> Array:
     ndarray
         (..., 2) [m/s]
     """
-    c, s = np.cos(psi), np.sin(psi)
-    north, east = wind[..., 0], wind[..., 1]
-    return velocity - np.stack([c * north + s * east, c * east - s * north], axis=-1)
+    return velocity - np.stack(ned_to_body(wind[..., 0], wind[..., 1], psi), axis=-1)
 
 
 def clear_heading(velocity: Array, wind: Array) -> float:

@@ -17,6 +17,7 @@ from experiment_design.limits import Circle
 from experiment_design.prediction import MotionBand, edge_distance
 from experiment_design.result import Design
 from greybox.report.figures import BLACK, BLUE, COLOURS, GREEN, VERMILION, tidy
+from greybox.rotation import ned_to_body
 
 Array = NDArray[np.float64]
 
@@ -265,10 +266,7 @@ def forbidden(design: Design, band: MotionBand, name: str) -> list[tuple[Array, 
         moved = [0 * one]
         for pair, matters in ((d[:2], True), (d[2:], wind)):
             if matters and pair.any() and name in ("u", "v"):
-                c, s = np.cos(psi), np.sin(psi)
-                moved.append(
-                    c * pair[0] + s * pair[1] if name == "u" else -s * pair[0] + c * pair[1]
-                )
+                moved.append(ned_to_body(pair[0], pair[1], psi)[name == "v"])
         edge = limits.margins.get(name, 0.0) + np.max([sign * m for m in moved], axis=0)
         zones.append((sign * edge, -sign))
     if name == "r" and limits.yaw_cap is not None:

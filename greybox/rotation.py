@@ -14,14 +14,16 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 
-def body_to_ned(forward: Array, starboard: Array, psi: Array) -> tuple[Array, Array]:
+def body_to_ned(
+    forward: Array | float, starboard: Array | float, psi: Array | float
+) -> tuple[Array, Array]:
     """Return north and east components of vectors given in body axes.
 
     Parameters
     ----------
-    forward, starboard : ndarray
-        (N,) components along the bow and to starboard, any unit.
-    psi : ndarray
+    forward, starboard : ndarray or float
+        (N,) components along the bow and to starboard, any unit; any shapes that go together.
+    psi : ndarray or float
         (N,) heading, clockwise from north [rad].
 
     Returns
@@ -30,17 +32,19 @@ def body_to_ned(forward: Array, starboard: Array, psi: Array) -> tuple[Array, Ar
         North and east, (N,) each, in the unit of the components.
     """
     c, s = np.cos(psi), np.sin(psi)
-    return c * forward - s * starboard, s * forward + c * starboard
+    return np.asarray(c * forward - s * starboard), np.asarray(s * forward + c * starboard)
 
 
-def ned_to_body(north: Array, east: Array, psi: Array) -> tuple[Array, Array]:
+def ned_to_body(
+    north: Array | float, east: Array | float, psi: Array | float
+) -> tuple[Array, Array]:
     """Return components along the bow and to starboard of vectors given north and east.
 
     Parameters
     ----------
-    north, east : ndarray
-        (N,) components, any unit.
-    psi : ndarray
+    north, east : ndarray or float
+        (N,) components, any unit; any shapes that go together.
+    psi : ndarray or float
         (N,) heading, clockwise from north [rad].
 
     Returns
@@ -49,4 +53,4 @@ def ned_to_body(north: Array, east: Array, psi: Array) -> tuple[Array, Array]:
         Forward and starboard, (N,) each: the inverse of `body_to_ned`.
     """
     c, s = np.cos(psi), np.sin(psi)
-    return c * north + s * east, c * east - s * north
+    return np.asarray(c * north + s * east), np.asarray(c * east - s * north)

@@ -81,7 +81,7 @@ _SUFFIXES = sorted(
 )
 
 # seconds since 1970 that a date of a log exceeds (1973); a clock that starts with the log does not
-_UNIX_SECONDS = 1e8
+EARLIEST_UNIX = 1e8
 # larger numbers cannot be UNIX time in the unit before them: in s this is the year 5138
 _UNIX_LIMITS = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
 # seconds in 2001, milliseconds after eleven days: only below it does the step decide
@@ -170,6 +170,19 @@ def unix_unit(size: float) -> str | None:
     return next((unit for limit, unit in _UNIX_LIMITS if size > limit), None)
 
 
+def unix_seconds(times: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return UNIX times in seconds, from the unit that their size tells.
+
+    Parameters
+    ----------
+    times : ndarray
+        (N,) since 1970, all in s, ms, us or ns; NaN where missing.
+    """
+    known = np.abs(times[np.isfinite(times)])
+    unit = unix_unit(float(np.median(known))) if len(known) else None
+    return times * UNITS[unit].factor if unit else times
+
+
 def time_unit(times: NDArray[np.floating | np.integer]) -> str:
     """Guess in what unit the times of a log are, from their size and their step.
 
@@ -193,4 +206,4 @@ def time_unit(times: NDArray[np.floating | np.integer]) -> str:
 
 def is_unix_time(seconds: float) -> bool:
     """Whether a time [s] counts from 1970, and not from a moment of the recorder's own."""
-    return seconds >= _UNIX_SECONDS
+    return seconds >= EARLIEST_UNIX

@@ -15,6 +15,7 @@ from greybox.units import (
     time_unit,
     unit_dimension,
     unit_factor,
+    unix_seconds,
 )
 
 
@@ -89,3 +90,11 @@ NOW = 1_714_550_400.0
 def test_the_unit_of_times_that_nobody_stated(times, unit, absolute):
     assert time_unit(times) == unit
     assert is_unix_time(float(np.median(times)) * UNITS[unit].factor) == absolute
+
+
+def test_unix_times_in_seconds_from_their_size():
+    seconds = np.array([NOW, np.nan, NOW + 0.5])
+    for factor in (1.0, 1e3, 1e6, 1e9):
+        np.testing.assert_allclose(unix_seconds(seconds * factor), seconds, rtol=1e-12)
+    nothing = np.full(2, np.nan)
+    np.testing.assert_array_equal(unix_seconds(nothing), nothing)

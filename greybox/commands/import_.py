@@ -119,10 +119,11 @@ def run(options: argparse.Namespace) -> None:
     """Read, merge, mend, resample, write."""
     from pathlib import Path
 
-    from greybox.errors import UsageError
+    from greybox.errors import UsageError, suggestion
     from greybox.files import check_targets, write_json
     from greybox.trial.import_files import LOG_SUFFIXES, import_files, is_folder, targets
     from greybox.trial.store import read_record, record_path
+    from greybox.vessel.conditions import UNITS
     from greybox.vessel.toml import load_vessel
 
     folder = is_folder(options.raw, options.out)
@@ -153,6 +154,9 @@ def run(options: argparse.Namespace) -> None:
         write_json({"logs": records} if folder else records[0], options.json)
     if options.json != "-":
         say(summary)
+        for key in pairs(options.note, "--note"):
+            if key not in UNITS and (near := suggestion(key, UNITS)):
+                say(f"note: '{key}' is kept in words, as no condition.{near}")
         written = ", ".join(str(log) for log in logs)
         beside = "its record" if len(logs) == 1 else "their records"
         say(f"wrote {written} and {record_path(logs[0]).name if not folder else beside}")

@@ -21,6 +21,7 @@ from greybox.model.functions import Integrator
 from greybox.model.predictor import Predictor, Regime, build_predictor
 from greybox.model.structure import Structure
 from greybox.regression.regression import build_regression
+from greybox.rotation import body_to_ned
 from greybox.trial.log import TrialLog
 
 Array = NDArray[np.float64]
@@ -301,9 +302,8 @@ def _as_it_should_be(log: TrialLog, ship: Ship) -> TrialLog:
     for name, seconds in sensors.late:
         channels[name] = shifted(channels[name], -seconds / log.sample_time)
     if "u" in channels and "v" in channels:
-        c, s = np.cos(sensors.turned), np.sin(sensors.turned)
-        u, v = channels["u"], channels["v"]
-        channels["u"], channels["v"] = c * u - s * v, s * u + c * v
+        u, v = body_to_ned(channels["u"], channels["v"], sensors.turned)
+        channels["u"], channels["v"] = u, v
         if "r" in channels:
             channels["u"] = channels["u"] + sensors.lever[1] * channels["r"]
             channels["v"] = channels["v"] - sensors.lever[0] * channels["r"]

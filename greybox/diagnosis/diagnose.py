@@ -98,9 +98,9 @@ def diagnose(
         left_out = ", ".join(ready.short)
         notes.append(f"left out for having fewer than {SHORTEST} samples: {left_out}.")
     pooled = pooled_conditions(case.logs)
-    known = pooled.values if model is None else model.conditions
-    beside = ready.validate if model is None else (*case.logs, *ready.validate)
-    conditions = (*pooled.differences, *other_conditions(known, beside))
+    conditions = (*pooled.differences, *other_conditions(pooled.values, ready.validate))
+    if model is not None:
+        conditions = (*conditions, *other_conditions(model.conditions, case.logs))
     notes += [d.sentence for d in conditions]
     report = Report(case, ready.structure, ready.causes, found, model, options.seed, notes)
     causes = causes_of(ready.findings, ready.causes, ready.tried)

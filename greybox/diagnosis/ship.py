@@ -17,6 +17,7 @@ from greybox.diagnosis.simulator import Simulator
 from greybox.model.functions import Integrator
 from greybox.model.simulation import mid_step
 from greybox.model.structure import Structure
+from greybox.rotation import ned_to_body
 from greybox.trial.log import TrialLog
 from greybox.vessel.actuation import actuated_force, delayed
 from greybox.vessel.vessel import Vessel
@@ -237,9 +238,7 @@ class LogRun:
                 y[:, iu] = y[:, iu] - sensors.lever[1] * rate
                 y[:, iv] = y[:, iv] + sensors.lever[0] * rate
             if sensors.turned:
-                c, s = np.cos(sensors.turned), np.sin(sensors.turned)
-                u, v = y[:, iu].copy(), y[:, iv].copy()
-                y[:, iu], y[:, iv] = c * u + s * v, c * v - s * u
+                y[:, iu], y[:, iv] = ned_to_body(y[:, iu], y[:, iv], sensors.turned)
         for name, seconds in sensors.late:
             i = names.index(name)
             y[:, i] = shifted(y[:, i], seconds / self.sample_time)

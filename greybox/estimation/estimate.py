@@ -24,6 +24,7 @@ from greybox.model.predictor import Predictor
 from greybox.one_thread import one_thread
 from greybox.regression.instruments import Instruments, build_instruments
 from greybox.regression.regression import Regression, build_regression
+from greybox.trial.actuator_estimate import known_actuators
 from greybox.trial.log import TrialLog
 from greybox.trial.ranges import ranges
 from greybox.trial.validity import pooled_conditions
@@ -484,6 +485,7 @@ def _result(
         ),
         ranges=ranges(logs, predictor.structure.states),
         conditions=pooled_conditions(logs),
+        actuators=known_actuators(log.provenance.actuators for log in logs),
     )
     if evidence is None:
         return estimate

@@ -45,6 +45,7 @@ from greybox.model.output_runs import Simulator
 from greybox.model.predictor import Predictor
 from greybox.one_thread import one_thread
 from greybox.regression.regression import common_sample_time
+from greybox.trial.actuator_estimate import known_actuators
 from greybox.trial.log import TrialLog
 from greybox.trial.ranges import ranges
 from greybox.trial.validity import pooled_conditions
@@ -479,6 +480,7 @@ def _result(fitted: _Fitted, logs: Sequence[TrialLog], options: OutputErrorOptio
         ),
         ranges=ranges(logs, predictor.structure.states),
         conditions=pooled_conditions(logs),
+        actuators=known_actuators(log.provenance.actuators for log in logs),
     )
 
 

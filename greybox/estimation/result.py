@@ -14,6 +14,7 @@ from greybox.model.model import ManoeuvringModel
 from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import Predictor
 from greybox.notebook import Shown, items, parameters, text
+from greybox.trial.actuator_estimate import ActuatorEstimate
 from greybox.trial.validity import PooledConditions
 from greybox.vessel.vessel import Vessel
 
@@ -208,6 +209,8 @@ class Estimate(Shown):
         Whether all equations were solved jointly with their error made white.
     conditions : PooledConditions
         Draught, depth and the like of the logs, and in what they differ.
+    actuators : tuple of ActuatorEstimate
+        Measured from command and feedback when the logs were imported.
     """
 
     predictor: Predictor
@@ -236,6 +239,7 @@ class Estimate(Shown):
     limits: Mapping[str, Limit] = field(default_factory=dict)
     prefilter: str = "none"
     conditions: PooledConditions = field(default_factory=PooledConditions)
+    actuators: tuple[ActuatorEstimate, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -324,6 +328,7 @@ class Estimate(Shown):
             },
             "logs": list(self.logs),
             "ranges": dict(self.ranges),
+            "actuators": [a.to_dict() for a in self.actuators],
             "condition_differences": [d.to_dict() for d in self.conditions.differences],
         }
 

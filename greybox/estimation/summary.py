@@ -46,6 +46,8 @@ def summarise(estimate: Estimate) -> str:
         lines += _wrapped(f"{BOUNDS[name]}: {limit.sentence}", "  ")
     if estimate.conditions.values:
         lines += _wrapped(f"Conditions: {in_words(estimate.conditions.values)}", "  ")
+    for actuator in estimate.actuators:
+        lines += _wrapped(f"Actuator: {actuator.sentence}", "  ")
     lines += _tests(estimate.tests)
     if estimate.notes:
         lines += ["", "Notes"]

@@ -18,6 +18,7 @@ from greybox.model.functions import (
 )
 from greybox.model.structure import Structure
 from greybox.notebook import Shown, number, sparkline, table
+from greybox.rotation import body_to_ned
 
 Array = NDArray[np.float64]
 
@@ -333,9 +334,7 @@ def positions(x: Array, psi: Array, sample_time: float, start: Array | None = No
     ndarray
         (..., N, 2) positions [m].
     """
-    c, s = np.cos(psi), np.sin(psi)
-    u, v = x[..., 0], x[..., 1]
-    rate = np.stack([c * u - s * v, s * u + c * v], axis=-1) * sample_time
+    rate = np.stack(body_to_ned(x[..., 0], x[..., 1], psi), axis=-1) * sample_time
     out = np.zeros_like(rate)
     np.cumsum(rate[..., :-1, :], axis=-2, out=out[..., 1:, :])
     return out + (0.0 if start is None else np.asarray(start))

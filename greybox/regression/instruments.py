@@ -18,6 +18,7 @@ from greybox.model.predictor import Predictor
 from greybox.model.simulation import FreeRun
 from greybox.model.structure import Structure
 from greybox.regression.regression import within_margins
+from greybox.rotation import ned_to_body
 from greybox.trial.log import TrialLog
 
 Array = NDArray[np.float64]
@@ -148,8 +149,8 @@ def _air_instrument(log: TrialLog, x: Array, psi: Array, wind: str) -> tuple[Arr
     if blow is None:
         return log["u_q"][: len(x)], log["v_q"][: len(x)]
     north, east = blow[0][: len(x)], blow[1][: len(x)]
-    c, s = np.cos(psi), np.sin(psi)
-    return x[:, 0] - (c * north + s * east), x[:, 1] - (-s * north + c * east)
+    ahead, across = ned_to_body(north, east, psi)
+    return x[:, 0] - ahead, x[:, 1] - across
 
 
 def build_instruments(

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from greybox.model.functions import accumulate
 from greybox.model.predictor import Predictor
 from greybox.regression.instruments import initial_state, smoothed_wind, state_bound
+from greybox.rotation import ned_to_body
 from greybox.trial.log import TrialLog
 from greybox.vectorised import Vectorised
 
@@ -204,9 +205,7 @@ def predicted_motion(
     air = np.zeros((samples, 2))
     blow = smoothed_wind(log) if wind == "smoothed" and predictor.air_measured and nx > 1 else None
     if blow is not None:
-        c, s = np.cos(psi), np.sin(psi)
-        north, east = blow[0][:-1], blow[1][:-1]
-        air = np.column_stack([c * north + s * east, c * east - s * north])
+        air = np.column_stack(ned_to_body(blow[0][:-1], blow[1][:-1], psi))
     elif predictor.air_measured:
         air = np.column_stack([log["u_q"][:-1], log["v_q"][:-1]])
     start = np.append(initial_state(log, structure.states), psi[0])

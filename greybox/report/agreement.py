@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.rotation import ned_to_body
 from greybox.trial.checks.motion import Motion, smooth, turn
 
 Array = NDArray[np.float64]
@@ -213,12 +214,8 @@ def compare(
             value = turning
         else:
             north, east = rates["x_n"] - drift[0], rates["y_n"] - drift[1]
-            c, s = np.cos(psi), np.sin(psi)
-            value = (
-                c * north + s * east + antenna[1] * turning
-                if name == "u"
-                else c * east - s * north - antenna[0] * turning
-            )
+            u, v = ned_to_body(north, east, psi)
+            value = u + antenna[1] * turning if name == "u" else v - antenna[0] * turning
         logged[name] = np.where(away, np.nan, rates[name])
         implied[name] = np.where(away, np.nan, value)
     return Agreement(parts.t, logged, implied, turning, psi)

@@ -26,6 +26,7 @@ _MOST_MARKS = 300
 _BESIDE = 1.0
 _BESIDE_SAMPLES = 25
 _ROWS = 8
+_FRACTION_SECONDS = 5.0
 _NAMED = {
     "x_n": "position north x_n [m]", "y_n": "position east y_n [m]",
     "v_n": "velocity north v_n [m/s]", "v_e": "velocity east v_e [m/s]",
@@ -99,6 +100,24 @@ def order_figure(finding: Finding) -> Figure:
     return figure
 
 
+def fractions_figure(finding: Finding) -> Figure:
+    """Draw how late the times come that lack the zeros of their fraction, and the first closer."""
+    meant: Array = finding.picture["meant"]
+    written: Array = finding.picture["written"]
+    figure, whole, zoom, _ = _axes("Fractions of a second without leading zeros")
+    near = np.abs(meant - meant[0]) <= _FRACTION_SECONDS
+    for ax, part in ((whole, slice(None)), (zoom, near)):
+        late = written[part] - meant[part]
+        ax.vlines(meant[part], 0.0, late, color=BLACK, linewidth=0.6)
+        ax.plot(meant[part], late, "v", color=VERMILION, markersize=5, label="as written")
+        ax.plot(meant[part], 0 * late, ".", color=BLUE, markersize=5, label="as meant")
+        ax.set_ylabel("late [s]", fontsize=9)
+        ax.set_xlabel("time [s]", fontsize=9)
+    zoom.set_title(f"around the first, t = {meant[0]:.6g} s", fontsize=9)
+    _legend(whole)
+    return figure
+
+
 def missing_figure(finding: Finding, recording: Recording) -> Figure:
     """Draw a signal with the stretches that hold no number, and the longest one closer."""
     t: Array = finding.picture["t"]
@@ -138,11 +157,10 @@ def spike_figure(finding: Finding) -> Figure:
     figure, whole, zoom, third = _axes(f"Outliers of {finding.channel}", True)
     _draw(whole, t, value)
     k = int(finding.picture["worst"])
-    low, high = max(k - _BESIDE_SAMPLES, 0), min(k + _BESIDE_SAMPLES + 1, len(t))
-    part = slice(low, high)
+    part = _around_rows(k, k + 1, len(t))
     zoom.plot(t[part], value[part], color=BLUE, linewidth=1.0)
     zoom.plot(t[part], value[part], ".", color=BLUE, markersize=4)
-    near = spikes[(spikes >= low) & (spikes < high)]
+    near = spikes[(spikes >= part.start) & (spikes < part.stop)]
     for ax, marked in ((whole, spikes[:_MOST_MARKS]), (zoom, near)):
         ax.plot(
             t[marked], value[marked], "o", markersize=8, markerfacecolor="none",
@@ -161,6 +179,102 @@ def spike_figure(finding: Finding) -> Figure:
     _label(whole, finding)
     _label(zoom, finding)
     _legend(whole)
+    return figure
+
+
+def wrap_figure(finding: Finding) -> Figure:
+    """Draw the recorded heading with what lies between its sides, closer, and without it."""
+    t: Array = finding.picture["t"]
+    turn = float(finding.picture["turn"])
+    value: Array = finding.picture["value"] * (360.0 / turn)
+    between: NDArray[np.int64] = finding.picture["between"]
+    figure, whole, zoom, third = _axes("Heading interpolated across its wrap", True)
+    # lines would hide what lies between the two sides
+    whole.plot(*_dots(t, value, 3000), ".", color=BLUE, markersize=1.5)
+    part = _around_rows(int(between[0]), int(between[0]) + 1, len(t))
+    zoom.plot(t[part], value[part], ".-", color=BLUE, linewidth=0.8, markersize=4)
+    near = between[(between >= part.start) & (between < part.stop)]
+    for ax, marked in ((whole, between[:_MOST_MARKS]), (zoom, near)):
+        ax.plot(
+            t[marked], value[marked], "o", markersize=7, markerfacecolor="none",
+            markeredgecolor=VERMILION, markeredgewidth=1.4, label="between the sides",
+        )  # fmt: skip
+    zoom.set_title(f"closer, around t = {t[between[0]]:.6g} s", fontsize=9)
+    kept = np.setdiff1d(np.arange(part.start, part.stop), near)
+    third.plot(
+        t[kept], np.unwrap(value[kept], period=360.0), ".-", color=BLUE, linewidth=0.8,
+        markersize=4,
+    )  # fmt: skip
+    third.set_title("without those samples, unwrapped", fontsize=9)
+    for ax in (whole, zoom, third):
+        ax.set_ylabel("heading psi [deg]", fontsize=9)
+        ax.set_xlabel("time [s]", fontsize=9)
+    _legend(whole)
+    return figure
+
+
+def hold_figure(finding: Finding) -> Figure:
+    """Draw a coordinate with its held samples, the longest hold closer, and the way per sample."""
+    t: Array = finding.picture["t"]
+    held: NDArray[np.int64] = finding.picture["held"]
+    worst = int(finding.picture["worst"])
+    figure, whole, zoom, third = _axes("Positions that repeat under way", True)
+    part = _around_rows(worst, worst + 1, len(t))
+    name = max(("x_n", "y_n"), key=lambda n: float(np.ptp(finding.picture[n][part])))
+    value: Array = finding.picture[name]
+    near = held[(held >= part.start) & (held < part.stop)]
+    _draw(whole, t, value)
+    zoom.plot(t[part], value[part], ".-", color=BLUE, linewidth=0.8, markersize=4)
+    for ax, marked in ((whole, held[:_MOST_MARKS]), (zoom, near)):
+        ax.plot(
+            t[marked], value[marked], "o", markersize=7, markerfacecolor="none",
+            markeredgecolor=VERMILION, markeredgewidth=1.4, label="repeated",
+        )  # fmt: skip
+        ax.set_ylabel(label_of(name, "m"), fontsize=9)
+        ax.set_xlabel("time [s]", fontsize=9)
+    zoom.set_title("most repeated in a row", fontsize=9)
+    way = np.hypot(np.diff(finding.picture["x_n"]), np.diff(finding.picture["y_n"]))
+    rows = np.arange(max(part.start, 1), part.stop)
+    third.plot(t[rows], way[rows - 1], ".-", color=BLUE, linewidth=0.8, markersize=4)
+    third.plot(t[near], way[near - 1], "v", color=VERMILION, markersize=5)
+    third.set_title("way since the sample before: none, then all at once", fontsize=9)
+    third.set_ylabel("way [m]", fontsize=9)
+    third.set_xlabel("time [s]", fontsize=9)
+    _legend(whole)
+    return figure
+
+
+def jump_figure(finding: Finding) -> Figure:
+    """Draw the coordinate that jumps most, closer around the jump, and the track there."""
+    t: Array = finding.picture["t"]
+    after = float(finding.picture["after"])
+    size = np.abs(np.asarray(finding.value))
+    name = "x_n" if size[0] >= size[1] else "y_n"
+    value: Array = finding.picture[name]
+    figure, whole, zoom, third = _axes("The position jumps", True)
+    k = int(np.searchsorted(t, after))
+    part = _around_rows(k, k + 1, len(t))
+    _draw(whole, t, value)
+    zoom.plot(t[part], value[part], ".-", color=BLUE, linewidth=0.8, markersize=4)
+    for ax in (whole, zoom):
+        ax.axvline(after, color=VERMILION, linewidth=1.0, label="cut here")
+        ax.set_ylabel(label_of(name, "m"), fontsize=9)
+        ax.set_xlabel("time [s]", fontsize=9)
+    zoom.set_title(f"closer: a step of {np.hypot(*size):.3g} m", fontsize=9)
+    for rows, colour, when in (
+        (slice(part.start, k), BLUE, "before"),
+        (slice(k, part.stop), VERMILION, "after"),
+    ):
+        third.plot(
+            finding.picture["y_n"][rows], finding.picture["x_n"][rows], ".-", color=colour,
+            linewidth=0.8, markersize=4, label=when,
+        )  # fmt: skip
+    third.set_aspect("equal", adjustable="datalim")
+    third.set_title("the track, before and after", fontsize=9)
+    third.set_xlabel("east [m]", fontsize=9)
+    third.set_ylabel("north [m]", fontsize=9)
+    _legend(whole)
+    third.legend(fontsize=8, frameon=False)
     return figure
 
 
@@ -339,6 +453,11 @@ def _around(t: Array, start: float, stop: float) -> tuple[float, float]:
         max(start - beside, min(float(t.min()), start) - period),
         min(stop + beside, max(float(t.max()), stop) + period),
     )
+
+
+def _around_rows(first: int, stop: int, count: int) -> slice:
+    """Return some rows with others on both sides, of `count` that there are."""
+    return slice(max(first - _BESIDE_SAMPLES, 0), min(stop + _BESIDE_SAMPLES, count))
 
 
 def _margin(low: float, high: float) -> tuple[float, float]:

@@ -14,13 +14,17 @@ from greybox.report.chart import chart_of
 from greybox.report.check_answers import answer_figure, course_figure, wind_figure
 from greybox.report.check_rows import (
     coarse_figure,
+    fractions_figure,
     gap_figure,
+    hold_figure,
+    jump_figure,
     missing_figure,
     order_figure,
     range_figure,
     signals_figure,
     spike_figure,
     stuck_figure,
+    wrap_figure,
 )
 from greybox.report.check_ties import make_tie, tie_figure
 from greybox.report.figures import to_svg
@@ -34,7 +38,8 @@ from greybox.vessel.vessel import Vessel
 
 # what makes a force model wrong before what it only has to do without
 _SERIOUS = (
-    "frame", "sign", "unit", "clock_offset", "heading_bias", "lever_arm", "duplicate_time",
+    "frame", "sign", "unit", "clock_offset", "heading_bias", "lever_arm", "time_format",
+    "duplicate_time", "position_jump", "heading_wrap", "position_hold",
     "stuck", "nan", "outlier", "gap", "quantised",
 )  # fmt: skip
 _SHOWN = {
@@ -42,9 +47,17 @@ _SHOWN = {
     "sample to the next.",
     "duplicate_time": "Times by row with the wrong ones marked, closer around the first, and "
     "the time since the row before.",
+    "time_format": "How late the times come that lack the leading zeros of their fraction, and "
+    "the first of them closer.",
     "nan": "The signal with the samples that hold no number shaded, and the longest stretch "
     "closer.",
     "outlier": "The whole signal with its outliers circled, and the largest one closer.",
+    "heading_wrap": "The heading as recorded with the samples between the two sides of its wrap "
+    "circled, closer around the first, and the same without them, unwrapped.",
+    "position_hold": "A coordinate with its repeated samples circled, the longest hold closer, and "
+    "the way from sample to sample.",
+    "position_jump": "The coordinate that jumps most, closer around the jump, and the track before "
+    "and after it.",
     "stuck": "The whole signal, the time in which it repeats one value closer, and a channel "
     "that moves meanwhile.",
     "quantised": "The whole signal, its steps closer, and how many steps it changes by from "
@@ -169,10 +182,18 @@ def _drawn(finding: Finding, report: CheckReport, vessel: Vessel) -> tuple[Figur
         return gap_figure(finding, recording), ""
     if finding.id == "duplicate_time":
         return order_figure(finding), ""
+    if finding.id == "time_format":
+        return fractions_figure(finding), ""
     if finding.id == "nan":
         return missing_figure(finding, recording), ""
     if finding.id == "outlier":
         return spike_figure(finding), ""
+    if finding.id == "heading_wrap":
+        return wrap_figure(finding), ""
+    if finding.id == "position_hold":
+        return hold_figure(finding), ""
+    if finding.id == "position_jump":
+        return jump_figure(finding), ""
     if finding.id == "stuck":
         return stuck_figure(finding, recording), ""
     if finding.id == "quantised":

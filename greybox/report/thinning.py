@@ -7,11 +7,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.trial.gaps import split_at_gaps
+
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
-
-# a step longer than this many sample times is a gap
-GAP = 1.5
 
 
 def points_for(curves: int, *, most: int = 2000, room: int = 60_000) -> int:
@@ -42,9 +41,9 @@ def find_gaps(t: Array, sample_time: float) -> Index:
     Returns
     -------
     ndarray of int
-        (G,) k with ``t[k + 1] - t[k]`` above 1.5 Ts.
+        (G,) k with a gap from ``t[k]`` to ``t[k + 1]``.
     """
-    return np.flatnonzero(np.diff(t) > GAP * sample_time)
+    return np.array([stop - 1 for _, stop in split_at_gaps(t, sample_time)[:-1]], np.intp)
 
 
 def longest(gaps: Index, t: Array, most: int) -> Index:

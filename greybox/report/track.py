@@ -10,8 +10,11 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from greybox.report.figures import BLACK, BLUE, GREEN, ORANGE, SKY, VERMILION, tidy
-from greybox.report.thinning import GAP, pick, thin
+from greybox.report.thinning import pick, thin
+from greybox.rotation import body_to_ned
+from greybox.trial.gaps import GAP
 from greybox.trial.log import TrialLog
+from greybox.trial.manoeuvres.track import without_antenna
 from greybox.trial.wind import true_wind
 
 Array = NDArray[np.float64]
@@ -128,18 +131,10 @@ def _draw_ships(
     length = min(max(log.vessel.length, shortest), most)
     scale = length / log.vessel.length
     psi = log["psi"][chosen]
-    c, s = np.cos(psi), np.sin(psi)
-    ax, ay = log.vessel.sensors.get("antenna", (0.0, 0.0))[:2]
-    north = log["x_n"][chosen] - (c * ax - s * ay)
-    east = log["y_n"][chosen] - (s * ax + c * ay)
-    x, y = length * _HULL.T
-    hulls = np.stack(
-        [
-            east[:, None] + s[:, None] * x + c[:, None] * y,
-            north[:, None] + c[:, None] * x - s[:, None] * y,
-        ],
-        axis=-1,
-    )
+    antenna = log.vessel.sensors.get("antenna", (0.0, 0.0))
+    north, east = without_antenna(log["x_n"][chosen], log["y_n"][chosen], psi, antenna)
+    x, y = body_to_ned(length * _HULL[:, 0], length * _HULL[:, 1], psi[:, None])
+    hulls = np.stack([east[:, None] + y, north[:, None] + x], axis=-1)
     label = f"ship every {step:g} s" if step < 3600 else f"ship every {step / 3600:g} h"
     if scale != 1:
         label += f", {scale:.2g} × its size" if scale < 10 else f", {scale:.0f} × its size"

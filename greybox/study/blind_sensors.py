@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.rotation import body_to_ned, ned_to_body
 from greybox.study.blind_causes import Effect
 from greybox.study.blind_ship import History
 
@@ -66,10 +67,8 @@ def observe(
         n: np.interp(whole - float(late.get(f"clock_{n}", 0.0)), t, value)
         for n, value in fine.items()
     }
-    c, s = np.cos(heading), np.sin(heading)
-    blow = wind[lead:]
-    channels["u_q"] = over - (c * blow[:, 0] + s * blow[:, 1])
-    channels["v_q"] = across - (c * blow[:, 1] - s * blow[:, 0])
+    blow = ned_to_body(wind[lead:, 0], wind[lead:, 1], heading)
+    channels["u_q"], channels["v_q"] = over - blow[0], across - blow[1]
     for i, n in enumerate(("n1", "n2", "alpha1", "alpha2")):
         channels[n] = history.commands[lead:, i, ship].copy()
     if "angle_offset" in found:
@@ -87,9 +86,8 @@ def observe(
 def _at_antenna(fine: dict[str, Array], effect: Effect) -> None:
     """Measure positions, and perhaps velocities, where the antenna stands."""
     lx, ly = effect.number("lever_arm_x"), effect.number("lever_arm_y")
-    c, s = np.cos(fine["psi"]), np.sin(fine["psi"])
-    fine["x_n"] = fine["x_n"] + c * lx - s * ly
-    fine["y_n"] = fine["y_n"] + s * lx + c * ly
+    north, east = body_to_ned(lx, ly, fine["psi"])
+    fine["x_n"], fine["y_n"] = fine["x_n"] + north, fine["y_n"] + east
     if effect.parameters["variant"] == "antenna":
         fine["u"] = fine["u"] - fine["r"] * ly
         fine["v"] = fine["v"] + fine["r"] * lx
@@ -100,8 +98,7 @@ def _misaligned(fine: dict[str, Array], effect: Effect) -> None:
     bias = effect.number("heading_bias")
     fine["psi"] = fine["psi"] + bias
     if effect.parameters["variant"] == "earth":
-        u, v, c, s = fine["u"], fine["v"], np.cos(bias), np.sin(bias)
-        fine["u"], fine["v"] = c * u + s * v, c * v - s * u
+        fine["u"], fine["v"] = ned_to_body(fine["u"], fine["v"], bias)
 
 
 def _rock(fine: dict[str, Array], t: Array, effect: Effect, rng: np.random.Generator) -> None:
@@ -110,9 +107,8 @@ def _rock(fine: dict[str, Array], t: Array, effect: Effect, rng: np.random.Gener
     for name in "uvr":
         rms = effect.number("ratio") * NOISE[name]
         motion[name], way[name] = narrow_band(rng, t, effect.number("frequency"), rms)
-    c, s = np.cos(fine["psi"]), np.sin(fine["psi"])
-    fine["x_n"] = fine["x_n"] + c * way["u"] - s * way["v"]
-    fine["y_n"] = fine["y_n"] + s * way["u"] + c * way["v"]
+    north, east = body_to_ned(way["u"], way["v"], fine["psi"])
+    fine["x_n"], fine["y_n"] = fine["x_n"] + north, fine["y_n"] + east
     fine["psi"] = fine["psi"] + way["r"]
     for name in "uvr":
         fine[name] = fine[name] + motion[name]

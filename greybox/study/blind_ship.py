@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.rotation import body_to_ned, ned_to_body
 from greybox.study.blind_inputs import RATES, Programme
 
 Array = NDArray[np.float64]
@@ -120,8 +121,7 @@ class History:
         """Return times (K,), and positions north and east (K,) [m] from steps of 0.1 s."""
         t = np.arange(round(self.t[-1] / STEP) + 1) * STEP
         u, v, _, psi = (np.interp(t, self.t, self.x[:, i, ship]) for i in range(4))
-        c, s = np.cos(psi), np.sin(psi)
-        rate = np.array([c * u - s * v, s * u + c * v])
+        rate = np.array(body_to_ned(u, v, psi))
         way = np.cumsum(0.5 * STEP * (rate[:, 1:] + rate[:, :-1]), axis=1)
         north, east = np.concatenate([np.zeros((2, 1)), way], axis=1)
         return t, north, east
@@ -169,10 +169,10 @@ class _Fleet:
         (Xu, Xvr, Xuu, Wuu, Xmu, Xkappa, Yv, Yur, Yvv, Yvr, Wvv, Ymu,
          Nr, Nuv, Nvv, Nvr, Wuv, Nmu) = self.theta  # fmt: skip
         u, v, r, psi = x
-        c, s = np.cos(psi), np.sin(psi)
-        north, east = self.current
-        ur, vr = u - (c * north + s * east), v - (c * east - s * north)
-        uq, vq = u - (c * wind[0] + s * wind[1]), v - (c * wind[1] - s * wind[0])
+        through = ned_to_body(self.current[0], self.current[1], psi)
+        ur, vr = u - through[0], v - through[1]
+        blow = ned_to_body(wind[0], wind[1], psi)
+        uq, vq = u - blow[0], v - blow[1]
         size = np.abs(vr)
         loss = 1 - self.advance * ur
         du = (

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from greybox.model.catalogue import get_structure
 from greybox.model.predictor import Predictor, build_predictor
 from greybox.model.simulation import simulate, stationary_disturbance
+from greybox.rotation import ned_to_body
 from greybox.study.inputs import smooth, zig_zag
 from greybox.study.monte_carlo import Batch, BatchEstimate, BatchRegression
 from greybox.study.parallel import map_pieces
@@ -192,9 +193,8 @@ def virtual_batch(
     )
     run = simulate(structure, _vector(TRUE), START, tau, 1.0, d=d)
     x, psi = run.x, run.psi
-    c, s = np.cos(psi[:, :-1]), np.sin(psi[:, :-1])
-    u_q = x[:, :-1, 0] - (c * d[..., 2] + s * d[..., 3])
-    v_q = x[:, :-1, 1] - (c * d[..., 3] - s * d[..., 2])
+    ahead, across = ned_to_body(d[..., 2], d[..., 3], psi[:, :-1])
+    u_q, v_q = x[:, :-1, 0] - ahead, x[:, :-1, 1] - across
     y = x + np.sqrt(VELOCITY_VARIANCE) * rng.standard_normal(x.shape)
     heading = psi + np.sqrt(HEADING_VARIANCE) * rng.standard_normal(psi.shape)
     return Batch(y, heading, tau[None], (u_q, v_q), START)

@@ -27,6 +27,7 @@ from greybox.model.catalogue import get_structure
 from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import Predictor, Regime, build_predictor
 from greybox.model.simulation import simulate, stationary_disturbance
+from greybox.rotation import ned_to_body
 from greybox.study.chapter6 import TRUE, pulse_commands
 from greybox.study.parallel import map_pieces
 from greybox.study.tables import Row, summarise
@@ -213,12 +214,12 @@ def virtual_trial(rng: np.random.Generator, case: Case, samples: int = SAMPLES) 
         process_noise=rng.standard_normal((samples - 1, 3)) * np.array(case.process),
     )  # fmt: skip
     x, heading = run.x[0], run.psi[0]
-    c, s = np.cos(heading), np.sin(heading)
+    ahead, across = ned_to_body(wind[:, 0], wind[:, 1], heading)
     noise = np.sqrt(SENSOR_VARIANCE) * rng.standard_normal(x.shape)
     channels = {n: x[:, i] + noise[:, i] for i, n in enumerate(structure.states)}
     channels["psi"] = heading + np.sqrt(HEADING_VARIANCE) * rng.standard_normal(samples)
-    channels["u_q"] = x[:, 0] - (c * wind[:, 0] + s * wind[:, 1])
-    channels["v_q"] = x[:, 1] - (c * wind[:, 1] - s * wind[:, 0])
+    channels["u_q"] = x[:, 0] - ahead
+    channels["v_q"] = x[:, 1] - across
     return make_log(vessel, commands | channels, 1.0, case.name)
 
 

@@ -155,7 +155,8 @@ def recording_from_pandas(
     """Return a DataFrame as a recording, to be checked, mended and imported.
 
     Unlike `log_from_pandas` it may have holes, jitter and gaps in its time, and names
-    that are to be guessed, as `read_recording` reads them from a file.
+    that are to be guessed, as `read_recording` reads them from a file. A frame that was a log
+    tells what was done to it, so that nothing is corrected twice.
 
     Parameters
     ----------
@@ -176,10 +177,22 @@ def recording_from_pandas(
     LogError
         It is no DataFrame, or has no time.
     """
-    raw, assigned = table_recording(
-        open_frame(frame, name, vessel.recorded_columns), vessel, guess=guess
+    record = _recorded(frame.attrs.get(FRAME_KEY) if hasattr(frame, "attrs") else None)
+    if record:
+        # it is canonical
+        vessel, guess = replace(vessel, columns={}), False
+    table = open_frame(frame, name, vessel.recorded_columns)
+    raw, assigned = table_recording(table, vessel, guess=guess)
+    recording = canonical(raw, assigned, vessel)
+    if not record:
+        return recording
+    known = recorded_provenance(record)
+    return replace(
+        recording,
+        epoch=known.epoch if recording.epoch is None else recording.epoch,
+        steps=(*known.steps, *recording.steps),
+        conditions=known.conditions,
     )
-    return canonical(raw, assigned, vessel)
 
 
 def _recorded(said: Any) -> dict[str, Any]:

@@ -5,18 +5,22 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from greybox.errors import LogError
+from greybox.trial.checks.actuators import measure_actuators
 from greybox.trial.checks.check import check_recordings
-from greybox.trial.convert.channel_mapping import merge, read_recording, unused_mappings
-from greybox.trial.convert.convert import import_recording
+from greybox.trial.convert.channel_mapping import read_trial
+from greybox.trial.convert.convert import Imported, import_recording
+from greybox.trial.convert.derived_signals import derive_signals
 from greybox.trial.convert.options import ImportOptions
 from greybox.trial.convert.two_pass_import import Stream, is_large
 from greybox.trial.log import TrialLog
 from greybox.trial.raw_log import Recording
 from greybox.trial.readers.formats import open_raw
+from greybox.trial.readers.topic_files import TopicTable
 from greybox.trial.repair import check_ids, repair
 from greybox.trial.store import record_path, write_log
 from greybox.vessel.vessel import Vessel
@@ -87,7 +91,7 @@ def import_files(
             for files, target in trials:
                 summaries.append(_import_trial(files, vessel, target, options, reader, extra))
         else:
-            recordings = [_read(files, vessel, reader) for files, _ in trials]
+            recordings = [read_trial(files, vessel, **(reader or {})) for files, _ in trials]
             reports = check_recordings(recordings, vessel)
             while recordings:
                 recording, (_, target) = recordings.pop(0), trials[len(summaries)]
@@ -160,7 +164,9 @@ def _import_trial(
 ) -> str:
     if len(paths) == 1 and Path(paths[0]).is_file():
         table = open_raw(paths[0], **(reader or {}))
-        if not isinstance(table, Recording) and is_large(table):
+        # axes that only the other signals tell need all of them
+        unsure = isinstance(table, TopicTable) and bool(table.unsure)
+        if not isinstance(table, Recording) and is_large(table) and not unsure:
             stream = Stream(table, vessel, options)
             write_log(stream.segments(), out, extra=extra, provenance=stream.provenance)
             assert stream.first is not None
@@ -173,17 +179,8 @@ def _import_trial(
                 len(spans),
                 [f"note: {n}" for n in notes],
             )
-    return _write(_read(paths, vessel, reader), vessel, out, options, extra, [])
-
-
-def _read(
-    paths: Sequence[str | Path], vessel: Vessel, reader: Mapping[str, Any] | None
-) -> Recording:
-    """Return the files of one trial, merged."""
-    recordings = [read_recording(p, vessel, **(reader or {})) for p in paths]
-    unused = unused_mappings(recordings, vessel)
-    recording = merge(recordings)
-    return recording.with_signals(recording.signals, *unused)
+    recording = read_trial(paths, vessel, **(reader or {}))
+    return _write(recording, vessel, out, options, extra, [])
 
 
 def _write(
@@ -194,7 +191,7 @@ def _write(
     extra: Mapping[str, Any] | None,
     lines: list[str],
 ) -> str:
-    imported = import_recording(recording, vessel, options)
+    imported = _with_actuators(import_recording(recording, vessel, options), recording, vessel)
     write_log(imported.segments, out, extra=extra)
     first, last = imported.segments[0], imported.segments[-1]
     return _summary(
@@ -212,6 +209,18 @@ def _keep_source(path: str | Path, logs: Sequence[Path]) -> None:
         raise LogError(
             f"'{Path(path).name}' is also the log to write: name another file for the log."
         )
+
+
+def _with_actuators(imported: Imported, recording: Recording, vessel: Vessel) -> Imported:
+    """Return the segments with what command and feedback tell of the actuators."""
+    actuators, _, _ = measure_actuators([derive_signals(recording)], vessel)
+    if not actuators:
+        return imported
+    segments = tuple(
+        replace(s, provenance=replace(s.provenance, actuators=actuators)) for s in imported.segments
+    )
+    told = tuple(f"actuator: {a.sentence}" for a in actuators)
+    return replace(imported, segments=segments, notes=(*imported.notes, *told))
 
 
 def _summary(

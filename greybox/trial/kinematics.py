@@ -101,10 +101,7 @@ def decimate(log: TrialLog, sample_time: float) -> TrialLog:
     half = step // 2
     centres = np.arange(half, len(log) - step, step)
     if len(centres) < 3:
-        raise LogError(
-            f"'{log.name}' keeps {len(centres)} samples at {sample_time:g} s, at least 3 are "
-            f"needed: choose a shorter sample time."
-        )
+        raise _too_few(log, len(centres), sample_time)
     sums = {k: np.concatenate([[0.0], np.cumsum(v)]) for k, v in log.channels.items()}
     channels: dict[str, Array] = {}
     inputs = set(log.vessel.recorded_columns)
@@ -127,8 +124,19 @@ def decimate(log: TrialLog, sample_time: float) -> TrialLog:
         closed_loop=log.closed_loop[centres],
         provenance=replace(log.provenance, steps=(*log.provenance.steps, *made)),
     )
+    if len(made) == 1:
+        return out
     # the first and last sample have only one neighbour (3.57)
-    return replace(out.window(1, len(out) - 1), name=log.name) if len(made) > 1 else out
+    if len(out) < 5:
+        raise _too_few(log, len(out) - 2, sample_time)
+    return replace(out.window(1, len(out) - 1), name=log.name)
+
+
+def _too_few(log: TrialLog, kept: int, sample_time: float) -> LogError:
+    return LogError(
+        f"'{log.name}' keeps {kept} samples at {sample_time:g} s, at least 3 are needed: choose a "
+        f"shorter sample time."
+    )
 
 
 def _differences(log: TrialLog, channels: dict[str, Array], sample_time: float) -> list[Step]:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from greybox.channels import CHANNELS
 from greybox.errors import LogError, UsageError
 from greybox.notebook import Shown, items, number, sparkline, table
+from greybox.trial.actuator_estimate import ActuatorEstimate
 from greybox.trial.steps import Step
 from greybox.vessel.actuation import actuated_force
 from greybox.vessel.conditions import Conditions
@@ -51,6 +52,8 @@ class Provenance:
     conditions : Conditions
         What the trial states of draught, trim, loading, water depth and sea state, and the
         vessel file where the trial does not.
+    actuators : tuple of ActuatorEstimate
+        How the feedback of each actuator follows its command, as it was measured on import.
     """
 
     source: str = ""
@@ -61,6 +64,7 @@ class Provenance:
     epoch: float | None = None
     notes: Mapping[str, str] = field(default_factory=dict)
     conditions: Conditions = field(default_factory=Conditions)
+    actuators: tuple[ActuatorEstimate, ...] = ()
 
     @property
     def derived(self) -> tuple[str, ...]:
@@ -85,6 +89,7 @@ class Provenance:
             "epoch": self.epoch,
             "notes": dict(self.notes),
             "conditions": self.conditions.to_dict(),
+            "actuators": [a.to_dict() for a in self.actuators],
         }
 
 
@@ -170,6 +175,7 @@ class TrialLog(Shown):
         loop = float(np.mean(self.closed_loop)) if self.loop_known and len(self) else 0.0
         closed = [f"a controller moves the thrusters in {100 * loop:.0f} % of it"] if loop else []
         closed += [f"conditions: {self.conditions.sentence}"] if self.conditions else []
+        closed += [f"actuator: {a.sentence}" for a in p.actuators]
         return [*closed, *(f"derived: {d}" for d in p.derived), *(f"mended: {f}" for f in p.fixed)]
 
     def _parts(self) -> tuple[str, ...]:

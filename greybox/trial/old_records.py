@@ -7,13 +7,12 @@ that it is told as it was; what none of them matches is kept as a step without a
 from __future__ import annotations
 
 import json
-import math
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
-from greybox.trial.steps import RECORDED, Step, Value
+from greybox.trial.steps import RECORDED, Step, Value, finite_number
 
 _NUMBER = r"([-+.\deE]+)"
 _MADE_OF = {
@@ -91,7 +90,7 @@ def _corrections(sentence: str, key: str, text: str, whole: dict[str, Any]) -> l
     try:
         value = json.loads(text)
         steps = list(_REMOVED[key](value, whole.get(key)))
-    except (KeyError, ValueError, TypeError, AttributeError, IndexError):
+    except (KeyError, ValueError, TypeError, AttributeError, IndexError, RecursionError):
         return [_step(sentence, "recorded", ())]
     whole[key] = value
     return [
@@ -109,27 +108,20 @@ def _reversed(now: Any, before: Any) -> Told:
 
 
 def _clock(now: Any, before: Any) -> Told:
-    late = {c: _finite(s) - (before or {}).get(c, 0.0) for c, s in now.items()}
+    late = {c: finite_number(s) - (before or {}).get(c, 0.0) for c, s in now.items()}
     return [("shift", (str(c),), {"late": s}) for c, s in late.items() if s]
 
 
 def _heading_bias(now: Any, before: Any) -> Told:
-    return [("turn_heading", ("psi",), {"angle": _finite(now) - (before or 0.0)})]
+    return [("turn_heading", ("psi",), {"angle": finite_number(now) - (before or 0.0)})]
 
 
 def _arm(sensor: str) -> Callable[[Any, Any], Told]:
     def told(now: Any, before: Any) -> Told:
-        x, y = (_finite(a) - b for a, b in zip(now, before or (0.0, 0.0), strict=True))
+        x, y = (finite_number(a) - b for a, b in zip(now, before or (0.0, 0.0), strict=True))
         return [("move_velocity", ("u", "v"), {"x": x, "y": y, "sensor": sensor})]
 
     return told
-
-
-def _finite(value: Any) -> float:
-    number = float(value)
-    if not math.isfinite(number):
-        raise ValueError(value)
-    return number
 
 
 _REMOVED: dict[str, Callable[[Any, Any], Told]] = {
@@ -150,7 +142,7 @@ _PATTERNS: tuple[tuple[re.Pattern[str], Callable[[str, re.Match[str]], Step]], .
             "local_polynomials",
             ("u", "v"),
             _MADE_OF["positions and heading"],
-            window=_finite(m[1]),
+            window=finite_number(m[1]),
         ),
     ),
     (
@@ -167,20 +159,28 @@ _PATTERNS: tuple[tuple[re.Pattern[str], Callable[[str, re.Match[str]], Step]], .
     ),
     (
         re.compile(rf"u_q, v_q moved from the anemometer at \({_NUMBER}, {_NUMBER}\) m .*"),
-        lambda s, m: _step(s, "move_anemometer", ("u_q", "v_q"), x=_finite(m[1]), y=_finite(m[2])),
+        lambda s, m: _step(
+            s, "move_anemometer", ("u_q", "v_q"), x=finite_number(m[1]), y=finite_number(m[2])
+        ),
     ),
     (
         re.compile(rf"true wind brought from {_NUMBER} to {_NUMBER} m\b.*"),
         lambda s, m: _step(
-            s, "wind_height", ("u_q", "v_q"), measured=_finite(m[1]), height=_finite(m[2])
+            s,
+            "wind_height",
+            ("u_q", "v_q"),
+            measured=finite_number(m[1]),
+            height=finite_number(m[2]),
         ),
     ),
     (
         re.compile(rf"(\w+) smoothed over {_NUMBER} s \(local polynomials of order 2\)"),
-        lambda s, m: _step(s, "smooth", (m[1],), window=_finite(m[2]), order=2.0),
+        lambda s, m: _step(s, "smooth", (m[1],), window=finite_number(m[2]), order=2.0),
     ),
     (
         re.compile(rf"decimated from {_NUMBER} s to {_NUMBER} s"),
-        lambda s, m: _step(s, "decimate", (), measured=_finite(m[1]), sample_time=_finite(m[2])),
+        lambda s, m: _step(
+            s, "decimate", (), measured=finite_number(m[1]), sample_time=finite_number(m[2])
+        ),
     ),
 )

@@ -92,6 +92,11 @@ class Recording(Shown):
         Signal or column of words -> column that ``[columns]`` takes for it.
     conditions : Conditions
         As stated before, where the file is a log that greybox wrote.
+    ahead : float, optional
+        How far the clock of the program that wrote the file is ahead of the times of the
+        samples [s], where the file holds both.
+    unsure : frozenset of str
+        Signals of which the file does not tell the axes: read as REP 103 has it.
     """
 
     name: str
@@ -104,6 +109,8 @@ class Recording(Shown):
     steps: tuple[Step, ...] = ()
     mapped: Mapping[str, str] = field(default_factory=dict)
     conditions: Conditions = field(default_factory=Conditions)
+    ahead: float | None = None
+    unsure: frozenset[str] = frozenset()
 
     def __contains__(self, name: object) -> bool:
         return any(s.name == name for s in self.signals)
@@ -118,6 +125,17 @@ class Recording(Shown):
     def names(self) -> tuple[str, ...]:
         """Names of the signals, in the order of the source."""
         return tuple(s.name for s in self.signals)
+
+    @property
+    def cuts(self) -> tuple[float, ...]:
+        """Times [s] at which positions begin anew: no stretch of the log reaches over them."""
+        times: list[float] = []
+        for step in self.steps:
+            if step.operation == "cut":
+                times += step.numbers("times")
+            elif step.operation == "shift" and "x_n" in step.channels:
+                times = [t - step.number("late") for t in times]
+        return tuple(sorted(set(times)))
 
     def summary(self) -> str:
         """Return the signals with units, times and ranges, and the notes, as text."""

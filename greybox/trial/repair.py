@@ -9,10 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import LogError, UsageError, suggestion
+from greybox.rotation import body_to_ned, ned_to_body
 from greybox.trial.checks.finding import IDS, CheckReport, Finding
 from greybox.trial.convert.derived_signals import continuous, derive_signals
 from greybox.trial.raw_log import Recording, Signal
 from greybox.trial.steps import Step, mend
+from greybox.trial.time_format import unpadded_numbers
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
@@ -142,10 +144,17 @@ def _beside(recording: Recording) -> dict[str, int]:
 
 def apply_repairs(recording: Recording, findings: Iterable[Finding]) -> Recording:
     """Return the recording with the repairs of the findings applied in order, as its steps."""
-    steps = [replace(step, reason=step.reason or f.evidence) for f in findings for step in f.repair]
-    if any(s.operation in _ON_DERIVED for s in steps):
-        recording = derive_signals(recording)
+    # what reading did already is not done again
+    steps = [
+        replace(step, reason=step.reason or f.evidence)
+        for f in findings
+        for step in f.repair
+        if step not in recording.steps
+    ]
     for step in steps:
+        if step.operation in _ON_DERIVED:
+            # not before: what was interpolated across a wrap must go before it is unwrapped
+            recording = derive_signals(recording)
         recording = _ACTIONS[step.operation](recording, step)
     return recording.with_steps(*steps)
 
@@ -166,18 +175,44 @@ def _order(recording: Recording, step: Step) -> Recording:
     return recording.with_signals(out)
 
 
+def _cut(recording: Recording, step: Step) -> Recording:
+    """Return the recording as it is: its steps tell where it is cut."""
+    return recording
+
+
 def _drop(recording: Recording, step: Step) -> Recording:
     out = []
+    names: set[str] = set()
+    for n in step.channels:
+        names |= {n} if n in recording else set(_MEASURED_AS.get(n, ()))
     times = np.array(step.numbers("times"))
     shared: dict[tuple[int, bytes], Array] = {}
     for s in recording.signals:
-        if s.name in step.channels:
+        if s.name in names:
             keep = np.isfinite(s.value) & np.isfinite(s.t)
             if len(times):
                 keep &= ~np.isin(s.t, times)
+            if step.interval is not None:
+                keep &= (s.t < step.interval[0]) | (s.t > step.interval[1])
             # signals that keep the same rows keep sharing one clock
             t = shared.setdefault((id(s.t), np.packbits(keep).tobytes()), s.t[keep])
             s = replace(s, t=t, value=s.value[keep])
+        out.append(s)
+    return recording.with_signals(out)
+
+
+def _pad_fractions(recording: Recording, step: Step) -> Recording:
+    zero = recording.epoch or 0.0
+    shared: dict[int, Array] = {}
+    out = []
+    for s in recording.signals:
+        if s.name in step.channels:
+            if id(s.t) not in shared:
+                wrong = unpadded_numbers(s.t + zero)
+                t = s.t.copy()
+                t[wrong.rows] = wrong.times - zero
+                shared[id(s.t)] = t
+            s = replace(s, t=shared[id(s.t)])
         out.append(s)
     return recording.with_signals(out)
 
@@ -221,12 +256,8 @@ def _turn_heading(recording: Recording, step: Step) -> Recording:
 def _earth_to_body(recording: Recording, step: Step) -> Recording:
     north, east = (recording[n] for n in step.channels)
     psi = _heading_at(recording, north.t)
-    c, s = np.cos(psi), np.sin(psi)
-    east_value = np.interp(north.t, east.t, east.value)
-    made = {
-        "u": c * north.value + s * east_value,
-        "v": c * east_value - s * north.value,
-    }
+    u, v = ned_to_body(north.value, np.interp(north.t, east.t, east.value), psi)
+    made = {"u": u, "v": v}
     return recording.with_signals(
         replace(x, t=north.t, value=made[x.name]) if x.name in made else x
         for x in recording.signals
@@ -238,10 +269,8 @@ def _move_antenna(recording: Recording, step: Step) -> Recording:
     out: list[Signal] = []
     for s in recording.signals:
         if s.name in ("x_n", "y_n"):
-            psi = _heading_at(recording, s.t)
-            c, si = np.cos(psi), np.sin(psi)
-            arm = c * x - si * y if s.name == "x_n" else si * x + c * y
-            s = s.with_value(s.value - arm)
+            arm = body_to_ned(x, y, _heading_at(recording, s.t))
+            s = s.with_value(s.value - arm[s.name == "y_n"])
         out.append(s)
     return recording.with_signals(out)
 
@@ -252,10 +281,16 @@ def _heading_at(recording: Recording, t: Array) -> Array:
     return np.interp(t, psi.t[keep], continuous(psi.value[keep]))
 
 
+# what a channel is derived from, where a recording does not hold it yet
+_MEASURED_AS = {
+    "x_n": ("lat", "lon"), "y_n": ("lat", "lon"), "v_n": ("sog", "cog"), "v_e": ("sog", "cog"),
+    "u_q": ("V_q", "gamma_q", "dir_q"), "v_q": ("V_q", "gamma_q", "dir_q"),
+}  # fmt: skip
 _ACTIONS = {
-    "order": _order, "drop": _drop, "scale": _scale, "offset": _offset, "exchange": _exchange,
-    "shift": _shift, "turn_heading": _turn_heading, "earth_to_body": _earth_to_body,
-    "move_antenna": _move_antenna,
+    "order": _order, "drop": _drop, "cut": _cut, "scale": _scale, "offset": _offset,
+    "exchange": _exchange, "shift": _shift, "turn_heading": _turn_heading,
+    "earth_to_body": _earth_to_body, "move_antenna": _move_antenna,
+    "pad_fractions": _pad_fractions,
 }  # fmt: skip
 # these act on positions and unwrapped headings
 _ON_DERIVED = frozenset({"earth_to_body", "move_antenna", "shift", "turn_heading"})

@@ -12,7 +12,6 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import savgol_coeffs, savgol_filter
 
 from greybox.errors import LogError
 from greybox.rotation import ned_to_body
@@ -82,6 +81,9 @@ def savgol_velocities(
     for name, value in (("x_n", x_n), ("y_n", y_n), ("psi", psi)):
         _require_finite(name, value)
 
+    # SciPy's filters take half a second to load, and most logs need none
+    from scipy.signal import savgol_filter
+
     def fitted(value: Array, derivative: int) -> Array:
         return np.asarray(
             savgol_filter(value, count, order, deriv=derivative, delta=sample_time), float
@@ -120,6 +122,8 @@ def smooth(value: Array, sample_time: float, window_s: float, order: int = 2) ->
         A value is not finite; the order is below 0; the window holds fewer than
         order + 2 samples, or more than the log.
     """
+    from scipy.signal import savgol_filter
+
     count = window_samples(len(value), sample_time, window_s, order, least_order=0)
     _require_finite("the signal", value)
     return np.asarray(savgol_filter(value, count, order), float)
@@ -189,6 +193,8 @@ def _require_finite(name: str, value: Array) -> None:
 
 def _kept_noise(samples: int, count: int, order: int) -> Array:
     """Return the share of white noise (N,) that a smoothed signal keeps, ends included."""
+    from scipy.signal import savgol_coeffs
+
     half = count // 2
     # savgol_filter evaluates the outermost polynomials in the half windows at the ends
     weights = [savgol_coeffs(count, order, pos=k, use="dot") for k in range(half + 1)]

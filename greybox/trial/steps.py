@@ -14,6 +14,8 @@ Value = float | str | tuple[float, ...]
 RECORDED = "recorded"
 # numbers of a sequence that a record keeps: thousands of times would burst it
 _LONGEST = 1000
+# no time, angle or length in SI is larger, and sums and ratios of such numbers are finite
+_LARGEST = 1e30
 _OF_MOTION = frozenset({"difference", "local_polynomials", "earth_to_body"})
 
 
@@ -111,7 +113,7 @@ def step_from_dict(data: Any) -> Step | None:
             tuple(map(str, data["channels"])),
             tuple(map(str, data.get("source", ()))),
             {str(k): _value(v) for k, v in parameters.items()},
-            None if interval is None else (float(interval[0]), float(interval[1])),
+            None if interval is None else (finite_number(interval[0]), finite_number(interval[1])),
             data.get("decided_by", "default"),
             str(data.get("reason", "")),
         )
@@ -121,8 +123,22 @@ def step_from_dict(data: Any) -> Step | None:
 
 def _value(value: Any) -> Value:
     if isinstance(value, list | tuple):
-        return tuple(float(v) for v in value)
-    return value if isinstance(value, str) else float(value)
+        return tuple(finite_number(v) for v in value)
+    return value if isinstance(value, str) else finite_number(value)
+
+
+def finite_number(value: Any) -> float:
+    """Return a number of a record.
+
+    Raises
+    ------
+    ValueError
+        It is none, or none that a log can hold.
+    """
+    number = float(value)
+    if not abs(number) < _LARGEST:
+        raise ValueError(f"{number} is no quantity of a log")
+    return number
 
 
 def new_steps(known: Iterable[Step], more: Iterable[Step]) -> tuple[Step, ...]:
@@ -140,8 +156,17 @@ def mend(operation: str, channels: tuple[str, ...], **parameters: Value) -> Step
     return Step(operation, channels, parameters=parameters, decided_by="check")
 
 
+def _word(step: Step, name: str) -> str:
+    # a record may have been damaged
+    return str(step.parameters.get(name, "?"))
+
+
 def _names(step: Step) -> str:
     return ", ".join(step.channels)
+
+
+def _times(step: Step) -> str:
+    return ", ".join(f"{t:.6g}" for t in step.numbers("times"))
 
 
 def _sources(step: Step) -> str:
@@ -168,6 +193,7 @@ OPERATIONS: dict[str, Callable[[Step], str]] = {
     # signals on their own clocks
     "order": lambda s: f"rows of {_names(s)} put in order of time, each time once",
     "drop": lambda s: f"samples of {_names(s)} left out",
+    "cut": lambda s: f"log cut where {_names(s)} begin anew, at t = {_times(s)} s",
     "scale": lambda s: f"{_names(s)} multiplied by {s.number('factor'):.6g}",
     "offset": lambda s: f"{s.number('offset'):+.6g} added to {_names(s)}",
     "exchange": lambda s: f"{_names(s)} exchanged",
@@ -211,4 +237,13 @@ OPERATIONS: dict[str, Callable[[Step], str]] = {
     ),
     # what a record of an older version tells and this version has no operation for
     "recorded": lambda s: f"{_names(s)} changed, as an older record tells",
+    "time_zone": lambda s: (
+        f"clock of {', '.join(s.source)} is {s.number('ahead') / 3600:+g} h ahead of "
+        f"{_word(s, 'against')}: put on that"
+    ),
+    "read_axes": lambda s: f"{_names(s)} read in axes {_word(s, 'axes')}",
+    "pad_fractions": lambda s: (
+        f"{s.number('count'):.0f} times of {_names(s)} lack leading zeros in their fraction of a "
+        f"second, such as {_word(s, 'written')} for {_word(s, 'meant')}: read as meant"
+    ),
 }

@@ -15,6 +15,7 @@ import numpy as np
 from greybox.channels import LOGGED
 from greybox.errors import LogError
 from greybox.files import check_targets, replacing, sha256, write_json
+from greybox.trial.actuator_estimate import recorded_actuators
 from greybox.trial.gaps import joined_spans
 from greybox.trial.log import RECORD_FORMAT, RECORD_VERSION, Provenance, TrialLog
 from greybox.trial.old_records import steps_of_sentences
@@ -23,6 +24,8 @@ from greybox.trial.steps import Step, step_from_dict
 from greybox.vessel.conditions import Conditions
 
 _ROWS = 1 << 17
+# seconds since 1970 that a date can have: the year 5138
+_LATEST = 1e11
 
 
 def record_path(path: str | Path) -> Path:
@@ -178,13 +181,16 @@ def recorded_provenance(record: Mapping[str, Any]) -> Provenance:
         str(record.get("source", "")),
         str(record.get("sha256", "")),
         _recorded_steps(record, words),
-        tuple((str(f[0]), str(f[1]), str(f[2])) for f in files if len(f) == 3)
-        if isinstance(files, list)
-        else (),
+        tuple(
+            (str(f[0]), str(f[1]), str(f[2]))
+            for f in (files if isinstance(files, list) else ())
+            if isinstance(f, list) and len(f) == 3
+        ),
         words("read"),
-        float(epoch) if isinstance(epoch, int | float) else None,
+        float(epoch) if isinstance(epoch, int | float) and abs(epoch) < _LATEST else None,
         {str(k): str(v) for k, v in notes.items()} if isinstance(notes, dict) else {},
         Conditions.recorded(record),
+        recorded_actuators(record),
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from greybox.errors import GreyboxError
@@ -19,6 +19,8 @@ from greybox.vessel.vessel import Vessel
 _SHORTEST = 5.0
 # a state keeps its sign with a margin of this share of its usual size
 _MARGIN = 0.1
+# samples after a cut within which a manoeuvre begins on it
+_AFTER_CUT = 5
 
 
 @dataclass(frozen=True, repr=False)
@@ -106,9 +108,18 @@ def describe_recording(recording: Recording, vessel: Vessel) -> Contents:
         Manoeuvres and sign regimes; ``note`` says why where there are none.
     """
     try:
-        return describe_logs(import_recording(recording, vessel).segments)
+        segments = import_recording(recording, vessel).segments
+        found = describe_logs(segments)
     except GreyboxError as error:
         return Contents(note=str(error))
+    # what begins on a jump was cut in two: its first part is missing
+    begin = [c + _AFTER_CUT * segments[0].sample_time for c in recording.cuts]
+    whole = tuple(
+        m
+        for m in found.manoeuvres
+        if not any(c <= m.start <= b for c, b in zip(recording.cuts, begin, strict=True))
+    )
+    return replace(found, manoeuvres=whole)
 
 
 def manoeuvre_to_dict(manoeuvre: Manoeuvre) -> dict[str, Any]:

@@ -95,13 +95,6 @@ def force_expressions(vessel: Vessel, commands: ca.SX) -> dict[str, ca.SX]:
     return total
 
 
-def force_function(vessel: Vessel) -> ca.Function:
-    """Return ``commands (nc,) -> generalised inputs (nu,)`` in the order of `force_inputs`."""
-    commands = ca.SX.sym("commands", len(vessel.commands))
-    inputs = ca.vertcat(*force_expressions(vessel, commands).values())
-    return ca.Function("force", [commands], [inputs], ["commands"], ["tau"])
-
-
 def generalised_force(vessel: Vessel, commands: dict[str, Array]) -> dict[str, Array]:
     """Evaluate the generalised inputs on logged commands.
 

@@ -183,6 +183,7 @@ _TABLES: dict[str, type[Table]] = {
 }
 _THRUSTERS: dict[str, type[Table]] = dict(zip(THRUSTER_TYPES, get_args(AnyThruster), strict=True))
 _COLUMNS = {"speed": "its propeller speed", "angle": "its angle", "rudder": "its rudder angle"}
+_LACKS = {"angle": "has no angle of its own", "rudder": "cannot have a rudder"}
 _CHOICES = {"type": THRUSTER_TYPES, "drive": get_args(Drive), "law": ("linear", "quadratic")}
 _LIMITS = "{name} must be [lowest, highest], it is {value}: correct it."
 _LOOP = (
@@ -190,7 +191,7 @@ _LOOP = (
     "values under which a controller moves the thrusters."
 )
 _NUMBER = "{number} is {value}, a finite number is needed: correct it."
-_TABLE = "{name} is {value}, not a table: write it as key = value lines."
+_TABLE = "{name} is not a table but {value}: write it as key = value lines."
 _TYPES = f"Types: {', '.join(THRUSTER_TYPES)}."
 # what is said of a kind of error, whatever the key
 _BY_KIND = {
@@ -322,12 +323,9 @@ def _shown(value: Any) -> str:
 
 def _unknown(place: _Place) -> str:
     """Return what is said of a key that its table does not have."""
-    has = {"angle": "an angle of its own", "rudder": "a rudder"}.get(place.key.partition("_")[0])
+    has = _LACKS.get(place.key.partition("_")[0])
     if place.thruster and has and any(place.key in t.model_fields for t in _THRUSTERS.values()):
-        return (
-            f"{place.where} is of type {place.thruster} and cannot have {has}: remove "
-            f"'{place.key}'."
-        )
+        return f"{place.where} is of type {place.thruster} and {has}: remove '{place.key}'."
     known = place.table.model_fields
     dotted = " A name with a dot is written in quotes." if place.table is ColumnTable else ""
     return (

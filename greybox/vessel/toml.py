@@ -71,8 +71,8 @@ def load_vessel(path: str | Path) -> Vessel:
         ) from error
     if len(raw) > _MAX_BYTES:
         raise VesselError(
-            f"'{source}' has more than {_MAX_BYTES} bytes, the most of a vessel file: is it the "
-            f"log?"
+            f"'{source}' has {max(source.stat().st_size, len(raw))} bytes, a vessel file at most "
+            f"{_MAX_BYTES}: is it the log?"
         )
     try:
         data = tomllib.loads(raw.decode("utf-8"))

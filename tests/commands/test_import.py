@@ -331,13 +331,15 @@ def test_a_log_that_is_imported_again_is_the_same(tmp_path, capsys, monkeypatch,
     for name in ("a.csv", "b.csv", "c.csv"):
         assert run(
             capsys, "import", tmp_path / source, "--vessel", ship, "--reference-height", 10,
-            "--out", tmp_path / name,
+            "--out", tmp_path / name, *(("--note", "draught=1.2") if name == "a.csv" else ()),
         )[0] == 0  # fmt: skip
         records.append(json.loads((tmp_path / f"{name}.json").read_text()))
         source = name
     assert (tmp_path / "b.csv").read_bytes() == (tmp_path / "a.csv").read_bytes()
     assert (tmp_path / "c.csv").read_bytes() == (tmp_path / "a.csv").read_bytes()
-    assert records[0]["derived"] == records[1]["derived"] == records[2]["derived"]
+    for key in ("steps", "derived", "conditions"):
+        assert records[0][key] == records[1][key] == records[2][key] != []
+    assert records[0]["conditions"] == {"draught": 1.2}
 
 
 def test_a_height_is_changed_from_that_of_the_log(tmp_path, capsys):

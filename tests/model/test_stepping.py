@@ -14,7 +14,7 @@ from greybox.model.functions import accumulate
 from greybox.model.model import ManoeuvringModel
 from greybox.model.simulation import positions
 from greybox.validation.fit import run_model
-from greybox.vessel.force import force_function
+from greybox.vessel.force import generalised_force
 from greybox.vessel.vessel import Actuation
 
 WIND = (1.0, -0.5)
@@ -109,7 +109,9 @@ def test_rate_is_the_step_over_the_sample_time(ship, true_theta, lag_on):
     memory = len(late.step_states) - 6
     rate = np.array(late.rhs_function()(x=[*x, *[0.5] * memory], command=command)["x_dot"])
     goal = {
-        "force": np.array(force_function(ship)(command)).ravel(),
+        "force": np.array(
+            [*generalised_force(ship, dict(zip(ship.commands, command, strict=True))).values()]
+        ),
         "command": np.array(command),
         "speed": np.array(command[:1]),
     }[lag_on]

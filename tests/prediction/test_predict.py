@@ -18,6 +18,7 @@ from greybox.prediction.predict import predict_manoeuvre
 from greybox.trial.log import make_log
 from greybox.trial.manoeuvres import Verdict, find_manoeuvres
 from greybox.validation.fit import run_model
+from greybox.vessel.conditions import Conditions
 
 FEW = {"draws": 40, "command": 12.0}
 
@@ -256,6 +257,13 @@ def test_prediction_and_trial_side_by_side():
     assert len(own.agreement.rows) == 8
     assert sum(r.agrees for r in own.agreement.rows) >= 7
     assert value(made, "approach_speed") == pytest.approx(value(source, "approach_speed"), rel=0.01)
+    assert not made.conditions
+
+    known = replace(trial.provenance, conditions=Conditions(draught=2.0))
+    loaded = replace(trial, provenance=known)
+    light = replace(model, conditions={"draught": (1.5,)})
+    (elsewhere,) = predict_manoeuvre(light, "zigzag", trial=loaded, draws=40).conditions
+    assert elsewhere.sentence.startswith("draught is 2 m in trial, the model was estimated at 1.5")
 
     theta = model.theta.copy()
     theta[model.names.index("N_|u|u*rudder")] *= 1.6

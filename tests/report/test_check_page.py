@@ -20,7 +20,10 @@ from greybox.report.figures import to_svg
 from greybox.trial.checks.course import course_findings
 from greybox.trial.checks.finding import IDS, CheckReport, Finding, Outcome
 from greybox.trial.checks.frame_sign_unit import _PSI, _RATE, _VELOCITY, Reading, reading_findings
+from greybox.trial.checks.heading_wrap import wrap_findings
 from greybox.trial.checks.motion import make_motion
+from greybox.trial.checks.position_hold import hold_findings
+from greybox.trial.checks.position_jump import jump_findings
 from greybox.trial.checks.signal_quality import (
     angle_unit_findings,
     coarse_findings,
@@ -116,6 +119,15 @@ def row_case(name):
         c["psi"][100:200] = c["psi"][100]
     elif name == "quantised":
         c["v"] = np.round(c["v"], 1)
+    elif name == "heading_wrap":
+        c["psi"] %= 2 * np.pi
+        k = int(np.argmax(np.abs(np.diff(c["psi"]))))
+        c["psi"][k] = 0.5 * (c["psi"][k - 1] + c["psi"][k + 1])
+    elif name == "position_hold":
+        for k in (100, 101, 300):
+            c["x_n"][k], c["y_n"][k] = c["x_n"][k - 1], c["y_n"][k - 1]
+    elif name == "position_jump":
+        c["y_n"][200:] += 5.0
     elif name == "unit":
         c["alpha1"] = np.degrees(c["alpha1"])
     recording = as_recording(c)
@@ -123,6 +135,8 @@ def row_case(name):
         "gap": time_findings, "duplicate_time": time_findings, "nan": missing_findings,
         "outlier": spike_findings, "stuck": lambda r: stuck_findings(r, SHIP),
         "quantised": coarse_findings, "unit": lambda r: angle_unit_findings(r, SHIP),
+        "heading_wrap": wrap_findings, "position_hold": hold_findings,
+        "position_jump": jump_findings,
     }  # fmt: skip
     return report_of([f for f in make[name](recording) if f.id == name], recording)
 
@@ -152,7 +166,10 @@ def answer_case(name):
 
 TIES = ("clock of u, v", "clock of psi", "clock of r", "lever arm", "heading bias")
 READINGS = ("speeds in knots", "velocities north and east", "rate reversed", "heading reversed")
-ROWS = ("gap", "duplicate_time", "nan", "outlier", "stuck", "quantised", "unit")
+ROWS = (
+    "gap", "duplicate_time", "nan", "outlier", "stuck", "quantised", "unit", "heading_wrap",
+    "position_hold", "position_jump",
+)  # fmt: skip
 ANSWERS = ("course", "thruster", "wind sign", "wind frame")
 
 

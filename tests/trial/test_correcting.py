@@ -9,8 +9,10 @@ import pandas as pd
 import pytest
 
 from greybox.errors import LogError, VesselError
+from greybox.trial.convert.convert import import_recording
 from greybox.trial.convert.read import read_log, read_segments
 from greybox.trial.convert.sensor_corrections import correct_log
+from greybox.trial.dataframe import recording_from_pandas
 from greybox.trial.import_files import import_files
 from greybox.trial.log import make_log
 from greybox.trial.steps import mend
@@ -196,7 +198,7 @@ def test_an_anemometer_is_moved_by_the_corrected_yaw_rate(tmp_path):
         np.testing.assert_allclose(log["v_q"], 3, atol=1e-12)
 
 
-def test_blocks_are_corrected_as_the_whole(tmp_path, monkeypatch):
+def test_blocks_are_corrected_as_the_whole(tmp_path, monkeypatch, limited):
     late = {"u": 0.7, "psi": -1.3, "n": 0.25}
     columns = {"t": np.arange(600) * STEP} | signals(late)
     frame = pd.DataFrame(columns).drop(index=range(200, 240))
@@ -206,7 +208,7 @@ def test_blocks_are_corrected_as_the_whole(tmp_path, monkeypatch):
     import_files([tmp_path / "raw.csv"], vessel, tmp_path / "whole.csv")
     monkeypatch.setattr("greybox.trial.convert.two_pass_import._LARGE_CELLS", 0)
     monkeypatch.setattr("greybox.trial.convert.two_pass_import._BLOCK_ROWS", 50)
-    monkeypatch.setattr("greybox.trial.readers.csv._BLOCK_BYTES", 1 << 12)
+    limited(block_bytes=1 << 12)
     import_files([tmp_path / "raw.csv"], vessel, tmp_path / "blocks.csv")
     one, two = (pd.read_csv(tmp_path / f"{n}.csv") for n in ("whole", "blocks"))
     pd.testing.assert_frame_equal(one, two, rtol=1e-9, atol=1e-9)
@@ -220,6 +222,31 @@ def test_clocks_that_leave_nothing_are_refused_by_the_import(tmp_path):
     with pytest.raises(LogError, match=r"fewer than 3 samples .* \(u by 100 s\)"):
         import_files([tmp_path / "raw.csv"], ship(clock={"u": 100.0}), tmp_path / "log.csv")
     assert not (tmp_path / "log.csv").exists()
+
+
+def test_a_corrected_log_is_not_merged_with_a_raw_one(tmp_path):
+    """The record of the one would speak for the other."""
+    whole = pd.DataFrame({"t": np.arange(600) * STEP} | signals())
+    whole[:300].to_csv(tmp_path / "first.csv", index=False)
+    whole[300:].to_csv(tmp_path / "later.csv", index=False)
+    vessel, out = ship(heading_bias=0.08), tmp_path / "both.csv"
+    import_files([tmp_path / "first.csv"], vessel, tmp_path / "log.csv")
+    with pytest.raises(
+        LogError, match=r"psi of 'log' is corrected \(heading turned back .*'later'"
+    ):
+        import_files([tmp_path / "log.csv", tmp_path / "later.csv"], vessel, out)
+    import_files([tmp_path / "later.csv"], vessel, tmp_path / "log2.csv")
+    import_files([tmp_path / "log.csv", tmp_path / "log2.csv"], vessel, out)
+    np.testing.assert_allclose(read_log(out, vessel)["psi"], signals()["psi"] - 0.08, atol=1e-12)
+
+
+def test_a_frame_of_a_corrected_log_is_not_corrected_again(tmp_path):
+    vessel = ship(heading_bias=0.08, reversed=["r"])
+    log = read(signals(), tmp_path, vessel)
+    (again,) = import_recording(recording_from_pandas(log.to_pandas(), vessel), vessel).segments
+    for name in log.channels:
+        np.testing.assert_allclose(again[name], log[name], atol=1e-12)
+    assert again.provenance.steps == log.provenance.steps
 
 
 def test_only_the_signs_that_import_mended_are_left_to_it(tmp_path):

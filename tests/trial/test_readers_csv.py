@@ -474,3 +474,71 @@ def test_numbers_are_those_that_arrow_itself_gives(values, part):
     column = pa.array([None if v is None else str(v) for v in values], pa.string())[part]
     expected = column.cast(pa.float64()).to_numpy(zero_copy_only=False)
     np.testing.assert_array_equal(cells.numbers(column, ".", "u", {}), expected)
+
+
+# short names of positions, and points between thousands
+
+
+def track(n=200):
+    t = np.arange(n) * 0.5
+    return pd.DataFrame({"t": t, "n": 3 * t, "e": 20 * np.sin(t / 30), "heading": 0.1 * np.sin(t)})
+
+
+UNCLAIMED = vessel_from_dict(
+    {**SHIP, "thruster": [{"type": "azimuth", "speed": "rpm", "angle": "a"}]}
+)
+
+
+def test_north_and_east_may_be_called_n_and_e(tmp_path):
+    track().to_csv(tmp_path / "x.csv", index=False)
+    recording = read_recording(tmp_path / "x.csv", UNCLAIMED)
+    np.testing.assert_array_equal(recording["x_n"].value, track()["n"])
+    np.testing.assert_array_equal(recording["y_n"].value, track()["e"])
+    assert "n taken for x_n in m, no unit being stated" in recording.notes
+
+
+@pytest.mark.parametrize("left_out", ["e", "n"])
+def test_n_or_e_alone_is_no_position(tmp_path, left_out):
+    track().drop(columns=left_out).to_csv(tmp_path / "x.csv", index=False)
+    assert not {"x_n", "y_n"} & set(read_recording(tmp_path / "x.csv", UNCLAIMED).names)
+
+
+def test_a_shaft_speed_that_the_vessel_claims_is_no_position(tmp_path):
+    track().to_csv(tmp_path / "x.csv", index=False)
+    recording = read_recording(tmp_path / "x.csv", VESSEL)
+    assert "n" in recording.names
+    assert not {"x_n", "y_n"} & set(recording.names)
+
+
+@pytest.mark.parametrize("kind", ["held", "noise"])
+def test_n_and_e_that_do_not_travel_are_no_positions(tmp_path, kind):
+    data = track()
+    rng = np.random.default_rng(0)
+    data["n"] = 15.0 + np.arange(len(data)) // 60 if kind == "held" else rng.normal(size=len(data))
+    data.to_csv(tmp_path / "x.csv", index=False)
+    assert not {"x_n", "y_n"} & set(read_recording(tmp_path / "x.csv", UNCLAIMED).names)
+
+
+def german(value):
+    return f"{value:,.3f}".translate(str.maketrans(",.", ".,"))
+
+
+@pytest.mark.parametrize("rows", [50, 5000])
+def test_points_between_thousands_before_a_decimal_comma(tmp_path, rows):
+    data = pd.DataFrame({"t": np.arange(rows) * 0.5, "x_n": 990.0 + np.arange(rows) * 1.25})
+    data["psi"] = -0.5
+    data.map(german).to_csv(tmp_path / "x.csv", sep=";", index=False)
+    found, table = read(tmp_path / "x.csv")
+    pd.testing.assert_frame_equal(found, data, check_exact=True)
+    assert "column 'x_n' has points between thousands: 1.234,5 read as 1234.5" in table.notes
+
+
+def test_points_that_are_no_thousands_stay_decimal(tmp_path):
+    data = pd.DataFrame({"t": np.arange(50) * 0.5, "x_n": np.arange(50) * 1.25})
+    texts = data.map(german)
+    texts.loc[7, "x_n"] = "1.5"
+    texts.loc[9, "x_n"] = "1.234,500"
+    texts.to_csv(tmp_path / "x.csv", sep=";", index=False)
+    found, _ = read(tmp_path / "x.csv")
+    assert found.loc[7, "x_n"] == 1.5
+    assert np.isnan(found.loc[9, "x_n"])

@@ -426,13 +426,13 @@ def check_cut_files(tmp_path, kind, shares):
 
 @pytest.mark.parametrize("kind", ["five", "packed", "four"])
 def test_cut_files_are_refused(tmp_path, kind):
-    check_cut_files(tmp_path, kind, [0.0, 0.2, 0.55, 0.9, 0.999])
+    check_cut_files(tmp_path, kind, [0.2, 0.6, 0.99])
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("kind", ["five", "packed", "four"])
 def test_files_cut_anywhere_are_refused(tmp_path, kind):
-    check_cut_files(tmp_path, kind, np.linspace(0, 0.999, 30))
+    check_cut_files(tmp_path, kind, np.linspace(0, 0.999, 12))
 
 
 def test_cut_hdf_files_are_refused(tmp_path):
@@ -442,9 +442,9 @@ def test_cut_hdf_files_are_refused(tmp_path):
 @pytest.mark.parametrize(
     ("kind", "copies"),
     [
-        (hdf, 80), (five, 5), (packed, 3),
-        pytest.param(five, 40, marks=pytest.mark.long),
-        pytest.param(packed, 40, marks=pytest.mark.long),
+        (hdf, 80), (five, 3), (packed, 2),
+        pytest.param(five, 15, marks=pytest.mark.long),
+        pytest.param(packed, 15, marks=pytest.mark.long),
     ],
 )  # fmt: skip
 def test_flipped_bytes_never_raise_anything_else(tmp_path, kind, copies):
@@ -570,6 +570,8 @@ def test_every_kind_of_value_arrives_as_it_was_saved(tmp_path, compressed):
             "rows": np.array(["ab", "cde"]),
             "greek": "\u03b1\u03b2",
             "cell": np.array([[np.arange(3.0), "x"], [{"a": 1.0}, np.empty((0, 0))]], object),
+            "bare": {"inner": {}},
+            "none": np.empty((0, 0), object),
         },
         do_compression=compressed,
     )
@@ -581,6 +583,8 @@ def test_every_kind_of_value_arrives_as_it_was_saved(tmp_path, compressed):
         np.testing.assert_array_equal(tree[name], value.toarray())
     assert tree["rows"] == ["ab", "cde"]
     assert tree["greek"] == "\u03b1\u03b2"
+    assert tree["none"] == []
+    assert tree["bare"] == {"inner": {}}
     # columns first
     assert [type(v).__name__ for v in tree["cell"]] == ["ndarray", "dict", "str", "ndarray"]
 

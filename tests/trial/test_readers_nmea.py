@@ -306,6 +306,15 @@ def test_shafts_and_rudders_go_to_the_vessels_columns(tmp_path):
         {"name": "S", "length": 5, "thruster": [{"type": "azimuth", "speed": "n", "angle": "a"}]}
     )
     assert "a" not in read_recording(path, azimuth)
+    led = vessel_from_dict(
+        {"name": "S", "length": 5, "thruster": [
+            {"type": "propeller_rudder", "speed": f"n{k}", "rudder": f"d{k}", "y": k,
+             "speed_command": f"n{k}_ref", "rudder_command": f"d{k}_ref", "drive": "command"}
+            for k in (1, 2)]}
+    )  # fmt: skip
+    names = read_recording(path, led).names
+    assert {"n1", "n2", "d1", "d2"} <= set(names)
+    assert not any(n.endswith("_ref") for n in names)
 
 
 @pytest.mark.parametrize(

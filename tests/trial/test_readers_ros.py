@@ -22,10 +22,13 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from greybox.errors import LogError
+from greybox.trial.convert.channel_mapping import read_recording
 from greybox.trial.readers.limits import limits
 from greybox.trial.readers.ros import messages as rosmessages
+from greybox.trial.readers.ros.axes import compass_heading
 from greybox.trial.readers.ros.read import read_bag
 from greybox.trial.readers.ros.storage import Channel
+from greybox.vessel.toml import load_vessel
 
 ROS1 = get_typestore(Stores.ROS1_NOETIC)
 ROS2 = get_typestore(Stores.ROS2_HUMBLE)
@@ -290,6 +293,28 @@ def test_stamped_poses_and_twists(tmp_path):
     assert any("'map' is the world's" in n for n in recording.notes)
 
 
+def test_axes_in_the_frame_of_a_receiver_are_decided_by_the_data(tmp_path):
+    g = ROS2.types
+    speed = g["geometry_msgs/msg/TwistStamped"]
+    turn = g["geometry_msgs/msg/QuaternionStamped"]
+    rows = []
+    for k in range(60):
+        t = START + k
+        stamped = header(ROS2, t, "gnss")
+        # north at 1 m/s, east-north-up; the heading clockwise from north
+        rows += [
+            ("/velocity", t, speed(header=stamped, twist=twist(ROS2, 0.0, 1.0, 0.0))),
+            ("/heading", t, turn(header=stamped, quaternion=quaternion(ROS2, 0.1))),
+            ("/fix", t, fix(ROS2, t, lat=59.0 + k / 111_400)),
+        ]
+    bag = ros2(tmp_path / "b", rows)
+    assert read_bag(bag).unsure == {"u", "v", "psi"}
+    recording = read_recording(bag, load_vessel("thesis"))
+    np.testing.assert_allclose(recording["psi"].value, 0.1)
+    np.testing.assert_allclose(recording["v_n"].value, 1.0)
+    assert {s.parameters["axes"] for s in recording.steps} == {"east-north-up", "north-east-down"}
+
+
 def test_fixes_without_a_fix_are_counted_and_left_out(tmp_path):
     rows = [
         ("/fix", START + 0, fix(ROS2, START + 0)),
@@ -438,6 +463,15 @@ print(float(compass_heading(0.0, 0.0, 0.0, 1.0, ned=False)))
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     # the body looks east where it is not turned
     assert float(done.stdout) == pytest.approx(math.pi / 2)
+
+
+def test_headings_of_many_quaternions():
+    yaw = np.array([0.0, 0.3, -2.0])
+    q = (np.zeros(3), np.zeros(3), np.sin(yaw / 2), np.cos(yaw / 2))
+    np.testing.assert_allclose(compass_heading(*q, ned=True), yaw % (2 * np.pi))
+    np.testing.assert_allclose(compass_heading(*q, ned=False), (np.pi / 2 - yaw) % (2 * np.pi))
+    wrong = np.array([0.0, np.nan, np.inf, 1e200])
+    assert np.isnan(compass_heading(wrong, wrong, wrong, wrong, ned=True)).all()
 
 
 # files that are damaged, foreign or hostile

@@ -73,7 +73,10 @@ OLD = {
             "heading and the rate: shifted so, positions, velocities and heading agree",
         ],
     ),
-    "edited by hand": (["the mast was moved", "[sensors] clock = oops: x"], ["glued"]),
+    "edited by hand": (
+        ["the mast was moved", "[sensors] clock = oops: x", f"[sensors] clock = {'[' * 9999}: x"],
+        ["glued"],
+    ),
 }  # fmt: skip
 
 
@@ -189,11 +192,29 @@ def test_what_is_damaged_in_a_record_is_left_out(tmp_path):
         {}, None, 3, "x", good | {"operation": "rub"}, good | {"channels": 4},
         good | {"decided_by": "nobody"}, good | {"interval": [1]}, good | {"parameters": []},
         good | {"parameters": {"late": {}}}, good | {"parameters": {"late": [[1]]}},
+        good | {"parameters": {"late": float("inf")}}, good | {"parameters": {"late": 1e308}},
     ]  # fmt: skip
     for steps in ([*bad, good], "shift", 4, {}, None):
         (tmp_path / "log.csv.json").write_text(json.dumps(record | {"steps": steps}))
         got = gb.read_log(path, ship()).provenance.steps
         assert got == ((step_from_dict(good),) if isinstance(steps, list) else ())
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"files": [3, None, ["a"], ["a", "b", "c"]]}, {"files": 4}, {"epoch": float("inf")},
+        {"epoch": "x"}, {"notes": []}, {"read": {}}, {"conditions": [1]}, {"version": None},
+    ],
+)  # fmt: skip
+def test_other_damage_does_no_harm(tmp_path, damage):
+    path = old_log(tmp_path, [], [])
+    record = json.loads((tmp_path / "log.csv.json").read_text()) | {"version": 2, "steps": []}
+    (tmp_path / "log.csv.json").write_text(json.dumps(record | damage))
+    log = gb.read_log(path, ship())
+    np.testing.assert_array_equal(log["u"], columns()["u"])
+    gb.write_log([log], tmp_path / "again.csv")
+    assert gb.read_log(tmp_path / "again.csv", ship()).provenance == log.provenance
 
 
 def test_steps_are_the_same_after_writing_and_reading(tmp_path):

@@ -68,6 +68,18 @@ def test_names_and_units_of_the_vessel_file(tmp_path):
     np.testing.assert_allclose(log["u"], 10 * 1852 / 3600)
 
 
+def test_dates_count_from_the_first_and_numbers_keep_their_zero(tmp_path):
+    start = pd.Timestamp("2024-05-01T12:00:00Z")
+    frame = table()
+    dates = (start + pd.to_timedelta(frame["t"], unit="s")).dt.strftime("%Y-%m-%dT%H:%M:%S.%fZ")
+    log = read(frame.assign(t=dates), tmp_path)
+    np.testing.assert_allclose(log.t, frame["t"], atol=1e-6)
+    assert log.provenance.epoch == pytest.approx(start.timestamp())
+    log = read(frame.assign(t=frame["t"] + 1.7e9), tmp_path)
+    np.testing.assert_array_equal(log.t, frame["t"] + 1.7e9)
+    assert log.provenance.epoch is None
+
+
 def test_heading_is_unwrapped(tmp_path):
     psi = np.linspace(3.0, 9.0, 20)
     log = read(table(psi=(psi + np.pi) % (2 * np.pi) - np.pi), tmp_path)
@@ -182,6 +194,9 @@ def test_velocities_without_positions_are_averaged_at_a_longer_sample_time(tmp_p
         "difference", "earth_to_body", "decimate", "difference",
     ]  # fmt: skip
     assert slow.provenance.steps[-1].channels == ("r",)
+    # differences take a sample at either end
+    with pytest.raises(LogError, match=r"keeps 2 samples at 8 s, at least 3 are needed"):
+        decimate(log, 8.0)
 
 
 @pytest.mark.parametrize("velocities", ["central", "savgol"])

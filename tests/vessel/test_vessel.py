@@ -14,7 +14,7 @@ import pytest
 from greybox.errors import VesselError
 from greybox.trial.log import make_log
 from greybox.vessel.actuation import Actuation, actuated_force
-from greybox.vessel.force import force_function, force_inputs, generalised_force
+from greybox.vessel.force import force_expressions, force_inputs, generalised_force
 from greybox.vessel.thrust import ThrustLaw
 from greybox.vessel.toml import load_vessel, vessel_from_dict, vessel_to_dict
 from greybox.vessel.vessel import ColumnMapping, Thruster
@@ -48,7 +48,10 @@ def test_symbolic_and_array_forces_agree():
     rng = np.random.default_rng(0)
     values = {c: rng.uniform(-900, 900, 20) for c in v.commands}
     got = generalised_force(v, values)
-    function = force_function(v)
+    commands = ca.SX.sym("commands", len(v.commands))
+    function = ca.Function(
+        "force", [commands], [ca.vertcat(*force_expressions(v, commands).values())]
+    )
     want = np.array(
         [np.array(function([values[c][k] for c in v.commands])).ravel() for k in range(20)]
     )
@@ -236,7 +239,7 @@ def test_all_that_a_diagnosis_adds_survives_a_round_trip():
         ({"thrust": {"quadratic_shar": 0.2}}, "Did you mean 'quadratic_share'"),
         ({"thrust": [[1, 2], [2, "x"]]}, "thrust of thruster 1 is 'x', a finite number"),
         ({"thrust": [[1, 2], [2]]}, "must list [speed, force] pairs"),
-        ({"type": "tunnel"}, "is of type tunnel and cannot have an angle of its own"),
+        ({"type": "tunnel"}, "is of type tunnel and has no angle of its own"),
         ({"speed": 3}, "'speed' must name the column of its propeller speed"),
         ({"x": True}, "x of thruster 1 is True, a finite number"),
     ],
@@ -253,8 +256,8 @@ def test_bad_thrusters(change, message):
         ({"columns": {"x": "psy"}}, "Did you mean 'psi'"),
         ({"columns": {"x": {"unit": "deg"}}}, "column 'x' has no 'name'"),
         ({"columns": {"x": {"name": "psi", "sign": True}}}, "sign = True: write 1, or -1"),
-        ({"columns": {"x": 3}}, "column 'x' is 3, not a table"),
-        ({"sensors": 3}, "\\[sensors\\] is 3, not a table"),
+        ({"columns": {"x": 3}}, "column 'x' is not a table but 3"),
+        ({"sensors": 3}, "\\[sensors\\] is not a table but 3"),
         ({"mass": -1}, "mass is -1, it must be positive"),
         ({"length": 10**5000}, "length is an integer too large to be read, a finite number"),
         ({"name": ["long"] * 100}, "name is \\['long', .{1,60}…, a word in quotes"),
@@ -300,11 +303,11 @@ def test_missing_and_foreign_files(tmp_path):
     with pytest.raises(VesselError, match="is not TOML"):
         load_vessel(bad)
     bad.write_text("#" * 1_000_001)
-    with pytest.raises(VesselError, match="more than 1000000 bytes"):
+    with pytest.raises(VesselError, match="has 1000001 bytes, a vessel file at most 1000000"):
         load_vessel(bad)
     with pytest.raises(VesselError, match="has no 'thruster'"):
         vessel_from_dict({"name": "x", "length": 3})
-    with pytest.raises(VesselError, match="the vessel file is 3, not a table"):
+    with pytest.raises(VesselError, match="the vessel file is not a table but 3"):
         vessel_from_dict(3)
 
 

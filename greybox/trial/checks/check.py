@@ -6,14 +6,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from greybox.trial.actuator_estimate import ActuatorEstimate
+from greybox.trial.checks.actuators import measure_actuators
 from greybox.trial.checks.course import course_findings
+from greybox.trial.checks.external_force import force_findings
 from greybox.trial.checks.finding import IDS, CheckReport, Finding, Outcome
 from greybox.trial.checks.frame_sign_unit import (
     find_readings,
     frame_outcomes,
     reading_findings,
 )
+from greybox.trial.checks.heading_wrap import wrap_findings
 from greybox.trial.checks.motion import Motion, make_motion
+from greybox.trial.checks.position_hold import hold_findings
+from greybox.trial.checks.position_jump import jump_findings
 from greybox.trial.checks.sensor_offsets.find import Tied, find_offsets
 from greybox.trial.checks.signal_quality import (
     angle_unit_findings,
@@ -24,6 +30,7 @@ from greybox.trial.checks.signal_quality import (
     time_findings,
 )
 from greybox.trial.checks.thruster_response import response_findings
+from greybox.trial.checks.time_format import time_format_findings
 from greybox.trial.checks.wind_convention import wind_findings
 from greybox.trial.convert.channel_mapping import read_recording
 from greybox.trial.convert.derived_signals import derive_signals
@@ -108,8 +115,8 @@ def check_recordings(recordings: Sequence[Recording], vessel: Vessel) -> list[Ch
     """
     logs = [_signal_quality(recording, vessel) for recording in recordings]
     _kinematics(logs, vessel)
-    for log in logs:
-        _forces(log, vessel)
+    _forces(logs, vessel)
+    actuators = _actuators(logs, vessel)
     return [
         CheckReport(
             log.recorded.name,
@@ -117,6 +124,7 @@ def check_recordings(recordings: Sequence[Recording], vessel: Vessel) -> list[Ch
             _outcomes(log.findings, log.outcomes),
             log.recorded.notes,
             log.recorded,
+            tuple(a for a in actuators if log.recorded.name in a.logs),
         )
         for log in logs
     ]
@@ -124,12 +132,16 @@ def check_recordings(recordings: Sequence[Recording], vessel: Vessel) -> list[Ch
 
 def _signal_quality(recording: Recording, vessel: Vessel) -> _Log:
     """Check the samples of one log, each channel by itself."""
-    raw = time_findings(recording)
+    raw = time_format_findings(recording)
+    raw += time_findings(apply_repairs(recording, raw))
     raw += missing_findings(recording)
     raw += angle_unit_findings(recording, vessel)
+    # before the heading is unwrapped
+    raw += wrap_findings(apply_repairs(recording, raw))
     whole = derive_signals(apply_repairs(recording, raw))
     log = _Log(recording, raw, {}, whole)
-    measured = _independent(whole)
+    log.add(hold_findings(_independent(whole)))
+    measured = _independent(log.mended)
     log.add(
         [
             *stuck_findings(measured, vessel),
@@ -137,6 +149,7 @@ def _signal_quality(recording: Recording, vessel: Vessel) -> _Log:
             *coarse_findings(measured),
         ]
     )
+    log.add(jump_findings(_independent(log.mended)))
     log.motion = make_motion(_independent(log.mended))
     return log
 
@@ -163,10 +176,34 @@ def _kinematics(logs: Sequence[_Log], vessel: Vessel) -> None:
             log.say(said)
 
 
-def _forces(log: _Log, vessel: Vessel) -> None:
-    """Check wind and thrusters of one log against its motion."""
-    log.findings += wind_findings(log.mended, log.findings)
-    log.findings += response_findings(log.mended, vessel, log.findings)
+def _forces(logs: Sequence[_Log], vessel: Vessel) -> None:
+    """Check wind and thrusters of the logs against their motion."""
+    for log in logs:
+        log.findings += wind_findings(log.mended, log.findings)
+    pushed, untold = force_findings([log.mended for log in logs], vessel)
+    for log, forces, reason in zip(logs, pushed, untold, strict=True):
+        # what pushes the ship from outside tells nothing of the signs of its thrusters
+        own = apply_repairs(log.mended, forces)
+        signs = response_findings(own, vessel, log.findings)
+        log.findings += signs
+        doubt = next(
+            (f for f in log.findings if f.id in ("sign", "frame", "unit") and not f.safe), None
+        )
+        if doubt is not None:
+            said = f"the {doubt.id} of {', '.join(doubt.channels)} is to be settled first"
+            log.say([Outcome("external_force", "cannot tell", said)])
+            continue
+        log.findings += forces
+        log.say([reason] if reason is not None else [])
+
+
+def _actuators(logs: Sequence[_Log], vessel: Vessel) -> tuple[ActuatorEstimate, ...]:
+    """Measure the actuators from all logs together."""
+    estimates, findings, untold = measure_actuators([log.mended for log in logs], vessel)
+    for log in logs:
+        log.say([untold] if untold is not None else [])
+        log.findings += [finding for finding, names in findings if log.recorded.name in names]
+    return estimates
 
 
 def _independent(recording: Recording) -> Recording:

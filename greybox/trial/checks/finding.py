@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from greybox.notebook import Shown, items, table
+from greybox.trial.actuator_estimate import ActuatorEstimate
 from greybox.trial.raw_log import Recording
 from greybox.trial.steps import Step
 
@@ -124,6 +125,8 @@ class CheckReport(Shown):
         What was guessed or skipped while reading.
     recording : Recording, optional
         What was checked, for pictures.
+    actuators : tuple of ActuatorEstimate
+        Actuators whose command and feedback the log holds, as all logs together measure them.
     """
 
     name: str
@@ -131,6 +134,7 @@ class CheckReport(Shown):
     outcomes: tuple[Outcome, ...]
     notes: tuple[str, ...] = ()
     recording: Recording | None = None
+    actuators: tuple[ActuatorEstimate, ...] = ()
 
     def summary(self) -> str:
         """Return the findings as text."""
@@ -149,6 +153,7 @@ class CheckReport(Shown):
             text = f"{f.line}, as above" if f.key in known else f.summary()
             lines += [f"  {line}" for line in text.splitlines()]
         lines += [f"  {o.id}: {o.sentence}" for o in self.outcomes if o.status == "cannot tell"]
+        lines += [f"  actuator: {a.sentence}" for a in self.actuators]
         lines += [f"  note: {n}" for n in self.notes]
         return "\n".join(lines)
 
@@ -164,6 +169,7 @@ class CheckReport(Shown):
                 ],
             ),
             items("Cannot be told", untold),
+            items("Actuators", [a.sentence for a in self.actuators]),
         )  # fmt: skip
 
     def to_dict(self) -> dict[str, Any]:
@@ -175,6 +181,7 @@ class CheckReport(Shown):
                 {"id": o.id, "status": o.status, "sentence": o.sentence} for o in self.outcomes
             ],
             "notes": list(self.notes),
+            "actuators": [a.to_dict() for a in self.actuators],
         }
 
 

@@ -18,6 +18,7 @@ from greybox.trial.checks.finding import Finding, Outcome
 from greybox.trial.checks.motion import Motion, integrate, profile, turn
 from greybox.trial.convert.derived_signals import continuous
 from greybox.trial.steps import Step, mend
+from greybox.units import UNITS
 
 Array = NDArray[np.float64]
 Values = dict[str, Array]
@@ -32,7 +33,7 @@ _EXCERPT = 8000
 # and in means over so many seconds of a fast one
 _STEP = 0.5
 _DEG = np.pi / 180
-_KNOT = 1852 / 3600
+_KNOT = UNITS["kn"].factor
 
 
 @dataclass(frozen=True)

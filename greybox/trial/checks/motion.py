@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from greybox.rotation import body_to_ned
 from greybox.trial.convert.derived_signals import continuous
-from greybox.trial.convert.resample import clock, covered, runs
+from greybox.trial.convert.resample import clock, stretches
 from greybox.trial.raw_log import Recording, Signal
 
 Array = NDArray[np.float64]
@@ -125,7 +125,7 @@ def make_motion(recording: Recording, names: tuple[str, ...] = NAMES) -> Motion 
                 signals[name] = s
     if not signals:
         return None
-    clocks = {n: clock(s.t) for n, s in signals.items()}
+    clocks = {n: clock(s.t, cuts=recording.cuts) for n, s in signals.items()}
     step = max(c.period for c in clocks.values())
     start = max(float(c.t[0]) for c in clocks.values())
     stop = min(float(c.t[-1]) for c in clocks.values())
@@ -133,18 +133,16 @@ def make_motion(recording: Recording, names: tuple[str, ...] = NAMES) -> Motion 
         return None
     count = min(int((stop - start) / step + 1e-6) + 1, _MAX_SAMPLES)
     grid = start + step * np.arange(count, dtype=np.float64)
-    keep = np.ones(count, bool)
-    for c in clocks.values():
-        keep &= covered(grid, c)
-    longest = sorted((r for r in runs(keep) if r[1] - r[0] >= _MIN_STRETCH), key=_length)
+    whole = stretches(grid, clocks.values(), recording.cuts)
+    longest = sorted((r for r in whole if r[1] - r[0] >= _MIN_STRETCH), key=_length)
     kept = sorted(longest[-_MAX_STRETCHES:])
     if not kept:
         return None
     rows = np.concatenate([np.arange(a, b) for a, b in kept])
     values = {n: np.interp(grid[rows], s.t, s.value) for n, s in signals.items()}
     edges = np.concatenate([[0], np.cumsum([b - a for a, b in kept])])
-    stretches = tuple((int(a), int(b)) for a, b in pairwise(edges))
-    return Motion(grid[rows], step, values, stretches)
+    kept_as = tuple((int(a), int(b)) for a, b in pairwise(edges))
+    return Motion(grid[rows], step, values, kept_as)
 
 
 def _length(run: tuple[int, int]) -> int:

@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.channels import ANGLES
+from greybox.rotation import body_to_ned
 from greybox.trial.checks.finding import Finding
 from greybox.trial.convert.derived_signals import continuous
 from greybox.trial.convert.resample import clock, runs
-from greybox.trial.gaps import HOLE
+from greybox.trial.gaps import GAP, HOLE
 from greybox.trial.raw_log import Recording, Signal
 from greybox.trial.steps import mend
 from greybox.vessel.vessel import Vessel
@@ -33,8 +34,8 @@ _MATERIAL = {
 # steps of rounded values that matter, as a share of the signal's spread
 _COARSE = 0.004
 # a sensor that is stuck repeats itself this long
-_STUCK_SECONDS = 3.0
-_STUCK_SAMPLES = 8
+STUCK_SECONDS = 3.0
+STUCK_SAMPLES = 8
 
 
 def time_findings(recording: Recording) -> list[Finding]:
@@ -46,7 +47,7 @@ def time_findings(recording: Recording) -> list[Finding]:
         Canonical signals.
     """
     found: list[Finding] = []
-    for names, t in _clocks(recording):
+    for names, t in clocks(recording):
         finite = t[np.isfinite(t)]
         steps = np.diff(finite)
         repeated, back = int((steps == 0).sum()), int((steps < 0).sum())
@@ -62,7 +63,7 @@ def time_findings(recording: Recording) -> list[Finding]:
                     float(count),
                     (float(count), float(count)),
                     "1",
-                    f"of {len(finite)} times of {_listed(names)}, {' and '.join(what)}, the first "
+                    f"of {len(finite)} times of {listed(names)}, {' and '.join(what)}, the first "
                     f"after t = {finite[k]:.6g} s",
                     "sort the rows by time and keep the first of those that repeat "
                     "(import --fix does)",
@@ -82,11 +83,11 @@ def _gaps(names: tuple[str, ...], t: Array) -> list[Finding]:
     usual = clock(t).period
     steps = np.diff(t)
     limit = np.full(len(steps), HOLE * usual)
-    digits = _digits(t)
+    digits = significant_digits(t)
     if digits:
         # between times that were rounded there may have been others
         grid = 10.0 ** (np.floor(np.log10(np.maximum(t[1:], 1e-9))) + 1 - digits)
-        limit = np.maximum(limit, 1.5 * grid)
+        limit = np.maximum(limit, GAP * grid)
     wide = np.flatnonzero(steps > limit)
     if not len(wide):
         return []
@@ -99,7 +100,7 @@ def _gaps(names: tuple[str, ...], t: Array) -> list[Finding]:
             size,
             (size, size),
             "s",
-            f"{len(wide)} time{'s' if len(wide) > 1 else ''} {_listed(names)} has no value for "
+            f"{len(wide)} time{'s' if len(wide) > 1 else ''} {listed(names)} has no value for "
             f"more than {HOLE:g} usual steps of {usual:.4g} s, the longest {size:.4g} s after "
             f"t = {t[longest]:.6g} s",
             "none needed: import keeps gaps as gaps, and each stretch becomes a segment",
@@ -148,7 +149,7 @@ def missing_findings(recording: Recording) -> list[Finding]:
                 count,
                 (count, count),
                 "1",
-                f"{int(count)} of {n} samples of {_listed(names)} hold no number, in "
+                f"{int(count)} of {n} samples of {listed(names)} hold no number, in "
                 f"{len(stretches)} stretch{'es' if len(stretches) > 1 else ''}, {where}",
                 "leave them out: import does, and keeps longer stretches as gaps",
                 names,
@@ -173,8 +174,8 @@ def spike_findings(recording: Recording) -> list[Finding]:
     """Find single samples, or up to three, that leave their neighbours and come back."""
     found = []
     for s in _motion(recording):
-        t, value = _clean(s)
-        if len(value) < 30 or _digits(_wrapped(s)):
+        t, value = clean(s)
+        if len(value) < 30 or significant_digits(_wrapped(s)):
             continue
         spikes, scale, gap = _spikes(value)
         spikes = spikes[np.abs(gap[spikes]) > _worth(s.name, value)]
@@ -228,7 +229,7 @@ def _spikes(value: Array) -> tuple[NDArray[np.int64], float, Array]:
     predicted = [(b * b * mean[a] - a * a * mean[b]) / (b * b - a * a) for a, b in pairs]
     gap = value - np.median(predicted, axis=0)
     scale = 1.4826 * float(np.median(np.abs(gap)))
-    step = _quantum(value)
+    step = quantum(value)
     scale = max(scale, step / np.sqrt(12), 1e-12 * max(float(np.abs(value).max()), 1e-300))
     out = np.abs(gap) > _SPIKE * scale + 2 * step
     if out.any():
@@ -268,7 +269,7 @@ def _comes_back(value: Array, a: int, b: int) -> bool:
     return excess > 3 * max(steps, float(abs(after[0] - before[-1])) if len(after) else 0.0)
 
 
-def _digits(value: Array) -> int:
+def significant_digits(value: Array) -> int:
     """Return the significant digits, at most four, that a signal was rounded to; else 0."""
     part = np.abs(value[value != 0][:20000])
     # one decade alone cannot tell significant digits from decimals
@@ -312,20 +313,22 @@ def _rounded_finding(
 def coarse_findings(recording: Recording) -> list[Finding]:
     """Find signals, and times, that move in steps coarser than what they measure."""
     found = []
-    for _, t in _clocks(recording):
+    for _, t in clocks(recording):
         times = t[np.isfinite(t)]
-        digits = _digits(times)
+        digits = significant_digits(times)
         steps = np.diff(np.unique(times))
         # an even clock looks rounded too, when its step is
         uneven = np.mean(np.abs(steps - np.median(steps)) > 0.3 * np.median(steps))
         if digits and uneven > 0.2:
             found.append(_rounded_finding("t", times, times, "s", digits))
     for s in _motion(recording):
-        t, value = _clean(s)
-        step = _quantum(value)
-        digits = _digits(_wrapped(s)) if step <= 0 else 0
+        t, value = clean(s)
+        step = quantum(value)
+        digits = significant_digits(_wrapped(s)) if step <= 0 else 0
         if digits and (digits < 4 or np.mean(np.diff(value) == 0) > 0.3):
-            degrees = s.name in ANGLES | {"r"} and not _digits(s.value[np.isfinite(s.value)])
+            degrees = s.name in ANGLES | {"r"} and not significant_digits(
+                s.value[np.isfinite(s.value)]
+            )
             per = np.pi / 180 if degrees else 1.0
             coarse = _rounded_finding(s.name, t, value, s.unit or "1", digits, per)
             if isinstance(coarse.value, float) and coarse.value > _COARSE * np.std(value):
@@ -368,12 +371,12 @@ def _wrapped(s: Signal) -> Array:
     """Return the values as they were written: digits count in degrees, not in radians."""
     value = s.value[np.isfinite(s.value) & np.isfinite(s.t)]
     degrees = np.degrees(value)
-    if s.name in ANGLES | {"r"} and _digits(degrees):
+    if s.name in ANGLES | {"r"} and significant_digits(degrees):
         return np.asarray(degrees)
     return value
 
 
-def _quantum(value: Array) -> float:
+def quantum(value: Array) -> float:
     """Return the step of which all values are multiples; 0 where there is none."""
     part = value[: min(len(value), 20000)]
     unique = np.unique(part)
@@ -393,7 +396,7 @@ def stuck_findings(recording: Recording, vessel: Vessel) -> list[Finding]:
     found = []
     signals = list(_motion(recording))
     for s in signals:
-        t, value = _clean(s)
+        t, value = clean(s)
         if len(value) < 50:
             continue
         same = np.diff(value) == 0
@@ -405,14 +408,14 @@ def stuck_findings(recording: Recording, vessel: Vessel) -> list[Finding]:
         longest = int(np.argmax(lengths))
         a, b = stretches[longest]
         span = float(t[b - 1] - t[a])
-        if _digits(_wrapped(s)):
+        if significant_digits(_wrapped(s)):
             continue
         # runs of a held or coarse signal are its habit; a stuck one is far longer
         usual = float(np.quantile(lengths, 0.9)) if len(lengths) > 5 else 1.0
-        enough = max(_STUCK_SECONDS, 5 * usual * period)
-        if span < enough or lengths[longest] < _STUCK_SAMPLES:
+        enough = max(STUCK_SECONDS, 5 * usual * period)
+        if span < enough or lengths[longest] < STUCK_SAMPLES:
             continue
-        if not _moves(s.name, t[a], t[b - 1], signals, _quantum(value)):
+        if not _moves(s.name, t[a], t[b - 1], signals, quantum(value)):
             continue
         found.append(
             Finding(
@@ -439,7 +442,7 @@ def _moves(name: str, start: float, stop: float, signals: list[Signal], step: fl
     def part(other: str) -> Array | None:
         for s in signals:
             if s.name == other:
-                t, value = _clean(s)
+                t, value = clean(s)
                 inside = value[(t >= start) & (t <= stop)]
                 return inside if len(inside) > 3 else None
         return None
@@ -451,8 +454,7 @@ def _moves(name: str, start: float, stop: float, signals: list[Signal], step: fl
             u, v = part("v_n"), part("v_e")
         psi = part("psi")
         if u is not None and v is not None and psi is not None and len(u) == len(v) == len(psi):
-            c, s = np.cos(psi), np.sin(psi)
-            rate = c * u - s * v if name == "x_n" else s * u + c * v
+            rate = body_to_ned(u, v, psi)[name == "y_n"]
             return bool(np.ptp(np.cumsum(rate)) * span / len(rate) > max(0.3, 3 * step))
     if name == "psi":
         r = part("r")
@@ -463,7 +465,7 @@ def _moves(name: str, start: float, stop: float, signals: list[Signal], step: fl
         inside = part(other.name)
         if other.name == name or inside is None:
             continue
-        whole = _clean(other)[1]
+        whole = clean(other)[1]
         if np.ptp(inside) > 0.3 * np.std(whole) > 0:
             return True
     return False
@@ -472,11 +474,12 @@ def _moves(name: str, start: float, stop: float, signals: list[Signal], step: fl
 def angle_unit_findings(recording: Recording, vessel: Vessel) -> list[Finding]:
     """Find degrees under a radian name by range: angles of wind and thrusters."""
     found = []
-    rudders = {t.rudder for t in vessel.thrusters if t.rudder}
+    moved = [m for t in vessel.thrusters for m in t.movements]
+    rudders = {c for kind, *both, _ in moved if kind == "rudder" for c in both}
     for s in recording.signals:
         if s.name not in (ANGLES | vessel.recorded_angles) - {"psi", "cog"}:
             continue
-        _, value = _clean(s)
+        _, value = clean(s)
         if len(value) < 3:
             continue
         largest = float(np.quantile(np.abs(value), 0.98))
@@ -508,7 +511,8 @@ def _motion(recording: Recording) -> Iterable[Signal]:
     return (s for s in recording.signals if s.name in MOTION)
 
 
-def _clean(s: Signal) -> tuple[Array, Array]:
+def clean(s: Signal) -> tuple[Array, Array]:
+    """Return times and values where both are numbers, headings unwrapped."""
     keep = np.isfinite(s.value) & np.isfinite(s.t)
     t, value = (s.t, s.value) if keep.all() else (s.t[keep], s.value[keep])
     if s.name == "psi":
@@ -516,7 +520,7 @@ def _clean(s: Signal) -> tuple[Array, Array]:
     return t, value
 
 
-def _clocks(recording: Recording) -> list[tuple[tuple[str, ...], Array]]:
+def clocks(recording: Recording) -> list[tuple[tuple[str, ...], Array]]:
     """Return the signals that share each clock."""
     groups: dict[int, tuple[list[str], Array]] = {}
     for s in recording.signals:
@@ -524,7 +528,8 @@ def _clocks(recording: Recording) -> list[tuple[tuple[str, ...], Array]]:
     return [(tuple(names), t) for names, t in groups.values()]
 
 
-def _listed(names: Iterable[str]) -> str:
+def listed(names: Iterable[str]) -> str:
+    """Return names for a sentence; of many, the first three and how many more."""
     names = list(names)
     if len(names) > 4:
         return f"{', '.join(names[:3])} and {len(names) - 3} more"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from pathlib import Path
@@ -14,11 +14,15 @@ from numpy.typing import NDArray
 from greybox.channels import CHANNELS
 from greybox.errors import LogError, suggestion
 from greybox.files import sha256
-from greybox.trial.convert.column_names import Assigned, assign
+from greybox.trial.convert.column_names import Assigned, assign, is_short_pair
 from greybox.trial.convert.derived_signals import wind_state
+from greybox.trial.convert.file_clocks import on_one_clock
+from greybox.trial.convert.settle_axes import settle_axes
+from greybox.trial.log import Provenance
 from greybox.trial.raw_log import Recording, Signal, SourceFile
 from greybox.trial.readers.formats import open_raw
 from greybox.trial.readers.table import Batch, TableFile, read_columns
+from greybox.trial.readers.topic_files import STAMP, TopicTable
 from greybox.trial.steps import Step, new_steps
 from greybox.trial.store import read_record, recorded_provenance
 from greybox.units import is_unix_time, time_unit, unit_factor, unix_unit
@@ -30,6 +34,9 @@ Array = NDArray[np.float64]
 MOTION = frozenset({"x_n", "y_n", "psi", "u", "v", "r", "v_n", "v_e", "lat", "lon", "sog"})
 
 _HEAD = 10_000
+# a position changes from row to row by less than this share of what it spreads over
+_SMOOTH = 0.2
+_NO_MOTION = "no position, heading or velocity was recognised: map their columns in [columns]"
 # files that overlap for less than this share of the shorter one follow one another
 _OVERLAP = 0.05
 
@@ -61,19 +68,71 @@ def read_recording(
     LogError
         The file cannot be read, or has no time.
     """
+    return settle_axes(_read(path, vessel, guess=guess, **options), vessel)
+
+
+def read_trial(paths: Sequence[str | Path], vessel: Vessel, **options: Any) -> Recording:
+    """Read the raw files of one trial and merge them on their clocks.
+
+    Parameters
+    ----------
+    paths : sequence of str or Path
+        In any order. Columns of several files may be qualified by their file
+        (``az1.data``).
+    vessel : Vessel
+        Its ``[columns]`` rename and convert.
+    **options
+        Handed to the readers.
+
+    Returns
+    -------
+    Recording
+        As `read_recording`.
+
+    Raises
+    ------
+    LogError
+        A file cannot be read, or has no time; none tells anything that is known; or the
+        files are not of one trial.
+    """
+    if len(paths) == 1:
+        recording = read_recording(paths[0], vessel, **options)
+        return recording.with_signals(recording.signals, *unused_mappings([recording], vessel))
+    recordings = [_read(p, vessel, alone=False, **options) for p in paths]
+    notes = unused_mappings(recordings, vessel)
+    kept = [r for r in recordings if r.signals or r.text]
+    if not kept:
+        raise LogError(
+            f"no column of the {len(paths)} files but their times is known: map them in the "
+            f"vessel file's [columns], qualified as in '{recordings[0].name}.column'."
+        )
+    notes += [f"{r.name}: no column but its time is known" for r in recordings if r not in kept]
+    kept, moved = on_one_clock(kept, MOTION)
+    notes += [s.sentence for s in moved]
+    recording = settle_axes(merge(kept).with_steps(*moved), vessel)
+    if not MOTION & set(recording.names):
+        notes.append(_NO_MOTION)
+    return recording.with_signals(recording.signals, *notes)
+
+
+def _read(
+    path: str | Path, vessel: Vessel, *, guess: bool = True, alone: bool = True, **options: Any
+) -> Recording:
+    """Read one file; `alone` where no other belongs to it, so that it must tell something."""
     raw = open_raw(path, **options)
     if not isinstance(raw, Recording):
-        record = read_record(Path(path))
-        if record is not None:
-            # what greybox wrote is canonical: a mapping would convert it twice
-            vessel, guess = replace(vessel, columns={}), False
+        known, vessel = written_log(Path(path), vessel)
         source = SourceFile(raw.path.name, sha256(raw.path), raw.format)
-        raw, assigned = table_recording(raw, vessel, guess=guess)
+        raw, assigned = table_recording(raw, vessel, guess=guess and known is None, alone=alone)
         raw = replace(raw, files=(source,))
-        if record is not None:
-            known = recorded_provenance(record)
+        if known is not None:
             epoch = known.epoch if raw.epoch is None else raw.epoch
-            raw = replace(raw, epoch=epoch, steps=known.steps, conditions=known.conditions)
+            raw = replace(
+                raw,
+                epoch=epoch,
+                steps=(*map(_past, known.steps), *raw.steps),
+                conditions=known.conditions,
+            )
     else:
         assigned = assign(
             raw.names,
@@ -86,20 +145,76 @@ def read_recording(
     return canonical(raw, assigned, vessel)
 
 
+def written_log(path: Path, vessel: Vessel) -> tuple[Provenance | None, Vessel]:
+    """Return the provenance of a log that greybox wrote, None of any other file.
+
+    With it comes the vessel by which the columns are read: what greybox wrote is canonical,
+    and a mapping would convert it twice.
+    """
+    record = read_record(path)
+    if record is None:
+        return None, vessel
+    return recorded_provenance(record), replace(vessel, columns={})
+
+
 def table_recording(
-    table: TableFile, vessel: Vessel, *, guess: bool = True
+    table: TableFile, vessel: Vessel, *, guess: bool = True, alone: bool = True
 ) -> tuple[Recording, dict[str, Assigned]]:
     """Read the columns of a table that mean something into a recording."""
-    assigned = table_columns(table, vessel, guess=guess)
+    assigned = table_columns(table, vessel, guess=guess, alone=alone)
     batch = read_columns(table, [a.raw for a in assigned.values()])
+    if is_short_pair(assigned) and not all(
+        _travelled(batch[assigned[n].raw]) for n in ("x_n", "y_n")
+    ):
+        assigned = {n: a for n, a in assigned.items() if n not in ("x_n", "y_n")}
     time = assigned["t"]
     scale = time_scale(batch[time.raw], time, table)
-    recording = batch_recording(table, batch, assigned, scale, vessel)
+    return whole_recording(table, batch, assigned, scale, vessel, alone=alone), assigned
+
+
+def whole_recording(
+    table: TableFile,
+    batch: Batch,
+    assigned: dict[str, Assigned],
+    scale: TimeScale,
+    vessel: Vessel,
+    *,
+    alone: bool = True,
+) -> Recording:
+    """Return all columns of a table as a recording that tells what reading them took."""
+    recording = batch_recording(table, batch, assigned, scale, vessel, alone=alone)
+    if isinstance(table, TopicTable):
+        stamped = assigned["t"].raw == STAMP
+        unsure = frozenset(n for n, a in assigned.items() if a.raw in table.unsure)
+        recording = replace(recording, unsure=unsure, ahead=table.ahead if stamped else None)
     notes = (*table.notes, *scale.notes, *recording.notes)
-    return replace(recording, notes=notes), assigned
+    return replace(recording, notes=notes, steps=reading_steps(table, scale))
 
 
-def table_columns(table: TableFile, vessel: Vessel, *, guess: bool = True) -> dict[str, Assigned]:
+def reading_steps(table: TableFile, scale: TimeScale) -> tuple[Step, ...]:
+    """Return what reading the rows of a table took, on the clock of its recording."""
+    return tuple(on_zero(s, -scale.zero) for s in table.steps)
+
+
+def on_zero(step: Step, shift: float) -> Step:
+    """Return a step of reading with the places that it names on another zero of time."""
+    if step.operation != "pad_fractions":
+        return step
+    times = tuple(t + shift for t in step.numbers("times"))
+    return replace(step, parameters={**step.parameters, "times": times})
+
+
+def _past(step: Step) -> Step:
+    """Return a step of an earlier reading without its places, which are not in this file."""
+    if step.operation != "pad_fractions":
+        return step
+    kept = {k: v for k, v in step.parameters.items() if k not in ("times", "late")}
+    return replace(step, parameters=kept)
+
+
+def table_columns(
+    table: TableFile, vessel: Vessel, *, guess: bool = True, alone: bool = True
+) -> dict[str, Assigned]:
     """Say which columns of a table to read.
 
     Raises
@@ -107,7 +222,14 @@ def table_columns(table: TableFile, vessel: Vessel, *, guess: bool = True) -> di
     LogError
         There is no time among them, or it is written in words.
     """
-    assigned = assign(table.columns, vessel, units=table.units, guess=guess)
+    parts = _parts(table)
+    assigned = assign(
+        table.columns, vessel, units=table.units, guess=guess, stem=table.path.stem,
+        parts={c for of in parts.values() for c in of},
+    )  # fmt: skip
+    own = {a.raw for a in assigned.values()}
+    # what the vessel file maps itself is not made of the same columns once more
+    assigned = {n: a for n, a in assigned.items() if not own & set(parts.get(a.raw, ()))}
     if "t" not in assigned:
         raise LogError(
             f"'{table.path.name}' has no column 't'.{suggestion('t', table.columns)} "
@@ -121,12 +243,31 @@ def table_columns(table: TableFile, vessel: Vessel, *, guess: bool = True) -> di
             f"write seconds, UNIX time or ISO 8601 (2024-05-01T12:00:00Z), or map another column "
             f"to 't' in [columns]."
         )
-    if len(assigned) == 1:
+    if len(assigned) == 1 and alone:
         raise LogError(
             f"no column of '{table.path.name}' but its time '{time}' is known: map them in the "
             f"vessel file's [columns]. Its columns: {', '.join(table.columns[:30])}."
         )
     return assigned
+
+
+def _travelled(value: NDArray[Any]) -> bool:
+    """Whether values change as positions do: all the time, and little from row to row."""
+    if value.dtype == object or not np.isfinite(value).any():
+        return False
+    value = value[np.isfinite(value)]
+    steps = np.diff(value)
+    smooth = float(np.sqrt(np.mean(steps**2))) < _SMOOTH * float(np.std(value)) if len(steps) else 0
+    return bool(smooth) and float(np.mean(steps == 0)) < 0.5
+
+
+def _parts(table: TableFile) -> dict[str, tuple[str, ...]]:
+    """Return the columns of the file behind each column that is made of others."""
+    return table.parts if isinstance(table, TopicTable) else {}
+
+
+def _listed(columns: Sequence[str]) -> str:
+    return ", ".join(f"'{c}'" for c in columns)
 
 
 @dataclass(frozen=True)
@@ -177,7 +318,9 @@ def time_scale(raw: Array, time: Assigned, table: TableFile) -> TimeScale:
     stated = unit is not None and not (unit == "s" and time.how == "exact" and unix_unit(size))
     if not stated and not date:
         unit = time_unit(head)
-    if time.how == "guessed" or not stated:
+    if time.raw == STAMP:
+        notes.append("times are the header stamps")
+    elif time.how == "guessed" or not stated:
         notes.append(f"column '{time.raw}' taken for time in {unit or 's'}")
     if date or time.raw in table.clocks:
         unit = "s"
@@ -194,11 +337,17 @@ def batch_recording(
     assigned: dict[str, Assigned],
     scale: TimeScale,
     vessel: Vessel,
+    *,
+    alone: bool = True,
 ) -> Recording:
-    """Return columns of a table as a recording, names as in the source."""
+    """Return columns of a table as a recording, names as in the source.
+
+    Motion is missed only where the file stands `alone`.
+    """
     t = scale.seconds(batch[assigned["t"].raw])
     signals, text, notes = [], {}, []
     loop = vessel.closed_loop[0] if vessel.closed_loop else None
+    parts = _parts(table)
     for name, a in assigned.items():
         if name == "t":
             continue
@@ -207,16 +356,18 @@ def batch_recording(
         elif a.raw in table.text or a.raw in table.dates:
             notes.append(f"column '{a.raw}' holds words or dates, not numbers: left out")
         else:
-            signals.append(Signal(a.raw, t, batch[a.raw], a.unit, f"column '{a.raw}'"))
+            source = (
+                f"column '{a.raw}'" if a.raw not in parts else f"columns {_listed(parts[a.raw])}"
+            )
+            signals.append(Signal(a.raw, t, batch[a.raw], a.unit, source))
     used = {a.raw for a in assigned.values()}
+    used |= {c for made, of in parts.items() if made in used for c in of}
     ignored = [c for c in table.columns if c not in used]
     if ignored:
         more = f" and {len(ignored) - 12} more" if len(ignored) > 12 else ""
         notes.append(f"columns not used: {', '.join(ignored[:12])}{more}")
-    if not set(assigned) & MOTION:
-        notes.append(
-            "no position, heading or velocity was recognised: map their columns in [columns]"
-        )
+    if alone and not set(assigned) & MOTION:
+        notes.append(_NO_MOTION)
     return Recording(table.path.stem, tuple(signals), text, scale.epoch, notes=tuple(notes))
 
 
@@ -288,10 +439,16 @@ def angle_unit(reach: tuple[float, float]) -> str:
 
 def _guess_commands(raw: Recording, assigned: dict[str, Assigned], vessel: Vessel) -> None:
     """Give rudders and shafts of NMEA 0183 to the vessel's columns where only one fit exists."""
-    missing = [c for c in vessel.commands if c not in assigned]
+    # sensors tell what was measured, also where the command drives the model
+    measured = {
+        (kind, column if t.drive == "feedback" else other)
+        for t in vessel.thrusters
+        for kind, column, other, _ in t.movements
+    }
+    missing = [c for c in vessel.recorded_columns if c not in assigned]
     # azimuths are not what RSA tells of: their sign and range differ from a rudder's
-    rudders = [c for c in missing if c in {t.rudder for t in vessel.thrusters}]
-    speeds = [c for c in missing if c not in vessel.angle_commands]
+    rudders = [c for c in missing if ("rudder", c) in measured]
+    speeds = [c for c in missing if ("speed", c) in measured]
     shafts = sorted((n for n in raw.names if n.startswith("rpm_")), key=_shaft)
     of_kind = [n for n in shafts if n.startswith("rpm_shaft")]
     # an engine and its shaft turn together: one of each kind is enough
@@ -340,9 +497,11 @@ def merge(recordings: list[Recording]) -> Recording:
     stated: dict[str, int] = {}
     text: dict[str, tuple[Array, NDArray[Any]]] = {}
     notes: list[str] = []
+    steps: list[Step] = []
     for r in recordings:
         shift = r.epoch - epoch if epoch is not None and r.epoch is not None else 0.0
         notes += [f"{r.name}: {n}" for n in r.notes]
+        steps += [on_zero(s, shift) for s in r.steps]
         moved: dict[int, Array] = {}
         for s in r.signals:
             t = moved.setdefault(id(s.t), s.t + shift)
@@ -352,15 +511,17 @@ def merge(recordings: list[Recording]) -> Recording:
             parts.insert(at, (r.name, replace(s, t=t)))
             stated[s.name] = stated.get(s.name, 0) + (s.name not in r.guessed)
         for name, (t, words) in r.text.items():
-            before = text.get(name, (np.empty(0), np.empty(0, dtype=str)))
+            first = text.get(name, (np.empty(0), np.empty(0, dtype=str)))
             text[name] = (
-                np.concatenate([before[0], t + shift]),
-                np.concatenate([before[1], words]),
+                np.concatenate([first[0], t + shift]),
+                np.concatenate([first[1], words]),
             )
     signals = []
     clocks: dict[tuple[int, ...], Array] = {}
+    unsure = {(r.name, n) for r in recordings for n in r.unsure}
+    still: set[str] = set()
     mapped = {(r.name, n): raw for r in recordings for n, raw in r.mapped.items()}
-    steps = {r.name: r.steps for r in recordings}
+    done = {r.name: r.steps for r in recordings}
     for name, parts in found.items():
         kept = [parts[0]]
         for part in parts[1:]:
@@ -379,8 +540,8 @@ def merge(recordings: list[Recording]) -> Recording:
                 )
             else:
                 kept.append(part)
-        if name in ("u_q", "v_q"):
-            _refuse_two_winds([(n, steps[n]) for n, _ in kept])
+        _refuse_two_states(name, [(n, done[n]) for n, _ in kept])
+        still |= {name for n, _ in kept if (n, name) in unsure}
         kept.sort(key=lambda p: _span(p[1])[0])
         # columns of one table go on sharing their clock
         key = tuple(id(p[1].t) for p in kept)
@@ -395,20 +556,35 @@ def merge(recordings: list[Recording]) -> Recording:
         epoch,
         tuple(f for r in recordings for f in r.files),
         tuple(notes),
-        steps=new_steps((), (step for r in recordings for step in r.steps)),
         conditions=reduce(Conditions.over, (r.conditions for r in recordings)),
+        steps=new_steps((), steps),
+        unsure=frozenset(still),
     )
 
 
-def _refuse_two_winds(parts: list[tuple[str, tuple[Step, ...]]]) -> None:
-    """Refuse winds of several files that are not of one place and height."""
-    (first, steps), *others = parts
-    for name, more in others:
-        if wind_state(more) != wind_state(steps):
+def _refuse_two_states(name: str, parts: list[tuple[str, tuple[Step, ...]]]) -> None:
+    """Refuse a signal of several files of which one was corrected or moved and the other not."""
+    (first, before), *others = parts
+    for other, steps in others:
+        if name in ("u_q", "v_q") and wind_state(steps) != wind_state(before):
             raise LogError(
-                f"the wind of '{first}' is {wind_state(steps)}, that of '{name}' is "
-                f"{wind_state(more)}: they cannot be merged. Import both from their raw files."
+                f"the wind of '{first}' is {wind_state(before)}, that of '{other}' is "
+                f"{wind_state(steps)}: they cannot be merged. Import both from their raw files."
             )
+        one, two = (_corrections(of, name) for of in (before, steps))
+        if one != two:
+            raise LogError(
+                f"{name} of '{first}' is {_in_words(one)}, that of '{other}' is {_in_words(two)}: "
+                f"they cannot be merged. Import both from their raw files."
+            )
+
+
+def _corrections(steps: Iterable[Step], name: str) -> list[Step]:
+    return [s for s in steps if s.decided_by == "vessel" and name in s.channels]
+
+
+def _in_words(steps: list[Step]) -> str:
+    return f"corrected ({'; '.join(s.sentence for s in steps)})" if steps else "as recorded"
 
 
 def _span(signal: Signal) -> tuple[float, float]:

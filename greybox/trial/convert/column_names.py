@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from greybox.channels import CHANNELS
@@ -18,16 +18,16 @@ _QUALIFIERS = {
 }  # fmt: skip
 # most telling spelling first: where two columns match, the earlier one is taken
 _GUESSES: dict[str, tuple[str, ...]] = {
-    "t": ("t", "time", "times", "timestamp", "t_rel", "elapsed", "elapsed_time", "seconds",
-          "original_timestamp", "unix", "unix_time", "unix_utc", "utc", "datetime", "date_time",
-          "epoch", "gps_time", "time_unix", "utc_time", "time_utc", "uhrzeit", "stamp",
+    "t": ("header_stamp", "t", "time", "times", "timestamp", "t_rel", "elapsed", "elapsed_time",
+          "seconds", "original_timestamp", "unix", "unix_time", "unix_utc", "utc", "datetime",
+          "date_time", "epoch", "gps_time", "time_unix", "utc_time", "time_utc", "uhrzeit", "stamp",
           "zeit", "tid", "clock"),
     "psi": ("psi", "heading", "hdg", "true_heading", "heading_true", "yaw", "yaw_angle", "head",
             "hdt"),
-    "x_n": ("x_n", "x_ned", "north", "n", "northing", "pos_n", "pos_north", "position_north",
+    "x_n": ("x_n", "x_ned", "north", "northing", "pos_n", "pos_north", "position_north",
             "north_position", "p_n", "pn", "x_north", "x0", "x_earth", "x_position", "x_pos",
             "pos_x", "position_x", "x"),
-    "y_n": ("y_n", "y_ned", "east", "e", "easting", "pos_e", "pos_east", "position_east",
+    "y_n": ("y_n", "y_ned", "east", "easting", "pos_e", "pos_east", "position_east",
             "east_position", "p_e", "pe", "y_east", "y0", "y_earth", "y_position", "y_pos",
             "pos_y", "position_y", "y"),
     "u": ("u", "surge", "surge_velocity", "surge_speed", "surge_vel", "velocity_surge",
@@ -53,6 +53,10 @@ _GUESSES: dict[str, tuple[str, ...]] = {
     "V_w": ("tws", "true_wind_speed", "wind_speed_true", "wind_velo_true"),
     "dir_w": ("twd", "true_wind_direction", "wind_direction_true", "wind_dir_true"),
 }  # fmt: skip
+# north and east where both stand together; alone, n is a shaft speed
+_SHORT = {"x_n": "n", "y_n": "e"}
+# the field of messages that hold one value
+_ALONE = "data"
 
 
 @dataclass(frozen=True)
@@ -99,6 +103,8 @@ def assign(
     units: Mapping[str, str] | None = None,
     canonical: Iterable[str] = (),
     guess: bool = True,
+    stem: str = "",
+    parts: Collection[str] = (),
 ) -> dict[str, Assigned]:
     """Say which column is which signal.
 
@@ -115,6 +121,11 @@ def assign(
         Names that the format itself defines.
     guess : bool
         Whether to guess what is left from well-known spellings.
+    stem : str
+        Name of the file, by which the vessel file may qualify a column
+        (``az1.data``, ``az1/data``, or ``az1`` where ``data`` is all it holds).
+    parts : collection of str
+        Columns that mean something only with others: never guessed.
 
     Returns
     -------
@@ -128,11 +139,12 @@ def assign(
     """
     columns, units, defined = list(columns), units or {}, set(canonical)
     found: dict[str, Assigned] = {}
-    for raw, mapping in vessel.columns.items():
-        name = mapping.name
-        if raw not in columns:
+    qualified = _qualified(columns, stem)
+    for called, mapping in vessel.columns.items():
+        raw, name = called if called in columns else qualified.get(called, ""), mapping.name
+        if not raw:
             continue
-        if name in found:
+        if name in found and found[name].raw != raw:
             raise LogError(
                 f"columns '{found[name].raw}' and '{raw}' are both there, and [columns] maps both "
                 f"to '{name}': remove one of the two lines from the vessel file."
@@ -151,8 +163,14 @@ def assign(
             how = "exact" if raw not in defined else "defined"
             found[raw] = Assigned(raw, raw, unit, 1, how)
             taken.add(raw)
+    for name in (*vessel.recorded_columns, *loop):
+        raw = qualified.get(name, "")
+        if raw and name not in found and raw not in taken:
+            found[name] = Assigned(raw, name, units.get(raw), 1, "mapped")
+            taken.add(raw)
     if not guess:
         return found
+    taken |= set(parts)
     stems = {raw: split_unit(raw.rsplit(".", 1)[-1]) for raw in columns if raw not in taken}
     for name, spellings in _GUESSES.items():
         if name in found or _pointless(name, found):
@@ -171,6 +189,43 @@ def assign(
         if unit is None or _fits(unit, CHANNELS[name].unit):
             found[name] = Assigned(raw, name, unit, 1, "guessed")
             taken.add(raw)
+    if not {"x_n", "y_n", "lat", "lon"} & found.keys():
+        found |= _short_pair(stems, taken, units)
+    return found
+
+
+def _short_pair(
+    stems: Mapping[str, tuple[str, str | None]], taken: Collection[str], units: Mapping[str, str]
+) -> dict[str, Assigned]:
+    """Return north and east where columns ``n`` and ``e`` stand together.
+
+    Alone, ``n`` is a shaft speed.
+    """
+    found = {}
+    for name, short in _SHORT.items():
+        for raw, (stem, spelled) in stems.items():
+            unit = units.get(raw, spelled)
+            fits = unit is None or _fits(unit, "m")
+            if raw not in taken and _rank(stem, (short,)) is not None and fits:
+                found[name] = Assigned(raw, name, unit, 1, "guessed")
+                break
+    return found if len(found) == 2 else {}
+
+
+def is_short_pair(assigned: Mapping[str, Assigned]) -> bool:
+    """Whether north and east were guessed from columns ``n`` and ``e``, which may be others."""
+    pair = [(assigned[n], short) for n, short in _SHORT.items() if n in assigned]
+    return len(pair) == 2 and all(
+        a.how == "guessed" and _rank(split_unit(a.raw)[0], (short,)) is not None
+        for a, short in pair
+    )
+
+
+def _qualified(columns: Sequence[str], stem: str) -> dict[str, str]:
+    """Return the columns by the names that tell the file too."""
+    found = {f"{stem}{mark}{c}": c for c in columns for mark in "./"} if stem else {}
+    if stem and _ALONE in columns and stem not in columns:
+        found[stem] = _ALONE
     return found
 
 

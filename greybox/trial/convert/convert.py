@@ -196,7 +196,7 @@ def signal_clocks(
         period = None if periods is None else periods[s.name]
         key = (id(s.t), period)
         if key not in found:
-            found[key] = clock(s.t, options.hole, period)
+            found[key] = clock(s.t, options.hole, period, recording.cuts)
         clocks[s.name] = found[key]
     return clocks
 
@@ -222,7 +222,7 @@ def cut_segments(
         return Cut([])
     clocks = signal_clocks(used, conversion.options, plan.periods)
     channels = _resample(used, clocks, vessel, grid, plan.sample_time)
-    everything = plan.stretches(grid, clocks)
+    everything = plan.stretches(grid, clocks, recording.cuts)
     held = {n: (clock(t), words) for n, (t, words) in recording.text.items() if len(t)}
     segments = []
     steps: tuple[Step, ...] = ()

@@ -12,12 +12,14 @@ from greybox.errors import LogError
 from greybox.trial.convert.derived_signals import derive_signals
 from greybox.trial.gaps import usual_step
 from greybox.trial.raw_log import Recording
+from greybox.trial.time_format import unpadded_numbers
 
 Array = NDArray[np.float64]
 
 # usual steps by which time may go back without there being two runs in a file
 _FAR = 50.0
 _MAX_RUNS = 1000
+_TWO_RUNS = ": cut the file there and import each run, or mend it with --fix"
 
 
 def clean_signals(recording: Recording, origin: tuple[float, float] | None = None) -> Recording:
@@ -82,7 +84,7 @@ def in_order(recording: Recording) -> Recording:
 
     def order(t: Array, name: str) -> tuple[NDArray[np.int64], Array] | None:
         if id(t) not in orders:
-            orders[id(t)] = _order(t, name, recording.name, notes)
+            orders[id(t)] = _order(t, recording.epoch or 0.0, name, recording.name, notes)
         return orders[id(t)]
 
     signals = []
@@ -97,7 +99,7 @@ def in_order(recording: Recording) -> Recording:
 
 
 def _order(
-    t: Array, signal: str, name: str, notes: list[str]
+    t: Array, epoch: float, signal: str, name: str, notes: list[str]
 ) -> tuple[NDArray[np.int64], Array] | None:
     steps = np.diff(t)
     if (steps >= 0).all() and np.isfinite(t).all():
@@ -106,16 +108,23 @@ def _order(
     ordered = t[rows]
     back = np.flatnonzero(np.diff(ordered) < 0)
     if len(back):
-        _refuse_two_runs(ordered, back, signal, name)
+        wrong = len(unpadded_numbers(ordered + epoch))
+        cause = (
+            f"; {wrong} time{'s lack' if wrong > 1 else ' lacks'} the leading zeros of the "
+            f"fraction of a second: mend with --fix"
+            if wrong
+            else ""
+        )
+        _refuse_two_runs(ordered, back, signal, name, cause)
         notes.append(
             f"time of {signal} goes back {len(back)} time{'s' if len(back) > 1 else ''}, first "
-            f"from {ordered[back[0]]:.6g} to {ordered[back[0] + 1]:.6g} s: put in order"
+            f"from {ordered[back[0]]:.6g} to {ordered[back[0] + 1]:.6g} s: put in order{cause}"
         )
         rows = rows[np.argsort(ordered, kind="stable")]
     return rows, t[rows]
 
 
-def _refuse_two_runs(t: Array, back: NDArray[np.int64], signal: str, name: str) -> None:
+def _refuse_two_runs(t: Array, back: NDArray[np.int64], signal: str, name: str, cause: str) -> None:
     """Refuse times that go back far, over times that are there already."""
     usual = usual_step(np.sort(t)) or float(np.median(np.abs(np.diff(t))))
     far = back[t[back] - t[back + 1] > _FAR * usual]
@@ -128,6 +137,5 @@ def _refuse_two_runs(t: Array, back: NDArray[np.int64], signal: str, name: str) 
             k = int(far[0])
             raise LogError(
                 f"time of {signal} in '{name}' goes back from {t[k]:.6g} to {t[k + 1]:.6g} s, over "
-                f"{min(stop, end) - start:.4g} s that are there twice: cut the file there and "
-                f"import each run, or mend it with --fix."
+                f"{min(stop, end) - start:.4g} s that are there twice{cause or _TWO_RUNS}."
             )

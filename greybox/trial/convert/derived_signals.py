@@ -64,7 +64,7 @@ def derive_signals(recording: Recording, origin: tuple[float, float] | None = No
     steps: list[Step] = []
     if "lat" in signals and "lon" in signals:
         lat, lon = signals.pop("lat"), signals.pop("lon")
-        if not {"x_n", "y_n"} <= signals.keys() and np.isfinite(lat.value).any():
+        if not {"x_n", "y_n"} <= signals.keys() and np.isfinite(_places(lat, lon)[1]).any():
             north, east, zero = local_positions(lat, lon, origin)
             signals["x_n"], signals["y_n"] = north, east
             place = {"lat": zero[0], "lon": zero[1]}
@@ -94,9 +94,9 @@ def local_positions(
     """
     import pymap3d
 
-    t, phi, lam = _paired(lat, lon)
+    t, phi, lam = _places(lat, lon)
     if origin is None:
-        k = int(np.flatnonzero(np.isfinite(phi) & np.isfinite(lam))[0])
+        k = int(np.flatnonzero(np.isfinite(phi))[0])
         origin = (float(phi[k]), float(lam[k]))
     north, east, _ = pymap3d.geodetic2ned(
         phi, lam, np.zeros_like(phi), origin[0], origin[1], 0.0, deg=True
@@ -106,6 +106,13 @@ def local_positions(
         Signal("y_n", t, np.asarray(east), "m", lon.source, True),
         origin,
     )
+
+
+def _places(lat: Signal, lon: Signal) -> tuple[Array, Array, Array]:
+    """Return times, latitude and longitude [deg], NaN for both where they are no place on earth."""
+    t, phi, lam = _paired(lat, lon)
+    known = (np.abs(phi) <= 90) & (np.abs(lam) <= 360)
+    return t, np.where(known, phi, np.nan), np.where(known, lam, np.nan)
 
 
 def unwrapped(signal: Signal) -> Signal:

@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 from greybox.errors import LogError, suggestion
 from greybox.files import sha256
 from greybox.trial.convert.channel_mapping import (
-    batch_recording,
     canonical,
     table_columns,
     time_scale,
+    whole_recording,
+    written_log,
 )
 from greybox.trial.convert.column_names import Assigned
 from greybox.trial.convert.convert import Conversion, cut_segments
@@ -32,7 +33,6 @@ from greybox.trial.log import Provenance, TrialLog
 from greybox.trial.raw_log import Recording
 from greybox.trial.readers.formats import open_raw
 from greybox.trial.readers.table import Batch, TableFile, read_columns
-from greybox.trial.store import read_record, recorded_provenance
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
@@ -123,11 +123,8 @@ def read_segments(
             f"'{path.name}' is a raw file ({table.files[0].format if table.files else 'raw'}): "
             f"make a log of it first with greybox import {path.name} --vessel V --out LOG.csv."
         )
-    record = read_record(path)
-    if record is not None:
-        # what greybox wrote is canonical already: the raw names were mapped before
-        vessel = replace(vessel, columns={})
-    known = Provenance(path.name) if record is None else recorded_provenance(record)
+    known, vessel = written_log(path, vessel)
+    known = known or Provenance(path.name)
     segments = table_segments(table, vessel, known, states=states, fill=fill)
     known = segments[0].provenance
     known = replace(known, sha256=known.sha256 or sha256(path))
@@ -159,7 +156,8 @@ def table_segments(
     steps = (*recording.steps, *cut.steps)
     read = (*known.read, *(n for n in cut.notes if n not in known.read))
     conditions = known.conditions.over(vessel.conditions)
-    known = replace(known, steps=steps, read=read, conditions=conditions)
+    epoch = recording.epoch if known.epoch is None else known.epoch
+    known = replace(known, steps=steps, read=read, epoch=epoch, conditions=conditions)
     columns = [str(c) for c in table.columns]
     segments = []
     for k, log in enumerate(cut.segments):
@@ -196,8 +194,8 @@ def _clean_recording(
         # a log's own clock is kept as it is
         scale = replace(scale, zero=0.0, epoch=None)
     sample_time = _require_uniform(scale.seconds(batch[time.raw]), table)
-    raw = batch_recording(table, batch, assigned, scale, vessel)
-    recording = replace(canonical(raw, assigned, vessel), steps=known.steps)
+    raw = whole_recording(table, batch, assigned, scale, vessel)
+    recording = replace(canonical(raw, assigned, vessel), steps=(*known.steps, *raw.steps))
     return clean_signals(recording), sample_time
 
 

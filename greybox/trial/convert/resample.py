@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,7 +60,12 @@ class Clock:
         return int(np.sum(within & (np.abs(steps - self.period) > 0.33 * self.period)))
 
 
-def clock(t: Array, hole: float | None = None, period: float | None = None) -> Clock:
+def clock(
+    t: Array,
+    hole: float | None = None,
+    period: float | None = None,
+    cuts: Sequence[float] = (),
+) -> Clock:
     """Return the usual step of times and the stretches without a hole.
 
     Parameters
@@ -70,6 +76,8 @@ def clock(t: Array, hole: float | None = None, period: float | None = None) -> C
         Shortest step that counts as a hole [s]; `HOLE` usual steps by default.
     period : float, optional
         Usual step [s], where it is known from more than these times.
+    cuts : sequence of float
+        Times at which a stretch begins although there is no hole [s].
     """
     steps = np.diff(t)
     period = usual_step(t) if period is None else period
@@ -78,6 +86,10 @@ def clock(t: Array, hole: float | None = None, period: float | None = None) -> C
         # what the user calls a hole is one, but not every step
         limit = max(hole, 1.01 * min(period, float(np.median(steps)) if len(steps) else period))
     starts, stops = np.array(pieces(t, limit), np.int64).T
+    if cuts:
+        inner = np.searchsorted(t, cuts)
+        starts = np.union1d(starts, inner[inner < len(t)])
+        stops = np.union1d(stops, inner[inner > 0])
     return Clock(t, period, starts, stops)
 
 
@@ -88,6 +100,23 @@ def covered(grid: Array, of: Clock) -> Mask:
     k = np.searchsorted(first, grid + slack, side="right") - 1
     inside = (k >= 0) & (grid <= last[np.clip(k, 0, None)] + slack)
     return np.asarray(inside)
+
+
+def stretches(
+    grid: Array, clocks: Iterable[Clock], cuts: Sequence[float] = ()
+) -> list[tuple[int, int]]:
+    """Return the runs (start, stop) of an even grid in which all clocks have values.
+
+    Around a cut as many samples are left out as make a hole, so that whoever reads the
+    samples again finds them apart.
+    """
+    keep = np.ones(len(grid), bool)
+    for c in {id(c): c for c in clocks}.values():
+        keep &= covered(grid, c)
+    for k in np.searchsorted(grid, cuts):
+        if 0 < k < len(grid):
+            keep[k - 1 : k - 1 + int(HOLE)] = False
+    return runs(keep)
 
 
 def resampled_by(period: float, sample_time: float, *, held: bool) -> str | None:

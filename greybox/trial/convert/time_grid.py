@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from greybox.errors import LogError
 from greybox.trial.convert.options import ImportOptions
-from greybox.trial.convert.resample import Clock, covered, nice_period, resampled_by, runs
+from greybox.trial.convert.resample import Clock, nice_period, resampled_by, stretches
 from greybox.trial.gaps import split_at_gaps
+from greybox.trial.smoothing import window_samples
 from greybox.trial.steps import Step
 from greybox.vessel.vessel import Vessel
 
@@ -116,14 +117,16 @@ class Plan:
         # rounding keeps 0.3 from becoming 0.30000000000000004 in the file
         return np.round(self.start + self.sample_time * np.arange(first, stop), 9)
 
-    def stretches(self, grid: Array, clocks: Mapping[str, Clock]) -> list[tuple[int, int]]:
-        """Return the runs of samples (start, stop) in which every leading signal has values."""
+    def stretches(
+        self, grid: Array, clocks: Mapping[str, Clock], cuts: Sequence[float] = ()
+    ) -> list[tuple[int, int]]:
+        """Return the runs of samples (start, stop) in which every leading signal has values.
+
+        None reaches over one of `cuts` [s].
+        """
         if self.times is not None:
             return split_at_gaps(grid, self.sample_time)
-        keep = np.ones(len(grid), bool)
-        for c in {id(clocks[n]): clocks[n] for n in self.leading}.values():
-            keep &= covered(grid, c)
-        return runs(keep)
+        return stretches(grid, (clocks[n] for n in self.leading), cuts)
 
 
 def plan_import(
@@ -137,43 +140,9 @@ def plan_import(
         Nothing moves in the recording, or its signals do not overlap; a window
         of smoothing is too short or too long.
     """
-    notes = [
-        f"{n} has {e.count} value{'s' if e.count != 1 else ''}: left out"
-        for n, e in extents.items()
-        if e.count < MIN_SEGMENT
-    ]
-    commands = set(vessel.commands)
-    # a command beside its feedback, or the other way round: it moves no model, so its holes
-    # and its ends must not cut the log
-    beside = set(vessel.recorded_columns) - commands
-    used = {
-        n: e
-        for n, e in extents.items()
-        if e.count >= MIN_SEGMENT and n in {*_MOTION, *_WIND, *commands, *beside}
-    }
-    motion = [n for n in _MOTION if n in used]
+    used, notes = _usable(extents, vessel, name)
     inputs = [c for c in vessel.commands if c in used]
-    if not motion and not inputs:
-        raise LogError(
-            f"'{name}' has no position, heading, velocity or thruster column with values among "
-            f"{', '.join(extents) or 'nothing'}: map its columns in the vessel file."
-        )
-    missing = [c for c in vessel.commands if c not in used]
-    if missing:
-        notes.append(
-            f"no thruster column {', '.join(missing)}: motion only, no force model can be fitted"
-        )
-    most = max(used[n].covered for n in (motion or inputs))
-    brief = {n for n in used if n not in commands and used[n].covered < _ENOUGH * most}
-    for n in sorted(brief):
-        others = used.keys() - brief
-        # a sensor that soon died must not take the others with it, where they do without
-        if n in beside and not used[n].steady:
-            # recorded where it changes, it holds until it changes again
-            continue
-        if n in beside or n in _WIND or any(pair <= others for pair in _INSTEAD.get(n, ())):
-            notes.append(f"{n} covers {used[n].covered:.4g} of {most:.4g} s: left out")
-            used.pop(n)
+    beside = set(vessel.recorded_columns) - set(vessel.commands)
     leading = [n for n in _MOTION if n in used] or inputs
     sample_time = options.sample_time or _sample_time([used[n] for n in leading])
     held = [n for n in used if n not in (*leading, *beside) and used[n].steady]
@@ -220,6 +189,50 @@ def plan_import(
     )
 
 
+def _usable(
+    extents: Mapping[str, Extent], vessel: Vessel, name: str
+) -> tuple[dict[str, Extent], list[str]]:
+    """Return the signals that the log is made of, and what is said of the others."""
+    notes = [
+        f"{n} has {e.count} value{'s' if e.count != 1 else ''}: left out"
+        for n, e in extents.items()
+        if e.count < MIN_SEGMENT
+    ]
+    commands = set(vessel.commands)
+    # a command beside its feedback, or the other way round: it moves no model, so its holes
+    # and its ends must not cut the log
+    beside = set(vessel.recorded_columns) - commands
+    used = {
+        n: e
+        for n, e in extents.items()
+        if e.count >= MIN_SEGMENT and n in {*_MOTION, *_WIND, *commands, *beside}
+    }
+    motion = [n for n in _MOTION if n in used]
+    inputs = [c for c in vessel.commands if c in used]
+    if not motion and not inputs:
+        raise LogError(
+            f"'{name}' has no position, heading, velocity or thruster column with values among "
+            f"{', '.join(extents) or 'nothing'}: map its columns in the vessel file."
+        )
+    missing = [c for c in vessel.commands if c not in used]
+    if missing:
+        notes.append(
+            f"no thruster column {', '.join(missing)}: motion only, no force model can be fitted"
+        )
+    most = max(used[n].covered for n in (motion or inputs))
+    brief = {n for n in used if n not in commands and used[n].covered < _ENOUGH * most}
+    for n in sorted(brief):
+        others = used.keys() - brief
+        # a sensor that soon died must not take the others with it, where they do without
+        if n in beside and not used[n].steady:
+            # recorded where it changes, it holds until it changes again
+            continue
+        if n in beside or n in _WIND or any(pair <= others for pair in _INSTEAD.get(n, ())):
+            notes.append(f"{n} covers {used[n].covered:.4g} of {most:.4g} s: left out")
+            used.pop(n)
+    return used, notes
+
+
 def _resampling(
     periods: Mapping[str, float], sample_time: float, vessel: Vessel
 ) -> tuple[Step, ...]:
@@ -238,8 +251,6 @@ def _resampling(
 
 def _windows(options: ImportOptions, count: int, sample_time: float) -> Iterator[int]:
     """Yield the samples of each window of smoothing."""
-    if options.smooth:
-        from greybox.trial.smoothing import window_samples
     for name, seconds in options.smooth.items():
         try:
             yield window_samples(count, sample_time, seconds)

@@ -23,9 +23,11 @@ from greybox.trial.convert.channel_mapping import (
     angle_unit,
     batch_recording,
     canonical,
+    reading_steps,
     table_columns,
     time_scale,
     unused_mappings,
+    written_log,
 )
 from greybox.trial.convert.column_names import Assigned
 from greybox.trial.convert.convert import Conversion, Cut, cut_segments, make_provenance
@@ -38,8 +40,9 @@ from greybox.trial.gaps import joined_spans
 from greybox.trial.log import Provenance, TrialLog
 from greybox.trial.raw_log import Recording, Signal, SourceFile
 from greybox.trial.readers.table import Batch, TableFile
+from greybox.trial.readers.topic_files import TopicTable
 from greybox.trial.steps import Step, new_steps
-from greybox.trial.store import read_record, recorded_provenance
+from greybox.vessel.conditions import Conditions
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
@@ -69,7 +72,9 @@ class Scan:
     plan : Plan
     notes : tuple of str
     before : tuple of Step
-        What was done before, where the table is a log that greybox wrote.
+        What was done before, where the table is a log that greybox wrote, and by reading it.
+    conditions : Conditions
+        Of the trial, where the record of that log tells.
     """
 
     assigned: dict[str, Assigned]
@@ -78,7 +83,8 @@ class Scan:
     back: float
     plan: Plan
     notes: tuple[str, ...]
-    before: tuple[Step, ...] = ()
+    before: tuple[Step, ...]
+    conditions: Conditions
 
 
 def scan_table(table: TableFile, vessel: Vessel, options: ImportOptions) -> Scan:
@@ -89,11 +95,8 @@ def scan_table(table: TableFile, vessel: Vessel, options: ImportOptions) -> Scan
     LogError
         As `plan_import`; or time goes back too far to be sorted in blocks.
     """
-    record = read_record(table.path)
-    if record is not None:
-        # what greybox wrote is canonical: a mapping would convert it twice
-        vessel = replace(vessel, columns={})
-    assigned = table_columns(table, vessel, guess=record is None)
+    before, vessel = written_log(table.path, vessel)
+    assigned = table_columns(table, vessel, guess=before is None)
     found = _Found(table, vessel, options, assigned)
     for batch in table.batches([a.raw for a in assigned.values()]):
         found.add(batch)
@@ -101,7 +104,7 @@ def scan_table(table: TableFile, vessel: Vessel, options: ImportOptions) -> Scan
         # nothing to measure: the message is that of an empty time column
         time_scale(np.empty(0), assigned["t"], table)
         raise AssertionError
-    before = recorded_provenance(record or {})
+    before = before or Provenance()
     if found.scale.epoch is None:
         found.scale = replace(found.scale, epoch=before.epoch)
     if found.back > _MAX_BACK_ROWS * found.usual:
@@ -113,6 +116,7 @@ def scan_table(table: TableFile, vessel: Vessel, options: ImportOptions) -> Scan
     units = {n: angle_unit(reach) for n, reach in found.reach.items()}
     whole = canonical(found.sample, assigned, vessel, found.reach)
     derived = derive_signals(whole, found.origin)
+    steps = (*before.steps, *reading_steps(table, found.scale))
     decided = {n: replace(a, unit=units[n]) if n in units else a for n, a in assigned.items()}
     extents = {n: parts.extent() for n, parts in found.parts.items()}
     plan = plan_import(extents, vessel, options, table.path.stem)
@@ -132,7 +136,14 @@ def scan_table(table: TableFile, vessel: Vessel, options: ImportOptions) -> Scan
             f"the first is kept"
         )
     return Scan(
-        decided, found.scale, found.origin, found.back, plan, (*notes, *plan.notes), before.steps
+        decided,
+        found.scale,
+        found.origin,
+        found.back,
+        plan,
+        (*notes, *plan.notes),
+        steps,
+        before.conditions,
     )
 
 
@@ -261,8 +272,10 @@ def _first_position(recording: Recording) -> tuple[float, float] | None:
 
 
 def is_large(table: TableFile) -> bool:
-    """Whether a table may not fit in memory."""
-    return table.cells > _LARGE_CELLS
+    """Whether a table may not fit in memory, and can be imported in blocks."""
+    # axes that only the other signals tell need all of them
+    unsure = isinstance(table, TopicTable) and bool(table.unsure)
+    return table.cells > _LARGE_CELLS and not unsure
 
 
 class Stream:
@@ -312,6 +325,7 @@ class Stream:
         whole = Recording(
             self.table.path.stem, (), epoch=self.scan.scale.epoch, files=(self.file,),
             notes=tuple(notes), steps=(*self.scan.before, *self.steps),
+            conditions=self.scan.conditions,
         )  # fmt: skip
         return make_provenance(whole, self.options, self.vessel.conditions)
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.notebook import Shown
+from greybox.rotation import ned_to_body
 from greybox.trial.manoeuvres.approach import measure_approach
 from greybox.trial.manoeuvres.local import crossing, fit_at
 from greybox.trial.manoeuvres.quantity import Quantity
@@ -165,13 +166,10 @@ def measure_stopping(
         lost = approach.speed.value * start_std
         way = path_length(track, start, when, scale)
         reach = Quantity(way.value, math.hypot(way.std, lost), "m", way.dof)
-        c, s = math.cos(psi0.value), math.sin(psi0.value)
+        along, across = ned_to_body(track.x_n, track.y_n, psi0.value)
         ends = {}
         walk = track.walk * (when - start)
-        for name, y in (
-            ("along", c * track.x_n + s * track.y_n),
-            ("across", -s * track.x_n + c * track.y_n),
-        ):
+        for name, y in (("along", along), ("across", across)):
             one, two = (fit_at(t, y, at, scale, std=track.std) for at in (start, when))
             ends[name] = (
                 two.value(when) - one.value(start),

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
+from greybox.rotation import body_to_ned
 from greybox.trial.manoeuvres.local import noise_std, regress
 from greybox.trial.manoeuvres.quantity import Quantity
 
@@ -68,7 +69,7 @@ def make_track(
     """
     if x_n is not None and y_n is not None:
         return Track(t, x_n, y_n, position_std, 0.0, False)
-    north, east = np.cos(psi) * u - np.sin(psi) * v, np.sin(psi) * u + np.cos(psi) * v
+    north, east = body_to_ned(u, v, psi)
     steps = np.diff(t)
 
     def integral(rate: Array) -> Array:
@@ -93,8 +94,8 @@ def without_antenna(
     antenna : tuple of float
         Antenna from the origin, forward and starboard [m].
     """
-    c, s = np.cos(psi), np.sin(psi)
-    return x_n - (c * antenna[0] - s * antenna[1]), y_n - (s * antenna[0] + c * antenna[1])
+    north, east = body_to_ned(antenna[0], antenna[1], psi)
+    return x_n - north, y_n - east
 
 
 def path_length(track: Track, start: float, stop: float, scale: float) -> Quantity:

@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.trial.readers.limits import limits
+from greybox.trial.steps import Step
+from greybox.trial.time_format import unpadded_text
 
 NULLS = ["", "NaN", "nan", "NAN", "NA", "N/A", "n/a", "null", "NULL", "None", "none", "-", "--"]
 NULLS += ["#N/A", "NaT"]
@@ -21,10 +23,18 @@ _NOTHING = {n.lower() for n in NULLS} | {"inf", "-inf", "+inf"}
 _BLANK = {"", "-", "--"}
 _POINT = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?")
 _COMMA = re.compile(r"[+-]?(\d+,\d*|,\d+)([eEdD][+-]?\d+)?")
+# points between thousands, before a decimal comma
+_THOUSANDS = re.compile(r"[+-]?\d{1,3}(\.\d{3})+,\d+")
 _DATE = re.compile(r"\d{4}([-/])\d\d\1\d\d[T ]\d\d:\d\d|\d\d\.\d\d\.\d{4}[T ]\d\d:\d\d")
+# behind the seconds of a time of day
+_FRACTION = r":\d\d[.,](\d+)"
 _CLOCK = re.compile(r"\d\d?:\d\d:\d\d([.,]\d+)?")
 # RE2, on bytes
+_GROUPED = r"^\s*[-+]?(\d{1,3}(\.\d{3})*|\d+)(,\d+)?\s*$"
 _PLAIN = r"^-?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?$"
+_MOST_DIGITS = 9
+# wrong times of which the place is kept
+_MOST_PLACES = 100
 
 
 def is_blank(cell: str) -> bool:
@@ -54,7 +64,8 @@ def is_number(cell: str, *, comma: bool) -> bool:
 
 def has_comma(cell: str) -> bool:
     """Whether a cell is a number with a decimal comma."""
-    return bool(_COMMA.fullmatch(cell.strip()))
+    bare = cell.strip()
+    return bool(_COMMA.fullmatch(bare) or _THOUSANDS.fullmatch(bare))
 
 
 def kind(cells: Iterable[str], *, comma: bool) -> str:
@@ -67,6 +78,18 @@ def kind(cells: Iterable[str], *, comma: bool) -> str:
     if filled and sum(is_number(c, comma=comma) for c in filled) < 0.5 * len(filled):
         return "text"
     return "number"
+
+
+def grouped(column: Any) -> bool:
+    """Whether a column of text holds points between thousands, and every cell fits that."""
+    import pyarrow as pa
+    from pyarrow import compute
+
+    if not compute.any(compute.match_substring_regex(column, _THOUSANDS.pattern)).as_py():
+        return False
+    missing = compute.is_in(compute.ascii_lower(column), pa.array(sorted(_NOTHING)))
+    fits = compute.or_(compute.match_substring_regex(column, _GROUPED), missing)
+    return bool(compute.all(fits).as_py())
 
 
 def numbers(column: Any, decimal: str, name: str, words: Counter[str]) -> NDArray[np.float64]:
@@ -179,20 +202,100 @@ def unix_seconds(stamps: Any) -> NDArray[np.float64]:
     return np.where(ns == np.iinfo(np.int64).min, np.nan, value)
 
 
+class Stamps:
+    """Times written as text, from one block to the next; short fractions are read as meant.
+
+    Parameters
+    ----------
+    column, file : str
+        Names of column and file.
+    days : bool
+        Whether they are times of day, which go on past midnight, and not dates.
+    """
+
+    def __init__(self, column: str, file: str, *, days: bool) -> None:
+        self._source = f"column '{column}' of {file}"
+        self._days = DayClock() if days else None
+        self._width = 0
+        self._count = 0
+        self._first = ("", "")
+        self._places: list[float] = []
+        self._late: list[float] = []
+
+    def seconds(self, column: Any) -> NDArray[np.float64]:
+        """Return dates as UNIX time [s], times of day as seconds since the first midnight, (n,)."""
+        value = dates(column) if self._days is None else times_of_day(column)
+        value = self._as_meant(value, column)
+        return value if self._days is None else self._days.past_midnight(value)
+
+    @property
+    def step(self) -> Step | None:
+        """What was done to the times, None where nothing had to be."""
+        if not self._count:
+            return None
+        written, meant = self._first
+        return Step(
+            "pad_fractions",
+            ("t",),
+            (self._source,),
+            {
+                "count": float(self._count),
+                "written": written,
+                "meant": meant,
+                "times": tuple(self._places),
+                "late": tuple(self._late),
+            },
+            decided_by="format",
+        )
+
+    def _as_meant(self, value: NDArray[np.float64], column: Any) -> NDArray[np.float64]:
+        import pandas as pd
+        from pyarrow import compute
+
+        size = compute.min_max(compute.utf8_length(column))
+        if not self._width and size["min"].as_py() == size["max"].as_py():
+            return value
+        words = pd.Series(text(column))
+        part = words.str.extract(_FRACTION)[0].fillna("").astype(str)
+        length = np.array([len(d) for d in part], np.int64)
+        # nanoseconds are the finest that anybody writes
+        length[length > _MOST_DIGITS] = 0
+        self._width = max(self._width, int(length.max(initial=0)))
+        digits = np.array([int(d) if 0 < len(d) <= _MOST_DIGITS else 0 for d in part], float)
+        zero_ends = part.str.endswith("0").to_numpy(dtype=bool)
+        found = unpadded_text(value, digits, length, zero_ends, self._width)
+        if len(found):
+            room = _MOST_PLACES - len(self._places)
+            self._late += (value[found.rows] - found.times)[:room].tolist()
+            self._places += found.times[:room].tolist()
+            value = value.copy()
+            value[found.rows] = found.times
+            if not self._count:
+                bare = part.iloc[int(found.rows[0])]
+                self._first = (f".{bare}", f".{bare:0>{self._width}}")
+            self._count += len(found)
+        return value
+
+
+def times_of_day(column: Any) -> NDArray[np.float64]:
+    """Return times of day as seconds since midnight, (n,), NaN where there is none."""
+    import pandas as pd
+
+    words = pd.Series(text(column)).str.strip().str.replace(",", ".", regex=False)
+    parts = words.str.extract(r"^(\d\d?):(\d\d):(\d\d(?:\.\d+)?)$").astype(float).to_numpy()
+    value: NDArray[np.float64] = parts @ np.array([3600.0, 60.0, 1.0])
+    return value
+
+
 class DayClock:
-    """Times of day as seconds that go on past midnight, from one block to the next."""
+    """Times of day that go on past midnight, from one block to the next."""
 
     def __init__(self) -> None:
         self.day = 0
         self.last: float | None = None
 
-    def seconds(self, column: Any) -> NDArray[np.float64]:
-        """Return times of day as seconds since the first midnight, (n,)."""
-        import pandas as pd
-
-        words = pd.Series(text(column)).str.strip().str.replace(",", ".", regex=False)
-        parts = words.str.extract(r"^(\d\d?):(\d\d):(\d\d(?:\.\d+)?)$").astype(float).to_numpy()
-        value: NDArray[np.float64] = parts @ np.array([3600.0, 60.0, 1.0])
+    def past_midnight(self, value: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return seconds since midnight as seconds since the first midnight, (n,)."""
         good = np.flatnonzero(np.isfinite(value))
         if not len(good):
             return value

@@ -16,6 +16,7 @@ from greybox.trial.readers import cells as cell_text
 from greybox.trial.readers.layout import find_layout
 from greybox.trial.readers.limits import limits
 from greybox.trial.readers.table import Batch
+from greybox.trial.steps import Step
 
 _BLANKS = re.compile(rb"[ \t]+")
 
@@ -37,6 +38,8 @@ class CsvFile:
     notes: list[str] = field(default_factory=list)
     format: str = "CSV"
     first_row: int = 2
+    steps: tuple[Step, ...] = ()
+    _grouped: set[str] = field(default_factory=set)
 
     @property
     def cells(self) -> int:
@@ -63,7 +66,11 @@ class CsvFile:
             return "skip"
 
         words: Counter[str] = Counter()
-        days = {c: cell_text.DayClock() for c in columns if c in self.clocks}
+        stamps = {
+            c: cell_text.Stamps(c, self.path.name, days=c in self.clocks)
+            for c in columns
+            if c in self.clocks or c in self.dates
+        }
         rows = 0
         try:
             clean = _Clean(self.path, self.encoding, blanks=self.delimiter == " ")
@@ -87,7 +94,7 @@ class CsvFile:
             )
             for batch in reader:
                 rows += batch.num_rows
-                yield {c: self._values(batch.column(c), c, words, days) for c in columns}
+                yield {c: self._values(batch.column(c), c, words, stamps) for c in columns}
         except (pa.ArrowException, OSError, UnicodeError, ValueError) as error:
             if isinstance(error, LogError):
                 raise
@@ -109,6 +116,10 @@ class CsvFile:
                 f"{count} row{'s' if count > 1 else ''} with another number of fields than the "
                 f"{len(self.columns)} of the header left out"
             )
+        # the file may be read twice
+        self.steps = tuple(s for s in (stamp.step for stamp in stamps.values()) if s is not None)
+        for step in self.steps:
+            self._note(f"{step.source[0]}: {step.sentence}")
         for name, lost in words.items():
             self._note(
                 f"column '{name}' holds words in {lost} row{'s' if lost > 1 else ''}: "
@@ -121,15 +132,26 @@ class CsvFile:
             self.notes.append(note)
 
     def _values(
-        self, column: Any, name: str, words: Counter[str], days: dict[str, cell_text.DayClock]
+        self, column: Any, name: str, words: Counter[str], stamps: dict[str, cell_text.Stamps]
     ) -> Any:
         if name in self.text:
             return cell_text.text(column)
-        if name in self.dates:
-            return cell_text.dates(column)
-        if name in days:
-            return days[name].seconds(column)
-        return cell_text.numbers(column, self.decimal, name, words)
+        if name in stamps:
+            return stamps[name].seconds(column)
+        return cell_text.numbers(self._without_groups(column, name), self.decimal, name, words)
+
+    def _without_groups(self, column: Any, name: str) -> Any:
+        """Return cells without the points between thousands."""
+        if self.decimal != ",":
+            return column
+        from pyarrow import compute
+
+        if name not in self._grouped:
+            if not cell_text.grouped(column):
+                return column
+            self._grouped.add(name)
+            self._note(f"column '{name}' has points between thousands: 1.234,5 read as 1234.5")
+        return compute.replace_substring(column, ".", "")
 
 
 def _reason(error: Exception) -> str:

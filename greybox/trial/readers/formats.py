@@ -14,6 +14,7 @@ from typing import Any, cast
 from greybox.errors import LogError, suggestion
 from greybox.trial.raw_log import Recording
 from greybox.trial.readers.table import TableFile
+from greybox.trial.readers.topic_files import as_topic
 
 # third parties add theirs: an entry point named after the ending, without the dot
 GROUP = "greybox.readers"
@@ -93,7 +94,7 @@ def open_raw(path: str | Path, **options: Any) -> Recording | TableFile:
     kind = _kind(path)
     if kind in ("csv", "parquet"):
         module = import_module(f"greybox.trial.readers.{kind}")
-        return cast(TableFile, getattr(module, f"open_{kind}")(path))
+        return as_topic(cast(TableFile, getattr(module, f"open_{kind}")(path)))
     if kind in _READ:
         given = options if kind == "ros" else {}
         return cast(Recording, _reader(kind, path)(path, **given))

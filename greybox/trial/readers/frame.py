@@ -11,6 +11,7 @@ from greybox.errors import LogError
 from greybox.trial.readers import cells
 from greybox.trial.readers.parquet import column_kind, column_values
 from greybox.trial.readers.table import Batch
+from greybox.trial.steps import Step
 from greybox.units import spelled_unit
 
 if TYPE_CHECKING:
@@ -34,6 +35,7 @@ class FrameTable:
     clocks: frozenset[str] = frozenset()
     format: str = "DataFrame"
     first_row: int = 0
+    steps: tuple[Step, ...] = ()
 
     @property
     def cells(self) -> int:

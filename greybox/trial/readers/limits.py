@@ -49,7 +49,7 @@ class Limits:
     block_bytes, block_rows : int
         Read at a time from files that are not held as a whole; no line of a table is longer.
     values : int
-        Numbers kept of all topics of a bag: 1 GiB of them.
+        Numbers kept of a bag or a MATLAB file: 1 GiB of them.
     items : int
         Variables, fields and cells of a MATLAB file.
     messages, topics, topic_fields : int

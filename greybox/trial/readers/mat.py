@@ -19,6 +19,7 @@ from greybox.trial.raw_log import Array, Recording, Signal, SourceFile
 from greybox.trial.readers.limits import limits
 from greybox.trial.readers.mat_tree import Tree, Unreadable
 from greybox.trial.readers.matfile import load_tree
+from greybox.trial.readers.names import free_name, shortened
 from greybox.units import UNITS, find_unit, is_unix_time, spelled_unit, time_unit, unix_unit
 
 # settings among the notes
@@ -250,7 +251,7 @@ class _Reader:
                 time = self._own_time(item, (len(item.value),))
                 if time is not None:
                     words = np.array([w[: limits().text] for w in item.value])
-                    text[_free(item.name, used)] = (clocks[id(time)], words)
+                    text[free_name(item.name, used)] = (clocks[id(time)], words)
                 continue
             time = self._own_time(item, item.value.shape)
             if time is None:
@@ -258,10 +259,10 @@ class _Reader:
                 continue
             for column, values, unit in self._columns(item, len(time.t)):
                 signals.append(
-                    Signal(_free(column, used), clocks[id(time)], values, unit, item.name)
+                    Signal(free_name(column, used), clocks[id(time)], values, unit, item.name)
                 )
         if left:
-            self.note(f"no time is as long as {_shortened(left)}: left out.")
+            self.note(f"no time is as long as {shortened(left, 12)}: left out.")
         if not signals:
             lengths = ", ".join(f"'{t.name}' ({len(t.t)})" for t in self.times[:5])
             raise LogError(
@@ -332,14 +333,6 @@ def _join(outer: str, name: str) -> str:
     return f"{outer}.{name}" if outer else name
 
 
-def _free(name: str, used: set[str]) -> str:
-    free, k = name, 2
-    while free in used:
-        free, k = f"{name}_{k}", k + 1
-    used.add(free)
-    return free
-
-
 def _likeness(time: str, name: str) -> tuple[int, int]:
     """Order times by what their name shares with a signal's, then the plainest first."""
     time, name = time.rsplit(".", 1)[-1].casefold(), name.rsplit(".", 1)[-1].casefold()
@@ -352,24 +345,19 @@ def _shape(value: Any) -> str:
     return f"({' x '.join(map(str, value.shape))})"
 
 
-def _shortened(names: list[str], limit: int = 12) -> str:
-    more = f" and {len(names) - limit} more" if len(names) > limit else ""
-    return ", ".join(names[:limit]) + more
-
-
 def _inventory(tree: Tree) -> str:
     """Return what the file holds, a few words each."""
     words = []
     for name, value in tree.items():
         if isinstance(value, dict):
-            words.append(f"{name} (struct with {_shortened(list(value), 6)})")
+            words.append(f"{name} (struct with {shortened(value, 6)})")
         elif isinstance(value, list):
             words.append(f"{name} ({len(value)} cells)")
         elif isinstance(value, (str, Unreadable)):
             words.append(f"{name} ({'text' if isinstance(value, str) else 'unreadable'})")
         else:
             words.append(f"{name} {_shape(value)}")
-    return _shortened(words) or "nothing"
+    return shortened(words, 12) or "nothing"
 
 
 def _child(tree: Mapping[str, Any], name: str) -> Any:

@@ -264,6 +264,9 @@ class _Packer:
         array = np.asarray(value)
         if array.dtype.names is not None or array.dtype == np.dtype([]):
             return self._structs(array, depth)
+        if array.dtype == object and all(v is None for v in array.flat):
+            # a struct without fields, or no cell
+            return ("struct", {}) if array.size else ("list", [])
         if array.dtype == object:
             return "list", [self._node(v, depth + 1) for v in array.ravel(order="F")]
         if array.dtype.kind == "U":

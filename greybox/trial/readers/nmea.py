@@ -308,6 +308,7 @@ def _shaft(kind: str) -> tuple[_Value, ...]:
 
 
 _SPEED = _Value("sog", ((5, "kn"), (7, "km/h")), required=False)
+_COURSE = _Value("cog", ((1, "deg"),), required=False)
 _SENTENCES: dict[bytes, _Sentence] = {
     b"GGA": _Sentence(time=1, place=2, status=6, good=_none_of(b"", b"0")),
     b"GNS": _Sentence(time=1, place=2, status=6, good=_any_system),
@@ -318,7 +319,7 @@ _SENTENCES: dict[bytes, _Sentence] = {
     ),
     b"ZDA": _Sentence(time=1, date=(2, 3, 4)),
     b"VTG": _Sentence(
-        (_SPEED, _Value("cog", ((1, "deg"),), required=False)), status=9, good=_none_of(b"N")
+        (_SPEED, _COURSE), status=9, good=_none_of(b"N")
     ),
     b"HDT": _Sentence((_Value("psi", ((1, "deg"),)),)),
     b"THS": _Sentence(

@@ -12,6 +12,7 @@ from greybox.errors import LogError
 from greybox.trial.readers import cells as cell_text
 from greybox.trial.readers.limits import limits
 from greybox.trial.readers.table import Batch
+from greybox.trial.steps import Step
 
 _READ_BYTES = 1 << 20
 # damaged footers and pages surface as any of these, beside Arrow's own
@@ -33,6 +34,7 @@ class ParquetFile:
     rows: int = 0
     format: str = "Parquet"
     first_row: int = 2
+    steps: tuple[Step, ...] = ()
 
     @property
     def cells(self) -> int:

@@ -9,22 +9,53 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.trial.steps import Step
+
 Batch = dict[str, NDArray[Any]]
 
 
 class TableFile(Protocol):
     """A table on disk: its header is known, its rows come in batches."""
 
-    path: Path
-    columns: tuple[str, ...]
-    units: dict[str, str]
-    text: frozenset[str]
-    dates: frozenset[str]
-    clocks: frozenset[str]
-    notes: list[str]
-    format: str
-    # number of the first sample's row, as a user counts them
-    first_row: int
+    @property
+    def path(self) -> Path:
+        """The file, or the name by which messages call it."""
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names, each once."""
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Units that the table states beside its names."""
+
+    @property
+    def text(self) -> frozenset[str]:
+        """Columns of words."""
+
+    @property
+    def dates(self) -> frozenset[str]:
+        """Columns of dates: UNIX time [s]."""
+
+    @property
+    def clocks(self) -> frozenset[str]:
+        """Columns of times of day [s]."""
+
+    @property
+    def notes(self) -> list[str]:
+        """What was recovered."""
+
+    @property
+    def format(self) -> str:
+        """Format, as a record names it."""
+
+    @property
+    def first_row(self) -> int:
+        """Number of the first sample's row, as a user counts them."""
+
+    @property
+    def steps(self) -> tuple[Step, ...]:
+        """What had to be done to read the times, known once the rows have been read."""
 
     @property
     def cells(self) -> int:

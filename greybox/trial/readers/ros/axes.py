@@ -12,16 +12,21 @@ REP 103 (axes and units), REP 145 (IMU), REP 147 (``_ned``, ``_frd``).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+Value = TypeVar("Value", float, NDArray[np.float64])
 Fields = dict[str, float]
 Remarks = dict[str, None]
 
 # frames whose axes are those of the world, whatever the message
 WORLD_FRAMES = frozenset({"map", "odom", "world", "earth", "enu", "ned", "utm"})
+
+
+# what the body is called
+BODY_FRAMES = frozenset({"base_link", "base_footprint", "base", "body"})
 
 
 class SkippedMessageError(Exception):
@@ -43,9 +48,11 @@ def compass_heading(x: Any, y: Any, z: Any, w: Any, *, ned: bool) -> NDArray[np.
     ndarray
         (N,) [rad], 0 to 2π; NaN where the quaternion gives no direction.
     """
-    ahead, aside = w * w + x * x - y * y - z * z, 2 * (w * z + x * y)
-    yaw = np.arctan2(aside, ahead)
-    heading = (yaw if ned else np.pi / 2 - yaw) % (2 * np.pi)
+    # what is no quaternion gives no heading, and no warning
+    with np.errstate(over="ignore", invalid="ignore"):
+        ahead, aside = w * w + x * x - y * y - z * z, 2 * (w * z + x * y)
+        yaw = np.arctan2(aside, ahead)
+        heading = (yaw if ned else np.pi / 2 - yaw) % (2 * np.pi)
     return np.where((ahead == 0) & (aside == 0), np.nan, heading)
 
 
@@ -58,6 +65,11 @@ def frame_name(name: Any) -> str:
     return str(name).strip("/").rsplit("/", 1)[-1].casefold()
 
 
+def is_world(frame: str) -> bool:
+    """Whether a frame has the world's axes by its name."""
+    return frame in WORLD_FRAMES or frame.endswith("_enu")
+
+
 def is_ned(frame: str) -> bool:
     """Whether the world's axes are north-east-down by the name of the frame."""
     return frame == "ned" or frame.endswith("_ned")
@@ -68,6 +80,22 @@ def is_frd(frame: str) -> bool:
     return "frd" in frame or "ned" in frame
 
 
+def tells_axes(frame: str) -> bool:
+    """Whether the axes of a frame are known by its name; those of a sensor's frame are not."""
+    named = is_ned(frame) or is_frd(frame) or "flu" in frame
+    return named or is_world(frame) or frame in BODY_FRAMES
+
+
+def north_east(x: Value, y: Value, *, ned: bool) -> tuple[Value, Value]:
+    """Return north and east of a vector along the world's x and y."""
+    return (x, y) if ned else (y, x)
+
+
+def starboard(value: Value, *, frd: bool) -> Value:
+    """Return a component along the body's y, or about its z, as positive to starboard."""
+    return value if frd else -value
+
+
 def pose_fields(pose: Mapping[str, Any], ned: bool, remarks: Remarks) -> Fields:
     """Return ``x_n``, ``y_n`` [m] and ``psi`` [rad] of a pose, and remark on its axes."""
     x, y = float(pose["position"]["x"]), float(pose["position"]["y"])
@@ -76,13 +104,12 @@ def pose_fields(pose: Mapping[str, Any], ned: bool, remarks: Remarks) -> Fields:
         if ned
         else "world frame east-north-up (REP 103): x_n = y, y_n = x, psi = pi/2 - yaw"
     ] = None
-    north, east = (x, y) if ned else (y, x)
+    north, east = north_east(x, y, ned=ned)
     return {"x_n": north, "y_n": east, "psi": _heading(pose["orientation"], ned=ned)}
 
 
 def twist_fields(twist: Mapping[str, Any], frd: bool, remarks: Remarks) -> Fields:
     """Return ``u``, ``v`` [m/s] and ``r`` [rad/s] of a twist in body axes, and remark on them."""
-    sign = 1.0 if frd else -1.0
     remarks[
         "body frame forward-right-down: velocities as they are"
         if frd
@@ -91,8 +118,8 @@ def twist_fields(twist: Mapping[str, Any], frd: bool, remarks: Remarks) -> Field
     linear, angular = twist["linear"], twist["angular"]
     return {
         "u": float(linear["x"]),
-        "v": sign * float(linear["y"]),
-        "r": sign * float(angular["z"]),
+        "v": starboard(float(linear["y"]), frd=frd),
+        "r": starboard(float(angular["z"]), frd=frd),
     }
 
 
@@ -114,12 +141,21 @@ def _twist_stamped(m: Mapping[str, Any], remarks: Remarks) -> Fields:
     twist = m["twist"]
     twist = twist.get("twist", twist)
     frame = frame_name(m["header"]["frame_id"])
-    if frame in WORLD_FRAMES or frame.endswith("_enu"):
+    if is_world(frame):
         remarks[f"its frame '{frame}' is the world's, so its velocities are not u, v"] = None
         return {
             f"{part}.{k}": float(twist[part][k]) for part in ("linear", "angular") for k in "xyz"
         }
-    return twist_fields(twist, is_frd(frame), remarks)
+    # of a sensor's frame the other signals of the trial tell
+    return twist_fields(twist, is_frd(frame), remarks if tells_axes(frame) else {})
+
+
+def _quaternion_stamped(m: Mapping[str, Any], remarks: Remarks) -> Fields:
+    frame = frame_name(m["header"]["frame_id"])
+    ned = is_ned(frame)
+    if tells_axes(frame):
+        remarks["psi = yaw" if ned else "psi = pi/2 - yaw (REP 103)"] = None
+    return {"psi": _heading(m["quaternion"], ned=ned)}
 
 
 def _imu(m: Mapping[str, Any], remarks: Remarks) -> Fields:
@@ -128,7 +164,7 @@ def _imu(m: Mapping[str, Any], remarks: Remarks) -> Fields:
     found: Fields = {}
     # a first covariance of -1 says that the sensor does not measure the quantity
     if m["angular_velocity_covariance"][0] != -1:
-        found["r"] = (1.0 if frd else -1.0) * float(m["angular_velocity"]["z"])
+        found["r"] = starboard(float(m["angular_velocity"]["z"]), frd=frd)
         remarks["yaw rate as it is" if frd else "r = -yaw rate (z up, REP 103)"] = None
     if m["orientation_covariance"][0] != -1:
         found["psi"] = _heading(m["orientation"], ned=frd)
@@ -152,6 +188,21 @@ HANDLERS: dict[str, Callable[[Mapping[str, Any], Remarks], Fields]] = {
     "nav_msgs/msg/Odometry": _odometry,
     "geometry_msgs/msg/PoseStamped": _pose_stamped,
     "geometry_msgs/msg/PoseWithCovarianceStamped": _pose_stamped,
+    "geometry_msgs/msg/QuaternionStamped": _quaternion_stamped,
     "geometry_msgs/msg/TwistStamped": _twist_stamped,
     "geometry_msgs/msg/TwistWithCovarianceStamped": _twist_stamped,
 }
+# messages that a driver stamps with the frame of its sensor, whatever their axes
+_OF_SENSORS = {
+    "geometry_msgs/msg/QuaternionStamped": frozenset({"psi"}),
+    "geometry_msgs/msg/TwistStamped": frozenset({"u", "v"}),
+    "geometry_msgs/msg/TwistWithCovarianceStamped": frozenset({"u", "v"}),
+}
+
+
+def unsure_fields(kind: str, message: Mapping[str, Any]) -> frozenset[str]:
+    """Return the signals of a message whose axes its frame does not tell."""
+    names = _OF_SENSORS.get(kind, frozenset())
+    if names and tells_axes(frame_name(message["header"]["frame_id"])):
+        return frozenset()
+    return names

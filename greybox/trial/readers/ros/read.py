@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from array import array
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -16,7 +16,8 @@ from greybox.errors import LogError, suggestion
 from greybox.files import sha256
 from greybox.trial.raw_log import Array, Recording, Signal, SourceFile
 from greybox.trial.readers.limits import limits
-from greybox.trial.readers.ros.axes import HANDLERS, Fields, SkippedMessageError
+from greybox.trial.readers.names import free_name, shortened
+from greybox.trial.readers.ros.axes import HANDLERS, Fields, SkippedMessageError, unsure_fields
 from greybox.trial.readers.ros.bags import read_messages, storage_files
 from greybox.trial.readers.ros.messages import (
     Decoded,
@@ -104,9 +105,9 @@ def read_bag(path: Path, topics: Mapping[str, str] | None = None) -> Recording:
         if name not in seen:
             raise LogError(
                 f"'{path.name}' has no topic '{name}'.{suggestion(name, seen)} "
-                f"Its topics: {_shortened(seen)}."
+                f"Its topics: {shortened(seen, 20)}."
             )
-    recording = _recording(path, list(collected.values()), notes)
+    signals, text, epoch, unsure = _recording(path, list(collected.values()), notes)
     recorded = [f for f in [path / "metadata.yaml", *files] if path.is_dir()] or [path]
     formats = {".bag": "ROS 1 bag", ".mcap": "MCAP", ".db3": "rosbag2 database"}
     sources = tuple(
@@ -114,7 +115,9 @@ def read_bag(path: Path, topics: Mapping[str, str] | None = None) -> Recording:
         for f in recorded
         if f.is_file()
     )
-    return Recording(path.stem, *recording, files=sources, notes=tuple(notes))
+    return Recording(
+        path.stem, signals, text, epoch, files=sources, notes=tuple(notes), unsure=unsure
+    )
 
 
 @dataclass
@@ -146,6 +149,7 @@ class _Topic:
     remarks: dict[str, None] = field(default_factory=dict)
     fields: dict[str, None] = field(default_factory=dict)
     converted: set[str] = field(default_factory=set)
+    unsure: set[str] = field(default_factory=set)
     unstamped: int = 0
     stamped: bool = False
     _decoders: dict[Channel, Callable[[bytes], Decoded] | DecodeError] = field(default_factory=dict)
@@ -202,6 +206,7 @@ class _Topic:
             try:
                 found = handle(message, self.remarks)
                 self.converted.update(found.keys() & _UNITS.keys())
+                self.unsure |= unsure_fields(kind, message) & found.keys()
             # the definition in the file is not that of the type's name
             except (KeyError, TypeError, ValueError, IndexError):
                 self.remarks["does not have the fields of its type, so it was not converted"] = None
@@ -293,13 +298,15 @@ def _stamp(message: Decoded) -> int | None:
 
 def _recording(
     path: Path, topics: list[_Topic], notes: list[str]
-) -> tuple[tuple[Signal, ...], dict[str, tuple[Array, NDArray[np.str_]]], float | None]:
+) -> tuple[
+    tuple[Signal, ...], dict[str, tuple[Array, NDArray[np.str_]]], float | None, frozenset[str]
+]:
     full = [t for t in topics if len(t.logged)]
     for topic in topics:
         _remark(topic, notes)
     _check_rules(topics)
     if not any(t.columns for t in full):
-        held = _shortened(f"{t.channel.topic} ({t.channel.msgtype})" for t in topics)
+        held = shortened((f"{t.channel.topic} ({t.channel.msgtype})" for t in topics), 20)
         reasons = " ".join(notes[:3])
         raise LogError(
             f"'{path.name}' holds no number that can be read; its topics: {held or 'none'}. "
@@ -314,18 +321,20 @@ def _recording(
     keepers = _keepers(full)
     signals: list[Signal] = []
     used: set[str] = set()
+    unsure: set[str] = set()
     text: dict[str, tuple[Array, NDArray[np.str_]]] = {}
     for topic, clock in zip(full, clocks, strict=True):
         # the difference is exact in integers, a float of the epoch would round to 0.2 us
         t: Array = np.asarray((clock - first) * 1e-9, np.float64)
         if topic.words:
-            text[_free(topic.rule or topic.dotted, used)] = (t, np.array(topic.words))
+            text[free_name(topic.rule or topic.dotted, used)] = (t, np.array(topic.words))
         for name in topic.columns:
             converted = name in topic.converted
             final, canonical = _named(topic, name, converted, keepers, notes)
+            unsure |= {final} if canonical and name in topic.unsure else set()
             signals.append(
                 Signal(
-                    _free(final, used),
+                    free_name(final, used),
                     t,
                     topic.column(name),
                     _UNITS[name] if converted else None,
@@ -333,7 +342,7 @@ def _recording(
                     canonical,
                 )
             )
-    return tuple(signals), text, epoch
+    return tuple(signals), text, epoch, frozenset(unsure)
 
 
 def _keepers(topics: list[_Topic]) -> dict[str, _Topic]:
@@ -369,14 +378,6 @@ def _named(
     return topic.dotted if alone else f"{topic.dotted}.{name}", False
 
 
-def _free(name: str, used: set[str]) -> str:
-    free, k = name, 2
-    while free in used:
-        free, k = f"{name}_{k}", k + 1
-    used.add(free)
-    return free
-
-
 def _remark(topic: _Topic, notes: list[str]) -> None:
     label = f"'{topic.channel.topic}' ({topic.channel.msgtype or 'no type'})"
     for remark in topic.remarks:
@@ -395,9 +396,3 @@ def _check_rules(topics: list[_Topic]) -> None:
                 f"'{lost[0]}'.{suggestion(lost[0], topic.fields)} Name the path of a field in "
                 f"its message, as in 'twist.twist.linear.x'."
             )
-
-
-def _shortened(names: Iterable[str], limit: int = 20) -> str:
-    names = list(names)
-    more = f" and {len(names) - limit} more" if len(names) > limit else ""
-    return ", ".join(names[:limit]) + more

@@ -1,0 +1,451 @@
+"""Positions that jump because recordings were joined or their origin moved."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.rotation import body_to_ned, ned_to_body
+from greybox.trial.checks.finding import Finding
+from greybox.trial.checks.position_hold import Track, position_track
+from greybox.trial.checks.signal_quality import clean
+from greybox.trial.gaps import HOLE, usual_step
+from greybox.trial.raw_log import Recording
+from greybox.trial.steps import mend
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+# samples on both sides of a jump that may say what it should have been
+_BESIDE = (6, 9, 13, 20)
+# a jump in standard deviations of what is predicted
+_JUMP = 5.5
+# steps that come as often as this are the receiver's or the ship's habit: so many in a log, a
+# tenth of its separate steps or at most as many, or one a minute [s]; a jump is twice as large
+_FEW, _OFTEN, _MANY, _MINUTE, _ABOVE = 5, 0.1, 10, 60.0, 2.0
+# samples after which a position that returns is no outlier any more
+_RETURN = 3
+# share of a jump that falls between two samples, and that lasts
+_AT_ONCE, _LASTS = 0.5, 0.45
+# time within which a receiver's filter comes back from its own correction, and time on both
+# sides of a jump that must differ by it [s]
+_SETTLED, _LONG = 2.0, 5.0
+# samples that say so at least, and share of a jump above which their scatter says nothing
+_LEAST_LASTING, _VAGUE = 10, 0.25
+# places where it is tried how well positions are predicted so long
+_TRIED = 40
+# samples over which a speed is the median
+_SPEED = 15
+# share of uneven steps from which on a message may be a tick of the table late
+_UNEVEN = 0.01
+# no receiver or tank resolves less [m]
+_FINEST = 1e-3
+_MOST_JUMPS = 200
+
+
+def jump_findings(recording: Recording) -> list[Finding]:
+    """Find positions that step because recordings were joined or the origin moved.
+
+    The way from sample to sample is predicted by its neighbours in earth axes, or in body
+    axes, and by the velocities. A jump is what stands out far beyond the log's own scatter,
+    falls between two samples and lasts.
+
+    Parameters
+    ----------
+    recording : Recording
+        With positions in order of time, without outliers and held samples.
+
+    Returns
+    -------
+    list of Finding
+        One a jump, in order of time.
+    """
+    track = position_track(recording)
+    if track is None:
+        return []
+    found = []
+    for jump in _jumps(track, recording):
+        half = 1.96 * jump.error
+        north, east = jump.size
+        size = float(np.hypot(north, east))
+        found.append(
+            Finding(
+                "position_jump",
+                "x_n",
+                (north, east),
+                ((north - half, north + half), (east - half, east + half)),
+                "m",
+                f"the position steps by {size:.3g} m ({north:+.3g} north, {east:+.3g} east) "
+                f"between t = {jump.before:.6g} and {jump.after:.6g} s and stays there, where the "
+                f"samples on both sides predict it to {jump.error:.2g} m (standard error)",
+                "cut the log there (import --fix does: what follows is a segment of its own), or "
+                "correct the origin of one part",
+                ("x_n", "y_n"),
+                (mend("cut", ("x_n", "y_n"), times=(jump.after,)),),
+                True,
+                {
+                    "t": track.t, "x_n": track.p[:, 0], "y_n": track.p[:, 1],
+                    "before": jump.before, "after": jump.after,
+                },
+            )
+        )  # fmt: skip
+    return found
+
+
+@dataclass(frozen=True)
+class _Jump:
+    """A step of the position between two samples.
+
+    Parameters
+    ----------
+    before, after : float
+        Times of the samples on both sides [s].
+    size : tuple of float
+        North and east [m].
+    error : float
+        Standard error of either [m].
+    """
+
+    before: float
+    after: float
+    size: tuple[float, float]
+    error: float
+
+
+def _jumps(track: Track, recording: Recording) -> list[_Jump]:
+    """Return the jumps of positions, in order of time."""
+    t, p = _messages(track)
+    if len(t) < 4 * _BESIDE[0] + 1:
+        return []
+    period, tick = usual_step(t), usual_step(track.t)
+    dt = np.diff(t)
+    whole = dt <= HOLE * period
+    way = np.diff(p, axis=0)
+    speed = _median(way / dt[:, None])
+    middle = 0.5 * (t[1:] + t[:-1])
+    psi = _heading(recording, middle)
+    sailed = _velocity(recording, middle, psi)
+    rest = None if sailed is None else np.where(whole[:, None], way - sailed * dt[:, None], 0.0)
+    # as if every step took the usual time: what a longer or shorter one adds is known
+    way = np.where(whole[:, None], way - speed * (dt - period)[:, None], 0.0)
+    long = _Window(max(_BESIDE[0], round(_LONG / period)), max(_RETURN, round(_SETTLED / period)))
+    lasting, vague = _steadier(way, rest, whole, long)
+    # where messages come unevenly, each may be a tick of the table late
+    uneven = np.mean(np.abs(dt - period) > 0.5 * min(tick, period)) > _UNEVEN
+    slip = speed * tick if uneven else np.zeros_like(way)
+    search = _Search(whole, slip, lasting, vague, long, float(t[-1] - t[0]))
+    zero, rounded = np.zeros(len(way)), max(track.step) / np.sqrt(12)
+    # in body axes a turn is no bend
+    alone = [_view(way, x, whole, rounded) for x in (zero, psi) if x is not None]
+    views = sorted((v for v in alone if v is not None), key=_spread)[:1]
+    if rest is not None:
+        views += [v for v in [_view(rest, zero, whole, rounded)] if v is not None]
+    found: dict[int, tuple[Array, float]] = {}
+    for view in views:
+        # velocities that were made of the positions hide a jump, those of a sensor show it
+        more = search.jumps(view)
+        found |= {k: x for k, x in more.items() if all(abs(k - j) > _RETURN for j in found)}
+    return [
+        _Jump(float(t[k]), float(t[k + 1]), (float(size[0]), float(size[1])), error)
+        for k, (size, error) in sorted(found.items())
+    ]
+
+
+def _messages(track: Track) -> tuple[Array, Array]:
+    """Return times and positions once a message of the receiver, (N,) and (N, 2)."""
+    new = np.concatenate([[True], (np.diff(track.p, axis=0) != 0).any(axis=1)])
+    length = np.diff(np.append(np.flatnonzero(new), len(new)))
+    if np.median(length) < 2:
+        return track.t, track.p
+    # after a gap the same position is another message
+    new[1:] |= np.diff(track.t) > HOLE * usual_step(track.t)
+    return track.t[new], track.p[new]
+
+
+def _heading(recording: Recording, t: Array) -> Array | None:
+    """Return the heading [rad] at some times, None where the log has none."""
+    if "psi" not in recording:
+        return None
+    at, value = clean(recording["psi"])
+    return np.interp(t, at, value) if len(at) > 1 else None
+
+
+def _velocity(recording: Recording, t: Array, psi: Array | None) -> Array | None:
+    """Return the velocity over ground at some times, (N, 2) [m/s]; None where it is not known."""
+    pair = ("v_n", "v_e") if "v_n" in recording else ("u", "v")
+    if not all(n in recording for n in pair) or (pair == ("u", "v") and psi is None):
+        return None
+    values = []
+    for name in pair:
+        at, value = clean(recording[name])
+        if len(at) < 2:
+            return None
+        values.append(np.interp(t, at, value))
+    if psi is not None and pair == ("u", "v"):
+        return np.column_stack(body_to_ned(values[0], values[1], psi))
+    return np.column_stack(values)
+
+
+@dataclass(frozen=True)
+class _View:
+    """Increments of the position in one pair of axes, and how they scatter.
+
+    Parameters
+    ----------
+    way : ndarray
+        (N, 2) [m].
+    psi : ndarray
+        (N,) from earth to these axes [rad].
+    halves : tuple of int
+        Samples on one side that predict them, from best to fewest.
+    level : ndarray
+        (N,) which of `halves` is free of holes and ends, its length where none is.
+    scale : ndarray
+        (N, 2) standard deviation of the steps that they leave [m].
+    spread : float
+        Most of `scale` [m].
+    """
+
+    way: Array
+    psi: Array
+    halves: tuple[int, ...]
+    level: NDArray[np.int64]
+    scale: Array
+    spread: float
+
+    def steps(self, way: Array) -> Array:
+        """Return the step at each increment of a way in these axes, (N, 2) [m]."""
+        size = np.zeros_like(way)
+        for k, half in enumerate(self.halves):
+            here = self.level == k
+            if here.any():
+                size[here] = _filtered(way, _kernel(half))[here]
+        return size
+
+
+def _spread(view: _View) -> float:
+    return view.spread
+
+
+def _view(way: Array, psi: Array, whole: Mask, rounded: float) -> _View | None:
+    """Return increments in axes turned by psi, with the windows that leave the least scatter.
+
+    `rounded` is the standard deviation of the rounding of a position [m].
+    """
+    if psi.any():
+        way = np.column_stack(ned_to_body(way[:, 0], way[:, 1], psi))
+    made = []
+    for half in _BESIDE:
+        if 4 * half > len(way):
+            continue
+        step = _kernel(half)
+        clear = np.convolve(whole, np.ones(len(step)), "same") > len(step) - 0.5
+        if not clear.any():
+            continue
+        least = max(_FINEST, rounded) * float(np.linalg.norm(np.diff(step, prepend=0, append=0)))
+        scale = np.maximum(_scale(_filtered(way, step), clear, half), least)
+        spread = float(np.quantile(np.hypot(*scale[clear].T), 0.9))
+        made.append((spread, half, clear, scale))
+    if not made:
+        return None
+    best = int(np.argmin([m[0] for m in made]))
+    # near holes and ends fewer samples have to do
+    chosen = made[best::-1]
+    level = np.full(len(way), len(chosen))
+    scale = np.full_like(way, np.inf)
+    for k in reversed(range(len(chosen))):
+        clear = chosen[k][2]
+        level[clear], scale[clear] = k, chosen[k][3][clear]
+    return _View(way, psi, tuple(m[1] for m in chosen), level, scale, made[best][0])
+
+
+@dataclass(frozen=True)
+class _Search:
+    """The search for jumps among the increments of a track.
+
+    Parameters
+    ----------
+    whole : ndarray
+        (N,) bool, whether an increment spans no hole.
+    slip : ndarray
+        (N, 2) what a slip in time by one message changes, north and east [m].
+    lasting : ndarray
+        (N, 2) increments beside what predicts them best over a long window [m].
+    vague : float
+        What is left there of nothing [m].
+    long : _Window
+    seconds : float
+        Length of the log.
+    """
+
+    whole: Mask
+    slip: Array
+    lasting: Array
+    vague: float
+    long: _Window
+    seconds: float
+
+    def jumps(self, view: _View) -> dict[int, tuple[Array, float]]:
+        """Return size north and east, and standard error, of the jumps by increment."""
+        way, lasting = view.way.copy(), self.lasting.copy()
+        clear = view.level < len(view.halves)
+        most = view.halves[0]
+        slip = np.column_stack(ned_to_body(self.slip[:, 0], self.slip[:, 1], view.psi))
+        found: dict[int, Array] = {}
+
+        def look() -> tuple[Array, Array]:
+            size = view.steps(way)
+            total = np.maximum(np.hypot(*size.T), 1e-12)
+            beyond = np.maximum(1 - np.abs(np.sum(slip * size, axis=1)) / total**2, 0.0)
+            return size, np.where(clear, np.hypot(*(size / view.scale).T) * beyond, 0.0)
+
+        def take(k: int, jump: Array) -> None:
+            way[k] -= jump
+            lasting[k] -= _to_earth(jump, view.psi[k])
+
+        def holds(k: int, size: Array) -> bool:
+            if not _at_once(way, k, size):
+                return False
+            if not _Window(max(most, _LEAST_LASTING), _RETURN).lasts(way, self.whole, k, size):
+                return False
+            if self.vague > _VAGUE * _norm(size):
+                return True
+            return self.long.lasts(lasting, self.whole, k, _to_earth(size, view.psi[k]))
+
+        size, distance = look()
+        peaks = _peaks(distance, most)
+        often = int(max(_FEW, min(_OFTEN * len(peaks), _MANY), self.seconds / _MINUTE))
+        least = max(_JUMP, _ABOVE * float(peaks[min(often, len(peaks)) - 1]))
+        for _ in range(_MOST_JUMPS):
+            k = int(np.argmax(distance))
+            if distance[k] < least:
+                break
+            if holds(k, size[k]):
+                found[k] = size[k]
+                take(k, size[k])
+            else:
+                # what is beside it is its echo
+                clear[max(k - most, 0) : k + most + 1] = False
+            size, distance = look()
+        # what was taken first may have been part of a larger one beside it
+        for k in sorted(found) if len(found) > 1 else ():
+            take(k, -found.pop(k))
+            size, distance = look()
+            if distance[k] >= least and holds(k, size[k]):
+                found[k] = size[k]
+                take(k, size[k])
+        # steps one after another are motion, not jumps
+        return {
+            k: (_to_earth(x, view.psi[k]), _norm(view.scale[k]) / np.sqrt(2))
+            for k, x in found.items()
+            if all(j == k or abs(j - k) > _RETURN for j in found)
+        }
+
+
+@dataclass(frozen=True)
+class _Window:
+    """Samples on both sides of a step, and how many beside it are left out on one side."""
+
+    half: int
+    skipped: int
+
+    def lasts(self, way: Array, whole: Mask, k: int, size: Array) -> bool:
+        """Whether a step at increment `k` is there without the samples beside it, too."""
+        return bool(self.least(way, whole, k) @ size > _LASTS * (size @ size))
+
+    def least(self, way: Array, whole: Mask, k: int) -> Array:
+        """Return the smaller of the steps at `k` without the samples after or before it, (2,).
+
+        By a parabola through the samples on both sides [m].
+        """
+        low, high = max(k - self.half + 1, 0), min(k + self.half, len(way))
+        holes = np.flatnonzero(~whole[low:high]) + low
+        low = max([low, *(holes[holes < k] + 1)])
+        high = min([high, *holes[holes > k]])
+        z = np.vstack([[0.0, 0.0], np.cumsum(way[low:high], axis=0)])
+        at = np.arange(low, high + 1) - k - 0.5
+        steps = []
+        for side in (at > 0, at < 0):
+            skipped = min(self.skipped, int(side.sum()) - 4)
+            if skipped < 0:
+                continue
+            keep = ~(side & (np.abs(at) < skipped))
+            x = at[keep] / self.half
+            design = np.column_stack([x > 0, np.ones(len(x)), x, x**2])
+            # normal equations of four columns of order one: fast, and exact enough for a test
+            steps.append(np.linalg.solve(design.T @ design, design.T @ z[keep])[0])
+        return np.asarray(min(steps, key=_norm)) if steps else np.zeros(2)
+
+
+def _at_once(way: Array, k: int, size: Array) -> bool:
+    """Whether most of a step falls on one increment."""
+    beside = np.median(np.r_[way[max(k - 3, 0) : k], way[k + 1 : k + 4]], axis=0)
+    return bool((way[k] - beside) @ size > _AT_ONCE * (size @ size))
+
+
+def _steadier(way: Array, rest: Array | None, whole: Mask, window: _Window) -> tuple[Array, float]:
+    """Return what predicts positions best over a window, neighbours or velocities, and how well."""
+    at = np.linspace(window.half, len(way) - window.half - 1, _TRIED).astype(int)
+    best: tuple[Array, float] = (way, np.inf)
+    for x in (way, rest):
+        if x is not None and at[0] < at[-1]:
+            size = float(np.median([_norm(window.least(x, whole, k)) for k in at]))
+            if size < best[1]:
+                best = (x, size)
+    return best
+
+
+def _norm(step: Array) -> float:
+    return float(np.hypot(*step))
+
+
+def _to_earth(step: Array, psi: float) -> Array:
+    c, s = np.cos(psi), np.sin(psi)
+    return np.array([c * step[0] - s * step[1], s * step[0] + c * step[1]])
+
+
+def _kernel(half: int) -> Array:
+    """Return what gives the step in the middle of increments by least squares beside a cubic."""
+    at = np.arange(2 * half) - half + 0.5
+    design = np.column_stack([at > 0, *((at / half) ** k for k in range(4))])
+    # of increments instead of samples
+    return np.asarray(np.cumsum(np.linalg.pinv(design)[0][::-1])[::-1][1:])
+
+
+def _filtered(way: Array, kernel: Array) -> Array:
+    return np.column_stack([np.convolve(w, kernel[::-1], "same") for w in way.T])
+
+
+def _peaks(distance: Array, half: int) -> Array:
+    """Return the largest distances that are apart from each other, in falling order."""
+    from scipy.ndimage import maximum_filter1d
+
+    return np.sort(distance[distance == maximum_filter1d(distance, 2 * half + 1)])[::-1]
+
+
+def _median(rate: Array) -> Array:
+    from scipy.ndimage import median_filter
+
+    return np.column_stack([median_filter(x, size=_SPEED, mode="nearest") for x in rate.T])
+
+
+def _scale(size: Array, clear: Mask, half: int) -> Array:
+    """Return the robust scatter of steps beside each sample, not below that of the log, (N, 2).
+
+    The samples that a jump itself moves are left out: the larger scatter of both sides.
+    """
+    part = np.abs(size)
+    overall = np.median(part[clear] if clear.any() else part, axis=0)
+    span = min(8 * half, len(part))
+    windows = np.lib.stride_tricks.sliding_window_view(part, span, axis=0)[::half]
+    centre = span / 2 + half * np.arange(len(windows))
+    level = np.median(windows, axis=2)
+    at = np.arange(len(part))
+    away = span / 2 + 2 * half
+    local = [
+        np.maximum(np.interp(at - away, centre, x), np.interp(at + away, centre, x))
+        for x in level.T
+    ]
+    return np.asarray(1.4826 * np.maximum(np.column_stack(local), overall))
