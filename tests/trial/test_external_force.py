@@ -75,7 +75,7 @@ def overlap(finding, start):
 @pytest.mark.parametrize("fixed", [False, True])
 def test_a_push_is_found_where_it_acts_and_nowhere_else(fixed):
     for seed in range(4):
-        recording, start = sailed(seed, 0.3, fixed=fixed)
+        recording, start = sailed(seed, 0.5, fixed=fixed)
         ((finding,),), _ = force_findings([recording], VESSEL)
         assert finding.id == "external_force"
         assert not finding.safe
