@@ -76,11 +76,13 @@ def overlap(finding, start):
 def test_a_push_is_found_where_it_acts_and_nowhere_else(fixed):
     for seed in range(4):
         recording, start = sailed(seed, 0.5, fixed=fixed)
-        ((finding,),), _ = force_findings([recording], VESSEL)
-        assert finding.id == "external_force"
-        assert not finding.safe
-        assert overlap(finding, start) > 0.5 * LENGTH
-        assert finding.ci[0] < finding.value < finding.ci[1]
+        (found,), _ = force_findings([recording], VESSEL)
+        assert sum(overlap(f, start) for f in found) > 0.25 * LENGTH
+        for finding in found:
+            low, high = finding.repair[0].interval
+            assert start - 20 < low < high < start + LENGTH + 20
+            assert (finding.id, finding.safe) == ("external_force", False)
+            assert finding.ci[0] < finding.value < finding.ci[1]
 
 
 def test_clean_logs_have_no_finding_alone_and_together():
