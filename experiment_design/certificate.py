@@ -30,7 +30,7 @@ from experiment_design.moments import Moments
 from experiment_design.problem import TrialProblem
 from experiment_design.search import ascend, draw_two_level, perturb
 from experiment_design.surge_bound import bound_surge, why_not_surge
-from greybox.notebook import Shown, text
+from greybox.notebook import DisplayMixin, text
 
 Array = NDArray[np.float64]
 
@@ -77,7 +77,7 @@ _SURGE_CHECKED = (
 
 
 @dataclass(frozen=True, repr=False)
-class Certificate(Shown):
+class Certificate(DisplayMixin):
     """At least which fraction of the best possible a design reaches.
 
     Parameters

@@ -16,7 +16,7 @@ from experiment_design.request import DesignRequest, Rival, build_problem
 from experiment_design.result import Design
 from experiment_design.search import draw_two_level
 from greybox.errors import UsageError
-from greybox.notebook import Shown, items, number, sparkline, table
+from greybox.notebook import DisplayMixin, items, number, sparkline, table
 
 Array = NDArray[np.float64]
 
@@ -31,7 +31,7 @@ _REFITS = 2
 
 
 @dataclass(frozen=True, repr=False)
-class Discrimination(Shown):
+class Discrimination(DisplayMixin):
     """A trial between two explanations.
 
     Parameters

@@ -13,13 +13,13 @@ from experiment_design.limits import LimitName
 from experiment_design.moments import Moments
 from experiment_design.request import DesignRequest, build_problem, wanted_parameters
 from greybox.errors import ExcitationError, UsageError
-from greybox.notebook import Shown, items, number, table
+from greybox.notebook import DisplayMixin, items, number, table
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, repr=False)
-class PredictedPrecision(Shown):
+class PredictedPrecision(DisplayMixin):
     """Predicted precision of given sequences.
 
     Parameters

@@ -15,7 +15,7 @@ from experiment_design.request import DesignRequest
 from experiment_design.robust import Keeping
 from experiment_design.rollout import Motion
 from experiment_design.search import REFERENCE
-from greybox.notebook import Shown, interval, items, number, sparkline, table, text
+from greybox.notebook import DisplayMixin, interval, items, number, sparkline, table, text
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -38,7 +38,7 @@ class LimitReport:
 
 
 @dataclass(frozen=True, repr=False)
-class Design(Shown):
+class Design(DisplayMixin):
     """Sequences for the next trials and what they are worth.
 
     Parameters

@@ -22,7 +22,7 @@ _LEFT, _RIGHT = (f' style="text-align:{side};padding:0 0.5em"' for side in ("lef
 _FORBIDDEN = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
-class Shown(ABC):
+class DisplayMixin(ABC):
     """A result that people read.
 
     ``repr`` is one line. A notebook shows that line, then what matters most, then

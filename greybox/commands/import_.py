@@ -46,7 +46,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--hole",
         type=positive,
         metavar="S",
-        help="shortest step that is a gap [s]; 2.5 usual steps of the sensor by default",
+        help="longest step that is bridged, a longer one is a gap [s]; 2.5 usual steps of the "
+        "sensor by default",
     )
     parser.add_argument(
         "--fix", action="store_true", help="mend what greybox check finds, where that is safe"
@@ -174,7 +175,7 @@ def import_options(options: argparse.Namespace) -> ImportOptions:
         raise UsageError(f"--note: {error}") from None
     return ImportOptions(
         sample_time=options.sample_time,
-        hole=options.hole,
+        max_gap=options.hole,
         velocities=options.velocities,
         window=options.window,
         reference_height=options.reference_height,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from greybox.estimation.result import TestResult
 from greybox.model.model import ManoeuvringModel
-from greybox.notebook import Shown, interval, items, number, table, text
+from greybox.notebook import DisplayMixin, interval, items, number, table, text
 from greybox.trial.log import TrialLog
 from greybox.trial.validity import ConditionDifference
 
@@ -157,7 +157,7 @@ class Runs:
 
 
 @dataclass(frozen=True, repr=False)
-class Diagnosis(Shown):
+class Diagnosis(DisplayMixin):
     """What the simulation gets wrong, why, and what it gains to mend it.
 
     Parameters
@@ -306,7 +306,7 @@ class Diagnosis(Shown):
 
 
 @dataclass(frozen=True, repr=False)
-class Given(Shown):
+class Given(DisplayMixin):
     """What causes do that are taken for granted.
 
     Parameters

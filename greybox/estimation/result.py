@@ -13,7 +13,7 @@ from greybox.estimation.summary import estimated, summarise
 from greybox.model.model import ManoeuvringModel
 from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import Predictor
-from greybox.notebook import Shown, items, parameters, text
+from greybox.notebook import DisplayMixin, items, parameters, text
 from greybox.trial.actuator_estimate import ActuatorEstimate
 from greybox.trial.validity import PooledConditions
 from greybox.vessel.vessel import Vessel
@@ -79,7 +79,7 @@ def not_applicable(name: str, null: str, reason: str) -> TestResult:
 
 
 @dataclass(frozen=True, repr=False)
-class Verdict(Shown):
+class Verdict(DisplayMixin):
     """Whether to trust an estimate.
 
     Parameters
@@ -157,7 +157,7 @@ class Limit:
 
 
 @dataclass(frozen=True, repr=False)
-class Estimate(Shown):
+class Estimate(DisplayMixin):
     """Parameters of a predictor, estimated from logs.
 
     Parameters

@@ -12,14 +12,14 @@ from greybox.export.motion import Heading, Wind
 from greybox.export.sampled import SampledModel, sampled_model
 from greybox.files import check_targets, replacing, to_json
 from greybox.model.model import ManoeuvringModel
-from greybox.notebook import Shown, items
+from greybox.notebook import DisplayMixin, items
 
 TARGETS = ("c", "fmu", "casadi", "mat", "json")
 _OPTIONS = {"heading": ("simulated", "measured"), "wind": ("earth", "relative")}
 
 
 @dataclass(frozen=True, repr=False)
-class Exported(Shown):
+class Exported(DisplayMixin):
     """What was written.
 
     Parameters

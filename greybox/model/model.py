@@ -22,7 +22,7 @@ from greybox.model.structure import Structure
 from greybox.model.terms import Factor, Term
 from greybox.model.units import parameter_unit
 from greybox.model.versions import VERSION, upgraded
-from greybox.notebook import Shown, items, parameters, text
+from greybox.notebook import DisplayMixin, items, parameters, text
 from greybox.trial.validity import Validity, in_words, validity_from_dict, validity_to_dict
 from greybox.vessel.toml import vessel_from_dict, vessel_to_dict
 from greybox.vessel.vessel import Vessel
@@ -35,7 +35,7 @@ _MAX_BYTES = 50_000_000
 
 
 @dataclass(frozen=True, repr=False)
-class ManoeuvringModel(Shown):
+class ManoeuvringModel(DisplayMixin):
     """A model that can be simulated, compared, saved and designed with.
 
     Parameters

@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import UsageError
-from greybox.notebook import Shown, number, table, text
+from greybox.notebook import DisplayMixin, number, table, text
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, repr=False)
-class NoiseLevels(Shown):
+class NoiseLevels(DisplayMixin):
     """Standard deviations that a precision or a band rests on.
 
     Parameters

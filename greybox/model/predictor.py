@@ -24,7 +24,7 @@ from greybox.errors import StructureError, suggestion
 from greybox.model.disturbances import CURRENT
 from greybox.model.spelling import atoms, spelled_expression, spellings
 from greybox.model.structure import Structure
-from greybox.notebook import Shown, table
+from greybox.notebook import DisplayMixin, table
 from greybox.vectorised import Vectorised
 
 Array = NDArray[np.float64]
@@ -77,7 +77,7 @@ class BiasShare:
 
 
 @dataclass(frozen=True, repr=False)
-class Predictor(Shown):
+class Predictor(DisplayMixin):
     """The regressors of every equation, in order, and the rule that gave them.
 
     Parameters

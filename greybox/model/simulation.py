@@ -17,7 +17,7 @@ from greybox.model.functions import (
     RunVariant,
 )
 from greybox.model.structure import Structure
-from greybox.notebook import Shown, number, sparkline, table
+from greybox.notebook import DisplayMixin, number, sparkline, table
 from greybox.rotation import body_to_ned
 
 Array = NDArray[np.float64]
@@ -29,7 +29,7 @@ _STEP_RUNS = 16
 
 
 @dataclass(frozen=True, repr=False)
-class FreeRun(Shown):
+class FreeRun(DisplayMixin):
     """What a free run gave.
 
     Parameters

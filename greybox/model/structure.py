@@ -15,7 +15,7 @@ import casadi as ca
 from greybox.errors import StructureError, suggestion
 from greybox.model.disturbances import DisturbanceKind, disturbance_names, disturbed_signals
 from greybox.model.terms import SIGNALS, Term, parse_term
-from greybox.notebook import Shown, items, text
+from greybox.notebook import DisplayMixin, items, text
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ def _symbols(*names: tuple[str, ...]) -> Symbols:
 
 
 @dataclass(frozen=True, repr=False)
-class Structure(Shown):
+class Structure(DisplayMixin):
     """A set of terms over named states, inputs and disturbances.
 
     Parameters

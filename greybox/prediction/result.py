@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.notebook import Shown, items, number, table
+from greybox.notebook import DisplayMixin, items, number, table
 from greybox.prediction.drawn import Drawn
 from greybox.prediction.measuring import LABELS
 from greybox.trial.log import TrialLog
@@ -242,7 +242,7 @@ def _range(ci: Sequence[float | None] | None) -> str:
 
 
 @dataclass(frozen=True, repr=False)
-class ManoeuvrePrediction(Shown):
+class ManoeuvrePrediction(DisplayMixin):
     """What a model predicts of one kind of manoeuvre.
 
     Parameters

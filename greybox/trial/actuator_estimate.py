@@ -212,7 +212,7 @@ def recorded_actuators(record: Mapping[str, Any]) -> tuple[ActuatorEstimate, ...
     found = []
     entries = record.get("actuators")
     for entry in entries if isinstance(entries, list) else []:
-        with suppress(KeyError, TypeError, ValueError, AttributeError):
+        with suppress(KeyError, TypeError, ValueError, AttributeError, OverflowError):
             found.append(ActuatorEstimate.from_dict(entry))
     return tuple(found)
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from greybox.channels import CHANNELS
 from greybox.errors import LogError, UsageError
-from greybox.notebook import Shown, items, number, sparkline, table
+from greybox.notebook import DisplayMixin, items, number, sparkline, table
 from greybox.trial.actuator_estimate import ActuatorEstimate
 from greybox.trial.steps import Step
 from greybox.vessel.actuation import actuated_force
@@ -94,7 +94,7 @@ class Provenance:
 
 
 @dataclass(frozen=True, repr=False)
-class TrialLog(Shown):
+class TrialLog(DisplayMixin):
     """Signals of one trial on a uniform clock.
 
     Parameters

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.notebook import Shown, items, number, sparkline, table
+from greybox.notebook import DisplayMixin, items, number, sparkline, table
 from greybox.trial.steps import Step
 from greybox.vessel.conditions import Conditions
 
@@ -68,7 +68,7 @@ class SourceFile:
 
 
 @dataclass(frozen=True, repr=False)
-class Recording(Shown):
+class Recording(DisplayMixin):
     """All that was read from the files of one trial.
 
     Parameters

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, get_args
 
 DecidedBy = Literal["format", "vessel", "user", "check", "default"]
@@ -117,7 +118,7 @@ def step_from_dict(data: Any) -> Step | None:
             data.get("decided_by", "default"),
             str(data.get("reason", "")),
         )
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError):
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError):
         return None
 
 
@@ -135,7 +136,10 @@ def finite_number(value: Any) -> float:
     ValueError
         It is none, or none that a log can hold.
     """
-    number = float(value)
+    try:
+        number = float(value)
+    except OverflowError:
+        number = math.inf
     if not abs(number) < _LARGEST:
         raise ValueError(f"{number} is no quantity of a log")
     return number
@@ -149,6 +153,14 @@ def new_steps(known: Iterable[Step], more: Iterable[Step]) -> tuple[Step, ...]:
             before.append(step)
             found.append(step)
     return tuple(found)
+
+
+def on_zero(step: Step, shift: float) -> Step:
+    """Return a step of reading with the places that it names on another zero of time."""
+    if step.operation != "pad_fractions":
+        return step
+    times = tuple(t + shift for t in step.numbers("times"))
+    return replace(step, parameters={**step.parameters, "times": times})
 
 
 def mend(operation: str, channels: tuple[str, ...], **parameters: Value) -> Step:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from greybox.errors import GreyboxError
-from greybox.notebook import Shown
+from greybox.notebook import DisplayMixin
 from greybox.trial.convert.convert import import_recording
 from greybox.trial.log import TrialLog
 from greybox.trial.manoeuvres import Criterion, Manoeuvre, Quantity, Verdict, find_manoeuvres
@@ -24,7 +24,7 @@ _AFTER_CUT = 5
 
 
 @dataclass(frozen=True, repr=False)
-class Contents(Shown):
+class Contents(DisplayMixin):
     """What the segments of one trial hold.
 
     Parameters

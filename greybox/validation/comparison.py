@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from greybox.errors import UsageError
 from greybox.model.changes import Change, simulate_changing
 from greybox.model.model import ManoeuvringModel
-from greybox.notebook import Shown, items, number, table
+from greybox.notebook import DisplayMixin, items, number, table
 from greybox.one_thread import one_thread
 from greybox.regression.instruments import state_bound
 from greybox.trial.log import TrialLog
@@ -54,7 +54,7 @@ class SignTest:
 
 
 @dataclass(frozen=True, repr=False)
-class Comparison(Shown):
+class Comparison(DisplayMixin):
     """Models (rows) on logs (columns).
 
     Parameters

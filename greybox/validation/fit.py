@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from greybox.channels import CHANNELS
 from greybox.errors import LogError
 from greybox.model.model import ManoeuvringModel
-from greybox.notebook import Shown, number, sparkline, table
+from greybox.notebook import DisplayMixin, number, sparkline, table
 from greybox.regression.instruments import simulate_log
 from greybox.trial.kinematics import decimate
 from greybox.trial.log import TrialLog
@@ -58,7 +58,7 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, repr=False)
-class LogFit(Shown):
+class LogFit(DisplayMixin):
     """A free run beside its log.
 
     Parameters

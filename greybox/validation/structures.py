@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from greybox.errors import GreyboxError, UsageError
 from greybox.estimation.result import Estimate
 from greybox.model.catalogue import structure_for
-from greybox.notebook import Shown
+from greybox.notebook import DisplayMixin
 from greybox.one_thread import one_thread
 from greybox.trial.log import TrialLog
 from greybox.validation.choose import estimate_model
@@ -71,7 +71,7 @@ class StructureRow:
 
 
 @dataclass(frozen=True, repr=False)
-class StructureChoice(Shown):
+class StructureChoice(DisplayMixin):
     """An estimate of the chosen structure, and the table that chose it."""
 
     estimate: Estimate

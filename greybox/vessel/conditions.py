@@ -5,10 +5,11 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from math import isfinite
+from math import inf, isfinite
 from typing import Any
 
-from greybox.errors import GreyboxError, LogError
+from greybox.errors import GreyboxError, LogError, suggestion
+from greybox.units import UNITS as LOG_UNITS
 from greybox.units import unit_factor
 
 Value = float | int | str
@@ -136,14 +137,7 @@ def _read(name: str, value: Any) -> Value:
         if isinstance(value, str) and value.strip():
             return " ".join(value.split())
         raise LogError(f"loading is {value!r}, words are needed, such as 'ballast': correct it.")
-    number: float | None = None
-    unit = ""
-    if isinstance(value, str):
-        match = _NUMBER.fullmatch(value)
-        if match:
-            number, unit = float(match[1]), match[2]
-    elif isinstance(value, int | float) and not isinstance(value, bool):
-        number = float(value)
+    number, unit = _quantity(value)
     if name == "sea_state":
         if number is not None and not unit and number.is_integer():
             return int(number)
@@ -154,4 +148,25 @@ def _read(name: str, value: Any) -> Value:
         raise LogError(
             f"{words(name)} is {value!r}, a length is needed, such as 1.2 or '120 cm': correct it."
         )
-    return number * unit_factor(unit, UNITS[name], name) if unit else number
+    try:
+        return number * unit_factor(unit, UNITS[name], name) if unit else number
+    except LogError:
+        lengths = [w for u in LOG_UNITS.values() if u.si == "m" for w in (u.symbol, *u.spellings)]
+        raise LogError(
+            f"{words(name)} is {value!r}, and '{unit}' is no unit of length."
+            f"{suggestion(unit, lengths)} Write metres, or a unit such as cm or ft."
+        ) from None
+
+
+def _quantity(value: Any) -> tuple[float | None, str]:
+    """Return number and unit that a text or a number states, None where it states no number."""
+    if isinstance(value, str):
+        match = _NUMBER.fullmatch(value)
+        return (float(match[1]), match[2]) if match else (None, "")
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None, ""
+    try:
+        return float(value), ""
+    except OverflowError:
+        # an integer of hundreds of digits
+        return inf, ""

@@ -9,7 +9,7 @@ from typing import Any, Literal, get_args
 
 from greybox.channels import CHANNELS
 from greybox.errors import VesselError, suggestion
-from greybox.notebook import Shown, number, table
+from greybox.notebook import DisplayMixin, number, table
 from greybox.vessel.conditions import Conditions
 from greybox.vessel.thrust import ThrustLaw
 
@@ -221,7 +221,7 @@ class ColumnMapping:
 
 
 @dataclass(frozen=True, repr=False)
-class Vessel(Shown):
+class Vessel(DisplayMixin):
     """A vessel as its TOML file describes it.
 
     Parameters

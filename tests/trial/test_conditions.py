@@ -63,8 +63,10 @@ def test_texts_with_units_become_si():
     ("values", "message"),
     [
         ({"draught": "deep"}, "draught is 'deep', a length is needed, such as 1.2 or '120 cm'"),
-        ({"draught": "1.2 kn"}, "'draught' is in 'kn'"),
-        ({"draught": "1.2 metrs"}, "unknown unit 'metrs'. Did you mean"),
+        ({"draught": "1.2 kn"}, "draught is '1.2 kn', and 'kn' is no unit of length"),
+        ({"draught": "1.2 metrs"}, "'metrs' is no unit of length. Did you mean 'metres'"),
+        ({"draught": 10**400}, "draught is inf m, it must be finite"),
+        ({"sea_state": 10**400}, "sea state is 1000"),
         ({"draught": -1}, "draught is -1 m, it must be finite and positive"),
         ({"draught": True}, "draught is True"),
         ({"water_depth": 0}, "water depth is 0 m"),

@@ -13,8 +13,9 @@ from virtual import as_recording, recorded
 
 from greybox.errors import LogError
 from greybox.trial.convert import two_pass_import as stream
-from greybox.trial.convert.channel_mapping import merge, read_recording
+from greybox.trial.convert.channel_mapping import read_recording
 from greybox.trial.convert.convert import import_recording
+from greybox.trial.convert.merge import merge
 from greybox.trial.convert.options import ImportOptions
 from greybox.trial.convert.read import read_segments
 from greybox.trial.import_files import import_files
@@ -232,7 +233,7 @@ def test_stretches_that_are_too_short():
     data = columns()
     data["psi"] = np.where(np.arange(400) % 10 < 2, data["psi"], np.nan)
     with pytest.raises(LogError, match="no 3 that follow each other in which x_n, y_n, psi"):
-        imported(data, hole=1.0)
+        imported(data, max_gap=1.0)
 
 
 def large(case, n=9000):

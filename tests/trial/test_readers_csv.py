@@ -542,3 +542,13 @@ def test_points_that_are_no_thousands_stay_decimal(tmp_path):
     found, _ = read(tmp_path / "x.csv")
     assert found.loc[7, "x_n"] == 1.5
     assert np.isnan(found.loc[9, "x_n"])
+
+
+def test_damaged_numbers_in_columns_called_n_and_e_are_no_positions(tmp_path):
+    rows = "".join(f"{0.1 * k:.1f},{1e300 * (-1) ** k},{k},0.1\n" for k in range(50))
+    path = tmp_path / "log.csv"
+    path.write_text("t,n,e,psi\n" + rows)
+    ship = vessel_from_dict(
+        {"name": "S", "length": 5, "thruster": [{"type": "fixed", "speed": "rps"}]}
+    )
+    assert not {"x_n", "y_n"} & set(read_recording(path, ship).names)

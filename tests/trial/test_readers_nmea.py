@@ -317,6 +317,13 @@ def test_shafts_and_rudders_go_to_the_vessels_columns(tmp_path):
     assert not any(n.endswith("_ref") for n in names)
 
 
+def test_numbers_that_no_shaft_has_are_damage(tmp_path):
+    lines = minute(*(sentence(f"IIRPM,S,{k},10,,A") for k in (1, 100, -1, 10**20)))
+    recording = read(tmp_path, *lines)
+    assert [n for n in recording.names if "rpm" in n] == ["rpm_shaft1"]
+    assert "180 IIRPM with empty or wrong fields skipped" in recording.notes
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [

@@ -205,6 +205,10 @@ def test_what_is_damaged_in_a_record_is_left_out(tmp_path):
     [
         {"files": [3, None, ["a"], ["a", "b", "c"]]}, {"files": 4}, {"epoch": float("inf")},
         {"epoch": "x"}, {"notes": []}, {"read": {}}, {"conditions": [1]}, {"version": None},
+        {"conditions": {"draught": 10**400}}, {"conditions": [], "notes": {"trim": 10**400}},
+        {"actuators": [{"thruster": float("inf"), "kind": "speed", "command": "n", "feedback": "m"}]},
+        {"version": 1, "derived": [f"[sensors] heading_bias = {10**400}: psi turned back"]},
+        {"version": 1, "derived": [f'[sensors] clock = {{"psi":{10**400}}}: earlier by it']},
     ],
 )  # fmt: skip
 def test_other_damage_does_no_harm(tmp_path, damage):

@@ -37,8 +37,8 @@ def test_stretches_end_at_holes():
 def test_one_lost_sample_is_no_hole_and_three_are():
     t = np.delete(np.arange(100) * 0.1, [20, 50, 51, 52])
     assert len(clock(t).starts) == 2
-    assert len(clock(t, hole=10).starts) == 1
-    assert len(clock(t, hole=0.15).starts) == 3
+    assert len(clock(t, max_gap=10).starts) == 1
+    assert len(clock(t, max_gap=0.15).starts) == 3
 
 
 @pytest.mark.parametrize("holes", [1, 3, 10])

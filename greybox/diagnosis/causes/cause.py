@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from greybox.diagnosis.atom import Atom
 from greybox.model.structure import Structure
-from greybox.notebook import Shown, table
+from greybox.notebook import DisplayMixin, table
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
@@ -71,7 +71,7 @@ class Context:
         return tuple(out)
 
 
-class Cause(Shown):
+class Cause(DisplayMixin):
     """A reason why a simulation may disagree with the sea.
 
     A subclass states the class variables and gives its atoms. It becomes known to

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from greybox.notebook import Shown, items, table
+from greybox.notebook import DisplayMixin, items, table
 from greybox.trial.actuator_estimate import ActuatorEstimate
 from greybox.trial.raw_log import Recording
 from greybox.trial.steps import Step
@@ -19,7 +19,7 @@ IDS = (
 
 
 @dataclass(frozen=True, repr=False)
-class Finding(Shown):
+class Finding(DisplayMixin):
     """One defect of a log.
 
     Parameters
@@ -113,7 +113,7 @@ class Outcome:
 
 
 @dataclass(frozen=True, repr=False)
-class CheckReport(Shown):
+class CheckReport(DisplayMixin):
     """All findings of one log, and what became of every check.
 
     Parameters

@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import LogError
-from greybox.notebook import Shown, items, table
+from greybox.notebook import DisplayMixin, items, table
 from greybox.trial.convert.deduplicate import clean_signals
 from greybox.trial.convert.derived_signals import complete_channels
 from greybox.trial.convert.options import ImportOptions
 from greybox.trial.convert.resample import Clock, clock, hold, hold_mean, interpolate
-from greybox.trial.convert.sensor_corrections import correct_channels, too_late
+from greybox.trial.convert.sensor_corrections import clock_shift_error, correct_channels
 from greybox.trial.convert.time_grid import (
     MIN_SEGMENT,
     Plan,
@@ -38,7 +38,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, repr=False)
-class Imported(Shown):
+class Imported(DisplayMixin):
     """The segments of one trial, in order of time.
 
     Parameters
@@ -117,7 +117,7 @@ class Cut:
     def refusal(self, conversion: Conversion) -> LogError:
         """Return why there is no segment."""
         if self.late:
-            return too_late(conversion.vessel, conversion.plan.name)
+            return clock_shift_error(conversion.vessel, conversion.plan.name)
         return too_short(conversion.plan)
 
 
@@ -196,7 +196,7 @@ def signal_clocks(
         period = None if periods is None else periods[s.name]
         key = (id(s.t), period)
         if key not in found:
-            found[key] = clock(s.t, options.hole, period, recording.cuts)
+            found[key] = clock(s.t, options.max_gap, period, recording.cuts)
         clocks[s.name] = found[key]
     return clocks
 

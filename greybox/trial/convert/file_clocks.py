@@ -20,6 +20,8 @@ _OVERLAP = 0.05
 # the same where only another time zone lets them
 _ZONE_OVERLAP = 0.8
 _LARGEST_ZONE = 14 * 3600.0
+# seconds since 1970 that a date can have: the year 5138
+_LATEST = 1e11
 
 
 def on_one_clock(
@@ -153,4 +155,7 @@ def _overlap(a: Span, b: Span) -> float:
 
 
 def _clock(time: float) -> str:
+    """Return a UNIX time as a date, as a number where it is none that a calendar has."""
+    if not abs(time) < _LATEST:
+        return f"{time:.6g} s"
     return datetime.fromtimestamp(time, UTC).strftime("%Y-%m-%d %H:%M:%S")

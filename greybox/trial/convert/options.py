@@ -16,9 +16,9 @@ class ImportOptions:
     ----------
     sample_time : float, optional
         Ts of the log [s]; that of the slowest motion sensor by default.
-    hole : float, optional
-        Shortest step that counts as a gap [s]; 2.5 usual steps of the sensor
-        by default.
+    max_gap : float, optional
+        Longest step that is bridged [s], a longer one is a gap; 2.5 usual steps of the
+        sensor by default.
     velocities : {"central", "savgol"}
         How u, v, r are made from positions where nothing measured them.
     window : float
@@ -40,7 +40,7 @@ class ImportOptions:
     """
 
     sample_time: float | None = None
-    hole: float | None = None
+    max_gap: float | None = None
     velocities: str = "central"
     window: float = 2.0
     reference_height: float | None = None

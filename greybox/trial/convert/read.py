@@ -19,7 +19,6 @@ from greybox.files import sha256
 from greybox.trial.convert.channel_mapping import (
     canonical,
     table_columns,
-    time_scale,
     whole_recording,
     written_log,
 )
@@ -28,6 +27,7 @@ from greybox.trial.convert.convert import Conversion, cut_segments
 from greybox.trial.convert.deduplicate import clean_signals
 from greybox.trial.convert.options import ImportOptions
 from greybox.trial.convert.time_grid import MIN_SEGMENT, Plan
+from greybox.trial.convert.time_scale import time_scale
 from greybox.trial.gaps import split_at_gaps
 from greybox.trial.log import Provenance, TrialLog
 from greybox.trial.raw_log import Recording

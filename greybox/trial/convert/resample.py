@@ -62,7 +62,7 @@ class Clock:
 
 def clock(
     t: Array,
-    hole: float | None = None,
+    max_gap: float | None = None,
     period: float | None = None,
     cuts: Sequence[float] = (),
 ) -> Clock:
@@ -72,8 +72,8 @@ def clock(
     ----------
     t : ndarray
         (N,) [s], increasing, N >= 1.
-    hole : float, optional
-        Shortest step that counts as a hole [s]; `HOLE` usual steps by default.
+    max_gap : float, optional
+        Longest step that is no hole [s]; `HOLE` usual steps by default.
     period : float, optional
         Usual step [s], where it is known from more than these times.
     cuts : sequence of float
@@ -82,9 +82,9 @@ def clock(
     steps = np.diff(t)
     period = usual_step(t) if period is None else period
     limit = HOLE * period
-    if hole is not None:
+    if max_gap is not None:
         # what the user calls a hole is one, but not every step
-        limit = max(hole, 1.01 * min(period, float(np.median(steps)) if len(steps) else period))
+        limit = max(max_gap, 1.01 * min(period, float(np.median(steps)) if len(steps) else period))
     starts, stops = np.array(pieces(t, limit), np.int64).T
     if cuts:
         inner = np.searchsorted(t, cuts)

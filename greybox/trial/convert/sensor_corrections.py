@@ -88,7 +88,7 @@ def correct_log(log: TrialLog, vessel: Vessel | None = None) -> TrialLog:
     if not made.before and not made.after:
         return out
     if len(log) - made.before - made.after < 3:
-        raise too_late(vessel, log.name)
+        raise clock_shift_error(vessel, log.name)
     return out.window(made.before, len(log) - made.after, log.name)
 
 
@@ -152,7 +152,7 @@ def correct_channels(
     )
 
 
-def too_late(vessel: Vessel, name: str) -> LogError:
+def clock_shift_error(vessel: Vessel, name: str) -> LogError:
     """Return the error of a log that moved clocks leave fewer than three samples."""
     clock = ", ".join(f"{c} by {s:g} s" for c, s in vessel.sensors.get("clock", {}).items())
     return LogError(

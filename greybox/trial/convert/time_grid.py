@@ -88,7 +88,7 @@ class Plan:
         Samples, those in gaps included.
     periods : mapping of str to float
         Usual step of each signal that is used [s].
-    leading : tuple of str
+    reference_channels : tuple of str
         Signals whose holes are gaps.
     notes : tuple of str
     least : int
@@ -104,7 +104,7 @@ class Plan:
     start: float
     count: int
     periods: Mapping[str, float]
-    leading: tuple[str, ...]
+    reference_channels: tuple[str, ...]
     notes: tuple[str, ...]
     least: int
     steps: tuple[Step, ...] = ()
@@ -120,13 +120,13 @@ class Plan:
     def stretches(
         self, grid: Array, clocks: Mapping[str, Clock], cuts: Sequence[float] = ()
     ) -> list[tuple[int, int]]:
-        """Return the runs of samples (start, stop) in which every leading signal has values.
+        """Return the runs of samples (start, stop) in which every reference channel has values.
 
         None reaches over one of `cuts` [s].
         """
         if self.times is not None:
             return split_at_gaps(grid, self.sample_time)
-        return stretches(grid, (clocks[n] for n in self.leading), cuts)
+        return stretches(grid, (clocks[n] for n in self.reference_channels), cuts)
 
 
 def plan_import(
@@ -143,23 +143,23 @@ def plan_import(
     used, notes = _usable(extents, vessel, name)
     inputs = [c for c in vessel.commands if c in used]
     beside = set(vessel.recorded_columns) - set(vessel.commands)
-    leading = [n for n in _MOTION if n in used] or inputs
-    sample_time = options.sample_time or _sample_time([used[n] for n in leading])
-    held = [n for n in used if n not in (*leading, *beside) and used[n].steady]
-    late = [n for n in inputs if n not in leading and n not in held]
-    leading = [*leading, *held]
-    start = max(used[n].first for n in (*leading, *late))
-    stop = min(used[n].last for n in leading)
+    reference = [n for n in _MOTION if n in used] or inputs
+    sample_time = options.sample_time or _sample_time([used[n] for n in reference])
+    held = [n for n in used if n not in (*reference, *beside) and used[n].steady]
+    late = [n for n in inputs if n not in reference and n not in held]
+    reference = [*reference, *held]
+    start = max(used[n].first for n in (*reference, *late))
+    stop = min(used[n].last for n in reference)
     # a held value lasts until the next would have come
     if stop - start < (MIN_SEGMENT - 1) * sample_time * (1 - 1e-6):
-        one = max((*leading, *late), key=lambda n: used[n].first)
-        two = min(leading, key=lambda n: used[n].last)
+        one = max((*reference, *late), key=lambda n: used[n].first)
+        two = min(reference, key=lambda n: used[n].last)
         raise LogError(
             f"the signals of '{name}' overlap from {start:.6g} s ({one}) to {stop:.6g} s ({two}), "
             f"less than {MIN_SEGMENT} samples of {sample_time:g} s: check the clocks of the "
             f"files, or choose a shorter sample time."
         )
-    values = sum(used[n].count for n in leading)
+    values = sum(used[n].count for n in reference)
     samples = (stop - start) / sample_time + 1
     if samples > _MAX_GROWTH * values + 1000:
         raise LogError(
@@ -169,8 +169,8 @@ def plan_import(
     shaping = [e for n, e in used.items() if n not in beside]
     longest = max(e.last for e in shaping) - min(e.first for e in shaping)
     if stop - start < 0.9 * longest:
-        one = max((*leading, *late), key=lambda n: used[n].first)
-        two = min(leading, key=lambda n: used[n].last)
+        one = max((*reference, *late), key=lambda n: used[n].first)
+        two = min(reference, key=lambda n: used[n].last)
         notes.append(
             f"of {longest:.4g} s, {start:.6g} s ({one} begins) to {stop:.6g} s ({two} ends) are "
             f"covered by every signal"
@@ -182,7 +182,7 @@ def plan_import(
         start,
         count,
         {n: e.period for n, e in used.items()},
-        tuple(leading),
+        tuple(reference),
         tuple(notes),
         max([MIN_SEGMENT, *_windows(options, count, sample_time)]),
         _resampling({n: e.period for n, e in used.items()}, sample_time, vessel),
@@ -289,9 +289,9 @@ def too_short(plan: Plan) -> LogError:
     other = " or a shorter window of smoothing" if plan.least > MIN_SEGMENT else ""
     return LogError(
         f"'{plan.name}' has {plan.count} samples of {plan.sample_time:g} s but no "
-        f"{plan.least} that follow each other in which {', '.join(plan.leading)} all have "
-        f"values (two more where velocities are derived): choose another sample time or "
-        f"hole{other}."
+        f"{plan.least} that follow each other in which "
+        f"{', '.join(plan.reference_channels)} all have values (two more where "
+        f"velocities are derived): choose another sample time or --hole{other}."
     )
 
 

@@ -18,14 +18,12 @@ from greybox.channels import CHANNELS
 from greybox.errors import LogError
 from greybox.files import sha256
 from greybox.trial.convert.channel_mapping import (
-    TimeScale,
     angle_reach,
     angle_unit,
     batch_recording,
     canonical,
     reading_steps,
     table_columns,
-    time_scale,
     unused_mappings,
     written_log,
 )
@@ -36,6 +34,7 @@ from greybox.trial.convert.derived_signals import derive_signals
 from greybox.trial.convert.options import ImportOptions
 from greybox.trial.convert.resample import clock
 from greybox.trial.convert.time_grid import Extent, Plan, extent, gap_notes, plan_import
+from greybox.trial.convert.time_scale import TimeScale, time_scale
 from greybox.trial.gaps import joined_spans
 from greybox.trial.log import Provenance, TrialLog
 from greybox.trial.raw_log import Recording, Signal, SourceFile
@@ -150,8 +149,8 @@ def scan_table(table: TableFile, vessel: Vessel, options: ImportOptions) -> Scan
 class _Parts:
     """The clock of one signal, from batch to batch."""
 
-    def __init__(self, hole: float | None) -> None:
-        self.hole = hole
+    def __init__(self, max_gap: float | None) -> None:
+        self.max_gap = max_gap
         self.last: float | None = None
         self.extents: list[Extent] = []
 
@@ -162,12 +161,12 @@ class _Parts:
         if len(t) > 1 and not (np.diff(t) > 0).all():
             t = np.unique(t)
         if len(t) > 1:
-            part = extent(clock(t, self.hole))
+            part = extent(clock(t, self.max_gap))
             self.extents.append(part if self.last is None else replace(part, count=part.count - 1))
             self.last = part.last
         elif len(t) and self.last is None:
             self.last = float(t[0])
-            self.extents.append(extent(clock(t, self.hole)))
+            self.extents.append(extent(clock(t, self.max_gap)))
 
     def extent(self) -> Extent:
         """Return the whole: the usual step is the median over batches, by their counts."""
@@ -229,7 +228,7 @@ class _Found:
         for s in derive_signals(recording, self.origin).signals:
             keep = np.isfinite(s.t) & np.isfinite(s.value)
             t = keeps.setdefault((id(s.t), np.packbits(keep).tobytes()), s.t[keep])
-            self.parts.setdefault(s.name, _Parts(self.options.hole)).add(t)
+            self.parts.setdefault(s.name, _Parts(self.options.max_gap)).add(t)
 
     def _order(self, t: Array) -> None:
         if not len(t):

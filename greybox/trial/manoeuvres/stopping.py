@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.notebook import Shown
+from greybox.notebook import DisplayMixin
 from greybox.rotation import ned_to_body
 from greybox.trial.manoeuvres.approach import measure_approach
 from greybox.trial.manoeuvres.local import crossing, fit_at
@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, repr=False)
-class Stopping(Shown):
+class Stopping(DisplayMixin):
     """A stop as it was measured; None where the ship still moves when the log ends.
 
     Parameters

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import LogError
-from greybox.notebook import Shown
+from greybox.notebook import DisplayMixin
 from greybox.trial.manoeuvres.approach import Approach, measure_approach
 from greybox.trial.manoeuvres.local import LocalFit, crossing, fit_at, noise_std, regress
 from greybox.trial.manoeuvres.quantity import Quantity
@@ -33,7 +33,7 @@ _DRIFT_RANGE = math.radians(300)
 
 
 @dataclass(frozen=True, repr=False)
-class TurningCircle(Shown):
+class TurningCircle(DisplayMixin):
     """A turning circle as it was measured; None where the log ends before it.
 
     Parameters

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import LogError
-from greybox.notebook import Shown
+from greybox.notebook import DisplayMixin
 from greybox.trial.manoeuvres.approach import measure_approach
 from greybox.trial.manoeuvres.local import crossing, fit_at, peak
 from greybox.trial.manoeuvres.quantity import Quantity
@@ -35,7 +35,7 @@ _RUDDER_NEAR, _HEADING_NEAR = math.radians(1.0), math.radians(1.6)
 
 
 @dataclass(frozen=True, repr=False)
-class ZigZag(Shown):
+class ZigZag(DisplayMixin):
     """A zig-zag as it was measured; None where the log ends before it.
 
     Parameters

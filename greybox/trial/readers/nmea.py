@@ -179,7 +179,7 @@ class _Value:
         value *= factor
         if not isfinite(value):
             raise ValueError(self.name)
-        return f"{self.name}{int(f[self.number])}" if self.number else self.name, value, si
+        return f"{self.name}{_numbered(f[self.number])}" if self.number else self.name, value, si
 
 
 @dataclass(frozen=True)
@@ -249,6 +249,14 @@ class _Sentence:
             s.remarks[self.lacking[1]] += 1
         for name, number, unit in found:
             s.give(name, number, unit)
+
+
+def _numbered(text: bytes) -> int:
+    """Return the number of a shaft or engine; a ship has no hundred, a damaged file may."""
+    number = int(text)
+    if not 0 <= number < 100:
+        raise ValueError(text)
+    return number
 
 
 def _field(f: Fields, k: int) -> bytes:
