@@ -20,7 +20,8 @@ STEPS = {
     "log": "Vessel load_vessel vessel_from_dict TrialLog make_log read_log read_segments decimate "
     "write_log",
     "check": "read_recording Recording import_files import_recording ImportOptions check_files "
-    "check_recording CheckReport Finding repair describe_recording find_manoeuvres",
+    "check_recording check_recordings CheckReport Finding repair describe_recording "
+    "find_manoeuvres",
     "model": "get_structure structure_names Structure build_predictor output_predictor Predictor "
     "ManoeuvringModel load_model simulate stationary_disturbance",
     "estimate": "estimate_model Request estimate_ls estimate_iv estimate_refined_iv estimate_oe "

@@ -125,6 +125,7 @@ def test_a_jump_of_the_origin_is_found_alone_with_its_place(rate, sensors, ship)
     log = as_recording(d)
     (found,) = check_recording(log, ship).findings
     assert (found.id, found.channels, found.safe) == ("position_jump", ("x_n", "y_n"), True)
+    assert not jump_findings(apply_repairs(log, [found]))
     for value, (low, high), true in zip(found.value, found.ci, (0.6, -0.8), strict=True):
         assert abs(value - true) < 3 * (high - low) / 3.92
     assert times(found) == (d["t"][k],)

@@ -93,11 +93,10 @@ def measure_actuators(
             findings.append((_finding(estimate, fit, pairs), estimate.logs))
     if estimates:
         return tuple(estimates), findings, None
-    reason = (
-        f"too few moves of a command that its feedback follows: {', '.join(untold)}"
-        if untold
-        else "the vessel file names no actuator by command and feedback"
-    )
+    if not untold:
+        nothing = "the vessel file names no actuator by command and feedback"
+        return (), [], Outcome("actuator", "clean", nothing)
+    reason = f"too few moves of a command that its feedback follows: {', '.join(untold)}"
     return (), [], Outcome("actuator", "cannot tell", reason)
 
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from greybox.rotation import body_to_ned, ned_to_body
 from greybox.trial.checks.finding import Finding, Outcome
-from greybox.trial.checks.motion import Motion, make_motion, smooth
+from greybox.trial.checks.motion import Motion, denoise, make_motion, smooth
 from greybox.trial.convert.resample import clock as make_clock
 from greybox.trial.convert.resample import hold_mean
 from greybox.trial.raw_log import Recording
@@ -40,12 +40,12 @@ _LENGTHS = (15.0, 30.0, 60.0, 120.0)
 # left to compare with
 _LEAST_SECONDS, _LEAST_STRETCHES = 240.0, 6.0
 # chance of a false finding that is aimed at, and stretches that count for one of a scan
-_LEVEL, _OVERLAP = 5e-4, 3.0
+_LEVEL, _OVERLAP = 1e-3, 3.0
 # part of the stretches below which lies the usual, and mean excess over it of two normal deviates
 _TAIL, _NORMAL_EXCESS = 0.75, 0.5
 # a remainder has longer tails than a normal one: its size is not taken for smaller than this
 # share of what the thrusters do at half speed
-_MISFIT = 0.01
+_MISFIT = 0.005
 # what matters: force over thrust at half speed
 _LEAST_SHARE = 0.08
 # of all speeds, those that count as half of the top speed
@@ -53,11 +53,13 @@ _HALF = (0.35, 0.65)
 # how much speed is left where a ship with thrust is held, over the top speed
 _STANDING = 0.1
 _RIDGE = 1e-6
+# columns that belong to one log
+_OWN = 7
 # variance that the fit may add to that of a stretch: beyond, the rest of the logs does not tell
 # how the ship moves there
-_EXTRAPOLATION = 1.0
+_EXTRAPOLATION = 2.0
 # time beside a force within which a jump of a sensor goes back [s], and which share of it
-_TAKEN_BACK, _TAKEN_SHARE = 16.0, 0.5
+_TAKEN_BACK, _TAKEN_SHARE = 16.0, 0.15
 # a force that acts in more than this share of a log cannot be told from a steady one
 _LONGEST_SHARE = 1 / 3
 
@@ -127,7 +129,8 @@ class _Log:
     thrust : ndarray
         (K, q) generalised forces.
     own : ndarray
-        (K, 2, 3) constant, and a force fixed north and east in body axes: flow of this log.
+        (K, 2, 7) of this log: a constant; a force fixed north and east, in body axes; and that
+        times the yaw rate and the speed, what a current adds to turning and to square damping.
     psi : ndarray
         (K,) heading [rad].
     speed : ndarray
@@ -167,7 +170,8 @@ def _make_log(number: int, recording: Recording, vessel: Vessel) -> _Log | str:
         inputs[c] = hold_mean(make_clock(t), signal.value[keep][first], motion.t, motion.step)
     forces = list(generalised_force(vessel, inputs).values())
     count = max(1, round(_STEP / motion.step))
-    u, v, r = (motion[s] for s in ("u", "v", "r"))
+    # noise within products of velocities would weaken their coefficients
+    u, v, r = (denoise(motion[s], motion) for s in ("u", "v", "r"))
     known = [u, v, r, *(a * b for a, b in combinations((u, v, r), 2))]
     known += [x * np.abs(x) for x in (u, v, r)]
     known += [np.abs(v) * r, np.abs(r) * v]
@@ -182,7 +186,15 @@ def _make_log(number: int, recording: Recording, vessel: Vessel) -> _Log | str:
         "known": np.column_stack(known),
         "thrust": np.column_stack(forces),
         "own": np.stack(
-            [np.column_stack([one, north, east]), np.column_stack([one, -east, north])], axis=1
+            [
+                np.column_stack(
+                    [one, north, east, r * north, r * east, abs(u) * north, abs(u) * east]
+                ),
+                np.column_stack(
+                    [one, -east, north, -r * east, r * north, -abs(v) * east, abs(v) * north]
+                ),
+            ],
+            axis=1,
         ).reshape(len(one), -1),
         "psi": motion["psi"][:, None],
         "speed": u[:, None],
@@ -192,12 +204,13 @@ def _make_log(number: int, recording: Recording, vessel: Vessel) -> _Log | str:
     blocks: dict[str, list[Array]] = {n: [] for n in parts}
     stretches: list[tuple[int, int]] = []
     at = 0
+    measured = np.column_stack([motion["u"], motion["v"]])
     for a, b in motion.stretches:
         m = (b - a) // count
         if m < 4:
             continue
         edges = a + count * np.arange(m)
-        sums = np.vstack([np.zeros((1, 2)), np.cumsum(np.column_stack([u, v])[a:b], axis=0)])
+        sums = np.vstack([np.zeros((1, 2)), np.cumsum(measured[a:b], axis=0)])
         mean = (sums[edges - a + count] - sums[edges - a]) / count
         rate.append(np.diff(mean, axis=0) / (count * motion.step))
         times.append(motion.t[edges[1:]] - 0.5 * motion.step)
@@ -216,7 +229,7 @@ def _make_log(number: int, recording: Recording, vessel: Vessel) -> _Log | str:
         np.concatenate(rate),
         made["known"],
         made["thrust"],
-        made["own"].reshape(-1, 2, 3),
+        made["own"].reshape(-1, 2, _OWN),
         made["psi"][:, 0],
         made["speed"][:, 0],
     )
@@ -284,14 +297,14 @@ class _Scan:
         self.seconds = float(sum(len(x.t) * x.step for x in logs))
         self.rate = np.concatenate([x.rate for x in logs])
         shared = np.concatenate([np.hstack([x.known, x.thrust]) for x in logs])
-        rows, own = len(shared), 3 * len(logs)
+        rows, own = len(shared), _OWN * len(logs)
         self.phi = np.zeros((2, rows, shared.shape[1] + own))
         for s in range(2):
             self.phi[s, :, : shared.shape[1]] = shared
             for k, log in enumerate(logs):
                 part = slice(self.ends[k], self.ends[k + 1])
-                at = shared.shape[1] + 3 * k
-                self.phi[s, part, at : at + 3] = log.own[:, s]
+                at = shared.shape[1] + _OWN * k
+                self.phi[s, part, at : at + _OWN] = log.own[:, s]
         size = np.sqrt(np.mean(self.phi**2, axis=1, keepdims=True))
         self.phi /= np.where(size > 0, size, 1.0)
         self.thrust = slice(logs[0].known.shape[1], shared.shape[1])
@@ -315,7 +328,7 @@ class _Scan:
         theta = inverse[0] @ (self.phi[0].T @ self.rate[:, 0])
         # what a thrust that never changes does stands in the constant
         parts = [*range(self.thrust.start, self.thrust.stop)]
-        parts += range(self.thrust.stop, self.phi.shape[2], 3)
+        parts += range(self.thrust.stop, self.phi.shape[2], _OWN)
         push = np.abs(self.phi[0][:, parts] @ theta[parts])
         speed = np.abs(np.concatenate([x.speed for x in self.logs]))
         share = speed / max(float(np.quantile(speed, 0.95)), 1e-9)

@@ -122,6 +122,9 @@ def _jumps(track: Track, recording: Recording) -> list[_Jump]:
     period, tick = usual_step(t), usual_step(track.t)
     dt = np.diff(t)
     whole = dt <= HOLE * period
+    # where the log is cut already, positions may begin anew
+    begun = np.searchsorted(t, recording.cuts)
+    whole[begun[(begun > 0) & (begun < len(t))] - 1] = False
     way = np.diff(p, axis=0)
     speed = _median(way / dt[:, None])
     middle = 0.5 * (t[1:] + t[:-1])
