@@ -21,6 +21,8 @@ from greybox.report.checks import finding_figure
 from greybox.report.diagnosis_figures import ranking_figure
 from greybox.report.figures import new_figure, save_png, tidy
 from greybox.study.blind import draw
+from greybox.study.chapter6 import TRUE
+from greybox.study.inputs import smoothed_pulses
 
 FOLDER = Path(__file__).parent / "images"
 GREY, RED, BLUE = "#555555", "#b2182b", "#2166ac"
@@ -156,27 +158,72 @@ def defective(check, columns):
         c["y_n"] = c["y_n"] + 6 * np.sin(c["psi"])
     if check == "heading_bias":
         c["psi"] = c["psi"] + np.radians(6)
+    if check == "actuator":
+        # the log says what was asked for, and beside it what the shaft did
+        c["n1_ref"] = c["n1"].copy()
+        for k in range(1, len(c["n1"])):
+            c["n1"][k] = c["n1"][k - 1] + 0.2 * (c["n1_ref"][max(k - 2, 0)] - c["n1"][k - 1])
+        c["n1"] += 0.02 * np.random.default_rng(1).standard_normal(len(c["n1"]))
     return c
+
+
+def towed():
+    """Return vessel and columns (N,) of a ship of the thesis that a tug pulls for a minute."""
+    vessel, rng, step, samples = gb.load_vessel("thesis"), np.random.default_rng(1), 0.5, 2400
+    bounds = {"n": (4, 20), "alpha1": (-0.5, 0.5), "alpha2": (-0.5, 0.5)}
+    commands = {
+        name: smoothed_pulses(rng, samples, *reach, widths=(30, 120), smoothing=10)
+        for name, reach in bounds.items()
+    }
+    tau = gb.make_log(vessel, commands, step).forces(STRUCTURE.inputs).copy()
+    tau[1000:1120, STRUCTURE.inputs.index("taux")] += 2 * np.abs(tau[:, 0]).mean()
+    theta = step * np.array([TRUE[n] for n in STRUCTURE.parameters])
+    run = gb.simulate(STRUCTURE, theta, np.array([1.5, 0.5, 0.0]), tau[:-1], step)
+    noise = rng.standard_normal((samples, 4)) * [0.014, 0.014, 0.014, 0.01]
+    states = {s: run.x[0][:, k] + noise[:, k] for k, s in enumerate("uvr")}
+    heading = {"psi": run.psi[0] + noise[:, 3]}
+    return vessel, {"t": step * np.arange(samples), **states, **heading, **commands}
+
+
+def written(check, columns):
+    """Return a log's columns (N,) as text; the defect may be one of the text alone."""
+    table = pd.DataFrame(columns)
+    if check == "time_format":
+        # fifty samples a second, one second of which lost the zeros of its fractions
+        t = np.arange(len(table)) / 50
+        whole = np.floor(t + 1e-9).astype(int)
+        part = np.round(1000 * (t - whole)).astype(int)
+        short = whole == 9
+        table["t"] = [
+            f"{a}.{b}" if s else f"{a}.{b:03d}" for a, b, s in zip(whole, part, short, strict=True)
+        ]
+    return table
 
 
 CHECKS = (
     "gap", "duplicate_time", "nan", "outlier", "stuck", "quantised", "heading_wrap",
-    "position_hold", "position_jump", "unit", "frame", "sign", "clock_offset", "lever_arm",
-    "heading_bias",
+    "position_hold", "position_jump", "time_format", "unit", "frame", "sign", "clock_offset",
+    "lever_arm", "heading_bias", "external_force", "actuator",
 )  # fmt: skip
 
 
 def check_figure(check):
     """Plant one defect in a clean log, run the checks, and draw what they find."""
-    trial = draw(np.random.default_rng(3), (), kind="manoeuvres", samples=900)
-    columns = {"t": trial.estimation.t, **trial.estimation.channels}
-    columns = defective(check, columns)
+    if check == "external_force":
+        vessel, columns = towed()
+    else:
+        trial = draw(np.random.default_rng(3), (), kind="manoeuvres", samples=900)
+        vessel = trial.vessel
+        columns = defective(check, {"t": trial.estimation.t, **trial.estimation.channels})
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "trial.csv"
-        pd.DataFrame(columns).to_csv(path, index=False)
-        (report,) = gb.check_files([path], trial.vessel)
-    (found,) = report.findings
-    return finding_figure(found, report, trial.vessel)
+        written(check, columns).to_csv(path, index=False)
+        if check == "actuator":
+            first, *others = vessel.thrusters
+            vessel = replace(vessel, thrusters=(replace(first, speed_other="n1_ref"), *others))
+        (report,) = gb.check_files([path], vessel)
+    found = next(f for f in report.findings if f.id == check)
+    return finding_figure(found, report, vessel)
 
 
 def plan_figure(folder):

@@ -95,7 +95,19 @@ def check_files(paths: Sequence[str | Path], vessel: Vessel) -> list[CheckReport
 
 
 def check_recording(recording: Recording, vessel: Vessel) -> CheckReport:
-    """Check one recording by itself; see `check_recordings`."""
+    """Check one recording by itself; see `check_recordings`.
+
+    Parameters
+    ----------
+    recording : Recording
+        Canonical signals as they were recorded.
+    vessel : Vessel
+
+    Returns
+    -------
+    CheckReport
+        Findings by id, and what became of every check.
+    """
     return check_recordings([recording], vessel)[0]
 
 
