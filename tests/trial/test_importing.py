@@ -330,6 +330,21 @@ def test_blocks_give_the_log_that_memory_gives(
         assert sorted(a["read"]) == sorted(b["read"])
 
 
+@pytest.mark.parametrize("cells", [20_000_000, 0])
+@pytest.mark.parametrize("held", [True, False])
+def test_columns_n_and_e_of_a_file_of_any_size(tmp_path, monkeypatch, cells, held):
+    t = np.arange(400) * 0.5
+    north = 15.0 + t // 30 if held else 2 * t
+    table = pd.DataFrame({"t": t, "psi": 0.01 * t, "u": 2 + 0 * t, "n": north, "e": 0.5 * t})
+    table.to_csv(tmp_path / "raw.csv", index=False)
+    vessel = vessel_from_dict(
+        {"name": "S", "length": 30, "thruster": [{"type": "fixed", "speed": "rpm"}]}
+    )
+    monkeypatch.setattr(stream, "_LARGE_CELLS", cells)
+    import_files([tmp_path / "raw.csv"], vessel, tmp_path / "log.csv")
+    assert ("x_n" in pd.read_csv(tmp_path / "log.csv")) is not held
+
+
 def test_a_large_file_whose_time_starts_again(tmp_path, monkeypatch):
     table = large("plain")
     pd.concat([table, table]).to_csv(tmp_path / "raw.csv", index=False)
