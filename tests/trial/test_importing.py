@@ -220,6 +220,16 @@ def test_rows_out_of_order_and_twice():
     assert any("2 values of x_n repeat a time: the first is kept" in n for n in result.notes)
 
 
+def test_times_that_are_no_number_cost_their_rows_alone():
+    data = columns()
+    times = data["t"].copy()
+    times[[7, 200, 201]] = [np.nan, np.inf, np.inf]
+    (log,) = imported(data | {"t": times}, max_gap=2.0).segments
+    assert len(log) == len(data["t"])
+    kept = ~np.isin(np.arange(len(log)), [7, 200, 201])
+    np.testing.assert_array_equal(log["u"][kept], data["u"][kept])
+
+
 def test_two_runs_in_one_file_are_not_shuffled():
     data = columns()
     twice = {k: np.concatenate([v, v[100:300] + (0 if k == "t" else 1)]) for k, v in data.items()}
@@ -232,6 +242,7 @@ def test_two_runs_in_one_file_are_not_shuffled():
     [
         (lambda d: {"t": d["t"]}, "no position, heading, velocity or thruster column"),
         (lambda d: {k: v[:2] for k, v in d.items()}, "no position, heading"),
+        (lambda d: {"t": d["t"], "v_n": d["u"], "v_e": d["v"]}, "v_n, v_e alone: velocities need"),
         (lambda d: d | {"t": np.append(d["t"][:-1], 1e12)}, "1e.12 s, 2e.12 samples of 0.5 s, but"),
     ],
 )
@@ -317,6 +328,21 @@ def test_blocks_give_the_log_that_memory_gives(
         assert a[key] == b[key]
     if case != "disorder":
         assert sorted(a["read"]) == sorted(b["read"])
+
+
+@pytest.mark.parametrize("cells", [20_000_000, 0])
+@pytest.mark.parametrize("held", [True, False])
+def test_columns_n_and_e_of_a_file_of_any_size(tmp_path, monkeypatch, cells, held):
+    t = np.arange(400) * 0.5
+    north = 15.0 + t // 30 if held else 2 * t
+    table = pd.DataFrame({"t": t, "psi": 0.01 * t, "u": 2 + 0 * t, "n": north, "e": 0.5 * t})
+    table.to_csv(tmp_path / "raw.csv", index=False)
+    vessel = vessel_from_dict(
+        {"name": "S", "length": 30, "thruster": [{"type": "fixed", "speed": "rpm"}]}
+    )
+    monkeypatch.setattr(stream, "_LARGE_CELLS", cells)
+    import_files([tmp_path / "raw.csv"], vessel, tmp_path / "log.csv")
+    assert ("x_n" in pd.read_csv(tmp_path / "log.csv")) is not held
 
 
 def test_a_large_file_whose_time_starts_again(tmp_path, monkeypatch):

@@ -159,10 +159,7 @@ def table_recording(
     """Read the recognised columns of a table into a recording."""
     assigned = table_columns(table, vessel, guess=guess, alone=alone)
     batch = read_columns(table, [a.raw for a in assigned.values()])
-    if is_short_pair(assigned) and not all(
-        _moves_like_a_position(batch[assigned[n].raw]) for n in ("x_n", "y_n")
-    ):
-        assigned = {n: a for n, a in assigned.items() if n not in ("x_n", "y_n")}
+    assigned = without_false_positions(assigned, batch)
     time = assigned["t"]
     scale = time_scale(batch[time.raw], time, table)
     return whole_recording(table, batch, assigned, scale, vessel, alone=alone), assigned
@@ -237,6 +234,15 @@ def table_columns(
             f"vessel file's [columns]. Its columns: {', '.join(table.columns[:30])}."
         )
     return assigned
+
+
+def without_false_positions(assigned: dict[str, Assigned], batch: Batch) -> dict[str, Assigned]:
+    """Leave out columns ``n`` and ``e`` whose values do not change as positions do."""
+    if not is_short_pair(assigned):
+        return assigned
+    if all(_moves_like_a_position(batch[assigned[n].raw]) for n in ("x_n", "y_n")):
+        return assigned
+    return {n: a for n, a in assigned.items() if n not in ("x_n", "y_n")}
 
 
 def _moves_like_a_position(value: NDArray[Any]) -> bool:

@@ -101,10 +101,10 @@ def in_order(recording: Recording) -> Recording:
 def _order(
     t: Array, epoch: float, signal: str, name: str, notes: list[str]
 ) -> tuple[NDArray[np.int64], Array] | None:
-    steps = np.diff(t)
-    if (steps >= 0).all() and np.isfinite(t).all():
+    finite = np.isfinite(t)
+    if finite.all() and (np.diff(t) >= 0).all():
         return None
-    rows = np.flatnonzero(np.isfinite(t))
+    rows = np.flatnonzero(finite)
     ordered = t[rows]
     back = np.flatnonzero(np.diff(ordered) < 0)
     if len(back):

@@ -226,8 +226,8 @@ def complete_channels(
     Raises
     ------
     LogError
-        The wind is to be brought to a height and that of the anemometer is not known;
-        a channel that the log has not is to be smoothed.
+        Nothing can be made of them; the wind is to be brought to a height and that of the
+        anemometer is not known; a channel that the log has not is to be smoothed.
     """
     logged = (*LOGGED, *vessel.recorded_columns)
     measured = [n for n in options.smooth if n in part and n in logged]
@@ -236,6 +236,11 @@ def complete_channels(
     steps += motion
     steps += _wind(part, vessel, options, wind_state(before))
     channels = {n: part[n] for n in logged if n in part}
+    if not channels:
+        raise LogError(
+            f"no channel of a log can be made of {', '.join(part)} alone: velocities need the "
+            f"heading psi. Map more columns in [columns], or add the file that holds them."
+        )
     later = [n for n in options.smooth if n not in measured]
     steps += _smooth(channels, later, sample_time, options)
     trim = any(s.operation in ("difference", "local_polynomials") for s in motion)

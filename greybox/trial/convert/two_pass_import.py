@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import chain
+from itertools import chain, islice
 from typing import Any
 
 import numpy as np
@@ -25,9 +25,10 @@ from greybox.trial.convert.channel_mapping import (
     reading_steps,
     table_columns,
     unused_mappings,
+    without_false_positions,
     written_log,
 )
-from greybox.trial.convert.column_names import Assigned
+from greybox.trial.convert.column_names import Assigned, is_short_pair
 from greybox.trial.convert.convert import Conversion, Cut, cut_segments, make_provenance
 from greybox.trial.convert.deduplicate import clean_signals
 from greybox.trial.convert.derived_signals import derive_signals
@@ -96,6 +97,10 @@ def scan_table(table: TableFile, vessel: Vessel, options: ImportOptions) -> Scan
     """
     before, vessel = written_log(table.path, vessel)
     assigned = table_columns(table, vessel, guess=before is None)
+    if is_short_pair(assigned):
+        pair = [assigned["x_n"].raw, assigned["y_n"].raw]
+        for first in islice(table.batches(pair), 1):
+            assigned = without_false_positions(assigned, first)
     found = _Found(table, vessel, options, assigned)
     for batch in table.batches([a.raw for a in assigned.values()]):
         found.add(batch)

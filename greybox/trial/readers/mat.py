@@ -117,7 +117,8 @@ class _Reader:
         self.notes: list[str] = []
         self.found: list[_Found] = []
         self.times: list[_Time] = []
-        self.unreadable: list[str] = []
+        # what is said of the first value that cannot be read
+        self.unreadable = ""
         self.scalars = 0
 
     def note(self, text: str) -> None:
@@ -154,8 +155,9 @@ class _Reader:
 
     def _value(self, path: str, key: str, value: Any, scope: _Scope, tree: Tree) -> None:
         if isinstance(value, Unreadable):
-            self.unreadable.append(f"'{path}'")
-            self.note(f"'{path}' was left out: {value.reason}.")
+            said = f"'{path}' was left out: {value.reason}."
+            self.unreadable = self.unreadable or said
+            self.note(said)
         elif isinstance(value, dict):
             if key.casefold() in ("properties", "timeinfo", "datainfo"):
                 return
@@ -315,10 +317,7 @@ class _Reader:
         return unit.symbol
 
     def _objects(self) -> str:
-        if not self.unreadable:
-            return ""
-        reasons = [n for n in self.notes if "was left out" in n]
-        return f"{reasons[0][:-1]}. " if reasons else ""
+        return f"{self.unreadable} " if self.unreadable else ""
 
     def _no_time(self, tree: Tree) -> str:
         names = [f.name.rsplit(".", 1)[-1] for f in self.found]
