@@ -142,7 +142,8 @@ def _motion(recording: Recording, findings: Sequence[Finding]) -> Motion | None:
 def _reaches(f: Finding) -> bool:
     """Whether a finding changes what velocities and positions say, beyond single samples."""
     return any(
-        s.operation not in ("drop", "order") and set(s.channels) & set(NAMES) for s in f.repair
+        s.operation not in ("drop", "interpolate", "order") and set(s.channels) & set(NAMES)
+        for s in f.repair
     )
 
 

@@ -182,11 +182,32 @@ def _cut(recording: Recording, step: Step) -> Recording:
     return recording
 
 
-def _drop(recording: Recording, step: Step) -> Recording:
-    out = []
+def _signals_of(recording: Recording, step: Step) -> set[str]:
+    """Return the signals that hold the channels of a step, or of which they are derived."""
     names: set[str] = set()
     for n in step.channels:
         names |= {n} if n in recording else set(_MEASURED_AS.get(n, ()))
+    return names
+
+
+def _interpolate(recording: Recording, step: Step) -> Recording:
+    names, times = _signals_of(recording, step), np.array(step.numbers("times"))
+    out = []
+    for s in recording.signals:
+        if s.name in names:
+            bad = np.isin(s.t, times)
+            good = np.isfinite(s.value) & np.isfinite(s.t) & ~bad
+            if bad.any() and good.any():
+                value = s.value.copy()
+                value[bad] = np.interp(s.t[bad], s.t[good], s.value[good])
+                s = s.with_value(value)
+        out.append(s)
+    return recording.with_signals(out)
+
+
+def _drop(recording: Recording, step: Step) -> Recording:
+    out = []
+    names = _signals_of(recording, step)
     times = np.array(step.numbers("times"))
     shared: dict[tuple[int, bytes], Array] = {}
     for s in recording.signals:
@@ -289,8 +310,8 @@ _MEASURED_AS = {
     "u_q": ("V_q", "gamma_q", "dir_q"), "v_q": ("V_q", "gamma_q", "dir_q"),
 }  # fmt: skip
 _ACTIONS = {
-    "order": _order, "drop": _drop, "cut": _cut, "scale": _scale, "offset": _offset,
-    "exchange": _exchange, "shift": _shift, "turn_heading": _turn_heading,
+    "order": _order, "drop": _drop, "interpolate": _interpolate, "cut": _cut, "scale": _scale,
+    "offset": _offset, "exchange": _exchange, "shift": _shift, "turn_heading": _turn_heading,
     "earth_to_body": _earth_to_body, "move_antenna": _move_antenna,
     "pad_fractions": _pad_fractions,
 }  # fmt: skip

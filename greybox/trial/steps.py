@@ -205,6 +205,7 @@ OPERATIONS: dict[str, Callable[[Step], str]] = {
     # signals on their own clocks
     "order": lambda s: f"rows of {_names(s)} put in order of time, each time once",
     "drop": lambda s: f"samples of {_names(s)} left out",
+    "interpolate": lambda s: f"samples of {_names(s)} interpolated between their neighbours",
     "cut": lambda s: f"log cut where {_names(s)} begin anew, at t = {_times(s)} s",
     "scale": lambda s: f"{_names(s)} multiplied by {s.number('factor'):.6g}",
     "offset": lambda s: f"{s.number('offset'):+.6g} added to {_names(s)}",

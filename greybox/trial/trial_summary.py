@@ -21,6 +21,9 @@ _SHORTEST = 5.0
 _MARGIN = 0.1
 # samples after a cut within which a manoeuvre begins on it
 _AFTER_CUT = 5
+# a step of the position by less than this share of the length does not end a manoeuvre, whose
+# quantities are told in lengths: it is a receiver that corrects itself, not another recording
+_SMALL_STEP = 0.1
 
 
 @dataclass(frozen=True, repr=False)
@@ -107,8 +110,14 @@ def describe_recording(recording: Recording, vessel: Vessel) -> Contents:
     Contents
         Manoeuvres and sign regimes; ``note`` says why where there are none.
     """
+    small = _SMALL_STEP * vessel.length
+    kept = (
+        s
+        for s in recording.steps
+        if s.operation != "cut" or "size" not in s.parameters or s.number("size") >= small
+    )
     try:
-        segments = import_recording(recording, vessel).segments
+        segments = import_recording(replace(recording, steps=tuple(kept)), vessel).segments
         found = describe_logs(segments)
     except GreyboxError as error:
         return Contents(note=str(error))

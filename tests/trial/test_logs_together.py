@@ -156,9 +156,9 @@ def test_mends_that_contradict_are_refused_with_both_values(ship):
 def test_a_mend_that_would_leave_too_little_is_refused_with_both_numbers(ship):
     (r,) = logs_of([70], seconds=60.0)
     times = tuple(float(t) for t in r["psi"].t[2:])
-    with pytest.raises(LogError, match="of psi .* leave 2 of its 121 samples"):
+    with pytest.raises(LogError, match=r"of psi .* leave 2 of its 121 samples"):
         repair(r, ship, planted(mend("drop", ("psi",), times=times), ids=("outlier",)))
-    with pytest.raises(LogError, match="of psi .* leave 0 of its 121 samples"):
+    with pytest.raises(LogError, match=r"of psi .* leave 0 of its 121 samples"):
         repair(r, ship, planted(mend("shift", ("psi",), late=600.0)))
 
 

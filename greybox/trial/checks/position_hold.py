@@ -126,10 +126,9 @@ def hold_findings(recording: Recording) -> list[Finding]:
             f"before to the last digit under way, the first at t = {t[rows[0]]:.6g} s, most in a "
             f"row {longest[1]} at t = {t[longest[0]]:.6g} s, where the ship went "
             f"{missed:.3g} m meanwhile: the receiver's messages came late",
-            "leave those samples out (import --fix does; what is missing is bridged where one "
-            "sample is, else a gap)",
+            "interpolate those samples between their neighbours (import --fix does)",
             ("x_n", "y_n"),
-            (mend("drop", ("x_n", "y_n"), times=tuple(float(x) for x in t[rows])),),
+            (mend("interpolate", ("x_n", "y_n"), times=tuple(float(x) for x in t[rows])),),
             True,
             {
                 "t": t, "x_n": track.p[:, 0], "y_n": track.p[:, 1], "held": rows,

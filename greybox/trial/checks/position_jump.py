@@ -83,7 +83,7 @@ def jump_findings(recording: Recording) -> list[Finding]:
                 "cut the log there (import --fix does: what follows is a segment of its own), or "
                 "correct the origin of one part",
                 ("x_n", "y_n"),
-                (mend("cut", ("x_n", "y_n"), times=(jump.after,)),),
+                (mend("cut", ("x_n", "y_n"), times=(jump.after,), size=size),),
                 True,
                 {
                     "t": track.t, "x_n": track.p[:, 0], "y_n": track.p[:, 1],

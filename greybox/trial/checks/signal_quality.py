@@ -12,7 +12,7 @@ from greybox.rotation import body_to_ned
 from greybox.trial.checks.finding import Finding
 from greybox.trial.convert.derived_signals import continuous
 from greybox.trial.convert.resample import clock, runs
-from greybox.trial.gaps import GAP, HOLE
+from greybox.trial.gaps import GAP, HOLE, usual_step
 from greybox.trial.raw_log import Recording, Signal
 from greybox.trial.steps import mend
 from greybox.vessel.vessel import Vessel
@@ -25,6 +25,10 @@ MOTION = ("x_n", "y_n", "psi", "u", "v", "r", "v_n", "v_e", "u_q", "v_q")
 _SPIKE = 10.0
 _LOCAL_SPIKE = 7.0
 _SPIKE_WIDTH = 3
+# rounds in which spikes that stood beside larger ones come out
+_ROUNDS = 5
+# samples of an even clock over those recorded, beyond which a log is mostly gaps
+_MOST_BRIDGED = 2.0
 # a coarse signal has steps larger than its noise, and large enough to matter
 _LEAST_STEP = 1.2
 _MATERIAL = {
@@ -177,8 +181,7 @@ def spike_findings(recording: Recording) -> list[Finding]:
         t, value = clean(s)
         if len(value) < 30 or significant_digits(_wrapped(s)):
             continue
-        spikes, scale, gap = _spikes(value)
-        spikes = spikes[np.abs(gap[spikes]) > _worth(s.name, value)]
+        spikes, scale, gap = _spikes_bridged(t, value, _worth(s.name, value))
         if not len(spikes):
             continue
         worst = spikes[np.argmax(np.abs(gap[spikes]))]
@@ -216,6 +219,32 @@ def _worth(name: str, value: Array) -> float:
         # gusts have heavy tails
         return 0.5 * spread
     return 0.005 if name == "psi" else 0.03 * spread
+
+
+def _spikes_bridged(t: Array, value: Array, least: float) -> tuple[NDArray[np.int64], float, Array]:
+    """Return what `_spikes` finds beyond `least` on the even clock that an import makes.
+
+    Samples that were left out are bridged there; a spike hides smaller ones beside it, which
+    show once it is bridged too.
+    """
+    period = usual_step(t)
+    rows = np.arange(len(t))
+    if period > 0 and 0 <= t[-1] - t[0] < _MOST_BRIDGED * len(t) * period:
+        likely = np.round((t - t[0]) / period).astype(np.int64)
+        rows = likely if (np.diff(likely) > 0).all() else rows
+    even = np.interp(np.arange(rows[-1] + 1), rows, value)
+    found = np.zeros(len(t), bool)
+    scale, distance = 0.0, np.zeros(len(t))
+    for _ in range(_ROUNDS):
+        spikes, now, gap = _spikes(even)
+        fresh = np.isin(rows, spikes[np.abs(gap[spikes]) > least]) & ~found
+        scale = scale or now
+        distance = np.where(found, distance, gap[rows])
+        if not fresh.any():
+            break
+        found |= fresh
+        even = np.interp(np.arange(rows[-1] + 1), rows[~found], value[~found])
+    return np.flatnonzero(found), scale, distance
 
 
 def _spikes(value: Array) -> tuple[NDArray[np.int64], float, Array]:
