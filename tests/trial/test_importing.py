@@ -381,3 +381,9 @@ def test_a_log_is_read_again_as_it_was_written(tmp_path, ending):
     record = tmp_path / f"log.{ending}.json"
     record.write_text("{" * 10000)
     assert read_segments(log, mapped)[0]["v"][0] != segments[0]["v"][0]
+
+
+def test_the_old_name_of_the_longest_gap_still_works():
+    with pytest.warns(DeprecationWarning, match="max_gap"):
+        assert ImportOptions(hole=3.0).max_gap == 3.0
+    assert ImportOptions(max_gap=2.0).max_gap == 2.0

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import InitVar, dataclass, field
 
 from greybox.vessel.conditions import Conditions
 
@@ -32,6 +33,8 @@ class ImportOptions:
     smooth : mapping of str to float
         Window [s] of the local polynomials for each channel of the log that is to be
         smoothed; none by default.
+    hole : float, optional
+        Deprecated name of `max_gap`.
 
     Raises
     ------
@@ -47,8 +50,12 @@ class ImportOptions:
     origin: tuple[float, float] | None = None
     notes: Mapping[str, str] = field(default_factory=dict)
     smooth: Mapping[str, float] = field(default_factory=dict)
+    hole: InitVar[float | None] = None
 
-    def __post_init__(self) -> None:
+    def __post_init__(self, hole: float | None) -> None:
+        if hole is not None:
+            warnings.warn("'hole' is called 'max_gap'", DeprecationWarning, stacklevel=3)
+            object.__setattr__(self, "max_gap", hole)
         # a condition that cannot be read is told before any file is
         Conditions.read(self.notes)
 
