@@ -238,7 +238,7 @@ class Diagnosis(DisplayMixin):
         return f"{VERDICTS[self.verdict][0].upper()}{VERDICTS[self.verdict][1:]}."
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the diagnosis as CONTRACT's JSON, with more beside."""
+        """Return the diagnosis as the documented JSON, with more beside."""
         return {
             "verdict": self.verdict,
             "causes": [c.to_dict() for c in self.causes],

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.rotation import ned_to_body
-from greybox.trial.checks.motion import Motion, smooth, turn
+from greybox.trial.checks.motion import Motion, smooth, to_ned
 
 Array = NDArray[np.float64]
 
@@ -151,9 +151,9 @@ def smoothed(motion: Motion, widths: Widths, guide: Motion) -> Smoothed:
     if "u" in motion and "v" in motion and "psi" in guide:
         psi = np.interp(motion.t, guide.t, guide["psi"])
         slow = smooth(psi, motion, widths.heading)
-        over = turn(psi, motion["u"], motion["v"])
+        over = to_ned(psi, motion["u"], motion["v"])
         north, east = (smooth(over[:, k], motion, widths.position) for k in (0, 1))
-        back = turn(-slow, north, east)
+        back = to_ned(-slow, north, east)
         rates["u"], rates["v"] = back[:, 0], back[:, 1]
     if "psi" in motion:
         rates["psi"] = smooth(motion["psi"], motion, widths.heading)

@@ -19,7 +19,13 @@ from greybox.report.checks import alternative, caption, check_page, finding_figu
 from greybox.report.figures import to_svg
 from greybox.trial.checks.course import course_findings
 from greybox.trial.checks.finding import IDS, CheckReport, Finding, Outcome
-from greybox.trial.checks.frame_sign_unit import _PSI, _RATE, _VELOCITY, Reading, reading_findings
+from greybox.trial.checks.frame_sign_unit import (
+    _PSI,
+    _RATE,
+    _VELOCITY,
+    ColumnReading,
+    reading_findings,
+)
 from greybox.trial.checks.heading_wrap import wrap_findings
 from greybox.trial.checks.motion import make_motion
 from greybox.trial.checks.position_hold import hold_findings
@@ -99,7 +105,7 @@ def reading_case(name):
     else:
         change, c["psi"] = _PSI[0], -psi
     recording = as_recording(c)
-    reading = Reading((change,), make_motion(recording), 100.0)
+    reading = ColumnReading((change,), make_motion(recording), 100.0)
     return report_of(reading_findings(reading), recording)
 
 

@@ -428,3 +428,21 @@ def test_readings_of_long_logs_are_judged_on_parts_of_them(ship, monkeypatch, la
     monkeypatch.setattr("greybox.trial.checks.frame_sign_unit._EXCERPT", 400)
     report = check_recording(as_recording(recorded(4, rate=2.0, seconds=600, late=late)), ship)
     assert {f.id for f in report.findings} == ({"clock_offset"} if late else set())
+
+
+def test_a_file_named_twice_is_no_second_log(tmp_path, ship):
+    path = tmp_path / "a.csv"
+    columns = recorded(7, 1.0, seconds=120.0)
+    np.savetxt(
+        path, np.column_stack([*columns.values()]), delimiter=",", header=",".join(columns),
+        comments="",
+    )  # fmt: skip
+    with pytest.raises(UsageError, match=r"'a\.csv' is named 2 times"):
+        check_files([path, path.parent / "." / "a.csv"], ship)
+
+
+def test_without_positions_nothing_is_said_of_them(ship):
+    columns = recorded(7, 1.0, seconds=120.0)
+    log = as_recording({k: v for k, v in columns.items() if k not in ("x_n", "y_n")})
+    said = {o.id: o.status for o in check_recording(log, ship).outcomes}
+    assert said["position_jump"] == said["position_hold"] == "cannot tell"

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from greybox.errors import UsageError
 from greybox.trial.actuator_estimate import ActuatorEstimate
 from greybox.trial.checks.actuators import measure_actuators
 from greybox.trial.checks.course import course_findings
@@ -90,7 +91,16 @@ def check_files(paths: Sequence[str | Path], vessel: Vessel) -> list[CheckReport
     ------
     LogError
         A file cannot be read.
+    UsageError
+        A file is named twice: its evidence would count twice.
     """
+    places = [Path(path).resolve() for path in paths]
+    twice = next((p for p in places if places.count(p) > 1), None)
+    if twice is not None:
+        raise UsageError(
+            f"'{twice.name}' is named {places.count(twice)} times and would count as as many "
+            f"logs: name each log once."
+        )
     return check_recordings([read_recording(path, vessel) for path in paths], vessel)
 
 
@@ -162,6 +172,9 @@ def _signal_quality(recording: Recording, vessel: Vessel) -> _Log:
         ]
     )
     log.add(jump_findings(_independent(log.mended)))
+    if not {"x_n", "y_n"} <= set(whole.names):
+        missing = "needs positions, which the log has not"
+        log.say([Outcome(i, "cannot tell", missing) for i in ("position_hold", "position_jump")])
     log.motion = make_motion(_independent(log.mended))
     return log
 

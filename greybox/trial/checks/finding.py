@@ -78,7 +78,7 @@ class Finding(DisplayMixin):
         return f"{self.id} ({', '.join(self.channels or (self.channel,))}): {size_in_words(self)}"
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the finding as CONTRACT's JSON, with `channels`, `safe` and `logs` beside."""
+        """Return the finding as the documented JSON, with `channels`, `safe` and `logs` beside."""
         vector = isinstance(self.value, tuple)
         pooled = {"logs": list(self.logs)} if len(self.logs) > 1 else {}
         return {
@@ -173,7 +173,7 @@ class CheckReport(DisplayMixin):
         )  # fmt: skip
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the report as CONTRACT's JSON, with `checks` and `notes` beside."""
+        """Return the report as the documented JSON, with `checks` and `notes` beside."""
         return {
             "log": self.name,
             "findings": [f.to_dict() for f in self.findings],

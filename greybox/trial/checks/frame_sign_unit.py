@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.trial.checks.finding import Finding, Outcome
-from greybox.trial.checks.motion import Motion, integrate, profile, turn
+from greybox.trial.checks.motion import Motion, integrate, profile, to_ned
 from greybox.trial.convert.derived_signals import continuous
 from greybox.trial.steps import Step, mend
 from greybox.units import UNITS
@@ -37,7 +37,7 @@ _KNOT = UNITS["kn"].factor
 
 
 @dataclass(frozen=True)
-class Change:
+class ColumnHypothesis:
     """One alternative reading of some columns.
 
     Parameters
@@ -79,8 +79,8 @@ def _permuted(names: tuple[str, ...]) -> Callable[[Values], Values]:
     return lambda x: {**x, a: x[b], b: x[a]}
 
 
-def _sign(*names: str, group: str, cost: float = 1.0) -> Change:
-    return Change(
+def _sign(*names: str, group: str, cost: float = 1.0) -> ColumnHypothesis:
+    return ColumnHypothesis(
         "sign", group, names, _scaled(names, -1.0), (mend("scale", names, factor=-1.0),),
         f"{' and '.join(names)} {'is' if len(names) == 1 else 'are'} reversed",
         f"change the sign of {' and '.join(names)} (import --fix does), or map it with sign = -1",
@@ -88,8 +88,10 @@ def _sign(*names: str, group: str, cost: float = 1.0) -> Change:
     )  # fmt: skip
 
 
-def _unit(names: tuple[str, ...], group: str, factor: float, said: str, held: str) -> Change:
-    return Change(
+def _unit(
+    names: tuple[str, ...], group: str, factor: float, said: str, held: str
+) -> ColumnHypothesis:
+    return ColumnHypothesis(
         "unit", group, names, _scaled(names, factor), (mend("scale", names, factor=factor),),
         f"{' and '.join(names)} {'holds' if len(names) == 1 else 'hold'} {held} under a {said} "
         f"name",
@@ -98,8 +100,8 @@ def _unit(names: tuple[str, ...], group: str, factor: float, said: str, held: st
     )  # fmt: skip
 
 
-def _swap(a: str, b: str, *, group: str, words: str = "") -> Change:
-    return Change(
+def _swap(a: str, b: str, *, group: str, words: str = "") -> ColumnHypothesis:
+    return ColumnHypothesis(
         "sign", group, (a, b), _permuted((a, b)), (mend("exchange", (a, b)),),
         f"{a} and {b} are swapped{words}",
         f"exchange {a} and {b} (import --fix does), or correct [columns]",
@@ -107,13 +109,13 @@ def _swap(a: str, b: str, *, group: str, words: str = "") -> Change:
     )  # fmt: skip
 
 
-def _earth(names: tuple[str, str], words: str) -> Change:
+def _earth(names: tuple[str, str], words: str) -> ColumnHypothesis:
     def apply(x: Values) -> Values:
         north, east = x[names[0]], x[names[1]]
         c, s = np.cos(x["psi"]), np.sin(x["psi"])
         return {**x, "u": c * north + s * east, "v": c * east - s * north}
 
-    return Change(
+    return ColumnHypothesis(
         "frame", "velocity", ("u", "v"), apply, (mend("earth_to_body", names),),
         f"u and v are velocities {words}, not along the body's axes",
         "turn them by the heading into body axes (import --fix does), or map them to "
@@ -128,19 +130,19 @@ def _degrees(x: Values) -> Values:
 
 _PSI = (
     _sign("psi", group="psi"),
-    Change(
+    ColumnHypothesis(
         "frame", "psi", ("psi",), lambda x: {**x, "psi": np.pi / 2 - x["psi"]},
         (mend("scale", ("psi",), factor=-1.0), mend("offset", ("psi",), offset=np.pi / 2)),
         "psi counts from east, anticlockwise, not from north, clockwise",
         "replace psi by pi/2 - psi (import --fix does)", 0.0, "1",
     ),
-    Change(
+    ColumnHypothesis(
         "unit", "psi", ("psi",), _degrees, (mend("scale", ("psi",), factor=_DEG),),
         "psi holds degrees under a radian name",
         "multiply psi by pi/180 (import --fix does), or map it with unit = \"deg\" in [columns]",
         180 / np.pi, "deg per rad",
     ),
-    Change(
+    ColumnHypothesis(
         "sign", "psi", ("psi",), lambda x: {**x, "psi": x["psi"] + np.pi},
         (mend("offset", ("psi",), offset=np.pi),),
         "psi points astern",
@@ -181,12 +183,12 @@ _CHANGES = (*_PSI, *_RATE, *_VELOCITY, *_POSITION, *_ACROSS)
 
 
 @dataclass(frozen=True)
-class Reading:
+class ColumnReading:
     """The reading of a log's columns that the kinematics agree with.
 
     Parameters
     ----------
-    changes : tuple of Change
+    changes : tuple of ColumnHypothesis
         Empty where the log is as its names say.
     motion : Motion
         Read so.
@@ -198,14 +200,14 @@ class Reading:
         Whether this log follows logs that agree, or tells by itself.
     """
 
-    changes: tuple[Change, ...]
+    changes: tuple[ColumnHypothesis, ...]
     motion: Motion
     gain: float
     logs: tuple[int, ...] = (0,)
     sure: bool = True
 
 
-def find_readings(motions: Sequence[Motion]) -> list[Reading]:
+def find_readings(motions: Sequence[Motion]) -> list[ColumnReading]:
     """Choose among the readings of the columns, of all logs of one ship together.
 
     Parameters
@@ -215,7 +217,7 @@ def find_readings(motions: Sequence[Motion]) -> list[Reading]:
 
     Returns
     -------
-    list of Reading
+    list of ColumnReading
         Fewest changes first: each must gain 15 in log-likelihood (a chance of
         1e-7) and shrink the residual by 15 %. A log that contradicts the
         others by as much is read by itself.
@@ -239,14 +241,14 @@ def find_readings(motions: Sequence[Motion]) -> list[Reading]:
 def _reading(
     i: int, motion: Motion, logs: Sequence[_Alternatives], key: Key, together: tuple[int, ...],
     divided: bool,
-) -> Reading:  # fmt: skip
+) -> ColumnReading:  # fmt: skip
     mine = logs[i]
     changes = tuple(c for c in _changes([logs[k] for k in together], key) if mine.applies(c))
     if not changes:
-        return Reading((), motion, 0.0, together)
+        return ColumnReading((), motion, 0.0, together)
     gain = sum(logs[k].gain(key) for k in together)
-    sure = not divided or mine.gain(key) >= _LEAST_GAIN * mine.inflation
-    return Reading(changes, read(motion, changes), gain, together, sure)
+    sure = not divided or mine.gain(key) >= _LEAST_GAIN * mine.sample_correlation_factor
+    return ColumnReading(changes, read(motion, changes), gain, together, sure)
 
 
 def _decide(logs: Sequence[_Alternatives]) -> Key:
@@ -254,7 +256,7 @@ def _decide(logs: Sequence[_Alternatives]) -> Key:
     costs: dict[Key, float] = {}
     for log in logs:
         costs |= {key: cost for key, (_, _, cost) in log.ranked.items()}
-    penalty = _LEAST_GAIN * max(log.inflation for log in logs)
+    penalty = _LEAST_GAIN * max(log.sample_correlation_factor for log in logs)
     worth = {key: sum(log.gain(key) for log in logs) - penalty * c for key, c in costs.items()}
     key = max(worth, key=lambda k: worth[k])
     changes = _changes(logs, key)
@@ -278,7 +280,7 @@ def _decide(logs: Sequence[_Alternatives]) -> Key:
     return tuple(c.words for c in kept)
 
 
-def _changes(logs: Sequence[_Alternatives], key: Key) -> tuple[Change, ...]:
+def _changes(logs: Sequence[_Alternatives], key: Key) -> tuple[ColumnHypothesis, ...]:
     for log in logs:
         if key in log.ranked:
             return log.ranked[key][0]
@@ -290,12 +292,12 @@ def _contradicts(log: _Alternatives, key: Key) -> bool:
     own = _decide([log])
     if own == key:
         return False
-    penalty = _LEAST_GAIN * log.inflation
+    penalty = _LEAST_GAIN * log.sample_correlation_factor
     cost = log.ranked[own][2] - log.ranked[key][2] if key in log.ranked else 0.0
     return log.gain(own) - log.gain(key) > penalty * (1.0 + cost)
 
 
-def read(motion: Motion, changes: tuple[Change, ...]) -> Motion:
+def read(motion: Motion, changes: tuple[ColumnHypothesis, ...]) -> Motion:
     """Return the motion with its columns read otherwise."""
     values = dict(motion.values)
     for change in sorted(changes, key=_order):
@@ -303,12 +305,12 @@ def read(motion: Motion, changes: tuple[Change, ...]) -> Motion:
     return replace(motion, values=values)
 
 
-def reading_findings(reading: Reading, names: Sequence[str] = ()) -> list[Finding]:
+def reading_findings(reading: ColumnReading, names: Sequence[str] = ()) -> list[Finding]:
     """Return one finding for each change of a reading.
 
     Parameters
     ----------
-    reading : Reading
+    reading : ColumnReading
     names : sequence of str
         Of all logs that were read together.
     """
@@ -356,24 +358,24 @@ def frame_outcomes(motion: Motion | None) -> list[Outcome]:
     return [Outcome(i, "clean", " and ".join(seen)) for i in ("unit", "frame", "sign")]
 
 
-def _turned(m: Motion) -> Change:
+def _turned(m: Motion) -> ColumnHypothesis:
     """Return the change that turns the heading by the angle that fits best."""
     angle = 0.0
     if m.positioned:
         span = max(1, round(_TURN_SECONDS / m.step))
-        walked = integrate(turn(m["psi"], m["u"], m["v"]), m)
+        walked = integrate(to_ned(m["psi"], m["u"], m["v"]), m)
         way = (m["x_n"] + 1j * m["y_n"])[span:] - (m["x_n"] + 1j * m["y_n"])[:-span]
         by = (walked[:, 0] + 1j * walked[:, 1])[span:] - (walked[:, 0] + 1j * walked[:, 1])[:-span]
         for a, _ in m.stretches[1:]:
             way[max(a - span, 0) : a] = 0
         angle = float(np.angle(np.vdot(by, way)))
-    return Change(
+    return ColumnHypothesis(
         "sign", "turned", ("psi",), lambda x: {**x, "psi": x["psi"] + angle}, (),
         f"turned by {angle:.6f}", "", angle, "rad", cost=1.3,
     )  # fmt: skip
 
 
-def _late(motion: Motion) -> list[Change]:
+def _late(motion: Motion) -> list[ColumnHypothesis]:
     """Return readings with some channels moved in time, so that lateness is no frame or unit."""
 
     # by whole samples: between samples the noise would be averaged, which looks like agreement
@@ -399,16 +401,16 @@ def _late(motion: Motion) -> list[Change]:
             if steps == 0:
                 continue
             found.append(
-                Change(
+                ColumnHypothesis(
                     "sign", "late", names, shifted(names, steps), (), words, "", late, "s", cost=1.3
                 )
             )
     return found
 
 
-def _silent(changes: tuple[Change, ...]) -> Change:
+def _silent(changes: tuple[ColumnHypothesis, ...]) -> ColumnHypothesis:
     names = tuple(n for c in changes for n in c.channels if n in ("u", "v", "r"))
-    return Change(
+    return ColumnHypothesis(
         "sign", "silent", names, _scaled(names, 0.0), (),
         f"without {', '.join(names)}", "",
     )  # fmt: skip
@@ -426,9 +428,11 @@ class _Alternatives:
         self.motion = motion = motion.coarser(_STEP).excerpt(_EXCERPT)
         self.cache: dict[tuple[str, Key], float] = {}
         # neighbouring samples of a fast log say the same: its likelihood counts them all
-        self.inflation = max(1.0, 0.5 / motion.step / 5)
+        self.sample_correlation_factor = max(1.0, 0.5 / motion.step / 5)
         self.base = self.score(())
-        self.ranked: dict[Key, tuple[tuple[Change, ...], float, float]] = {(): ((), 0.0, 0.0)}
+        self.ranked: dict[Key, tuple[tuple[ColumnHypothesis, ...], float, float]] = {
+            (): ((), 0.0, 0.0)
+        }
         usable = [c for c in _CHANGES if self.applies(c)]
         for c in usable:
             self._rank((c,))
@@ -440,7 +444,7 @@ class _Alternatives:
             if a.group != b.group and not set(a.channels) & set(b.channels):
                 self._rank((a, b))
 
-    def _rank(self, changes: tuple[Change, ...], key: Key | None = None) -> None:
+    def _rank(self, changes: tuple[ColumnHypothesis, ...], key: Key | None = None) -> None:
         words = key or tuple(c.words for c in changes)
         gain = self.score(changes) - self.base
         self.ranked[words] = (changes, gain, sum(c.cost for c in changes))
@@ -449,7 +453,7 @@ class _Alternatives:
         """Return the log-likelihood that a reading gains; nothing where it does not apply."""
         return self.ranked[key][1] if key in self.ranked else 0.0
 
-    def judging(self, changes: tuple[Change, ...]) -> int:
+    def judging(self, changes: tuple[ColumnHypothesis, ...]) -> int:
         """Return how many residuals can tell about these changes."""
         channels = {c for change in changes for c in change.channels}
         n = len(self.motion)
@@ -457,14 +461,14 @@ class _Alternatives:
         heading = self.motion.turned and bool(channels & {"psi", "r"})
         return 2 * n * position + n * heading
 
-    def applies(self, change: Change) -> bool:
+    def applies(self, change: ColumnHypothesis) -> bool:
         if not all(c in self.motion for c in change.channels):
             return False
         if change.group in ("velocity", "position", "speed", "length"):
             return self.motion.positioned
         return self.motion.positioned or self.motion.turned
 
-    def score(self, changes: tuple[Change, ...]) -> float:
+    def score(self, changes: tuple[ColumnHypothesis, ...]) -> float:
         as_read = read(self.motion, changes)
         total = 0.0
         if as_read.positioned:
@@ -473,7 +477,7 @@ class _Alternatives:
             total += self._cached("heading", changes, as_read)
         return total
 
-    def _cached(self, what: str, changes: tuple[Change, ...], as_read: Motion) -> float:
+    def _cached(self, what: str, changes: tuple[ColumnHypothesis, ...], as_read: Motion) -> float:
         relevant = {"x_n", "y_n", "u", "v", "psi"} if what == "position" else {"psi", "r"}
         key = (what, tuple(c.words for c in changes if set(c.channels) & relevant))
         if key not in self.cache:
@@ -482,7 +486,7 @@ class _Alternatives:
         return self.cache[key]
 
 
-def _order(change: Change) -> int:
+def _order(change: ColumnHypothesis) -> int:
     # the heading must be right before velocities are turned by it
     if change.group in ("turned", "silent", "late"):
         return 2
@@ -490,7 +494,7 @@ def _order(change: Change) -> int:
 
 
 def _position_score(m: Motion) -> float:
-    walked = integrate(turn(m["psi"], m["u"], m["v"]), m)
+    walked = integrate(to_ned(m["psi"], m["u"], m["v"]), m)
     position = np.column_stack([m["x_n"], m["y_n"]])
     drift = (m.t - m.t[0])[:, None]
     # a reading is judged per metre, so that one in kilometres has no advantage

@@ -310,6 +310,6 @@ def denoise(value: Array, motion: Motion) -> Array:
     return slow + smooth(value - slow, motion, chosen * motion.step)
 
 
-def turn(psi: Array, forward: Array, starboard: Array) -> Array:
+def to_ned(psi: Array, forward: Array, starboard: Array) -> Array:
     """Return north and east (N, 2) of body components."""
     return np.column_stack(body_to_ned(forward, starboard, psi))

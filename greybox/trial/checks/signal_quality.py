@@ -347,8 +347,8 @@ def coarse_findings(recording: Recording) -> list[Finding]:
         digits = significant_digits(times)
         steps = np.diff(np.unique(times))
         # an even clock looks rounded too, when its step is
-        uneven = np.mean(np.abs(steps - np.median(steps)) > 0.3 * np.median(steps))
-        if digits and uneven > 0.2:
+        usual = float(np.median(steps)) if len(steps) else 0.0
+        if digits and np.mean(np.abs(steps - usual) > 0.3 * usual) > 0.2:
             found.append(_rounded_finding("t", times, times, "s", digits))
     for s in _motion(recording):
         t, value = clean(s)

@@ -100,8 +100,8 @@ def response_findings(
         )
         if clear and lost < _MOST_LOSS * won and (best is None or gain > best[0]):
             best = (gain, alternative)
-    inflation = max(1.0, 0.2 / motion.step)
-    if best is None or best[0] < _LEAST_GAIN * inflation:
+    sample_correlation_factor = max(1.0, 0.2 / motion.step)
+    if best is None or best[0] < _LEAST_GAIN * sample_correlation_factor:
         return []
     gain, a = best
     single = len(a.repair[0].channels) == 1

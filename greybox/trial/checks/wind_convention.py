@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.trial.checks.finding import Finding
-from greybox.trial.checks.motion import make_motion, smooth, turn
+from greybox.trial.checks.motion import make_motion, smooth, to_ned
 from greybox.trial.raw_log import Recording
 from greybox.trial.steps import Step, mend
 
@@ -51,7 +51,7 @@ _CONVENTIONS: tuple[Convention, ...] = (
 
 
 def wind_findings(recording: Recording, findings: list[Finding]) -> list[Finding]:
-    """Find a wind in another convention than CONTRACT's.
+    """Find a wind in another convention than the documented one.
 
     The air over ground, v_air = R(ψ)(ν − ν_q), does not turn with the ship. Of
     the conventions that people use, the one that leaves it steadiest is right,
@@ -73,7 +73,7 @@ def wind_findings(recording: Recording, findings: list[Finding]) -> list[Finding
     u, v, u_q, v_q = (smooth(motion[n], motion, 2.0) for n in ("u", "v", "u_q", "v_q"))
 
     def scatter(through: Array) -> float:
-        air = turn(psi, u - through.real, v - through.imag)
+        air = to_ned(psi, u - through.real, v - through.imag)
         # gusts are slower than a block, turns are not: both count alike in every convention
         return float(np.sum(np.var(air, axis=0)))
 
@@ -102,8 +102,8 @@ def wind_findings(recording: Recording, findings: list[Finding]) -> list[Finding
             {
                 "t": motion.t,
                 "psi": psi,
-                "air": turn(psi, u - u_q, v - v_q),
-                "air_mended": turn(psi, u - through.real, v - through.imag),
+                "air": to_ned(psi, u - u_q, v - v_q),
+                "air_mended": to_ned(psi, u - through.real, v - through.imag),
             },
         )
     ]

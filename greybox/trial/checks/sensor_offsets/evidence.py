@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.trial.checks.motion import GAINS, outlier_weights, solve, whiten, without_starts
-from greybox.trial.checks.sensor_offsets.model import BIAS, CLOCKS, SIZE, Residuals, Tie
+from greybox.trial.checks.sensor_offsets.model import BIAS, CLOCKS, SIZE, KinematicModel, Residuals
 
 Array = NDArray[np.float64]
 
@@ -53,7 +53,7 @@ class Evidence:
 class Likelihood:
     """Whitened residuals of one log, with gains and weights as they fit at some offsets."""
 
-    def __init__(self, tie: Tie) -> None:
+    def __init__(self, tie: KinematicModel) -> None:
         self.tie = tie
         self._blocks: list[tuple[float, float, Array]] = []
 
@@ -175,12 +175,14 @@ def fit(likelihood: Likelihood, start: Array, prior: Array) -> Array:
     return offsets
 
 
-def search(tie: Tie, coarse: Tie, prior: Array, near: Array | None = None) -> Array:
+def search(
+    tie: KinematicModel, coarse: KinematicModel, prior: Array, near: Array | None = None
+) -> Array:
     """Return the offsets of one log, large ones too, looked for on a coarse grid of clocks.
 
     Parameters
     ----------
-    tie, coarse : Tie
+    tie, coarse : KinematicModel
         Of the log, and of means over longer blocks, on which the scan runs.
     prior : ndarray
         (2, `SIZE`), see `fit`.
@@ -206,7 +208,7 @@ def search(tie: Tie, coarse: Tie, prior: Array, near: Array | None = None) -> Ar
     return fit(fine, best, prior)
 
 
-def _places(tie: Tie, offsets: Array) -> list[tuple[Array, bool]]:
+def _places(tie: KinematicModel, offsets: Array) -> list[tuple[Array, bool]]:
     found = []
     for names in _TOGETHER:
         rows = [CLOCKS.index(n) for n in names if CLOCKS.index(n) in tie.free]
@@ -223,7 +225,7 @@ def _places(tie: Tie, offsets: Array) -> list[tuple[Array, bool]]:
     return found
 
 
-def expand(tie: Tie, offsets: Array) -> Evidence:
+def expand(tie: KinematicModel, offsets: Array) -> Evidence:
     """Return the quadratic likelihood of one log around some offsets (`SIZE`,)."""
     likelihood = Likelihood(tie)
     tie.align(offsets)
@@ -274,7 +276,7 @@ def _embedded(offsets: Array, free: NDArray[np.int64], information: Array, pull:
     return Evidence(offsets, wide, long)
 
 
-def coarse_tie(tie: Tie) -> Tie:
+def coarse_tie(tie: KinematicModel) -> KinematicModel:
     """Return the tie of means over longer blocks, to look for large offsets."""
     coarser = tie.motion.coarser(_SCAN_STEP)
-    return tie if coarser is tie.motion else Tie(coarser)
+    return tie if coarser is tie.motion else KinematicModel(coarser)

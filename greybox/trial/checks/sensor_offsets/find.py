@@ -16,7 +16,7 @@ from greybox.trial.checks.finding import Finding, Outcome
 from greybox.trial.checks.motion import Motion
 from greybox.trial.checks.sensor_offsets.evidence import Evidence, coarse_tie, expand, search
 from greybox.trial.checks.sensor_offsets.findings import IDS, Campaign, campaign_findings
-from greybox.trial.checks.sensor_offsets.model import ARM, Tie
+from greybox.trial.checks.sensor_offsets.model import ARM, KinematicModel
 from greybox.trial.checks.sensor_offsets.pool import pool
 from greybox.trial.checks.sensor_offsets.select import judge
 from greybox.trial.checks.sensor_offsets.thresholds import SIGMAS, expected, least
@@ -68,7 +68,7 @@ def find_offsets(logs: Sequence[Tied], vessel: Vessel) -> list[tuple[list[Findin
     for i, log in enumerate(logs):
         if log.motion is not None and (log.motion.positioned or log.motion.turned):
             rows.append(i)
-            ties.append(Tie(log.motion.coarser(_STEP)))
+            ties.append(KinematicModel(log.motion.coarser(_STEP)))
     # a clock of heading against yaw rate alone is another question
     for positioned in (True, False):
         of_kind = [k for k, tie in enumerate(ties) if tie.positioned == positioned]
@@ -83,7 +83,9 @@ def find_offsets(logs: Sequence[Tied], vessel: Vessel) -> list[tuple[list[Findin
     return out
 
 
-def _campaigns(logs: Sequence[Tied], ties: Sequence[Tie], vessel: Vessel) -> list[Campaign]:
+def _campaigns(
+    logs: Sequence[Tied], ties: Sequence[KinematicModel], vessel: Vessel
+) -> list[Campaign]:
     prior, material = expected(vessel), least(vessel)
     first = []
     for tie in ties:

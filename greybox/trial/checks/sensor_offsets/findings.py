@@ -262,7 +262,7 @@ def _judged(finding: Finding, d: Defect, campaign: Campaign, vessel: Vessel) -> 
     else:
         margin, rival = separation(campaign.judged, d)
         if margin < SEPARATED and rival is not None:
-            ask = _rivals(rival, campaign)
+            ask = _alternative_explanations(rival, campaign)
     if ask:
         evidence += f"; {ask}"
         finding = replace(
@@ -272,7 +272,7 @@ def _judged(finding: Finding, d: Defect, campaign: Campaign, vessel: Vessel) -> 
     return replace(finding, evidence=evidence)
 
 
-def _rivals(rival: Judged, campaign: Campaign) -> str:
+def _alternative_explanations(rival: Judged, campaign: Campaign) -> str:
     """Say what else explains as much, and which logs can tell."""
     said = []
     for d in rival.defects:

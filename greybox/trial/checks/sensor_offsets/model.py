@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.trial.checks.motion import Motion, denoise, integrate, smooth, turn
+from greybox.trial.checks.motion import Motion, denoise, integrate, smooth, to_ned
 
 Array = NDArray[np.float64]
 
@@ -48,7 +48,7 @@ class Residuals:
     heading_columns: Array
 
 
-class Tie:
+class KinematicModel:
     """Residuals of positions and heading of one log for given offsets."""
 
     def __init__(self, motion: Motion) -> None:
@@ -96,12 +96,12 @@ class Tie:
         if self.positioned:
             bias, arm = offsets[BIAS], offsets[ARM]
             psi = slow["psi"] - bias
-            lever = turn(psi, np.full(n, arm[0]), np.full(n, arm[1]))
+            lever = to_ned(psi, np.full(n, arm[0]), np.full(n, arm[1]))
             walked = self._walked(now["psi"] - bias, now["u"], now["v"])
             position = np.column_stack([m["x_n"], m["y_n"]]) - walked - lever
-            ahead = turn(psi, rate["u"], np.zeros(n))
-            aside = turn(psi, np.zeros(n), rate["v"])
-            velocity = turn(psi, slow["u"], slow["v"])
+            ahead = to_ned(psi, rate["u"], np.zeros(n))
+            aside = to_ned(psi, np.zeros(n), rate["v"])
+            velocity = to_ned(psi, slow["u"], slow["v"])
             across = np.column_stack([-velocity[:, 1], velocity[:, 0]])
             levered = np.column_stack([-lever[:, 1], lever[:, 0]])
             turning = rate["psi"][:, None]
@@ -109,8 +109,8 @@ class Tie:
             columns[:, :, CLOCKS.index("u")] = ways[:, 0:2]
             columns[:, :, CLOCKS.index("v")] = ways[:, 2:4]
             columns[:, :, CLOCKS.index("psi")] = ways[:, 4:6] + levered * turning
-            columns[:, :, ARM.start] = turn(psi, np.ones(n), np.zeros(n))
-            columns[:, :, ARM.start + 1] = turn(psi, np.zeros(n), np.ones(n))
+            columns[:, :, ARM.start] = to_ned(psi, np.ones(n), np.zeros(n))
+            columns[:, :, ARM.start + 1] = to_ned(psi, np.zeros(n), np.ones(n))
             columns[:, :, BIAS] = -ways[:, 6:8] - levered
             columns[:, 0, SIZE] = columns[:, 1, SIZE + 1] = self.drift
             columns[:, :, SIZE + 2] = ways[:, 8:10]
@@ -147,7 +147,7 @@ class Tie:
 
     def _walked(self, psi: Array, u: Array, v: Array) -> Array:
         """Return the way made by velocities and heading (N, 2) [m]."""
-        return integrate(turn(psi, u, v), self.motion)
+        return integrate(to_ned(psi, u, v), self.motion)
 
     def _moved(self, value: Array, late: float) -> Array:
         """Return a noise-free channel as it would be were it not late."""
