@@ -25,7 +25,7 @@ from greybox.validation.comparison import compare_models
 from greybox.validation.request import Request
 from greybox.vessel.conditions import Conditions
 from greybox.vessel.toml import load_vessel, vessel_from_dict, vessel_to_dict
-from tests.schemas import schema
+from schemas import schema
 from tests.virtual import virtual_log, write_csv
 
 SHIP = {"name": "V", "length": 10, "thruster": [{"type": "fixed", "speed": "n"}]}

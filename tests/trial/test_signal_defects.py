@@ -297,7 +297,7 @@ def test_a_moored_ship_may_repeat_its_position():
     assert not hold_findings(as_recording({"t": t, "x_n": x, "y_n": y}))
 
 
-def test_samples_of_geographic_positions_are_left_out_too():
+def test_samples_of_geographic_positions_are_interpolated_too():
     t = np.arange(0, 60, 0.2)
     rng = np.random.default_rng(4)
     lat = 63.4 + 1e-5 * t + 2e-5 * np.sin(t / 7) + 1e-8 * rng.standard_normal(len(t))
@@ -310,7 +310,8 @@ def test_samples_of_geographic_positions_are_left_out_too():
     (found,) = check_recording(log, vessel).findings
     assert (found.id, times(found)) == ("position_hold", (t[150],))
     mended = apply_repairs(log, [found])
-    assert (len(mended["lat"]), len(mended["lon"])) == (len(t) - 1, len(t) - 1)
+    for name, value in (("lat", lat), ("lon", lon)):
+        assert mended[name].value[150] == pytest.approx(0.5 * (value[149] + value[151]), abs=1e-12)
 
 
 def test_all_at_once_each_is_named_once(ship):
