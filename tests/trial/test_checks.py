@@ -57,7 +57,17 @@ PLANTED = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", PLANTED)
+# one of each kind; the others among the long tests
+QUICK = {
+    "earth-fixed", "heading in degrees, wrapped", "surge in knots", "sway reversed",
+    "heading and rate swapped", "heading from east", "azimuths swapped",
+    "wind, not velocity through it",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.long) for n in PLANTED]
+)
 def test_a_planted_defect_is_found_alone(name, ship):
     plant, kind, channels = PLANTED[name]
     log = as_recording(plant(recorded(list(PLANTED).index(name), 2.0)))

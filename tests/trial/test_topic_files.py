@@ -478,7 +478,9 @@ def log_of(texts, folder, as_date):
 
 @pytest.mark.parametrize("as_date", [True, False])
 @pytest.mark.parametrize("digits", [3, 6])
-@pytest.mark.parametrize("rate", [10, 20, 50])
+@pytest.mark.parametrize(
+    "rate", [10, pytest.param(20, marks=pytest.mark.long), pytest.param(50, marks=pytest.mark.long)]
+)
 def test_one_second_of_wrong_fractions_is_found_and_mended(tmp_path, as_date, digits, rate):
     rng = np.random.default_rng(rate + digits)
     t = 100.013 + np.arange(60 * rate) / rate + rng.uniform(-0.1, 0.1, 60 * rate) / rate
@@ -533,7 +535,7 @@ def disturbed(kind, rng):
 
 @pytest.mark.parametrize("kind", ["jitter", "dropped rows", "rows exchanged", "bursts"])
 @pytest.mark.parametrize("as_date", [True, False])
-@pytest.mark.parametrize("stripped", [True, False])
+@pytest.mark.parametrize("stripped", [True, pytest.param(False, marks=pytest.mark.long)])
 def test_times_that_are_wrong_otherwise_have_their_zeros(tmp_path, kind, as_date, stripped):
     rng = np.random.default_rng([len(kind), as_date, stripped])
     for _ in range(3):
