@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from schemas import schema
+from virtual import virtual_log, write_csv
 
 from greybox.commands.main import main
 from greybox.diagnosis.diagnose import DiagnosisOptions, diagnose
@@ -26,7 +27,6 @@ from greybox.validation.comparison import compare_models
 from greybox.validation.request import Request
 from greybox.vessel.conditions import Conditions
 from greybox.vessel.toml import load_vessel, vessel_from_dict, vessel_to_dict
-from tests.virtual import virtual_log, write_csv
 
 SHIP = {"name": "V", "length": 10, "thruster": [{"type": "fixed", "speed": "n"}]}
 
