@@ -64,13 +64,21 @@ def read_logs(
     vessel: Vessel,
     sample_time: float | None = None,
     states: tuple[str, ...] = (),
-) -> list[TrialLog]:
-    """Read log files as the segments between gaps, decimated where a sample time is asked for."""
+) -> tuple[list[TrialLog], tuple[str, ...]]:
+    """Read log files as the segments between gaps, decimated where a sample time is asked for.
+
+    Returns
+    -------
+    tuple of (list of TrialLog, tuple of str)
+        The segments, and a sentence for each that was left out.
+    """
     from greybox.trial.convert.read import read_segments
-    from greybox.trial.kinematics import decimate
+    from greybox.trial.kinematics import decimate_segments
 
     logs = [s for path in paths for s in read_segments(path, vessel, states=states)]
-    return logs if sample_time is None else [decimate(log, sample_time) for log in logs]
+    if sample_time is None or not logs:
+        return logs, ()
+    return decimate_segments(logs, sample_time)
 
 
 # options that name files to read, and to write

@@ -60,6 +60,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 @one_thread
 def run(options: argparse.Namespace) -> None:
     """Read, diagnose, report, write."""
+    from dataclasses import replace
+
     from greybox.diagnosis.diagnose import DiagnosisOptions, diagnose
     from greybox.files import check_targets, write_json
     from greybox.model.catalogue import get_structure
@@ -71,8 +73,8 @@ def run(options: argparse.Namespace) -> None:
     model = load_model(options.model) if options.model else None
     structure = get_structure(options.structure) if model is None else model.structure
     sample_time = options.sample_time or (model.sample_time if model else None)
-    logs = read_logs(options.logs, vessel, sample_time, structure.states)
-    validate = read_logs(options.validate, vessel, sample_time, structure.states)
+    logs, left_out = read_logs(options.logs, vessel, sample_time, structure.states)
+    validate, also = read_logs(options.validate, vessel, sample_time, structure.states)
     diagnosis = diagnose(
         logs,
         model=model,
@@ -84,6 +86,7 @@ def run(options: argparse.Namespace) -> None:
             progress=activity(),
         ),
     )
+    diagnosis = replace(diagnosis, notes=(*left_out, *also, *diagnosis.notes))
     record = provenance(options) | {"logs": _read(logs), "validate": _read(validate)}
     if options.out:
         _save(diagnosis, options.out, record)

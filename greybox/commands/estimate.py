@@ -264,7 +264,7 @@ def run(options: argparse.Namespace) -> None:
     # the vessel's own terms may be changed too: here only the states matter
     named = options.structure or (options.compare_structures or ["thesis"])[0]
     states = get_structure(named.split("+")[0].split("-")[0]).states
-    logs = read_logs(options.logs, vessel, options.sample_time, states)
+    logs, left_out = read_logs(options.logs, vessel, options.sample_time, states)
     margins = {k: v for k, v in (("u", options.margin_u), ("v", options.margin_v)) if v is not None}
     request = Request(
         method=options.method,
@@ -292,6 +292,7 @@ def run(options: argparse.Namespace) -> None:
     )
     choice = _choose(logs, request, options)
     estimate = choice.estimate if choice else estimate_model(logs, request)
+    estimate = replace(estimate, notes=(*left_out, *estimate.notes))
     model = estimate.model()
     told = {"structure_choice": choice.to_list()} if choice else {}
     made = provenance(options)

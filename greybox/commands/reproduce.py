@@ -129,8 +129,10 @@ def _chapter7(options: argparse.Namespace):  # type: ignore[no-untyped-def]
         raise UsageError("chapter7 on logs needs --vessel, --estimate and --validate together.")
     if all(given):
         vessel = load_vessel(options.vessel)
-        estimation = read_logs(options.estimate, vessel, options.sample_time)
-        validation = read_logs(options.validate, vessel, options.sample_time)
+        estimation, left_out = read_logs(options.estimate, vessel, options.sample_time)
+        validation, also = read_logs(options.validate, vessel, options.sample_time)
+        for note in (*left_out, *also):
+            say(f"note: {note}")
     else:
         estimation = virtual_day(options.seed, 10.0, "windy")
         validation = virtual_day(options.seed + 1000, 2.0, "calm")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -132,11 +133,56 @@ def decimate(log: TrialLog, sample_time: float) -> TrialLog:
     return replace(out.window(1, len(out) - 1), name=log.name)
 
 
+class _TooShortError(LogError):
+    """A log keeps fewer than three samples at a longer sample time."""
+
+
 def _too_few(log: TrialLog, kept: int, sample_time: float) -> LogError:
-    return LogError(
+    return _TooShortError(
         f"'{log.name}' keeps {kept} samples at {sample_time:g} s, at least 3 are needed: choose a "
         f"shorter sample time."
     )
+
+
+def decimate_segments(
+    logs: Sequence[TrialLog], sample_time: float
+) -> tuple[list[TrialLog], tuple[str, ...]]:
+    """Return segments at a longer sample time without those that it leaves too short.
+
+    Parameters
+    ----------
+    logs : sequence of TrialLog
+        Such as the segments between the gaps of several files.
+    sample_time : float
+        As of `decimate` [s].
+
+    Returns
+    -------
+    tuple of (list of TrialLog, tuple of str)
+        At least one log, and a sentence for each segment that was left out.
+
+    Raises
+    ------
+    LogError
+        As of `decimate`, where no segment is long enough.
+    """
+    kept, notes, refused = [], [], None
+    for log in logs:
+        try:
+            kept.append(decimate(log, sample_time))
+        except _TooShortError as error:
+            refused = refused or error
+            notes.append(
+                f"'{log.name}' was left out: its {len(log)} samples ({_duration(log):.3g} s) are "
+                f"too few for a sample time of {sample_time:g} s."
+            )
+    if refused is not None and not kept:
+        raise refused
+    return kept, tuple(notes)
+
+
+def _duration(log: TrialLog) -> float:
+    return len(log) * log.sample_time
 
 
 def _differences(log: TrialLog, channels: dict[str, Array], sample_time: float) -> list[Step]:

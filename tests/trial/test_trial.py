@@ -11,7 +11,7 @@ from greybox.errors import LogError
 from greybox.trial.convert.options import ImportOptions
 from greybox.trial.convert.read import read_log
 from greybox.trial.import_files import import_files
-from greybox.trial.kinematics import decimate, velocities_from_positions
+from greybox.trial.kinematics import decimate, decimate_segments, velocities_from_positions
 from greybox.trial.log import make_log
 from greybox.trial.wind import relative_wind
 from greybox.vessel.toml import load_vessel, vessel_from_dict
@@ -150,6 +150,22 @@ def test_decimation_averages_what_the_ship_feels(ship):
     np.testing.assert_allclose(slow["n"], [signal[i : i + 4].mean() for i in k])  # ahead
     with pytest.raises(LogError, match=r"1\.5 times"):
         decimate(log, 0.75)
+
+
+def test_a_segment_too_short_for_a_sample_time_is_left_out(ship):
+    n = 40
+    flat = {name: np.ones(n) for name in ("n", "alpha1", "alpha2", "u", "v", "r", "psi")}
+    log = make_log(ship, flat, 0.5, "trial")
+    kept, notes = decimate_segments([log, log.window(0, 5, "trial[2]")], 2.0)
+    assert [(k.name, k.sample_time) for k in kept] == [("trial", 2.0)]
+    assert notes == (
+        "'trial[2]' was left out: its 5 samples (2.5 s) are too few for a sample time of 2 s.",
+    )
+    with pytest.raises(LogError, match=r"'trial\[2\]' keeps 0 samples at 2 s"):
+        decimate_segments([log.window(0, 5, "trial[2]")], 2.0)
+    # no whole multiple is no matter of length
+    with pytest.raises(LogError, match=r"1\.5 times"):
+        decimate_segments([log], 0.75)
 
 
 def earth_fixed(n=400, dt=0.1):
