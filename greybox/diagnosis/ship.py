@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from greybox.diagnosis.linear import Linear, sensitivities
 from greybox.diagnosis.simulator import Simulator
-from greybox.model.functions import Integrator
+from greybox.model.run.step import Integrator
 from greybox.model.simulation import mid_step
 from greybox.model.structure import Structure
 from greybox.rotation import ned_to_body
