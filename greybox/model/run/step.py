@@ -25,6 +25,7 @@ from greybox.rotation import body_to_ned
 Array = NDArray[np.float64]
 Integrator = Literal["euler", "rk4"]
 Heading = Literal["measured", "simulated"]
+Rule = Literal["euler", "trapezoid"]
 
 # the classical Runge-Kutta rule: the share of a stage's slope at which the next one looks,
 # and what each counts
@@ -243,9 +244,7 @@ def next_position(place: ca.SX, u: ca.SX, v: ca.SX, psi: ca.SX, dt: ca.SX | floa
     return place + dt * ca.vertcat(*body_to_ned(u, v, psi))
 
 
-def integrated(
-    rate: Array, steps: Array | float, rule: Literal["euler", "trapezoid"], axis: int = 0
-) -> Array:
+def integrated(rate: Array, steps: Array | float, rule: Rule, axis: int = 0) -> Array:
     """Integrate a rate that was run already, from zero.
 
     Parameters
