@@ -19,8 +19,8 @@ from scipy.linalg import solve_discrete_are
 
 from experiment_design.rollout import Rollout, step_expression
 from experiment_design.schedule import Schedule
-from greybox.model.functions import accumulate
 from greybox.model.noise import NoiseLevels
+from greybox.model.run.kernels import accumulate
 
 Array = NDArray[np.float64]
 

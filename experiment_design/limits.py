@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from experiment_design.rollout import Motion, Rollout
 from experiment_design.schedule import Schedule
 from greybox.errors import UsageError, suggestion
-from greybox.model.disturbances import rotate_to_body
+from greybox.rotation import ned_to_body
 from greybox.vectorised import Vectorised
 
 Array = NDArray[np.float64]
@@ -185,7 +185,7 @@ class LimitProgram:
             if name in ("u", "v"):
                 for pair, matters in ((d[:2], True), (d[2:], wind_matters)):
                     if matters and np.any(pair):
-                        moved = rotate_to_body(psi, ca.SX(pair[0]), ca.SX(pair[1]))
+                        moved = ned_to_body(ca.SX(pair[0]), ca.SX(pair[1]), psi)
                         seen.append(where[name] - moved[name == "v"])
             least = seen[0] * sign
             for other in seen[1:]:
@@ -197,7 +197,7 @@ class LimitProgram:
             rows.append(margin - least)
         u, v = where["u"], where.get("v", ca.SX(0))
         if limits.margin_air is not None:
-            blown = rotate_to_body(psi, ca.SX(float(d[2])), ca.SX(float(d[3])))
+            blown = ned_to_body(ca.SX(float(d[2])), ca.SX(float(d[3])), psi)
             for name, wind in zip(("u", "v"), blown, strict=True):
                 if name in where:
                     names.append(

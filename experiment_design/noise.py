@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import UsageError
-from greybox.model.functions import jacobians
 from greybox.model.model import ManoeuvringModel
 from greybox.model.noise import NoiseLevels
+from greybox.model.run.step import StepModel
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
@@ -49,9 +49,9 @@ def noise_levels(
     has_residual = residual.shape == (len(states),) and bool((residual > 0).all())
     stated = [vessel.std(s) for s in states]
     a = np.asarray(
-        jacobians(model.structure)(
+        StepModel(model.structure).jacobians(
             [1.0] * len(states), 0.0, [0.0] * len(model.structure.inputs),
-            model.d, [1.0, 1.0], model.theta,
+            model.d, [1.0, 1.0], model.theta, model.sample_time,
         )[0]
     )  # fmt: skip
     missing = [s for s, v in zip(states, stated, strict=True) if v is None]

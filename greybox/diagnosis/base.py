@@ -17,8 +17,8 @@ from greybox.diagnosis.ship import LogRun, Ship, shifted, wired
 from greybox.errors import ExcitationError
 from greybox.estimation.free_run import fit_free_runs
 from greybox.estimation.output_setup import measured, output_model, output_predictor
-from greybox.model.functions import Integrator
 from greybox.model.predictor import Predictor, Regime, build_predictor
+from greybox.model.run.step import Integrator
 from greybox.model.structure import Structure
 from greybox.regression.regression import build_regression
 from greybox.rotation import body_to_ned

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.held_out import HeldOut, proof_of
 from greybox.diagnosis.search import Candidate
-from greybox.model.functions import Integrator
+from greybox.model.run.step import Integrator
 
 Array = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.model.functions import RK4_AHEAD, RK4_WEIGHTS, Integrator
+from greybox.model.run.step import Integrator, increment
 from greybox.model.structure import Structure
 from greybox.recursion import propagate
 from greybox.vectorised import Vectorised
@@ -63,11 +63,14 @@ class Slopes:
         of_state = ca.Function("rate", [s.x, *others], [rate])
         slopes = ca.jacobian(rate, ca.vertcat(s.x, s.theta, current))
         of_slopes = ca.Function("slopes", [s.x, *others], [ca.densify(slopes)])
-        points = [s.x]
-        if integrator == "rk4":
-            for share in RK4_AHEAD:
-                points.append(s.x + share * of_state(points[-1], *others))
-        stages = [of_slopes(point, *others) for point in points]
+        stages: list[ca.SX] = []
+
+        def stage(x: ca.SX) -> ca.SX:
+            stages.append(of_slopes(x, *others))
+            return of_state(x, *others)
+
+        increment(integrator, stage, s.x)
+        self._integrator = integrator
         self._shape = (len(stages), *slopes.shape)
         flat = ca.vertcat(*[ca.vec(stage.T) for stage in stages])
         self._program = Vectorised(ca.vertsplit(flat), ca.vertsplit(ca.vertcat(s.x, *others)))
@@ -103,19 +106,21 @@ class Slopes:
         """Return ∂x⁺ (nx, nx + m, N−1) from the rate's derivatives at each stage."""
         nx = self._states
         own = np.arange(nx)
-        slope = stages[0].copy()
-        total = slope.copy()
-        if len(stages) > 1:
-            total *= RK4_WEIGHTS[0]
-            for share, weight, stage in zip(RK4_AHEAD, RK4_WEIGHTS[1:], stages[1:], strict=True):
-                slope *= share
-                slope[own, own] += 1.0
-                slope = np.einsum("ijn,jmn->imn", stage[:, :nx], slope)
-                slope[:, nx:] += stage[:, nx:]
-                total += weight * slope
-        if self._increment:
-            total[own, own] += 1.0
-        return np.asarray(total)
+        start = np.zeros(stages.shape[1:])
+        start[own, own] = 1.0
+        at = iter(stages)
+
+        def slope(by: Array) -> Array:
+            """Return the derivatives of a stage's slope, its state having those given."""
+            stage = next(at)
+            if by is start:
+                return np.array(stage)
+            after = np.einsum("ijn,jmn->imn", stage[:, :nx], by)
+            after[:, nx:] += stage[:, nx:]
+            return np.asarray(after)
+
+        total = increment(self._integrator, slope, start)
+        return np.asarray(total + start if self._increment else total)
 
 
 @lru_cache(maxsize=32)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cholesky, solve_discrete_are, solve_triangular
 
-from greybox.model.functions import accumulate
+from greybox.model.run.kernels import accumulate
 
 Array = NDArray[np.float64]
 

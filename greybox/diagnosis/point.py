@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from greybox.diagnosis.atom import Atom
 from greybox.diagnosis.noise import Noise
 from greybox.diagnosis.ship import Ship
-from greybox.model.functions import Integrator
+from greybox.model.run.step import Integrator
 
 Array = NDArray[np.float64]
 

@@ -28,7 +28,7 @@ from greybox.diagnosis.refitting import (
     slow,
 )
 from greybox.diagnosis.scores import MOMENTS, Directions, Score, score_atoms
-from greybox.model.functions import Integrator
+from greybox.model.run.step import Integrator
 
 Array = NDArray[np.float64]
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from greybox.diagnosis.linear import Linear, sensitivities
 from greybox.diagnosis.simulator import Simulator
-from greybox.model.functions import Integrator
+from greybox.model.run.step import Integrator, Rule, integrated
 from greybox.model.simulation import mid_step
 from greybox.model.structure import Structure
 from greybox.rotation import ned_to_body
@@ -149,7 +149,6 @@ class LogRun:
             self._psi, self._air = mid_step(self._psi), mid_step(self._air.T).T
         self._commands = {c: log[c] for c in log.vessel.commands}
         self._simulator = Simulator(structure, len(log), self.air_measured, integrator)
-        self._trapezoid = integrator == "rk4"
         self._forces: tuple[Vessel, tuple[Wire, ...], Array] | None = None
 
     def forces(self, vessel: Vessel, wires: tuple[Wire, ...] = ()) -> Array:
@@ -220,10 +219,9 @@ class LogRun:
 
     def _heading(self, r: Array) -> Array:
         """Integrate a yaw rate (N, ...) from zero."""
-        out = np.zeros_like(r)
-        rate = (r[1:] + r[:-1]) / 2 if self._trapezoid else r[:-1]
-        np.cumsum(rate * self.sample_time, axis=0, out=out[1:])
-        return out
+        # the mean of both ends is that of an RK4 step to second order
+        rule: Rule = "trapezoid" if self.integrator == "rk4" else "euler"
+        return integrated(r, self.sample_time, rule)
 
     def sense(self, sensors: Sensors, x: Array) -> Array:
         """Return what sensors show of motions (N, ny, m); linear in the motion."""

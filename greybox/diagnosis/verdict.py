@@ -13,7 +13,7 @@ from greybox.diagnosis.point import Fit
 from greybox.diagnosis.result import Found, Verdict
 from greybox.diagnosis.search import RELEVANT, Candidate, Search
 from greybox.diagnosis.symptoms import coloured
-from greybox.model.functions import Integrator
+from greybox.model.run.step import Integrator
 
 # significance of what any force could still explain
 _SURE = 0.005

@@ -11,9 +11,10 @@ import casadi as ca
 
 from greybox.export.actuators import column
 from greybox.export.ports import Port, channel_port
-from greybox.model.disturbances import WIND, rotate_to_body
-from greybox.model.functions import step_function
+from greybox.model.disturbances import WIND
 from greybox.model.model import ManoeuvringModel
+from greybox.model.run.step import StepModel, next_position
+from greybox.rotation import body_to_ned, ned_to_body
 
 Heading = Literal["simulated", "measured", "either"]
 Wind = Literal["earth", "relative", "either"]
@@ -63,12 +64,13 @@ class Motion:
         def of(measured: bool, relative: bool) -> list[ca.SX]:
             psi = self._psi(measured)
             step = self._step(forces, measured, relative, self.model.integrator)
-            found = ca.vertsplit(step[0])
-            if "psi" in self.states:
-                found.append(psi if measured else step[1])
+            found = ca.vertsplit(step)
+            if "psi" in self.states and measured:
+                found.append(psi)
             if "x_n" in self.states:
-                north, east = self.over_ground(psi)
-                found += [self.states["x_n"] + ts * north, self.states["y_n"] + ts * east]
+                place = ca.vertcat(self.states["x_n"], self.states["y_n"])
+                u, v = self.states["u"], self.states["v"]
+                found += ca.vertsplit(next_position(place, u, v, psi, ts))
             return found
 
         return self._chosen(of)
@@ -80,7 +82,7 @@ class Motion:
         def of(measured: bool, relative: bool) -> list[ca.SX]:
             # an Euler step is the rate times the sample time that the parameters hold
             step = self._step(forces, measured, relative, "euler")
-            found = ca.vertsplit((step[0] - self._x) / ts)
+            found = ca.vertsplit((step[: self._x.numel()] - self._x) / ts)
             if "psi" in self.states:
                 found.append(ca.SX(0) if measured else self.states["r"])
             if "x_n" in self.states:
@@ -91,9 +93,7 @@ class Motion:
 
     def over_ground(self, psi: ca.SX) -> tuple[ca.SX, ca.SX]:
         """Return the velocity over ground, north and east."""
-        c, s = ca.cos(psi), ca.sin(psi)
-        u, v = self.states["u"], self.states["v"]
-        return c * u - s * v, s * u + c * v
+        return body_to_ned(self.states["u"], self.states["v"], psi)
 
     def outputs(self) -> tuple[list[Port], list[ca.SX]]:
         """Return motion, and velocities over ground and through the water."""
@@ -107,7 +107,7 @@ class Motion:
             north, east = self.over_ground(psi)
             ports += [channel_port(n) for n in ("x_n", "y_n", "v_n", "v_e")]
             seen += [self.states["x_n"], self.states["y_n"], north, east]
-        along, across = rotate_to_body(psi, *self.current)
+        along, across = ned_to_body(self.current[0], self.current[1], psi)
         for name, flow, words in (("u", along, "forward"), ("v", across, "to starboard")):
             if name in self.states:
                 ports.append(Port(f"{name}_r", "m/s", f"velocity through the water, {words}"))
@@ -129,20 +129,20 @@ class Motion:
         measured: bool,
         relative: bool,
         integrator: Literal["euler", "rk4"],
-    ) -> list[ca.SX]:
+    ) -> ca.SX:
         structure, none = self.model.structure, ca.SX(0)
         wind = [none if relative else self.inputs.get(n, none) for n in WIND]
         air = [self.inputs.get(n, none) if relative else none for n in ("u_q", "v_q")]
-        step = step_function(
+        step = StepModel(
             structure,
-            air_measured=relative and structure.uses_air,
-            integrator=integrator,
-            heading="measured" if measured else "simulated",
+            integrator,
+            "measured" if measured else "simulated",
+            relative and structure.uses_air,
         )
         tau = column(forces[n] for n in structure.inputs)
         d = ca.vertcat(*self.current, *wind)
-        ts = ca.SX(self.model.sample_time)
-        return list(step.call([self._x, self._psi(measured), tau, d, column(air), self.theta, ts]))
+        ts = self.model.sample_time
+        return step(self._x, self._psi(measured), tau, d, column(air), self.theta, ts)
 
     def _chosen(self, of: Callable[[bool, bool], list[ca.SX]]) -> list[ca.SX]:
         """Return expressions under the heading and wind that are chosen, by switches where open."""

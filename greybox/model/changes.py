@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import StructureError
-from greybox.model.functions import Integrator
+from greybox.model.run.step import Integrator
 from greybox.model.simulation import FreeRun, simulate
 from greybox.model.structure import Structure
 

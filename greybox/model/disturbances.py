@@ -13,6 +13,8 @@ from typing import Literal
 
 import casadi as ca
 
+from greybox.rotation import ned_to_body
+
 DisturbanceKind = Literal["marine", "additive", "none"]
 
 CURRENT = ("current_north", "current_east")
@@ -26,12 +28,6 @@ def disturbance_names(kind: DisturbanceKind, states: Sequence[str]) -> tuple[str
     if kind == "additive":
         return tuple(f"{state}_disturbance" for state in states)
     return ()
-
-
-def rotate_to_body(psi: ca.SX, north: ca.SX, east: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Return the body components of an n-frame vector, Rᵀ(ψ)·vector (5.2)."""
-    c, s = ca.cos(psi), ca.sin(psi)
-    return c * north + s * east, -s * north + c * east
 
 
 def disturbed_signals(
@@ -63,8 +59,8 @@ def disturbed_signals(
         return {name: x + d[i] for i, (name, x) in enumerate(states.items())}
     if kind == "none":
         return signals
-    u_c, v_c = rotate_to_body(psi, d[0], d[1])
-    u_w, v_w = rotate_to_body(psi, d[2], d[3])
+    u_c, v_c = ned_to_body(d[0], d[1], psi)
+    u_w, v_w = ned_to_body(d[2], d[3], psi)
     if "u" in states:
         signals["u"] = states["u"] - u_c
         signals["uq"] = states["u"] - u_w if air is None else air[0]

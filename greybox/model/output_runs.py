@@ -15,9 +15,9 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.model.functions import bind
 from greybox.model.output import OutputModel
-from greybox.model.output_step import Walking, filtered, free, likelihood, observed, over
+from greybox.model.output_step import Walking, filtered, free, likelihood, observed
+from greybox.model.run.kernels import along, bind
 from greybox.recursion import propagate
 from greybox.vectorised import Vectorised
 
@@ -34,7 +34,7 @@ def _pass(walk: Walking, model: OutputModel, steps: int, runs: int) -> ca.Functi
     step = ca.Function(
         "step", [*of.carried, of.read, *of.constant], [*of.after, *of.found], {"cse": True}
     )
-    return over(step, len(of.carried), steps, runs)
+    return along(step, len(of.carried), steps, runs)
 
 
 @dataclass(frozen=True)

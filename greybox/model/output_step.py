@@ -13,12 +13,11 @@ from functools import lru_cache
 
 import casadi as ca
 
-from greybox.model.disturbances import WIND, rotate_to_body
-from greybox.model.functions import accumulate, unrolled
+from greybox.model.disturbances import WIND
 from greybox.model.output import OutputModel
-
-# steps that are one scalar function, and the instructions that it has at most
-_UNROLLED, _INSTRUCTIONS = 16, 2000
+from greybox.model.run.kernels import accumulate
+from greybox.model.run.step import StepModel
+from greybox.rotation import ned_to_body
 
 
 @dataclass(frozen=True)
@@ -36,43 +35,30 @@ class _Step:
 def _step(model: OutputModel) -> _Step:
     predictor = model.predictor
     structure = predictor.structure
-    s = structure.symbols
-    names = structure.states
+    names, count = structure.states, len(predictor.columns)
     z = ca.SX.sym("z", len(model.states))
     w = ca.SX.sym("w", len(model.drivers))
     p = ca.SX.sym("p", len(model.parameters))
     given = {name: w[i] for i, name in enumerate(model.drivers)}
-    heading = z[len(names)] if model.heading == "output" else given.get("psi", ca.SX(0))
-    count = len(predictor.columns)
-    d = [ca.SX(0)] * len(structure.disturbances)
-    for i, name in enumerate(model.means):
-        d[structure.disturbances.index(name)] = p[count + i]
-    air = ca.vertcat(given.get("u_q", ca.SX(0)), given.get("v_q", ca.SX(0)))
+    none = ca.SX(0)
+    turns = model.heading == "output"
+    heading = z[len(names)] if turns else given.get("psi", none)
+    mean = {name: p[count + i] for i, name in enumerate(model.means)}
+    air = ca.vertcat(given.get("u_q", none), given.get("v_q", none))
     if model.wind == "output":
         state = {name: z[i] for i, name in enumerate(names)}
-        u_w, v_w = rotate_to_body(heading, *[d[structure.disturbances.index(n)] for n in WIND])
-        air = ca.vertcat(state["u"] - u_w, state.get("v", ca.SX(0)) - v_w)
-    regressors = structure.regressors(air_measured=predictor.air_measured)
-    at_zero = predictor.expressions
-    # biases capture what the means do not; wind that is not measured is in them
-    unknown_wind = (
-        [] if predictor.air_measured else [n for n in WIND if n in structure.disturbances]
+        u_w, v_w = ned_to_body(mean[WIND[0]], mean[WIND[1]], heading)
+        air = ca.vertcat(state["u"] - u_w, state.get("v", none) - v_w)
+    step = StepModel.of_predictor(predictor, "simulated" if turns else "measured")
+    after = step(
+        z[: len(names)],
+        heading,
+        ca.vertcat(*[given[n] for n in structure.inputs]),
+        ca.vertcat(*[mean.get(n, none) for n in structure.disturbances]),
+        air,
+        p[:count],
+        model.sample_time,
     )
-    calm = [s.d[structure.disturbances.index(n)] for n in unknown_wind]
-    rows = [ca.SX(0)] * len(names)
-    for i, column in enumerate(predictor.columns):
-        expression = at_zero[i] if column.is_bias else regressors[structure.index(column.terms[0])]
-        if calm:
-            expression = ca.substitute(expression, ca.vertcat(*calm), ca.SX.zeros(len(calm)))
-        rows[names.index(column.state)] += p[i] * expression
-    change = ca.substitute(
-        ca.vertcat(*rows),
-        ca.vertcat(s.x, s.psi, s.tau, s.d, s.air),
-        ca.vertcat(z[: len(names)], heading, *[given[n] for n in structure.inputs], *d, air),
-    )
-    after = z[: len(names)] + change if structure.increment else change
-    if model.heading == "output":
-        after = ca.vertcat(after, heading + model.sample_time * z[names.index("r")])
     seen = ca.vertcat(z, air) if model.wind == "output" else z
     return _Step(z, w, p, ca.densify(after), ca.densify(seen))
 
@@ -153,30 +139,6 @@ def observed(model: OutputModel) -> Walk:
     error = use * (y - s.seen)
     slopes = Slope.of(after, s), Slope.of(s.seen, s)
     return Walk((s.z,), read, (s.p, gain), (after,), (error,), *slopes)
-
-
-def over(step: ca.Function, carried: int, steps: int, runs: int) -> ca.Function:
-    """Accumulate a step over samples, its last arguments constant, and over runs side by side.
-
-    Arguments are the carried ones, then one that changes with the sample, then
-    constants; results are those of every sample.
-    """
-    size = max(1, min(_UNROLLED, _INSTRUCTIONS // step.n_instructions(), steps))
-    blocks = -(-steps // size)
-    several = accumulate(unrolled(step, carried, size), blocks, range(carried))
-    given = [
-        ca.MX.sym(step.name_in(i), step.size1_in(i), steps if i == carried else 1)
-        for i in range(step.n_in())
-    ]
-    read = given[carried]
-    padding = ca.repmat(read[:, -1], 1, blocks * size - steps)
-    constants = [ca.repmat(c, 1, blocks) for c in given[carried + 1 :]]
-    found = several.call([*given[:carried], ca.horzcat(read, padding), *constants])[carried:]
-    one = ca.Function("run", given, [x[:, :steps] for x in found])
-    if runs == 1:
-        return one
-    # the constants are given once
-    return one.map("runs", "serial", runs, list(range(carried + 1, step.n_in())), [])
 
 
 @lru_cache(maxsize=32)

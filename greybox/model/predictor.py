@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import StructureError, suggestion
-from greybox.model.disturbances import CURRENT
+from greybox.model.disturbances import CURRENT, WIND
 from greybox.model.spelling import atoms, spelled_expression, spellings
 from greybox.model.structure import Structure
 from greybox.notebook import DisplayMixin, table
@@ -193,6 +193,33 @@ class Predictor(DisplayMixin):
     def expressions(self) -> list[ca.SX]:
         """The regressors as expressions of the structure's symbols at d = 0."""
         return _column_expressions(self.structure, self.air_measured, self.columns, self._spelled)
+
+    def increment_expression(self, coefficients: ca.SX) -> ca.SX:
+        """Return what a sample adds to the states (nx,), as `Structure.increment_expression`.
+
+        Terms see the disturbance means; biases stand for what the means do not tell, of a
+        wind that is not measured all.
+
+        Parameters
+        ----------
+        coefficients : SX
+            (p,) of all columns.
+        """
+        structure = self.structure
+        d, names = structure.symbols.d, structure.disturbances
+        unknown = [] if self.air_measured else [d[names.index(n)] for n in WIND if n in names]
+        regressors = structure.regressors(air_measured=self.air_measured)
+        rows = [ca.SX(0)] * len(structure.states)
+        for i, column in enumerate(self.columns):
+            regressor = self.expressions[i]
+            if column.terms:
+                regressor = regressors[structure.index(column.terms[0])]
+            if unknown:
+                regressor = ca.substitute(
+                    regressor, ca.vertcat(*unknown), ca.SX.zeros(len(unknown))
+                )
+            rows[structure.states.index(column.state)] += coefficients[i] * regressor
+        return ca.vertcat(*rows)
 
     @cached_property
     def _program(self) -> Vectorised:

@@ -8,14 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import DivergenceError
-from greybox.model.functions import (
-    MANY_RUNS,
-    FreeRunKernel,
-    Heading,
-    Integrator,
-    OverRunsKernel,
-    RunVariant,
-)
+from greybox.model.run.kernels import MANY_RUNS, FreeRunKernel, FreeRunStep, OverRunsKernel
+from greybox.model.run.step import Heading, Integrator, StepModel, integrated
 from greybox.model.structure import Structure
 from greybox.notebook import DisplayMixin, number, sparkline, table
 from greybox.rotation import body_to_ned
@@ -174,15 +168,17 @@ def simulate(
     theta = np.broadcast_to(theta, (runs, theta.shape[1]))
     if process_noise is not None:
         series.append(np.broadcast_to(np.asarray(process_noise, float), (runs, samples, nx)))
-    variant = RunVariant(
-        heading, air is not None, d is not None, process_noise is not None, integrator
+    step = FreeRunStep(
+        StepModel(structure, integrator, heading, air is not None),
+        d is not None,
+        process_noise is not None,
     )
     out = np.empty((runs, samples + 1, nx + (heading == "simulated")))
     with np.errstate(all="ignore"):
         if runs < MANY_RUNS:
-            _few(structure, variant, series, x0, start, theta, sample_time, out)
+            _few(step, series, x0, start, theta, sample_time, out)
         else:
-            _many(structure, variant, series, x0, start, theta, sample_time, out)
+            _many(step, series, x0, start, theta, sample_time, out)
     x = out[:, :, :nx]
     if heading == "simulated":
         angle = out[:, :, nx]
@@ -219,8 +215,7 @@ def mid_step(value: Array) -> Array:
 
 
 def _few(
-    structure: Structure,
-    variant: RunVariant,
+    step: FreeRunStep,
     series: list[Array],
     x0: Array,
     psi0: Array,
@@ -231,18 +226,19 @@ def _few(
     """Fill `out` run by run."""
     runs, samples = series[0].shape[:2]
     nx = x0.shape[1]
-    kernel = FreeRunKernel(structure, samples, 1, variant)
+    kernel = FreeRunKernel(step.function, samples)
+    kernel.constants[1][:] = sample_time
     for run in range(runs):
-        kernel.w[0, :samples] = np.concatenate([part[run] for part in series], axis=1)
-        kernel.x0[0, :nx] = x0[run]
-        kernel.x0[0, nx:] = psi0[run]
-        kernel.theta[0] = theta[run]
-        kernel(sample_time, out[run : run + 1])
+        np.concatenate([part[run] for part in series], axis=1, out=kernel.read)
+        kernel.start[:nx] = x0[run]
+        kernel.start[nx:] = psi0[run]
+        kernel.constants[0][:] = theta[run]
+        out[run, 0] = kernel.start
+        out[run, 1:] = kernel()
 
 
 def _many(
-    structure: Structure,
-    variant: RunVariant,
+    step: FreeRunStep,
     series: list[Array],
     x0: Array,
     psi0: Array,
@@ -255,7 +251,7 @@ def _many(
     nx = x0.shape[1]
     # few sizes are compiled: the last batch holds copies of its last run
     size = min(-(-runs // _STEP_RUNS) * _STEP_RUNS, _BATCH_RUNS)
-    kernel = OverRunsKernel(structure, samples, size, variant)
+    kernel = OverRunsKernel(step, samples, size)
     for first in range(0, runs, size):
         batch = slice(first, min(first + size, runs))
         n = batch.stop - first
@@ -334,7 +330,6 @@ def positions(x: Array, psi: Array, sample_time: float, start: Array | None = No
     ndarray
         (..., N, 2) positions [m].
     """
-    rate = np.stack(body_to_ned(x[..., 0], x[..., 1], psi), axis=-1) * sample_time
-    out = np.zeros_like(rate)
-    np.cumsum(rate[..., :-1, :], axis=-2, out=out[..., 1:, :])
-    return out + (0.0 if start is None else np.asarray(start))
+    rate = np.stack(body_to_ned(x[..., 0], x[..., 1], psi), axis=-1)
+    way = integrated(rate, sample_time, "euler", axis=-2)
+    return way + (0.0 if start is None else np.asarray(start))

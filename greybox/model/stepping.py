@@ -16,7 +16,8 @@ import numpy as np
 
 from greybox.errors import StructureError, UsageError
 from greybox.model.disturbances import WIND
-from greybox.model.functions import step_function
+from greybox.model.run.step import StepModel, next_position
+from greybox.rotation import body_to_ned
 from greybox.vessel.force import force_expressions, force_inputs
 
 if TYPE_CHECKING:
@@ -83,14 +84,12 @@ def whole_step(model: ManoeuvringModel) -> ca.Function:
     wind = ca.SX.sym("wind", 2)
     late = _delayed(model, command)
     slow, tau, slow_after = _lagged(model, late.acting)
-    step = step_function(model.structure, integrator=model.integrator, heading="simulated")
-    x_next, psi_next = step.call(
-        [s.x, s.psi, tau, _disturbance(model, wind), ca.SX(2, 1), ca.DM(model.theta),
-         ca.DM(model.sample_time)]
-    )  # fmt: skip
-    moved = position + model.sample_time * _north_east(s.x, s.psi)
+    d, dt = _disturbance(model, wind), model.sample_time
+    step = StepModel(model.structure, model.integrator, "simulated")
+    moved = step(s.x, s.psi, tau, d, ca.SX(2, 1), model.theta, dt)
+    place = next_position(position, s.x[0], s.x[1], s.psi, dt)
     x = ca.vertcat(s.x, s.psi, position, late.memory, slow)
-    after = ca.vertcat(x_next, psi_next, moved, late.after, slow_after)
+    after = ca.vertcat(moved, place, late.after, slow_after)
     return _function("step", model, x, command, wind, after, "x_next")
 
 
@@ -130,16 +129,11 @@ def whole_rate(model: ManoeuvringModel) -> ca.Function:
     command = ca.SX.sym("command", len(model.vessel.commands))
     wind = ca.SX.sym("wind", 2)
     slow, tau, slow_after = _lagged(model, command, held=False)
-    turn = model.sample_time * s.x[2]
-    f = (
-        step_function(model.structure)(
-            s.x, s.psi, tau, _disturbance(model, wind), ca.SX(2, 1), ca.DM(model.theta), 1.0
-        )
-        - s.x
-    )
-    rate = ca.vertcat(f, turn) / model.sample_time
+    d, dt = _disturbance(model, wind), model.sample_time
+    step = StepModel(model.structure, heading="simulated")
+    rate = (step(s.x, s.psi, tau, d, ca.SX(2, 1), model.theta, dt) - step.symbolic.state) / dt
     x = ca.vertcat(s.x, s.psi, position, slow)
-    x_dot = ca.vertcat(rate, _north_east(s.x, s.psi), slow_after)
+    x_dot = ca.vertcat(rate, *body_to_ned(s.x[0], s.x[1], s.psi), slow_after)
     return _function("rhs", model, x, command, wind, x_dot, "x_dot")
 
 
@@ -176,11 +170,6 @@ def _disturbance(model: ManoeuvringModel, wind: ca.SX) -> ca.SX:
 def _windy(model: ManoeuvringModel) -> bool:
     """Whether the wind is an input."""
     return model.structure.uses_air and not set(WIND) & model.disturbances.keys()
-
-
-def _north_east(x: ca.SX, psi: ca.SX) -> ca.SX:
-    c, s = ca.cos(psi), ca.sin(psi)
-    return ca.vertcat(c * x[0] - s * x[1], s * x[0] + c * x[1])
 
 
 def _slow(model: ManoeuvringModel) -> tuple[str, ...]:

@@ -10,10 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.model.model import ManoeuvringModel
+from greybox.model.run.step import integrated
 from greybox.prediction.helm import Helm, bounds
 from greybox.prediction.orders import Orders
 from greybox.prediction.ship import Ship
 from greybox.prediction.steady import Steady
+from greybox.rotation import body_to_ned
 
 Array = NDArray[np.float64]
 
@@ -56,13 +58,10 @@ class Runs:
 
     def track(self, run: int, stop: int) -> tuple[Array, Array]:
         """Return positions north and east (stop,) [m] by the trapezoidal rule."""
-        u, v = self.states[:stop, 0, run], self.states[:stop, 1, run]
-        c, s = np.cos(self.psi[:stop, run]), np.sin(self.psi[:stop, run])
-        steps = np.diff(self.t[:stop])
-        made = []
-        for rate in (c * u - s * v, s * u + c * v):
-            made.append(np.concatenate([[0.0], np.cumsum(steps * (rate[1:] + rate[:-1]) / 2)]))
-        return made[0], made[1]
+        u, v, _ = self.states[:stop, :, run].T
+        rate = np.stack(body_to_ned(u, v, self.psi[:stop, run]))
+        north, east = integrated(rate, np.diff(self.t[:stop]), "trapezoid", axis=1)
+        return north, east
 
 
 def sail(

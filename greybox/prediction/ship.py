@@ -9,7 +9,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.model.functions import Integrator, bind, over_runs, step_function
+from greybox.model.run.kernels import bind, over_runs
+from greybox.model.run.step import Integrator, StepModel
 from greybox.model.structure import Structure
 from greybox.vessel.force import force_expressions
 from greybox.vessel.vessel import Actuation, Thruster, Vessel
@@ -144,9 +145,7 @@ def _many(
     vessel = Vessel("", 1.0, thrusters)
     s = structure.symbols
     turns = "r" in structure.states
-    step = step_function(
-        structure, integrator=integrator, heading="simulated" if turns else "measured"
-    )
+    step = StepModel(structure, integrator, "simulated" if turns else "measured")
     columns = vessel.commands
     c = ca.SX.sym("c", len(columns))
     dt = ca.SX.sym("dt")
@@ -173,12 +172,11 @@ def _many(
         tau = _forces(structure, vessel, ca.vertcat(*moved))
     else:
         tau = _forces(structure, vessel, c)
-    made_step = step.call([s.x, s.psi, tau, s.d, ca.SX.zeros(2), s.theta, dt])
-    psi = made_step[1] if turns else s.psi
+    after_step = step(s.x, s.psi, tau, s.d, ca.SX(2, 1), s.theta, dt)
     one = ca.Function(
         "ship",
         [ca.vertcat(s.x, s.psi, z), ca.vertcat(c, s.d), s.theta, dt],
-        [ca.vertcat(made_step[0], psi, after)],
+        [ca.vertcat(after_step, *[s.psi] * (not turns), after)],
         {"cse": True},
     )
     return over_runs(one, runs)

@@ -18,7 +18,7 @@ from greybox.model.predictor import Predictor
 from greybox.model.simulation import FreeRun
 from greybox.model.structure import Structure
 from greybox.regression.regression import within_margins
-from greybox.rotation import ned_to_body
+from greybox.rotation import body_to_ned, ned_to_body
 from greybox.trial.log import TrialLog
 
 Array = NDArray[np.float64]
@@ -136,11 +136,12 @@ def smoothed_wind(log: TrialLog) -> tuple[Array, Array] | None:
     from scipy.ndimage import uniform_filter1d
 
     u_w, v_w = log["u"] - log["u_q"], log["v"] - log["v_q"]
-    c, s = np.cos(log["psi"]), np.sin(log["psi"])
     window = min(max(_LEAST_WINDOW, round(WIND_WINDOW / log.sample_time)), len(log))
-    north = uniform_filter1d(c * u_w - s * v_w, window, mode="nearest")
-    east = uniform_filter1d(s * u_w + c * v_w, window, mode="nearest")
-    return north, east
+    north, east = body_to_ned(u_w, v_w, log["psi"])
+    return (
+        uniform_filter1d(north, window, mode="nearest"),
+        uniform_filter1d(east, window, mode="nearest"),
+    )
 
 
 def _air_instrument(log: TrialLog, x: Array, psi: Array, wind: str) -> tuple[Array, Array]:

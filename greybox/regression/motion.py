@@ -16,8 +16,9 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.model.functions import accumulate
 from greybox.model.predictor import Predictor
+from greybox.model.run.kernels import accumulate
+from greybox.model.run.step import Heading, StepModel
 from greybox.regression.instruments import initial_state, smoothed_wind, state_bound
 from greybox.rotation import ned_to_body
 from greybox.trial.log import TrialLog
@@ -61,58 +62,47 @@ def further_channels(predictor: Predictor) -> tuple[str, ...]:
 
 
 @lru_cache(maxsize=32)
-def _step(predictor: Predictor, samples: int, heading: str, relative: bool) -> ca.Function:
+def _step(predictor: Predictor, samples: int, heading: Heading, relative: bool) -> ca.Function:
     """Return ``samples`` steps ``(state, w, coefficients and constants and dt) -> states``.
 
     ``w`` holds heading, inputs and air: the velocity through the air, or, where
     `relative`, the wind along the body axes, from which the state is taken.
     """
-    s = predictor.structure.symbols
-    coefficients = ca.SX.sym("c", len(predictor.columns))
-    constants = ca.SX.sym("k", s.x.numel())
-    dt, psi = ca.SX.sym("dt"), ca.SX.sym("psi")
-    air = ca.SX.sym("air", 2)
-    increment = ca.vertcat(*predicted(predictor, coefficients)) + constants
-    through = s.x[:2] - air if relative else air
-    increment = ca.substitute(increment, s.air, through)
-    after = s.x + increment if predictor.structure.increment else increment
-    turn = dt * s.x[predictor.structure.states.index("r")] if heading == "simulated" else 0.0
+    step = StepModel.of_predictor(predictor, heading)
+    s = step.symbolic
+    nx = s.x.numel()
+    constants, psi, air = ca.SX.sym("k", nx), ca.SX.sym("psi"), ca.SX.sym("air", 2)
     # the last state is the heading of a simulated one; a measured one comes with w
-    own = ca.SX.sym("own")
-    after = ca.substitute(after, s.psi, own if heading == "simulated" else psi)
-    state = ca.vertcat(s.x, own)
+    state = ca.vertcat(s.x, ca.SX.sym("own"))
+    turns = heading == "simulated"
+    after = step(
+        s.x,
+        state[nx] if turns else psi,
+        s.tau,
+        ca.SX(s.d.numel(), 1),
+        s.x[:2] - air if relative else air,
+        s.theta,
+        s.dt,
+    )
     one = ca.Function(
         "step",
-        [state, ca.vertcat(psi, s.tau, air), ca.vertcat(coefficients, constants, dt)],
-        [ca.vertcat(after, own + turn)],
+        [state, ca.vertcat(psi, s.tau, air), ca.vertcat(s.theta, constants, s.dt)],
+        [ca.vertcat(after[:nx] + constants, after[nx] if turns else state[nx])],
         {"cse": True},
     )
     return accumulate(one, samples, name="motion")
 
 
-def predicted(predictor: Predictor, coefficients: ca.SX) -> list[ca.SX]:
-    """Return φᵀθ of each equation as expressions."""
-    out = []
-    for state in predictor.structure.states:
-        mine = predictor.equation(state)
-        out.append(sum((coefficients[i] * predictor.expressions[i] for i in mine), ca.SX(0)))
-    return out
-
-
 @lru_cache(maxsize=32)
 def _slopes(predictor: Predictor) -> Vectorised:
-    s = predictor.structure.symbols
-    coefficients = ca.SX.sym("c", len(predictor.columns))
-    after = ca.vertcat(*predicted(predictor, coefficients))
-    if predictor.structure.increment:
-        after = after + s.x
+    step = StepModel.of_predictor(predictor)
+    s = step.symbolic
+    given = (s.x, s.psi, s.tau, s.air, s.theta)
+    after = step(s.x, s.psi, s.tau, ca.SX(s.d.numel(), 1), s.air, s.theta, 1.0)
     further = {"psi": s.psi, "u_q": s.air[0], "v_q": s.air[1]}
     symbols = ca.vertcat(s.x, *[further[n] for n in further_channels(predictor)])
-    scalars = [*ca.vertsplit(s.x), s.psi, *ca.vertsplit(s.tau), *ca.vertsplit(s.air)]
-    jacobian = ca.jacobian(after, symbols)
-    return Vectorised(
-        ca.vertsplit(ca.densify(ca.vec(jacobian.T))), [*scalars, *ca.vertsplit(coefficients)]
-    )
+    jacobian = ca.densify(ca.jacobian(after, symbols))
+    return Vectorised(ca.vertsplit(ca.vec(jacobian.T)), ca.vertsplit(ca.vertcat(*given)))
 
 
 def smoothed_heading(measured: Array, yaw_rate: Array, sample_time: float) -> Array:

@@ -14,8 +14,8 @@ from experiment_design.moments import Moments
 from experiment_design.noise import noise_levels
 from experiment_design.request import build_problem
 from greybox.errors import UsageError
-from greybox.model.functions import jacobians
 from greybox.model.noise import NoiseLevels
+from greybox.model.run.step import StepModel
 from greybox.model.simulation import simulate
 from greybox.study.monte_carlo import Batch, BatchRegression
 from greybox.vessel.toml import load_vessel
@@ -39,10 +39,10 @@ def _covariance_by_definition(request, problem, motion):
     for i, state in enumerate(request.structure.states):
         mine = predictor.equation(state)
         big[mine, i::3] = z[mine]
-    slope = jacobians(request.structure)
+    slope = StepModel(request.structure).jacobians
     d = np.zeros((3 * samples, 3 * (samples + 1)))
     for k in range(samples):
-        a = slope(x[k], psi[k], tau[k], request.d, [0, 0], request.theta)[0].full()
+        a = slope(x[k], psi[k], tau[k], request.d, [0, 0], request.theta, 1)[0].full()
         d[3 * k : 3 * k + 3, 3 * k + 3 : 3 * k + 6] = np.eye(3)
         d[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = -a
     e = np.kron(np.eye(samples + 1), np.diag(request.noise.measurement**2))
@@ -206,7 +206,8 @@ def test_noise_levels_from_residuals_and_sensors():
     levels = noise_levels(model, model.vessel)
     np.testing.assert_allclose(levels.measurement, 0.014142)
     assert (levels.process == 0).all()
-    a = jacobians(request.structure)([1, 1, 1], 0, [0, 0, 0], model.d, [1, 1], model.theta)[0]
+    jacobians = StepModel(request.structure).jacobians
+    a = jacobians([1, 1, 1], 0, [0, 0, 0], model.d, [1, 1], model.theta, 1)[0]
     beyond = (np.eye(3) + a.full() ** 2) @ levels.measurement**2
     residual = np.sqrt(beyond + 0.003**2)
     levels = noise_levels(replace(model, residual_std=residual), model.vessel)

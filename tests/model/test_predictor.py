@@ -7,8 +7,8 @@ import pytest
 
 from greybox.errors import StructureError
 from greybox.model.catalogue import get_structure
-from greybox.model.functions import step_function
 from greybox.model.predictor import build_predictor
+from greybox.model.run.step import StepModel
 
 SIGNS = [(1, 1), (1, -1), (-1, 1), (-1, -1)]
 
@@ -86,7 +86,7 @@ def test_bias_terms_are_the_exact_taylor_expansion(name):
     x = np.array([rng.uniform(0.5, 2, n), -rng.uniform(0.5, 2, n), rng.uniform(-1, 1, n)])
     psi = rng.uniform(-3, 3, n)
     tau = rng.uniform(-1, 1, (3, n))
-    step = step_function(structure)
+    step = StepModel(structure).function
     disturbed = np.array(
         [
             np.array(step(x[:, k], psi[k], tau[:, k], d, [0, 0], theta, 1)).ravel() - x[:, k]

@@ -8,16 +8,16 @@ from scipy.integrate import solve_ivp
 
 from greybox.errors import DivergenceError, StructureError
 from greybox.model.catalogue import get_structure
-from greybox.model.functions import MANY_RUNS, step_function
+from greybox.model.run.kernels import MANY_RUNS
+from greybox.model.run.step import StepModel
 from greybox.model.simulation import positions, simulate, stationary_disturbance
 
 
 def slow_run(structure, theta, x0, psi0, tau, d):
-    step = step_function(structure, heading="simulated")
+    step = StepModel(structure, heading="simulated").function
     x, psi, out = np.array(x0, float), psi0, [np.array(x0, float)]
     for k in range(len(tau)):
-        x, psi = (np.array(v).ravel() for v in step(x, psi, tau[k], d[k], [0, 0], theta, 1.0))
-        psi = float(psi[0])
+        *x, psi = np.array(step(x, psi, tau[k], d[k], [0, 0], theta, 1.0)).ravel()
         out.append(x)
     return np.array(out), psi
 
@@ -45,7 +45,7 @@ def test_length_need_not_fill_the_unrolled_block(thesis, true_theta):
 
 
 def test_rk4_follows_the_differential_equation(thesis, true_theta):
-    step = step_function(thesis)
+    step = StepModel(thesis).function
     tau = np.array([10.0, 8.0, 3.0])
 
     def rate(_, z):
@@ -105,6 +105,6 @@ def test_positions_turn_with_the_heading():
 
 def test_a_map_cannot_be_integrated_by_rk4():
     with pytest.raises(StructureError, match="is a map"):
-        step_function(get_structure("siso"), integrator="rk4")
+        StepModel(get_structure("siso"), "rk4")
     with pytest.raises(StructureError, match="no yaw rate"):
-        step_function(get_structure("surge"), heading="simulated")
+        StepModel(get_structure("surge"), heading="simulated")

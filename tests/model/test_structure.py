@@ -10,7 +10,7 @@ import pytest
 
 from greybox.errors import StructureError
 from greybox.model.catalogue import get_structure, structure_names
-from greybox.model.functions import jacobians, step_function
+from greybox.model.run.step import StepModel
 from greybox.model.terms import Factor, Term, parse_term
 from greybox.model.units import parameter_unit
 from greybox.vectorised import Vectorised
@@ -90,7 +90,7 @@ def thesis_step(x, psi, tau, d, th):
 
 def test_step_is_the_thesis_model(thesis, true_theta):
     rng = np.random.default_rng(0)
-    step = step_function(thesis)
+    step = StepModel(thesis).function
     for _ in range(20):
         x, tau, d = rng.normal(size=3), rng.normal(size=3), rng.normal(size=4)
         psi = rng.normal()
@@ -98,14 +98,16 @@ def test_step_is_the_thesis_model(thesis, true_theta):
         np.testing.assert_allclose(got, thesis_step(x, psi, tau, d, true_theta), rtol=1e-12)
 
 
+@pytest.mark.parametrize("integrator", ["euler", "rk4"])
 @pytest.mark.parametrize("name", ["thesis", "modulus", "abkowitz"])
-def test_jacobians_equal_finite_differences(name):
+def test_jacobians_equal_finite_differences(name, integrator):
     structure = get_structure(name)
     rng = np.random.default_rng(1)
     theta = rng.uniform(-0.3, 0.3, len(structure.terms))
     x, tau, d = rng.uniform(0.5, 1.5, 3), rng.normal(size=3), rng.normal(size=4) * 0.1
-    step = step_function(structure)
-    a, b, p, e = (np.array(m) for m in jacobians(structure)(x, 0.4, tau, d, [0, 0], theta))
+    model = StepModel(structure, integrator)
+    step = model.function
+    a, b, p, e = (np.array(m) for m in model.jacobians(x, 0.4, tau, d, [0, 0], theta, 1))
     h = 1e-6
 
     def numeric(which, size):

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from greybox.estimation.credibility.evidence import Evidence
 from greybox.estimation.credibility.words import listed
 from greybox.estimation.result import TestResult, not_applicable
-from greybox.model.functions import jacobians
+from greybox.model.run.step import StepModel
 
 Array = NDArray[np.float64]
 
@@ -71,7 +71,7 @@ def _affine_jacobian(evidence: Evidence, terms: list[int]) -> tuple[Array, Array
     predictor = evidence.predictor
     structure = predictor.structure
     n = len(structure.states)
-    function = jacobians(structure, air_measured=predictor.air_measured)
+    function = StepModel(structure, air_measured=predictor.air_measured).jacobians
     rows = []
     for log, keep in zip(evidence.logs, evidence.keep, strict=True):
         kept = np.flatnonzero(keep)
@@ -92,7 +92,7 @@ def _affine_jacobian(evidence: Evidence, terms: list[int]) -> tuple[Array, Array
     d = np.zeros((len(structure.disturbances), len(table)))
 
     def evaluate(theta: Array) -> Array:
-        a = function(x, psi, tau, d, air, np.repeat(theta[:, None], len(table), axis=1))[0]
+        a = function(x, psi, tau, d, air, np.repeat(theta[:, None], len(table), axis=1), 1.0)[0]
         return np.asarray(a.full()).reshape(n, len(table), n).transpose(1, 0, 2)
 
     zero = np.zeros(len(structure.terms))

@@ -1,0 +1,271 @@
+"""One sample of a model: the only place where its states are moved on.
+
+A structure, or a predictor with estimated coefficients, gives what its equations add in
+a sample, f (3.51). Around it stand the integrator and the kinematics of heading and
+position. Free runs, output error, instruments, diagnosis, design, prediction and export
+all take this step; the fast forms of `greybox.model.run.kernels` are compiled from it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Literal, TypeVar
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.errors import StructureError
+from greybox.model.predictor import Predictor
+from greybox.model.structure import Structure
+from greybox.rotation import body_to_ned
+
+Array = NDArray[np.float64]
+Integrator = Literal["euler", "rk4"]
+Heading = Literal["measured", "simulated"]
+Rule = Literal["euler", "trapezoid"]
+
+# the classical Runge-Kutta rule: the share of a stage's slope at which the next one looks,
+# and what each counts
+_AHEAD = (0.5, 0.5, 1.0)
+_WEIGHTS = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
+
+_State = TypeVar("_State", ca.SX, Array)
+
+
+def increment(integrator: Integrator, slope: Callable[[_State], _State], start: _State) -> _State:
+    """Return what one sample adds to a state, inputs held.
+
+    Parameters
+    ----------
+    integrator : {"euler", "rk4"}
+        Explicit Euler as (2.6), or the classical fourth-order rule.
+    slope : callable
+        The change over the sample at a state; called once a stage, in their order.
+    start : SX or ndarray
+        The state. Since the rule is linear in the slopes, a derivative of the state is
+        moved on by it as well, with the chain rule as its slope.
+    """
+    now = slope(start)
+    if integrator == "euler":
+        return now
+    total = _WEIGHTS[0] * now
+    for share, weight in zip(_AHEAD, _WEIGHTS[1:], strict=True):
+        now = slope(start + share * now)
+        total = total + weight * now
+    return total
+
+
+@dataclass(frozen=True)
+class SymbolicStep:
+    """A step in symbols, to be differentiated or filled in.
+
+    Parameters
+    ----------
+    x, psi, tau, d, air, theta, dt : SX
+        States (nx,) [m/s, rad/s], heading [rad], generalised inputs (nu,), disturbance
+        means (nd,) and velocity through the air (2,) [m/s], coefficients (p,), and the
+        sample time [s].
+    after : SX
+        (nx,) next states, and the next heading below them where it is simulated.
+    """
+
+    x: ca.SX
+    psi: ca.SX
+    tau: ca.SX
+    d: ca.SX
+    air: ca.SX
+    theta: ca.SX
+    dt: ca.SX
+    after: ca.SX
+
+    @property
+    def state(self) -> ca.SX:
+        """What a step hands to the next one: `x`, and `psi` where it is simulated."""
+        simulated = self.after.numel() > self.x.numel()
+        return ca.vertcat(self.x, self.psi) if simulated else self.x
+
+    def at(self, expression: ca.SX, d: Array, theta: Array, air: ca.SX | None = None) -> ca.SX:
+        """Return an expression at known means and coefficients, and a known wind."""
+        found = ca.substitute(
+            ca.densify(expression), ca.vertcat(self.d, self.theta), ca.vertcat(ca.DM(d), theta)
+        )
+        return found if air is None else ca.substitute(found, self.air, air)
+
+
+@dataclass(frozen=True)
+class StepModel:
+    """What one sample does to a ship.
+
+    Parameters
+    ----------
+    structure : Structure
+    integrator : {"euler", "rk4"}
+    heading : {"measured", "simulated"}
+        Held over the sample, or integrated with the states.
+    air_measured : bool
+        Whether the velocity through the air is an input, held over the sample; else the
+        wind's mean forms it.
+    predictor : Predictor, optional
+        Its columns and their coefficients take the place of the structure's terms and
+        parameters; biases capture what the means do not.
+
+    Raises
+    ------
+    StructureError
+        The heading is to be simulated but the structure has no yaw rate, or a map that
+        is not an increment is to be integrated by RK4.
+    """
+
+    structure: Structure
+    integrator: Integrator = "euler"
+    heading: Heading = "measured"
+    air_measured: bool = False
+    predictor: Predictor | None = None
+
+    def __post_init__(self) -> None:
+        if self.heading == "simulated" and "r" not in self.structure.states:
+            raise StructureError(
+                f"structure '{self.structure.name}' has no yaw rate to integrate: use the "
+                f"measured heading."
+            )
+        if self.integrator != "euler" and not self.structure.increment:
+            raise StructureError(
+                f"structure '{self.structure.name}' is a map, not a rate: use euler."
+            )
+
+    @classmethod
+    def of_predictor(cls, predictor: Predictor, heading: Heading = "measured") -> StepModel:
+        """Return the step of a predictor with its own coefficients."""
+        return cls(
+            predictor.structure,
+            heading=heading,
+            air_measured=predictor.air_measured,
+            predictor=predictor,
+        )
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """What a step hands to the next one, the heading last where it is simulated."""
+        own = self.structure.states
+        return (*own, "psi") if self.heading == "simulated" else own
+
+    @property
+    def symbolic(self) -> SymbolicStep:
+        """The step as expressions of its symbols."""
+        return _symbolic(self)
+
+    @property
+    def function(self) -> ca.Function:
+        """The step, ``(x, psi, tau, d, air, theta, dt) -> after``; see `SymbolicStep`."""
+        return _function(self)
+
+    def __call__(
+        self,
+        x: ca.SX,
+        psi: ca.SX | float,
+        tau: ca.SX,
+        d: ca.SX | Array,
+        air: ca.SX | Array,
+        theta: ca.SX | Array,
+        dt: ca.SX | float,
+    ) -> ca.SX:
+        """Return the next states as an expression of others; see `SymbolicStep`."""
+        after = _function(self).call([ca.SX(a) for a in (x, psi, tau, d, air, theta, dt)])
+        return ca.SX(after[0])
+
+    @property
+    def jacobians(self) -> ca.Function:
+        """Derivatives of the next states, ``(x, psi, tau, d, air, theta, dt) -> A, B, P, E``.
+
+        ``A`` (nx, nx) in the states, ``B`` (nx, nu) in the inputs, ``P`` (nx, p) in the
+        coefficients, ``E`` (nx, nd) in the disturbance means.
+        """
+        return _jacobians(self)
+
+
+@lru_cache(maxsize=128)
+def _symbolic(step: StepModel) -> SymbolicStep:
+    structure, predictor = step.structure, step.predictor
+    s = structure.symbols
+    nx = s.x.numel()
+    theta = s.theta if predictor is None else ca.SX.sym("c", len(predictor.columns))
+    f = structure.increment_expression(air_measured=step.air_measured)
+    if predictor is not None:
+        f = predictor.increment_expression(theta)
+    rate = ca.Function("rate", [s.x, s.psi, s.tau, s.d, s.air, theta], [f])
+    dt = ca.SX.sym("dt")
+    turns = step.heading == "simulated"
+    state = ca.vertcat(s.x, s.psi) if turns else s.x
+
+    def slope(z: ca.SX) -> ca.SX:
+        own = rate(z[:nx], z[nx] if turns else s.psi, s.tau, s.d, s.air, theta)
+        turn = [dt * z[structure.states.index("r")]] if turns else []
+        return ca.vertcat(own, *turn)
+
+    before = state
+    if not structure.increment:
+        # the terms of a map give the next state itself
+        before = ca.vertcat(ca.SX(nx, 1), *[s.psi] * turns)
+    after = ca.densify(before + increment(step.integrator, slope, state))
+    return SymbolicStep(s.x, s.psi, s.tau, s.d, s.air, theta, dt, after)
+
+
+@lru_cache(maxsize=128)
+def _function(step: StepModel) -> ca.Function:
+    s = _symbolic(step)
+    return ca.Function("step", [s.x, s.psi, s.tau, s.d, s.air, s.theta, s.dt], [s.after])
+
+
+@lru_cache(maxsize=64)
+def _jacobians(step: StepModel) -> ca.Function:
+    s = _symbolic(step)
+    return ca.Function(
+        "jacobians",
+        [s.x, s.psi, s.tau, s.d, s.air, s.theta, s.dt],
+        [ca.jacobian(s.after, v) for v in (s.x, s.tau, s.theta, s.d)],
+        ["x", "psi", "tau", "d", "air", "theta", "dt"],
+        ["A", "B", "P", "E"],
+    )
+
+
+def next_position(place: ca.SX, u: ca.SX, v: ca.SX, psi: ca.SX, dt: ca.SX | float) -> ca.SX:
+    """Return north and east a sample later by Euler, p⁺ = p + Ts·R(ψ)(u, v), of either integrator.
+
+    Parameters
+    ----------
+    place : SX
+        (2,) [m]
+    u, v, psi, dt : SX
+        At the sample [m/s, rad], and its length [s].
+    """
+    return place + dt * ca.vertcat(*body_to_ned(u, v, psi))
+
+
+def integrated(rate: Array, steps: Array | float, rule: Rule, axis: int = 0) -> Array:
+    """Integrate a rate that was run already, from zero.
+
+    Parameters
+    ----------
+    rate : ndarray
+        (..., N, ...)
+    steps : ndarray or float
+        (N−1,) or one: lengths of the samples [s].
+    rule : {"euler", "trapezoid"}
+        By the rate at the start of each sample, as a step moves positions, or by the mean
+        of both ends.
+    axis : int
+        Of time.
+
+    Returns
+    -------
+    ndarray
+        As `rate`.
+    """
+    moved = np.moveaxis(rate, axis, -1)
+    out = np.zeros_like(moved)
+    mean = moved[..., :-1] if rule == "euler" else (moved[..., 1:] + moved[..., :-1]) / 2
+    np.cumsum(mean * steps, axis=-1, out=out[..., 1:])
+    return np.moveaxis(out, -1, axis)
