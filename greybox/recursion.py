@@ -59,6 +59,14 @@ def propagate(a: Array, b: Array, start: Array) -> Array:
     return found.reshape(*lead, steps + 1, n, columns)
 
 
+def decay(share: float, b: Array) -> Array:
+    """Return y with y(0) = b(0) and y(k+1) = share·y(k) + b(k+1), along axis 0 of b (N, …)."""
+    columns = np.array(b.reshape(len(b), -1), order="F")
+    band = np.vstack([np.ones(len(b)), np.full(len(b), -share)])
+    solved, _ = dtbtrs(band, columns, uplo="L", diag="U", overwrite_b=True)
+    return np.asarray(solved.reshape(b.shape))
+
+
 def _stepped(a: Array, b: Array, out: Array) -> None:
     """Fill out (N, M, n, m) behind the first sample of all runs."""
     after, own = (np.ascontiguousarray(x.swapaxes(0, 1)) for x in (a, b))

@@ -7,7 +7,7 @@ the fewest changes win unless the gain is beyond doubt.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.trial.checks.finding import Finding, Outcome
-from greybox.trial.checks.motion import Motion, integrate, profile, to_ned
+from greybox.trial.checks.motion import Motion, integrate, profiles, to_ned
 from greybox.trial.convert.derived_signals import continuous
 from greybox.trial.steps import Step, mend
 from greybox.units import UNITS
@@ -32,6 +32,8 @@ _TURN_SECONDS = 10.0
 _EXCERPT = 8000
 # and in means over so many seconds of a fast one
 _STEP = 0.5
+# residuals whitened together hold about so many numbers
+_AT_ONCE = 100_000
 _DEG = np.pi / 180
 _KNOT = UNITS["kn"].factor
 
@@ -277,7 +279,7 @@ def _decide(logs: Sequence[_Alternatives]) -> Key:
         )
         if not silent.channels or lost >= _LEAST_GAIN:
             kept.append(change)
-    return tuple(c.words for c in kept)
+    return _words(kept)
 
 
 def _changes(logs: Sequence[_Alternatives], key: Key) -> tuple[ColumnHypothesis, ...]:
@@ -426,28 +428,26 @@ class _Alternatives:
 
     def __init__(self, motion: Motion) -> None:
         self.motion = motion = motion.coarser(_STEP).excerpt(_EXCERPT)
+        self.relations = [r for r in _RELATIONS if all(n in motion for n in r.channels)]
         self.cache: dict[tuple[str, Key], float] = {}
         # neighbouring samples of a fast log say the same: its likelihood counts them all
         self.sample_correlation_factor = max(1.0, 0.5 / motion.step / 5)
-        self.base = self.score(())
-        self.ranked: dict[Key, tuple[tuple[ColumnHypothesis, ...], float, float]] = {
-            (): ((), 0.0, 0.0)
-        }
         usable = [c for c in _CHANGES if self.applies(c)]
-        for c in usable:
-            self._rank((c,))
+        alternatives: dict[Key, tuple[ColumnHypothesis, ...]] = {(): ()}
+        alternatives |= {_words((c,)): (c,) for c in usable}
         if motion.positioned:
-            self._rank((_turned(motion),), ("turned",))
-            for c in _late(motion):
-                self._rank((c,))
+            alternatives[("turned",)] = (_turned(motion),)
+            alternatives |= {_words((c,)): (c,) for c in _late(motion)}
         for a, b in combinations(usable, 2):
             if a.group != b.group and not set(a.channels) & set(b.channels):
-                self._rank((a, b))
-
-    def _rank(self, changes: tuple[ColumnHypothesis, ...], key: Key | None = None) -> None:
-        words = key or tuple(c.words for c in changes)
-        gain = self.score(changes) - self.base
-        self.ranked[words] = (changes, gain, sum(c.cost for c in changes))
+                alternatives[_words((a, b))] = (a, b)
+        self._score_all(list(alternatives.values()))
+        base = self.score(())
+        # what is read so, the log-likelihood that it gains, and what it costs
+        self.ranked = {
+            key: (changes, self.score(changes) - base, sum(c.cost for c in changes))
+            for key, changes in alternatives.items()
+        }
 
     def gain(self, key: Key) -> float:
         """Return the log-likelihood that a reading gains; nothing where it does not apply."""
@@ -455,11 +455,8 @@ class _Alternatives:
 
     def judging(self, changes: tuple[ColumnHypothesis, ...]) -> int:
         """Return how many residuals can tell about these changes."""
-        channels = {c for change in changes for c in change.channels}
-        n = len(self.motion)
-        position = self.motion.positioned and bool(channels & {"x_n", "y_n", "u", "v", "psi"})
-        heading = self.motion.turned and bool(channels & {"psi", "r"})
-        return 2 * n * position + n * heading
+        told = (r for r in self.relations if any(map(r.reads, changes)))
+        return len(self.motion) * sum(r.components for r in told)
 
     def applies(self, change: ColumnHypothesis) -> bool:
         if not all(c in self.motion for c in change.channels):
@@ -469,21 +466,26 @@ class _Alternatives:
         return self.motion.positioned or self.motion.turned
 
     def score(self, changes: tuple[ColumnHypothesis, ...]) -> float:
-        as_read = read(self.motion, changes)
-        total = 0.0
-        if as_read.positioned:
-            total += self._cached("position", changes, as_read)
-        if as_read.turned:
-            total += self._cached("heading", changes, as_read)
-        return total
+        """Return the log-likelihood of a reading."""
+        self._score_all([changes])
+        return sum(self.cache[r.name, _words(filter(r.reads, changes))] for r in self.relations)
 
-    def _cached(self, what: str, changes: tuple[ColumnHypothesis, ...], as_read: Motion) -> float:
-        relevant = {"x_n", "y_n", "u", "v", "psi"} if what == "position" else {"psi", "r"}
-        key = (what, tuple(c.words for c in changes if set(c.channels) & relevant))
-        if key not in self.cache:
-            score = _position_score if what == "position" else _heading_score
-            self.cache[key] = score(as_read)
-        return self.cache[key]
+    def _score_all(self, alternatives: Sequence[tuple[ColumnHypothesis, ...]]) -> None:
+        """Fill the cache with these readings, many residuals at once."""
+        for relation in self.relations:
+            new: dict[Key, tuple[ColumnHypothesis, ...]] = {}
+            for changes in alternatives:
+                key = _words(filter(relation.reads, changes))
+                if (relation.name, key) not in self.cache:
+                    new.setdefault(key, changes)
+            m = self.motion
+            drift = (m.t - m.t[0])[:, None]
+            at_once = max(1, _AT_ONCE // len(m))
+            for k in range(0, len(new), at_once):
+                keys = list(new)[k : k + at_once]
+                z = np.stack([relation.residual(read(m, new[key])) for key in keys], axis=1)
+                for key, found in zip(keys, profiles(z, drift, m), strict=True):
+                    self.cache[relation.name, key] = found.loglik
 
 
 def _order(change: ColumnHypothesis) -> int:
@@ -493,19 +495,39 @@ def _order(change: ColumnHypothesis) -> int:
     return 1 if change.id == "frame" and change.group == "velocity" else 0
 
 
-def _position_score(m: Motion) -> float:
+def _words(changes: Iterable[ColumnHypothesis]) -> Key:
+    return tuple(c.words for c in changes)
+
+
+def _position_residual(m: Motion) -> Array:
     walked = integrate(to_ned(m["psi"], m["u"], m["v"]), m)
     position = np.column_stack([m["x_n"], m["y_n"]])
-    drift = (m.t - m.t[0])[:, None]
     # a reading is judged per metre, so that one in kilometres has no advantage
     # the size of all steps together stays the same whatever is reversed or exchanged
     scale = float(np.sqrt(np.mean(np.diff(position, axis=0) ** 2))) or 1.0
-    found = profile((position - walked) / scale, drift, m)
-    return found.loglik
+    return np.asarray((position - walked) / scale)
 
 
-def _heading_score(m: Motion) -> float:
+def _heading_residual(m: Motion) -> Array:
     scale = float(np.sqrt(np.mean(np.diff(m["psi"]) ** 2))) or 1.0
-    drift = (m.t - m.t[0])[:, None]
-    rest = (m["psi"] - integrate(m["r"], m)) / scale
-    return profile(rest, drift, m).loglik
+    return np.asarray((m["psi"] - integrate(m["r"], m)) / scale)[:, None]
+
+
+@dataclass(frozen=True)
+class _Relation:
+    """What ties motion channels together: a residual (N, `components`) that should be noise."""
+
+    name: str
+    channels: tuple[str, ...]
+    components: int
+    residual: Callable[[Motion], Array]
+
+    def reads(self, change: ColumnHypothesis) -> bool:
+        """Whether a change concerns it."""
+        return bool(set(change.channels) & set(self.channels))
+
+
+_RELATIONS = (
+    _Relation("position", ("x_n", "y_n", "u", "v", "psi"), 2, _position_residual),
+    _Relation("heading", ("psi", "r"), 1, _heading_residual),
+)

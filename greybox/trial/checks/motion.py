@@ -16,6 +16,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.recursion import decay
 from greybox.rotation import body_to_ned
 from greybox.trial.convert.derived_signals import continuous
 from greybox.trial.convert.resample import clock, stretches
@@ -178,11 +179,11 @@ def integrate(rate: Array, motion: Motion) -> Array:
 
 def whiten(z: Array, gain: float, motion: Motion) -> Array:
     """Return the innovations of the local-level model along axis 0, stretch by stretch."""
-    from scipy.signal import lfilter
-
+    steps = np.diff(z, axis=0, prepend=0.0)
     out = np.empty_like(z)
     for a, b in motion.stretches:
-        out[a:b] = lfilter([1.0, -1.0], [1.0, gain - 1.0], z[a:b], axis=0)
+        steps[a] = z[a]
+        out[a:b] = decay(1.0 - gain, steps[a:b])
     return out
 
 
@@ -229,19 +230,26 @@ def profile(z: Array, nuisance: Array, motion: Motion, gains: Array = GAINS) -> 
     nuisance : ndarray
         (N, q).
     """
-    best: Profile | None = None
-    count = int(z.size / len(z))
-    both = np.column_stack([z, nuisance])
-    for gain in gains:
+    return profiles(z.reshape(len(z), 1, -1), nuisance, motion, gains)[0]
+
+
+def profiles(z: Array, nuisance: Array, motion: Motion, gains: Array = GAINS) -> list[Profile]:
+    """Return the likelihood of each of several residuals (N, k, m); see `profile`."""
+    size, (count, components) = len(z), z.shape[1:]
+    both = np.column_stack([z.reshape(size, -1), nuisance])
+    logliks, stds = np.empty((len(gains), count)), np.empty((len(gains), count))
+    for i, gain in enumerate(gains):
         white = without_starts(whiten(both, float(gain), motion), float(gain), motion)
-        e, x = white[:, :count], white[:, count:]
+        e, x = white[:, : count * components], white[:, count * components :]
         rest = e - x @ solve(x, e)
-        variance = float(np.mean(rest**2))
-        loglik = -0.5 * rest.size * np.log(max(variance, 1e-300))
-        if best is None or loglik > best.loglik:
-            best = Profile(loglik, float(gain), float(np.sqrt(variance)))
-    assert best is not None
-    return best
+        variance = np.einsum("ij,ij->j", rest, rest).reshape(count, components).mean(axis=1) / size
+        logliks[i] = -0.5 * size * components * np.log(np.maximum(variance, 1e-300))
+        stds[i] = np.sqrt(variance)
+    best = logliks.argmax(axis=0)
+    return [
+        Profile(float(logliks[i, k]), float(gains[i]), float(stds[i, k]))
+        for k, i in enumerate(best)
+    ]
 
 
 def outlier_weights(size: Array) -> Array:

@@ -220,7 +220,7 @@ def _least_hold(messages: Rows, p: Array, went: Array, step: tuple[float, float]
     """
     if not min(step) > 0:
         return 1.0
-    from scipy.stats import poisson
+    from scipy.special import pdtrc
 
     way = np.diff(p, axis=0)
     near = (np.abs(way) < 1.5 * np.array(step)).all(axis=1)
@@ -233,6 +233,6 @@ def _least_hold(messages: Rows, p: Array, went: Array, step: tuple[float, float]
         astern = np.count_nonzero(near & among & (along < 0))
         once = np.sqrt((ahead + 0.5) * (astern + 0.5)) / 4
         expected = once * (once / max(np.count_nonzero(among), 1)) ** (least - 1)
-        if poisson.sf(np.count_nonzero(messages >= least) - 1, expected) < _CHANCE:
+        if pdtrc(np.count_nonzero(messages >= least) - 1, expected) < _CHANCE:
             return float(least)
     return np.inf

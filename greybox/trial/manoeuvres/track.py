@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import BSpline
 
 from greybox.rotation import body_to_ned
 from greybox.trial.manoeuvres.local import noise_std, regress
@@ -112,6 +111,8 @@ def path_length(track: Track, start: float, stop: float, scale: float) -> Quanti
     scale : float
         Time over which the track changes its course [s].
     """
+    from scipy.interpolate import BSpline
+
     pad = scale / 6
     k = np.flatnonzero((track.t >= start - pad) & (track.t <= stop + pad))
     t = track.t[k]
