@@ -187,8 +187,8 @@ def _rudder_trial(seed: int, zigzag: bool) -> dict[str, Array]:
             order[0] = angle
         elif abs(psi) > angle and order[0] * psi > 0:
             order[0] = -order[0]
-        # the steering gear moves 0.1 rad/s
-        order[1] += float(np.clip(order[0] - order[1], -0.05, 0.05))
+        # the steering gear moves 0.087 rad/s
+        order[1] += float(np.clip(order[0] - order[1], -0.0437, 0.0437))
         return {"n": 10.0, "delta": order[1]}
 
     ship = {n: (s, f, step * v) for n, (s, f, v) in RUDDER.items()}
@@ -208,7 +208,9 @@ def _model(ship: Ship, vessel: str, step: float = 1.0, **more: object) -> dict[s
     if vessel == "rudder":
         inputs = ["taux", "race", "rudder", "race_drag", "rudder_drag"]
     std = np.abs(theta) / 20
-    covariance = np.outer(std, std) * (0.2 + 0.8 * np.eye(len(std)))
+    place = np.arange(len(std))
+    # no two eigenvalues are equal, so that draws from it are what they are
+    covariance = np.outer(std, std) * 0.4 ** np.abs(place[:, None] - place)
     noise = {
         "measurement": dict.fromkeys(states, 0.0141), "process": dict.fromkeys(states, 1e-3),
         "heading": 0.01, "wind": 0.1, "source": "given", "memory": {},
