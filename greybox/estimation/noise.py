@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.estimation.whitening import ErrorBand, ErrorNoise
+from greybox.estimation.whitening import ErrorBand, ErrorNoise, inverse_band
 from greybox.model.noise import NoiseLevels
 from greybox.vessel.vessel import Vessel
 
@@ -27,8 +27,10 @@ _SLOWEST = 300.0
 _BELIEVED = 16.3
 # steps of a climb that tell whether it is worth going on, and the gain from which it is
 _PROBE, _PROMISING = 3, 5.0
-# loss where a covariance is singular: finite, so that differences stay numbers
+# loss where a covariance is singular: finite, so that a line search goes on
 _IMPOSSIBLE = 1e100
+# correlation of neighbouring samples that is as good as none
+_NEXT_TO_NONE = 1e-12
 
 
 @dataclass(frozen=True)
@@ -108,34 +110,92 @@ class ErrorLikelihood:
 
     def loss(self, noise: ErrorNoise) -> float:
         """Return minus the logarithm of the likelihood, up to a constant."""
-        total = 0.0
-        gram, score = np.zeros((self._shared, self._shared)), np.zeros(self._shared)
+        whitened = self._whitened(noise)
+        return _IMPOSSIBLE if whitened is None else whitened[0]
+
+    def slopes(self, noise: ErrorNoise) -> tuple[float, Array, Array, Array]:
+        """Return the loss and its derivatives.
+
+        Returns
+        -------
+        tuple
+            The loss; derivatives in the variances of the measurements (nx,), in those of the
+            process noise (nx,), and in its memory (nx,), which must not all be zero for that.
+
+        References
+        ----------
+        Patterson and Thompson (1971); Takahashi, Fagan and Chen (1973) for the elements of
+        the inverse that they need.
+        """
+        nx = len(self.scale)
+        total = np.zeros((3, nx))
+        whitened = self._whitened(noise)
+        if whitened is None:
+            return _IMPOSSIBLE, *total
+        loss, logs = whitened
+        for band, factor, rows in logs:
+            own = rows[:, : band.rows * nx]
+            # what each row is multiplied by where it meets an error: P = Ω⁻¹ − Σ v vᵀ
+            dual = band.unwhiten(factor, own)
+            by_covariance = inverse_band(factor)
+            for diagonal, entries in enumerate(by_covariance):
+                left, right = dual[:, diagonal:], dual[:, : dual.shape[1] - diagonal]
+                entries[: right.shape[1]] -= np.einsum("qk,qk->k", left, right)
+                # both triangles, and ½ log det
+                entries *= 0.5 if diagonal == 0 else 1.0
+            measured, process, memory = band.slopes(noise, by_covariance)
+            if noise.memory.any():
+                taken = dual * rows[:, band.rows * nx :]
+                memory = memory - taken.reshape(-1, nx).sum(axis=0)
+            total += measured[:nx], process, memory
+        return loss, *total
+
+    def _whitened(
+        self, noise: ErrorNoise
+    ) -> tuple[float, list[tuple[ErrorBand, Array, Array]]] | None:
+        """Return the loss, and each log's factor and rows; None where a covariance is singular.
+
+        Rows are the constants, orthonormal, the regressors, orthonormal over all logs, and
+        what the error keeps beside them, first white, then as they are in the row before
+        where the process noise has a memory.
+        """
+        loss, logs = 0.0, []
+        own, shared = self._own, self._shared
+        gram, score = np.zeros((shared, shared)), np.zeros(shared)
         try:
             for band, values in zip(self.bands, self.values, strict=True):
                 if not band.rows:
                     continue
                 factor = band.factor(noise)
                 if factor is None:
-                    return _IMPOSSIBLE
-                white = band.whiten(factor, noise, values)
-                constants, rest = white[: self._own], white[self._own :]
-                total += float(np.log(factor[0]).sum())
-                if self._own:
-                    root = np.linalg.cholesky(constants @ constants.T)
-                    basis = np.linalg.solve(root, constants)
-                    rest = rest - (rest @ basis.T) @ basis
-                    total += float(np.log(np.diag(root)).sum())
-                error, regressors = rest[0], rest[1:]
-                total += 0.5 * float(error @ error)
+                    return None
+                rows = band.whiten(factor, noise, values)
+                n = rows.shape[1]
+                if noise.memory.any():
+                    rows = np.hstack([rows, band.before(values).reshape(rows.shape)])
+                loss += float(np.log(factor[0]).sum())
+                if own:
+                    constants = rows[:own]
+                    root = np.linalg.cholesky(constants[:, :n] @ constants[:, :n].T)
+                    constants = rows[:own] = np.linalg.inv(root) @ constants
+                    rows[own:] -= (rows[own:, :n] @ constants[:, :n].T) @ constants
+                    loss += float(np.log(np.diag(root)).sum())
+                error, regressors = rows[own, :n], rows[own + 1 :, :n]
+                loss += 0.5 * float(error @ error)
                 gram += regressors @ regressors.T
                 score += regressors @ error
-            if self._shared:
+                logs.append((band, factor, rows))
+            if shared:
                 root = np.linalg.cholesky(gram)
-                taken = np.linalg.solve(root, score)
-                total += float(np.log(np.diag(root)).sum()) - 0.5 * float(taken @ taken)
+                inverse = np.linalg.inv(root)
+                taken = inverse @ score
+                loss += float(np.log(np.diag(root)).sum()) - 0.5 * float(taken @ taken)
+                for _, _, rows in logs:
+                    rows[own + 1 :] = inverse @ rows[own + 1 :]
+                    rows[own] -= taken @ rows[own + 1 :]
         except np.linalg.LinAlgError:
-            return _IMPOSSIBLE
-        return total
+            return None
+        return loss, logs
 
     def fit(self, start: NoiseFit, most: int = 40) -> tuple[NoiseFit, float]:
         """Return the levels of greatest likelihood from a start, and the loss there.
@@ -150,18 +210,33 @@ class ErrorLikelihood:
 
         nx = len(self.scale)
         free = np.flatnonzero(start.free)
-        longest = np.log(_SLOWEST)
+        moved = slice(len(free), len(free) + nx)
 
         def unpack(p: Array) -> ErrorNoise:
             measurement = start.noise.measurement.copy()
             measurement[free] = self.scale[free] * np.exp(p[: len(free)])
-            process = self.scale * np.exp(p[len(free) : len(free) + nx])
+            process = self.scale * np.exp(p[moved])
             memory = np.zeros(nx)
             if start.remembers:
-                memory = -np.expm1(-p[len(free) + nx :])
+                memory = -np.expm1(-p[moved.stop :])
             return replace(start.noise, measurement=measurement, process=process, memory=memory)
 
-        low = np.log(_LEAST)
+        def at(p: Array) -> tuple[float, Array]:
+            noise = unpack(p)
+            told = noise
+            if start.remembers:
+                # none at all has a slope too
+                told = replace(noise, memory=np.maximum(noise.memory, _NEXT_TO_NONE))
+            loss, measured, process, memory = self.slopes(told)
+            slope = [
+                2 * noise.measurement[free] ** 2 * measured[free],
+                2 * noise.process**2 * process,
+            ]
+            if start.remembers:
+                slope.append((1.0 - noise.memory) * memory)
+            return loss, np.concatenate(slope)
+
+        low, longest = np.log(_LEAST), np.log(_SLOWEST)
         first = np.concatenate(
             [
                 np.log(start.noise.measurement[free] / self.scale[free]),
@@ -174,12 +249,18 @@ class ErrorLikelihood:
         # in these units curvature is about 1, and a slope of 0.01 is next to nothing
         unit = np.sqrt(sum(band.rows for band in self.bands))
         ends = np.array(bounds) * unit
+
+        def scaled(p: Array) -> tuple[float, Array]:
+            loss, slope = at(p / unit)
+            return loss, slope / unit
+
         found = minimize(
-            lambda p: self.loss(unpack(p / unit)),
+            scaled,
             np.clip(first * unit, ends[:, 0], ends[:, 1]),
             method="L-BFGS-B",
+            jac=True,
             bounds=ends,
-            options={"ftol": 1e-9, "gtol": 0.01, "eps": 1e-4 * unit, "maxiter": most},
+            options={"ftol": 1e-9, "gtol": 0.01, "maxiter": most},
         )
         return replace(start, noise=unpack(found.x / unit)), float(found.fun)
 

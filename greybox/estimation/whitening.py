@@ -14,11 +14,18 @@ moving average again. All equations stacked sample by sample, the covariance of
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.model.functions import accumulate, unrolled
+
 Array = NDArray[np.float64]
+
+# columns of the inverse that are one scalar function
+_UNROLLED = 24
 
 
 @dataclass(frozen=True)
@@ -103,6 +110,54 @@ class ErrorBand:
                     band[far * nx + i - j, : self.rows - far, j] = blocks[far][i, j, far:]
         return band.reshape(len(band), -1)
 
+    def slopes(self, noise: ErrorNoise, by_covariance: Array) -> tuple[Array, Array, Array]:
+        """Return the derivatives of a function of the covariance in what `noise` consists of.
+
+        Parameters
+        ----------
+        by_covariance : ndarray
+            (diagonals, rows·nx) derivatives in the entries of the lower band, those on the
+            diagonal once, the others counting for both triangles.
+
+        Returns
+        -------
+        tuple of ndarray
+            (nx + m,) in the variances of the measurements and of heading and wind, (nx,) in
+            those of the process noise, (nx,) in its memory.
+        """
+        nx, rows = self.nx, self.rows
+        band = by_covariance.reshape(-1, rows, nx)
+        blocks = np.zeros((len(band) // nx, nx, nx, rows))
+        for i in range(nx):
+            for j in range(nx):
+                # both triangles of the block on the diagonal
+                blocks[0, i, j] = band[abs(i - j), :, min(i, j)] / (1 if i == j else 2)
+                for far in range(1, len(blocks)):
+                    blocks[far, i, j, far:] = band[far * nx + i - j, : rows - far, j]
+        drive = np.einsum("iik->ik", blocks[0])
+        process = (drive * (1.0 - self._one * noise.memory[:, None] ** 2)).sum(axis=1)
+        same, near, memory = blocks[0], blocks[1], np.zeros(nx)
+        if len(blocks) > 2:
+            far, one = blocks[2], self._one
+            left, right = noise.memory[:, None, None], noise.memory[:, None]
+            variances = np.concatenate([noise.measurement, noise.further]) ** 2
+            own = np.tensordot(variances, self._same, axes=1)
+            tie = np.tensordot(variances, self._next, axes=1)
+            before, earlier = _previous(own) * one, _previous(tie)
+            memory -= 2 * noise.memory * noise.process**2 * (drive * one).sum(axis=1)
+            memory -= 2 * (same * tie).sum(axis=(0, 2))
+            memory += 2 * (same * right * before).sum(axis=(1, 2))
+            memory -= (near * before).sum(axis=(1, 2)) + (far * earlier * self._two).sum((1, 2))
+            both = near * earlier * one
+            memory += (both * right).sum(axis=(1, 2)) + (both * left).sum(axis=(0, 2))
+            same, near = (
+                same + _following((left * right * same - left * near) * one),
+                near - 2 * same * right + _following((left * right * near) * one
+                                                     - left * far * self._two),
+            )  # fmt: skip
+        measured = np.tensordot(self._same, same, axes=3) + np.tensordot(self._next, near, axes=3)
+        return measured, process, memory
+
     def factor(self, noise: ErrorNoise) -> Array | None:
         """Return the Cholesky factor of the band, None where it is not positive."""
         from scipy.linalg.lapack import dpbtrf
@@ -129,11 +184,72 @@ class ErrorBand:
 
         v = values[:, self.keep]
         if noise.memory.any():
-            v[:, 1:] -= noise.memory * self._one[1:, None] * values[:, self.keep[:-1]]
+            v -= noise.memory * self.before(values)
         out = v.reshape(len(v), -1)
         for row in out:
             row[:] = dtbsv(len(factor) - 1, factor, row, lower=1)
         return out
+
+    def unwhiten(self, factor: Array, white: Array) -> Array:
+        """Return the transposed factor's inverse times white rows (q, rows·nx): Ω⁻¹ v."""
+        from scipy.linalg.blas import dtbsv
+
+        return np.array([dtbsv(len(factor) - 1, factor, row, lower=1, trans=1) for row in white])
+
+    def before(self, values: Array) -> Array:
+        """Return the values (q, N, nx) of the row before each, zero where none is."""
+        out = np.zeros((len(values), self.rows, self.nx))
+        out[:, 1:] = self._one[1:, None] * values[:, self.keep[:-1]]
+        return out
+
+
+def inverse_band(factor: Array) -> Array:
+    """Return the band of the inverse of a symmetric matrix from that of its Cholesky factor.
+
+    Parameters
+    ----------
+    factor : ndarray
+        (b + 1, n) lower band, the diagonal first.
+
+    Returns
+    -------
+    ndarray
+        (b + 1, n), alike.
+
+    References
+    ----------
+    Takahashi, Fagan and Chen (1973); Erisman and Tinney (1975).
+    """
+    width, columns = factor.shape
+    count = -(-columns // _UNROLLED)
+    backwards = np.ones((width, count * _UNROLLED))
+    backwards[:, :columns] = factor[:, ::-1]
+    found = _backwards(width - 1, count)(np.zeros(width * (width - 1) // 2), backwards)[2]
+    return np.asarray(found.full())[:, :columns][:, ::-1]
+
+
+@lru_cache(maxsize=32)
+def _backwards(width: int, count: int) -> ca.Function:
+    """Return ``(window, columns of the factor) -> columns of the inverse``, last column first."""
+    window = ca.SX.sym("window", width * (width + 1) // 2)
+    column = ca.SX.sym("column", width + 1)
+    behind = ca.tril2symm(ca.SX(ca.Sparsity.lower(width), window))
+    below = column[1:] / column[0]
+    own = -(behind @ below)
+    own = ca.vertcat(1 / column[0] ** 2 - ca.dot(below, own), own)
+    after = ca.SX(width, width)
+    after[:, 0] = own[:width]
+    after[1:, 1:] = behind[: width - 1, : width - 1]
+    packed = ca.tril(ca.densify(after)).nz[:]
+    step = ca.Function("step", [window, column], [packed, own], {"cse": True})
+    return accumulate(unrolled(step, 1, _UNROLLED), count)
+
+
+def _following(values: Array) -> Array:
+    """Return the values of the row behind, zero behind the last: the adjoint of `_previous`."""
+    out = np.zeros_like(values)
+    out[..., :-1] = values[..., 1:]
+    return out
 
 
 def _previous(values: Array) -> Array:

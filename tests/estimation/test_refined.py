@@ -263,6 +263,41 @@ def test_the_restricted_likelihood_equals_dense_algebra():
     np.testing.assert_allclose(got, want / 2, rtol=1e-10)
 
 
+@pytest.mark.parametrize("own", [(True, True, True), (False, True, False)])
+@pytest.mark.parametrize("memory", [(0.0, 0.0, 0.0), (0.5, 0.2, 0.7)])
+@pytest.mark.parametrize("restricted", [False, True])
+def test_slopes_of_the_likelihood_equal_differences(own, memory, restricted):
+    rng = np.random.default_rng(0)
+    bands, errors, regressors = [], [], []
+    for samples in (90, 60):
+        slopes = 0.5 * rng.standard_normal((samples, 3, 5))
+        bands.append(ErrorBand(slopes, rng.random(samples) > 0.1))
+        errors.append(rng.standard_normal((samples, 3)))
+        regressors.append(rng.standard_normal((4, samples, 3)))
+    likelihood = ErrorLikelihood(
+        bands, errors, own, np.full(3, 1e-6), regressors if restricted else None
+    )
+    at = ErrorNoise(
+        np.array([0.3, 0.5, 0.4]), np.array([0.6, 0.3, 0.8]), np.array(memory), np.array([0.1, 0.2])
+    )
+    loss, *found = likelihood.slopes(at)
+    assert loss == pytest.approx(likelihood.loss(at), rel=1e-12)
+
+    def differences(name, power):
+        out = []
+        for i in range(3):
+            step = 1e-5 * np.eye(3)[i]
+            level = getattr(at, name)
+            ends = [(level**power + sign * step) ** (1 / power) for sign in (1, -1)]
+            high, low = (likelihood.loss(replace(at, **{name: end})) for end in ends)
+            out.append((high - low) / 2e-5)
+        return out
+
+    powers = {"measurement": 2, "process": 2} | ({"memory": 1} if any(memory) else {})
+    for slope, (name, power) in zip(found, powers.items(), strict=False):
+        np.testing.assert_allclose(slope, differences(name, power), rtol=1e-6, atol=1e-6)
+
+
 def test_plain_estimates_keep_noise_levels(basic, still_log):
     estimate = with_noise(estimate_iv(basic, [still_log]), [still_log])
     assert estimate.prefilter == "none"

@@ -142,7 +142,7 @@ def accumulate(
         Arguments that a step hands to the next one, first among its results too.
     name : str
     """
-    base = max(_LEAST_BASE, math.isqrt(max(count - 1, 0)) + 1)
+    base = max(_LEAST_BASE, math.isqrt(count) + 1)
     return step.mapaccum(name, count, list(carried), list(range(len(carried))), {"base": base})
 
 
