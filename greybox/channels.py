@@ -48,3 +48,5 @@ CHANNELS: dict[str, Channel] = {
 ANGLES = frozenset({"psi", "gamma_q", "cog", "dir_q", "dir_t", "dir_w"})
 # what a log keeps; the rest only serves to derive these
 LOGGED = ("t", "x_n", "y_n", "psi", "u", "v", "r", "u_q", "v_q")
+# what a model predicts: a run needs none of them past its start
+MOTIONS = frozenset({"x_n", "y_n", "psi", "u", "v", "r"})

@@ -70,15 +70,20 @@ def read_logs(
     Returns
     -------
     tuple of (list of TrialLog, tuple of str)
-        The segments, and a sentence for each that was left out.
+        The segments, and a sentence for each gap and for each segment that was left out.
     """
     from greybox.trial.convert.read import read_segments
     from greybox.trial.kinematics import decimate_segments
+    from greybox.trial.segments import find_log_gaps, join_segments
 
-    logs = [s for path in paths for s in read_segments(path, vessel, states=states)]
+    files = [(path, read_segments(path, vessel, states=states)) for path in paths]
+    logs = [s for _, segments in files for s in segments]
+    whole = (join_segments(segments, Path(path).stem) for path, segments in files)
+    told = tuple(g.sentence for log in whole for g in find_log_gaps(log))
     if sample_time is None or not logs:
-        return logs, ()
-    return decimate_segments(logs, sample_time)
+        return logs, told
+    logs, left_out = decimate_segments(logs, sample_time)
+    return logs, (*told, *left_out)
 
 
 # options that name files to read, and to write

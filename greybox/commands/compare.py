@@ -46,7 +46,10 @@ def run(options: argparse.Namespace) -> None:
     if len(set(names)) < len(names):
         names = list(options.models)
     logs = [
-        [read_log(path, model.vessel, states=model.structure.states) for path in options.log]
+        [
+            read_log(path, model.vessel, states=model.structure.states, gaps=True)
+            for path in options.log
+        ]
         for model in models
     ]
     comparison = compare_models(

@@ -5,10 +5,11 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from greybox.commands.common import add_seed, count, positive, progress, provenance, say
+from greybox.commands.common import add_seed, count, positive, progress, provenance, read_logs, say
 
 if TYPE_CHECKING:
     from greybox.prediction.result import ManoeuvrePrediction
+    from greybox.trial.log import TrialLog
 
 HELP = "predict standard manoeuvres, with intervals and the IMO limits"
 EXAMPLES = """examples:
@@ -114,19 +115,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Predict, compare, report, write."""
     import math
+    from dataclasses import replace
 
     from greybox.files import check_targets, write_json
     from greybox.model.model import load_model
     from greybox.prediction.predict import predict_manoeuvre
-    from greybox.trial.convert.read import read_segments
 
     check_targets(options.json, options.report, options.out)
     angles = [_angle(text) for text in options.angle]
     command = _command(options.propellers)
     model = load_model(options.model)
-    trial = None
+    trial: list[TrialLog] | None = None
+    told: tuple[str, ...] = ()
     if options.trial is not None:
-        trial = read_segments(options.trial, model.vessel, states=model.structure.states)
+        trial, told = read_logs([options.trial], model.vessel, states=model.structure.states)
     made = predict_manoeuvre(
         model,
         options.manoeuvre,
@@ -148,6 +150,7 @@ def run(options: argparse.Namespace) -> None:
         trial=trial,
         progress=progress("manoeuvres"),
     )
+    made = replace(made, notes=(*told, *made.notes))
     record = provenance(options)
     written = []
     if options.out:

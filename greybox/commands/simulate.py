@@ -47,6 +47,8 @@ def run(options: argparse.Namespace) -> None:
     from greybox.model.model import load_model
     from greybox.model.simulation import positions
     from greybox.trial.convert.read import read_log
+    from greybox.trial.gaps import split_at_gaps
+    from greybox.trial.segments import find_log_gaps
     from greybox.trial.validity import other_conditions
     from greybox.validation.bands import predict_bands
     from greybox.validation.fit import run_model
@@ -65,7 +67,7 @@ def run(options: argparse.Namespace) -> None:
                 f"1.5,1.2,0,0."
             )
         fill = dict(zip(("u", "v", "r", "psi"), values, strict=True))
-    log = read_log(options.log, model.vessel, states=model.structure.states, fill=fill)
+    log = read_log(options.log, model.vessel, states=model.structure.states, fill=fill, gaps=True)
     heading: Literal["measured", "simulated"] = options.heading or (
         "simulated" if fill else "measured"
     )
@@ -81,13 +83,15 @@ def run(options: argparse.Namespace) -> None:
     columns = {"t": result.log.t} | {s: result.x[:, i] for i, s in enumerate(states)}
     columns["psi"] = result.psi
     if "u" in states and "v" in states:
-        start = (
-            np.array([result.log["x_n"][0], result.log["y_n"][0]])
-            if "x_n" in result.log and "y_n" in result.log
-            else np.zeros(2)
-        )
-        track = positions(result.x, result.psi, model.sample_time, start)
-        columns |= {"x_n": track[:, 0], "y_n": track[:, 1]}
+        track = []
+        for a, b in split_at_gaps(result.log.t, model.sample_time):
+            start = (
+                np.array([result.log["x_n"][a], result.log["y_n"][a]])
+                if "x_n" in result.log and "y_n" in result.log
+                else np.zeros(2)
+            )
+            track.append(positions(result.x[a:b], result.psi[a:b], model.sample_time, start))
+        columns |= dict(zip(("x_n", "y_n"), np.concatenate(track).T, strict=True))
     notes: tuple[str, ...] = ()
     if not options.no_bands:
         bands = predict_bands(model, result.log, heading=heading, seed=options.seed)
@@ -107,7 +111,8 @@ def run(options: argparse.Namespace) -> None:
     ]
     if winds and not result.log.has_wind:
         say(f"note: {', '.join(winds)} act as in still air, because the log has no wind")
-    for note in (*notes, *(d.sentence for d in other_conditions(model.conditions, [log]))):
+    gaps = (g.sentence for g in find_log_gaps(result.log))
+    for note in (*gaps, *notes, *(d.sentence for d in other_conditions(model.conditions, [log]))):
         say(f"note: {note}")
     if not fill:
         say(f"free run of {len(result.log)} samples, fit {shown}")

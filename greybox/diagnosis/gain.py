@@ -70,9 +70,10 @@ def _fit(error: Array | float, spread: Array | float) -> Array:
 
 
 def _squares(run: LogFit, i: int, state: str, size: int) -> tuple[Array, Array]:
-    measured = run.log[state][:size]
-    spread = (measured - measured.mean()) ** 2
+    measured, known = run.log[state][:size], run.log.known((state,))[:size]
+    # where nothing was measured, nothing counts
+    spread = (measured - measured[known].mean()) ** 2 * known
     with np.errstate(over="ignore", invalid="ignore"):
-        error = (measured - run.x[:size, i]) ** 2
+        error = (measured - run.x[:size, i]) ** 2 * known
     worst = _WORST**2 * max(float(spread.mean()), 1e-300)
     return np.minimum(np.nan_to_num(error, nan=worst, posinf=worst), worst), spread

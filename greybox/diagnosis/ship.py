@@ -140,6 +140,7 @@ class LogRun:
         self._turns = "r" in self.states and "psi" in log
         self.outputs = (*self.states, "psi") if self._turns else self.states
         self.y = np.column_stack([log[n] for n in self.outputs])
+        self._gaps = [(i, ~log.missing[n]) for i, n in enumerate(self.outputs) if n in log.missing]
         self._psi = log["psi"] if "psi" in log else np.zeros(len(log))
         air = log.air
         self.air_measured = air is not None and structure.uses_air
@@ -197,11 +198,24 @@ class LogRun:
         full = x
         if self._turns:
             full = np.column_stack([x, start[nx] + self._heading(x[:, self.states.index("r")])])
-        y = self.sense(ship.sensors, full[..., None])[..., 0]
+        y = self._across_gaps(self.sense(ship.sensors, full[..., None])[..., 0])
         if ship.sensors.late:
             # a run tells nothing of what was before its first sample
             y = self.y + self.within(ship.sensors) * (y - self.y)
         return Shown(x, y)
+
+    def _across_gaps(self, y: Array) -> Array:
+        """Return outputs (N, ny, ...) as the log has them in its gaps: straight between the ends.
+
+        So the error there is what lies between those beside it, and surprises no filter.
+        """
+        for i, known in self._gaps:
+            k, rows = np.flatnonzero(known), np.flatnonzero(~known)
+            right = np.searchsorted(k, rows)
+            left, right = k[right - 1], k[right]
+            share = ((rows - left) / (right - left)).reshape(-1, *[1] * (y.ndim - 2))
+            y[rows, i] = (1 - share) * y[left, i] + share * y[right, i]
+        return y
 
     def within(self, sensors: Sensors) -> Array:
         """Return the share of each measurement that shows a time within the log, (N, ny).
@@ -284,7 +298,7 @@ class LogRun:
             first = np.zeros((self.samples, slope.shape[1], 1))
             first[:, -1] = 1.0
             slope = np.concatenate([slope, first], axis=2)
-        y = self.sense(ship.sensors, slope)
+        y = self._across_gaps(self.sense(ship.sensors, slope))
         return y * self.within(ship.sensors)[:, :, None] if ship.sensors.late else y
 
 

@@ -28,7 +28,7 @@ from greybox.model.model import ManoeuvringModel
 from greybox.model.structure import Structure
 from greybox.trial.log import TrialLog
 from greybox.trial.ranges import ranges
-from greybox.validation.fit import LogFit, fit_percent
+from greybox.validation.fit import LogFit, fit_on
 
 Array = NDArray[np.float64]
 
@@ -224,10 +224,7 @@ class Report:
         seen = self.case.problem(self.found.final.integrator).runs[0]
         outputs = np.column_stack([run.x, run.psi])[:, : len(seen.outputs)]
         x = seen.sense(sensors, outputs[..., None])[:, : len(seen.states), 0]
-        percent = fit_percent(log.states(seen.states), x)
-        return replace(
-            run, log=log, x=x, fit=dict(zip(seen.states, map(float, percent), strict=True))
-        )
+        return replace(run, log=log, x=x, fit=fit_on(log, seen.states, x))
 
     def where(self, validate: Sequence[TrialLog]) -> str:
         """Say what is held out."""
@@ -290,7 +287,8 @@ def _likelier_story(model: ManoeuvringModel, logs: Sequence[TrialLog]) -> Manoeu
 
     def missed(candidate: ManoeuvringModel) -> float:
         return sum(
-            float(np.square(run.log[s] - run.x[:, i]).sum() / max(np.var(run.log[s]), 1e-12))
+            float(np.nansum((run.log.measured(s) - run.x[:, i]) ** 2))
+            / max(float(np.var(run.log[s])), 1e-12)
             for run in (run_on(candidate, log) for log in logs)
             for i, s in enumerate(run.fit)
         )
@@ -331,11 +329,10 @@ def _held_runs(pairs: Sequence[Pair]) -> list[LogFit]:
         ship = pair.held_fit.point.ship
         for run, start in zip(pair.held.runs, pair.held_fit.point.starts, strict=True):
             x = run.run(ship, start).y[:, : len(run.states)]
-            percent = fit_percent(run.log.states(run.states), x)
             out.append(
                 LogFit(
                     run.log, x, run.log["psi"] if "psi" in run.log else np.zeros(len(x)),
-                    {s: float(f) for s, f in zip(run.states, percent, strict=True)}, -1,
+                    fit_on(run.log, run.states, x), -1,
                 )
             )  # fmt: skip
     return out

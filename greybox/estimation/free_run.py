@@ -159,7 +159,7 @@ def fit_free_runs(
         found.append(attempt(p, starts, "single" if once else shooting))
         if once or not doubtful(found[0]):
             return found[0]
-    part = [Measured(log.w[:_PART], log.y[:_PART]) for log in logs]
+    part = [log.first(_PART) for log in logs]
     begun = [approach(model, part, p, starts, restrictions, noise)]
     if once:
         return attempt(*begun[0], "single")

@@ -67,14 +67,14 @@ def autocovariance(residuals: Sequence[Array], lags: int) -> Array:
     Parameters
     ----------
     residuals : sequence of ndarray
-        (N, ny) an uninterrupted stretch each.
+        (N, ny) an uninterrupted stretch each; rows of zeros where nothing was measured.
     lags : int
         Memory in samples.
     """
     from scipy.fft import irfft, next_fast_len, rfft
 
     ny = residuals[0].shape[1]
-    samples = sum(len(r) for r in residuals)
+    samples = max(sum(int(r.any(axis=1).sum()) for r in residuals), 1)
     reach = min(2 * lags, max(len(r) for r in residuals) - 1)
     gamma = np.zeros((reach + 1, ny, ny))
     for r in residuals:

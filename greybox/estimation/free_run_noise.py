@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from greybox.estimation.free_run import noise_of
 from greybox.estimation.innovations import FilterRuns, first_noise, fit_noise
 from greybox.estimation.output_setup import measured, turns
-from greybox.estimation.shooting import FreeRuns, Loss, Measured, cut
+from greybox.estimation.shooting import FreeRuns, Loss, cut
 from greybox.model.output import OutputModel
 from greybox.trial.log import TrialLog
 
@@ -59,10 +59,7 @@ def noise_of_run(
         model = replace(model, heading="output")
         nodes = np.column_stack([nodes, [log["psi"][0] for log in logs]])
     # levels need fewer samples than coefficients
-    data = [
-        Measured(d.w[:_NOISE_SAMPLES], d.y[:_NOISE_SAMPLES])
-        for d in (measured(model, log) for log in logs)
-    ]
+    data = [measured(model, log).first(_NOISE_SAMPLES) for log in logs]
     whole = cut(data, max(len(d.y) for d in data))
     first = first_noise(data, len(model.states))
     sigma = np.array([seen.get(n, np.sqrt(first[i])) for i, n in enumerate(model.outputs)])

@@ -280,10 +280,10 @@ def _fit(
 
 
 def _require_rows(model: OutputModel, data: Sequence[Measured]) -> None:
-    rows = sum(len(d.y) for d in data)
+    rows = sum(int(d.known.sum()) for d in data)
     unknown = len(model.parameters) + len(data) * len(model.states)
     most = _ROWS * unknown
-    if rows <= most or min(len(d.y) for d in data) < 3:
+    if rows <= most or min(int(d.known.sum()) for d in data) < 3:
         raise ExcitationError(
             f"{rows} samples and {unknown} unknowns (parameters, disturbance means and initial "
             f"states): more than {most} samples, and 3 in each log, are needed. Use a longer log "
@@ -367,7 +367,7 @@ def log_rows(at: Linearised, segments: Segments, q: int) -> list[tuple[Array, Ar
     for j in range(len(at.r)):
         if not rows:
             link = np.vstack([np.zeros((q, nz)), np.eye(nz)])
-        samples = int(segments.use[j].sum())
+        samples = int(np.flatnonzero(segments.use[j])[-1]) + 1 if segments.use[j].any() else 0
         width = at.r.shape[2]
         used = at.rows[j, : samples * width].T
         own = link @ used[q:]
@@ -422,7 +422,7 @@ def _result(fitted: _Fitted, logs: Sequence[TrialLog], options: OutputErrorOptio
     middle = shared_score_covariance(
         list(zip(rows, residuals, strict=True)), options.covariance, lags
     )
-    samples = sum(len(d.y) for d in data)
+    samples = sum(int(d.known.sum()) for d in data)
     # degrees of freedom, as a regression counts them
     middle *= samples * ny / max(samples * ny - q - nz * len(data), 1)
     covariance = _sandwich(fitted.hessian, middle + np.diag(restrictions.precision), bound)
@@ -460,7 +460,7 @@ def _result(fitted: _Fitted, logs: Sequence[TrialLog], options: OutputErrorOptio
         residual_std=np.sqrt((errors**2).mean(axis=0))[: len(own)],
         vessel=logs[0].vessel,
         sample_time=model.sample_time,
-        samples=samples,
+        samples=sum(len(d.y) for d in data),
         kept=samples,
         covariance_kind=options.covariance,
         lags=lags,

@@ -88,6 +88,7 @@ def measured(model: OutputModel, log: TrialLog) -> Measured:
     return Measured(
         np.column_stack([signal(n) for n in model.drivers]),
         np.column_stack([signal(n) for n in model.outputs]),
+        log.known(model.outputs),
     )
 
 

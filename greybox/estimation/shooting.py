@@ -47,10 +47,23 @@ _DAMPING_LIMIT = 1e8
 
 @dataclass(frozen=True)
 class Measured:
-    """What one log gives to a fit: drivers w (N, nw) and measured outputs y (N, ny)."""
+    """What one log gives to a fit.
+
+    Parameters
+    ----------
+    w, y : ndarray
+        (N, nw) drivers and (N, ny) measured outputs.
+    known : ndarray of bool
+        (N,) samples whose outputs were measured; a run passes over the others.
+    """
 
     w: Array
     y: Array
+    known: NDArray[np.bool_]
+
+    def first(self, samples: int) -> Measured:
+        """Return the first samples."""
+        return Measured(self.w[:samples], self.y[:samples], self.known[:samples])
 
 
 @dataclass(frozen=True)
@@ -62,7 +75,7 @@ class Segments:
     w, y : ndarray
         (M, m, nw) and (M, m, ny).
     use : ndarray
-        (M, m) 1 where a sample belongs to a log.
+        (M, m) 1 where a sample belongs to a log and was measured.
     joined : ndarray of bool
         (M,) whether the next segment continues this one.
     """
@@ -83,7 +96,8 @@ def cut(logs: Sequence[Measured], steps: int, *, joined_up: bool = True) -> Segm
             index = np.minimum(np.arange(j * steps, (j + 1) * steps), samples - 1)
             w.append(log.w[index])
             y.append(log.y[index])
-            use.append((np.arange(j * steps, (j + 1) * steps) < samples).astype(float))
+            own = np.arange(j * steps, (j + 1) * steps) < samples
+            use.append((own & log.known[index]).astype(float))
             joined.append(joined_up and j + 1 < count)
     return Segments(np.array(w), np.array(y), np.array(use), np.array(joined))
 
@@ -468,4 +482,6 @@ def measured_starts(segments: Segments, nz: int) -> Array:
     """Return the mean of the first samples of each segment, (M, nz)."""
     count = min(5, segments.y.shape[1])
     use = segments.use[:, :count, None]
+    # in a gap, what lies between its ends
+    use = np.where(use.any(axis=1, keepdims=True), use, 1.0)
     return np.asarray((segments.y[:, :count, :nz] * use).sum(axis=1) / use.sum(axis=1))

@@ -17,7 +17,7 @@ from greybox.model.changes import Change, simulate_changing
 from greybox.model.predictor import Predictor
 from greybox.model.simulation import FreeRun
 from greybox.model.structure import Structure
-from greybox.regression.regression import within_margins
+from greybox.regression.regression import measured_rows, within_margins
 from greybox.rotation import body_to_ned, ned_to_body
 from greybox.trial.log import TrialLog
 
@@ -79,6 +79,7 @@ def simulate_log(
     use_wind: bool = False,
     integrator: Literal["euler", "rk4"] = "euler",
     changes: Sequence[Change] = (),
+    first: float = 0.0,
 ) -> FreeRun:
     """Run a model freely on the inputs of a log, from its first samples.
 
@@ -94,7 +95,9 @@ def simulate_log(
     use_wind : bool
         Whether the measured velocity through the air drives the wind terms.
     changes : sequence of Change
-        Of parameters, on the clock of the log.
+        Of parameters.
+    first : float
+        Time of the log's first sample on the clock of the changes [s].
 
     Returns
     -------
@@ -116,6 +119,7 @@ def simulate_log(
         initial_state(log, structure.states),
         tau,
         log.sample_time,
+        first=first,
         psi=psi if marine and (heading == "measured" or not has_yaw) else None,
         psi0=float(psi[0]),
         d=d,
@@ -207,6 +211,7 @@ def build_instruments(
         x = run.x[0][:-1]
         samples = len(x)
         rows = within_margins(x, structure.states, margins) if keep is None else keep[i].copy()
+        rows &= measured_rows(predictor, log)
         tau = (
             log.forces(structure.inputs)[:-1]
             if structure.disturbance == "marine"

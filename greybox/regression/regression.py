@@ -27,7 +27,8 @@ class Experiment:
     phi : ndarray
         (p, N) regressors, in the order of the predictor's columns.
     keep : ndarray of bool
-        (N,) rows that take part; the others violate a sign margin (Remark 4.2).
+        (N,) rows that take part; the others violate a sign margin (Remark 4.2), or lie in a
+        gap of what was measured.
     """
 
     name: str
@@ -124,9 +125,8 @@ def build_regression(
             else [log[n][:-1] for n in structure.inputs],
             (log["u_q"][:-1], log["v_q"][:-1]) if predictor.air_measured else None,
         )
-        experiments.append(
-            Experiment(log.name, y, phi, within_margins(x[:-1], structure.states, margins))
-        )
+        keep = within_margins(x[:-1], structure.states, margins) & measured_rows(predictor, log)
+        experiments.append(Experiment(log.name, y, phi, keep))
     regression = Regression(predictor, tuple(experiments), sample_time)
     most = max(len(predictor.equation(s)) for s in structure.states)
     if regression.kept <= 2 * most:
@@ -136,6 +136,14 @@ def build_regression(
             f"smaller margins."
         )
     return regression
+
+
+def measured_rows(predictor: Predictor, log: TrialLog) -> NDArray[np.bool_]:
+    """Return which rows of a regression were measured, at both ends of their step, (N−1,)."""
+    known = log.known(predictor.structure.states)
+    # only what captures a disturbance turns with the heading
+    heading = ("psi",) if any(c.is_bias for c in predictor.columns) else ()
+    return known[1:] & known[:-1] & log.known(heading)[:-1]
 
 
 def within_margins(

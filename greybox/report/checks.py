@@ -35,6 +35,7 @@ from greybox.trial.checks.finding import CheckReport, Finding, shared_findings, 
 from greybox.trial.convert.convert import import_recording
 from greybox.trial.log import TrialLog
 from greybox.trial.raw_log import Recording
+from greybox.trial.segments import join_segments
 from greybox.vessel.vessel import Vessel
 
 # what makes a force model wrong before what it only has to do without
@@ -310,14 +311,4 @@ def alternative(finding: Finding) -> str:
 
 def _whole(recording: Recording, vessel: Vessel) -> TrialLog:
     """Return all segments of a recording as one log with gaps."""
-    from dataclasses import replace
-
-    parts = import_recording(recording, vessel).segments
-    names = [n for n in parts[0].channels if all(n in p for p in parts)]
-    return replace(
-        parts[0],
-        name=recording.name,
-        t=np.concatenate([p.t for p in parts]),
-        channels={n: np.concatenate([p[n] for p in parts]) for n in names},
-        closed_loop=np.concatenate([p.closed_loop for p in parts]),
-    )
+    return join_segments(import_recording(recording, vessel).segments, recording.name)

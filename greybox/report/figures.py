@@ -83,7 +83,11 @@ def comparison_figure(
         measured = log[state]
         index = thin(gaps, measured, points=points)
         top.plot(
-            pick(t, index), pick(measured, index), color=BLACK, linewidth=1.0, label="measured"
+            pick(t, index),
+            pick(log.measured(state), index),
+            color=BLACK,
+            linewidth=1.0,
+            label="measured",
         )
         spread = float(np.ptp(measured)) or 1.0
         low, high = measured.min() - 0.6 * spread, measured.max() + 0.6 * spread

@@ -57,6 +57,17 @@ def split_at_gaps(t: Array, sample_time: float) -> list[tuple[int, int]]:
     return pieces(t, GAP * sample_time)
 
 
+def bridge(value: Array, known: NDArray[np.bool_]) -> Array:
+    """Return a signal (N,) with straight lines where it is not known, its ends as they are."""
+    k = np.flatnonzero(known)
+    if len(k) < 2 or len(k) == len(value):
+        return value
+    out = value.copy()
+    inner = np.arange(k[0], k[-1] + 1)
+    out[inner] = np.interp(inner, k, value[k])
+    return out
+
+
 def joined_spans(
     spans: Iterable[tuple[float, float, int]], sample_time: float
 ) -> list[tuple[float, float, int]]:

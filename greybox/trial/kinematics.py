@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from greybox.trial.log import TrialLog
 from greybox.trial.steps import Step
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 # corrections of derived velocities that those of the positions and heading imply
 _FOLLOWED = frozenset({"turn_heading", "move_velocity"})
@@ -123,6 +125,9 @@ def decimate(log: TrialLog, sample_time: float) -> TrialLog:
         t=log.t[centres],
         channels=channels,
         closed_loop=log.closed_loop[centres],
+        missing=carried_gaps(
+            _without_means(log.missing, centres - half, step), made[1:], sample_time
+        ),
         provenance=replace(log.provenance, steps=(*log.provenance.steps, *made)),
     )
     if len(made) == 1:
@@ -131,6 +136,55 @@ def decimate(log: TrialLog, sample_time: float) -> TrialLog:
     if len(out) < 5:
         raise _too_few(log, len(out) - 2, sample_time)
     return replace(out.window(1, len(out) - 1), name=log.name)
+
+
+def _without_means(
+    missing: Mapping[str, Mask], first: NDArray[np.int_], step: int
+) -> dict[str, Mask]:
+    """Return the samples of each channel with gaps most of whose mean was not measured."""
+    sums = {n: np.concatenate([[0], np.cumsum(gap)]) for n, gap in missing.items()}
+    return {n: 2 * (s[first + step] - s[first]) > step for n, s in sums.items()}
+
+
+def carried_gaps(
+    missing: Mapping[str, Mask], steps: Iterable[Step], sample_time: float
+) -> dict[str, Mask]:
+    """Return which samples of each channel are not measured once steps have been taken.
+
+    Parameters
+    ----------
+    missing : mapping of str to ndarray of bool
+        (N,) of the channels with gaps, as they were before.
+    steps : iterable of Step
+        In order: what is made of a gap is one, with the neighbours that a difference reaches.
+    sample_time : float
+        [s]
+    """
+    from scipy.ndimage import binary_dilation
+
+    out = dict(missing)
+    for step in steps if missing else ():
+        # velocities are moved with the yaw rate
+        source = ("r",) if step.operation == "move_velocity" else step.source
+        gaps = [out[n] for n in source if n in out]
+        if gaps:
+            gap = np.any(gaps, axis=0)
+            if reach := _reach(step, sample_time):
+                gap = binary_dilation(gap, iterations=reach)
+            out |= {n: gap | out.get(n, False) for n in step.channels}
+        if step.operation == "shift":
+            late = step.number("late") / sample_time
+            for name in out.keys() & set(step.channels):
+                k = np.arange(len(out[name]))
+                out[name] = np.interp(k + late, k, out[name].astype(float)) > 0
+    return {n: m for n, m in out.items() if m.any()}
+
+
+def _reach(step: Step, sample_time: float) -> int:
+    """Return how many neighbours on either side a step takes into a sample."""
+    if step.operation == "difference":
+        return 1
+    return math.ceil(step.number("window") / (2 * sample_time))
 
 
 class _TooShortError(LogError):

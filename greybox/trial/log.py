@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.channels import CHANNELS
+from greybox.channels import CHANNELS, MOTIONS
 from greybox.errors import LogError, UsageError
 from greybox.notebook import DisplayMixin, items, number, sparkline, table
 from greybox.trial.actuator_estimate import ActuatorEstimate
+from greybox.trial.gaps import bridge
 from greybox.trial.steps import Step
 from greybox.vessel.actuation import actuated_force
 from greybox.vessel.conditions import Conditions
@@ -113,6 +114,9 @@ class TrialLog(DisplayMixin):
     loop_known : bool
         Whether the log itself tells so.
     provenance : Provenance
+    missing : mapping of str to ndarray of bool
+        (N,) of channels with gaps: samples that were not measured, where the channel holds
+        what lies between its neighbours.
     """
 
     name: str
@@ -123,6 +127,7 @@ class TrialLog(DisplayMixin):
     closed_loop: NDArray[np.bool_]
     loop_known: bool = False
     provenance: Provenance = field(default_factory=Provenance)
+    missing: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.t)
@@ -182,6 +187,20 @@ class TrialLog(DisplayMixin):
         head = ("channel", "unit", "least", "mean", "most", "over time")
         return table(head, self._rows()), items("History", self._history())
 
+    def known(self, names: Iterable[str]) -> NDArray[np.bool_]:
+        """Return which samples hold measured values of all the named channels, (N,)."""
+        out = np.ones(len(self), bool)
+        for name in names:
+            if name in self.missing:
+                out &= ~self.missing[name]
+        return out
+
+    def measured(self, name: str) -> Array:
+        """Return a channel as it was measured, (N,), NaN where it was not."""
+        return (
+            np.where(self.missing[name], np.nan, self[name]) if name in self.missing else self[name]
+        )
+
     def states(self, names: tuple[str, ...]) -> Array:
         """Return the named states as (N, nx)."""
         return np.column_stack([self[n] for n in names])
@@ -216,7 +235,8 @@ class TrialLog(DisplayMixin):
         """
         import pandas as pd
 
-        frame = pd.DataFrame(dict(self.channels), index=pd.Index(self.t, name="t"))
+        channels = {n: self.measured(n) for n in self.channels}
+        frame = pd.DataFrame(channels, index=pd.Index(self.t, name="t"))
         for name, words in self._mode().items():
             frame[name] = words
         frame.attrs = {"units": self._stated_units(), FRAME_KEY: self._record()}
@@ -238,7 +258,7 @@ class TrialLog(DisplayMixin):
             said = {"units": units.get(name, ""), "long_name": meaning.get(name, "")}
             return {k: v for k, v in said.items() if v}
 
-        variables = {n: ("t", a, attrs(n)) for n, a in self.channels.items()}
+        variables = {n: ("t", self.measured(n), attrs(n)) for n in self.channels}
         variables |= {n: ("t", words, {}) for n, words in self._mode().items()}
         dataset: xr.Dataset = xarray.Dataset(
             variables,
@@ -275,6 +295,7 @@ class TrialLog(DisplayMixin):
             t=self.t[start:stop],
             channels={k: v[start:stop] for k, v in self.channels.items()},
             closed_loop=self.closed_loop[start:stop],
+            missing={k: m for k, v in self.missing.items() if (m := v[start:stop]).any()},
         )
 
 
@@ -292,6 +313,7 @@ def make_log(
     channels : mapping of str to ndarray, or DataFrame
         (N,) each, by canonical name; ``t`` is made when absent. Of a DataFrame its index
         is ``t`` where it is called so; what is to be converted goes to `log_from_pandas`.
+        NaN where a motion was not measured, between samples where it was.
     sample_time : float
         [s]
     name : str
@@ -304,7 +326,7 @@ def make_log(
     Raises
     ------
     LogError
-        Lengths differ, or a value is not finite.
+        Lengths differ, or a value is not finite: an input's, or the first or last of a motion.
     """
     arrays = {k: np.asarray(v, float) for k, v in channels.items()}
     index = getattr(channels, "index", None)
@@ -314,6 +336,11 @@ def make_log(
     if len(set(lengths.values())) > 1:
         (a, na), (b, nb) = min(lengths.items(), key=_second), max(lengths.items(), key=_second)
         raise LogError(f"'{a}' has {na} samples and '{b}' has {nb}: give arrays of one length.")
+    missing = {
+        k: np.isnan(v) for k, v in arrays.items() if k in MOTIONS and np.isnan(v[1:-1]).any()
+    }
+    for key, gap in missing.items():
+        arrays[key] = bridge(arrays[key], ~gap)
     for key, value in arrays.items():
         if not np.isfinite(value).all():
             k = int(np.flatnonzero(~np.isfinite(value))[0])
@@ -321,7 +348,10 @@ def make_log(
     size = next(iter(lengths.values()))
     t = arrays.pop("t", np.arange(size) * sample_time)
     known = Provenance(conditions=vessel.conditions)
-    return TrialLog(name, sample_time, t, arrays, vessel, np.zeros(size, bool), provenance=known)
+    return TrialLog(
+        name, sample_time, t, arrays, vessel, np.zeros(size, bool), provenance=known,
+        missing=missing,
+    )  # fmt: skip
 
 
 def require_xarray() -> Any:

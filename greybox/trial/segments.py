@@ -1,11 +1,12 @@
-"""Segments of a log in which states keep their signs."""
+"""Segments of a log: between its gaps, and those in which states keep their signs."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +53,110 @@ class Segment:
     def cut(self, log: TrialLog) -> TrialLog:
         """Return the samples of this segment as a log of their own."""
         return log.window(self.start, self.stop, f"{log.name}[{self.label}]")
+
+
+def join_segments(segments: Sequence[TrialLog], name: str) -> TrialLog:
+    """Return segments that follow each other in time as one log with gaps."""
+    if len(segments) == 1:
+        return replace(segments[0], name=name)
+    names = [n for n in segments[0].channels if all(n in s for s in segments)]
+    lacking = {n for s in segments for n in s.missing if n in names}
+    return replace(
+        segments[0],
+        name=name,
+        t=np.concatenate([s.t for s in segments]),
+        channels={n: np.concatenate([s[n] for s in segments]) for n in names},
+        closed_loop=np.concatenate([s.closed_loop for s in segments]),
+        missing={n: np.concatenate([~s.known((n,)) for s in segments]) for n in lacking},
+    )
+
+
+def split_segments(log: TrialLog) -> list[TrialLog]:
+    """Return the segments between the gaps of a log's time; the log itself where it has none."""
+    found = split_at_gaps(log.t, log.sample_time)
+    if len(found) < 2:
+        return [log]
+    return [log.window(a, b, f"{log.name}[{k + 1}]") for k, (a, b) in enumerate(found)]
+
+
+@dataclass(frozen=True)
+class LogGaps:
+    """Gaps of one log.
+
+    Parameters
+    ----------
+    log : str
+    channels : tuple of str
+        Motions that were not measured, over which a run goes on; empty where rows are
+        missing altogether, so that a run begins anew.
+    count, samples : int
+        Stretches, and samples in them.
+    longest, start : float
+        Length of the longest stretch, and the time of its first sample [s].
+    """
+
+    log: str
+    channels: tuple[str, ...]
+    count: int
+    samples: int
+    longest: float
+    start: float
+
+    @property
+    def sentence(self) -> str:
+        """What is missing, and what a run and a fit make of it."""
+        several = self.count != 1
+        where = (
+            f"{'the longest of ' if several else ''}{self.longest:.4g} s at t = {self.start:.6g} s"
+        )
+        if not self.channels:
+            return (
+                f"'{self.log}' has {self.count} gap{'s' * several} in which inputs or rows are "
+                f"missing, {where}: a run begins anew after {'each' if several else 'it'}."
+            )
+        return (
+            f"'{self.log}' lacks {', '.join(self.channels)} in {self.count} "
+            f"stretch{'es' * several} of {self.samples} samples in all, {where}: no fit counts "
+            f"them, and a run goes on over them."
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the gaps for JSON, SI."""
+        return {
+            "log": self.log,
+            "channels": list(self.channels),
+            "run": "goes on" if self.channels else "begins anew",
+            "count": self.count,
+            "samples": self.samples,
+            "longest": self.longest,
+            "start": self.start,
+        }
+
+
+def find_log_gaps(log: TrialLog) -> tuple[LogGaps, ...]:
+    """Return the gaps of a log: in its time, and in what was measured."""
+    made = []
+    breaks = [stop for _, stop in split_at_gaps(log.t, log.sample_time)[:-1]]
+    if breaks:
+        lost = np.diff(log.t)[np.array(breaks) - 1] - log.sample_time
+        k = int(np.argmax(lost))
+        samples = round(float(lost.sum()) / log.sample_time)
+        begin = float(log.t[breaks[k] - 1]) + log.sample_time
+        made.append(LogGaps(log.name, (), len(breaks), samples, float(lost[k]), begin))
+    alike: dict[bytes, list[str]] = {}
+    for name, gap in log.missing.items():
+        alike.setdefault(gap.tobytes(), []).append(name)
+    for names in alike.values():
+        edges = np.diff(np.concatenate([[0], log.missing[names[0]].astype(int), [0]]))
+        first, stop = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
+        k = int(np.argmax(stop - first))
+        made.append(
+            LogGaps(
+                log.name, tuple(names), len(first), int((stop - first).sum()),
+                float(stop[k] - first[k]) * log.sample_time, float(log.t[first[k]]),
+            )
+        )  # fmt: skip
+    return tuple(made)
 
 
 def by_sign(

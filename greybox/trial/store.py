@@ -117,7 +117,10 @@ def _tables(
         spans.append((float(log.t[0]), float(log.t[-1]), len(log)))
         for start in range(0, len(log), _ROWS):
             part = slice(start, start + _ROWS)
-            arrays = [pa.array((log.t if n == "t" else log[n])[part]) for n in names]
+            arrays = [
+                pa.array(log.t[part] if n == "t" else log.measured(n)[part], from_pandas=True)
+                for n in names
+            ]
             if loop is not None:
                 words = np.where(log.closed_loop[part], loop[1][0], "open")
                 arrays.append(pa.array(words.astype(str)))

@@ -17,6 +17,7 @@ from greybox.model.changes import simulate_changing
 from greybox.model.model import ManoeuvringModel
 from greybox.regression.instruments import state_bound
 from greybox.trial.log import TrialLog
+from greybox.trial.segments import split_segments
 from greybox.validation.fit import at_model_rate
 
 Array = NDArray[np.float64]
@@ -146,7 +147,14 @@ def predict_bands(
     inside, counted = np.zeros((runs, len(states))), 0
     good = np.ones(runs, bool)
     rng = np.random.default_rng([71, seed])
-    for first, x in _pieces(model, log, heading, rng, runs):
+    parts = split_segments(log)
+    starts = np.cumsum([0, *map(len, parts)])
+    drawn = (
+        (a + first, x)
+        for a, part in zip(starts, parts, strict=False)
+        for first, x in _pieces(model, part, heading, rng, runs, float(part.t[0] - log.t[0]))
+    )
+    for first, x in drawn:
         bound = state_bound(log, states)
         good &= np.asarray((np.abs(x) <= bound).all(axis=(1, 2)))
         if good.mean() <= _LEAST:
@@ -174,7 +182,9 @@ def predict_bands(
         for i, state in enumerate(states):
             if np.ptp(log[state]) > 0:
                 held = (log[state] >= measurement[0, :, i]) & (log[state] <= measurement[1, :, i])
-                coverage[state] = _coverage(state, float(held.mean()), usual[:, i])
+                held = held[log.known((state,))]
+                if len(held):
+                    coverage[state] = _coverage(state, float(held.mean()), usual[:, i])
     return Bands(states, motion, measurement, coverage, runs, int((~good).sum()), _missing(model))
 
 
@@ -209,8 +219,12 @@ def _pieces(
     heading: Literal["measured", "simulated"],
     rng: np.random.Generator,
     runs: int,
+    begin: float,
 ) -> Iterator[tuple[int, Array]]:
-    """Yield the draws piece by piece: its first sample, and the states (R, n, nx)."""
+    """Yield the draws piece by piece: its first sample, and the states (R, n, nx).
+
+    `begin` is the time of the first sample on the clock of the model's changes [s].
+    """
     structure, noise = model.structure, model.noise
     nx = len(structure.states)
     marine = structure.disturbance == "marine"
@@ -249,7 +263,7 @@ def _pieces(
             x,
             tau[first:last],
             log.sample_time,
-            first=first * log.sample_time,
+            first=begin + first * log.sample_time,
             psi=_noisy(rng, psi[first : last + 1], turned, runs) if follows else None,
             psi0=psi0,
             d=d,

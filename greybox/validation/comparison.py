@@ -16,6 +16,7 @@ from greybox.notebook import DisplayMixin, items, number, table
 from greybox.one_thread import one_thread
 from greybox.regression.instruments import state_bound
 from greybox.trial.log import TrialLog
+from greybox.trial.segments import find_log_gaps
 from greybox.trial.validity import ConditionDifference, other_conditions
 from greybox.validation.bands import LEVEL, Bands, predict_bands
 from greybox.validation.fit import LogFit, run_model
@@ -103,6 +104,7 @@ class Comparison(DisplayMixin):
                         {
                             "log": run.log.name,
                             "samples": len(run.log),
+                            "gaps": [g.to_dict() for g in find_log_gaps(run.log)],
                             "fit": run.fit,
                             "rmse": rmse,
                             "ahead": ahead,
@@ -176,6 +178,8 @@ class Comparison(DisplayMixin):
             for name, differences in zip(self.names, self.conditions, strict=True)
             for d in differences
         ]
+        told = (g.sentence for row in self.runs for run in row for g in find_log_gaps(run.log))
+        lines += [f"note: {sentence}" for sentence in dict.fromkeys(told)]
         if len(self.runs[0]) > 1:
             lines += [t.sentence for t in self.sign_tests]
         return "\n".join(lines)
@@ -274,7 +278,7 @@ def errors_ahead(
         half the log are left out.
     """
     log, structure = run.log, model.structure
-    x = log.states(structure.states)
+    x, known = log.states(structure.states), log.known(structure.states)
     tau = log.forces(structure.inputs)
     psi = log["psi"] if "psi" in log else np.zeros(len(log))
     follows = heading == "measured" or "r" not in structure.states
@@ -285,6 +289,12 @@ def errors_ahead(
             continue
         last = len(log) - steps
         starts = np.unique(np.linspace(0, last - 1, min(last, _MOST_STARTS)).astype(int))
+        unbroken = np.isclose(
+            log.t[starts + steps] - log.t[starts], horizon, atol=log.sample_time / 2
+        )
+        starts = starts[known[starts] & known[starts + steps] & unbroken]
+        if not len(starts):
+            continue
         window = starts[:, None] + np.arange(steps + 1)
         air = log.air if log.has_wind and structure.uses_air else None
         end = np.empty((len(starts), x.shape[1]))
@@ -370,7 +380,7 @@ def compare_models(
     rmse = tuple(
         tuple(
             {
-                s: float(np.sqrt(np.mean((r.log[s] - r.x[:, i]) ** 2)))
+                s: float(np.sqrt(np.nanmean((r.log.measured(s) - r.x[:, i]) ** 2)))
                 if r.diverged < 0
                 else float("inf")
                 for i, s in enumerate(model.structure.states)

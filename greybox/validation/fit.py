@@ -15,8 +15,9 @@ from greybox.errors import LogError
 from greybox.model.model import ManoeuvringModel
 from greybox.notebook import DisplayMixin, number, sparkline, table
 from greybox.regression.instruments import simulate_log
-from greybox.trial.kinematics import decimate
+from greybox.trial.kinematics import decimate_segments
 from greybox.trial.log import TrialLog
+from greybox.trial.segments import join_segments, split_segments
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -52,6 +53,16 @@ def fit_percent(measured: Array, simulated: Array) -> Array:
         return np.asarray(
             np.where(spread > 0, 100 * (1 - error / spread), np.where(error == 0, 100.0, -np.inf))
         )
+
+
+def fit_on(log: TrialLog, states: Sequence[str], x: Array) -> dict[str, float]:
+    """Return the fit (6.12) of simulated states (N, nx) where a log was measured, a state [%]."""
+    fit = {}
+    for i, state in enumerate(states):
+        known = log.known((state,))
+        percent = fit_percent(log[state][known], x[known, i]) if known.any() else np.nan
+        fit[state] = float(percent)
+    return fit
 
 
 _log = logging.getLogger(__name__)
@@ -93,7 +104,7 @@ class LogFit(DisplayMixin):
         import pandas as pd
 
         run = dict(zip(self.fit, self.x.T, strict=True)) | {"psi": self.psi}
-        measured = {f"{n}_measured": self.log[n] for n in run if n in self.log}
+        measured = {f"{n}_measured": self.log.measured(n) for n in run if n in self.log}
         frame = pd.DataFrame(run | measured, index=pd.Index(self.log.t, name="t"))
         units = {n: CHANNELS[n].unit for n in run if n in CHANNELS}
         units |= {f"{n}_measured": unit for n, unit in units.items() if f"{n}_measured" in measured}
@@ -112,11 +123,16 @@ class LogFit(DisplayMixin):
     def _rows(self) -> list[tuple[str, str, str, str]]:
         rows = []
         for (s, fit), x in zip(self.fit.items(), self.x.T, strict=True):
-            measured = self.log[s]
+            known = self.log.known((s,))
             with np.errstate(all="ignore"):
-                rmse = float(np.sqrt(np.mean((measured - x) ** 2)))
+                rmse = float(np.sqrt(np.mean((self.log[s] - x)[known] ** 2)))
             rows.append((s, number(fit, 3), number(rmse, 3), self.picture(s)))
         return rows
+
+    def errors(self) -> Array:
+        """Return measured less simulated states where all were measured, (n, nx)."""
+        states = tuple(self.fit)
+        return (self.log.states(states) - self.x)[self.log.known(states)]
 
     def picture(self, state: str) -> str:
         """Return a state as measured and as simulated, as one small picture of a notebook."""
@@ -143,7 +159,8 @@ def at_model_rate(log: TrialLog, model: ManoeuvringModel) -> TrialLog:
             f"the model's sample time is {model.sample_time:g} s and '{log.name}' has "
             f"{log.sample_time:g} s: use a log sampled at least as fast as the model."
         )
-    return decimate(log, model.sample_time)
+    parts, _ = decimate_segments(split_segments(log), model.sample_time)
+    return join_segments(parts, log.name)
 
 
 def run_model(
@@ -154,8 +171,9 @@ def run_model(
 ) -> LogFit:
     """Run a model freely on a log and compare.
 
-    The run starts from the mean of the log's first samples, uses the model's
-    current, and the wind where the log has it and the model has wind terms. Its
+    The run starts from the mean of the log's first samples, begins anew after each gap in its
+    time, and goes on where a motion was not measured, which the fit does not count. It uses
+    the model's current, and the wind where the log has it and the model has wind terms. Its
     parameters change when the model says so.
 
     Parameters
@@ -169,28 +187,34 @@ def run_model(
     LogFit
     """
     log = at_model_rate(log, model)
-    run = simulate_log(
-        model.structure,
-        model.theta,
-        log,
-        heading=heading,
-        d=model.d if model.disturbances else None,
-        use_wind=log.has_wind,
-        integrator=model.integrator,
-        changes=model.changes,
+    runs = [
+        simulate_log(
+            model.structure,
+            model.theta,
+            part,
+            heading=heading,
+            d=model.d if model.disturbances else None,
+            use_wind=part.has_wind,
+            integrator=model.integrator,
+            changes=model.changes,
+            first=float(part.t[0] - log.t[0]),
+        )
+        for part in split_segments(log)
+    ]
+    x, psi = (
+        np.concatenate(parts) for parts in zip(*((r.x[0], r.psi[0]) for r in runs), strict=True)
     )
+    starts = np.cumsum([0, *(r.x.shape[1] for r in runs)])
+    left = [
+        int(a + r.diverged[0]) for a, r in zip(starts, runs, strict=False) if r.diverged[0] >= 0
+    ]
+    diverged = min(left, default=-1)
     states = model.structure.states
-    fit = fit_percent(log.states(states), run.x[0])
-    if run.diverged[0] >= 0:
-        fit = np.full(len(states), -np.inf)
-        _log.info("the free run on %s leaves its bound at sample %d", log.name, run.diverged[0])
-    return LogFit(
-        log,
-        run.x[0],
-        run.psi[0],
-        {s: float(f) for s, f in zip(states, fit, strict=True)},
-        int(run.diverged[0]),
-    )
+    fit = fit_on(log, states, x)
+    if diverged >= 0:
+        fit = dict.fromkeys(states, -np.inf)
+        _log.info("the free run on %s leaves its bound at sample %d", log.name, diverged)
+    return LogFit(log, x, psi, fit, diverged)
 
 
 def average_fit(fits: Sequence[LogFit]) -> dict[str, float]:

@@ -109,8 +109,8 @@ def score_runs(runs: Sequence[LogFit], spread: dict[str, float], blocks: int = 1
     if any(r.diverged >= 0 for r in runs):
         return out
     moving = [(i, s) for i, s in enumerate(runs[0].fit) if spread[s] > 0]
-    errors = np.concatenate([r.log.states(tuple(r.fit)) - r.x for r in runs])
-    for b, part in enumerate(np.array_split(errors, blocks)):
+    errors = np.concatenate([r.errors() for r in runs])
+    for b, part in enumerate(np.array_split(errors, blocks) if len(errors) >= blocks else []):
         ratio = [float(np.sqrt(np.mean(part[:, i] ** 2))) / spread[s] for i, s in moving]
         out[b] = np.mean([max(100 * (1 - r), FLOOR) for r in ratio])
     return out

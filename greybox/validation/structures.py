@@ -168,7 +168,7 @@ class Bench:
         runs = [run_model(model, log) for log in self.logs]
         errors = None
         if all(r.diverged < 0 for r in runs):
-            errors = [r.log.states(tuple(r.fit)) - r.x for r in runs]
+            errors = [r.errors() for r in runs]
         return Tried(request, estimate, scores, errors, dropped)
 
 

@@ -251,8 +251,12 @@ def test_a_longer_sample_time_keeps_how_velocities_were_made(tmp_path, velocitie
         (lambda f: f.drop(columns=["u", "x_n"]), "no 'u' and it cannot be derived"),
         (lambda f: f.drop(columns=["psi"]), "no heading 'psi'"),
         (
-            lambda f: f.assign(u=f["u"].where(f.index != 4)),
-            "holds no finite number in row 6 and in 1 of 20",
+            lambda f: f.assign(u=f["u"].where(f.index > 99)),
+            "holds no finite number in 20 rows, from row 2 on",
+        ),
+        (
+            lambda f: f.assign(u=f["u"].where(f.index < 9), v=f["v"].where(f.index > 12)),
+            "no 3 that follow each other",
         ),
         (lambda f: f.assign(v="x"), "no finite number"),
         (lambda f: f.assign(t=f["t"][::-1].to_numpy()), "must increase"),
@@ -293,7 +297,10 @@ def test_a_mapped_column_must_be_there(tmp_path):
 def test_holes_in_positions_do_not_matter_beside_velocities(tmp_path):
     frame = table()
     frame.loc[7, "x_n"] = np.nan
-    assert "x_n" not in read(frame, tmp_path)
+    log = read(frame, tmp_path)
+    assert np.flatnonzero(np.isnan(log.measured("x_n"))).tolist() == [7]
+    assert log.known(("u", "v", "r", "psi")).all()
+    assert len(log) == len(frame)
 
 
 def test_closed_loop_is_read_from_the_mode(tmp_path):

@@ -28,6 +28,7 @@ from greybox.trial.convert.time_grid import (
     plan_import,
     too_short,
 )
+from greybox.trial.kinematics import carried_gaps
 from greybox.trial.log import Provenance, TrialLog
 from greybox.trial.raw_log import Recording
 from greybox.trial.steps import Step
@@ -224,6 +225,7 @@ def cut_segments(
     channels = _resample(used, clocks, vessel, grid, plan.sample_time)
     everything = plan.stretches(grid, clocks, recording.cuts)
     held = {n: (clock(t), words) for n, (t, words) in recording.text.items() if len(t)}
+    gaps = plan.gaps(grid, used, clocks)
     segments = []
     steps: tuple[Step, ...] = ()
     notes: tuple[str, ...] = ()
@@ -243,15 +245,30 @@ def cut_segments(
             vessel, plan.sample_time, conversion.options, conversion.before,
         )  # fmt: skip
         steps, notes = (*plan.steps, *corrected.steps, *made.steps), corrected.notes
+        missing = {n: m[start:stop] for n, m in gaps.items()}
+        missing = carried_gaps(missing, corrected.steps, plan.sample_time)
+        missing = carried_gaps(
+            {n: m[own] for n, m in missing.items()}, made.steps, plan.sample_time
+        )
+        missing = {n: m for n, m in missing.items() if n in made.channels}
         closed, known = _loop(held, vessel, grid[first:last])
         log = TrialLog(
             plan.name, plan.sample_time, grid[first:last], made.channels, vessel, closed, known,
-            Provenance(plan.name),
+            Provenance(plan.name), missing,
         )  # fmt: skip
         log = log.window(1, len(log) - 1, plan.name) if made.trim else log
+        log = _between_known(log)
         if len(log) >= MIN_SEGMENT:
             segments.append(log)
     return Cut(segments, steps, notes, len(everything) - len(segments), late)
+
+
+def _between_known(log: TrialLog) -> TrialLog:
+    """Return a log from its first to its last sample that holds every motion of its model."""
+    if not log.missing:
+        return log
+    known = np.flatnonzero(log.known(("u", "v", "r", "psi")))
+    return log.window(known[0], known[-1] + 1, log.name) if len(known) else log.window(0, 0)
 
 
 def _resample(

@@ -33,6 +33,7 @@ from greybox.trial.log import Provenance, TrialLog
 from greybox.trial.raw_log import Recording
 from greybox.trial.readers.formats import open_raw
 from greybox.trial.readers.table import Batch, TableFile, read_columns
+from greybox.trial.segments import join_segments
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
@@ -42,6 +43,9 @@ _log = logging.getLogger(__name__)
 _JITTER = 0.2
 # samples by which a time may differ from a uniform clock
 _DRIFT = 0.6
+# wind of fewer rows than this share is none
+_LEAST_WIND = 0.5
+_WIND = ("u_q", "v_q", "V_q", "gamma_q", "dir_q", "V_w", "dir_w", "dir_t")
 # share of steps past which gaps are another sample time
 _MOST_GAPS = 0.2
 
@@ -52,8 +56,9 @@ def read_log(
     *,
     states: tuple[str, ...] = (),
     fill: Mapping[str, float] | None = None,
+    gaps: bool = False,
 ) -> TrialLog:
-    """Read one log file without gaps for a vessel.
+    """Read one log file for a vessel.
 
     Parameters
     ----------
@@ -66,6 +71,8 @@ def read_log(
     fill : mapping of str to float, optional
         Constant values of channels that the file may lack, such as the start of
         a plan that holds commands only.
+    gaps : bool
+        Whether rows may be missing: runs of a model then begin anew after each gap.
 
     Returns
     -------
@@ -81,12 +88,12 @@ def read_log(
         two sample times, or a gap.
     """
     segments = read_segments(path, vessel, states=states, fill=fill)
-    if len(segments) > 1:
+    if len(segments) > 1 and not gaps:
         raise LogError(
             f"'{Path(path).name}' has {len(segments) - 1} gaps in its time, and one run cannot "
             f"cross them: cut the log at them, or read it as segments."
         )
-    return segments[0]
+    return join_segments(segments, Path(path).stem)
 
 
 def read_segments(
@@ -147,14 +154,14 @@ def table_segments(
         Of the table; what is done here is added to it.
     """
     name = table.path.name
-    recording, sample_time = _clean_recording(table, vessel, known, plan=bool(fill))
+    recording, sample_time, lost = _clean_recording(table, vessel, known, plan=bool(fill))
     plan = _recorded_grid(recording, table, sample_time)
     conversion = Conversion(vessel, ImportOptions(), plan, recording.steps)
     cut = cut_segments(recording, conversion)
     if not cut.segments:
         raise cut.refusal(conversion)
     steps = (*recording.steps, *cut.steps)
-    read = (*known.read, *(n for n in cut.notes if n not in known.read))
+    read = (*known.read, *(n for n in (*lost, *cut.notes) if n not in known.read))
     conditions = known.conditions.over(vessel.conditions)
     epoch = recording.epoch if known.epoch is None else known.epoch
     known = replace(known, steps=steps, read=read, epoch=epoch, conditions=conditions)
@@ -176,8 +183,8 @@ def table_segments(
 
 def _clean_recording(
     table: TableFile, vessel: Vessel, known: Provenance, *, plan: bool
-) -> tuple[Recording, float]:
-    """Return the table as a recording that needs no mending, and its sample time [s].
+) -> tuple[Recording, float, list[str]]:
+    """Return the table as a recording that needs no mending, sample time [s], what was left out.
 
     Raises
     ------
@@ -187,7 +194,7 @@ def _clean_recording(
     assigned = table_columns(table, vessel, guess=False)
     _require_mapped(assigned, vessel, table, plan=plan)
     batch = read_columns(table, [a.raw for a in assigned.values()])
-    _require_finite(assigned, batch, vessel, table)
+    batch, notes = _known_rows(assigned, batch, vessel, table)
     time = assigned["t"]
     scale = time_scale(batch[time.raw], time, table)
     if time.raw not in table.dates:
@@ -196,13 +203,14 @@ def _clean_recording(
     sample_time = _require_uniform(scale.seconds(batch[time.raw]), table)
     raw = whole_recording(table, batch, assigned, scale, vessel)
     recording = replace(canonical(raw, assigned, vessel), steps=(*known.steps, *raw.steps))
-    return clean_signals(recording), sample_time
+    return clean_signals(recording), sample_time, notes
 
 
 def _recorded_grid(recording: Recording, table: TableFile, sample_time: float) -> Plan:
     """Return the samples as they were recorded: every signal stands at each of them."""
     signals = recording.signals
-    t = signals[0].t
+    # a motion may have holes, over which the others go on
+    t = np.unique(np.concatenate([s.t for s in signals]))
     names = tuple(s.name for s in signals)
     return Plan(
         table.path.stem, sample_time, float(t[0]), len(t), dict.fromkeys(names, sample_time),
@@ -226,24 +234,47 @@ def _require_mapped(
             )
 
 
-def _require_finite(
+def _known_rows(
     assigned: dict[str, Assigned], batch: Batch, vessel: Vessel, table: TableFile
-) -> None:
-    """Refuse columns with holes; those that are not needed are left out, in place."""
+) -> tuple[Batch, list[str]]:
+    """Return the rows in which time, inputs and wind are numbers, and say which are left out.
+
+    Columns that hold none and are not needed are left out, in place. Motions keep their
+    holes, over which a run of the model goes on.
+    """
     loop = vessel.closed_loop[0] if vessel.closed_loop else None
-    holed = [
-        n for n, a in assigned.items() if n != loop and not np.isfinite(_floats(batch, a)).all()
-    ]
-    # positions are not needed where velocities were logged
+    numbers = {n: np.isfinite(_floats(batch, a)) for n, a in assigned.items() if n != loop}
+    # positions are not needed where velocities were logged, nor what moves no model
     spare = {"x_n", "y_n"} if {"u", "v"} <= assigned.keys() else set()
-    spare = spare if spare & {*holed} else set()
-    # what moves no model is not needed either
     beside = set(vessel.recorded_columns) - set(vessel.commands)
-    for name in [n for n in assigned if n in spare or (n in beside and n in holed)]:
-        del assigned[name]
-    for name in holed:
-        if name in assigned:
-            _finite(_floats(batch, assigned[name]), assigned[name].raw, table)
+    notes = []
+    for name in [n for n, known in numbers.items() if not known.all()]:
+        known = numbers[name]
+        lacking = name in _WIND and known.mean() < _LEAST_WIND
+        if name in beside or lacking or (name in spare and not known.any()):
+            if name not in beside:
+                notes.append(
+                    f"'{assigned[name].raw}' holds no number in {int((~known).sum())} of "
+                    f"{len(known)} rows: left out"
+                )
+            del assigned[name], numbers[name]
+        elif not known.any():
+            raise LogError(
+                f"column '{assigned[name].raw}' of '{table.path.name}' holds no finite number in "
+                f"{len(known)} rows, from row {table.first_row} on: export it again, or take it "
+                f"out of the file."
+            )
+    needed = [n for n in numbers if n in {"t", *vessel.commands, *_WIND}]
+    keep = np.all([numbers[n] for n in needed], axis=0)
+    if keep.all():
+        return batch, notes
+    first = int(np.flatnonzero(~keep)[0])
+    lost = [assigned[n].raw for n in needed if not numbers[n].all()]
+    notes.append(
+        f"{int((~keep).sum())} of {len(keep)} rows left out, the first row "
+        f"{first + table.first_row}, where {', '.join(lost)} hold no finite number"
+    )
+    return {n: values[keep] for n, values in batch.items()}, notes
 
 
 def _floats(batch: Batch, a: Assigned) -> Array:
@@ -251,17 +282,6 @@ def _floats(batch: Batch, a: Assigned) -> Array:
     if values.dtype == object:
         return np.full(len(values), np.nan)
     return np.asarray(values, float)
-
-
-def _finite(values: Array, name: str, table: TableFile) -> Array:
-    bad = np.flatnonzero(~np.isfinite(values))
-    if len(bad):
-        raise LogError(
-            f"column '{name}' of '{table.path.name}' holds no finite number in row "
-            f"{int(bad[0]) + table.first_row} and in {len(bad)} of {len(values)} rows: "
-            f"{_importer(table)} reads such logs and keeps the holes as gaps."
-        )
-    return values
 
 
 def _importer(table: TableFile) -> str:

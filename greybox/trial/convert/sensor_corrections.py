@@ -14,8 +14,10 @@ from math import ceil, isclose
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.channels import MOTIONS
 from greybox.errors import LogError
 from greybox.rotation import body_to_ned, ned_to_body
+from greybox.trial.kinematics import carried_gaps
 from greybox.trial.log import TrialLog
 from greybox.trial.steps import Step, Value
 from greybox.vessel.vessel import Vessel
@@ -25,7 +27,6 @@ Arm = tuple[float, float]
 
 # keys that a finding made void which mended the same
 _MENDED_BY = {"heading_bias": "turn_heading", "antenna": "move_antenna", "clock": "shift"}
-_MOTION = frozenset({"x_n", "y_n", "psi", "u", "v", "r"})
 # sums of corrections that a record tells differ from what is stated by rounding only
 _ROUNDING = 1e-9
 
@@ -84,7 +85,10 @@ def correct_log(log: TrialLog, vessel: Vessel | None = None) -> TrialLog:
     made = correct_channels(log.channels, log.sample_time, vessel, known.steps)
     read = (*known.read, *(n for n in made.notes if n not in known.read))
     provenance = replace(known, steps=(*known.steps, *made.steps), read=read)
-    out = replace(log, channels=made.channels, vessel=vessel, provenance=provenance)
+    missing = carried_gaps(log.missing, made.steps, log.sample_time)
+    out = replace(
+        log, channels=made.channels, vessel=vessel, provenance=provenance, missing=missing
+    )
     if not made.before and not made.after:
         return out
     if len(log) - made.before - made.after < 3:
@@ -113,7 +117,7 @@ def correct_channels(
         What was done to the channels before.
     """
     steps = tuple(steps)
-    if not _MOTION & channels.keys():
+    if not MOTIONS & channels.keys():
         return Correction(channels)
     before = _removed(steps)
     now, notes = _wanted(vessel, before, steps)

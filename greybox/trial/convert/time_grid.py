@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from greybox.errors import LogError
 from greybox.trial.convert.options import ImportOptions
-from greybox.trial.convert.resample import Clock, nice_period, resampled_by, stretches
+from greybox.trial.convert.resample import Clock, covered, nice_period, resampled_by, stretches
 from greybox.trial.gaps import split_at_gaps
+from greybox.trial.raw_log import Recording
 from greybox.trial.smoothing import window_samples
 from greybox.trial.steps import Step
 from greybox.vessel.vessel import Vessel
@@ -128,6 +129,22 @@ class Plan:
             return split_at_gaps(grid, self.sample_time)
         return stretches(grid, (clocks[n] for n in self.reference_channels), cuts)
 
+    def gaps(
+        self, grid: Array, recording: Recording, clocks: Mapping[str, Clock]
+    ) -> dict[str, NDArray[np.bool_]]:
+        """Return the samples at which motions were not measured, of those that have such."""
+        gaps = {}
+        for s in recording.signals:
+            if s.name not in _MOTION or (self.times is None and s.name in self.reference_channels):
+                continue
+            if self.times is None:
+                gap = ~covered(grid, clocks[s.name])
+            else:
+                gap = ~np.isin(grid, s.t) if len(s) < len(grid) else np.zeros(len(grid), bool)
+            if gap.any():
+                gaps[s.name] = gap
+        return gaps
+
 
 def plan_import(
     extents: Mapping[str, Extent], vessel: Vessel, options: ImportOptions, name: str
@@ -142,6 +159,8 @@ def plan_import(
     """
     used, notes = _usable(extents, vessel, name)
     inputs = [c for c in vessel.commands if c in used]
+    # a run needs no positions where its velocities were measured
+    spare = _PLACE if any(pair <= used.keys() for pair in (_BODY, _EARTH)) else frozenset()
     beside = set(vessel.recorded_columns) - set(vessel.commands)
     reference = [n for n in _MOTION if n in used] or inputs
     sample_time = options.sample_time or _sample_time([used[n] for n in reference])
@@ -182,7 +201,7 @@ def plan_import(
         start,
         count,
         {n: e.period for n, e in used.items()},
-        tuple(reference),
+        tuple(n for n in reference if n not in spare),
         tuple(notes),
         max([MIN_SEGMENT, *_windows(options, count, sample_time)]),
         _resampling({n: e.period for n, e in used.items()}, sample_time, vessel),
