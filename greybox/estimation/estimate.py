@@ -15,7 +15,7 @@ from greybox.estimation.covariance import (
     block_bootstrap,
     score_covariance,
 )
-from greybox.estimation.credibility import Evidence, assess, convergence, judge
+from greybox.estimation.credibility import Evidence, assess, convergence, weigh
 from greybox.estimation.disturbance import estimate_current
 from greybox.estimation.error_shape import ErrorShape, error_shapes
 from greybox.estimation.moments import Solution, solve_stacked
@@ -507,5 +507,5 @@ def _result(
     return replace(
         estimate,
         tests=tests,
-        verdict=judge(tests, estimate.labels, method, contaminated=predictor.contaminated),
+        verdict=weigh(tests, estimate.labels, method, contaminated=predictor.contaminated),
     )

@@ -26,7 +26,7 @@ from greybox.estimation.free_run_errors import (
 from greybox.estimation.free_run_noise import noise_of_run, noise_of_sensors, residual_noise
 from greybox.estimation.innovations import FilterRuns, fit_innovations
 from greybox.estimation.output_setup import deviations, measured, output_model, turns
-from greybox.estimation.result import Estimate, TestResult
+from greybox.estimation.result import Estimate
 from greybox.estimation.shooting import (
     RANK,
     FreeRuns,
@@ -38,6 +38,7 @@ from greybox.estimation.shooting import (
     ShootingFit,
     loss_weights,
 )
+from greybox.estimation.verdict import TestResult
 from greybox.model.disturbances import CURRENT, WIND
 from greybox.model.noise import NoiseLevels
 from greybox.model.output import OutputModel, Role
@@ -516,7 +517,7 @@ def _excitation_tests(
         )
         out.append(
             TestResult(
-                f"excitation_{state}",
+                "excitation",
                 "the sensitivities of the run are independent",
                 ratio,
                 None,
@@ -527,6 +528,7 @@ def _excitation_tests(
                 passed,
                 tuple(names),
                 {"own_share": {model.parameters[free[i]]: float(share[i]) for i in mine}},
+                state=state,
             )
         )
     return tuple(out)
@@ -543,11 +545,12 @@ def _slow_tests(slow: Mapping[str, tuple[float, float]]) -> tuple[TestResult, ..
         )
         out.append(
             TestResult(
-                f"slow_errors_{name}",
+                "slow_errors",
                 f"the free-run error of {name} is white: nothing beside the model moves it",
                 z,
                 p,
                 f"the free-run error of {name} {found}",
+                state=name,
             )
         )
     return tuple(out)

@@ -27,7 +27,8 @@ from greybox.estimation.noise import (
     noise_levels_of,
     stated_levels,
 )
-from greybox.estimation.result import UNJUDGED, Estimate
+from greybox.estimation.result import Estimate
+from greybox.estimation.verdict import UNJUDGED
 from greybox.estimation.white_rows import (
     WhiteRows,
     own_constants,

@@ -9,7 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.errors import UnknownParameterError, suggestion
+from greybox.estimation.inference import Restrictions, confidence_intervals, wald_test
 from greybox.estimation.summary import estimated, summarise
+from greybox.estimation.verdict import UNJUDGED, TestResult, Verdict
 from greybox.model.model import ManoeuvringModel
 from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import Predictor
@@ -22,97 +25,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class TestResult:
-    """One test: what it supposes, what it found, and a sentence to act on.
-
-    ``statistic`` and ``p_value`` are None where the test does not apply; the
-    sentence then says why.
-
-    Parameters
-    ----------
-    name : str
-    null : str
-    statistic, p_value : float or None
-    sentence : str
-    level : float, optional
-        What the statistic, or the p-value where there is one, is compared with.
-    passed : bool, optional
-        None where the test does not apply or only informs.
-    parameters : tuple of str
-        Parameters that the finding concerns.
-    detail : mapping
-        Numbers behind the sentence, for machines.
-    """
-
-    name: str
-    null: str
-    statistic: float | None
-    p_value: float | None
-    sentence: str
-    level: float | None = None
-    passed: bool | None = None
-    parameters: tuple[str, ...] = ()
-    detail: Mapping[str, Any] = field(default_factory=dict)
-
-    __test__ = False  # not a test case
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the fields for JSON."""
-        return {
-            "null": self.null,
-            "statistic": self.statistic,
-            "p_value": self.p_value,
-            "sentence": self.sentence,
-            "level": self.level,
-            "passed": self.passed,
-            "parameters": list(self.parameters),
-            "detail": dict(self.detail),
-        }
-
-
-def not_applicable(name: str, null: str, reason: str) -> TestResult:
-    """Return a test that does not apply, with the reason."""
-    return TestResult(name, null, None, None, f"not applicable: {reason}.")
-
-
-@dataclass(frozen=True, repr=False)
-class Verdict(DisplayMixin):
-    """Whether to trust an estimate.
-
-    Parameters
-    ----------
-    text : str
-        ``trust``, ``trust except A, B`` or ``do not trust: reason``.
-    excepted : tuple of str
-        Parameters not to rely on.
-    reasons : tuple of str
-        One sentence a finding.
-    """
-
-    text: str
-    excepted: tuple[str, ...] = ()
-    reasons: tuple[str, ...] = ()
-
-    def summary(self) -> str:
-        """Return the verdict and its reasons as text."""
-        return "\n".join([self.text, *(f"  {r}" for r in self.reasons)])
-
-    def _parts(self) -> tuple[str, ...]:
-        return (items("Because", self.reasons),)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the fields for JSON."""
-        return {
-            "text": self.text,
-            "excepted": list(self.excepted),
-            "reasons": list(self.reasons),
-        }
-
-
-UNJUDGED = Verdict("not judged")
 
 
 @dataclass(frozen=True)
@@ -257,8 +169,93 @@ class Estimate(DisplayMixin):
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
 
     def __getitem__(self, name: str) -> float:
-        """Return the value of a parameter by name."""
+        """Return the value of a parameter by name.
+
+        Raises
+        ------
+        UnknownParameterError
+            The estimate has no such parameter.
+        """
+        if name not in self.names:
+            raise UnknownParameterError(
+                f"the estimate has no parameter '{name}'.{suggestion(name, self.names)} "
+                f"Parameters: {', '.join(self.names)}."
+            )
         return float(self.theta[self.predictor.parameter_columns[self.names.index(name)]])
+
+    @property
+    def params(self) -> pd.Series[float]:
+        """Values of the parameters by name, biases left out; discrete ones at `sample_time`."""
+        import pandas as pd
+
+        place = list(self.predictor.parameter_columns)
+        return pd.Series(self.theta[place], index=list(self.names), name="parameter")
+
+    @property
+    def std_errors(self) -> pd.Series[float]:
+        """Standard errors of the parameters by name."""
+        import pandas as pd
+
+        place = list(self.predictor.parameter_columns)
+        return pd.Series(self.std[place], index=list(self.names), name="std_error")
+
+    @property
+    def cov(self) -> pd.DataFrame:
+        """Covariance of the parameters, rows and columns by name."""
+        import pandas as pd
+
+        return pd.DataFrame(self._covariance, index=list(self.names), columns=list(self.names))
+
+    @property
+    def _covariance(self) -> Array:
+        place = list(self.predictor.parameter_columns)
+        return self.covariance[np.ix_(place, place)]
+
+    def conf_int(self, level: float = 0.95) -> pd.DataFrame:
+        """Return the confidence interval of each parameter, from the normal distribution.
+
+        Parameters
+        ----------
+        level : float
+            Probability with which the intervals hold the parameters.
+
+        Returns
+        -------
+        DataFrame
+            Index the names; columns ``lower`` and ``upper``.
+
+        Raises
+        ------
+        UsageError
+            The level is not between 0 and 1.
+        """
+        import pandas as pd
+
+        place = list(self.predictor.parameter_columns)
+        limits = confidence_intervals(self.theta[place], self.std[place], level)
+        return pd.DataFrame(limits, index=list(self.names), columns=["lower", "upper"])
+
+    def wald_test(self, restrictions: Restrictions | None = None) -> TestResult:
+        """Test linear restrictions on the parameters by their covariance.
+
+        Parameters
+        ----------
+        restrictions : str, sequence of str or mapping of str to float, optional
+            ``"Xu = 2*Yv, Nr = -0.1"``, the same one by one, or the value of each parameter;
+            by default that all parameters are zero.
+
+        Returns
+        -------
+        TestResult
+            With the null hypothesis in words, `statistic`, `df` and `p_value`.
+
+        Raises
+        ------
+        UsageError
+            A restriction cannot be read, names no parameter, or follows from the others.
+        """
+        place = list(self.predictor.parameter_columns)
+        return wald_test(self.names, self.theta[place], self._covariance, restrictions)
 
     def structure_theta(self) -> Array:
         """Return the parameters of the predictor's full structure, (p_structure,).
