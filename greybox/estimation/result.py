@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -17,8 +17,10 @@ from greybox.model.model import ManoeuvringModel
 from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import Predictor
 from greybox.notebook import DisplayMixin, items, parameters, text
-from greybox.trial.actuator_estimate import ActuatorEstimate
-from greybox.trial.validity import PooledConditions
+from greybox.trial.actuator_estimate import ActuatorEstimate, known_actuators
+from greybox.trial.log import TrialLog
+from greybox.trial.ranges import ranges
+from greybox.trial.validity import PooledConditions, pooled_conditions
 from greybox.vessel.vessel import Vessel
 
 if TYPE_CHECKING:
@@ -68,6 +70,67 @@ class Limit:
         }
 
 
+@dataclass(frozen=True)
+class EstimationData:
+    """What an estimate rests on.
+
+    Parameters
+    ----------
+    samples, kept : int
+        Rows there were, and rows that took part.
+    logs : tuple of dict
+        Name, hash and length of each log.
+    ranges : dict of str to (float, float)
+        Least and greatest value of each state and command in the logs.
+    conditions : PooledConditions
+        Draught, depth and the like of the logs, and in what they differ.
+    actuators : tuple of ActuatorEstimate
+        Measured from command and feedback when the logs were imported.
+    """
+
+    samples: int
+    kept: int
+    logs: tuple[dict[str, Any], ...] = ()
+    ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    conditions: PooledConditions = field(default_factory=PooledConditions)
+    actuators: tuple[ActuatorEstimate, ...] = ()
+
+
+def estimation_data(
+    logs: Sequence[TrialLog], states: Sequence[str], samples: int, kept: int
+) -> EstimationData:
+    """Return what an estimate from these logs rests on."""
+    return EstimationData(
+        samples,
+        kept,
+        tuple(
+            {"name": log.name, "sha256": log.provenance.sha256, "samples": len(log)} for log in logs
+        ),
+        ranges(logs, tuple(states)),
+        pooled_conditions(logs),
+        known_actuators(log.provenance.actuators for log in logs),
+    )
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """How the iteration of an estimator ended.
+
+    Parameters
+    ----------
+    count : int
+        Steps, or refinements of the instruments; 0 where there is no iteration.
+    status : str
+        A sentence on how it ended.
+    converged : bool
+        Whether it ended where it no longer moves.
+    """
+
+    count: int = 0
+    status: str = "solved"
+    converged: bool = True
+
+
 @dataclass(frozen=True, repr=False)
 class Estimate(DisplayMixin):
     """Parameters of a predictor, estimated from logs.
@@ -86,17 +149,13 @@ class Estimate(DisplayMixin):
     vessel : Vessel
     sample_time : float
         [s]
-    samples, kept : int
-        Rows there were, and rows that took part.
+    data : EstimationData
+        What it rests on.
     covariance_kind : str
     lags : int
         Memory of the residuals that the covariance allows for, in samples.
-    iterations : int
-        Refinements of the instruments.
-    status : str
-        A sentence on how the estimation ended.
-    converged : bool
-        Whether its iteration, if it has one, ended where it no longer moves.
+    iteration : Iteration
+        How it was found.
     current : tuple
         (name, value, standard error) of each current component; empty where the
         predictor cannot tell it.
@@ -109,20 +168,12 @@ class Estimate(DisplayMixin):
         Choices made and warnings.
     fit : dict
         Free-run fit (6.12) on the estimation logs [%].
-    logs : tuple of dict
-        Name, hash and length of each log.
-    ranges : dict of str to (float, float)
-        Least and greatest value of each state and command in the logs.
     noise : NoiseLevels, optional
         What was found of measurement and process noise.
     limits : dict of str to Limit
         ``cramer_rao`` and ``optimal_iv`` beside the standard errors.
     prefilter : {"none", "noise"}
         Whether all equations were solved jointly with their error made white.
-    conditions : PooledConditions
-        Draught, depth and the like of the logs, and in what they differ.
-    actuators : tuple of ActuatorEstimate
-        Measured from command and feedback when the logs were imported.
     """
 
     predictor: Predictor
@@ -132,26 +183,59 @@ class Estimate(DisplayMixin):
     residual_std: Array
     vessel: Vessel
     sample_time: float
-    samples: int
-    kept: int
+    data: EstimationData
     covariance_kind: str
     lags: int
-    iterations: int = 0
-    status: str = "solved"
-    converged: bool = True
+    iteration: Iteration = field(default_factory=Iteration)
     current: tuple[tuple[str, float, float], ...] = ()
     current_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
     tests: tuple[TestResult, ...] = ()
     verdict: Verdict = UNJUDGED
     notes: tuple[str, ...] = ()
     fit: dict[str, float] = field(default_factory=dict)
-    logs: tuple[dict[str, Any], ...] = ()
-    ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     noise: NoiseLevels | None = None
     limits: Mapping[str, Limit] = field(default_factory=dict)
     prefilter: str = "none"
-    conditions: PooledConditions = field(default_factory=PooledConditions)
-    actuators: tuple[ActuatorEstimate, ...] = ()
+
+    @property
+    def samples(self) -> int:
+        """Rows there were."""
+        return self.data.samples
+
+    @property
+    def kept(self) -> int:
+        """Rows that took part."""
+        return self.data.kept
+
+    @property
+    def logs(self) -> tuple[dict[str, Any], ...]:
+        """Name, hash and length of each log."""
+        return self.data.logs
+
+    @property
+    def conditions(self) -> PooledConditions:
+        """Draught, depth and the like of the logs, and in what they differ."""
+        return self.data.conditions
+
+    @property
+    def actuators(self) -> tuple[ActuatorEstimate, ...]:
+        """Measured from command and feedback when the logs were imported."""
+        return self.data.actuators
+
+    @property
+    def iterations(self) -> int:
+        """Steps of the iteration that it comes from, 0 where there was none."""
+        return self.iteration.count
+
+    @property
+    def status(self) -> str:
+        """How the estimation ended, in words."""
+        return self.iteration.status
+
+    @property
+    def converged(self) -> bool:
+        """Whether its iteration, if it has one, ended where it no longer moves."""
+        return self.iteration.converged
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -324,7 +408,7 @@ class Estimate(DisplayMixin):
                 "std": self.std[biases],
             },
             "logs": list(self.logs),
-            "ranges": dict(self.ranges),
+            "ranges": dict(self.data.ranges),
             "actuators": [a.to_dict() for a in self.actuators],
             "condition_differences": [d.to_dict() for d in self.conditions.differences],
         }
