@@ -63,7 +63,7 @@ from greybox.trial.convert.read import read_segments
 from greybox.trial.kinematics import decimate
 from greybox.trial.log import TrialLog
 from greybox.trial.store import write_log
-from greybox.validation.choose import estimate_model
+from greybox.validation.choose import estimate_requested
 from greybox.validation.fit import average_fit, run_model
 from greybox.validation.informative import regime_of
 from greybox.validation.request import Request
@@ -468,7 +468,7 @@ def with_theta(model: ManoeuvringModel, problem: Problem, p: Array) -> Manoeuvri
 
 def chosen(logs: list[TrialLog], request: Request) -> ManoeuvringModel:
     """Return the model whose method is left open, and say how it was chosen."""
-    estimate = estimate_model(logs, request)
+    estimate = estimate_requested(logs, request)
     print(f"\nown choice: {estimate.method}, {estimate.status}; {estimate.notes[-1]}")
     return estimate.model()
 

@@ -27,8 +27,7 @@ def virtual_trial(samples=3000):
 
 
 first, second = virtual_trial(), virtual_trial()
-biased = gb.estimate_model([first], gb.Request(method="ls", predictor="basic"))
-estimate = gb.estimate_model([first])
+biased = gb.estimate_model(first, method="ls", predictor="basic")
+estimate = gb.estimate_model(first)
 print(estimate.summary())
-models = [biased.model(), estimate.model()]
-print(gb.compare_models(models, ["least squares", "chosen"], [[second], [second]]).summary())
+print(gb.compare({"least squares": biased, "chosen": estimate}, second).summary())

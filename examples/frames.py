@@ -19,7 +19,7 @@ other.index = np.datetime64("2024-05-01T12:00") + (frame.index * 1e9).astype("ti
 other.attrs = {"units": {"psi": "deg", "u": "kn"}}
 print(gb.log_from_pandas(other, vessel, name="other"))
 
-estimate = gb.estimate_model([log], gb.Request(method="ls", predictor="basic"))
+estimate = gb.estimate_model(log, method="ls", predictor="basic")
 print(estimate.to_pandas().round(4))
 run = gb.run_model(estimate.model(), trial.validation)
 print(run.to_pandas()[["u", "u_measured"]].head())

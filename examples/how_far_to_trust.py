@@ -7,7 +7,7 @@ from greybox.study.efficiency import CASES, virtual_trial
 
 log = virtual_trial(np.random.default_rng(4), CASES[0], 1500)
 for method in ("iv", "oe"):
-    estimate = gb.estimate_model([log], gb.Request(method=method, predictor="wind"))
+    estimate = gb.estimate_model(log, method=method, predictor="wind")
     print(f"{method}: {estimate.verdict.text}")
     for reason in estimate.verdict.reasons[:3]:
         print(f"  {reason}")
@@ -18,5 +18,5 @@ for method in ("iv", "oe"):
 options = gb.OutputErrorOptions(
     bounds={"Xu": (-0.2, 0.0)}, priors={"Nr": (-0.1, 0.02)}, damping="enforce"
 )
-careful = gb.estimate_model([log], gb.Request(method="oe", predictor="wind", output_error=options))
+careful = gb.estimate_model(log, method="oe", predictor="wind", output_error=options)
 print(careful.summary())

@@ -121,7 +121,7 @@ def sail(model, d):
     return np.array(way), np.hypot(away[..., 0], away[..., 1]).min(axis=1), np.median(times)
 
 
-model = gb.estimate_model([trial()], gb.Request(method="oe", structure="thesis")).model()
+model = gb.estimate_model(trial(), method="oe", structure="thesis").model()
 for (name, (value, std)), mean in zip(model.disturbances.items(), CURRENT, strict=True):
     print(f"{name}: {value:.3f} ± {1.96 * std:.3f} m/s, wanders about {mean} in truth")
 d = sea(SECONDS)

@@ -7,7 +7,7 @@ from greybox.study.chapter6 import TRUE
 from greybox.study.efficiency import CASES, virtual_trial
 
 trial = virtual_trial(np.random.default_rng(4), CASES[0], samples=3000)
-model = gb.estimate_model([trial]).model()
+model = gb.estimate_model(trial).model()
 ship = gb.ManoeuvringModel(
     model.structure,
     np.array([TRUE[name] for name in model.names]),

@@ -32,7 +32,7 @@ guess = true * (1 + 0.1 * rng.standard_normal(true.size))
 model = gb.ManoeuvringModel(structure, guess, np.zeros((18, 18)), 1.0, ship)
 wishes = Wishes(400.0, regime="u+v+", margin_u=0.5, margin_v=0.4, predictor="basic", effort=0.3)
 first = design_trial(prepare_request(model, wishes).request, alternatives=False)
-estimate = gb.estimate_model([sail(first)], gb.Request(method="iv", predictor="basic"))
+estimate = gb.estimate_model(sail(first), method="iv", predictor="basic")
 model = estimate.model()
 
 # the second trial adds to the first one's information, and keeps its limits in nine of ten models

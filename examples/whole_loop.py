@@ -15,10 +15,9 @@ print(design.summary())
 sea = virtual_sea(design, "current", seed=3)
 trial, other = sea.estimation, sea.validation
 
-estimate = gb.estimate_model([trial], gb.Request(method="oe", predictor="basic"))
+estimate = gb.estimate_model(trial, method="oe", predictor="basic")
 print(estimate.summary())
-models = [prior, estimate.model()]
-print(gb.compare_models(models, ["prior", "estimate"], [[other], [other]]).summary())
+print(gb.compare({"prior": prior, "estimate": estimate}, other).summary())
 
 found = gb.diagnose([trial], validate=[other])
 print(found.summary())

@@ -13,7 +13,7 @@ from experiment_design.campaign import (
     random_campaign,
 )
 from experiment_design.feasible import in_words, least_change, moved_constant, stirred
-from experiment_design.limits import TOLERANCE, Circle, LimitName, TrialLimits
+from experiment_design.limits import TOLERANCE, Circle, LimitKind, LimitName, TrialLimits
 from experiment_design.problem import TrialProblem
 from experiment_design.regimes import steady_motions
 from experiment_design.request import DesignRequest, build_problem, wanted_parameters
@@ -105,10 +105,10 @@ def require_start(problem: TrialProblem, request: DesignRequest, trial: int) -> 
         if m - more > TOLERANCE:
             where = (
                 f"{m:.1f} m outside the sea room"
-                if name.name == "sea room"
+                if name.kind is LimitKind.SEA_ROOM
                 else f"{m:.3g} {name.unit} beyond the {name.name} of {name.bound:g} {name.unit}"
             )
-            if name.name == "sea room":
+            if name.kind is LimitKind.SEA_ROOM:
                 raise InfeasibleError(
                     f"the trial starts {where}: move it by --position, or the sea room."
                 )
@@ -144,14 +144,14 @@ def feasible_or_reason(
         return chosen, unexcited([problem], [chosen.unit], request)
     changes = least_change(problem, chosen)
     name, amount = changes[0]
-    more = _turning(problem, request, name.name)
-    if name.name.startswith("margin of") and request.d[:2].any():
+    more = _turning(problem, request) if name.kind is LimitKind.SEA_ROOM else ""
+    if name.kind is LimitKind.MARGIN and request.d[:2].any():
         more += (
             f" Margins are kept through the water too, and a current of "
             f"{float(np.hypot(*request.d[:2])):.2g} m/s is expected."
         )
     lower = ""
-    if all(n.option.startswith("--margin-") for n, _ in changes):
+    if all(n.kind is LimitKind.MARGIN for n, _ in changes):
         lower = _margins_within_reach(request, trial, chosen, changes)
     return chosen, in_words(name, amount, more, lower)
 
@@ -163,7 +163,7 @@ def _margins_within_reach(
 
     What it reaches itself leaves no room to move in, so that shares of it are tried.
     """
-    reached = {n.option.removeprefix("--margin-"): n.bound - m for n, m in changes}
+    reached = {n.margin: n.bound - m for n, m in changes}
     for share in ROOM:
         margins = {n: np.floor(1e3 * share * v) / 1e3 for n, v in reached.items()}
         if min(margins.values()) < 0:
@@ -211,10 +211,8 @@ def tells_enough(request: DesignRequest) -> bool:
     return bool(2 * (share > _VAGUE).sum() <= share.size)
 
 
-def _turning(problem: TrialProblem, request: DesignRequest, name: str) -> str:
-    """Return what the turning circle has to do with it, where it has."""
-    if name != "sea room":
-        return ""
+def _turning(problem: TrialProblem, request: DesignRequest) -> str:
+    """Return what the turning circle has to do with the sea room, where it has."""
     steady = steady_motions(
         request.vessel, request.structure, request.theta, request.d, problem.schedule
     )

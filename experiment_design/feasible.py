@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from experiment_design.limits import TOLERANCE, LimitName
+from experiment_design.limits import TOLERANCE, LimitKind, LimitName
 from experiment_design.problem import TrialProblem
 from experiment_design.search import Candidate, assess, draw_two_level, limit_scale, within_reach
 
@@ -128,11 +128,11 @@ def in_words(name: LimitName, amount: float, what: str = "", lower: str = "") ->
     """
     a = float(np.ceil(amount * 1e3) / 1e3)
     unit = f" {name.unit}" if name.unit else ""
-    if name.name.startswith("margin of"):
+    if name.kind is LimitKind.MARGIN:
         reached = name.bound - a
         if reached >= 0:
             other = "start on another heading (--start)"
-            if name.option != "--margin-air":
+            if name.margin != "air":
                 other = "choose another --regime"
             return (
                 f"the {name.name}, {name.bound:g}{unit}, cannot be kept: {reached:.3f}{unit} is "
@@ -144,19 +144,19 @@ def in_words(name: LimitName, amount: float, what: str = "", lower: str = "") ->
             f"{-reached:.3f}{unit} in every sequence that was tried. Choose another --regime or "
             f"widen the limits of the thrusters.{what}"
         )
-    if name.name == "sea room":
+    if name.kind is LimitKind.SEA_ROOM:
         return (
             f"the sea room is too small: the best sequence leaves it by {amount:.1f} m. Enlarge "
             f"it by {np.ceil(amount):.0f} m on every side, or shorten the trial.{what}"
         )
-    if name.name == "heading coverage":
+    if name.kind is LimitKind.HEADINGS:
         least = np.floor(99 * (name.bound - a)) / 100
         return (
             f"headings cannot cover {name.bound:.3g} rad: {name.bound - amount:.3g} rad is the "
             f"most that was reached. Lower --headings to {least:g} or "
             f"lengthen the trial.{what}"
         )
-    if name.name.startswith("end state of"):
+    if name.kind is LimitKind.END_STATE:
         return (
             f"the {name.name} within {name.bound:g}{unit} cannot be reached: it is missed by "
             f"{amount:.3g}{unit} beyond that. Raise the tolerance in --end to "

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from enum import Enum
 
 import casadi as ca
 import numpy as np
@@ -117,14 +118,45 @@ class TrialLimits:
             )
 
 
+class LimitKind(Enum):
+    """What a limit bounds."""
+
+    MARGIN = "margin of"
+    SPEED = "speed cap"
+    YAW_RATE = "yaw-rate cap"
+    SEA_ROOM = "sea room"
+    END_STATE = "end state of"
+    ENERGY = "energy"
+    HEADINGS = "heading coverage"
+
+
 @dataclass(frozen=True)
 class LimitName:
-    """One limit in words: what it is, its bound and unit, and the option that sets it."""
+    """One limit: what it bounds, in words too, its bound and unit, and the option that sets it.
 
-    name: str
+    Parameters
+    ----------
+    kind : LimitKind
+    bound : float
+    unit : str
+    option : str
+    of : str
+        What a margin or an end state is of, in words.
+    margin : str
+        Key of a margin: a state, or ``air``; empty for other limits.
+    """
+
+    kind: LimitKind
     bound: float
     unit: str
     option: str
+    of: str = ""
+    margin: str = ""
+
+    @property
+    def name(self) -> str:
+        """The limit in words."""
+        return f"{self.kind.value} {self.of}".rstrip()
 
 
 def _polygon_distance(corners: Array, north: ca.SX, east: ca.SX) -> ca.SX:
@@ -191,8 +223,8 @@ class LimitProgram:
             for other in seen[1:]:
                 least = ca.fmin(least, other * sign)
             names.append(
-                LimitName(f"margin of {_NAMES.get(name, name)}", margin,
-                          "rad/s" if name == "r" else "m/s", f"--margin-{name}")
+                LimitName(LimitKind.MARGIN, margin, "rad/s" if name == "r" else "m/s",
+                          f"--margin-{name}", _NAMES.get(name, name), name)
             )  # fmt: skip
             rows.append(margin - least)
         u, v = where["u"], where.get("v", ca.SX(0))
@@ -201,20 +233,20 @@ class LimitProgram:
             for name, wind in zip(("u", "v"), blown, strict=True):
                 if name in where:
                     names.append(
-                        LimitName(f"margin of {_NAMES[name]} through the air", limits.margin_air,
-                                  "m/s", "--margin-air")
+                        LimitName(LimitKind.MARGIN, limits.margin_air, "m/s", "--margin-air",
+                                  f"{_NAMES[name]} through the air", "air")
                     )  # fmt: skip
                     rows.append(limits.margin_air - ca.fabs(where[name] - wind))
         if limits.speed_cap is not None:
-            names.append(LimitName("speed cap", limits.speed_cap, "m/s", "--speed-cap"))
+            names.append(LimitName(LimitKind.SPEED, limits.speed_cap, "m/s", "--speed-cap"))
             rows.append(ca.sqrt(u**2 + v**2 + 1e-12) - limits.speed_cap)
         if limits.yaw_cap is not None and "r" in where:
-            names.append(LimitName("yaw-rate cap", limits.yaw_cap, "rad/s", "--yaw-cap"))
+            names.append(LimitName(LimitKind.YAW_RATE, limits.yaw_cap, "rad/s", "--yaw-cap"))
             rows.append(ca.fabs(where["r"]) - limits.yaw_cap)
         if limits.area is not None:
             north = state[self.nx + 1] + limits.position[0]
             east = state[self.nx + 2] + limits.position[1]
-            names.append(LimitName("sea room", limits.clearance, "m", "--area"))
+            names.append(LimitName(LimitKind.SEA_ROOM, limits.clearance, "m", "--area"))
             if isinstance(limits.area, Circle):
                 circle = limits.area
                 distance = (
@@ -268,7 +300,9 @@ class LimitProgram:
                     f"positive: write --end {name}=VALUE:TOLERANCE."
                 )
             names.append(
-                LimitName(f"end state of {name} = {value:g}", tolerance, units[name], "--end")
+                LimitName(
+                    LimitKind.END_STATE, tolerance, units[name], "--end", f"{name} = {value:g}"
+                )
             )
             shift = {"x_n": limits.position[0], "y_n": limits.position[1]}.get(name, 0.0)
             ends.append((place[name], value - shift))
@@ -277,9 +311,9 @@ class LimitProgram:
     def _whole_names(self, limits: TrialLimits) -> list[LimitName]:
         names = list(self.end_names)
         if limits.energy is not None:
-            names.append(LimitName("energy", limits.energy, "", "--energy"))
+            names.append(LimitName(LimitKind.ENERGY, limits.energy, "", "--energy"))
         if limits.headings is not None:
-            names.append(LimitName("heading coverage", limits.headings, "rad", "--headings"))
+            names.append(LimitName(LimitKind.HEADINGS, limits.headings, "rad", "--headings"))
         return names
 
     def path_values(self, state: Array) -> Array:

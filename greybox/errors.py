@@ -51,6 +51,17 @@ class UsageError(GreyboxError, ValueError):
     """Options that exclude one another, or that need another one beside them."""
 
 
+class KeywordError(UsageError, TypeError):
+    """A function has no such keyword."""
+
+
+class UnknownParameterError(UsageError, KeyError):
+    """An estimate has no such parameter."""
+
+    # that of KeyError quotes the message
+    __str__ = Exception.__str__
+
+
 class ConfigurationError(GreyboxError, ValueError):
     """The configuration file names what does not exist, or gives it a value it cannot have."""
 

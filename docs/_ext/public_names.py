@@ -25,8 +25,8 @@ STEPS = {
     "model": "get_structure structure_names Structure build_predictor output_predictor Predictor "
     "ManoeuvringModel load_model simulate stationary_disturbance",
     "estimate": "estimate_model Request estimate_ls estimate_iv estimate_refined_iv estimate_oe "
-    "OutputErrorOptions Estimate Verdict",
-    "compare": "run_model compare_models fit_percent",
+    "OutputErrorOptions Estimate Verdict TrustLevel TestResult",
+    "compare": "run_model compare Comparison compare_models fit_percent",
     "diagnose": "diagnose DiagnosisOptions Diagnosis fit_given Given known_causes Cause",
     "design": "prepare_request Wishes TrialLimits Circle DesignRequest build_problem noise_levels "
     "NoiseLevels design_trial Design write_plan certify Certificate predict_precision "

@@ -29,8 +29,7 @@ from greybox.trial.checks.finding import CheckReport
 from greybox.trial.convert.read import read_log
 from greybox.trial.store import write_log
 from greybox.validation.choose import estimate_model
-from greybox.validation.comparison import Comparison, compare_models
-from greybox.validation.request import Request
+from greybox.validation.comparison import Comparison, compare
 from greybox.vessel.toml import load_vessel
 
 Array = NDArray[np.float64]
@@ -124,7 +123,7 @@ def run_demo(
 
     trial, other = read_log(files.trial, ship), read_log(files.other, ship)
     progress("estimating")
-    estimate = estimate_model([trial], Request(method="oe", predictor="basic"))
+    estimate = estimate_model(trial, method="oe", predictor="basic")
     estimate.model().save(files.model)
     done(_estimated(estimate))
 
@@ -157,8 +156,7 @@ def run_demo(
 
 def _run_on(path: Path, models: Mapping[str, ManoeuvringModel]) -> Comparison:
     # each model reads the log by its own vessel, whose thrusters may be slow or turned
-    logs = [[read_log(path, model.vessel)] for model in models.values()]
-    return compare_models(list(models.values()), list(models), logs)
+    return compare(models, {name: read_log(path, model.vessel) for name, model in models.items()})
 
 
 def prior_model() -> ManoeuvringModel:

@@ -38,25 +38,28 @@ def run(options: argparse.Namespace) -> None:
     from greybox.files import check_targets, write_json
     from greybox.model.model import load_model
     from greybox.trial.convert.read import read_log
-    from greybox.validation.comparison import compare_models
+    from greybox.validation.comparison import compare
 
     check_targets(options.json, options.report)
     models = [load_model(path) for path in options.models]
     names = [Path(path).stem for path in options.models]
     if len(set(names)) < len(names):
         names = list(options.models)
-    logs = [
-        [
+    # one file may be compared with itself
+    names = [n if n not in names[:i] else f"{n} ({i + 1})" for i, n in enumerate(names)]
+    named = dict(zip(names, models, strict=True))
+    logs = {
+        name: [
             read_log(path, model.vessel, states=model.structure.states, gaps=True)
             for path in options.log
         ]
-        for model in models
-    ]
-    comparison = compare_models(
-        models, names, logs, heading=options.heading, bands=not options.no_bands, seed=options.seed
+        for name, model in named.items()
+    }
+    comparison = compare(
+        named, logs, heading=options.heading, bands=not options.no_bands, seed=options.seed
     )
     record = provenance(options) | {
-        "logs": [log.provenance.source + " " + log.provenance.sha256[:12] for log in logs[0]]
+        "logs": [log.provenance.source + " " + log.provenance.sha256[:12] for log in logs[names[0]]]
     }
     if options.json:
         write_json(comparison.to_dict() | {"provenance": record}, options.json)

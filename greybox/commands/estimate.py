@@ -255,7 +255,7 @@ def run(options: argparse.Namespace) -> None:
     from greybox.model.catalogue import get_structure
     from greybox.model.model import load_model
     from greybox.report.physical import physical_summary
-    from greybox.validation.choose import estimate_model
+    from greybox.validation.choose import estimate_requested
     from greybox.validation.request import Request
     from greybox.vessel.toml import load_vessel
 
@@ -291,7 +291,7 @@ def run(options: argparse.Namespace) -> None:
         seed=options.seed,
     )
     choice = _choose(logs, request, options)
-    estimate = choice.estimate if choice else estimate_model(logs, request)
+    estimate = choice.estimate if choice else estimate_requested(logs, request)
     estimate = replace(estimate, notes=(*left_out, *estimate.notes))
     model = estimate.model()
     told = {"structure_choice": choice.to_list()} if choice else {}

@@ -10,7 +10,7 @@ from greybox.diagnosis.omnibus import Omnibus
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.symptoms import word
 from greybox.diagnosis.waves import Waves
-from greybox.estimation.result import TestResult
+from greybox.estimation.verdict import Distribution, TestResult
 
 Array = NDArray[np.float64]
 
@@ -83,16 +83,15 @@ def residual_tests(
 
 
 def _whiteness(name: str, e: Array) -> TestResult:
-    from scipy.stats import chi2
-
     e = e - e.mean()
     energy = max(float(e @ e), 1e-300)
     rho = np.array([float(e[k:] @ e[:-k]) / energy for k in range(1, _LAGS + 1)])
     n = len(e)
     statistic = n * (n + 2) * float((rho**2 / (n - np.arange(1, _LAGS + 1))).sum())
-    p = float(chi2.sf(statistic, _LAGS))
+    null = Distribution("chi2", (float(_LAGS),))
+    p = null.sf(statistic)
     return TestResult(
-        f"whiteness_{name}",
+        "whiteness",
         f"the free-run error of {word(name)} is white",
         statistic,
         p,
@@ -104,4 +103,6 @@ def _whiteness(name: str, e: Array) -> TestResult:
         ),
         _LEVEL,
         p > _LEVEL,
+        state=name,
+        distribution=null,
     )

@@ -4,25 +4,35 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from enum import StrEnum
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.estimation.result import TestResult
+from greybox.estimation.verdict import TestResult
 from greybox.model.model import ManoeuvringModel
 from greybox.notebook import DisplayMixin, interval, items, number, table, text
 from greybox.trial.log import TrialLog
 from greybox.trial.validity import ConditionDifference
 
 Array = NDArray[np.float64]
-Verdict = Literal["named", "none", "confused", "unexplained"]
 
-VERDICTS: Mapping[Verdict, str] = {
-    "named": "what is wrong has a name",
-    "none": "nothing is wrong beyond noise",
-    "confused": "something is wrong, and several causes explain it equally well",
-    "unexplained": "something is wrong, and no known cause explains it",
+
+class DiagnosisVerdict(StrEnum):
+    """What a diagnosis ends with; equal to the words that its JSON holds."""
+
+    NAMED = "named"
+    NONE = "none"
+    CONFUSED = "confused"
+    UNEXPLAINED = "unexplained"
+
+
+_SAID = {
+    DiagnosisVerdict.NAMED: "what is wrong has a name",
+    DiagnosisVerdict.NONE: "nothing is wrong beyond noise",
+    DiagnosisVerdict.CONFUSED: "something is wrong, and several causes explain it equally well",
+    DiagnosisVerdict.UNEXPLAINED: "something is wrong, and no known cause explains it",
 }
 
 
@@ -162,7 +172,7 @@ class Diagnosis(DisplayMixin):
 
     Parameters
     ----------
-    verdict : {"named", "none", "confused", "unexplained"}
+    verdict : DiagnosisVerdict
     causes : tuple of Found
         In the order found.
     groups : tuple of tuple of str
@@ -199,7 +209,7 @@ class Diagnosis(DisplayMixin):
         In what the logs differ from each other, and from those of the model.
     """
 
-    verdict: Verdict
+    verdict: DiagnosisVerdict
     causes: tuple[Found, ...]
     groups: tuple[tuple[str, ...], ...]
     gain: Mapping[str, Gain]
@@ -223,24 +233,24 @@ class Diagnosis(DisplayMixin):
     @property
     def headline(self) -> str:
         """The verdict in one sentence."""
-        if self.verdict == "named":
+        if self.verdict == DiagnosisVerdict.NAMED:
             return "; ".join(f"{c.title}: {c.evidence}" for c in self.causes) + "."
-        if self.verdict == "confused":
+        if self.verdict == DiagnosisVerdict.CONFUSED:
             return (
                 f"Something is wrong, and these logs cannot tell which it is: "
                 f"{' or '.join(self.groups[0])}."
             )
-        if self.verdict == "none" and self.wrong:
+        if self.verdict == DiagnosisVerdict.NONE and self.wrong:
             return (
                 "Nothing is wrong that would repeat: what moves the ship beside the model does not "
                 "come back in the held-out logs."
             )
-        return f"{VERDICTS[self.verdict][0].upper()}{VERDICTS[self.verdict][1:]}."
+        return f"{_SAID[self.verdict][0].upper()}{_SAID[self.verdict][1:]}."
 
     def to_dict(self) -> dict[str, Any]:
         """Return the diagnosis as the documented JSON, with more beside."""
         return {
-            "verdict": self.verdict,
+            "verdict": str(self.verdict),
             "causes": [c.to_dict() for c in self.causes],
             "groups": [list(g) for g in self.groups],
             "gain": {k: g.to_dict() for k, g in self.gain.items()},

@@ -207,7 +207,10 @@ def take_step(case: Case, fit: Fit, causes: Sequence[Candidate], atoms: Sequence
     if not causes:
         fits += case.begun_again(fit, left, [s.atom for s in scores if s.gain == -np.inf])
     candidates = sorted(
-        (judge(held_out, fit, found, atom, len(left), problem.names) for atom, found in fits),
+        (
+            assess_candidate(held_out, fit, found, atom, len(left), problem.names)
+            for atom, found in fits
+        ),
         key=_merit,
     )
     sure = (_sure(case, c) for c in candidates if c.holds)
@@ -278,7 +281,7 @@ def backwards(fit: Fit, names: Sequence[str]) -> list[str]:
     return [n for n in _THRUST if theta.get(n, 0.0) < 0]
 
 
-def judge(
+def assess_candidate(
     held_out: HeldOut, before: Fit, fit: Fit, atom: Atom, tried: int, names: tuple[str, ...] = ()
 ) -> Candidate:
     """Return a refitted cause with its significance and what it does for held-out logs."""
@@ -302,7 +305,7 @@ def _backward(
         without = problem.settle(
             problem.fit(problem.drop(fit.point, cause.atom), fit.noise, most=FIRST), 2
         )
-        if not judge(held_out, without, fit, cause.atom, tried).holds:
+        if not assess_candidate(held_out, without, fit, cause.atom, tried).holds:
             fit = without
             kept = [c for c in kept if c.atom.key != cause.atom.key]
     return fit, kept
@@ -320,5 +323,7 @@ def instead(
         k = [a.key for a in other.fit.point.atoms].index(other.atom.key)
         value = other.fit.point.values[k]
         score = Score(other.atom, value, other.gain)
-        out.append(judge(held_out, without, refit(problem, without, score), other.atom, 1))
-    return judge(held_out, without, fit, best.atom, 1), out
+        out.append(
+            assess_candidate(held_out, without, refit(problem, without, score), other.atom, 1)
+        )
+    return assess_candidate(held_out, without, fit, best.atom, 1), out

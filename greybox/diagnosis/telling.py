@@ -18,7 +18,16 @@ from greybox.diagnosis.gain import gains, run_on
 from greybox.diagnosis.held_out import Pair
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.residuals import residual_tests
-from greybox.diagnosis.result import Diagnosis, Found, Gain, Quantity, Ranked, Runs, Symptom
+from greybox.diagnosis.result import (
+    Diagnosis,
+    DiagnosisVerdict,
+    Found,
+    Gain,
+    Quantity,
+    Ranked,
+    Runs,
+    Symptom,
+)
 from greybox.diagnosis.search import Candidate, Search, backwards, instead
 from greybox.diagnosis.ship import CURRENTS
 from greybox.diagnosis.symptoms import find_symptoms
@@ -134,8 +143,8 @@ class Report:
                 f"model was not extended."
             )
             gain, runs, after = self.gain(before, before, validate, held.pairs(found.base))
-            verdict = "unexplained"
-        unexplained = verdict == "unexplained"
+            verdict = DiagnosisVerdict.UNEXPLAINED
+        unexplained = verdict is DiagnosisVerdict.UNEXPLAINED
         problem = case.problem(found.base.integrator)
         return Diagnosis(
             verdict=verdict,

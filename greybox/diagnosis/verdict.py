@@ -10,7 +10,7 @@ import numpy as np
 from greybox.diagnosis.held_out import HeldOut, Pair
 from greybox.diagnosis.omnibus import Omnibus, disagreement, omnibus
 from greybox.diagnosis.point import Fit
-from greybox.diagnosis.result import Found, Verdict
+from greybox.diagnosis.result import DiagnosisVerdict, Found
 from greybox.diagnosis.search import RELEVANT, Candidate, Search
 from greybox.diagnosis.symptoms import coloured
 from greybox.model.run.step import Integrator
@@ -36,14 +36,14 @@ class Ruling:
 
     Parameters
     ----------
-    verdict : {"named", "none", "confused", "unexplained"}
+    verdict : DiagnosisVerdict
     remaining : str
     next_steps : list of str
     before, omnibus : Omnibus
         Of the model without causes, and of what was found.
     """
 
-    verdict: Verdict
+    verdict: DiagnosisVerdict
     remaining: str
     next_steps: list[str]
     before: Omnibus
@@ -82,15 +82,14 @@ def rule(
     # a cause that leaves much of the error where it was is not what is wrong, or not alone
     much = bool(found.causes) and after > _LARGE and after > _MOST_OF * before
     drifts = not found.causes and before > _LARGE and _drifts(pairs)
-    verdict: Verdict
     if wrong or apart or much or drifts:
-        verdict = "unexplained"
+        verdict = DiagnosisVerdict.UNEXPLAINED
     elif groups and not known and len(groups) == len(found.causes):
-        verdict = "confused"
+        verdict = DiagnosisVerdict.CONFUSED
     elif found.causes or known:
-        verdict = "named"
+        verdict = DiagnosisVerdict.NAMED
     else:
-        verdict = "none"
+        verdict = DiagnosisVerdict.NONE
     why = ""
     if wrong:
         why = (
@@ -146,22 +145,22 @@ def _remaining(final: Fit, outputs: Sequence[str], why: str) -> str:
     return f"What is left is not told from noise.{tail}"
 
 
-def _next(verdict: Verdict, groups: Sequence[Sequence[Candidate]]) -> list[str]:
+def _next(verdict: DiagnosisVerdict, groups: Sequence[Sequence[Candidate]]) -> list[str]:
     out = [
         f"design a trial that tells {' from '.join(c.atom.cause for c in pair)}: greybox design "
         f"--between {' '.join(f'MODEL.{c.atom.cause}.json' for c in pair[:2])}"
         for pair in groups
     ]
-    if verdict == "unexplained":
+    if verdict is DiagnosisVerdict.UNEXPLAINED:
         out.append(
             "measure what the model does not know (wind, depth, draught, propeller and rudder as "
             "they really moved), repeat a run of these logs, and diagnose both together"
         )
-    elif verdict == "named":
+    elif verdict is DiagnosisVerdict.NAMED:
         out.append(
             "design the next trial with the extended model, so that its least certain "
             "coefficients move: greybox design --model MODEL"
         )
-    elif verdict == "none":
+    elif verdict is DiagnosisVerdict.NONE:
         out.append("the model may be used as it is; a trial in other conditions would tell more")
     return out

@@ -15,19 +15,16 @@ from greybox.estimation.covariance import (
     block_bootstrap,
     score_covariance,
 )
-from greybox.estimation.credibility import Evidence, assess, convergence, judge
+from greybox.estimation.credibility import Evidence, assess, convergence, weigh
 from greybox.estimation.disturbance import estimate_current
 from greybox.estimation.error_shape import ErrorShape, error_shapes
 from greybox.estimation.moments import Solution, solve_stacked
-from greybox.estimation.result import Estimate
+from greybox.estimation.result import Estimate, Iteration, estimation_data
 from greybox.model.predictor import Predictor
 from greybox.one_thread import one_thread
 from greybox.regression.instruments import Instruments, build_instruments
 from greybox.regression.regression import Regression, build_regression
-from greybox.trial.actuator_estimate import known_actuators
 from greybox.trial.log import TrialLog
-from greybox.trial.ranges import ranges
-from greybox.trial.validity import pooled_conditions
 
 Array = NDArray[np.float64]
 Covariance = Literal["hac", "ma", "white", "bootstrap"]
@@ -466,13 +463,10 @@ def _result(
         residual_std=residual_std,
         vessel=logs[0].vessel,
         sample_time=regression.sample_time,
-        samples=regression.samples,
-        kept=kept,
+        data=estimation_data(logs, predictor.structure.states, regression.samples, kept),
         covariance_kind=kind,
         lags=lags,
-        iterations=iterations,
-        status=status,
-        converged=converged,
+        iteration=Iteration(iterations, status, converged),
         current=estimate_current(
             predictor,
             theta,
@@ -480,12 +474,6 @@ def _result(
             heading_std=logs[0].vessel.std("psi") or 0.0,
             heading_measured=heading == "measured",
         ),
-        logs=tuple(
-            {"name": log.name, "sha256": log.provenance.sha256, "samples": len(log)} for log in logs
-        ),
-        ranges=ranges(logs, predictor.structure.states),
-        conditions=pooled_conditions(logs),
-        actuators=known_actuators(log.provenance.actuators for log in logs),
     )
     if evidence is None:
         return estimate
@@ -507,5 +495,5 @@ def _result(
     return replace(
         estimate,
         tests=tests,
-        verdict=judge(tests, estimate.labels, method, contaminated=predictor.contaminated),
+        verdict=weigh(tests, estimate.labels, method, contaminated=predictor.contaminated),
     )

@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import ExcitationError
-from greybox.estimation.credibility import Evidence, assess, convergence, judge
+from greybox.estimation.credibility import Evidence, assess, convergence, weigh
 from greybox.estimation.output_error import one_step_errors
 from greybox.estimation.output_setup import measured, output_model
-from greybox.estimation.result import Estimate, TestResult, Verdict
+from greybox.estimation.result import Estimate
+from greybox.estimation.verdict import NoRegression, TestResult, refused
 from greybox.model.predictor import Predictor, build_predictor
 from greybox.one_thread import one_thread
 from greybox.regression.instruments import build_instruments
@@ -54,8 +55,7 @@ def judge_estimate(
     try:
         regression = build_regression(predictor, logs, margins=margins)
     except ExcitationError as error:
-        text = f"do not trust: {str(error).rstrip('.')}"
-        return replace(estimate, verdict=Verdict(text, estimate.labels, (str(error),)))
+        return replace(estimate, verdict=refused([NoRegression(str(error))], estimate.labels))
     instruments = build_instruments(
         predictor,
         logs,
@@ -86,7 +86,7 @@ def judge_estimate(
     tests += [t for t in convergence(estimate) if t.name not in own]
     tests += own.values()
     return replace(
-        estimate, tests=tuple(tests), verdict=judge(tests, estimate.labels, estimate.method)
+        estimate, tests=tuple(tests), verdict=weigh(tests, estimate.labels, estimate.method)
     )
 
 

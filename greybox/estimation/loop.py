@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.estimation.result import TestResult
+from greybox.estimation.verdict import TestResult
 from greybox.trial.log import TrialLog
 
 Array = NDArray[np.float64]

@@ -26,7 +26,7 @@ from greybox.estimation.free_run_errors import (
 from greybox.estimation.free_run_noise import noise_of_run, noise_of_sensors, residual_noise
 from greybox.estimation.innovations import FilterRuns, fit_innovations
 from greybox.estimation.output_setup import deviations, measured, output_model, turns
-from greybox.estimation.result import Estimate, TestResult
+from greybox.estimation.result import Estimate, Iteration, estimation_data
 from greybox.estimation.shooting import (
     RANK,
     FreeRuns,
@@ -38,6 +38,7 @@ from greybox.estimation.shooting import (
     ShootingFit,
     loss_weights,
 )
+from greybox.estimation.verdict import TestResult
 from greybox.model.disturbances import CURRENT, WIND
 from greybox.model.noise import NoiseLevels
 from greybox.model.output import OutputModel, Role
@@ -45,10 +46,7 @@ from greybox.model.output_runs import Simulator
 from greybox.model.predictor import Predictor
 from greybox.one_thread import one_thread
 from greybox.regression.regression import common_sample_time
-from greybox.trial.actuator_estimate import known_actuators
 from greybox.trial.log import TrialLog
-from greybox.trial.ranges import ranges
-from greybox.trial.validity import pooled_conditions
 
 Array = NDArray[np.float64]
 Damping = Literal["warn", "enforce"]
@@ -460,13 +458,10 @@ def _result(fitted: _Fitted, logs: Sequence[TrialLog], options: OutputErrorOptio
         residual_std=np.sqrt((errors**2).mean(axis=0))[: len(own)],
         vessel=logs[0].vessel,
         sample_time=model.sample_time,
-        samples=sum(len(d.y) for d in data),
-        kept=samples,
+        data=estimation_data(logs, own, sum(len(d.y) for d in data), samples),
         covariance_kind=options.covariance,
         lags=lags,
-        iterations=fit.iterations,
-        status=status,
-        converged=fit.converged,
+        iteration=Iteration(fit.iterations, status, fit.converged),
         current=tuple((n, float(v), float(s)) for n, (v, s) in means.items() if n in CURRENT),
         current_covariance=covariance[np.ix_([*range(count), *flow], flow)],
         noise=_noise_levels(fitted, logs, options.weights) if options.search else None,
@@ -475,12 +470,6 @@ def _result(fitted: _Fitted, logs: Sequence[TrialLog], options: OutputErrorOptio
             *_excitation_tests(model, fitted.hessian, bound),
             *(_slow_tests(fitted.slow) if options.search and not options.process_noise else ()),
         ),
-        logs=tuple(
-            {"name": log.name, "sha256": log.provenance.sha256, "samples": len(log)} for log in logs
-        ),
-        ranges=ranges(logs, predictor.structure.states),
-        conditions=pooled_conditions(logs),
-        actuators=known_actuators(log.provenance.actuators for log in logs),
     )
 
 
@@ -516,7 +505,7 @@ def _excitation_tests(
         )
         out.append(
             TestResult(
-                f"excitation_{state}",
+                "excitation",
                 "the sensitivities of the run are independent",
                 ratio,
                 None,
@@ -527,6 +516,7 @@ def _excitation_tests(
                 passed,
                 tuple(names),
                 {"own_share": {model.parameters[free[i]]: float(share[i]) for i in mine}},
+                state=state,
             )
         )
     return tuple(out)
@@ -543,11 +533,12 @@ def _slow_tests(slow: Mapping[str, tuple[float, float]]) -> tuple[TestResult, ..
         )
         out.append(
             TestResult(
-                f"slow_errors_{name}",
+                "slow_errors",
                 f"the free-run error of {name} is white: nothing beside the model moves it",
                 z,
                 p,
                 f"the free-run error of {name} {found}",
+                state=name,
             )
         )
     return tuple(out)

@@ -27,7 +27,8 @@ from greybox.estimation.noise import (
     noise_levels_of,
     stated_levels,
 )
-from greybox.estimation.result import UNJUDGED, Estimate
+from greybox.estimation.result import Estimate, Iteration
+from greybox.estimation.verdict import UNJUDGED
 from greybox.estimation.white_rows import (
     WhiteRows,
     own_constants,
@@ -264,12 +265,14 @@ def estimate_refined_iv(
         theta=theta,
         covariance=matrix,
         residual_std=_spread(work.errors(theta), found.keep),
-        kept=kept,
+        data=replace(plain.data, kept=kept),
         covariance_kind=covariance,
         lags=lags,
-        iterations=plain.iterations + found.rounds,
-        status=f"prefiltered by the noise, {found.status}",
-        converged=found.converged,
+        iteration=Iteration(
+            plain.iterations + found.rounds,
+            f"prefiltered by the noise, {found.status}",
+            found.converged,
+        ),
         current=estimate_current(
             predictor,
             theta,

@@ -2,117 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.errors import UnknownParameterError, suggestion
+from greybox.estimation.inference import Restrictions, confidence_intervals, wald_test
 from greybox.estimation.summary import estimated, summarise
+from greybox.estimation.verdict import UNJUDGED, TestResult, Verdict
 from greybox.model.model import ManoeuvringModel
 from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import Predictor
 from greybox.notebook import DisplayMixin, items, parameters, text
-from greybox.trial.actuator_estimate import ActuatorEstimate
-from greybox.trial.validity import PooledConditions
+from greybox.trial.actuator_estimate import ActuatorEstimate, known_actuators
+from greybox.trial.log import TrialLog
+from greybox.trial.ranges import ranges
+from greybox.trial.validity import PooledConditions, pooled_conditions
 from greybox.vessel.vessel import Vessel
 
 if TYPE_CHECKING:
     import pandas as pd
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class TestResult:
-    """One test: what it supposes, what it found, and a sentence to act on.
-
-    ``statistic`` and ``p_value`` are None where the test does not apply; the
-    sentence then says why.
-
-    Parameters
-    ----------
-    name : str
-    null : str
-    statistic, p_value : float or None
-    sentence : str
-    level : float, optional
-        What the statistic, or the p-value where there is one, is compared with.
-    passed : bool, optional
-        None where the test does not apply or only informs.
-    parameters : tuple of str
-        Parameters that the finding concerns.
-    detail : mapping
-        Numbers behind the sentence, for machines.
-    """
-
-    name: str
-    null: str
-    statistic: float | None
-    p_value: float | None
-    sentence: str
-    level: float | None = None
-    passed: bool | None = None
-    parameters: tuple[str, ...] = ()
-    detail: Mapping[str, Any] = field(default_factory=dict)
-
-    __test__ = False  # not a test case
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the fields for JSON."""
-        return {
-            "null": self.null,
-            "statistic": self.statistic,
-            "p_value": self.p_value,
-            "sentence": self.sentence,
-            "level": self.level,
-            "passed": self.passed,
-            "parameters": list(self.parameters),
-            "detail": dict(self.detail),
-        }
-
-
-def not_applicable(name: str, null: str, reason: str) -> TestResult:
-    """Return a test that does not apply, with the reason."""
-    return TestResult(name, null, None, None, f"not applicable: {reason}.")
-
-
-@dataclass(frozen=True, repr=False)
-class Verdict(DisplayMixin):
-    """Whether to trust an estimate.
-
-    Parameters
-    ----------
-    text : str
-        ``trust``, ``trust except A, B`` or ``do not trust: reason``.
-    excepted : tuple of str
-        Parameters not to rely on.
-    reasons : tuple of str
-        One sentence a finding.
-    """
-
-    text: str
-    excepted: tuple[str, ...] = ()
-    reasons: tuple[str, ...] = ()
-
-    def summary(self) -> str:
-        """Return the verdict and its reasons as text."""
-        return "\n".join([self.text, *(f"  {r}" for r in self.reasons)])
-
-    def _parts(self) -> tuple[str, ...]:
-        return (items("Because", self.reasons),)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the fields for JSON."""
-        return {
-            "text": self.text,
-            "excepted": list(self.excepted),
-            "reasons": list(self.reasons),
-        }
-
-
-UNJUDGED = Verdict("not judged")
 
 
 @dataclass(frozen=True)
@@ -156,6 +70,67 @@ class Limit:
         }
 
 
+@dataclass(frozen=True)
+class EstimationData:
+    """What an estimate rests on.
+
+    Parameters
+    ----------
+    samples, kept : int
+        Rows there were, and rows that took part.
+    logs : tuple of dict
+        Name, hash and length of each log.
+    ranges : dict of str to (float, float)
+        Least and greatest value of each state and command in the logs.
+    conditions : PooledConditions
+        Draught, depth and the like of the logs, and in what they differ.
+    actuators : tuple of ActuatorEstimate
+        Measured from command and feedback when the logs were imported.
+    """
+
+    samples: int
+    kept: int
+    logs: tuple[dict[str, Any], ...] = ()
+    ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    conditions: PooledConditions = field(default_factory=PooledConditions)
+    actuators: tuple[ActuatorEstimate, ...] = ()
+
+
+def estimation_data(
+    logs: Sequence[TrialLog], states: Sequence[str], samples: int, kept: int
+) -> EstimationData:
+    """Return what an estimate from these logs rests on."""
+    return EstimationData(
+        samples,
+        kept,
+        tuple(
+            {"name": log.name, "sha256": log.provenance.sha256, "samples": len(log)} for log in logs
+        ),
+        ranges(logs, tuple(states)),
+        pooled_conditions(logs),
+        known_actuators(log.provenance.actuators for log in logs),
+    )
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """How the iteration of an estimator ended.
+
+    Parameters
+    ----------
+    count : int
+        Steps, or refinements of the instruments; 0 where there is no iteration.
+    status : str
+        A sentence on how it ended.
+    converged : bool
+        Whether it ended where it no longer moves.
+    """
+
+    count: int = 0
+    status: str = "solved"
+    converged: bool = True
+
+
 @dataclass(frozen=True, repr=False)
 class Estimate(DisplayMixin):
     """Parameters of a predictor, estimated from logs.
@@ -174,17 +149,13 @@ class Estimate(DisplayMixin):
     vessel : Vessel
     sample_time : float
         [s]
-    samples, kept : int
-        Rows there were, and rows that took part.
+    data : EstimationData
+        What it rests on.
     covariance_kind : str
     lags : int
         Memory of the residuals that the covariance allows for, in samples.
-    iterations : int
-        Refinements of the instruments.
-    status : str
-        A sentence on how the estimation ended.
-    converged : bool
-        Whether its iteration, if it has one, ended where it no longer moves.
+    iteration : Iteration
+        How it was found.
     current : tuple
         (name, value, standard error) of each current component; empty where the
         predictor cannot tell it.
@@ -197,20 +168,12 @@ class Estimate(DisplayMixin):
         Choices made and warnings.
     fit : dict
         Free-run fit (6.12) on the estimation logs [%].
-    logs : tuple of dict
-        Name, hash and length of each log.
-    ranges : dict of str to (float, float)
-        Least and greatest value of each state and command in the logs.
     noise : NoiseLevels, optional
         What was found of measurement and process noise.
     limits : dict of str to Limit
         ``cramer_rao`` and ``optimal_iv`` beside the standard errors.
     prefilter : {"none", "noise"}
         Whether all equations were solved jointly with their error made white.
-    conditions : PooledConditions
-        Draught, depth and the like of the logs, and in what they differ.
-    actuators : tuple of ActuatorEstimate
-        Measured from command and feedback when the logs were imported.
     """
 
     predictor: Predictor
@@ -220,26 +183,59 @@ class Estimate(DisplayMixin):
     residual_std: Array
     vessel: Vessel
     sample_time: float
-    samples: int
-    kept: int
+    data: EstimationData
     covariance_kind: str
     lags: int
-    iterations: int = 0
-    status: str = "solved"
-    converged: bool = True
+    iteration: Iteration = field(default_factory=Iteration)
     current: tuple[tuple[str, float, float], ...] = ()
     current_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
     tests: tuple[TestResult, ...] = ()
     verdict: Verdict = UNJUDGED
     notes: tuple[str, ...] = ()
     fit: dict[str, float] = field(default_factory=dict)
-    logs: tuple[dict[str, Any], ...] = ()
-    ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     noise: NoiseLevels | None = None
     limits: Mapping[str, Limit] = field(default_factory=dict)
     prefilter: str = "none"
-    conditions: PooledConditions = field(default_factory=PooledConditions)
-    actuators: tuple[ActuatorEstimate, ...] = ()
+
+    @property
+    def samples(self) -> int:
+        """Rows there were."""
+        return self.data.samples
+
+    @property
+    def kept(self) -> int:
+        """Rows that took part."""
+        return self.data.kept
+
+    @property
+    def logs(self) -> tuple[dict[str, Any], ...]:
+        """Name, hash and length of each log."""
+        return self.data.logs
+
+    @property
+    def conditions(self) -> PooledConditions:
+        """Draught, depth and the like of the logs, and in what they differ."""
+        return self.data.conditions
+
+    @property
+    def actuators(self) -> tuple[ActuatorEstimate, ...]:
+        """Measured from command and feedback when the logs were imported."""
+        return self.data.actuators
+
+    @property
+    def iterations(self) -> int:
+        """Steps of the iteration that it comes from, 0 where there was none."""
+        return self.iteration.count
+
+    @property
+    def status(self) -> str:
+        """How the estimation ended, in words."""
+        return self.iteration.status
+
+    @property
+    def converged(self) -> bool:
+        """Whether its iteration, if it has one, ended where it no longer moves."""
+        return self.iteration.converged
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -257,8 +253,93 @@ class Estimate(DisplayMixin):
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
 
     def __getitem__(self, name: str) -> float:
-        """Return the value of a parameter by name."""
+        """Return the value of a parameter by name.
+
+        Raises
+        ------
+        UnknownParameterError
+            The estimate has no such parameter.
+        """
+        if name not in self.names:
+            raise UnknownParameterError(
+                f"the estimate has no parameter '{name}'.{suggestion(name, self.names)} "
+                f"Parameters: {', '.join(self.names)}."
+            )
         return float(self.theta[self.predictor.parameter_columns[self.names.index(name)]])
+
+    @property
+    def params(self) -> pd.Series[float]:
+        """Values of the parameters by name, biases left out; discrete ones at `sample_time`."""
+        import pandas as pd
+
+        place = list(self.predictor.parameter_columns)
+        return pd.Series(self.theta[place], index=list(self.names), name="parameter")
+
+    @property
+    def std_errors(self) -> pd.Series[float]:
+        """Standard errors of the parameters by name."""
+        import pandas as pd
+
+        place = list(self.predictor.parameter_columns)
+        return pd.Series(self.std[place], index=list(self.names), name="std_error")
+
+    @property
+    def cov(self) -> pd.DataFrame:
+        """Covariance of the parameters, rows and columns by name."""
+        import pandas as pd
+
+        return pd.DataFrame(self._covariance, index=list(self.names), columns=list(self.names))
+
+    @property
+    def _covariance(self) -> Array:
+        place = list(self.predictor.parameter_columns)
+        return self.covariance[np.ix_(place, place)]
+
+    def conf_int(self, level: float = 0.95) -> pd.DataFrame:
+        """Return the confidence interval of each parameter, from the normal distribution.
+
+        Parameters
+        ----------
+        level : float
+            Probability with which the intervals hold the parameters.
+
+        Returns
+        -------
+        DataFrame
+            Index the names; columns ``lower`` and ``upper``.
+
+        Raises
+        ------
+        UsageError
+            The level is not between 0 and 1.
+        """
+        import pandas as pd
+
+        place = list(self.predictor.parameter_columns)
+        limits = confidence_intervals(self.theta[place], self.std[place], level)
+        return pd.DataFrame(limits, index=list(self.names), columns=["lower", "upper"])
+
+    def wald_test(self, restrictions: Restrictions | None = None) -> TestResult:
+        """Test linear restrictions on the parameters by their covariance.
+
+        Parameters
+        ----------
+        restrictions : str, sequence of str or mapping of str to float, optional
+            ``"Xu = 2*Yv, Nr = -0.1"``, the same one by one, or the value of each parameter;
+            by default that all parameters are zero.
+
+        Returns
+        -------
+        TestResult
+            With the null hypothesis in words, `statistic`, `df` and `p_value`.
+
+        Raises
+        ------
+        UsageError
+            A restriction cannot be read, names no parameter, or follows from the others.
+        """
+        place = list(self.predictor.parameter_columns)
+        return wald_test(self.names, self.theta[place], self._covariance, restrictions)
 
     def structure_theta(self) -> Array:
         """Return the parameters of the predictor's full structure, (p_structure,).
@@ -327,7 +408,7 @@ class Estimate(DisplayMixin):
                 "std": self.std[biases],
             },
             "logs": list(self.logs),
-            "ranges": dict(self.ranges),
+            "ranges": dict(self.data.ranges),
             "actuators": [a.to_dict() for a in self.actuators],
             "condition_differences": [d.to_dict() for d in self.conditions.differences],
         }

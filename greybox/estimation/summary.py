@@ -10,7 +10,8 @@ from greybox.model.units import parameter_unit
 from greybox.trial.validity import in_words
 
 if TYPE_CHECKING:
-    from greybox.estimation.result import Estimate, TestResult
+    from greybox.estimation.result import Estimate
+    from greybox.estimation.verdict import TestResult
 
 WIDTH = 100
 # closed intervals, None for an infinite end
@@ -20,8 +21,8 @@ _GROUPS = {
                                 "combinations"),
     "Whether the model explains it": ("input_independence", "heading_independence",
                                       "overidentification", "whiteness"),
-    "What noise does to it": ("endogeneity", "many_instruments", "margin_u", "margin_v",
-                              "margin_bias", "closed_loop"),
+    "What noise does to it": ("endogeneity", "many_instruments", "margin", "margin_bias",
+                              "closed_loop"),
     "How it was found": ("convergence",),
     "What the model does": ("stability", "damping_signs", "slow_errors"),
 }  # fmt: skip
@@ -120,7 +121,7 @@ def weak_safe_sets(tests: Sequence[TestResult]) -> dict[str, Pieces]:
     """Return the sets (95 %) that hold however weak the instruments are, by parameter."""
     sets: dict[str, Pieces] = {}
     for test in tests:
-        if test.name.startswith("anderson_rubin"):
+        if test.kind == "anderson_rubin":
             sets |= test.detail.get("sets", {})
     return sets
 
@@ -145,8 +146,8 @@ def grouped(tests: Sequence[TestResult]) -> list[tuple[str, list[TestResult]]]:
     """Return the tests under the titles that tell what they ask."""
     left = list(tests)
     groups = []
-    for title, prefixes in _GROUPS.items():
-        mine = [t for t in left if t.name.startswith(prefixes)]
+    for title, kinds in _GROUPS.items():
+        mine = [t for t in left if t.kind in kinds]
         left = [t for t in left if t not in mine]
         groups.append((title, mine))
     return [g for g in [*groups, ("Further", left)] if g[1]]

@@ -11,6 +11,9 @@ VERSION = 2
 
 Tables = dict[str, Any]
 
+# the longer one before its beginning
+_LEVELS = ("do not trust", "trust except", "trust")
+
 
 def _from_1(data: Tables) -> Tables:
     """Version 1 at first had no noise, nor its memory, nor covariances with the current."""
@@ -57,4 +60,14 @@ def upgraded(data: Tables, source: str) -> Tables:
         )
     for step in range(version, VERSION):
         data = _STEPS[step](data)
-    return data
+    return _with_level(data)
+
+
+def _with_level(data: Tables) -> Tables:
+    """Return the tables with the level of the estimate's verdict, which was at first its text."""
+    verdict = data.get("verdict")
+    if not isinstance(verdict, dict) or "level" in verdict:
+        return data
+    said = str(verdict.get("text", ""))
+    level = next((w for w in _LEVELS if said.startswith(w)), "not judged")
+    return {**data, "verdict": {**verdict, "level": level}}

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,8 +16,43 @@ _NAMES = {"u": "surge", "v": "sway", "r": "yaw rate"}
 _SLACK, _NEAR = 0.05, 0.01
 
 
-def extrapolation(model: ManoeuvringModel, log: TrialLog) -> tuple[str, ...]:
-    """Return a sentence for each signal that leaves its range in the estimation logs.
+@dataclass(frozen=True)
+class Extrapolation:
+    """One signal of a predicted run that leaves its range in the estimation logs.
+
+    Parameters
+    ----------
+    signal : str
+    run, known : tuple of float
+        Least and greatest value in the run, and in the logs [m/s, rad, rad/s, as logged].
+    angle : bool
+        Whether it is an angle or its rate.
+    """
+
+    signal: str
+    run: tuple[float, float]
+    known: tuple[float, float]
+    angle: bool
+
+    @property
+    def sentence(self) -> str:
+        """Both ranges in words."""
+        factor = 180 / math.pi if self.angle else 1.0
+        unit = {"u": " m/s", "v": " m/s", "r": " deg/s"}.get(
+            self.signal, " deg" if self.angle else ""
+        )
+        (least, most), (low, high) = self.run, self.known
+        spread = f"is {least * factor:.3g}{unit}"
+        if most > least:
+            spread = f"goes from {least * factor:.3g} to {most * factor:.3g}{unit}"
+        return (
+            f"extrapolated: {_NAMES.get(self.signal, self.signal)} {spread}, and the model was "
+            f"estimated on {low * factor:.3g} to {high * factor:.3g}{unit}."
+        )
+
+
+def extrapolations(model: ManoeuvringModel, log: TrialLog) -> tuple[Extrapolation, ...] | None:
+    """Return the signals that leave their ranges in the estimation logs.
 
     Parameters
     ----------
@@ -27,32 +63,29 @@ def extrapolation(model: ManoeuvringModel, log: TrialLog) -> tuple[str, ...]:
 
     Returns
     -------
-    tuple of str
-        One sentence that says so where the model holds no ranges.
+    tuple of Extrapolation or None
+        None where the model holds no ranges.
     """
     known = model.record.get("ranges")
     if not isinstance(known, Mapping) or not known:
-        return (
-            "the MODEL does not say on what motions it was estimated, so whether this prediction "
-            "extrapolates cannot be told: estimate it again.",
-        )
-    told = []
+        return None
+    found = []
     angles = {*model.vessel.angle_commands, "r"}
     for name, (low, high) in known.items():
         if name not in log:
             continue
         least, most = float(np.min(log[name])), float(np.max(log[name]))
         slack = max(_SLACK * (high - low), _NEAR * max(abs(low), abs(high)))
-        if least >= low - slack and most <= high + slack:
-            continue
-        factor = 180 / math.pi if name in angles else 1.0
-        unit = {"u": " m/s", "v": " m/s", "r": " deg/s"}.get(name, " deg" if factor != 1 else "")
-        spread = f"is {least * factor:.3g}{unit}"
-        if most > least:
-            spread = f"goes from {least * factor:.3g} to {most * factor:.3g}{unit}"
-        seen = f"{low * factor:.3g} to {high * factor:.3g}{unit}"
-        told.append(
-            f"extrapolated: {_NAMES.get(name, name)} {spread}, and the model was "
-            f"estimated on {seen}."
+        if least < low - slack or most > high + slack:
+            found.append(Extrapolation(name, (least, most), (low, high), name in angles))
+    return tuple(found)
+
+
+def extrapolation_notes(found: Sequence[Extrapolation] | None) -> tuple[str, ...]:
+    """Return a sentence for each signal beyond its range, or that the ranges are not known."""
+    if found is None:
+        return (
+            "the MODEL does not say on what motions it was estimated, so whether this prediction "
+            "extrapolates cannot be told: estimate it again.",
         )
-    return tuple(told)
+    return tuple(e.sentence for e in found)

@@ -56,8 +56,6 @@ class Helm:
     def sentence(self) -> str:
         """What steers, in words."""
         names = " and ".join(self.steering_columns)
-        other = tuple(c for c, s in zip(self.columns, self.drive, strict=True) if s != 0)
-        driven = f"propelled by {' and '.join(other)}" if other else "without propulsion"
         how = {
             "rudder": f"steered by the rudder angle {names}",
             "azimuth": f"steered by turning {names}, the other azimuths straight ahead",
@@ -65,7 +63,13 @@ class Helm:
             "tunnel": f"steered by the speed of the tunnel thrusters {names}",
             "none": "not steered",
         }[self.kind]
-        return f"{how}, {driven}"
+        return f"{how}, {self.propulsion}"
+
+    @property
+    def propulsion(self) -> str:
+        """What drives, in words."""
+        driving = [c for c, s in zip(self.columns, self.drive, strict=True) if s != 0]
+        return f"propelled by {' and '.join(driving)}" if driving else "without propulsion"
 
     @property
     def angular(self) -> bool:

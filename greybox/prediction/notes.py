@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from greybox.estimation.verdict import TrustLevel
 from greybox.model.model import ManoeuvringModel
 from greybox.prediction.conditions import Conditions, Task
 from greybox.prediction.drawn import Drawn
-from greybox.prediction.extrapolation import extrapolation
+from greybox.prediction.extrapolation import Extrapolation, extrapolation_notes
 from greybox.prediction.helm import Helm
 from greybox.prediction.result import Kind, PredictedManoeuvre
 from greybox.prediction.running import Runs
 from greybox.prediction.steady import Steady
 from greybox.trial.log import TrialLog
-from greybox.trial.manoeuvres import TurningCircle, ZigZag
+from greybox.trial.manoeuvres import Stopping, TurningCircle, ZigZag
 from greybox.trial.manoeuvres.finding import Manoeuvre
 from greybox.trial.wind import true_wind
 
@@ -33,6 +34,7 @@ def run_notes(
     helm: Helm,
     steady: Steady,
     longest: float,
+    beyond: Sequence[Extrapolation] | None,
 ) -> tuple[str, ...]:
     """Say what limits one prediction: draws that were lost, rates, trim, extrapolation."""
     told = []
@@ -80,16 +82,26 @@ def run_notes(
         trim = math.degrees(steady.trim[0]) if helm.angular else float(steady.trim[0])
         unit = " deg" if helm.angular else ""
         told.append(f"the straight approach needs a steering order of {trim:.3g}{unit}.")
-    told += [n for n in own.notes if n.startswith(("the yaw rate changes", "the ship still moves"))]
-    return (*told, *extrapolation(model, log))
+    if isinstance(own, TurningCircle) and own.unsteady:
+        told.append(own.unsteady)
+    if isinstance(own, Stopping) and own.unfinished:
+        told.append(own.unfinished)
+    return (*told, *extrapolation_notes(beyond))
+
+
+def trust_level(model: ManoeuvringModel) -> TrustLevel:
+    """Return the level of the verdict that the model's record holds."""
+    verdict = model.record.get("verdict")
+    level = verdict.get("level") if isinstance(verdict, Mapping) else None
+    known = set(map(str, TrustLevel))
+    return TrustLevel(level) if level in known else TrustLevel.NOT_JUDGED
 
 
 def model_notes(model: ManoeuvringModel, helm: Helm, asked: Conditions) -> tuple[str, ...]:
     """Say what holds for all manoeuvres of a prediction."""
     told = []
-    verdict = str(model.record.get("verdict", {}).get("text", ""))
-    if verdict.startswith(("do not trust", "trust except")):
-        told.append(f"the estimate's own verdict is '{verdict}'.")
+    if trust_level(model) in (TrustLevel.DO_NOT_TRUST, TrustLevel.TRUST_EXCEPT):
+        told.append(f"the estimate's own verdict is '{model.record['verdict']['text']}'.")
     if not model.covariance.any():
         told.append("the model has no covariance, so its parameters were taken as exact.")
     if asked.disturbed and model.noise is None:

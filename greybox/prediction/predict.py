@@ -21,9 +21,10 @@ from greybox.prediction.conditions import (
     tasks,
 )
 from greybox.prediction.drawn import Drawn, drawn
+from greybox.prediction.extrapolation import extrapolations
 from greybox.prediction.helm import Helm, find_helm
 from greybox.prediction.measuring import measure, quantities
-from greybox.prediction.notes import model_notes, run_notes, trial_notes
+from greybox.prediction.notes import model_notes, run_notes, trial_notes, trust_level
 from greybox.prediction.orders import Orders, Stop, Turn, ZigZagOrders
 from greybox.prediction.result import (
     CRITERIA,
@@ -37,9 +38,9 @@ from greybox.prediction.showing import bundle_of, log_of
 from greybox.prediction.steady import Steady, require_straight, straight_run
 from greybox.prediction.trial import compare, end_again, found_in_trial, with_rates
 from greybox.trial.log import TrialLog
-from greybox.trial.manoeuvres import Criterion, Quantity, Verdict
+from greybox.trial.manoeuvres import Compliance, Criterion, Quantity, TurningCircle
 from greybox.trial.manoeuvres.finding import Manoeuvre
-from greybox.trial.manoeuvres.standards import judge
+from greybox.trial.manoeuvres.standards import check_limit
 from greybox.trial.validity import ConditionDifference, other_conditions
 from greybox.validation.bands import draw_parameters, process_noise
 
@@ -195,7 +196,7 @@ def predict_manoeuvre(
     return ManoeuvrePrediction(
         manoeuvre,
         model.vessel.name,
-        helm.sentence if manoeuvre in ("turning", "zigzag") else helm.sentence.split(", ")[-1],
+        helm.sentence if manoeuvre in ("turning", "zigzag") else helm.propulsion,
         tuple(made),
         asked.draws,
         (
@@ -205,6 +206,7 @@ def predict_manoeuvre(
             *shared,
         ),
         elsewhere,
+        trust_level(model),
     )
 
 
@@ -286,6 +288,7 @@ def _one(
         for i, name in enumerate(helm.columns)
     }
     log = log_of(runs, 0, model, helm)
+    beyond = extrapolations(model, log)
     return PredictedManoeuvre(
         kind,
         task.side,
@@ -299,10 +302,11 @@ def _one(
         int(runs.diverged[1:].sum()),
         int(((runs.complete[1:] < 0) & ~runs.diverged[1:]).sum()),
         unheld,
-        run_notes(kind, task, model, own, runs, unheld, values, log, helm, steady, longest),
+        run_notes(kind, task, model, own, runs, unheld, values, log, helm, steady, longest, beyond),
         log,
         float(runs.t[runs.order]),
         bundle_of(runs, helm, task.course, model.vessel.length),
+        extrapolated=beyond or (),
     )
 
 
@@ -349,23 +353,23 @@ def _criteria(
 ) -> tuple[Criterion, ...]:
     """Judge the limits that apply by the intervals of the draws."""
     made = []
+    unsteered = isinstance(own, TurningCircle) and own.rudder is None
     for criterion in own.criteria:
         value = values.get(CRITERIA.get(criterion.name, ""))
         if criterion.limit is None:
-            reason = criterion.reason.replace("the log has no rudder angle", "no angle steers")
-            made.append(replace(criterion, reason=reason))
+            made.append(replace(criterion, reason="no angle steers") if unsteered else criterion)
             continue
         if value is None:
             made.append(
-                replace(criterion, verdict=Verdict.OPEN, reason="the run does not reach it")
+                replace(criterion, verdict=Compliance.OPEN, reason="the run does not reach it")
             )
             continue
         lengths = criterion.measured is None or criterion.measured.unit == "1"
         shown = value.scaled(1 / length, "1") if lengths else value
-        judged = judge(criterion.name, shown, criterion.limit, criterion.reason)
-        if judged.verdict is Verdict.PASS and not value.certain:
+        judged = check_limit(criterion.name, shown, criterion.limit, criterion.reason)
+        if judged.verdict is Compliance.PASS and not value.certain:
             reason = f"{value.reached} of {value.draws} draws reach it"
-            judged = replace(judged, verdict=Verdict.OPEN, reason=reason)
+            judged = replace(judged, verdict=Compliance.OPEN, reason=reason)
         made.append(judged)
     return tuple(made)
 

@@ -10,11 +10,13 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.estimation.verdict import TrustLevel
 from greybox.notebook import DisplayMixin, items, number, table
 from greybox.prediction.drawn import Drawn
+from greybox.prediction.extrapolation import Extrapolation
 from greybox.prediction.measuring import LABELS
 from greybox.trial.log import TrialLog
-from greybox.trial.manoeuvres import Criterion, Quantity, Verdict
+from greybox.trial.manoeuvres import Compliance, Criterion, Quantity
 from greybox.trial.manoeuvres.finding import Manoeuvre
 from greybox.trial.validity import ConditionDifference
 
@@ -24,10 +26,10 @@ Side = Literal["port", "starboard", ""]
 
 # how a verdict reads in a prediction
 WORDS = {
-    Verdict.PASS: "meets",
-    Verdict.FAIL: "fails",
-    Verdict.OPEN: "cannot be told",
-    Verdict.NOT_APPLICABLE: "not applicable",
+    Compliance.PASS: "meets",
+    Compliance.FAIL: "fails",
+    Compliance.OPEN: "cannot be told",
+    Compliance.NOT_APPLICABLE: "not applicable",
 }
 # the quantity that each criterion is about
 CRITERIA = {
@@ -143,6 +145,8 @@ class PredictedManoeuvre:
         When the manoeuvre was ordered in `log` [s].
     bundle : Bundle
     agreement : Agreement or None
+    extrapolated : tuple of Extrapolation
+        Signals that leave their ranges in the estimation logs.
     """
 
     kind: Kind
@@ -162,6 +166,7 @@ class PredictedManoeuvre:
     order_time: float
     bundle: Bundle
     agreement: Agreement | None = None
+    extrapolated: tuple[Extrapolation, ...] = ()
 
     @property
     def length(self) -> float:
@@ -257,6 +262,8 @@ class ManoeuvrePrediction(DisplayMixin):
         What holds for all of them.
     conditions : tuple of ConditionDifference
         In what the trial differs from the logs that the model was estimated on.
+    trust : TrustLevel
+        Of the estimate's verdict.
     """
 
     kind: Kind
@@ -266,6 +273,7 @@ class ManoeuvrePrediction(DisplayMixin):
     draws: int
     notes: tuple[str, ...]
     conditions: tuple[ConditionDifference, ...] = ()
+    trust: TrustLevel = TrustLevel.NOT_JUDGED
 
     def summary(self) -> str:
         """Return all manoeuvres as text."""

@@ -227,7 +227,7 @@ def _sentence(model: ManoeuvringModel, log: TrialLog, rows: list[Compared], leng
 
 
 def _short(value: Quantity, length: float) -> str:
-    return value.text(length).split(" (")[0]
+    return value.words(length)[0]
 
 
 def _positions(log: TrialLog) -> tuple[Array | None, Array | None]:

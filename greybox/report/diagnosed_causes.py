@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from greybox.diagnosis.causes import known_causes
-from greybox.diagnosis.result import Diagnosis, Found
+from greybox.diagnosis.result import Diagnosis, DiagnosisVerdict, Found
 from greybox.report.diagnosis_figures import narrow, ranked_for_picture, ranking_figure
 from greybox.report.model_difference import shown_unit, unbroken, with_error
 from greybox.report.page import Picture, Section, Table
@@ -19,17 +19,18 @@ _OUTSIDE = ["none needed", "none needed"]
 def cause_section(diagnosis: Diagnosis) -> Section:
     """Show why: causes, their numbers, groups that look alike, and the search."""
     told = {
-        "named": "",
-        "none": f"{diagnosis.tried} causes were tried; none of them proved itself.",
-        "confused": "Each of these explains the logs about as well as the others. A model with the "
-        "wrong one fits these logs, and may fail on the next.",
-        "unexplained": f"None of the {diagnosis.tried} causes that were tried explains the errors."
+        DiagnosisVerdict.NAMED: "",
+        DiagnosisVerdict.NONE: f"{diagnosis.tried} causes were tried; none of them proved itself.",
+        DiagnosisVerdict.CONFUSED: "Each of these explains the logs about as well as the others. "
+        "A model with the wrong one fits these logs, and may fail on the next.",
+        DiagnosisVerdict.UNEXPLAINED: f"None of the {diagnosis.tried} causes that were tried "
+        "explains the errors."
         + (" These help, but leave errors beyond noise:" if diagnosis.partial else ""),
     }[diagnosis.verdict]
     found = _all_found(diagnosis)
     points = [f"{_called(c)}: {c.evidence}." for c in found]
     return Section(
-        "2. The cause" if diagnosis.verdict == "named" else "2. Causes",
+        "2. The cause" if diagnosis.verdict == DiagnosisVerdict.NAMED else "2. Causes",
         [told] if told else [],
         list(_ranking(diagnosis, [c.key for c in found])),
         [t for t in (_numbers(found), _proofs(found, diagnosis.tried)) if t],

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.estimation.result import Estimate, TestResult
+from greybox.estimation.result import Estimate
 from greybox.estimation.summary import BOUNDS, grouped, set_in_words, weak_safe_sets
+from greybox.estimation.verdict import TestResult, TrustLevel
 from greybox.model.units import parameter_unit
 from greybox.report.chart import chart_of
 from greybox.report.estimation_figures import (
@@ -93,13 +94,13 @@ def estimation_page(
 
 def headline(estimate: Estimate) -> str:
     """Return the verdict as a sentence, with how well the free run follows the logs."""
-    text = estimate.verdict.text.rstrip(".")
-    if text == "trust":
+    verdict = estimate.verdict
+    if verdict.level is TrustLevel.TRUST:
         told = "Trust this model: no test speaks against it"
-    elif text.startswith("trust except "):
-        told = f"Trust this model, except for {text.removeprefix('trust except ')}"
+    elif verdict.level is TrustLevel.TRUST_EXCEPT:
+        told = f"Trust this model, except for {', '.join(verdict.excepted)}"
     else:
-        told = text[:1].upper() + text[1:]
+        told = verdict.text[:1].upper() + verdict.text[1:]
     if not estimate.fit:
         return f"{told}."
     fit = ", ".join(
@@ -120,7 +121,7 @@ def _summary(estimate: Estimate) -> list[str]:
         f"{estimate.samples} samples of {estimate.sample_time:g} s in {logs} "
         f"log{'s' * (logs != 1)}.",
         # the headline has the others
-        *(r for r in estimate.verdict.reasons if r not in estimate.verdict.text),
+        *(r.sentence for r in estimate.verdict.because if not r.fatal),
     ]
     if estimate.current:
         shown = ", ".join(f"{n} {v:.3f} ± {1.96 * s:.3f} m/s" for n, v, s in estimate.current)
@@ -271,26 +272,23 @@ def _parameter_table(
     )  # fmt: skip
 
 
-def _by_state(tests: Sequence[TestResult], prefix: str, key: str) -> dict[str, Any]:
-    """Return what one kind of test found, by state; those that do not apply are left out."""
-    return {
-        t.name.removeprefix(prefix): (t.detail if key == "" else t.detail[key])
-        for t in tests
-        if t.name.startswith(prefix) and (t.detail.get(key) if key else "band" in t.detail)
-    }
+def _by_state(tests: Sequence[TestResult], kind: str) -> dict[str, Mapping[str, Any]]:
+    """Return the numbers of one kind of test, by state; those that do not apply are left out."""
+    return {t.state: t.detail for t in tests if t.kind == kind and t.obstacle is None}
 
 
 def _residuals(estimate: Estimate) -> Section | None:
     states = estimate.predictor.structure.states
-    own = _by_state(estimate.tests, "whiteness_", "")
-    inputs = _by_state(estimate.tests, "input_independence_", "inputs")
+    own = _by_state(estimate.tests, "whiteness")
+    moved = _by_state(estimate.tests, "input_independence")
+    inputs = {s: detail["inputs"] for s, detail in moved.items()}
     if not own and not inputs:
         return None
     told = [
         _sentence(f"{_NAMES.get(s, s)}: {t.sentence}")
         for s in states
         for t in estimate.tests
-        if t.name in (f"whiteness_{s}", f"input_independence_{s}")
+        if t.state == s and t.kind in ("whiteness", "input_independence")
     ]
     figure = residual_figure(states, own, inputs)
     caption = (
@@ -344,16 +342,16 @@ def _visited(estimate: Estimate, logs: Sequence[TrialLog]) -> Section:
         _sentence(f"{_NAMES.get(s, s)}: {t.sentence}")
         for s in states
         for t in estimate.tests
-        if t.name == f"excitation_{s}"
+        if t.state == s and t.kind == "excitation"
     ]
     return Section("4. What did the logs excite?", pictures=pictures, points=told)
 
 
 def _margins(estimate: Estimate) -> dict[str, float]:
     return {
-        t.name.removeprefix("margin_"): float(t.level)
+        t.state: float(t.detail["margin"])
         for t in estimate.tests
-        if t.name in ("margin_u", "margin_v") and t.level and estimate.kept < estimate.samples
+        if t.kind == "margin" and t.obstacle is None and estimate.kept < estimate.samples
     }
 
 
@@ -374,9 +372,7 @@ def _tests(estimate: Estimate) -> Section:
                     t.name.replace("_", " "),
                     "" if t.statistic is None else f"{t.statistic:.3g}".replace("e-", "e−"),
                     "" if t.p_value is None else f"{t.p_value:.2g}".replace("e-", "e−"),
-                    "does not apply"
-                    if t.sentence.startswith("not applicable")
-                    else _OUTCOMES[t.passed],
+                    "does not apply" if t.obstacle is not None else _OUTCOMES[t.passed],
                     _sentence(t.sentence),
                 ]
                 for t in tests

@@ -105,8 +105,7 @@ def unbroken(number: str) -> str:
 def other_changes(base: ManoeuvringModel, model: ManoeuvringModel) -> list[str]:
     """Return what is different beside the equations, one sentence each."""
     told = vessel_changes(base.vessel, model.vessel)
-    known = {c.sentence for c in base.changes}
-    told += [f"{c.sentence}, on the log's clock." for c in model.changes if c.sentence not in known]
+    told += [f"{c.sentence}, on the log's clock." for c in model.changes if c not in base.changes]
     for name, (value, std) in model.disturbances.items():
         if name not in base.disturbances:
             told.append(f"{name} is {with_error(value, std)} m/s; before, the water stood still.")

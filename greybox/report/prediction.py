@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.estimation.verdict import TrustLevel
 from greybox.prediction.drawn import Drawn
 from greybox.prediction.measuring import LABELS
 from greybox.prediction.result import (
@@ -18,7 +19,7 @@ from greybox.prediction.result import (
 )
 from greybox.report.figures import BLACK, BLUE, VERMILION, new_figure, tidy, to_svg
 from greybox.report.page import Page, Picture, Section, Table, flatten
-from greybox.trial.manoeuvres import Verdict
+from greybox.trial.manoeuvres import Compliance
 
 Array = NDArray[np.float64]
 
@@ -49,15 +50,15 @@ def prediction_page(made: ManoeuvrePrediction, record: dict[str, Any]) -> Page:
 def headline(made: ManoeuvrePrediction) -> str:
     """Return one sentence on the limits of the IMO, and one on the trial where there is one."""
     judged = [
-        c for m in made.manoeuvres for c in m.criteria if c.verdict is not Verdict.NOT_APPLICABLE
+        c for m in made.manoeuvres for c in m.criteria if c.verdict is not Compliance.NOT_APPLICABLE
     ]
-    count = {v: sum(c.verdict is v for c in judged) for v in Verdict}
+    count = {v: sum(c.verdict is v for c in judged) for v in Compliance}
     parts = [
         f"{count[v]} of {len(judged)} {word}"
         for v, word in (
-            (Verdict.PASS, "met"),
-            (Verdict.FAIL, "failed"),
-            (Verdict.OPEN, "cannot be told"),
+            (Compliance.PASS, "met"),
+            (Compliance.FAIL, "failed"),
+            (Compliance.OPEN, "cannot be told"),
         )
         if count[v]
     ]
@@ -75,9 +76,9 @@ def headline(made: ManoeuvrePrediction) -> str:
             f"intervals. {told}"
         )
     doubts = [
-        *["the estimate is not to be trusted"] * any("do not trust" in n for n in made.notes),
+        *["the estimate is not to be trusted"] * (made.trust is TrustLevel.DO_NOT_TRUST),
         *["the model is used beyond the motion that it was estimated on"]
-        * any(n.startswith("extrapolated") for m in made.manoeuvres for n in m.notes),
+        * any(m.extrapolated for m in made.manoeuvres),
     ]
     return f"{told} But {' and '.join(doubts)}." if doubts else told
 
@@ -128,22 +129,18 @@ def _values(made: PredictedManoeuvre) -> Table:
 def _cells(value: Drawn | None, length: float) -> list[str]:
     if value is None:
         return ["not reached", "", ""]
-    plain, _, interval = value.text().partition(" (95 %: ")
+    plain, interval = value.words()
     lengths = f"{value.value / length:.2f} L" if value.unit == "m" else ""
-    return [plain, lengths, interval.rstrip(")")]
+    return [plain, lengths, interval]
 
 
 def _beside(made: PredictedManoeuvre) -> Table:
     agreement = made.agreement
     rows = []
     for row in agreement.rows if agreement is not None else ():
-        shown = [v.text().partition(" (95 %: ") for v in (row.predicted, row.measured)]
-        gap, _, around = row.difference.text().partition(" (95 %: ")
-        rows.append(
-            [LABELS[row.name]]
-            + [part for plain, _, interval in shown for part in (plain, interval.rstrip(")"))]
-            + [gap, around.rstrip(")"), "agrees" if row.agrees else "differs"]
-        )
+        shown = [v.words() for v in (row.predicted, row.measured, row.difference)]
+        word = "agrees" if row.agrees else "differs"
+        rows.append([LABELS[row.name], *(part for pair in shown for part in pair), word])
     return Table(
         "Predicted and measured",
         ["quantity", "predicted", "95 %", "measured", "95 %", "difference", "95 %", ""],

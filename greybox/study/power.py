@@ -16,6 +16,7 @@ import numpy as np
 
 from greybox.diagnosis.diagnose import diagnose
 from greybox.diagnosis.given import fit_given
+from greybox.diagnosis.result import DiagnosisVerdict
 from greybox.errors import GreyboxError, UsageError
 from greybox.study.blind import Order, Trial, draw_many
 from greybox.study.blind_causes import CAUSES, Effect
@@ -25,7 +26,7 @@ from greybox.study.parallel import map_pieces, processors
 from greybox.study.tables import Row
 
 ANSWERS = ("detected", "right", "group", "part", "wrong", "unexplained", "none", "failed")
-VERDICTS = ("named", "none", "confused", "unexplained")
+VERDICTS = tuple(map(str, DiagnosisVerdict))
 SINGLE = tuple((name,) for name in (*CAUSES, *UNKNOWN))
 # share of the free-run errors from which on an effect has to be found
 LEAST_FALL = 0.05
@@ -143,7 +144,7 @@ class Outcome:
     @property
     def detected(self) -> bool:
         """Whether the judge says that something is wrong."""
-        return self.judgement is not None and self.judgement.verdict != "none"
+        return self.judgement is not None and self.judgement.verdict != DiagnosisVerdict.NONE
 
     @property
     def answer(self) -> str:
@@ -160,11 +161,11 @@ class Outcome:
         true = set(self.cell.effects)
         nameless = bool(true) and true <= set(UNKNOWN)
         members = {i for group in self.judgement.groups for i in group}
-        if verdict == "none":
+        if verdict == DiagnosisVerdict.NONE:
             return "right" if not true else "none"
-        if verdict == "unexplained":
+        if verdict == DiagnosisVerdict.UNEXPLAINED:
             return "right" if nameless else "unexplained"
-        if verdict == "confused":
+        if verdict == DiagnosisVerdict.CONFUSED:
             return "group" if true and true <= ids | members else "wrong"
         if ids == true:
             return "right"
@@ -175,9 +176,9 @@ class Outcome:
         """The column of the confusion matrix: the cause found first, or what was said instead."""
         if self.judgement is None:
             return "failed"
-        if self.judgement.verdict == "confused":
+        if self.judgement.verdict == DiagnosisVerdict.CONFUSED:
             return "group with it" if self.answer == "group" else "group without"
-        if self.judgement.verdict == "named":
+        if self.judgement.verdict == DiagnosisVerdict.NAMED:
             return self.judgement.ids[0]
         return self.judgement.verdict
 
@@ -356,7 +357,9 @@ def _judged(cell: Cell, run: int, trial: Trial, judge: Judge) -> Outcome:
         judgement = judge(blind)
     except GreyboxError as error:
         return Outcome(cell, run, trial.truth, None, str(error))
-    if judgement.verdict not in VERDICTS or (judgement.verdict == "named" and not judgement.ids):
+    if judgement.verdict not in VERDICTS or (
+        judgement.verdict == DiagnosisVerdict.NAMED and not judgement.ids
+    ):
         raise UsageError(
             f"the judge gave the verdict '{judgement.verdict}' with {len(judgement.ids)} ids: give "
             f"one of {', '.join(VERDICTS)}, and at least 1 id where it is 'named'."

@@ -10,7 +10,7 @@ from greybox.errors import GreyboxError
 from greybox.notebook import DisplayMixin
 from greybox.trial.convert.convert import import_recording
 from greybox.trial.log import TrialLog
-from greybox.trial.manoeuvres import Criterion, Manoeuvre, Quantity, Verdict, find_manoeuvres
+from greybox.trial.manoeuvres import Compliance, Criterion, Manoeuvre, Quantity, find_manoeuvres
 from greybox.trial.raw_log import Recording
 from greybox.trial.segments import by_sign
 from greybox.vessel.vessel import Vessel
@@ -150,7 +150,7 @@ def _plain(value: Any) -> Any:
         }
     if isinstance(value, Criterion):
         return {f.name: _plain(getattr(value, f.name)) for f in fields(value)}
-    if isinstance(value, Verdict):
+    if isinstance(value, Compliance):
         return value.value
     if isinstance(value, tuple | list):
         return [_plain(v) for v in value]

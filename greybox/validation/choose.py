@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import logging
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 
-from greybox.errors import GreyboxError
-from greybox.estimation.credibility import judge
-from greybox.estimation.credibility.verdict import misfit, motion
+from greybox.errors import GreyboxError, UsageError
+from greybox.estimation.credibility.verdict import free_run_faults, misfit, weigh
+from greybox.estimation.estimate import Covariance
 from greybox.estimation.limits import limits_of
-from greybox.estimation.result import Estimate, Verdict
+from greybox.estimation.loop import Loop
+from greybox.estimation.output_error import OutputErrorOptions
+from greybox.estimation.result import Estimate
+from greybox.estimation.verdict import TrustLevel, Verdict, refused
+from greybox.keywords import known_keywords
+from greybox.model.model import ManoeuvringModel
 from greybox.one_thread import one_thread
 from greybox.regression.regression import common_sample_time
 from greybox.trial.log import TrialLog
@@ -24,12 +31,30 @@ from greybox.validation.request import Request, regression_only
 from greybox.validation.simulating import Way, compare_ways
 
 _log = logging.getLogger(__name__)
-_OPEN = Request()
 
 
-@one_thread
-def estimate_model(logs: Sequence[TrialLog], request: Request = _OPEN) -> Estimate:
-    """Estimate a model, choosing what the request leaves open.
+@known_keywords
+def estimate_model(
+    logs: TrialLog | Sequence[TrialLog],
+    request: Request | None = None,
+    *,
+    method: str | None = None,
+    predictor: str | None = None,
+    structure: str | None = None,
+    margins: Mapping[str, float] | None = None,
+    covariance: Covariance | None = None,
+    heading: Literal["measured", "simulated"] = "measured",
+    loop: Loop = "auto",
+    zero_mean: bool = True,
+    refine: bool | int = True,
+    nominal: ManoeuvringModel | None = None,
+    output_error: OutputErrorOptions | None = None,
+    seed: int = 0,
+    prefilter: Literal["auto", "noise", "none"] = "auto",
+    judged: bool = True,
+    without: Sequence[str] = (),
+) -> Estimate:
+    """Estimate a model from logs, choosing what is left open, and say whether to trust it.
 
     Where the method is open and the tests speak against the estimate that theory or
     held-out runs prefer, output error is tried on the same predictor, and kept if it can
@@ -38,9 +63,40 @@ def estimate_model(logs: Sequence[TrialLog], request: Request = _OPEN) -> Estima
 
     Parameters
     ----------
-    logs : sequence of TrialLog
+    logs : TrialLog or sequence of TrialLog
         One experiment each, of one vessel and sample time.
-    request : Request
+    request : Request, optional
+        Deprecated: the same as keywords.
+    method : {"ls", "iv", "refined-iv", "oe"}, optional
+        Least squares, instrumental variables (refined by the noise where nothing speaks
+        against it, or always), output error; by default chosen.
+    predictor : {"basic", "augmented", "wind", "basic+wind"}, optional
+        Which disturbances are captured or measured; by default chosen.
+    structure : str, optional
+        As `get_structure`; by default chosen.
+    margins : mapping of str to float, optional
+        |u|, |v| [m/s] below which samples are cut out.
+    covariance : {"ma", "hac", "white", "bootstrap"}, optional
+        What the standard errors allow for; by default the method's own.
+    heading : {"measured", "simulated"}
+        Heading inside the instruments.
+    loop : {"auto", "open", "closed"}
+        Whether a controller moved the thrusters.
+    zero_mean : bool
+        Whether instruments lose their mean (4.63).
+    refine : bool or int
+        Whether, or how many times at most, instruments are simulated again.
+    nominal : ManoeuvringModel, optional
+        Simulates the first instruments, or starts output error.
+    output_error : OutputErrorOptions, optional
+        What only ``oe`` heeds.
+    seed : int
+    prefilter : {"auto", "noise", "none"}
+        Whether instrumental variables are refined by the noise.
+    judged : bool
+        Whether tests and verdict are asked for.
+    without : sequence of str
+        Bias-capturing columns to leave out, spelled ``state:function``.
 
     Returns
     -------
@@ -53,7 +109,44 @@ def estimate_model(logs: Sequence[TrialLog], request: Request = _OPEN) -> Estima
         No alternative can be estimated.
     LogError
         Logs differ in sample time, or lack a channel.
+    UsageError
+        A keyword is unknown or has a value that it cannot have, or two contradict each other.
     """
+    asked = Request(
+        method,
+        predictor,
+        structure,
+        None if margins is None else dict(margins),
+        covariance,
+        heading,
+        loop,
+        zero_mean,
+        refine,
+        nominal,
+        OutputErrorOptions() if output_error is None else output_error,
+        seed,
+        prefilter,
+        judged,
+        tuple(without),
+    )
+    if request is not None:
+        if asked != Request():
+            raise UsageError(
+                "a Request and keywords beside it say two things: give all of them as keywords."
+            )
+        warnings.warn(
+            "estimate_model(logs, Request(method=…)) is deprecated: write "
+            "estimate_model(logs, method=…).",
+            DeprecationWarning,
+            stacklevel=3,
+        )
+        asked = request
+    return estimate_requested([logs] if isinstance(logs, TrialLog) else logs, asked)
+
+
+@one_thread
+def estimate_requested(logs: Sequence[TrialLog], request: Request) -> Estimate:
+    """Return what `estimate_model` does of a request."""
     common_sample_time(logs)
     notes: list[str] = []
     alternatives = alternatives_for(logs, request, notes)
@@ -104,7 +197,7 @@ def _at_fault(estimate: Estimate, tried: Estimate | None) -> bool:
     """Whether an estimate is not to be trusted because of the model, as far as tests tell."""
     if _rank(estimate)[0] < 2:
         return False
-    return any(misfit(e.tests) or motion(e.tests, e.fit) for e in (estimate, tried) if e)
+    return any(misfit(e.tests) or free_run_faults(e.tests, e.fit) for e in (estimate, tried) if e)
 
 
 def _rank(estimate: Estimate) -> tuple[int, int]:
@@ -113,7 +206,7 @@ def _rank(estimate: Estimate) -> tuple[int, int]:
     Of those not to be trusted, the one whose free run is worse than a constant in fewest states.
     """
     verdict = estimate.verdict
-    if verdict.text.startswith("do not trust"):
+    if verdict.level is TrustLevel.DO_NOT_TRUST:
         return 2, len(_poor(estimate.fit))
     return (1 if verdict.excepted else 0), len(verdict.excepted)
 
@@ -183,11 +276,10 @@ def _by_held_out_runs(
             found,
             f"{way.label} follows the whole logs less well than {found.method}, and was left.",
         )
-    lacks = misfit(found.tests) or (misfit(spare.tests) if spare else [])
+    lacks = misfit(found.tests) or (misfit(spare.tests) if spare else ())
     if lacks and _rank(other)[0] < 2:
         # output error hides a misfit that the regression's tests have found
-        text = f"do not trust: {'; '.join(lacks)}"
-        other = replace(other, verdict=replace(other.verdict, text=text, reasons=tuple(lacks)))
+        other = replace(other, verdict=refused(lacks, other.verdict.excepted))
     return _noting(other, compared.sentence())
 
 
@@ -288,7 +380,7 @@ def _finished(
 
 def _verdict(estimate: Estimate, diverged: bool) -> Verdict:
     """Weigh the tests again, now with the loop and the free run."""
-    return judge(
+    return weigh(
         estimate.tests,
         estimate.labels,
         estimate.method,

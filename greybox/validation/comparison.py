@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.errors import UsageError
+from greybox.errors import UsageError, suggestion
+from greybox.estimation.result import Estimate
+from greybox.keywords import known_keywords
 from greybox.model.changes import Change, simulate_changing
 from greybox.model.model import ManoeuvringModel
 from greybox.notebook import DisplayMixin, items, number, table
@@ -332,11 +335,13 @@ def _alike(changes: Sequence[Change], starts: Array, horizon: float) -> list[NDA
     return [g for g in groups if len(g)] + [np.array([k]) for k in np.flatnonzero(crossing)]
 
 
-@one_thread
-def compare_models(
-    models: Sequence[ManoeuvringModel],
-    names: Sequence[str],
-    logs: Sequence[Sequence[TrialLog]],
+Logs = TrialLog | Sequence[TrialLog]
+
+
+@known_keywords
+def compare(
+    models: Mapping[str, ManoeuvringModel | Estimate],
+    logs: Logs | Mapping[str, Logs],
     *,
     heading: Literal["measured", "simulated"] = "measured",
     bands: bool = True,
@@ -346,10 +351,10 @@ def compare_models(
 
     Parameters
     ----------
-    models : sequence of ManoeuvringModel
-    names : sequence of str
-    logs : sequence of sequence of TrialLog
-        The logs as each model reads them (its vessel's columns).
+    models : mapping of str to ManoeuvringModel or Estimate
+        By the names that the comparison shows.
+    logs : TrialLog, sequence of TrialLog, or mapping of str to these
+        A mapping holds the logs as each model reads them (its vessel's columns), by its name.
     heading : {"measured", "simulated"}
     bands : bool
         Whether to draw bands.
@@ -364,8 +369,66 @@ def compare_models(
     Raises
     ------
     UsageError
-        Models differ in their states.
+        There is no model or no log, a model has no logs, or models differ in their states.
     """
+    known = {n: m.model() if isinstance(m, Estimate) else m for n, m in models.items()}
+    own = logs if isinstance(logs, Mapping) else dict.fromkeys(known, logs)
+    for name in known:
+        if name not in own:
+            raise UsageError(
+                f"the logs have no '{name}'.{suggestion(name, own)} They have {', '.join(own)}: "
+                f"give those of every model, or one sequence for all."
+            )
+    lists = [[x] if isinstance(x, TrialLog) else list(x) for x in (own[n] for n in known)]
+    if not known or not all(lists):
+        raise UsageError(
+            f"{len(known)} models on {min(map(len, lists), default=0)} logs: give at least one of "
+            f"each."
+        )
+    return _compare(list(known.values()), list(known), lists, heading, bands, seed)
+
+
+def compare_models(
+    models: Sequence[ManoeuvringModel],
+    names: Sequence[str],
+    logs: Sequence[Sequence[TrialLog]],
+    *,
+    heading: Literal["measured", "simulated"] = "measured",
+    bands: bool = True,
+    seed: int = 0,
+) -> Comparison:
+    """Return what `compare` does (deprecated).
+
+    Parameters
+    ----------
+    models : sequence of ManoeuvringModel
+    names : sequence of str
+    logs : sequence of sequence of TrialLog
+        The logs as each model reads them.
+    heading, bands, seed
+        As `compare`.
+
+    Returns
+    -------
+    Comparison
+    """
+    warnings.warn(
+        "compare_models(models, names, logs) is deprecated: write compare({name: model}, logs).",
+        DeprecationWarning,
+        stacklevel=2,
+    )
+    return _compare(models, names, logs, heading, bands, seed)
+
+
+@one_thread
+def _compare(
+    models: Sequence[ManoeuvringModel],
+    names: Sequence[str],
+    logs: Sequence[Sequence[TrialLog]],
+    heading: Literal["measured", "simulated"],
+    bands: bool,
+    seed: int,
+) -> Comparison:
     states = {model.structure.states for model in models}
     if len(states) > 1:
         one, two = sorted(states)[:2]

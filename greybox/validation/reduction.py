@@ -19,7 +19,7 @@ from greybox.model.disturbances import CURRENT, WIND
 from greybox.model.predictor import Column
 from greybox.one_thread import one_thread
 from greybox.trial.log import TrialLog
-from greybox.validation.choose import estimate_model
+from greybox.validation.choose import estimate_requested
 from greybox.validation.criteria import independent_samples
 from greybox.validation.held_out import rank
 from greybox.validation.request import Request
@@ -195,7 +195,7 @@ def reduce_structure(
     accepted = [None if t.note else t.scores for t in tried]
     chosen = rank(accepted, [t.size for t in tried]).chosen
     found = replace(rank([t.scores for t in tried], [t.size for t in tried]), chosen=chosen)
-    estimate = estimate_model(logs, tried[found.chosen].request)
+    estimate = estimate_requested(logs, tried[found.chosen].request)
     return StructureChoice(told(estimate, found), rows_of(tried, found))
 
 

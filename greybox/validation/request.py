@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, get_args
 
+from greybox.errors import UsageError, suggestion
 from greybox.estimation.estimate import Covariance
 from greybox.estimation.loop import Loop
 from greybox.estimation.output_error import OutputErrorOptions
 from greybox.model.model import ManoeuvringModel
+
+CHOICES: Mapping[str, tuple[str, ...]] = {
+    "method": ("ls", "iv", "refined-iv", "oe"),
+    "predictor": ("basic", "augmented", "wind", "basic+wind"),
+    "covariance": get_args(Covariance),
+    "heading": ("measured", "simulated"),
+    "loop": get_args(Loop),
+    "prefilter": ("auto", "noise", "none"),
+}
 
 
 @dataclass(frozen=True)
@@ -17,7 +28,7 @@ class Request:
 
     Parameters
     ----------
-    method : {"ls", "iv", "oe"}, optional
+    method : {"ls", "iv", "refined-iv", "oe"}, optional
     predictor : {"basic", "augmented", "wind", "basic+wind"}, optional
     structure : str, optional
         As `get_structure`.
@@ -44,6 +55,11 @@ class Request:
         Whether tests and verdict are asked for.
     without : tuple of str
         Bias-capturing columns to leave out, spelled ``state:function``.
+
+    Raises
+    ------
+    UsageError
+        A value is none of those that can be chosen, or two contradict each other.
     """
 
     method: str | None = None
@@ -61,6 +77,23 @@ class Request:
     prefilter: Literal["auto", "noise", "none"] = "auto"
     judged: bool = True
     without: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name, choices in CHOICES.items():
+            value = getattr(self, name)
+            if value is not None and value not in choices:
+                raise UsageError(
+                    f"'{value}' is no {name}.{suggestion(str(value), choices)} It is one of "
+                    f"{', '.join(choices)}."
+                )
+        if self.method == "refined-iv":
+            if self.prefilter == "none":
+                raise UsageError(
+                    "method 'refined-iv' refines by the noise and prefilter 'none' does not: use "
+                    "method 'iv' for plain instrumental variables."
+                )
+            object.__setattr__(self, "method", "iv")
+            object.__setattr__(self, "prefilter", "noise")
 
 
 def regression_only(request: Request) -> bool:

@@ -15,7 +15,7 @@ from greybox.model.catalogue import structure_for
 from greybox.notebook import DisplayMixin
 from greybox.one_thread import one_thread
 from greybox.trial.log import TrialLog
-from greybox.validation.choose import estimate_model
+from greybox.validation.choose import estimate_requested
 from greybox.validation.criteria import independent_samples, information_criteria
 from greybox.validation.fit import run_model
 from greybox.validation.held_out import Ranking, folds, rank, score_runs, spread_of
@@ -218,7 +218,7 @@ def settle(logs: Sequence[TrialLog], request: Request) -> Request:
     """Return the request with method, predictor and structure as the data choose them."""
     if request.method and request.predictor and request.structure:
         return request
-    first = estimate_model(logs, replace(request, judged=False))
+    first = estimate_requested(logs, replace(request, judged=False))
     return replace(
         request,
         method=first.method,
@@ -280,7 +280,7 @@ def compare_structures(
         tried.append(bench.tried(replace(settled, structure=name)))
     progress(len(names), len(names))
     found = rank([t.scores for t in tried], [t.size for t in tried])
-    estimate = estimate_model(logs, tried[found.chosen].request)
+    estimate = estimate_requested(logs, tried[found.chosen].request)
     return StructureChoice(told(estimate, found), rows_of(tried, found))
 
 

@@ -11,7 +11,7 @@ from surge import TRUE, predictor, surge_log
 from virtual import virtual_log
 
 from greybox.errors import GreyboxError
-from greybox.estimation.credibility import Evidence, assess, judge
+from greybox.estimation.credibility import Evidence, assess, weigh
 from greybox.estimation.credibility.anderson_rubin import confidence_sets, solve_quadratic
 from greybox.estimation.credibility.many import surplus_bias
 from greybox.estimation.credibility.margins import noise_bias
@@ -20,14 +20,13 @@ from greybox.estimation.credibility.verdict import holm
 from greybox.estimation.credibility.weak import measure_strength, threshold
 from greybox.estimation.credibility.words import combination
 from greybox.estimation.estimate import estimate_iv, estimate_ls
-from greybox.estimation.result import TestResult
+from greybox.estimation.verdict import BiasSource, LeastSquaresBias, TestResult, TrustLevel
 from greybox.model.catalogue import get_structure
 from greybox.model.predictor import build_predictor
 from greybox.model.terms import parse_term
 from greybox.regression.instruments import build_instruments
 from greybox.regression.regression import build_regression
 from greybox.validation.choose import estimate_model
-from greybox.validation.request import Request
 
 REGIME = (("u", (1,)), ("v", (1,)))
 
@@ -114,7 +113,7 @@ def test_a_free_run_that_hides_it_is_not_trusted_either(seed):
     """Fitted to the log, the run without the term is as good as with it, and was trusted."""
     logs = [virtual_log(seed, 2000)]
     wrong, right = (
-        estimate_model(logs, Request(method="oe", structure=s)) for s in ("thesis-Yur", "thesis")
+        estimate_model(logs, method="oe", structure=s) for s in ("thesis-Yur", "thesis")
     )
     assert all(wrong.fit[s] > right.fit[s] - 2 for s in "uvr")
     assert "the simulated motion still explains the residuals of v" in wrong.verdict.text
@@ -124,7 +123,7 @@ def test_a_free_run_that_hides_it_is_not_trusted_either(seed):
 def test_many_logs_are_no_evidence_against_a_free_run():
     """Their own instruments would reject a correct model; free runs do not rest on them."""
     logs = [virtual_log(600 + k, 300) for k in range(8)]
-    found = by_name(estimate_model(logs, Request(method="oe", structure="thesis")))
+    found = by_name(estimate_model(logs, method="oe", structure="thesis"))
     for state in "uvr":
         assert found[f"overidentification_{state}"].p_value > 1e-3
 
@@ -406,12 +405,13 @@ def test_a_model_that_cannot_be_simulated_leaves_words(thesis, noisy_log, true_t
     tests = assess(replace(e, instruments=diverged, method="ls"))
     named = {t.name: t for t in tests}
     assert named["endogeneity_u"].sentence.startswith("not applicable: it left its bound")
-    verdict = judge(tests, [c.label for c in p.columns], "ls")
+    verdict = weigh(tests, [c.label for c in p.columns], "ls")
+    assert verdict.because[0] == LeastSquaresBias(BiasSource.UNKNOWN)
     assert "could not be compared with instruments" in verdict.text
 
 
-def result(name, passed, parameters=(), p=None, **detail):
-    return TestResult(name, "", 1.0, p, "it is so.", 0.05, passed, parameters, detail)
+def result(kind, passed, parameters=(), p=None, state="", **detail):
+    return TestResult(kind, "", 1.0, p, "it is so.", 0.05, passed, parameters, detail, state)
 
 
 def test_the_summary_keeps_to_a_hundred_columns(good):
@@ -427,25 +427,46 @@ def test_the_summary_keeps_to_a_hundred_columns(good):
 
 def test_verdicts():
     names = ["Nuv", "Nvv", "Wuv", "Nr"]
-    weak = result("weak_instruments_r", False, ("Wuv", "Nvv"))
-    assert judge([weak], names, "iv").text == "trust except Nvv, Wuv"
-    many = result("anderson_rubin_r", False, ("Nuv",))
-    assert "3 of 4 parameters are not determined" in judge([weak, many], names, "iv").text
-    misfit = result("input_independence_r", False, p=1e-6)
-    assert judge([misfit], names, "iv").text == (
+    weak = result("weak_instruments", False, ("Wuv", "Nvv"))
+    assert weigh([weak], names, "iv").text == "trust except Nvv, Wuv"
+    many = result("anderson_rubin", False, ("Nuv",))
+    assert "3 of 4 parameters are not determined" in weigh([weak, many], names, "iv").text
+    misfit = result("input_independence", False, p=1e-6, state="r")
+    assert weigh([misfit], names, "iv").text == (
         "do not trust: the inputs still explain the residuals of r, so the model lacks something"
     )
-    assert judge([result("input_independence_r", False, p=0.02)], names, "iv").text == "trust"
-    endogenous = result("endogeneity_r", False, p=1e-6)
-    assert judge([endogenous], names, "iv").text == "trust"
-    assert "biases least squares" in judge([endogenous], names, "ls").text
+    assert (
+        weigh([result("input_independence", False, p=0.02, state="r")], names, "iv").text == "trust"
+    )
+    endogenous = result("endogeneity", False, p=1e-6, state="r")
+    assert weigh([endogenous], names, "iv").text == "trust"
+    assert "biases least squares" in weigh([endogenous], names, "ls").text
     closed = result("closed_loop", False)
-    assert "closed loop" in judge([closed], names, "ls").text
+    assert "closed loop" in weigh([closed], names, "ls").text
     shaky = result("stability", False, unstable_samples=0.0, unstable_draws=0.2)
-    assert "20 % of the models" in judge([shaky], names, "iv").text
-    assert "worse than a constant" in judge([], names, "iv", fit={"u": -3.0}).text
-    assert "diverges" in judge([], names, "iv", diverged=True).text
-    assert judge([], names, "iv", contaminated=["Nr"]).text == "trust except Nr"
+    assert "20 % of the models" in weigh([shaky], names, "iv").text
+    assert "worse than a constant" in weigh([], names, "iv", fit={"u": -3.0}).text
+    assert "diverges" in weigh([], names, "iv", diverged=True).text
+    assert weigh([], names, "iv", contaminated=["Nr"]).text == "trust except Nr"
+
+
+def test_a_verdict_is_data():
+    names = ["Nuv", "Nvv", "Wuv", "Nr"]
+    weak = result("weak_instruments", False, ("Wuv",), state="r")
+    misfit = result("input_independence", False, p=1e-6, state="r")
+    verdict = weigh([weak, misfit], names, "iv")
+    assert verdict.level is TrustLevel.DO_NOT_TRUST
+    assert verdict.excepted == ("Wuv",)
+    told = verdict.to_dict()
+    assert told["level"] == "do not trust"
+    assert told["text"].startswith("do not trust: the inputs still explain")
+    assert [(r["kind"], r["fatal"]) for r in told["because"]] == [
+        ("misfit", True),
+        ("failed_test", False),
+    ]
+    assert told["because"][0]["p_values"] == {"input_independence_r": 1e-6}
+    assert told["because"][1]["test"] == "weak_instruments_r"
+    assert told["reasons"] == [r["sentence"] for r in told["because"]]
 
 
 def test_holm_steps_down():
@@ -501,26 +522,28 @@ def test_bands_of_single_delays_cover(true_theta):
 def test_a_current_that_is_not_captured_is_found_by_the_heading():
     log = virtual_log(1, 2000, current=(0.1, -0.05), wind=0.0)
     for method in ("iv", "oe"):
-        estimate = estimate_model([log], Request(method=method, predictor="basic"))
+        estimate = estimate_model([log], method=method, predictor="basic")
         found = by_name(estimate)["heading_independence_u"]
         assert found.p_value < 1e-3
         assert "a current or wind" in found.sentence
         assert "the heading still explains" in estimate.verdict.text
-    caught = by_name(estimate_model([log], Request(method="iv", predictor="augmented")))
+    caught = by_name(estimate_model([log], method="iv", predictor="augmented"))
     assert "captures the disturbance" in caught["heading_independence_u"].sentence
     straight = replace(log, channels={**log.channels, "psi": 0.01 * log["psi"]})
-    told = by_name(estimate_model([straight], Request(method="ls", predictor="basic")))
+    told = by_name(estimate_model([straight], method="ls", predictor="basic"))
     assert "the heading spreads by" in told["heading_independence_u"].sentence
 
 
 def test_a_missing_current_is_said_in_the_verdict():
     names = ("Xu",)
-    heading = result("heading_independence_u", False, p=1e-6)
-    assert judge([heading], names, "iv").text == (
+    heading = result("heading_independence", False, p=1e-6, state="u")
+    assert weigh([heading], names, "iv").text == (
         "do not trust: the heading still explains the residuals of u, so the model lacks a current "
         "or wind"
     )
-    both = judge([heading, result("input_independence_v", False, p=1e-6)], names, "iv").text
+    both = weigh(
+        [heading, result("input_independence", False, p=1e-6, state="v")], names, "iv"
+    ).text
     assert both == (
         "do not trust: the heading still explains the residuals of u and the inputs still explain "
         "the residuals of v, so the model lacks something"
@@ -529,14 +552,14 @@ def test_a_missing_current_is_said_in_the_verdict():
 
 def test_the_verdict_says_by_what_residuals_are_explained():
     names = ("Yv",)
-    further = [result(f"overidentification_{s}", False, p=1e-6) for s in "vr"]
-    assert judge(further, names, "iv").text == (
+    further = [result("overidentification", False, p=1e-6, state=s) for s in "vr"]
+    assert weigh(further, names, "iv").text == (
         "do not trust: the simulated motion still explains the residuals of v, r, so the model "
         "lacks something"
     )
     # what the inputs move moves the motion too: said once
-    inputs = result("input_independence_v", False, p=1e-6)
-    assert judge([inputs, *further], names, "iv").text == (
+    inputs = result("input_independence", False, p=1e-6, state="v")
+    assert weigh([inputs, *further], names, "iv").text == (
         "do not trust: the inputs still explain the residuals of v and the simulated motion still "
         "explains the residuals of r, so the model lacks something"
     )

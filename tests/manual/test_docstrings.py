@@ -7,6 +7,7 @@ import inspect
 import re
 import textwrap
 from collections.abc import Callable, Iterator
+from enum import Enum
 from functools import cache
 from typing import Any
 
@@ -56,7 +57,8 @@ def own_methods(cls: type) -> Iterator[tuple[str, Callable[..., Any]]]:
 CALLABLE = {
     name: value
     for name, value in PUBLIC.items()
-    if callable(value) and not (inspect.isclass(value) and inspect.isabstract(value))
+    if callable(value)
+    and not (inspect.isclass(value) and (inspect.isabstract(value) or issubclass(value, Enum)))
 }
 DOCUMENTED = PUBLIC | {
     f"{name}.{method}": target

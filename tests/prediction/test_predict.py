@@ -16,7 +16,7 @@ from greybox.model.noise import NoiseLevels
 from greybox.prediction.measuring import quantities
 from greybox.prediction.predict import predict_manoeuvre
 from greybox.trial.log import make_log
-from greybox.trial.manoeuvres import Verdict, find_manoeuvres
+from greybox.trial.manoeuvres import Compliance, find_manoeuvres
 from greybox.validation.fit import run_model
 from greybox.vessel.conditions import Conditions
 
@@ -61,7 +61,7 @@ def test_head_reach_without_thrust():
 
     made = predict_manoeuvre(rudder_model(step=0.02), "stopping", **FEW)
     assert value(made, "head_reach") == pytest.approx(math.log(5) / 0.02, rel=2e-3)
-    assert made.manoeuvres[0].criteria[0].verdict is Verdict.NOT_APPLICABLE
+    assert made.manoeuvres[0].criteria[0].verdict is Compliance.NOT_APPLICABLE
 
 
 @pytest.mark.long
@@ -153,7 +153,7 @@ def test_both_sides_of_a_symmetric_ship_are_equal():
 def test_criteria_are_judged_by_the_interval():
     """Twice the tactical diameter that is allowed fails, well below it meets."""
     wide = dict(RUDDER, **{"N_|u|u*rudder": 0.0012})
-    for values, verdict in ((RUDDER, Verdict.PASS), (wide, Verdict.FAIL)):
+    for values, verdict in ((RUDDER, Compliance.PASS), (wide, Compliance.FAIL)):
         model = rudder_model(step=0.25)
         theta = 0.25 * np.array([values[n] for n in model.names])
         made = predict_manoeuvre(replace(model, theta=theta), "turning", side="port", **FEW)
@@ -173,7 +173,7 @@ def test_criteria_are_judged_by_the_interval():
         made = predict_manoeuvre(model, "turning", side="port", **FEW)
         criterion = made.manoeuvres[0].criterion("tactical_diameter")
         low, high = criterion.measured.interval
-        assert (criterion.verdict is Verdict.OPEN) == (low <= 5 < high)
+        assert (criterion.verdict is Compliance.OPEN) == (low <= 5 < high)
 
 
 def test_draws_that_diverge_are_counted():
@@ -189,7 +189,7 @@ def test_draws_that_diverge_are_counted():
     assert 0 < lost < 40
     assert turn.quantities["advance"].reached <= 60 - turn.diverged
     assert f"{turn.diverged} of 60 draws diverge" in made.summary()
-    assert turn.criterion("advance").verdict is not Verdict.PASS
+    assert turn.criterion("advance").verdict is not Compliance.PASS
 
 
 def test_draws_that_cannot_hold_the_speed_are_counted():

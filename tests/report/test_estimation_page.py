@@ -11,12 +11,11 @@ from browser import needs_browser, require_legible, without_scripts
 from virtual import virtual_log
 
 from greybox.commands.main import main
-from greybox.estimation.result import Verdict
+from greybox.estimation.verdict import Divergence, TrustLevel, Verdict, refused
 from greybox.report.estimation import estimation_page, headline
 from greybox.report.estimation_figures import regime_shares
 from greybox.report.page import computed, render
 from greybox.validation.choose import estimate_model
-from greybox.validation.request import Request
 
 HOSTILE = '<script>alert("x")</script> & $x^$'
 
@@ -28,7 +27,7 @@ def log():
 
 @pytest.fixture(scope="module")
 def estimate(log):
-    return estimate_model([log], Request(method="iv", predictor="augmented"))
+    return estimate_model([log], method="iv", predictor="augmented")
 
 
 @pytest.fixture(scope="module")
@@ -71,18 +70,21 @@ def test_same_estimate_same_bytes(estimate, log, page):
 
 
 @pytest.mark.parametrize(
-    ("text", "first"),
+    ("verdict", "first"),
     [
-        ("trust", "Trust this model: no test speaks against it."),
-        ("trust except Xu, Nr", "Trust this model, except for Xu, Nr."),
-        ("do not trust: it diverges", "Do not trust: it diverges."),
+        (Verdict(TrustLevel.TRUST), "Trust this model: no test speaks against it."),
+        (Verdict(TrustLevel.TRUST_EXCEPT, ("Xu", "Nr")), "Trust this model, except for Xu, Nr."),
+        (
+            refused([Divergence()], ()),
+            "Do not trust: its free run diverges on the estimation logs.",
+        ),
     ],
 )
-def test_the_verdict_stands_first(estimate, text, first):
-    told = headline(replace(estimate, verdict=Verdict(text)))
+def test_the_verdict_stands_first(estimate, verdict, first):
+    told = headline(replace(estimate, verdict=verdict))
     assert told.startswith(first)
     assert "(100 is perfect)" in told
-    assert headline(replace(estimate, verdict=Verdict(text), fit={})) == first
+    assert headline(replace(estimate, verdict=verdict, fit={})) == first
 
 
 def test_without_tests_the_page_stands(estimate, log):

@@ -185,7 +185,7 @@ def test_a_model_keeps_the_actuators_of_its_logs(tmp_path):
     e, _ = only([moved(1, delay=0.43, lag=0.8)])
     log = virtual_log(3, 400)
     log = replace(log, provenance=replace(log.provenance, actuators=(e,)))
-    estimate = gb.estimate_model([log], gb.Request(method="ls", predictor="basic"))
+    estimate = gb.estimate_model([log], method="ls", predictor="basic")
     assert e.sentence[:30] in " ".join(estimate.summary().split())
     estimate.model().save(tmp_path / "model.json")
     assert gb.load_model(tmp_path / "model.json").record["actuators"] == [e.to_dict()]

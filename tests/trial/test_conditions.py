@@ -23,8 +23,7 @@ from greybox.trial.log import make_log
 from greybox.trial.store import write_log
 from greybox.trial.validity import other_conditions, pooled_conditions
 from greybox.validation.choose import estimate_model
-from greybox.validation.comparison import compare_models
-from greybox.validation.request import Request
+from greybox.validation.comparison import compare
 from greybox.vessel.conditions import Conditions
 from greybox.vessel.toml import load_vessel, vessel_from_dict, vessel_to_dict
 
@@ -188,7 +187,7 @@ def logs():
 
 @pytest.fixture(scope="module")
 def estimate(logs):
-    return estimate_model(logs, Request(method="ls", structure="thesis"))
+    return estimate_model(logs, method="ls", structure="thesis")
 
 
 def test_logs_of_other_conditions_are_not_pooled_without_a_word(logs, estimate):
@@ -203,7 +202,7 @@ def test_logs_of_other_conditions_are_not_pooled_without_a_word(logs, estimate):
     assert [d["condition"] for d in data["condition_differences"]] == ["draught"]
     schema("model-2").validate(data)
     assert dict(model_from_dict(data).conditions) == {"draught": (1.2, 1.5), "sea_state": (2,)}
-    alike = estimate_model(logs[:1], Request(method="ls", structure="thesis"))
+    alike = estimate_model(logs[:1], method="ls", structure="thesis")
     assert not alike.conditions.differences
     assert not any("differ in" in n for n in alike.notes)
     assert alike.model().to_dict()["conditions"] == {"draught": 1.2, "sea_state": 2}
@@ -211,7 +210,7 @@ def test_logs_of_other_conditions_are_not_pooled_without_a_word(logs, estimate):
 
 def test_a_model_is_not_used_elsewhere_without_a_word(logs, estimate):
     model: ManoeuvringModel = replace(estimate.model(), conditions={"draught": (1.2,)})
-    compared = compare_models([model], ["m"], [logs], bands=False)
+    compared = compare({"m": model}, logs, bands=False)
     (one,) = compared.conditions[0]
     assert one.logs == (("day2", 1.5),)
     assert one.sentence == (
@@ -221,7 +220,7 @@ def test_a_model_is_not_used_elsewhere_without_a_word(logs, estimate):
     assert one.sentence in compared.summary()
     (told,) = compared.to_dict()["models"][0]["condition_differences"]
     assert told["logs"] == {"day2": 1.5}
-    assert not compare_models([estimate.model()], ["m"], [logs], bands=False).conditions[0]
+    assert not compare({"m": estimate}, logs, bands=False).conditions[0]
 
 
 def test_a_diagnosis_tells_them(logs, estimate):

@@ -236,7 +236,7 @@ def test_make_log_takes_a_frame(ship):
 
 def test_estimates_and_runs_as_frames(ship):
     log = virtual_log(2, 800)
-    estimate = gb.estimate_model([log], gb.Request(method="ls", predictor="basic"))
+    estimate = gb.estimate_model([log], method="ls", predictor="basic")
     frame = estimate.to_pandas()
     assert list(frame.index) == [*estimate.labels, *(n for n, _, _ in estimate.current)]
     assert list(frame.columns) == ["theta", "std", "ci_low", "ci_high", "unit", "per_second"]
@@ -252,5 +252,5 @@ def test_estimates_and_runs_as_frames(ship):
         gb.fit_percent(table[["v_measured"]].to_numpy(), table[["v"]].to_numpy()), run.fit["v"]
     )
     assert table.attrs["units"]["r_measured"] == "rad/s"
-    rows = gb.compare_models([estimate.model()], ["a"], [[log]]).to_pandas()
+    rows = gb.compare({"a": estimate}, log).to_pandas()
     assert rows.loc[("a", "virtual"), "fit_u"] == run.fit["u"]

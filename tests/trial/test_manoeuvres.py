@@ -13,10 +13,10 @@ from greybox.errors import LogError
 from greybox.study.inputs import smoothed_pulses
 from greybox.trial.log import make_log
 from greybox.trial.manoeuvres import (
+    Compliance,
     Quantity,
     Stopping,
     TurningCircle,
-    Verdict,
     ZigZag,
     find_manoeuvres,
     held_angles,
@@ -26,8 +26,8 @@ from greybox.trial.manoeuvres import (
 )
 from greybox.trial.manoeuvres.local import fit_at, noise_std
 from greybox.trial.manoeuvres.standards import (
+    check_limit,
     first_overshoot_limit,
-    judge,
     second_overshoot_limit,
 )
 from greybox.trial.manoeuvres.track import make_track, path_length
@@ -194,7 +194,7 @@ def test_a_perfect_circle(side, heading):
     assert turn.drift_angle.value == pytest.approx(0, abs=1e-9)
     assert turn.speed_loss.value == pytest.approx(0, abs=1e-9)
     assert turn.time_90.value == pytest.approx(math.pi / 2 / abs(rate), abs=1e-6)
-    assert [c.verdict for c in turn.criteria] == [Verdict.PASS, Verdict.FAIL]
+    assert [c.verdict for c in turn.criteria] == [Compliance.PASS, Compliance.FAIL]
 
 
 def test_a_drifting_circle_is_told_from_its_drift():
@@ -254,7 +254,7 @@ def test_a_stop_on_a_straight_line():
         assert stop.track_reach.value == pytest.approx(640, rel=2e-3)
         assert stop.head_reach.value == pytest.approx(640, rel=2e-3)
         assert stop.lateral_deviation.value == pytest.approx(0, abs=1e-6)
-    assert stop.criteria[0].verdict is Verdict.PASS
+    assert stop.criteria[0].verdict is Compliance.PASS
     assert "up to 20 L" in stop.summary()
     moving = measure_stopping(t[:400], x[:400], y[:400], psi[:400], u[:400], 0 * t[:400],
                               start=100, length=80)  # fmt: skip
@@ -409,7 +409,7 @@ def test_other_angles_have_no_limit():
     order, _ = zigzag_helm(-20 * DEG, 5 * DEG, 60.0)
     (z,) = find_manoeuvres(log_of(sampled(nomoto(order, 300), 0.5)))
     assert z.label == "zig-zag 20/5, first to port"
-    assert z.criteria[0].verdict is Verdict.NOT_APPLICABLE
+    assert z.criteria[0].verdict is Compliance.NOT_APPLICABLE
     assert "no IMO limit for a 20/5 zig-zag" in z.summary()
 
 
@@ -459,7 +459,7 @@ def test_without_a_rudder_the_yaw_rate_shows_the_turn(turn_run, turn_truth):
     run.pop("n")
     (turn,) = find_manoeuvres(log_of(run | {"n1": 10 + delta, "n2": 10 - delta}, ship))
     assert turn.rudder is None
-    assert turn.criteria[0].verdict is Verdict.NOT_APPLICABLE
+    assert turn.criteria[0].verdict is Compliance.NOT_APPLICABLE
     assert turn.start == pytest.approx(60, abs=2)
     assert turn.tactical_diameter.value == pytest.approx(turn_truth["tactical_diameter"], rel=0.02)
     bare = make_log(ship, run, 0.5)
@@ -481,7 +481,7 @@ def test_a_stop_is_found(astern):
     assert stop.reversed == (astern < 0)
     assert stop.start == pytest.approx(100)
     assert stop.track_reach.value == pytest.approx(640, rel=5e-3)
-    verdict = Verdict.PASS if astern < 0 else Verdict.NOT_APPLICABLE
+    verdict = Compliance.PASS if astern < 0 else Compliance.NOT_APPLICABLE
     assert stop.criteria[0].verdict is verdict
 
 
@@ -524,13 +524,13 @@ def test_limits_of_the_standard():
 
 
 def test_verdicts_by_the_interval():
-    assert judge("x", Quantity(4.0, 0.1, "1"), 4.5).verdict is Verdict.PASS
-    assert judge("x", Quantity(5.0, 0.1, "1"), 4.5).verdict is Verdict.FAIL
-    unsure = judge("x", Quantity(4.4, 0.1, "1"), 4.5)
+    assert check_limit("x", Quantity(4.0, 0.1, "1"), 4.5).verdict is Compliance.PASS
+    assert check_limit("x", Quantity(5.0, 0.1, "1"), 4.5).verdict is Compliance.FAIL
+    unsure = check_limit("x", Quantity(4.4, 0.1, "1"), 4.5)
     assert "within uncertainty, cannot be said" in unsure.summary()
-    assert "the log ends before it" in judge("x", None, 4.5).summary()
+    assert "the log ends before it" in check_limit("x", None, 4.5).summary()
     # with few degrees of freedom the interval is wider
-    assert judge("x", Quantity(4.2, 0.1, "1", 2), 4.5).verdict is Verdict.OPEN
+    assert check_limit("x", Quantity(4.2, 0.1, "1", 2), 4.5).verdict is Compliance.OPEN
 
 
 def test_misuse_is_told(turn_run):
@@ -604,7 +604,7 @@ def test_overshoots_of_kvlcc2_are_those_of_the_benchmark(data_folder):
     (z,) = find_manoeuvres(kvlcc2(data_folder / "kvlcc2" / "marin_zz_-10.csv"))
     assert z.overshoots[0].value / DEG == pytest.approx(8, abs=0.5)
     assert z.overshoots[1].value / DEG == pytest.approx(21.7, abs=0.7)
-    assert [c.verdict for c in z.criteria] == [Verdict.PASS] * 3
+    assert [c.verdict for c in z.criteria] == [Compliance.PASS] * 3
 
 
 def test_turning_circle_of_kvlcc2(data_folder):
@@ -614,7 +614,7 @@ def test_turning_circle_of_kvlcc2(data_folder):
     assert 3.0 < turn.tactical_diameter.value / 320 < 3.5
     assert 2.8 < turn.advance.value / 320 < 3.3
     assert turn.final_diameter.value < turn.tactical_diameter.value
-    assert [c.verdict for c in turn.criteria] == [Verdict.PASS] * 2
+    assert [c.verdict for c in turn.criteria] == [Compliance.PASS] * 2
 
 
 def test_turns_and_zigzags_of_esso_osaka(data_folder):

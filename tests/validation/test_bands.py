@@ -21,8 +21,8 @@ from greybox.study.chapter6 import TRUE
 from greybox.study.inputs import smoothed_pulses
 from greybox.trial.log import make_log
 from greybox.validation.bands import draw_parameters, predict_bands
-from greybox.validation.choose import estimate_model
-from greybox.validation.comparison import compare_models
+from greybox.validation.choose import estimate_requested
+from greybox.validation.comparison import compare
 from greybox.validation.request import Request
 from greybox.vessel.toml import load_vessel
 
@@ -245,7 +245,7 @@ def test_commands_write_bands(tmp_path, capsys):
     assert set(band["u"]) == {"coverage", "expected", "usual", "sentence"}
     assert "Shaded: where 95 %" in page.read_text()
     assert load_model(model).noise is not None
-    without = compare_models([load_model(model)], ["m"], [[log]], bands=False)
+    without = compare({"m": load_model(model)}, log, bands=False)
     assert without.to_dict()["models"][0]["logs"][0]["band"] == {}
 
 
@@ -261,7 +261,7 @@ def test_bands_cover_the_motion_of_another_log(push, least, most):
         log, _ = pushed(2 * k, 1500, push)
         new, x = pushed(2 * k + 1, 600, push)
         request = Request(method="oe", predictor="wind", structure="thesis")
-        bands = predict_bands(estimate_model([log], request).model(), new, seed=k)
+        bands = predict_bands(estimate_requested([log], request).model(), new, seed=k)
         motion.append(((x >= bands.motion[0]) & (x <= bands.motion[1])).mean())
         measured.append(np.mean([c.share for c in bands.coverage.values()]))
     assert least < np.mean(motion) <= most

@@ -7,9 +7,9 @@ import pytest
 from virtual import virtual_log
 
 from greybox.errors import ExcitationError, UsageError
-from greybox.estimation.result import Verdict
+from greybox.estimation.verdict import Misfit, NoRegression, TrustLevel, Verdict, refused
 from greybox.validation import choose
-from greybox.validation.choose import estimate_model
+from greybox.validation.choose import estimate_model, estimate_requested
 from greybox.validation.fit import run_model
 from greybox.validation.held_out import FLOOR, spread_of
 from greybox.validation.request import Request
@@ -88,22 +88,22 @@ def small():
 @pytest.mark.long
 def test_where_the_model_misfits_held_out_runs_choose(small):
     *logs, other = small
-    found = estimate_model(logs, SMALL)
-    assert found.verdict.text.startswith("do not trust")
+    found = estimate_requested(logs, SMALL)
+    assert found.verdict.level is TrustLevel.DO_NOT_TRUST
     assert "so the estimators were compared by free runs" in found.notes[-1]
 
     def level(estimate):
         fit = run_model(estimate.model(), other).fit.values()
         return np.mean([max(v, FLOOR) for v in fit])
 
-    plain = estimate_model(logs, Request(method="iv", structure="linear", predictor="basic"))
+    plain = estimate_model(logs, method="iv", structure="linear", predictor="basic")
     assert level(found) > level(plain) - 5
 
 
 @pytest.mark.long
 def test_ways_that_fail_have_no_score(small, monkeypatch):
     logs = small[:3]
-    found = estimate_model(logs, Request(method="ls", structure="linear", predictor="basic"))
+    found = estimate_model(logs, method="ls", structure="linear", predictor="basic")
     whole = compare_ways(found, logs, SMALL)
     assert whole.ways == (Way("ls"), Way("iv"), Way("oe"), Way("oe", "deviation"))
     # of three logs each held-out run is scored in two halves
@@ -123,26 +123,27 @@ def test_ways_that_fail_have_no_score(small, monkeypatch):
 def test_a_misfit_that_was_found_is_not_forgotten(small, monkeypatch):
     """Output error of a wrong structure may look sound; the regression's tests have spoken."""
     logs = small[:3]
-    monkeypatch.setattr(choose, "misfit", lambda _: ["the inputs still explain the residuals of u"])
-    judged = Verdict("do not trust: a reason")
+    lacks = Misfit({"input_independence": ("u",)}, {})
+    monkeypatch.setattr(choose, "misfit", lambda _: (lacks,))
+    judged = refused([NoRegression("a reason")], ())
     finish = choose._finished
 
     def sound(alternative, *rest):
         estimate, diverged = finish(alternative, *rest)
-        verdict = Verdict("trust") if alternative.method == "oe" else judged
+        verdict = Verdict(TrustLevel.TRUST) if alternative.method == "oe" else judged
         return choose.replace(estimate, verdict=verdict), diverged
 
     monkeypatch.setattr(choose, "_finished", sound)
     better = Comparison((Way("iv"), Way("oe", "deviation")), np.array([[0.0] * 4, [9.0] * 4]))
     monkeypatch.setattr(choose, "compare_ways", lambda *_: better)
-    found = estimate_model(logs, SMALL)
+    found = estimate_requested(logs, SMALL)
     assert found.method == "oe"
     assert "weighed by the deviation" in found.status
-    assert found.verdict.text == "do not trust: the inputs still explain the residuals of u"
+    assert found.verdict.because == (lacks,)
     assert found.notes[-1] == better.sentence()
     # one that follows its own logs less well than the regression is left
     monkeypatch.setattr(choose, "_level", lambda e: -50.0 if e.method == "oe" else 0.0)
-    found = estimate_model(logs, SMALL)
+    found = estimate_requested(logs, SMALL)
     assert found.method != "oe"
     assert "follows the whole logs less well" in found.notes[-1]
 
@@ -155,10 +156,10 @@ def test_where_no_regression_can_be_solved_output_error_is_tried(monkeypatch):
     monkeypatch.setattr("greybox.validation.once.estimate_ls", singular)
     log = virtual_log(3, 400, spread=0.0)
     request = Request(structure="thesis", predictor="wind")
-    assert estimate_model([log], request).method == "oe"
+    assert estimate_requested([log], request).method == "oe"
     monkeypatch.setattr("greybox.validation.once.estimate_oe", singular)
     with pytest.raises(ExcitationError, match="the instruments are singular"):
-        estimate_model([log], request)
+        estimate_requested([log], request)
 
 
 def test_scores_of_whole_logs_are_the_fit():

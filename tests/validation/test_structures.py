@@ -15,7 +15,7 @@ from greybox.model.catalogue import get_structure, structure_for
 from greybox.model.predictor import build_predictor
 from greybox.study.chapter7 import REDUCED_BIASES
 from greybox.trial.log import TrialLog
-from greybox.validation.choose import estimate_model
+from greybox.validation.choose import estimate_requested
 from greybox.validation.criteria import independent_samples, information_criteria
 from greybox.validation.fit import run_model
 from greybox.validation.held_out import folds, rank, score_runs, spread_of
@@ -94,7 +94,7 @@ def test_folds_hold_out_every_sample_once(quiet):
 
 
 def test_scores_of_blocks_average_the_whole(quiet):
-    model = estimate_model([quiet], LS).model()
+    model = estimate_requested([quiet], LS).model()
     run = run_model(model, quiet)
     spread = spread_of([quiet], ("u", "v", "r"))
     whole = score_runs([run], spread)
@@ -105,7 +105,7 @@ def test_scores_of_blocks_average_the_whole(quiet):
 
 
 def test_least_earning_columns_are_jointly_insignificant(quiet):
-    estimate = estimate_model([quiet], LS)
+    estimate = estimate_requested([quiet], LS)
     found = least_earning(estimate)
     # all at once, then half of it, down to one
     sizes = [len(c.columns) for c in found]

@@ -16,7 +16,7 @@ from greybox.errors import (
     UsageError,
 )
 from greybox.estimation.estimate import UnexcitedBiasError, estimate_iv, estimate_ls
-from greybox.estimation.result import Verdict
+from greybox.estimation.verdict import NoRegression, TrustLevel, refused
 from greybox.model.catalogue import get_structure, structure_for
 from greybox.model.conversion import (
     Inertia,
@@ -32,10 +32,9 @@ from greybox.model.model import load_model, model_from_dict
 from greybox.model.predictor import build_predictor
 from greybox.trial.log import make_log
 from greybox.validation.choose import estimate_model
-from greybox.validation.comparison import compare_models, sign_test
+from greybox.validation.comparison import compare, sign_test
 from greybox.validation.fit import fit_percent, run_model
 from greybox.validation.informative import heading_range, regime_of
-from greybox.validation.request import Request
 
 
 @pytest.fixture(scope="module")
@@ -114,7 +113,7 @@ def test_comparison_tells_models_apart(thesis_model, clean_log, noisy_log):
 
     worse = replace(thesis_model, theta=thesis_model.theta * 0.8)
     logs = [clean_log, noisy_log]
-    c = compare_models([worse, thesis_model], ["worse", "true"], [logs, logs])
+    c = compare({"worse": worse, "true": thesis_model}, logs)
     assert c.fits()[1]["u"] > c.fits()[0]["u"]
     assert {t.wins for t in c.sign_tests} <= {1, 2}
     assert set(c.ahead[0][0]) == {"10", "30", "60"}
@@ -144,19 +143,19 @@ def test_the_theory_chooses_where_its_conditions_hold(noisy_log):
 def test_output_error_takes_over_where_it_is_trusted_and_instruments_are_not():
     """Constant measured wind: its terms move instruments little, the free run enough."""
     log = virtual_log(4, 1500, spread=0.0)
-    assert estimate_model([log], Request(method="iv")).verdict.text.startswith("do not trust")
+    assert estimate_model([log], method="iv").verdict.level is TrustLevel.DO_NOT_TRUST
     e = estimate_model([log])
     assert e.method == "oe"
     assert e.verdict.text == "trust"
     assert "output error was taken, because it is judged 'trust' and iv" in e.notes[-1]
-    kept = estimate_model([log], Request(zero_mean=False))
+    kept = estimate_model([log], zero_mean=False)
     assert kept.method != "oe"
 
 
 @pytest.mark.long
 def test_output_error_that_is_judged_no_better_is_left(monkeypatch):
     log = virtual_log(4, 1500, spread=0.0)
-    doubtful = Verdict("do not trust: a reason")
+    doubtful = refused([NoRegression("a reason")], ())
     monkeypatch.setattr("greybox.validation.choose._verdict", lambda *_: doubtful)
     # of two that are not to be trusted the one that simulates is taken …
     e = estimate_model([log])
@@ -203,15 +202,15 @@ def test_uninformative_logs_are_refused(noisy_log):
     straight = {**noisy_log.channels, "psi": noisy_log["psi"] * 1e-4}
     log = make_log(noisy_log.vessel, straight, 1.0, "straight")
     with pytest.raises(ExcitationError, match=r"heading stays within \d+ deg"):
-        estimate_model([log], Request(method="iv", predictor="augmented"))
+        estimate_model([log], method="iv", predictor="augmented")
     dead = {**noisy_log.channels, **{c: 0 * noisy_log[c] + 1 for c in noisy_log.vessel.commands}}
     log = make_log(noisy_log.vessel, dead, 1.0, "dead")
     with pytest.raises(ExcitationError, match="every thruster command is constant"):
-        estimate_model([log], Request(method="ls", predictor="basic"))
+        estimate_model([log], method="ls", predictor="basic")
     no_wind = {k: v for k, v in noisy_log.channels.items() if k not in ("u_q", "v_q")}
     log = make_log(noisy_log.vessel, no_wind, 1.0, "calm")
     with pytest.raises(LogError, match="needs the wind"):
-        estimate_model([log], Request(predictor="wind"))
+        estimate_model([log], predictor="wind")
 
 
 def test_whole_turns_between_logs_are_no_coverage(noisy_log):
@@ -228,7 +227,7 @@ def test_rare_signs_make_no_regime_of_their_own(noisy_log, thesis):
     v[::60] = -0.01
     log = make_log(noisy_log.vessel, {**noisy_log.channels, "v": v}, 1.0)
     assert dict(regime_of([log], thesis))["v"] == (1,)
-    e = estimate_model([log], Request(method="iv", predictor="augmented", structure="thesis"))
+    e = estimate_model([log], method="iv", predictor="augmented", structure="thesis")
     assert "sgn(v)" not in {c.name for c in e.predictor.columns}
 
 
@@ -245,11 +244,9 @@ def test_bias_columns_that_do_not_vary_are_left_out(thesis, noisy_log, true_thet
 
 
 def test_models_of_other_states_are_not_compared(thesis_model, noisy_log):
-    surge = estimate_model(
-        [noisy_log], Request(method="ls", predictor="basic", structure="surge")
-    ).model()
+    surge = estimate_model([noisy_log], method="ls", predictor="basic", structure="surge").model()
     with pytest.raises(UsageError, match="cannot stand in one table"):
-        compare_models([thesis_model, surge], ["a", "b"], [[noisy_log], [noisy_log]])
+        compare({"a": thesis_model, "b": surge}, noisy_log)
 
 
 def test_rudder_terms_can_be_removed():

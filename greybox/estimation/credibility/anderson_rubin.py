@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from greybox.estimation.covariance import correlation_lags
 from greybox.estimation.credibility.evidence import Equation
-from greybox.estimation.result import TestResult, not_applicable
+from greybox.estimation.verdict import TestResult, not_applicable
 
 Array = NDArray[np.float64]
 
@@ -179,10 +179,9 @@ def anderson_rubin(
     equation : Equation
     biases : frozenset of str
     """
-    name = f"anderson_rubin_{equation.state}"
     null = "intervals that hold under weak instruments are as wide as the ordinary ones"
     if equation.obstacle:
-        return not_applicable(name, null, equation.obstacle), {}
+        return not_applicable("anderson_rubin", null, equation.obstacle, equation.state), {}
     sets = dict(zip(equation.labels, confidence_sets(equation), strict=True))
     wide, ratios = [], []
     for label, s in zip(equation.labels, equation.std, strict=True):
@@ -198,7 +197,7 @@ def anderson_rubin(
     shown = "; ".join(f"{n}: {sets[n].words()}" for n in wide)
     worst = max(ratios, default=1.0)
     result = TestResult(
-        name,
+        "anderson_rubin",
         null,
         worst if np.isfinite(worst) else None,
         None,
@@ -209,5 +208,6 @@ def anderson_rubin(
         not wide,
         tuple(wide),
         {"sets": {n: s.to_list() for n, s in sets.items() if n not in biases}},
+        state=equation.state,
     )
     return result, sets

@@ -17,7 +17,7 @@ from greybox.estimation.credibility.overidentification import overidentification
 from greybox.estimation.credibility.residuals import whiteness
 from greybox.estimation.credibility.stability import damping_signs, stability
 from greybox.estimation.credibility.weak import weak_instruments
-from greybox.estimation.result import TestResult, not_applicable
+from greybox.estimation.verdict import NotApplicable, TestResult, not_applicable
 
 _OF_EQUATIONS = {
     "excitation": "the regressors that the instruments explain are independent",
@@ -48,10 +48,11 @@ def assess(evidence: Evidence) -> tuple[TestResult, ...]:
         tests += _of_equation(evidence, equation)
     states = evidence.predictor.structure.states
     if not evidence.equations:
+        diverged = evidence.instruments.diverged
+        obstacle = NotApplicable(diverged or "there are no instruments", bool(diverged))
         for state in states:
             for name, null in _OF_EQUATIONS.items():
-                reason = evidence.instruments.diverged or "there are no instruments"
-                tests.append(not_applicable(f"{name}_{state}", null, reason))
+                tests.append(not_applicable(name, null, obstacle, state))
     for row, state in enumerate(states):
         tests += [whiteness(evidence, row), combinations(evidence, state)]
     if evidence.predictor.structure.disturbance == "marine":
@@ -74,7 +75,7 @@ def _of_equation(evidence: Evidence, equation: Equation) -> list[TestResult]:
     if not len(equation.columns) or not np.isfinite(equation.solution.theta).all():
         reason = "its instruments leave a direction free"
         return [
-            not_applicable(f"{name}_{equation.state}", null, reason)
+            not_applicable(name, null, reason, equation.state)
             for name, null in _OF_EQUATIONS.items()
         ]
     return [

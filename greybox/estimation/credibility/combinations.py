@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from greybox.estimation.credibility.evidence import Evidence
-from greybox.estimation.result import TestResult, not_applicable
+from greybox.estimation.verdict import TestResult, not_applicable
 
 # a combination is reported where its standard error is so many times smaller
 _FACTOR = 3.0
@@ -19,14 +19,14 @@ def combinations(evidence: Evidence, state: str) -> TestResult:
 
     θ_i + c θ_j with c = −C_ij / C_jj has the standard error s_i √(1 − ρ²).
     """
-    name = f"combinations_{state}"
     null = "each parameter is known about as well as any combination of two"
     predictor = evidence.predictor
     mine = [i for i in predictor.equation(state) if not predictor.columns[i].is_bias]
     std = evidence.std
     known = [i for i in mine if np.isfinite(std[i]) and std[i] > 0]
     if len(known) < 2:
-        return not_applicable(name, null, "fewer than two parameters have a standard error")
+        reason = "fewer than two parameters have a standard error"
+        return not_applicable("combinations", null, reason, state)
     found = []
     for a, i in enumerate(known):
         for j in known[a + 1 :]:
@@ -57,5 +57,14 @@ def combinations(evidence: Evidence, state: str) -> TestResult:
         else f"no pair is known more than {_FACTOR:g} times better than its members."
     )
     return TestResult(
-        name, null, float(found[0][0]), None, sentence, _FACTOR, None, (), {"pairs": shown}
+        "combinations",
+        null,
+        float(found[0][0]),
+        None,
+        sentence,
+        _FACTOR,
+        None,
+        (),
+        {"pairs": shown},
+        state=state,
     )

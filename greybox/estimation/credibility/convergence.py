@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from greybox.estimation.result import Estimate, TestResult
+from greybox.estimation.result import Estimate
+from greybox.estimation.verdict import TestResult
 
 _NULL = "the iteration ended at an estimate that it no longer moves"
 _MEANS = {

@@ -9,7 +9,7 @@ from greybox.estimation.credibility.kernel import Array
 from greybox.estimation.credibility.predetermined import moments_mean, noise_after_error
 from greybox.estimation.credibility.question import Finding, Question
 from greybox.estimation.credibility.scores import Score, score_test
-from greybox.estimation.result import TestResult
+from greybox.estimation.verdict import TestResult
 
 _QUESTION = Question(
     "endogeneity",

@@ -6,7 +6,7 @@ import numpy as np
 
 from greybox.estimation.credibility.evidence import Equation
 from greybox.estimation.credibility.words import combination
-from greybox.estimation.result import TestResult
+from greybox.estimation.verdict import TestResult
 
 # a direction with a smaller share of the largest singular value is called weak
 _WEAK = 1e-3
@@ -47,7 +47,7 @@ def excitation(equation: Equation) -> TestResult:
         else f"every direction is determined, the weakest is {missing}."
     )
     return TestResult(
-        f"excitation_{equation.state}",
+        "excitation",
         "the regressors that the instruments explain are independent",
         ratio,
         None,
@@ -63,4 +63,5 @@ def excitation(equation: Equation) -> TestResult:
                 for n, v in zip(labels, against, strict=True)
             },
         },
+        state=equation.state,
     )

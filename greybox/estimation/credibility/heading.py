@@ -8,7 +8,7 @@ from greybox.estimation.credibility.evidence import Equation, Evidence
 from greybox.estimation.credibility.kernel import Array
 from greybox.estimation.credibility.question import Finding, Question
 from greybox.estimation.credibility.scores import Score, score_test
-from greybox.estimation.result import TestResult, not_applicable
+from greybox.estimation.verdict import TestResult, not_applicable
 
 _QUESTION = Question(
     "heading_independence",
@@ -32,15 +32,16 @@ def heading_independence(evidence: Evidence, equation: Equation) -> TestResult:
     """
     if evidence.predictor.augmented:
         return not_applicable(
-            f"{_QUESTION.kind}_{equation.state}", _QUESTION.null,
-            "the predictor captures the disturbance",
+            _QUESTION.kind, _QUESTION.null, "the predictor captures the disturbance",
+            equation.state,
         )  # fmt: skip
     spread = max((float(np.std(log["psi"])) for log in evidence.logs if "psi" in log), default=0.0)
     if spread < _LEAST_SPREAD:
         return not_applicable(
-            f"{_QUESTION.kind}_{equation.state}", _QUESTION.null,
+            _QUESTION.kind, _QUESTION.null,
             f"the heading spreads by {np.degrees(spread):.0f} deg, {np.degrees(_LEAST_SPREAD):.0f} "
             f"are needed",
+            equation.state,
         )  # fmt: skip
 
     def score() -> Score:

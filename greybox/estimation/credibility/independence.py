@@ -13,7 +13,7 @@ from greybox.estimation.credibility.kernel import Array
 from greybox.estimation.credibility.overidentification import delayed
 from greybox.estimation.credibility.question import Finding, Question
 from greybox.estimation.credibility.scores import Score, score_test
-from greybox.estimation.result import TestResult
+from greybox.estimation.verdict import TestResult
 
 # delays of the joint statistic: dense where a lag or a delay shows, sparse behind
 LAGS = (0, 1, 2, 4, 8, 16)

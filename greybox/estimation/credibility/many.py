@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from greybox.estimation.credibility.evidence import Equation
 from greybox.estimation.credibility.words import listed
-from greybox.estimation.result import TestResult, not_applicable
+from greybox.estimation.verdict import TestResult, not_applicable
 
 Array = NDArray[np.float64]
 
@@ -71,19 +71,19 @@ def _shifted(rows: Array, k: int) -> tuple[Array, Array]:
 
 def many_instruments(equation: Equation, biases: frozenset[str]) -> TestResult:
     """Say in standard errors what surplus instruments bias."""
-    name = f"many_instruments_{equation.state}"
     null = "the instruments of several logs are few enough not to fit the noise"
     if equation.obstacle:
-        return not_applicable(name, null, equation.obstacle)
+        return not_applicable("many_instruments", null, equation.obstacle, equation.state)
     if len(equation.z) == 1:
-        return not_applicable(name, null, "one log has as many instruments as parameters")
+        reason = "one log has as many instruments as parameters"
+        return not_applicable("many_instruments", null, reason, equation.state)
     std = np.where(equation.std > 0, equation.std, np.inf)
     ratio = dict(zip(equation.labels, (surplus_bias(equation) / std).tolist(), strict=True))
     wanted = [n for n in equation.labels if n not in biases]
     worst = max(wanted, key=lambda n: abs(ratio[n]))
     hit = tuple(n for n in wanted if abs(ratio[n]) > TOLERATED_BIAS)
     return TestResult(
-        name,
+        "many_instruments",
         null,
         abs(ratio[worst]),
         None,
@@ -94,4 +94,5 @@ def many_instruments(equation: Equation, biases: frozenset[str]) -> TestResult:
         not hit,
         hit,
         {"standard_errors": {n: ratio[n] for n in wanted}},
+        state=equation.state,
     )

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from greybox.errors import GreyboxError
 from greybox.estimation.credibility.evidence import Evidence
-from greybox.estimation.result import TestResult, not_applicable
+from greybox.estimation.verdict import TestResult, not_applicable
 from greybox.regression.instruments import simulate_log
 from greybox.trial.log import TrialLog
 
@@ -37,7 +37,7 @@ def sign_margins(
             margin = 3 * std
         if margin is None:
             reason = f"the vessel file gives no {state}_std and no margin was set"
-            out.append(not_applicable(f"margin_{state}", null, reason))
+            out.append(not_applicable("margin", null, reason, state))
             continue
         value = np.concatenate([log[state] for log in logs])
         share = float((np.abs(value) <= margin).mean())
@@ -50,12 +50,14 @@ def sign_margins(
         )
         out.append(
             TestResult(
-                f"margin_{state}",
+                "margin",
                 null,
                 share,
                 None,
                 f"{100 * share:.1f} % of the samples have |{state}| below {margin:.3g} m/s"
                 f"{advice}.",
+                detail={"margin": margin},
+                state=state,
             )
         )
     return out

@@ -8,7 +8,7 @@ from greybox.estimation.credibility.evidence import Equation
 from greybox.estimation.credibility.kernel import Array
 from greybox.estimation.credibility.question import Finding, Question
 from greybox.estimation.credibility.scores import Score, score_test
-from greybox.estimation.result import TestResult
+from greybox.estimation.verdict import TestResult
 
 # samples by which the further instruments of a single log are delayed
 _DELAY = 5

@@ -8,7 +8,7 @@ from typing import Any
 
 from greybox.estimation.credibility.evidence import Equation
 from greybox.estimation.credibility.scores import Score
-from greybox.estimation.result import TestResult, not_applicable
+from greybox.estimation.verdict import TestResult, not_applicable
 
 LEVEL = 0.05
 
@@ -64,15 +64,14 @@ class Question:
         finding : callable
             Of the score, and whether it is accepted at the 5 % level.
         """
-        name = f"{self.kind}_{equation.state}"
         if equation.obstacle:
-            return not_applicable(name, self.null, equation.obstacle)
+            return not_applicable(self.kind, self.null, equation.obstacle, equation.state)
         found = score()
         if not found.freedom:
-            return not_applicable(name, self.null, self.silent)
+            return not_applicable(self.kind, self.null, self.silent, equation.state)
         told = finding(found, found.p_value >= LEVEL)
         return TestResult(
-            name,
+            self.kind,
             self.null,
             found.statistic,
             found.p_value,
@@ -82,4 +81,6 @@ class Question:
             told.passed,
             (),
             {"degrees_of_freedom": found.freedom, **told.detail},
+            state=equation.state,
+            distribution=found.null,
         )

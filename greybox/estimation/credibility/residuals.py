@@ -7,7 +7,7 @@ import numpy as np
 from greybox.estimation.credibility.evidence import Equation, Evidence
 from greybox.estimation.credibility.kernel import Array
 from greybox.estimation.credibility.scores import score_test
-from greybox.estimation.result import TestResult, not_applicable
+from greybox.estimation.verdict import TestResult, not_applicable
 
 LEVEL = 0.05
 _LAGS = 10
@@ -27,13 +27,14 @@ def whiteness(evidence: Evidence, row: int) -> TestResult:
     Breusch (1978); Godfrey (1978); Lobato, Nankervis and Savin (2002).
     """
     state = evidence.predictor.structure.states[row]
-    name, null = f"whiteness_{state}", "the one-step residuals are white"
+    null = "the one-step residuals are white"
     residuals = _centred(evidence, row)
     total = sum(int(k.sum()) for k in evidence.keep)
     variance = sum(float(e @ e) for e in residuals)
     columns = evidence.predictor.equation(state)
     if variance < 1e-30 or total <= _LAGS + 2 * len(columns):
-        return not_applicable(name, null, f"{total} residuals, or none that differ from zero")
+        reason = f"{total} residuals, or none that differ from zero"
+        return not_applicable("whiteness", null, reason, state)
     xi = [np.array([_later(e, lag) for lag in range(1, _LAGS + 1)]) for e in residuals]
     phi, zhat = _normal_equations(evidence, row, residuals)
     score = score_test(xi, phi, zhat, residuals, memory="white")
@@ -44,7 +45,8 @@ def whiteness(evidence: Evidence, row: int) -> TestResult:
         else "coloured, as noisy regressors make them; the standard errors allow for it."
     )
     return TestResult(
-        name, null, score.statistic, score.p_value, f"residuals are {found}", LEVEL,
+        "whiteness", null, score.statistic, score.p_value, f"residuals are {found}", LEVEL,
+        state=state, distribution=score.null,
         detail={
             "degrees_of_freedom": score.freedom,
             "lags": list(range(1, _LAGS + 1)),

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from greybox.estimation.colour import WHITE, Colour
 from greybox.estimation.credibility.kernel import lagged_products, quadratic_form
+from greybox.estimation.verdict import Distribution
 
 Array = NDArray[np.float64]
 # directions with a smaller share of the largest variance rest on a few rows: left untested
@@ -33,8 +34,8 @@ class Score:
     statistic : float
     freedom : int
         Rank of the covariance: restrictions that are not copies of one another.
-    p_value : float
-        Of χ², or with the variance that the statistic has when the signs of the
+    null : Distribution
+        χ², or with the variance that the statistic has when the signs of the
         scores are random; of F where the noise model leaves the variance uncertain.
     moments : ndarray
         (k,) Σ ξ ê, less its expectation.
@@ -44,9 +45,14 @@ class Score:
 
     statistic: float
     freedom: int
-    p_value: float
+    null: Distribution
     moments: Array
     covariance: Array
+
+    @property
+    def p_value(self) -> float:
+        """Probability of a larger statistic under the null; 1 where nothing was tested."""
+        return self.null.sf(self.statistic) if self.freedom else 1.0
 
 
 def residualise(xi: Sequence[Array], phi: Sequence[Array], zhat: Sequence[Array]) -> list[Array]:
@@ -102,8 +108,6 @@ def score_test(
     Sargan (1958); Hansen (1982); Wooldridge (1995); Durbin (1954); random
     signs: Davidson and Flachaire (2008), whose bootstrap moments are used.
     """
-    from scipy.special import fdtrc
-
     tilde = _without_copies(xi, residualise(xi, phi, zhat))
     moments = np.asarray(sum(x @ e for x, e in zip(xi, errors, strict=True)))
     if mean is not None:
@@ -125,8 +129,6 @@ def score_test(
         if freedom:
             known = float(h.freedom_of([whitening @ x for x in tilde], together=True)[0])
         taken = sum(float((((whitening @ s) ** 2).sum(axis=0) ** 2).sum()) for s in scores)
-    p = 1.0
-    if freedom:
-        share = max(1.0 - taken / freedom, 0.05)
-        p = float(fdtrc(freedom / share, known, statistic / freedom))
-    return Score(statistic, freedom, p, moments, covariance)
+    share = max(1.0 - taken / freedom, 0.05) if freedom else 1.0
+    null = Distribution("F", (freedom / share, known), float(freedom))
+    return Score(statistic, freedom, null, moments, covariance)

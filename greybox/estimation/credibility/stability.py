@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from greybox.estimation.credibility.evidence import Evidence
 from greybox.estimation.credibility.words import listed
-from greybox.estimation.result import TestResult, not_applicable
+from greybox.estimation.verdict import TestResult, not_applicable
 from greybox.model.run.step import StepModel
 
 Array = NDArray[np.float64]

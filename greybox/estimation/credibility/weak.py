@@ -19,7 +19,7 @@ from greybox.estimation.credibility.kernel import (
     quadratic_form,
 )
 from greybox.estimation.credibility.words import combination, listed
-from greybox.estimation.result import TestResult, not_applicable
+from greybox.estimation.verdict import TestResult, not_applicable
 
 Array = NDArray[np.float64]
 
@@ -194,17 +194,20 @@ def weak_instruments(equation: Equation, biases: frozenset[str]) -> list[TestRes
         ``weak_instruments_<state>``: each parameter by what only it has.
     """
     state = equation.state
-    names = f"relevance_{state}", f"weak_instruments_{state}"
+    kinds = "relevance", "weak_instruments"
     nulls = (
         "some combination of the regressors is hardly moved by the instruments",
         "the part of a regressor that no other has is hardly moved by the instruments",
     )
     if equation.obstacle:
-        return [not_applicable(n, h, equation.obstacle) for n, h in zip(names, nulls, strict=True)]
+        return [
+            not_applicable(k, h, equation.obstacle, state)
+            for k, h in zip(kinds, nulls, strict=True)
+        ]
     s = measure_strength(equation)
     if not np.isfinite(s.own).any():
         reason = "no regressor of this equation is noisy"
-        return [not_applicable(n, h, reason) for n, h in zip(names, nulls, strict=True)]
+        return [not_applicable(k, h, reason, state) for k, h in zip(kinds, nulls, strict=True)]
     labels = equation.labels
     freedom = max(s.rank_freedom, 1)
     needed = threshold(freedom)
@@ -215,7 +218,7 @@ def weak_instruments(equation: Equation, biases: frozenset[str]) -> list[TestRes
     )
     shown = combination(labels, s.direction, _NAMED)
     relevance = TestResult(
-        names[0],
+        kinds[0],
         nulls[0],
         joint,
         None,
@@ -231,6 +234,7 @@ def weak_instruments(equation: Equation, biases: frozenset[str]) -> list[TestRes
             "degrees_of_freedom": s.rank_freedom,
             "direction": dict(zip(labels, s.direction.tolist(), strict=True)),
         },
+        state=state,
     )
     judged = [i for i in range(len(labels)) if np.isfinite(s.own[i])]
     needed = threshold()
@@ -246,7 +250,7 @@ def weak_instruments(equation: Equation, biases: frozenset[str]) -> list[TestRes
         f"({needed:.3g} needed; its first-stage F is {rest:.3g})."
     )
     own = TestResult(
-        names[1],
+        kinds[1],
         nulls[1],
         float(s.own[weakest]),
         None,
@@ -259,6 +263,7 @@ def weak_instruments(equation: Equation, biases: frozenset[str]) -> list[TestRes
             "shea_partial_r2": _finite(labels, s.shea),
             "first_stage_f": _finite(labels, s.partial_f),
         },
+        state=state,
     )
     return [relevance, own]
 

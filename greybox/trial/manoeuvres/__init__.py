@@ -2,19 +2,19 @@
 
 from greybox.trial.manoeuvres.finding import Manoeuvre, find_manoeuvres
 from greybox.trial.manoeuvres.quantity import Quantity
-from greybox.trial.manoeuvres.standards import Criterion, Verdict
+from greybox.trial.manoeuvres.standards import Compliance, Criterion
 from greybox.trial.manoeuvres.steering import held_angles, steering_angle
 from greybox.trial.manoeuvres.stopping import Stopping, measure_stopping
 from greybox.trial.manoeuvres.turning_circle import TurningCircle, measure_turning_circle
 from greybox.trial.manoeuvres.zig_zag import ZigZag, measure_zigzag
 
 __all__ = [
+    "Compliance",
     "Criterion",
     "Manoeuvre",
     "Quantity",
     "Stopping",
     "TurningCircle",
-    "Verdict",
     "ZigZag",
     "find_manoeuvres",
     "held_angles",

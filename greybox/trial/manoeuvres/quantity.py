@@ -49,15 +49,18 @@ class Quantity:
 
     def text(self, length: float | None = None) -> str:
         """Return the value and its interval in words: degrees, and ship lengths where given."""
+        shown, interval = self.words(length)
+        return f"{shown} (95 %: {interval})"
+
+    def words(self, length: float | None = None) -> tuple[str, str]:
+        """Return the value in words, and its interval."""
         unit, factor = _SHOWN.get(self.unit, (self.unit, 1.0))
         low, high = (b * factor for b in self.interval)
         digits = _decimals(high - low, abs(self.value * factor))
         shown = f"{self.value * factor:.{digits}f} {unit}".rstrip()
-        shown += f" (95 %: {low:.{digits}f} to {high:.{digits}f})"
         if length is not None and self.unit == "m":
-            ratio = self.scaled(1 / length, "1")
-            shown = f"{ratio.value:.2f} L = {shown}"
-        return shown
+            shown = f"{self.value / length:.2f} L = {shown}"
+        return shown, f"{low:.{digits}f} to {high:.{digits}f}"
 
 
 def _decimals(width: float, size: float) -> int:

@@ -22,7 +22,7 @@ TRACK_REACH_AT_MOST = 20.0
 SHORTEST_SHIP = 100.0
 
 
-class Verdict(Enum):
+class Compliance(Enum):
     """Whether a limit is met; the values are the sentences that users read."""
 
     PASS = "pass"
@@ -41,7 +41,7 @@ class Criterion:
     measured : Quantity or None
         In the unit of the limit: ship lengths ("1") or angle [rad].
     limit : float or None
-    verdict : Verdict
+    verdict : Compliance
     reason : str
         Why the limit does not apply, or what else is to be known.
     """
@@ -49,7 +49,7 @@ class Criterion:
     name: str
     measured: Quantity | None
     limit: float | None
-    verdict: Verdict
+    verdict: Compliance
     reason: str = ""
 
     def summary(self) -> str:
@@ -62,7 +62,7 @@ class Criterion:
         return f"{self.name}, at most {limit}: {self.verdict.value}{note}"
 
 
-def judge(name: str, measured: Quantity | None, limit: float, reason: str = "") -> Criterion:
+def check_limit(name: str, measured: Quantity | None, limit: float, reason: str = "") -> Criterion:
     """Compare a measurement with an upper limit by its 95 % interval.
 
     Parameters
@@ -76,13 +76,15 @@ def judge(name: str, measured: Quantity | None, limit: float, reason: str = "") 
     if measured is None:
         return not_applicable(name, "the log ends before it")
     low, high = measured.interval
-    verdict = Verdict.PASS if high <= limit else Verdict.FAIL if low > limit else Verdict.OPEN
+    verdict = (
+        Compliance.PASS if high <= limit else Compliance.FAIL if low > limit else Compliance.OPEN
+    )
     return Criterion(name, measured, limit, verdict, reason)
 
 
 def not_applicable(name: str, reason: str) -> Criterion:
     """Return the verdict that a limit does not apply, with the reason."""
-    return Criterion(name, None, None, Verdict.NOT_APPLICABLE, reason)
+    return Criterion(name, None, None, Compliance.NOT_APPLICABLE, reason)
 
 
 def first_overshoot_limit(length_over_speed: float) -> float:

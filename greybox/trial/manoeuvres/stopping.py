@@ -17,7 +17,7 @@ from greybox.trial.manoeuvres.standards import (
     TRACK_REACH_AT_MOST,
     TRACK_REACH_LENGTHS,
     Criterion,
-    judge,
+    check_limit,
     not_applicable,
 )
 from greybox.trial.manoeuvres.track import make_track, path_length
@@ -49,6 +49,8 @@ class Stopping(DisplayMixin):
         Clockwise positive [rad].
     criteria : tuple of Criterion
     notes : tuple of str
+    last_speed : float or None
+        Surge velocity with which the ship still moves ahead when the log ends [m/s].
 
     References
     ----------
@@ -68,6 +70,12 @@ class Stopping(DisplayMixin):
     heading_change: Quantity | None
     criteria: tuple[Criterion, ...]
     notes: tuple[str, ...]
+    last_speed: float | None = None
+
+    @property
+    def unfinished(self) -> str:
+        """What is to be said of a ship that has not stopped; empty of one that has."""
+        return _unfinished(self.last_speed)
 
     @property
     def label(self) -> str:
@@ -89,6 +97,12 @@ class Stopping(DisplayMixin):
         lines += [f"  IMO {c.summary()}" for c in self.criteria]
         lines += [f"  note: {n}" for n in self.notes]
         return "\n".join(lines)
+
+
+def _unfinished(speed: float | None) -> str:
+    if speed is None:
+        return ""
+    return f"the ship still moves ahead with {speed:.2g} m/s when the log ends"
 
 
 def measure_stopping(
@@ -150,7 +164,7 @@ def measure_stopping(
     if track.integrated:
         notes.append("positions are integrated from u, v and heading, none were measured")
     psi0 = approach.heading
-    time = reach = head = lateral = turned = None
+    time = reach = head = lateral = turned = last = None
     run = approach.duration(length)
     rest = crossing(t, -u, -end_speed, start, stop, run)
     if rest is not None:
@@ -158,7 +172,7 @@ def measure_stopping(
         rest = crossing(t, -u, -end_speed, start, stop, scale)
     if rest is None:
         last = float(np.mean(u[(t <= stop)][-5:]))
-        notes.append(f"the ship still moves ahead with {last:.2g} m/s when the log ends")
+        notes.append(_unfinished(last))
     else:
         when, fit = rest
         slow = fit.std(when) / fit.value(when, 1)
@@ -190,7 +204,7 @@ def measure_stopping(
     if reversed_thrust:
         lengths = None if reach is None else reach.scaled(1 / length, "1")
         why = f"up to {TRACK_REACH_AT_MOST:g} L where the administration allows it"
-        criteria = (judge("track reach", lengths, TRACK_REACH_LENGTHS, why),)
+        criteria = (check_limit("track reach", lengths, TRACK_REACH_LENGTHS, why),)
     else:
         criteria = (not_applicable("track reach", "the thrust was not reversed"),)
     return Stopping(
@@ -207,4 +221,5 @@ def measure_stopping(
         turned,
         criteria,
         tuple(notes),
+        last,
     )

@@ -17,7 +17,7 @@ from greybox.trial.manoeuvres.standards import (
     ADVANCE_LENGTHS,
     TACTICAL_LENGTHS,
     Criterion,
-    judge,
+    check_limit,
     not_applicable,
 )
 from greybox.trial.manoeuvres.track import Track, make_track
@@ -30,6 +30,8 @@ _STANDARD, _TOLERANCE = math.radians(35), math.radians(2.5)
 _STEADY_FROM, _STEADY_LEAST = math.pi, math.pi / 2
 # heading range below which drift and circle cannot be told apart
 _DRIFT_RANGE = math.radians(300)
+# change of the yaw rate between the halves of a turn up to which it is steady, relative
+_STEADY = 0.05
 
 
 @dataclass(frozen=True, repr=False)
@@ -69,6 +71,8 @@ class TurningCircle(DisplayMixin):
     criteria : tuple of Criterion
     notes : tuple of str
         What limits the measurement, one sentence each.
+    yaw_rate_change : float or None
+        Of the steady turn, from its first half to its second, relative.
 
     References
     ----------
@@ -98,6 +102,12 @@ class TurningCircle(DisplayMixin):
     set_east: Quantity | None
     criteria: tuple[Criterion, ...]
     notes: tuple[str, ...]
+    yaw_rate_change: float | None = None
+
+    @property
+    def unsteady(self) -> str:
+        """What is to be said of a turn that does not become steady; empty of one that does."""
+        return _unsteady(self.yaw_rate_change)
 
     @property
     def label(self) -> str:
@@ -143,6 +153,16 @@ class _SteadyTurn:
     set_north: Quantity | None
     set_east: Quantity | None
     notes: tuple[str, ...]
+    yaw_rate_change: float
+
+
+def _unsteady(change: float | None) -> str:
+    if change is None or change <= _STEADY:
+        return ""
+    return (
+        f"the yaw rate changes by {100 * change:.0f} % between the halves of the "
+        f"steady turn: it is not steady, or wind or current moves it"
+    )
 
 
 def measure_turning_circle(
@@ -256,6 +276,7 @@ def measure_turning_circle(
         steady.set_east if steady else None,
         _criteria(advance, tactical, length, rudder, full_rudder),
         tuple(notes),
+        steady.yaw_rate_change if steady else None,
     )
 
 
@@ -278,7 +299,7 @@ def _criteria(
         return tuple(not_applicable(n, reason) for n in names)
     limits = (ADVANCE_LENGTHS, TACTICAL_LENGTHS)
     return tuple(
-        judge(n, None if q is None else q.scaled(1 / length, "1"), limit)
+        check_limit(n, None if q is None else q.scaled(1 / length, "1"), limit)
         for n, q, limit in zip(names, (advance, tactical), limits, strict=True)
     )
 
@@ -387,11 +408,8 @@ def _steady(
             f"the steady turn is measured over {math.degrees(spread):.0f} deg: "
             f"a drift of the circle cannot be told from it"
         )
-    if change > 0.05:
-        notes.append(
-            f"the yaw rate changes by {100 * change:.0f} % between the halves of the "
-            f"steady turn: it is not steady, or wind or current moves it"
-        )
+    if _unsteady(change):
+        notes.append(_unsteady(change))
     # position = p0 + d t + R(psi) w: with constant body velocity the origin stays at w from
     # the centre of the circle, which drifts with d
     c, s = np.cos(psi[k]), np.sin(psi[k])
@@ -441,6 +459,7 @@ def _steady(
         sets[0],
         sets[1],
         tuple(notes),
+        float(change),
     )
 
 

@@ -18,9 +18,9 @@ from greybox.trial.manoeuvres.standards import (
     INITIAL_TURNING_LENGTHS,
     SHORTEST_SHIP,
     Criterion,
+    check_limit,
     first_overshoot_limit,
     first_overshoot_limit_20,
-    judge,
     not_applicable,
     second_overshoot_limit,
 )
@@ -328,15 +328,15 @@ def _criteria(
     made = []
     if is_near(rudder, 10) and math.degrees(heading) > 9.5:
         lengths = None if turning is None else turning.scaled(1 / length, "1")
-        made.append(judge("initial turning", lengths, INITIAL_TURNING_LENGTHS))
+        made.append(check_limit("initial turning", lengths, INITIAL_TURNING_LENGTHS))
     if is_near(rudder, 10) and is_near(heading, 10):
         why = f"L/V = {time_scale:.1f} s"
         made += [
-            judge("first overshoot", first, first_overshoot_limit(time_scale), why),
-            judge("second overshoot", second, second_overshoot_limit(time_scale), why),
+            check_limit("first overshoot", first, first_overshoot_limit(time_scale), why),
+            check_limit("second overshoot", second, second_overshoot_limit(time_scale), why),
         ]
     elif is_near(rudder, 20) and is_near(heading, 20):
-        made.append(judge("first overshoot", first, first_overshoot_limit_20()))
+        made.append(check_limit("first overshoot", first, first_overshoot_limit_20()))
     else:
         angles = f"{math.degrees(rudder):.0f}/{math.degrees(heading):.0f}"
         made.append(not_applicable("overshoot", f"there is no IMO limit for a {angles} zig-zag"))

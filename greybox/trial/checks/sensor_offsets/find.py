@@ -18,7 +18,7 @@ from greybox.trial.checks.sensor_offsets.evidence import Evidence, coarse_tie, e
 from greybox.trial.checks.sensor_offsets.findings import IDS, Campaign, campaign_findings
 from greybox.trial.checks.sensor_offsets.model import ARM, KinematicModel
 from greybox.trial.checks.sensor_offsets.pool import pool
-from greybox.trial.checks.sensor_offsets.select import judge
+from greybox.trial.checks.sensor_offsets.select import score_hypotheses
 from greybox.trial.checks.sensor_offsets.thresholds import SIGMAS, expected, least
 from greybox.trial.raw_log import Recording
 from greybox.vessel.vessel import Vessel
@@ -102,7 +102,7 @@ def _campaigns(
         members = [ties[i] for i in campaign.logs]
         turned = any(t.turned for t in members)
         channels = members[0].motion.values if members[0].positioned else {"psi": 0, "r": 0}
-        judged = judge(
+        judged = score_hypotheses(
             tuple(channels), turned=turned, offsets=campaign.offsets,
             covariance=campaign.covariance, vessel=vessel,
             scatter=np.hypot(campaign.scatter, material / SIGMAS),

@@ -147,7 +147,7 @@ def hypotheses(channels: tuple[str, ...], *, turned: bool) -> Iterator[Hypothesi
                 yield Hypothesis(clocks, arm, bias)
 
 
-def judge(
+def score_hypotheses(
     channels: tuple[str, ...], *, turned: bool, offsets: Array, covariance: Array,
     scatter: Array, vessel: Vessel, antenna: Array,
 ) -> list[Judged]:  # fmt: skip

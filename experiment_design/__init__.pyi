@@ -1,0 +1,23 @@
+# The promised names, the only list of them: `greybox.lazy` reads it, and so do type checkers.
+from experiment_design.certificate import Certificate as Certificate
+from experiment_design.certificate import certify as certify
+from experiment_design.design import design_trial as design_trial
+from experiment_design.discriminate import Discrimination as Discrimination
+from experiment_design.discriminate import design_between as design_between
+from experiment_design.inputs import prbs as prbs
+from experiment_design.inputs import random_two_level as random_two_level
+from experiment_design.inputs import to_log as to_log
+from experiment_design.limits import Circle as Circle
+from experiment_design.limits import TrialLimits as TrialLimits
+from experiment_design.noise import noise_levels as noise_levels
+from experiment_design.plan import write_plan as write_plan
+from experiment_design.precision import PredictedPrecision as PredictedPrecision
+from experiment_design.precision import predict_precision as predict_precision
+from experiment_design.prepare import Wishes as Wishes
+from experiment_design.prepare import prepare_request as prepare_request
+from experiment_design.request import DesignRequest as DesignRequest
+from experiment_design.request import Rival as Rival
+from experiment_design.request import build_problem as build_problem
+from experiment_design.result import Design as Design
+from experiment_design.timing import least_duration as least_duration
+from greybox.model.noise import NoiseLevels as NoiseLevels

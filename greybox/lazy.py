@@ -1,0 +1,37 @@
+"""Names of a package that are loaded when they are first used, read from its stub."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+
+def lazy_names(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
+    """Return ``__getattr__``, ``__dir__`` and ``__all__`` of a package.
+
+    Parameters
+    ----------
+    package : str
+        Beside its ``__init__.py`` lies ``__init__.pyi``, which imports every promised name
+        from where it is: one list for programs, type checkers and the manual.
+    """
+    module = import_module(package)
+    stub = Path(str(module.__file__)).with_suffix(".pyi")
+    where = {
+        alias.name: str(node.module)
+        for node in ast.parse(stub.read_text(encoding="utf-8")).body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+
+    def load(name: str) -> Any:
+        if name not in where:
+            raise AttributeError(f"module '{package}' has no attribute '{name}'")
+        value = getattr(import_module(where[name]), name)
+        setattr(module, name, value)
+        return value
+
+    return load, lambda: sorted(where), sorted(where)
