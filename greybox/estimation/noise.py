@@ -13,14 +13,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.estimation.whitening import ErrorBand, ErrorNoise, inverse_band
+from greybox.estimation.whitening import ErrorBand, ErrorNoise
 from greybox.model.noise import NoiseLevels
+from greybox.numerics.banded import factor_band, inverse_band
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
 
 # levels are sought down to this share of the residual's standard deviation
 _LEAST = 1e-3
+# rows that tell levels to a hundredth, and those of a stretch, several times the slowest memory
+_ENOUGH, _STRETCH = 6000, 1000
 # slowest process noise that is told from a constant, in samples
 _SLOWEST = 300.0
 # 2 Δ log-likelihood beyond which nx further levels are believed (χ², p = 0.001, 3 of them)
@@ -52,6 +55,29 @@ class NoiseFit:
     free: NDArray[np.bool_]
     remembers: bool = False
     contradicted: bool = False
+
+
+def on_stretches(keep: Sequence[NDArray[np.bool_]]) -> Sequence[NDArray[np.bool_]]:
+    """Return the rows that the levels are sought on: all, or stretches all along long logs.
+
+    Parameters
+    ----------
+    keep : sequence of ndarray of bool
+        (N,) a log: rows that take part.
+    """
+    rows = sum(int(k.sum()) for k in keep)
+    if rows <= _ENOUGH:
+        return keep
+    out = []
+    for k in keep:
+        whole = len(k) * _ENOUGH / rows
+        count = max(1, round(whole / _STRETCH))
+        length = int(whole / count)
+        some = np.zeros(len(k), bool)
+        for start in np.linspace(0, len(k) - length, count).astype(int):
+            some[start : start + length] = True
+        out.append(k & some)
+    return out
 
 
 def constant_rows(rows: int, equations: Sequence[bool]) -> Array:
@@ -124,8 +150,7 @@ class ErrorLikelihood:
 
         References
         ----------
-        Patterson and Thompson (1971); Takahashi, Fagan and Chen (1973) for the elements of
-        the inverse that they need.
+        Patterson and Thompson (1971).
         """
         nx = len(self.scale)
         total = np.zeros((3, nx))
@@ -133,11 +158,11 @@ class ErrorLikelihood:
         if whitened is None:
             return _IMPOSSIBLE, *total
         loss, logs = whitened
-        for band, factor, rows in logs:
+        for band, covariance, factor, rows in logs:
             own = rows[:, : band.rows * nx]
             # what each row is multiplied by where it meets an error: P = Ω⁻¹ − Σ v vᵀ
             dual = band.unwhiten(factor, own)
-            by_covariance = inverse_band(factor)
+            by_covariance = inverse_band(covariance, len(covariance) - nx)
             for diagonal, entries in enumerate(by_covariance):
                 left, right = dual[:, diagonal:], dual[:, : dual.shape[1] - diagonal]
                 entries[: right.shape[1]] -= np.einsum("qk,qk->k", left, right)
@@ -152,8 +177,8 @@ class ErrorLikelihood:
 
     def _whitened(
         self, noise: ErrorNoise
-    ) -> tuple[float, list[tuple[ErrorBand, Array, Array]]] | None:
-        """Return the loss, and each log's factor and rows; None where a covariance is singular.
+    ) -> tuple[float, list[tuple[ErrorBand, Array, Array, Array]]] | None:
+        """Return the loss, and each log's covariance, factor and rows; None where singular.
 
         Rows are the constants, orthonormal, the regressors, orthonormal over all logs, and
         what the error keeps beside them, first white, then as they are in the row before
@@ -166,7 +191,8 @@ class ErrorLikelihood:
             for band, values in zip(self.bands, self.values, strict=True):
                 if not band.rows:
                     continue
-                factor = band.factor(noise)
+                covariance = band.covariance(noise)
+                factor = factor_band(covariance)
                 if factor is None:
                     return None
                 rows = band.whiten(factor, noise, values)
@@ -184,13 +210,13 @@ class ErrorLikelihood:
                 loss += 0.5 * float(error @ error)
                 gram += regressors @ regressors.T
                 score += regressors @ error
-                logs.append((band, factor, rows))
+                logs.append((band, covariance, factor, rows))
             if shared:
                 root = np.linalg.cholesky(gram)
                 inverse = np.linalg.inv(root)
                 taken = inverse @ score
                 loss += float(np.log(np.diag(root)).sum()) - 0.5 * float(taken @ taken)
-                for _, _, rows in logs:
+                for *_, rows in logs:
                     rows[own + 1 :] = inverse @ rows[own + 1 :]
                     rows[own] -= taken @ rows[own + 1 :]
         except np.linalg.LinAlgError:

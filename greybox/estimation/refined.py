@@ -25,6 +25,7 @@ from greybox.estimation.noise import (
     first_levels,
     fit_noise,
     noise_levels_of,
+    on_stretches,
     stated_levels,
 )
 from greybox.estimation.result import Estimate, Iteration
@@ -155,21 +156,32 @@ class _Refinement:
     def bands(self, point: _Point, keep: Sequence[NDArray[np.bool_]]) -> list[ErrorBand]:
         return [ErrorBand(m.slopes, k) for m, k in zip(point.motions, keep, strict=True)]
 
-    def first_levels(self, bands: Sequence[ErrorBand], theta: Array) -> NoiseFit:
+    def first_levels(
+        self, point: _Point, keep: Sequence[NDArray[np.bool_]], theta: Array
+    ) -> NoiseFit:
         stated, further = stated_levels(
             self.logs[0].vessel, self.predictor.structure.states, further_channels(self.predictor)
         )
-        return first_levels(self.likelihood(bands, theta), stated, further)
+        return first_levels(self.likelihood(point, keep, theta), stated, further)
 
     def likelihood(
-        self, bands: Sequence[ErrorBand], theta: Array, restricted: _Point | None = None
+        self,
+        point: _Point,
+        keep: Sequence[NDArray[np.bool_]],
+        theta: Array,
+        *,
+        restricted: bool = False,
     ) -> ErrorLikelihood:
         spread = np.concatenate(self.y, axis=1).std(axis=1)
         regressors = None
-        if restricted is not None:
-            regressors = [spread_columns(self.predictor, m.z) for m in restricted.motions]
+        if restricted:
+            regressors = [spread_columns(self.predictor, m.z) for m in point.motions]
         return ErrorLikelihood(
-            bands, self.errors(theta), own_constants(self.predictor), _EXACT * spread, regressors
+            self.bands(point, on_stretches(keep)),
+            self.errors(theta),
+            own_constants(self.predictor),
+            _EXACT * spread,
+            regressors,
         )
 
 
@@ -347,19 +359,19 @@ def _refine(
 ) -> _Refined:
     """Find noise, coefficients and motions in turn until the coefficients settle."""
     status = f"still moving after {_MOST} rounds"
-    fit = work.first_levels(work.bands(point, keep), theta)
+    fit = work.first_levels(point, keep, theta)
     settling, settled, converged = False, False, False
     for rounds in range(1, _MOST + 1):
         bands = work.bands(point, keep)
         if settling:
             # errors of coefficients that are still far off would decide wrongly, and were the
             # noise sought in every round the two would chase each other
-            fit, settled = fit_noise(work.likelihood(bands, theta), fit), True
+            fit, settled = fit_noise(work.likelihood(point, keep, theta), fit), True
             if fit.remembers:
                 # slow noise looks like slow regressors, which take much of it
-                fit = work.likelihood(bands, theta, point).fit(fit)[0]
+                fit = work.likelihood(point, keep, theta, restricted=True).fit(fit)[0]
         elif rounds > 1 and not settled:
-            fit = work.likelihood(bands, theta).fit(fit)[0]
+            fit = work.likelihood(point, keep, theta).fit(fit)[0]
         rows = work.rows(bands, fit, point)
         new, inverse = solve_white(rows)
         if not np.isfinite(new).all():
@@ -420,7 +432,7 @@ def with_noise(
     point = work.start(estimate.theta, keep)
     if point.diverged >= 0:
         return estimate
-    fit = work.first_levels(work.bands(point, keep), estimate.theta)
+    fit = work.first_levels(point, keep, estimate.theta)
     levels = noise_levels_of(
         fit, estimate.predictor.structure.states, logs[0].vessel, regression.sample_time
     )

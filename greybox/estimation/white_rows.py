@@ -17,6 +17,7 @@ from greybox.estimation.covariance import CovarianceKind, block_bootstrap, score
 from greybox.estimation.noise import constant_rows
 from greybox.estimation.whitening import ErrorBand, ErrorNoise
 from greybox.model.predictor import Predictor
+from greybox.numerics.banded import factor_band
 
 Array = NDArray[np.float64]
 
@@ -83,7 +84,7 @@ def white_rows(
     ExcitationError
         The covariance of the errors is not positive: the noise levels make no sense.
     """
-    factor = band.factor(noise)
+    factor = factor_band(band.covariance(noise))
     if factor is None:
         raise ExcitationError(
             f"the covariance of {band.rows} equation errors is singular at the noise levels "

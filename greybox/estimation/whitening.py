@@ -14,18 +14,11 @@ moving average again. All equations stacked sample by sample, the covariance of
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 
-import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.model.run.kernels import accumulate, unrolled
-
 Array = NDArray[np.float64]
-
-# columns of the inverse that are one scalar function
-_UNROLLED = 24
 
 
 @dataclass(frozen=True)
@@ -158,13 +151,6 @@ class ErrorBand:
         measured = np.tensordot(self._same, same, axes=3) + np.tensordot(self._next, near, axes=3)
         return measured, process, memory
 
-    def factor(self, noise: ErrorNoise) -> Array | None:
-        """Return the Cholesky factor of the band, None where it is not positive."""
-        from scipy.linalg.lapack import dpbtrf
-
-        factor, info = dpbtrf(self.covariance(noise), lower=1)
-        return np.asarray(factor) if info == 0 and np.isfinite(factor[0]).all() else None
-
     def whiten(self, factor: Array, noise: ErrorNoise, values: Array) -> Array:
         """Return values of all equations with the error made white.
 
@@ -201,48 +187,6 @@ class ErrorBand:
         out = np.zeros((len(values), self.rows, self.nx))
         out[:, 1:] = self._one[1:, None] * values[:, self.keep[:-1]]
         return out
-
-
-def inverse_band(factor: Array) -> Array:
-    """Return the band of the inverse of a symmetric matrix from that of its Cholesky factor.
-
-    Parameters
-    ----------
-    factor : ndarray
-        (b + 1, n) lower band, the diagonal first.
-
-    Returns
-    -------
-    ndarray
-        (b + 1, n), alike.
-
-    References
-    ----------
-    Takahashi, Fagan and Chen (1973); Erisman and Tinney (1975).
-    """
-    width, columns = factor.shape
-    count = -(-columns // _UNROLLED)
-    backwards = np.ones((width, count * _UNROLLED))
-    backwards[:, :columns] = factor[:, ::-1]
-    found = _backwards(width - 1, count)(np.zeros(width * (width - 1) // 2), backwards)[2]
-    return np.asarray(found.full())[:, :columns][:, ::-1]
-
-
-@lru_cache(maxsize=32)
-def _backwards(width: int, count: int) -> ca.Function:
-    """Return ``(window, columns of the factor) -> columns of the inverse``, last column first."""
-    window = ca.SX.sym("window", width * (width + 1) // 2)
-    column = ca.SX.sym("column", width + 1)
-    behind = ca.tril2symm(ca.SX(ca.Sparsity.lower(width), window))
-    below = column[1:] / column[0]
-    own = -(behind @ below)
-    own = ca.vertcat(1 / column[0] ** 2 - ca.dot(below, own), own)
-    after = ca.SX(width, width)
-    after[:, 0] = own[:width]
-    after[1:, 1:] = behind[: width - 1, : width - 1]
-    packed = ca.tril(ca.densify(after)).nz[:]
-    step = ca.Function("step", [window, column], [packed, own], {"cse": True})
-    return accumulate(unrolled(step, 1, _UNROLLED), count)
 
 
 def _following(values: Array) -> Array:

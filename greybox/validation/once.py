@@ -280,7 +280,7 @@ def _prefiltered(
             against = str(error).rstrip(".")
     if against and request.prefilter == "auto":
         notes.append(f"the instruments were not refined by the noise: {against}.")
-    return with_noise(plain, logs, **common)
+    return with_noise(plain, logs, **common) if request.judged else plain
 
 
 def _pushed_through_air(estimate: Estimate) -> bool:

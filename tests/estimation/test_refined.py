@@ -28,6 +28,7 @@ from greybox.model.model import model_from_dict
 from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import build_predictor
 from greybox.model.simulation import stationary_disturbance
+from greybox.numerics.banded import factor_band
 from greybox.regression.motion import predicted_motion, smoothed_heading
 from greybox.regression.regression import build_regression
 from greybox.study.chapter6 import TRUE
@@ -92,7 +93,7 @@ def test_the_band_equals_the_dense_covariance(remembers, cut):
         keep[[7, 8, 15, 20]] = False
     noise = NOISE if remembers else replace(NOISE, memory=np.zeros(3))
     band = ErrorBand(slopes, keep)
-    factor = band.factor(noise)
+    factor = factor_band(band.covariance(noise))
     omega = dense_covariance(slopes, keep, noise)
     values = rng.normal(size=(4, 30, 3))
     white = band.whiten(factor, noise, values)

@@ -1,0 +1,1 @@
+"""Numerical routines on arrays: nothing here knows of ships or logs."""
