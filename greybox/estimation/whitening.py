@@ -20,7 +20,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.model.functions import accumulate, unrolled
+from greybox.model.run.kernels import accumulate, unrolled
 
 Array = NDArray[np.float64]
 
