@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from greybox.trial.convert.convert import Imported, import_recording
 from greybox.trial.convert.derived_signals import derive_signals
 from greybox.trial.convert.options import ImportOptions
 from greybox.trial.convert.two_pass_import import Stream, is_large
-from greybox.trial.log import TrialLog
+from greybox.trial.log import Provenance, TrialLog
 from greybox.trial.raw_log import Recording
 from greybox.trial.readers.formats import open_raw
 from greybox.trial.repair import check_ids, repair
@@ -171,10 +172,17 @@ def _import_trial(
         table = open_raw(paths[0], **(reader or {}))
         if not isinstance(table, Recording) and is_large(table):
             stream = Stream(table, vessel, options)
-            write_log(stream.segments(), out, extra=extra, provenance=stream.provenance)
+
+            @cache
+            def provenance() -> Provenance:
+                actuators, _, _ = measure_actuators([stream.moved], vessel)
+                return replace(stream.provenance(), actuators=actuators)
+
+            write_log(stream.segments(), out, extra=extra, provenance=provenance)
             assert stream.first is not None
             spans = stream.spans
-            notes = [*stream.provenance().read, *(s.sentence for s in stream.steps)]
+            notes = [*provenance().read, *(s.sentence for s in stream.steps)]
+            notes += [f"actuator: {a.sentence}" for a in provenance().actuators]
             return _summary(
                 stream.first,
                 sum(count for _, _, count in spans),

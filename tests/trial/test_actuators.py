@@ -156,7 +156,7 @@ def test_estimates_survive_their_record():
     assert known_actuators([[e], [e]]) == (e,)
 
 
-def test_check_reports_and_import_keeps_the_actuators(tmp_path):
+def test_check_reports_and_import_keeps_the_actuators(tmp_path, monkeypatch):
     vessel = ship("speed")
     log = moved(1, delay=0.43, lag=0.8)
     c, y = log["c"], log["y"]
@@ -176,6 +176,10 @@ def test_check_reports_and_import_keeps_the_actuators(tmp_path):
     assert "actuator: y follows c" in said
     record = read_record(tmp_path / "log.csv")
     assert record["actuators"][0]["command"] == "c"
+    # in blocks as at once
+    monkeypatch.setattr("greybox.trial.convert.two_pass_import._LARGE_CELLS", 0)
+    assert gb.import_files([raw], vessel, tmp_path / "blocks.csv") == said
+    assert read_record(tmp_path / "blocks.csv")["actuators"] == record["actuators"]
     kept = gb.read_log(tmp_path / "log.csv", vessel)
     kept = kept[0] if isinstance(kept, list | tuple) else kept
     assert kept.provenance.actuators[0].response.value == pytest.approx(estimate.response.value)

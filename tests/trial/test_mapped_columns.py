@@ -95,3 +95,10 @@ def test_a_mapped_column_of_words_is_not_told_unused(tmp_path):
     notes = log.provenance.read
     assert "[columns] maps 'none' to 'x_n', which no file has" in notes
     assert not any("'state'" in n for n in notes)
+
+
+@pytest.mark.parametrize("there", [{"lat": 63 + 1e-6 * T, "lon": 10 + 1e-6 * T}, {}])
+def test_nothing_is_missed_where_another_column_serves(tmp_path, there):
+    ship = vessel({"tvec": "t", "yaw": "psi", "north": "x_n", "east": "y_n"})
+    notes = imported(tmp_path, ship, table(**there)).provenance.read
+    assert any("which no file has" in n for n in notes) is not bool(there)

@@ -32,6 +32,15 @@ Array = NDArray[np.float64]
 
 MOTION = frozenset({"x_n", "y_n", "psi", "u", "v", "r", "v_n", "v_e", "lat", "lon", "sog"})
 
+# channels that tell what others would
+_PLACE, _BODY, _EARTH = ("x_n", "y_n"), ("u", "v"), ("v_n", "v_e")
+_ALTERNATIVES = (
+    (("lat", "lon"), _PLACE),
+    (_PLACE, ("lat", "lon")),
+    (_EARTH, _BODY),
+    (_BODY, _EARTH),
+)
+
 # a position changes from row to row by less than this share of what it spreads over
 _SMOOTH = 0.2
 _NO_MOTION = "no position, heading or velocity was recognised: map their columns in [columns]"
@@ -405,9 +414,12 @@ def _shaft(name: str) -> tuple[str, int]:
 
 
 def unused_mappings(recordings: Iterable[Recording], vessel: Vessel) -> list[str]:
-    """Say which columns the vessel file maps and no file has."""
+    """Say which columns the vessel file maps and no file has, nor others that tell the same."""
     recordings = list(recordings)
     names = {n for r in recordings for n in (*r.names, *r.mapped)}
+    for one, other in _ALTERNATIVES:
+        if names.issuperset(one):
+            names.update(other)
     return [
         f"[columns] maps '{raw}' to '{m.name}', which no file has"
         for raw, m in vessel.columns.items()

@@ -50,6 +50,8 @@ Array = NDArray[np.float64]
 # tables that may hold more numbers are imported in blocks
 _LARGE_CELLS = 20_000_000
 _BLOCK_ROWS = 300_000
+# of the first block, what names the channels that are derived, and what actuators are measured by
+_SAMPLE_ROWS, _ACTUATOR_ROWS = 100, 40_000
 # samples on both sides of a block that are made with it and not kept
 _MARGIN = 4
 # time may go back by this share of what a block spans: more cannot be sorted in blocks
@@ -226,7 +228,7 @@ class _Found:
         self._reach(raw)
         recording = canonical(raw, self.assigned, self.vessel)
         if not self.sample.signals:
-            self.sample, self.raw = _head(raw), recording
+            self.sample, self.raw = _head(raw, _SAMPLE_ROWS), recording
         if self.origin is None:
             self.origin = _first_position(recording)
         keeps: dict[tuple[int, bytes], Array] = {}
@@ -259,10 +261,10 @@ class _Found:
                 self.reach[name] = (max(new[0], old[0]), max(new[1], old[1]))
 
 
-def _head(recording: Recording) -> Recording:
-    """Return the first values of a recording, enough to name what is derived of them."""
+def _head(recording: Recording, rows: int) -> Recording:
+    """Return a copy of the first values of a recording."""
     return recording.with_signals(
-        Signal(s.name, s.t[:100], s.value[:100], s.unit, s.source, s.canonical)
+        Signal(s.name, s.t[:rows].copy(), s.value[:rows].copy(), s.unit, s.source, s.canonical)
         for s in recording.signals
     )
 
@@ -290,11 +292,17 @@ class Stream:
     table : TableFile
     vessel : Vessel
     options : ImportOptions
+
+    Attributes
+    ----------
+    moved : Recording
+        The first commands and feedback of the vessel's actuators.
     """
 
     def __init__(self, table: TableFile, vessel: Vessel, options: ImportOptions) -> None:
         self.table, self.vessel, self.options = table, vessel, options
         self.scan = scan_table(table, vessel, options)
+        self.moved = Recording(table.path.stem, ())
         self.first: TrialLog | None = None
         self.steps: tuple[Step, ...] = ()
         self.said: tuple[str, ...] = ()
@@ -381,6 +389,10 @@ class Stream:
         # the first row from which on nothing older comes: rows may be out of order
         older = np.flatnonzero(t < needed)
         start = int(older[-1]) + 1 if len(older) else 0
+        if not self.done:
+            names = {c for a in self.vessel.actuators for c in (a.command, a.feedback)}
+            moved = recording.with_signals(s for s in recording.signals if s.name in names)
+            self.moved = _head(moved, _ACTUATOR_ROWS)
         recording = self._turned(recording, start)
         pieces = self._pieces(recording, stop)
         self.done = stop
