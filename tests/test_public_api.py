@@ -73,3 +73,13 @@ def test_one_log_needs_no_list_and_old_calls_still_work():
 def test_refined_instruments_by_name():
     asked = gb.Request(method="refined-iv")
     assert (asked.method, asked.prefilter) == ("iv", "noise")
+
+
+def test_estimators_take_one_log_too():
+    log = virtual_log(3, 300)
+    predictor = gb.build_predictor(gb.get_structure("linear"), "basic")
+    for estimator in (gb.estimate_ls, gb.estimate_iv):
+        one = estimator(predictor, log, judged=False)
+        assert one.params.equals(estimator(predictor, [log], judged=False).params)
+        with pytest.raises(UsageError, match="Did you mean 'judged'"):
+            estimator(predictor, log, judge=False)

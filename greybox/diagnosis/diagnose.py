@@ -12,9 +12,10 @@ from greybox.diagnosis.result import Diagnosis
 from greybox.diagnosis.search import search
 from greybox.diagnosis.telling import Report
 from greybox.diagnosis.waves import find_waves, found_waves
+from greybox.keywords import known_keywords
 from greybox.model.model import ManoeuvringModel
 from greybox.one_thread import one_thread
-from greybox.trial.log import TrialLog
+from greybox.trial.log import Logs, as_list
 from greybox.trial.validity import other_conditions, pooled_conditions
 
 _log = logging.getLogger(__name__)
@@ -42,19 +43,20 @@ class DiagnosisOptions:
     progress: Callable[[str], None] = field(default=lambda _: None)
 
 
+@known_keywords
 @one_thread
 def diagnose(
-    logs: Sequence[TrialLog],
+    logs: Logs,
     *,
     model: ManoeuvringModel | None = None,
-    validate: Sequence[TrialLog] = (),
+    validate: Logs = (),
     options: DiagnosisOptions = DiagnosisOptions(),
 ) -> Diagnosis:
     """Find what a simulation gets wrong, name the cause, and extend the model.
 
     Parameters
     ----------
-    logs : sequence of TrialLog
+    logs : TrialLog or sequence of TrialLog
         To estimate on.
     model : ManoeuvringModel, optional
         To diagnose; by default (3.51) in still water and air, estimated on the logs.
@@ -83,6 +85,7 @@ def diagnose(
         options.progress(doing)
 
     say("log checks")
+    logs, validate = as_list(logs), as_list(validate)
     ready = prepare(logs, validate, model, options.structure, options.causes)
     case = ready.case
     say("model without causes")

@@ -16,8 +16,9 @@ from greybox.diagnosis.result import Given
 from greybox.diagnosis.scores import Directions, score_atoms
 from greybox.diagnosis.search import Search
 from greybox.diagnosis.telling import Report
+from greybox.keywords import known_keywords
 from greybox.one_thread import one_thread
-from greybox.trial.log import TrialLog
+from greybox.trial.log import Logs, as_list
 
 Array = NDArray[np.float64]
 
@@ -25,12 +26,13 @@ Array = NDArray[np.float64]
 _FORMS = 3
 
 
+@known_keywords
 @one_thread
 def fit_given(
-    logs: Sequence[TrialLog],
+    logs: Logs,
     ids: Sequence[str],
     *,
-    validate: Sequence[TrialLog] = (),
+    validate: Logs = (),
     structure: str = "thesis",
     seed: int = 0,
 ) -> Given:
@@ -38,7 +40,7 @@ def fit_given(
 
     Parameters
     ----------
-    logs : sequence of TrialLog
+    logs : TrialLog or sequence of TrialLog
     ids : sequence of str
         Causes; those that these logs cannot show, or that kinematics have mended, change
         nothing.
@@ -61,6 +63,7 @@ def fit_given(
     UsageError
         A cause does not exist.
     """
+    logs, validate = as_list(logs), as_list(validate)
     ready = prepare(logs, validate, None, structure, ids)
     case, base = ready.case, ready.base()
     final = base

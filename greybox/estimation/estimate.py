@@ -20,11 +20,12 @@ from greybox.estimation.disturbance import estimate_current
 from greybox.estimation.error_shape import ErrorShape, error_shapes
 from greybox.estimation.moments import Solution, solve_stacked
 from greybox.estimation.result import Estimate, Iteration, estimation_data
+from greybox.keywords import known_keywords
 from greybox.model.predictor import Predictor
 from greybox.one_thread import one_thread
 from greybox.regression.instruments import Instruments, build_instruments
 from greybox.regression.regression import Regression, build_regression
-from greybox.trial.log import TrialLog
+from greybox.trial.log import Logs, TrialLog, as_list
 
 Array = NDArray[np.float64]
 Covariance = Literal["hac", "ma", "white", "bootstrap"]
@@ -46,10 +47,11 @@ class UnexcitedBiasError(ExcitationError):
         self.column = column
 
 
+@known_keywords
 @one_thread
 def estimate_ls(
     predictor: Predictor,
-    logs: Sequence[TrialLog],
+    logs: Logs,
     *,
     margins: dict[str, float] | None = None,
     covariance: Covariance = "hac",
@@ -63,7 +65,7 @@ def estimate_ls(
     predictor : Predictor
         With an intercept where it is augmented: only zero-mean instruments
         remove the constants that its derivation leaves out.
-    logs : sequence of TrialLog
+    logs : TrialLog or sequence of TrialLog
         One experiment each.
     margins : dict of str to float, optional
         Rows with |state| below are left out (Remark 4.2) [m/s, rad/s].
@@ -88,6 +90,7 @@ def estimate_ls(
     ----------
     Ljungberg (2020), eq. 2.17.
     """
+    logs = as_list(logs)
     regression = build_regression(predictor, logs, margins=margins)
     instruments = _regressors_as_instruments(regression)
     solutions = _solve(regression, instruments)
@@ -110,10 +113,11 @@ def estimate_ls(
     )
 
 
+@known_keywords
 @one_thread
 def estimate_iv(
     predictor: Predictor,
-    logs: Sequence[TrialLog],
+    logs: Logs,
     *,
     start: Array | Estimate | None = None,
     zero_mean: bool = True,
@@ -181,13 +185,14 @@ def estimate_iv(
             "instruments that keep their mean do not remove the constants that the augmented "
             "predictor leaves out: build it with an intercept, or use zero-mean instruments."
         )
-    regression = build_regression(predictor, logs, margins=margins)
+    experiments = as_list(logs)
+    regression = build_regression(predictor, experiments, margins=margins)
     theta = _start(regression, start)
 
     def instruments_of(theta: Array, keep: Sequence[NDArray[np.bool_]] | None) -> Instruments:
         return build_instruments(
             predictor,
-            logs,
+            experiments,
             theta,
             zero_mean=zero_mean,
             heading=heading,
@@ -248,7 +253,7 @@ def estimate_iv(
         regression,
         instruments,
         solutions,
-        logs,
+        experiments,
         covariance,
         seed,
         iterations,

@@ -39,6 +39,7 @@ from greybox.estimation.shooting import (
     loss_weights,
 )
 from greybox.estimation.verdict import TestResult
+from greybox.keywords import known_keywords
 from greybox.model.disturbances import CURRENT, WIND
 from greybox.model.noise import NoiseLevels
 from greybox.model.output import OutputModel, Role
@@ -46,7 +47,7 @@ from greybox.model.output_runs import Simulator
 from greybox.model.predictor import Predictor
 from greybox.one_thread import one_thread
 from greybox.regression.regression import common_sample_time
-from greybox.trial.log import TrialLog
+from greybox.trial.log import Logs, TrialLog, as_list
 
 Array = NDArray[np.float64]
 Damping = Literal["warn", "enforce"]
@@ -120,10 +121,11 @@ class OutputErrorOptions:
     search: bool = True
 
 
+@known_keywords
 @one_thread
 def estimate_oe(
     predictor: Predictor,
-    logs: Sequence[TrialLog],
+    logs: Logs,
     *,
     start: Array | Estimate | None = None,
     options: OutputErrorOptions = OutputErrorOptions(),
@@ -134,7 +136,7 @@ def estimate_oe(
     ----------
     predictor : Predictor
         Of `output_predictor`.
-    logs : sequence of TrialLog
+    logs : TrialLog or sequence of TrialLog
         One experiment each, with an initial state of its own.
     start : ndarray or Estimate, optional
         (p,) parameters of the structure, or an estimate such as that of IV. By
@@ -160,6 +162,7 @@ def estimate_oe(
     ----------
     Ljung (1999), sections 7.2-7.4 and 9.4; Åström (1980).
     """
+    logs = as_list(logs)
     fitted = _fit(predictor, logs, start, options)
     if not (np.isfinite(fitted.fit.cost) and fitted.bounded):
         raise ExcitationError(

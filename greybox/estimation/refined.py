@@ -39,11 +39,12 @@ from greybox.estimation.white_rows import (
     white_rows,
 )
 from greybox.estimation.whitening import ErrorBand
+from greybox.keywords import known_keywords
 from greybox.model.predictor import Predictor
 from greybox.one_thread import one_thread
 from greybox.regression.motion import Motion, further_channels, predicted_motion, smoothed_heading
 from greybox.regression.regression import Regression, build_regression, within_margins
-from greybox.trial.log import TrialLog
+from greybox.trial.log import Logs, TrialLog, as_list
 
 Array = NDArray[np.float64]
 
@@ -185,10 +186,11 @@ class _Refinement:
         )
 
 
+@known_keywords
 @one_thread
 def estimate_refined_iv(
     predictor: Predictor,
-    logs: Sequence[TrialLog],
+    logs: Logs,
     *,
     start: Array | Estimate | None = None,
     heading: Literal["measured", "simulated"] = "measured",
@@ -207,7 +209,7 @@ def estimate_refined_iv(
     Parameters
     ----------
     predictor : Predictor
-    logs : sequence of TrialLog
+    logs : TrialLog or sequence of TrialLog
         One experiment each, in open loop.
     start : ndarray or Estimate, optional
         A plain IV estimate of the same predictor and logs, or (p,) parameters of the
@@ -236,6 +238,7 @@ def estimate_refined_iv(
     ----------
     Söderström and Stoica (1983); Young (2008).
     """
+    logs = as_list(logs)
     plain = start if isinstance(start, Estimate) and start.method == "iv" else None
     if plain is None:
         plain = estimate_iv(

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import InfeasibleError, LogError, UsageError
+from greybox.keywords import known_keywords
 from greybox.model.model import ManoeuvringModel
 from greybox.prediction.conditions import (
     Conditions,
@@ -53,6 +54,7 @@ _LONGEST = 200.0
 _STEPS = 1024
 
 
+@known_keywords
 def predict_manoeuvre(
     model: ManoeuvringModel,
     manoeuvre: Kind,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -297,6 +297,15 @@ class TrialLog(DisplayMixin):
             closed_loop=self.closed_loop[start:stop],
             missing={k: m for k, v in self.missing.items() if (m := v[start:stop]).any()},
         )
+
+
+# one experiment, or several
+Logs = TrialLog | Sequence[TrialLog]
+
+
+def as_list(logs: Logs) -> list[TrialLog]:
+    """Return the logs, a single one as a list of its own."""
+    return [logs] if isinstance(logs, TrialLog) else list(logs)
 
 
 def make_log(

@@ -22,7 +22,7 @@ from greybox.keywords import known_keywords
 from greybox.model.model import ManoeuvringModel
 from greybox.one_thread import one_thread
 from greybox.regression.regression import common_sample_time
-from greybox.trial.log import TrialLog
+from greybox.trial.log import Logs, TrialLog, as_list
 from greybox.validation.alternatives import Alternative, alternatives_for
 from greybox.validation.fit import average_fit, run_model
 from greybox.validation.held_out import FLOOR
@@ -35,7 +35,7 @@ _log = logging.getLogger(__name__)
 
 @known_keywords
 def estimate_model(
-    logs: TrialLog | Sequence[TrialLog],
+    logs: Logs,
     request: Request | None = None,
     *,
     method: str | None = None,
@@ -141,7 +141,7 @@ def estimate_model(
             stacklevel=3,
         )
         asked = request
-    return estimate_requested([logs] if isinstance(logs, TrialLog) else logs, asked)
+    return estimate_requested(as_list(logs), asked)
 
 
 @one_thread

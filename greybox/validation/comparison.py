@@ -18,7 +18,7 @@ from greybox.model.model import ManoeuvringModel
 from greybox.notebook import DisplayMixin, items, number, table
 from greybox.one_thread import one_thread
 from greybox.regression.instruments import state_bound
-from greybox.trial.log import TrialLog
+from greybox.trial.log import Logs, TrialLog, as_list
 from greybox.trial.segments import find_log_gaps
 from greybox.trial.validity import ConditionDifference, other_conditions
 from greybox.validation.bands import LEVEL, Bands, predict_bands
@@ -335,9 +335,6 @@ def _alike(changes: Sequence[Change], starts: Array, horizon: float) -> list[NDA
     return [g for g in groups if len(g)] + [np.array([k]) for k in np.flatnonzero(crossing)]
 
 
-Logs = TrialLog | Sequence[TrialLog]
-
-
 @known_keywords
 def compare(
     models: Mapping[str, ManoeuvringModel | Estimate],
@@ -379,7 +376,7 @@ def compare(
                 f"the logs have no '{name}'.{suggestion(name, own)} They have {', '.join(own)}: "
                 f"give those of every model, or one sequence for all."
             )
-    lists = [[x] if isinstance(x, TrialLog) else list(x) for x in (own[n] for n in known)]
+    lists = [as_list(own[name]) for name in known]
     if not known or not all(lists):
         raise UsageError(
             f"{len(known)} models on {min(map(len, lists), default=0)} logs: give at least one of "
