@@ -280,7 +280,7 @@ def _run_between(options: argparse.Namespace, request: Any, notes: tuple[str, ..
     vessel = with_actuators_of(request.vessel, other.vessel)
     found = design_between(
         request,
-        Rival(second, structure, theta, other.d, vessel),
+        Rival(second, structure, theta, other.d, vessel, other.integrator),
         (first, second),
         best_effort=options.best_effort,
         progress=progress("design"),

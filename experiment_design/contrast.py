@@ -142,7 +142,7 @@ class Pair:
         for m, t in zip(models, theta, strict=True):
             split = m.theta.size
             symbols, stepped = step_expression(
-                m.vessel, m.structure, t[:split], t[split:], m.sample_time
+                m.vessel, m.structure, t[:split], t[split:], m.sample_time, m.integrator
             )
             n = m.nx + 1
             steps.append(ca.Function("step", [symbols[0][:n], symbols[1], t], [stepped[:n]]))

@@ -128,6 +128,7 @@ def require_stable(problem: TrialProblem, request: DesignRequest) -> None:
         request.d,
         problem.schedule,
         request.starts[0],
+        request.integrator,
     )
     if sentence:
         raise InfeasibleError(sentence)
@@ -214,8 +215,9 @@ def tells_enough(request: DesignRequest) -> bool:
 def _turning(problem: TrialProblem, request: DesignRequest) -> str:
     """Return what the turning circle has to do with the sea room, where it has."""
     steady = steady_motions(
-        request.vessel, request.structure, request.theta, request.d, problem.schedule
-    )
+        request.vessel, request.structure, request.theta, request.d, problem.schedule,
+        integrator=request.integrator,
+    )  # fmt: skip
     signs = np.ones(len(steady.x), bool)
     for state, sign in request.regimes[0]:
         column = steady.x[:, request.structure.states.index(state)]

@@ -189,7 +189,9 @@ def design_between(
     """
     if request.trials != 1:
         raise UsageError("--between designs one trial at a time: leave out --trials.")
-    first = Rival(names[0], request.structure, request.theta, request.d)
+    first = Rival(
+        names[0], request.structure, request.theta, request.d, integrator=request.integrator
+    )
     pairs = [(first, rival)]
     _require_different(replace(request, contrasts=tuple(pairs)), names)
     best: Discrimination | None = None

@@ -20,8 +20,11 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.model.disturbances import velocity_through
 from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import Predictor
+from greybox.model.run.step import Integrator, StepModel
+from greybox.model.structure import Structure
 from greybox.vectorised import Vectorised
 
 Array = NDArray[np.float64]
@@ -38,6 +41,13 @@ class Moments:
         return Moments(self.gram + other.gram, self.score + other.score)
 
 
+def measured_air(structure: Structure, north: ca.SX, east: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """Return the velocity through the air that would be measured, in the structure's symbols."""
+    s = structure.symbols
+    states = dict(zip(structure.states, ca.vertsplit(s.x), strict=True))
+    return velocity_through(states, s.psi, north, east)
+
+
 class MomentProgram:
     """Compiled sums of one predictor at one prior model.
 
@@ -49,6 +59,10 @@ class MomentProgram:
     d : ndarray
         (nd,) disturbance means that the trial is expected to meet [m/s].
     noise : NoiseLevels
+    sample_time : float
+        [s]
+    integrator : {"euler", "rk4"}
+        Of the step whose slopes say how a sample's noise enters the next equation error.
     white : bool
         Take the equation error as white with its average variance: M ∝ G.
     gust : ndarray, optional
@@ -63,12 +77,18 @@ class MomentProgram:
         theta: Array,
         d: Array,
         noise: NoiseLevels,
+        sample_time: float,
         *,
+        integrator: Integrator = "euler",
         white: bool = False,
         gust: Array | None = None,
     ) -> None:
         structure = predictor.structure
-        s = structure.symbols
+        turns = "r" in structure.states
+        step = StepModel(
+            structure, integrator, "simulated" if turns else "measured", predictor.air_measured
+        )
+        s = step.symbolic
         self.predictor = predictor
         self.white = white
         self.nx = len(structure.states)
@@ -78,17 +98,10 @@ class MomentProgram:
         air = s.air
         blow = ca.SX(0, 1)
         self.gust = gust
-        if predictor.air_measured and structure.disturbance == "marine":
-            c, sn = ca.cos(s.psi), ca.sin(s.psi)
+        if predictor.air_measured:
             blow = ca.SX.sym("gust", 2)
-            north, east = float(d[2]) + blow[0], float(d[3]) + blow[1]
-            air = ca.vertcat(
-                s.x[structure.states.index("u")] - (c * north + sn * east),
-                (s.x[structure.states.index("v")] if "v" in structure.states else 0)
-                - (c * east - sn * north),
-            )
-        f = structure.increment_expression(air_measured=predictor.air_measured)
-        x_next = s.x + f if structure.increment else f
+            air = ca.vertcat(*measured_air(structure, d[2] + blow[0], d[3] + blow[1]))
+        x_next = s.after[: self.nx]
         channels: list[tuple[ca.SX, float, int | None]] = [
             (s.x[i], float(noise.measurement[i]), i) for i in range(self.nx)
         ]
@@ -98,11 +111,7 @@ class MomentProgram:
             channels += [(s.air[i], noise.wind, None) for i in range(2)]
         slopes = ca.horzcat(*[ca.jacobian(x_next, symbol) for symbol, _, _ in channels])
         fixed = [
-            ca.substitute(
-                ca.substitute(e, ca.vertcat(s.d, s.theta), ca.DM(np.concatenate([d, theta]))),
-                s.air,
-                air,
-            )
+            ca.substitute(s.at(e, d, theta, sample_time), s.air, air)
             for e in (ca.vertcat(*predictor.expressions), slopes)
         ]
         self._std = np.array([std for _, std, _ in channels])

@@ -49,7 +49,7 @@ def noise_levels(
     has_residual = residual.shape == (len(states),) and bool((residual > 0).all())
     stated = [vessel.std(s) for s in states]
     a = np.asarray(
-        StepModel(model.structure).jacobians(
+        StepModel(model.structure, model.integrator).jacobians(
             [1.0] * len(states), 0.0, [0.0] * len(model.structure.inputs),
             model.d, [1.0, 1.0], model.theta, model.sample_time,
         )[0]

@@ -139,6 +139,7 @@ def predict_motion(design: Design, draws: int = 200) -> tuple[MotionBand, ...]:
             psi0=float(start[-1]),
             d=np.broadcast_to(r.d, (samples, r.d.size)) if r.d.any() else None,
             process_noise=noise,
+            integrator=r.integrator,
             bound=np.full(len(states), _BOUND),
         )  # fmt: skip
         stable = free.diverged < 0

@@ -209,6 +209,7 @@ def prepare_request(
         structure=structure,
         theta=theta,
         sample_time=model.sample_time,
+        integrator=model.integrator,
         noise=noise,
         duration=wishes.duration,
         hold=wishes.hold,
@@ -230,9 +231,11 @@ def prepare_request(
         seed=wishes.seed,
         effort=wishes.effort,
     )
-    steady = steady_motions(vessel, structure, theta, d, schedule)
+    steady = steady_motions(vessel, structure, theta, d, schedule, integrator=model.integrator)
     if not len(steady.x):
-        raise InfeasibleError(unstable_sentence(vessel, structure, theta, d, schedule))
+        raise InfeasibleError(
+            unstable_sentence(vessel, structure, theta, d, schedule, integrator=model.integrator)
+        )
     start = _start(wishes, structure)
     if wishes.regime.strip().lower() == "auto":
         regimes = _choose_regimes(base, steady, start, wishes, notes)

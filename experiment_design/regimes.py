@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from experiment_design.rollout import Rollout
 from experiment_design.schedule import Schedule
 from greybox.errors import UsageError
+from greybox.model.run.step import Integrator
 from greybox.model.structure import Structure
 from greybox.vessel.vessel import Vessel
 
@@ -50,6 +51,7 @@ def steady_motions(
     d: Array,
     schedule: Schedule,
     start: Array | None = None,
+    integrator: Integrator = "euler",
 ) -> Steady:
     """Run constant commands on a grid of the limits until the motion has settled."""
     commands = len(schedule.commands)
@@ -62,8 +64,9 @@ def steady_motions(
     rest = np.zeros(len(structure.states) + 1)
     rest[0] = 0.1
     rollout = Rollout(
-        vessel, structure, theta, d, rest if start is None else start, schedule.sample_time
-    )
+        vessel, structure, theta, d, rest if start is None else start, schedule.sample_time,
+        integrator,
+    )  # fmt: skip
     motion = rollout.run(np.repeat(values[:, None], samples, axis=1))
     nx = rollout.nx
     x = motion.state[:, -1, :nx]

@@ -22,6 +22,7 @@ from greybox.model.disturbances import CURRENT, WIND
 from greybox.model.model import ManoeuvringModel
 from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import Column, Predictor, Regime, build_predictor
+from greybox.model.run.step import Integrator
 from greybox.model.simulation import stationary_disturbance
 from greybox.model.structure import Structure
 from greybox.vessel.vessel import Vessel
@@ -48,6 +49,7 @@ class Rival:
         (nd,) disturbance means [m/s].
     vessel : Vessel, optional
         How its thrusters act, where that is another than the request's.
+    integrator : {"euler", "rk4"}
     """
 
     name: str
@@ -55,6 +57,7 @@ class Rival:
     theta: Array
     d: Array
     vessel: Vessel | None = None
+    integrator: Integrator = "euler"
 
 
 @dataclass(frozen=True)
@@ -112,6 +115,8 @@ class DesignRequest:
     seed : int
     effort : float
         Evaluations of the search, 1 being the usual number.
+    integrator : {"euler", "rk4"}
+        Of the prior model.
     """
 
     vessel: Vessel
@@ -141,6 +146,7 @@ class DesignRequest:
     contrasts: tuple[tuple[Rival, Rival], ...] = ()
     seed: int = 0
     effort: float = 1.0
+    integrator: Integrator = "euler"
 
     @property
     def trials(self) -> int:
@@ -322,7 +328,7 @@ def build_problem(
     for k, theta in enumerate(request.thetas()):
         rollout = Rollout(
             request.vessel, request.structure, theta, request.d, request.starts[trial],
-            request.sample_time,
+            request.sample_time, request.integrator,
         )  # fmt: skip
         program = LimitProgram(
             rollout,
@@ -350,7 +356,9 @@ def build_problem(
 def _rival_rollout(request: DesignRequest, rival: Rival, trial: int) -> Rollout:
     start = rival_start(request, rival, trial)
     vessel = request.vessel if rival.vessel is None else rival.vessel
-    return Rollout(vessel, rival.structure, rival.theta, rival.d, start, request.sample_time)
+    return Rollout(
+        vessel, rival.structure, rival.theta, rival.d, start, request.sample_time, rival.integrator
+    )
 
 
 def rival_start(request: DesignRequest, rival: Rival, trial: int) -> Array:
@@ -367,13 +375,16 @@ def _yardstick(request: DesignRequest, predictor: Predictor, theta: Array) -> Ya
         if predictor.kind == "augmented" and request.structure.uses_air:
             means = CURRENT + WIND
         return SensitivityProgram(
-            predictor, theta, request.d, request.noise, request.sample_time, means=means
-        )
+            predictor, theta, request.d, request.noise, request.sample_time, means=means,
+            integrator=request.integrator,
+        )  # fmt: skip
     return MomentProgram(
         predictor,
         theta,
         request.d,
         request.noise,
+        request.sample_time,
+        integrator=request.integrator,
         white=request.estimator == "iv-white",
         gust=draw_gusts(request) if predictor.air_measured else None,
     )

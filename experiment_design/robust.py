@@ -87,8 +87,9 @@ def keep_probability(request: DesignRequest, units: list[Array], draws: int = _D
     wind = plain.predictor in ("augmented",)
     for t, c in enumerate(commands):
         nominal = Rollout(
-            plain.vessel, plain.structure, plain.theta, plain.d, plain.starts[t], plain.sample_time
-        )
+            plain.vessel, plain.structure, plain.theta, plain.d, plain.starts[t],
+            plain.sample_time, plain.integrator,
+        )  # fmt: skip
         program = LimitProgram(nominal, schedule, plain.trial_limits(t), wind_matters=wind)
         motion = nominal.run_models(thetas, c, late=True)
         over = program.path_values(motion.state[:, 1:]).max(axis=-1)

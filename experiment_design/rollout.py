@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_banded
 
 from greybox.errors import StructureError
+from greybox.model.run.step import Integrator, StepModel, next_position
 from greybox.model.simulation import positions, simulate
 from greybox.model.structure import Structure
 from greybox.vectorised import Vectorised
@@ -61,6 +62,7 @@ class Rollout:
         (nx + 1,) initial states [m/s, rad/s] and heading [rad].
     sample_time : float
         [s]
+    integrator : {"euler", "rk4"}
 
     Raises
     ------
@@ -76,6 +78,7 @@ class Rollout:
         d: Array,
         start: Array,
         sample_time: float,
+        integrator: Integrator = "euler",
     ) -> None:
         if structure.disturbance != "marine" or "u" not in structure.states:
             raise StructureError(
@@ -88,9 +91,10 @@ class Rollout:
         self.d = np.asarray(d, float)
         self.start = np.asarray(start, float)
         self.sample_time = sample_time
+        self.integrator: Integrator = integrator
         self.nx = len(structure.states)
         self.symbols, self.step = step_expression(
-            vessel, structure, self.theta, self.d, sample_time
+            vessel, structure, self.theta, self.d, sample_time, integrator
         )
         state, commands = self.symbols
         s = structure.symbols
@@ -133,6 +137,7 @@ class Rollout:
             structure, theta, self.start[:-1], tau, self.sample_time,
             psi=heading, psi0=float(self.start[-1]),
             d=np.broadcast_to(self.d, (samples, self.d.size)) if self.d.any() else None,
+            integrator=self.integrator,
             bound=bound,
         )  # fmt: skip
         stable = free.diverged < 0
@@ -204,27 +209,20 @@ def step_expression(
     theta: Array | ca.SX,
     d: Array | ca.SX,
     sample_time: float,
+    integrator: Integrator,
 ) -> tuple[tuple[ca.SX, ca.SX], ca.SX]:
-    """Return symbols (state (nx+3,), commands (nc,)) and the next state, by Euler (3.51).
+    """Return symbols (state (nx+3,), commands (nc,)) and the next state.
 
     The state holds the structure's states, the heading, and north and east.
     """
-    s = structure.symbols
+    turns = "r" in structure.states
+    step = StepModel(structure, integrator, "simulated" if turns else "measured")
+    s = step.symbolic
     commands = ca.vertcat(*[ca.SX.sym(c) for c in vessel.commands])
     place = ca.vertcat(ca.SX.sym("north"), ca.SX.sym("east"))
-    f = structure.increment_expression(air_measured=False)
-    x_next = s.x + f if structure.increment else f
-    fixed = ca.substitute(x_next, ca.vertcat(s.d, s.theta), ca.vertcat(ca.SX(d), ca.SX(theta)))
-    fixed = ca.substitute(fixed, s.tau, force_vector(vessel, structure, commands))
-    states = structure.states
-    u = s.x[states.index("u")]
-    v = s.x[states.index("v")] if "v" in states else ca.SX(0)
-    turn = sample_time * s.x[states.index("r")] if "r" in states else ca.SX(0)
-    c, sn = ca.cos(s.psi), ca.sin(s.psi)
-    after = ca.vertcat(
-        fixed,
-        s.psi + turn,
-        place[0] + sample_time * (c * u - sn * v),
-        place[1] + sample_time * (sn * u + c * v),
-    )
+    tau = force_vector(vessel, structure, commands)
+    moved = step(s.x, s.psi, tau, d, ca.SX(2, 1), theta, sample_time)
+    speed = dict(zip(structure.states, ca.vertsplit(s.x), strict=True))
+    place_after = next_position(place, speed["u"], speed.get("v", ca.SX(0)), s.psi, sample_time)
+    after = ca.vertcat(moved, *[s.psi] * (not turns), place_after)
     return (ca.vertcat(s.x, s.psi, place), commands), after

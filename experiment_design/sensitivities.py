@@ -26,10 +26,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_banded
 
-from experiment_design.moments import Moments
+from experiment_design.moments import Moments, measured_air
 from greybox.errors import UsageError
 from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import Predictor
+from greybox.model.run.step import Integrator, StepModel
 from greybox.recursion import propagate
 from greybox.vectorised import Vectorised
 
@@ -61,6 +62,7 @@ class SensitivityProgram:
     means : tuple of str
         Names of the disturbance means that are estimated, such as
         ``("current_north", "current_east")``; the measured wind's are not.
+    integrator : {"euler", "rk4"}
 
     Attributes
     ----------
@@ -85,9 +87,9 @@ class SensitivityProgram:
         *,
         initial: bool = True,
         means: tuple[str, ...] = (),
+        integrator: Integrator = "euler",
     ) -> None:
         structure = predictor.structure
-        s = structure.symbols
         states = structure.states
         theta, d = np.asarray(theta, float), np.asarray(d, float)
         self.predictor = predictor
@@ -110,12 +112,12 @@ class SensitivityProgram:
         self.size = self.nx + heading
         std = np.append(noise.measurement, [noise.heading] * heading)
         self.weight = np.where(std > 0, 1 / np.where(std > 0, std, 1.0) ** 2, 0.0)
-        f = structure.increment_expression(air_measured=predictor.air_measured)
-        after = s.x + f if structure.increment else f
-        z = s.x
-        if heading:
-            after = ca.vertcat(after, s.psi + sample_time * s.x[states.index("r")])
-            z = ca.vertcat(s.x, s.psi)
+        step = StepModel(
+            structure, integrator, "simulated" if turns else "measured", predictor.air_measured
+        )
+        s = step.symbolic
+        after = s.after[: self.size]
+        z = ca.vertcat(s.x, *[s.psi] * heading)
         slope = ca.jacobian(after, z)
         by_theta = ca.jacobian(after, s.theta)
         columns = [predictor.columns[i] for i in predictor.parameter_columns]
@@ -130,18 +132,10 @@ class SensitivityProgram:
         if chosen:
             parts.append(ca.jacobian(after, s.d)[:, chosen])
         entry = ca.densify(ca.horzcat(*parts))
-        air = s.air
-        if predictor.air_measured and structure.disturbance == "marine":
-            c, sn = ca.cos(s.psi), ca.sin(s.psi)
-            v = s.x[states.index("v")] if "v" in states else ca.SX(0)
-            air = ca.vertcat(
-                s.x[states.index("u")] - (c * d[2] + sn * d[3]), v - (c * d[3] - sn * d[2])
-            )
-        values = ca.DM(np.concatenate([d, theta]))
-        slope, entry = (
-            ca.substitute(ca.substitute(e, ca.vertcat(s.d, s.theta), values), s.air, air)
-            for e in (ca.densify(slope), entry)
-        )
+        slope, entry = (s.at(e, d, theta, sample_time) for e in (slope, entry))
+        if predictor.air_measured:
+            air = ca.vertcat(*measured_air(structure, ca.SX(d[2]), ca.SX(d[3])))
+            slope, entry = (ca.substitute(e, s.air, air) for e in (slope, entry))
         # what IPOPT's interval functions are built from
         self.symbols = (s.x, s.psi, s.tau)
         self.expressions = (slope, entry)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from experiment_design.regimes import steady_motions
 from experiment_design.schedule import Schedule
+from greybox.model.run.step import Integrator
 from greybox.model.structure import Structure
 from greybox.vessel.vessel import Vessel
 
@@ -39,6 +40,7 @@ def unstable_sentence(
     d: Array,
     schedule: Schedule,
     start: Array | None = None,
+    integrator: Integrator = "euler",
 ) -> str:
     """Return why no steady motion exists, empty where one does.
 
@@ -47,10 +49,10 @@ def unstable_sentence(
     start : ndarray, optional
         (nx + 1,) initial states and heading; by default nearly at rest.
     """
-    steady = steady_motions(vessel, structure, theta, d, schedule, start)
+    steady = steady_motions(vessel, structure, theta, d, schedule, start, integrator)
     if len(steady.x):
         return ""
-    least = least_damping(vessel, structure, theta, d, schedule, start)
+    least = least_damping(vessel, structure, theta, d, schedule, start, integrator)
     names = [n for n in _DAMPING.values() if n in structure.parameters]
     change = f"Lowering one of {', '.join(names)} alone does not help."
     if not names:
@@ -74,6 +76,7 @@ def least_damping(
     d: Array,
     schedule: Schedule,
     start: Array | None = None,
+    integrator: Integrator = "euler",
 ) -> Damping | None:
     """Return the linear damping that falls least before some constant command is settled under.
 
@@ -85,7 +88,8 @@ def least_damping(
     def settles(place: int, value: float) -> bool:
         changed = np.array(theta, float)
         changed[place] = value
-        return len(steady_motions(vessel, structure, changed, d, schedule, start).x) > 0
+        steady = steady_motions(vessel, structure, changed, d, schedule, start, integrator)
+        return len(steady.x) > 0
 
     found: list[Damping] = []
     for name in _DAMPING.values():

@@ -158,7 +158,7 @@ class _Trial:
         psi = np.full(samples + 1, rollout.start[-1])
         free = simulate(
             rollout.structure, rollout.theta, start[:, None], tau[..., None],
-            rollout.sample_time, psi=psi, d=d,
+            rollout.sample_time, psi=psi, d=d, integrator=rollout.integrator,
         )  # fmt: skip
         return np.asarray(free.x[..., 0])
 

@@ -30,6 +30,30 @@ def disturbance_names(kind: DisturbanceKind, states: Sequence[str]) -> tuple[str
     return ()
 
 
+def velocity_through(
+    states: Mapping[str, ca.SX], psi: ca.SX, north: ca.SX, east: ca.SX
+) -> tuple[ca.SX, ca.SX]:
+    """Return the velocity through what itself moves over ground, water or air (5.2), (5.3).
+
+    Parameters
+    ----------
+    states : mapping of str to SX
+        Of which u and v over ground count, as zero where there is none [m/s].
+    psi : SX
+        [rad]
+    north, east : SX
+        Velocity of the water or the air [m/s].
+
+    Returns
+    -------
+    tuple of SX
+        Forward and to starboard.
+    """
+    forward, starboard = ned_to_body(north, east, psi)
+    none = ca.SX(0)
+    return states.get("u", none) - forward, states.get("v", none) - starboard
+
+
 def disturbed_signals(
     kind: DisturbanceKind,
     states: Mapping[str, ca.SX],
@@ -59,12 +83,9 @@ def disturbed_signals(
         return {name: x + d[i] for i, (name, x) in enumerate(states.items())}
     if kind == "none":
         return signals
-    u_c, v_c = ned_to_body(d[0], d[1], psi)
-    u_w, v_w = ned_to_body(d[2], d[3], psi)
-    if "u" in states:
-        signals["u"] = states["u"] - u_c
-        signals["uq"] = states["u"] - u_w if air is None else air[0]
-    if "v" in states:
-        signals["v"] = states["v"] - v_c
-        signals["vq"] = states["v"] - v_w if air is None else air[1]
+    for name, through in zip(("u", "v"), velocity_through(states, psi, d[0], d[1]), strict=True):
+        if name in states:
+            signals[name] = through
+    air = ca.vertcat(*velocity_through(states, psi, d[2], d[3])) if air is None else air
+    signals |= {f"{name}q": air[i] for i, name in enumerate(("u", "v")) if name in states}
     return signals

@@ -13,11 +13,10 @@ from functools import lru_cache
 
 import casadi as ca
 
-from greybox.model.disturbances import WIND
+from greybox.model.disturbances import WIND, velocity_through
 from greybox.model.output import OutputModel
 from greybox.model.run.kernels import accumulate
 from greybox.model.run.step import StepModel
-from greybox.rotation import ned_to_body
 
 
 @dataclass(frozen=True)
@@ -47,8 +46,7 @@ def _step(model: OutputModel) -> _Step:
     air = ca.vertcat(given.get("u_q", none), given.get("v_q", none))
     if model.wind == "output":
         state = {name: z[i] for i, name in enumerate(names)}
-        u_w, v_w = ned_to_body(mean[WIND[0]], mean[WIND[1]], heading)
-        air = ca.vertcat(state["u"] - u_w, state.get("v", none) - v_w)
+        air = ca.vertcat(*velocity_through(state, heading, *[mean[n] for n in WIND]))
     step = StepModel.of_predictor(predictor, "simulated" if turns else "measured")
     after = step(
         z[: len(names)],

@@ -8,7 +8,7 @@ is a derivative or an evaluation of it.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cache
 
 import casadi as ca
 
@@ -35,9 +35,9 @@ class Symbols:
     theta: ca.SX
 
 
-@lru_cache(maxsize=256)
+@cache
 def _symbols(*names: tuple[str, ...]) -> Symbols:
-    """Return the same symbols for equal structures, so that expressions can be shared."""
+    """Return the same symbols for equal structures, as long as expressions of them are kept."""
     states, inputs, disturbances, parameters = (
         ca.vertcat(*[ca.SX.sym(n) for n in group]) for group in names
     )

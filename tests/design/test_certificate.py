@@ -40,7 +40,7 @@ def make_problem(ship, name, duration, kind="D", *, white=False, start=None, pre
     schedule = make_schedule(ship, duration, 10.0, 1.0)
     first = start or ((1.5, 0.0) if nx == 1 else (1.5, 1.2, 0.0, 0.0))
     rollout = Rollout(ship, structure, theta, STILL, np.array(first), 1.0)
-    yardstick = MomentProgram(model, theta, STILL, noise, white=white)
+    yardstick = MomentProgram(model, theta, STILL, noise, 1.0, white=white)
     wanted = tuple(model.parameter_columns)
     scale = np.array([abs(sum(TRUE[t] for t in model.columns[i].terms)) for i in wanted])
     signs = {"u": 1} if nx == 1 else {"u": 1, "v": 1}

@@ -67,6 +67,29 @@ def test_covariance_equals_its_definition(predictor, duration):
                                atol=1e-6)  # fmt: skip
 
 
+def test_the_slopes_are_those_of_the_priors_integrator():
+    """Noise of a sample enters the next equation error as an RK4 step carries it on."""
+    request = make_request(integrator="rk4", d=np.array([0.2, -0.1, 1.0, 0.5]))
+    request = replace(request, noise=replace(request.noise, heading=0.01))
+    problem, _, motion = _random_motion(request)
+    k = 7
+    x, tau = motion.state[0, k, :4], motion.tau[0, k]
+    yardstick = problem.scenarios[0].yardstick
+    _, slopes = yardstick.regressors(x[None, None, :3], x[None, None, 3], tau[None, None])
+    for j in range(4):
+        ends = []
+        for step in (1e-6, -1e-6):
+            moved = x.copy()
+            moved[j] += step
+            run = simulate(
+                request.structure, request.theta, moved[:3], tau[None], 1.0, psi0=moved[3],
+                d=request.d, integrator="rk4",
+            )  # fmt: skip
+            ends.append(run.x[0, 1])
+        expected = (ends[0] - ends[1]) / 2e-6
+        np.testing.assert_allclose(slopes[:, j, 0, 0], expected, rtol=1e-6, atol=1e-9)
+
+
 def test_white_residuals_give_the_gram_matrix():
     request = make_request(estimator="iv-white")
     problem, _, motion = _random_motion(request)
@@ -78,13 +101,18 @@ def test_white_residuals_give_the_gram_matrix():
     np.testing.assert_allclose(ratio / ratio[0, 0], np.eye(len(mine)), atol=1e-6)
 
 
-@pytest.mark.parametrize("estimator", ["iv", "iv-white"])
-@pytest.mark.parametrize("kind", ["D", "A", "E", "c"])
-def test_gradient_equals_finite_differences(kind, estimator):
+@pytest.mark.parametrize(
+    ("kind", "estimator", "integrator"),
+    [
+        *((k, e, "euler") for k in ("D", "A", "E", "c") for e in ("iv", "iv-white")),
+        ("D", "iv", "rk4"),
+    ],
+)
+def test_gradient_equals_finite_differences(kind, estimator, integrator):
     request = make_request(
         criterion=kind, combination={"Yvv": 1.0, "Ymu": 3.0} if kind == "c" else {},
         wanted=("Yvv", "Yv", "Ymu", "Nmu") if kind != "c" else (), estimator=estimator,
-        vessel=make_request().vessel, predictor="basic",
+        vessel=make_request().vessel, predictor="basic", integrator=integrator,
     )  # fmt: skip
     problem, unit, _ = _random_motion(request)
     value, _, slope, _ = problem.gradient(unit[0])

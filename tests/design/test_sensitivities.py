@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from designs import thesis_model
 
+from experiment_design import Wishes, predict_precision, prepare_request
 from experiment_design.criteria import Criterion
 from experiment_design.limits import LimitProgram, TrialLimits
 from experiment_design.problem import Scenario, TrialProblem
@@ -17,6 +20,8 @@ from experiment_design.sensitivities import SensitivityProgram
 from greybox.errors import UsageError
 from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import build_predictor
+from greybox.model.simulation import simulate
+from greybox.vessel.force import generalised_force
 
 REGIME = (("u", (1,)), ("v", (1,)), ("r", (1, -1)))
 START = np.array([1.5, 1.2, 0.0, 0.3])
@@ -29,8 +34,8 @@ def noise_of(structure, heading=0.002):
     )
 
 
-def rollout_of(ship, structure, theta, d, start=START):
-    return Rollout(ship, structure, theta, d, start, 1.0)
+def rollout_of(ship, structure, theta, d, start=START, integrator="euler"):
+    return Rollout(ship, structure, theta, d, start, 1.0, integrator)
 
 
 def random_commands(ship, schedule, seed=0):
@@ -40,18 +45,21 @@ def random_commands(ship, schedule, seed=0):
 
 @pytest.mark.parametrize("heading", [0.0, 0.002])
 @pytest.mark.parametrize("d", [np.zeros(4), np.array([0.3, -0.2, 2.0, -1.0])])
-def test_sensitivities_of_simulations(ship, thesis, true_theta, d, heading):
+@pytest.mark.parametrize("integrator", ["euler", "rk4"])
+def test_sensitivities_of_simulations(ship, thesis, true_theta, d, heading, integrator):
     schedule = make_schedule(ship, 60, 10, 1.0)
     predictor = build_predictor(thesis, "basic", REGIME)
     program = SensitivityProgram(
-        predictor, true_theta, d, noise_of(thesis, heading), 1.0, means=MEANS
-    )
+        predictor, true_theta, d, noise_of(thesis, heading), 1.0, means=MEANS,
+        integrator=integrator,
+    )  # fmt: skip
     commands = random_commands(ship, schedule)
 
     def states(theta, d, start):
-        return rollout_of(ship, thesis, theta, d, start).run(commands).state[0, :, : program.size]
+        rollout = rollout_of(ship, thesis, theta, d, start, integrator)
+        return rollout.run(commands).state[0, :, : program.size]
 
-    motion = rollout_of(ship, thesis, true_theta, d).run(commands)
+    motion = rollout_of(ship, thesis, true_theta, d, integrator=integrator).run(commands)
     s = program.sensitivities(motion.state[:, :-1, :3], motion.state[:, :-1, 3], motion.tau)[0]
     assert s.shape == (61, 3 + (heading > 0 or d.any()), len(program.names))
     for j, name in enumerate(program.names):
@@ -134,3 +142,45 @@ def test_misuse(ship, thesis, true_theta):
         SensitivityProgram(
             predictor, true_theta, np.zeros(4), noise_of(thesis), 1.0, means=("tide",)
         )
+
+
+@pytest.mark.parametrize("estimator", ["iv", "oe"])
+def test_predicted_precision_knows_the_integrator(ship, thesis, true_theta, estimator):
+    """Of an RK4 prior it is that of the RK4 motion, here by differences of its simulation."""
+    precise = replace(thesis_model(), integrator="rk4", noise=noise_of(thesis, 0.0))
+    wishes = Wishes(
+        120.0, regime="u+v+", start=START, predictor="basic", estimator=estimator,
+        margin_u=0.0, margin_v=0.0,
+    )  # fmt: skip
+    requests = [
+        prepare_request(m, wishes).request for m in (precise, replace(precise, integrator="euler"))
+    ]
+    schedule = requests[0].schedule
+    commands = random_commands(ship, schedule)[0]
+    plan = dict(zip(schedule.commands, commands.T, strict=True))
+    found, euler = (predict_precision(r, [plan]) for r in requests)
+    assert np.abs(found.std / euler.std - 1).max() > 1e-3
+    if estimator == "iv":
+        return
+    made = generalised_force(ship, plan)
+    tau = np.column_stack([made[n] for n in thesis.inputs])
+
+    def measured(theta, start):
+        run = simulate(thesis, theta, start[:3], tau, 1.0, psi0=start[3], integrator="rk4")
+        return np.column_stack([run.x[0], run.psi[0]]).ravel()
+
+    predictor = requests[0].build_predictor()
+    moves = [(np.zeros(18), start) for start in np.eye(4)]
+    for i in reversed(predictor.parameter_columns):
+        places = [thesis.index(t) for t in predictor.columns[i].terms]
+        move = np.zeros(18)
+        move[places] = true_theta[places] / true_theta[places].sum()
+        moves.insert(0, (move, np.zeros(4)))
+    noise = requests[0].noise
+    rows = []
+    for theta, start in moves:
+        ends = [measured(true_theta + s * theta, START + s * start) for s in (1e-6, -1e-6)]
+        rows.append((ends[0] - ends[1]) / 2e-6 / np.tile([*noise.measurement, noise.heading], 121))
+    expected = np.linalg.inv(np.array(rows) @ np.transpose(rows))
+    std = np.sqrt(np.diag(expected))[: len(found.names)]
+    np.testing.assert_allclose(found.std, std, rtol=1e-4)

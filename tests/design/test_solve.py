@@ -48,7 +48,7 @@ def problem(
     schedule = make_schedule(vessel, duration, hold, 1.0)
     d = np.array([current, -current / 2, 0.0, 0.0])
     rollout = Rollout(vessel, thesis, theta, d, np.array([1.5, 1.2, 0.0, 0.0]), 1.0)
-    yardstick = MomentProgram(columns, theta, d, noise, white=white)
+    yardstick = MomentProgram(columns, theta, d, noise, 1.0, white=white)
     wanted = tuple(columns.parameter_columns)
     weights = np.linspace(-1, 1, len(wanted))
     criterion = Criterion(kind, wanted, np.abs(theta[list(range(len(wanted)))]), weights)

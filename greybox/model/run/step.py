@@ -87,12 +87,10 @@ class SymbolicStep:
         simulated = self.after.numel() > self.x.numel()
         return ca.vertcat(self.x, self.psi) if simulated else self.x
 
-    def at(self, expression: ca.SX, d: Array, theta: Array, air: ca.SX | None = None) -> ca.SX:
-        """Return an expression at known means and coefficients, and a known wind."""
-        found = ca.substitute(
-            ca.densify(expression), ca.vertcat(self.d, self.theta), ca.vertcat(ca.DM(d), theta)
-        )
-        return found if air is None else ca.substitute(found, self.air, air)
+    def at(self, expression: ca.SX, d: Array, theta: Array, dt: float) -> ca.SX:
+        """Return an expression, dense, at known means, coefficients and sample time."""
+        symbols = ca.vertcat(self.d, self.theta, self.dt)
+        return ca.substitute(ca.densify(expression), symbols, ca.vertcat(ca.DM(d), theta, dt))
 
 
 @dataclass(frozen=True)
