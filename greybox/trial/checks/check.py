@@ -171,7 +171,7 @@ def _signal_quality(recording: Recording, vessel: Vessel) -> _Log:
             *coarse_findings(measured),
         ]
     )
-    log.add(jump_findings(_independent(log.mended)))
+    log.add(jump_findings(_independent(log.mended), vessel))
     if not {"x_n", "y_n"} <= set(whole.names):
         missing = "needs positions, which the log has not"
         log.say([Outcome(i, "cannot tell", missing) for i in ("position_hold", "position_jump")])

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,26 +16,40 @@ from greybox.trial.checks.signal_quality import clean
 from greybox.trial.gaps import HOLE, usual_step
 from greybox.trial.raw_log import Recording
 from greybox.trial.steps import mend
+from greybox.vessel.force import generalised_force
+from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 # samples on both sides of a jump that may say what it should have been
-_BESIDE = (6, 9, 13, 20)
-# a jump in standard deviations of what is predicted
-_JUMP = 5.5
+_BESIDE = (4, 6, 9, 13, 20, 30)
+# what wanders at random beside white noise: the position itself, or its rate
+_WANDERS = (0, 1)
+# reach of what says so, in the times over which it decays
+_REACH = 4.0
+# chance that noise makes one jump in a log
+_CHANCE = 0.002
 # steps that come as often as this are the receiver's or the ship's habit: so many in a log, a
-# tenth of its separate steps or at most as many, or one a minute [s]; a jump is twice as large
-_FEW, _OFTEN, _MANY, _MINUTE, _ABOVE = 5, 0.1, 10, 60.0, 2.0
+# tenth of its separate steps or at most as many, or one a minute [s]; a jump is so much larger
+_FEW, _OFTEN, _MANY, _MINUTE, _ABOVE = 5, 0.1, 10, 60.0, 1.8
+# lags by which velocities answer forces [samples], and samples for each of their coefficients
+_LAGS, _LEAST_SAMPLES = (1.5, 6.0, 30.0), 12
+# scatter beyond which a sample says no more of them; share of the clearest combination below
+# which another says too little
+_BOUND, _SAME = 4.0, 1e-3
 # samples after which a position that returns is no outlier any more
 _RETURN = 3
+_OFF = (-3, -2, -1, 1, 2, 3)
+# steps of a rounded position below which it may be rounding
+_ROUNDINGS = 1.5
 # share of a jump that falls between two samples, and that lasts
 _AT_ONCE, _LASTS = 0.5, 0.45
 # time within which a receiver's filter comes back from its own correction, and time on both
 # sides of a jump that must differ by it [s]
 _SETTLED, _LONG = 2.0, 5.0
-# samples that say so at least, and share of a jump above which their scatter says nothing
-_LEAST_LASTING, _VAGUE = 10, 0.25
+# samples that say so on one side, and share of a jump above which their scatter says nothing
+_LASTING, _VAGUE = (10, 15, 20, 30), 0.25
 # places where it is tried how well positions are predicted so long
 _TRIED = 40
 # samples over which a speed is the median
@@ -45,17 +61,19 @@ _FINEST = 1e-3
 _MOST_JUMPS = 200
 
 
-def jump_findings(recording: Recording) -> list[Finding]:
+def jump_findings(recording: Recording, vessel: Vessel | None = None) -> list[Finding]:
     """Find positions that step because recordings were joined or the origin moved.
 
     The way from sample to sample is predicted by its neighbours in earth axes, or in body
-    axes, and by the velocities. A jump is what stands out far beyond the log's own scatter,
-    falls between two samples and lasts.
+    axes beside what thrusters and turning explain, and by the velocities. A jump is what stands
+    out far beyond the log's own scatter, falls between two samples and lasts.
 
     Parameters
     ----------
     recording : Recording
         With positions in order of time, without outliers and held samples.
+    vessel : Vessel, optional
+        Whose thrusters the recording tells of.
 
     Returns
     -------
@@ -66,7 +84,7 @@ def jump_findings(recording: Recording) -> list[Finding]:
     if track is None:
         return []
     found = []
-    for jump in _jumps(track, recording):
+    for jump in _jumps(track, recording, vessel):
         half = 1.96 * jump.error
         north, east = jump.size
         size = float(np.hypot(north, east))
@@ -114,7 +132,7 @@ class _Jump:
     error: float
 
 
-def _jumps(track: Track, recording: Recording) -> list[_Jump]:
+def _jumps(track: Track, recording: Recording, vessel: Vessel | None) -> list[_Jump]:
     """Return the jumps of positions, in order of time."""
     t, p = _messages(track)
     if len(t) < 4 * _BESIDE[0] + 1:
@@ -138,10 +156,14 @@ def _jumps(track: Track, recording: Recording) -> list[_Jump]:
     # where messages come unevenly, each may be a tick of the table late
     uneven = np.mean(np.abs(dt - period) > 0.5 * min(tick, period)) > _UNEVEN
     slip = speed * tick if uneven else np.zeros_like(way)
-    search = _Search(whole, slip, lasting, vague, long, float(t[-1] - t[0]))
-    zero, rounded = np.zeros(len(way)), max(track.step) / np.sqrt(12)
+    seconds, rounding = float(t[-1] - t[0]), max(track.step)
+    search = _Search(whole, slip, lasting, vague, long, seconds, rounding)
+    zero, rounded = np.zeros(len(way)), rounding / np.sqrt(12)
     # in body axes a turn is no bend
     alone = [_view(way, x, whole, rounded) for x in (zero, psi) if x is not None]
+    if psi is not None and vessel is not None and alone[-1] is not None:
+        pushes = _pushes(recording, vessel, middle)
+        alone += [_beside(alone[-1], pushes, whole, rounded)] if pushes is not None else []
     views = sorted((v for v in alone if v is not None), key=_spread)[:1]
     if rest is not None:
         views += [v for v in [_view(rest, zero, whole, rounded)] if v is not None]
@@ -203,6 +225,8 @@ class _View:
         (N,) from earth to these axes [rad].
     halves : tuple of int
         Samples on one side that predict them, from best to fewest.
+    wanders : int
+        What wanders beside the noise: 0 for the position, 1 for its rate.
     level : ndarray
         (N,) which of `halves` is free of holes and ends, its length where none is.
     scale : ndarray
@@ -214,6 +238,7 @@ class _View:
     way: Array
     psi: Array
     halves: tuple[int, ...]
+    wanders: int
     level: NDArray[np.int64]
     scale: Array
     spread: float
@@ -224,44 +249,103 @@ class _View:
         for k, half in enumerate(self.halves):
             here = self.level == k
             if here.any():
-                size[here] = _filtered(way, _kernel(half))[here]
+                size[here] = _filtered(way, _kernel(half, self.wanders))[here]
         return size
+
+    def lasts(self, way: Array, whole: Mask, k: int) -> bool:
+        """Whether a step at increment `k` is likelier than samples beside it that lie off."""
+        around = max(self.halves[0], _LASTING[0])
+        low, high = max(k - around, 0), min(k + around, len(way) - 1)
+        holes = np.flatnonzero(~whole[low : high + 1]) + low
+        around = min([k - low, high - k, *(abs(holes - k) - 1)]) + 1
+        if around <= _RETURN:
+            return False
+        z = np.vstack([[0.0, 0.0], np.cumsum(way[k - around + 1 : k + around], axis=0)])
+        at = np.arange(2 * around) - around
+        shapes = np.column_stack(
+            [at >= 0, *((at >= min(m, 0)) & (at < max(m, 0)) for m in _OFF)]
+        ).astype(float)
+        weighted = _precision(self.halves[0], self.wanders, around) @ shapes
+        gain = np.sum((weighted.T @ z) ** 2, axis=1) / np.sum(weighted * shapes, axis=0)
+        return bool(np.argmax(gain) == 0)
 
 
 def _spread(view: _View) -> float:
     return view.spread
 
 
-def _view(way: Array, psi: Array, whole: Mask, rounded: float) -> _View | None:
+def _pushes(recording: Recording, vessel: Vessel, t: Array) -> Array | None:
+    """Return the generalised forces and the yaw rate at some times, (N, q); None without them."""
+    signals = {c: clean(recording[c]) for c in (*vessel.commands, "r") if c in recording}
+    if len(signals) <= len(vessel.commands) or any(len(at) < 2 for at, _ in signals.values()):
+        return None
+    values = {c: np.interp(t, at, value) for c, (at, value) in signals.items()}
+    turning = values.pop("r")
+    return np.column_stack([*generalised_force(vessel, values).values(), turning])
+
+
+def _beside(view: _View, pushes: Array, whole: Mask, rounded: float) -> _View | None:
+    """Return a view in body axes beside what thrusters and turning explain of it.
+
+    The velocities answer forces, and the turning of the ship's own momentum, as lags of
+    unknown time do: sums of first-order lags. Their coefficients are those of generalised
+    least squares, with the view's own filter as weight.
+    """
+    from scipy.signal import lfilter
+
+    turning = pushes[:, -1:]
+    moved = np.column_stack([pushes[:, :-1], _smooth(view.way) * turning])
+    lags = np.exp(-1 / np.array(_LAGS))
+    columns = [lfilter([1 - a], [1, -a], moved - moved[0], axis=0) for a in lags]
+    still = [turning, np.cos(view.psi)[:, None], np.sin(view.psi)[:, None], np.ones_like(turning)]
+    x = np.column_stack(columns + still)
+    clear = view.level == 0
+    if clear.sum() < _LEAST_SAMPLES * x.shape[1]:
+        return None
+    x /= np.maximum(np.sqrt(np.mean(x[clear] ** 2, axis=0)), 1e-12)
+    step = _kernel(view.halves[0], view.wanders)
+    bound = _BOUND * view.scale[clear]
+    left = np.clip(_filtered(view.way, step)[clear], -bound, bound)
+    gram = x[clear].T @ _filtered(x, step)[clear]
+    found = np.linalg.lstsq(0.5 * (gram + gram.T), x[clear].T @ left, rcond=_SAME)[0]
+    rest = np.where(whole[:, None], view.way - x @ found, 0.0)
+    made = _view(rest, view.psi, whole, rounded, turned=True)
+    fitted = np.sqrt(1 - x.shape[1] / clear.sum())
+    return None if made is None else replace(made, spread=made.spread / fitted)
+
+
+def _view(
+    way: Array, psi: Array, whole: Mask, rounded: float, *, turned: bool = False
+) -> _View | None:
     """Return increments in axes turned by psi, with the windows that leave the least scatter.
 
     `rounded` is the standard deviation of the rounding of a position [m].
     """
-    if psi.any():
+    if psi.any() and not turned:
         way = np.column_stack(ned_to_body(way[:, 0], way[:, 1], psi))
     made = []
-    for half in _BESIDE:
+    for wanders, half in product(_WANDERS, _BESIDE):
         if 4 * half > len(way):
             continue
-        step = _kernel(half)
+        step = _kernel(half, wanders)
         clear = np.convolve(whole, np.ones(len(step)), "same") > len(step) - 0.5
         if not clear.any():
             continue
         least = max(_FINEST, rounded) * float(np.linalg.norm(np.diff(step, prepend=0, append=0)))
         scale = np.maximum(_scale(_filtered(way, step), clear, half), least)
         spread = float(np.quantile(np.hypot(*scale[clear].T), 0.9))
-        made.append((spread, half, clear, scale))
+        made.append((spread, half, clear, scale, wanders))
     if not made:
         return None
-    best = int(np.argmin([m[0] for m in made]))
+    best = min(made, key=lambda m: m[0])
     # near holes and ends fewer samples have to do
-    chosen = made[best::-1]
+    chosen = [m for m in reversed(made) if m[4] == best[4] and m[1] <= best[1]]
     level = np.full(len(way), len(chosen))
     scale = np.full_like(way, np.inf)
     for k in reversed(range(len(chosen))):
         clear = chosen[k][2]
         level[clear], scale[clear] = k, chosen[k][3][clear]
-    return _View(way, psi, tuple(m[1] for m in chosen), level, scale, made[best][0])
+    return _View(way, psi, tuple(m[1] for m in chosen), best[4], level, scale, best[0])
 
 
 @dataclass(frozen=True)
@@ -281,6 +365,8 @@ class _Search:
     long : _Window
     seconds : float
         Length of the log.
+    rounding : float
+        Step of rounded positions [m], 0 where there is none.
     """
 
     whole: Mask
@@ -289,12 +375,15 @@ class _Search:
     vague: float
     long: _Window
     seconds: float
+    rounding: float
 
     def jumps(self, view: _View) -> dict[int, tuple[Array, float]]:
         """Return size north and east, and standard error, of the jumps by increment."""
         way, lasting = view.way.copy(), self.lasting.copy()
         clear = view.level < len(view.halves)
         most = view.halves[0]
+        windows = [_Window(half, _RETURN) for half in _LASTING]
+        vague = [_vagueness(way, self.whole, w) for w in windows]
         slip = np.column_stack(ned_to_body(self.slip[:, 0], self.slip[:, 1], view.psi))
         found: dict[int, Array] = {}
 
@@ -309,9 +398,14 @@ class _Search:
             lasting[k] -= _to_earth(jump, view.psi[k])
 
         def holds(k: int, size: Array) -> bool:
-            if not _at_once(way, k, size):
+            # rounding alone makes steps of its own size
+            if _norm(size) < _ROUNDINGS * self.rounding or not _at_once(way, k, size):
                 return False
-            if not _Window(max(most, _LEAST_LASTING), _RETURN).lasts(way, self.whole, k, size):
+            if not view.lasts(way, self.whole, k):
+                return False
+            # a receiver that wanders steps over one window and not over another
+            sharp = [w for w, v in zip(windows, vague, strict=True) if v <= _VAGUE * _norm(size)]
+            if not all(w.lasts(way, self.whole, k, size) for w in sharp):
                 return False
             if self.vague > _VAGUE * _norm(size):
                 return True
@@ -320,7 +414,9 @@ class _Search:
         size, distance = look()
         peaks = _peaks(distance, most)
         often = int(max(_FEW, min(_OFTEN * len(peaks), _MANY), self.seconds / _MINUTE))
-        least = max(_JUMP, _ABOVE * float(peaks[min(often, len(peaks)) - 1]))
+        # the length of two normal components is beyond x by a chance of exp(-x²/2)
+        noise = np.sqrt(2 * np.log(len(way) / _CHANCE))
+        least = max(noise, _ABOVE * float(peaks[min(often, len(peaks)) - 1]))
         for _ in range(_MOST_JUMPS):
             k = int(np.argmax(distance))
             if distance[k] < least:
@@ -390,14 +486,19 @@ def _at_once(way: Array, k: int, size: Array) -> bool:
 
 def _steadier(way: Array, rest: Array | None, whole: Mask, window: _Window) -> tuple[Array, float]:
     """Return what predicts positions best over a window, neighbours or velocities, and how well."""
-    at = np.linspace(window.half, len(way) - window.half - 1, _TRIED).astype(int)
     best: tuple[Array, float] = (way, np.inf)
     for x in (way, rest):
-        if x is not None and at[0] < at[-1]:
-            size = float(np.median([_norm(window.least(x, whole, k)) for k in at]))
-            if size < best[1]:
-                best = (x, size)
+        if x is not None and (size := _vagueness(x, whole, window)) < best[1]:
+            best = (x, size)
     return best
+
+
+def _vagueness(way: Array, whole: Mask, window: _Window) -> float:
+    """Return what is usually left of nothing over a window [m]."""
+    at = np.linspace(window.half, len(way) - window.half - 1, _TRIED).astype(int)
+    if at[0] >= at[-1]:
+        return float(np.inf)
+    return float(np.median([_norm(window.least(way, whole, k)) for k in at]))
 
 
 def _norm(step: Array) -> float:
@@ -409,12 +510,27 @@ def _to_earth(step: Array, psi: float) -> Array:
     return np.array([c * step[0] - s * step[1], s * step[0] + c * step[1]])
 
 
-def _kernel(half: int) -> Array:
-    """Return what gives the step in the middle of increments by least squares beside a cubic."""
-    at = np.arange(2 * half) - half + 0.5
-    design = np.column_stack([at > 0, *((at / half) ** k for k in range(4))])
+@lru_cache(maxsize=32)
+def _kernel(half: int, wanders: int) -> Array:
+    """Return what gives the step in the middle of increments by generalised least squares."""
+    step = _precision(half, wanders, half) @ (np.arange(2 * half) >= half)
     # of increments instead of samples
-    return np.asarray(np.cumsum(np.linalg.pinv(design)[0][::-1])[::-1][1:])
+    return np.asarray(np.cumsum((step / step[half:].sum())[::-1])[::-1][1:])
+
+
+@lru_cache(maxsize=32)
+def _precision(half: int, wanders: int, around: int) -> Array:
+    """Return the inverse covariance of the positions up to `around` samples on both sides.
+
+    They are a random walk (`wanders` 0) or its integral (1), started anywhere, beside white noise
+    of unit variance, in the ratio at which what is `half` samples away says nothing any more:
+    what a smoothing spline leaves (Wahba, 1978).
+    """
+    bend = np.diff(np.eye(2 * around), wanders + 1, axis=0)
+    stiffness = (half / _REACH) ** (2 * wanders + 2)
+    return np.asarray(
+        np.eye(2 * around) - np.linalg.inv(np.eye(2 * around) + stiffness * bend.T @ bend)
+    )
 
 
 def _filtered(way: Array, kernel: Array) -> Array:
@@ -428,10 +544,17 @@ def _peaks(distance: Array, half: int) -> Array:
     return np.sort(distance[distance == maximum_filter1d(distance, 2 * half + 1)])[::-1]
 
 
-def _median(rate: Array) -> Array:
+def _median(rate: Array, size: int = _SPEED) -> Array:
     from scipy.ndimage import median_filter
 
-    return np.column_stack([median_filter(x, size=_SPEED, mode="nearest") for x in rate.T])
+    return np.column_stack([median_filter(x, size=size, mode="nearest") for x in rate.T])
+
+
+def _smooth(way: Array) -> Array:
+    """Return increments without noise, and without one that stands out."""
+    from scipy.ndimage import gaussian_filter1d
+
+    return np.asarray(gaussian_filter1d(_median(way, 5), 2.0, axis=0, mode="nearest"))
 
 
 def _scale(size: Array, clear: Mask, half: int) -> Array:
