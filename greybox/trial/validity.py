@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from greybox.trial.log import TrialLog
+from greybox.trial.raw_log import shortened
 from greybox.vessel.conditions import UNITS, Conditions, Value, spelled, words
 
 # field -> values of the logs of a model, ascending, each once
@@ -58,7 +59,8 @@ class ConditionDifference:
         for log, value in self.logs:
             by_value.setdefault(value, []).append(log)
         shown = "; ".join(
-            f"{spelled(self.condition, v)} in {_some(logs)}" for v, logs in by_value.items()
+            f"{spelled(self.condition, v)} in {shortened(logs, _MOST_NAMED)}"
+            for v, logs in by_value.items()
         )
         if not self.model:
             return (
@@ -190,9 +192,3 @@ def _differ(name: str, one: Any, other: Any, draught: float | None) -> bool:
 def _ends(values: tuple[Any, ...]) -> tuple[Any, ...]:
     """Return least and greatest number, or all words."""
     return values if isinstance(values[0], str) or len(values) < 2 else (values[0], values[-1])
-
-
-def _some(names: list[str]) -> str:
-    more = len(names) - _MOST_NAMED
-    shown = ", ".join(names[:_MOST_NAMED])
-    return f"{shown} and {more} more" if more > 0 else shown

@@ -179,11 +179,10 @@ def integrate(rate: Array, motion: Motion) -> Array:
 
 def whiten(z: Array, gain: float, motion: Motion) -> Array:
     """Return the innovations of the local-level model along axis 0, stretch by stretch."""
-    steps = np.diff(z, axis=0, prepend=0.0)
-    out = np.empty_like(z)
+    out = z.copy()
     for a, b in motion.stretches:
-        steps[a] = z[a]
-        out[a:b] = decay(1.0 - gain, steps[a:b])
+        out[a + 1 : b] -= z[a : b - 1]
+        out[a:b] = decay(1.0 - gain, out[a:b])
     return out
 
 

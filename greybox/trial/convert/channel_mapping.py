@@ -19,7 +19,7 @@ from greybox.trial.convert.merge import merge
 from greybox.trial.convert.settle_axes import settle_axes
 from greybox.trial.convert.time_scale import TimeScale, time_scale
 from greybox.trial.log import Provenance
-from greybox.trial.raw_log import Recording, Signal, SourceFile
+from greybox.trial.raw_log import Recording, Signal, SourceFile, shortened
 from greybox.trial.readers.formats import open_raw
 from greybox.trial.readers.table import Batch, TableFile, read_columns
 from greybox.trial.readers.topic_files import STAMP, TopicTable
@@ -310,8 +310,7 @@ def batch_recording(
     used |= {c for made, of in parts.items() if made in used for c in of}
     ignored = [c for c in table.columns if c not in used]
     if ignored:
-        more = f" and {len(ignored) - 12} more" if len(ignored) > 12 else ""
-        notes.append(f"columns not used: {', '.join(ignored[:12])}{more}")
+        notes.append(f"columns not used: {shortened(ignored, 12)}")
     if alone and not set(assigned) & MOTION:
         notes.append(_NO_MOTION)
     return Recording(table.path.stem, tuple(signals), text, scale.epoch, notes=tuple(notes))

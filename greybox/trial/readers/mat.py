@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 
 from greybox.errors import LogError, suggestion
 from greybox.files import sha256
-from greybox.trial.raw_log import Array, Recording, Signal, SourceFile
+from greybox.trial.raw_log import Array, Recording, Signal, SourceFile, free_name, shortened
 from greybox.trial.readers.limits import limits
 from greybox.trial.readers.mat_tree import Tree, Unreadable
 from greybox.trial.readers.matfile import load_tree
-from greybox.trial.readers.names import free_name, shortened
 from greybox.units import UNITS, find_unit, is_unix_time, spelled_unit, time_unit, unix_unit
 
 # settings among the notes

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from greybox.channels import CHANNELS
 from greybox.errors import LogError, suggestion
 from greybox.files import sha256
-from greybox.trial.raw_log import Array, Recording, Signal, SourceFile
+from greybox.trial.raw_log import Array, Recording, Signal, SourceFile, free_name, shortened
 from greybox.trial.readers.limits import limits
-from greybox.trial.readers.names import free_name, shortened
 from greybox.trial.readers.ros.axes import HANDLERS, Fields, SkippedMessageError, unsure_fields
 from greybox.trial.readers.ros.bags import read_messages, storage_files
 from greybox.trial.readers.ros.messages import (
