@@ -49,6 +49,7 @@ import greybox as gb
 from greybox.errors import GreyboxError
 from greybox.estimation.estimate import estimate_iv, estimate_ls
 from greybox.estimation.free_run import fit_free_runs
+from greybox.estimation.informative import regime_of
 from greybox.estimation.output_error import OutputErrorOptions, estimate_oe
 from greybox.estimation.output_setup import measured, output_model, output_predictor
 from greybox.estimation.result import Estimate
@@ -65,7 +66,6 @@ from greybox.trial.log import TrialLog
 from greybox.trial.store import write_log
 from greybox.validation.choose import estimate_requested
 from greybox.validation.fit import average_fit, run_model
-from greybox.validation.informative import regime_of
 from greybox.validation.request import Request
 from greybox.vessel.force import force_inputs
 

@@ -28,7 +28,7 @@ from experiment_design.schedule import make_schedule
 from experiment_design.stability import unstable_sentence
 from greybox.errors import InfeasibleError, StructureError, UsageError
 from greybox.model.model import ManoeuvringModel
-from greybox.model.predictor import PREDICTORS
+from greybox.model.predictor_kinds import PREDICTORS
 from greybox.model.structure import Structure
 from greybox.vessel.actuation import with_actuators_of
 from greybox.vessel.vessel import Vessel

@@ -15,6 +15,8 @@ from greybox.commands.common import (
     read_logs,
     say,
 )
+from greybox.estimation.registry import ESTIMATORS
+from greybox.model.predictor_kinds import PREDICTORS
 from greybox.one_thread import one_thread
 
 if TYPE_CHECKING:
@@ -50,12 +52,12 @@ def _add_model(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("what is estimated, and how")
     group.add_argument(
         "--method",
-        choices=("ls", "iv", "oe"),
-        help="least squares, instrumental variables, output error; by default chosen, and said why",
+        choices=tuple(ESTIMATORS),
+        help=f"{', '.join(e.words for e in ESTIMATORS.values())}; by default chosen, and said why",
     )
     group.add_argument(
         "--predictor",
-        choices=("basic", "augmented", "wind", "basic+wind"),
+        choices=tuple(PREDICTORS),
         help="which disturbances are captured or measured; by default chosen",
     )
     group.add_argument(

@@ -17,6 +17,7 @@ from greybox.errors import ExcitationError
 from greybox.estimation.credibility import Evidence, assess, convergence, weigh
 from greybox.estimation.output_error import one_step_errors
 from greybox.estimation.output_setup import measured, output_model
+from greybox.estimation.registry import ESTIMATORS
 from greybox.estimation.result import Estimate
 from greybox.estimation.verdict import NoRegression, TestResult, refused
 from greybox.model.predictor import Predictor, build_predictor
@@ -77,9 +78,10 @@ def judge_estimate(
         covariance,
         _residuals(estimate, regression, logs, keep, zero_mean),
         keep,
-        estimate.method if estimate.method == "oe" or not estimate.prefilter else "refined iv",
+        estimate.method,
         zero_mean,
         margins,
+        solved=False,
     )
     own = {t.name: t for t in estimate.tests}
     tests: list[TestResult] = [own.pop(t.name, t) for t in assess(evidence)]
@@ -96,7 +98,7 @@ def _regression_predictor(estimate: Estimate) -> Predictor:
     A free run has the current in the model; a regression captures it by columns.
     """
     own = estimate.predictor
-    if estimate.method != "oe":
+    if not ESTIMATORS[estimate.method].free_run:
         return own
     return build_predictor(own.structure, own.kind, own.regime)
 
@@ -128,7 +130,8 @@ def _residuals(
     predictor = estimate.predictor
     states = predictor.structure.states
     found: list[list[Array]] = [[] for _ in states]
-    model = output_model(predictor, estimate.sample_time) if estimate.method == "oe" else None
+    free_run = ESTIMATORS[estimate.method].free_run
+    model = output_model(predictor, estimate.sample_time) if free_run else None
     current = {n: v for n, v, _ in estimate.current}
     for e, log, rows in zip(regression.experiments, logs, keep, strict=True):
         if model is not None:

@@ -22,6 +22,7 @@ from greybox.estimation.bound import iv_bound
 from greybox.estimation.innovations import FilterRuns
 from greybox.estimation.output_error import log_rows, without_start
 from greybox.estimation.output_setup import measured, output_model, output_predictor
+from greybox.estimation.registry import ESTIMATORS
 from greybox.estimation.result import Estimate, Limit
 from greybox.estimation.shooting import Measured, Segments, cut
 from greybox.model.noise import NoiseLevels
@@ -178,7 +179,7 @@ def limits_of(estimate: Estimate, logs: Sequence[TrialLog]) -> tuple[dict[str, L
         found["cramer_rao"] = _limit(names, bound, covariance)
     except GreyboxError as error:
         trouble.append(str(error))
-    if estimate.method != "oe":
+    if not ESTIMATORS[estimate.method].free_run:
         try:
             theta = estimate.structure_theta()
             whole = iv_bound(estimate.predictor, logs, theta, estimate.noise)
@@ -192,7 +193,8 @@ def _parameter_bound(estimate: Estimate, logs: Sequence[TrialLog], noise: NoiseL
     """Return the Cramér-Rao bound of the estimate's parameters, in their order."""
     own = estimate.predictor
     predictor = own
-    if estimate.method != "oe":
+    free_run = ESTIMATORS[estimate.method].free_run
+    if not free_run:
         predictor = output_predictor(own.structure, own.kind, own.regime)
     turns = "r" in own.structure.states and own.structure.disturbance == "marine"
     seen = turns and noise.heading > 0 and all("psi" in log for log in logs)
@@ -201,7 +203,7 @@ def _parameter_bound(estimate: Estimate, logs: Sequence[TrialLog], noise: NoiseL
     theta = dict(zip(own.structure.parameters, estimate.structure_theta(), strict=True))
     for i in predictor.parameter_columns:
         p[i] = theta[predictor.columns[i].terms[0]]
-    if estimate.method == "oe":
+    if free_run:
         p[: len(predictor.columns)] = estimate.theta
     current = {n: value for n, value, _ in estimate.current}
     for i, name in enumerate(model.means):

@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.estimation.registry import ESTIMATORS
 from greybox.estimation.verdict import TestResult
 from greybox.trial.log import TrialLog
 
@@ -37,7 +38,8 @@ def assess_loop(
     Parameters
     ----------
     logs : sequence of TrialLog
-    method : {"iv", "ls", "oe"}
+    method : str
+        Name of the estimator.
     loop : {"open", "closed", "auto"}
         ``auto`` follows the mode column that the vessel file names in
         ``[closed_loop]``; without one the logs count as open loop.
@@ -54,15 +56,7 @@ def assess_loop(
         amount = "the user says so" if share is None else f"{100 * share:.0f} % of the samples"
         sentence = (
             f"closed loop ({amount}): a controller moved the thrusters, "
-            + (
-                f"so instruments are delayed by {CLOSED_LOOP_LAG} samples; that removes the "
-                f"dependence on measurement noise, not on slow gusts. "
-                if method == "iv"
-                else "which a free run that is driven by the commands feels only through process "
-                "noise. "
-                if method == "oe"
-                else "and least squares has nothing against it: its bias is not known. "
-            )
+            + ESTIMATORS[method].closed_loop.format(lag=CLOSED_LOOP_LAG)
             + "Prefer a trial with open-loop commands."
         )
     elif unknown:

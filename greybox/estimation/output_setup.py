@@ -13,6 +13,7 @@ from greybox.estimation.shooting import Measured
 from greybox.model.disturbances import WIND
 from greybox.model.output import OutputModel, Role, current_means
 from greybox.model.predictor import Predictor, Regime, build_predictor
+from greybox.model.predictor_kinds import PREDICTORS
 from greybox.model.structure import Structure
 from greybox.trial.log import TrialLog
 
@@ -36,12 +37,13 @@ def output_predictor(structure: Structure, kind: str, regime: Regime) -> Predict
     -------
     Predictor
     """
-    if kind in ("basic", "basic+wind"):
+    asked = PREDICTORS[kind]
+    if not asked.captures:
         return build_predictor(structure, kind, regime)
-    if kind == "wind":
-        return replace(build_predictor(structure, "basic+wind", regime), kind="wind")
+    if asked.air_measured:
+        return replace(build_predictor(structure, asked.plain, regime), kind=kind)
     if structure.disturbance != "marine" or not structure.uses_air:
-        return replace(build_predictor(structure, "basic", regime), kind=kind)
+        return replace(build_predictor(structure, asked.plain, regime), kind=kind)
     return build_predictor(structure, kind, regime, disturbances=WIND, intercept=True)
 
 
@@ -50,7 +52,7 @@ def output_model(
 ) -> OutputModel:
     """Return the simulator of a predictor's kind, its unknown means as parameters."""
     means: tuple[str, ...] = ()
-    if predictor.kind in ("augmented", "wind"):
+    if PREDICTORS[predictor.kind].captures:
         means = current_means(predictor)
     if wind == "output":
         means = (*means, *WIND)

@@ -28,6 +28,7 @@ from greybox.estimation.noise import (
     on_stretches,
     stated_levels,
 )
+from greybox.estimation.registry import ESTIMATORS
 from greybox.estimation.result import Estimate, Iteration
 from greybox.estimation.verdict import UNJUDGED
 from greybox.estimation.white_rows import (
@@ -239,7 +240,8 @@ def estimate_refined_iv(
     Söderström and Stoica (1983); Young (2008).
     """
     logs = as_list(logs)
-    plain = start if isinstance(start, Estimate) and start.method == "iv" else None
+    own = isinstance(start, Estimate) and ESTIMATORS[start.method].instruments
+    plain = start if isinstance(start, Estimate) and own else None
     if plain is None:
         plain = estimate_iv(
             predictor,

@@ -14,22 +14,20 @@ from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from itertools import combinations_with_replacement
 from math import factorial
-from typing import Literal
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.errors import StructureError, suggestion
+from greybox.errors import StructureError
 from greybox.model.disturbances import CURRENT, WIND
+from greybox.model.predictor_kinds import PREDICTORS
 from greybox.model.spelling import atoms, spelled_expression, spellings
 from greybox.model.structure import Structure
 from greybox.notebook import DisplayMixin, table
 from greybox.vectorised import Vectorised
 
 Array = NDArray[np.float64]
-PredictorKind = Literal["basic", "augmented", "wind", "basic+wind"]
-PREDICTORS: tuple[PredictorKind, ...] = ("basic", "augmented", "wind", "basic+wind")
 
 # signs that each state takes in the data, such as {"u": (1,), "v": (1, -1)}
 Regime = tuple[tuple[str, tuple[int, ...]], ...]
@@ -104,7 +102,7 @@ class Predictor(DisplayMixin):
     @property
     def air_measured(self) -> bool:
         """Whether the velocity through the air is a measured regressor."""
-        return self.kind in ("wind", "basic+wind")
+        return PREDICTORS[self.kind].air_measured
 
     @property
     def augmented(self) -> bool:
@@ -473,14 +471,10 @@ def build_predictor(
     ----------
     Ljungberg (2020), sections 5.1.2 and 5.2.
     """
-    if kind not in PREDICTORS:
-        raise StructureError(
-            f"there is no predictor '{kind}'.{suggestion(kind, PREDICTORS)} "
-            f"Predictors: {', '.join(PREDICTORS)}."
-        )
+    asked = PREDICTORS[kind]
     if regime is None:
         regime = tuple((s, (1, -1)) for s in structure.states)
-    air_measured = kind in ("wind", "basic+wind")
+    air_measured = asked.air_measured
     points = _sample_points(structure, regime, seed=20)
     s = structure.symbols
     scalars = [*ca.vertsplit(s.x), s.psi, *ca.vertsplit(s.tau), *ca.vertsplit(s.air)]
@@ -493,7 +487,7 @@ def build_predictor(
     own = values(structure.regressors(air_measured=air_measured))
     derived = (
         _derivatives(structure, air_measured, disturbances)
-        if kind in ("augmented", "wind") and biases is None
+        if asked.captures and biases is None
         else []
     )
     derived_values = values([e for _, _, e in derived]) if derived else np.empty((0, _POINTS))

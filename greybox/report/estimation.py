@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.estimation.registry import ESTIMATORS
 from greybox.estimation.result import Estimate
 from greybox.estimation.summary import BOUNDS, grouped, set_in_words, weak_safe_sets
 from greybox.estimation.verdict import TestResult, TrustLevel
@@ -34,11 +35,6 @@ from greybox.validation.structures import StructureChoice
 Array = NDArray[np.float64]
 
 _NAMES = {"u": "surge", "v": "sway", "r": "yaw rate", "psi": "heading"}
-_METHODS = {
-    "ls": "least squares",
-    "iv": "instrumental variables",
-    "oe": "output error (the free run fitted to the log)",
-}
 _OUTCOMES = {True: "passed", False: "speaks against it", None: "tells"}
 # logs that are drawn against time: with more the page grows and tells nothing new
 _MOST_LOGS = 3
@@ -111,7 +107,7 @@ def headline(estimate: Estimate) -> str:
 
 
 def _summary(estimate: Estimate) -> list[str]:
-    method = _METHODS.get(estimate.method, estimate.method)
+    method = ESTIMATORS[estimate.method].description
     if estimate.prefilter == "noise":
         method += ", refined by the noise"
     logs = len(estimate.logs)

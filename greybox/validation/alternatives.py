@@ -9,12 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import GreyboxError, LogError
+from greybox.estimation.informative import ADVISED_HEADING, heading_range
+from greybox.estimation.registry import ESTIMATORS, automatic_estimators
 from greybox.model.catalogue import structure_for
+from greybox.model.predictor_kinds import PREDICTORS
 from greybox.model.structure import Structure
 from greybox.trial.log import TrialLog
 from greybox.validation.fit import run_model
 from greybox.validation.held_out import rank, score_runs, spread_of
-from greybox.validation.informative import ADVISED_HEADING, heading_range
 from greybox.validation.once import estimate_once
 from greybox.validation.request import Request
 from greybox.vessel.force import force_inputs
@@ -63,19 +65,25 @@ def alternatives_for(
     wind = all(log.has_wind for log in logs)
     names = [request.structure] if request.structure is not None else _structures(logs, wind)
     structures = [structure_for(name, inputs) for name in names]
-    methods = [request.method] if request.method else ["iv", "ls"]
+    estimators = (
+        [ESTIMATORS[request.method]]
+        if request.method
+        else [e for e in automatic_estimators() if not e.free_run]
+    )
     kinds = (
         [request.predictor] if request.predictor else _plausible(logs, structures[0], wind, notes)
     )
     for kind in kinds:
-        if kind in ("wind", "basic+wind") and not wind:
+        if PREDICTORS[kind].air_measured and not wind:
             lacking = next(log.name for log in logs if not log.has_wind)
             raise LogError(
                 f"predictor '{kind}' needs the wind, and '{lacking}' has neither u_q, v_q nor "
                 f"V_q, gamma_q: use --predictor augmented or basic."
             )
-    alternatives = [Alternative(s, m, k) for s in structures for m in methods for k in kinds]
-    if request.method == "oe":
+    alternatives = [
+        Alternative(s, e.name, k) for s in structures for e in estimators for k in kinds
+    ]
+    if all(e.free_run for e in estimators):
         reason = (
             "a free run feels the mean current itself, so it needs no sign condition, and the "
             "first structure whose run stays bounded is kept"
@@ -86,7 +94,9 @@ def alternatives_for(
         first = [
             a
             for a in alternatives
-            if a.structure is structures[0] and a.method == "iv" and a.kind == theory
+            if a.structure is structures[0]
+            and ESTIMATORS[a.method].instruments
+            and a.kind == theory
         ]
         if first:
             first[0] = replace(

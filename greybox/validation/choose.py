@@ -16,6 +16,7 @@ from greybox.estimation.estimate import Covariance
 from greybox.estimation.limits import limits_of
 from greybox.estimation.loop import Loop
 from greybox.estimation.output_error import OutputErrorOptions
+from greybox.estimation.registry import ESTIMATORS, free_run_estimator
 from greybox.estimation.result import Estimate
 from greybox.estimation.verdict import TrustLevel, Verdict, refused
 from greybox.keywords import known_keywords
@@ -163,7 +164,7 @@ def estimate_requested(logs: Sequence[TrialLog], request: Request) -> Estimate:
     if _rank(estimate)[0] == 0:
         return estimate
     tried: Estimate | None = None
-    if estimate.method != "oe" and not misfit(estimate.tests):
+    if not ESTIMATORS[estimate.method].free_run and not misfit(estimate.tests):
         # what the structure lacks no other estimator mends
         estimate, tried = _or_output_error(estimate, logs, request, notes)
     if _at_fault(estimate, tried):
@@ -184,7 +185,7 @@ def _without_regression(
     """
     reason = "no regression could be solved, and a free run tells the parameters apart"
     ways = {
-        a.structure.name: Alternative(a.structure, "oe", a.kind, reason)
+        a.structure.name: Alternative(a.structure, free_run_estimator().name, a.kind, reason)
         for a in reversed(alternatives)
     }
     try:
@@ -224,13 +225,14 @@ def _or_output_error(
     Beside it output error's own estimate, if its free run stays bounded.
     """
     before = f"{found.method} of this predictor alone is judged '{found.verdict.text}'"
-    way = Alternative(found.predictor.structure, "oe", found.predictor.kind)
+    other = free_run_estimator()
+    way = Alternative(found.predictor.structure, other.name, found.predictor.kind)
     try:
         tried, diverged = _finished(way, logs, request, notes)
     except GreyboxError as error:
-        return _noting(found, f"output error was tried too, and failed: {error}"), None
+        return _noting(found, f"{other.words} was tried too, and failed: {error}"), None
     if diverged:
-        return _noting(found, "output error was tried too, and its free run diverges."), None
+        return _noting(found, f"{other.words} was tried too, and its free run diverges."), None
     if _rank(tried) < _rank(found):
         why = f"it is judged '{tried.verdict.text}' and {before}"
         if _rank(tried)[0] == 2:
@@ -238,8 +240,8 @@ def _or_output_error(
                 f"its free run is better than a constant in more of the states, though neither "
                 f"is to be trusted: {before}"
             )
-        return _noting(tried, f"output error was taken, because {why}."), tried
-    note = f"output error was tried too, and is judged no better: '{tried.verdict.text}'."
+        return _noting(tried, f"{other.words} was taken, because {why}."), tried
+    note = f"{other.words} was tried too, and is judged no better: '{tried.verdict.text}'."
     return _noting(found, note), tried
 
 
@@ -259,7 +261,7 @@ def _by_held_out_runs(
     way = compared.ways[compared.chosen]
     if not compared.chosen:
         return found
-    if spare is not None and way == Way("oe"):
+    if spare is not None and way == Way(spare.method):
         other, diverged = spare, False
     else:
         start = spare if _diverges(found) else found
@@ -270,7 +272,7 @@ def _by_held_out_runs(
             return _noting(found, f"{way.label} failed on the whole logs: {error}")
     if diverged and not _diverges(found):
         return _noting(found, f"{way.label} diverges on the whole logs, and was left.")
-    if way.method == "oe" and _level(other) < _level(found):
+    if ESTIMATORS[way.method].free_run and _level(other) < _level(found):
         # the free run is what it fits, so this is no optimum to speak of
         return _noting(
             found,
@@ -342,10 +344,9 @@ def _finished(
     own = list(estimate.notes)
     if alternative.reason:
         own.append(f"{alternative.label} was taken: {alternative.reason}.")
-    if estimate.method == "iv":
-        own.append(f"instruments: {estimate.status}.")
-    elif estimate.method == "oe":
-        own.append(f"the fit {estimate.status}.")
+    ended = ESTIMATORS[estimate.method].ended
+    if ended:
+        own.append(ended.format(status=estimate.status))
     if estimate.predictor.contaminated:
         own.append(
             f"{', '.join(estimate.predictor.contaminated)} also carry a second moment of the "

@@ -10,16 +10,24 @@ from greybox.errors import UsageError, suggestion
 from greybox.estimation.estimate import Covariance
 from greybox.estimation.loop import Loop
 from greybox.estimation.output_error import OutputErrorOptions
+from greybox.estimation.registry import ESTIMATORS
 from greybox.model.model import ManoeuvringModel
+from greybox.model.predictor_kinds import PREDICTORS
 
-CHOICES: Mapping[str, tuple[str, ...]] = {
-    "method": ("ls", "iv", "refined-iv", "oe"),
-    "predictor": ("basic", "augmented", "wind", "basic+wind"),
-    "covariance": get_args(Covariance),
-    "heading": ("measured", "simulated"),
-    "loop": get_args(Loop),
-    "prefilter": ("auto", "noise", "none"),
-}
+# methods that are another one with a prefilter
+_PREFILTERED: Mapping[str, tuple[str, Literal["noise"]]] = {"refined-iv": ("iv", "noise")}
+
+
+def _choices() -> dict[str, tuple[str, ...]]:
+    """Return what each field may be, estimators as they are registered now."""
+    return {
+        "method": (*ESTIMATORS, *_PREFILTERED),
+        "predictor": tuple(PREDICTORS),
+        "covariance": get_args(Covariance),
+        "heading": ("measured", "simulated"),
+        "loop": get_args(Loop),
+        "prefilter": ("auto", "noise", "none"),
+    }
 
 
 @dataclass(frozen=True)
@@ -79,21 +87,22 @@ class Request:
     without: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        for name, choices in CHOICES.items():
+        for name, choices in _choices().items():
             value = getattr(self, name)
             if value is not None and value not in choices:
                 raise UsageError(
                     f"'{value}' is no {name}.{suggestion(str(value), choices)} It is one of "
                     f"{', '.join(choices)}."
                 )
-        if self.method == "refined-iv":
+        if self.method is not None and self.method in _PREFILTERED:
+            method, prefilter = _PREFILTERED[self.method]
             if self.prefilter == "none":
                 raise UsageError(
-                    "method 'refined-iv' refines by the noise and prefilter 'none' does not: use "
-                    "method 'iv' for plain instrumental variables."
+                    f"method '{self.method}' refines by the noise and prefilter 'none' does not: "
+                    f"use method '{method}' for plain instrumental variables."
                 )
-            object.__setattr__(self, "method", "iv")
-            object.__setattr__(self, "prefilter", "noise")
+            object.__setattr__(self, "method", method)
+            object.__setattr__(self, "prefilter", prefilter)
 
 
 def regression_only(request: Request) -> bool:

@@ -19,6 +19,7 @@ from scipy.special import ndtr, stdtrit
 
 from greybox.errors import GreyboxError
 from greybox.estimation.output_error import Weights
+from greybox.estimation.registry import ESTIMATORS, automatic_estimators
 from greybox.estimation.result import Estimate
 from greybox.trial.log import TrialLog
 from greybox.validation.fit import run_model
@@ -60,7 +61,9 @@ class Way:
         return replace(request, output_error=options)
 
 
-_WAYS = (Way("iv"), Way("ls"), Way("oe"), Way("oe", "deviation"))
+def _ways() -> list[Way]:
+    """Return the ways to estimate that the data may choose."""
+    return [Way(e.name, weights) for e in automatic_estimators() for weights in e.weights]
 
 
 @dataclass(frozen=True)
@@ -174,7 +177,7 @@ def compare_ways(
     UsageError
         A single log is too short to be parted.
     """
-    ways = list(dict.fromkeys([Way(found.method), *_WAYS]))
+    ways = list(dict.fromkeys([Way(found.method), *_ways()]))
     spread = spread_of(logs, found.predictor.structure.states) if len(logs) == 1 else None
     parts = parts_of(logs)
     blocks = -(-_WANTED // max(len(logs), len(parts)))
@@ -215,15 +218,16 @@ def _estimates(
     start: Estimate | None = None
     most = -np.inf
     # regressions first: output error starts from one of them
-    for way in sorted(ways, key=lambda w: w.method == "oe"):
-        from_here = start or (spare if way.method == "oe" else None)
+    for way in sorted(ways, key=lambda w: ESTIMATORS[w.method].free_run):
+        free_run = ESTIMATORS[way.method].free_run
+        from_here = start or (spare if free_run else None)
         try:
             found[way] = estimate_way(way, logs, like, request, from_here)
         except GreyboxError as error:
             _log.info("%s on a part: %s", way.label, error)
             found[way] = None
         estimate = found[way]
-        if estimate is not None and way.method != "oe":
+        if estimate is not None and not free_run:
             runs = [run_model(estimate.model(), log) for log in logs]
             level = float(np.mean([v for run in runs for v in run.fit.values()]))
             if level > most and all(run.diverged < 0 for run in runs):

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import GreyboxError, UsageError
+from greybox.estimation.registry import ESTIMATORS
 from greybox.estimation.result import Estimate
 from greybox.model.catalogue import structure_for
 from greybox.notebook import DisplayMixin
@@ -184,7 +185,7 @@ def criteria_of(tried: Tried, worth: Array) -> tuple[float, float] | tuple[None,
     """
     if tried.estimate is None or tried.errors is None:
         return None, None
-    means = len(tried.estimate.current) if tried.estimate.method == "oe" else 0
+    means = len(tried.estimate.current) if ESTIMATORS[tried.estimate.method].free_run else 0
     return information_criteria(np.concatenate(tried.errors), tried.size + means, worth)
 
 

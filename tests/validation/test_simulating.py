@@ -113,7 +113,7 @@ def test_ways_that_fail_have_no_score(small, monkeypatch):
     def refuse(*_, **__):
         raise ExcitationError("nothing moves.")
 
-    monkeypatch.setattr("greybox.validation.once.estimate_iv", refuse)
+    monkeypatch.setattr("greybox.estimation.estimate.estimate_iv", refuse)
     partly = compare_ways(found, logs, SMALL)
     assert np.isnan(partly.scores[1]).all()
     np.testing.assert_allclose(partly.scores[0], whole.scores[0])
@@ -152,12 +152,12 @@ def test_where_no_regression_can_be_solved_output_error_is_tried(monkeypatch):
     def singular(*_, **__):
         raise ExcitationError("the instruments are singular.")
 
-    monkeypatch.setattr("greybox.validation.once.estimate_iv", singular)
-    monkeypatch.setattr("greybox.validation.once.estimate_ls", singular)
+    monkeypatch.setattr("greybox.estimation.estimate.estimate_iv", singular)
+    monkeypatch.setattr("greybox.estimation.estimate.estimate_ls", singular)
     log = virtual_log(3, 400, spread=0.0)
     request = Request(structure="thesis", predictor="wind")
     assert estimate_requested([log], request).method == "oe"
-    monkeypatch.setattr("greybox.validation.once.estimate_oe", singular)
+    monkeypatch.setattr("greybox.estimation.output_error.estimate_oe", singular)
     with pytest.raises(ExcitationError, match="the instruments are singular"):
         estimate_requested([log], request)
 

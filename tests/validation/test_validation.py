@@ -16,6 +16,7 @@ from greybox.errors import (
     UsageError,
 )
 from greybox.estimation.estimate import UnexcitedBiasError, estimate_iv, estimate_ls
+from greybox.estimation.informative import heading_range, regime_of
 from greybox.estimation.verdict import NoRegression, TrustLevel, refused
 from greybox.model.catalogue import get_structure, structure_for
 from greybox.model.conversion import (
@@ -34,7 +35,6 @@ from greybox.trial.log import make_log
 from greybox.validation.choose import estimate_model
 from greybox.validation.comparison import compare, sign_test
 from greybox.validation.fit import fit_percent, run_model
-from greybox.validation.informative import heading_range, regime_of
 
 
 @pytest.fixture(scope="module")
@@ -172,11 +172,11 @@ def test_output_error_that_is_judged_no_better_is_left(monkeypatch):
 
 
 def test_output_error_that_fails_is_told(monkeypatch):
-    def fail(*_):
+    def fail(*_, **__):
         raise ExcitationError("the run leaves every bound.")
 
     log = virtual_log(4, 1500, spread=0.0)
-    monkeypatch.setattr("greybox.validation.once._estimate_oe", fail)
+    monkeypatch.setattr("greybox.estimation.output_error.estimate_oe", fail)
     monkeypatch.setattr("greybox.validation.choose._at_fault", lambda *_: False)
     e = estimate_model([log])
     assert e.method != "oe"

@@ -65,7 +65,7 @@ def assess(evidence: Evidence) -> tuple[TestResult, ...]:
 
 def _of_equation(evidence: Evidence, equation: Equation) -> list[TestResult]:
     biases = frozenset(c.label for c in evidence.predictor.columns if c.is_bias)
-    if evidence.method == "oe":
+    if evidence.estimator.free_run:
         # a free run needs no instruments: only what speaks of the model is asked
         return [
             overidentification(equation, biases, each_log=False),
@@ -86,7 +86,7 @@ def _of_equation(evidence: Evidence, equation: Equation) -> list[TestResult]:
         input_independence(evidence, equation),
         *_still_water(evidence, equation),
         many_instruments(equation, biases),
-        endogeneity(equation, evidence.method),
+        endogeneity(equation, decisive=evidence.estimator.biased_by_noise),
     ]
 
 

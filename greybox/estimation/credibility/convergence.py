@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
+from greybox.estimation.registry import ESTIMATORS
 from greybox.estimation.result import Estimate
 from greybox.estimation.verdict import TestResult
 
 _NULL = "the iteration ended at an estimate that it no longer moves"
-_MEANS = {
-    "iv": "so the standard errors may be too small: 95 % intervals of such estimates held 91 % of "
-    "the true values in simulated trials",
-    "oe": "so a better fit may be near: start elsewhere (--nominal), or take a smaller structure",
-}
 
 
 def convergence(estimate: Estimate) -> tuple[TestResult, ...]:
@@ -23,7 +19,7 @@ def convergence(estimate: Estimate) -> tuple[TestResult, ...]:
     """
     if not estimate.iterations:
         return ()
-    means = "" if estimate.converged else f", {_MEANS.get(estimate.method, 'so it may be off')}"
+    means = "" if estimate.converged else f", {ESTIMATORS[estimate.method].unconverged}"
     sentence = f"the iteration {_after_the(estimate.status)}{means}."
     return (
         TestResult(

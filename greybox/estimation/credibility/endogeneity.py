@@ -18,7 +18,7 @@ _QUESTION = Question(
 )
 
 
-def endogeneity(equation: Equation, method: str = "ls") -> TestResult:
+def endogeneity(equation: Equation, *, decisive: bool = True) -> TestResult:
     """Test that least squares and instrumental variables estimate the same.
 
     The moments of the instruments are taken with the residuals of least
@@ -29,7 +29,7 @@ def endogeneity(equation: Equation, method: str = "ls") -> TestResult:
     which is taken off.
 
     A rejection speaks against a least-squares estimate and for an instrumental
-    one, so only the former can fail (`passed`).
+    one, so only the former can fail (`passed`): there the test is `decisive`.
 
     References
     ----------
@@ -54,7 +54,7 @@ def endogeneity(equation: Equation, method: str = "ls") -> TestResult:
             if suffices
             else f"least squares is biased here, most in {equation.labels[far]} "
             f"(by {gap[far]:.1f} standard errors of the instrumental estimate).",
-            suffices if method == "ls" else None,
+            suffices if decisive else None,
             {"least_squares": dict(zip(equation.labels, theta.tolist(), strict=True))},
         )
 

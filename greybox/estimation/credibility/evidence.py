@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from greybox.estimation.colour import Colour
 from greybox.estimation.error_shape import ErrorShape, error_shapes, fit_shaped_colour
 from greybox.estimation.moments import Solution, solve_stacked
+from greybox.estimation.registry import ESTIMATORS, Estimator
 from greybox.model.predictor import Predictor
 from greybox.regression.instruments import Instruments
 from greybox.regression.regression import Regression
@@ -164,10 +165,13 @@ class Evidence:
     keep : tuple of ndarray of bool
         (N,) rows on which it rests.
     method : str
-        ``ls``, ``iv`` or another estimator's name.
+        Name of the estimator.
     zero_mean : bool
         Whether the instruments are zero-mean, which leaves constants free.
     margins : dict of str to float, optional
+    solved : bool
+        Whether the estimate solves the normal equations of its residuals, as least squares
+        and plain instrumental variables do.
     """
 
     predictor: Predictor
@@ -181,6 +185,12 @@ class Evidence:
     method: str
     zero_mean: bool = True
     margins: dict[str, float] | None = None
+    solved: bool = True
+
+    @property
+    def estimator(self) -> Estimator:
+        """The estimator's entry."""
+        return ESTIMATORS[self.method]
 
     @property
     def std(self) -> Array:

@@ -142,7 +142,7 @@ def margin_bias(evidence: Evidence) -> TestResult:
     predictor = evidence.predictor
     if predictor.structure.disturbance != "marine":
         return not_applicable(name, null, "the structure has no modulus of measured velocities")
-    if evidence.method == "ls":
+    if evidence.estimator.biased_by_noise:
         reason = "least squares is biased by noise in every regressor, see endogeneity"
         return not_applicable(name, null, reason)
     bias = noise_bias(evidence)

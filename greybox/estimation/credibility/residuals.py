@@ -80,11 +80,11 @@ def _normal_equations(
     are taken as they are.
     """
     empty = [np.zeros((0, len(e))) for e in residuals]
-    if not evidence.equations or evidence.method not in ("ls", "iv"):
+    if not evidence.equations or not evidence.solved:
         return empty, empty
     equation: Equation = evidence.equations[row]
     same = all(np.array_equal(a, b) for a, b in zip(equation.keep, evidence.keep, strict=True))
     if equation.obstacle or not same:
         return empty, empty
-    zhat = equation.phi if evidence.method == "ls" else equation.solution.projected
+    zhat = equation.solution.projected if evidence.estimator.instruments else equation.phi
     return list(equation.phi), list(zhat)

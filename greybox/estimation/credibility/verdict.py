@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from greybox.estimation.registry import ESTIMATORS
 from greybox.estimation.verdict import (
     MISFIT_TESTS,
     BiasSource,
@@ -121,7 +122,7 @@ def misfit(tests: Sequence[TestResult]) -> tuple[Misfit, ...]:
 
 
 def _of_least_squares(tests: Sequence[TestResult], method: str) -> tuple[LeastSquaresBias, ...]:
-    if method != "ls":
+    if not ESTIMATORS[method].biased_by_noise:
         return ()
     family = [t for t in tests if t.kind == "endogeneity"]
     if any(t.kind == "closed_loop" and t.passed is False for t in tests):

@@ -8,6 +8,7 @@ import numpy as np
 
 from greybox.errors import ExcitationError
 from greybox.model.predictor import Regime
+from greybox.model.predictor_kinds import PredictorKind
 from greybox.model.structure import Structure
 from greybox.trial.log import TrialLog
 
@@ -39,7 +40,7 @@ def regime_of(logs: Sequence[TrialLog], structure: Structure) -> Regime:
     return tuple(regime)
 
 
-def require_informative(logs: Sequence[TrialLog], predictor: str) -> None:
+def require_informative(logs: Sequence[TrialLog], predictor: PredictorKind) -> None:
     """Refuse logs that cannot answer, before any algebra does so obscurely.
 
     Raises
@@ -59,12 +60,12 @@ def require_informative(logs: Sequence[TrialLog], predictor: str) -> None:
             f"every thruster command is constant over the log ({', '.join(commands)}), so its "
             f"effect cannot be told from a constant: change the commands during the trial."
         )
-    if predictor in ("augmented", "wind"):
+    if predictor.captures:
         turned = heading_range(logs)
         if turned < LEAST_HEADING:
             raise ExcitationError(
                 f"heading stays within {np.degrees(turned):.0f} deg, so current_north and "
                 f"current_east cannot be told apart (needs about "
                 f"{np.degrees(ADVISED_HEADING):.0f} deg). Turn during the trial, or use "
-                f"--predictor {'basic' if predictor == 'augmented' else 'basic+wind'}."
+                f"--predictor {predictor.plain}."
             )

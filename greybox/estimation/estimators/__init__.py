@@ -1,0 +1,1 @@
+"""One file an estimator, each with its ``ENTRY`` in the registry."""

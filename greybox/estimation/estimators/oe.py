@@ -1,0 +1,102 @@
+"""Output error: the free run fitted to the log, as ``--method oe``."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from greybox.estimation.registry import Estimator
+
+if TYPE_CHECKING:
+    from greybox.estimation.problem import EstimationProblem
+    from greybox.estimation.result import Estimate
+
+# refinements of the instruments where a free-run fit starts
+_STARTING_REFINEMENTS = 1
+
+
+def _fit(problem: EstimationProblem) -> Estimate:
+    """Fit free runs, from the nominal model, else from an estimate by IV or least squares."""
+    from greybox.errors import UsageError
+    from greybox.estimation.judging import judge_estimate
+    from greybox.estimation.output_error import estimate_oe
+    from greybox.estimation.output_setup import output_predictor
+
+    if problem.margins:
+        raise UsageError(
+            f"margins cut samples out of a regression, and a free run needs every one: leave "
+            f"--margin-{min(problem.margins)} out, or use --method iv."
+        )
+    if problem.covariance == "bootstrap":
+        raise UsageError(
+            "the block bootstrap resamples rows of a regression: use --covariance ma, hac or white "
+            "with --method oe."
+        )
+    options = problem.output_error
+    if problem.covariance is not None:
+        options = replace(options, covariance=problem.covariance)
+    start = problem.nominal_theta if problem.start is None else problem.start
+    notes = ["it started from the nominal model."]
+    if problem.nominal_theta is not None:
+        start = problem.nominal_theta
+    elif problem.start is not None:
+        notes = [f"it started from the estimate by {problem.start.method}."]
+    else:
+        start, said = _quick_start(problem)
+        notes = [said]
+    predictor = problem.less(output_predictor(problem.structure, problem.kind.name, problem.regime))
+    estimate, dropped = problem.drop_unexcited(
+        predictor, lambda p: estimate_oe(p, problem.logs, start=start, options=options)
+    )
+    if problem.judged:
+        estimate = judge_estimate(estimate, problem.logs)
+    _, loop_test = problem.loop_test("oe")
+    return replace(
+        estimate,
+        tests=(*estimate.tests, loop_test),
+        notes=(*estimate.notes, *notes, *dropped),
+    )
+
+
+def _quick_start(problem: EstimationProblem) -> tuple[Estimate | None, str]:
+    """Return an estimate by IV, else by least squares, that a free-run fit can start from.
+
+    Bias-capturing terms are left out: the fit finds the current by itself.
+    """
+    from greybox.errors import DivergenceError, ExcitationError
+    from greybox.estimation.estimate import estimate_iv, estimate_ls
+    from greybox.model.predictor import build_predictor
+
+    predictor = build_predictor(problem.structure, problem.kind.plain, problem.regime)
+    try:
+        found = estimate_iv(
+            predictor,
+            problem.logs,
+            refine=_STARTING_REFINEMENTS,
+            covariance="white",
+            judged=False,
+        )
+        return found, "it started from an estimate by instrumental variables."
+    except (ExcitationError, DivergenceError):
+        pass
+    try:
+        found = estimate_ls(predictor, problem.logs, covariance="white", judged=False)
+        return found, "it started from the least-squares estimate."
+    except ExcitationError:
+        return None, "it started from nothing."
+
+
+ENTRY = Estimator(
+    "oe",
+    "output error",
+    _fit,
+    free_run=True,
+    weights=("noise", "deviation"),
+    detail="the free run fitted to the log",
+    ended="the fit {status}.",
+    unconverged="so a better fit may be near: start elsewhere (--nominal), or take a smaller "
+    "structure",
+    closed_loop="which a free run that is driven by the commands feels only through process "
+    "noise. ",
+    order=2,
+)
