@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.estimation.error_shape import ErrorShape, fit_shaped_colour
+from greybox.numerics.moments import autocovariance, lagged_products, lagged_sums
 
 Array = NDArray[np.float64]
 CovarianceKind = Literal["hac", "ma", "white"]
@@ -45,12 +46,7 @@ def correlation_lags(residuals: Sequence[Array], largest: int | None = None) -> 
         return 0
     look = max(5, int(np.sqrt(np.log10(max(total, 10)))) + 3)
     limit = 2.0 * np.sqrt(np.log10(max(total, 10)) / total)
-    rho = np.array(
-        [
-            sum(float(r[lag:] @ r[: len(r) - lag]) for r in residuals if len(r) > lag) / variance
-            for lag in range(1, largest + look + 1)
-        ]
-    )
+    rho = lagged_sums(residuals, residuals, largest + look)[1:] / variance
     small = np.abs(rho) < limit
     for m in range(largest + 1):
         if small[m : m + look].all():
@@ -112,14 +108,15 @@ def score_covariance(
     total = np.zeros((sum(sizes), sum(sizes)))
     spread = np.repeat(np.arange(len(sizes)), sizes)
     reach = 0 if kind == "white" else 2 * lags
-    for e in range(len(projected[0])):
-        stacked = np.vstack([equation[e] for equation in projected])
-        samples = stacked.shape[1]
-        scores = stacked * np.array([equation[e] for equation in residuals])[spread]
-        for lag in range(min(reach, samples - 1) + 1):
-            weight = flat_top(lag, lags)
-            block = scores[:, lag:] @ scores[:, : samples - lag].T
-            total += weight * (block if lag == 0 else block + block.T)
+    scores = [
+        np.vstack(hats) * np.array(errors)[spread]
+        for hats, errors in zip(
+            zip(*projected, strict=True), zip(*residuals, strict=True), strict=True
+        )
+    ]
+    for lag in range(min(reach, max(s.shape[1] for s in scores) - 1) + 1):
+        block = flat_top(lag, lags) * lagged_products(scores, scores, lag)
+        total += block if lag == 0 else block + block.T
     return nearest_positive(total), lags
 
 
@@ -158,20 +155,11 @@ def _moving_average(
     p = sum(sizes)
     spread = np.repeat(np.arange(len(sizes)), sizes)
     total = np.zeros((p, p))
-    for lag in range(lags + 1):
-        gamma = np.zeros((len(sizes), len(sizes)))
-        outer = np.zeros((p, p))
-        pairs = 0
-        for e in range(len(projected[0])):
-            errors = np.array([equation[e] for equation in residuals])
-            stacked = np.vstack([equation[e] for equation in projected])
-            samples = stacked.shape[1]
-            gamma += errors[:, lag:] @ errors[:, : samples - lag].T
-            taking_part = np.asarray(stacked.any(axis=0))
-            pairs += int((taking_part[lag:] & taking_part[: samples - lag]).sum())
-            outer += stacked[:, lag:] @ stacked[:, : samples - lag].T
-        gamma /= max(pairs, 1)
-        block = outer * gamma[np.ix_(spread, spread)]
+    errors = [np.array(e) for e in zip(*residuals, strict=True)]
+    stacked = [np.vstack(hats) for hats in zip(*projected, strict=True)]
+    gammas = autocovariance(errors, [np.asarray(s.any(axis=0)) for s in stacked], lags)
+    for lag, gamma in enumerate(gammas):
+        block = lagged_products(stacked, stacked, lag) * gamma[np.ix_(spread, spread)]
         total += block if lag == 0 else block + block.T
     return total
 

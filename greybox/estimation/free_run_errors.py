@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.estimation.covariance import CovarianceKind, flat_top, nearest_positive
+from greybox.numerics.moments import lagged_products, lagged_sums
 
 Array = NDArray[np.float64]
 
@@ -52,8 +53,8 @@ def shared_score_covariance(
         for rows, residuals in scores:
             product = np.einsum("qkc,kc->qk", rows, residuals)
             for lag in range(min(0 if kind == "white" else 2 * lags, product.shape[1] - 1) + 1):
-                block = product[:, lag:] @ product[:, : product.shape[1] - lag].T
-                total += flat_top(lag, lags) * (block if lag == 0 else block + block.T)
+                block = flat_top(lag, lags) * lagged_products([product], [product], lag)
+                total += block if lag == 0 else block + block.T
         return nearest_positive(total)
     gamma = autocovariance([r for _, r in scores], lags)
     for rows, r in scores:
@@ -71,19 +72,11 @@ def autocovariance(residuals: Sequence[Array], lags: int) -> Array:
     lags : int
         Memory in samples.
     """
-    from scipy.fft import irfft, next_fast_len, rfft
-
-    ny = residuals[0].shape[1]
     samples = max(sum(int(r.any(axis=1).sum()) for r in residuals), 1)
     reach = min(2 * lags, max(len(r) for r in residuals) - 1)
-    gamma = np.zeros((reach + 1, ny, ny))
-    for r in residuals:
-        size = next_fast_len(len(r) + reach + 1, real=True)
-        spectrum = rfft(r, size, axis=0)
-        products = irfft(spectrum[:, :, None] * spectrum.conj()[:, None, :], size, axis=0)
-        gamma += products[: reach + 1]
+    gamma = lagged_sums([r.T[:, None] for r in residuals], [r.T[None] for r in residuals], reach)
     weight = np.array([flat_top(lag, lags) for lag in range(reach + 1)])
-    return np.asarray(gamma * weight[:, None, None] / samples)
+    return np.asarray(np.moveaxis(gamma * weight, -1, 0) / samples)
 
 
 def memory_correction(
@@ -156,17 +149,10 @@ def _draw(rng: np.random.Generator, root: NDArray[np.complex128], samples: int) 
 
 def _lagged_products(rows: Array, reach: int) -> Array:
     """Return C with Σ_lag Σ_ab γ_ab(lag) C_lab,q the variance that γ gives, (q, reach, ny, ny)."""
-    from scipy.fft import irfft, next_fast_len, rfft
-
-    q, samples, ny = rows.shape
-    reach = min(reach, samples)
-    size = next_fast_len(samples + reach, real=True)
-    spectrum = rfft(rows, size, axis=1)
-    out = np.empty((q, reach, ny, ny))
-    for a in range(ny):
-        for b in range(ny):
-            product = irfft(spectrum[:, :, a] * spectrum[:, :, b].conj(), size, axis=1)
-            out[:, :, a, b] = product[:, :reach]
+    by_channel = rows.transpose(0, 2, 1)
+    reach = min(reach, rows.shape[1]) - 1
+    sums = lagged_sums([by_channel[:, :, None]], [by_channel[:, None]], reach)
+    out = np.ascontiguousarray(np.moveaxis(sums, -1, 1))
     # both signs of every lag but the first
     out[:, 1:] *= 2.0
     return out

@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from greybox.estimation.covariance import correlation_lags
 from greybox.estimation.credibility.evidence import Equation
 from greybox.estimation.verdict import TestResult, not_applicable
+from greybox.numerics.linalg import scaled_inverse
+from greybox.numerics.moments import lagged_sums, pairs
 
 Array = NDArray[np.float64]
 
@@ -107,9 +109,7 @@ def confidence_sets(equation: Equation, level: float = 0.95) -> list[ConfidenceS
     solution = equation.solution
     p = len(equation.labels)
     explained = solution.projected
-    scale = np.sqrt(np.diag(solution.information))
-    inverse = np.linalg.pinv(solution.information / np.outer(scale, scale), rcond=1e-15)
-    inverse = inverse / np.outer(scale, scale)
+    inverse = scaled_inverse(solution.information)
     # w with Σ w_i φ_j = 1 where i = j, else 0
     weights = [inverse @ h for h in explained]
     follow = inverse / np.diag(inverse)
@@ -141,20 +141,12 @@ def _of_shift(
         correlation_lags([b[i, k] for b, k in zip(shift, equation.keep, strict=True)])
         for i in range(p)
     )
-    v01, v11 = np.zeros(p), np.zeros(p)
-    for lag in range(lags + 1):
-        pairs, memory, g01, g11 = 0, np.zeros(p), np.zeros(p), np.zeros(p)
-        for w, b, e, keep in zip(weights, shift, errors, equation.keep, strict=True):
-            n = len(e) - lag
-            if n <= 0:
-                continue
-            pairs += int((keep[lag:] & keep[:n]).sum())
-            memory += (w[:, lag:] * w[:, :n]).sum(axis=1)
-            g01 += (b[:, lag:] @ e[:n] + b[:, :n] @ e[lag:]) / 2
-            g11 += (b[:, lag:] * b[:, :n]).sum(axis=1)
-        memory *= (1.0 if lag == 0 else 2.0) * lost / max(pairs, 1)
-        v01, v11 = v01 + memory * g01, v11 + memory * g11
-    return v01, v11
+    memory = lagged_sums(weights, weights, lags) * lost
+    memory[:, 1:] *= 2.0
+    memory /= np.maximum([pairs(equation.keep, lag) for lag in range(lags + 1)], 1)
+    single = [e[None] for e in errors]
+    both = (lagged_sums(shift, single, lags) + lagged_sums(single, shift, lags)) / 2
+    return (memory * both).sum(axis=1), (memory * lagged_sums(shift, shift, lags)).sum(axis=1)
 
 
 def _unexplained(equation: Equation) -> list[Array]:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from greybox.estimation.credibility.evidence import Equation
-from greybox.estimation.credibility.kernel import Array
 from greybox.estimation.credibility.predetermined import moments_mean, noise_after_error
 from greybox.estimation.credibility.question import Finding, Question
 from greybox.estimation.credibility.scores import Score, score_test
 from greybox.estimation.verdict import TestResult
+
+Array = NDArray[np.float64]
 
 _QUESTION = Question(
     "endogeneity",

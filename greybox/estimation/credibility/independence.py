@@ -7,13 +7,15 @@ input, at whatever delay, may explain them.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from greybox.estimation.credibility.evidence import Equation, Evidence
-from greybox.estimation.credibility.kernel import Array
 from greybox.estimation.credibility.overidentification import delayed
 from greybox.estimation.credibility.question import Finding, Question
 from greybox.estimation.credibility.scores import Score, score_test
 from greybox.estimation.verdict import TestResult
+
+Array = NDArray[np.float64]
 
 # delays of the joint statistic: dense where a lag or a delay shows, sparse behind
 LAGS = (0, 1, 2, 4, 8, 16)

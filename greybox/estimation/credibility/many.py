@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from greybox.estimation.credibility.evidence import Equation
 from greybox.estimation.credibility.words import listed
 from greybox.estimation.verdict import TestResult, not_applicable
+from greybox.numerics.moments import lagged_products
 
 Array = NDArray[np.float64]
 
@@ -51,22 +52,13 @@ def surplus_bias(equation: Equation) -> Array:
         basis = vt[values > 1e-12 * values[0]]
         q += len(basis)
         for k in range(-_REACH, _REACH + 1):
-            first, later = _shifted(basis, k)
-            traces[k + _REACH] += float((first * later).sum())
-            noise = _shifted(f - hat, k)[0]
-            meeting[k + _REACH] += noise @ _shifted(e[None], k)[1][0]
-            itself[k + _REACH] += noise @ _shifted(f, k)[1].T
+            noise = [f - hat]
+            traces[k + _REACH] += float(np.trace(lagged_products([basis], [basis], k)))
+            meeting[k + _REACH] += lagged_products(noise, [e[None]], -k)[:, 0]
+            itself[k + _REACH] += lagged_products(noise, [f], -k)
     weights = traces / max(equation.freedom - q, 1) * max(q - p, 0) / max(q, 1)
     left = equation.solution.information - np.tensordot(weights, itself, 1)
     return np.asarray(np.linalg.pinv(left, rcond=1e-15) @ (weights @ meeting))
-
-
-def _shifted(rows: Array, k: int) -> tuple[Array, Array]:
-    """Return rows at t and at t + k, where both exist."""
-    n = rows.shape[1]
-    if abs(k) >= n:
-        return rows[:, :0], rows[:, :0]
-    return (rows[:, : n - k], rows[:, k:]) if k >= 0 else (rows[:, -k:], rows[:, : n + k])
 
 
 def many_instruments(equation: Equation, biases: frozenset[str]) -> TestResult:

@@ -15,8 +15,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
-from greybox.estimation.credibility.kernel import Array, lagged_products
+from greybox.numerics.linalg import scaled_inverse
+from greybox.numerics.moments import convolve, lagged_products, lagged_sums
+
+Array = NDArray[np.float64]
+
 
 # lags that are looked at, in roots of the number of rows
 _REACH = 2.0
@@ -34,10 +39,8 @@ def noise_after_error(noise: Sequence[Array], errors: Sequence[Array]) -> Array:
     """
     rows = sum(len(e) for e in errors)
     reach = int(_REACH * np.sqrt(rows))
-    single = [e[None] for e in errors]
-    return np.array(
-        [lagged_products(noise, single, j)[:, 0] / max(rows - j, 1) for j in range(1, reach + 1)]
-    )
+    sums = lagged_sums(noise, [e[None] for e in errors], reach)[:, 1:]
+    return np.asarray((sums / np.maximum(rows - np.arange(1, reach + 1), 1)).T)
 
 
 def moments_mean(
@@ -60,15 +63,15 @@ def moments_mean(
     ----------
     Kendall (1954); Stein (1981), lemma 1; Stambaugh (1999).
     """
-    gram = lagged_products(phi, phi, 0)
-    size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
-    inverse = np.linalg.pinv(gram / np.outer(size, size), rcond=1e-13) / np.outer(size, size)
+    inverse = scaled_inverse(lagged_products(phi, phi, 0), 1e-13)
     weights = lagged_products(xi, phi, 0) @ inverse
     left = [x - weights @ f for x, f in zip(xi, phi, strict=True)]
-    mean = np.zeros(len(weights))
-    for j, gamma in enumerate(after, 1):
-        trace = float((inverse * lagged_products(phi, phi, j).T).sum())
-        mean += trace * (weights @ gamma) - lagged_products(left, phi, j) @ inverse @ gamma
+    # Σ_s φ(s)ᵀ G⁻¹ φ(s+j), and Σ_s ξ̃(s+j) φ(s)ᵀ G⁻¹ γ(j) summed over j
+    traces = lagged_sums(phi, [inverse @ f for f in phi], len(after)).sum(axis=0)[1:]
+    mean = weights @ (traces @ after)
+    steps = np.concatenate([np.zeros((1, len(inverse))), after @ inverse.T])
+    for x, f in zip(left, phi, strict=True):
+        mean = mean - x @ convolve(f, steps.T[:, : f.shape[1]]).sum(axis=0)
     if centred:
         mean += len(phi) * (weights @ after.sum(axis=0))
     return np.asarray(mean)

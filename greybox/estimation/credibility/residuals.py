@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from greybox.estimation.credibility.evidence import Equation, Evidence
-from greybox.estimation.credibility.kernel import Array
 from greybox.estimation.credibility.scores import score_test
 from greybox.estimation.verdict import TestResult, not_applicable
+
+Array = NDArray[np.float64]
 
 LEVEL = 0.05
 _LAGS = 10

@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.estimation.colour import WHITE, Colour
-from greybox.estimation.credibility.kernel import lagged_products, quadratic_form
 from greybox.estimation.verdict import Distribution
+from greybox.numerics.linalg import quadratic_form, sizes
+from greybox.numerics.moments import lagged_products
 
 Array = NDArray[np.float64]
 # directions with a smaller share of the largest variance rest on a few rows: left untested
@@ -61,7 +62,7 @@ def residualise(xi: Sequence[Array], phi: Sequence[Array], zhat: Sequence[Array]
         return list(xi)
     cross = lagged_products(xi, phi, 0)
     gram = lagged_products(zhat, phi, 0)
-    size = np.sqrt(np.maximum(np.abs(np.diag(gram)), 1e-300))
+    size = sizes(gram)
     weights = np.linalg.solve((gram / np.outer(size, size)).T, (cross / size).T).T / size
     return [x - weights @ z for x, z in zip(xi, zhat, strict=True)]
 

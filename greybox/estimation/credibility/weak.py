@@ -13,13 +13,10 @@ from numpy.typing import NDArray
 
 from greybox.estimation.covariance import correlation_lags
 from greybox.estimation.credibility.evidence import Equation
-from greybox.estimation.credibility.kernel import (
-    autocovariance,
-    independent_covariance,
-    quadratic_form,
-)
 from greybox.estimation.credibility.words import combination, listed
 from greybox.estimation.verdict import TestResult, not_applicable
+from greybox.numerics.linalg import quadratic_form, scaled_inverse
+from greybox.numerics.moments import autocovariance, independent_covariance
 
 Array = NDArray[np.float64]
 
@@ -89,7 +86,7 @@ def measure_strength(equation: Equation) -> Strength:
     p = len(equation.labels)
     freedom = max(equation.freedom - q, 1)
     gram = solution.information
-    inverse = _inverse(gram)
+    inverse = scaled_inverse(gram)
     moments = np.asarray(sum(f @ f.T for f in equation.phi))
     covariance = np.asarray(sum(v @ v.T for v in noise)) / freedom
     noisy = np.diag(covariance) * freedom > _EXACT * np.diag(moments)
@@ -100,15 +97,9 @@ def measure_strength(equation: Equation) -> Strength:
         size = float(sum((w**2).sum() for w in part))
         own[i] = size**2 / _noise_variance(part, [v[i : i + 1] for v in noise], equation, q)
         first[i] = gram[i, i] / covariance[i, i] / q
-    shea = np.diag(_inverse(moments)) / np.diag(inverse)
+    shea = np.diag(scaled_inverse(moments)) / np.diag(inverse)
     joint = _joint(equation, bases, noise, covariance, noisy, q)
     return Strength(first, shea, own, *joint)
-
-
-def _inverse(matrix: Array) -> Array:
-    size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    unit = matrix / np.outer(size, size)
-    return np.asarray(np.linalg.pinv(unit, rcond=1e-15) / np.outer(size, size))
 
 
 def _orthonormal(z: Array) -> Array:

@@ -1,0 +1,51 @@
+"""Inverses and quadratic forms of matrices whose rows have units of their own."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+# relative singular value of a scaled matrix below which a direction is rounding
+ROUNDING = 1e-15
+_TINY = 1e-300
+
+
+def sizes(matrix: Array) -> Array:
+    """Return the roots of the diagonal (n,), a tiny number where that is nothing."""
+    return np.asarray(np.sqrt(np.maximum(np.abs(np.diag(matrix)), _TINY)))
+
+
+def scaled_inverse(matrix: Array, least: float = ROUNDING) -> Array:
+    """Return the pseudo-inverse of a square matrix, its rows and columns scaled to one before.
+
+    Parameters
+    ----------
+    matrix : ndarray
+        (n, n) with a diagonal that tells the size of its rows.
+    least : float
+        Directions with less than this share of the largest singular value are left out.
+    """
+    size = np.outer(*[sizes(matrix)] * 2)
+    return np.asarray(np.linalg.pinv(matrix / size, rcond=least) / size)
+
+
+def quadratic_form(
+    moments: Array, covariance: Array, least: float = 1e-9
+) -> tuple[float, int, Array]:
+    """Return mᵀ C⁺ m, the rank, and the whitening W with W C Wᵀ = I, (rank, k).
+
+    Works in correlation units; directions that carry less than `least` of the
+    largest variance are left out.
+    """
+    size = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    used = np.flatnonzero(size > 1e-150)
+    if not len(used):
+        return 0.0, 0, np.zeros((0, len(moments)))
+    scaled = covariance[np.ix_(used, used)] / np.outer(size[used], size[used])
+    values, vectors = np.linalg.eigh((scaled + scaled.T) / 2)
+    good = values > least * values[-1]
+    whitening = np.zeros((int(good.sum()), len(moments)))
+    whitening[:, used] = (vectors[:, good] / np.sqrt(values[good])).T / size[used]
+    return float(((whitening @ moments) ** 2).sum()), int(good.sum()), whitening

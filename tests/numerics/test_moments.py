@@ -1,0 +1,55 @@
+"""Sums with memory, and inverses of scaled and banded matrices, against what defines them."""
+
+import numpy as np
+import pytest
+
+from greybox.numerics.banded import factor_band, inverse_band
+from greybox.numerics.linalg import scaled_inverse
+from greybox.numerics.moments import convolve, lagged_products, lagged_sums
+
+
+def test_lagged_sums_are_the_diagonal_of_lagged_products():
+    rng = np.random.default_rng(0)
+    a = [rng.standard_normal((3, n)) for n in (40, 7)]
+    b = [rng.standard_normal((3, n)) for n in (40, 7)]
+    expected = np.array([np.diag(lagged_products(a, b, lag)) for lag in range(12)]).T
+    np.testing.assert_allclose(lagged_sums(a, b, 11), expected, rtol=1e-12, atol=1e-12)
+    slow = sum(np.outer(x[:, k], y[:, k + 2]) for x, y in zip(a, b, strict=True)
+               for k in range(x.shape[1] - 2))  # fmt: skip
+    np.testing.assert_allclose(lagged_products(a, b, -2), slow, rtol=1e-12)
+
+
+@pytest.mark.parametrize("memory", [1, 5, 30])
+def test_convolution_equals_that_of_numpy(memory):
+    rng = np.random.default_rng(1)
+    rows, weights = rng.standard_normal((2, 20)), rng.standard_normal((2, memory))
+    expected = [np.convolve(r, w)[:20] for r, w in zip(rows, weights, strict=True)]
+    np.testing.assert_allclose(convolve(rows, weights), expected, rtol=1e-12, atol=1e-12)
+
+
+def test_units_do_not_change_an_inverse():
+    rng = np.random.default_rng(2)
+    root = rng.standard_normal((4, 6))
+    units = np.diag([1.0, 1e-7, 1e6, 1e-3])
+    expected = np.linalg.inv(root @ root.T)
+    found = scaled_inverse(units @ root @ root.T @ units)
+    np.testing.assert_allclose(units @ found @ units, expected, rtol=1e-10)
+
+
+@pytest.mark.parametrize(("size", "rows"), [(1, 9), (3, 60), (6, 62)])
+def test_the_band_of_an_inverse_equals_the_dense_inverse(size, rows):
+    rng = np.random.default_rng(3)
+    block = np.arange(rows) // size
+    tied = np.abs(block[:, None] - block) <= 1
+    dense = np.where(tied, rng.standard_normal((rows, rows)), 0.0)
+    dense = dense + dense.T + 12 * size * np.eye(rows)
+    width = 2 * size
+    band = np.array([np.append(np.diag(dense, -d), np.zeros(d)) for d in range(width)])
+    inverse = np.linalg.inv(dense)
+    found = inverse_band(band, size)
+    for d in range(width):
+        inside = tied[np.arange(rows - d) + d, np.arange(rows - d)]
+        np.testing.assert_allclose(
+            found[d, : rows - d][inside], np.diag(inverse, -d)[inside], rtol=1e-9, atol=1e-15
+        )
+    assert factor_band(-band) is None
