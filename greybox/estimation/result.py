@@ -30,8 +30,8 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Limit:
-    """One bound beside the standard errors of an estimate.
+class EfficiencyBound:
+    """A lower bound of the standard errors, beside those of an estimate.
 
     Parameters
     ----------
@@ -170,7 +170,7 @@ class Estimate(DisplayMixin):
         Free-run fit (6.12) on the estimation logs [%].
     noise : NoiseLevels, optional
         What was found of measurement and process noise.
-    limits : dict of str to Limit
+    limits : dict of str to EfficiencyBound
         ``cramer_rao`` and ``optimal_iv`` beside the standard errors.
     prefilter : {"none", "noise"}
         Whether all equations were solved jointly with their error made white.
@@ -194,7 +194,7 @@ class Estimate(DisplayMixin):
     notes: tuple[str, ...] = ()
     fit: dict[str, float] = field(default_factory=dict)
     noise: NoiseLevels | None = None
-    limits: Mapping[str, Limit] = field(default_factory=dict)
+    limits: Mapping[str, EfficiencyBound] = field(default_factory=dict)
     prefilter: str = "none"
 
     @property

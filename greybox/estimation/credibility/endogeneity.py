@@ -7,11 +7,11 @@ import numpy as np
 from greybox.estimation.credibility.evidence import Equation
 from greybox.estimation.credibility.kernel import Array
 from greybox.estimation.credibility.predetermined import moments_mean, noise_after_error
-from greybox.estimation.credibility.question import Finding, Question
-from greybox.estimation.credibility.scores import Score, score_test
+from greybox.estimation.credibility.question import Conclusion, ScoreTest
+from greybox.estimation.credibility.scores import ScoreStatistic, score_test
 from greybox.estimation.verdict import TestResult
 
-_QUESTION = Question(
+_TEST = ScoreTest(
     "endogeneity",
     "the regressors do not depend on the noise: least squares suffices",
     "no regressor of this equation is noisy",
@@ -36,7 +36,7 @@ def endogeneity(equation: Equation, *, decisive: bool = True) -> TestResult:
     Durbin (1954); Hausman (1978); Wooldridge (1995), score form.
     """
 
-    def score() -> Score:
+    def score() -> ScoreStatistic:
         errors = _residuals(equation, _least_squares(equation))
         zhat = equation.solution.projected
         noise = [f - z for f, z in zip(equation.phi, zhat, strict=True)]
@@ -44,12 +44,12 @@ def endogeneity(equation: Equation, *, decisive: bool = True) -> TestResult:
         mean = moments_mean(zhat, equation.phi, after, centred=equation.centred)
         return score_test(zhat, equation.phi, equation.phi, errors, memory="white", mean=mean)
 
-    def finding(score: Score, suffices: bool) -> Finding:
+    def conclude(score: ScoreStatistic, suffices: bool) -> Conclusion:
         theta = _least_squares(equation)
         std = np.where(equation.std > 0, equation.std, np.inf)
         gap = np.abs(theta - equation.solution.theta) / std
         far = int(np.argmax(gap))
-        return Finding(
+        return Conclusion(
             "least squares is not told from instrumental variables here."
             if suffices
             else f"least squares is biased here, most in {equation.labels[far]} "
@@ -58,7 +58,7 @@ def endogeneity(equation: Equation, *, decisive: bool = True) -> TestResult:
             {"least_squares": dict(zip(equation.labels, theta.tolist(), strict=True))},
         )
 
-    return _QUESTION.answer(equation, score, finding)
+    return _TEST.apply(equation, score, conclude)
 
 
 def _least_squares(equation: Equation) -> Array:
