@@ -23,8 +23,9 @@ from greybox.estimation.innovations import FilterRuns
 from greybox.estimation.output_error import log_rows, without_start
 from greybox.estimation.output_setup import measured, output_model, output_predictor
 from greybox.estimation.registry import ESTIMATORS
-from greybox.estimation.result import EfficiencyBound, Estimate
+from greybox.estimation.result import Estimate
 from greybox.estimation.shooting import Measured, Segments, cut
+from greybox.estimation.values import EfficiencyBound
 from greybox.model.noise import NoiseLevels
 from greybox.model.output import OutputModel
 from greybox.model.output_runs import Simulator
