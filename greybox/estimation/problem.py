@@ -14,7 +14,8 @@ from greybox.estimation.estimate import Covariance, UnexcitedBiasError
 from greybox.estimation.informative import regime_of
 from greybox.estimation.loop import Loop, assess_loop
 from greybox.estimation.output_error import OutputErrorOptions
-from greybox.estimation.result import Estimate, TestResult
+from greybox.estimation.result import Estimate
+from greybox.estimation.verdict import TestResult
 from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor import Predictor, Regime, build_predictor
 from greybox.model.predictor_kinds import PredictorKind

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal, get_args
 
@@ -10,16 +9,12 @@ from greybox.errors import UsageError, suggestion
 from greybox.estimation.estimate import Covariance
 from greybox.estimation.loop import Loop
 from greybox.estimation.output_error import OutputErrorOptions
+from greybox.estimation.registry import ESTIMATORS
 from greybox.model.model import ManoeuvringModel
+from greybox.model.predictor_kinds import PREDICTORS
 
-CHOICES: Mapping[str, tuple[str, ...]] = {
-    "method": ("ls", "iv", "refined-iv", "oe"),
-    "predictor": ("basic", "augmented", "wind", "basic+wind"),
-    "covariance": get_args(Covariance),
-    "heading": ("measured", "simulated"),
-    "loop": get_args(Loop),
-    "prefilter": ("auto", "noise", "none"),
-}
+# instrumental variables that are always refined by the noise
+REFINED = "refined-iv"
 
 
 @dataclass(frozen=True)
@@ -79,14 +74,14 @@ class Request:
     without: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        for name, choices in CHOICES.items():
+        for name, choices in _choices().items():
             value = getattr(self, name)
             if value is not None and value not in choices:
                 raise UsageError(
                     f"'{value}' is no {name}.{suggestion(str(value), choices)} It is one of "
                     f"{', '.join(choices)}."
                 )
-        if self.method == "refined-iv":
+        if self.method == REFINED:
             if self.prefilter == "none":
                 raise UsageError(
                     "method 'refined-iv' refines by the noise and prefilter 'none' does not: use "
@@ -94,6 +89,17 @@ class Request:
                 )
             object.__setattr__(self, "method", "iv")
             object.__setattr__(self, "prefilter", "noise")
+
+
+def _choices() -> dict[str, tuple[str, ...]]:
+    return {
+        "method": (*ESTIMATORS, REFINED),
+        "predictor": tuple(PREDICTORS),
+        "covariance": get_args(Covariance),
+        "heading": ("measured", "simulated"),
+        "loop": get_args(Loop),
+        "prefilter": ("auto", "noise", "none"),
+    }
 
 
 def regression_only(request: Request) -> bool:
