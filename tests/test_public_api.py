@@ -41,7 +41,7 @@ def test_type_checkers_and_programs_see_the_same_names(package):
 )
 def test_what_is_unknown_is_refused_in_one_sentence(keywords, told):
     with pytest.raises(UsageError) as error:
-        gb.estimate_model([], **keywords)
+        gb.estimate_model(virtual_log(3, 20), **keywords)
     assert told in str(error.value)
 
 
@@ -66,7 +66,7 @@ def test_one_log_needs_no_list_and_old_calls_still_work():
     assert by_name.names == ("a",)
     with pytest.raises(GreyboxError, match=r"the logs have no 'ab'\. Did you mean 'a'"):
         gb.compare({"ab": estimate}, {"a": log})
-    with pytest.raises(GreyboxError, match="1 models on 0 logs"):
+    with pytest.raises(GreyboxError, match="0 logs are given"):
         gb.compare({"a": estimate}, [])
 
 
@@ -83,3 +83,10 @@ def test_estimators_take_one_log_too():
         assert one.params.equals(estimator(predictor, [log], judged=False).params)
         with pytest.raises(UsageError, match="Did you mean 'judged'"):
             estimator(predictor, log, judge=False)
+
+
+@pytest.mark.parametrize("logs", [[], "trial.csv", ["trial.csv"], None, {"t": [0.0, 1.0]}])
+def test_what_is_no_log_is_refused_in_one_sentence(logs):
+    for use in (gb.estimate_model, gb.diagnose, lambda x: gb.compare({"a": gb.Vessel}, x)):
+        with pytest.raises(GreyboxError, match=r"is no log: read one|0 logs are given|have no 'a'"):
+            use(logs)

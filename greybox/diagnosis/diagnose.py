@@ -85,7 +85,7 @@ def diagnose(
         options.progress(doing)
 
     say("log checks")
-    logs, validate = as_list(logs), as_list(validate)
+    logs, validate = as_list(logs), as_list(validate, 0)
     ready = prepare(logs, validate, model, options.structure, options.causes)
     case = ready.case
     say("model without causes")

@@ -63,7 +63,7 @@ def fit_given(
     UsageError
         A cause does not exist.
     """
-    logs, validate = as_list(logs), as_list(validate)
+    logs, validate = as_list(logs), as_list(validate, 0)
     ready = prepare(logs, validate, None, structure, ids)
     case, base = ready.case, ready.base()
     final = base

@@ -19,7 +19,8 @@ from greybox.estimation.credibility import Evidence, assess, convergence, weigh
 from greybox.estimation.disturbance import estimate_current
 from greybox.estimation.error_shape import ErrorShape, error_shapes
 from greybox.estimation.moments import Solution, solve_stacked
-from greybox.estimation.result import Estimate, Iteration, estimation_data
+from greybox.estimation.result import Estimate
+from greybox.estimation.values import Iteration, estimation_data
 from greybox.keywords import known_keywords
 from greybox.model.predictor import Predictor
 from greybox.one_thread import one_thread

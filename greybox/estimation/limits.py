@@ -23,8 +23,9 @@ from greybox.estimation.innovations import FilterRuns
 from greybox.estimation.output_error import log_rows, without_start
 from greybox.estimation.output_setup import measured, output_model, output_predictor
 from greybox.estimation.registry import ESTIMATORS
-from greybox.estimation.result import Estimate, Limit
+from greybox.estimation.result import Estimate
 from greybox.estimation.shooting import Measured, Segments, cut
+from greybox.estimation.values import EfficiencyBound
 from greybox.model.noise import NoiseLevels
 from greybox.model.output import OutputModel
 from greybox.model.output_runs import Simulator
@@ -134,7 +135,7 @@ def cramer_rao(
     return np.asarray(root @ root.T)
 
 
-def _limit(names: Sequence[str], bound: Array, covariance: Array) -> Limit:
+def _limit(names: Sequence[str], bound: Array, covariance: Array) -> EfficiencyBound:
     std = np.sqrt(np.diag(bound))
     reported = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     efficiency = np.where(reported > 0, (std / np.where(reported > 0, reported, 1.0)) ** 2, 0.0)
@@ -144,14 +145,16 @@ def _limit(names: Sequence[str], bound: Array, covariance: Array) -> Limit:
         signs, logs = zip(*(np.linalg.slogdet(c / scale) for c in (bound, covariance)), strict=True)
         if min(signs) > 0:
             determinant = float(np.exp((logs[0] - logs[1]) / len(names)))
-    return Limit(
+    return EfficiencyBound(
         dict(zip(names, map(float, std), strict=True)),
         dict(zip(names, map(float, efficiency), strict=True)),
         determinant,
     )
 
 
-def limits_of(estimate: Estimate, logs: Sequence[TrialLog]) -> tuple[dict[str, Limit], str]:
+def limits_of(
+    estimate: Estimate, logs: Sequence[TrialLog]
+) -> tuple[dict[str, EfficiencyBound], str]:
     """Compare an estimate's standard errors with the bounds at its own model and noises.
 
     Parameters
@@ -172,7 +175,7 @@ def limits_of(estimate: Estimate, logs: Sequence[TrialLog]) -> tuple[dict[str, L
     names = estimate.predictor.parameter_names
     wanted = estimate.predictor.parameter_columns
     covariance = estimate.covariance[np.ix_(wanted, wanted)]
-    found: dict[str, Limit] = {}
+    found: dict[str, EfficiencyBound] = {}
     trouble = []
     try:
         bound = _parameter_bound(estimate, logs, estimate.noise)

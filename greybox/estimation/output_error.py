@@ -26,7 +26,7 @@ from greybox.estimation.free_run_errors import (
 from greybox.estimation.free_run_noise import noise_of_run, noise_of_sensors, residual_noise
 from greybox.estimation.innovations import FilterRuns, fit_innovations
 from greybox.estimation.output_setup import deviations, measured, output_model, turns
-from greybox.estimation.result import Estimate, Iteration, estimation_data
+from greybox.estimation.result import Estimate
 from greybox.estimation.shooting import (
     RANK,
     FreeRuns,
@@ -38,6 +38,7 @@ from greybox.estimation.shooting import (
     ShootingFit,
     loss_weights,
 )
+from greybox.estimation.values import Iteration, estimation_data
 from greybox.estimation.verdict import TestResult
 from greybox.keywords import known_keywords
 from greybox.model.disturbances import CURRENT, WIND

@@ -29,7 +29,8 @@ from greybox.estimation.noise import (
     stated_levels,
 )
 from greybox.estimation.registry import ESTIMATORS
-from greybox.estimation.result import Estimate, Iteration
+from greybox.estimation.result import Estimate
+from greybox.estimation.values import Iteration
 from greybox.estimation.verdict import UNJUDGED
 from greybox.estimation.white_rows import (
     WhiteRows,

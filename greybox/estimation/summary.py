@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
+import numpy as np
+
+from greybox.estimation.values import EstimateValues
+from greybox.estimation.verdict import TestResult
 from greybox.model.units import parameter_unit
 from greybox.trial.validity import in_words
-
-if TYPE_CHECKING:
-    from greybox.estimation.result import Estimate
-    from greybox.estimation.verdict import TestResult
 
 WIDTH = 100
 # closed intervals, None for an infinite end
@@ -33,7 +32,7 @@ BOUNDS = {
 _MARKS = {True: "ok", False: "!!", None: "  "}
 
 
-def summarise(estimate: Estimate) -> str:
+def summarise(estimate: EstimateValues) -> str:
     """Return the verdict, the parameters in the manner of a regression table, and the tests."""
     lines = [f"{'Estimate of ' + estimate.vessel.name:^{WIDTH}}".rstrip(), "=" * WIDTH]
     lines += _wrapped(f"Verdict: {estimate.verdict.text}", "  ")
@@ -45,9 +44,9 @@ def summarise(estimate: Estimate) -> str:
         lines.append(f"Free-run fit on the estimation logs: {shown}")
     for name, limit in estimate.limits.items():
         lines += _wrapped(f"{BOUNDS[name]}: {limit.sentence}", "  ")
-    if estimate.conditions.values:
-        lines += _wrapped(f"Conditions: {in_words(estimate.conditions.values)}", "  ")
-    for actuator in estimate.actuators:
+    if estimate.data.conditions.values:
+        lines += _wrapped(f"Conditions: {in_words(estimate.data.conditions.values)}", "  ")
+    for actuator in estimate.data.actuators:
         lines += _wrapped(f"Actuator: {actuator.sentence}", "  ")
     lines += _tests(estimate.tests)
     if estimate.notes:
@@ -57,19 +56,23 @@ def summarise(estimate: Estimate) -> str:
     return "\n".join(lines)
 
 
-def estimated(estimate: Estimate) -> list[tuple[str, float, float, str]]:
+def estimated(estimate: EstimateValues) -> list[tuple[str, float, float, str]]:
     """Return label, value, standard error and unit of each parameter, biases left out."""
     unit, structure = estimate.vessel.force_unit, estimate.predictor.structure
-    columns = estimate.predictor.columns
+    columns, std = estimate.predictor.columns, _std(estimate)
     return [
         (
             columns[i].label,
             float(estimate.theta[i]),
-            float(estimate.std[i]),
+            float(std[i]),
             parameter_unit(structure.terms[structure.index(columns[i].terms[0])], unit),
         )
         for i in estimate.predictor.parameter_columns
     ]
+
+
+def _std(estimate: EstimateValues) -> np.ndarray:
+    return np.asarray(np.sqrt(np.maximum(np.diag(estimate.covariance), 0.0)))
 
 
 def _wrapped(text: str, indent: str) -> list[str]:
@@ -78,20 +81,20 @@ def _wrapped(text: str, indent: str) -> list[str]:
     )
 
 
-def _head(estimate: Estimate) -> list[str]:
+def _head(estimate: EstimateValues) -> list[str]:
     method = estimate.method + (", prefiltered" if estimate.prefilter == "noise" else "")
     rows = (
-        ("Method:", method, "Samples:", f"{estimate.samples}"),
-        ("Predictor:", estimate.predictor.kind, "Samples used:", f"{estimate.kept}"),
+        ("Method:", method, "Samples:", f"{estimate.data.samples}"),
+        ("Predictor:", estimate.predictor.kind, "Samples used:", f"{estimate.data.kept}"),
         ("Structure:", estimate.predictor.structure.name, "Sample time:",
          f"{estimate.sample_time:g} s"),
         ("Std errors:", f"{estimate.covariance_kind}, {estimate.lags} lags", "Refinements:",
-         f"{estimate.iterations}"),
+         f"{estimate.iteration.count}"),
     )  # fmt: skip
     return [f"{a:<18}{b:<28}{c:<18}{d}" for a, b, c, d in rows]
 
 
-def _table(estimate: Estimate) -> list[str]:
+def _table(estimate: EstimateValues) -> list[str]:
     sets = weak_safe_sets(estimate.tests)
     # only instruments can be weak
     safe = 24 if sets else 0
@@ -99,7 +102,7 @@ def _table(estimate: Estimate) -> list[str]:
         f"{'parameter':<12}{'value':>10}{'std err':>9}{'[0.025':>11}{'0.975]':>11}"
         f"{'weak-safe 95 %' if sets else '':>{safe}}{'per second':>11}  unit"
     ]
-    unit = estimate.vessel.force_unit
+    unit, errors = estimate.vessel.force_unit, _std(estimate)
     structure = estimate.predictor.structure
     for state in structure.states:
         lines.append("-" * WIDTH)
@@ -107,7 +110,7 @@ def _table(estimate: Estimate) -> list[str]:
             column = estimate.predictor.columns[i]
             if column.is_bias:
                 continue
-            value, std = estimate.theta[i], estimate.std[i]
+            value, std = estimate.theta[i], errors[i]
             term = structure.terms[structure.index(column.terms[0])]
             lines.append(
                 f"{column.label:<12}{value:>10.4g}{std:>9.2g}{value - 1.96 * std:>11.4g}"

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from greybox.prediction.running import Runs
+from greybox.prediction.running import DrawnRuns
 from greybox.trial.manoeuvres import (
     Quantity,
     TurningCircle,
@@ -94,7 +94,7 @@ def quantities(of: Manoeuvre) -> dict[str, Quantity | None]:
 
 
 def measure(
-    runs: Runs,
+    runs: DrawnRuns,
     run: int,
     length: float,
     *,
@@ -109,7 +109,7 @@ def measure(
 
     Parameters
     ----------
-    runs : Runs
+    runs : DrawnRuns
     run : int
     length : float
         [m]

@@ -14,7 +14,7 @@ from greybox.prediction.drawn import Drawn
 from greybox.prediction.extrapolation import Extrapolation, extrapolation_notes
 from greybox.prediction.helm import Helm
 from greybox.prediction.result import Kind, PredictedManoeuvre
-from greybox.prediction.running import Runs
+from greybox.prediction.running import DrawnRuns
 from greybox.prediction.steady import Steady
 from greybox.trial.log import TrialLog
 from greybox.trial.manoeuvres import Stopping, TurningCircle, ZigZag
@@ -27,7 +27,7 @@ def run_notes(
     task: Task,
     model: ManoeuvringModel,
     own: Manoeuvre,
-    runs: Runs,
+    runs: DrawnRuns,
     unheld: int,
     values: Mapping[str, Drawn | None],
     log: TrialLog,

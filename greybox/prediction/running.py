@@ -27,7 +27,7 @@ _DIVERGED = 10.0
 
 
 @dataclass(frozen=True)
-class Runs:
+class DrawnRuns:
     """Manoeuvres as they were sailed.
 
     Parameters
@@ -74,7 +74,7 @@ def sail(
     orders: Orders,
     longest: float,
     process: Iterator[Array] | None = None,
-) -> Runs:
+) -> DrawnRuns:
     """Sail from straight runs until all manoeuvres are complete.
 
     Parameters
@@ -143,7 +143,7 @@ def sail(
             if process is not None:
                 state[:nx] += next(process)
     complete = np.where((orders.complete >= 0) & ~diverged, orders.complete + before, -1)
-    return Runs(
+    return DrawnRuns(
         np.asarray(np.arange(len(psi)) * step, float),
         np.stack(states),
         np.stack(psi),

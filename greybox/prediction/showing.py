@@ -9,14 +9,14 @@ import numpy as np
 from greybox.model.model import ManoeuvringModel
 from greybox.prediction.helm import Helm
 from greybox.prediction.result import Bundle
-from greybox.prediction.running import Runs
+from greybox.prediction.running import DrawnRuns
 from greybox.trial.log import TrialLog, make_log
 
 # samples and tracks that pictures hold
 _SHOWN_SAMPLES, _SHOWN_TRACKS = 400, 40
 
 
-def log_of(runs: Runs, run: int, model: ManoeuvringModel, helm: Helm) -> TrialLog:
+def log_of(runs: DrawnRuns, run: int, model: ManoeuvringModel, helm: Helm) -> TrialLog:
     """Return one run as a log."""
     stop = int(runs.complete[run]) + 1 if runs.complete[run] >= 0 else len(runs.t)
     x_n, y_n = runs.track(run, stop)
@@ -26,7 +26,7 @@ def log_of(runs: Runs, run: int, model: ManoeuvringModel, helm: Helm) -> TrialLo
     return make_log(model.vessel, channels, model.sample_time, "prediction")
 
 
-def bundle_of(runs: Runs, helm: Helm, course: float, length: float) -> Bundle:
+def bundle_of(runs: DrawnRuns, helm: Helm, course: float, length: float) -> Bundle:
     """Return what pictures need of all runs; the course is that of the approach [rad]."""
     stop = int(runs.complete[0]) + 1 if runs.complete[0] >= 0 else len(runs.t)
     sailed = length / float(np.hypot(*runs.states[0, :2, 0]))

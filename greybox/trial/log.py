@@ -303,9 +303,26 @@ class TrialLog(DisplayMixin):
 Logs = TrialLog | Sequence[TrialLog]
 
 
-def as_list(logs: Logs) -> list[TrialLog]:
-    """Return the logs, a single one as a list of its own."""
-    return [logs] if isinstance(logs, TrialLog) else list(logs)
+def as_list(logs: Logs, least: int = 1) -> list[TrialLog]:
+    """Return the logs, a single one as a list of its own.
+
+    Raises
+    ------
+    LogError
+        There are fewer than `least`, or something else stands among them.
+    """
+    given: Any = logs
+    several = isinstance(given, Iterable) and not isinstance(given, TrialLog | str)
+    found: list[TrialLog] = list(given) if several else [given]
+    for log in found:
+        if not isinstance(log, TrialLog):
+            raise LogError(
+                f"{log!r:.60} is no log: read one with read_log(path, vessel), or make one of a "
+                f"DataFrame with log_from_pandas(frame, vessel)."
+            )
+    if len(found) < least:
+        raise LogError(f"{len(found)} logs are given, at least {least} is needed.")
+    return found
 
 
 def make_log(

@@ -366,7 +366,9 @@ def compare(
     Raises
     ------
     UsageError
-        There is no model or no log, a model has no logs, or models differ in their states.
+        There is no model, a model has no logs, or models differ in their states.
+    LogError
+        There is no log.
     """
     known = {n: m.model() if isinstance(m, Estimate) else m for n, m in models.items()}
     own = logs if isinstance(logs, Mapping) else dict.fromkeys(known, logs)
@@ -377,11 +379,8 @@ def compare(
                 f"give those of every model, or one sequence for all."
             )
     lists = [as_list(own[name]) for name in known]
-    if not known or not all(lists):
-        raise UsageError(
-            f"{len(known)} models on {min(map(len, lists), default=0)} logs: give at least one of "
-            f"each."
-        )
+    if not known:
+        raise UsageError("there is no model to compare: give at least one, by name.")
     return _compare(list(known.values()), list(known), lists, heading, bands, seed)
 
 

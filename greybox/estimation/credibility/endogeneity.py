@@ -7,13 +7,13 @@ from numpy.typing import NDArray
 
 from greybox.estimation.credibility.evidence import Equation
 from greybox.estimation.credibility.predetermined import moments_mean, noise_after_error
-from greybox.estimation.credibility.question import Finding, Question
-from greybox.estimation.credibility.scores import Score, score_test
+from greybox.estimation.credibility.question import Conclusion, ScoreTest
+from greybox.estimation.credibility.scores import ScoreStatistic, score_test
 from greybox.estimation.verdict import TestResult
 
 Array = NDArray[np.float64]
 
-_QUESTION = Question(
+_TEST = ScoreTest(
     "endogeneity",
     "the regressors do not depend on the noise: least squares suffices",
     "no regressor of this equation is noisy",
@@ -38,7 +38,7 @@ def endogeneity(equation: Equation, *, decisive: bool = True) -> TestResult:
     Durbin (1954); Hausman (1978); Wooldridge (1995), score form.
     """
 
-    def score() -> Score:
+    def score() -> ScoreStatistic:
         errors = _residuals(equation, _least_squares(equation))
         zhat = equation.solution.projected
         noise = [f - z for f, z in zip(equation.phi, zhat, strict=True)]
@@ -46,12 +46,12 @@ def endogeneity(equation: Equation, *, decisive: bool = True) -> TestResult:
         mean = moments_mean(zhat, equation.phi, after, centred=equation.centred)
         return score_test(zhat, equation.phi, equation.phi, errors, memory="white", mean=mean)
 
-    def finding(score: Score, suffices: bool) -> Finding:
+    def conclude(score: ScoreStatistic, suffices: bool) -> Conclusion:
         theta = _least_squares(equation)
         std = np.where(equation.std > 0, equation.std, np.inf)
         gap = np.abs(theta - equation.solution.theta) / std
         far = int(np.argmax(gap))
-        return Finding(
+        return Conclusion(
             "least squares is not told from instrumental variables here."
             if suffices
             else f"least squares is biased here, most in {equation.labels[far]} "
@@ -60,7 +60,7 @@ def endogeneity(equation: Equation, *, decisive: bool = True) -> TestResult:
             {"least_squares": dict(zip(equation.labels, theta.tolist(), strict=True))},
         )
 
-    return _QUESTION.answer(equation, score, finding)
+    return _TEST.apply(equation, score, conclude)
 
 
 def _least_squares(equation: Equation) -> Array:

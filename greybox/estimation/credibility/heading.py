@@ -6,13 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.estimation.credibility.evidence import Equation, Evidence
-from greybox.estimation.credibility.question import Finding, Question
-from greybox.estimation.credibility.scores import Score, score_test
+from greybox.estimation.credibility.question import Conclusion, ScoreTest
+from greybox.estimation.credibility.scores import ScoreStatistic, score_test
 from greybox.estimation.verdict import TestResult, not_applicable
 
 Array = NDArray[np.float64]
 
-_QUESTION = Question(
+_TEST = ScoreTest(
     "heading_independence",
     "the residuals do not depend on the heading: no current or wind that turns about the ship",
     "the heading does not vary beyond what the estimate used",
@@ -34,19 +34,19 @@ def heading_independence(evidence: Evidence, equation: Equation) -> TestResult:
     """
     if evidence.predictor.augmented:
         return not_applicable(
-            _QUESTION.kind, _QUESTION.null, "the predictor captures the disturbance",
+            _TEST.kind, _TEST.null, "the predictor captures the disturbance",
             equation.state,
         )  # fmt: skip
     spread = max((float(np.std(log["psi"])) for log in evidence.logs if "psi" in log), default=0.0)
     if spread < _LEAST_SPREAD:
         return not_applicable(
-            _QUESTION.kind, _QUESTION.null,
+            _TEST.kind, _TEST.null,
             f"the heading spreads by {np.degrees(spread):.0f} deg, {np.degrees(_LEAST_SPREAD):.0f} "
             f"are needed",
             equation.state,
         )  # fmt: skip
 
-    def score() -> Score:
+    def score() -> ScoreStatistic:
         return score_test(
             _around(evidence, equation),
             equation.phi,
@@ -55,7 +55,7 @@ def heading_independence(evidence: Evidence, equation: Equation) -> TestResult:
             colour=equation.colour,
         )
 
-    return _QUESTION.answer(equation, score, _finding)
+    return _TEST.apply(equation, score, _conclude)
 
 
 def _around(evidence: Evidence, equation: Equation) -> list[Array]:
@@ -70,8 +70,8 @@ def _around(evidence: Evidence, equation: Equation) -> list[Array]:
     return out
 
 
-def _finding(score: Score, fine: bool) -> Finding:
-    return Finding(
+def _conclude(score: ScoreStatistic, fine: bool) -> Conclusion:
+    return Conclusion(
         "no disturbance turns with the heading."
         if fine
         else "the residuals turn with the heading, as in a current or wind that this predictor "

@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 
 from greybox.estimation.credibility.evidence import Equation, Evidence
 from greybox.estimation.credibility.overidentification import delayed
-from greybox.estimation.credibility.question import Finding, Question
-from greybox.estimation.credibility.scores import Score, score_test
+from greybox.estimation.credibility.question import Conclusion, ScoreTest
+from greybox.estimation.credibility.scores import ScoreStatistic, score_test
 from greybox.estimation.verdict import TestResult
 
 Array = NDArray[np.float64]
 
 # delays of the joint statistic: dense where a lag or a delay shows, sparse behind
 LAGS = (0, 1, 2, 4, 8, 16)
-_QUESTION = Question(
+_TEST = ScoreTest(
     "input_independence",
     "the residuals do not depend on the inputs, at any delay",
     "no input varies beyond what the estimate used",
@@ -39,7 +39,7 @@ def input_independence(evidence: Evidence, equation: Equation) -> TestResult:
     names = [(n, lag) for lag in LAGS for n in evidence.predictor.structure.inputs]
     xi = _delayed_inputs(evidence, equation)
 
-    def score() -> Score:
+    def score() -> ScoreStatistic:
         return score_test(
             xi,
             equation.phi,
@@ -48,11 +48,11 @@ def input_independence(evidence: Evidence, equation: Equation) -> TestResult:
             colour=equation.colour,
         )
 
-    def finding(score: Score, fine: bool) -> Finding:
+    def conclude(score: ScoreStatistic, fine: bool) -> Conclusion:
         std = np.sqrt(np.maximum(np.diag(score.covariance), 0.0))
         ratio = np.divide(np.abs(score.moments), std, out=np.zeros_like(std), where=std > 0)
         worst = int(np.argmax(ratio))
-        return Finding(
+        return Conclusion(
             "no input explains the residuals."
             if fine
             else f"the inputs still explain the residuals, most {names[worst][0]} "
@@ -62,7 +62,7 @@ def input_independence(evidence: Evidence, equation: Equation) -> TestResult:
             {"inputs": _correlations(names, xi, equation, score.moments, std)},
         )
 
-    return _QUESTION.answer(equation, score, finding)
+    return _TEST.apply(equation, score, conclude)
 
 
 def _delayed_inputs(evidence: Evidence, equation: Equation) -> list[Array]:

@@ -6,15 +6,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.estimation.credibility.evidence import Equation
-from greybox.estimation.credibility.question import Finding, Question
-from greybox.estimation.credibility.scores import Score, score_test
+from greybox.estimation.credibility.question import Conclusion, ScoreTest
+from greybox.estimation.credibility.scores import ScoreStatistic, score_test
 from greybox.estimation.verdict import TestResult
 
 Array = NDArray[np.float64]
 
 # samples by which the further instruments of a single log are delayed
 _DELAY = 5
-_QUESTION = Question(
+_TEST = ScoreTest(
     "overidentification",
     "the estimate satisfies the equations of all instruments, delayed ones included",
     "no further instrument says anything new",
@@ -46,7 +46,7 @@ def overidentification(
     Sargan (1958); Hansen (1982); score form: Wooldridge (1995).
     """
 
-    def score() -> Score:
+    def score() -> ScoreStatistic:
         wanted = [i for i, n in enumerate(equation.labels) if n not in biases]
         xi = [delayed(z[wanted], k, _DELAY) for z, k in zip(equation.z, equation.keep, strict=True)]
         if equation.states:
@@ -65,7 +65,7 @@ def overidentification(
             colour=equation.colour,
         )
 
-    return _QUESTION.answer(equation, score, _finding)
+    return _TEST.apply(equation, score, _conclude)
 
 
 def _products(x: Array) -> Array:
@@ -74,10 +74,10 @@ def _products(x: Array) -> Array:
     return np.vstack([x, x[first] * x[second]])
 
 
-def _finding(score: Score, agree: bool) -> Finding:
+def _conclude(score: ScoreStatistic, agree: bool) -> Conclusion:
     if agree:
-        return Finding("the instruments agree.", True, {})
-    return Finding(
+        return Conclusion("the instruments agree.", True, {})
+    return Conclusion(
         "the instruments contradict each other: the model lacks something that the inputs move, or "
         "logs differ.",
         False,

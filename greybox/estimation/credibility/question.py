@@ -7,14 +7,14 @@ from dataclasses import dataclass
 from typing import Any
 
 from greybox.estimation.credibility.evidence import Equation
-from greybox.estimation.credibility.scores import Score
+from greybox.estimation.credibility.scores import ScoreStatistic
 from greybox.estimation.verdict import TestResult, not_applicable
 
 LEVEL = 0.05
 
 
 @dataclass(frozen=True)
-class Finding:
+class Conclusion:
     """What a score says.
 
     Parameters
@@ -32,27 +32,27 @@ class Finding:
 
 
 @dataclass(frozen=True)
-class Question:
-    """What a score test asks.
+class ScoreTest:
+    """A score test: what it asks of an equation, and how its answer is told.
 
     Parameters
     ----------
     kind : str
         The test's name without its equation.
     null : str
-    silent : str
+    untested : str
         Why it does not apply where no moment is left to test.
     """
 
     kind: str
     null: str
-    silent: str
+    untested: str
 
-    def answer(
+    def apply(
         self,
         equation: Equation,
-        score: Callable[[], Score],
-        finding: Callable[[Score, bool], Finding],
+        score: Callable[[], ScoreStatistic],
+        conclude: Callable[[ScoreStatistic, bool], Conclusion],
     ) -> TestResult:
         """Return the test of an equation, or why it does not apply.
 
@@ -61,15 +61,15 @@ class Question:
         equation : Equation
         score : callable
             Called only where the equation can be tested.
-        finding : callable
+        conclude : callable
             Of the score, and whether it is accepted at the 5 % level.
         """
         if equation.obstacle:
             return not_applicable(self.kind, self.null, equation.obstacle, equation.state)
         found = score()
         if not found.freedom:
-            return not_applicable(self.kind, self.null, self.silent, equation.state)
-        told = finding(found, found.p_value >= LEVEL)
+            return not_applicable(self.kind, self.null, self.untested, equation.state)
+        told = conclude(found, found.p_value >= LEVEL)
         return TestResult(
             self.kind,
             self.null,

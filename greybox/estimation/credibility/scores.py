@@ -27,7 +27,7 @@ Memory = Literal["iid", "white", "coloured"]
 
 
 @dataclass(frozen=True)
-class Score:
+class ScoreStatistic:
     """A score test.
 
     Parameters
@@ -84,7 +84,7 @@ def score_test(
     memory: Memory = "coloured",
     colour: Colour = WHITE,
     mean: Array | None = None,
-) -> Score:
+) -> ScoreStatistic:
     """Test E ξ e = 0 where the estimate solves Σ ẑ ê = 0.
 
     Parameters
@@ -132,4 +132,4 @@ def score_test(
         taken = sum(float((((whitening @ s) ** 2).sum(axis=0) ** 2).sum()) for s in scores)
     share = max(1.0 - taken / freedom, 0.05) if freedom else 1.0
     null = Distribution("F", (freedom / share, known), float(freedom))
-    return Score(statistic, freedom, null, moments, covariance)
+    return ScoreStatistic(statistic, freedom, null, moments, covariance)

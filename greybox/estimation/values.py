@@ -1,0 +1,149 @@
+"""The values that an estimate consists of."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.estimation.verdict import UNJUDGED, TestResult, Verdict
+from greybox.model.noise import NoiseLevels
+from greybox.model.predictor import Predictor
+from greybox.trial.actuator_estimate import ActuatorEstimate, known_actuators
+from greybox.trial.log import TrialLog
+from greybox.trial.ranges import ranges
+from greybox.trial.validity import PooledConditions, pooled_conditions
+from greybox.vessel.vessel import Vessel
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class EfficiencyBound:
+    """A lower bound of the standard errors, beside those of an estimate.
+
+    Parameters
+    ----------
+    std : dict of str to float
+        The least standard error of each parameter.
+    efficiency : dict of str to float
+        (bound / reported variance) of each parameter, 1 at best.
+    determinant : float
+        (det C_bound / det C)^(1/p), 1 at best.
+    """
+
+    std: dict[str, float]
+    efficiency: dict[str, float]
+    determinant: float
+
+    @property
+    def sentence(self) -> str:
+        """What is lost, overall and at worst."""
+        worst = min(self.efficiency, key=lambda n: self.efficiency[n])
+        most = np.sqrt(1 / self.efficiency[worst]) if self.efficiency[worst] > 0 else np.inf
+        share = 100 * self.determinant
+        reached = f"{share:.0f} %" if share >= 10 else f"{share:.2g} %"
+        if share > 100:
+            reached = "all of it, as far as estimated standard errors can tell"
+        return (
+            f"efficiency by determinant {reached}; the standard error of {worst} is {most:.2g} "
+            f"times the least possible one, {self.std[worst]:.2g}."
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fields for JSON."""
+        return {
+            "std": self.std,
+            "efficiency": self.efficiency,
+            "determinant_efficiency": self.determinant,
+        }
+
+
+@dataclass(frozen=True)
+class EstimationData:
+    """What an estimate rests on.
+
+    Parameters
+    ----------
+    samples, kept : int
+        Rows there were, and rows that took part.
+    logs : tuple of dict
+        Name, hash and length of each log.
+    ranges : dict of str to (float, float)
+        Least and greatest value of each state and command in the logs.
+    conditions : PooledConditions
+        Draught, depth and the like of the logs, and in what they differ.
+    actuators : tuple of ActuatorEstimate
+        Measured from command and feedback when the logs were imported.
+    """
+
+    samples: int
+    kept: int
+    logs: tuple[dict[str, Any], ...] = ()
+    ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    conditions: PooledConditions = field(default_factory=PooledConditions)
+    actuators: tuple[ActuatorEstimate, ...] = ()
+
+
+def estimation_data(
+    logs: Sequence[TrialLog], states: Sequence[str], samples: int, kept: int
+) -> EstimationData:
+    """Return what an estimate from these logs rests on."""
+    return EstimationData(
+        samples,
+        kept,
+        tuple(
+            {"name": log.name, "sha256": log.provenance.sha256, "samples": len(log)} for log in logs
+        ),
+        ranges(logs, tuple(states)),
+        pooled_conditions(logs),
+        known_actuators(log.provenance.actuators for log in logs),
+    )
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """How the iteration of an estimator ended.
+
+    Parameters
+    ----------
+    count : int
+        Steps, or refinements of the instruments; 0 where there is no iteration.
+    status : str
+        A sentence on how it ended.
+    converged : bool
+        Whether it ended where it no longer moves.
+    """
+
+    count: int = 0
+    status: str = "solved"
+    converged: bool = True
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class EstimateValues:
+    """Fields of an `Estimate`, which tells what they are and what follows from them."""
+
+    predictor: Predictor
+    method: str
+    theta: Array
+    covariance: Array
+    residual_std: Array
+    vessel: Vessel
+    sample_time: float
+    data: EstimationData
+    covariance_kind: str
+    lags: int
+    iteration: Iteration = field(default_factory=Iteration)
+    current: tuple[tuple[str, float, float], ...] = ()
+    current_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    tests: tuple[TestResult, ...] = ()
+    verdict: Verdict = UNJUDGED
+    notes: tuple[str, ...] = ()
+    fit: dict[str, float] = field(default_factory=dict)
+    noise: NoiseLevels | None = None
+    limits: Mapping[str, EfficiencyBound] = field(default_factory=dict)
+    prefilter: str = "none"
