@@ -33,6 +33,8 @@ Covariance = Literal["hac", "ma", "white", "bootstrap"]
 
 # scaled singular value below which a direction counts as not excited
 SINGULAR = 1e-8
+_NO_ITERATION = Iteration()
+_STRONGEST = "the estimate of the strongest instruments is given"
 _REFINE_TOLERANCE = 1e-4
 _MAX_REFINEMENTS = 30
 
@@ -211,16 +213,16 @@ def estimate_iv(
             f"give a nominal model that is stable, or use --method ls."
         )
     solutions = _solve(regression, instruments, metric)
-    status, iterations, converged = "one step, instruments not refined", 0, True
+    iteration = Iteration(0, "one step, instruments not refined")
     strongest = (_strength(solutions), theta, instruments, solutions)
     if refine:
         most = _MAX_REFINEMENTS if refine is True else int(refine)
-        status, converged = f"the refinement still moved after {most} steps", False
-        for iterations in range(1, most + 1):
+        iteration = Iteration(most, f"still moved after {most} steps", False, "the refinement ")
+        for count in range(1, most + 1):
             previous = _coefficients(solutions)
             target = _structure_theta(predictor, previous)
             # rows are cut once by a refined model and then kept, or the cut would chatter
-            rows = None if iterations == 1 else instruments.keep
+            rows = None if count == 1 else instruments.keep
             candidate, fresh = target, instruments_of(target, rows)
             for _ in range(4):
                 if not fresh.diverged:
@@ -228,10 +230,8 @@ def estimate_iv(
                 candidate = (candidate + theta) / 2
                 fresh = instruments_of(candidate, rows)
             if fresh.diverged:
-                status = (
-                    f"stopped after {iterations - 1} refinements: {fresh.diverged}; "
-                    f"the estimate of the strongest instruments is given"
-                )
+                ended = f"stopped after {count - 1} refinements: {fresh.diverged}; {_STRONGEST}"
+                iteration = Iteration(count, ended, False)
                 _, theta, instruments, solutions = strongest
                 break
             theta, instruments = candidate, fresh
@@ -243,11 +243,11 @@ def estimate_iv(
             scale = np.abs(previous) + 1e-12
             # a halfway model settles too, but not at an estimate that can be simulated
             if candidate is target and (moved < _REFINE_TOLERANCE * scale).all():
-                status, converged = f"converged after {iterations} refinements", True
+                iteration = Iteration(count, f"converged after {count} refinements")
                 break
         else:
             if refine is True:
-                status += "; the estimate of the strongest instruments is given"
+                iteration = replace(iteration, ended=f"{iteration.ended}; {_STRONGEST}")
                 _, theta, instruments, solutions = strongest
     return _result(
         "iv",
@@ -257,13 +257,11 @@ def estimate_iv(
         experiments,
         covariance,
         seed,
-        iterations,
-        status,
+        iteration,
         centred=zero_mean,
         margins=margins,
         heading=heading,
         evidence=instruments if judged else None,
-        converged=converged,
     )
 
 
@@ -439,13 +437,11 @@ def _result(
     logs: Sequence[TrialLog],
     kind: Covariance,
     seed: int,
-    iterations: int = 0,
-    status: str = "solved",
+    iteration: Iteration = _NO_ITERATION,
     centred: bool = False,
     margins: dict[str, float] | None = None,
     heading: str = "measured",
     evidence: Instruments | None = None,
-    converged: bool = True,
 ) -> Estimate:
     """Collect what was found; `evidence` are the simulated instruments to test it with."""
     predictor = regression.predictor
@@ -472,7 +468,7 @@ def _result(
         data=estimation_data(logs, predictor.structure.states, regression.samples, kept),
         covariance_kind=kind,
         lags=lags,
-        iteration=Iteration(iterations, status, converged),
+        iteration=iteration,
         current=estimate_current(
             predictor,
             theta,

@@ -288,8 +288,9 @@ def estimate_refined_iv(
         lags=lags,
         iteration=Iteration(
             plain.iterations + found.rounds,
-            f"prefiltered by the noise, {found.status}",
+            found.status,
             found.converged,
+            "prefiltered by the noise, ",
         ),
         current=estimate_current(
             predictor,

@@ -112,15 +112,23 @@ class Iteration:
     ----------
     count : int
         Steps, or refinements of the instruments; 0 where there is no iteration.
-    status : str
-        A sentence on how it ended.
+    ended : str
+        How it ended, in words that follow "the iteration".
     converged : bool
         Whether it ended where it no longer moves.
+    before : str
+        Words that stand before these in a status.
     """
 
     count: int = 0
-    status: str = "solved"
+    ended: str = "solved"
     converged: bool = True
+    before: str = ""
+
+    @property
+    def status(self) -> str:
+        """How the estimation ended, in words."""
+        return f"{self.before}{self.ended}"
 
 
 @dataclass(frozen=True, repr=False, eq=False)

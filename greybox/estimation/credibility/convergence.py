@@ -15,19 +15,15 @@ def convergence(estimate: Estimate) -> tuple[TestResult, ...]:
     Parameters
     ----------
     estimate : Estimate
-        Its ``converged`` and ``status`` are read.
+        Its ``iteration`` is read.
     """
     if not estimate.iterations:
         return ()
     means = "" if estimate.converged else f", {ESTIMATORS[estimate.method].unconverged}"
-    sentence = f"the iteration {_after_the(estimate.status)}{means}."
+    sentence = f"the iteration {estimate.iteration.ended}{means}."
     return (
         TestResult(
             "convergence", _NULL, float(estimate.iterations), None, sentence,
             passed=estimate.converged,
         ),
     )  # fmt: skip
-
-
-def _after_the(status: str) -> str:
-    return status.removeprefix("the refinement ").removeprefix("prefiltered by the noise, ")
