@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import casadi as ca
 
-from greybox.export.actuators import column
 from greybox.export.ports import Port, distinct_ports
 from greybox.model.disturbances import CURRENT
 from greybox.model.model import ManoeuvringModel
+from greybox.model.run.actuators import column
 
 
 def parameter_ports(model: ManoeuvringModel) -> tuple[Port, ...]:

@@ -9,10 +9,10 @@ from typing import Literal
 
 import casadi as ca
 
-from greybox.export.actuators import column
 from greybox.export.ports import Port, channel_port
 from greybox.model.disturbances import WIND
 from greybox.model.model import ManoeuvringModel
+from greybox.model.run.actuators import column
 from greybox.model.run.step import StepModel, next_position
 from greybox.rotation import body_to_ned, ned_to_body
 

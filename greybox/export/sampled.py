@@ -12,15 +12,17 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.errors import StructureError
-from greybox.export.actuators import actuators, column
+from greybox.errors import StructureError, UsageError
 from greybox.export.coefficients import coefficients, current, parameter_ports
 from greybox.export.motion import Heading, Motion, Wind
 from greybox.export.names import line
 from greybox.export.ports import Port, channel_port, command_ports, distinct_ports
 from greybox.model.disturbances import WIND
 from greybox.model.model import ManoeuvringModel
+from greybox.model.run.actuators import Memory, actuators, column
 
+# earlier commands that a step carries at most
+_MOST = 1000
 _WINDS = {
     "wind_north": "wind velocity towards north",
     "wind_east": "wind velocity towards east",
@@ -135,9 +137,9 @@ def sampled_model(
     u, s, p = (
         ca.SX.sym(n, len(of)) for n, of in (("u", inputs), ("s", switches), ("p", parameters))
     )
-    late = actuators(
-        model.vessel, u[: len(commands)], commands, structure.inputs, model.sample_time
-    )
+    _require_memory(model)
+    late = actuators(model.vessel, u[: len(commands)], structure.inputs, model.sample_time)
+    memory = [_memory_port(m, model, commands) for m in late.memory]
     ports = [channel_port(n) for n in structure.states]
     ports += [channel_port("psi")] if heading != "measured" else []
     if {"u", "v"} <= set(structure.states):
@@ -168,7 +170,7 @@ def sampled_model(
     return SampledModel(
         sample_time=model.sample_time,
         integrator=model.integrator,
-        states=distinct_ports([*ports, *late.memory, *count]),
+        states=distinct_ports([*ports, *memory, *count]),
         motion=len(ports),
         inputs=distinct_ports(inputs),
         switches=tuple(switches),
@@ -230,6 +232,29 @@ def _require_ship(model: ManoeuvringModel) -> None:
                 f"{name} of the model holds a number that is not finite, which no program could "
                 f"run: estimate the model again."
             )
+
+
+def _require_memory(model: ManoeuvringModel) -> None:
+    delay, commands = model.vessel.actuation.delay, len(model.vessel.commands)
+    whole, share = model.vessel.actuation.delay_samples(model.sample_time)
+    length = whole + (share > 0)
+    if length * commands > _MOST:
+        raise UsageError(
+            f"the delay of {delay:g} s is {length} samples of {model.sample_time:g} s of "
+            f"{commands} commands, and a step carries at most {_MOST} of them: correct the "
+            f"delay in the model, or delay the commands outside."
+        )
+
+
+def _memory_port(memory: Memory, model: ManoeuvringModel, commands: list[Port]) -> Port:
+    lag, unit = model.vessel.actuation.lag, model.vessel.force_unit
+    newtons = {"taun": "m N"}.get(memory.of, "N") if unit == "N" else None
+    units = {port.name: port.unit for port in commands}
+    own = "1" if memory.of in ("rudder", "rudder_drag") else units.get(memory.of, newtons)
+    meaning = f"{memory.of} {memory.before} samples ago"
+    return Port(
+        memory.name, own, meaning if memory.before else f"{memory.of} behind a lag of {lag:g} s"
+    )
 
 
 def _notes(model: ManoeuvringModel, heading: Heading, wind: Wind) -> tuple[str, ...]:

@@ -101,7 +101,7 @@ def sail(
     speed = float(steady.speed[0])
     before = max(_FEWEST, math.ceil(APPROACH_LENGTHS * length / (speed * step)))
     most = before + max(1, math.ceil(longest / step))
-    delay = model.vessel.actuation.delay / step
+    delay = model.vessel.actuation.delay_samples(step)
     state = ship.start(steady.x, heading, steady.commands)
     low, high = (b[:, None] for b in bounds(helm.limits))
     rates = np.array([[math.inf if x.rate is None else x.rate] for x in helm.limits]) * step
@@ -154,12 +154,8 @@ def sail(
     )
 
 
-def _earlier(commands: list[Array], k: int, delay: float) -> Array:
-    """Return the commands some samples before sample `k`, linear between samples."""
-    if delay == 0:
-        return commands[k]
-    place = max(k - delay, 0.0)
-    whole = int(place)
-    share = place - whole
-    after = commands[min(whole + 1, k)]
-    return np.asarray((1 - share) * commands[whole] + share * after)
+def _earlier(commands: list[Array], k: int, delay: tuple[int, float]) -> Array:
+    """Return the commands that act at sample `k`, linear between samples; the first were held."""
+    whole, share = delay
+    here, before = (commands[max(k - n, 0)] for n in (whole, whole + 1))
+    return (1 - share) * here + share * before if share else here

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import math
+from dataclasses import replace
 from functools import lru_cache
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.model.run.actuators import Actuators, actuators, column
 from greybox.model.run.kernels import bind, over_runs
 from greybox.model.run.step import Integrator, StepModel
 from greybox.model.structure import Structure
-from greybox.vessel.force import force_expressions
 from greybox.vessel.vessel import Actuation, Thruster, Vessel
 
 Array = NDArray[np.float64]
@@ -52,12 +52,11 @@ class Ship:
         *,
         lagged: bool = True,
     ) -> None:
-        late = vessel.actuation if lagged else Actuation()
-        lag = late.lag / sample_time
+        late = replace(vessel.actuation, delay=0.0) if lagged else Actuation()
         runs = len(theta)
-        key = (structure, vessel.thrusters, lag, late.lag_on, late.lag_held, integrator)
-        self._step = _many(*key, runs)
-        self._remember = _memory(*key) if lag else None
+        step = _ship(structure, vessel.thrusters, late, float(sample_time), integrator)
+        self._step = over_runs(step, runs)
+        self._rest = _rest(structure, vessel.thrusters, late, float(sample_time))
         self.states = structure.states
         self.runs = runs
         self.commands = len(vessel.commands)
@@ -91,8 +90,8 @@ class Ship:
         state = np.zeros((self.size, self.runs))
         state[:nx] = x
         state[nx] = psi
-        if self._remember is not None:
-            state[nx + 1 :] = np.asarray(self._remember.map(self.runs)(commands))
+        if late := len(state) - nx - 1:
+            state[nx + 1 :] = np.asarray(self._rest.map(self.runs)(commands)).reshape(late, -1)
         return state
 
     def __call__(self, state: Array, commands: Array) -> Array:
@@ -111,72 +110,41 @@ class Ship:
         return self._after.copy()
 
 
-def _forces(structure: Structure, vessel: Vessel, commands: ca.SX) -> ca.SX:
-    made = force_expressions(vessel, commands)
-    return ca.vertcat(*[made.get(n, ca.SX(0)) for n in structure.inputs])
+def _actuators(
+    structure: Structure, thrusters: tuple[Thruster, ...], late: Actuation, sample_time: float
+) -> tuple[ca.SX, Actuators]:
+    vessel = Vessel("", 1.0, thrusters, actuation=late)
+    commands = ca.SX.sym("c", len(vessel.commands))
+    return commands, actuators(vessel, commands, structure.inputs, sample_time)
 
 
 @lru_cache(maxsize=32)
-def _memory(
-    structure: Structure,
-    thrusters: tuple[Thruster, ...],
-    lag: float,
-    lag_on: str,
-    lag_held: str,
-    integrator: Integrator,
+def _rest(
+    structure: Structure, thrusters: tuple[Thruster, ...], late: Actuation, sample_time: float
 ) -> ca.Function:
-    """Return what a lag remembers after commands were held for long, ``commands -> z``."""
-    vessel = Vessel("", 1.0, thrusters)
-    c = ca.SX.sym("c", len(vessel.commands))
-    return ca.Function("z", [c], [_forces(structure, vessel, c) if lag_on == "force" else c])
+    """Return what a lag remembers after commands were held for long, ``commands -> memory``."""
+    commands, made = _actuators(structure, thrusters, late, sample_time)
+    return ca.Function("rest", [commands], [ca.densify(made.rest)])
 
 
 @lru_cache(maxsize=32)
-def _many(
+def _ship(
     structure: Structure,
     thrusters: tuple[Thruster, ...],
-    lag: float,
-    lag_on: str,
-    lag_held: str,
+    late: Actuation,
+    sample_time: float,
     integrator: Integrator,
-    runs: int,
 ) -> ca.Function:
-    """Return the step of `runs` ships, ``(state, commands and d, theta, dt) -> state⁺``."""
-    vessel = Vessel("", 1.0, thrusters)
-    s = structure.symbols
+    """Return the step of one ship, ``(state, commands and d, theta, dt) -> state``."""
+    commands, made = _actuators(structure, thrusters, late, sample_time)
     turns = "r" in structure.states
     step = StepModel(structure, integrator, "simulated" if turns else "measured")
-    columns = vessel.commands
-    c = ca.SX.sym("c", len(columns))
-    dt = ca.SX.sym("dt")
-    share = 1 - math.exp(-1 / lag) if lag else 1.0
-
-    def follow(old: ca.SX, new: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """Return what acts during the sample, and what is remembered after it."""
-        weight = {"start": 1.0, "mean": share * lag, "end": 1 - share}[lag_held]
-        return new + (old - new) * weight, old + (new - old) * share
-
-    z: ca.SX = ca.SX(0, 1)
-    after: ca.SX = ca.SX(0, 1)
-    if lag and lag_on == "force":
-        made = _forces(structure, vessel, c)
-        z = ca.SX.sym("z", made.numel())
-        tau, after = follow(z, made)
-    elif lag:
-        z = ca.SX.sym("z", len(columns))
-        acting, after = follow(z, c)
-        speeds = {t.speed for t in thrusters}
-        moved = [
-            acting[i] if lag_on == "command" or n in speeds else c[i] for i, n in enumerate(columns)
-        ]
-        tau = _forces(structure, vessel, ca.vertcat(*moved))
-    else:
-        tau = _forces(structure, vessel, c)
-    after_step = step(s.x, s.psi, tau, s.d, ca.SX(2, 1), s.theta, dt)
-    one = ca.Function(
+    s = step.symbolic
+    tau = column(made.forces[n] for n in structure.inputs)
+    moved = step(s.x, s.psi, tau, s.d, ca.SX(2, 1), s.theta, s.dt)
+    return ca.Function(
         "ship",
-        [ca.vertcat(s.x, s.psi, z), ca.vertcat(c, s.d), s.theta, dt],
-        [ca.vertcat(after_step, *[s.psi] * (not turns), after)],
+        [ca.vertcat(s.x, s.psi, made.symbols), ca.vertcat(commands, s.d), s.theta, s.dt],
+        [ca.vertcat(moved, *[s.psi] * (not turns), made.after)],
         {"cse": True},
     )
-    return over_runs(one, runs)

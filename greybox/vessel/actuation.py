@@ -115,8 +115,17 @@ def lagged(value: Array, samples: float, held: LagHeld = "start") -> Array:
     value = np.asarray(value, float)
     if samples == 0:
         return value
-    a = np.exp(-1.0 / samples)
+    a = decay(samples)
     out, _ = lfilter([0.0, 1.0 - a], [1.0, -a], value, axis=-1, zi=value[..., :1])
-    if held == "mean":
-        return np.asarray(value + (out - value) * (1 - a) * samples)
-    return np.asarray(out if held == "start" else value + (out - value) * a)
+    return np.asarray(value + (out - value) * held_share(samples, held))
+
+
+def decay(samples: float) -> float:
+    """Return what is left of a difference after one sample of a lag of so many samples."""
+    return float(np.exp(-1.0 / samples))
+
+
+def held_share(samples: float, held: LagHeld) -> float:
+    """Return what is left of a difference where it acts: at the start, in the mean, at the end."""
+    a = decay(samples)
+    return {"start": 1.0, "mean": (1 - a) * samples, "end": a}[held]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from math import inf, isfinite
+from math import floor, inf, isfinite
 from typing import Any, Literal, get_args
 
 from greybox.channels import CHANNELS
@@ -155,6 +155,10 @@ LagOn = Literal["force", "speed", "command"]
 LagHeld = Literal["start", "mean", "end"]
 
 
+# a delay this close to whole samples has no share of the next one
+_WHOLE = 1e-9
+
+
 @dataclass(frozen=True)
 class Actuation:
     """How late the force follows the logged commands.
@@ -201,6 +205,13 @@ class Actuation:
 
     def __bool__(self) -> bool:
         return self.lag > 0 or self.delay > 0
+
+    def delay_samples(self, sample_time: float) -> tuple[int, float]:
+        """Return the delay as whole samples and the share of a further one."""
+        samples = self.delay / sample_time
+        whole = floor(samples + _WHOLE)
+        share = samples - whole
+        return whole, share if share > _WHOLE else 0.0
 
     @property
     def sentence(self) -> str:

@@ -216,6 +216,7 @@ class FreeRunKernel:
         return self._states[:samples]
 
 
+@lru_cache(maxsize=32)
 def over_runs(step: ca.Function, runs: int) -> ca.Function:
     """Return a scalar step of one ship as one of many.
 

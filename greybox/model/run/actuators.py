@@ -1,0 +1,131 @@
+"""Thrusters that act late, one sample at a time: what must be remembered, and how it moves on.
+
+The same delay and lag as `greybox.vessel.actuation` makes of whole logs, with the
+commands and lagged values of earlier samples as states.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import casadi as ca
+
+from greybox.vessel.actuation import decay, held_share
+from greybox.vessel.force import force_expressions
+from greybox.vessel.vessel import Vessel
+
+
+@dataclass(frozen=True)
+class Memory:
+    """A number that late thrusters carry from sample to sample.
+
+    Parameters
+    ----------
+    of : str
+        A command or a generalised input.
+    before : int
+        How many samples ago it was commanded; 0 for its lagged value.
+    """
+
+    of: str
+    before: int
+
+    @property
+    def name(self) -> str:
+        """Such as ``n_before_2`` or ``taux_lagged``."""
+        return f"{self.of}_before_{self.before}" if self.before else f"{self.of}_lagged"
+
+
+@dataclass(frozen=True)
+class Actuators:
+    """How the generalised inputs follow the commands.
+
+    Parameters
+    ----------
+    memory : tuple of Memory
+    symbols : SX
+        (m,) the memory.
+    forces : mapping of str to SX
+        Generalised inputs that act during the sample.
+    after, rest : SX
+        (m,) the memory one sample later, and at rest on the commands.
+    rate : SX or None
+        (m,) change of the memory [1/s]; None where there is a pure delay.
+    rate_forces : mapping of str to SX
+        Generalised inputs at an instant.
+    """
+
+    memory: tuple[Memory, ...]
+    symbols: ca.SX
+    forces: Mapping[str, ca.SX]
+    after: ca.SX
+    rest: ca.SX
+    rate: ca.SX | None
+    rate_forces: Mapping[str, ca.SX]
+
+
+def actuators(
+    vessel: Vessel, commands: ca.SX, inputs: Iterable[str], sample_time: float
+) -> Actuators:
+    """Return how the generalised inputs follow the commands from sample to sample.
+
+    Parameters
+    ----------
+    vessel : Vessel
+    commands : SX
+        (nc,) of one sample, in the order of `Vessel.commands`.
+    inputs : iterable of str
+        Generalised inputs that the structure uses; zero where no thruster makes them.
+    sample_time : float
+        [s]
+    """
+    late = vessel.actuation
+    whole, share = late.delay_samples(sample_time)
+    remembered: list[tuple[Memory, ca.SX, ca.SX, ca.SX]] = []
+    rate: list[ca.SX] = []
+    slow: list[ca.SX] = []
+    for i, name in enumerate(vessel.commands):
+        past = [commands[i]]
+        for before in range(1, whole + 1 + (share > 0)):
+            symbol = ca.SX.sym("before")
+            remembered.append((Memory(name, before), symbol, past[-1], commands[i]))
+            past.append(symbol)
+        slow.append(share * past[whole + 1] + (1 - share) * past[whole] if share else past[whole])
+
+    def follow(name: str, value: ca.SX, at_rest: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """Return what acts during the sample, and at an instant."""
+        samples = late.lag / sample_time
+        symbol = ca.SX.sym("lagged")
+        moved = value + (symbol - value) * decay(samples)
+        remembered.append((Memory(name, 0), symbol, moved, at_rest))
+        rate.append((value - symbol) / late.lag)
+        return value + (symbol - value) * held_share(samples, late.lag_held), symbol
+
+    inputs = tuple(inputs)
+
+    def forces(of: Iterable[ca.SX]) -> dict[str, ca.SX]:
+        made = force_expressions(vessel, column(of))
+        return {n: made.get(n, ca.SX(0)) for n in inputs}
+
+    acting, instant = list(slow), list(slow)
+    if late.lag and late.lag_on != "force":
+        speeds = {t.speed for t in vessel.thrusters}
+        for i, name in enumerate(vessel.commands):
+            if late.lag_on == "command" or name in speeds:
+                acting[i], instant[i] = follow(name, slow[i], commands[i])
+    made, at_instant = forces(acting), forces(instant)
+    if late.lag and late.lag_on == "force":
+        for name, at_rest in forces(ca.vertsplit(commands)).items():
+            if not made[name].is_constant():
+                made[name], at_instant[name] = follow(name, made[name], at_rest)
+    memory, symbols, after, rest = zip(*remembered, strict=True) if remembered else ((),) * 4
+    return Actuators(
+        tuple(memory), column(symbols), made, column(after), column(rest),
+        None if late.delay else column(rate), at_instant,
+    )  # fmt: skip
+
+
+def column(parts: Iterable[ca.SX]) -> ca.SX:
+    """Return expressions below one another, (0, 1) where there are none."""
+    return ca.vertcat(ca.SX(0, 1), *parts)
