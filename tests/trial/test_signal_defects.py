@@ -11,6 +11,7 @@ from greybox.trial.checks.check import check_recording
 from greybox.trial.checks.heading_wrap import wrap_findings
 from greybox.trial.checks.position_hold import hold_findings
 from greybox.trial.checks.position_jump import jump_findings
+from greybox.trial.checks.signal_quality import coarse_findings
 from greybox.trial.convert.convert import import_recording
 from greybox.trial.raw_log import Recording, Signal
 from greybox.trial.repair import apply_repairs
@@ -96,6 +97,20 @@ def test_a_fast_turn_the_long_way_round_is_no_wrap():
     rng = np.random.default_rng(1)
     noisy = wrapped(psi + 0.005 * rng.standard_normal(len(t)))
     assert not wrap_findings(as_recording({"t": t, "psi": noisy}))
+
+
+def test_a_heading_that_wavers_about_the_wrap_crosses_it_and_comes_back(ship):
+    """Both neighbours of a sample lie on one side; between them the heading was on the other."""
+    rng = np.random.default_rng(94)
+    t = np.arange(0, 300, 0.5)
+    course = wrapped(0.02 * np.sin(t / 9) + 0.005 * rng.standard_normal(len(t)))
+    inner = range(10, len(t) - 10)
+    k = next(k for k in inner if np.ptp(course[k - 1 : k + 2]) < 0.1 and course[k] < 0.01)
+    course[k] = 0.6 * course[k] + 0.4 * TURN
+    log = as_recording({"t": t, "psi": course})
+    (found,) = check_recording(log, ship).findings
+    assert (found.id, between(t, found)) == ("heading_wrap", [k])
+    assert not wrap_findings(apply_repairs(log, [found]))
 
 
 def test_an_outlier_away_from_the_wrap_is_an_outlier(ship):
@@ -281,6 +296,18 @@ def test_a_late_message_of_a_slow_receiver():
     log = as_recording({"t": d["t"], "x_n": d["x_n"][rows], "y_n": d["y_n"][rows]})
     (found,) = hold_findings(log)
     assert between(d["t"], found) == [1500, 1501, 1502, 1503, 1504]
+
+
+def test_a_steady_course_is_not_quantised():
+    """Positions at constant speed are all one step apart, and no step of a sensor's."""
+    rng = np.random.default_rng(5)
+    t = np.arange(0, 400, 1.0)
+    speed = np.where(t < 360, 0.9, 0.6)
+    x = np.cumsum(speed) + 0.005 * rng.standard_normal(len(t))
+    log = as_recording({"t": t, "x_n": x})
+    assert not coarse_findings(log)
+    (found,) = coarse_findings(as_recording({"t": t, "x_n": np.round(x / 0.5) * 0.5}))
+    assert (found.id, found.value) == ("quantised", pytest.approx(0.5))
 
 
 def test_coarse_positions_that_repeat_by_rounding_are_not_held():

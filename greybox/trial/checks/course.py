@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.trial.checks.finding import Finding, Outcome
-from greybox.trial.checks.motion import make_motion
+from greybox.trial.checks.motion import make_motion, smooth
 from greybox.trial.raw_log import Recording
 from greybox.trial.steps import mend
 from greybox.vessel.vessel import Vessel
@@ -18,14 +18,16 @@ _PLAUSIBLE = np.radians(20)
 _LEAST_TURN = np.radians(20)
 _LEAST_SHARE = 0.95
 _WINDOW = 2.0
+# parts of a log that are left out in turn for the error (jackknife)
+_BLOCKS = 12
 
 
 def course_findings(recording: Recording, vessel: Vessel) -> tuple[list[Finding], list[Outcome]]:
     """Find a compass that points elsewhere than the vessel goes.
 
     The velocity over ground is a body-fixed direction turned by the heading,
-    plus a current: where the direction is far off the bow on every heading and
-    no thruster pushes that way, the heading is wrong.
+    plus a current and the drift of a turning hull: where the direction is far off
+    the bow on every heading and no thruster pushes that way, the heading is wrong.
 
     Parameters
     ----------
@@ -58,14 +60,22 @@ def course_findings(recording: Recording, vessel: Vessel) -> tuple[list[Finding]
         return [], [
             Outcome("heading_bias", "cannot tell", f"{sentence}, and the thrusters push that way")
         ]
-    # a current beside the body-fixed direction: both are fitted
+    # a current beside the body-fixed direction, and the drift of a turning hull: all are fitted
     rows = np.flatnonzero(under_way)
-    turned = np.exp(1j * psi[rows]) * np.median(np.abs(drift))
-    design = np.column_stack([turned, np.ones(len(rows))])
-    estimate = np.linalg.lstsq(design, track[rows], rcond=None)[0]
-    bias = -float(np.angle(estimate[0]))
-    blocks = np.array_split(np.arange(len(rows)), 12)
-    error = float(np.std([np.angle(np.mean(unit[b])) for b in blocks])) / np.sqrt(len(blocks))
+    bow = np.exp(1j * psi[rows])
+    turning = np.gradient(smooth(psi, motion, _WINDOW / 2), motion.step)[rows]
+    design = np.column_stack([bow, np.ones(len(rows)), 1j * turning * bow])
+    bias = _bias(design, track[rows])
+    blocks = np.array_split(np.arange(len(rows)), _BLOCKS)
+    left = [_bias(np.delete(design, b, axis=0), np.delete(track[rows], b)) for b in blocks]
+    apart = np.angle(np.exp(1j * (np.array(left) - bias)))
+    error = float(np.sqrt((_BLOCKS - 1) / _BLOCKS * np.sum((apart - apart.mean()) ** 2)))
+    if abs(bias) - 1.96 * error < _PLAUSIBLE:
+        told = (
+            f"{vague}: beside a current and the drift of turning, the course lies "
+            f"{np.degrees(-bias):.0f} +/- {np.degrees(1.96 * error):.0f} deg off the heading"
+        )
+        return [], [Outcome("heading_bias", "cannot tell", told)]
     # what a drifting hull may add is unknown: the interval allows for a plausible drift angle
     half = float(np.hypot(1.96 * error, _PLAUSIBLE / 2))
     finding = Finding(
@@ -86,6 +96,11 @@ def course_findings(recording: Recording, vessel: Vessel) -> tuple[list[Finding]
         {"t": motion.t[rows], "drift": np.angle(drift)},
     )
     return [finding], []
+
+
+def _bias(design: NDArray[np.complex128], track: NDArray[np.complex128]) -> float:
+    """Return minus the angle of the body-fixed direction [rad]."""
+    return -float(np.angle(np.linalg.lstsq(design, track, rcond=None)[0][0]))
 
 
 def _velocity(t: Array, north: Array, east: Array, step: float, name: str) -> Array:

@@ -101,7 +101,8 @@ def _between(t: Array, psi: Array) -> NDArray[np.int64]:
         & (np.abs(total) < 2.5 * np.pi)
         & (np.maximum.reduceat(turned, edges) > tolerance)
     )
-    if not likely.any():
+    flips = np.flatnonzero((np.abs(step) > np.pi) & (turned <= tolerance))
+    if not likely.any() and not len(flips):
         return np.empty(0, np.int64)
     apart = np.ones(len(step), bool)
     for a, b in zip(edges[likely], ends[likely], strict=True):
@@ -135,9 +136,14 @@ def _between(t: Array, psi: Array) -> NDArray[np.int64]:
         if rate > _FASTER * usual and (rate > _FASTEST or even):
             found += rows.tolist()
             longest = max(longest, len(rows))
-    if found:
+    # what lies beside the wrap on either side of it
+    beside = np.setdiff1d(
+        [*flips, *(k - 1 for k in found[:1]), *(k + 1 for k in found[-1:])], found
+    )
+    if len(beside):
         reach = np.maximum(tolerance, _FASTER * usual * np.diff(t_new))
-        found = sorted({*found, *_returning(new, found, 2 * longest + 2, reach)})
+        edge = 0.0 if np.mean(np.cos(new[beside.astype(int)])) > 0 else np.pi
+        found = sorted({*found, *_returning(new, edge, 2 * longest + 2, reach)})
     last = np.concatenate([first[1:], [len(psi)]])
     rows_of = [np.arange(first[k], last[k]) for k in found]
     return np.concatenate(rows_of) if rows_of else np.empty(0, np.int64)
@@ -168,15 +174,13 @@ def _bow(t: Array, psi: Array, low: int, high: int) -> float:
     return float(np.abs(after - before) / apart * (t[high] - t[low]) ** 2 / 8)
 
 
-def _returning(psi: Array, found: list[int], most: int, least: Array) -> list[int]:
+def _returning(psi: Array, edge: float, most: int, least: Array) -> list[int]:
     """Return samples that leave the wrap and come back to the side where they began.
 
-    A heading that wavers about the wrap crosses it twice between two samples; at either end
-    of a log one side is missing.
+    A heading that wavers about the wrap, at `edge`, crosses it twice between two samples; at
+    either end of a log one side is missing.
     """
     step = np.abs(_wrapped(np.diff(psi)))
-    beside = psi[np.setdiff1d(np.clip([found[0] - 1, found[-1] + 1], 0, len(psi) - 1), found)]
-    edge = 0.0 if np.mean(np.cos(beside)) > 0 else np.pi
     # before the log begins and after it ends it may have been anywhere
     near = np.concatenate([[True], np.abs(_wrapped(psi - edge)) < np.median(least), [True]])
     leap = np.concatenate([[True], step > least, [True]])

@@ -417,7 +417,13 @@ def quantum(value: Array) -> float:
     step = float(np.mean(near))
     multiple = steps / step
     # positions from latitude and longitude lie on a grid that bends a little
-    return step if np.mean(np.abs(multiple - np.round(multiple)) < 0.1) > 0.9 else 0.0
+    if np.mean(np.abs(multiple - np.round(multiple)) < 0.1) <= 0.9:
+        return 0.0
+    # at a steady rate all changes are alike: on a grid the others are whole steps, too
+    change = np.abs(np.diff(part)) / step
+    off = np.abs(change - np.round(change))
+    other = off[(np.round(change) != np.median(np.round(change))) | (off >= 0.1)]
+    return step if len(other) and np.mean(other < 0.1) > 0.5 else 0.0
 
 
 def stuck_findings(recording: Recording, vessel: Vessel) -> list[Finding]:
