@@ -49,8 +49,6 @@ _SCENARIOS = 8
 # wanted parameters up to which the information of all columns is mixed: a matrix of
 # few entries would leave no room for what the ascents miss
 _FEW = 3
-# exponent of the norm that the gradient of E stands on
-_SHARP = 8
 # smallest eigenvalue of a correlation-scaled score matrix that is inverted
 _FLOOR = 1e-13
 _TOLERANCE = 1e-4
@@ -229,8 +227,8 @@ def _concave(criterion: Criterion, info: Array) -> tuple[float, Array]:
 
 
 def _slack(criterion: Criterion) -> float:
-    """Return how much the smooth stand-in of E may lie below E."""
-    return float(np.log(len(criterion.wanted)) / _SHARP) if criterion.kind == "E" else 0.0
+    """Return how much what is climbed may lie below the criterion."""
+    return criterion.optimality.slack(len(criterion.wanted))
 
 
 class _Pool:
@@ -421,7 +419,7 @@ def certify(
     bounds = np.array([p.bound for p in parts])
     value = float(values.min() if first.worst_case else values @ share / share.sum())
     bound = float(bounds.min() if first.worst_case else bounds @ share / share.sum())
-    size = len(first.criterion.wanted) if first.criterion.kind == "D" else 1
+    size = len(first.criterion.wanted) if first.criterion.optimality.determinant else 1
     several = f"Each of {count} scenarios by itself. " if count > 1 else ""
     return Certificate(
         float(np.exp(min(value - bound, 0.0) / size)),

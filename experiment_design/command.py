@@ -6,7 +6,11 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from experiment_design.estimators import ESTIMATORS
+from experiment_design.optimality import CRITERIA
 from greybox.commands.common import add_seed, count, positive, progress, provenance, say
+from greybox.model.predictor_kinds import PREDICTORS
+from greybox.registry import Registry
 
 HELP = "design the thruster sequences of the next trial"
 EXAMPLES = """examples:
@@ -19,6 +23,12 @@ EXAMPLES = """examples:
   greybox design --vessel ship.toml --model model.json --duration 600 \\
       --between plain.json current.json --out plan.csv
 """
+
+
+def _listed(registry: Registry[Any]) -> str:
+    """Return the words of all entries, for a help text."""
+    *others, last = (entry.words for entry in registry.values())
+    return f"{', '.join(others)}, or {last}"
 
 
 def _pair(text: str) -> tuple[float, float]:
@@ -77,10 +87,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     goal = parser.add_argument_group("what is to be learnt")
     goal.add_argument(
         "--criterion",
-        choices=("D", "A", "E", "c"),
+        choices=tuple(CRITERIA),
         default="D",
-        help="of the covariance of the wanted parameters: determinant, relative trace, worst "
-        "direction, or one function --of them (D)",
+        help=f"of the covariance of the wanted parameters: {_listed(CRITERIA)} (D)",
     )
     goal.add_argument(
         "--want", nargs="+", default=[], metavar="NAME", help="parameters that count (all)"
@@ -96,15 +105,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     goal.add_argument(
         "--predictor",
-        choices=("basic", "augmented", "wind", "basic+wind"),
+        choices=tuple(PREDICTORS),
         help="that the estimate will use: which disturbances it captures or measures (augmented; "
         "basic for a model without yaw rate)",
     )
     goal.add_argument(
         "--estimator",
-        choices=("iv", "iv-white", "oe"),
+        choices=tuple(ESTIMATORS),
         default="iv",
-        help="zero-mean IV, the same with white residuals, or output error (iv)",
+        help=f"{_listed(ESTIMATORS)} (iv)",
     )
     goal.add_argument("--prior", metavar="MODEL", help="model of earlier trials, its information")
     goal.add_argument(

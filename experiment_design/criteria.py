@@ -8,21 +8,16 @@ largest relative variance; −log of the variance of one combination.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from experiment_design.moments import Moments
-from greybox.errors import UsageError
+from experiment_design.optimality import CRITERIA, Optimality
 
 Array = NDArray[np.float64]
-CriterionKind = Literal["D", "A", "E", "c"]
-CRITERIA: tuple[CriterionKind, ...] = ("D", "A", "E", "c")
 # smallest eigenvalue of a correlation-scaled Gram matrix that counts as excited
 _FLOOR = 1e-12
-# exponent of the norm that stands for the largest eigenvalue while climbing
-_SHARP = 8
 
 
 @dataclass(frozen=True)
@@ -31,7 +26,8 @@ class Criterion:
 
     Parameters
     ----------
-    kind : {"D", "A", "E", "c"}
+    kind : str
+        Name of the optimality: {"D", "A", "E", "c"}.
     wanted : tuple of int
         Positions of the wanted columns among all columns of the predictor.
     scale : ndarray
@@ -42,17 +38,20 @@ class Criterion:
         (p_w, p_w) information on the wanted parameters from earlier trials.
     """
 
-    kind: CriterionKind
+    kind: str
     wanted: tuple[int, ...]
     scale: Array
     combination: Array
     prior: Array | None = None
 
     def __post_init__(self) -> None:
-        if self.kind not in CRITERIA:
-            raise UsageError(
-                f"there is no criterion '{self.kind}': use one of {', '.join(CRITERIA)}."
-            )
+        # an unknown one is refused at once
+        self.optimality  # noqa: B018
+
+    @property
+    def optimality(self) -> Optimality:
+        """The scalar itself."""
+        return CRITERIA[self.kind]
 
     def covariance(self, moments: Moments) -> Array:
         """Return C, (R, p_w, p_w), prior included; infinite where a direction is not excited."""
@@ -99,24 +98,12 @@ class Criterion:
 
     def of_covariance(self, c: Array) -> Array:
         """Return the criterion of covariances (R, p_w, p_w)."""
-        if self.kind == "D":
-            d = np.sqrt(np.diagonal(c, axis1=1, axis2=2))
-            unit = c / (d[:, :, None] * d[:, None, :])
-            sign, logdet = np.linalg.slogdet(unit)
-            value = -logdet - 2 * np.log(d).sum(axis=1)
-            return np.where(sign > 0, value, -np.inf)
-        if self.kind == "c":
-            h = self.combination
-            return np.asarray(-np.log(np.einsum("i,rij,j->r", h, c, h)))
-        relative = c / np.outer(self.scale, self.scale)
-        if self.kind == "A":
-            return np.asarray(-np.log(np.trace(relative, axis1=1, axis2=2) / len(self.scale)))
-        return np.asarray(-np.log(np.linalg.eigvalsh(relative)[:, -1]))
+        return self.optimality.of_covariance(c, self.scale, self.combination)
 
     def gradient(self, moments: Moments) -> tuple[float, Array, Array]:
         """Return the criterion of one sequence and its derivatives in G and M.
 
-        E is climbed as −log of the 8-norm of the eigenvalues, which is smooth.
+        Of what is climbed: a smooth stand-in where the criterion itself has kinks.
         """
         c, rows, inverse, good = self._solve(moments)
         p = moments.gram.shape[1]
@@ -124,23 +111,8 @@ class Criterion:
             return -np.inf, np.zeros((p, p)), np.zeros((p, p))
         own, w, g = c[0], rows[0], inverse[0]
         cov = self._posterior(c)[0]
-        value = float(self.of_covariance(cov[None])[0])
-        if self.kind == "D":
-            d = np.sqrt(np.diag(cov))
-            gamma = -np.linalg.inv(cov / np.outer(d, d)) / np.outer(d, d)
-        elif self.kind == "c":
-            h = self.combination
-            gamma = -np.outer(h, h) / float(h @ cov @ h)
-        else:
-            outer = np.outer(self.scale, self.scale)
-            if self.kind == "A":
-                gamma = -np.diag(1 / self.scale**2) / float(np.trace(cov / outer))
-            else:
-                values, vectors = np.linalg.eigh(cov / outer)
-                share = values / values[-1]
-                power = share ** (_SHARP - 1) / (share**_SHARP).sum() / values[-1]
-                gamma = -(vectors * power) @ vectors.T / outer
-                value = float(-np.log(values[-1]) - np.log((share**_SHARP).sum()) / _SHARP)
+        value = self.optimality.climbed(cov, self.scale, self.combination)
+        gamma = self.optimality.slope(cov, self.scale, self.combination)
         if self.prior is not None:
             # d C_post = T dC Tᵀ with T = C_post C⁻¹ = (I + C prior)⁻¹
             carried = np.linalg.inv(np.eye(len(own)) + own @ self.prior)

@@ -12,8 +12,10 @@ from experiment_design.campaign import (
     own_moments,
     random_campaign,
 )
+from experiment_design.estimators import ESTIMATORS
 from experiment_design.feasible import in_words, least_change, moved_constant, stirred
 from experiment_design.limits import TOLERANCE, Circle, LimitKind, LimitName, TrialLimits
+from experiment_design.optimality import CRITERIA
 from experiment_design.problem import TrialProblem
 from experiment_design.regimes import steady_motions
 from experiment_design.request import DesignRequest, build_problem, wanted_parameters
@@ -56,7 +58,7 @@ def require_informative(
 
     `hopeless` is how many times vaguer random sequences may be than the design.
     """
-    if request.targets or request.contrasts or request.criterion == "c":
+    if request.targets or request.contrasts or CRITERIA[request.criterion].combined:
         return []
     names = [c.name for c in wanted_parameters(request, problems[0].criterion)]
     share = _relative_errors(problems, units)
@@ -206,7 +208,7 @@ def tells_enough(request: DesignRequest) -> bool:
         found = ascend(here, units[t], _BRIEF)
         if found.feasible:
             units[t] = found.unit
-    if request.targets or request.contrasts or request.criterion == "c":
+    if request.targets or request.contrasts or CRITERIA[request.criterion].combined:
         return True
     share = _relative_errors(problems, units)
     return bool(2 * (share > _VAGUE).sum() <= share.size)
@@ -241,7 +243,7 @@ def _turning(problem: TrialProblem, request: DesignRequest) -> str:
 
 def unexcited(problems: list[TrialProblem], units: list[Array], request: DesignRequest) -> str:
     """Return which regressor no sequence moves enough to be told from the others."""
-    if request.estimator == "oe":
+    if ESTIMATORS[request.estimator].free_run:
         return (
             "this trial cannot tell the parameters of an output-error fit apart: lengthen it, "
             "widen the limits, or use --predictor basic."

@@ -261,7 +261,7 @@ def forbidden(design: Design, band: MotionBand, name: str) -> list[tuple[Array, 
         d = np.zeros(4)
         d[: min(4, r.d.size)] = r.d[:4]
         predictor = r.build_predictor()
-        wind = predictor.augmented and predictor.kind != "wind"
+        wind = predictor.augmented and not predictor.air_measured
         # over ground, through the water and, where its wind is not measured, through the air
         moved = [0 * one]
         for pair, matters in ((d[:2], True), (d[2:], wind)):

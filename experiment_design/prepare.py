@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from experiment_design.air import MEASURING, clear_heading
 from experiment_design.campaign import random_campaign
-from experiment_design.criteria import CriterionKind
 from experiment_design.demands import ROOM, tells_enough, with_margins
 from experiment_design.limits import TrialLimits
 from experiment_design.noise import noise_levels
@@ -23,7 +22,7 @@ from experiment_design.regimes import (
     steady_motions,
     steady_start,
 )
-from experiment_design.request import DesignRequest, EstimatorKind, build_problem, full_structure
+from experiment_design.request import DesignRequest, build_problem, full_structure
 from experiment_design.schedule import make_schedule
 from experiment_design.stability import unstable_sentence
 from greybox.errors import InfeasibleError, StructureError, UsageError
@@ -93,8 +92,8 @@ class Wishes:
     start: Sequence[float] | None = None
     trials: int = 1
     predictor: str | None = None
-    estimator: EstimatorKind = "iv"
-    criterion: CriterionKind = "D"
+    estimator: str = "iv"
+    criterion: str = "D"
     wanted: tuple[str, ...] = ()
     combination: Mapping[str, float] = field(default_factory=dict)
     current: tuple[float, float] | None = None
@@ -270,11 +269,7 @@ def _predictor(
     model: ManoeuvringModel, structure: Structure, wishes: Wishes, notes: list[str]
 ) -> str:
     if wishes.predictor is not None:
-        if wishes.predictor not in PREDICTORS:
-            raise UsageError(
-                f"there is no predictor '{wishes.predictor}': use {', '.join(PREDICTORS)}."
-            )
-        return wishes.predictor
+        return PREDICTORS[wishes.predictor].name
     if "r" not in structure.states:
         notes.append(
             "basic predictor: without a yaw rate the heading stays, and a current looks like the "

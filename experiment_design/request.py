@@ -4,21 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from experiment_design.contrast import Contrast
-from experiment_design.criteria import Criterion, CriterionKind
+from experiment_design.criteria import Criterion
+from experiment_design.estimators import ESTIMATORS
 from experiment_design.limits import LimitProgram, TrialLimits
-from experiment_design.moments import MomentProgram, Moments
-from experiment_design.problem import Scenario, TrialProblem, Yardstick
+from experiment_design.moments import Moments
+from experiment_design.optimality import CRITERIA
+from experiment_design.problem import Scenario, TrialProblem
 from experiment_design.rollout import Rollout
 from experiment_design.schedule import Schedule, make_schedule
-from experiment_design.sensitivities import SensitivityProgram
 from greybox.errors import UsageError, suggestion
-from greybox.model.disturbances import CURRENT, WIND
 from greybox.model.model import ManoeuvringModel
 from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import Column, Predictor, Regime, build_predictor
@@ -28,8 +27,6 @@ from greybox.model.structure import Structure
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
-EstimatorKind = Literal["iv", "iv-white", "oe"]
-ESTIMATORS: tuple[EstimatorKind, ...] = ("iv", "iv-white", "oe")
 Signs = tuple[tuple[str, int], ...]
 # memory of the wind's variation [s]
 _GUST_SECONDS = 20.0
@@ -130,8 +127,8 @@ class DesignRequest:
     starts: tuple[Array, ...]
     limits: TrialLimits = field(default_factory=TrialLimits)
     predictor: str = "augmented"
-    estimator: EstimatorKind = "iv"
-    criterion: CriterionKind = "D"
+    estimator: str = "iv"
+    criterion: str = "D"
     wanted: tuple[str, ...] = ()
     combination: Mapping[str, float] = field(default_factory=dict)
     targets: tuple[float, ...] = ()
@@ -260,7 +257,7 @@ def build_criterion(request: DesignRequest, predictor: Predictor) -> Criterion:
     combination = np.zeros(len(names))
     for name, slope in request.combination.items():
         combination[chosen.index(wanted_columns(predictor, (name,))[0])] += slope
-    if request.criterion == "c" and not combination.any():
+    if CRITERIA[request.criterion].combined and not combination.any():
         raise UsageError(
             "criterion c looks at one coefficient or one function of the parameters: name it, "
             "such as --of Yvv or --of 'Xuu/Xmu'."
@@ -269,7 +266,7 @@ def build_criterion(request: DesignRequest, predictor: Predictor) -> Criterion:
     if request.prior is not None:
         prior = _prior_information(names, *request.prior)
     wanted = chosen
-    if request.estimator == "oe":
+    if ESTIMATORS[request.estimator].free_run:
         # sensitivities stand in the order of the parameters, bias-capturing columns left out
         wanted = tuple(predictor.parameter_columns.index(i) for i in chosen)
     return Criterion(request.criterion, wanted, scale, combination, prior)
@@ -279,7 +276,7 @@ def wanted_parameters(request: DesignRequest, criterion: Criterion) -> tuple[Col
     """Return the predictor's columns of the wanted parameters, in the order of the criterion."""
     predictor = request.build_predictor()
     places = predictor.parameter_columns
-    if request.estimator == "oe":
+    if ESTIMATORS[request.estimator].free_run:
         return tuple(predictor.columns[places[i]] for i in criterion.wanted)
     return tuple(predictor.columns[i] for i in criterion.wanted)
 
@@ -321,6 +318,8 @@ def build_problem(
     TrialProblem
     """
     predictor = request.build_predictor()
+    assumed = ESTIMATORS[request.estimator]
+    gust = draw_gusts(request) if predictor.air_measured else None
     criterion = build_criterion(request, predictor)
     schedule = request.schedule
     limits = request.trial_limits(trial)
@@ -334,12 +333,19 @@ def build_problem(
             rollout,
             schedule,
             limits,
-            wind_matters=predictor.augmented and predictor.kind != "wind",
+            wind_matters=predictor.augmented and not predictor.air_measured,
             backoff=request.backoff,
         )
-        scenarios.append(
-            Scenario(rollout, _yardstick(request, predictor, theta), program, 1.0 if k else 2.0)
+        yardstick = assumed.information(
+            predictor,
+            theta,
+            request.d,
+            request.noise,
+            request.sample_time,
+            request.integrator,
+            gust,
         )
+        scenarios.append(Scenario(rollout, yardstick, program, 1.0 if k else 2.0))
     contrast = None
     if request.contrasts:
         pairs = [
@@ -365,29 +371,6 @@ def rival_start(request: DesignRequest, rival: Rival, trial: int) -> Array:
     """Return a rival's initial states and heading, those that it lacks left out."""
     start = dict(zip((*request.structure.states, "psi"), request.starts[trial], strict=True))
     return np.array([start.get(s, 0.0) for s in (*rival.structure.states, "psi")])
-
-
-def _yardstick(request: DesignRequest, predictor: Predictor, theta: Array) -> Yardstick:
-    if request.estimator == "oe":
-        means: tuple[str, ...] = ()
-        if predictor.kind in ("augmented", "wind"):
-            means = CURRENT
-        if predictor.kind == "augmented" and request.structure.uses_air:
-            means = CURRENT + WIND
-        return SensitivityProgram(
-            predictor, theta, request.d, request.noise, request.sample_time, means=means,
-            integrator=request.integrator,
-        )  # fmt: skip
-    return MomentProgram(
-        predictor,
-        theta,
-        request.d,
-        request.noise,
-        request.sample_time,
-        integrator=request.integrator,
-        white=request.estimator == "iv-white",
-        gust=draw_gusts(request) if predictor.air_measured else None,
-    )
 
 
 def draw_gusts(request: DesignRequest) -> Array:

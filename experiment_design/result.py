@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from experiment_design.certificate import Certificate
 from experiment_design.classical import Alternative
+from experiment_design.optimality import CRITERIA
 from experiment_design.regimes import spell_regime
 from experiment_design.request import DesignRequest
 from experiment_design.robust import Keeping
@@ -170,7 +171,7 @@ class Design(DisplayMixin):
     def _gain(self, alternative: Alternative) -> float | None:
         if not np.isfinite(alternative.value):
             return None
-        size = len(self.names) if self.request.criterion == "D" else 1
+        size = len(self.names) if CRITERIA[self.request.criterion].determinant else 1
         return float(np.exp((self.criterion_value - alternative.value) / size))
 
     def summary(self) -> str:

@@ -298,7 +298,7 @@ class Shooting(ABC):
         self.levels = self.schedule.holds * self.nc
         self.nodes_at = self.levels
         self.sums_at = self.levels + self.nk * (len(self.intervals) + 1)
-        closed = self.problem.criterion.kind == "D"
+        closed = self.problem.criterion.optimality.determinant
         self._terminal = self._terminal_closed() if closed else self._terminal_solved()
         self.variables = self.sums_at + self.lifted + self._terminal.extra
         self._assemble()
@@ -587,7 +587,7 @@ class Shooting(ABC):
         size = len(self.order)
         wanted = list(criterion.wanted)
         # C = D C' D with the scaled columns, D = 1 / size
-        if criterion.kind == "c":
+        if criterion.optimality.combined:
             h = np.zeros(size)
             for weight, c in zip(criterion.combination, wanted, strict=True):
                 h[place[c]] = weight / self.size[c]
@@ -701,5 +701,5 @@ class Shooting(ABC):
     def value(self, unit: Array) -> float:
         """Return the criterion that is climbed, at a sequence, in the units of `Criterion`."""
         f = self.functions["nlp"](x=self.begin(unit), p=ca.DM(0, 1))["f"]
-        size = len(self.wanted) if self.problem.criterion.kind == "D" else 1
+        size = len(self.wanted) if self.problem.criterion.optimality.determinant else 1
         return -float(f) * size

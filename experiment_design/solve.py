@@ -135,7 +135,7 @@ def make_shooting(problem: TrialProblem, unit: Array, exact: bool | None = None)
         The yardstick or the criterion has no such program.
     """
     yardstick = problem.scenarios[0].yardstick
-    if problem.criterion.kind == "E":
+    if not problem.criterion.optimality.smooth:
         raise UsageError(
             "IPOPT polishes D, A and c designs, and the largest variance (E) is not smooth: "
             "use the ascent (search.ascend), or --criterion A."

@@ -91,7 +91,7 @@ class Registry(Mapping[str, T]):
         if name not in known:
             raise self._error(
                 f"there is no {self._what} '{name}'.{suggestion(name, known)} "
-                f"{self._what.capitalize()}s: {', '.join(known)}."
+                f"Known: {', '.join(known)}."
             )
         return known[name]
 

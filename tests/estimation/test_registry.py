@@ -76,7 +76,7 @@ def test_it_is_offered_while_it_is_registered(ridge, capsys):
 
 def test_without_it_the_name_is_unknown():
     assert tuple(ESTIMATORS) == ("ls", "iv", "oe")
-    with pytest.raises(UsageError, match=r"there is no method 'rigde'. Methods: ls, iv, oe\."):
+    with pytest.raises(UsageError, match=r"there is no method 'rigde'. Known: ls, iv, oe\."):
         ESTIMATORS["rigde"]
 
 

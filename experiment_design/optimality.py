@@ -1,0 +1,174 @@
+"""Optimality criteria by name: what of the covariance of the wanted parameters is to be small.
+
+Every criterion is a number that grows with the information, in logarithms, so that
+they share one scale. A new one is a class here with its entry, or an entry point.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from greybox.registry import Registry
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    Array = NDArray[np.float64]
+
+# exponent of the norm that stands for the largest eigenvalue while climbing
+_SHARP = 8
+
+
+@dataclass(frozen=True)
+class Optimality(ABC):
+    """A scalar of covariances, larger where they are smaller.
+
+    ``scale`` (p,) is the unit of each parameter, ``combination`` (p,) the gradient of the
+    function of the parameters that is looked at.
+
+    Parameters
+    ----------
+    name : str
+        As ``--criterion`` takes it.
+    words : str
+        What it looks at.
+    """
+
+    name: str
+    words: str
+
+    @abstractmethod
+    def of_covariance(self, c: Array, scale: Array, combination: Array) -> Array:
+        """Return the criterion of covariances (R, p, p)."""
+
+    @abstractmethod
+    def slope(self, c: Array, scale: Array, combination: Array) -> Array:
+        """Return the derivative of what is climbed in a covariance (p, p)."""
+
+    def climbed(self, c: Array, scale: Array, combination: Array) -> float:
+        """Return what is climbed at a covariance (p, p): the criterion, or a smooth stand-in."""
+        return float(self.of_covariance(c[None], scale, combination)[0])
+
+    def slack(self, size: int) -> float:
+        """Return how much what is climbed may lie below the criterion, of so many parameters."""
+        return 0.0
+
+    @property
+    def smooth(self) -> bool:
+        """Whether the criterion itself can be climbed by Newton steps."""
+        return True
+
+    @property
+    def determinant(self) -> bool:
+        """Whether it is −log det: of one variance for each parameter together."""
+        return False
+
+    @property
+    def combined(self) -> bool:
+        """Whether it looks at one combination of the parameters."""
+        return False
+
+
+class _Determinant(Optimality):
+    """−log det C."""
+
+    def of_covariance(self, c: Array, scale: Array, combination: Array) -> Array:
+        import numpy as np
+
+        d = np.sqrt(np.diagonal(c, axis1=1, axis2=2))
+        unit = c / (d[:, :, None] * d[:, None, :])
+        sign, logdet = np.linalg.slogdet(unit)
+        value = -logdet - 2 * np.log(d).sum(axis=1)
+        return np.where(sign > 0, value, -np.inf)
+
+    def slope(self, c: Array, scale: Array, combination: Array) -> Array:
+        import numpy as np
+
+        d = np.sqrt(np.diag(c))
+        return np.asarray(-np.linalg.inv(c / np.outer(d, d)) / np.outer(d, d))
+
+    @property
+    def determinant(self) -> bool:
+        return True
+
+
+class _Trace(Optimality):
+    """−log of the mean relative variance."""
+
+    def of_covariance(self, c: Array, scale: Array, combination: Array) -> Array:
+        import numpy as np
+
+        relative = c / np.outer(scale, scale)
+        return np.asarray(-np.log(np.trace(relative, axis1=1, axis2=2) / len(scale)))
+
+    def slope(self, c: Array, scale: Array, combination: Array) -> Array:
+        import numpy as np
+
+        return np.asarray(-np.diag(1 / scale**2) / float(np.trace(c / np.outer(scale, scale))))
+
+
+class _Largest(Optimality):
+    """−log of the largest relative variance, climbed as −log of a norm of the eigenvalues."""
+
+    def of_covariance(self, c: Array, scale: Array, combination: Array) -> Array:
+        import numpy as np
+
+        relative = c / np.outer(scale, scale)
+        return np.asarray(-np.log(np.linalg.eigvalsh(relative)[:, -1]))
+
+    def slope(self, c: Array, scale: Array, combination: Array) -> Array:
+        import numpy as np
+
+        outer = np.outer(scale, scale)
+        values, vectors = np.linalg.eigh(c / outer)
+        share = values / values[-1]
+        power = share ** (_SHARP - 1) / (share**_SHARP).sum() / values[-1]
+        return np.asarray(-(vectors * power) @ vectors.T / outer)
+
+    def climbed(self, c: Array, scale: Array, combination: Array) -> float:
+        import numpy as np
+
+        values = np.linalg.eigh(c / np.outer(scale, scale))[0]
+        share = values / values[-1]
+        return float(-np.log(values[-1]) - np.log((share**_SHARP).sum()) / _SHARP)
+
+    def slack(self, size: int) -> float:
+        import numpy as np
+
+        return float(np.log(size) / _SHARP)
+
+    @property
+    def smooth(self) -> bool:
+        return False
+
+
+class _Combination(Optimality):
+    """−log of the variance of one combination."""
+
+    def of_covariance(self, c: Array, scale: Array, combination: Array) -> Array:
+        import numpy as np
+
+        return np.asarray(-np.log(np.einsum("i,rij,j->r", combination, c, combination)))
+
+    def slope(self, c: Array, scale: Array, combination: Array) -> Array:
+        import numpy as np
+
+        h = combination
+        return np.asarray(-np.outer(h, h) / float(h @ c @ h))
+
+    @property
+    def combined(self) -> bool:
+        return True
+
+
+CRITERIA: Registry[Optimality] = Registry(
+    "criterion",
+    _Determinant("D", "determinant"),
+    _Trace("A", "relative trace"),
+    _Largest("E", "worst direction"),
+    _Combination("c", "one function --of them"),
+    group="experiment_design.criteria",
+)
