@@ -22,8 +22,8 @@ from greybox.estimation.result import Estimate
 from greybox.estimation.verdict import NoRegression, TestResult, refused
 from greybox.model.predictor import Predictor, build_predictor
 from greybox.one_thread import one_thread
-from greybox.regression.instruments import build_instruments
-from greybox.regression.regression import Regression, build_regression
+from greybox.regression.problem import RegressionProblem
+from greybox.regression.regression import Regression
 from greybox.trial.log import TrialLog
 
 Array = NDArray[np.float64]
@@ -52,35 +52,34 @@ def judge_estimate(
     margins, zero_mean, heading, wind, lag
         Of its instruments, as `build_instruments`.
     """
-    predictor = _regression_predictor(estimate)
+    problem = RegressionProblem(
+        _regression_predictor(estimate), tuple(logs), margins, zero_mean, heading, wind, lag
+    )
+    return judge_on(problem, estimate)
+
+
+def judge_on(problem: RegressionProblem, estimate: Estimate) -> Estimate:
+    """Return an estimate with its tests and verdict, by the regression of a problem beside it."""
+    predictor, logs = problem.predictor, problem.logs
     try:
-        regression = build_regression(predictor, logs, margins=margins)
+        regression = problem.regression
     except ExcitationError as error:
         return replace(estimate, verdict=refused([NoRegression(str(error))], estimate.labels))
-    instruments = build_instruments(
-        predictor,
-        logs,
-        estimate.structure_theta(),
-        zero_mean=zero_mean,
-        heading=heading,
-        wind=wind,
-        lag=lag,
-        margins=margins,
-    )
+    instruments = problem.instruments(estimate.structure_theta())
     keep = instruments.keep or tuple(e.keep for e in regression.experiments)
     theta, covariance = _coefficients(estimate, predictor)
     evidence = Evidence(
         predictor,
         regression,
-        tuple(logs),
+        logs,
         instruments,
         theta,
         covariance,
-        _residuals(estimate, regression, logs, keep, zero_mean),
+        _residuals(estimate, regression, logs, keep, problem.zero_mean),
         keep,
         estimate.method,
-        zero_mean,
-        margins,
+        problem.zero_mean,
+        problem.margins,
         solved=False,
     )
     own = {t.name: t for t in estimate.tests}

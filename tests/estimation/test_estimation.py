@@ -200,8 +200,17 @@ def test_bootstrap_of_white_noise_has_the_known_spread():
     rng = np.random.default_rng(3)
     x = rng.normal(size=(2, 4000))
     y = np.array([1.0, 2.0]) @ x + rng.normal(size=4000)
-    draws = block_bootstrap([x], [x], [y], rng, draws=400)
+    draws = block_bootstrap([([x], [x], [y])], rng, draws=400)
     np.testing.assert_allclose(draws.std(axis=0), 1 / np.sqrt(4000), rtol=0.25)
+
+
+def test_bootstrap_keeps_what_equations_have_in_common():
+    rng = np.random.default_rng(4)
+    x = rng.normal(size=(1, 4000))
+    e = rng.multivariate_normal([0, 0], [[1.0, 0.8], [0.8, 1.0]], 4000).T
+    draws = block_bootstrap([([x], [x], [x[0] + e[i]]) for i in range(2)], rng)
+    # 500 draws of about 63 blocks
+    assert np.corrcoef(draws.T)[0, 1] == pytest.approx(0.8, abs=0.15)
 
 
 def test_mean_kept_instruments_need_an_intercept(thesis, noisy_log):
