@@ -95,12 +95,7 @@ def estimate_ls(
     Ljungberg (2020), eq. 2.17.
     """
     problem = RegressionProblem(predictor, tuple(as_list(logs)), margins, zero_mean=False)
-    solved = solve_ls(problem)
-    simulated = None
-    if judged:
-        theta = _structure_theta(predictor, solved.theta)
-        simulated = problem.instruments(theta, problem.keep)
-    return solved.estimate(covariance, seed, evidence=simulated)
+    return _judged(solve_ls(problem).estimate(covariance, seed, tested=judged))
 
 
 @known_keywords
@@ -170,16 +165,22 @@ def estimate_iv(
     ----------
     Ljungberg (2020), eqs. 2.21, 4.5, 4.60-4.63; Young (2008).
     """
-    if not zero_mean and predictor.augmented and "1" not in {c.name for c in predictor.columns}:
-        raise UsageError(
-            "instruments that keep their mean do not remove the constants that the augmented "
-            "predictor leaves out: build it with an intercept, or use zero-mean instruments."
-        )
     problem = RegressionProblem(
         predictor, tuple(as_list(logs)), margins, zero_mean, heading, wind, lag
     )
     solved = solve_iv(problem, start=start, refine=refine, metric=metric)
-    return solved.estimate(covariance, seed, evidence=solved.instruments if judged else None)
+    return _judged(solved.estimate(covariance, seed, tested=judged))
+
+
+def _judged(estimate: Estimate) -> Estimate:
+    """Return an estimate with the verdict of its tests, where it has some."""
+    if not estimate.tests:
+        return estimate
+    verdict = weigh(
+        estimate.tests, estimate.labels, estimate.method,
+        contaminated=estimate.predictor.contaminated,
+    )  # fmt: skip
+    return replace(estimate, verdict=verdict)
 
 
 def solve_ls(problem: RegressionProblem) -> Solved:
@@ -196,7 +197,17 @@ def solve_iv(
     metric: str = "moments",
 ) -> Solved:
     """Solve a problem by instrumental variables; parameters and errors as `estimate_iv`."""
-    predictor, regression = problem.predictor, problem.regression
+    predictor = problem.predictor
+    if (
+        not problem.zero_mean
+        and predictor.augmented
+        and "1" not in {c.name for c in predictor.columns}
+    ):
+        raise UsageError(
+            "instruments that keep their mean do not remove the constants that the augmented "
+            "predictor leaves out: build it with an intercept, or use zero-mean instruments."
+        )
+    regression = problem.regression
     theta = _start(problem, start)
     # the first model may be far off: rows are first cut by the measured states
     instruments = problem.instruments(theta, problem.keep)
@@ -277,12 +288,21 @@ class Solved:
         return self.instruments.keep
 
     @property
+    def simulated(self) -> Instruments:
+        """Simulated instruments: those of the solution, or by the model that it gives."""
+        if self.instruments.x:
+            return self.instruments
+        return self.problem.instruments(
+            _structure_theta(self.problem.predictor, self.theta), self.problem.keep
+        )
+
+    @property
     def centred(self) -> bool:
         """Whether constants of the experiments were removed: by zero-mean instruments."""
         return self.problem.zero_mean
 
     def estimate(
-        self, covariance: Covariance | None, seed: int = 0, evidence: Instruments | None = None
+        self, covariance: Covariance | None, seed: int = 0, *, tested: bool = False
     ) -> Estimate:
         """Return the estimate.
 
@@ -291,8 +311,8 @@ class Solved:
         covariance : {"ma", "hac", "white", "bootstrap"}, optional
             None leaves standard errors out, where they will not be looked at.
         seed : int
-        evidence : Instruments, optional
-            Simulated ones to test it with.
+        tested : bool
+            Whether its tests are asked for.
         """
         problem, theta = self.problem, self.theta
         predictor, logs = problem.predictor, problem.logs
@@ -332,14 +352,14 @@ class Solved:
             if covariance is not None
             else (),
         )
-        if evidence is None:
+        if not tested:
             return estimate
         tests = convergence(estimate) + assess(
             Evidence(
                 predictor,
                 problem.regression,
                 logs,
-                evidence,
+                self.simulated,
                 theta,
                 matrix,
                 tuple(tuple(equation) for equation in residuals),
@@ -349,11 +369,7 @@ class Solved:
                 problem.margins,
             )
         )
-        return replace(
-            estimate,
-            tests=tests,
-            verdict=weigh(tests, estimate.labels, self.method, contaminated=predictor.contaminated),
-        )
+        return replace(estimate, tests=tests)
 
 
 def _regressors_as_instruments(regression: Regression) -> Instruments:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,14 +52,25 @@ def judge_estimate(
     margins, zero_mean, heading, wind, lag
         Of its instruments, as `build_instruments`.
     """
-    problem = RegressionProblem(
-        _regression_predictor(estimate), tuple(logs), margins, zero_mean, heading, wind, lag
+    problem = beside(
+        estimate, logs, margins=margins, zero_mean=zero_mean, heading=heading, wind=wind, lag=lag
     )
-    return judge_on(problem, estimate)
+    tested = with_tests(problem, estimate)
+    if tested.verdict is not estimate.verdict:
+        return tested
+    return replace(tested, verdict=weigh(tested.tests, estimate.labels, estimate.method))
 
 
-def judge_on(problem: RegressionProblem, estimate: Estimate) -> Estimate:
-    """Return an estimate with its tests and verdict, by the regression of a problem beside it."""
+def beside(estimate: Estimate, logs: Sequence[TrialLog], **instruments: Any) -> RegressionProblem:
+    """Return the regression that stands beside an estimate; `instruments` as `judge_estimate`."""
+    return RegressionProblem(_regression_predictor(estimate), tuple(logs), **instruments)
+
+
+def with_tests(problem: RegressionProblem, estimate: Estimate) -> Estimate:
+    """Return an estimate with its tests, by the regression of a problem beside it.
+
+    Without a regression there are none, and the verdict refuses the estimate.
+    """
     predictor, logs = problem.predictor, problem.logs
     try:
         regression = problem.regression
@@ -86,9 +97,7 @@ def judge_on(problem: RegressionProblem, estimate: Estimate) -> Estimate:
     tests: list[TestResult] = [own.pop(t.name, t) for t in assess(evidence)]
     tests += [t for t in convergence(estimate) if t.name not in own]
     tests += own.values()
-    return replace(
-        estimate, tests=tuple(tests), verdict=weigh(tests, estimate.labels, estimate.method)
-    )
+    return replace(estimate, tests=tuple(tests))
 
 
 def _regression_predictor(estimate: Estimate) -> Predictor:

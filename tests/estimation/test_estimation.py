@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import statsmodels.api as sm
@@ -286,14 +288,14 @@ def test_too_few_samples(thesis, noisy_log):
 
 def test_unexcited_parameters_are_named(thesis, clean_log):
     still = {**clean_log.channels, "v": 0 * clean_log["v"]}
-    log = type(clean_log)(**{**clean_log.__dict__, "channels": still})
+    log = replace(clean_log, channels=still)
     with pytest.raises(ExcitationError, match="parameter Xvr is not excited"):
         estimate_ls(build_predictor(thesis, "basic", REGIME), [log])
 
 
 def test_singular_instruments_name_the_parameters(thesis, clean_log):
     slave = {**clean_log.channels, "v": 2 * clean_log["u"], "u": clean_log["u"]}
-    log = type(clean_log)(**{**clean_log.__dict__, "channels": slave})
+    log = replace(clean_log, channels=slave)
     with pytest.raises(ExcitationError, match="cannot be told apart in the v equation"):
         estimate_ls(build_predictor(thesis, "basic", REGIME), [log])
 
