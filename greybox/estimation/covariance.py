@@ -179,25 +179,23 @@ def nearest_positive(matrix: Array) -> Array:
 
 
 def block_bootstrap(
-    projected: Sequence[Array],
-    phi: Sequence[Array],
-    y: Sequence[Array],
+    equations: Sequence[tuple[Sequence[Array], Sequence[Array], Sequence[Array]]],
     rng: np.random.Generator,
     *,
     draws: int = 500,
     block: int | None = None,
 ) -> Array:
-    """Draw estimates of one equation by resampling blocks of rows.
+    """Draw estimates of all equations by resampling blocks of rows that do not overlap.
 
     The normal equations add over blocks, so a draw is a weighted sum of block
-    sums and costs nothing more than a solve.
+    sums and costs nothing more than a solve. A block brings its rows of every
+    equation, so that what errors of different equations have in common is kept.
 
     Parameters
     ----------
-    projected, phi : sequence of ndarray
-        (p, N) a experiment.
-    y : sequence of ndarray
-        (N,) a experiment.
+    equations : sequence of tuple
+        Instruments as the estimator combined them and regressors, (p, N) an experiment
+        each, and (N,) the left-hand side.
     rng : numpy.random.Generator
     draws : int
     block : int, optional
@@ -206,23 +204,25 @@ def block_bootstrap(
     Returns
     -------
     ndarray
-        (draws, p)
+        (draws, p), equation after equation.
 
     References
     ----------
-    Künsch (1989); Politis and Romano (1994).
+    Carlstein (1986).
     """
-    total = sum(len(e) for e in y)
+    lengths = [len(e) for e in equations[0][2]]
     if block is None:
-        block = max(10, round(total**0.5))
-    information, right = [], []
-    for hat, fe, ye in zip(projected, phi, y, strict=True):
-        for start in range(0, len(ye), block):
+        block = max(10, round(sum(lengths) ** 0.5))
+    starts = [(e, start) for e, n in enumerate(lengths) for start in range(0, n, block)]
+    counts = rng.multinomial(len(starts), np.full(len(starts), 1 / len(starts)), size=draws)
+    found = []
+    for projected, phi, y in equations:
+        information, right = [], []
+        for e, start in starts:
             part = slice(start, start + block)
-            information.append(hat[:, part] @ fe[:, part].T)
-            right.append(hat[:, part] @ ye[part])
-    blocks = len(right)
-    counts = rng.multinomial(blocks, np.full(blocks, 1 / blocks), size=draws).astype(float)
-    a = np.tensordot(counts, np.array(information), axes=1)
-    b = counts @ np.array(right)
-    return np.asarray(np.linalg.solve(a, b[..., None])[..., 0])
+            information.append(projected[e][:, part] @ phi[e][:, part].T)
+            right.append(projected[e][:, part] @ y[e][part])
+        a = np.tensordot(counts.astype(float), np.array(information), axes=1)
+        b = counts @ np.array(right)
+        found.append(np.linalg.solve(a, b[..., None])[..., 0])
+    return np.concatenate(found, axis=1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -24,9 +24,10 @@ from greybox.estimation.values import Iteration, estimation_data
 from greybox.keywords import known_keywords
 from greybox.model.predictor import Predictor
 from greybox.one_thread import one_thread
-from greybox.regression.instruments import Instruments, build_instruments
-from greybox.regression.regression import Regression, build_regression
-from greybox.trial.log import Logs, TrialLog, as_list
+from greybox.regression.instruments import Instruments
+from greybox.regression.problem import RegressionProblem
+from greybox.regression.regression import Regression
+from greybox.trial.log import Logs, as_list
 
 Array = NDArray[np.float64]
 Covariance = Literal["hac", "ma", "white", "bootstrap"]
@@ -93,27 +94,8 @@ def estimate_ls(
     ----------
     Ljungberg (2020), eq. 2.17.
     """
-    logs = as_list(logs)
-    regression = build_regression(predictor, logs, margins=margins)
-    instruments = _regressors_as_instruments(regression)
-    solutions = _solve(regression, instruments)
-    simulated = None
-    if judged:
-        theta = _structure_theta(predictor, _coefficients(solutions))
-        simulated = build_instruments(
-            predictor, logs, theta, zero_mean=False, keep=[e.keep for e in regression.experiments]
-        )
-    return _result(
-        "ls",
-        regression,
-        instruments,
-        solutions,
-        logs,
-        covariance,
-        seed,
-        margins=margins,
-        evidence=simulated,
-    )
+    problem = RegressionProblem(predictor, tuple(as_list(logs)), margins, zero_mean=False)
+    return _judged(solve_ls(problem).estimate(covariance, seed, tested=judged))
 
 
 @known_keywords
@@ -183,30 +165,52 @@ def estimate_iv(
     ----------
     Ljungberg (2020), eqs. 2.21, 4.5, 4.60-4.63; Young (2008).
     """
-    if not zero_mean and predictor.augmented and "1" not in {c.name for c in predictor.columns}:
+    problem = RegressionProblem(
+        predictor, tuple(as_list(logs)), margins, zero_mean, heading, wind, lag
+    )
+    solved = solve_iv(problem, start=start, refine=refine, metric=metric)
+    return _judged(solved.estimate(covariance, seed, tested=judged))
+
+
+def _judged(estimate: Estimate) -> Estimate:
+    """Return an estimate with the verdict of its tests, where it has some."""
+    if not estimate.tests:
+        return estimate
+    verdict = weigh(
+        estimate.tests, estimate.labels, estimate.method,
+        contaminated=estimate.predictor.contaminated,
+    )  # fmt: skip
+    return replace(estimate, verdict=verdict)
+
+
+def solve_ls(problem: RegressionProblem) -> Solved:
+    """Solve a problem by least squares; errors as `estimate_ls`."""
+    instruments = _regressors_as_instruments(problem.regression)
+    return Solved("ls", problem, instruments, _solve(problem.regression, instruments))
+
+
+def solve_iv(
+    problem: RegressionProblem,
+    *,
+    start: Array | Estimate | None = None,
+    refine: bool | int = True,
+    metric: str = "moments",
+) -> Solved:
+    """Solve a problem by instrumental variables; parameters and errors as `estimate_iv`."""
+    predictor = problem.predictor
+    if (
+        not problem.zero_mean
+        and predictor.augmented
+        and "1" not in {c.name for c in predictor.columns}
+    ):
         raise UsageError(
             "instruments that keep their mean do not remove the constants that the augmented "
             "predictor leaves out: build it with an intercept, or use zero-mean instruments."
         )
-    experiments = as_list(logs)
-    regression = build_regression(predictor, experiments, margins=margins)
-    theta = _start(regression, start)
-
-    def instruments_of(theta: Array, keep: Sequence[NDArray[np.bool_]] | None) -> Instruments:
-        return build_instruments(
-            predictor,
-            experiments,
-            theta,
-            zero_mean=zero_mean,
-            heading=heading,
-            wind=wind,
-            lag=lag,
-            margins=margins,
-            keep=keep,
-        )
-
+    regression = problem.regression
+    theta = _start(problem, start)
     # the first model may be far off: rows are first cut by the measured states
-    instruments = instruments_of(theta, [e.keep for e in regression.experiments])
+    instruments = problem.instruments(theta, problem.keep)
     if instruments.diverged:
         raise ExcitationError(
             f"{instruments.diverged} already with the first model, so there are no instruments: "
@@ -223,12 +227,12 @@ def estimate_iv(
             target = _structure_theta(predictor, previous)
             # rows are cut once by a refined model and then kept, or the cut would chatter
             rows = None if count == 1 else instruments.keep
-            candidate, fresh = target, instruments_of(target, rows)
+            candidate, fresh = target, problem.instruments(target, rows)
             for _ in range(4):
                 if not fresh.diverged:
                     break
                 candidate = (candidate + theta) / 2
-                fresh = instruments_of(candidate, rows)
+                fresh = problem.instruments(candidate, rows)
             if fresh.diverged:
                 ended = f"stopped after {count - 1} refinements: {fresh.diverged}; {_STRONGEST}"
                 iteration = Iteration(count, ended, False)
@@ -249,20 +253,123 @@ def estimate_iv(
             if refine is True:
                 iteration = replace(iteration, ended=f"{iteration.ended}; {_STRONGEST}")
                 _, theta, instruments, solutions = strongest
-    return _result(
-        "iv",
-        regression,
-        instruments,
-        solutions,
-        experiments,
-        covariance,
-        seed,
-        iteration,
-        centred=zero_mean,
-        margins=margins,
-        heading=heading,
-        evidence=instruments if judged else None,
-    )
+    return Solved("iv", problem, instruments, solutions, iteration)
+
+
+@dataclass(frozen=True)
+class Solved:
+    """Equations that are solved, before standard errors and tests.
+
+    Parameters
+    ----------
+    method : str
+    problem : RegressionProblem
+    instruments : Instruments
+        Those of the solution.
+    solutions : sequence of Solution
+        One an equation.
+    iteration : Iteration
+    """
+
+    method: str
+    problem: RegressionProblem
+    instruments: Instruments
+    solutions: Sequence[Solution]
+    iteration: Iteration = _NO_ITERATION
+
+    @property
+    def theta(self) -> Array:
+        """Coefficients of all columns, (p,)."""
+        return _coefficients(self.solutions)
+
+    @property
+    def keep(self) -> Sequence[NDArray[np.bool_]]:
+        """Rows that take part."""
+        return self.instruments.keep
+
+    @property
+    def simulated(self) -> Instruments:
+        """Simulated instruments: those of the solution, or by the model that it gives."""
+        if self.instruments.x:
+            return self.instruments
+        return self.problem.instruments(
+            _structure_theta(self.problem.predictor, self.theta), self.problem.keep
+        )
+
+    @property
+    def centred(self) -> bool:
+        """Whether constants of the experiments were removed: by zero-mean instruments."""
+        return self.problem.zero_mean
+
+    def estimate(
+        self, covariance: Covariance | None, seed: int = 0, *, tested: bool = False
+    ) -> Estimate:
+        """Return the estimate.
+
+        Parameters
+        ----------
+        covariance : {"ma", "hac", "white", "bootstrap"}, optional
+            None leaves standard errors out, where they will not be looked at.
+        seed : int
+        tested : bool
+            Whether its tests are asked for.
+        """
+        problem, theta = self.problem, self.theta
+        predictor, logs = problem.predictor, problem.logs
+        projected, residuals = _masked(self)
+        kept = sum(int(k.sum()) for k in self.keep)
+        matrix, lags = np.full((len(theta), len(theta)), np.nan), 0
+        if covariance is not None:
+            shapes = (
+                error_shapes(predictor, logs, theta, residuals, self.keep)
+                if covariance == "ma"
+                else ()
+            )
+            matrix, lags = _covariance(self, projected, residuals, covariance, seed, shapes)
+        estimate = Estimate(
+            predictor=predictor,
+            method=self.method,
+            theta=theta,
+            covariance=matrix,
+            residual_std=np.array(
+                [np.sqrt(sum(float(e @ e) for e in each) / max(kept, 1)) for each in residuals]
+            ),
+            vessel=logs[0].vessel,
+            sample_time=problem.regression.sample_time,
+            data=estimation_data(
+                logs, predictor.structure.states, problem.regression.samples, kept
+            ),
+            covariance_kind=covariance or "",
+            lags=lags,
+            iteration=self.iteration,
+            current=estimate_current(
+                predictor,
+                theta,
+                matrix,
+                heading_std=logs[0].vessel.std("psi") or 0.0,
+                heading_measured=problem.heading == "measured",
+            )
+            if covariance is not None
+            else (),
+        )
+        if not tested:
+            return estimate
+        tests = convergence(estimate) + assess(
+            Evidence(
+                predictor,
+                problem.regression,
+                logs,
+                self.simulated,
+                theta,
+                matrix,
+                tuple(tuple(equation) for equation in residuals),
+                tuple(self.keep),
+                self.method,
+                self.centred,
+                problem.margins,
+            )
+        )
+        return replace(estimate, tests=tests)
 
 
 def _regressors_as_instruments(regression: Regression) -> Instruments:
@@ -271,13 +378,12 @@ def _regressors_as_instruments(regression: Regression) -> Instruments:
     )
 
 
-def _start(regression: Regression, start: Array | Estimate | None) -> Array:
+def _start(problem: RegressionProblem, start: Array | Estimate | None) -> Array:
     if isinstance(start, Estimate):
         return start.structure_theta()
     if start is not None:
         return np.asarray(start, float)
-    ls = _solve(regression, _regressors_as_instruments(regression))
-    return _structure_theta(regression.predictor, _coefficients(ls))
+    return _structure_theta(problem.predictor, solve_ls(problem).theta)
 
 
 def _structure_theta(predictor: Predictor, coefficients: Array) -> Array:
@@ -356,27 +462,22 @@ def _singular(
     )
 
 
-def _masked(
-    solutions: Sequence[Solution],
-    regression: Regression,
-    instruments: Instruments,
-    *,
-    centred: bool,
-) -> tuple[list[list[Array]], list[list[Array]]]:
+def _masked(solved: Solved) -> tuple[list[list[Array]], list[list[Array]]]:
     """Return projected instruments and residuals on all rows, zero where cut out.
 
     Zero-mean instruments leave the constant of each experiment undetermined; it
     belongs to the equation, not to the residual, so those are `centred`.
     """
-    predictor = regression.predictor
+    problem, centred = solved.problem, solved.centred
+    predictor = problem.predictor
     projected, residuals = [], []
     for row, (state, solution) in enumerate(
-        zip(predictor.structure.states, solutions, strict=True)
+        zip(predictor.structure.states, solved.solutions, strict=True)
     ):
         mine = predictor.equation(state)
         hats, errors = [], []
         for e, keep, hat in zip(
-            regression.experiments, instruments.keep, solution.projected, strict=True
+            problem.regression.experiments, solved.keep, solution.projected, strict=True
         ):
             full = np.zeros((len(mine), len(keep)))
             full[:, keep] = hat
@@ -392,110 +493,38 @@ def _masked(
 
 
 def _covariance(
-    solutions: Sequence[Solution],
-    regression: Regression,
+    solved: Solved,
     projected: list[list[Array]],
     residuals: list[list[Array]],
     kind: Covariance,
     seed: int,
-    centred: bool,
     shapes: Sequence[Sequence[ErrorShape]],
 ) -> tuple[Array, int]:
-    predictor = regression.predictor
+    regression, predictor = solved.problem.regression, solved.problem.predictor
     p = len(predictor.columns)
     if kind == "bootstrap":
-        rng = np.random.default_rng(seed)
-        total = np.zeros((p, p))
+        equations = []
         for row, state in enumerate(predictor.structure.states):
             mine = predictor.equation(state)
             phi = [e.phi[mine] for e in regression.experiments]
             y = [e.y[row] for e in regression.experiments]
-            if centred:
+            if solved.centred:
                 # the constant of each experiment belongs to the equation, not to a block
                 phi = [f - f.mean(axis=1, keepdims=True) for f in phi]
                 y = [v - v.mean() for v in y]
-            draws = block_bootstrap(projected[row], phi, y, rng)
-            total[np.ix_(mine, mine)] = np.cov(draws.T).reshape(len(mine), len(mine))
-        return total, 0
+            equations.append((projected[row], phi, y))
+        draws = block_bootstrap(equations, np.random.default_rng(seed))
+        order = np.argsort(
+            np.concatenate([predictor.equation(s) for s in predictor.structure.states])
+        )
+        return np.cov(draws[:, order].T).reshape(p, p), 0
     robust: CovarianceKind = kind
     middle, lags = score_covariance(projected, residuals, robust, shapes=shapes)
     inverse = np.zeros((p, p))
-    for state, solution in zip(predictor.structure.states, solutions, strict=True):
+    for state, solution in zip(predictor.structure.states, solved.solutions, strict=True):
         mine = predictor.equation(state)
         inverse[np.ix_(mine, mine)] = np.linalg.pinv(solution.information, rcond=1e-15)
     # degrees of freedom, as statsmodels counts them
     rows = regression.kept
     largest = max(len(predictor.equation(s)) for s in predictor.structure.states)
     return inverse @ middle @ inverse.T * rows / max(rows - largest, 1), lags
-
-
-def _result(
-    method: str,
-    regression: Regression,
-    instruments: Instruments,
-    solutions: Sequence[Solution],
-    logs: Sequence[TrialLog],
-    kind: Covariance,
-    seed: int,
-    iteration: Iteration = _NO_ITERATION,
-    centred: bool = False,
-    margins: dict[str, float] | None = None,
-    heading: str = "measured",
-    evidence: Instruments | None = None,
-) -> Estimate:
-    """Collect what was found; `evidence` are the simulated instruments to test it with."""
-    predictor = regression.predictor
-    projected, residuals = _masked(solutions, regression, instruments, centred=centred)
-    kept = sum(int(k.sum()) for k in instruments.keep)
-    theta = _coefficients(solutions)
-    shapes = (
-        error_shapes(predictor, logs, theta, residuals, instruments.keep) if kind == "ma" else ()
-    )
-    covariance, lags = _covariance(
-        solutions, regression, projected, residuals, kind, seed, centred, shapes
-    )
-    residual_std = np.array(
-        [np.sqrt(sum(float(e @ e) for e in equation) / max(kept, 1)) for equation in residuals]
-    )
-    estimate = Estimate(
-        predictor=predictor,
-        method=method,
-        theta=theta,
-        covariance=covariance,
-        residual_std=residual_std,
-        vessel=logs[0].vessel,
-        sample_time=regression.sample_time,
-        data=estimation_data(logs, predictor.structure.states, regression.samples, kept),
-        covariance_kind=kind,
-        lags=lags,
-        iteration=iteration,
-        current=estimate_current(
-            predictor,
-            theta,
-            covariance,
-            heading_std=logs[0].vessel.std("psi") or 0.0,
-            heading_measured=heading == "measured",
-        ),
-    )
-    if evidence is None:
-        return estimate
-    tests = convergence(estimate) + assess(
-        Evidence(
-            predictor,
-            regression,
-            tuple(logs),
-            evidence,
-            theta,
-            covariance,
-            tuple(tuple(equation) for equation in residuals),
-            instruments.keep,
-            method,
-            centred,
-            margins,
-        )
-    )
-    return replace(
-        estimate,
-        tests=tests,
-        verdict=weigh(tests, estimate.labels, method, contaminated=predictor.contaminated),
-    )

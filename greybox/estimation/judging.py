@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +22,8 @@ from greybox.estimation.result import Estimate
 from greybox.estimation.verdict import NoRegression, TestResult, refused
 from greybox.model.predictor import Predictor, build_predictor
 from greybox.one_thread import one_thread
-from greybox.regression.instruments import build_instruments
-from greybox.regression.regression import Regression, build_regression
+from greybox.regression.problem import RegressionProblem
+from greybox.regression.regression import Regression
 from greybox.trial.log import TrialLog
 
 Array = NDArray[np.float64]
@@ -52,44 +52,52 @@ def judge_estimate(
     margins, zero_mean, heading, wind, lag
         Of its instruments, as `build_instruments`.
     """
-    predictor = _regression_predictor(estimate)
+    problem = beside(
+        estimate, logs, margins=margins, zero_mean=zero_mean, heading=heading, wind=wind, lag=lag
+    )
+    tested = with_tests(problem, estimate)
+    if tested.verdict is not estimate.verdict:
+        return tested
+    return replace(tested, verdict=weigh(tested.tests, estimate.labels, estimate.method))
+
+
+def beside(estimate: Estimate, logs: Sequence[TrialLog], **instruments: Any) -> RegressionProblem:
+    """Return the regression that stands beside an estimate; `instruments` as `judge_estimate`."""
+    return RegressionProblem(_regression_predictor(estimate), tuple(logs), **instruments)
+
+
+def with_tests(problem: RegressionProblem, estimate: Estimate) -> Estimate:
+    """Return an estimate with its tests, by the regression of a problem beside it.
+
+    Without a regression there are none, and the verdict refuses the estimate.
+    """
+    predictor, logs = problem.predictor, problem.logs
     try:
-        regression = build_regression(predictor, logs, margins=margins)
+        regression = problem.regression
     except ExcitationError as error:
         return replace(estimate, verdict=refused([NoRegression(str(error))], estimate.labels))
-    instruments = build_instruments(
-        predictor,
-        logs,
-        estimate.structure_theta(),
-        zero_mean=zero_mean,
-        heading=heading,
-        wind=wind,
-        lag=lag,
-        margins=margins,
-    )
+    instruments = problem.instruments(estimate.structure_theta())
     keep = instruments.keep or tuple(e.keep for e in regression.experiments)
     theta, covariance = _coefficients(estimate, predictor)
     evidence = Evidence(
         predictor,
         regression,
-        tuple(logs),
+        logs,
         instruments,
         theta,
         covariance,
-        _residuals(estimate, regression, logs, keep, zero_mean),
+        _residuals(estimate, regression, logs, keep, problem.zero_mean),
         keep,
         estimate.method,
-        zero_mean,
-        margins,
+        problem.zero_mean,
+        problem.margins,
         solved=False,
     )
     own = {t.name: t for t in estimate.tests}
     tests: list[TestResult] = [own.pop(t.name, t) for t in assess(evidence)]
     tests += [t for t in convergence(estimate) if t.name not in own]
     tests += own.values()
-    return replace(
-        estimate, tests=tuple(tests), verdict=weigh(tests, estimate.labels, estimate.method)
-    )
+    return replace(estimate, tests=tuple(tests))
 
 
 def _regression_predictor(estimate: Estimate) -> Predictor:

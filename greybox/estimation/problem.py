@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,7 @@ from greybox.regression.instruments import simulate_log
 from greybox.trial.log import TrialLog
 
 Array = NDArray[np.float64]
+Fitted = TypeVar("Fitted")
 
 
 @dataclass(frozen=True)
@@ -59,12 +60,6 @@ class EstimationProblem:
     prefilter: Literal["auto", "noise", "none"] = "auto"
     judged: bool = True
     without: tuple[str, ...] = ()
-
-    @property
-    def common(self) -> dict[str, Any]:
-        """What every regression takes: margins, seed, and the covariance where one is asked for."""
-        asked = {} if self.covariance is None else {"covariance": self.covariance}
-        return {"margins": self.margins, "seed": self.seed, **asked}
 
     @cached_property
     def regime(self) -> Regime:
@@ -104,8 +99,8 @@ class EstimationProblem:
         return predictor
 
     def drop_unexcited(
-        self, predictor: Predictor, fit: Callable[[Predictor], Estimate]
-    ) -> tuple[Estimate, list[str]]:
+        self, predictor: Predictor, fit: Callable[[Predictor], Fitted]
+    ) -> tuple[Fitted, list[str]]:
         """Estimate without the bias-capturing columns that do not vary, and note which."""
         notes: list[str] = []
         while True:
@@ -142,8 +137,8 @@ class EstimationProblem:
         self,
         method: str,
         predictor: Predictor,
-        fit: Callable[[Predictor], Estimate],
-        finish: Callable[[Estimate, list[str]], Estimate] = lambda estimate, _: estimate,
+        fit: Callable[[Predictor], Fitted],
+        finish: Callable[[Fitted, list[str]], Estimate],
     ) -> Estimate:
         """Estimate from one-step equations, and say what these rest on.
 
@@ -152,13 +147,13 @@ class EstimationProblem:
         method : str
         predictor : Predictor
         fit : callable
-            Estimates a predictor.
+            Solves the equations of a predictor.
         finish : callable
-            What follows once the predictor is settled; may note more.
+            Estimates once the predictor is settled; may note more.
         """
         _, loop_test = self.loop_test(method)
-        estimate, notes = self.drop_unexcited(predictor, fit)
-        estimate = finish(estimate, notes)
+        fitted, notes = self.drop_unexcited(predictor, fit)
+        estimate = finish(fitted, notes)
         notes += _coarse(self.logs)
         return replace(estimate, tests=(*estimate.tests, loop_test), notes=tuple(notes))
 

@@ -9,7 +9,7 @@ instruments are Ω⁻¹ times the noise-free regressors, θ̂ = (Zᵀ Ω⁻¹ Φ
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from greybox.errors import ExcitationError
 from greybox.estimation.disturbance import estimate_current
-from greybox.estimation.estimate import Covariance, estimate_iv, estimate_ls
+from greybox.estimation.estimate import Covariance, solve_iv, solve_ls
 from greybox.estimation.noise import (
     ErrorLikelihood,
     NoiseFit,
@@ -45,7 +45,8 @@ from greybox.keywords import known_keywords
 from greybox.model.predictor import Predictor
 from greybox.one_thread import one_thread
 from greybox.regression.motion import Motion, further_channels, predicted_motion, smoothed_heading
-from greybox.regression.regression import Regression, build_regression, within_margins
+from greybox.regression.problem import RegressionProblem
+from greybox.regression.regression import within_margins
 from greybox.trial.log import Logs, TrialLog, as_list
 
 Array = NDArray[np.float64]
@@ -79,20 +80,12 @@ class _Point:
 class _Refinement:
     """What the rounds share: the regression, and how a motion is predicted."""
 
-    def __init__(
-        self,
-        regression: Regression,
-        logs: Sequence[TrialLog],
-        heading: Literal["measured", "simulated"],
-        wind: Literal["smoothed", "measured"],
-    ) -> None:
-        self.regression = regression
-        self.predictor = regression.predictor
-        self.logs = logs
-        self._heading: Literal["measured", "simulated"] = heading
-        self._wind: Literal["smoothed", "measured"] = wind
-        self.phi = [e.phi for e in regression.experiments]
-        self.y = [e.y for e in regression.experiments]
+    def __init__(self, problem: RegressionProblem) -> None:
+        self.predictor = problem.predictor
+        self.logs = problem.logs
+        self._heading, self._wind = problem.heading, problem.wind
+        self.phi = [e.phi for e in problem.regression.experiments]
+        self.y = [e.y for e in problem.regression.experiments]
 
     def point(self, theta: Array, constants: Sequence[Array]) -> _Point:
         motions = [
@@ -240,33 +233,29 @@ def estimate_refined_iv(
     ----------
     Söderström and Stoica (1983); Young (2008).
     """
-    logs = as_list(logs)
+    problem = RegressionProblem(
+        predictor, tuple(as_list(logs)), margins, heading=heading, wind=wind
+    )
     own = isinstance(start, Estimate) and ESTIMATORS[start.method].instruments
     plain = start if isinstance(start, Estimate) and own else None
     if plain is None:
-        plain = estimate_iv(
-            predictor,
-            logs,
-            start=start,
-            heading=heading,
-            wind=wind,
-            margins=margins,
-            judged=False,
-        )
-    regression = build_regression(predictor, logs, margins=margins)
-    work = _Refinement(regression, logs, heading, wind)
-    states = predictor.structure.states
-    keep = [e.keep for e in regression.experiments]
-    found = _from_a_start(
-        work,
-        [
-            lambda: plain.theta,
-            # plain instruments may fail on a short log where refined ones do not
-            lambda: estimate_ls(predictor, logs, margins=margins, covariance="white").theta,
-        ],
-        keep,
-        margins,
-    )
+        plain = solve_iv(problem, start=start).estimate(None)
+    return refine_by_noise(problem, plain, covariance, seed)
+
+
+def refine_by_noise(
+    problem: RegressionProblem, plain: Estimate, covariance: Covariance = "ma", seed: int = 0
+) -> Estimate:
+    """Refine a plain estimate of a problem, whose standard errors may be left out.
+
+    Parameters and errors are those of `estimate_refined_iv`.
+    """
+    logs, regression = problem.logs, problem.regression
+    work = _Refinement(problem)
+    states = problem.predictor.structure.states
+    # plain instruments may fail on a short log where refined ones do not
+    starts = [lambda: plain.theta, lambda: solve_ls(problem).theta]
+    found = _from_a_start(work, starts, problem.keep, problem.margins)
     theta, kept = found.theta, sum(b.rows for b in found.bands)
     matrix, lags = white_covariance(
         found.rows,
@@ -293,11 +282,11 @@ def estimate_refined_iv(
             "prefiltered by the noise, ",
         ),
         current=estimate_current(
-            predictor,
+            problem.predictor,
             theta,
             matrix,
             heading_std=vessel.std("psi") or 0.0,
-            heading_measured=heading == "measured",
+            heading_measured=problem.heading == "measured",
         ),
         # those of the plain estimate say nothing of this one
         tests=(),
@@ -326,7 +315,7 @@ def _from_a_start(
     work: _Refinement,
     starts: Sequence[Callable[[], Array]],
     keep: Sequence[NDArray[np.bool_]],
-    margins: dict[str, float] | None,
+    margins: Mapping[str, float] | None,
 ) -> _Refined:
     """Return where the rounds ended from the first start that they converge from.
 
@@ -433,14 +422,23 @@ def with_noise(
     coefficients are too far off to decide more. Without change where the motion
     that the estimate predicts diverges.
     """
-    regression = build_regression(estimate.predictor, logs, margins=margins)
-    work = _Refinement(regression, logs, heading, wind)
-    keep = [e.keep for e in regression.experiments]
-    point = work.start(estimate.theta, keep)
+    problem = RegressionProblem(
+        estimate.predictor, tuple(logs), margins, heading=heading, wind=wind
+    )
+    return add_noise(problem, estimate)
+
+
+def add_noise(problem: RegressionProblem, estimate: Estimate) -> Estimate:
+    """Return a plain estimate of a problem with noise levels, as `with_noise`."""
+    work = _Refinement(problem)
+    point = work.start(estimate.theta, problem.keep)
     if point.diverged >= 0:
         return estimate
-    fit = work.first_levels(point, keep, estimate.theta)
+    fit = work.first_levels(point, problem.keep, estimate.theta)
     levels = noise_levels_of(
-        fit, estimate.predictor.structure.states, logs[0].vessel, regression.sample_time
+        fit,
+        estimate.predictor.structure.states,
+        problem.logs[0].vessel,
+        problem.regression.sample_time,
     )
     return replace(estimate, noise=levels)

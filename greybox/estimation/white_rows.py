@@ -147,9 +147,7 @@ def white_covariance(
     errors = [r.y - theta @ r.phi for r in rows]
     if kind == "bootstrap":
         draws = block_bootstrap(
-            [r.z for r in rows],
-            [r.phi for r in rows],
-            [r.y for r in rows],
+            [([r.z for r in rows], [r.phi for r in rows], [r.y for r in rows])],
             np.random.default_rng(seed),
             block=nx * max(10, round(sum(b.rows for b in bands) ** 0.5)),
         )

@@ -6,7 +6,7 @@ noise, because only the inputs and the heading of the log enter the simulation.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -167,7 +167,7 @@ def build_instruments(
     heading: Literal["measured", "simulated"] = "measured",
     wind: Literal["smoothed", "measured"] = "smoothed",
     lag: int = 0,
-    margins: dict[str, float] | None = None,
+    margins: Mapping[str, float] | None = None,
     keep: Sequence[NDArray[np.bool_]] | None = None,
 ) -> Instruments:
     """Simulate a model on each log and form its regressors.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -78,7 +78,7 @@ def build_regression(
     predictor: Predictor,
     logs: Sequence[TrialLog],
     *,
-    margins: dict[str, float] | None = None,
+    margins: Mapping[str, float] | None = None,
     second_measurement: Sequence[Array] | None = None,
 ) -> Regression:
     """Form y and Φ from measured logs.
@@ -147,7 +147,7 @@ def measured_rows(predictor: Predictor, log: TrialLog) -> NDArray[np.bool_]:
 
 
 def within_margins(
-    x: Array, states: tuple[str, ...], margins: dict[str, float] | None
+    x: Array, states: tuple[str, ...], margins: Mapping[str, float] | None
 ) -> NDArray[np.bool_]:
     """Return which rows of x (N, nx) keep every state beyond its margin (A10)."""
     keep = np.ones(len(x), bool)

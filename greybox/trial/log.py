@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -210,9 +211,14 @@ class TrialLog(DisplayMixin):
 
         They follow the commands as late as the vessel's `actuation` says.
         """
-        commands = {c: self[c] for c in self.vessel.commands}
-        made = actuated_force(self.vessel, commands, self.sample_time)
+        made = self._made_forces
         return np.column_stack([made.get(n, np.zeros(len(self))) for n in inputs])
+
+    @cached_property
+    def _made_forces(self) -> Mapping[str, Array]:
+        """Generalised forces by name, of the commands as the thrusters follow them."""
+        commands = {c: self[c] for c in self.vessel.commands}
+        return actuated_force(self.vessel, commands, self.sample_time)
 
     @property
     def has_wind(self) -> bool:

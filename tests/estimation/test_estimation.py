@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import statsmodels.api as sm
@@ -200,8 +202,17 @@ def test_bootstrap_of_white_noise_has_the_known_spread():
     rng = np.random.default_rng(3)
     x = rng.normal(size=(2, 4000))
     y = np.array([1.0, 2.0]) @ x + rng.normal(size=4000)
-    draws = block_bootstrap([x], [x], [y], rng, draws=400)
+    draws = block_bootstrap([([x], [x], [y])], rng, draws=400)
     np.testing.assert_allclose(draws.std(axis=0), 1 / np.sqrt(4000), rtol=0.25)
+
+
+def test_bootstrap_keeps_what_equations_have_in_common():
+    rng = np.random.default_rng(4)
+    x = rng.normal(size=(1, 4000))
+    e = rng.multivariate_normal([0, 0], [[1.0, 0.8], [0.8, 1.0]], 4000).T
+    draws = block_bootstrap([([x], [x], [x[0] + e[i]]) for i in range(2)], rng)
+    # 500 draws of about 63 blocks
+    assert np.corrcoef(draws.T)[0, 1] == pytest.approx(0.8, abs=0.15)
 
 
 def test_mean_kept_instruments_need_an_intercept(thesis, noisy_log):
@@ -277,14 +288,14 @@ def test_too_few_samples(thesis, noisy_log):
 
 def test_unexcited_parameters_are_named(thesis, clean_log):
     still = {**clean_log.channels, "v": 0 * clean_log["v"]}
-    log = type(clean_log)(**{**clean_log.__dict__, "channels": still})
+    log = replace(clean_log, channels=still)
     with pytest.raises(ExcitationError, match="parameter Xvr is not excited"):
         estimate_ls(build_predictor(thesis, "basic", REGIME), [log])
 
 
 def test_singular_instruments_name_the_parameters(thesis, clean_log):
     slave = {**clean_log.channels, "v": 2 * clean_log["u"], "u": clean_log["u"]}
-    log = type(clean_log)(**{**clean_log.__dict__, "channels": slave})
+    log = replace(clean_log, channels=slave)
     with pytest.raises(ExcitationError, match="cannot be told apart in the v equation"):
         estimate_ls(build_predictor(thesis, "basic", REGIME), [log])
 

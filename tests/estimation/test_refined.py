@@ -337,7 +337,7 @@ def test_a_prediction_that_diverges_is_an_error(basic, still_log, refined, monke
     # least squares serves as a start where the plain estimate cannot be simulated
     again = estimate_refined_iv(basic, [still_log], start=wild)
     assert (np.abs(again.theta - refined.theta) < 0.05 * refined.std).all()
-    monkeypatch.setattr("greybox.estimation.refined.estimate_ls", lambda *_, **__: wild)
+    monkeypatch.setattr("greybox.estimation.refined.solve_ls", lambda problem: wild)
     with pytest.raises(ExcitationError, match="left its bound at sample"):
         estimate_refined_iv(basic, [still_log], start=wild)
 

@@ -7,6 +7,7 @@ properties of that regression.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -184,7 +185,7 @@ class Evidence:
     keep: tuple[NDArray[np.bool_], ...]
     method: str
     zero_mean: bool = True
-    margins: dict[str, float] | None = None
+    margins: Mapping[str, float] | None = None
     solved: bool = True
 
     @property

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,7 @@ _ROWS = 1500
 
 
 def sign_margins(
-    logs: Sequence[TrialLog], states: tuple[str, ...], margins: dict[str, float] | None, cut: int
+    logs: Sequence[TrialLog], states: tuple[str, ...], margins: Mapping[str, float] | None, cut: int
 ) -> list[TestResult]:
     """Report how many samples come closer to the origin than three noise deviations (A10)."""
     out = []

@@ -2,57 +2,42 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from greybox.estimation.registry import Estimator
 
 if TYPE_CHECKING:
+    from greybox.estimation.estimate import Solved
     from greybox.estimation.problem import EstimationProblem
     from greybox.estimation.result import Estimate
+    from greybox.model.predictor import Predictor
 
 # process noise, in deviations of the measurements, from which on it counts
 _PUSHED = 0.05
 
 
 def _fit(problem: EstimationProblem) -> Estimate:
-    from greybox.estimation.estimate import estimate_iv
-    from greybox.estimation.judging import judge_estimate
+    from greybox.estimation.estimate import solve_iv
+    from greybox.estimation.judging import with_tests
     from greybox.estimation.loop import CLOSED_LOOP_LAG
-    from greybox.model.predictor import Predictor
     from greybox.regression.instruments import WIND_WINDOW
+    from greybox.regression.problem import RegressionProblem
 
     noisy_wind = float(problem.logs[0].vessel.sensors.get("wind_std", 0.0)) > 0
     wind: Literal["smoothed", "measured"] = "smoothed" if noisy_wind else "measured"
     closed, _ = problem.loop_test("iv")
     lag = CLOSED_LOOP_LAG if closed else 0
 
-    def plain(predictor: Predictor) -> Estimate:
-        return estimate_iv(
-            predictor,
-            problem.logs,
-            start=problem.nominal_theta,
-            zero_mean=problem.zero_mean,
-            refine=problem.refine,
-            heading=problem.heading,
-            wind=wind,
-            lag=lag,
-            # it is judged once, after the refinement by the noise
-            judged=False,
-            **problem.common,
+    def plain(predictor: Predictor) -> Solved:
+        regression = RegressionProblem(
+            predictor, problem.logs, problem.margins, problem.zero_mean, problem.heading, wind, lag
         )
+        return solve_iv(regression, start=problem.nominal_theta, refine=problem.refine)
 
-    def finish(estimate: Estimate, notes: list[str]) -> Estimate:
-        estimate = _prefiltered(estimate, problem, wind, closed, notes)
+    def finish(solved: Solved, notes: list[str]) -> Estimate:
+        estimate = _prefiltered(solved, problem, closed, notes)
         if problem.judged:
-            estimate = judge_estimate(
-                estimate,
-                problem.logs,
-                margins=problem.margins,
-                zero_mean=problem.zero_mean,
-                heading=problem.heading,
-                wind=wind,
-                lag=lag,
-            )
+            estimate = with_tests(solved.problem, estimate)
         if problem.kind.air_measured:
             notes.append(
                 f"the wind in the instruments is the measured one averaged over {WIND_WINDOW:g} s, "
@@ -70,9 +55,8 @@ def _fit(problem: EstimationProblem) -> Estimate:
 
 
 def _prefiltered(
-    plain: Estimate,
+    solved: Solved,
     problem: EstimationProblem,
-    wind: Literal["smoothed", "measured"],
     closed: bool,
     notes: list[str],
 ) -> Estimate:
@@ -86,13 +70,9 @@ def _prefiltered(
         The refinement that the problem asks for fails.
     """
     from greybox.errors import ExcitationError, UsageError
-    from greybox.estimation.refined import estimate_refined_iv, with_noise
+    from greybox.estimation.refined import add_noise, refine_by_noise
 
-    common: dict[str, Any] = {
-        "heading": problem.heading,
-        "wind": wind,
-        "margins": problem.margins,
-    }
+    kind = problem.covariance or "ma"
     against = ""
     if closed:
         against = "instruments are delayed for the closed loop, which a prefilter would undo"
@@ -104,16 +84,12 @@ def _prefiltered(
             f"use --prefilter none."
         )
     if problem.prefilter != "none" and not against:
-        kind: dict[str, Any] = (
-            {} if problem.covariance is None else {"covariance": problem.covariance}
-        )
         try:
-            refined = estimate_refined_iv(
-                plain.predictor, problem.logs, start=plain, seed=problem.seed, **kind, **common
-            )
+            # standard errors of the plain estimate would be those of another one
+            refined = refine_by_noise(solved.problem, solved.estimate(None), kind, problem.seed)
             if problem.prefilter == "noise":
                 return refined
-            mixed = wind == "measured" and _pushed_through_air(refined)
+            mixed = solved.problem.wind == "measured" and _pushed_through_air(refined)
             if problem.stays_bounded(refined) and not mixed:
                 return refined
             against = (
@@ -128,7 +104,8 @@ def _prefiltered(
             against = str(error).rstrip(".")
     if against and problem.prefilter == "auto":
         notes.append(f"the instruments were not refined by the noise: {against}.")
-    return with_noise(plain, problem.logs, **common) if problem.judged else plain
+    plain = solved.estimate(kind, problem.seed)
+    return add_noise(solved.problem, plain) if problem.judged else plain
 
 
 def _pushed_through_air(estimate: Estimate) -> bool:

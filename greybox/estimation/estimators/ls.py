@@ -7,20 +7,25 @@ from typing import TYPE_CHECKING
 from greybox.estimation.registry import Estimator
 
 if TYPE_CHECKING:
+    from greybox.estimation.estimate import Solved
     from greybox.estimation.problem import EstimationProblem
     from greybox.estimation.result import Estimate
+    from greybox.model.predictor import Predictor
 
 
 def _fit(problem: EstimationProblem) -> Estimate:
-    from greybox.estimation.estimate import estimate_ls
+    from greybox.estimation.estimate import solve_ls
+    from greybox.regression.problem import RegressionProblem
 
-    return problem.fit_regression(
-        "ls",
-        problem.predictor(intercept=True),
-        lambda predictor: estimate_ls(
-            predictor, problem.logs, judged=problem.judged, **problem.common
-        ),
-    )
+    def fit(predictor: Predictor) -> Solved:
+        return solve_ls(
+            RegressionProblem(predictor, problem.logs, problem.margins, zero_mean=False)
+        )
+
+    def finish(solved: Solved, notes: list[str]) -> Estimate:
+        return solved.estimate(problem.covariance or "hac", problem.seed, tested=problem.judged)
+
+    return problem.fit_regression("ls", problem.predictor(intercept=True), fit, finish)
 
 
 ENTRY = Estimator(

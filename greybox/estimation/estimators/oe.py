@@ -18,7 +18,7 @@ _STARTING_REFINEMENTS = 1
 def _fit(problem: EstimationProblem) -> Estimate:
     """Fit free runs, from the nominal model, else from an estimate by IV or least squares."""
     from greybox.errors import UsageError
-    from greybox.estimation.judging import judge_estimate
+    from greybox.estimation.judging import beside, with_tests
     from greybox.estimation.output_error import estimate_oe
     from greybox.estimation.output_setup import output_predictor
 
@@ -49,7 +49,7 @@ def _fit(problem: EstimationProblem) -> Estimate:
         predictor, lambda p: estimate_oe(p, problem.logs, start=start, options=options)
     )
     if problem.judged:
-        estimate = judge_estimate(estimate, problem.logs)
+        estimate = with_tests(beside(estimate, problem.logs), estimate)
     _, loop_test = problem.loop_test("oe")
     return replace(
         estimate,
@@ -64,24 +64,19 @@ def _quick_start(problem: EstimationProblem) -> tuple[Estimate | None, str]:
     Bias-capturing terms are left out: the fit finds the current by itself.
     """
     from greybox.errors import DivergenceError, ExcitationError
-    from greybox.estimation.estimate import estimate_iv, estimate_ls
+    from greybox.estimation.estimate import solve_iv, solve_ls
     from greybox.model.predictor import build_predictor
+    from greybox.regression.problem import RegressionProblem
 
     predictor = build_predictor(problem.structure, problem.kind.plain, problem.regime)
+    regression = RegressionProblem(predictor, problem.logs)
     try:
-        found = estimate_iv(
-            predictor,
-            problem.logs,
-            refine=_STARTING_REFINEMENTS,
-            covariance="white",
-            judged=False,
-        )
+        found = solve_iv(regression, refine=_STARTING_REFINEMENTS).estimate("white")
         return found, "it started from an estimate by instrumental variables."
     except (ExcitationError, DivergenceError):
         pass
     try:
-        found = estimate_ls(predictor, problem.logs, covariance="white", judged=False)
-        return found, "it started from the least-squares estimate."
+        return solve_ls(regression).estimate("white"), "it started from the least-squares estimate."
     except ExcitationError:
         return None, "it started from nothing."
 

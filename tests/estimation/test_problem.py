@@ -1,0 +1,67 @@
+"""One estimate forms its regression once, its instruments once a model, its forces once a log."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+import pytest
+from virtual import virtual_log
+
+from greybox.model.predictor import build_predictor
+from greybox.regression.problem import RegressionProblem
+from greybox.validation.choose import estimate_model
+
+REGIME = (("u", (1,)), ("v", (1,)), ("r", (1, -1)))
+
+
+@pytest.fixture
+def counted(monkeypatch):
+    """How often what is expensive is formed, by function and model."""
+    count: Counter[str] = Counter()
+
+    def count_calls(place, name, key=lambda *_: ""):
+        module = __import__(place, fromlist=[name])
+        original = getattr(module, name)
+
+        def call(*args, **options):
+            count[name, key(*args)] += 1
+            return original(*args, **options)
+
+        monkeypatch.setattr(module, name, call)
+
+    count_calls("greybox.regression.problem", "build_regression")
+    count_calls(
+        "greybox.regression.problem", "build_instruments", lambda p, logs, theta: theta.tobytes()
+    )
+    count_calls("greybox.trial.log", "actuated_force")
+    count_calls("greybox.estimation.judging", "assess")
+    count_calls("greybox.validation.choose", "weigh")
+    return count
+
+
+def test_one_estimate_forms_each_thing_once(counted):
+    log = virtual_log(31, 1000)
+    counted.clear()
+    found = estimate_model([log], method="iv", predictor="augmented", structure="linear")
+    assert found.prefilter == "noise"
+    assert {name for name, _ in counted} == {
+        "build_regression", "build_instruments", "actuated_force", "assess", "weigh"
+    }  # fmt: skip
+    assert max(counted.values()) == 1
+    # the first model, each refinement, and the estimate itself for its tests
+    refinements = sum(name == "build_instruments" for name, _ in counted)
+    assert 3 <= refinements <= 10
+
+
+def test_instruments_of_a_model_are_simulated_once(thesis, true_theta, counted):
+    predictor = build_predictor(thesis, "basic", REGIME)
+    problem = RegressionProblem(predictor, (virtual_log(32, 300),))
+    counted.clear()
+    first = problem.instruments(true_theta)
+    assert problem.instruments(true_theta.copy()) is first
+    other = problem.instruments(0.9 * true_theta)
+    assert other is not first
+    assert max(counted.values()) == 1
+    cut = [np.arange(299) > 10]
+    np.testing.assert_array_equal(problem.instruments(true_theta, cut).keep[0], cut[0])
