@@ -26,7 +26,8 @@ from greybox.model.predictor import Predictor
 from greybox.one_thread import one_thread
 from greybox.regression.instruments import Instruments, build_instruments
 from greybox.regression.regression import Regression, build_regression
-from greybox.trial.log import Logs, TrialLog, as_list
+from greybox.trial.log import Logs, TrialLog
+from greybox.trial.segments import as_segments
 
 Array = NDArray[np.float64]
 Covariance = Literal["hac", "ma", "white", "bootstrap"]
@@ -93,7 +94,7 @@ def estimate_ls(
     ----------
     Ljungberg (2020), eq. 2.17.
     """
-    logs = as_list(logs)
+    logs = as_segments(logs)
     regression = build_regression(predictor, logs, margins=margins)
     instruments = _regressors_as_instruments(regression)
     solutions = _solve(regression, instruments)
@@ -188,7 +189,7 @@ def estimate_iv(
             "instruments that keep their mean do not remove the constants that the augmented "
             "predictor leaves out: build it with an intercept, or use zero-mean instruments."
         )
-    experiments = as_list(logs)
+    experiments = as_segments(logs)
     regression = build_regression(predictor, experiments, margins=margins)
     theta = _start(regression, start)
 

@@ -46,7 +46,8 @@ from greybox.model.predictor import Predictor
 from greybox.one_thread import one_thread
 from greybox.regression.motion import Motion, further_channels, predicted_motion, smoothed_heading
 from greybox.regression.regression import Regression, build_regression, within_margins
-from greybox.trial.log import Logs, TrialLog, as_list
+from greybox.trial.log import Logs, TrialLog
+from greybox.trial.segments import as_segments
 
 Array = NDArray[np.float64]
 
@@ -240,7 +241,7 @@ def estimate_refined_iv(
     ----------
     Söderström and Stoica (1983); Young (2008).
     """
-    logs = as_list(logs)
+    logs = as_segments(logs)
     own = isinstance(start, Estimate) and ESTIMATORS[start.method].instruments
     plain = start if isinstance(start, Estimate) and own else None
     if plain is None:
