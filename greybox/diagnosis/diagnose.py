@@ -15,7 +15,8 @@ from greybox.diagnosis.waves import find_waves, found_waves
 from greybox.keywords import known_keywords
 from greybox.model.model import ManoeuvringModel
 from greybox.one_thread import one_thread
-from greybox.trial.log import Logs, as_list
+from greybox.trial.log import Logs
+from greybox.trial.segments import as_segments
 from greybox.trial.validity import other_conditions, pooled_conditions
 
 _log = logging.getLogger(__name__)
@@ -85,7 +86,7 @@ def diagnose(
         options.progress(doing)
 
     say("log checks")
-    logs, validate = as_list(logs), as_list(validate, 0)
+    logs, validate = as_segments(logs), as_segments(validate, 0)
     ready = prepare(logs, validate, model, options.structure, options.causes)
     case = ready.case
     say("model without causes")

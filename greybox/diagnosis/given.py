@@ -18,7 +18,8 @@ from greybox.diagnosis.search import Search
 from greybox.diagnosis.telling import Report
 from greybox.keywords import known_keywords
 from greybox.one_thread import one_thread
-from greybox.trial.log import Logs, as_list
+from greybox.trial.log import Logs
+from greybox.trial.segments import as_segments
 
 Array = NDArray[np.float64]
 
@@ -63,7 +64,7 @@ def fit_given(
     UsageError
         A cause does not exist.
     """
-    logs, validate = as_list(logs), as_list(validate, 0)
+    logs, validate = as_segments(logs), as_segments(validate, 0)
     ready = prepare(logs, validate, None, structure, ids)
     case, base = ready.case, ready.base()
     final = base

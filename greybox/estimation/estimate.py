@@ -27,7 +27,8 @@ from greybox.one_thread import one_thread
 from greybox.regression.instruments import Instruments
 from greybox.regression.problem import RegressionProblem
 from greybox.regression.regression import Regression
-from greybox.trial.log import Logs, as_list
+from greybox.trial.log import Logs
+from greybox.trial.segments import as_segments
 
 Array = NDArray[np.float64]
 Covariance = Literal["hac", "ma", "white", "bootstrap"]
@@ -94,7 +95,7 @@ def estimate_ls(
     ----------
     Ljungberg (2020), eq. 2.17.
     """
-    problem = RegressionProblem(predictor, tuple(as_list(logs)), margins, zero_mean=False)
+    problem = RegressionProblem(predictor, tuple(as_segments(logs)), margins, zero_mean=False)
     return _judged(solve_ls(problem).estimate(covariance, seed, tested=judged))
 
 
@@ -166,7 +167,7 @@ def estimate_iv(
     Ljungberg (2020), eqs. 2.21, 4.5, 4.60-4.63; Young (2008).
     """
     problem = RegressionProblem(
-        predictor, tuple(as_list(logs)), margins, zero_mean, heading, wind, lag
+        predictor, tuple(as_segments(logs)), margins, zero_mean, heading, wind, lag
     )
     solved = solve_iv(problem, start=start, refine=refine, metric=metric)
     return _judged(solved.estimate(covariance, seed, tested=judged))

@@ -48,7 +48,8 @@ from greybox.model.output_runs import Simulator
 from greybox.model.predictor import Predictor
 from greybox.one_thread import one_thread
 from greybox.regression.regression import common_sample_time
-from greybox.trial.log import Logs, TrialLog, as_list
+from greybox.trial.log import Logs, TrialLog
+from greybox.trial.segments import as_segments
 
 Array = NDArray[np.float64]
 Damping = Literal["warn", "enforce"]
@@ -163,7 +164,7 @@ def estimate_oe(
     ----------
     Ljung (1999), sections 7.2-7.4 and 9.4; Åström (1980).
     """
-    logs = as_list(logs)
+    logs = as_segments(logs)
     fitted = _fit(predictor, logs, start, options)
     if not (np.isfinite(fitted.fit.cost) and fitted.bounded):
         raise ExcitationError(

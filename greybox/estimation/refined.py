@@ -47,7 +47,8 @@ from greybox.one_thread import one_thread
 from greybox.regression.motion import Motion, further_channels, predicted_motion, smoothed_heading
 from greybox.regression.problem import RegressionProblem
 from greybox.regression.regression import within_margins
-from greybox.trial.log import Logs, TrialLog, as_list
+from greybox.trial.log import Logs, TrialLog
+from greybox.trial.segments import as_segments
 
 Array = NDArray[np.float64]
 
@@ -234,7 +235,7 @@ def estimate_refined_iv(
     Söderström and Stoica (1983); Young (2008).
     """
     problem = RegressionProblem(
-        predictor, tuple(as_list(logs)), margins, heading=heading, wind=wind
+        predictor, tuple(as_segments(logs)), margins, heading=heading, wind=wind
     )
     own = isinstance(start, Estimate) and ESTIMATORS[start.method].instruments
     plain = start if isinstance(start, Estimate) and own else None

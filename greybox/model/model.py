@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from math import isfinite
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, get_args
 
 import casadi as ca
 import numpy as np
@@ -18,6 +18,7 @@ from greybox.errors import GreyboxError, ModelFileError, StructureError, suggest
 from greybox.files import nearest_file, plain, write_json
 from greybox.model.changes import Change, factors_at
 from greybox.model.noise import NoiseLevels, noise_from_dict
+from greybox.model.run.step import Integrator
 from greybox.model.structure import Structure
 from greybox.model.terms import Factor, Term
 from greybox.model.units import parameter_unit
@@ -34,7 +35,7 @@ FORMAT = "greybox-model"
 _MAX_BYTES = 50_000_000
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, eq=False)
 class ManoeuvringModel(DisplayMixin):
     """A model that can be simulated, compared, saved and designed with.
 
@@ -79,7 +80,7 @@ class ManoeuvringModel(DisplayMixin):
     covariance: Array
     sample_time: float
     vessel: Vessel
-    integrator: Literal["euler", "rk4"] = "euler"
+    integrator: Integrator = "euler"
     disturbances: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     disturbance_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
     residual_std: Array = field(default_factory=lambda: np.zeros(0))
@@ -97,6 +98,18 @@ class ManoeuvringModel(DisplayMixin):
                     f"'{self.structure.name}'.{suggestion(change.parameter, self.names)} "
                     f"It has: {', '.join(self.names)}."
                 )
+
+    def __eq__(self, other: object) -> bool:
+        """Whether both are the same model: their files would hold the same."""
+        if not isinstance(other, ManoeuvringModel):
+            return NotImplemented
+        return self is other or self._content() == other._content()
+
+    def __hash__(self) -> int:
+        return hash((self.names, self.theta.tobytes(), self.sample_time, self.integrator))
+
+    def _content(self) -> str:
+        return json.dumps(self.to_dict(), sort_keys=True)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -270,7 +283,24 @@ def model_from_dict(data: Any, source: str = "model") -> ManoeuvringModel:
         raise ModelFileError(
             f"'{source}' is not a model file: make one with 'greybox estimate … --out MODEL'."
         )
+    from greybox.model.schema import require_tables
+
     data = upgraded(data, source)
+    require_tables(data, source)
+    integrators = get_args(Integrator)
+    if data["integrator"] not in integrators:
+        raise ModelFileError(
+            f"'{source}' has the integrator '{data['integrator']}', which is not known."
+            f"{suggestion(data['integrator'], integrators)} Known: {', '.join(integrators)}."
+        )
+    widths = (
+        {len(row) for row in data["covariance"]},
+        {len(r) for r in data["disturbance_covariance"]},
+    )
+    if any(len(w) > 1 for w in widths):
+        raise ModelFileError(
+            f"'{source}' has a covariance with rows of different lengths: estimate the model again."
+        )
     try:
         s = data["structure"]
         terms = tuple(
@@ -319,7 +349,7 @@ def model_from_dict(data: Any, source: str = "model") -> ManoeuvringModel:
             covariance=np.nan_to_num(covariance),
             sample_time=float(data["sample_time"]),
             vessel=vessel_from_dict(data["vessel"]),
-            integrator="rk4" if data["integrator"] == "rk4" else "euler",
+            integrator=data["integrator"],
             disturbances={
                 k: (float(v["value"]), float(v["std"] or 0.0))
                 for k, v in data["disturbances"].items()
@@ -334,10 +364,15 @@ def model_from_dict(data: Any, source: str = "model") -> ManoeuvringModel:
         )
     except ModelFileError:
         raise
-    except (KeyError, TypeError, ValueError, AttributeError, GreyboxError) as error:
+    except GreyboxError as error:
         raise ModelFileError(
-            f"'{source}' is a damaged model file ({type(error).__name__}: {error}): "
-            f"estimate the model again."
+            f"'{source}' is a damaged model file ({str(error).rstrip('.')}): estimate the model "
+            f"again."
+        ) from error
+    except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+        raise ModelFileError(
+            f"'{source}' is a damaged model file, whose entries do not fit each other: estimate "
+            f"the model again."
         ) from error
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.errors import DivergenceError
+from greybox.errors import DivergenceError, UsageError
 from greybox.model.run.kernels import MANY_RUNS, FreeRunKernel, FreeRunStep, OverRunsKernel
 from greybox.model.run.step import Heading, Integrator, StepModel, integrated
 from greybox.model.structure import Structure
@@ -133,22 +135,33 @@ def simulate(
     -------
     FreeRun
         R = 1 when no argument has runs.
+
+    Raises
+    ------
+    UsageError
+        The shapes of two arguments do not fit each other.
     """
-    theta = np.atleast_2d(np.asarray(theta, float))
-    x0 = np.atleast_2d(np.asarray(x0, float))
+    theta, x0 = np.atleast_1d(np.asarray(theta, float)), np.atleast_1d(np.asarray(x0, float))
     tau = np.asarray(tau, float)
-    tau = tau[None] if tau.ndim == 2 else tau
-    samples = tau.shape[1]
-    runs = max(
-        len(theta),
-        len(x0),
-        len(tau),
-        *[len(a) for a in (d, process_noise) if a is not None and np.ndim(a) == 3],
+    nx = len(structure.states)
+    samples = tau.shape[-2] if tau.ndim > 1 else 0
+    runs = _common_runs(
+        {
+            "theta": (theta, (len(structure.parameters),)),
+            "x0": (x0, (nx,)),
+            "tau": (tau, (samples, len(structure.inputs))),
+            "psi": (psi, (samples + 1,)),
+            "psi0": (psi0, ()),
+            "d": (d, (samples, len(structure.disturbances))),
+            "air": (air, (samples, 2)),
+            "process_noise": (process_noise, (samples, nx)),
+        }
     )
+    theta, x0 = np.atleast_2d(theta), np.atleast_2d(x0)
+    tau = tau[None] if tau.ndim == 2 else tau
     heading: Heading = "simulated"
     if psi is not None or "r" not in structure.states or structure.disturbance != "marine":
         heading = "measured"
-    nx = len(structure.states)
     series: list[Array] = [np.broadcast_to(tau, (runs, samples, tau.shape[2]))]
     if heading == "measured" and structure.disturbance == "marine":
         measured = np.zeros(samples + 1) if psi is None else np.asarray(psi, float)
@@ -192,6 +205,41 @@ def simulate(
         outside = np.asarray(~(np.abs(x) <= bound).all(axis=2))
     diverged = np.where(outside.any(axis=1), outside.argmax(axis=1), -1)
     return FreeRun(x, angle, diverged, np.asarray(bound, float))
+
+
+def _common_runs(given: Mapping[str, tuple[Any, tuple[int, ...]]]) -> int:
+    """Return how many runs arguments are for; each comes with its shape for one run.
+
+    Raises
+    ------
+    UsageError
+        One has another shape, or two are for other numbers of runs.
+    """
+    runs, first = 1, ""
+    for name, (value, one) in given.items():
+        if value is None:
+            continue
+        shape = np.shape(value)
+        # what is constant over the samples may stand for all of them
+        fits = [one, (1, *one[1:])] if len(one) == 2 else [one]
+        last = shape[max(len(shape) - len(one), 0) :]
+        constant = name == "d" and shape == one[1:]
+        longer = name == "psi" and len(last) == 1 and last > one
+        if not (constant or longer or last in fits) or len(shape) > len(one) + 1:
+            several = ", ".join(["R", *map(str, one)])
+            raise UsageError(
+                f"'{name}' has the shape {shape}, where {one or 'a number'}, or ({several}) for R "
+                f"runs, is needed: give one row a sample and one column a signal."
+            )
+        own = shape[0] if len(shape) > len(one) else 1
+        if own > 1 and runs > 1 and own != runs:
+            raise UsageError(
+                f"'{first}' is for {runs} runs and '{name}' for {own}: give both for as many, or "
+                f"one of them for a single run."
+            )
+        if own > runs:
+            runs, first = own, name
+    return runs
 
 
 def mid_step(value: Array) -> Array:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from greybox.errors import LogError
 from greybox.trial.gaps import split_at_gaps
-from greybox.trial.log import TrialLog
+from greybox.trial.log import Logs, TrialLog, as_list
 
 Array = NDArray[np.float64]
 
@@ -79,6 +79,11 @@ def split_segments(log: TrialLog) -> list[TrialLog]:
     return [log.window(a, b, f"{log.name}[{k + 1}]") for k, (a, b) in enumerate(found)]
 
 
+def as_segments(logs: Logs, least: int = 1) -> list[TrialLog]:
+    """Return the segments between the gaps of one log or of several, as `as_list` takes them."""
+    return [segment for log in as_list(logs, least) for segment in split_segments(log)]
+
+
 @dataclass(frozen=True)
 class LogGaps:
     """Gaps of one log.
@@ -134,7 +139,7 @@ class LogGaps:
 
 
 def find_log_gaps(log: TrialLog) -> tuple[LogGaps, ...]:
-    """Return the gaps of a log: in its time, and in what was measured."""
+    """Return the gaps of a log: in its time, and in the motions that a model has."""
     made = []
     breaks = [stop for _, stop in split_at_gaps(log.t, log.sample_time)[:-1]]
     if breaks:
@@ -145,6 +150,9 @@ def find_log_gaps(log: TrialLog) -> tuple[LogGaps, ...]:
         made.append(LogGaps(log.name, (), len(breaks), samples, float(lost[k]), begin))
     alike: dict[bytes, list[str]] = {}
     for name, gap in log.missing.items():
+        if name in ("x_n", "y_n"):
+            # no model has them as states
+            continue
         alike.setdefault(gap.tobytes(), []).append(name)
     for names in alike.values():
         edges = np.diff(np.concatenate([[0], log.missing[names[0]].astype(int), [0]]))

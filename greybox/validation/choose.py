@@ -23,7 +23,8 @@ from greybox.keywords import known_keywords
 from greybox.model.model import ManoeuvringModel
 from greybox.one_thread import one_thread
 from greybox.regression.regression import common_sample_time
-from greybox.trial.log import Logs, TrialLog, as_list
+from greybox.trial.log import Logs, TrialLog
+from greybox.trial.segments import as_segments
 from greybox.validation.alternatives import Alternative, alternatives_for
 from greybox.validation.fit import average_fit, run_model
 from greybox.validation.held_out import FLOOR
@@ -142,7 +143,7 @@ def estimate_model(
             stacklevel=3,
         )
         asked = request
-    return estimate_requested(as_list(logs), asked)
+    return estimate_requested(as_segments(logs), asked)
 
 
 @one_thread

@@ -18,7 +18,8 @@ from greybox.model.catalogue import structure_for
 from greybox.model.disturbances import CURRENT, WIND
 from greybox.model.predictor import Column
 from greybox.one_thread import one_thread
-from greybox.trial.log import TrialLog
+from greybox.trial.log import Logs
+from greybox.trial.segments import as_segments
 from greybox.validation.choose import estimate_requested
 from greybox.validation.criteria import independent_samples
 from greybox.validation.held_out import rank
@@ -145,7 +146,7 @@ def _without(
 
 @one_thread
 def reduce_structure(
-    logs: Sequence[TrialLog],
+    logs: Logs,
     request: Request = CHOOSE,
     progress: Progress = lambda done, total: None,
 ) -> StructureChoice:
@@ -158,7 +159,7 @@ def reduce_structure(
 
     Parameters
     ----------
-    logs : sequence of TrialLog
+    logs : TrialLog or sequence of TrialLog
     request : Request
         What it leaves open is chosen first, for the full structure.
     progress : callable
@@ -176,6 +177,7 @@ def reduce_structure(
     ExcitationError
         The full structure cannot be estimated on the parts.
     """
+    logs = as_segments(logs)
     settled = settle(logs, request)
     states = structure_for(str(settled.structure), force_inputs(logs[0].vessel)).states
     bench = Bench(logs, states)

@@ -15,7 +15,8 @@ from greybox.estimation.result import Estimate
 from greybox.model.catalogue import structure_for
 from greybox.notebook import DisplayMixin
 from greybox.one_thread import one_thread
-from greybox.trial.log import TrialLog
+from greybox.trial.log import Logs, TrialLog
+from greybox.trial.segments import as_segments
 from greybox.validation.choose import estimate_requested
 from greybox.validation.criteria import independent_samples, information_criteria
 from greybox.validation.fit import run_model
@@ -230,7 +231,7 @@ def settle(logs: Sequence[TrialLog], request: Request) -> Request:
 
 @one_thread
 def compare_structures(
-    logs: Sequence[TrialLog],
+    logs: Logs,
     names: Sequence[str],
     request: Request = CHOOSE,
     progress: Progress = lambda done, total: None,
@@ -239,7 +240,7 @@ def compare_structures(
 
     Parameters
     ----------
-    logs : sequence of TrialLog
+    logs : TrialLog or sequence of TrialLog
     names : sequence of str
         Structures, such as ``thesis`` and ``thesis-Xkappa``.
     request : Request
@@ -265,6 +266,7 @@ def compare_structures(
             f"{len(names)} structures are named, {len(set(names))} of them different: name at "
             f"least two different ones, such as thesis linear."
         )
+    logs = as_segments(logs)
     inputs = force_inputs(logs[0].vessel)
     states = {name: structure_for(name, inputs).states for name in names}
     other = next((n for n in names if states[n] != states[names[0]]), None)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal, get_args
 
 from pydantic import (
+    AfterValidator,
     BaseModel,
     BeforeValidator,
     ConfigDict,
@@ -17,11 +18,22 @@ from pydantic import (
     Tag,
     ValidationError,
 )
+from pydantic_core import PydanticCustomError
 
 from greybox.errors import VesselError, suggestion
 from greybox.vessel.vessel import THRUSTER_TYPES, Drive
 
-Number = Annotated[float, Field(allow_inf_nan=False)]
+# beyond it no ship has a number, and squares of squares overflow
+_LARGEST = 1e12
+
+
+def _possible(value: float) -> float:
+    if abs(value) > _LARGEST:
+        raise PydanticCustomError("too_large", "too large")
+    return value
+
+
+Number = Annotated[float, Field(allow_inf_nan=False), AfterValidator(_possible)]
 Spread = Annotated[Number, Field(ge=0)]
 Positive = Annotated[Number, Field(gt=0)]
 Pair = Annotated[list[Number], Field(min_length=2, max_length=2)]
@@ -197,6 +209,7 @@ _TYPES = f"Types: {', '.join(THRUSTER_TYPES)}."
 _BY_KIND = {
     "float_type": _NUMBER,
     "finite_number": _NUMBER,
+    "too_large": f"{{name}} is {{value}}, no ship has more than {_LARGEST:g}: correct it.",
     "greater_than": "{name} is {value}, it must be positive: correct it.",
     "greater_than_equal": "{name} is {value}, it cannot be negative: correct it.",
     "union_tag_not_found": f"{{name}} has no 'type'. {_TYPES}",

@@ -114,3 +114,28 @@ def test_the_present_version_must_be_whole():
     with pytest.raises(ModelFileError, match="damaged model file"):
         model_from_dict(data, "m.json")
     assert not schema(f"model-{VERSION}").is_valid(data)
+
+
+def test_a_model_read_again_is_the_same(tmp_path):
+    model = replace(plain_model(), disturbances={"current_north": (0.2, 0.01)})
+    model.save(tmp_path / "m.json")
+    again = load_model(tmp_path / "m.json")
+    assert again == model
+    assert len({again, model}) == 1
+    assert model != replace(model, theta=model.theta + 1e-9)
+    assert model != "model"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"integrator": "RK4"}, "integrator 'RK4', which is not known. Did you mean 'rk4'"),
+        ({"integrator": 4}, "'integrator' is 4, where a word is needed"),
+        ({"sums": {"Xu": [1]}}, "its entry 'sums.Xu.0' is 1, where a word is needed"),
+        ({"covariance": [[1.0], [1.0, 2.0]]}, "rows of different lengths"),
+        ({"residual_std": {"u": "x"}}, "its entry 'residual_std.u' is 'x', where a number"),
+    ],
+)
+def test_a_damaged_entry_is_named(change, message):
+    with pytest.raises(ModelFileError, match=message):
+        model_from_dict(plain_model().to_dict() | change, "m.json")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from greybox.errors import DivergenceError, StructureError
+from greybox.errors import DivergenceError, StructureError, UsageError
 from greybox.model.catalogue import get_structure
 from greybox.model.run.kernels import MANY_RUNS
 from greybox.model.run.step import StepModel
@@ -35,6 +35,37 @@ def test_both_forms_equal_a_slow_loop(thesis, true_theta, runs):
         want, psi = slow_run(thesis, theta[i], x0[i], 0.3, tau[i], d[i])
         np.testing.assert_allclose(run.x[i], want, rtol=1e-10, atol=1e-12)
         np.testing.assert_allclose(run.psi[i, -1], psi, rtol=1e-10)
+
+
+@pytest.mark.parametrize("integrator", ["euler", "rk4"])
+@pytest.mark.parametrize("name", ["psi", "psi0", "air"])
+def test_any_argument_may_be_of_several_runs(thesis, true_theta, name, integrator):
+    rng = np.random.default_rng(1)
+    shape = {"psi": (3, 13), "psi0": (3,), "air": (3, 12, 2)}[name]
+    several = rng.standard_normal(shape)
+    ship = (thesis, true_theta, np.array([1.5, 0.1, 0.0]), rng.uniform(0, 1, (12, 3)), 1.0)
+    together = simulate(*ship, integrator=integrator, **{name: several})
+    assert together.x.shape == (3, 13, 3)
+    for i in range(3):
+        alone = simulate(*ship, integrator=integrator, **{name: several[i]})
+        np.testing.assert_array_equal(together.x[i], alone.x[0])
+        np.testing.assert_array_equal(together.psi[i], alone.psi[0])
+
+
+@pytest.mark.parametrize(
+    ("shapes", "message"),
+    [
+        ({"psi": (3, 12)}, r"'psi' has the shape \(3, 12\), where \(13,\), or \(R, 13\) for R"),
+        ({"psi0": (2,), "air": (3, 12, 2)}, "'psi0' is for 2 runs and 'air' for 3"),
+        ({"air": (12, 3)}, r"'air' has the shape \(12, 3\)"),
+        ({"tau": (12, 2)}, r"'tau' has the shape \(12, 2\)"),
+    ],
+)
+def test_shapes_that_do_not_fit_are_refused(thesis, true_theta, shapes, message):
+    given = {"x0": (3,), "tau": (12, 3)} | shapes
+    arrays = {n: np.zeros(s) for n, s in given.items()}
+    with pytest.raises(UsageError, match=message):
+        simulate(thesis, true_theta, sample_time=1.0, **arrays)
 
 
 def test_length_need_not_fill_the_unrolled_block(thesis, true_theta):

@@ -10,6 +10,7 @@ import logging
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +46,8 @@ _JITTER = 0.2
 _DRIFT = 0.6
 # wind of fewer rows than this share is none
 _LEAST_WIND = 0.5
+# largest number of a signal, positions and encoders included
+_LARGEST = 1e9
 _WIND = ("u_q", "v_q", "V_q", "gamma_q", "dir_q", "V_w", "dir_w", "dir_t")
 # share of steps past which gaps are another sample time
 _MOST_GAPS = 0.2
@@ -243,6 +246,7 @@ def _known_rows(
     holes, over which a run of the model goes on.
     """
     loop = vessel.closed_loop[0] if vessel.closed_loop else None
+    batch = {c: _possible(v) if c != assigned["t"].raw else v for c, v in batch.items()}
     numbers = {n: np.isfinite(_floats(batch, a)) for n, a in assigned.items() if n != loop}
     # positions are not needed where velocities were logged, nor what moves no model
     spare = {"x_n", "y_n"} if {"u", "v"} <= assigned.keys() else set()
@@ -275,6 +279,13 @@ def _known_rows(
         f"{first + table.first_row}, where {', '.join(lost)} hold no finite number"
     )
     return {n: values[keep] for n, values in batch.items()}, notes
+
+
+def _possible(values: NDArray[Any]) -> NDArray[Any]:
+    """Return a column without numbers that no signal of a ship has, which overflow in sums."""
+    if values.dtype == object or not (np.abs(values) > _LARGEST).any():
+        return values
+    return np.where(np.abs(values) > _LARGEST, np.nan, values)
 
 
 def _floats(batch: Batch, a: Assigned) -> Array:

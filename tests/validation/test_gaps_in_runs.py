@@ -1,0 +1,153 @@
+"""Fits and runs on logs with gaps."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from designs import thesis_model
+from virtual import virtual_log, write_csv
+
+from greybox.commands.main import main
+from greybox.diagnosis.ship import LogRun, Ship
+from greybox.errors import UsageError
+from greybox.estimation.estimate import estimate_iv, estimate_ls
+from greybox.estimation.output_error import OutputErrorOptions, estimate_oe
+from greybox.estimation.output_setup import output_predictor
+from greybox.model.catalogue import get_structure
+from greybox.model.predictor import build_predictor
+from greybox.regression.regression import build_regression
+from greybox.trial.log import make_log
+from greybox.trial.segments import join_segments
+from greybox.validation.bands import predict_bands
+from greybox.validation.choose import estimate_model
+from greybox.validation.comparison import compare_models
+from greybox.validation.fit import fit_percent, run_model
+from greybox.validation.request import Request
+from greybox.vessel.toml import load_vessel
+
+N = 400
+GAP = slice(150, 180)
+MEASURED = np.r_[0:150, 180:N]
+
+
+@pytest.fixture(scope="module")
+def log():
+    return virtual_log(
+        5, N, wind=0.0, current=(0.0, 0.0), spread=0.0, without=("Wuu", "Wvv", "Wuv")
+    )
+
+
+@pytest.fixture(scope="module")
+def true_model():
+    return replace(thesis_model(spread=0.01), vessel=load_vessel("thesis"))
+
+
+@pytest.fixture(scope="module")
+def gapped(log):
+    channels = {n: a.copy() for n, a in log.channels.items()}
+    for name in ("u", "v", "r", "psi"):
+        channels[name][GAP] = np.nan
+    return make_log(log.vessel, channels, 1.0, "gapped")
+
+
+def otherwise_bridged(log):
+    """The same log with other numbers where nothing was measured."""
+    channels = {n: a.copy() for n, a in log.channels.items()}
+    for name, gap in log.missing.items():
+        channels[name][gap] += 0.3
+    return replace(log, channels=channels)
+
+
+@pytest.mark.parametrize("method", ["ls", "iv", "oe"])
+def test_no_fit_counts_what_was_not_measured(gapped, method):
+    found = []
+    for one in (gapped, otherwise_bridged(gapped)):
+        if method == "oe":
+            options = OutputErrorOptions(heading="input", search=False, covariance="white")
+            predictor = output_predictor(get_structure("thesis"), "basic", ())
+            start = build_predictor(get_structure("thesis"), "basic")
+            begin = estimate_ls(start, [gapped], judged=False, covariance="white")
+            found.append(estimate_oe(predictor, [one], start=begin, options=options))
+            assert found[-1].kept == len(MEASURED)
+        else:
+            estimate = estimate_ls if method == "ls" else estimate_iv
+            predictor = build_predictor(get_structure("thesis"), "basic")
+            found.append(estimate(predictor, [one], judged=False, covariance="white"))
+            # the step into the gap and that out of it hold one measurement only
+            assert found[-1].kept == N - 1 - 31
+    np.testing.assert_allclose(found[0].theta, found[1].theta, rtol=1e-6)
+
+
+def test_augmented_rows_need_the_heading_too(log):
+    channels = {n: a.copy() for n, a in log.channels.items()}
+    channels["psi"][GAP] = np.nan
+    one = make_log(log.vessel, channels, 1.0)
+    kept = [
+        build_regression(build_predictor(get_structure("thesis"), kind, regime), [one]).kept
+        for kind, regime in (("basic", ()), ("augmented", (("u", (1,)), ("v", (1,)))))
+    ]
+    assert kept == [N - 1, N - 1 - 30]
+
+
+def test_a_run_goes_on_where_motions_were_not_measured(log, gapped, true_model):
+    whole, run = run_model(true_model, log), run_model(true_model, gapped)
+    np.testing.assert_allclose(run.x, whole.x, atol=1e-12)
+    want = fit_percent(log["u"][MEASURED], whole.x[MEASURED, 0])
+    assert run.fit["u"] == pytest.approx(float(want))
+    assert len(run.errors()) == len(MEASURED)
+    assert run.to_pandas()["u_measured"].isna().sum() == 30
+
+
+def test_a_run_begins_anew_after_missing_rows(log, true_model):
+    parts = [log.window(0, 200), log.window(210, N)]
+    joined = join_segments(parts, "two")
+    run = run_model(true_model, joined)
+    alone = [run_model(true_model, part) for part in parts]
+    np.testing.assert_array_equal(run.x, np.concatenate([r.x for r in alone]))
+    bands = predict_bands(true_model, joined, runs=40)
+    assert bands.motion.shape == (2, N - 10, 3)
+    assert np.isfinite(bands.motion).all()
+    found = compare_models([true_model], ["m"], [[joined]], bands=False)
+    (gap,) = found.to_dict()["models"][0]["logs"][0]["gaps"]
+    assert (gap["run"], gap["samples"], gap["start"]) == ("begins anew", 10, 200.0)
+    assert "a run begins anew after it" in found.summary()
+
+
+def test_a_run_of_a_diagnosis_is_straight_across_a_gap(log, gapped, true_model):
+    ship = Ship(true_model.theta, np.zeros(2), log.vessel)
+    whole, run = (LogRun(true_model.structure, one, "euler") for one in (log, gapped))
+    places = np.arange(2)
+    shown = [r.run(ship, whole.start()) for r in (whole, run)]
+    slopes = [r.columns(ship, s, places) for r, s in zip((whole, run), shown, strict=True)]
+    for one, two in ((shown[0].y, shown[1].y), slopes):
+        np.testing.assert_allclose(two[MEASURED], one[MEASURED], atol=1e-12)
+        np.testing.assert_allclose(np.diff(two[149:181], 2, axis=0), 0, atol=1e-9)
+
+
+def test_commands_say_what_they_do_with_gaps(log, tmp_path, true_model, capsys):
+    true_model.save(tmp_path / "m.json")
+    r, n = log["r"].copy(), log["n"].copy()
+    r[GAP], n[300] = np.nan, np.nan
+    path = str(write_csv(log, tmp_path / "trial.csv", r=r, n=n))
+    out = str(tmp_path / "run.csv")
+    assert main(["simulate", str(tmp_path / "m.json"), path, "--no-bands", "--out", out]) == 0
+    said = capsys.readouterr().out
+    assert "note: 'trial' lacks r in 1 stretch of 30 samples" in said
+    assert "note: 'trial' has 1 gap in which inputs or rows are missing" in said
+    assert f"free run of {N - 1} samples" in said
+    model = str(tmp_path / "e.json")
+    assert main(["estimate", path, "--vessel", "thesis", "--structure", "thesis", "--method", "ls",
+                 "--predictor", "basic", "--out", model]) == 0  # fmt: skip
+    notes = json.loads((tmp_path / "e.json").read_text())["notes"]
+    assert [("lacks r" in n, "1 gap" in n) for n in notes[:2]] == [(False, True), (True, False)]
+
+
+def test_a_single_log_with_gaps_is_estimated(log):
+    joined = join_segments([log.window(0, 200), log.window(210, N)], "two")
+    estimate = estimate_model(joined, Request(method="ls", predictor="basic", structure="thesis"))
+    assert [one["samples"] for one in estimate.logs] == [200, 190]
+    with pytest.raises(UsageError, match=r"no parameter 'XU'\. Did you mean 'Xu'"):
+        estimate["XU"]
