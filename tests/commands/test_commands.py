@@ -24,9 +24,13 @@ def run(*arguments):
     return main([str(a) for a in arguments])
 
 
-def test_estimate_simulate_compare(noisy_csv, tmp_path, capsys):
-    model = tmp_path / "m.json"
-    assert run("estimate", noisy_csv, "--vessel", "thesis", "--out", model) == 0
+# no choice of structure, predictor and estimator
+LEAST = ("--method", "ls", "--predictor", "basic", "--structure", "thesis")
+
+
+def test_estimate_simulate_compare(tmp_path, capsys):
+    log, model = write_csv(virtual_log(2, 2000), tmp_path / "trial.csv"), tmp_path / "m.json"
+    assert run("estimate", log, "--vessel", "thesis", "--out", model) == 0
     shown = capsys.readouterr().out
     assert "Estimate of Thesis ship" in shown
     data = json.loads(model.read_text())
@@ -37,18 +41,17 @@ def test_estimate_simulate_compare(noisy_csv, tmp_path, capsys):
     assert set(data["fit"]) == {"u", "v", "r"}
 
     out = tmp_path / "run.csv"
-    assert run("simulate", model, noisy_csv, "--out", out) == 0
+    assert run("simulate", model, log, "--out", out) == 0
     with open(out) as handle:
         rows = list(csv.DictReader(handle))
     assert list(rows[0])[:7] == ["t", "u", "v", "r", "psi", "x_n", "y_n"]
-    assert len(rows) == 5000
+    assert len(rows) == 2000
 
     other = tmp_path / "ls.json"
-    assert run("estimate", noisy_csv, "--vessel", "thesis", "--method", "ls",
-               "--predictor", "basic", "--structure", "thesis", "--out", other) == 0  # fmt: skip
+    assert run("estimate", log, "--vessel", "thesis", *LEAST, "--out", other) == 0
     page, result = tmp_path / "c.html", tmp_path / "c.json"
     capsys.readouterr()
-    assert run("compare", model, other, "--log", noisy_csv, "--json", result, "--report", page) == 0
+    assert run("compare", model, other, "--log", log, "--json", result, "--report", page) == 0
     compared = json.loads(result.read_text())
     assert [m["model"] for m in compared["models"]] == ["m", "ls"]
     assert set(compared["models"][0]["logs"][0]["fit"]) == {"u", "v", "r"}
@@ -93,7 +96,7 @@ def test_json_to_standard_output(noisy_csv, capsys):
 
 def test_a_plan_of_commands_is_simulated_from_a_start(noisy_csv, tmp_path, capsys):
     model = tmp_path / "m.json"
-    assert run("estimate", noisy_csv, "--vessel", "thesis", "--out", model) == 0
+    assert run("estimate", noisy_csv, "--vessel", "thesis", *LEAST, "--out", model) == 0
     plan = tmp_path / "plan.csv"
     t = np.arange(50)
     np.savetxt(plan, np.column_stack([t, 0 * t + 15, 0 * t + 0.8, 0 * t + 0.8]), delimiter=",",
@@ -144,7 +147,7 @@ def test_targets_are_checked_before_anything_is_written(noisy_csv, tmp_path, cap
 
 
 def test_a_device_is_written_and_not_replaced(noisy_csv):
-    assert run("estimate", noisy_csv, "--vessel", "thesis", "--out", "/dev/null") == 0
+    assert run("estimate", noisy_csv, "--vessel", "thesis", *LEAST, "--out", "/dev/null") == 0
     assert not Path("/dev/null").is_file()
 
 
@@ -185,7 +188,7 @@ def test_help_imports_nothing_heavy():
 
 def test_reproduce_writes_tables_figures_and_page(tmp_path, capsys):
     out = tmp_path / "c4"
-    assert run("reproduce", "chapter4", "--runs", "5", "--workers", "1", "--out", out) == 0
+    assert run("reproduce", "chapter4", "--runs", "2", "--workers", "1", "--out", out) == 0
     with open(out / "tables.csv") as handle:
         rows = list(csv.DictReader(handle))
     assert list(rows[0]) == ["table", "set", "estimator", "parameter", "mean", "sd",
@@ -207,7 +210,7 @@ def test_reproduce_chapter7_on_logs(tmp_path, capsys):
 
 
 def test_physical_quantities_when_a_mass_is_given(noisy_csv, capsys):
-    assert run("estimate", noisy_csv, "--vessel", "thesis", "--mass", "150000") == 0
+    assert run("estimate", noisy_csv, "--vessel", "thesis", *LEAST, "--mass", "150000") == 0
     shown = capsys.readouterr().out
     assert "Physical quantities for m = 150000 kg" in shown
     assert "assumed added mass" in shown

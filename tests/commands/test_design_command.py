@@ -15,6 +15,7 @@ from greybox.commands.main import main
 from greybox.vessel.toml import vessel_to_dict
 
 FAST = ["--effort", "0.05", "--workers", "1"]
+SHORT = ["--duration", "100", "--predictor", "basic", "--seed", "3"]
 
 
 @pytest.fixture(scope="module")
@@ -51,6 +52,15 @@ def run(folder, *options, model="model.json"):
     return status, plan
 
 
+@pytest.fixture(scope="module")
+def designed(folder):
+    """Plan and JSON of a short design."""
+    out = folder / "short.json"
+    status, plan = run(folder, *SHORT, "--json", str(out))
+    assert status == 0
+    return plan.read_bytes(), json.loads(out.read_text())
+
+
 def test_plan_and_json(folder, capsys):
     out = folder / "design.json"
     status, plan = run(
@@ -71,11 +81,9 @@ def test_plan_and_json(folder, capsys):
     assert "predicted" not in capsys.readouterr().err
 
 
-def test_same_seed_same_bytes(folder):
-    _, plan = run(folder, "--duration", "100", "--predictor", "basic", "--seed", "3")
-    first = plan.read_bytes()
-    _, plan = run(folder, "--duration", "100", "--predictor", "basic", "--seed", "3")
-    assert plan.read_bytes() == first
+def test_same_seed_same_bytes(folder, designed):
+    _, plan = run(folder, *SHORT)
+    assert plan.read_bytes() == designed[0]
 
 
 def test_surge_model(folder, capsys):
@@ -147,13 +155,10 @@ def test_one_function_of_the_parameters(folder, capsys):
     assert set(data["predicted_std"]) == {"Yvv", "Ymu"}
 
 
-def test_prior_of_earlier_trials(folder, capsys):
-    base = ["--duration", "100", "--predictor", "basic", "--json", "-"]
-    run(folder, *base)
-    alone = json.loads(capsys.readouterr().out)
-    run(folder, *base, "--prior", str(folder / "prior.json"))
+def test_prior_of_earlier_trials(folder, designed, capsys):
+    run(folder, *SHORT, "--json", "-", "--prior", str(folder / "prior.json"))
     both = json.loads(capsys.readouterr().out)
-    assert both["logdet"] > alone["logdet"]
+    assert both["logdet"] > designed[1]["logdet"]
     for name, value in both["parameters"].items():
         # merged columns hold two parameters, whose prior errors add
         assert both["predicted_std"][name] < 0.11 * abs(value)
@@ -162,7 +167,7 @@ def test_prior_of_earlier_trials(folder, capsys):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--duration", "100", "--margin-v", "3"], "no steady motion keeps the margins"),
+        ([*SHORT, "--margin-v", "3"], "no steady motion keeps the margins"),
         (["--duration", "100", "--area", "nowhere.csv"], "cannot read the sea room"),
         (["--duration", "100", "--circle", "0,0"], "--circle needs three numbers"),
         (["--duration", "100", "--end", "x_n"], "--end 'x_n' cannot be read"),

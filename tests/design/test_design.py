@@ -57,8 +57,8 @@ def replay(request, commands, theta=None, start=None):
 
 @pytest.fixture(scope="module")
 def basic():
-    """The issue's first design: 15 parameters, 300 s."""
-    return design_trial(make_request(duration=300.0), workers=1)
+    """15 parameters in 300 s, after a shorter search than usual."""
+    return design_trial(make_request(duration=300.0, effort=0.3), workers=1)
 
 
 def test_a_design_beats_the_best_of_200_random_sequences(basic):
@@ -311,7 +311,11 @@ def test_least_trial_time():
             "headings cannot cover 30 rad",
             marks=pytest.mark.long,
         ),
-        ({"limits": TrialLimits(speed_cap=1.0), "start": (0.7, 0.6, 0, 0)}, "speed cap"),
+        pytest.param(
+            {"duration": 60.0, "limits": TrialLimits(speed_cap=1.0), "start": (0.7, 0.6, 0, 0)},
+            "speed cap",
+            marks=pytest.mark.long,
+        ),
     ],
 )
 def test_what_cannot_be_is_said(wishes, message):
@@ -463,9 +467,14 @@ def test_precision_of_a_given_plan():
         predict_precision(request, [])
 
 
-def test_a_design_starts_from_what_it_is_given():
+@pytest.fixture(scope="module")
+def good():
+    """A design of 120 s after a short search."""
+    return design_trial(make_request(duration=120.0, effort=0.1), workers=1, alternatives=False)
+
+
+def test_a_design_starts_from_what_it_is_given(good):
     request = make_request(duration=120.0, effort=0.02)
-    good = design_trial(make_request(duration=120.0, effort=0.1), workers=1, alternatives=False)
     again = design_trial(request, workers=1, alternatives=False, first=good.levels)
     assert again.logdet >= good.logdet - 1e-9
     cold = design_trial(request, workers=1, alternatives=False)
@@ -486,9 +495,8 @@ def test_a_first_sequence_need_not_keep_the_limits():
     assert np.isfinite(design.std).all()
 
 
-def test_a_first_sequence_is_brought_within_the_rates():
+def test_a_first_sequence_is_brought_within_the_rates(good):
     request = make_request(duration=120.0, effort=0.02, vessel=limited_ship(0.5, 0.01))
-    good = design_trial(make_request(duration=120.0, effort=0.1), workers=1, alternatives=False)
     assert np.abs(np.diff(good.levels[0], axis=0)).max(axis=0)[1] > 0.1
     design = design_trial(request, workers=1, alternatives=False, first=good.levels)
     step = np.abs(np.diff(design.commands[0], axis=0)).max(axis=0)
