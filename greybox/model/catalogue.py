@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import lru_cache
 
-from greybox.errors import StructureError, suggestion
+from greybox.errors import StructureError
 from greybox.model.structure import Structure
 from greybox.model.terms import THESIS_TERMS, Factor, Term, parse_term
+from greybox.registry import Registry
 
 RUDDER_TERMS = (
     "X_race_drag",
@@ -93,15 +94,18 @@ def _siso() -> Structure:
     )
 
 
-_CATALOGUE = {
-    "thesis": _thesis,
-    "surge": _surge,
-    "linear": _linear,
-    "blanke": _blanke,
-    "modulus": _modulus,
-    "abkowitz": _abkowitz,
-    "siso": _siso,
-}
+STRUCTURES: Registry[Structure] = Registry(
+    "structure",
+    _thesis(),
+    _surge(),
+    _linear(),
+    _blanke(),
+    _modulus(),
+    _abkowitz(),
+    _siso(),
+    group="greybox.structures",
+    error=StructureError,
+)
 
 
 def structure_names() -> tuple[str, ...]:
@@ -112,7 +116,7 @@ def structure_names() -> tuple[str, ...]:
     tuple of str
         As `get_structure` takes them.
     """
-    return tuple(_CATALOGUE)
+    return tuple(STRUCTURES)
 
 
 @lru_cache
@@ -136,12 +140,7 @@ def get_structure(name: str) -> Structure:
         There is no such structure or term; the nearest name is suggested.
     """
     base, changes = _split(name)
-    if base not in _CATALOGUE:
-        raise StructureError(
-            f"there is no structure '{base}'.{suggestion(base, _CATALOGUE)} "
-            f"Published structures: {', '.join(_CATALOGUE)}."
-        )
-    return _changed(_CATALOGUE[base](), changes)
+    return _changed(STRUCTURES[base], changes)
 
 
 def _split(name: str) -> tuple[str, list[str]]:
