@@ -33,7 +33,7 @@ from greybox.regression.motion import predicted_motion, smoothed_heading
 from greybox.regression.regression import build_regression
 from greybox.study.chapter6 import TRUE
 from greybox.study.efficiency import CASES, virtual_trial
-from greybox.validation.once import estimate_once
+from greybox.validation.fit_single import estimate_once
 from greybox.validation.request import Request
 
 REGIME = (("u", (1,)), ("v", (1,)), ("r", (1, -1)))

@@ -15,7 +15,7 @@ from greybox.errors import UsageError
 from greybox.estimation.registry import ESTIMATORS, Estimator
 from greybox.registry import Registry
 from greybox.validation.alternatives import alternatives_for
-from greybox.validation.simulating import Way, compare_ways
+from greybox.validation.cross_validation import Way, compare_ways
 
 SMALL = {"structure": "surge", "predictor": "basic"}
 

@@ -25,11 +25,11 @@ from greybox.one_thread import one_thread
 from greybox.regression.regression import common_sample_time
 from greybox.trial.log import Logs, TrialLog, as_list
 from greybox.validation.alternatives import Alternative, alternatives_for
+from greybox.validation.cross_validation import Way, compare_ways
 from greybox.validation.fit import average_fit, run_model
+from greybox.validation.fit_single import estimate_once
 from greybox.validation.held_out import FLOOR
-from greybox.validation.once import estimate_once
 from greybox.validation.request import Request, regression_only
-from greybox.validation.simulating import Way, compare_ways
 
 _log = logging.getLogger(__name__)
 

@@ -23,8 +23,8 @@ from greybox.estimation.registry import ESTIMATORS, automatic_estimators
 from greybox.estimation.result import Estimate
 from greybox.trial.log import TrialLog
 from greybox.validation.fit import run_model
+from greybox.validation.fit_single import estimate_once
 from greybox.validation.held_out import FLOOR, folds, score_runs, spread_of
-from greybox.validation.once import estimate_once
 from greybox.validation.request import Request
 
 Array = NDArray[np.float64]

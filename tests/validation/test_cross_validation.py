@@ -8,12 +8,12 @@ from virtual import virtual_log
 
 from greybox.errors import ExcitationError, UsageError
 from greybox.estimation.verdict import Misfit, NoRegression, TrustLevel, Verdict, refused
-from greybox.validation import choose
-from greybox.validation.choose import estimate_model, estimate_requested
+from greybox.validation import selection
+from greybox.validation.cross_validation import Comparison, Way, compare_ways, parts_of
 from greybox.validation.fit import run_model
 from greybox.validation.held_out import FLOOR, spread_of
 from greybox.validation.request import Request
-from greybox.validation.simulating import Comparison, Way, compare_ways, parts_of
+from greybox.validation.selection import estimate_model, estimate_requested
 
 WAYS = (Way("iv"), Way("oe"), Way("oe", "deviation"))
 SMALL = Request(structure="linear", predictor="basic")
@@ -75,7 +75,7 @@ def test_an_estimate_to_be_trusted_is_compared_with_nothing(monkeypatch):
     def never(*_):
         raise AssertionError
 
-    monkeypatch.setattr(choose, "compare_ways", never)
+    monkeypatch.setattr(selection, "compare_ways", never)
     assert estimate_model([virtual_log(3, 1500)]).verdict.text == "trust"
 
 
@@ -124,25 +124,25 @@ def test_a_misfit_that_was_found_is_not_forgotten(small, monkeypatch):
     """Output error of a wrong structure may look sound; the regression's tests have spoken."""
     logs = small[:3]
     lacks = Misfit({"input_independence": ("u",)}, {})
-    monkeypatch.setattr(choose, "misfit", lambda _: (lacks,))
+    monkeypatch.setattr(selection, "misfit", lambda _: (lacks,))
     judged = refused([NoRegression("a reason")], ())
-    finish = choose._finished
+    finish = selection._finished
 
     def sound(alternative, *rest):
         estimate, diverged = finish(alternative, *rest)
         verdict = Verdict(TrustLevel.TRUST) if alternative.method == "oe" else judged
-        return choose.replace(estimate, verdict=verdict), diverged
+        return selection.replace(estimate, verdict=verdict), diverged
 
-    monkeypatch.setattr(choose, "_finished", sound)
+    monkeypatch.setattr(selection, "_finished", sound)
     better = Comparison((Way("iv"), Way("oe", "deviation")), np.array([[0.0] * 4, [9.0] * 4]))
-    monkeypatch.setattr(choose, "compare_ways", lambda *_: better)
+    monkeypatch.setattr(selection, "compare_ways", lambda *_: better)
     found = estimate_requested(logs, SMALL)
     assert found.method == "oe"
     assert "weighed by the deviation" in found.status
     assert found.verdict.because == (lacks,)
     assert found.notes[-1] == better.sentence()
     # one that follows its own logs less well than the regression is left
-    monkeypatch.setattr(choose, "_level", lambda e: -50.0 if e.method == "oe" else 0.0)
+    monkeypatch.setattr(selection, "_level", lambda e: -50.0 if e.method == "oe" else 0.0)
     found = estimate_requested(logs, SMALL)
     assert found.method != "oe"
     assert "follows the whole logs less well" in found.notes[-1]
