@@ -11,10 +11,10 @@ from typing import Literal
 import numpy as np
 
 from greybox.errors import GreyboxError, UsageError
+from greybox.estimation.closed_loop import Loop
 from greybox.estimation.credibility.verdict import free_run_faults, misfit, weigh
+from greybox.estimation.efficiency_bounds import limits_of
 from greybox.estimation.estimate import Covariance
-from greybox.estimation.limits import limits_of
-from greybox.estimation.loop import Loop
 from greybox.estimation.output_error import OutputErrorOptions
 from greybox.estimation.registry import ESTIMATORS, free_run_estimator
 from greybox.estimation.result import Estimate

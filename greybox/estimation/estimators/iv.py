@@ -15,9 +15,9 @@ _PUSHED = 0.05
 
 
 def _fit(problem: EstimationProblem) -> Estimate:
+    from greybox.estimation.closed_loop import CLOSED_LOOP_LAG
     from greybox.estimation.estimate import estimate_iv
-    from greybox.estimation.judging import judge_estimate
-    from greybox.estimation.loop import CLOSED_LOOP_LAG
+    from greybox.estimation.post_estimation import judge_estimate
     from greybox.model.predictor import Predictor
     from greybox.regression.instruments import WIND_WINDOW
 
