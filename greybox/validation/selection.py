@@ -25,7 +25,7 @@ from greybox.one_thread import one_thread
 from greybox.regression.regression import common_sample_time
 from greybox.trial.log import Logs, TrialLog, as_list
 from greybox.validation.alternatives import Alternative, alternatives_for
-from greybox.validation.cross_validation import Way, compare_ways
+from greybox.validation.cross_validation import EstimatorVariant, compare_estimators
 from greybox.validation.fit import average_fit, run_model
 from greybox.validation.fit_single import estimate_once
 from greybox.validation.held_out import FLOOR
@@ -254,14 +254,14 @@ def _by_held_out_runs(
 ) -> Estimate:
     """Return the way to estimate whose runs on parts left out are best, `found` in doubt."""
     try:
-        compared = compare_ways(found, logs, request, spare)
+        compared = compare_estimators(found, logs, request, spare)
     except GreyboxError as error:
         return _noting(found, f"estimators were not compared by held-out runs: {error}")
     found = _noting(found, compared.sentence())
-    way = compared.ways[compared.chosen]
+    way = compared.variants[compared.chosen]
     if not compared.chosen:
         return found
-    if spare is not None and way == Way(spare.method):
+    if spare is not None and way == EstimatorVariant(spare.method):
         other, diverged = spare, False
     else:
         start = spare if _diverges(found) else found

@@ -9,18 +9,23 @@ from virtual import virtual_log
 from greybox.errors import ExcitationError, UsageError
 from greybox.estimation.verdict import Misfit, NoRegression, TrustLevel, Verdict, refused
 from greybox.validation import selection
-from greybox.validation.cross_validation import Comparison, Way, compare_ways, parts_of
+from greybox.validation.cross_validation import (
+    EstimatorComparison,
+    EstimatorVariant,
+    compare_estimators,
+    parts_of,
+)
 from greybox.validation.fit import run_model
 from greybox.validation.held_out import FLOOR, spread_of
 from greybox.validation.request import Request
 from greybox.validation.selection import estimate_model, estimate_requested
 
-WAYS = (Way("iv"), Way("oe"), Way("oe", "deviation"))
+VARIANTS = (EstimatorVariant("iv"), EstimatorVariant("oe"), EstimatorVariant("oe", "deviation"))
 SMALL = Request(structure="linear", predictor="basic")
 
 
 def comparison(*rows):
-    return Comparison(WAYS[: len(rows)], np.array(rows, float))
+    return EstimatorComparison(VARIANTS[: len(rows)], np.array(rows, float))
 
 
 def test_the_first_way_stays_unless_another_gains_more_than_its_error():
@@ -75,7 +80,7 @@ def test_an_estimate_to_be_trusted_is_compared_with_nothing(monkeypatch):
     def never(*_):
         raise AssertionError
 
-    monkeypatch.setattr(selection, "compare_ways", never)
+    monkeypatch.setattr(selection, "compare_estimators", never)
     assert estimate_model([virtual_log(3, 1500)]).verdict.text == "trust"
 
 
@@ -104,8 +109,13 @@ def test_where_the_model_misfits_held_out_runs_choose(small):
 def test_ways_that_fail_have_no_score(small, monkeypatch):
     logs = small[:3]
     found = estimate_model(logs, method="ls", structure="linear", predictor="basic")
-    whole = compare_ways(found, logs, SMALL)
-    assert whole.ways == (Way("ls"), Way("iv"), Way("oe"), Way("oe", "deviation"))
+    whole = compare_estimators(found, logs, SMALL)
+    assert whole.variants == (
+        EstimatorVariant("ls"),
+        EstimatorVariant("iv"),
+        EstimatorVariant("oe"),
+        EstimatorVariant("oe", "deviation"),
+    )
     # of three logs each held-out run is scored in two halves
     assert whole.scores.shape == (4, 6)
     assert np.isfinite(whole.scores).all()
@@ -114,7 +124,7 @@ def test_ways_that_fail_have_no_score(small, monkeypatch):
         raise ExcitationError("nothing moves.")
 
     monkeypatch.setattr("greybox.estimation.estimate.estimate_iv", refuse)
-    partly = compare_ways(found, logs, SMALL)
+    partly = compare_estimators(found, logs, SMALL)
     assert np.isnan(partly.scores[1]).all()
     np.testing.assert_allclose(partly.scores[0], whole.scores[0])
 
@@ -134,8 +144,11 @@ def test_a_misfit_that_was_found_is_not_forgotten(small, monkeypatch):
         return selection.replace(estimate, verdict=verdict), diverged
 
     monkeypatch.setattr(selection, "_finished", sound)
-    better = Comparison((Way("iv"), Way("oe", "deviation")), np.array([[0.0] * 4, [9.0] * 4]))
-    monkeypatch.setattr(selection, "compare_ways", lambda *_: better)
+    better = EstimatorComparison(
+        (EstimatorVariant("iv"), EstimatorVariant("oe", "deviation")),
+        np.array([[0.0] * 4, [9.0] * 4]),
+    )
+    monkeypatch.setattr(selection, "compare_estimators", lambda *_: better)
     found = estimate_requested(logs, SMALL)
     assert found.method == "oe"
     assert "weighed by the deviation" in found.status
