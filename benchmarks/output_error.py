@@ -64,9 +64,9 @@ from greybox.trial.convert.read import read_segments
 from greybox.trial.kinematics import decimate
 from greybox.trial.log import TrialLog
 from greybox.trial.store import write_log
-from greybox.validation.choose import estimate_requested
 from greybox.validation.fit import average_fit, run_model
 from greybox.validation.request import Request
+from greybox.validation.selection import estimate_requested
 from greybox.vessel.force import force_inputs
 
 Array = NDArray[np.float64]

@@ -51,13 +51,13 @@ from greybox.trial.raw_log import Recording as Recording
 from greybox.trial.repair import repair as repair
 from greybox.trial.store import write_log as write_log
 from greybox.trial.trial_summary import describe_recording as describe_recording
-from greybox.validation.choose import estimate_model as estimate_model
 from greybox.validation.comparison import Comparison as Comparison
 from greybox.validation.comparison import compare as compare
 from greybox.validation.comparison import compare_models as compare_models
 from greybox.validation.fit import fit_percent as fit_percent
 from greybox.validation.fit import run_model as run_model
 from greybox.validation.request import Request as Request
+from greybox.validation.selection import estimate_model as estimate_model
 from greybox.vessel.toml import load_vessel as load_vessel
 from greybox.vessel.toml import vessel_from_dict as vessel_from_dict
 from greybox.vessel.vessel import Vessel as Vessel

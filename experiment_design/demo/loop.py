@@ -28,8 +28,8 @@ from greybox.trial.checks.check import check_files
 from greybox.trial.checks.finding import CheckReport
 from greybox.trial.convert.read import read_log
 from greybox.trial.store import write_log
-from greybox.validation.choose import estimate_model
 from greybox.validation.comparison import Comparison, compare
+from greybox.validation.selection import estimate_model
 from greybox.vessel.toml import load_vessel
 
 Array = NDArray[np.float64]

@@ -257,8 +257,8 @@ def run(options: argparse.Namespace) -> None:
     from greybox.model.catalogue import get_structure
     from greybox.model.model import load_model
     from greybox.report.physical import physical_summary
-    from greybox.validation.choose import estimate_requested
     from greybox.validation.request import Request
+    from greybox.validation.selection import estimate_requested
     from greybox.vessel.toml import load_vessel
 
     check_targets(options.out, options.json, options.report)

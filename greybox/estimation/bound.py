@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.estimation.white_rows import own_constants, solve_white, white_rows
-from greybox.estimation.whitening import ErrorBand, ErrorNoise
+from greybox.estimation.banded_covariance import ErrorBand, ErrorNoise
+from greybox.estimation.gls_regression import own_constants, solve_white, white_rows
 from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import Predictor
 from greybox.regression.instruments import simulate_log

@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.estimation.error_shape import ErrorShape, fit_shaped_colour
+from greybox.estimation.error_variance_profile import ErrorShape, fit_shaped_colour
 from greybox.numerics.moments import autocovariance, lagged_products, lagged_sums
 
 Array = NDArray[np.float64]

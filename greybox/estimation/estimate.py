@@ -17,7 +17,7 @@ from greybox.estimation.covariance import (
 )
 from greybox.estimation.credibility import Evidence, assess, convergence, weigh
 from greybox.estimation.disturbance import estimate_current
-from greybox.estimation.error_shape import ErrorShape, error_shapes
+from greybox.estimation.error_variance_profile import ErrorShape, error_shapes
 from greybox.estimation.moments import Solution, solve_stacked
 from greybox.estimation.result import Estimate
 from greybox.estimation.values import Iteration, estimation_data

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.estimation.whitening import ErrorBand, ErrorNoise
+from greybox.estimation.banded_covariance import ErrorBand, ErrorNoise
 from greybox.model.noise import NoiseLevels
 from greybox.numerics.banded import factor_band, inverse_band
 from greybox.vessel.vessel import Vessel

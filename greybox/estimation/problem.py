@@ -10,9 +10,9 @@ from typing import Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.estimation.closed_loop import Loop, assess_loop
 from greybox.estimation.estimate import Covariance, UnexcitedBiasError
 from greybox.estimation.informative import regime_of
-from greybox.estimation.loop import Loop, assess_loop
 from greybox.estimation.output_error import OutputErrorOptions
 from greybox.estimation.result import Estimate
 from greybox.estimation.verdict import TestResult

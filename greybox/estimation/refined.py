@@ -17,8 +17,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import ExcitationError
+from greybox.estimation.banded_covariance import ErrorBand
 from greybox.estimation.disturbance import estimate_current
 from greybox.estimation.estimate import Covariance, solve_iv, solve_ls
+from greybox.estimation.gls_regression import (
+    WhiteRows,
+    own_constants,
+    solve_white,
+    spread_columns,
+    white_covariance,
+    white_rows,
+)
 from greybox.estimation.noise import (
     ErrorLikelihood,
     NoiseFit,
@@ -32,15 +41,6 @@ from greybox.estimation.registry import ESTIMATORS
 from greybox.estimation.result import Estimate
 from greybox.estimation.values import Iteration
 from greybox.estimation.verdict import UNJUDGED
-from greybox.estimation.white_rows import (
-    WhiteRows,
-    own_constants,
-    solve_white,
-    spread_columns,
-    white_covariance,
-    white_rows,
-)
-from greybox.estimation.whitening import ErrorBand
 from greybox.keywords import known_keywords
 from greybox.model.predictor import Predictor
 from greybox.one_thread import one_thread

@@ -10,9 +10,9 @@ import numpy as np
 from greybox.estimation.verdict import TrustLevel
 from greybox.model.model import ManoeuvringModel
 from greybox.prediction.conditions import Conditions, Task
-from greybox.prediction.drawn import Drawn
 from greybox.prediction.extrapolation import Extrapolation, extrapolation_notes
 from greybox.prediction.helm import Helm
+from greybox.prediction.monte_carlo import Drawn
 from greybox.prediction.result import Kind, PredictedManoeuvre
 from greybox.prediction.running import DrawnRuns
 from greybox.prediction.steady import Steady

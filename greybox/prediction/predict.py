@@ -21,10 +21,10 @@ from greybox.prediction.conditions import (
     stop_throttle,
     tasks,
 )
-from greybox.prediction.drawn import Drawn, drawn
 from greybox.prediction.extrapolation import extrapolations
 from greybox.prediction.helm import Helm, find_helm
 from greybox.prediction.measuring import measure, quantities
+from greybox.prediction.monte_carlo import Drawn, drawn
 from greybox.prediction.notes import model_notes, run_notes, trial_notes, trust_level
 from greybox.prediction.orders import Orders, Stop, Turn, ZigZagOrders
 from greybox.prediction.result import (

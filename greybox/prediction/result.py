@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from greybox.estimation.verdict import TrustLevel
 from greybox.notebook import DisplayMixin, items, number, table
-from greybox.prediction.drawn import Drawn
 from greybox.prediction.extrapolation import Extrapolation
 from greybox.prediction.measuring import LABELS
+from greybox.prediction.monte_carlo import Drawn
 from greybox.trial.log import TrialLog
 from greybox.trial.manoeuvres import Compliance, Criterion, Quantity
 from greybox.trial.manoeuvres.finding import Manoeuvre

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from greybox.errors import LogError
 from greybox.model.model import ManoeuvringModel
 from greybox.prediction.conditions import Conditions, Task
-from greybox.prediction.drawn import Drawn
 from greybox.prediction.helm import Helm
 from greybox.prediction.measuring import LABELS, quantities
+from greybox.prediction.monte_carlo import Drawn
 from greybox.prediction.result import Agreement, Compared, Kind, PredictedManoeuvre, Side
 from greybox.trial.log import TrialLog
 from greybox.trial.manoeuvres import (

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.estimation.verdict import TrustLevel
-from greybox.prediction.drawn import Drawn
 from greybox.prediction.measuring import LABELS
+from greybox.prediction.monte_carlo import Drawn
 from greybox.prediction.result import (
     WORDS,
     ManoeuvrePrediction,

@@ -17,8 +17,8 @@ from scipy.special import polygamma, psi
 
 from greybox.errors import GreyboxError
 from greybox.estimation.bound import iv_bound
+from greybox.estimation.efficiency_bounds import cramer_rao, noise_variances
 from greybox.estimation.estimate import estimate_iv
-from greybox.estimation.limits import cramer_rao, noise_variances
 from greybox.estimation.output_error import OutputErrorOptions, estimate_oe
 from greybox.estimation.output_setup import measured, output_model, output_predictor
 from greybox.estimation.refined import estimate_refined_iv

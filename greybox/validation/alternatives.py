@@ -16,8 +16,8 @@ from greybox.model.predictor_kinds import PREDICTORS
 from greybox.model.structure import Structure
 from greybox.trial.log import TrialLog
 from greybox.validation.fit import run_model
+from greybox.validation.fit_single import estimate_once
 from greybox.validation.held_out import rank, score_runs, spread_of
-from greybox.validation.once import estimate_once
 from greybox.validation.request import Request
 from greybox.vessel.force import force_inputs
 

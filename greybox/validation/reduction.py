@@ -20,10 +20,10 @@ from greybox.model.predictor import Column
 from greybox.one_thread import one_thread
 from greybox.trial.log import Logs
 from greybox.trial.segments import as_segments
-from greybox.validation.choose import estimate_requested
 from greybox.validation.criteria import independent_samples
 from greybox.validation.held_out import rank
 from greybox.validation.request import Request
+from greybox.validation.selection import estimate_requested
 from greybox.validation.structures import (
     CHOOSE,
     FOLDS,

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from typing import Literal, get_args
 
 from greybox.errors import UsageError, suggestion
+from greybox.estimation.closed_loop import Loop
 from greybox.estimation.estimate import Covariance
-from greybox.estimation.loop import Loop
 from greybox.estimation.output_error import OutputErrorOptions
 from greybox.estimation.registry import ESTIMATORS
 from greybox.model.model import ManoeuvringModel

@@ -17,12 +17,12 @@ from greybox.notebook import DisplayMixin
 from greybox.one_thread import one_thread
 from greybox.trial.log import Logs, TrialLog
 from greybox.trial.segments import as_segments
-from greybox.validation.choose import estimate_requested
 from greybox.validation.criteria import independent_samples, information_criteria
 from greybox.validation.fit import run_model
+from greybox.validation.fit_single import estimate_once
 from greybox.validation.held_out import Ranking, folds, rank, score_runs, spread_of
-from greybox.validation.once import estimate_once
 from greybox.validation.request import Request
+from greybox.validation.selection import estimate_requested
 from greybox.vessel.force import force_inputs
 
 Array = NDArray[np.float64]

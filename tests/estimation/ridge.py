@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from greybox.estimation.estimate import estimate_ls
-from greybox.estimation.judging import judge_estimate
+from greybox.estimation.post_estimation import judge_estimate
 from greybox.estimation.problem import EstimationProblem
 from greybox.estimation.registry import Estimator
 from greybox.estimation.result import Estimate

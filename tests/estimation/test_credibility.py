@@ -26,7 +26,7 @@ from greybox.model.predictor import build_predictor
 from greybox.model.terms import parse_term
 from greybox.regression.instruments import build_instruments
 from greybox.regression.regression import build_regression
-from greybox.validation.choose import estimate_model
+from greybox.validation.selection import estimate_model
 
 REGIME = (("u", (1,)), ("v", (1,)))
 

@@ -9,10 +9,10 @@ import pytest
 import statsmodels.api as sm
 from linearmodels.iv import IV2SLS
 
-from greybox.estimation.colour import WHITE, fit_colour
+from greybox.estimation.arma_noise import WHITE, fit_colour
 from greybox.estimation.covariance import score_covariance
 from greybox.estimation.credibility.evidence import Equation
-from greybox.estimation.credibility.scores import score_test
+from greybox.estimation.credibility.score_statistic import score_test
 from greybox.estimation.credibility.weak import measure_strength
 from greybox.estimation.moments import solve_stacked
 

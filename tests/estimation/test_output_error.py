@@ -12,6 +12,7 @@ from virtual import virtual_log, write_csv
 from greybox.commands.main import main
 from greybox.errors import ExcitationError, StructureError, UsageError
 from greybox.estimation import free_run, free_run_noise, output_error
+from greybox.estimation.efficiency_bounds import cramer_rao, information, noise_variances
 from greybox.estimation.free_run import _follows, fit_free_runs
 from greybox.estimation.free_run_errors import (
     autocovariance,
@@ -19,7 +20,6 @@ from greybox.estimation.free_run_errors import (
     slow_errors,
 )
 from greybox.estimation.innovations import FilterRuns, fit_innovations
-from greybox.estimation.limits import cramer_rao, information, noise_variances
 from greybox.estimation.output_error import OutputErrorOptions, estimate_oe
 from greybox.estimation.output_setup import measured, output_model, output_predictor
 from greybox.estimation.shooting import (

@@ -15,7 +15,7 @@ from greybox.errors import UsageError
 from greybox.estimation.registry import ESTIMATORS, Estimator
 from greybox.registry import Registry
 from greybox.validation.alternatives import alternatives_for
-from greybox.validation.simulating import Way, compare_ways
+from greybox.validation.cross_validation import EstimatorVariant, compare_estimators
 
 SMALL = {"structure": "surge", "predictor": "basic"}
 
@@ -60,9 +60,9 @@ def test_a_new_estimator_is_compared_and_can_be_chosen(ridge, log):
     assert {a.method for a in alternatives_for([log], request, notes)} == {"iv", "ls", "ridge"}
     assert "ridge with predictor 'basic'" in notes[0]
     found = gb.estimate_model(log, method="ls", **SMALL)
-    compared = compare_ways(found, [log], request)
-    assert Way("ridge") in compared.ways
-    assert np.isfinite(compared.scores[compared.ways.index(Way("ridge"))]).all()
+    compared = compare_estimators(found, [log], request)
+    assert EstimatorVariant("ridge") in compared.variants
+    assert np.isfinite(compared.scores[compared.variants.index(EstimatorVariant("ridge"))]).all()
     assert "ridge" in compared.sentence()
 
 

@@ -11,10 +11,13 @@ from manoeuvring import LENGTH, LINEAR, RUDDER, azimuth_ship, linear_ship, model
 from scipy.stats import norm
 
 from greybox.errors import InfeasibleError, LogError, UsageError
+from greybox.estimation.verdict import TrustLevel
 from greybox.model.catalogue import get_structure
+from greybox.model.model import load_model
 from greybox.model.noise import NoiseLevels
 from greybox.prediction.measuring import quantities
 from greybox.prediction.predict import predict_manoeuvre
+from greybox.report.prediction import headline
 from greybox.trial.log import make_log
 from greybox.trial.manoeuvres import Compliance, find_manoeuvres
 from greybox.validation.fit import run_model
@@ -219,6 +222,26 @@ def test_current_moves_the_ship_only_when_asked():
     assert value(moved, "approach_speed") == pytest.approx(value(still, "approach_speed") + 0.3)
     assert still.manoeuvres[0].quantities["advance"].std < 1e-9
     assert moved.manoeuvres[0].quantities["advance"].std > 0.01
+
+
+@pytest.mark.parametrize(
+    ("said", "level"),
+    [
+        ("do not trust: it diverges", TrustLevel.DO_NOT_TRUST),
+        ("trust except Xu", TrustLevel.TRUST_EXCEPT),
+        ("trust", TrustLevel.TRUST),
+    ],
+)
+def test_the_verdict_of_an_older_model_file_is_known(said, level, tmp_path):
+    """Files had its text only, without its level."""
+    verdict = {"text": said, "excepted": [], "reasons": []}
+    path = tmp_path / "model.json"
+    replace(linear_ship(), record={"verdict": verdict}).save(path)
+    made = predict_manoeuvre(load_model(path), "stopping", until=0.3, **FEW)
+    assert made.trust is level
+    told = f"the estimate's own verdict is '{said}'."
+    assert (told in made.notes) == (level is not TrustLevel.TRUST)
+    assert ("not to be trusted" in headline(made)) == (level is TrustLevel.DO_NOT_TRUST)
 
 
 def test_leaving_the_range_of_the_logs_is_said():

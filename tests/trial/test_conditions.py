@@ -22,8 +22,8 @@ from greybox.trial.kinematics import decimate
 from greybox.trial.log import make_log
 from greybox.trial.store import write_log
 from greybox.trial.validity import other_conditions, pooled_conditions
-from greybox.validation.choose import estimate_model
 from greybox.validation.comparison import compare
+from greybox.validation.selection import estimate_model
 from greybox.vessel.conditions import Conditions
 from greybox.vessel.toml import load_vessel, vessel_from_dict, vessel_to_dict
 

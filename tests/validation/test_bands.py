@@ -21,9 +21,9 @@ from greybox.study.chapter6 import TRUE
 from greybox.study.inputs import smoothed_pulses
 from greybox.trial.log import make_log
 from greybox.validation.bands import draw_parameters, predict_bands
-from greybox.validation.choose import estimate_requested
 from greybox.validation.comparison import compare
 from greybox.validation.request import Request
+from greybox.validation.selection import estimate_requested
 from greybox.vessel.toml import load_vessel
 
 STATES = ("u", "v", "r")

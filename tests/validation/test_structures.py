@@ -15,13 +15,13 @@ from greybox.model.catalogue import get_structure, structure_for
 from greybox.model.predictor import build_predictor
 from greybox.study.chapter7 import REDUCED_BIASES
 from greybox.trial.log import TrialLog
-from greybox.validation.choose import estimate_requested
 from greybox.validation.criteria import independent_samples, information_criteria
 from greybox.validation.fit import run_model
+from greybox.validation.fit_single import estimate_once
 from greybox.validation.held_out import folds, rank, score_runs, spread_of
-from greybox.validation.once import estimate_once
 from greybox.validation.reduction import _step, least_earning, of_absent, reduce_structure, wald
 from greybox.validation.request import Request
+from greybox.validation.selection import estimate_requested
 from greybox.validation.structures import Tried, compare_structures
 from greybox.vessel.force import force_inputs
 

@@ -14,8 +14,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.estimation.colour import Colour
-from greybox.estimation.error_shape import ErrorShape, error_shapes, fit_shaped_colour
+from greybox.estimation.arma_noise import Colour
+from greybox.estimation.error_variance_profile import ErrorShape, error_shapes, fit_shaped_colour
 from greybox.estimation.moments import Solution, solve_stacked
 from greybox.estimation.registry import ESTIMATORS, Estimator
 from greybox.model.predictor import Predictor

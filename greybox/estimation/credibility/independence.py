@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from greybox.estimation.credibility.evidence import Equation, Evidence
 from greybox.estimation.credibility.overidentification import delayed
-from greybox.estimation.credibility.question import Conclusion, ScoreTest
-from greybox.estimation.credibility.scores import ScoreStatistic, score_test
+from greybox.estimation.credibility.score_statistic import ScoreStatistic, score_test
+from greybox.estimation.credibility.score_test import Conclusion, ScoreTest
 from greybox.estimation.verdict import TestResult
 
 Array = NDArray[np.float64]

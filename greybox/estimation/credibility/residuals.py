@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.estimation.credibility.evidence import Equation, Evidence
-from greybox.estimation.credibility.scores import score_test
+from greybox.estimation.credibility.score_statistic import score_test
 from greybox.estimation.verdict import TestResult, not_applicable
 
 Array = NDArray[np.float64]

@@ -17,9 +17,9 @@ _PUSHED = 0.05
 
 
 def _fit(problem: EstimationProblem) -> Estimate:
+    from greybox.estimation.closed_loop import CLOSED_LOOP_LAG
     from greybox.estimation.estimate import solve_iv
-    from greybox.estimation.judging import with_tests
-    from greybox.estimation.loop import CLOSED_LOOP_LAG
+    from greybox.estimation.post_estimation import with_tests
     from greybox.regression.instruments import WIND_WINDOW
     from greybox.regression.problem import RegressionProblem
 

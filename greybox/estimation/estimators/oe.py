@@ -18,9 +18,9 @@ _STARTING_REFINEMENTS = 1
 def _fit(problem: EstimationProblem) -> Estimate:
     """Fit free runs, from the nominal model, else from an estimate by IV or least squares."""
     from greybox.errors import UsageError
-    from greybox.estimation.judging import beside, with_tests
     from greybox.estimation.output_error import estimate_oe
     from greybox.estimation.output_setup import output_predictor
+    from greybox.estimation.post_estimation import beside, with_tests
 
     if problem.margins:
         raise UsageError(

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.estimation.colour import WHITE, Colour
+from greybox.estimation.arma_noise import WHITE, Colour
 from greybox.estimation.verdict import Distribution
 from greybox.numerics.linalg import quadratic_form, sizes
 from greybox.numerics.moments import lagged_products

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from greybox.estimation.credibility.evidence import Equation
-from greybox.estimation.credibility.scores import ScoreStatistic
+from greybox.estimation.credibility.score_statistic import ScoreStatistic
 from greybox.estimation.verdict import TestResult, not_applicable
 
 LEVEL = 0.05

@@ -9,16 +9,16 @@ import pytest
 from scipy.stats import binom, chi2
 from virtual import virtual_log
 
-from greybox.estimation.colour import Colour
+from greybox.estimation.arma_noise import Colour
+from greybox.estimation.banded_covariance import ErrorBand, ErrorNoise
 from greybox.estimation.covariance import score_covariance
-from greybox.estimation.error_shape import (
+from greybox.estimation.error_variance_profile import (
     ErrorShape,
     _Restricted,
     error_shapes,
     fit_shaped_colour,
 )
 from greybox.estimation.estimate import estimate_iv
-from greybox.estimation.whitening import ErrorBand, ErrorNoise
 from greybox.model.catalogue import get_structure
 from greybox.model.predictor import build_predictor
 from greybox.regression.motion import measured_slopes

@@ -11,10 +11,10 @@ from typing import Literal
 import numpy as np
 
 from greybox.errors import GreyboxError, UsageError
+from greybox.estimation.closed_loop import Loop
 from greybox.estimation.credibility.verdict import free_run_faults, misfit, weigh
+from greybox.estimation.efficiency_bounds import limits_of
 from greybox.estimation.estimate import Covariance
-from greybox.estimation.limits import limits_of
-from greybox.estimation.loop import Loop
 from greybox.estimation.output_error import OutputErrorOptions
 from greybox.estimation.registry import ESTIMATORS, free_run_estimator
 from greybox.estimation.result import Estimate
@@ -26,11 +26,11 @@ from greybox.regression.regression import common_sample_time
 from greybox.trial.log import Logs, TrialLog
 from greybox.trial.segments import as_segments
 from greybox.validation.alternatives import Alternative, alternatives_for
+from greybox.validation.cross_validation import EstimatorVariant, compare_estimators
 from greybox.validation.fit import average_fit, run_model
+from greybox.validation.fit_single import estimate_once
 from greybox.validation.held_out import FLOOR
-from greybox.validation.once import estimate_once
 from greybox.validation.request import Request, regression_only
-from greybox.validation.simulating import Way, compare_ways
 
 _log = logging.getLogger(__name__)
 
@@ -255,14 +255,14 @@ def _by_held_out_runs(
 ) -> Estimate:
     """Return the way to estimate whose runs on parts left out are best, `found` in doubt."""
     try:
-        compared = compare_ways(found, logs, request, spare)
+        compared = compare_estimators(found, logs, request, spare)
     except GreyboxError as error:
         return _noting(found, f"estimators were not compared by held-out runs: {error}")
     found = _noting(found, compared.sentence())
-    way = compared.ways[compared.chosen]
+    way = compared.variants[compared.chosen]
     if not compared.chosen:
         return found
-    if spare is not None and way == Way(spare.method):
+    if spare is not None and way == EstimatorVariant(spare.method):
         other, diverged = spare, False
     else:
         start = spare if _diverges(found) else found

@@ -8,19 +8,24 @@ from virtual import virtual_log
 
 from greybox.errors import ExcitationError, UsageError
 from greybox.estimation.verdict import Misfit, NoRegression, TrustLevel, Verdict, refused
-from greybox.validation import choose
-from greybox.validation.choose import estimate_model, estimate_requested
+from greybox.validation import selection
+from greybox.validation.cross_validation import (
+    EstimatorComparison,
+    EstimatorVariant,
+    compare_estimators,
+    parts_of,
+)
 from greybox.validation.fit import run_model
 from greybox.validation.held_out import FLOOR, spread_of
 from greybox.validation.request import Request
-from greybox.validation.simulating import Comparison, Way, compare_ways, parts_of
+from greybox.validation.selection import estimate_model, estimate_requested
 
-WAYS = (Way("iv"), Way("oe"), Way("oe", "deviation"))
+VARIANTS = (EstimatorVariant("iv"), EstimatorVariant("oe"), EstimatorVariant("oe", "deviation"))
 SMALL = Request(structure="linear", predictor="basic")
 
 
 def comparison(*rows):
-    return Comparison(WAYS[: len(rows)], np.array(rows, float))
+    return EstimatorComparison(VARIANTS[: len(rows)], np.array(rows, float))
 
 
 def test_the_first_way_stays_unless_another_gains_more_than_its_error():
@@ -75,7 +80,7 @@ def test_an_estimate_to_be_trusted_is_compared_with_nothing(monkeypatch):
     def never(*_):
         raise AssertionError
 
-    monkeypatch.setattr(choose, "compare_ways", never)
+    monkeypatch.setattr(selection, "compare_estimators", never)
     assert estimate_model([virtual_log(3, 1500)]).verdict.text == "trust"
 
 
@@ -104,8 +109,13 @@ def test_where_the_model_misfits_held_out_runs_choose(small):
 def test_ways_that_fail_have_no_score(small, monkeypatch):
     logs = small[:3]
     found = estimate_model(logs, method="ls", structure="linear", predictor="basic")
-    whole = compare_ways(found, logs, SMALL)
-    assert whole.ways == (Way("ls"), Way("iv"), Way("oe"), Way("oe", "deviation"))
+    whole = compare_estimators(found, logs, SMALL)
+    assert whole.variants == (
+        EstimatorVariant("ls"),
+        EstimatorVariant("iv"),
+        EstimatorVariant("oe"),
+        EstimatorVariant("oe", "deviation"),
+    )
     # of three logs each held-out run is scored in two halves
     assert whole.scores.shape == (4, 6)
     assert np.isfinite(whole.scores).all()
@@ -114,7 +124,7 @@ def test_ways_that_fail_have_no_score(small, monkeypatch):
         raise ExcitationError("nothing moves.")
 
     monkeypatch.setattr("greybox.estimation.estimate.estimate_iv", refuse)
-    partly = compare_ways(found, logs, SMALL)
+    partly = compare_estimators(found, logs, SMALL)
     assert np.isnan(partly.scores[1]).all()
     np.testing.assert_allclose(partly.scores[0], whole.scores[0])
 
@@ -124,25 +134,28 @@ def test_a_misfit_that_was_found_is_not_forgotten(small, monkeypatch):
     """Output error of a wrong structure may look sound; the regression's tests have spoken."""
     logs = small[:3]
     lacks = Misfit({"input_independence": ("u",)}, {})
-    monkeypatch.setattr(choose, "misfit", lambda _: (lacks,))
+    monkeypatch.setattr(selection, "misfit", lambda _: (lacks,))
     judged = refused([NoRegression("a reason")], ())
-    finish = choose._finished
+    finish = selection._finished
 
     def sound(alternative, *rest):
         estimate, diverged = finish(alternative, *rest)
         verdict = Verdict(TrustLevel.TRUST) if alternative.method == "oe" else judged
-        return choose.replace(estimate, verdict=verdict), diverged
+        return selection.replace(estimate, verdict=verdict), diverged
 
-    monkeypatch.setattr(choose, "_finished", sound)
-    better = Comparison((Way("iv"), Way("oe", "deviation")), np.array([[0.0] * 4, [9.0] * 4]))
-    monkeypatch.setattr(choose, "compare_ways", lambda *_: better)
+    monkeypatch.setattr(selection, "_finished", sound)
+    better = EstimatorComparison(
+        (EstimatorVariant("iv"), EstimatorVariant("oe", "deviation")),
+        np.array([[0.0] * 4, [9.0] * 4]),
+    )
+    monkeypatch.setattr(selection, "compare_estimators", lambda *_: better)
     found = estimate_requested(logs, SMALL)
     assert found.method == "oe"
     assert "weighed by the deviation" in found.status
     assert found.verdict.because == (lacks,)
     assert found.notes[-1] == better.sentence()
     # one that follows its own logs less well than the regression is left
-    monkeypatch.setattr(choose, "_level", lambda e: -50.0 if e.method == "oe" else 0.0)
+    monkeypatch.setattr(selection, "_level", lambda e: -50.0 if e.method == "oe" else 0.0)
     found = estimate_requested(logs, SMALL)
     assert found.method != "oe"
     assert "follows the whole logs less well" in found.notes[-1]

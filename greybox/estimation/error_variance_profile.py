@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.estimation.colour import Colour, Factor, fit_colour
+from greybox.estimation.arma_noise import Colour, Factor, fit_colour
 from greybox.model.predictor import Predictor
 from greybox.regression.motion import further_channels, measured_slopes
 from greybox.trial.log import TrialLog

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import ExcitationError
+from greybox.estimation.banded_covariance import ErrorBand, ErrorNoise
 from greybox.estimation.covariance import CovarianceKind, block_bootstrap, score_covariance
 from greybox.estimation.noise import constant_rows
-from greybox.estimation.whitening import ErrorBand, ErrorNoise
 from greybox.model.predictor import Predictor
 from greybox.numerics.banded import factor_band
 

@@ -23,8 +23,8 @@ from greybox.estimation.registry import ESTIMATORS, automatic_estimators
 from greybox.estimation.result import Estimate
 from greybox.trial.log import TrialLog
 from greybox.validation.fit import run_model
+from greybox.validation.fit_single import estimate_once
 from greybox.validation.held_out import FLOOR, folds, score_runs, spread_of
-from greybox.validation.once import estimate_once
 from greybox.validation.request import Request
 
 Array = NDArray[np.float64]
@@ -37,7 +37,7 @@ _REFINEMENTS = 4
 
 
 @dataclass(frozen=True)
-class Way:
+class EstimatorVariant:
     """An estimator: its method, and what output error measures its errors in."""
 
     method: str
@@ -45,11 +45,11 @@ class Way:
 
     @property
     def label(self) -> str:
-        """The way in words."""
+        """The estimator in words."""
         return self.method + (" weighed by deviation" if self.weights == "deviation" else "")
 
     def asked(self, request: Request, start: Estimate | None = None) -> Request:
-        """Return the request with this way's weights.
+        """Return the request with this variant's weights.
 
         From a start that stays bounded, whole runs are fitted: segments would hold up a
         model that no run follows. The likelihood is sought in all ways.
@@ -61,29 +61,31 @@ class Way:
         return replace(request, output_error=options)
 
 
-def _ways() -> list[Way]:
-    """Return the ways to estimate that the data may choose."""
-    return [Way(e.name, weights) for e in automatic_estimators() for weights in e.weights]
+def _variants() -> list[EstimatorVariant]:
+    """Return the estimators that the data may choose."""
+    return [
+        EstimatorVariant(e.name, weights) for e in automatic_estimators() for weights in e.weights
+    ]
 
 
 @dataclass(frozen=True)
-class Comparison:
-    """Ways after their held-out runs.
+class EstimatorComparison:
+    """Estimators after their held-out runs.
 
     Parameters
     ----------
-    ways : tuple of Way
+    variants : tuple of EstimatorVariant
         The one that stands first.
     scores : ndarray
-        (W, parts) [%]; no number where a part did not do for an estimate.
+        (V, parts) [%]; no number where a part did not do for an estimate.
     """
 
-    ways: tuple[Way, ...]
+    variants: tuple[EstimatorVariant, ...]
     scores: Array
 
     @cached_property
     def gains(self) -> tuple[tuple[float, float], ...]:
-        """Mean gain on the way that stands, and its one-sided 84 % limit [%], by way.
+        """Mean gain on the variant that stands, and its one-sided 84 % limit [%], by variant.
 
         The limit is a standard error that allows for the number of parts.
         """
@@ -91,29 +93,29 @@ class Comparison:
 
     @property
     def best(self) -> int:
-        """The way of largest gain."""
-        return max(range(len(self.ways)), key=lambda i: self.gains[i][0])
+        """The variant of largest gain."""
+        return max(range(len(self.variants)), key=lambda i: self.gains[i][0])
 
     @property
     def chosen(self) -> int:
-        """The best way of those that gain more than a standard error, else the first."""
+        """The best variant of those that gain more than a standard error, else the first."""
         sure = [i for i, (gain, se) in enumerate(self.gains) if gain > se]
         return max(sure, key=lambda i: self.gains[i][0], default=0)
 
     def sentence(self) -> str:
-        """Return what was compared, and each way's score."""
+        """Return what was compared, and each variant's score."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)
             mean = np.nanmean(self.scores, axis=1)
         shown = ", ".join(
             f"{w.label} {m:.1f}" if np.isfinite(m) else f"{w.label} refused"
-            for w, m in zip(self.ways, mean, strict=True)
+            for w, m in zip(self.variants, mean, strict=True)
         )
         i = self.chosen or self.best
         gain, se = self.gains[i]
-        first = self.ways[0].label
+        first = self.variants[0].label
         told = (
-            f"{self.ways[i].label} is {gain:.1f} ± {se:.1f} better than {first}"
+            f"{self.variants[i].label} is {gain:.1f} ± {se:.1f} better than {first}"
             if i
             else f"none is better than {first}"
         )
@@ -156,15 +158,15 @@ def parts_of(logs: Sequence[TrialLog]) -> list[tuple[list[TrialLog], list[TrialL
     ]
 
 
-def compare_ways(
+def compare_estimators(
     found: Estimate, logs: Sequence[TrialLog], request: Request, spare: Estimate | None = None
-) -> Comparison:
-    """Compare the ways to estimate the model of `found`, its own first.
+) -> EstimatorComparison:
+    """Compare estimators of the model of `found`, its own first.
 
     Parameters
     ----------
     found : Estimate
-        Its predictor and structure are kept; its way stays unless another is better by
+        Its predictor and structure are kept; its variant stays unless another is better by
         more than one standard error of the difference.
     logs : sequence of TrialLog
         Those it was estimated on.
@@ -177,13 +179,13 @@ def compare_ways(
     UsageError
         A single log is too short to be parted.
     """
-    ways = list(dict.fromkeys([Way(found.method), *_ways()]))
+    variants = list(dict.fromkeys([EstimatorVariant(found.method), *_variants()]))
     spread = spread_of(logs, found.predictor.structure.states) if len(logs) == 1 else None
     parts = parts_of(logs)
     blocks = -(-_WANTED // max(len(logs), len(parts)))
     scores = []
     for fitting, held in parts:
-        estimates = _estimates(ways, fitting, found, request, spare)
+        estimates = _estimates(variants, fitting, found, request, spare)
         scores.append(
             np.array(
                 [
@@ -194,19 +196,19 @@ def compare_ways(
             )
         )  # fmt: skip
         _log.info("a part left out: %s", ", ".join(
-            f"{w.label} {s.mean():.1f}" for w, s in zip(ways, scores[-1], strict=True)
+            f"{w.label} {s.mean():.1f}" for w, s in zip(variants, scores[-1], strict=True)
         ))  # fmt: skip
-    return Comparison(tuple(ways), np.concatenate(scores, axis=1))
+    return EstimatorComparison(tuple(variants), np.concatenate(scores, axis=1))
 
 
 def _estimates(
-    ways: Sequence[Way],
+    variants: Sequence[EstimatorVariant],
     logs: Sequence[TrialLog],
     like: Estimate,
     request: Request,
     spare: Estimate | None,
 ) -> list[Estimate | None]:
-    """Estimate in each way, output error from the regression that follows the logs best."""
+    """Estimate by each variant, output error from the regression that follows the logs best."""
     request = replace(
         request,
         covariance="white",
@@ -214,35 +216,35 @@ def _estimates(
         judged=False,
         output_error=replace(request.output_error, search=False, process_noise=False),
     )
-    found: dict[Way, Estimate | None] = {}
+    found: dict[EstimatorVariant, Estimate | None] = {}
     start: Estimate | None = None
     most = -np.inf
     # regressions first: output error starts from one of them
-    for way in sorted(ways, key=lambda w: ESTIMATORS[w.method].free_run):
-        free_run = ESTIMATORS[way.method].free_run
+    for variant in sorted(variants, key=lambda w: ESTIMATORS[w.method].free_run):
+        free_run = ESTIMATORS[variant.method].free_run
         from_here = start or (spare if free_run else None)
         try:
-            found[way] = estimate_way(way, logs, like, request, from_here)
+            found[variant] = estimate_variant(variant, logs, like, request, from_here)
         except GreyboxError as error:
-            _log.info("%s on a part: %s", way.label, error)
-            found[way] = None
-        estimate = found[way]
+            _log.info("%s on a part: %s", variant.label, error)
+            found[variant] = None
+        estimate = found[variant]
         if estimate is not None and not free_run:
             runs = [run_model(estimate.model(), log) for log in logs]
             level = float(np.mean([v for run in runs for v in run.fit.values()]))
             if level > most and all(run.diverged < 0 for run in runs):
                 start, most = estimate, level
-    return [found[way] for way in ways]
+    return [found[variant] for variant in variants]
 
 
-def estimate_way(
-    way: Way,
+def estimate_variant(
+    variant: EstimatorVariant,
     logs: Sequence[TrialLog],
     like: Estimate,
     request: Request,
     start: Estimate | None = None,
 ) -> Estimate:
-    """Estimate the model of `like` in one way, output error from `start`.
+    """Estimate the model of `like` by one variant, output error from `start`.
 
     Raises
     ------
@@ -251,7 +253,12 @@ def estimate_way(
     """
     predictor = like.predictor
     return estimate_once(
-        logs, predictor.structure, way.method, predictor.kind, way.asked(request, start), start
+        logs,
+        predictor.structure,
+        variant.method,
+        predictor.kind,
+        variant.asked(request, start),
+        start,
     )
 
 
