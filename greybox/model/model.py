@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from math import isfinite
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import casadi as ca
 import numpy as np
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from greybox.errors import GreyboxError, ModelFileError, StructureError, suggestion
 from greybox.files import nearest_file, plain, write_json
 from greybox.model.changes import Change, factors_at
+from greybox.model.disturbances import DisturbanceKind
 from greybox.model.noise import NoiseLevels, noise_from_dict
 from greybox.model.structure import Structure
 from greybox.model.terms import Factor, Term
@@ -297,7 +298,7 @@ def model_from_dict(data: Any, source: str = "model") -> ManoeuvringModel:
                 f"'{source}' has {len(terms)} terms but {theta.size} parameters: "
                 f"estimate the model again."
             )
-        if s["disturbance"] not in ("marine", "additive", "none"):
+        if s["disturbance"] not in get_args(DisturbanceKind):
             raise ModelFileError(f"'{source}' has the disturbance '{s['disturbance']}', unknown.")
         if not 0 < float(data["sample_time"]) < float("inf"):
             raise ModelFileError(

@@ -145,12 +145,10 @@ def simulate(
         len(tau),
         *[len(a) for a in (d, process_noise) if a is not None and np.ndim(a) == 3],
     )
-    heading: Heading = "simulated"
-    if psi is not None or "r" not in structure.states or structure.disturbance != "marine":
-        heading = "measured"
+    heading: Heading = "simulated" if psi is None and structure.turns else "measured"
     nx = len(structure.states)
     series: list[Array] = [np.broadcast_to(tau, (runs, samples, tau.shape[2]))]
-    if heading == "measured" and structure.disturbance == "marine":
+    if heading == "measured" and structure.marine:
         measured = np.zeros(samples + 1) if psi is None else np.asarray(psi, float)
         if integrator == "rk4":
             measured = mid_step(measured)
