@@ -158,7 +158,7 @@ def prepare_request(
         )
     vessel = model.vessel if vessel is None else vessel
     structure, theta = full_structure(model)
-    if structure.disturbance != "marine" or "u" not in structure.states:
+    if not structure.marine or "u" not in structure.states:
         raise StructureError(
             f"structure '{structure.name}' has no surge speed u, so no trial can be designed for "
             f"it: use a manoeuvring structure such as 'thesis' or 'surge'."

@@ -80,7 +80,7 @@ class Rollout:
         sample_time: float,
         integrator: Integrator = "euler",
     ) -> None:
-        if structure.disturbance != "marine" or "u" not in structure.states:
+        if not structure.marine or "u" not in structure.states:
             raise StructureError(
                 f"structure '{structure.name}' has no surge speed u, so no trial can be designed "
                 f"for it: use a manoeuvring structure such as 'thesis' or 'surge'."

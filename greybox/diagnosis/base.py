@@ -174,7 +174,7 @@ class Case:
             yield lambda: given, False
         case = (self.structure, self.logs)
         yield lambda: rough(*case, self.kind, self.regime)[0], False
-        if self.structure.disturbance == "marine" and self.kind == "basic":
+        if self.structure.marine and self.kind == "basic":
             # columns for a current and a wind, so that they bias the others less
             yield lambda: rough(*case, "augmented", self.regime)[0], False
         yield lambda: steady(self.structure, self.logs, self.regime), True

@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.model.run.step import Integrator, increment
+from greybox.model.run.step import Integrator, StepModel
 from greybox.model.structure import Structure
 from greybox.recursion import propagate
 from greybox.vectorised import Vectorised
@@ -52,28 +52,26 @@ class Slopes:
     """
 
     def __init__(self, structure: Structure, air_measured: bool, integrator: Integrator) -> None:
-        s = structure.symbols
-        self._increment = structure.increment
+        self._step = StepModel(structure, integrator, air_measured=air_measured)
+        s, f = self._step.symbolic, self._step.increment
         self._states, unknown = s.x.numel(), s.d.numel()
         current = ca.SX.sym("current", 2)
         # the wind's mean is no disturbance here: it is measured, or there is none
         means = ca.vertcat(current, ca.SX.zeros(max(unknown - 2, 0)))[:unknown]
-        rate = ca.substitute(structure.increment_expression(air_measured=air_measured), s.d, means)
-        others = (s.tau, s.psi, s.air, current, s.theta)
-        of_state = ca.Function("rate", [s.x, *others], [rate])
-        slopes = ca.jacobian(rate, ca.vertcat(s.x, s.theta, current))
-        of_slopes = ca.Function("slopes", [s.x, *others], [ca.densify(slopes)])
+        others = (s.psi, s.tau, means, s.air, s.theta)
+        slopes = ca.jacobian(f(s.x, *others), ca.vertcat(s.x, s.theta, current))
+        symbols = [s.x, s.tau, s.psi, s.air, current, s.theta]
+        of_slopes = ca.Function("slopes", symbols, [ca.densify(slopes)])
         stages: list[ca.SX] = []
 
         def stage(x: ca.SX) -> ca.SX:
-            stages.append(of_slopes(x, *others))
-            return of_state(x, *others)
+            stages.append(of_slopes(x, *symbols[1:]))
+            return f(x, *others)
 
-        increment(integrator, stage, s.x)
-        self._integrator = integrator
+        self._step.moved(stage, s.x)
         self._shape = (len(stages), *slopes.shape)
         flat = ca.vertcat(*[ca.vec(stage.T) for stage in stages])
-        self._program = Vectorised(ca.vertsplit(flat), ca.vertsplit(ca.vertcat(s.x, *others)))
+        self._program = Vectorised(ca.vertsplit(flat), ca.vertsplit(ca.vertcat(*symbols)))
 
     def __call__(self, x: Array, drivers: Array, theta: Array, places: Array) -> Linear:
         """Return the derivatives along a run.
@@ -119,8 +117,7 @@ class Slopes:
             after[:, nx:] += stage[:, nx:]
             return np.asarray(after)
 
-        total = increment(self._integrator, slope, start)
-        return np.asarray(total + start if self._increment else total)
+        return self._step.moved(slope, start)
 
 
 @lru_cache(maxsize=32)

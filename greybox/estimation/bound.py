@@ -11,6 +11,7 @@ from greybox.estimation.banded_covariance import ErrorBand, ErrorNoise
 from greybox.estimation.gls_regression import own_constants, solve_white, white_rows
 from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import Predictor
+from greybox.model.run.inputs import LogInputs
 from greybox.regression.instruments import simulate_log
 from greybox.regression.motion import further_channels, regressors_along
 from greybox.trial.log import TrialLog
@@ -78,12 +79,8 @@ def iv_bound(
         run.require_bounded(structure.states, f"the model on the inputs of '{log.name}'")
         x = run.x[0]
         samples = len(x) - 1
-        marine = structure.disturbance == "marine"
-        tau = (
-            log.forces(structure.inputs)[:-1]
-            if marine
-            else np.column_stack([log[n] for n in structure.inputs])[:-1]
-        )
+        marine = structure.marine
+        tau = LogInputs.of(structure, log).tau[:-1]
         psi = np.broadcast_to(run.psi[0][:samples], samples) if marine else np.zeros(samples)
         air = np.zeros((samples, 2)) if log.air is None else log.air[:samples]
         y = (np.diff(x, axis=0) if structure.increment else x[1:]).T

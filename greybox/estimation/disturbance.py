@@ -91,7 +91,7 @@ def estimate_current(
     ----------
     Ljungberg (2020), eqs. 5.30, 5.31, 5.63, 5.72; generalised least squares.
     """
-    if predictor.structure.disturbance != "marine" or not predictor.biases:
+    if not predictor.structure.marine or not predictor.biases:
         return ()
     rows, a, derivative = current_equations(predictor, theta)
     if len(rows) < 2 or np.linalg.matrix_rank(a) < 2:

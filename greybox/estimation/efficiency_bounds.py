@@ -199,7 +199,7 @@ def _parameter_bound(estimate: Estimate, logs: Sequence[TrialLog], noise: NoiseL
     free_run = ESTIMATORS[estimate.method].free_run
     if not free_run:
         predictor = output_predictor(own.structure, own.kind, own.regime)
-    turns = "r" in own.structure.states and own.structure.disturbance == "marine"
+    turns = own.structure.turns
     seen = turns and noise.heading > 0 and all("psi" in log for log in logs)
     model = output_model(predictor, estimate.sample_time, "output" if seen else "input")
     p = np.zeros(len(model.parameters))

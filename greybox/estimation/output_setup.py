@@ -14,6 +14,7 @@ from greybox.model.disturbances import WIND
 from greybox.model.output import OutputModel, Role, current_means
 from greybox.model.predictor import Predictor, Regime, build_predictor
 from greybox.model.predictor_kinds import PREDICTORS
+from greybox.model.run.inputs import LogInputs
 from greybox.model.structure import Structure
 from greybox.trial.log import TrialLog
 
@@ -42,7 +43,7 @@ def output_predictor(structure: Structure, kind: str, regime: Regime) -> Predict
         return build_predictor(structure, kind, regime)
     if asked.air_measured:
         return replace(build_predictor(structure, asked.plain, regime), kind=kind)
-    if structure.disturbance != "marine" or not structure.uses_air:
+    if not structure.marine or not structure.uses_air:
         return replace(build_predictor(structure, asked.plain, regime), kind=kind)
     return build_predictor(structure, kind, regime, disturbances=WIND, intercept=True)
 
@@ -74,18 +75,11 @@ def measured(model: OutputModel, log: TrialLog) -> Measured:
             f"predictor '{model.predictor.kind}' needs the wind, and '{log.name}' has neither "
             f"u_q, v_q nor V_q, gamma_q: use the predictor 'augmented' or 'basic'."
         )
-    marine = structure.disturbance == "marine"
-    inputs = dict(
-        zip(structure.inputs, log.forces(structure.inputs).T, strict=True)
-        if marine
-        else ((n, log[n]) for n in structure.inputs)
-    )
+    inputs = LogInputs.of(structure, log)
+    given = dict(zip((*structure.inputs, "psi"), [*inputs.tau.T, inputs.psi], strict=True))
 
     def signal(name: str) -> Array:
-        if name in inputs:
-            return np.asarray(inputs[name])
-        # a structure without yaw may come with a log without heading
-        return log[name] if name in log or name != "psi" else np.zeros(len(log))
+        return np.asarray(given[name] if name in given else log[name])
 
     return Measured(
         np.column_stack([signal(n) for n in model.drivers]),
@@ -102,5 +96,4 @@ def deviations(data: Sequence[Measured]) -> Array:
 
 def turns(structure: Structure, logs: Sequence[TrialLog]) -> bool:
     """Whether the structure turns the ship and every log has the heading."""
-    turning = "r" in structure.states and structure.disturbance == "marine"
-    return turning and all("psi" in log for log in logs)
+    return structure.turns and all("psi" in log for log in logs)

@@ -100,7 +100,7 @@ class _Refinement:
         )
         structure = self.predictor.structure
         states = structure.states
-        told = structure.disturbance == "marine" and "r" in states
+        told = structure.turns
         if self._heading == "simulated" or not told or found.diverged >= 0:
             return found
         # a measured heading is no instrument for itself: its noise is the regressors' too

@@ -215,7 +215,7 @@ def _outside(
 def _require_ship(model: ManoeuvringModel) -> None:
     structure = model.structure
     odd = set(structure.states) - {"u", "v", "r"}
-    if structure.disturbance != "marine" or not structure.increment or odd:
+    if not structure.marine or not structure.increment or odd:
         raise StructureError(
             f"structure '{structure.name}' is a map of {', '.join(structure.inputs)} and not the "
             f"motion of a ship with thrusters, so it has no ports to export: export a model of "

@@ -182,7 +182,7 @@ def for_inputs(structure: Structure, inputs: tuple[str, ...]) -> Structure:
     `greybox.vessel.force`); a force component that no thruster can produce
     takes its terms away.
     """
-    if structure.disturbance != "marine":
+    if not structure.marine:
         return structure
     gone = [
         t.name

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from greybox.errors import GreyboxError, ModelFileError, StructureError, suggestion
 from greybox.files import nearest_file, plain, write_json
 from greybox.model.changes import Change, factors_at
+from greybox.model.disturbances import DisturbanceKind
 from greybox.model.noise import NoiseLevels, noise_from_dict
 from greybox.model.run.step import Integrator
 from greybox.model.structure import Structure
@@ -327,7 +328,7 @@ def model_from_dict(data: Any, source: str = "model") -> ManoeuvringModel:
                 f"'{source}' has {len(terms)} terms but {theta.size} parameters: "
                 f"estimate the model again."
             )
-        if s["disturbance"] not in ("marine", "additive", "none"):
+        if s["disturbance"] not in get_args(DisturbanceKind):
             raise ModelFileError(f"'{source}' has the disturbance '{s['disturbance']}', unknown.")
         if not 0 < float(data["sample_time"]) < float("inf"):
             raise ModelFileError(

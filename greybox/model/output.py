@@ -78,7 +78,7 @@ class OutputModel:
         """What a step reads of the log: generalised inputs, heading, wind."""
         structure = self.predictor.structure
         names = list(structure.inputs)
-        if self.heading == "input" and structure.disturbance == "marine":
+        if self.heading == "input" and structure.marine:
             names.append("psi")
         if self.wind == "input" and self.predictor.air_measured:
             names += ["u_q", "v_q"]
@@ -99,7 +99,7 @@ class OutputModel:
 def current_means(predictor: Predictor) -> tuple[str, ...]:
     """Return the means of the current that a marine structure can feel."""
     structure = predictor.structure
-    if structure.disturbance != "marine":
+    if not structure.marine:
         return ()
     sees = {f.signal for t in structure.terms for f in t.factors} & {"u", "v"}
     return CURRENT if sees else ()

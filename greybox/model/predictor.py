@@ -354,7 +354,7 @@ def _derivatives(
     """Return (term, monomial in d, ∂ⁿ⁺¹f/∂θ∂dⁿ at d = 0) until the derivatives vanish."""
     s = structure.symbols
     names = structure.disturbances
-    if structure.disturbance == "marine" and air_measured:
+    if structure.marine and air_measured:
         names = CURRENT
     if only is not None:
         names = tuple(n for n in names if n in only)

@@ -159,11 +159,9 @@ def simulate(
     )
     theta, x0 = np.atleast_2d(theta), np.atleast_2d(x0)
     tau = tau[None] if tau.ndim == 2 else tau
-    heading: Heading = "simulated"
-    if psi is not None or "r" not in structure.states or structure.disturbance != "marine":
-        heading = "measured"
+    heading: Heading = "simulated" if psi is None and structure.turns else "measured"
     series: list[Array] = [np.broadcast_to(tau, (runs, samples, tau.shape[2]))]
-    if heading == "measured" and structure.disturbance == "marine":
+    if heading == "measured" and structure.marine:
         measured = np.zeros(samples + 1) if psi is None else np.asarray(psi, float)
         if integrator == "rk4":
             measured = mid_step(measured)

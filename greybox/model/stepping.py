@@ -122,7 +122,7 @@ def whole_rate(model: ManoeuvringModel) -> ca.Function:
 
 def _checked(model: ManoeuvringModel) -> ManoeuvringModel:
     structure = model.structure
-    if structure.disturbance != "marine" or structure.states != _BODY:
+    if not structure.marine or structure.states != _BODY:
         raise StructureError(
             f"structure '{structure.name}' has the states {', '.join(structure.states)}, a ship "
             f"that moves in the plane needs {', '.join(_BODY)}: estimate with one that has them, "

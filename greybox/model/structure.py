@@ -103,6 +103,16 @@ class Structure(DisplayMixin):
         return tuple(term.name for term in self.terms)
 
     @property
+    def marine(self) -> bool:
+        """Whether it is a ship's: a current and a wind that turn with the heading disturb it."""
+        return self.disturbance == "marine"
+
+    @property
+    def turns(self) -> bool:
+        """Whether its heading can be simulated: a ship's, with a yaw rate."""
+        return self.marine and "r" in self.states
+
+    @property
     def disturbances(self) -> tuple[str, ...]:
         """Names of the disturbance means, in the order of ``d``."""
         return disturbance_names(self.disturbance, self.states)
@@ -192,8 +202,7 @@ class Structure(DisplayMixin):
 
     def equations(self) -> list[str]:
         """Return the equations as readable lines, such as ``u⁺ = u + Xu·u_r + …``."""
-        marine = self.disturbance == "marine"
-        shown = {"u": "u_r", "v": "v_r", "uq": "u_q", "vq": "v_q"} if marine else {}
+        shown = {"u": "u_r", "v": "v_r", "uq": "u_q", "vq": "v_q"} if self.marine else {}
         lines = []
         for state in self.states:
             terms = [

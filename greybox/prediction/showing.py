@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from greybox.model.model import ManoeuvringModel
 from greybox.prediction.helm import Helm
 from greybox.prediction.result import Bundle
 from greybox.prediction.running import DrawnRuns
+from greybox.rotation import ned_to_body
 from greybox.trial.log import TrialLog, make_log
 
 # samples and tracks that pictures hold
@@ -44,14 +43,14 @@ def bundle_of(runs: DrawnRuns, helm: Helm, course: float, length: float) -> Bund
         helms = int(np.flatnonzero(helm.steer)[0])
         signals["steering"] = np.sign(helm.steer[helms]) * runs.commands[k][:, helms][:, good]
     tail = {n: np.quantile(v, [0.025, 0.975], axis=1) for n, v in signals.items()}
-    c, s = math.cos(course), math.sin(course)
     tracks = []
     for run in good[:_SHOWN_TRACKS]:
         last = int(runs.complete[run]) + 1 if runs.complete[run] >= 0 else stop
         north, east = runs.track(int(run), last)
         north, east = north - north[runs.order], east - east[runs.order]
         thin = slice(near, None, max(1, last // _SHOWN_SAMPLES))
-        tracks.append(((c * north + s * east)[thin], (-s * north + c * east)[thin]))
+        ahead, across = ned_to_body(north, east, course)
+        tracks.append((ahead[thin], across[thin]))
     return Bundle(
         runs.t[k] - runs.t[runs.order],
         {n: v[:, 0] for n, v in signals.items()},

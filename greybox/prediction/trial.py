@@ -16,6 +16,7 @@ from greybox.prediction.helm import Helm
 from greybox.prediction.measuring import LABELS, quantities
 from greybox.prediction.monte_carlo import Drawn
 from greybox.prediction.result import Agreement, Compared, Kind, PredictedManoeuvre, Side
+from greybox.rotation import ned_to_body
 from greybox.trial.log import TrialLog
 from greybox.trial.manoeuvres import (
     Quantity,
@@ -242,8 +243,7 @@ def _track(found: Manoeuvre, log: TrialLog, k: NDArray[np.intp]) -> tuple[Array,
     track = make_track(log.t, x_n, y_n, log["psi"], log["u"], log["v"])
     north = track.x_n[k] - np.interp(found.start, log.t, track.x_n)
     east = track.y_n[k] - np.interp(found.start, log.t, track.y_n)
-    c, s = math.cos(found.approach_heading.value), math.sin(found.approach_heading.value)
-    return c * north + s * east, -s * north + c * east
+    return ned_to_body(north, east, found.approach_heading.value)
 
 
 def _history(found: Manoeuvre, log: TrialLog, helm: Helm, k: NDArray[np.intp]) -> dict[str, Array]:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from greybox.model.changes import Change, simulate_changing
 from greybox.model.predictor import Predictor
+from greybox.model.run.inputs import LogInputs
 from greybox.model.simulation import FreeRun
 from greybox.model.structure import Structure
 from greybox.regression.regression import measured_rows, within_margins
@@ -104,24 +105,18 @@ def simulate_log(
     FreeRun
         One run of N−1 steps, (1, N, nx).
     """
-    marine = structure.disturbance == "marine"
-    if marine:
-        tau = log.forces(structure.inputs)[:-1]
-    else:
-        tau = np.column_stack([log[n] for n in structure.inputs])[:-1]
+    given = LogInputs.of(structure, log)
     air = log.air if use_wind and structure.uses_air else None
-    has_yaw = "r" in structure.states
-    psi = log["psi"] if "psi" in log else np.zeros(len(log))
     return simulate_changing(
         structure,
         theta,
         changes,
         initial_state(log, structure.states),
-        tau,
+        given.tau[:-1],
         log.sample_time,
         first=first,
-        psi=psi if marine and (heading == "measured" or not has_yaw) else None,
-        psi0=float(psi[0]),
+        psi=given.heading(structure, heading),
+        psi0=float(given.psi[0]),
         d=d,
         air=None if air is None else air[:-1],
         integrator=integrator,
@@ -212,17 +207,13 @@ def build_instruments(
         samples = len(x)
         rows = within_margins(x, structure.states, margins) if keep is None else keep[i].copy()
         rows &= measured_rows(predictor, log)
-        tau = (
-            log.forces(structure.inputs)[:-1]
-            if structure.disturbance == "marine"
-            else np.column_stack([log[n] for n in structure.inputs])[:-1]
-        )
+        tau = LogInputs.of(structure, log).tau[:-1]
         if lag:
             shift = np.maximum(np.arange(samples) - lag, 0)
             x, tau = x[shift], tau[shift]
             rows[:lag] = False
         psi: Array | float = 0.0
-        if structure.disturbance == "marine":
+        if structure.marine:
             psi = run.psi[0][:samples]
         z = predictor.evaluate(
             [np.ascontiguousarray(x[:, j]) for j in range(x.shape[1])],

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.model.predictor import Predictor
+from greybox.model.run.inputs import LogInputs
 from greybox.model.run.kernels import accumulate
 from greybox.model.run.step import Heading, StepModel
 from greybox.regression.instruments import initial_state, smoothed_wind, state_bound
@@ -56,7 +57,7 @@ class Motion:
 
 def further_channels(predictor: Predictor) -> tuple[str, ...]:
     """Return what a predictor reads beside states and inputs: ``psi``, ``u_q``, ``v_q``."""
-    if predictor.structure.disturbance != "marine":
+    if not predictor.structure.marine:
         return ()
     return ("psi", "u_q", "v_q") if predictor.air_measured else ("psi",)
 
@@ -183,15 +184,9 @@ def predicted_motion(
         Of N−1 samples of the log, as its regression has.
     """
     structure = predictor.structure
-    marine = structure.disturbance == "marine"
     samples, nx = len(log) - 1, len(structure.states)
-    psi = np.asarray(log["psi"][:-1], float) if marine else np.zeros(samples)
-    psi = psi if course is None else course
-    tau = (
-        log.forces(structure.inputs)[:-1]
-        if marine
-        else np.column_stack([log[n] for n in structure.inputs])[:-1]
-    )
+    given = LogInputs.of(structure, log)
+    psi, tau = given.psi[:-1] if course is None else course, given.tau[:-1]
     air = np.zeros((samples, 2))
     blow = smoothed_wind(log) if wind == "smoothed" and predictor.air_measured and nx > 1 else None
     if blow is not None:
@@ -246,16 +241,10 @@ def measured_slopes(predictor: Predictor, log: TrialLog, theta: Array) -> Array:
         (p,) coefficients of all columns, which the slopes depend on.
     """
     structure = predictor.structure
-    marine = structure.disturbance == "marine"
     samples = len(log) - 1
-    tau = (
-        log.forces(structure.inputs)
-        if marine
-        else np.column_stack([log[n] for n in structure.inputs])
-    )
-    psi = log["psi"] if "psi" in log else np.zeros(len(log))
+    given = LogInputs.of(structure, log)
     air = np.zeros((samples, 2))
     if predictor.air_measured:
         air = np.column_stack([log["u_q"], log["v_q"]])[:-1]
     x = log.states(structure.states)[:-1]
-    return regressors_along(predictor, x, psi[:-1], tau[:-1], air, theta)[1]
+    return regressors_along(predictor, x, given.psi[:-1], given.tau[:-1], air, theta)[1]

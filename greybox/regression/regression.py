@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from greybox.errors import ExcitationError, LogError
 from greybox.model.predictor import Predictor
+from greybox.model.run.inputs import LogInputs
 from greybox.trial.log import TrialLog
 
 Array = NDArray[np.float64]
@@ -117,12 +118,11 @@ def build_regression(
         x = log.states(structure.states)
         y = (np.diff(x, axis=0) if structure.increment else x[1:]).T
         seen = x if second_measurement is None else x + second_measurement[i]
+        given = LogInputs.of(structure, log)
         phi = predictor.evaluate(
             [np.ascontiguousarray(seen[:-1, j]) for j in range(seen.shape[1])],
-            log["psi"][:-1] if "psi" in log else 0.0,
-            list(log.forces(structure.inputs)[:-1].T)
-            if structure.disturbance == "marine"
-            else [log[n][:-1] for n in structure.inputs],
+            given.psi[:-1],
+            list(given.tau[:-1].T),
             (log["u_q"][:-1], log["v_q"][:-1]) if predictor.air_measured else None,
         )
         keep = within_margins(x[:-1], structure.states, margins) & measured_rows(predictor, log)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.rotation import ned_to_body
+from greybox.rotation import body_to_ned, ned_to_body
 from greybox.trial.checks.motion import Motion, smooth, to_ned
 
 Array = NDArray[np.float64]
@@ -230,8 +230,7 @@ def constant_drift(agreement: Agreement) -> tuple[float, float]:
     if "u" not in agreement.logged:
         return 0.0, 0.0
     along, across = (agreement.implied[n] - agreement.logged[n] for n in ("u", "v"))
-    c, s = np.cos(agreement.psi), np.sin(agreement.psi)
-    north, east = np.nanmean(c * along - s * across), np.nanmean(s * along + c * across)
+    north, east = map(np.nanmean, body_to_ned(along, across, agreement.psi))
     scatter = np.hypot(np.nanstd(along), np.nanstd(across))
     speed = np.sqrt(np.nanmean(agreement.logged["u"] ** 2 + agreement.logged["v"] ** 2))
     size = np.hypot(north, east)

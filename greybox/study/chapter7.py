@@ -22,6 +22,7 @@ from greybox.model.catalogue import get_structure, structure_for
 from greybox.model.predictor import Predictor, build_predictor
 from greybox.model.simulation import positions, simulate, stationary_disturbance
 from greybox.model.structure import Structure
+from greybox.rotation import ned_to_body
 from greybox.study.chapter6 import TRUE
 from greybox.study.inputs import smoothed_pulses, zig_zag
 from greybox.study.tables import Row
@@ -311,11 +312,10 @@ def virtual_day(seed: int, wind: float, name: str, batches: int = 6) -> list[Tri
         psi = run.psi[0][:-1][keep] + 0.005 * rng.standard_normal(samples)
         where = track[keep] + 0.01 * rng.standard_normal((samples, 2))
         u, v, r = velocities_from_positions(where[:, 0], where[:, 1], psi, 1.0, heading_std=0.005)
-        c, s = np.cos(run.psi[0][:-1][keep]), np.sin(run.psi[0][:-1][keep])
         w = d[keep]
         x = run.x[0][:-1][keep]
-        u_q = x[:, 0] - (c * w[:, 2] + s * w[:, 3])
-        v_q = x[:, 1] - (c * w[:, 3] - s * w[:, 2])
+        forward, starboard = ned_to_body(w[:, 2], w[:, 3], run.psi[0][:-1][keep])
+        u_q, v_q = x[:, 0] - forward, x[:, 1] - starboard
         held = (np.arange(samples) // 5) * 5
         channels = {k: value[keep] for k, value in commands.items()} | {
             "x_n": where[:, 0], "y_n": where[:, 1], "psi": psi, "u": u, "v": v, "r": r,

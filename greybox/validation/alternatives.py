@@ -150,7 +150,7 @@ def _theory(logs: Sequence[TrialLog], structure: Structure, wind: bool) -> str |
     Without wind measurement u_r, u_q and u share a sign, likewise in sway (5.7),
     (5.68); with it only u_r and v_r must keep theirs (5.50), (5.77).
     """
-    if structure.disturbance != "marine":
+    if not structure.marine:
         return None
     for log in logs:
         for state in set(structure.states) & {"u", "v"}:

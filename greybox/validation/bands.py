@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from greybox.model.changes import simulate_changing
 from greybox.model.model import ManoeuvringModel
+from greybox.model.run.inputs import LogInputs
 from greybox.regression.instruments import state_bound
 from greybox.trial.log import TrialLog
 from greybox.trial.segments import split_segments
@@ -227,12 +228,7 @@ def _pieces(
     """
     structure, noise = model.structure, model.noise
     nx = len(structure.states)
-    marine = structure.disturbance == "marine"
-    tau = (
-        log.forces(structure.inputs)
-        if marine
-        else np.column_stack([log[n] for n in structure.inputs])
-    )
+    given = LogInputs.of(structure, log)
     theta, d = draw_parameters(model, rng, runs)
     zeros = np.zeros(nx)
     # the run starts from a mean, which a ship that gathers way has not reached yet; a plan
@@ -244,12 +240,11 @@ def _pieces(
     memory = zeros if noise is None or not noise.memory.size else noise.memory
     drive = process * np.sqrt(1 - memory**2)
     push = process * rng.standard_normal((runs, nx))
-    psi = log["psi"] if "psi" in log else np.zeros(len(log))
     turned = 0.0 if noise is None else noise.heading
     gust = 0.0 if noise is None else noise.wind
     air = log.air if log.has_wind and structure.uses_air else None
-    follows = marine and (heading == "measured" or "r" not in structure.states)
-    psi0: Array = psi[0] + turned * rng.standard_normal(runs)
+    psi = given.heading(structure, heading)
+    psi0: Array = given.psi[0] + turned * rng.standard_normal(runs)
     yield 0, x[:, None]
     for first in range(0, len(log) - 1, _STEPS):
         last = min(first + _STEPS, len(log) - 1)
@@ -261,10 +256,10 @@ def _pieces(
             theta,
             model.changes,
             x,
-            tau[first:last],
+            given.tau[first:last],
             log.sample_time,
             first=begin + first * log.sample_time,
-            psi=_noisy(rng, psi[first : last + 1], turned, runs) if follows else None,
+            psi=_noisy(rng, psi[first : last + 1], turned, runs) if psi is not None else None,
             psi0=psi0,
             d=d,
             air=None if air is None else _noisy(rng, air[first:last], gust, runs),

@@ -15,6 +15,7 @@ from greybox.estimation.result import Estimate
 from greybox.keywords import known_keywords
 from greybox.model.changes import Change, simulate_changing
 from greybox.model.model import ManoeuvringModel
+from greybox.model.run.inputs import LogInputs
 from greybox.notebook import DisplayMixin, items, number, table
 from greybox.one_thread import one_thread
 from greybox.regression.instruments import state_bound
@@ -282,9 +283,8 @@ def errors_ahead(
     """
     log, structure = run.log, model.structure
     x, known = log.states(structure.states), log.known(structure.states)
-    tau = log.forces(structure.inputs)
-    psi = log["psi"] if "psi" in log else np.zeros(len(log))
-    follows = heading == "measured" or "r" not in structure.states
+    given = LogInputs.of(structure, log)
+    tau, psi = given.tau, given.heading(structure, heading)
     found = {}
     for horizon in HORIZONS:
         steps = round(horizon / log.sample_time)
@@ -310,8 +310,8 @@ def errors_ahead(
                 tau[window[rows, :-1]],
                 log.sample_time,
                 first=float(starts[rows[0]] * log.sample_time),
-                psi=psi[window[rows]] if follows else None,
-                psi0=psi[starts[rows]],
+                psi=None if psi is None else psi[window[rows]],
+                psi0=given.psi[starts[rows]],
                 d=model.d if model.disturbances else None,
                 air=None if air is None else air[window[rows, :-1]],
                 integrator=model.integrator,

@@ -30,7 +30,7 @@ class Current(Cause):
 
     def atoms(self, context: Context) -> Sequence[Atom]:
         """Return the two components together."""
-        if context.current_known or context.structure.disturbance != "marine":
+        if context.current_known or not context.structure.marine:
             return ()
         return (
             Atom(

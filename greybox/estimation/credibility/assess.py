@@ -55,7 +55,7 @@ def assess(evidence: Evidence) -> tuple[TestResult, ...]:
                 tests.append(not_applicable(name, null, obstacle, state))
     for row, state in enumerate(states):
         tests += [whiteness(evidence, row), combinations(evidence, state)]
-    if evidence.predictor.structure.disturbance == "marine":
+    if evidence.predictor.structure.marine:
         kept = sum(int(k.sum()) for k in evidence.keep)
         cut = evidence.regression.samples - kept
         tests += sign_margins(evidence.logs, states, evidence.margins, cut)
@@ -92,6 +92,6 @@ def _of_equation(evidence: Evidence, equation: Equation) -> list[TestResult]:
 
 def _still_water(evidence: Evidence, equation: Equation) -> list[TestResult]:
     """Ask for a current where the structure may feel one."""
-    if evidence.predictor.structure.disturbance != "marine":
+    if not evidence.predictor.structure.marine:
         return []
     return [heading_independence(evidence, equation)]

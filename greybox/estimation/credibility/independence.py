@@ -14,6 +14,7 @@ from greybox.estimation.credibility.overidentification import delayed
 from greybox.estimation.credibility.score_statistic import ScoreStatistic, score_test
 from greybox.estimation.credibility.score_test import Conclusion, ScoreTest
 from greybox.estimation.verdict import TestResult
+from greybox.model.run.inputs import LogInputs
 
 Array = NDArray[np.float64]
 
@@ -69,11 +70,7 @@ def _delayed_inputs(evidence: Evidence, equation: Equation) -> list[Array]:
     structure = evidence.predictor.structure
     xi = []
     for log, keep in zip(evidence.logs, equation.keep, strict=True):
-        inputs = (
-            log.forces(structure.inputs)
-            if structure.disturbance == "marine"
-            else np.column_stack([log[n] for n in structure.inputs])
-        )[: len(keep)].T
+        inputs = LogInputs.of(structure, log).tau[: len(keep)].T
         xi.append(np.vstack([delayed(inputs, keep, lag) for lag in LAGS]))
     return xi
 

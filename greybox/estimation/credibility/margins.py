@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from greybox.errors import GreyboxError
 from greybox.estimation.credibility.evidence import Evidence
 from greybox.estimation.verdict import TestResult, not_applicable
+from greybox.model.run.inputs import LogInputs
 from greybox.regression.instruments import simulate_log
 from greybox.trial.log import TrialLog
 
@@ -102,8 +103,8 @@ def noise_bias(evidence: Evidence) -> Array | None:
             return None
         at = slice(0, len(log) - 1, stride)
         x = run.x[0][:-1][at]
-        tau = log.forces(predictor.structure.inputs)[:-1][at]
-        psi = log["psi"][:-1][at] if "psi" in log else np.zeros(len(x))
+        given = LogInputs.of(predictor.structure, log)
+        tau, psi = given.tau[:-1][at], given.psi[:-1][at]
         air = None
         if predictor.air_measured:
             air = (log["u_q"][:-1][at], log["v_q"][:-1][at])
@@ -140,7 +141,7 @@ def margin_bias(evidence: Evidence) -> TestResult:
     """Say in standard errors what the samples near a sign change can bias."""
     name, null = "margin_bias", "measurement noise near sign changes biases no parameter"
     predictor = evidence.predictor
-    if predictor.structure.disturbance != "marine":
+    if not predictor.structure.marine:
         return not_applicable(name, null, "the structure has no modulus of measured velocities")
     if evidence.estimator.biased_by_noise:
         reason = "least squares is biased by noise in every regressor, see endogeneity"

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from greybox.estimation.credibility.evidence import Evidence
 from greybox.estimation.credibility.words import listed
 from greybox.estimation.verdict import TestResult, not_applicable
+from greybox.model.run.inputs import LogInputs
 from greybox.model.run.step import StepModel
 
 Array = NDArray[np.float64]
@@ -76,16 +77,11 @@ def _affine_jacobian(evidence: Evidence, terms: list[int]) -> tuple[Array, Array
     for log, keep in zip(evidence.logs, evidence.keep, strict=True):
         kept = np.flatnonzero(keep)
         at = kept[:: max(1, len(kept) * len(evidence.logs) // _POINTS)]
-        tau = (
-            log.forces(structure.inputs)
-            if structure.disturbance == "marine"
-            else np.column_stack([log[i] for i in structure.inputs])
-        )
-        psi = log["psi"] if "psi" in log else np.zeros(len(log))
+        given = LogInputs.of(structure, log)
         air = np.zeros((len(log), 2))
         if predictor.air_measured and log.air is not None:
             air = log.air
-        rows.append(np.column_stack([log.states(structure.states), psi, tau, air])[at])
+        rows.append(np.column_stack([log.states(structure.states), given.psi, given.tau, air])[at])
     table = np.vstack(rows)
     x, psi = table[:, :n].T, table[:, n][None]
     tau, air = table[:, n + 1 : -2].T, table[:, -2:].T

@@ -59,7 +59,7 @@ class FreeRunStep:
         """What is read, in order."""
         structure = self.model.structure
         names = list(structure.inputs)
-        if self.model.heading == "measured" and structure.disturbance == "marine":
+        if self.model.heading == "measured" and structure.marine:
             names.append("psi")
         if self.disturbed:
             names += structure.disturbances

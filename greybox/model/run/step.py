@@ -35,29 +35,6 @@ _WEIGHTS = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
 _State = TypeVar("_State", ca.SX, Array)
 
 
-def increment(integrator: Integrator, slope: Callable[[_State], _State], start: _State) -> _State:
-    """Return what one sample adds to a state, inputs held.
-
-    Parameters
-    ----------
-    integrator : {"euler", "rk4"}
-        Explicit Euler as (2.6), or the classical fourth-order rule.
-    slope : callable
-        The change over the sample at a state; called once a stage, in their order.
-    start : SX or ndarray
-        The state. Since the rule is linear in the slopes, a derivative of the state is
-        moved on by it as well, with the chain rule as its slope.
-    """
-    now = slope(start)
-    if integrator == "euler":
-        return now
-    total = _WEIGHTS[0] * now
-    for share, weight in zip(_AHEAD, _WEIGHTS[1:], strict=True):
-        now = slope(start + share * now)
-        total = total + weight * now
-    return total
-
-
 @dataclass(frozen=True)
 class SymbolicStep:
     """A step in symbols, to be differentiated or filled in.
@@ -150,6 +127,33 @@ class StepModel:
         own = self.structure.states
         return (*own, "psi") if self.heading == "simulated" else own
 
+    def moved(self, slope: Callable[[_State], _State], start: _State) -> _State:
+        """Return a state one sample later, inputs held.
+
+        Parameters
+        ----------
+        slope : callable
+            What the terms give at a state, f; called once a stage, in their order.
+        start : SX or ndarray
+            The state. Since the rule is linear in the slopes, a derivative of the state is
+            moved on by it as well, with the chain rule as its slope.
+        """
+        now = slope(start)
+        if not self.structure.increment:
+            return now
+        if self.integrator == "euler":
+            return start + now
+        total = _WEIGHTS[0] * now
+        for share, weight in zip(_AHEAD, _WEIGHTS[1:], strict=True):
+            now = slope(start + share * now)
+            total = total + weight * now
+        return start + total
+
+    @property
+    def increment(self) -> ca.Function:
+        """What the terms give at a state, f: ``(x, psi, tau, d, air, theta) -> f``."""
+        return _increment(self)
+
     @property
     def symbolic(self) -> SymbolicStep:
         """The step as expressions of its symbols."""
@@ -185,30 +189,30 @@ class StepModel:
 
 
 @lru_cache(maxsize=128)
-def _symbolic(step: StepModel) -> SymbolicStep:
+def _increment(step: StepModel) -> ca.Function:
     structure, predictor = step.structure, step.predictor
     s = structure.symbols
-    nx = s.x.numel()
-    theta = s.theta if predictor is None else ca.SX.sym("c", len(predictor.columns))
-    f = structure.increment_expression(air_measured=step.air_measured)
+    theta, f = s.theta, structure.increment_expression(air_measured=step.air_measured)
     if predictor is not None:
+        theta = ca.SX.sym("c", len(predictor.columns))
         f = predictor.increment_expression(theta)
-    rate = ca.Function("rate", [s.x, s.psi, s.tau, s.d, s.air, theta], [f])
-    dt = ca.SX.sym("dt")
-    turns = step.heading == "simulated"
-    state = ca.vertcat(s.x, s.psi) if turns else s.x
+    return ca.Function("increment", [s.x, s.psi, s.tau, s.d, s.air, theta], [f])
 
-    def slope(z: ca.SX) -> ca.SX:
-        own = rate(z[:nx], z[nx] if turns else s.psi, s.tau, s.d, s.air, theta)
-        turn = [dt * z[structure.states.index("r")]] if turns else []
-        return ca.vertcat(own, *turn)
 
-    before = state
-    if not structure.increment:
-        # the terms of a map give the next state itself
-        before = ca.vertcat(ca.SX(nx, 1), *[s.psi] * turns)
-    after = ca.densify(before + increment(step.integrator, slope, state))
-    return SymbolicStep(s.x, s.psi, s.tau, s.d, s.air, theta, dt, after)
+@lru_cache(maxsize=128)
+def _symbolic(step: StepModel) -> SymbolicStep:
+    s, f = step.structure.symbols, step.increment
+    nx, theta, dt = s.x.numel(), ca.SX.sym("theta", f.size1_in(5)), ca.SX.sym("dt")
+    theta = s.theta if step.predictor is None else theta
+    held = (s.tau, s.d, s.air, theta)
+    if step.heading == "measured":
+        after = step.moved(lambda x: f(x, s.psi, *held), s.x)
+    else:
+        turn = step.structure.states.index("r")
+        after = step.moved(
+            lambda z: ca.vertcat(f(z[:nx], z[nx], *held), dt * z[turn]), ca.vertcat(s.x, s.psi)
+        )
+    return SymbolicStep(s.x, s.psi, s.tau, s.d, s.air, theta, dt, ca.densify(after))
 
 
 @lru_cache(maxsize=128)

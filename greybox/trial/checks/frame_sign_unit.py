@@ -14,6 +14,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.rotation import ned_to_body
 from greybox.trial.checks.finding import Finding, Outcome
 from greybox.trial.checks.motion import Motion, integrate, profiles, to_ned
 from greybox.trial.convert.derived_signals import continuous
@@ -113,9 +114,8 @@ def _swap(a: str, b: str, *, group: str, words: str = "") -> ColumnHypothesis:
 
 def _earth(names: tuple[str, str], words: str) -> ColumnHypothesis:
     def apply(x: Values) -> Values:
-        north, east = x[names[0]], x[names[1]]
-        c, s = np.cos(x["psi"]), np.sin(x["psi"])
-        return {**x, "u": c * north + s * east, "v": c * east - s * north}
+        u, v = ned_to_body(x[names[0]], x[names[1]], x["psi"])
+        return {**x, "u": u, "v": v}
 
     return ColumnHypothesis(
         "frame", "velocity", ("u", "v"), apply, (mend("earth_to_body", names),),

@@ -506,8 +506,7 @@ def _norm(step: Array) -> float:
 
 
 def _to_earth(step: Array, psi: float) -> Array:
-    c, s = np.cos(psi), np.sin(psi)
-    return np.array([c * step[0] - s * step[1], s * step[0] + c * step[1]])
+    return np.array(body_to_ned(step[0], step[1], psi))
 
 
 @lru_cache(maxsize=32)

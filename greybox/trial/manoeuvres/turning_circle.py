@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from greybox.errors import LogError
 from greybox.notebook import DisplayMixin
+from greybox.rotation import ned_to_body
 from greybox.trial.manoeuvres.approach import Approach, measure_approach
 from greybox.trial.manoeuvres.local import LocalFit, crossing, fit_at, noise_std, regress
 from greybox.trial.manoeuvres.quantity import Quantity
@@ -320,9 +321,8 @@ class _Frame:
 def _frame(
     track: Track, approach: Approach, start: float, scale: float, direction: int, start_std: float
 ) -> _Frame:
-    c, s = math.cos(approach.heading.value), math.sin(approach.heading.value)
-    along = c * track.x_n + s * track.y_n
-    across = direction * (-s * track.x_n + c * track.y_n)
+    along, starboard = ned_to_body(track.x_n, track.y_n, approach.heading.value)
+    across = direction * starboard
     # the origin is where the ship was at the order: an error of that time moves it along
     fits = [fit_at(track.t, y, start, scale, std=track.std) for y in (along, across)]
     variances = [f.std(start) ** 2 + (f.value(start, 1) * start_std) ** 2 for f in fits]
