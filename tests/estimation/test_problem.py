@@ -10,7 +10,7 @@ from virtual import virtual_log
 
 from greybox.model.predictor import build_predictor
 from greybox.regression.problem import RegressionProblem
-from greybox.validation.choose import estimate_model
+from greybox.validation.selection import estimate_model
 
 REGIME = (("u", (1,)), ("v", (1,)), ("r", (1, -1)))
 
@@ -35,8 +35,8 @@ def counted(monkeypatch):
         "greybox.regression.problem", "build_instruments", lambda p, logs, theta: theta.tobytes()
     )
     count_calls("greybox.trial.log", "actuated_force")
-    count_calls("greybox.estimation.judging", "assess")
-    count_calls("greybox.validation.choose", "weigh")
+    count_calls("greybox.estimation.post_estimation", "assess")
+    count_calls("greybox.validation.selection", "weigh")
     return count
 
 
