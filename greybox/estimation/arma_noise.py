@@ -138,7 +138,7 @@ def _filtered(numerator: Array, denominator: Array, rows: Array) -> Array:
 
     A banded triangular system; a signal library would take longer to load than to run.
     """
-    from scipy.linalg import solve_banded
+    from scipy.linalg.blas import dtbsv
 
     samples = rows.shape[-1]
     out = np.zeros(rows.shape)
@@ -147,9 +147,11 @@ def _filtered(numerator: Array, denominator: Array, rows: Array) -> Array:
     order = min(len(denominator), samples) - 1
     if order < 1:
         return out
-    band = np.repeat(np.asarray(denominator, float)[: order + 1, None], samples, axis=1)
-    flat = out.reshape(-1, samples).T
-    return np.asarray(solve_banded((order, 0), band, flat, check_finite=False).T.reshape(out.shape))
+    band = np.empty((order + 1, samples), order="F")
+    band[:] = np.asarray(denominator, float)[: order + 1, None]
+    for row in out.reshape(-1, samples):
+        dtbsv(order, band, row, lower=1, diag=1, overwrite_x=1)
+    return out
 
 
 def fit_colour(

@@ -168,12 +168,12 @@ class ErrorBand:
         """
         from scipy.linalg.blas import dtbsv
 
-        v = values[:, self.keep]
+        v = np.take(values, self.keep, axis=1)
         if noise.memory.any():
             v -= noise.memory * self.before(values)
         out = v.reshape(len(v), -1)
         for row in out:
-            row[:] = dtbsv(len(factor) - 1, factor, row, lower=1)
+            dtbsv(len(factor) - 1, factor, row, lower=1, overwrite_x=1)
         return out
 
     def unwhiten(self, factor: Array, white: Array) -> Array:
@@ -185,7 +185,7 @@ class ErrorBand:
     def before(self, values: Array) -> Array:
         """Return the values (q, N, nx) of the row before each, zero where none is."""
         out = np.zeros((len(values), self.rows, self.nx))
-        out[:, 1:] = self._one[1:, None] * values[:, self.keep[:-1]]
+        np.multiply(self._one[1:, None], np.take(values, self.keep[:-1], axis=1), out=out[:, 1:])
         return out
 
 

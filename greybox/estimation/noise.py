@@ -22,8 +22,8 @@ Array = NDArray[np.float64]
 
 # levels are sought down to this share of the residual's standard deviation
 _LEAST = 1e-3
-# rows that tell levels to a hundredth, and those of a stretch, several times the slowest memory
-_ENOUGH, _STRETCH = 6000, 1000
+# rows that tell levels to a hundredth, and those of a stretch: many times the slowest memory
+_ENOUGH, _STRETCH = 8000, 2000
 # slowest process noise that is told from a constant, in samples
 _SLOWEST = 300.0
 # 2 Δ log-likelihood beyond which nx further levels are believed (χ², p = 0.001, 3 of them)

@@ -95,13 +95,14 @@ class _Refinement:
         return _Point(theta, tuple(constants), tuple(motions))
 
     def _motion(self, log: TrialLog, theta: Array, constants: Array) -> Motion:
-        found = predicted_motion(
-            self.predictor, log, theta, constants, heading=self._heading, wind=self._wind
-        )
         structure = self.predictor.structure
         states = structure.states
-        told = structure.turns
-        if self._heading == "simulated" or not told or found.diverged >= 0:
+        smoothed = structure.turns and self._heading == "measured"
+        found = predicted_motion(
+            self.predictor, log, theta, constants, heading=self._heading, wind=self._wind,
+            states_only=smoothed,
+        )  # fmt: skip
+        if not smoothed or found.diverged >= 0:
             return found
         # a measured heading is no instrument for itself: its noise is the regressors' too
         turning = found.x[:, states.index("r")]

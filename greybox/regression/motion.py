@@ -162,6 +162,7 @@ def predicted_motion(
     heading: Literal["measured", "simulated"] = "measured",
     wind: Literal["smoothed", "measured"] = "smoothed",
     course: Array | None = None,
+    states_only: bool = False,
 ) -> Motion:
     """Feed a predictor's own prediction back along a log's inputs.
 
@@ -177,6 +178,8 @@ def predicted_motion(
         As in `build_instruments`.
     course : ndarray, optional
         (N−1,) heading [rad] in place of the measured one.
+    states_only : bool
+        Whether regressors and slopes are left out, which only a settled heading needs.
 
     Returns
     -------
@@ -201,8 +204,9 @@ def predicted_motion(
     x = whole[:, :nx]
     with np.errstate(invalid="ignore"):
         outside = np.asarray(~(np.abs(x) <= state_bound(log, structure.states)).all(axis=1))
-    if outside.any():
-        return Motion(x, np.empty((0, 0)), np.empty((0, 0, 0)), int(outside.argmax()))
+    if outside.any() or states_only:
+        diverged = int(outside.argmax()) if outside.any() else -1
+        return Motion(x, np.empty((0, 0)), np.empty((0, 0, 0)), diverged)
     angle = whole[:, nx] if heading == "simulated" else psi
     through = x[:, :2] - air if blow is not None else air
     z, slopes = regressors_along(predictor, x, angle, tau, through, theta)

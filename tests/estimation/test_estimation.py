@@ -136,7 +136,7 @@ def test_memory_of_a_moving_average_is_found():
 def test_rescaling_units_changes_nothing(thesis, noisy_log, nominal_theta):
     """Twice the propeller unit halves the gains and leaves the rest."""
     log = noisy_log.window(0, 1500)
-    doubled = type(log)(**{**log.__dict__, "channels": {**log.channels, "n": 2 * log["n"]}})
+    doubled = replace(log, channels={**log.channels, "n": 2 * log["n"]})
     predictor = build_predictor(thesis, "augmented", REGIME)
     start = nominal_theta.copy()
     scale = np.array([0.5 if "tau" in str(t) else 1.0 for t in thesis.terms])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -109,8 +110,6 @@ def test_foreign_model_files(tmp_path):
 
 
 def test_comparison_tells_models_apart(thesis_model, clean_log, noisy_log):
-    from dataclasses import replace
-
     worse = replace(thesis_model, theta=thesis_model.theta * 0.8)
     logs = [clean_log, noisy_log]
     c = compare({"worse": worse, "true": thesis_model}, logs)
@@ -187,12 +186,8 @@ def test_output_error_that_fails_is_told(monkeypatch):
 def test_held_out_runs_choose_elsewhere():
     log = virtual_log(4, 900)
     straight = make_log(log.vessel, {**log.channels, "psi": log["psi"] * 0.01}, 1.0, "straight")
-    without_wind = type(straight)(
-        **{
-            **straight.__dict__,
-            "channels": {k: v for k, v in straight.channels.items() if k not in ("u_q", "v_q")},
-        }
-    )
+    calm = {k: v for k, v in straight.channels.items() if k not in ("u_q", "v_q")}
+    without_wind = replace(straight, channels=calm)
     e = estimate_model([without_wind])
     assert any("chosen by the free run on the last third" in n for n in e.notes)
     assert any("bias-capturing terms were left out" in n for n in e.notes)
