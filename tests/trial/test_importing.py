@@ -254,7 +254,7 @@ def test_recordings_that_make_no_log(change, message):
 def test_stretches_that_are_too_short():
     data = columns()
     data["psi"] = np.where(np.arange(400) % 10 < 2, data["psi"], np.nan)
-    with pytest.raises(LogError, match="no 3 that follow each other in which x_n, y_n, psi"):
+    with pytest.raises(LogError, match="no 3 that follow each other in which psi"):
         imported(data, max_gap=1.0)
 
 

@@ -22,10 +22,9 @@ from greybox.regression.regression import build_regression
 from greybox.trial.log import make_log
 from greybox.trial.segments import join_segments
 from greybox.validation.bands import predict_bands
-from greybox.validation.selection import estimate_model
-from greybox.validation.comparison import compare_models
+from greybox.validation.comparison import compare
 from greybox.validation.fit import fit_percent, run_model
-from greybox.validation.request import Request
+from greybox.validation.selection import estimate_model
 from greybox.vessel.toml import load_vessel
 
 N = 400
@@ -110,7 +109,7 @@ def test_a_run_begins_anew_after_missing_rows(log, true_model):
     bands = predict_bands(true_model, joined, runs=40)
     assert bands.motion.shape == (2, N - 10, 3)
     assert np.isfinite(bands.motion).all()
-    found = compare_models([true_model], ["m"], [[joined]], bands=False)
+    found = compare({"m": true_model}, joined, bands=False)
     (gap,) = found.to_dict()["models"][0]["logs"][0]["gaps"]
     assert (gap["run"], gap["samples"], gap["start"]) == ("begins anew", 10, 200.0)
     assert "a run begins anew after it" in found.summary()
@@ -147,7 +146,7 @@ def test_commands_say_what_they_do_with_gaps(log, tmp_path, true_model, capsys):
 
 def test_a_single_log_with_gaps_is_estimated(log):
     joined = join_segments([log.window(0, 200), log.window(210, N)], "two")
-    estimate = estimate_model(joined, Request(method="ls", predictor="basic", structure="thesis"))
+    estimate = estimate_model(joined, method="ls", predictor="basic", structure="thesis")
     assert [one["samples"] for one in estimate.logs] == [200, 190]
     with pytest.raises(UsageError, match=r"no parameter 'XU'\. Did you mean 'Xu'"):
         estimate["XU"]
