@@ -28,8 +28,9 @@ _BESIDE = (4, 6, 9, 13, 20, 30)
 _WANDERS = (0, 1)
 # reach of what says so, in the times over which it decays
 _REACH = 4.0
-# chance that noise makes one jump in a log
-_CHANCE = 0.002
+# chance that noise makes one jump in a log, and how much larger a jump must be where the fewest
+# samples predict best: there the ship's own moves scatter, with heavier tails than noise
+_CHANCE, _MOVES = 0.002, 1.4
 # steps that come as often as this are the receiver's or the ship's habit: so many in a log, a
 # tenth of its separate steps or at most as many, or one a minute [s]; a jump is so much larger
 _FEW, _OFTEN, _MANY, _MINUTE, _ABOVE = 5, 0.1, 10, 60.0, 1.8
@@ -416,6 +417,8 @@ class _Search:
         often = int(max(_FEW, min(_OFTEN * len(peaks), _MANY), self.seconds / _MINUTE))
         # the length of two normal components is beyond x by a chance of exp(-x²/2)
         noise = np.sqrt(2 * np.log(len(way) / _CHANCE))
+        if most == _BESIDE[0]:
+            noise *= _MOVES
         least = max(noise, _ABOVE * float(peaks[min(often, len(peaks)) - 1]))
         for _ in range(_MOST_JUMPS):
             k = int(np.argmax(distance))
