@@ -30,10 +30,10 @@ _WANDERS = (0, 1)
 _REACH = 4.0
 # chance that noise makes one jump in a log, and how much larger a jump must be where the fewest
 # samples predict best: there the ship's own moves scatter, with heavier tails than noise
-_CHANCE, _MOVES = 0.002, 1.4
+_CHANCE, _MOVES = 0.0005, 1.4
 # steps that come as often as this are the receiver's or the ship's habit: so many in a log, a
-# tenth of its separate steps or at most as many, or one a minute [s]; a jump is so much larger
-_FEW, _OFTEN, _MANY, _MINUTE, _ABOVE = 5, 0.1, 10, 60.0, 1.8
+# tenth of its separate steps or at most as many, or one a minute [s]; a jump is twice as large
+_FEW, _OFTEN, _MANY, _MINUTE, _ABOVE = 5, 0.1, 10, 60.0, 2.0
 # lags by which velocities answer forces [samples], and samples for each of their coefficients
 _LAGS, _LEAST_SAMPLES = (1.5, 6.0, 30.0), 12
 # scatter beyond which a sample says no more of them; share of the clearest combination below
