@@ -9,6 +9,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.recursion import decay
 from greybox.rotation import body_to_ned, ned_to_body
 from greybox.trial.checks.finding import Finding
 from greybox.trial.checks.position_hold import Track, position_track
@@ -292,12 +293,10 @@ def _beside(view: _View, pushes: Array, whole: Mask, rounded: float) -> _View | 
     unknown time do: sums of first-order lags. Their coefficients are those of generalised
     least squares, with the view's own filter as weight.
     """
-    from scipy.signal import lfilter
-
     turning = pushes[:, -1:]
     moved = np.column_stack([pushes[:, :-1], _smooth(view.way) * turning])
     lags = np.exp(-1 / np.array(_LAGS))
-    columns = [lfilter([1 - a], [1, -a], moved - moved[0], axis=0) for a in lags]
+    columns = [decay(float(a), (1 - a) * (moved - moved[0])) for a in lags]
     still = [turning, np.cos(view.psi)[:, None], np.sin(view.psi)[:, None], np.ones_like(turning)]
     x = np.column_stack(columns + still)
     clear = view.level == 0
