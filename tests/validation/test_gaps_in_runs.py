@@ -22,10 +22,10 @@ from greybox.regression.regression import build_regression
 from greybox.trial.log import make_log
 from greybox.trial.segments import join_segments
 from greybox.validation.bands import predict_bands
-from greybox.validation.selection import estimate_model
 from greybox.validation.comparison import compare_models
 from greybox.validation.fit import fit_percent, run_model
 from greybox.validation.request import Request
+from greybox.validation.selection import estimate_model
 from greybox.vessel.toml import load_vessel
 
 N = 400
