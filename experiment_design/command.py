@@ -284,7 +284,7 @@ def _run_between(options: argparse.Namespace, request: Any, notes: tuple[str, ..
         *notes,
         *[f"{second}: {c.sentence}, and it is taken as it is then" for c in other.changes],
     )
-    other = other.settled()
+    other = other.at_final_parameters()
     structure, theta = full_structure(other)
     vessel = with_actuators_of(request.vessel, other.vessel)
     found = design_between(
@@ -358,7 +358,7 @@ def _wishes(options: argparse.Namespace, model: Any) -> Any:
     )
     combination = {}
     if options.of:
-        values = dict(zip(model.names, model.settled().theta, strict=True))
+        values = dict(zip(model.names, model.at_final_parameters().theta, strict=True))
         combination = gradient_of(options.of, values)
     criterion: Any = "c" if options.of and options.criterion == "D" else options.criterion
     process = None if options.process_noise is None else np.array(options.process_noise)

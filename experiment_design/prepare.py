@@ -149,7 +149,7 @@ def prepare_request(
         f"{c.sentence}, and the trial is designed for what it is from then on"
         for c in dict.fromkeys(changes)
     ]
-    model = model.settled()
+    model = model.at_final_parameters()
     if vessel is not None and vessel != (acting := with_actuators_of(vessel, model.vessel)):
         vessel = acting
         notes.append(
@@ -309,7 +309,7 @@ def _margins(
 def _prior(model: ManoeuvringModel | None) -> tuple[tuple[str, ...], Array] | None:
     if model is None:
         return None
-    model = model.settled()
+    model = model.at_final_parameters()
     d = model.std
     if not (d > 0).all():
         name = model.names[int(np.argmin(d))]

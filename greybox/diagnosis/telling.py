@@ -292,7 +292,7 @@ def _likelier_story(model: ManoeuvringModel, logs: Sequence[TrialLog]) -> Manoeu
     """Return the model with its changes within logs, or made before: whichever fits better."""
     if not model.changes:
         return model
-    settled = model.settled()
+    settled = model.at_final_parameters()
 
     def missed(candidate: ManoeuvringModel) -> float:
         return sum(

@@ -27,7 +27,7 @@ _LEAST_FREEDOM = 8.0
 
 
 @dataclass(frozen=True)
-class Factor:
+class NoiseFactor:
     """What makes one log's errors alike: e(k) = root(k) ν(k) + tie(k) root(k−1) ν(k−1).
 
     Parameters
@@ -57,23 +57,23 @@ class Factor:
 
 
 @dataclass(frozen=True)
-class Colour:
+class ARMANoise:
     """e = C(q)/D(q) ε, behind a factor of each log where the noise changes along it.
 
     Parameters
     ----------
     moving_average, autoregression : ndarray
         (m+1,) and (n+1,) coefficients of C and D in delays, each led by 1.
-    neighbours : tuple of Colour
+    neighbours : tuple of ARMANoise
         Models one standard error away along each principal axis of the fit.
-    factors : tuple of Factor
+    factors : tuple of NoiseFactor
         Of each experiment; empty where the noise is alike everywhere.
     """
 
     moving_average: Array
     autoregression: Array
-    neighbours: tuple[Colour, ...] = ()
-    factors: tuple[Factor, ...] = ()
+    neighbours: tuple[ARMANoise, ...] = ()
+    factors: tuple[NoiseFactor, ...] = ()
 
     @property
     def white(self) -> bool:
@@ -99,7 +99,7 @@ class Colour:
         back = _filtered(self.moving_average, self.autoregression, z[..., ::-1])
         return np.asarray(back[..., ::-1])
 
-    def beside(self, factors: tuple[Factor, ...]) -> Colour:
+    def beside(self, factors: tuple[NoiseFactor, ...]) -> ARMANoise:
         """Return this model with one more neighbour, of other factors."""
         other = replace(self, neighbours=(), factors=factors)
         return replace(self, neighbours=(*self.neighbours, other))
@@ -117,7 +117,7 @@ class Colour:
             Of all rows together, (1,), in place of (k,).
         """
 
-        def variance(colour: Colour) -> Array:
+        def variance(colour: ARMANoise) -> Array:
             each = np.asarray(
                 sum((colour.adjoint(x, log) ** 2).sum(axis=1) for log, x in enumerate(z))
             )
@@ -130,7 +130,7 @@ class Colour:
         return np.asarray(np.clip(2 / np.maximum(square, 1e-12), _LEAST_FREEDOM, 1e9))
 
 
-WHITE = Colour(np.ones(1), np.ones(1))
+WHITE = ARMANoise(np.ones(1), np.ones(1))
 
 
 def _filtered(numerator: Array, denominator: Array, rows: Array) -> Array:
@@ -154,11 +154,11 @@ def _filtered(numerator: Array, denominator: Array, rows: Array) -> Array:
     return out
 
 
-def fit_colour(
+def fit_arma_noise(
     residuals: Sequence[Array],
     keep: Sequence[NDArray[np.bool_]],
-    factors: tuple[Factor, ...] = (),
-) -> Colour:
+    factors: tuple[NoiseFactor, ...] = (),
+) -> ARMANoise:
     """Fit the noise model by least squares of the innovations, its order by BIC.
 
     Parameters
@@ -167,7 +167,7 @@ def fit_colour(
         (N,) an experiment, zero in rows that do not take part.
     keep : sequence of ndarray of bool
         Only uninterrupted stretches are used; too few rows give white noise.
-    factors : tuple of Factor
+    factors : tuple of NoiseFactor
         What makes the errors of each log alike; none where they are.
 
     References
@@ -212,11 +212,11 @@ def _polynomial(free: Array) -> Array:
     return out
 
 
-def _fit(series: Array, inside: NDArray[np.bool_], ar: int, ma: int) -> tuple[Colour, float]:
+def _fit(series: Array, inside: NDArray[np.bool_], ar: int, ma: int) -> tuple[ARMANoise, float]:
     from scipy.optimize import least_squares
 
-    def colour(free: Array) -> Colour:
-        return Colour(_polynomial(free[ar:]), _polynomial(free[:ar]))
+    def colour(free: Array) -> ARMANoise:
+        return ARMANoise(_polynomial(free[ar:]), _polynomial(free[:ar]))
 
     def innovations(free: Array) -> Array:
         return colour(free).innovations(series)[inside]

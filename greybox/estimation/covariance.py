@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.estimation.error_variance_profile import ErrorShape, fit_shaped_colour
+from greybox.estimation.error_variance_profile import ErrorVarianceProfile, fit_scaled_arma_noise
 from greybox.numerics.moments import autocovariance, lagged_products, lagged_sums
 
 Array = NDArray[np.float64]
@@ -66,7 +66,7 @@ def score_covariance(
     residuals: Sequence[Sequence[Array]],
     kind: CovarianceKind = "hac",
     lags: int | None = None,
-    shapes: Sequence[Sequence[ErrorShape]] = (),
+    shapes: Sequence[Sequence[ErrorVarianceProfile]] = (),
 ) -> tuple[Array, int]:
     """Estimate the covariance of the summed scores Σ ẑ e, equations together.
 
@@ -83,7 +83,7 @@ def score_covariance(
     lags : int, optional
         Memory in samples; by default found from the residuals. Given with
         ``ma``, R holds the residuals' own autocovariance up to there.
-    shapes : sequence over equations of sequence over experiments of ErrorShape
+    shapes : sequence over equations of sequence over experiments of ErrorVarianceProfile
         How measurement noise changes along each log, for ``ma``; empty where it
         is alike everywhere.
 
@@ -104,7 +104,7 @@ def score_covariance(
             lags = max(correlation_lags(equation) for equation in residuals)
     sizes = [equation[0].shape[0] for equation in projected]
     if kind == "ma":
-        return nearest_positive(_moving_average(projected, residuals, sizes, lags)), lags
+        return clip_to_psd(_moving_average(projected, residuals, sizes, lags)), lags
     total = np.zeros((sum(sizes), sum(sizes)))
     spread = np.repeat(np.arange(len(sizes)), sizes)
     reach = 0 if kind == "white" else 2 * lags
@@ -117,19 +117,19 @@ def score_covariance(
     for lag in range(min(reach, max(s.shape[1] for s in scores) - 1) + 1):
         block = flat_top(lag, lags) * lagged_products(scores, scores, lag)
         total += block if lag == 0 else block + block.T
-    return nearest_positive(total), lags
+    return clip_to_psd(total), lags
 
 
 def _coloured(
     projected: Sequence[Sequence[Array]],
     residuals: Sequence[Sequence[Array]],
-    shapes: Sequence[Sequence[ErrorShape]],
+    shapes: Sequence[Sequence[ErrorVarianceProfile]],
 ) -> tuple[Array, int]:
     """Return Σ s sᵀ with s = (Hᵀ ẑ) ε of all equations, and the longest memory of a model."""
     keep = [np.asarray(hat.any(axis=0)) for hat in projected[0]]
     shapes = shapes or [()] * len(residuals)
     colours = [
-        fit_shaped_colour(equation, keep, shape, hats)
+        fit_scaled_arma_noise(equation, keep, shape, hats)
         for equation, shape, hats in zip(residuals, shapes, projected, strict=True)
     ]
     sizes = sum(equation[0].shape[0] for equation in projected)
@@ -164,7 +164,7 @@ def _moving_average(
     return total
 
 
-def nearest_positive(matrix: Array) -> Array:
+def clip_to_psd(matrix: Array) -> Array:
     """Return the nearest matrix without negative variances, in correlation units."""
     scale = np.sqrt(np.maximum(np.diag(matrix), 0.0))
     if not (scale > 0).all():

@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.estimation.arma_noise import Colour, Factor, fit_colour
+from greybox.estimation.arma_noise import ARMANoise, NoiseFactor, fit_arma_noise
 from greybox.model.predictor import Predictor
 from greybox.regression.motion import further_channels, measured_slopes
 from greybox.trial.log import TrialLog
@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 _SHARES = (1e-7, 1e2)
 
 
-class ErrorShape:
+class ErrorVarianceProfile:
     """One equation's error on one log, as far as measurement noise makes it.
 
     Parameters
@@ -38,24 +38,24 @@ class ErrorShape:
     def __init__(self, same: Array, tie: Array) -> None:
         self.same, self.tie = same, tie
 
-    def factor(self, share: float) -> Factor | None:
+    def factor(self, share: float) -> NoiseFactor | None:
         """Return the factor with steady noise of a share of the mean variance added."""
         from scipy.linalg.lapack import dpttrf
 
         whole = self.same + share * self.same.mean()
         if len(whole) < 2:
-            return Factor(np.sqrt(whole), np.zeros(len(whole)))
+            return NoiseFactor(np.sqrt(whole), np.zeros(len(whole)))
         d, low, info = dpttrf(whole, self.tie[1:])
-        return Factor(np.sqrt(d), np.append(0.0, low)) if info == 0 else None
+        return NoiseFactor(np.sqrt(d), np.append(0.0, low)) if info == 0 else None
 
 
-def error_shapes(
+def error_variance_profiles(
     predictor: Predictor,
     logs: Sequence[TrialLog],
     theta: Array,
     residuals: Sequence[Sequence[Array]],
     keep: Sequence[NDArray[np.bool_]],
-) -> tuple[tuple[ErrorShape, ...], ...]:
+) -> tuple[tuple[ErrorVarianceProfile, ...], ...]:
     """Return the shape of each equation's error on each log; empty where none is told.
 
     Parameters
@@ -92,29 +92,29 @@ def error_shapes(
             typical = float(same[k].mean()) if k.any() else 1.0
             same = np.where(k, same, typical)
             tie = np.where(follow, -s[:, i, i] * variances[i], 0.0)
-            shapes.append(ErrorShape(same, tie))
+            shapes.append(ErrorVarianceProfile(same, tie))
         found.append(tuple(shapes) if variances[i] > 0 else ())
     return tuple(found)
 
 
-def fit_shaped_colour(
+def fit_scaled_arma_noise(
     residuals: Sequence[Array],
     keep: Sequence[NDArray[np.bool_]],
-    shapes: Sequence[ErrorShape],
+    shapes: Sequence[ErrorVarianceProfile],
     regressors: Sequence[Array],
-) -> Colour:
+) -> ARMANoise:
     """Fit a noise model whose measurement noise has a shape along the log.
 
     How much steady noise there is beside follows from the restricted likelihood, which
     allows for what the coefficients took of the errors; what colour that leaves, from
-    `fit_colour`. Where the errors contradict the shape, the steady noise drowns it.
+    `fit_arma_noise`. Where the errors contradict the shape, the steady noise drowns it.
 
     Parameters
     ----------
     residuals : sequence of ndarray
         (N,) a log, zero in rows that do not take part.
     keep : sequence of ndarray of bool
-    shapes : sequence of ErrorShape
+    shapes : sequence of ErrorVarianceProfile
         Empty where none is told.
     regressors : sequence of ndarray
         (p, N) what the coefficients stand beside, without noise.
@@ -124,13 +124,13 @@ def fit_shaped_colour(
     Patterson and Thompson (1971).
     """
     if not shapes:
-        return fit_colour(residuals, keep)
+        return fit_arma_noise(residuals, keep)
     likelihood = _Restricted(residuals, keep, shapes, regressors)
     share, more = likelihood.fit()
     factors = likelihood.factors(share)
     if factors is None:
-        return fit_colour(residuals, keep)
-    found = fit_colour(residuals, keep, factors)
+        return fit_arma_noise(residuals, keep)
+    found = fit_arma_noise(residuals, keep, factors)
     further = likelihood.factors(more)
     if further is None:
         return found
@@ -150,7 +150,7 @@ class _Restricted:
         self,
         residuals: Sequence[Array],
         keep: Sequence[NDArray[np.bool_]],
-        shapes: Sequence[ErrorShape],
+        shapes: Sequence[ErrorVarianceProfile],
         regressors: Sequence[Array],
     ) -> None:
         self.shapes = shapes
@@ -163,7 +163,7 @@ class _Restricted:
         ]
         self.rows = sum(int(k.sum()) for k in keep)
 
-    def factors(self, share: float) -> tuple[Factor, ...] | None:
+    def factors(self, share: float) -> tuple[NoiseFactor, ...] | None:
         found = [s.factor(share) for s in self.shapes]
         return None if any(f is None for f in found) else tuple(f for f in found if f)
 

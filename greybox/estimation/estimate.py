@@ -17,7 +17,7 @@ from greybox.estimation.covariance import (
 )
 from greybox.estimation.credibility import Evidence, assess, convergence, weigh
 from greybox.estimation.disturbance import estimate_current
-from greybox.estimation.error_variance_profile import ErrorShape, error_shapes
+from greybox.estimation.error_variance_profile import ErrorVarianceProfile, error_variance_profiles
 from greybox.estimation.moments import Solution, solve_stacked
 from greybox.estimation.result import Estimate
 from greybox.estimation.values import Iteration, estimation_data
@@ -322,7 +322,7 @@ class Solved:
         matrix, lags = np.full((len(theta), len(theta)), np.nan), 0
         if covariance is not None:
             shapes = (
-                error_shapes(predictor, logs, theta, residuals, self.keep)
+                error_variance_profiles(predictor, logs, theta, residuals, self.keep)
                 if covariance == "ma"
                 else ()
             )
@@ -499,7 +499,7 @@ def _covariance(
     residuals: list[list[Array]],
     kind: Covariance,
     seed: int,
-    shapes: Sequence[Sequence[ErrorShape]],
+    shapes: Sequence[Sequence[ErrorVarianceProfile]],
 ) -> tuple[Array, int]:
     regression, predictor = solved.problem.regression, solved.problem.predictor
     p = len(predictor.columns)

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.estimation.covariance import CovarianceKind, flat_top, nearest_positive
+from greybox.estimation.covariance import CovarianceKind, clip_to_psd, flat_top
 from greybox.numerics.moments import lagged_products, lagged_sums
 
 Array = NDArray[np.float64]
@@ -55,11 +55,11 @@ def shared_score_covariance(
             for lag in range(min(0 if kind == "white" else 2 * lags, product.shape[1] - 1) + 1):
                 block = flat_top(lag, lags) * lagged_products([product], [product], lag)
                 total += block if lag == 0 else block + block.T
-        return nearest_positive(total)
+        return clip_to_psd(total)
     gamma = autocovariance([r for _, r in scores], lags)
     for rows, r in scores:
         total += _filtered_products(rows, gamma[: len(r)])
-    return nearest_positive(total)
+    return clip_to_psd(total)
 
 
 def autocovariance(residuals: Sequence[Array], lags: int) -> Array:

@@ -74,7 +74,7 @@ class EstimationProblem:
         """
         if self.nominal is None:
             return None
-        nominal = self.nominal.settled()
+        nominal = self.nominal.at_final_parameters()
         known = dict(zip(nominal.names, nominal.theta, strict=True))
         return np.array([known.get(name, 0.0) for name in self.structure.parameters])
 

@@ -119,7 +119,7 @@ def export_model(
         raise UsageError(f"only an FMU holds a binary, '{to}' does not: leave --no-binary out.")
     if str(out) == "-":
         raise UsageError(f"'{to}' is written to a file: name one instead of '-'.")
-    model = model.settled() if settled else model
+    model = model.at_final_parameters() if settled else model
     path = Path(out)
     check_targets(out)
     if to == "fmu":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from math import isfinite
@@ -139,13 +140,22 @@ class ManoeuvringModel(DisplayMixin):
             [self.disturbances.get(n, (0.0, 0.0))[0] for n in self.structure.disturbances]
         )
 
-    def settled(self) -> ManoeuvringModel:
+    def at_final_parameters(self) -> ManoeuvringModel:
         """Return the model as it is after its last change."""
         if not self.changes:
             return self
         now = factors_at(self.changes, self.names, np.inf)
         covariance = self.covariance * np.outer(now, now)
         return replace(self, theta=self.theta * now, covariance=covariance, changes=())
+
+    def settled(self) -> ManoeuvringModel:
+        """Return `at_final_parameters` under its former name, which is deprecated."""
+        warnings.warn(
+            "ManoeuvringModel.settled() is deprecated: write at_final_parameters().",
+            DeprecationWarning,
+            stacklevel=2,
+        )
+        return self.at_final_parameters()
 
     def label(self, name: str) -> str:
         """Return a parameter's name with the terms it sums, such as ``Xuu+Wuu``."""

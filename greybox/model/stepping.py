@@ -128,7 +128,7 @@ def _checked(model: ManoeuvringModel) -> ManoeuvringModel:
             f"that moves in the plane needs {', '.join(_BODY)}: estimate with one that has them, "
             f"such as 'thesis'."
         )
-    return model.settled()
+    return model.at_final_parameters()
 
 
 def _function(

@@ -163,7 +163,7 @@ def predict_manoeuvre(
         seed,
     )
     check(manoeuvre, model, asked)
-    model = model.settled()
+    model = model.at_final_parameters()
     helm = find_helm(model.vessel, asked.thrusters, limited=limited)
     require_straight(helm)
     found: list[tuple[Task, Manoeuvre, TrialLog]] = []

@@ -27,10 +27,10 @@ from greybox.validation.selection import estimate_requested
 from greybox.validation.structures import (
     CHOOSE,
     FOLDS,
-    Bench,
+    CandidateFit,
+    CrossValidation,
     Progress,
     StructureChoice,
-    Tried,
     criteria_of,
     rows_of,
     settle,
@@ -102,7 +102,7 @@ def least_earning(estimate: Estimate, missed: Collection[str] = ()) -> list[Cand
     return [c for c in found if c.p_value >= _SIGNIFICANT]
 
 
-def of_absent(estimate: Estimate, missed: Collection[str] = ()) -> list[Candidate]:
+def bias_terms_without_current(estimate: Estimate, missed: Collection[str] = ()) -> list[Candidate]:
     """Return the bias-capturing columns that still water, or still air, would leave without use.
 
     Where there is no current all derivatives in its means are multiplied by zero; what is
@@ -180,8 +180,8 @@ def reduce_structure(
     logs = as_segments(logs)
     settled = settle(logs, request)
     states = structure_for(str(settled.structure), force_inputs(logs[0].vessel)).states
-    bench = Bench(logs, states)
-    current: Tried | None = bench.tried(settled, full=True)
+    validation = CrossValidation(logs, states)
+    current: CandidateFit | None = validation.fit(settled, full=True)
     assert current is not None
     full = current
     if full.scores is None:
@@ -192,7 +192,7 @@ def reduce_structure(
     tried, missed = [full], set[str]()
     while current is not None:
         progress(full.size - current.size, full.size)
-        current = _step(bench, tried, current, missed)
+        current = _step(validation, tried, current, missed)
     progress(full.size, full.size)
     accepted = [None if t.note else t.scores for t in tried]
     chosen = rank(accepted, [t.size for t in tried]).chosen
@@ -202,10 +202,12 @@ def reduce_structure(
 
 
 def _candidates(estimate: Estimate, missed: Collection[str]) -> list[Candidate]:
-    return [*of_absent(estimate, missed), *least_earning(estimate, missed)]
+    return [*bias_terms_without_current(estimate, missed), *least_earning(estimate, missed)]
 
 
-def _step(bench: Bench, tried: list[Tried], current: Tried, missed: set[str]) -> Tried | None:
+def _step(
+    validation: CrossValidation, tried: list[CandidateFit], current: CandidateFit, missed: set[str]
+) -> CandidateFit | None:
     """Leave out what the held-out runs do not miss; None where they miss all that is tried.
 
     A column that they miss is not tried again.
@@ -216,7 +218,7 @@ def _step(bench: Bench, tried: list[Tried], current: Tried, missed: set[str]) ->
             request, dropped = _without(current.estimate, current.request, candidate)
             if candidate.absent and any(t.note and t.dropped == tuple(dropped) for t in tried):
                 continue
-            found = bench.tried(request, full=True, dropped=tuple(dropped))
+            found = validation.fit(request, full=True, dropped=tuple(dropped))
             rows = [*(t for t in tried if not t.note), found]
             ranking = rank([t.scores for t in rows], [t.size for t in rows])
             near = found.scores is not None and ranking.behind[-1] <= ranking.se[-1]
@@ -232,7 +234,7 @@ def _step(bench: Bench, tried: list[Tried], current: Tried, missed: set[str]) ->
     return None
 
 
-def _supported(rows: Sequence[Tried]) -> bool:
+def _supported(rows: Sequence[CandidateFit]) -> bool:
     """Whether AIC leaves the last row some support against the best of those before."""
     if rows[0].errors is None:
         return True

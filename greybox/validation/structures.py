@@ -115,8 +115,8 @@ def _cell(value: float | int | None, form: str) -> str:
 
 
 @dataclass(frozen=True)
-class Tried:
-    """A structure as requested: its estimate on all of the logs, its scores on held-out parts."""
+class CandidateFit:
+    """A structure that may be chosen: its estimate on all logs, its scores on held-out parts."""
 
     request: Request
     estimate: Estimate | None
@@ -131,8 +131,8 @@ class Tried:
         return 0 if self.estimate is None else len(self.estimate.theta)
 
 
-class Bench:
-    """The logs, their parts, and what was settled of method and predictor."""
+class CrossValidation:
+    """Fits of structures to whole logs, and their scores on parts that are left out in turn."""
 
     def __init__(self, logs: Sequence[TrialLog], states: Sequence[str]) -> None:
         self.logs = logs
@@ -154,9 +154,9 @@ class Bench:
             found.append(score_runs([run_model(model, log) for log in held], self.spread)[0])
         return np.array(found)
 
-    def tried(
+    def fit(
         self, request: Request, *, full: bool = False, dropped: tuple[str, ...] = ()
-    ) -> Tried:
+    ) -> CandidateFit:
         """Estimate and score a structure; one that cannot be estimated says why.
 
         `full` keeps what the request asks of standard errors.
@@ -165,13 +165,13 @@ class Bench:
             scores = self.scores(request)
             estimate = self.once(self.logs, request if full else _without_errors(request))
         except GreyboxError as error:
-            return Tried(request, None, None, None, dropped, str(error))
+            return CandidateFit(request, None, None, None, dropped, str(error))
         model = estimate.model()
         runs = [run_model(model, log) for log in self.logs]
         errors = None
         if all(r.diverged < 0 for r in runs):
             errors = [r.errors() for r in runs]
-        return Tried(request, estimate, scores, errors, dropped)
+        return CandidateFit(request, estimate, scores, errors, dropped)
 
 
 def _without_errors(request: Request) -> Request:
@@ -179,18 +179,18 @@ def _without_errors(request: Request) -> Request:
     return replace(request, covariance="white")
 
 
-def criteria_of(tried: Tried, worth: Array) -> tuple[float, float] | tuple[None, None]:
+def criteria_of(fitted: CandidateFit, worth: Array) -> tuple[float, float] | tuple[None, None]:
     """Return AIC and BIC of the free runs on the estimation logs, None where they diverge.
 
     `worth` are the independent samples (nx,) that they count for, common to all structures.
     """
-    if tried.estimate is None or tried.errors is None:
+    if fitted.estimate is None or fitted.errors is None:
         return None, None
-    means = len(tried.estimate.current) if ESTIMATORS[tried.estimate.method].free_run else 0
-    return information_criteria(np.concatenate(tried.errors), tried.size + means, worth)
+    means = len(fitted.estimate.current) if ESTIMATORS[fitted.estimate.method].free_run else 0
+    return information_criteria(np.concatenate(fitted.errors), fitted.size + means, worth)
 
 
-def rows_of(tried: Sequence[Tried], found: Ranking) -> tuple[StructureRow, ...]:
+def rows_of(tried: Sequence[CandidateFit], found: Ranking) -> tuple[StructureRow, ...]:
     """Return the table, criteria counted by the best row's independent samples."""
     base = tried[found.best].errors
     worth = None if base is None else independent_samples(base)
@@ -276,11 +276,11 @@ def compare_structures(
             f"{', '.join(states[other])}: compare structures of the same states."
         )
     settled = settle(logs, replace(request, structure=names[0]))
-    bench = Bench(logs, states[names[0]])
+    validation = CrossValidation(logs, states[names[0]])
     tried = []
     for i, name in enumerate(names):
         progress(i, len(names))
-        tried.append(bench.tried(replace(settled, structure=name)))
+        tried.append(validation.fit(replace(settled, structure=name)))
     progress(len(names), len(names))
     found = rank([t.scores for t in tried], [t.size for t in tried])
     estimate = estimate_requested(logs, tried[found.chosen].request)

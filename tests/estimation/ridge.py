@@ -41,7 +41,9 @@ def fit(problem: EstimationProblem) -> Estimate:
             return found
         return judge_estimate(found, problem.logs, margins=problem.margins, zero_mean=False)
 
-    return problem.fit_regression(ENTRY.name, problem.predictor(intercept=True), shrunk)
+    return problem.fit_regression(
+        ENTRY.name, problem.predictor(intercept=True), shrunk, lambda found, notes: found
+    )
 
 
 ENTRY = Estimator(

@@ -9,14 +9,14 @@ import pytest
 from scipy.stats import binom, chi2
 from virtual import virtual_log
 
-from greybox.estimation.arma_noise import Colour
+from greybox.estimation.arma_noise import ARMANoise
 from greybox.estimation.banded_covariance import ErrorBand, ErrorNoise
 from greybox.estimation.covariance import score_covariance
 from greybox.estimation.error_variance_profile import (
-    ErrorShape,
+    ErrorVarianceProfile,
     _Restricted,
-    error_shapes,
-    fit_shaped_colour,
+    error_variance_profiles,
+    fit_scaled_arma_noise,
 )
 from greybox.estimation.estimate import estimate_iv
 from greybox.model.catalogue import get_structure
@@ -36,7 +36,7 @@ def drawn(rng, samples=800):
     n = rng.standard_normal(samples + 1)
     e = n[1:] - a * n[:-1]
     tie = np.append(0.0, -a[1:])
-    return e, ErrorShape(1 + a**2, tie), swell * np.sign(np.sin(np.arange(samples) / 90))
+    return e, ErrorVarianceProfile(1 + a**2, tie), swell * np.sign(np.sin(np.arange(samples) / 90))
 
 
 def dense(shape, share):
@@ -53,7 +53,7 @@ def test_the_factor_makes_the_covariance_white():
     inverse = factor.solve(np.eye(60)).T
     np.testing.assert_allclose(inverse @ dense(shape, 0.1) @ inverse.T, np.eye(60), atol=1e-10)
     # a log of one row has no neighbours
-    one = ErrorShape(np.array([4.0]), np.zeros(1)).factor(0.0)
+    one = ErrorVarianceProfile(np.array([4.0]), np.zeros(1)).factor(0.0)
     np.testing.assert_allclose(one.solve(np.array([6.0])), [3.0])
 
 
@@ -63,13 +63,13 @@ def test_adjoint_and_innovations_are_one_operator_on_every_log():
     residuals = [p[0] for p in pairs]
     keep = [np.ones(len(e), bool) for e in residuals]
     factors = tuple(p[1].factor(0.01) for p in pairs)
-    colour = Colour(np.array([1.0, 0.4]), np.array([1.0, -0.6]), factors=factors)
+    colour = ARMANoise(np.array([1.0, 0.4]), np.array([1.0, -0.6]), factors=factors)
     z = [rng.standard_normal((2, len(e))) for e in residuals]
     for log, (x, e) in enumerate(zip(z, residuals, strict=True)):
         np.testing.assert_allclose(
             colour.adjoint(x, log) @ colour.innovations(e, log), x @ e, rtol=1e-9
         )
-    found = fit_shaped_colour(residuals, keep, [p[1] for p in pairs], z)
+    found = fit_scaled_arma_noise(residuals, keep, [p[1] for p in pairs], z)
     assert found.white
     assert len(found.factors) == 2
 
@@ -109,7 +109,7 @@ def test_shapes_are_the_equations_blocks_of_the_whole_covariance(thesis, noisy_l
         [np.where(keep, e.y[i] - theta[predictor.equation(s)] @ e.phi[predictor.equation(s)], 0.0)]
         for i, s in enumerate("uvr")
     ]
-    shapes = error_shapes(predictor, [noisy_log], theta, errors, [keep])
+    shapes = error_variance_profiles(predictor, [noisy_log], theta, errors, [keep])
     slopes = measured_slopes(predictor, noisy_log, theta)
     std = np.array([noisy_log.vessel.std(n) for n in ("u", "v", "r")])
     further = np.zeros(slopes.shape[2] - 3)
@@ -133,8 +133,8 @@ def test_sensors_that_nobody_states_are_found_by_what_neighbours_share(thesis, t
         for i, s in enumerate("uvr")
     ]
     silent = replace(log, vessel=replace(log.vessel, sensors={}))
-    stated = error_shapes(predictor, [log], theta, errors, keep)
-    found = error_shapes(predictor, [silent], theta, errors, keep)
+    stated = error_variance_profiles(predictor, [log], theta, errors, keep)
+    found = error_variance_profiles(predictor, [silent], theta, errors, keep)
     for (one,), (two,) in zip(found, stated, strict=True):
         ratio = one.tie[1:].mean() / two.tie[1:].mean()
         # Bartlett: a lag's covariance is known to γ₀ √(1 + 2ρ²) / √N
@@ -176,7 +176,7 @@ def test_steady_noise_has_no_shape(thesis, clean_log):
     keep = [np.ones(samples, bool)]
     nothing = [[np.zeros(samples)]] * 3
     far = np.where(np.arange(len(theta)) == 0, np.nan, theta)
-    assert error_shapes(predictor, [clean_log], far, nothing, keep) == ((), (), ())
+    assert error_variance_profiles(predictor, [clean_log], far, nothing, keep) == ((), (), ())
 
 
 @pytest.mark.long

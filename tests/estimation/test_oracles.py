@@ -9,7 +9,7 @@ import pytest
 import statsmodels.api as sm
 from linearmodels.iv import IV2SLS
 
-from greybox.estimation.arma_noise import WHITE, fit_colour
+from greybox.estimation.arma_noise import WHITE, fit_arma_noise
 from greybox.estimation.covariance import score_covariance
 from greybox.estimation.credibility.evidence import Equation
 from greybox.estimation.credibility.score_statistic import score_test
@@ -151,18 +151,18 @@ def test_noise_model_equals_statsmodels():
     series = white[1:] - 0.9 * white[:-1]
     series = series - series.mean()
     keep = np.ones(3000, bool)
-    found = fit_colour([series], [keep])
+    found = fit_arma_noise([series], [keep])
     oracle = sm.tsa.ARIMA(series, order=(0, 0, 1), trend="n").fit()
     assert len(found.moving_average) == 2
     assert abs(found.moving_average[1] - oracle.params[0]) < 0.3 * oracle.bse[0]
-    assert fit_colour([rng.normal(size=2000)], [np.ones(2000, bool)]) == WHITE
+    assert fit_arma_noise([rng.normal(size=2000)], [np.ones(2000, bool)]) == WHITE
 
 
 def test_adjoint_and_innovations_are_one_operator():
     rng = np.random.default_rng(11)
     white = rng.normal(size=501)
     series = np.convolve(white, [1, 0.6], "valid")
-    colour = fit_colour([series], [np.ones(500, bool)])
+    colour = fit_arma_noise([series], [np.ones(500, bool)])
     z = rng.normal(size=(3, 500))
     np.testing.assert_allclose(
         colour.adjoint(z) @ colour.innovations(series), z @ series, rtol=1e-8

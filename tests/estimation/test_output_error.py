@@ -227,7 +227,7 @@ class TestSensitivities:
         """Also where one is padded: rows beyond its end count for nothing."""
         model, data, p = problem(predictor, noisy)
         noise = np.array([2e-4, 2e-4, 2e-4, 1e-4, 1e-5, 1e-5, 1e-6, 1e-8])
-        parts = [Measured(data.w[:80], data.y[:80]), Measured(data.w[200:250], data.y[200:250])]
+        parts = [data.first(80), Measured(data.w[200:250], data.y[200:250], data.known[200:250])]
         both = cut(parts, 80)
         starts = np.array([part.y[0] for part in parts])
         value, by_start, by_p = Filter(model, both.w, both.y, both.use).likelihood(starts, p, noise)
@@ -333,7 +333,9 @@ class TestFit:
         y, _ = Simulator(model, w[None])(np.array([[0.1]]), p)
         seen = y[0] + 0.05 * rng.standard_normal(y[0].shape)
         for shooting in ("auto", "multiple"):
-            fit, _ = fit_free_runs(model, [Measured(w, seen)], 0 * p, shooting=shooting)
+            fit, _ = fit_free_runs(
+                model, [Measured(w, seen, np.ones(len(seen), bool))], 0 * p, shooting=shooting
+            )
             std = np.sqrt(np.diag(np.linalg.inv(fit.hessian)))
             assert (np.abs(fit.p - p) < 4 * std).all()
 
@@ -406,7 +408,7 @@ class TestFit:
         w = data.w.copy()
         w[:, model.drivers.index("taux")] *= 10
         one, _ = fit_free_runs(model, [data], p)
-        ten, _ = fit_free_runs(model, [Measured(w, data.y)], 0 * p)
+        ten, _ = fit_free_runs(model, [Measured(w, data.y, data.known)], 0 * p)
         i = [c.name for c in predictor.columns].index("Xmu")
         assert ten.p[i] == pytest.approx(one.p[i] / 10, rel=1e-4)
 

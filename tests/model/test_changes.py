@@ -122,14 +122,16 @@ def test_bands_are_of_the_changing_model(model, clean_log):
 
 def test_a_settled_model_is_that_after_its_last_change(model):
     changing = replace(model, changes=CHANGES, covariance=np.eye(model.theta.size))
-    settled = changing.settled()
+    settled = changing.at_final_parameters()
     xu, nr = (model.names.index(n) for n in ("Xu", "Nr"))
     want = model.theta.copy()
     want[[xu, nr]] *= (1.5, 0.5)
     np.testing.assert_allclose(settled.theta, want)
     np.testing.assert_allclose(settled.std[[xu, nr]], [1.5, 0.5])
     assert settled.changes == ()
-    assert model.settled() is model
+    assert model.at_final_parameters() is model
+    with pytest.warns(DeprecationWarning, match="at_final_parameters"):
+        assert model.settled() is model
 
 
 def test_the_file_and_the_summary_hold_the_changes(model, tmp_path):

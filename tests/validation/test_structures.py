@@ -19,10 +19,16 @@ from greybox.validation.criteria import independent_samples, information_criteri
 from greybox.validation.fit import run_model
 from greybox.validation.fit_single import estimate_once
 from greybox.validation.held_out import folds, rank, score_runs, spread_of
-from greybox.validation.reduction import _step, least_earning, of_absent, reduce_structure, wald
+from greybox.validation.reduction import (
+    _step,
+    bias_terms_without_current,
+    least_earning,
+    reduce_structure,
+    wald,
+)
 from greybox.validation.request import Request
 from greybox.validation.selection import estimate_requested
-from greybox.validation.structures import Tried, compare_structures
+from greybox.validation.structures import CandidateFit, compare_structures
 from greybox.vessel.force import force_inputs
 
 ABSENT = ("Xkappa", "Yvr", "Nvv", "Wvv", "Wuv")
@@ -219,7 +225,7 @@ def test_without_a_current_the_reduced_predictors_of_the_thesis_are_left(predict
         structure = structure_for("thesis", force_inputs(logs[0].vessel))
         request = Request(method="iv", predictor=predictor, structure="thesis")
         estimate = estimate_once(logs, structure, "iv", predictor, request)
-        found[current] = of_absent(estimate)
+        found[current] = bias_terms_without_current(estimate)
     (still,) = found[0.0, 0.0]
     columns = estimate.predictor.columns
     left = {f"{c.state}:{c.name}" for i, c in enumerate(columns)
@@ -251,14 +257,16 @@ def test_what_was_refused_together_is_not_tried_together_again():
     estimate = estimate_once(logs, structure, "iv", "wind", request)
 
     class Refusing:
-        """A bench on which whatever lacks a column runs badly."""
+        """Held-out runs in which whatever lacks a column runs badly."""
 
-        def tried(self, request, *, full, dropped):
-            return Tried(request, estimate, np.zeros(5), None, dropped)
+        def fit(self, request, *, full, dropped):
+            return CandidateFit(request, estimate, np.zeros(5), None, dropped)
 
-    tried = [Tried(request, estimate, np.full(5, 80.0), None)]
+    tried = [CandidateFit(request, estimate, np.full(5, 80.0), None)]
     assert _step(Refusing(), tried, tried[0], set()) is None
-    together = [t for t in tried if len(t.dropped) == len(of_absent(estimate)[0].columns)]
+    together = [
+        t for t in tried if len(t.dropped) == len(bias_terms_without_current(estimate)[0].columns)
+    ]
     assert len(together) == 1
     assert together[0].note == "kept: held-out runs miss it"
     # its columns were tried one by one after it

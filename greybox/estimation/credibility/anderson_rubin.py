@@ -115,12 +115,12 @@ def confidence_sets(equation: Equation, level: float = 0.95) -> list[ConfidenceS
     follow = inverse / np.diag(inverse)
     # residuals move by δ·b as θ_i is held off its estimate and the others follow
     shift = [follow.T @ (f - h) for f, h in zip(equation.phi, explained, strict=True)]
-    colour = equation.colour
-    errors = [colour.innovations(e, log) for log, e in enumerate(_unexplained(equation))]
-    shift = [colour.innovations(b, log) for log, b in enumerate(shift)]
+    noise_model = equation.noise_model
+    errors = [noise_model.innovations(e, log) for log, e in enumerate(_unexplained(equation))]
+    shift = [noise_model.innovations(b, log) for log, b in enumerate(shift)]
     freedom = max(equation.freedom - p * len(equation.phi), 1)
-    known = np.minimum(colour.freedom_of(weights), freedom)
-    weights = [colour.adjoint(w, log) for log, w in enumerate(weights)]
+    known = np.minimum(noise_model.freedom_of(weights), freedom)
+    weights = [noise_model.adjoint(w, log) for log, w in enumerate(weights)]
     lost = equation.rows / freedom
     v00 = lost * sum(((w * e) ** 2).sum(axis=1) for w, e in zip(weights, errors, strict=True))
     v01, v11 = _of_shift(equation, weights, errors, shift, lost)

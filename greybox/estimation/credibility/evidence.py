@@ -14,8 +14,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.estimation.arma_noise import Colour
-from greybox.estimation.error_variance_profile import ErrorShape, error_shapes, fit_shaped_colour
+from greybox.estimation.arma_noise import ARMANoise
+from greybox.estimation.error_variance_profile import (
+    ErrorVarianceProfile,
+    error_variance_profiles,
+    fit_scaled_arma_noise,
+)
 from greybox.estimation.moments import Solution, solve_stacked
 from greybox.estimation.registry import ESTIMATORS, Estimator
 from greybox.model.predictor import Predictor
@@ -47,7 +51,7 @@ class Equation:
         (N,) rows that take part.
     centred : bool
         Whether the mean of each experiment was removed.
-    shapes : tuple of ErrorShape
+    shapes : tuple of ErrorVarianceProfile
         How measurement noise changes along each log; empty where it is alike everywhere.
     states : tuple of ndarray
         (nx, N) simulated states an experiment, in every row; empty where there are none.
@@ -61,7 +65,7 @@ class Equation:
     z: tuple[Array, ...]
     keep: tuple[NDArray[np.bool_], ...]
     centred: bool
-    shapes: tuple[ErrorShape, ...] = ()
+    shapes: tuple[ErrorVarianceProfile, ...] = ()
     states: tuple[Array, ...] = ()
 
     @property
@@ -105,15 +109,17 @@ class Equation:
         return tuple(y - theta @ f for y, f in zip(self.y, self.phi, strict=True))
 
     @cached_property
-    def colour(self) -> Colour:
+    def noise_model(self) -> ARMANoise:
         """Noise model of those residuals."""
-        return fit_shaped_colour(self.residuals, self.keep, self.shapes, self.solution.projected)
+        return fit_scaled_arma_noise(
+            self.residuals, self.keep, self.shapes, self.solution.projected
+        )
 
     @cached_property
     def std(self) -> Array:
         """Standard errors of that estimate, (p,)."""
-        weights = [self.colour.adjoint(h, k) for k, h in enumerate(self.solution.projected)]
-        innovations = [self.colour.innovations(e, k) for k, e in enumerate(self.residuals)]
+        weights = [self.noise_model.adjoint(h, k) for k, h in enumerate(self.solution.projected)]
+        innovations = [self.noise_model.innovations(e, k) for k, e in enumerate(self.residuals)]
         scores = [w * i for w, i in zip(weights, innovations, strict=True)]
         middle = sum(s @ s.T for s in scores) * self.rows / max(self.freedom - len(self.labels), 1)
         inverse = np.linalg.pinv(self.solution.information, rcond=1e-15)
@@ -210,7 +216,9 @@ class Evidence:
         for equation in plain:
             theta[list(equation.columns)] = equation.solution.theta
         residuals = [e.residuals for e in plain]
-        shapes = error_shapes(self.predictor, self.logs, theta, residuals, self.instruments.keep)
+        shapes = error_variance_profiles(
+            self.predictor, self.logs, theta, residuals, self.instruments.keep
+        )
         return tuple(replace(e, shapes=s) for e, s in zip(plain, shapes, strict=True))
 
 

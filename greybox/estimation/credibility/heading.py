@@ -52,7 +52,7 @@ def heading_independence(evidence: Evidence, equation: Equation) -> TestResult:
             equation.phi,
             equation.solution.projected,
             equation.residuals,
-            colour=equation.colour,
+            noise_model=equation.noise_model,
         )
 
     return _TEST.apply(equation, score, _conclude)

@@ -46,7 +46,7 @@ def input_independence(evidence: Evidence, equation: Equation) -> TestResult:
             equation.phi,
             equation.pooled.projected,
             equation.pooled_residuals,
-            colour=equation.colour,
+            noise_model=equation.noise_model,
         )
 
     def conclude(score: ScoreStatistic, fine: bool) -> Conclusion:

@@ -62,7 +62,7 @@ def overidentification(
             equation.phi,
             equation.pooled.projected,
             equation.pooled_residuals,
-            colour=equation.colour,
+            noise_model=equation.noise_model,
         )
 
     return _TEST.apply(equation, score, _conclude)

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.estimation.arma_noise import WHITE, Colour
+from greybox.estimation.arma_noise import WHITE, ARMANoise
 from greybox.estimation.verdict import Distribution
 from greybox.numerics.linalg import quadratic_form, sizes
 from greybox.numerics.moments import lagged_products
@@ -82,7 +82,7 @@ def score_test(
     errors: Sequence[Array],
     *,
     memory: Memory = "coloured",
-    colour: Colour = WHITE,
+    noise_model: ARMANoise = WHITE,
     mean: Array | None = None,
 ) -> ScoreStatistic:
     """Test E ξ e = 0 where the estimate solves Σ ẑ ê = 0.
@@ -99,7 +99,7 @@ def score_test(
         Errors alike and independent (Sargan, Durbin); uncorrelated, their size
         changing (Wooldridge); e = H ε with ξ and ẑ independent of the errors,
         Σ (Hᵀξ̃)(Hᵀξ̃)ᵀ ε².
-    colour : Colour
+    noise_model : ARMANoise
         H, for ``coloured``.
     mean : ndarray, optional
         (k,) what Σ ξ ê is expected to be, where that is not zero.
@@ -119,7 +119,7 @@ def score_test(
         covariance = lagged_products(tilde, tilde, 0) * square
         statistic, freedom, _ = quadratic_form(moments, covariance, _LEAST)
     else:
-        h = colour if memory == "coloured" else WHITE
+        h = noise_model if memory == "coloured" else WHITE
         scores = [
             h.adjoint(x, log) * h.innovations(e, log)
             for log, (x, e) in enumerate(zip(tilde, errors, strict=True))
