@@ -112,6 +112,9 @@ class Case:
                 for a, b in ((0, int(edges[k])), (int(edges[k + 1]), len(log))):
                     if b - a >= _SHORTEST:
                         fitting.append((log.window(a, b), first))
+            if not fitting:
+                # the middle of a short log leaves nothing long enough beside it
+                continue
             made = [
                 self._made([part for part, _ in parts], integrator, [first for _, first in parts])
                 for parts in (fitting, held)

@@ -11,6 +11,7 @@ from designs import thesis_model
 from virtual import virtual_log, write_csv
 
 from greybox.commands.main import main
+from greybox.diagnosis.diagnose import DiagnosisOptions, diagnose
 from greybox.diagnosis.ship import LogRun, Ship
 from greybox.errors import UsageError
 from greybox.estimation.estimate import estimate_iv, estimate_ls
@@ -124,6 +125,11 @@ def test_a_run_of_a_diagnosis_is_straight_across_a_gap(log, gapped, true_model):
     for one, two in ((shown[0].y, shown[1].y), slopes):
         np.testing.assert_allclose(two[MEASURED], one[MEASURED], atol=1e-12)
         np.testing.assert_allclose(np.diff(two[149:181], 2, axis=0), 0, atol=1e-9)
+
+
+def test_a_short_log_is_diagnosed(log):
+    found = diagnose(log.window(0, 150), options=DiagnosisOptions(causes=("current",)))
+    assert found.verdict in ("none", "named", "unexplained")
 
 
 def test_commands_say_what_they_do_with_gaps(log, tmp_path, true_model, capsys):
