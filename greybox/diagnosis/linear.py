@@ -13,8 +13,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.model.run.step import Integrator, StepModel
-from greybox.model.structure import Structure
+from greybox.model.run.step import StepModel
 from greybox.recursion import propagate
 from greybox.vectorised import Vectorised
 
@@ -40,25 +39,27 @@ class Linear:
     driven: Array
 
 
+def means(d: ca.SX, current: ca.SX) -> ca.SX:
+    """Return disturbance means for the symbols d: a current, and no wind that is not measured."""
+    unknown = d.numel()
+    return ca.vertcat(current, ca.SX.zeros(max(unknown - 2, 0)))[:unknown]
+
+
 class Slopes:
-    """Derivatives of the steps of one structure.
+    """Derivatives of a step in a current.
 
     Parameters
     ----------
-    structure : Structure
-    air_measured : bool
-        Whether terms see a measured velocity through the air.
-    integrator : {"euler", "rk4"}
+    step : StepModel
+        With the measured heading.
     """
 
-    def __init__(self, structure: Structure, air_measured: bool, integrator: Integrator) -> None:
-        self._step = StepModel(structure, integrator, air_measured=air_measured)
-        s, f = self._step.symbolic, self._step.increment
-        self._states, unknown = s.x.numel(), s.d.numel()
+    def __init__(self, step: StepModel) -> None:
+        self._step = step
+        s, f = step.symbolic, step.increment
+        self._states = s.x.numel()
         current = ca.SX.sym("current", 2)
-        # the wind's mean is no disturbance here: it is measured, or there is none
-        means = ca.vertcat(current, ca.SX.zeros(max(unknown - 2, 0)))[:unknown]
-        others = (s.psi, s.tau, means, s.air, s.theta)
+        others = (s.psi, s.tau, means(s.d, current), s.air, s.theta)
         slopes = ca.jacobian(f(s.x, *others), ca.vertcat(s.x, s.theta, current))
         symbols = [s.x, s.tau, s.psi, s.air, current, s.theta]
         of_slopes = ca.Function("slopes", symbols, [ca.densify(slopes)])
@@ -68,7 +69,7 @@ class Slopes:
             stages.append(of_slopes(x, *symbols[1:]))
             return f(x, *others)
 
-        self._step.moved(stage, s.x)
+        step.moved(stage, s.x)
         self._shape = (len(stages), *slopes.shape)
         flat = ca.vertcat(*[ca.vec(stage.T) for stage in stages])
         self._program = Vectorised(ca.vertsplit(flat), ca.vertsplit(ca.vertcat(*symbols)))
@@ -121,9 +122,9 @@ class Slopes:
 
 
 @lru_cache(maxsize=32)
-def slopes_of(structure: Structure, air_measured: bool, integrator: Integrator) -> Slopes:
-    """Return the derivatives of a structure's steps, built once."""
-    return Slopes(structure, air_measured, integrator)
+def slopes_of(step: StepModel) -> Slopes:
+    """Return the derivatives of a step, built once."""
+    return Slopes(step)
 
 
 def sensitivities(linear: Linear) -> Array:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from greybox.diagnosis.linear import Linear, sensitivities
 from greybox.diagnosis.simulator import Simulator
-from greybox.model.run.step import Integrator, Rule, integrated
+from greybox.model.run.step import Integrator, Rule, StepModel, integrated
 from greybox.model.simulation import mid_step
 from greybox.model.structure import Structure
 from greybox.rotation import ned_to_body
@@ -149,7 +149,8 @@ class LogRun:
             # as the free run of a model does: the ship turns during a step
             self._psi, self._air = mid_step(self._psi), mid_step(self._air.T).T
         self._commands = {c: log[c] for c in log.vessel.commands}
-        self._simulator = Simulator(structure, len(log), self.air_measured, integrator)
+        step = StepModel(structure, integrator, air_measured=self.air_measured)
+        self._simulator = Simulator(step, len(log))
         self._forces: tuple[Vessel, tuple[Wire, ...], Array] | None = None
 
     def forces(self, vessel: Vessel, wires: tuple[Wire, ...] = ()) -> Array:

@@ -8,10 +8,9 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.linear import Linear, slopes_of
+from greybox.diagnosis.linear import Linear, means, slopes_of
 from greybox.model.run.kernels import FreeRunKernel
-from greybox.model.run.step import Integrator, StepModel
-from greybox.model.structure import Structure
+from greybox.model.run.step import StepModel
 
 Array = NDArray[np.float64]
 
@@ -20,13 +19,12 @@ _ESCAPED = 1e3
 
 
 @lru_cache(maxsize=32)
-def _step(structure: Structure, air_measured: bool, integrator: Integrator) -> ca.Function:
+def _function(step: StepModel) -> ca.Function:
     """Return ``(x, [tau, psi, air, current, theta]) -> x⁺``."""
-    s = structure.symbols
-    step = StepModel(structure, integrator, air_measured=air_measured)
-    nu, nd, p = s.tau.numel(), s.d.numel(), s.theta.numel()
-    w = ca.SX.sym("w", nu + 5 + p)
-    d = ca.vertcat(w[nu + 3 : nu + 5], ca.SX.zeros(max(nd - 2, 0)))[:nd]
+    s = step.symbolic
+    nu = s.tau.numel()
+    w = ca.SX.sym("w", nu + 5 + s.theta.numel())
+    d = means(s.d, w[nu + 3 : nu + 5])
     after = step(s.x, w[nu], w[:nu], d, w[nu + 1 : nu + 3], w[nu + 5 :], 1.0)
     return ca.Function("step", [s.x, w], [after], {"cse": True})
 
@@ -36,20 +34,15 @@ class Simulator:
 
     Parameters
     ----------
-    structure : Structure
+    step : StepModel
+        With the measured heading.
     samples : int
         N, of the log.
-    air_measured : bool
-        Whether terms see a measured velocity through the air.
-    integrator : {"euler", "rk4"}
     """
 
-    def __init__(
-        self, structure: Structure, samples: int, air_measured: bool, integrator: Integrator
-    ) -> None:
-        key = (structure, air_measured, integrator)
-        self._kernel = FreeRunKernel(_step(*key), samples - 1)
-        self._slopes = slopes_of(*key)
+    def __init__(self, step: StepModel, samples: int) -> None:
+        self._kernel = FreeRunKernel(_function(step), samples - 1)
+        self._slopes = slopes_of(step)
         self._theta, self._drivers = np.zeros(0), np.zeros((0, 0))
 
     def __call__(self, x0: Array, drivers: Array, theta: Array) -> Array:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from greybox.model.predictor import Predictor
 from greybox.model.run.inputs import LogInputs
 from greybox.model.run.kernels import accumulate
-from greybox.model.run.step import Heading, StepModel
+from greybox.model.run.step import Heading, StepModel, integrated
 from greybox.regression.instruments import initial_state, smoothed_wind, state_bound
 from greybox.rotation import ned_to_body
 from greybox.trial.log import TrialLog
@@ -134,7 +134,7 @@ def smoothed_heading(measured: Array, yaw_rate: Array, sample_time: float) -> Ar
     """
     from scipy.linalg import solveh_banded
 
-    turned = np.concatenate([[0.0], np.cumsum(yaw_rate[:-1])]) * sample_time
+    turned = integrated(yaw_rate, sample_time, "euler")
     drift = measured - turned
     change = np.diff(drift)
     if len(change) <= _DRIFT or not np.isfinite(drift).all():

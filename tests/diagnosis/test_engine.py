@@ -20,6 +20,7 @@ from greybox.diagnosis.ship import Change, LogRun, Sensors, Ship, shifted, wired
 from greybox.diagnosis.simulator import Simulator
 from greybox.diagnosis.waves import find_waves
 from greybox.model.catalogue import get_structure
+from greybox.model.run.step import StepModel
 from greybox.model.simulation import simulate
 from greybox.study.blind import draw
 from greybox.study.chapter6 import TRUE
@@ -262,7 +263,7 @@ def test_every_cause_says_what_it_is(log: TrialLog) -> None:
 
 
 def test_sensitivities_of_nothing_are_those_of_the_start(log: TrialLog) -> None:
-    simulator = Simulator(WIDE, len(log), False, "euler")
+    simulator = Simulator(StepModel(WIDE), len(log))
     drivers = np.column_stack([log.forces(WIDE.inputs), log["psi"], np.zeros((len(log), 4))])
     x = simulator(np.array([1.5, 0.5, 0.0]), drivers, _theta(WIDE))
     linear = simulator.linearise(x, NOWHERE)
