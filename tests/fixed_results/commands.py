@@ -64,8 +64,10 @@ class Loose:
 
 NOWHERE = Loose()
 # tests and standard errors rest on a noise model whose fit stops at its tolerance
-_NOISE = dict.fromkeys(("tests", "covariance", "limits", "noise"), 1e-4)
-LEAST_SQUARES = Loose("the noise model of the tests is fitted to a tolerance", {"tests": 1e-5})
+_NOISE = dict.fromkeys(("tests", "verdict", "covariance", "limits", "noise"), 1e-4)
+LEAST_SQUARES = Loose(
+    "the noise model of the tests is fitted to a tolerance", {"tests": 1e-5, "verdict": 1e-5}
+)
 INSTRUMENTS = Loose(
     "the noise model of standard errors and tests is fitted to a tolerance",
     _NOISE | dict.fromkeys(("std", "nuisance", "disturbances"), 1e-6),
