@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from greybox.estimation.estimate import estimate_ls
-from greybox.estimation.post_estimation import judge_estimate
+from greybox.estimation.estimate import Solved, solve_ls
+from greybox.estimation.post_estimation import with_tests
 from greybox.estimation.problem import EstimationProblem
 from greybox.estimation.registry import Estimator
 from greybox.estimation.result import Estimate
 from greybox.model.predictor import Predictor
-from greybox.regression.regression import build_regression
+from greybox.regression.problem import RegressionProblem
 
 # share of the regressors' own squares that is added to them
 PENALTY = 0.01
@@ -21,29 +21,26 @@ PENALTY = 0.01
 def fit(problem: EstimationProblem) -> Estimate:
     """Shrink the least-squares estimate towards zero, each coefficient by its information."""
 
-    def shrunk(predictor: Predictor) -> Estimate:
-        plain = estimate_ls(predictor, problem.logs, judged=False, **problem.common)
-        regression = build_regression(predictor, problem.logs, margins=problem.margins)
-        theta, turn = plain.theta.copy(), np.eye(len(plain.theta))
-        for state in predictor.structure.states:
-            mine = predictor.equation(state)
-            gram = sum(e.phi[mine][:, e.keep] @ e.phi[mine][:, e.keep].T
-                       for e in regression.experiments)  # fmt: skip
-            less = np.linalg.solve(gram + PENALTY * np.diag(np.diag(gram)), gram)
-            turn[np.ix_(mine, mine)] = less
-        found = replace(
-            plain,
-            method=ENTRY.name,
-            theta=turn @ theta,
-            covariance=turn @ plain.covariance @ turn.T,
+    def solve(predictor: Predictor) -> Solved:
+        return solve_ls(
+            RegressionProblem(predictor, problem.logs, problem.margins, zero_mean=False)
         )
-        if not problem.judged:
-            return found
-        return judge_estimate(found, problem.logs, margins=problem.margins, zero_mean=False)
 
-    return problem.fit_regression(
-        ENTRY.name, problem.predictor(intercept=True), shrunk, lambda found, notes: found
-    )
+    def shrink(solved: Solved, notes: list[str]) -> Estimate:
+        plain = solved.estimate(problem.covariance or "hac", problem.seed, tested=False)
+        turn = np.eye(len(plain.theta))
+        for state in plain.predictor.structure.states:
+            mine = plain.predictor.equation(state)
+            rows = [e.phi[mine][:, e.keep] for e in solved.problem.regression.experiments]
+            gram = sum(phi @ phi.T for phi in rows)
+            turn[np.ix_(mine, mine)] = np.linalg.solve(
+                gram + PENALTY * np.diag(np.diag(gram)), gram
+            )
+        covariance = turn @ plain.covariance @ turn.T
+        found = replace(plain, method="ridge", theta=turn @ plain.theta, covariance=covariance)
+        return with_tests(solved.problem, found) if problem.judged else found
+
+    return problem.fit_regression("ridge", problem.predictor(intercept=True), solve, shrink)
 
 
 ENTRY = Estimator(
