@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -95,12 +95,14 @@ def _head(estimate: EstimateValues) -> list[str]:
 
 
 def _table(estimate: EstimateValues) -> list[str]:
-    sets = weak_safe_sets(estimate.tests)
+    sets, plain = weak_safe_sets(estimate.tests), plain_estimates(estimate)
     # only instruments can be weak
-    safe = 24 if sets else 0
+    beside = 10 if plain else 0
+    safe = 24 - beside // 2 if sets else 0
     lines = [
         f"{'parameter':<12}{'value':>10}{'std err':>9}{'[0.025':>11}{'0.975]':>11}"
-        f"{'weak-safe 95 %' if sets else '':>{safe}}{'per second':>11}  unit"
+        f"{'plain IV' if plain else '':>{beside}}{'weak-safe 95 %' if sets else '':>{safe}}"
+        f"{'per second':>11}  unit"
     ]
     unit, errors = estimate.vessel.force_unit, _std(estimate)
     structure = estimate.predictor.structure
@@ -114,7 +116,8 @@ def _table(estimate: EstimateValues) -> list[str]:
             term = structure.terms[structure.index(column.terms[0])]
             lines.append(
                 f"{column.label:<12}{value:>10.4g}{std:>9.2g}{value - 1.96 * std:>11.4g}"
-                f"{value + 1.96 * std:>11.4g}{set_in_words(sets.get(column.label)):>{safe}}"
+                f"{value + 1.96 * std:>11.4g}{own_value(plain, column.label):>{beside}}"
+                f"{set_in_words(sets.get(column.label)):>{safe}}"
                 f"{value / estimate.sample_time:>11.4g}  {parameter_unit(term, unit)}"
             )
     return lines
@@ -127,6 +130,21 @@ def weak_safe_sets(tests: Sequence[TestResult]) -> dict[str, Pieces]:
         if test.kind == "anderson_rubin":
             sets |= test.detail.get("sets", {})
     return sets
+
+
+def plain_estimates(estimate: EstimateValues) -> dict[str, float]:
+    """Return the plain estimates that those sets belong to, where the estimate is another one."""
+    own: dict[str, float] = {}
+    if estimate.prefilter == "noise":
+        for test in estimate.tests:
+            if test.kind == "anderson_rubin":
+                own |= test.detail.get("estimates", {})
+    return own
+
+
+def own_value(plain: Mapping[str, float], label: str) -> str:
+    """Return a plain estimate as it stands in a table: nothing where there is none."""
+    return f"{plain[label]:.4g}" if label in plain else ""
 
 
 def set_in_words(pieces: Pieces | None) -> str:

@@ -10,7 +10,14 @@ from numpy.typing import NDArray
 
 from greybox.estimation.registry import ESTIMATORS
 from greybox.estimation.result import Estimate
-from greybox.estimation.summary import BOUNDS, grouped, set_in_words, weak_safe_sets
+from greybox.estimation.summary import (
+    BOUNDS,
+    grouped,
+    own_value,
+    plain_estimates,
+    set_in_words,
+    weak_safe_sets,
+)
 from greybox.estimation.verdict import TestResult, TrustLevel
 from greybox.model.units import parameter_unit
 from greybox.report.chart import chart_of
@@ -247,12 +254,13 @@ def _pairs(labels: Sequence[str], correlation: Array) -> list[str]:
 def _parameter_table(
     estimate: Estimate, labels: Sequence[str], units: Sequence[str], theta: Array, std: Array
 ) -> Table:
-    sets = weak_safe_sets(estimate.tests)
+    sets, plain = weak_safe_sets(estimate.tests), plain_estimates(estimate)
     rows = []
     for name, unit, value, error in zip(labels, units, theta, std, strict=True):
         row = [
             name, f"{value:.4g}", f"{error:.2g}",
             f"{value - 1.96 * error:.4g} to {value + 1.96 * error:.4g}",
+            *([own_value(plain, name)] if plain else []),
             *([set_in_words(sets.get(name))] if sets else []),
             f"{value / estimate.sample_time:.4g}", unit,
             "not to rely on" if name in estimate.verdict.excepted else "",
@@ -262,7 +270,8 @@ def _parameter_table(
         f"Parameters per sample of {estimate.sample_time:g} s, and per second",
         [
             "parameter", "value", "std error", "95 % interval",
-            *(["safe if weak"] if sets else []), "per second", "unit per sample", "",
+            *(["plain IV"] if plain else []), *(["safe if weak"] if sets else []),
+            "per second", "unit per sample", "",
         ],
         rows,
     )  # fmt: skip

@@ -317,6 +317,22 @@ def test_a_short_log_is_estimated(basic):
     assert (estimate.std > 0).all()
 
 
+def test_sets_that_hold_under_weak_instruments_stand_beside_their_own_estimate(thesis):
+    log = virtual_log(11, 700)
+    found = estimate_once([log], thesis, "iv", "augmented", Request(prefilter="noise"))
+    shown = 0
+    for test in found.tests:
+        if test.kind == "anderson_rubin":
+            for label, pieces in test.detail["sets"].items():
+                own = test.detail["estimates"][label]
+                assert any((a is None or a <= own) and (b is None or own <= b) for a, b in pieces)
+                assert f"{own:.4g}" in found.summary()
+                shown += 1
+    assert shown == len(found.labels)
+    assert "plain IV" in found.summary()
+    assert "plain IV" not in estimate_iv(found.predictor, [log]).summary()
+
+
 def test_the_choice_says_why_it_does_not_refine(thesis, still_log):
     refined = estimate_once([still_log], thesis, "iv", "basic", Request())
     assert refined.prefilter == "noise"

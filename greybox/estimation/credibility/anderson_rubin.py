@@ -199,7 +199,15 @@ def anderson_rubin(
         _WIDER,
         not wide,
         tuple(wide),
-        {"sets": {n: s.to_list() for n, s in sets.items() if n not in biases}},
+        {
+            "sets": {n: s.to_list() for n, s in sets.items() if n not in biases},
+            # whose sets they are, which a refined estimate is not
+            "estimates": {
+                n: float(v)
+                for n, v in zip(equation.labels, equation.solution.theta, strict=True)
+                if n not in biases
+            },
+        },
         state=equation.state,
     )
     return result, sets
