@@ -1,28 +1,35 @@
 """Motion that the thrusters cannot have caused: towed, pushed, moored, aground.
 
-A response model of the logs themselves (the rate of change of surge and sway as damping,
-thrust and a constant flow; equations linear in their coefficients, as `thruster_response`)
-leaves a remainder. A constant force that acts for a while, in body axes or fixed to the
-earth, shifts its sum over that while. All stretches of 15 to 120 s are scanned; what such
-sums amount to elsewhere in the same logs (misfit, gusts, waves, current) is their yardstick, so
+A response model of the logs themselves leaves a remainder: the rate of change of surge and of
+sway is regressed on damping, thrust, wind and current (equations linear in their coefficients),
+and a force from outside is one more regressor, constant for 15 to 120 s in body axes or fixed to
+the earth. Model and force are fitted together, so a force costs no more certainty than it has in
+common with the regressors. Coefficients have a normal prior, one variance for each kind of term,
+and what remains is coloured noise (an ARMA process: misfit and gusts, and sensor noise that
+differences of velocities hold); variances and colour are those of the greatest evidence, so that
 nothing has to be known of the model's errors but that they are alike throughout the logs.
+
+References
+----------
+MacKay (1992), Bayesian interpolation: evidence and number of well-determined parameters.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import product
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.rotation import body_to_ned, ned_to_body
+from greybox.rotation import ned_to_body
 from greybox.trial.checks.finding import Finding, Outcome
-from greybox.trial.checks.motion import Motion, denoise, make_motion, smooth
+from greybox.trial.checks.motion import Motion, denoise, make_motion
 from greybox.trial.convert.resample import clock as make_clock
-from greybox.trial.convert.resample import hold_mean
+from greybox.trial.convert.resample import hold_mean, runs
 from greybox.trial.raw_log import Recording
 from greybox.trial.steps import Step
 from greybox.vessel.force import generalised_force
@@ -33,35 +40,49 @@ Array = NDArray[np.float64]
 _STATES = ("u", "v")
 _EARTH = ("v_n", "v_e")
 _AIR = ("u_q", "v_q")
-# time over which a rate of change is taken, and how long a force acts [s]
-_STEP = 2.0
-_LENGTHS = (15.0, 30.0, 60.0, 120.0)
-# least length of all logs together [s], and least number of stretches of a length that must be
-# left to compare with
-_LEAST_SECONDS, _LEAST_STRETCHES = 240.0, 6.0
-# chance of a false finding that is aimed at, and stretches that count for one of a scan
-_LEVEL, _OVERLAP = 1e-3, 3.0
-# part of the stretches below which lies the usual, and mean excess over it of two normal deviates
-_TAIL, _NORMAL_EXCESS = 0.75, 0.5
-# a remainder has longer tails than a normal one: its size is not taken for smaller than this
-# share of what the thrusters do at half speed
-_MISFIT = 0.005
+# time over which a rate of change is taken [s], and most of them, beyond which it is longer
+_STEP, _MOST_STEPS = 2.0, 1500
+# how long a force acts [s], and the part of a log beyond which it cannot be told from a steady one
+_LENGTHS, _LONGEST_SHARE = (30.0, 60.0, 120.0), 1 / 3
+# least length of all logs together [s]
+_LEAST_SECONDS = 240.0
+# chance of a false finding that is aimed at, stretches that count for one of a scan
+_LEVEL, _OVERLAP = 1e-5, 3.0
 # what matters: force over thrust at half speed
 _LEAST_SHARE = 0.08
-# of all speeds, those that count as half of the top speed
-_HALF = (0.35, 0.65)
-# how much speed is left where a ship with thrust is held, over the top speed
+# the same of a ship that stands, of which the stretches in which it sails tell less
+_LEAST_HELD = 0.5
+# speed that is left where a ship with thrust is held, over the top speed
 _STANDING = 0.1
-_RIDGE = 1e-6
-# columns that belong to one log
-_OWN = 7
-# variance that the fit may add to that of a stretch: beyond, the rest of the logs does not tell
-# how the ship moves there
-_EXTRAPOLATION = 2.0
-# time beside a force within which a jump of a sensor goes back [s], and which share of it
-_TAKEN_BACK, _TAKEN_SHARE = 16.0, 0.15
-# a force that acts in more than this share of a log cannot be told from a steady one
-_LONGEST_SHARE = 1 / 3
+# steps beside such a stretch in which the ship is stopped or let go
+_BESIDE = 3
+# no log has more stretches of this kind that are told one by one
+_MOST_EVENTS = 5
+# coefficients that are tried: of autoregression (misfit) and moving average (differenced noise)
+_MEMORY = (0.0, 0.5, 0.8, 0.9, 0.95, 0.98)
+_DIFFERENCED = (0.0, 0.4, 0.7, 0.85, 0.93, 0.97)
+# kinds of terms: of a ship alike to port and starboard, what such a ship has not, finer terms of
+# hull and thrusters, current and wind, their products; and with a prior that is not estimated:
+# turning, starts of stretches, steps and forces of their own
+_SHIP, _ASKEW, _FINE, _FLOW, _FLOW_FINE, _TURN, _START, _FREE = range(8)
+_FITTED = 5
+# mass that accelerates in sway over that in surge (Coriolis forces of rigid body and added mass)
+_MASSES, _MASSES_STD = 1.4, 0.4
+# prior standard deviation of a free coefficient, over that of the noise
+_VAGUE = 1e3
+# robust deviations from the steps around at which a step is one of the sensor, and steps around
+_JUMP, _AROUND, _ROUNDS_OF_JUMPS = 6.0, 9, 4
+# time over which wind and waves are alike [s]
+_ALIKE = 60.0
+# rounds in which the variances of the prior settle
+_ROUNDS = 8
+# part of the stretches below which lies the usual, logarithm of that beyond, and the shape of a
+# Weibull tail by its mean excess over that size: (log 4 · excess)^-0.76 within 1 % from 1 to 2
+_TAIL, _SHAPE = 0.75, 0.76
+_LOG_TAIL = float(-np.log(1 - _TAIL))
+# shifts by which stretches overlap, stretches that are judged at once, and steps after which
+# an innovation is forgotten
+_SHIFTS, _CHUNK, _REACH = 4, 200, 100
 
 
 def force_findings(
@@ -83,10 +104,13 @@ def force_findings(
         Of each recording, why nothing can be said; None where something can.
     """
     found: list[list[Finding]] = [[] for _ in recordings]
+    read = [_read(recording, vessel) for recording in recordings]
+    seconds = sum(len(x.motion) * x.motion.step for x in read if not isinstance(x, str))
+    step = max(_STEP, seconds / _MOST_STEPS)
     told: list[Outcome | None] = []
     logs: list[_Log] = []
-    for k, recording in enumerate(recordings):
-        log = _make_log(k, recording, vessel)
+    for k, x in enumerate(read):
+        log = x if isinstance(x, str) else _make_log(k, x, vessel, step)
         if isinstance(log, str):
             told.append(Outcome("external_force", "cannot tell", log))
         else:
@@ -94,23 +118,109 @@ def force_findings(
             told.append(None)
     if not logs:
         return found, told
-    scan = _Scan(logs)
-    if scan.seconds < _LEAST_SECONDS:
+    seconds = sum(len(x.t) * x.step for x in logs)
+    if seconds < _LEAST_SECONDS:
         short = (
-            f"{scan.seconds:.0f} s of motion with thrusters, at least {_LEAST_SECONDS:.0f} s are "
+            f"{seconds:.0f} s of motion with thrusters, at least {_LEAST_SECONDS:.0f} s are "
             f"needed to know what is usual"
         )
         untold = Outcome("external_force", "cannot tell", short)
         return found, [t or untold for t in told]
+    scan = _Scan(logs)
     for event in scan.events():
-        log = logs[event.log]
+        log = scan.logs[event.log]
         found[log.number].append(_finding(event, log, recordings[log.number], scan))
     return found, told
 
 
 @dataclass(frozen=True)
+class _Read:
+    """Motion in body axes and commands of one recording on one grid."""
+
+    motion: Motion
+    commands: dict[str, Array]
+
+
+def _read(recording: Recording, vessel: Vessel) -> _Read | str:
+    """Return motion and commands of a recording, or why it has none."""
+    earth = not all(c in recording for c in _STATES)
+    names = (*(_EARTH if earth else _STATES), "psi")
+    missing = [c for c in (*names, *vessel.commands) if c not in recording]
+    if missing:
+        return f"there is no {', '.join(missing)}"
+    motion = make_motion(recording, (*names, *(n for n in _AIR if n in recording)))
+    if motion is None or not all(n in motion for n in names):
+        return f"too few samples of {', '.join(names)} overlap"
+    values = dict(motion.values)
+    if earth:
+        values["u"], values["v"] = ned_to_body(motion["v_n"], motion["v_e"], motion["psi"])
+    # of slow turning the heading tells more than a rate gyro, whose noise adds up
+    values["r"] = _slope(denoise(motion["psi"], motion), motion)
+    commands = {}
+    for c in vessel.commands:
+        signal = recording[c]
+        keep = np.isfinite(signal.value) & np.isfinite(signal.t)
+        t, first = np.unique(signal.t[keep], return_index=True)
+        if not len(t):
+            return f"there is no {c}"
+        commands[c] = hold_mean(make_clock(t), signal.value[keep][first], motion.t, motion.step)
+    return _Read(replace(motion, values=values), commands)
+
+
+def _slope(value: Array, motion: Motion) -> Array:
+    return np.concatenate([np.gradient(value[a:b], motion.step) for a, b in motion.stretches])
+
+
+def _terms(x: _Read, vessel: Vessel) -> tuple[NDArray[np.int64], Array]:
+    """Return the kinds (p,) and the samples (N, 2, p) of what may explain surge and sway."""
+    motion = x.motion
+    # noise within products of velocities would weaken their coefficients
+    u, v = (denoise(motion[s], motion) for s in _STATES)
+    r = motion["r"]
+    fast, aside, turn = np.abs(u), np.abs(v), np.abs(r)
+    along = [u, u * fast, u**3, v * v, r * r]
+    across = [v, r, u * v, v * aside, r * turn, aside * r, turn * v]
+    fine = [u * v * v, u * r * r, u * v * r, fast * v * r]
+    fine_across = [v**3, r**3, u * u * v, u * u * r, v * r * r, v * v * r]
+    # thrust falls with the advance of the ship, its law may be another than the vessel file's, it
+    # may come late, and each thruster may have a gain of its own
+    for name, f in generalised_force(vessel, x.commands).items():
+        ahead = name in ("taux", "race_drag", "rudder_drag")
+        bent = f * u * fast if name.startswith("rudder") else f * np.abs(f)
+        (along if ahead else across).append(f)
+        (fine if ahead else fine_across).extend((f * u, bent, _slope(f, motion)))
+    for thruster in vessel.thrusters:
+        own = {c: x.commands[c] for c in thruster.columns}
+        force = generalised_force(replace(vessel, thrusters=(thruster,)), own)
+        parts = [force.get(name, np.zeros_like(u)) for name in ("taux", "tauy")]
+        size = np.maximum(np.hypot(*parts), 1e-12)
+        advance = (u * parts[0] + v * parts[1]) / size
+        for f, some in zip(parts, (fine, fine_across), strict=True):
+            some.extend((f, f * advance, f * advance / np.sqrt(size), f / np.sqrt(size)))
+    if all(n in motion for n in _AIR):
+        head, beam = motion["u_q"], motion["v_q"]
+        air = np.hypot(head, beam)
+        along += [air * head, head * np.abs(head)]
+        across += [air * beam, head * beam]
+    c, s, one = np.cos(motion["psi"]), np.sin(motion["psi"]), np.ones_like(u)
+    twice = [c * c - s * s, 2 * s * c]
+    flow = [r * c, r * s, fast * c, fast * s, v * c, v * s, *twice]
+    flow_across = [-r * s, r * c, -aside * s, aside * c, u * s, u * c, *twice]
+    more = len(fine) - len(fine_across)
+    fine_across += [np.zeros_like(u)] * more
+    fine += [np.zeros_like(u)] * -more
+    kinds = {_TURN: 1, _SHIP: 0, _ASKEW: 0, _FINE: len(fine), _FLOW: 3, _FLOW_FINE: len(flow)}
+    surge = [v * r, *along, *across, *fine, one, c, s, *flow]
+    sway = [u * r, *along, *across, *fine_across, one, -s, c, *flow_across]
+    kind = np.repeat(list(kinds), [kinds[k] for k in kinds])
+    ship = np.repeat([_SHIP, _ASKEW], [len(along), len(across)])
+    kind = np.insert(kind, 1, ship)
+    return kind, np.stack([np.column_stack(surge), np.column_stack(sway)], axis=1)
+
+
+@dataclass(frozen=True)
 class _Log:
-    """Rates of change of one log and what may explain them, over steps of two seconds.
+    """Rates of change of one log and what may explain them.
 
     Parameters
     ----------
@@ -124,17 +234,14 @@ class _Log:
         Steps that follow each other without a gap.
     rate : ndarray
         (K, 2) rate of change of u and v [m/s²].
-    known : ndarray
-        (K, p) damping and wind, the same of every log of the ship.
+    kind : ndarray
+        (p,) kinds of terms, of surge; of sway port and starboard change their places.
+    terms : ndarray
+        (K, 2, p)
+    psi, speed : ndarray
+        (K,) heading [rad] and surge [m/s].
     thrust : ndarray
-        (K, q) generalised forces.
-    own : ndarray
-        (K, 2, 7) of this log: a constant; a force fixed north and east, in body axes; and that
-        times the yaw rate and the speed, what a current adds to turning and to square damping.
-    psi : ndarray
-        (K,) heading [rad].
-    speed : ndarray
-        (K,) surge [m/s].
+        (K, q) generalised forces, to look at.
     """
 
     number: int
@@ -142,123 +249,220 @@ class _Log:
     step: float
     stretches: tuple[tuple[int, int], ...]
     rate: Array
-    known: Array
-    thrust: Array
-    own: Array
+    kind: NDArray[np.int64]
+    terms: Array
     psi: Array
     speed: Array
+    thrust: Array
 
 
-def _make_log(number: int, recording: Recording, vessel: Vessel) -> _Log | str:
+def _make_log(number: int, x: _Read, vessel: Vessel, step: float) -> _Log | str:
     """Return the rates of a recording, or why it has none."""
-    earth = not all(c in recording for c in _STATES)
-    names = (*(_EARTH if earth else _STATES), "psi", *("r",) * ("r" in recording))
-    missing = [c for c in (*names, *vessel.commands) if c not in recording]
-    if missing:
-        return f"there is no {', '.join(missing)}"
-    motion = make_motion(recording, (*names, *(n for n in _AIR if n in recording)))
-    if motion is None or not all(n in motion for n in names):
-        return f"too few samples of {', '.join(names)} overlap"
-    motion = _body_motion(motion)
-    inputs = {}
-    for c in vessel.commands:
-        signal = recording[c]
-        keep = np.isfinite(signal.value) & np.isfinite(signal.t)
-        t, first = np.unique(signal.t[keep], return_index=True)
-        if not len(t):
-            return f"there is no {c}"
-        inputs[c] = hold_mean(make_clock(t), signal.value[keep][first], motion.t, motion.step)
-    forces = list(generalised_force(vessel, inputs).values())
-    count = max(1, round(_STEP / motion.step))
-    # noise within products of velocities would weaken their coefficients
-    u, v, r = (denoise(motion[s], motion) for s in ("u", "v", "r"))
-    known = [u, v, r, *(a * b for a, b in combinations((u, v, r), 2))]
-    known += [x * np.abs(x) for x in (u, v, r)]
-    known += [np.abs(v) * r, np.abs(r) * v]
-    if all(n in motion for n in _AIR):
-        along, across = motion["u_q"], motion["v_q"]
-        known += [along * np.abs(along), across * np.abs(across), along * across]
-    north, east = np.cos(motion["psi"]), np.sin(motion["psi"])
-    one = np.ones_like(north)
-    # thrust falls with the advance of the ship, and its law may be another than the vessel file's
-    forces += [f * motion["u"] for f in forces] + [f * np.abs(f) for f in forces]
-    parts = {
-        "known": np.column_stack(known),
-        "thrust": np.column_stack(forces),
-        "own": np.stack(
-            [
-                np.column_stack(
-                    [one, north, east, r * north, r * east, abs(u) * north, abs(u) * east]
-                ),
-                np.column_stack(
-                    [one, -east, north, -r * east, r * north, -abs(v) * east, abs(v) * north]
-                ),
-            ],
-            axis=1,
-        ).reshape(len(one), -1),
-        "psi": motion["psi"][:, None],
-        "speed": u[:, None],
-    }
-    rate: list[Array] = []
-    times: list[Array] = []
-    blocks: dict[str, list[Array]] = {n: [] for n in parts}
-    stretches: list[tuple[int, int]] = []
-    at = 0
+    motion = x.motion
+    kind, terms = _terms(x, vessel)
+    count = max(1, round(step / motion.step))
     measured = np.column_stack([motion["u"], motion["v"]])
+    force = np.column_stack(list(generalised_force(vessel, x.commands).values()))
+    beside = np.column_stack([motion["psi"], motion["u"], force, terms.reshape(len(motion), -1)])
+    rate, times, means, stretches, at = [], [], [], [], 0
     for a, b in motion.stretches:
         m = (b - a) // count
         if m < 4:
             continue
         edges = a + count * np.arange(m)
-        sums = np.vstack([np.zeros((1, 2)), np.cumsum(measured[a:b], axis=0)])
-        mean = (sums[edges - a + count] - sums[edges - a]) / count
+        mean = measured[a : a + m * count].reshape(m, count, 2).mean(axis=1)
         rate.append(np.diff(mean, axis=0) / (count * motion.step))
         times.append(motion.t[edges[1:]] - 0.5 * motion.step)
-        for n, x in parts.items():
-            blocks[n].append(_between(x[a:b], edges - a, count))
+        means.append(_between(beside[a:b], edges - a, count))
         stretches.append((at, at + m - 1))
         at += m - 1
     if not rate:
         return "no stretch without a gap is long enough"
-    made = {n: np.concatenate(x) for n, x in blocks.items()}
+    made = np.concatenate(means)
     return _Log(
         number,
         np.concatenate(times),
         count * motion.step,
         tuple(stretches),
         np.concatenate(rate),
-        made["known"],
-        made["thrust"],
-        made["own"].reshape(-1, 2, _OWN),
-        made["psi"][:, 0],
-        made["speed"][:, 0],
+        kind,
+        made[:, 2 + force.shape[1] :].reshape(-1, 2, len(kind)),
+        made[:, 0],
+        made[:, 1],
+        made[:, 2 : 2 + force.shape[1]],
     )
-
-
-def _body_motion(motion: Motion) -> Motion:
-    """Return the motion with u, v and r, made of what is there."""
-    values = dict(motion.values)
-    if "u" not in motion:
-        values["u"], values["v"] = ned_to_body(motion["v_n"], motion["v_e"], motion["psi"])
-    if "r" not in motion:
-        psi = smooth(motion["psi"], motion, 1.0)
-        values["r"] = np.concatenate(
-            [np.gradient(psi[a:b], motion.step) for a, b in motion.stretches]
-        )
-    return replace(motion, values=values)
 
 
 def _between(x: Array, edges: NDArray[np.int64], count: int) -> Array:
     """Return what a rate from the mean of one block to that of the next is the mean of."""
-    sums = np.vstack([np.zeros((1, x.shape[1])), np.cumsum(x, axis=0)])
-    last = len(x)
-
-    def mean(shift: int) -> Array:
-        low, high = edges[:-1] + shift, np.minimum(edges[:-1] + shift + count, last)
-        return np.asarray((sums[high] - sums[low]) / count)
-
     # a difference of block means weighs the time between by a triangle
-    return np.asarray(np.mean([mean(k) for k in range(count)], axis=0)) if count > 1 else mean(0)
+    sums = np.vstack([np.zeros((1, x.shape[1])), np.cumsum(x, axis=0)])
+    low = edges[:-1, None] + np.arange(count)
+    return np.asarray((sums[np.minimum(low + count, len(x))] - sums[low]).mean(axis=1) / count)
+
+
+@dataclass(frozen=True)
+class _Noise:
+    """An ARMA(1, 1) process: coefficients of its past value and of its past innovation."""
+
+    memory: float
+    differenced: float
+
+    def whiten(self, z: Array) -> Array:
+        """Return innovations of rows that follow each other, along axis 0."""
+        from scipy.signal import lfilter
+
+        return np.asarray(lfilter([1.0, -self.memory], [1.0, -self.differenced], z, axis=0))
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Posterior of the coefficients of one equation, for columns of unit size.
+
+    Parameters
+    ----------
+    noise : _Noise
+    white : ndarray
+        (N, p) innovations of the columns.
+    rest : ndarray
+        (N,) innovations that remain.
+    theta : ndarray
+        (p,)
+    covariance : ndarray
+        (p, p), over the variance of the innovations.
+    variance : float
+        Of the innovations.
+    prior : ndarray
+        Variances of the kinds that are fitted, over that of the innovations.
+    evidence : float
+        Logarithm, constants left out.
+    """
+
+    noise: _Noise
+    white: Array
+    rest: Array
+    theta: Array
+    covariance: Array
+    variance: float
+    prior: Array
+    evidence: float
+
+
+class _Equation:
+    """Rate of change of surge or sway of all logs, and the columns that may explain it."""
+
+    def __init__(self, rate: Array, stretches: Sequence[tuple[int, int]]) -> None:
+        self.rate, self.stretches = rate, stretches
+        self.kind = np.empty(0, np.int64)
+        self.columns = np.empty((len(rate), 0))
+        self.size = np.empty(0)
+        self.weight = np.ones(len(rate))
+        self.inside = np.zeros(len(rate), bool)
+        for a, b in stretches:
+            self.inside[a:b] = True
+        self.starts: tuple[tuple[int, int], ...] = ((0, 3), (3, 2))
+        self.prior = np.full(_FITTED, 10.0)
+        self.fit: _Fit
+
+    def add(self, kind: NDArray[np.int64], columns: Array) -> None:
+        """Add columns (N, k) of some kinds."""
+        size = np.sqrt(np.mean(columns**2, axis=0))
+        size[size == 0] = 1.0
+        self.kind = np.concatenate([self.kind, kind])
+        self.columns = np.hstack([self.columns, columns / size])
+        self.size = np.concatenate([self.size, size])
+
+    def estimate(self) -> None:
+        """Fit coefficients, variances and the colour of the noise by the evidence."""
+        tried: dict[tuple[int, int], _Fit] = {}
+        starts, prior = self.starts, self.prior
+
+        def at(place: tuple[int, int]) -> float:
+            if not all(0 <= k < len(_MEMORY) for k in place):
+                return -np.inf
+            if place not in tried:
+                noise = _Noise(_MEMORY[place[0]], _DIFFERENCED[place[1]])
+                tried[place] = self._posterior(noise, prior)
+            return tried[place].evidence
+
+        for start in starts:
+            now, best = None, start
+            while best != now:
+                now = best
+                prior = tried[now].prior if now in tried else prior
+                near = [(now[0] + a, now[1] + b) for a, b in product((-1, 0, 1), repeat=2)]
+                best = max(near, key=at)
+        best = max(tried, key=lambda place: tried[place].evidence)
+        self.fit = tried[best]
+        # more columns or other weights change little
+        self.starts, self.prior = (best,), self.fit.prior
+
+    def _posterior(self, noise: _Noise, prior: Array) -> _Fit:
+        white = np.zeros((len(self.rate), 1 + self.columns.shape[1]))
+        both = np.column_stack([self.rate, self.columns])
+        begun = []
+        for a, b in self.stretches:
+            white[a:b] = noise.whiten(both[a:b])
+            # what happened before a stretch is not known
+            column = np.zeros(len(self.rate))
+            column[a:b] = (noise.memory - noise.differenced) * noise.differenced ** np.arange(b - a)
+            begun.append(column)
+        white = np.column_stack([white, *begun]) * self.weight[:, None]
+        y, x = white[:, 0], white[:, 1:]
+        kind = np.concatenate([self.kind, np.full(len(begun), _START)])
+        gram, moment, power, n = x.T @ x, x.T @ y, float(y @ y), self.inside.sum()
+        count = np.maximum(np.bincount(kind, minlength=_FREE + 1)[:_FITTED], 1)
+        variance = power / n / 4
+        turn = np.concatenate([self.size, np.ones(len(begun))])[kind == _TURN] * _MASSES_STD
+        scale = np.empty(len(kind))
+        for _ in range(_ROUNDS):
+            scale[kind < _FITTED] = np.sqrt(prior[kind[kind < _FITTED]])
+            scale[kind == _TURN] = turn / np.sqrt(variance)
+            scale[kind == _START], scale[kind == _FREE] = 1.0, _VAGUE
+            inner = np.eye(len(kind)) + scale[:, None] * gram * scale
+            inverse = np.linalg.inv(inner)
+            covariance = scale[:, None] * inverse * scale
+            theta = covariance @ moment
+            variance = max((power - float(moment @ theta)) / n, 1e-12 * power / n)
+            lost = np.bincount(kind, np.diag(inverse), _FREE + 1)[:_FITTED]
+            own = np.bincount(kind, theta**2, _FREE + 1)[:_FITTED] / variance
+            last, prior = prior, np.clip(own / np.maximum(count - lost, 1e-6), 1e-8, 1e6)
+            if np.all(np.abs(np.log(prior / last)) < 0.1):
+                break
+        evidence = -0.5 * (n * np.log(variance) + float(np.linalg.slogdet(inner)[1]))
+        return _Fit(noise, x, y - x @ theta, theta, covariance, variance, prior, evidence)
+
+    def settle(self, width: float) -> None:
+        """Fit all; single steps that stand out from those around them are of the sensor.
+
+        Steps are weighed by how large innovations are around them, within a width in steps.
+        """
+        from scipy.ndimage import gaussian_filter1d, median_filter
+
+        self.estimate()
+        for _ in range(_ROUNDS_OF_JUMPS):
+            rest = self.rate - self.columns @ self.fit.theta[: len(self.kind)]
+            apart = np.abs(rest - median_filter(rest, _AROUND, mode="nearest"))
+            usual = 1.4826 * float(np.median(np.abs(rest[self.inside])))
+            jumps = np.flatnonzero(self.inside & (apart > _JUMP * usual))
+            if not len(jumps):
+                break
+            self.add(np.full(len(jumps), _FREE), np.eye(len(rest))[:, jumps])
+            self.estimate()
+        power = (self.fit.rest / self.weight) ** 2
+        around = np.ones_like(power)
+        for a, b in self.stretches:
+            around[a:b] = gaussian_filter1d(power[a:b], width, mode="reflect")
+        mean = power[self.inside].mean()
+        self.weight = np.sqrt(mean / np.maximum(around, 1e-3 * mean))
+        self.estimate()
+
+    def unexplained(self) -> Array:
+        """Return the rate (N,) [m/s²] less all but steps and forces of their own."""
+        kept = self.kind < _FREE
+        return np.asarray(
+            self.rate - self.columns[:, kept] @ self.fit.theta[: len(self.kind)][kept]
+        )
 
 
 @dataclass(frozen=True)
@@ -267,221 +471,289 @@ class _Event:
 
     Parameters
     ----------
-    log, start, stop : int
-        Which of the logs, and its steps.
+    log, first, last : int
+        Which of the logs, and the steps at whose middle the force begins and ends.
     fixed : bool
         To the earth; else to the ship.
-    force : ndarray
-        (2,) mean force per mass [m/s²], forward and starboard or north and east.
-    spread : ndarray
-        (2,) standard errors.
-    chance : float
-        Of so large a force anywhere in logs that have none.
+    at : (int, int), optional
+        Of each equation, the first of its two columns; None where the stretch is left out.
     """
 
     log: int
-    start: int
-    stop: int
+    first: int
+    last: int
     fixed: bool
-    force: Array
-    spread: Array
-    chance: float
+    at: tuple[int, int] | None
 
 
 class _Scan:
-    """The response model of all logs, and the remainders of every stretch."""
+    """The response model of all logs, and the stretches in which another force acts."""
 
     def __init__(self, logs: Sequence[_Log]) -> None:
-        self.logs = logs
+        self.top = float(np.quantile(np.abs(np.concatenate([x.speed for x in logs])), 0.95))
+        self.standing = [_standing(x, _STANDING * self.top) for x in logs]
+        # what holds a ship is not constant: it takes up all that the model says
+        self.logs = logs = [_without(x, s) for x, s in zip(logs, self.standing, strict=True)]
         self.ends = np.cumsum([0, *(len(x.t) for x in logs)])
-        self.seconds = float(sum(len(x.t) * x.step for x in logs))
-        self.rate = np.concatenate([x.rate for x in logs])
-        shared = np.concatenate([np.hstack([x.known, x.thrust]) for x in logs])
-        rows, own = len(shared), _OWN * len(logs)
-        self.phi = np.zeros((2, rows, shared.shape[1] + own))
-        for s in range(2):
-            self.phi[s, :, : shared.shape[1]] = shared
-            for k, log in enumerate(logs):
-                part = slice(self.ends[k], self.ends[k + 1])
-                at = shared.shape[1] + _OWN * k
-                self.phi[s, part, at : at + _OWN] = log.own[:, s]
-        size = np.sqrt(np.mean(self.phi**2, axis=1, keepdims=True))
-        self.phi /= np.where(size > 0, size, 1.0)
-        self.thrust = slice(logs[0].known.shape[1], shared.shape[1])
         self.psi = np.concatenate([x.psi for x in logs])
-        self.used = np.ones(rows, bool)
-        self.half = self._half_thrust()
+        spans = [
+            (a + at, b + at)
+            for x, at in zip(logs, self.ends[:-1], strict=True)
+            for a, b in x.stretches
+        ]
+        rate = np.concatenate([x.rate for x in logs])
+        terms = np.concatenate([x.terms for x in logs])
+        self.free = np.ones(len(rate), bool)
+        self.equations = []
+        swapped = np.array([_ASKEW, _SHIP, *range(_FINE, _FREE + 1)])
+        for s, usual in enumerate((_MASSES, -1 / _MASSES)):
+            kind = swapped[logs[0].kind] if s else logs[0].kind
+            equation = _Equation(rate[:, s] - usual * terms[:, s, 0], spans)
+            own = np.isin(kind, (_FLOW, _FLOW_FINE))
+            equation.add(kind[~own], terms[:, s, ~own])
+            for k in range(len(logs)):
+                inside = np.arange(len(rate)) // 1
+                inside = (inside >= self.ends[k]) & (inside < self.ends[k + 1])
+                equation.add(kind[own], terms[:, s, own] * inside[:, None])
+            equation.settle(_ALIKE / logs[0].step)
+            self.equations.append(equation)
 
-    def _fit(self, used: NDArray[np.bool_]) -> tuple[Array, Array]:
-        """Return remainders (N, 2) of the fit to some rows, and the inverse moments (2, p, p)."""
-        rest, inverse = np.empty_like(self.rate), []
-        for s in range(2):
-            x = self.phi[s, used]
-            gram = x.T @ x + _RIDGE * used.sum() * np.eye(x.shape[1])
-            inverse.append(np.linalg.inv(gram))
-            rest[:, s] = self.rate[:, s] - self.phi[s] @ (inverse[s] @ (x.T @ self.rate[used, s]))
-        return rest, np.stack(inverse)
-
-    def _half_thrust(self) -> float:
-        """Return what the thrusters do to the surge at half speed [m/s²]."""
-        _, inverse = self._fit(self.used)
-        theta = inverse[0] @ (self.phi[0].T @ self.rate[:, 0])
-        # what a thrust that never changes does stands in the constant
-        parts = [*range(self.thrust.start, self.thrust.stop)]
-        parts += range(self.thrust.stop, self.phi.shape[2], _OWN)
-        push = np.abs(self.phi[0][:, parts] @ theta[parts])
-        speed = np.abs(np.concatenate([x.speed for x in self.logs]))
-        share = speed / max(float(np.quantile(speed, 0.95)), 1e-9)
-        half = (share > _HALF[0]) & (share < _HALF[1])
-        # a ship that speeds up has more thrust than that speed needs
-        half &= np.abs(self.rate[:, 0]) < 0.3 * push
-        if half.sum() < 10:
-            # thrust goes with the square of speed
-            half = np.ones_like(half)
-            push = push * 0.25 / np.maximum(share, 0.5) ** 2
-        return float(np.median(push[half]))
+    def half_thrust(self) -> tuple[float, float]:
+        """Return the thrust per mass that half of the top speed needs [m/s²], and its error."""
+        surge, half = self.equations[0], 0.5 * self.top
+        drag = np.zeros(len(surge.fit.theta))
+        drag[1:4] = -np.array([half, half**2, half**3]) / surge.size[1:4]
+        spread = np.sqrt(surge.fit.variance * float(drag @ surge.fit.covariance @ drag))
+        return max(float(drag @ surge.fit.theta), float(spread)), float(spread)
 
     def events(self) -> list[_Event]:
         """Return the stretches with a force of their own, the clearest first."""
-        found: list[_Event] = []
-        for _ in range(2 * _MOST_EVENTS):
+        found = [e for e in self._held() if self.share(e)[1] > _LEAST_HELD]
+        while len(found) < _MOST_EVENTS:
             event = self._clearest()
-            if event is None or len(found) == _MOST_EVENTS:
+            if event is None:
                 break
-            if not self._taken_back(event):
-                found.append(event)
-            at = self.ends[event.log]
-            margin = 2
-            self.used[max(at + event.start - margin, at) : at + event.stop + margin] = False
+            before, free = self.equations, self.free.copy()
+            self._allow(event)
+            force, covariance = self.force(event)
+            gain = float(force @ np.linalg.solve(covariance, force))
+            matters = self.share(event)[1] > _LEAST_SHARE
+            if not matters or self._chance(gain, event.fixed) > _LEVEL:
+                self.equations, self.free = before, free
+                break
+            found.append(event)
         return found
 
-    def _taken_back(self, event: _Event) -> bool:
-        """Whether speed that was gained is lost at once: so jump sensors, not ships."""
-        at = self.ends[event.log]
-        a, b = at + event.start, at + event.stop
-        used = self.used.copy()
-        used[a:b] = False
-        rest, _ = self._fit(used)
-        own = self._sums(rest, np.array([a]), np.array([b]), event.fixed)[0]
-        begin, end = next(
-            (at + p, at + q) for p, q in self.logs[event.log].stretches if p <= event.start < q
-        )
-        reach = np.arange(1, max(2, round(_TAKEN_BACK / self.logs[event.log].step)) + 1)
-        after = reach[b + reach <= end]
-        before = reach[a - reach >= begin]
-        first = np.concatenate([np.full(len(after), b), a - before])
-        last = np.concatenate([b + after, np.full(len(before), a)])
-        beside = self._sums(rest, first, last, event.fixed) @ own / float(own @ own)
-        return bool(len(beside)) and float(beside.min()) < -_TAKEN_SHARE
+    def _held(self) -> list[_Event]:
+        """Return the stretches in which the ship stood."""
+        return [
+            _Event(k, a, b - 1, False, None)
+            for k, stretches in enumerate(self.standing)
+            for a, b in stretches
+        ]
 
-    def _windows(self, length: float) -> tuple[Array, Array, Array]:
-        """Return log, first and one-past-last row of each stretch of a length."""
-        found = []
-        for k, log in enumerate(self.logs):
-            m = max(round(length / log.step), 2)
-            if m > _LONGEST_SHARE * len(log.t):
-                continue
-            for a, b in log.stretches:
-                first = np.arange(a, b - m + 1, max(1, m // 6)) + self.ends[k]
-                found.append(np.column_stack([np.full(len(first), k), first, first + m]))
-        table = np.concatenate(found).astype(np.int64) if found else np.empty((0, 3), np.int64)
-        clear = np.concatenate([[0], np.cumsum(~self.used)])
-        table = table[clear[table[:, 2]] == clear[table[:, 1]]]
-        return table[:, 0], table[:, 1], table[:, 2]
+    def _allow(self, event: _Event) -> None:
+        """Fit a force of its own to a stretch, and all else anew."""
+        at = self.ends[event.log]
+        box = _boxes(len(self.psi), np.array([event.first + at]), np.array([event.last + at]))
+        self.equations = [copy(equation) for equation in self.equations]
+        for s, equation in enumerate(self.equations):
+            equation.add(np.full(2, _FREE), box * self._directions(s, event.fixed))
+            equation.settle(_ALIKE / self.logs[0].step)
+        self.free[at + event.first : at + event.last + 1] = False
+
+    def force(self, event: _Event) -> tuple[Array, Array]:
+        """Return the force per mass of an event (2,) [m/s²], and its covariance (2, 2)."""
+        if event.at is None:
+            return self._left_out(event)
+        information, weighed = np.zeros((2, 2)), np.zeros(2)
+        for equation, at in zip(self.equations, event.at, strict=True):
+            fit, part = equation.fit, slice(at, at + 2)
+            size = equation.size[part]
+            prior = np.diag((size / _VAGUE) ** 2) / fit.variance
+            own = fit.variance * fit.covariance[part, part] / np.outer(size, size)
+            precision = np.asarray(np.linalg.inv(own))
+            information += precision - prior
+            weighed += precision @ (fit.theta[part] / size)
+        spread = np.asarray(np.linalg.inv(information))
+        return np.asarray(spread @ weighed), spread
+
+    def _left_out(self, event: _Event) -> tuple[Array, Array]:
+        """Return the mean of what the model, fitted elsewhere, leaves of a stretch."""
+        rows = slice(*(self.ends[event.log] + np.array([event.first, event.last + 1])))
+        force, variance = np.empty(2), np.empty(2)
+        for s, equation in enumerate(self.equations):
+            fit, count = equation.fit, len(equation.kind)
+            mean = equation.columns[rows].mean(axis=0)
+            force[s] = equation.rate[rows].mean() - mean @ fit.theta[:count]
+            colour = (1 - fit.noise.differenced) / (1 - fit.noise.memory)
+            own = mean @ fit.covariance[:count, :count] @ mean
+            variance[s] = fit.variance * (own + colour**2 / (event.last + 1 - event.first))
+        return force, np.diag(variance)
+
+    def share(self, event: _Event) -> tuple[float, float, float]:
+        """Return the force of an event over the thrust at half speed, with its interval."""
+        force, covariance = self.force(event)
+        half, spread = self.half_thrust()
+        size = float(np.hypot(*force))
+        error = float(np.sqrt(force @ covariance @ force)) / size
+        # both are uncertain by a factor
+        factor = float(np.exp(1.96 * np.hypot(error / size, spread / half)))
+        return size / half, size / half / factor, size / half * factor
+
+    def _directions(self, equation: int, fixed: bool) -> Array:
+        """Return what of a force forward and starboard, or north and east, an equation feels."""
+        if not fixed:
+            return np.tile(np.eye(2)[equation], (len(self.psi), 1))
+        c, s = np.cos(self.psi), np.sin(self.psi)
+        return np.column_stack([-s, c] if equation else [c, s])
 
     def _clearest(self) -> _Event | None:
-        rest, _ = self._fit(self.used)
-        candidates = []
-        for length in _LENGTHS:
-            which, first, last = self._windows(length)
-            if len(first) < _LEAST_STRETCHES:
+        """Return the force that explains most, of what is usual for its frame; None of none."""
+        least = _LEAST_SHARE * self.half_thrust()[0]
+        best, largest = None, 0.0
+        at = (len(self.equations[0].kind), len(self.equations[1].kind))
+        for fixed in (False, True):
+            place, force, gain = self._scanned(fixed)
+            gain = np.where(np.hypot(*force.T) > least, gain, 0.0)
+            if not gain.any():
                 continue
-            for fixed in (False, True):
-                size = self._sums(rest, first, last, fixed)
-                best = int(np.argmax((size**2).sum(axis=1)))
-                candidates.append((int(which[best]), int(first[best]), int(last[best]), fixed))
-        events = [e for c in candidates if (e := self._judge(*c)) is not None]
-        return min(events, key=lambda e: e.chance, default=None)
+            k = int(np.argmax(gain))
+            size = gain[k] / float(np.quantile(gain, _TAIL) + 1)
+            if size > largest:
+                log, first, last = (int(x) for x in place[k])
+                best, largest = _Event(log, first, last, fixed, at), size
+        return self._refined(best) if best is not None else None
 
-    def _sums(self, rest: Array, first: Array, last: Array, fixed: bool) -> Array:
-        """Return the sums of the remainders (W, 2) over stretches, forward, starboard or n, e."""
-        if fixed:
-            rest = np.column_stack(body_to_ned(rest[:, 0], rest[:, 1], self.psi))
-        total = np.vstack([np.zeros((1, 2)), np.cumsum(rest, axis=0)])
-        return np.asarray(total[last] - total[first])
+    def _chance(self, gain: float, fixed: bool) -> float:
+        """Return how often logs without other forces have one anywhere that explains so much."""
+        excess, tails = [], {}
+        for frame in (False, True):
+            usual = np.sqrt(self._scanned(frame)[2])
+            if not len(usual):
+                return 1.0
+            tails[frame] = float(np.quantile(usual, _TAIL))
+            excess.append(usual[usual > tails[frame]] / tails[frame] - 1)
+        # a Weibull tail: of normal noise of shape 2, of gusts and misfit longer
+        beyond = _LOG_TAIL * float(np.concatenate(excess).mean())
+        shape = min(2.0, float(beyond**-_SHAPE))
+        seconds = sum(len(x.t) * x.step for x in self.logs)
+        many = _OVERLAP * len(tails) * sum(seconds / length for length in _LENGTHS)
+        return many * float(np.exp(-_LOG_TAIL * (np.sqrt(gain) / tails[fixed]) ** shape))
 
-    def _judge(self, log: int, first: int, last: int, fixed: bool) -> _Event | None:
-        """Compare one stretch with all others of its length, its own rows left out of the fit."""
-        used = self.used.copy()
-        used[first:last] = False
-        rest, inverse = self._fit(used)
-        step = self.logs[log].step
-        length = (last - first) * step
-        a, b = first, last
-        _, begin, end = self._windows(length)
-        others = (end <= a) | (begin >= b)
-        begin, end = begin[others], end[others]
-        clear = float(np.sum(used)) * step / length
-        if clear < _LEAST_STRETCHES or len(begin) < _LEAST_STRETCHES:
-            return None
-        size = last - first
-        yardstick = self._sums(rest, begin, end, fixed)
-        lost = self._leverage(inverse, begin, end, fixed) / size
-        variance = np.mean(yardstick**2, axis=0) / max(1 - float(np.mean(lost)), 0.1)
-        own = self._leverage(inverse, np.array([a]), np.array([b]), fixed)[0] / size
-        if own > _EXTRAPOLATION:
-            return None
-        floor = (_MISFIT * self.half * size) ** 2
-        spread = np.sqrt(np.maximum(variance, floor) * (1 + own)) / size
-        force = self._sums(rest, np.array([a]), np.array([b]), fixed)[0] / size
-        size_of = float(np.hypot(*(force / spread)))
-        usual = np.hypot(*(yardstick / size / spread).T)
-        tail = float(np.quantile(usual, _TAIL))
-        independent = (1 - _TAIL) * clear
-        # tails of misfit and gusts fall off exponentially at best, and few stretches tell how fast
-        excess = max(float(np.mean(usual[usual > tail] - tail)), _NORMAL_EXCESS)
-        excess *= 1 + 1 / np.sqrt(max(independent, 1.0))
-        chance = _OVERLAP * independent * float(np.exp(-(size_of - tail) / excess))
-        if chance > _LEVEL or np.hypot(*force) < _LEAST_SHARE * self.half:
-            return None
-        at = self.ends[log]
-        return _Event(log, int(a - at), int(b - at), fixed, force, spread, chance)
+    def _scanned(self, fixed: bool) -> tuple[NDArray[np.int64], Array, Array]:
+        parts = [self._gains(length, fixed) for length in _LENGTHS]
+        place, force, gain = (np.concatenate(x) for x in zip(*parts, strict=True))
+        return place, force, gain
 
-    def _leverage(self, inverse: Array, first: Array, last: Array, fixed: bool) -> Array:
-        """Return how much the fit adds to the variance of each sum (W,), in rows."""
-        found = np.zeros(len(first))
-        for s in range(2):
-            total = np.vstack([np.zeros((1, self.phi.shape[2])), np.cumsum(self.phi[s], axis=0)])
-            x = total[last] - total[first]
-            found += 0.5 * np.einsum("ij,jk,ik->i", x, inverse[s], x)
-        return found
+    def _gains(self, length: float, fixed: bool) -> tuple[NDArray[np.int64], Array, Array]:
+        """Return place (W, 3), force (W, 2) and gain (W,) of stretches of a length."""
+        places = [np.empty((0, 3), np.int64)]
+        forces, gains = [np.empty((0, 2))], [np.empty(0)]
+        taken = np.concatenate([[0], np.cumsum(~self.free)])
+        for k, log in enumerate(self.logs):
+            size, at = max(round(length / log.step), 2), self.ends[k]
+            if size > _LONGEST_SHARE * len(log.t):
+                continue
+            for a, b in log.stretches:
+                first = np.arange(a, b - size, max(1, size // _SHIFTS)) + at
+                first = first[taken[first + size + 1] == taken[first]]
+                for part in np.split(first, np.arange(_CHUNK, len(first), _CHUNK)):
+                    if len(part):
+                        force, gain = self._explained(part, part + size, b + at, fixed)
+                        forces.append(force)
+                        gains.append(gain)
+                        place = part[:, None] - at + np.array([0, size])
+                        places.append(np.insert(place, 0, k, axis=1))
+        return np.concatenate(places), np.concatenate(forces), np.concatenate(gains)
+
+    def _refined(self, event: _Event) -> _Event:
+        """Return the event with begin and end where it explains most."""
+        at, size = int(self.ends[event.log]), event.last - event.first
+        stretches = self.logs[event.log].stretches
+        low, high = next((a, b) for a, b in stretches if a <= event.first < b)
+        moves = np.unique(np.round(size * np.linspace(-0.5, 0.5, 11)).astype(np.int64))
+        ends = [
+            (event.first + m, event.last + n)
+            for m, n in product(moves, moves)
+            if low <= event.first + m
+            and event.last + n < high
+            and n - m >= -size / 2
+            and self.free[at + event.first + m : at + event.last + n + 1].all()
+        ]
+        first, last = np.array(ends, np.int64).T
+        _, gain = self._explained(first + at, last + at, high + at, event.fixed)
+        best = int(np.argmax(gain))
+        return replace(event, first=int(first[best]), last=int(last[best]))
+
+    def _explained(
+        self, first: NDArray[np.int64], last: NDArray[np.int64], stop: int, fixed: bool
+    ) -> tuple[Array, Array]:
+        """Return the forces (W, 2) of stretches before a step, and what they add to the fit (W,).
+
+        Twice the log-likelihood, all else fitted too: of two degrees of freedom.
+        """
+        rows = slice(int(first.min()), min(stop, int(last.max()) + _REACH))
+        box = _boxes(rows.stop - rows.start, first - rows.start, last - rows.start)
+        information, score = np.zeros((len(first), 2, 2)), np.zeros((len(first), 2))
+        for s, equation in enumerate(self.equations):
+            fit, towards = equation.fit, self._directions(s, fixed)[rows]
+            weight = equation.weight[rows, None]
+            white = [fit.noise.whiten(box * towards[:, i : i + 1]) * weight for i in range(2)]
+            shared = [w.T @ fit.white[rows] for w in white]
+            for i, j in product(range(2), repeat=2):
+                alone = np.einsum("nw,nw->w", white[i], white[j])
+                known = np.einsum("wp,wp->w", shared[i] @ fit.covariance, shared[j])
+                information[:, i, j] += (alone - known) / fit.variance
+            for i in range(2):
+                score[:, i] += white[i].T @ fit.rest[rows] / fit.variance
+        force = np.asarray(np.linalg.solve(information, score[:, :, None])[:, :, 0])
+        return force, np.sum(force * score, axis=1)
 
 
-# no log has more stretches of this kind that are told one by one
-_MOST_EVENTS = 5
+def _standing(log: _Log, slow: float) -> list[tuple[int, int]]:
+    """Return the steps in which a ship stands, in a log in which it mostly sails."""
+    least = _LENGTHS[0] / log.step
+    found = [(a, b) for a, b in runs(np.abs(log.speed) < slow) if b - a >= least]
+    whole = sum(b - a for a, b in found) <= _LONGEST_SHARE * len(log.t)
+    within = [s for s in found if any(a <= s[0] and s[1] <= b for a, b in log.stretches)]
+    return within if whole else []
+
+
+def _without(log: _Log, standing: Sequence[tuple[int, int]]) -> _Log:
+    """Return the log with its stretches cut around those in which the ship stands."""
+    kept = np.zeros(len(log.t), np.int64)
+    for k, (a, b) in enumerate(log.stretches):
+        kept[a:b] = k + 1
+    for a, b in standing:
+        kept[max(a - _BESIDE, 0) : b + _BESIDE] = 0
+    parts = [p for k in range(len(log.stretches)) for p in runs(kept == k + 1)]
+    return replace(log, stretches=tuple((a, b) for a, b in parts if b - a >= 4))
+
+
+def _boxes(rows: int, first: NDArray[np.int64], last: NDArray[np.int64]) -> Array:
+    """Return forces (rows, W) of one from the middle of one step to that of another."""
+    step = np.arange(rows)[:, None]
+    return 0.5 * ((step >= first) & (step < last)) + 0.5 * ((step > first) & (step <= last))
 
 
 def _finding(event: _Event, log: _Log, recording: Recording, scan: _Scan) -> Finding:
-    size = float(np.hypot(*event.force))
-    spread = float(np.hypot(*(event.force * event.spread)) / size)
-    share, error = size / scan.half, spread / scan.half
-    begin = float(log.t[event.start] - 0.5 * log.step)
-    end = float(log.t[event.stop - 1] + 0.5 * log.step)
-    x, y = event.force
+    (x, y), _ = scan.force(event)
+    share, low, high = scan.share(event)
+    begin, end = float(log.t[event.first]), float(log.t[event.last])
     towards = float(np.degrees(np.arctan2(y, x)))
     if event.fixed:
         where = f"towards {towards % 360:.0f} deg from north"
     else:
         where = f"towards {abs(towards):.0f} deg to {'starboard' if y > 0 else 'port'} of the bow"
-    part = slice(event.start, event.stop)
-    top = float(np.quantile(np.abs(log.speed), 0.95))
-    standing = float(np.median(np.abs(log.speed[part]))) < _STANDING * top and x < 0
+    speed = float(np.median(np.abs(log.speed[event.first : event.last])))
+    standing = speed < _STANDING * scan.top and (event.fixed or x < 0)
     what = "held, moored or aground" if standing else "towed or pushed"
     return Finding(
         "external_force",
         "u" if abs(x) >= abs(y) else "v",
         share,
-        (max(share - 1.96 * error, 0.0), share + 1.96 * error),
+        (low, high),
         "1",
         f"from t = {begin:.6g} to {end:.6g} s the ship moves as if {what}: a force of "
         f"{100 * share:.0f} % of the thrust at half speed acts {where}, which its thrusters "
@@ -491,26 +763,16 @@ def _finding(event: _Event, log: _Log, recording: Recording, scan: _Scan) -> Fin
         _STATES,
         (Step("drop", recording.names, interval=(begin, end), decided_by="check"),),
         False,
-        _picture(event, log, scan),
+        _picture((begin, end), log, scan),
     )
 
 
-def _picture(event: _Event, log: _Log, scan: _Scan) -> dict[str, Any]:
+def _picture(interval: tuple[float, float], log: _Log, scan: _Scan) -> dict[str, Any]:
     """Return the motion that thrusters and damping leave, as a speed that it adds up to."""
-    at = scan.ends[event.log]
-    used = scan.used.copy()
-    used[at + event.start : at + event.stop] = False
-    rest, _ = scan._fit(used)
-    rest = rest[at : scan.ends[event.log + 1]]
+    k = scan.logs.index(log)
+    rows = slice(scan.ends[k], scan.ends[k + 1])
+    rest = np.column_stack([e.unexplained()[rows] for e in scan.equations])
     gathered = np.zeros_like(rest)
     for a, b in log.stretches:
         gathered[a:b] = np.cumsum(rest[a:b], axis=0) * log.step
-    return {
-        "t": log.t,
-        "gathered": gathered,
-        "interval": (
-            float(log.t[event.start] - 0.5 * log.step),
-            float(log.t[event.stop - 1] + 0.5 * log.step),
-        ),
-        "thrust": log.thrust,
-    }
+    return {"t": log.t, "gathered": gathered, "interval": interval, "thrust": log.thrust}
