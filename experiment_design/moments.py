@@ -84,10 +84,7 @@ class MomentProgram:
         gust: Array | None = None,
     ) -> None:
         structure = predictor.structure
-        turns = "r" in structure.states
-        step = StepModel(
-            structure, integrator, "simulated" if turns else "measured", predictor.air_measured
-        )
+        step = StepModel.free(structure, integrator, air_measured=predictor.air_measured)
         s = step.symbolic
         self.predictor = predictor
         self.white = white

@@ -215,8 +215,7 @@ def step_expression(
 
     The state holds the structure's states, the heading, and north and east.
     """
-    turns = "r" in structure.states
-    step = StepModel(structure, integrator, "simulated" if turns else "measured")
+    step = StepModel.free(structure, integrator)
     s = step.symbolic
     commands = ca.vertcat(*[ca.SX.sym(c) for c in vessel.commands])
     place = ca.vertcat(ca.SX.sym("north"), ca.SX.sym("east"))
@@ -224,5 +223,5 @@ def step_expression(
     moved = step(s.x, s.psi, tau, d, ca.SX(2, 1), theta, sample_time)
     speed = dict(zip(structure.states, ca.vertsplit(s.x), strict=True))
     place_after = next_position(place, speed["u"], speed.get("v", ca.SX(0)), s.psi, sample_time)
-    after = ca.vertcat(moved, *[s.psi] * (not turns), place_after)
+    after = ca.vertcat(moved, *[s.psi] * ("psi" not in step.states), place_after)
     return (ca.vertcat(s.x, s.psi, place), commands), after

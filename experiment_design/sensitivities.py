@@ -112,9 +112,7 @@ class SensitivityProgram:
         self.size = self.nx + heading
         std = np.append(noise.measurement, [noise.heading] * heading)
         self.weight = np.where(std > 0, 1 / np.where(std > 0, std, 1.0) ** 2, 0.0)
-        step = StepModel(
-            structure, integrator, "simulated" if turns else "measured", predictor.air_measured
-        )
+        step = StepModel.free(structure, integrator, air_measured=predictor.air_measured)
         s = step.symbolic
         after = s.after[: self.size]
         z = ca.vertcat(s.x, *[s.psi] * heading)

@@ -137,14 +137,13 @@ def _ship(
 ) -> ca.Function:
     """Return the step of one ship, ``(state, commands and d, theta, dt) -> state``."""
     commands, made = _actuators(structure, thrusters, late, sample_time)
-    turns = "r" in structure.states
-    step = StepModel(structure, integrator, "simulated" if turns else "measured")
+    step = StepModel.free(structure, integrator)
     s = step.symbolic
     tau = column(made.forces[n] for n in structure.inputs)
     moved = step(s.x, s.psi, tau, s.d, ca.SX(2, 1), s.theta, s.dt)
     return ca.Function(
         "ship",
         [ca.vertcat(s.x, s.psi, made.symbols), ca.vertcat(commands, s.d), s.theta, s.dt],
-        [ca.vertcat(moved, *[s.psi] * (not turns), made.after)],
+        [ca.vertcat(moved, *[s.psi] * ("psi" not in step.states), made.after)],
         {"cse": True},
     )

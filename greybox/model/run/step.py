@@ -121,6 +121,14 @@ class StepModel:
             predictor=predictor,
         )
 
+    @classmethod
+    def free(
+        cls, structure: Structure, integrator: Integrator, *, air_measured: bool = False
+    ) -> StepModel:
+        """Return the step of a ship whose heading is simulated if she has a yaw rate."""
+        heading: Heading = "simulated" if "r" in structure.states else "measured"
+        return cls(structure, integrator, heading, air_measured)
+
     @property
     def states(self) -> tuple[str, ...]:
         """What a step hands to the next one, the heading last where it is simulated."""
