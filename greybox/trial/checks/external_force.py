@@ -52,6 +52,8 @@ _LEVEL, _OVERLAP = 1e-5, 3.0
 _LEAST_SHARE = 0.08
 # the same of a ship that stands, of which the stretches in which it sails tell less
 _LEAST_HELD = 0.5
+# thrust at half speed over its standard error, below which no share of it can be told
+_KNOWN = 3.0
 # speed that is left where a ship with thrust is held, over the top speed
 _STANDING = 0.1
 # steps beside such a stretch in which the ship is stopped or let go
@@ -127,6 +129,14 @@ def force_findings(
         untold = Outcome("external_force", "cannot tell", short)
         return found, [t or untold for t in told]
     scan = _Scan(logs)
+    half, spread = scan.half_thrust()
+    if half < _KNOWN * spread:
+        vague = (
+            f"the thrust that half of the top speed needs is known to {100 * spread / half:.0f} % "
+            f"only, at most {100 / _KNOWN:.0f} % are needed: add logs with changes of thrust"
+        )
+        untold = Outcome("external_force", "cannot tell", vague)
+        return found, [t or untold for t in told]
     for event in scan.events():
         log = scan.logs[event.log]
         found[log.number].append(_finding(event, log, recordings[log.number], scan))
