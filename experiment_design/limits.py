@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from experiment_design.rollout import Motion, Rollout
 from experiment_design.schedule import Schedule
 from greybox.errors import UsageError, suggestion
+from greybox.numerics.vectorised import Vectorised
 from greybox.rotation import ned_to_body
-from greybox.vectorised import Vectorised
 
 Array = NDArray[np.float64]
 

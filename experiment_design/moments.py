@@ -25,7 +25,7 @@ from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import Predictor
 from greybox.model.run.step import Integrator, StepModel
 from greybox.model.structure import Structure
-from greybox.vectorised import Vectorised
+from greybox.numerics.vectorised import Vectorised
 
 Array = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ from greybox.errors import StructureError
 from greybox.model.run.step import Integrator, StepModel, next_position
 from greybox.model.simulation import positions, simulate
 from greybox.model.structure import Structure
-from greybox.vectorised import Vectorised
+from greybox.numerics.vectorised import Vectorised
 from greybox.vessel.actuation import actuated_force
 from greybox.vessel.force import force_expressions, generalised_force
 from greybox.vessel.vessel import Vessel

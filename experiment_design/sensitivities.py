@@ -31,8 +31,8 @@ from greybox.errors import UsageError
 from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import Predictor
 from greybox.model.run.step import Integrator, StepModel
-from greybox.recursion import propagate
-from greybox.vectorised import Vectorised
+from greybox.numerics.recursion import propagate
+from greybox.numerics.vectorised import Vectorised
 
 Array = NDArray[np.float64]
 

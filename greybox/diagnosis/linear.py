@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.model.run.step import StepModel
-from greybox.recursion import propagate
-from greybox.vectorised import Vectorised
+from greybox.numerics.recursion import propagate
+from greybox.numerics.vectorised import Vectorised
 
 Array = NDArray[np.float64]
 

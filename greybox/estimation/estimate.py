@@ -23,6 +23,7 @@ from greybox.estimation.result import Estimate
 from greybox.estimation.values import Iteration, estimation_data
 from greybox.keywords import known_keywords
 from greybox.model.predictor import Predictor
+from greybox.numerics.linalg import scaled_inverse
 from greybox.one_thread import one_thread
 from greybox.regression.instruments import Instruments
 from greybox.regression.problem import RegressionProblem
@@ -524,7 +525,7 @@ def _covariance(
     inverse = np.zeros((p, p))
     for state, solution in zip(predictor.structure.states, solved.solutions, strict=True):
         mine = predictor.equation(state)
-        inverse[np.ix_(mine, mine)] = np.linalg.pinv(solution.information, rcond=1e-15)
+        inverse[np.ix_(mine, mine)] = scaled_inverse(solution.information)
     # degrees of freedom, as statsmodels counts them
     rows = regression.kept
     largest = max(len(predictor.equation(s)) for s in predictor.structure.states)

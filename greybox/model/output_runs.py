@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from greybox.model.output import OutputModel
 from greybox.model.output_step import Walking, filtered, free, likelihood, observed
 from greybox.model.run.kernels import along, bind
-from greybox.recursion import propagate
-from greybox.vectorised import Vectorised
+from greybox.numerics.recursion import propagate
+from greybox.numerics.vectorised import Vectorised
 
 Array = NDArray[np.float64]
 

@@ -25,7 +25,7 @@ from greybox.model.predictor_kinds import PREDICTORS
 from greybox.model.spelling import atoms, spelled_expression, spellings
 from greybox.model.structure import Structure
 from greybox.notebook import DisplayMixin, table
-from greybox.vectorised import Vectorised
+from greybox.numerics.vectorised import Vectorised
 
 Array = NDArray[np.float64]
 

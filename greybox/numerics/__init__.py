@@ -1,1 +1,1 @@
-"""Numerical routines on arrays: nothing here knows of ships or logs."""
+"""Numerical routines on arrays and expressions: nothing here knows of ships or logs."""

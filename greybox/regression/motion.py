@@ -20,10 +20,10 @@ from greybox.model.predictor import Predictor
 from greybox.model.run.inputs import LogInputs
 from greybox.model.run.kernels import accumulate
 from greybox.model.run.step import Heading, StepModel, integrated
+from greybox.numerics.vectorised import Vectorised
 from greybox.regression.instruments import initial_state, smoothed_wind, state_bound
 from greybox.rotation import ned_to_body
 from greybox.trial.log import TrialLog
-from greybox.vectorised import Vectorised
 
 Array = NDArray[np.float64]
 

@@ -33,7 +33,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.vectorised import Vectorised
+from greybox.numerics.vectorised import Vectorised
 from greybox.vessel.vessel import Thruster, Vessel
 
 Array = NDArray[np.float64]

@@ -18,7 +18,7 @@ from greybox.diagnosis.omnibus import disagreement
 from greybox.diagnosis.scores import MOMENTS
 from greybox.diagnosis.search import Step, _sure, judge
 from greybox.diagnosis.ship import LogRun
-from greybox.recursion import propagate
+from greybox.numerics.recursion import propagate
 from greybox.study.blind import draw
 from greybox.trial.log import TrialLog
 

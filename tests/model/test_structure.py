@@ -13,7 +13,7 @@ from greybox.model.catalogue import get_structure, structure_names
 from greybox.model.run.step import StepModel
 from greybox.model.terms import Factor, Term, parse_term
 from greybox.model.units import parameter_unit
-from greybox.vectorised import Vectorised
+from greybox.numerics.vectorised import Vectorised
 
 
 def test_one_line_adds_a_term():

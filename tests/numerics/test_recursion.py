@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from greybox.recursion import propagate
+from greybox.numerics.recursion import propagate
 
 
 def looped(a, b, start):

@@ -23,6 +23,7 @@ from greybox.estimation.error_variance_profile import (
 from greybox.estimation.moments import Solution, solve_stacked
 from greybox.estimation.registry import ESTIMATORS, Estimator
 from greybox.model.predictor import Predictor
+from greybox.numerics.linalg import scaled_inverse
 from greybox.regression.instruments import Instruments
 from greybox.regression.regression import Regression
 from greybox.trial.log import TrialLog
@@ -122,7 +123,7 @@ class Equation:
         innovations = [self.noise_model.innovations(e, k) for k, e in enumerate(self.residuals)]
         scores = [w * i for w, i in zip(weights, innovations, strict=True)]
         middle = sum(s @ s.T for s in scores) * self.rows / max(self.freedom - len(self.labels), 1)
-        inverse = np.linalg.pinv(self.solution.information, rcond=1e-15)
+        inverse = scaled_inverse(self.solution.information)
         return np.asarray(np.sqrt(np.maximum(np.diag(inverse @ middle @ inverse.T), 0.0)))
 
     @cached_property

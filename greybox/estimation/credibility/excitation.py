@@ -7,6 +7,7 @@ import numpy as np
 from greybox.estimation.credibility.evidence import Equation
 from greybox.estimation.credibility.words import combination
 from greybox.estimation.verdict import TestResult
+from greybox.numerics.linalg import scaled_inverse, sizes
 
 # a direction with a smaller share of the largest singular value is called weak
 _WEAK = 1e-3
@@ -28,9 +29,8 @@ def excitation(equation: Equation) -> TestResult:
     values = solution.singular_values
     ratio = float(values[-1] / values[0]) if values[0] > 0 else 0.0
     gram = solution.information
-    size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
-    inverse = np.linalg.pinv(gram / np.outer(size, size), rcond=1e-15)
-    inflation = np.maximum(np.diag(inverse), 1.0)
+    size = sizes(gram)
+    inflation = np.maximum(np.diag(scaled_inverse(gram)) * size**2, 1.0)
     noise = np.sqrt(
         sum(
             ((f - h) ** 2).sum(axis=1)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from greybox.estimation.credibility.evidence import Equation
 from greybox.estimation.credibility.words import listed
 from greybox.estimation.verdict import TestResult, not_applicable
+from greybox.numerics.linalg import scaled_inverse
 from greybox.numerics.moments import lagged_products
 
 Array = NDArray[np.float64]
@@ -58,7 +59,7 @@ def surplus_bias(equation: Equation) -> Array:
             itself[k + _REACH] += lagged_products(noise, [f], -k)
     weights = traces / max(equation.freedom - q, 1) * max(q - p, 0) / max(q, 1)
     left = equation.solution.information - np.tensordot(weights, itself, 1)
-    return np.asarray(np.linalg.pinv(left, rcond=1e-15) @ (weights @ meeting))
+    return np.asarray(scaled_inverse(left) @ (weights @ meeting))
 
 
 def many_instruments(equation: Equation, biases: frozenset[str]) -> TestResult:

@@ -11,6 +11,7 @@ from greybox.errors import GreyboxError
 from greybox.estimation.credibility.evidence import Evidence
 from greybox.estimation.verdict import TestResult, not_applicable
 from greybox.model.run.inputs import LogInputs
+from greybox.numerics.linalg import scaled_inverse
 from greybox.regression.instruments import simulate_log
 from greybox.trial.log import TrialLog
 
@@ -125,7 +126,7 @@ def noise_bias(evidence: Evidence) -> Array | None:
     bias = np.zeros(p)
     for equation in evidence.equations:
         mine = list(equation.columns)
-        bias[mine] = np.linalg.pinv(equation.solution.information, rcond=1e-15) @ right[mine]
+        bias[mine] = scaled_inverse(equation.solution.information) @ right[mine]
     return bias
 
 

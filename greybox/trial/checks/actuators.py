@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.recursion import propagate
+from greybox.numerics.recursion import propagate
 from greybox.trial.actuator_estimate import ActuatorEstimate, Measured
 from greybox.trial.checks.finding import Finding, Outcome
 from greybox.trial.convert.derived_signals import continuous

@@ -16,7 +16,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.recursion import decay
+from greybox.numerics.recursion import decay
 from greybox.rotation import body_to_ned
 from greybox.trial.convert.derived_signals import continuous
 from greybox.trial.convert.resample import clock, stretches

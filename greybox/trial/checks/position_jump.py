@@ -9,7 +9,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.recursion import decay
+from greybox.numerics.recursion import decay
 from greybox.rotation import body_to_ned, ned_to_body
 from greybox.trial.checks.finding import Finding
 from greybox.trial.checks.position_hold import Track, position_track
