@@ -16,7 +16,7 @@ from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.held_out import OtherLogs, Pair, proof_of
 from greybox.diagnosis.omnibus import disagreement
 from greybox.diagnosis.scores import MOMENTS
-from greybox.diagnosis.search import Step, _sure, judge
+from greybox.diagnosis.search import Step, _sure, assess_candidate
 from greybox.diagnosis.ship import LogRun
 from greybox.numerics.recursion import propagate
 from greybox.study.blind import draw
@@ -36,10 +36,12 @@ def test_a_change_counts_for_as_many_causes_as_moments_were_tried(changed: Trial
 
     _, atom, fit = fitted(changed, MOMENT)
     worse = replace(fit, cost=fit.cost + 20.0)
-    found = judge(Nowhere(), worse, fit, atom, 10)
+    found = assess_candidate(Nowhere(), worse, fit, atom, 10)
     assert found.p_adjusted == pytest.approx(found.p_value * 10 * MOMENTS)
     plain = replace(atom, parameters=tuple(replace(p, reach=0.0) for p in atom.parameters))
-    assert judge(Nowhere(), worse, fit, plain, 10).p_adjusted == pytest.approx(10 * found.p_value)
+    assert assess_candidate(Nowhere(), worse, fit, plain, 10).p_adjusted == pytest.approx(
+        10 * found.p_value
+    )
 
 
 def test_the_robust_covariance_must_bear_a_cause_out(changed: TrialLog) -> None:

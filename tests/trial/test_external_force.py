@@ -159,3 +159,12 @@ def test_a_push_is_found_and_clean_logs_are_clean():
         false += bool(found)
     assert hits / 60 > 0.8 - 3 * np.sqrt(0.8 * 0.2 / 60)
     assert false / 60 < 0.02 + 3 * np.sqrt(0.02 * 0.98 / 60)
+
+
+def test_wind_that_one_log_measures_and_another_does_not():
+    (calm, _), (blown, _) = sailed(1), sailed(2)
+    u, v, t = blown["u"].value, blown["v"].value, blown["u"].t
+    wind = tuple(Signal(n, t, -x, "m/s", n, True) for n, x in (("u_q", u), ("v_q", v)))
+    both = [calm, Recording(blown.name, (*blown.signals, *wind))]
+    found, told = force_findings(both, VESSEL)
+    assert found == [[], []] and told == [None, None]

@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.numerics.recursion import decay
 from greybox.rotation import ned_to_body
 from greybox.trial.checks.finding import Finding, Outcome
 from greybox.trial.checks.motion import Motion, denoise, make_motion
@@ -107,6 +108,8 @@ def force_findings(
     """
     found: list[list[Finding]] = [[] for _ in recordings]
     read = [_read(recording, vessel) for recording in recordings]
+    if any(not isinstance(x, str) and _wind_measured(x) for x in read):
+        read = [x if isinstance(x, str) or _wind_measured(x) else _without_wind(x) for x in read]
     seconds = sum(len(x.motion) * x.motion.step for x in read if not isinstance(x, str))
     step = max(_STEP, seconds / _MOST_STEPS)
     told: list[Outcome | None] = []
@@ -177,6 +180,16 @@ def _read(recording: Recording, vessel: Vessel) -> _Read | str:
     return _Read(replace(motion, values=values), commands)
 
 
+def _wind_measured(x: _Read) -> bool:
+    return all(n in x.motion for n in _AIR)
+
+
+def _without_wind(x: _Read) -> _Read:
+    """Return a recording whose wind, measured in others of the ship, explains nothing."""
+    none = {n: np.zeros(len(x.motion)) for n in _AIR}
+    return replace(x, motion=replace(x.motion, values={**x.motion.values, **none}))
+
+
 def _slope(value: Array, motion: Motion) -> Array:
     return np.concatenate([np.gradient(value[a:b], motion.step) for a, b in motion.stretches])
 
@@ -207,7 +220,7 @@ def _terms(x: _Read, vessel: Vessel) -> tuple[NDArray[np.int64], Array]:
         advance = (u * parts[0] + v * parts[1]) / size
         for f, some in zip(parts, (fine, fine_across), strict=True):
             some.extend((f, f * advance, f * advance / np.sqrt(size), f / np.sqrt(size)))
-    if all(n in motion for n in _AIR):
+    if _wind_measured(x):
         head, beam = motion["u_q"], motion["v_q"]
         air = np.hypot(head, beam)
         along += [air * head, head * np.abs(head)]
@@ -320,9 +333,7 @@ class _Noise:
 
     def whiten(self, z: Array) -> Array:
         """Return innovations of rows that follow each other, along axis 0."""
-        from scipy.signal import lfilter
-
-        return np.asarray(lfilter([1.0, -self.memory], [1.0, -self.differenced], z, axis=0))
+        return decay(self.differenced, z - self.memory * np.vstack([0.0 * z[:1], z[:-1]]))
 
 
 @dataclass(frozen=True)
