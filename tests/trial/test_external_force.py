@@ -167,4 +167,5 @@ def test_wind_that_one_log_measures_and_another_does_not():
     wind = tuple(Signal(n, t, -x, "m/s", n, True) for n, x in (("u_q", u), ("v_q", v)))
     both = [calm, Recording(blown.name, (*blown.signals, *wind))]
     found, told = force_findings(both, VESSEL)
-    assert found == [[], []] and told == [None, None]
+    assert found == [[], []]
+    assert told == [None, None]
