@@ -64,6 +64,8 @@ def restriction_matrix(
         texts = restrictions.split(",") if isinstance(restrictions, str) else restrictions
         told = [" ".join(text.split()) for text in texts]
         rows = [_restriction(text) for text in told]
+    if not rows:
+        raise UsageError("there is no restriction to test: write one as 'Xu = 2*Yv + 0.1'.")
     matrix, values = np.zeros((len(rows), len(names))), np.zeros(len(rows))
     for i, (weights, value) in enumerate(rows):
         for name, weight in weights.items():
@@ -74,8 +76,8 @@ def restriction_matrix(
                 )
             matrix[i, list(names).index(name)] = weight
         values[i] = value
-    rank = int(np.linalg.matrix_rank(matrix)) if len(rows) else 0
-    if rank < max(len(rows), 1):
+    rank = int(np.linalg.matrix_rank(matrix))
+    if rank < len(rows):
         raise UsageError(
             f"{len(rows)} restrictions hold {rank} independent ones ({'; '.join(told)}): name each "
             f"only once."

@@ -98,7 +98,7 @@ def _table(estimate: EstimateValues) -> list[str]:
     sets, plain = weak_safe_sets(estimate.tests), plain_estimates(estimate)
     # only instruments can be weak
     beside = 10 if plain else 0
-    safe = 24 - beside // 2 if sets else 0
+    safe = (23 if plain else 24) if sets else 0
     lines = [
         f"{'parameter':<12}{'value':>10}{'std err':>9}{'[0.025':>11}{'0.975]':>11}"
         f"{'plain IV' if plain else '':>{beside}}{'weak-safe 95 %' if sets else '':>{safe}}"

@@ -299,11 +299,6 @@ class Predictor(DisplayMixin):
         return self._program([*x, *[0.0] * rest], out, prepared)
 
 
-def basic_regime(structure: Structure) -> Regime:
-    """Return the regime in which every state is positive."""
-    return tuple((s, (1,)) for s in structure.states)
-
-
 def _sample_points(structure: Structure, regime: Regime, seed: int) -> list[Array]:
     """Return arrays for x, psi, tau and air at random points of the regime."""
     rng = np.random.default_rng(seed)

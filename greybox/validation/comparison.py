@@ -370,7 +370,14 @@ def compare(
     LogError
         There is no log.
     """
+    if not isinstance(models, Mapping):
+        raise UsageError("the models to compare have no names: write compare({name: model}, logs).")
     known = {n: m.model() if isinstance(m, Estimate) else m for n, m in models.items()}
+    for name, model in known.items():
+        if not isinstance(model, ManoeuvringModel):
+            raise UsageError(
+                f"'{name}' is {model!r:.60}, which is no model: read one with load_model(path)."
+            )
     own = logs if isinstance(logs, Mapping) else dict.fromkeys(known, logs)
     for name in known:
         if name not in own:

@@ -244,6 +244,13 @@ def test_models_of_other_states_are_not_compared(thesis_model, noisy_log):
         compare({"a": thesis_model, "b": surge}, noisy_log)
 
 
+def test_models_are_compared_by_name(thesis_model, noisy_log):
+    with pytest.raises(UsageError, match="have no names"):
+        compare([thesis_model], noisy_log)
+    with pytest.raises(UsageError, match=r"'a' is 'model\.json', which is no model"):
+        compare({"a": "model.json"}, noisy_log)
+
+
 def test_rudder_terms_can_be_removed():
     inputs = ("taux", "race", "rudder", "race_drag", "rudder_drag")
     structure = structure_for("thesis-X_race_drag", inputs)
