@@ -46,7 +46,7 @@ from greybox.model.predictor import Predictor
 from greybox.one_thread import one_thread
 from greybox.regression.motion import Motion, further_channels, predicted_motion, smoothed_heading
 from greybox.regression.problem import RegressionProblem
-from greybox.regression.regression import within_margins
+from greybox.regression.regression import measured_rows, within_margins
 from greybox.trial.log import Logs, TrialLog
 from greybox.trial.segments import as_segments
 
@@ -337,7 +337,10 @@ def _from_a_start(
         if point.diverged >= 0:
             continue
         # rows are cut once, by simulated states, which do not select on the noise
-        cut = [within_margins(m.x, states, margins) for m in point.motions]
+        cut = [
+            within_margins(m.x, states, margins) & measured_rows(work.predictor, log)
+            for m, log in zip(point.motions, work.logs, strict=True)
+        ]
         found = _refine(work, point, theta, cut)
         if found.converged:
             return found

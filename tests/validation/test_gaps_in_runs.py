@@ -17,6 +17,7 @@ from greybox.errors import UsageError
 from greybox.estimation.estimate import estimate_iv, estimate_ls
 from greybox.estimation.output_error import OutputErrorOptions, estimate_oe
 from greybox.estimation.output_setup import output_predictor
+from greybox.estimation.refined import estimate_refined_iv
 from greybox.model.catalogue import get_structure
 from greybox.model.predictor import build_predictor
 from greybox.regression.regression import build_regression
@@ -61,7 +62,7 @@ def otherwise_bridged(log):
     return replace(log, channels=channels)
 
 
-@pytest.mark.parametrize("method", ["ls", "iv", "oe"])
+@pytest.mark.parametrize("method", ["ls", "iv", "refined", "oe"])
 def test_no_fit_counts_what_was_not_measured(gapped, method):
     found = []
     for one in (gapped, otherwise_bridged(gapped)):
@@ -73,9 +74,12 @@ def test_no_fit_counts_what_was_not_measured(gapped, method):
             found.append(estimate_oe(predictor, [one], start=begin, options=options))
             assert found[-1].kept == len(MEASURED)
         else:
-            estimate = estimate_ls if method == "ls" else estimate_iv
+            estimate = {"ls": estimate_ls, "iv": estimate_iv, "refined": estimate_refined_iv}[
+                method
+            ]
             predictor = build_predictor(get_structure("thesis"), "basic")
-            found.append(estimate(predictor, [one], judged=False, covariance="white"))
+            quietly = {} if method == "refined" else {"judged": False}
+            found.append(estimate(predictor, [one], covariance="white", **quietly))
             # the step into the gap and that out of it hold one measurement only
             assert found[-1].kept == N - 1 - 31
     np.testing.assert_allclose(found[0].theta, found[1].theta, rtol=1e-6)

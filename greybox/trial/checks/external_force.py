@@ -47,8 +47,9 @@ _STEP, _MOST_STEPS = 2.0, 1500
 _LENGTHS, _LONGEST_SHARE = (30.0, 60.0, 120.0), 1 / 3
 # least length of all logs together [s]
 _LEAST_SECONDS = 240.0
-# chance of a false finding that is aimed at, stretches that count for one of a scan
-_LEVEL, _OVERLAP = 1e-5, 3.0
+# chance of a false finding if the tail of usual stretches goes on as it begins, so small because
+# that of ships of another kind does not (see the manual); stretches that count for one of a scan
+_LEVEL, _OVERLAP = 1e-9, 3.0
 # what matters: force over thrust at half speed
 _LEAST_SHARE = 0.08
 # the same of a ship that stands, of which the stretches in which it sails tell less
@@ -581,7 +582,10 @@ class _Scan:
         for s, equation in enumerate(self.equations):
             equation.add(np.full(2, _FREE), box * self._directions(s, event.fixed))
             equation.settle(_ALIKE / self.logs[0].step)
-        self.free[at + event.first : at + event.last + 1] = False
+        # what its begin and end leave beside it is not usual
+        beside = event.last - event.first
+        first = max(at, at + event.first - beside)
+        self.free[first : min(self.ends[event.log + 1], at + event.last + beside + 1)] = False
 
     def force(self, event: _Event) -> tuple[Array, Array]:
         """Return the force per mass of an event (2,) [m/s²], and its covariance (2, 2)."""
