@@ -23,7 +23,5 @@ found = gb.diagnose([trial], validate=[other])
 print(found.summary())
 print("what had been hidden:", dict(sea.truth[0].parameters))
 
-# the next trial is estimated by one-step equations of Euler's rule, so it is designed by it
-extended = replace(found.model, integrator="euler")
-again = replace(wishes, prior=extended)
-print(design_trial(prepare_request(extended, again).request, alternatives=False).summary())
+again = replace(wishes, prior=found.model)
+print(design_trial(prepare_request(found.model, again).request, alternatives=False).summary())

@@ -144,7 +144,10 @@ def feasible_or_reason(
     if (chosen.missed <= TOLERANCE).all():
         if np.isfinite(chosen.value):
             return chosen, ""
-        return chosen, unexcited([problem], [chosen.unit], request)
+        if not np.isfinite(best.value):
+            return chosen, unexcited([problem], [chosen.unit], request)
+        # what keeps the limits tells nothing, so that the limits are what stops the trial
+        chosen = best
     changes = least_change(problem, chosen)
     name, amount = changes[0]
     more = _turning(problem, request) if name.kind is LimitKind.SEA_ROOM else ""

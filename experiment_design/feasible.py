@@ -64,12 +64,16 @@ def _constant(problem: TrialProblem, rng: np.random.Generator) -> Array:
 
 
 def moved_constant(problem: TrialProblem, seed: int) -> Candidate | None:
-    """Return a telling sequence around a constant one that keeps the limits, None without one."""
+    """Return the most telling sequence around constant ones that keep the limits, None without one.
+
+    A constant one may lie at the edge of a limit, so that every change of it crosses it:
+    several are changed.
+    """
     scale = limit_scale(problem)
     found = assess(problem, _constant(problem, np.random.default_rng([23, seed])))
-    nearest = min(found, key=lambda c: _short(c, scale))
-    lively = stirred(problem, nearest, seed)
-    return lively if lively.feasible else None
+    nearest = sorted(found, key=lambda c: _short(c, scale))[:_STARTS]
+    lively = [c for c in (stirred(problem, still, seed) for still in nearest) if c.feasible]
+    return max(lively, key=lambda c: c.value, default=None)
 
 
 def stirred(problem: TrialProblem, still: Candidate, seed: int) -> Candidate:

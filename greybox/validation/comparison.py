@@ -373,11 +373,6 @@ def compare(
     if not isinstance(models, Mapping):
         raise UsageError("the models to compare have no names: write compare({name: model}, logs).")
     known = {n: m.model() if isinstance(m, Estimate) else m for n, m in models.items()}
-    for name, model in known.items():
-        if not isinstance(model, ManoeuvringModel):
-            raise UsageError(
-                f"'{name}' is {model!r:.60}, which is no model: read one with load_model(path)."
-            )
     own = logs if isinstance(logs, Mapping) else dict.fromkeys(known, logs)
     for name in known:
         if name not in own:
@@ -386,6 +381,11 @@ def compare(
                 f"give those of every model, or one sequence for all."
             )
     lists = [as_list(own[name]) for name in known]
+    for name, model in known.items():
+        if not isinstance(model, ManoeuvringModel):
+            raise UsageError(
+                f"'{name}' is {model!r:.60}, which is no model: read one with load_model(path)."
+            )
     if not known:
         raise UsageError("there is no model to compare: give at least one, by name.")
     return _compare(list(known.values()), list(known), lists, heading, bands, seed)
