@@ -79,6 +79,7 @@ def test_no_short_surge_trial_beats_its_bound(ship, holds, levels, start, kind):
     assert found.efficiency_lower_bound <= np.exp((found.value - best) / (3 if kind == "D" else 1))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "holds"), [("thesis", 3), ("linear", 3)])
 def test_no_short_trial_in_three_degrees_beats_its_bound(ship, name, holds):
     problem = make_problem(ship, name, 10.0 * holds)
@@ -108,6 +109,7 @@ def test_surge_design_of_200_s_is_certified(ship):
     assert found.to_dict()["rigorous"] is False
 
 
+@pytest.mark.long
 def test_information_of_few_wanted_parameters_is_mixed_whole(ship):
     problem = make_problem(ship, "thesis", 60.0)
     one = replace(problem.criterion, wanted=(0,), scale=np.ones(1), combination=np.ones(1))
@@ -186,6 +188,7 @@ def test_sums_and_derivatives_of_a_surge_trial(ship):
         assert (ends[0] - ends[1]) / 2 / step == pytest.approx(expected, rel=1e-4)
 
 
+@pytest.mark.long
 def test_a_campaign_of_two_trials(ship):
     problem = make_problem(ship, "surge", 40.0)
     other = make_problem(ship, "surge", 40.0, start=(2.5, 0.0))
@@ -221,6 +224,7 @@ def test_known_sums_and_scenarios(ship):
     assert "9 scenarios" in certify([many], [design]).reason
 
 
+@pytest.mark.long
 def test_white_errors_are_bounded_by_information(ship):
     problem = make_problem(ship, "surge", 40.0, white=True)
     assert "no sum" in why_not_surge(problem)

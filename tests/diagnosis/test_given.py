@@ -38,6 +38,7 @@ def test_a_cause_that_is_given_is_fitted_as_one_that_was_found() -> None:
     assert given.fall > 0.5
 
 
+@pytest.mark.long
 def test_a_cause_that_does_not_act_lowers_little() -> None:
     trial = draw(np.random.default_rng([31, 2]), (), kind="pulses", samples=400)
     given = fit_given([trial.estimation], ["quadratic_yaw_damping"], validate=[trial.validation])

@@ -108,6 +108,7 @@ def test_a_missing_product_of_states_is_noticed_in_a_current(seed):
     assert "lacks" not in right.verdict.text
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [902, 905])
 def test_a_free_run_that_hides_it_is_not_trusted_either(seed):
     """Fitted to the log, the run without the term is as good as with it, and was trusted."""

@@ -142,6 +142,7 @@ def test_sensors_that_nobody_states_are_found_by_what_neighbours_share(thesis, t
         assert abs(ratio - 1) < 3.5 * np.sqrt((1 + 2 * rho**2) / len(keep[0])) / abs(rho)
 
 
+@pytest.mark.long
 def test_what_a_slow_instrument_sums_has_the_variance_that_is_reported():
     """A noise model that is alike everywhere gives too little."""
     runs, sums, told, alike = 200, [], [], []

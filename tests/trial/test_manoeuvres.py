@@ -293,6 +293,7 @@ def coverage(measure, truth, repeats=150):
     return {name: count / repeats for name, count in inside.items()}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("known", [True, False])
 def test_intervals_of_a_turning_circle_cover(turn_run, turn_truth, known):
     rng = np.random.default_rng(11)
@@ -308,6 +309,7 @@ def test_intervals_of_a_turning_circle_cover(turn_run, turn_truth, known):
     assert min(share.values()) > 0.89, share
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("known", [True, False])
 def test_intervals_of_a_zigzag_cover(zigzag_run, zigzag_truth, known):
     rng = np.random.default_rng(12)

@@ -391,6 +391,7 @@ def smallest(seed, rate, rng):
     return d, wrap, held.tolist(), jump
 
 
+@pytest.mark.long
 def test_the_smallest_defects_are_found_in_nearly_all_logs():
     """At least 95 % with the right place, less two binomial errors of 48 logs."""
     logs = 48
@@ -416,6 +417,7 @@ def test_the_smallest_defects_are_found_in_nearly_all_logs():
         assert found[kind] >= least, (kind, found[kind], count)
 
 
+@pytest.mark.long
 def test_clean_logs_have_none_of_these_defects():
     """At most 2 % false findings per check, plus two binomial errors of 64 logs."""
     logs = 64

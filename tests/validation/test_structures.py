@@ -216,6 +216,7 @@ def _in_wind_alone(seed: int, current: tuple[float, float] = (0.0, 0.0)) -> list
     ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("predictor", ["wind", "augmented"])
 def test_without_a_current_the_reduced_predictors_of_the_thesis_are_left(predictor):
     """What (7.1)-(7.6) keep follows from the derivatives alone, and the joint test agrees."""
