@@ -24,8 +24,8 @@ from greybox.model.model import ManoeuvringModel as ManoeuvringModel
 from greybox.model.model import load_model as load_model
 from greybox.model.predictor import Predictor as Predictor
 from greybox.model.predictor import build_predictor as build_predictor
-from greybox.model.simulation import simulate as simulate
-from greybox.model.simulation import stationary_disturbance as stationary_disturbance
+from greybox.model.run.simulation import simulate as simulate
+from greybox.model.run.simulation import stationary_disturbance as stationary_disturbance
 from greybox.model.structure import Structure as Structure
 from greybox.prediction.predict import predict_manoeuvre as predict_manoeuvre
 from greybox.prediction.result import ManoeuvrePrediction as ManoeuvrePrediction

@@ -13,10 +13,10 @@ import numpy as np
 from greybox.estimation.estimate import estimate_ls
 from greybox.export.export import export_model
 from greybox.model.catalogue import structure_for
-from greybox.model.changes import Change
 from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor import build_predictor
-from greybox.model.simulation import mid_step, positions
+from greybox.model.run.changes import Change
+from greybox.model.run.simulation import mid_step, positions
 from greybox.trial.convert.read import read_log
 from greybox.trial.kinematics import decimate
 from greybox.trial.log import TrialLog

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from greybox.diagnosis.linear import Linear, sensitivities
 from greybox.diagnosis.simulator import Simulator
+from greybox.model.run.simulation import mid_step
 from greybox.model.run.step import Integrator, Rule, StepModel, integrated
-from greybox.model.simulation import mid_step
 from greybox.model.structure import Structure
 from greybox.rotation import ned_to_body
 from greybox.trial.log import TrialLog

@@ -44,8 +44,8 @@ from greybox.keywords import known_keywords
 from greybox.model.disturbances import CURRENT, WIND
 from greybox.model.noise import NoiseLevels
 from greybox.model.output import OutputModel, Role
-from greybox.model.output_runs import Simulator
 from greybox.model.predictor import Predictor
+from greybox.model.run.output_runs import Simulator
 from greybox.one_thread import one_thread
 from greybox.regression.regression import common_sample_time
 from greybox.trial.log import Logs, TrialLog

@@ -13,10 +13,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.model.changes import Change, simulate_changing
 from greybox.model.predictor import Predictor
+from greybox.model.run.changes import Change, simulate_changing
 from greybox.model.run.inputs import LogInputs
-from greybox.model.simulation import FreeRun
+from greybox.model.run.simulation import FreeRun
 from greybox.model.structure import Structure
 from greybox.regression.regression import measured_rows, within_margins
 from greybox.rotation import body_to_ned, ned_to_body

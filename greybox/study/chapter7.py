@@ -20,7 +20,7 @@ from greybox.estimation.estimate import estimate_iv, estimate_ls
 from greybox.estimation.result import Estimate
 from greybox.model.catalogue import get_structure, structure_for
 from greybox.model.predictor import Predictor, build_predictor
-from greybox.model.simulation import positions, simulate, stationary_disturbance
+from greybox.model.run.simulation import positions, simulate, stationary_disturbance
 from greybox.model.structure import Structure
 from greybox.rotation import ned_to_body
 from greybox.study.chapter6 import TRUE

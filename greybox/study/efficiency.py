@@ -26,7 +26,7 @@ from greybox.estimation.result import Estimate
 from greybox.model.catalogue import get_structure
 from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import Predictor, Regime, build_predictor
-from greybox.model.simulation import simulate, stationary_disturbance
+from greybox.model.run.simulation import simulate, stationary_disturbance
 from greybox.rotation import ned_to_body
 from greybox.study.chapter6 import TRUE, pulse_commands
 from greybox.study.parallel import map_pieces

@@ -13,8 +13,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.model.changes import simulate_changing
 from greybox.model.model import ManoeuvringModel
+from greybox.model.run.changes import simulate_changing
 from greybox.model.run.inputs import LogInputs
 from greybox.regression.instruments import state_bound
 from greybox.trial.log import TrialLog

@@ -33,7 +33,7 @@ from greybox.estimation.shooting import (
 from greybox.model.catalogue import get_structure
 from greybox.model.noise import NoiseLevels
 from greybox.model.output import OutputModel
-from greybox.model.output_runs import Filter, Observer, Simulator
+from greybox.model.run.output_runs import Filter, Observer, Simulator
 from greybox.study.chapter6 import TRUE
 from greybox.study.efficiency import CASES, determinant_efficiency, virtual_trial
 
@@ -682,7 +682,7 @@ class TestCommand:
 @pytest.mark.parametrize("memory", [0.0, 20.0])
 def test_intervals_cover(predictor, memory):
     """White errors, and process noise that remembers: 95 % intervals hold."""
-    from greybox.model.simulation import simulate, stationary_disturbance
+    from greybox.model.run.simulation import simulate, stationary_disturbance
     from greybox.trial.log import make_log
     from greybox.vessel.toml import load_vessel
 

@@ -27,7 +27,7 @@ from greybox.model.catalogue import get_structure
 from greybox.model.model import model_from_dict
 from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import build_predictor
-from greybox.model.simulation import stationary_disturbance
+from greybox.model.run.simulation import stationary_disturbance
 from greybox.numerics.banded import factor_band
 from greybox.regression.motion import predicted_motion, smoothed_heading
 from greybox.regression.regression import build_regression
@@ -407,7 +407,7 @@ def test_intervals_cover_and_the_bound_is_reached(thesis, true_theta, basic, cor
     """60 trials with process noise, white or slow: coverage, and efficiency where white."""
     from scipy.special import digamma
 
-    from greybox.model.simulation import simulate
+    from greybox.model.run.simulation import simulate
     from greybox.trial.log import make_log
 
     runs, samples = 60, 1200

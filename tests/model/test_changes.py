@@ -10,9 +10,9 @@ import pytest
 
 from greybox.commands.main import main
 from greybox.errors import ModelFileError, StructureError
-from greybox.model.changes import Change, simulate_changing
 from greybox.model.model import ManoeuvringModel, load_model, model_from_dict
-from greybox.model.simulation import simulate
+from greybox.model.run.changes import Change, simulate_changing
+from greybox.model.run.simulation import simulate
 from greybox.validation.bands import predict_bands
 from greybox.validation.comparison import errors_ahead
 from greybox.validation.fit import run_model

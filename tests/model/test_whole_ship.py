@@ -12,7 +12,7 @@ from greybox.errors import StructureError, UsageError
 from greybox.model.catalogue import get_structure
 from greybox.model.model import ManoeuvringModel
 from greybox.model.run.kernels import accumulate
-from greybox.model.simulation import positions
+from greybox.model.run.simulation import positions
 from greybox.validation.fit import run_model
 from greybox.vessel.force import generalised_force
 from greybox.vessel.vessel import Actuation

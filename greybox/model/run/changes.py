@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import StructureError
+from greybox.model.run.simulation import FreeRun, simulate
 from greybox.model.run.step import Integrator
-from greybox.model.simulation import FreeRun, simulate
 from greybox.model.structure import Structure
 
 Array = NDArray[np.float64]

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.model.output import OutputModel
-from greybox.model.output_step import Walking, filtered, free, likelihood, observed
 from greybox.model.run.kernels import along, bind
+from greybox.model.run.output_step import Walking, filtered, free, likelihood, observed
 from greybox.numerics.recursion import propagate
 from greybox.numerics.vectorised import Vectorised
 
