@@ -360,7 +360,10 @@ def _wishes(options: argparse.Namespace, model: Any) -> Any:
     if options.of:
         values = dict(zip(model.names, model.at_final_parameters().theta, strict=True))
         combination = gradient_of(options.of, values)
-    criterion: Any = "c" if options.of and options.criterion == "D" else options.criterion
+    criterion = CRITERIA[options.criterion]
+    if options.of and criterion.determinant:
+        # of one function's variance alone, that is the criterion of one function
+        criterion = next(c for c in CRITERIA.values() if c.combined)
     process = None if options.process_noise is None else np.array(options.process_noise)
     return Wishes(
         duration=options.duration,
@@ -372,7 +375,7 @@ def _wishes(options: argparse.Namespace, model: Any) -> Any:
         trials=options.trials,
         predictor=options.predictor,
         estimator=options.estimator,
-        criterion=criterion,
+        criterion=criterion.name,
         wanted=tuple(options.want),
         combination=combination,
         current=options.current,

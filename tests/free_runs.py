@@ -16,7 +16,8 @@ from greybox.model.catalogue import structure_for
 from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor import build_predictor
 from greybox.model.run.changes import Change
-from greybox.model.run.simulation import mid_step, positions
+from greybox.model.run.simulation import positions
+from greybox.model.run.step import held
 from greybox.trial.convert.read import read_log
 from greybox.trial.kinematics import decimate
 from greybox.trial.log import TrialLog
@@ -132,12 +133,12 @@ def wanted(model: ManoeuvringModel, log: TrialLog, heading: str = "simulated") -
 
 def held_heading(model: ManoeuvringModel, psi: np.ndarray) -> np.ndarray:
     """Return the measured heading as a step of the free run holds it."""
-    return psi if model.integrator == "euler" else mid_step(psi)
+    return held(psi, model.integrator)
 
 
 def held_wind(model: ManoeuvringModel, value: np.ndarray) -> np.ndarray:
     """Return measured wind as a step holds it; the run reads none after its last step."""
-    return value if model.integrator == "euler" else np.append(mid_step(value[:-1]), value[-1])
+    return np.append(held(value[:-1], model.integrator), value[-1])
 
 
 def calm(model: ManoeuvringModel, log: TrialLog) -> TrialLog:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from greybox.errors import DivergenceError, UsageError
 from greybox.model.run.kernels import MANY_RUNS, FreeRunKernel, FreeRunStep, OverRunsKernel
-from greybox.model.run.step import Heading, Integrator, StepModel, integrated
+from greybox.model.run.step import Heading, Integrator, StepModel, held, integrated
 from greybox.model.structure import Structure
 from greybox.notebook import DisplayMixin, number, sparkline, table
 from greybox.rotation import body_to_ned
@@ -163,16 +163,13 @@ def simulate(
     series: list[Array] = [np.broadcast_to(tau, (runs, samples, tau.shape[2]))]
     if heading == "measured" and structure.marine:
         measured = np.zeros(samples + 1) if psi is None else np.asarray(psi, float)
-        if integrator == "rk4":
-            measured = mid_step(measured)
+        measured = held(measured, integrator, axis=-1)
         series.append(np.broadcast_to(measured[..., :samples, None], (runs, samples, 1)))
     if d is not None:
         d = np.asarray(d, float)
         series.append(np.broadcast_to(d, (runs, samples, d.shape[-1])))
     if air is not None:
-        blow = np.asarray(air, float)
-        if integrator == "rk4":
-            blow = np.swapaxes(mid_step(np.swapaxes(blow, -1, -2)), -1, -2)
+        blow = held(np.asarray(air, float), integrator, axis=-2)
         series.append(np.broadcast_to(blow, (runs, samples, 2)))
     x0 = np.broadcast_to(x0, (runs, nx))
     start = np.broadcast_to(np.asarray(psi0, float), (runs,))
@@ -238,26 +235,6 @@ def _common_runs(given: Mapping[str, tuple[Any, tuple[int, ...]]]) -> int:
         if own > runs:
             runs, first = own, name
     return runs
-
-
-def mid_step(value: Array) -> Array:
-    """Return what is measured at samples at the middle of the step that follows each.
-
-    The ship turns during a step; the last value stands, since no next one is known.
-
-    Parameters
-    ----------
-    value : ndarray
-        (..., N), time last.
-
-    Returns
-    -------
-    ndarray
-        (..., N)
-    """
-    out = np.array(value, float)
-    out[..., :-1] = (out[..., :-1] + out[..., 1:]) / 2
-    return out
 
 
 def _few(
