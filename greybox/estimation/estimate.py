@@ -18,7 +18,7 @@ from greybox.estimation.covariance import (
 from greybox.estimation.credibility import Evidence, assess, convergence, weigh
 from greybox.estimation.disturbance import estimate_current
 from greybox.estimation.error_variance_profile import ErrorVarianceProfile, error_variance_profiles
-from greybox.estimation.moments import Solution, solve_stacked
+from greybox.estimation.normal_equations import Solution, solve_stacked
 from greybox.estimation.result import Estimate
 from greybox.estimation.values import Iteration, estimation_data
 from greybox.keywords import known_keywords

@@ -19,7 +19,7 @@ from greybox.estimation.covariance import (
 )
 from greybox.estimation.disturbance import estimate_current
 from greybox.estimation.estimate import estimate_iv, estimate_ls
-from greybox.estimation.moments import solve_stacked
+from greybox.estimation.normal_equations import solve_stacked
 from greybox.estimation.post_estimation import judge_estimate
 from greybox.model.catalogue import get_structure
 from greybox.model.predictor import build_predictor

@@ -14,7 +14,7 @@ from greybox.estimation.covariance import score_covariance
 from greybox.estimation.credibility.evidence import Equation
 from greybox.estimation.credibility.score_statistic import score_test
 from greybox.estimation.credibility.weak import measure_strength
-from greybox.estimation.moments import solve_stacked
+from greybox.estimation.normal_equations import solve_stacked
 
 ROWS = 400
 

@@ -15,7 +15,7 @@ from greybox.estimation import free_run, free_run_noise, output_error
 from greybox.estimation.efficiency_bounds import cramer_rao, information, noise_variances
 from greybox.estimation.free_run import _follows, fit_free_runs
 from greybox.estimation.free_run_errors import (
-    autocovariance,
+    flat_top_autocovariance,
     shared_score_covariance,
     slow_errors,
 )
@@ -621,7 +621,7 @@ class TestErrors:
         rng = np.random.default_rng(7)
         rows, r = rng.standard_normal((3, 60, 2)), rng.standard_normal((60, 2))
         r[1:] += 0.6 * r[:-1]
-        gamma = autocovariance([r], 3)
+        gamma = flat_top_autocovariance([r], 3)
         total = np.zeros((3, 3))
         for k in range(60):
             for j in range(60):

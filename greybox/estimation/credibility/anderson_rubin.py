@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from greybox.estimation.covariance import correlation_lags
 from greybox.estimation.credibility.evidence import Equation
 from greybox.estimation.verdict import TestResult, not_applicable
+from greybox.numerics.lagged_moments import lagged_sums, pairs
 from greybox.numerics.linalg import scaled_inverse
-from greybox.numerics.moments import lagged_sums, pairs
 
 Array = NDArray[np.float64]
 

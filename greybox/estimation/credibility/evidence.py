@@ -20,7 +20,7 @@ from greybox.estimation.error_variance_profile import (
     error_variance_profiles,
     fit_scaled_arma_noise,
 )
-from greybox.estimation.moments import Solution, solve_stacked
+from greybox.estimation.normal_equations import Solution, solve_stacked
 from greybox.estimation.registry import ESTIMATORS, Estimator
 from greybox.model.predictor import Predictor
 from greybox.numerics.linalg import scaled_inverse

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from greybox.estimation.credibility.evidence import Equation
 from greybox.estimation.credibility.words import listed
 from greybox.estimation.verdict import TestResult, not_applicable
+from greybox.numerics.lagged_moments import lagged_products
 from greybox.numerics.linalg import scaled_inverse
-from greybox.numerics.moments import lagged_products
 
 Array = NDArray[np.float64]
 

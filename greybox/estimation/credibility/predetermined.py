@@ -17,8 +17,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.numerics.lagged_moments import convolve, lagged_products, lagged_sums
 from greybox.numerics.linalg import scaled_inverse
-from greybox.numerics.moments import convolve, lagged_products, lagged_sums
 
 Array = NDArray[np.float64]
 

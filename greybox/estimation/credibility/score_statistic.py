@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from greybox.estimation.arma_noise import WHITE, ARMANoise
 from greybox.estimation.verdict import Distribution
+from greybox.numerics.lagged_moments import lagged_products
 from greybox.numerics.linalg import quadratic_form, sizes
-from greybox.numerics.moments import lagged_products
 
 Array = NDArray[np.float64]
 # directions with a smaller share of the largest variance rest on a few rows: left untested

@@ -15,8 +15,8 @@ from greybox.estimation.covariance import correlation_lags
 from greybox.estimation.credibility.evidence import Equation
 from greybox.estimation.credibility.words import combination, listed
 from greybox.estimation.verdict import TestResult, not_applicable
+from greybox.numerics.lagged_moments import autocovariance, weighted_lags
 from greybox.numerics.linalg import quadratic_form, scaled_inverse
-from greybox.numerics.moments import autocovariance, independent_covariance
 
 Array = NDArray[np.float64]
 
@@ -116,7 +116,7 @@ def _noise_variance(
     """Return the variance of Σ w v for one noise v with memory."""
     lags = correlation_lags([v[0][k] for v, k in zip(noise, equation.keep, strict=True)])
     gamma = autocovariance(noise, equation.keep, lags, lost)
-    value = independent_covariance(weights, gamma).item()
+    value = weighted_lags(weights, gamma).item()
     # a truncated autocovariance need not be positive: then memory is left out
     return value if value > 0 else gamma[0].item() * float(sum((w**2).sum() for w in weights))
 
@@ -156,7 +156,7 @@ def _joint(
     start = 0
     for b in bases:
         stop = start + len(b)
-        blocks[start:stop, start:stop] = independent_covariance([b], gamma)
+        blocks[start:stop, start:stop] = weighted_lags([b], gamma)
         start = stop
     rank, freedom, _ = quadratic_form(left.T @ coordinates @ weak, left.T @ blocks @ left)
     spread = np.sqrt(np.asarray(sum((f**2).sum(axis=1) for f in equation.phi)))

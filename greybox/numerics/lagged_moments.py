@@ -96,15 +96,27 @@ def autocovariance(
     ]
 
 
-def independent_covariance(z: Sequence[Array], gamma: Sequence[Array]) -> Array:
-    """Return the covariance of Σ z e for instruments independent of scalar errors, Σ Z R Zᵀ.
+def weighted_lags(rows: Sequence[Array], weights: Sequence[float | Array]) -> Array:
+    """Return Σ_j w(j) Σ_k r(k) r(k−j)ᵀ over lags of both signs and all experiments, (m, m).
+
+    With autocovariances of errors as weights it is the covariance of Σ r e for rows
+    independent of the errors; with the weights of a kernel and scores as rows, a covariance
+    that is robust to memory.
+
+    Parameters
+    ----------
+    rows : sequence of ndarray
+        (m, N) an experiment.
+    weights : sequence of float or ndarray
+        At the lags 0, 1, …, a number or element by element; w(−j) = w(j)ᵀ.
 
     References
     ----------
-    Ljungberg (2020), eq. 2.21.
+    Ljungberg (2020), eq. 2.21; Newey and West (1987).
     """
-    total = np.zeros((z[0].shape[0],) * 2)
-    for lag, value in enumerate(gamma):
-        block = lagged_products(z, z, lag) * float(value.item())
+    total = np.zeros((rows[0].shape[0],) * 2)
+    longest = max(r.shape[1] for r in rows)
+    for lag, weight in enumerate(weights[:longest]):
+        block = weight * lagged_products(rows, rows, lag)
         total += block if lag == 0 else block + block.T
     return total
