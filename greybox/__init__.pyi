@@ -6,8 +6,6 @@ from greybox.diagnosis.diagnose import diagnose as diagnose
 from greybox.diagnosis.given import fit_given as fit_given
 from greybox.diagnosis.result import Diagnosis as Diagnosis
 from greybox.diagnosis.result import Given as Given
-from greybox.estimation.estimate import estimate_iv as estimate_iv
-from greybox.estimation.estimate import estimate_ls as estimate_ls
 from greybox.estimation.output_error import OutputErrorOptions as OutputErrorOptions
 from greybox.estimation.output_error import estimate_oe as estimate_oe
 from greybox.estimation.output_setup import output_predictor as output_predictor
@@ -56,6 +54,8 @@ from greybox.validation.comparison import compare as compare
 from greybox.validation.comparison import compare_models as compare_models
 from greybox.validation.fit import fit_percent as fit_percent
 from greybox.validation.fit import run_model as run_model
+from greybox.validation.fit_single import estimate_iv as estimate_iv
+from greybox.validation.fit_single import estimate_ls as estimate_ls
 from greybox.validation.request import Request as Request
 from greybox.validation.selection import estimate_model as estimate_model
 from greybox.vessel.toml import load_vessel as load_vessel

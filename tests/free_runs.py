@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from greybox.estimation.estimate import estimate_ls
 from greybox.export.export import export_model
 from greybox.model.catalogue import structure_for
 from greybox.model.model import ManoeuvringModel
@@ -22,6 +21,7 @@ from greybox.trial.convert.read import read_log
 from greybox.trial.kinematics import decimate
 from greybox.trial.log import TrialLog
 from greybox.validation.fit import run_model
+from greybox.validation.fit_single import estimate_ls
 from greybox.vessel.force import force_inputs
 from greybox.vessel.thrust import ThrustLaw
 from greybox.vessel.toml import vessel_from_dict

@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.channels import CHANNELS
+from greybox.credibility.words import listed
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.held_out import long_run_variance
 from greybox.diagnosis.noise import SEEN
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.result import Symptom
 from greybox.diagnosis.ship import LogRun
-from greybox.estimation.credibility.words import listed
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from greybox.errors import ExcitationError, UsageError, suggestion
 from greybox.estimation.covariance import correlation_lags
-from greybox.estimation.estimate import UnexcitedBiasError
 from greybox.estimation.free_run import Shooting, changes, fit_free_runs, in_doubt
 from greybox.estimation.free_run_errors import (
     memory_correction,
@@ -38,6 +37,7 @@ from greybox.estimation.shooting import (
     ShootingFit,
     loss_weights,
 )
+from greybox.estimation.solve import UnexcitedBiasError
 from greybox.estimation.values import Iteration, estimation_data
 from greybox.estimation.verdict import TestResult
 from greybox.keywords import known_keywords

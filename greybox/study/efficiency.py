@@ -18,7 +18,6 @@ from scipy.special import polygamma, psi
 from greybox.errors import GreyboxError
 from greybox.estimation.bound import iv_bound
 from greybox.estimation.efficiency_bounds import cramer_rao, noise_variances
-from greybox.estimation.estimate import estimate_iv
 from greybox.estimation.output_error import OutputErrorOptions, estimate_oe
 from greybox.estimation.output_setup import measured, output_model, output_predictor
 from greybox.estimation.refined import estimate_refined_iv
@@ -32,6 +31,7 @@ from greybox.study.chapter6 import TRUE, pulse_commands
 from greybox.study.parallel import map_pieces
 from greybox.study.tables import Row, summarise
 from greybox.trial.log import TrialLog, make_log
+from greybox.validation.fit_single import estimate_iv
 from greybox.vessel.toml import load_vessel
 
 Array = NDArray[np.float64]

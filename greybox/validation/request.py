@@ -8,9 +8,9 @@ from typing import Literal, get_args
 
 from greybox.errors import UsageError, suggestion
 from greybox.estimation.closed_loop import Loop
-from greybox.estimation.estimate import Covariance
 from greybox.estimation.output_error import OutputErrorOptions
 from greybox.estimation.registry import ESTIMATORS
+from greybox.estimation.solve import Covariance
 from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor_kinds import PREDICTORS
 

@@ -10,14 +10,14 @@ from typing import Literal
 
 import numpy as np
 
+from greybox.credibility.verdict import free_run_faults, misfit, weigh
 from greybox.errors import GreyboxError, UsageError
 from greybox.estimation.closed_loop import Loop
-from greybox.estimation.credibility.verdict import free_run_faults, misfit, weigh
 from greybox.estimation.efficiency_bounds import limits_of
-from greybox.estimation.estimate import Covariance
 from greybox.estimation.output_error import OutputErrorOptions
 from greybox.estimation.registry import ESTIMATORS, free_run_estimator
 from greybox.estimation.result import Estimate
+from greybox.estimation.solve import Covariance
 from greybox.estimation.verdict import TrustLevel, Verdict, refused
 from greybox.keywords import known_keywords
 from greybox.model.model import ManoeuvringModel

@@ -14,7 +14,6 @@ from greybox.errors import DivergenceError, ExcitationError, UsageError
 from greybox.estimation import refined as refinement
 from greybox.estimation.banded_covariance import ErrorBand, ErrorNoise
 from greybox.estimation.bound import iv_bound
-from greybox.estimation.estimate import estimate_iv, estimate_ls
 from greybox.estimation.gls_regression import solve_white, spread_columns, white_rows
 from greybox.estimation.noise import (
     ErrorLikelihood,
@@ -33,7 +32,7 @@ from greybox.regression.motion import predicted_motion, smoothed_heading
 from greybox.regression.regression import build_regression
 from greybox.study.chapter6 import TRUE
 from greybox.study.efficiency import CASES, virtual_trial
-from greybox.validation.fit_single import estimate_once
+from greybox.validation.fit_single import estimate_iv, estimate_ls, estimate_once
 from greybox.validation.request import Request
 
 REGIME = (("u", (1,)), ("v", (1,)), ("r", (1, -1)))

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.estimation.credibility.evidence import Evidence
-from greybox.estimation.credibility.words import listed
+from greybox.credibility.evidence import Evidence
+from greybox.credibility.words import listed
 from greybox.estimation.verdict import TestResult, not_applicable
 from greybox.model.run.inputs import LogInputs
 from greybox.model.run.step import StepModel

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.credibility.evidence import Equation
 from greybox.estimation.covariance import correlation_lags
-from greybox.estimation.credibility.evidence import Equation
 from greybox.estimation.verdict import TestResult, not_applicable
 from greybox.numerics.lagged_moments import lagged_sums, pairs
 from greybox.numerics.linalg import scaled_inverse

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 
-from greybox.estimation.credibility.anderson_rubin import anderson_rubin
-from greybox.estimation.credibility.combinations import combinations
-from greybox.estimation.credibility.endogeneity import endogeneity
-from greybox.estimation.credibility.evidence import Equation, Evidence
-from greybox.estimation.credibility.excitation import excitation
-from greybox.estimation.credibility.heading import heading_independence
-from greybox.estimation.credibility.independence import input_independence
-from greybox.estimation.credibility.many import many_instruments
-from greybox.estimation.credibility.margins import margin_bias, sign_margins
-from greybox.estimation.credibility.overidentification import overidentification
-from greybox.estimation.credibility.residuals import whiteness
-from greybox.estimation.credibility.stability import damping_signs, stability
-from greybox.estimation.credibility.weak import weak_instruments
+from greybox.credibility.anderson_rubin import anderson_rubin
+from greybox.credibility.combinations import combinations
+from greybox.credibility.endogeneity import endogeneity
+from greybox.credibility.evidence import Equation, Evidence
+from greybox.credibility.excitation import excitation
+from greybox.credibility.heading import heading_independence
+from greybox.credibility.independence import input_independence
+from greybox.credibility.many import many_instruments
+from greybox.credibility.margins import margin_bias, sign_margins
+from greybox.credibility.overidentification import overidentification
+from greybox.credibility.residuals import whiteness
+from greybox.credibility.stability import damping_signs, stability
+from greybox.credibility.weak import weak_instruments
 from greybox.estimation.verdict import NotApplicable, TestResult, not_applicable
 
 _OF_EQUATIONS = {

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from greybox.estimation.credibility.evidence import Evidence
+from greybox.credibility.evidence import Evidence
 from greybox.estimation.verdict import TestResult, not_applicable
 
 # a combination is reported where its standard error is so many times smaller

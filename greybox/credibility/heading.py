@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.estimation.credibility.evidence import Equation, Evidence
-from greybox.estimation.credibility.score_statistic import ScoreStatistic, score_test
-from greybox.estimation.credibility.score_test import Conclusion, ScoreTest
+from greybox.credibility.evidence import Equation, Evidence
+from greybox.credibility.score_statistic import ScoreStatistic, score_test
+from greybox.credibility.score_test import Conclusion, ScoreTest
 from greybox.estimation.verdict import TestResult, not_applicable
 
 Array = NDArray[np.float64]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.estimation.credibility.evidence import Equation, Evidence
-from greybox.estimation.credibility.score_statistic import score_test
+from greybox.credibility.evidence import Equation, Evidence
+from greybox.credibility.score_statistic import score_test
 from greybox.estimation.verdict import TestResult, not_applicable
 
 Array = NDArray[np.float64]

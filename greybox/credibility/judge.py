@@ -1,83 +1,51 @@
-"""The tests of an estimate that no regression of its own comes with.
+"""The tests of an estimate, by whatever estimator: the one place where they are run.
 
-Refined instruments and free runs are judged by the plain regression beside them,
-with instruments simulated by their own model.
+Least squares and plain instrumental variables are judged by the equations that they solve,
+refined instruments and free runs by the plain regression beside them, with instruments
+simulated by their own model.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.credibility.assess import assess
+from greybox.credibility.evidence import Evidence
 from greybox.errors import ExcitationError
-from greybox.estimation.credibility import Evidence, assess, convergence, weigh
 from greybox.estimation.output_error import one_step_errors
 from greybox.estimation.output_setup import measured, output_model
+from greybox.estimation.problem import Fitted
 from greybox.estimation.registry import ESTIMATORS
 from greybox.estimation.result import Estimate
 from greybox.estimation.verdict import NoRegression, TestResult, refused
-from greybox.model.predictor import Predictor, build_predictor
-from greybox.one_thread import one_thread
-from greybox.regression.problem import RegressionProblem
+from greybox.model.predictor import Predictor
 from greybox.regression.regression import Regression
 from greybox.trial.log import TrialLog
 
 Array = NDArray[np.float64]
 
 
-@one_thread
-def judge_estimate(
-    estimate: Estimate,
-    logs: Sequence[TrialLog],
-    *,
-    margins: dict[str, float] | None = None,
-    zero_mean: bool = True,
-    heading: Literal["measured", "simulated"] = "measured",
-    wind: Literal["smoothed", "measured"] = "smoothed",
-    lag: int = 0,
-) -> Estimate:
-    """Return an estimate with its tests and verdict.
+def run_tests(fitted: Fitted) -> Estimate:
+    """Return an estimate with its tests, by the regression beside it.
 
-    Parameters
-    ----------
-    estimate : Estimate
-        By instruments or by free runs. Tests that it has already stay, in place of
-        those of the same name.
-    logs : sequence of TrialLog
-        Those it was estimated on.
-    margins, zero_mean, heading, wind, lag
-        Of its instruments, as `build_instruments`.
+    Tests that it has already stay, in place of those of the same name. Without a regression
+    there are none, and the verdict refuses the estimate.
     """
-    problem = beside(
-        estimate, logs, margins=margins, zero_mean=zero_mean, heading=heading, wind=wind, lag=lag
-    )
-    tested = with_tests(problem, estimate)
-    if tested.verdict is not estimate.verdict:
-        return tested
-    return replace(tested, verdict=weigh(tested.tests, estimate.labels, estimate.method))
-
-
-def beside(estimate: Estimate, logs: Sequence[TrialLog], **instruments: Any) -> RegressionProblem:
-    """Return the regression that stands beside an estimate; `instruments` as `judge_estimate`."""
-    return RegressionProblem(_regression_predictor(estimate), tuple(logs), **instruments)
-
-
-def with_tests(problem: RegressionProblem, estimate: Estimate) -> Estimate:
-    """Return an estimate with its tests, by the regression of a problem beside it.
-
-    Without a regression there are none, and the verdict refuses the estimate.
-    """
+    estimate, problem, solved = fitted.estimate, fitted.regression, fitted.solved
     predictor, logs = problem.predictor, problem.logs
     try:
         regression = problem.regression
     except ExcitationError as error:
         return replace(estimate, verdict=refused([NoRegression(str(error))], estimate.labels))
-    instruments = problem.instruments(estimate.structure_theta())
-    keep = instruments.keep or tuple(e.keep for e in regression.experiments)
+    if solved is None:
+        instruments = problem.instruments(estimate.structure_theta())
+        keep = instruments.keep or tuple(e.keep for e in regression.experiments)
+    else:
+        instruments, keep = solved.simulated, tuple(solved.keep)
     theta, covariance = _coefficients(estimate, predictor)
     evidence = Evidence(
         predictor,
@@ -91,7 +59,7 @@ def with_tests(problem: RegressionProblem, estimate: Estimate) -> Estimate:
         estimate.method,
         problem.zero_mean,
         problem.margins,
-        solved=False,
+        solved=solved is not None,
     )
     own = {t.name: t for t in estimate.tests}
     tests: list[TestResult] = [own.pop(t.name, t) for t in assess(evidence)]
@@ -100,15 +68,28 @@ def with_tests(problem: RegressionProblem, estimate: Estimate) -> Estimate:
     return replace(estimate, tests=tuple(tests))
 
 
-def _regression_predictor(estimate: Estimate) -> Predictor:
-    """Return the predictor whose regression stands beside the estimate.
+def convergence(estimate: Estimate) -> tuple[TestResult, ...]:
+    """Return what is to be said of the iteration, nothing where there was none.
 
-    A free run has the current in the model; a regression captures it by columns.
+    Parameters
+    ----------
+    estimate : Estimate
+        Its ``iteration`` is read.
     """
-    own = estimate.predictor
-    if not ESTIMATORS[estimate.method].free_run:
-        return own
-    return build_predictor(own.structure, own.kind, own.regime)
+    if not estimate.iterations:
+        return ()
+    means = "" if estimate.converged else f", {ESTIMATORS[estimate.method].unconverged}"
+    sentence = f"the iteration {estimate.iteration.ended}{means}."
+    return (
+        TestResult(
+            "convergence",
+            "the iteration ended at an estimate that it no longer moves",
+            float(estimate.iterations),
+            None,
+            sentence,
+            passed=estimate.converged,
+        ),
+    )
 
 
 def _coefficients(estimate: Estimate, predictor: Predictor) -> tuple[Array, Array]:

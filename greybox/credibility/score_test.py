@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from greybox.estimation.credibility.evidence import Equation
-from greybox.estimation.credibility.score_statistic import ScoreStatistic
+from greybox.credibility.evidence import Equation
+from greybox.credibility.score_statistic import ScoreStatistic
 from greybox.estimation.verdict import TestResult, not_applicable
 
 LEVEL = 0.05

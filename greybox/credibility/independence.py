@@ -9,10 +9,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.estimation.credibility.evidence import Equation, Evidence
-from greybox.estimation.credibility.overidentification import delayed
-from greybox.estimation.credibility.score_statistic import ScoreStatistic, score_test
-from greybox.estimation.credibility.score_test import Conclusion, ScoreTest
+from greybox.credibility.evidence import Equation, Evidence
+from greybox.credibility.overidentification import delayed
+from greybox.credibility.score_statistic import ScoreStatistic, score_test
+from greybox.credibility.score_test import Conclusion, ScoreTest
 from greybox.estimation.verdict import TestResult
 from greybox.model.run.inputs import LogInputs
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from greybox.estimation.credibility.evidence import Equation
-from greybox.estimation.credibility.words import combination
+from greybox.credibility.evidence import Equation
+from greybox.credibility.words import combination
 from greybox.estimation.verdict import TestResult
 from greybox.numerics.linalg import scaled_inverse, sizes
 

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.credibility.evidence import Equation
+from greybox.credibility.words import combination, listed
 from greybox.estimation.covariance import correlation_lags
-from greybox.estimation.credibility.evidence import Equation
-from greybox.estimation.credibility.words import combination, listed
 from greybox.estimation.verdict import TestResult, not_applicable
 from greybox.numerics.lagged_moments import autocovariance, weighted_lags
 from greybox.numerics.linalg import quadratic_form, scaled_inverse

@@ -1,4 +1,4 @@
-"""Least squares and instrumental variables on the regressions of a predictor."""
+"""Solutions of the regressions of a predictor: least squares and instrumental variables."""
 
 from __future__ import annotations
 
@@ -15,21 +15,16 @@ from greybox.estimation.covariance import (
     block_bootstrap,
     score_covariance,
 )
-from greybox.estimation.credibility import Evidence, assess, convergence, weigh
 from greybox.estimation.disturbance import estimate_current
 from greybox.estimation.error_variance_profile import ErrorVarianceProfile, error_variance_profiles
 from greybox.estimation.normal_equations import Solution, solve_stacked
 from greybox.estimation.result import Estimate
 from greybox.estimation.values import Iteration, estimation_data
-from greybox.keywords import known_keywords
 from greybox.model.predictor import Predictor
 from greybox.numerics.linalg import scaled_inverse
-from greybox.one_thread import one_thread
 from greybox.regression.instruments import Instruments
 from greybox.regression.problem import RegressionProblem
 from greybox.regression.regression import Regression
-from greybox.trial.log import Logs
-from greybox.trial.segments import as_segments
 
 Array = NDArray[np.float64]
 Covariance = Literal["hac", "ma", "white", "bootstrap"]
@@ -53,39 +48,8 @@ class UnexcitedBiasError(ExcitationError):
         self.column = column
 
 
-@known_keywords
-@one_thread
-def estimate_ls(
-    predictor: Predictor,
-    logs: Logs,
-    *,
-    margins: dict[str, float] | None = None,
-    covariance: Covariance = "hac",
-    seed: int = 0,
-    judged: bool = True,
-) -> Estimate:
-    """Estimate the parameters by least squares, experiments pooled.
-
-    Parameters
-    ----------
-    predictor : Predictor
-        With an intercept where it is augmented: only zero-mean instruments
-        remove the constants that its derivation leaves out.
-    logs : TrialLog or sequence of TrialLog
-        One experiment each.
-    margins : dict of str to float, optional
-        Rows with |state| below are left out (Remark 4.2) [m/s, rad/s].
-    covariance : {"hac", "ma", "white", "bootstrap"}
-        ``hac`` by default: regressors that hold the noise rule ``ma`` out.
-    seed : int
-        For the bootstrap.
-    judged : bool
-        Test the estimate and give a verdict; an estimate among many does without.
-
-    Returns
-    -------
-    Estimate
-        Biased by measurement noise in the regressors, however long the log.
+def solve_ls(problem: RegressionProblem) -> Solved:
+    """Solve a problem by least squares.
 
     Raises
     ------
@@ -96,97 +60,6 @@ def estimate_ls(
     ----------
     Ljungberg (2020), eq. 2.17.
     """
-    problem = RegressionProblem(predictor, tuple(as_segments(logs)), margins, zero_mean=False)
-    return _judged(solve_ls(problem).estimate(covariance, seed, tested=judged))
-
-
-@known_keywords
-@one_thread
-def estimate_iv(
-    predictor: Predictor,
-    logs: Logs,
-    *,
-    start: Array | Estimate | None = None,
-    zero_mean: bool = True,
-    refine: bool | int = True,
-    heading: Literal["measured", "simulated"] = "measured",
-    wind: Literal["smoothed", "measured"] = "smoothed",
-    lag: int = 0,
-    margins: dict[str, float] | None = None,
-    covariance: Covariance = "ma",
-    metric: str = "moments",
-    seed: int = 0,
-    judged: bool = True,
-) -> Estimate:
-    """Estimate the parameters by instrumental variables, experiments stacked (4.5).
-
-    Parameters
-    ----------
-    predictor : Predictor
-    logs : sequence of TrialLog
-        One experiment each.
-    start : ndarray or Estimate, optional
-        (p,) parameters of the structure that simulate the first instruments: a
-        nominal model. By default the least-squares estimate (4.60).
-    zero_mean : bool
-        Remove each instrument's mean in each experiment (4.63): IV2. Kept: IV1.
-    refine : bool or int
-        Simulate the instruments again from each estimate until it stops moving,
-        or as many times at most.
-    heading : {"measured", "simulated"}
-        Heading in the instruments.
-    wind : {"smoothed", "measured"}
-        Wind in the instruments, as `build_instruments`.
-    lag : int
-        Delay of the instruments in samples, for logs in closed loop.
-    covariance : {"ma", "hac", "white", "bootstrap"}
-        ``ma`` by default, C = G⁻¹ (Σ Z R Zᵀ) G⁻ᵀ: the equation error is a moving
-        average and the instruments are independent of it. ``hac`` where the
-        noise changes its size along the log; it is noisier.
-    margins, seed, judged
-        As `estimate_ls`.
-    metric : {"moments", "identity"}
-        How the stacked equations of several experiments are weighted.
-
-    Returns
-    -------
-    Estimate
-        ``status`` says whether the refinement converged. Where an instrument
-        simulation diverges, the step is halved. Where that does not help, or the
-        estimates never settle, an estimate spoils the model of the next instruments:
-        the one whose instruments explain most of the regressors is returned.
-
-    Raises
-    ------
-    ExcitationError
-        Some direction is not excited, or even the first simulation diverges.
-    UsageError
-        Instruments keep their mean and the augmented predictor has no constant.
-
-    References
-    ----------
-    Ljungberg (2020), eqs. 2.21, 4.5, 4.60-4.63; Young (2008).
-    """
-    problem = RegressionProblem(
-        predictor, tuple(as_segments(logs)), margins, zero_mean, heading, wind, lag
-    )
-    solved = solve_iv(problem, start=start, refine=refine, metric=metric)
-    return _judged(solved.estimate(covariance, seed, tested=judged))
-
-
-def _judged(estimate: Estimate) -> Estimate:
-    """Return an estimate with the verdict of its tests, where it has some."""
-    if not estimate.tests:
-        return estimate
-    verdict = weigh(
-        estimate.tests, estimate.labels, estimate.method,
-        contaminated=estimate.predictor.contaminated,
-    )  # fmt: skip
-    return replace(estimate, verdict=verdict)
-
-
-def solve_ls(problem: RegressionProblem) -> Solved:
-    """Solve a problem by least squares; errors as `estimate_ls`."""
     instruments = _regressors_as_instruments(problem.regression)
     return Solved("ls", problem, instruments, _solve(problem.regression, instruments))
 
@@ -198,7 +71,35 @@ def solve_iv(
     refine: bool | int = True,
     metric: str = "moments",
 ) -> Solved:
-    """Solve a problem by instrumental variables; parameters and errors as `estimate_iv`."""
+    """Solve a problem by instrumental variables, experiments stacked (4.5).
+
+    Where an instrument simulation diverges, the step is halved. Where that does not help, or
+    the estimates never settle, an estimate spoils the model of the next instruments: the one
+    whose instruments explain most of the regressors is returned.
+
+    Parameters
+    ----------
+    problem : RegressionProblem
+    start : ndarray or Estimate, optional
+        (p,) parameters of the structure that simulate the first instruments: a nominal
+        model. By default the least-squares estimate (4.60).
+    refine : bool or int
+        Simulate the instruments again from each estimate until it stops moving, or as many
+        times at most.
+    metric : {"moments", "identity"}
+        How the stacked equations of several experiments are weighted.
+
+    Raises
+    ------
+    ExcitationError
+        Some direction is not excited, or even the first simulation diverges.
+    UsageError
+        Instruments keep their mean and the augmented predictor has no constant.
+
+    References
+    ----------
+    Ljungberg (2020), eqs. 4.5, 4.60-4.63; Young (2008).
+    """
     predictor = problem.predictor
     if (
         not problem.zero_mean
@@ -260,7 +161,7 @@ def solve_iv(
 
 @dataclass(frozen=True)
 class Solved:
-    """Equations that are solved, before standard errors and tests.
+    """Equations that are solved, before standard errors.
 
     Parameters
     ----------
@@ -303,9 +204,7 @@ class Solved:
         """Whether constants of the experiments were removed: by zero-mean instruments."""
         return self.problem.zero_mean
 
-    def estimate(
-        self, covariance: Covariance | None, seed: int = 0, *, tested: bool = False
-    ) -> Estimate:
+    def estimate(self, covariance: Covariance | None, seed: int = 0) -> Estimate:
         """Return the estimate.
 
         Parameters
@@ -313,8 +212,6 @@ class Solved:
         covariance : {"ma", "hac", "white", "bootstrap"}, optional
             None leaves standard errors out, where they will not be looked at.
         seed : int
-        tested : bool
-            Whether its tests are asked for.
         """
         problem, theta = self.problem, self.theta
         predictor, logs = problem.predictor, problem.logs
@@ -328,7 +225,7 @@ class Solved:
                 else ()
             )
             matrix, lags = _covariance(self, projected, residuals, covariance, seed, shapes)
-        estimate = Estimate(
+        return Estimate(
             predictor=predictor,
             method=self.method,
             theta=theta,
@@ -354,24 +251,6 @@ class Solved:
             if covariance is not None
             else (),
         )
-        if not tested:
-            return estimate
-        tests = convergence(estimate) + assess(
-            Evidence(
-                predictor,
-                problem.regression,
-                logs,
-                self.simulated,
-                theta,
-                matrix,
-                tuple(tuple(equation) for equation in residuals),
-                tuple(self.keep),
-                self.method,
-                self.centred,
-                problem.margins,
-            )
-        )
-        return replace(estimate, tests=tests)
 
 
 def _regressors_as_instruments(regression: Regression) -> Instruments:

@@ -10,22 +10,23 @@ from scipy.stats import binom
 from surge import TRUE, predictor, surge_log
 from virtual import virtual_log
 
+from greybox.credibility.anderson_rubin import confidence_sets, solve_quadratic
+from greybox.credibility.assess import assess
+from greybox.credibility.evidence import Evidence
+from greybox.credibility.many import surplus_bias
+from greybox.credibility.margins import noise_bias
+from greybox.credibility.stability import damping_signs
+from greybox.credibility.verdict import holm, weigh
+from greybox.credibility.weak import measure_strength, threshold
+from greybox.credibility.words import combination
 from greybox.errors import GreyboxError
-from greybox.estimation.credibility import Evidence, assess, weigh
-from greybox.estimation.credibility.anderson_rubin import confidence_sets, solve_quadratic
-from greybox.estimation.credibility.many import surplus_bias
-from greybox.estimation.credibility.margins import noise_bias
-from greybox.estimation.credibility.stability import damping_signs
-from greybox.estimation.credibility.verdict import holm
-from greybox.estimation.credibility.weak import measure_strength, threshold
-from greybox.estimation.credibility.words import combination
-from greybox.estimation.estimate import estimate_iv, estimate_ls
 from greybox.estimation.verdict import BiasSource, LeastSquaresBias, TestResult, TrustLevel
 from greybox.model.catalogue import get_structure
 from greybox.model.predictor import build_predictor
 from greybox.model.terms import parse_term
 from greybox.regression.instruments import build_instruments
 from greybox.regression.regression import build_regression
+from greybox.validation.fit_single import estimate_iv, estimate_ls
 from greybox.validation.selection import estimate_model
 
 REGIME = (("u", (1,)), ("v", (1,)))

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.credibility.evidence import Evidence
 from greybox.errors import GreyboxError
-from greybox.estimation.credibility.evidence import Evidence
 from greybox.estimation.verdict import TestResult, not_applicable
 from greybox.model.run.inputs import LogInputs
 from greybox.numerics.linalg import scaled_inverse

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from greybox.estimation.credibility.predetermined import moments_mean, noise_after_error
+from greybox.credibility.predetermined import moments_mean, noise_after_error
 
 DECAY, SAMPLES = 0.95, 300
 

@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.estimation.credibility.evidence import Equation
-from greybox.estimation.credibility.words import listed
+from greybox.credibility.evidence import Equation
+from greybox.credibility.words import listed
 from greybox.estimation.verdict import TestResult, not_applicable
 from greybox.numerics.lagged_moments import lagged_products
 from greybox.numerics.linalg import scaled_inverse
