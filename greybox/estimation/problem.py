@@ -53,27 +53,37 @@ class Fitted:
         return replace(self, estimate=more)
 
 
-@dataclass(frozen=True)
-class EstimationProblem:
-    """An estimate that is asked for, all choices made but the estimator's own.
+@dataclass(frozen=True, kw_only=True)
+class EstimationOptions:
+    """What can be asked of an estimate beside its method; an estimator heeds what concerns it.
 
     Parameters
     ----------
-    logs : tuple of TrialLog
-        One experiment each.
-    structure : Structure
-    kind : PredictorKind
-    start : Estimate, optional
-        Where a free-run fit starts.
-    margins, covariance, heading, loop, zero_mean, refine, nominal, output_error, seed, prefilter,
-    judged, without
-        As in a request; an estimator heeds what concerns it.
+    margins : mapping of str to float, optional
+        |u|, |v| [m/s] below which samples are cut out.
+    covariance : {"ma", "hac", "white", "bootstrap"}, optional
+        What the standard errors allow for; by default the method's own.
+    heading : {"measured", "simulated"}
+        Heading inside the instruments.
+    loop : {"auto", "open", "closed"}
+        Whether a controller moved the thrusters.
+    zero_mean : bool
+        Whether instruments lose their mean (4.63).
+    refine : bool or int
+        Whether, or how many times at most, instruments are simulated again.
+    nominal : ManoeuvringModel, optional
+        Simulates the first instruments, or starts output error; least squares does without it.
+    output_error : OutputErrorOptions
+        What only ``oe`` heeds.
+    seed : int
+    prefilter : {"auto", "noise", "none"}
+        ``noise`` for refined instrumental variables, ``none`` for plain ones.
+    judged : bool
+        Whether tests and verdict are asked for.
+    without : tuple of str
+        Bias-capturing columns to leave out, spelled ``state:function``.
     """
 
-    logs: tuple[TrialLog, ...]
-    structure: Structure
-    kind: PredictorKind
-    start: Estimate | None = None
     margins: dict[str, float] | None = None
     covariance: Covariance | None = None
     heading: Literal["measured", "simulated"] = "measured"
@@ -86,6 +96,28 @@ class EstimationProblem:
     prefilter: Literal["auto", "noise", "none"] = "auto"
     judged: bool = True
     without: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class EstimationProblem(EstimationOptions):
+    """An estimate that is asked for, all choices made but the estimator's own.
+
+    Parameters
+    ----------
+    logs : tuple of TrialLog
+        One experiment each.
+    structure : Structure
+    kind : PredictorKind
+    start : Estimate, optional
+        Where a free-run fit starts.
+    options
+        As `EstimationOptions`.
+    """
+
+    logs: tuple[TrialLog, ...]
+    structure: Structure
+    kind: PredictorKind
+    start: Estimate | None = None
 
     @cached_property
     def regime(self) -> Regime:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Literal
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from greybox.credibility.judge import run_tests
 from greybox.credibility.verdict import weigh
 from greybox.estimation.informative import require_informative
-from greybox.estimation.problem import EstimationProblem, Fitted
+from greybox.estimation.problem import EstimationOptions, EstimationProblem, Fitted
 from greybox.estimation.registry import ESTIMATORS
 from greybox.estimation.result import Estimate
 from greybox.estimation.solve import Covariance, Solved, solve_iv, solve_ls
@@ -27,12 +27,6 @@ from greybox.trial.segments import as_segments
 from greybox.validation.request import Request
 
 Array = NDArray[np.float64]
-
-# what a problem takes from a request as it is
-_ASKED = (
-    "margins", "covariance", "heading", "loop", "zero_mean", "refine", "nominal", "output_error",
-    "seed", "prefilter", "judged", "without",
-)  # fmt: skip
 
 
 @known_keywords
@@ -190,6 +184,6 @@ def estimate_once(
     """
     estimator, predictor = ESTIMATORS[method], PREDICTORS[kind]
     require_informative(logs, predictor)
-    asked = {name: getattr(request, name) for name in _ASKED}
+    asked = {f.name: getattr(request, f.name) for f in fields(EstimationOptions)}
     fitted = estimator.fit(EstimationProblem(tuple(logs), structure, predictor, start, **asked))
     return run_tests(fitted) if request.judged else fitted.estimate
