@@ -207,8 +207,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Read, design, write."""
     from experiment_design.design import design_trial
-    from experiment_design.plan import write_plan
     from experiment_design.prepare import prepare_request
+    from experiment_design.result import write_plan
     from experiment_design.timing import least_duration
     from greybox.errors import UsageError
     from greybox.files import check_targets, write_json
@@ -264,8 +264,8 @@ def run(options: argparse.Namespace) -> None:
 def _run_between(options: argparse.Namespace, request: Any, notes: tuple[str, ...]) -> None:
     """Design the trial between two models and write it."""
     from experiment_design.discriminate import design_between
-    from experiment_design.plan import write_plan
     from experiment_design.request import Rival, full_structure
+    from experiment_design.result import write_plan
     from greybox.errors import UsageError
     from greybox.files import write_json
     from greybox.model.model import load_model

@@ -1,4 +1,4 @@
-# The promised names, the only list of them: `greybox.lazy` reads it, and so do type checkers.
+# The promised names, the only list of them: `greybox.public` reads it, and so do type checkers.
 from greybox.diagnosis.causes import known_causes as known_causes
 from greybox.diagnosis.causes.cause import Cause as Cause
 from greybox.diagnosis.diagnose import DiagnosisOptions as DiagnosisOptions

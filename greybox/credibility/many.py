@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.credibility.evidence import Equation
-from greybox.credibility.words import listed
 from greybox.estimation.verdict import TestResult, not_applicable
 from greybox.numerics.lagged_moments import lagged_products
 from greybox.numerics.linalg import scaled_inverse
@@ -82,7 +81,7 @@ def many_instruments(equation: Equation, biases: frozenset[str]) -> TestResult:
         None,
         f"instruments of {len(equation.z)} logs shift {worst} by {ratio[worst]:+.2f} standard "
         f"errors towards least squares, the most of all"
-        + (f" ({listed(hit)} by more than half): use fewer, longer logs." if hit else "."),
+        + (f" ({', '.join(hit)} by more than half): use fewer, longer logs." if hit else "."),
         TOLERATED_BIAS,
         not hit,
         hit,

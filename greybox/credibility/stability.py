@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.credibility.evidence import Evidence
-from greybox.credibility.words import listed
 from greybox.estimation.verdict import TestResult, not_applicable
 from greybox.model.run.inputs import LogInputs
 from greybox.model.run.step import StepModel
@@ -149,8 +148,8 @@ def damping_signs(evidence: Evidence) -> TestResult:
         null,
         float(len(wrong)),
         p,
-        f"{listed(wrong)} {'is' if len(wrong) == 1 else 'are'} positive, which feeds energy into "
-        f"the motion: the structure lacks a term, or the log does not show the damping."
+        f"{', '.join(wrong)} {'is' if len(wrong) == 1 else 'are'} positive, which feeds energy "
+        f"into the motion: the structure lacks a term, or the log does not show the damping."
         if wrong
         else f"none of {len(found)} damping terms has the wrong sign beyond chance.",
         LEVEL,

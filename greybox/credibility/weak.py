@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.credibility.evidence import Equation
-from greybox.credibility.words import combination, listed
+from greybox.credibility.excitation import combination
 from greybox.estimation.covariance import correlation_lags
 from greybox.estimation.verdict import TestResult, not_applicable
 from greybox.numerics.lagged_moments import autocovariance, weighted_lags
@@ -233,8 +233,8 @@ def weak_instruments(equation: Equation, biases: frozenset[str]) -> list[TestRes
     weak = tuple(labels[i] for i in judged if s.own[i] < needed and labels[i] not in biases)
     rest = s.partial_f[weakest]
     sentence = (
-        f"weak: what only {listed(weak)} can explain moves too little against the noise (effective "
-        f"F {s.own[weakest]:.3g} at {labels[weakest]}, {needed:.3g} needed, though its "
+        f"weak: what only {', '.join(weak)} can explain moves too little against the noise "
+        f"(effective F {s.own[weakest]:.3g} at {labels[weakest]}, {needed:.3g} needed, though its "
         f"first-stage F is {rest:.3g}): move the ship over a wider range."
         if weak
         else f"the least effective F is {s.own[weakest]:.3g} at {labels[weakest]} "

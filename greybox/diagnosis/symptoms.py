@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.channels import CHANNELS
-from greybox.credibility.words import listed
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.held_out import long_run_variance
 from greybox.diagnosis.noise import SEEN
@@ -135,4 +134,4 @@ def coloured(fit: Fit, outputs: Sequence[str]) -> str | None:
             found.append(f"{word(outputs[group.outputs[0]])}{tail}")
     if not found:
         return None
-    return f"something beside the model moves {listed(found)}"
+    return f"something beside the model moves {', '.join(found)}"

@@ -40,13 +40,12 @@ from greybox.estimation.shooting import (
 from greybox.estimation.solve import UnexcitedBiasError
 from greybox.estimation.values import Iteration, estimation_data
 from greybox.estimation.verdict import TestResult
-from greybox.keywords import known_keywords
 from greybox.model.disturbances import CURRENT, WIND
 from greybox.model.noise import NoiseLevels
 from greybox.model.output import OutputModel, Role
 from greybox.model.predictor import Predictor
 from greybox.model.run.output_runs import Simulator
-from greybox.one_thread import one_thread
+from greybox.public import known_keywords, one_thread
 from greybox.regression.regression import common_sample_time
 from greybox.trial.log import Logs, TrialLog
 from greybox.trial.segments import as_segments

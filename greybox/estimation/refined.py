@@ -41,9 +41,8 @@ from greybox.estimation.result import Estimate
 from greybox.estimation.solve import Covariance, solve_iv, solve_ls
 from greybox.estimation.values import Iteration
 from greybox.estimation.verdict import UNJUDGED
-from greybox.keywords import known_keywords
 from greybox.model.predictor import Predictor
-from greybox.one_thread import one_thread
+from greybox.public import known_keywords, one_thread
 from greybox.regression.motion import Motion, further_channels, predicted_motion, smoothed_heading
 from greybox.regression.problem import RegressionProblem
 from greybox.regression.regression import measured_rows, within_margins

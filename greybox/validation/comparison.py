@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 
 from greybox.errors import UsageError, suggestion
 from greybox.estimation.result import Estimate
-from greybox.keywords import known_keywords
 from greybox.model.model import ManoeuvringModel
 from greybox.model.run.changes import Change, simulate_changing
 from greybox.model.run.inputs import LogInputs
 from greybox.notebook import DisplayMixin, items, number, table
-from greybox.one_thread import one_thread
+from greybox.public import known_keywords, one_thread
 from greybox.regression.instruments import state_bound
 from greybox.trial.log import Logs, TrialLog, as_list
 from greybox.trial.segments import find_log_gaps

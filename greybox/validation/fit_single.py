@@ -16,11 +16,10 @@ from greybox.estimation.problem import EstimationOptions, EstimationProblem, Fit
 from greybox.estimation.registry import ESTIMATORS
 from greybox.estimation.result import Estimate
 from greybox.estimation.solve import Covariance, Solved, solve_iv, solve_ls
-from greybox.keywords import known_keywords
 from greybox.model.predictor import Predictor
 from greybox.model.predictor_kinds import PREDICTORS
 from greybox.model.structure import Structure
-from greybox.one_thread import one_thread
+from greybox.public import known_keywords, one_thread
 from greybox.regression.problem import RegressionProblem
 from greybox.trial.log import Logs, TrialLog
 from greybox.trial.segments import as_segments

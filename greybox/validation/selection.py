@@ -19,9 +19,8 @@ from greybox.estimation.registry import ESTIMATORS, free_run_estimator
 from greybox.estimation.result import Estimate
 from greybox.estimation.solve import Covariance
 from greybox.estimation.verdict import TrustLevel, Verdict, refused
-from greybox.keywords import known_keywords
 from greybox.model.model import ManoeuvringModel
-from greybox.one_thread import one_thread
+from greybox.public import known_keywords, one_thread
 from greybox.regression.regression import common_sample_time
 from greybox.trial.log import Logs, TrialLog
 from greybox.trial.segments import as_segments

@@ -13,12 +13,12 @@ from virtual import virtual_log
 from greybox.credibility.anderson_rubin import confidence_sets, solve_quadratic
 from greybox.credibility.assess import assess
 from greybox.credibility.evidence import Evidence
+from greybox.credibility.excitation import combination
 from greybox.credibility.many import surplus_bias
 from greybox.credibility.margins import noise_bias
 from greybox.credibility.stability import damping_signs
 from greybox.credibility.verdict import holm, weigh
 from greybox.credibility.weak import measure_strength, threshold
-from greybox.credibility.words import combination
 from greybox.errors import GreyboxError
 from greybox.estimation.verdict import BiasSource, LeastSquaresBias, TestResult, TrustLevel
 from greybox.model.catalogue import get_structure

@@ -5,7 +5,7 @@ from __future__ import annotations
 import scipy.linalg  # noqa: F401
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from greybox.one_thread import one_thread
+from greybox.public import one_thread
 
 
 def threads() -> set[int]:
