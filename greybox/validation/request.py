@@ -39,8 +39,10 @@ class Request(EstimationOptions):
     predictor : {"basic", "augmented", "wind", "basic+wind"}, optional
     structure : str, optional
         As `get_structure`.
-    options
-        As `EstimationOptions`.
+    margins, covariance, heading, loop, zero_mean, refine, nominal
+        As `estimate_model`.
+    output_error, seed, prefilter, judged, without
+        As `estimate_model`.
 
     Raises
     ------
