@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from math import ceil, isfinite
@@ -11,9 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import StructureError
-from greybox.model.run.simulation import FreeRun, simulate
-from greybox.model.run.step import Integrator
-from greybox.model.structure import Structure
 
 Array = NDArray[np.float64]
 
@@ -63,72 +60,30 @@ def factors_at(changes: Sequence[Change], names: Sequence[str], time: float) -> 
     return found
 
 
-def simulate_changing(
-    structure: Structure,
-    theta: Array,
+def pieces(
     changes: Sequence[Change],
-    x0: Array,
-    tau: Array,
+    names: Sequence[str],
+    samples: int,
     sample_time: float,
-    *,
-    first: float = 0.0,
-    psi: Array | None = None,
-    psi0: Array | float = 0.0,
-    d: Array | None = None,
-    air: Array | None = None,
-    process_noise: Array | None = None,
-    integrator: Integrator = "euler",
-    bound: Array | None = None,
-) -> FreeRun:
-    """Run freely with parameters that change on the way.
+    first: float,
+) -> Iterator[tuple[int, int, Array]]:
+    """Yield from where to where no parameter changes, and what each is multiplied by there, (p,).
 
-    Parameters are those of `simulate`; the run is made of pieces, each of which
-    starts where the one before ended. A change acts from the first sample that
-    is not before it.
+    A change acts from the first sample that is not before it.
 
     Parameters
     ----------
     changes : sequence of Change
-        Of parameters of the structure.
+    names : sequence of str
+        All parameters.
+    samples : int
+    sample_time : float
+        [s]
     first : float
         Time of the first sample on the clock of the changes [s].
-
-    Returns
-    -------
-    FreeRun
     """
-    samples = np.shape(tau)[-2]
     # a time that is a whole number of samples may lie a rounding error beyond it
     starts = {ceil((c.time - first) / sample_time - 1e-6) for c in changes}
     edges = [0, *sorted(k for k in starts if 0 < k < samples), samples]
-    x: list[Array] = []
-    angle: list[Array] = []
-    diverged: NDArray[np.int64] | None = None
     for a, b in pairwise(edges):
-        now = factors_at(changes, structure.parameters, first + (a + 1e-6) * sample_time)
-        run = simulate(
-            structure, theta * now, x0, np.asarray(tau)[..., a:b, :], sample_time,
-            psi=None if psi is None else np.asarray(psi)[..., a : b + 1],
-            psi0=psi0,
-            d=None if d is None else _rows(d, a, b),
-            air=None if air is None else _rows(air, a, b),
-            process_noise=None if process_noise is None else _rows(process_noise, a, b),
-            integrator=integrator,
-            bound=bound,
-        )  # fmt: skip
-        with np.errstate(invalid="ignore"):
-            x0, psi0 = run.x[:, -1], run.psi[:, -1]
-        x.append(run.x[:, 1:] if x else run.x)
-        angle.append(run.psi[:, 1:] if angle else run.psi)
-        later = np.where(run.diverged >= 0, run.diverged + a, -1)
-        diverged = later if diverged is None else np.where(diverged >= 0, diverged, later)
-    assert diverged is not None
-    return FreeRun(np.concatenate(x, axis=1), np.concatenate(angle, axis=1), diverged, run.bound)
-
-
-def _rows(series: Array, a: int, b: int) -> Array:
-    """Return samples of a series; a constant (n,) or (R, 1, n) has none to choose."""
-    series = np.asarray(series, float)
-    if series.ndim < 2 or series.shape[-2] == 1:
-        return series
-    return series[..., a:b, :]
+        yield a, b, factors_at(changes, names, first + (a + 1e-6) * sample_time)

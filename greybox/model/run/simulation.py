@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import DivergenceError, UsageError
+from greybox.model.run.changes import Change, pieces
 from greybox.model.run.kernels import MANY_RUNS, FreeRunKernel, FreeRunStep, OverRunsKernel
 from greybox.model.run.step import Heading, Integrator, StepModel, held, integrated
 from greybox.model.structure import Structure
@@ -102,6 +103,8 @@ def simulate(
     process_noise: Array | None = None,
     integrator: Integrator = "euler",
     bound: Array | None = None,
+    changes: Sequence[Change] = (),
+    first: float = 0.0,
 ) -> FreeRun:
     """Run one or many ships freely from their initial states.
 
@@ -130,6 +133,10 @@ def simulate(
     integrator : {"euler", "rk4"}
     bound : ndarray, optional
         (nx,) magnitude past which a state counts as diverged.
+    changes : sequence of Change
+        Of parameters on the way; each acts from the first sample that is not before it.
+    first : float
+        Time of the first sample on the clock of the changes [s].
 
     Returns
     -------
@@ -171,8 +178,6 @@ def simulate(
     if air is not None:
         blow = held(np.asarray(air, float), integrator, axis=-2)
         series.append(np.broadcast_to(blow, (runs, samples, 2)))
-    x0 = np.broadcast_to(x0, (runs, nx))
-    start = np.broadcast_to(np.asarray(psi0, float), (runs,))
     theta = np.broadcast_to(theta, (runs, theta.shape[1]))
     if process_noise is not None:
         series.append(np.broadcast_to(np.asarray(process_noise, float), (runs, samples, nx)))
@@ -182,11 +187,12 @@ def simulate(
         process_noise is not None,
     )
     out = np.empty((runs, samples + 1, nx + (heading == "simulated")))
+    out[:, 0, :nx], out[:, 0, nx:] = x0, np.reshape(psi0, (-1, 1))
+    advance = _few if runs < MANY_RUNS else _many
     with np.errstate(all="ignore"):
-        if runs < MANY_RUNS:
-            _few(step, series, x0, start, theta, sample_time, out)
-        else:
-            _many(step, series, x0, start, theta, sample_time, out)
+        for a, b, factors in pieces(changes, structure.parameters, samples, sample_time, first):
+            read = [part[:, a:b] for part in series]
+            advance(step, read, theta * factors, sample_time, out[:, a : b + 1])
     x = out[:, :, :nx]
     if heading == "simulated":
         angle = out[:, :, nx]
@@ -238,40 +244,24 @@ def _common_runs(given: Mapping[str, tuple[Any, tuple[int, ...]]]) -> int:
 
 
 def _few(
-    step: FreeRunStep,
-    series: list[Array],
-    x0: Array,
-    psi0: Array,
-    theta: Array,
-    sample_time: float,
-    out: Array,
+    step: FreeRunStep, series: list[Array], theta: Array, sample_time: float, out: Array
 ) -> None:
-    """Fill `out` run by run."""
+    """Fill `out` (R, N+1, ·) from its first states on, run by run."""
     runs, samples = series[0].shape[:2]
-    nx = x0.shape[1]
     kernel = FreeRunKernel(step.function, samples)
     kernel.constants[1][:] = sample_time
     for run in range(runs):
         np.concatenate([part[run] for part in series], axis=1, out=kernel.read)
-        kernel.start[:nx] = x0[run]
-        kernel.start[nx:] = psi0[run]
+        kernel.start[:] = out[run, 0]
         kernel.constants[0][:] = theta[run]
-        out[run, 0] = kernel.start
         out[run, 1:] = kernel()
 
 
 def _many(
-    step: FreeRunStep,
-    series: list[Array],
-    x0: Array,
-    psi0: Array,
-    theta: Array,
-    sample_time: float,
-    out: Array,
+    step: FreeRunStep, series: list[Array], theta: Array, sample_time: float, out: Array
 ) -> None:
-    """Fill `out` in batches of runs."""
+    """Fill `out` (R, N+1, ·) from its first states on, in batches of runs."""
     runs, samples = series[0].shape[:2]
-    nx = x0.shape[1]
     # few sizes are compiled: the last batch holds copies of its last run
     size = min(-(-runs // _STEP_RUNS) * _STEP_RUNS, _BATCH_RUNS)
     kernel = OverRunsKernel(step, samples, size)
@@ -283,8 +273,7 @@ def _many(
             width = part.shape[2]
             kernel.w[:, column : column + width, :n] = part[batch].transpose(1, 2, 0)
             column += width
-        kernel.x[0, :nx, :n] = x0[batch].T
-        kernel.x[0, nx:, :n] = psi0[batch]
+        kernel.x[0, :, :n] = out[batch, 0].T
         kernel.theta[:, :n] = theta[batch].T
         for a in (kernel.w, kernel.x[0], kernel.theta):
             a[..., n:] = a[..., n - 1 : n]
