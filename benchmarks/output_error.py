@@ -47,7 +47,6 @@ from scipy.stats import t as student
 
 import greybox as gb
 from greybox.errors import GreyboxError
-from greybox.estimation.estimate import estimate_iv, estimate_ls
 from greybox.estimation.free_run import fit_free_runs
 from greybox.estimation.informative import regime_of
 from greybox.estimation.output_error import OutputErrorOptions, estimate_oe
@@ -65,6 +64,7 @@ from greybox.trial.kinematics import decimate
 from greybox.trial.log import TrialLog
 from greybox.trial.store import write_log
 from greybox.validation.fit import average_fit, run_model
+from greybox.validation.fit_single import estimate_iv, estimate_ls
 from greybox.validation.request import Request
 from greybox.validation.selection import estimate_requested
 from greybox.vessel.force import force_inputs

@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 
 import greybox as gb
-from greybox.model.simulation import positions
+from greybox.model.run.simulation import positions
 from greybox.study.chapter6 import TRUE
 from greybox.study.inputs import smoothed_pulses
 

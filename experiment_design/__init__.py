@@ -6,7 +6,7 @@ ones; each is loaded when it is first used.
 
 import logging
 
-from greybox.lazy import lazy_names
+from greybox.public import lazy_names
 
 # a library is silent until the program that uses it asks to hear
 logging.getLogger(__name__).addHandler(logging.NullHandler())

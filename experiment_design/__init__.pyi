@@ -1,4 +1,4 @@
-# The promised names, the only list of them: `greybox.lazy` reads it, and so do type checkers.
+# The promised names, the only list of them: `greybox.public` reads it, and so do type checkers.
 from experiment_design.certificate import Certificate as Certificate
 from experiment_design.certificate import certify as certify
 from experiment_design.design import design_trial as design_trial
@@ -10,7 +10,6 @@ from experiment_design.inputs import to_log as to_log
 from experiment_design.limits import Circle as Circle
 from experiment_design.limits import TrialLimits as TrialLimits
 from experiment_design.noise import noise_levels as noise_levels
-from experiment_design.plan import write_plan as write_plan
 from experiment_design.precision import PredictedPrecision as PredictedPrecision
 from experiment_design.precision import predict_precision as predict_precision
 from experiment_design.prepare import Wishes as Wishes
@@ -19,5 +18,6 @@ from experiment_design.request import DesignRequest as DesignRequest
 from experiment_design.request import Rival as Rival
 from experiment_design.request import build_problem as build_problem
 from experiment_design.result import Design as Design
+from experiment_design.result import write_plan as write_plan
 from experiment_design.timing import least_duration as least_duration
 from greybox.model.noise import NoiseLevels as NoiseLevels

@@ -7,14 +7,13 @@ from numpy.typing import NDArray
 
 from experiment_design.request import DesignRequest, draw_gusts
 from experiment_design.rollout import Motion
+from greybox.model.predictor_kinds import PREDICTORS
 from greybox.rotation import ned_to_body
 
 Array = NDArray[np.float64]
 
 # standard deviations of its sensor within which the sign of a velocity is not known
 _SURE = 3.0
-# predictors that measure the velocity through the air
-MEASURING = ("wind", "basic+wind")
 
 
 def air_velocity(velocity: Array, psi: Array, wind: Array) -> Array:
@@ -77,7 +76,8 @@ def share_near_zero(request: DesignRequest, motions: tuple[Motion, ...]) -> floa
 
 def air_notes(request: DesignRequest, motions: tuple[Motion, ...]) -> list[str]:
     """Return what a plan that measures the wind has to say where no margin was asked for."""
-    if request.predictor not in MEASURING or request.limits.margin_air is not None:
+    measured = PREDICTORS[request.predictor].air_measured
+    if not measured or request.limits.margin_air is not None:
         return []
     names = "|u_q| or |v_q|" if "v" in request.structure.states else "|u_q|"
     if not request.noise.wind > 0:

@@ -207,8 +207,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Read, design, write."""
     from experiment_design.design import design_trial
-    from experiment_design.plan import write_plan
     from experiment_design.prepare import prepare_request
+    from experiment_design.result import write_plan
     from experiment_design.timing import least_duration
     from greybox.errors import UsageError
     from greybox.files import check_targets, write_json
@@ -264,8 +264,8 @@ def run(options: argparse.Namespace) -> None:
 def _run_between(options: argparse.Namespace, request: Any, notes: tuple[str, ...]) -> None:
     """Design the trial between two models and write it."""
     from experiment_design.discriminate import design_between
-    from experiment_design.plan import write_plan
     from experiment_design.request import Rival, full_structure
+    from experiment_design.result import write_plan
     from greybox.errors import UsageError
     from greybox.files import write_json
     from greybox.model.model import load_model
@@ -360,7 +360,10 @@ def _wishes(options: argparse.Namespace, model: Any) -> Any:
     if options.of:
         values = dict(zip(model.names, model.at_final_parameters().theta, strict=True))
         combination = gradient_of(options.of, values)
-    criterion: Any = "c" if options.of and options.criterion == "D" else options.criterion
+    criterion = CRITERIA[options.criterion]
+    if options.of and criterion.determinant:
+        # of one function's variance alone, that is the criterion of one function
+        criterion = next(c for c in CRITERIA.values() if c.combined)
     process = None if options.process_noise is None else np.array(options.process_noise)
     return Wishes(
         duration=options.duration,
@@ -372,7 +375,7 @@ def _wishes(options: argparse.Namespace, model: Any) -> Any:
         trials=options.trials,
         predictor=options.predictor,
         estimator=options.estimator,
-        criterion=criterion,
+        criterion=criterion.name,
         wanted=tuple(options.want),
         combination=combination,
         current=options.current,

@@ -23,6 +23,7 @@ from experiment_design.search import Candidate, ascend, assess
 from experiment_design.stability import unstable_sentence
 from experiment_design.timing import telling_duration
 from greybox.errors import InfeasibleError
+from greybox.model.predictor_kinds import PREDICTORS
 
 Array = NDArray[np.float64]
 
@@ -41,7 +42,8 @@ def require_horizon(request: DesignRequest) -> None:
     most = max(len(predictor.equation(s)) + 1 for s in request.structure.states)
     if samples * request.trials <= most:
         longer = max(2 * most * request.sample_time, 6 * request.hold)
-        other = "." if request.predictor == "basic" else ", or --predictor basic."
+        fewer = PREDICTORS[request.predictor].plain
+        other = "." if fewer == request.predictor else f", or --predictor {fewer}."
         raise InfeasibleError(
             f"a trial of {request.duration:g} s has {samples} samples, too few for the {most} "
             f"unknowns of one equation: use --duration {longer:g} or more{other}"
@@ -68,8 +70,9 @@ def require_informative(
     if 2 * len(vague) > len(names):
         longer = telling_duration(request, _VAGUE)
         other = "--want fewer parameters"
-        if request.predictor != "basic":
-            other = "--predictor basic"
+        fewer = PREDICTORS[request.predictor].plain
+        if request.predictor != fewer:
+            other = f"--predictor {fewer}"
         if request.limits.margin_air:
             other = "a lower --margin-air"
         advice = f"Use {other}" if longer is None else f"Use --duration {longer:g}, or {other}"

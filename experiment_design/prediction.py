@@ -10,7 +10,7 @@ from scipy.spatial import ConvexHull
 
 from experiment_design.limits import Circle
 from experiment_design.result import Design
-from greybox.model.simulation import positions, simulate
+from greybox.model.run.simulation import positions, simulate
 from greybox.vessel.actuation import actuated_force
 
 Array = NDArray[np.float64]

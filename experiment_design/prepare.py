@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from experiment_design.air import MEASURING, clear_heading
+from experiment_design.air import clear_heading
 from experiment_design.campaign import random_campaign
 from experiment_design.demands import ROOM, tells_enough, with_margins
 from experiment_design.limits import TrialLimits
@@ -174,7 +174,7 @@ def prepare_request(
         d[:2] = wishes.current
     if wishes.wind is not None:
         d[2:] = wishes.wind
-    measuring = predictor in MEASURING
+    measuring = PREDICTORS[predictor].air_measured
     if wishes.limits.margin_air is not None and not measuring:
         raise UsageError(
             f"--margin-air keeps the measured velocity through the air from zero, and predictor "

@@ -21,8 +21,8 @@ from greybox.errors import UsageError, suggestion
 from greybox.model.model import ManoeuvringModel
 from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import Column, Predictor, Regime, build_predictor
+from greybox.model.run.simulation import stationary_disturbance
 from greybox.model.run.step import Integrator
-from greybox.model.simulation import stationary_disturbance
 from greybox.model.structure import Structure
 from greybox.vessel.vessel import Vessel
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from experiment_design.request import DesignRequest
 from experiment_design.robust import Keeping
 from experiment_design.rollout import Motion
 from experiment_design.search import REFERENCE
+from greybox.files import replacing
 from greybox.notebook import DisplayMixin, interval, items, number, sparkline, table, text
 
 if TYPE_CHECKING:
@@ -271,3 +273,25 @@ def logdet_information(covariance: Array) -> float:
     if not np.isfinite(d).all() or not (d > 0).all():
         return float("-inf")
     return -float(np.linalg.slogdet(covariance / np.outer(d, d))[1] + 2 * np.log(d).sum())
+
+
+def write_plan(design: Design, path: str | Path) -> None:
+    """Write the commands as CSV of ``t`` and the thruster columns, ``trial`` first if several.
+
+    Each row holds from its time on until the next.
+
+    Parameters
+    ----------
+    design : Design
+    path : str or Path
+    """
+    r = design.request
+    names = r.schedule.commands
+    several = r.trials > 1
+    with replacing(path) as handle:
+        handle.write(",".join([*(["trial"] if several else []), "t", *names]) + "\n")
+        for trial, commands in enumerate(design.commands):
+            t = np.arange(len(commands)) * r.sample_time
+            for k, row in enumerate(commands):
+                cells = [f"{t[k]:.10g}", *(f"{v:.10g}" for v in row)]
+                handle.write(",".join([*([str(trial + 1)] if several else []), *cells]) + "\n")

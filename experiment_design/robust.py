@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from experiment_design.limits import LimitProgram
 from experiment_design.request import DesignRequest
 from experiment_design.rollout import Rollout
+from greybox.model.predictor_kinds import PREDICTORS
 
 Array = NDArray[np.float64]
 
@@ -84,7 +85,8 @@ def keep_probability(request: DesignRequest, units: list[Array], draws: int = _D
     missed: list[Array] = []
     thetas = request.draw_models(draws, 1)
     plain = replace(request, backoff=())
-    wind = plain.predictor in ("augmented",)
+    kind = PREDICTORS[plain.predictor]
+    wind = kind.captures and not kind.air_measured
     for t, c in enumerate(commands):
         nominal = Rollout(
             plain.vessel, plain.structure, plain.theta, plain.d, plain.starts[t],

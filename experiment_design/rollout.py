@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_banded
 
 from greybox.errors import StructureError
+from greybox.model.run.simulation import positions, simulate
 from greybox.model.run.step import Integrator, StepModel, next_position
-from greybox.model.simulation import positions, simulate
 from greybox.model.structure import Structure
 from greybox.numerics.vectorised import Vectorised
 from greybox.vessel.actuation import actuated_force

@@ -19,7 +19,7 @@ from scipy.optimize import minimize
 from experiment_design.moments import MomentProgram, Moments
 from experiment_design.problem import TrialProblem
 from experiment_design.rollout import Rollout
-from greybox.model.simulation import simulate
+from greybox.model.run.simulation import simulate
 from greybox.vessel.force import generalised_force
 
 Array = NDArray[np.float64]

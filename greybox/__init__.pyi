@@ -1,4 +1,4 @@
-# The promised names, the only list of them: `greybox.lazy` reads it, and so do type checkers.
+# The promised names, the only list of them: `greybox.public` reads it, and so do type checkers.
 from greybox.diagnosis.causes import known_causes as known_causes
 from greybox.diagnosis.causes.cause import Cause as Cause
 from greybox.diagnosis.diagnose import DiagnosisOptions as DiagnosisOptions
@@ -6,8 +6,6 @@ from greybox.diagnosis.diagnose import diagnose as diagnose
 from greybox.diagnosis.given import fit_given as fit_given
 from greybox.diagnosis.result import Diagnosis as Diagnosis
 from greybox.diagnosis.result import Given as Given
-from greybox.estimation.estimate import estimate_iv as estimate_iv
-from greybox.estimation.estimate import estimate_ls as estimate_ls
 from greybox.estimation.output_error import OutputErrorOptions as OutputErrorOptions
 from greybox.estimation.output_error import estimate_oe as estimate_oe
 from greybox.estimation.output_setup import output_predictor as output_predictor
@@ -24,8 +22,8 @@ from greybox.model.model import ManoeuvringModel as ManoeuvringModel
 from greybox.model.model import load_model as load_model
 from greybox.model.predictor import Predictor as Predictor
 from greybox.model.predictor import build_predictor as build_predictor
-from greybox.model.simulation import simulate as simulate
-from greybox.model.simulation import stationary_disturbance as stationary_disturbance
+from greybox.model.run.simulation import simulate as simulate
+from greybox.model.run.simulation import stationary_disturbance as stationary_disturbance
 from greybox.model.structure import Structure as Structure
 from greybox.prediction.predict import predict_manoeuvre as predict_manoeuvre
 from greybox.prediction.result import ManoeuvrePrediction as ManoeuvrePrediction
@@ -56,6 +54,8 @@ from greybox.validation.comparison import compare as compare
 from greybox.validation.comparison import compare_models as compare_models
 from greybox.validation.fit import fit_percent as fit_percent
 from greybox.validation.fit import run_model as run_model
+from greybox.validation.fit_single import estimate_iv as estimate_iv
+from greybox.validation.fit_single import estimate_ls as estimate_ls
 from greybox.validation.request import Request as Request
 from greybox.validation.selection import estimate_model as estimate_model
 from greybox.vessel.toml import load_vessel as load_vessel

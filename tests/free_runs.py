@@ -10,17 +10,18 @@ from pathlib import Path
 
 import numpy as np
 
-from greybox.estimation.estimate import estimate_ls
 from greybox.export.export import export_model
 from greybox.model.catalogue import structure_for
-from greybox.model.changes import Change
 from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor import build_predictor
-from greybox.model.simulation import mid_step, positions
+from greybox.model.run.changes import Change
+from greybox.model.run.simulation import positions
+from greybox.model.run.step import held
 from greybox.trial.convert.read import read_log
 from greybox.trial.kinematics import decimate
 from greybox.trial.log import TrialLog
 from greybox.validation.fit import run_model
+from greybox.validation.fit_single import estimate_ls
 from greybox.vessel.force import force_inputs
 from greybox.vessel.thrust import ThrustLaw
 from greybox.vessel.toml import vessel_from_dict
@@ -132,12 +133,12 @@ def wanted(model: ManoeuvringModel, log: TrialLog, heading: str = "simulated") -
 
 def held_heading(model: ManoeuvringModel, psi: np.ndarray) -> np.ndarray:
     """Return the measured heading as a step of the free run holds it."""
-    return psi if model.integrator == "euler" else mid_step(psi)
+    return held(psi, model.integrator)
 
 
 def held_wind(model: ManoeuvringModel, value: np.ndarray) -> np.ndarray:
     """Return measured wind as a step holds it; the run reads none after its last step."""
-    return value if model.integrator == "euler" else np.append(mid_step(value[:-1]), value[-1])
+    return np.append(held(value[:-1], model.integrator), value[-1])
 
 
 def calm(model: ManoeuvringModel, log: TrialLog) -> TrialLog:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from greybox.model.catalogue import get_structure
-from greybox.model.simulation import simulate, stationary_disturbance
+from greybox.model.run.simulation import simulate, stationary_disturbance
 from greybox.study.chapter6 import TRUE
 from greybox.study.inputs import smoothed_pulses
 from greybox.trial.log import TrialLog, make_log

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from greybox.commands.common import add_logs, add_seed, positive, provenance, read_logs, say
 from greybox.commands.terminal import activity
-from greybox.one_thread import one_thread
+from greybox.public import one_thread
 
 if TYPE_CHECKING:
     from greybox.diagnosis.result import Diagnosis

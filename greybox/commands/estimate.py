@@ -17,7 +17,7 @@ from greybox.commands.common import (
 )
 from greybox.estimation.registry import ESTIMATORS
 from greybox.model.predictor_kinds import PREDICTORS
-from greybox.one_thread import one_thread
+from greybox.public import one_thread
 
 if TYPE_CHECKING:
     from greybox.trial.log import TrialLog

@@ -45,7 +45,7 @@ def run(options: argparse.Namespace) -> None:
     from greybox.errors import UsageError
     from greybox.files import check_targets, replacing
     from greybox.model.model import load_model
-    from greybox.model.simulation import positions
+    from greybox.model.run.simulation import positions
     from greybox.trial.convert.read import read_log
     from greybox.trial.gaps import split_at_gaps
     from greybox.trial.segments import find_log_gaps

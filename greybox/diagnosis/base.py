@@ -18,6 +18,7 @@ from greybox.errors import ExcitationError
 from greybox.estimation.free_run import fit_free_runs
 from greybox.estimation.output_setup import measured, output_model, output_predictor
 from greybox.model.predictor import Predictor, Regime, build_predictor
+from greybox.model.predictor_kinds import PREDICTORS
 from greybox.model.run.step import Integrator
 from greybox.model.structure import Structure
 from greybox.regression.regression import build_regression
@@ -177,7 +178,7 @@ class Case:
             yield lambda: given, False
         case = (self.structure, self.logs)
         yield lambda: rough(*case, self.kind, self.regime)[0], False
-        if self.structure.marine and self.kind == "basic":
+        if self.structure.marine and not PREDICTORS[self.kind].air_measured:
             # columns for a current and a wind, so that they bias the others less
             yield lambda: rough(*case, "augmented", self.regime)[0], False
         yield lambda: steady(self.structure, self.logs, self.regime), True

@@ -12,9 +12,8 @@ from greybox.diagnosis.result import Diagnosis
 from greybox.diagnosis.search import search
 from greybox.diagnosis.telling import Report
 from greybox.diagnosis.waves import find_waves, found_waves
-from greybox.keywords import known_keywords
 from greybox.model.model import ManoeuvringModel
-from greybox.one_thread import one_thread
+from greybox.public import known_keywords, one_thread
 from greybox.trial.log import Logs
 from greybox.trial.segments import as_segments
 from greybox.trial.validity import other_conditions, pooled_conditions

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.ship import CURRENTS, Sensors, Wire
-from greybox.model.changes import Change
 from greybox.model.model import ManoeuvringModel
 from greybox.model.noise import NoiseLevels
+from greybox.model.run.changes import Change
 from greybox.model.structure import Structure
 from greybox.trial.log import TrialLog
 from greybox.trial.validity import pooled_conditions

@@ -16,8 +16,7 @@ from greybox.diagnosis.result import Given
 from greybox.diagnosis.scores import Directions, score_atoms
 from greybox.diagnosis.search import Search
 from greybox.diagnosis.telling import Report
-from greybox.keywords import known_keywords
-from greybox.one_thread import one_thread
+from greybox.public import known_keywords, one_thread
 from greybox.trial.log import Logs
 from greybox.trial.segments import as_segments
 

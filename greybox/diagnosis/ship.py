@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from greybox.diagnosis.linear import Linear, sensitivities
 from greybox.diagnosis.simulator import Simulator
-from greybox.model.run.step import Integrator, Rule, StepModel, integrated
-from greybox.model.simulation import mid_step
+from greybox.model.run.step import Integrator, Rule, StepModel, held, integrated
 from greybox.model.structure import Structure
 from greybox.rotation import ned_to_body
 from greybox.trial.log import TrialLog
@@ -141,13 +140,10 @@ class LogRun:
         self.outputs = (*self.states, "psi") if self._turns else self.states
         self.y = np.column_stack([log[n] for n in self.outputs])
         self._gaps = [(i, ~log.missing[n]) for i, n in enumerate(self.outputs) if n in log.missing]
-        self._psi = log["psi"] if "psi" in log else np.zeros(len(log))
+        self._psi = held(log["psi"] if "psi" in log else np.zeros(len(log)), integrator)
         air = log.air
         self.air_measured = air is not None and structure.uses_air
-        self._air = air if air is not None else np.zeros((len(log), 2))
-        if integrator == "rk4":
-            # as the free run of a model does: the ship turns during a step
-            self._psi, self._air = mid_step(self._psi), mid_step(self._air.T).T
+        self._air = held(air if air is not None else np.zeros((len(log), 2)), integrator)
         self._commands = {c: log[c] for c in log.vessel.commands}
         step = StepModel(structure, integrator, air_measured=self.air_measured)
         self._simulator = Simulator(step, len(log))

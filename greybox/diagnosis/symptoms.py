@@ -14,7 +14,6 @@ from greybox.diagnosis.noise import SEEN
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.result import Symptom
 from greybox.diagnosis.ship import LogRun
-from greybox.estimation.credibility.words import listed
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -135,4 +134,4 @@ def coloured(fit: Fit, outputs: Sequence[str]) -> str | None:
             found.append(f"{word(outputs[group.outputs[0]])}{tail}")
     if not found:
         return None
-    return f"something beside the model moves {listed(found)}"
+    return f"something beside the model moves {', '.join(found)}"

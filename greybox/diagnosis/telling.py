@@ -36,7 +36,7 @@ from greybox.diagnosis.waves import Waves
 from greybox.model.model import ManoeuvringModel
 from greybox.model.structure import Structure
 from greybox.trial.log import TrialLog
-from greybox.trial.ranges import ranges
+from greybox.trial.validity import ranges
 from greybox.validation.fit import LogFit, fit_on
 
 Array = NDArray[np.float64]

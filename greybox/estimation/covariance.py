@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.estimation.error_variance_profile import ErrorVarianceProfile, fit_scaled_arma_noise
-from greybox.numerics.moments import autocovariance, lagged_products, lagged_sums
+from greybox.numerics.lagged_moments import autocovariance, lagged_sums, weighted_lags
 
 Array = NDArray[np.float64]
 CovarianceKind = Literal["hac", "ma", "white"]
@@ -105,7 +105,6 @@ def score_covariance(
     sizes = [equation[0].shape[0] for equation in projected]
     if kind == "ma":
         return clip_to_psd(_moving_average(projected, residuals, sizes, lags)), lags
-    total = np.zeros((sum(sizes), sum(sizes)))
     spread = np.repeat(np.arange(len(sizes)), sizes)
     reach = 0 if kind == "white" else 2 * lags
     scores = [
@@ -114,10 +113,8 @@ def score_covariance(
             zip(*projected, strict=True), zip(*residuals, strict=True), strict=True
         )
     ]
-    for lag in range(min(reach, max(s.shape[1] for s in scores) - 1) + 1):
-        block = flat_top(lag, lags) * lagged_products(scores, scores, lag)
-        total += block if lag == 0 else block + block.T
-    return clip_to_psd(total), lags
+    kernel = [flat_top(lag, lags) for lag in range(reach + 1)]
+    return clip_to_psd(weighted_lags(scores, kernel)), lags
 
 
 def _coloured(
@@ -152,16 +149,11 @@ def _moving_average(
     lags: int,
 ) -> Array:
     """Return Σ Z R Zᵀ with R the residuals' autocovariance over all experiments."""
-    p = sum(sizes)
     spread = np.repeat(np.arange(len(sizes)), sizes)
-    total = np.zeros((p, p))
     errors = [np.array(e) for e in zip(*residuals, strict=True)]
     stacked = [np.vstack(hats) for hats in zip(*projected, strict=True)]
     gammas = autocovariance(errors, [np.asarray(s.any(axis=0)) for s in stacked], lags)
-    for lag, gamma in enumerate(gammas):
-        block = lagged_products(stacked, stacked, lag) * gamma[np.ix_(spread, spread)]
-        total += block if lag == 0 else block + block.T
-    return total
+    return weighted_lags(stacked, [gamma[np.ix_(spread, spread)] for gamma in gammas])
 
 
 def clip_to_psd(matrix: Array) -> Array:

@@ -28,7 +28,7 @@ from greybox.estimation.shooting import Measured, Segments, cut
 from greybox.estimation.values import EfficiencyBound
 from greybox.model.noise import NoiseLevels
 from greybox.model.output import OutputModel
-from greybox.model.output_runs import Simulator
+from greybox.model.run.output_runs import Simulator
 from greybox.trial.log import TrialLog
 
 Array = NDArray[np.float64]

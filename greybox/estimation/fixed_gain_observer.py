@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from greybox.estimation.shooting import Linearised, Segments, by_sample
 from greybox.model.output import OutputModel
-from greybox.model.output_runs import Observer
+from greybox.model.run.output_runs import Observer
 
 Array = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.estimation.covariance import CovarianceKind, clip_to_psd, flat_top
-from greybox.numerics.moments import lagged_products, lagged_sums
+from greybox.numerics.lagged_moments import lagged_sums, weighted_lags
 
 Array = NDArray[np.float64]
 
@@ -47,22 +47,16 @@ def shared_score_covariance(
     ----------
     Ljung (1999), eq. 9.42; Newey and West (1987); Politis (2003).
     """
-    q = scores[0][0].shape[0]
-    total = np.zeros((q, q))
-    if kind != "ma":
-        for rows, residuals in scores:
-            product = np.einsum("qkc,kc->qk", rows, residuals)
-            for lag in range(min(0 if kind == "white" else 2 * lags, product.shape[1] - 1) + 1):
-                block = flat_top(lag, lags) * lagged_products([product], [product], lag)
-                total += block if lag == 0 else block + block.T
-        return clip_to_psd(total)
-    gamma = autocovariance([r for _, r in scores], lags)
-    for rows, r in scores:
-        total += _filtered_products(rows, gamma[: len(r)])
-    return clip_to_psd(total)
+    if kind == "ma":
+        gamma = flat_top_autocovariance([r for _, r in scores], lags)
+        found = [_filtered_products(rows, gamma[: len(r)]) for rows, r in scores]
+        return clip_to_psd(np.sum(found, axis=0))
+    products = [np.einsum("qkc,kc->qk", rows, residuals) for rows, residuals in scores]
+    reach = 0 if kind == "white" else 2 * lags
+    return clip_to_psd(weighted_lags(products, [flat_top(j, lags) for j in range(reach + 1)]))
 
 
-def autocovariance(residuals: Sequence[Array], lags: int) -> Array:
+def flat_top_autocovariance(residuals: Sequence[Array], lags: int) -> Array:
     """Return the flat-top estimate of E r(k + lag) r(k)ᵀ, (2·lags + 1, ny, ny).
 
     Parameters
@@ -106,7 +100,7 @@ def memory_correction(
         (q,) factors of at least 1 on the standard errors.
     """
     rng = np.random.default_rng(_SEED)
-    gamma = autocovariance(residuals, lags)
+    gamma = flat_top_autocovariance(residuals, lags)
     roots = [_spectral_root(gamma, len(r)) for r in residuals]
     inverse = np.linalg.pinv(hessian, hermitian=True)
     moved = [np.einsum("ij,jkc->ikc", inverse, e) for e in rows]
@@ -120,7 +114,7 @@ def memory_correction(
         errors = [_draw(rng, root, len(r)) for root, r in zip(roots, residuals, strict=True)]
         shift = sum(np.einsum("qkc,kc->q", e, r) for e, r in zip(moved, errors, strict=True))
         left = [r - np.einsum("qkc,q->kc", e, shift) for e, r in zip(rows, errors, strict=True)]
-        found += np.maximum(variance(autocovariance(left, lags)), 0.0)
+        found += np.maximum(variance(flat_top_autocovariance(left, lags)), 0.0)
     truth = np.maximum(variance(gamma), 0.0)
     ratio = truth * draws / np.maximum(found, 1e-300)
     return np.asarray(np.sqrt(np.clip(ratio, 1.0, _CORRECTION)), float)

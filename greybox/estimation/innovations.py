@@ -30,7 +30,7 @@ from greybox.estimation.shooting import (
     solve_step,
 )
 from greybox.model.output import OutputModel
-from greybox.model.output_runs import Filter
+from greybox.model.run.output_runs import Filter
 
 Array = NDArray[np.float64]
 

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from greybox.errors import ExcitationError, UsageError, suggestion
 from greybox.estimation.covariance import correlation_lags
-from greybox.estimation.estimate import UnexcitedBiasError
 from greybox.estimation.free_run import Shooting, changes, fit_free_runs, in_doubt
 from greybox.estimation.free_run_errors import (
     memory_correction,
@@ -38,15 +37,15 @@ from greybox.estimation.shooting import (
     ShootingFit,
     loss_weights,
 )
+from greybox.estimation.solve import UnexcitedBiasError
 from greybox.estimation.values import Iteration, estimation_data
 from greybox.estimation.verdict import TestResult
-from greybox.keywords import known_keywords
 from greybox.model.disturbances import CURRENT, WIND
 from greybox.model.noise import NoiseLevels
 from greybox.model.output import OutputModel, Role
-from greybox.model.output_runs import Simulator
 from greybox.model.predictor import Predictor
-from greybox.one_thread import one_thread
+from greybox.model.run.output_runs import Simulator
+from greybox.public import known_keywords, one_thread
 from greybox.regression.regression import common_sample_time
 from greybox.trial.log import Logs, TrialLog
 from greybox.trial.segments import as_segments

@@ -11,43 +11,79 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.estimation.closed_loop import Loop, assess_loop
-from greybox.estimation.estimate import Covariance, UnexcitedBiasError
 from greybox.estimation.informative import regime_of
 from greybox.estimation.output_error import OutputErrorOptions
 from greybox.estimation.result import Estimate
+from greybox.estimation.solve import Covariance, Solved, UnexcitedBiasError
 from greybox.estimation.verdict import TestResult
 from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor import Predictor, Regime, build_predictor
 from greybox.model.predictor_kinds import PredictorKind
 from greybox.model.structure import Structure
 from greybox.regression.instruments import simulate_log
+from greybox.regression.problem import RegressionProblem
 from greybox.trial.log import TrialLog
 
 Array = NDArray[np.float64]
-Fitted = TypeVar("Fitted")
+Found = TypeVar("Found")
 
 
 @dataclass(frozen=True)
-class EstimationProblem:
-    """An estimate that is asked for, all choices made but the estimator's own.
+class Fitted:
+    """An estimate, and the regression that its tests look at.
 
     Parameters
     ----------
-    logs : tuple of TrialLog
-        One experiment each.
-    structure : Structure
-    kind : PredictorKind
-    start : Estimate, optional
-        Where a free-run fit starts.
-    margins, covariance, heading, loop, zero_mean, refine, nominal, output_error, seed, prefilter,
-    judged, without
-        As in a request; an estimator heeds what concerns it.
+    estimate : Estimate
+    regression : RegressionProblem
+        Its own, or that which stands beside a free run.
+    solved : Solved, optional
+        The equations that the estimate solves as they stand, as least squares and plain
+        instrumental variables do.
     """
 
-    logs: tuple[TrialLog, ...]
-    structure: Structure
-    kind: PredictorKind
-    start: Estimate | None = None
+    estimate: Estimate
+    regression: RegressionProblem
+    solved: Solved | None = None
+
+    def with_more(self, test: TestResult, notes: Sequence[str]) -> Fitted:
+        """Return it with a test and notes behind those of the estimate."""
+        estimate = self.estimate
+        more = replace(estimate, tests=(*estimate.tests, test), notes=(*estimate.notes, *notes))
+        return replace(self, estimate=more)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EstimationOptions:
+    """What can be asked of an estimate beside its method; an estimator heeds what concerns it.
+
+    Parameters
+    ----------
+    margins : mapping of str to float, optional
+        |u|, |v| [m/s] below which samples are cut out.
+    covariance : {"ma", "hac", "white", "bootstrap"}, optional
+        What the standard errors allow for; by default the method's own.
+    heading : {"measured", "simulated"}
+        Heading inside the instruments.
+    loop : {"auto", "open", "closed"}
+        Whether a controller moved the thrusters.
+    zero_mean : bool
+        Whether instruments lose their mean (4.63).
+    refine : bool or int
+        Whether, or how many times at most, instruments are simulated again.
+    nominal : ManoeuvringModel, optional
+        Simulates the first instruments, or starts output error; least squares does without it.
+    output_error : OutputErrorOptions
+        What only ``oe`` heeds.
+    seed : int
+    prefilter : {"auto", "noise", "none"}
+        ``noise`` for refined instrumental variables, ``none`` for plain ones.
+    judged : bool
+        Whether tests and verdict are asked for.
+    without : tuple of str
+        Bias-capturing columns to leave out, spelled ``state:function``.
+    """
+
     margins: dict[str, float] | None = None
     covariance: Covariance | None = None
     heading: Literal["measured", "simulated"] = "measured"
@@ -60,6 +96,28 @@ class EstimationProblem:
     prefilter: Literal["auto", "noise", "none"] = "auto"
     judged: bool = True
     without: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class EstimationProblem(EstimationOptions):
+    """An estimate that is asked for, all choices made but the estimator's own.
+
+    Parameters
+    ----------
+    logs : tuple of TrialLog
+        One experiment each.
+    structure : Structure
+    kind : PredictorKind
+    start : Estimate, optional
+        Where a free-run fit starts.
+    options
+        As `EstimationOptions`.
+    """
+
+    logs: tuple[TrialLog, ...]
+    structure: Structure
+    kind: PredictorKind
+    start: Estimate | None = None
 
     @cached_property
     def regime(self) -> Regime:
@@ -99,8 +157,8 @@ class EstimationProblem:
         return predictor
 
     def drop_unexcited(
-        self, predictor: Predictor, fit: Callable[[Predictor], Fitted]
-    ) -> tuple[Fitted, list[str]]:
+        self, predictor: Predictor, fit: Callable[[Predictor], Found]
+    ) -> tuple[Found, list[str]]:
         """Estimate without the bias-capturing columns that do not vary, and note which."""
         notes: list[str] = []
         while True:
@@ -137,9 +195,9 @@ class EstimationProblem:
         self,
         method: str,
         predictor: Predictor,
-        fit: Callable[[Predictor], Fitted],
-        finish: Callable[[Fitted, list[str]], Estimate],
-    ) -> Estimate:
+        fit: Callable[[Predictor], Found],
+        finish: Callable[[Found, list[str]], Fitted],
+    ) -> Fitted:
         """Estimate from one-step equations, and say what these rest on.
 
         Parameters
@@ -150,12 +208,16 @@ class EstimationProblem:
             Solves the equations of a predictor.
         finish : callable
             Estimates once the predictor is settled; may note more.
+
+        Returns
+        -------
+        Fitted
+            Not tested yet but for the loop.
         """
         _, loop_test = self.loop_test(method)
-        fitted, notes = self.drop_unexcited(predictor, fit)
-        estimate = finish(fitted, notes)
-        notes += _coarse(self.logs)
-        return replace(estimate, tests=(*estimate.tests, loop_test), notes=tuple(notes))
+        found, notes = self.drop_unexcited(predictor, fit)
+        fitted = finish(found, notes)
+        return fitted.with_more(loop_test, [*notes, *_coarse(self.logs)])
 
 
 def _coarse(logs: Sequence[TrialLog]) -> list[str]:

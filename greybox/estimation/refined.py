@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from greybox.errors import ExcitationError
 from greybox.estimation.banded_covariance import ErrorBand
 from greybox.estimation.disturbance import estimate_current
-from greybox.estimation.estimate import Covariance, solve_iv, solve_ls
 from greybox.estimation.gls_regression import (
     WhiteRows,
     own_constants,
@@ -39,11 +38,11 @@ from greybox.estimation.noise import (
 )
 from greybox.estimation.registry import ESTIMATORS
 from greybox.estimation.result import Estimate
+from greybox.estimation.solve import Covariance, solve_iv, solve_ls
 from greybox.estimation.values import Iteration
 from greybox.estimation.verdict import UNJUDGED
-from greybox.keywords import known_keywords
 from greybox.model.predictor import Predictor
-from greybox.one_thread import one_thread
+from greybox.public import known_keywords, one_thread
 from greybox.regression.motion import Motion, further_channels, predicted_motion, smoothed_heading
 from greybox.regression.problem import RegressionProblem
 from greybox.regression.regression import measured_rows, within_margins

@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Literal
 from greybox.registry import Registry
 
 if TYPE_CHECKING:
-    from greybox.estimation.problem import EstimationProblem
-    from greybox.estimation.result import Estimate
+    from greybox.estimation.problem import EstimationProblem, Fitted
 
 
 @dataclass(frozen=True)
@@ -56,7 +55,7 @@ class Estimator:
 
     name: str
     words: str
-    fit: Callable[[EstimationProblem], Estimate]
+    fit: Callable[[EstimationProblem], Fitted]
     free_run: bool = False
     instruments: bool = False
     biased_by_noise: bool = False

@@ -27,7 +27,7 @@ from scipy.sparse import block_diag, bmat, csc_matrix
 from scipy.sparse.linalg import splu
 
 from greybox.model.output import OutputModel
-from greybox.model.output_runs import Simulator
+from greybox.model.run.output_runs import Simulator
 
 Array = NDArray[np.float64]
 Loss = Literal["gaussian", "huber"]

@@ -9,7 +9,7 @@ import numpy as np
 
 from greybox.estimation.values import EstimateValues
 from greybox.estimation.verdict import TestResult
-from greybox.model.units import parameter_unit
+from greybox.model.terms import parameter_unit
 from greybox.trial.validity import in_words
 
 WIDTH = 100

@@ -14,8 +14,7 @@ from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import Predictor
 from greybox.trial.actuator_estimate import ActuatorEstimate, known_actuators
 from greybox.trial.log import TrialLog
-from greybox.trial.ranges import ranges
-from greybox.trial.validity import PooledConditions, pooled_conditions
+from greybox.trial.validity import PooledConditions, pooled_conditions, ranges
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]

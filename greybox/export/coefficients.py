@@ -54,6 +54,6 @@ def coefficients(model: ManoeuvringModel, p: ca.SX, sample: ca.SX) -> ca.SX:
     for k in order:
         factor, time = p[first + 2 * k], p[first + 2 * k + 1]
         i = model.names.index(model.changes[k].parameter)
-        # as `simulate_changing`: a whole number of samples may be a rounding error more
+        # as a free run: a whole number of samples may be a rounding error more
         factors[i] = ca.if_else(sample >= time / model.sample_time - 1e-6, factor, factors[i])
     return column(t * f for t, f in zip(theta, factors, strict=True))

@@ -57,7 +57,7 @@ class Motion:
     def after(self, forces: Mapping[str, ca.SX]) -> list[ca.SX]:
         """Return the states one sample later, under generalised inputs that are held.
 
-        Positions follow as in `greybox.model.simulation.positions`, by Euler.
+        Positions follow as in `greybox.model.run.simulation.positions`, by Euler.
         """
         ts = self.model.sample_time
 

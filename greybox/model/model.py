@@ -17,13 +17,12 @@ from numpy.typing import NDArray
 
 from greybox.errors import GreyboxError, ModelFileError, StructureError, suggestion
 from greybox.files import nearest_file, plain, write_json
-from greybox.model.changes import Change, factors_at
 from greybox.model.disturbances import DisturbanceKind
 from greybox.model.noise import NoiseLevels, noise_from_dict
+from greybox.model.run.changes import Change, factors_at
 from greybox.model.run.step import Integrator
 from greybox.model.structure import Structure
-from greybox.model.terms import Factor, Term
-from greybox.model.units import parameter_unit
+from greybox.model.terms import Factor, Term, parameter_unit
 from greybox.model.versions import VERSION, upgraded
 from greybox.notebook import DisplayMixin, items, parameters, text
 from greybox.trial.validity import Validity, in_words, validity_from_dict, validity_to_dict
@@ -164,26 +163,26 @@ class ManoeuvringModel(DisplayMixin):
     @property
     def step_states(self) -> tuple[str, ...]:
         """Names of ``x`` of `step_function`."""
-        from greybox.model.stepping import state_names
+        from greybox.model.run.whole_ship import state_names
 
         return state_names(self)
 
     def step_function(self) -> ca.Function:
         """Return one sample of the whole ship, ``(x, command[, wind]) -> x_next``.
 
-        For controllers, observers and simulators: see `greybox.model.stepping.whole_step`.
+        For controllers, observers and simulators: see `greybox.model.run.whole_ship.whole_step`.
         The commands are ``vessel.commands``, their limits ``vessel.limits``.
         """
-        from greybox.model.stepping import whole_step
+        from greybox.model.run.whole_ship import whole_step
 
         return whole_step(self)
 
     def rhs_function(self) -> ca.Function:
         """Return the time derivatives ``(x, command[, wind]) -> x_dot``.
 
-        Its Euler step is `step_function`: see `greybox.model.stepping.whole_rate`.
+        Its Euler step is `step_function`: see `greybox.model.run.whole_ship.whole_rate`.
         """
-        from greybox.model.stepping import whole_rate
+        from greybox.model.run.whole_ship import whole_rate
 
         return whole_rate(self)
 

@@ -8,6 +8,7 @@ derivative of the model follows by differentiation.
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -20,21 +21,23 @@ _AIR = {"uq": "u", "vq": "v"}
 # equation letter of SNAME -> state whose increment the equation gives
 EQUATIONS = {"X": "u", "Y": "v", "N": "r"}
 
-# signals that a term may name, longest first so that greedy reading is unambiguous
-SIGNALS = (
-    "rudder_drag",
-    "race_drag",
-    "rudder",
-    "race",
-    "taux",
-    "tauy",
-    "taun",
-    "uq",
-    "vq",
-    "u",
-    "v",
-    "r",
-)
+# signals that a term may name, with the exponents of metre, second and the unit of force
+# (angles are pure numbers); longest first so that greedy reading is unambiguous
+_UNITS = {
+    "rudder_drag": (0, 0, 0),
+    "race_drag": (0, 0, 1),
+    "rudder": (0, 0, 0),
+    "race": (0, 0, 1),
+    "taux": (0, 0, 1),
+    "tauy": (0, 0, 1),
+    "taun": (1, 0, 1),
+    "uq": (1, -1, 0),
+    "vq": (1, -1, 0),
+    "u": (1, -1, 0),
+    "v": (1, -1, 0),
+    "r": (0, -1, 0),
+}
+SIGNALS = tuple(_UNITS)
 
 
 @dataclass(frozen=True)
@@ -186,3 +189,33 @@ def parse_term(name: str) -> Term:
         position = match.end()
     term = Term(name, EQUATIONS[equation], tuple(factors))
     return _BY_KEY.get(term.key, term)
+
+
+def parameter_unit(term: Term, force_unit: str = "n") -> str:
+    """Return the unit of a discrete parameter, such as ``s/m`` for ``Xuu``.
+
+    Parameters
+    ----------
+    term : Term
+    force_unit : str
+        Unit of the thrust law: ``N``, or ``n`` and ``n²`` where the force is
+        kept in units of propeller speed.
+    """
+    if term.state not in _UNITS or any(f.signal not in _UNITS for f in term.factors):
+        return "1"
+    total = Counter(dict(enumerate(_UNITS[term.state])))
+    for factor in term.factors:
+        for i, power in enumerate(_UNITS[factor.signal]):
+            total[i] -= power
+    up, down = [], []
+    for i, symbol in enumerate(("m", "s", force_unit)):
+        power = abs(total[i])
+        text = symbol if power == 1 else f"{symbol}^{power}"
+        if total[i] > 0:
+            up.append(text)
+        elif total[i] < 0:
+            down.append(text)
+    if not up and not down:
+        return "1"
+    under = down[0] if len(down) == 1 else f"({' '.join(down)})"
+    return (" ".join(up) or "1") + (f"/{under}" if down else "")

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import InfeasibleError, LogError, UsageError
-from greybox.keywords import known_keywords
 from greybox.model.model import ManoeuvringModel
 from greybox.prediction.conditions import (
     Conditions,
@@ -38,6 +37,7 @@ from greybox.prediction.running import sail
 from greybox.prediction.showing import bundle_of, log_of
 from greybox.prediction.steady import Steady, require_straight, straight_run
 from greybox.prediction.trial import compare, end_again, found_in_trial, with_rates
+from greybox.public import known_keywords
 from greybox.trial.log import TrialLog
 from greybox.trial.manoeuvres import Compliance, Criterion, Quantity, TurningCircle
 from greybox.trial.manoeuvres.finding import Manoeuvre

@@ -13,10 +13,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.model.changes import Change, simulate_changing
 from greybox.model.predictor import Predictor
+from greybox.model.run.changes import Change
 from greybox.model.run.inputs import LogInputs
-from greybox.model.simulation import FreeRun
+from greybox.model.run.simulation import FreeRun, simulate
 from greybox.model.structure import Structure
 from greybox.regression.regression import measured_rows, within_margins
 from greybox.rotation import body_to_ned, ned_to_body
@@ -107,13 +107,13 @@ def simulate_log(
     """
     given = LogInputs.of(structure, log)
     air = log.air if use_wind and structure.uses_air else None
-    return simulate_changing(
+    return simulate(
         structure,
         theta,
-        changes,
         initial_state(log, structure.states),
         given.tau[:-1],
         log.sample_time,
+        changes=changes,
         first=first,
         psi=given.heading(structure, heading),
         psi0=float(given.psi[0]),

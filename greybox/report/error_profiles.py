@@ -13,6 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.numerics.lagged_moments import lagged_sums
+
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
@@ -45,13 +47,11 @@ class Profile:
 def memory(error: Array) -> int:
     """Return after how many samples a series (N,) has forgotten its value, at least 1."""
     e = error - error.mean()
-    size = len(e)
-    power = np.abs(np.fft.rfft(e, 2 * size)) ** 2
-    covariance = np.fft.irfft(power)[:size]
+    covariance = lagged_sums([e], [e], len(e) - 1)
     if covariance[0] <= 0:
         return 1
     below = np.flatnonzero(covariance < _FORGOTTEN * covariance[0])
-    return int(max(below[0], 1)) if len(below) else size
+    return int(max(below[0], 1)) if len(below) else len(e)
 
 
 def block_ids(errors: Sequence[Array]) -> Index:

@@ -19,7 +19,7 @@ from greybox.estimation.summary import (
     weak_safe_sets,
 )
 from greybox.estimation.verdict import TestResult, TrustLevel
-from greybox.model.units import parameter_unit
+from greybox.model.terms import parameter_unit
 from greybox.report.chart import chart_of
 from greybox.report.estimation_figures import (
     REACH,

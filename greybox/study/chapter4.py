@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from greybox.model.catalogue import get_structure
 from greybox.model.predictor import build_predictor
-from greybox.model.simulation import simulate
+from greybox.model.run.simulation import simulate
 from greybox.study.inputs import offset_gaussian
 from greybox.study.monte_carlo import Batch, BatchRegression
 from greybox.study.parallel import map_pieces

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from greybox.model.catalogue import get_structure
 from greybox.model.predictor import Predictor, build_predictor
-from greybox.model.simulation import simulate, stationary_disturbance
+from greybox.model.run.simulation import simulate, stationary_disturbance
 from greybox.rotation import ned_to_body
 from greybox.study.inputs import smooth, zig_zag
 from greybox.study.monte_carlo import Batch, BatchEstimate, BatchRegression

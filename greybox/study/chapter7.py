@@ -16,11 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import GreyboxError, UsageError
-from greybox.estimation.estimate import estimate_iv, estimate_ls
 from greybox.estimation.result import Estimate
 from greybox.model.catalogue import get_structure, structure_for
 from greybox.model.predictor import Predictor, build_predictor
-from greybox.model.simulation import positions, simulate, stationary_disturbance
+from greybox.model.run.simulation import positions, simulate, stationary_disturbance
 from greybox.model.structure import Structure
 from greybox.rotation import ned_to_body
 from greybox.study.chapter6 import TRUE
@@ -30,6 +29,7 @@ from greybox.trial.kinematics import velocities_from_positions
 from greybox.trial.log import TrialLog, make_log
 from greybox.validation.comparison import SignTest, sign_test
 from greybox.validation.fit import run_model
+from greybox.validation.fit_single import estimate_iv, estimate_ls
 from greybox.vessel.force import force_inputs
 from greybox.vessel.toml import load_vessel
 

@@ -18,7 +18,6 @@ from scipy.special import polygamma, psi
 from greybox.errors import GreyboxError
 from greybox.estimation.bound import iv_bound
 from greybox.estimation.efficiency_bounds import cramer_rao, noise_variances
-from greybox.estimation.estimate import estimate_iv
 from greybox.estimation.output_error import OutputErrorOptions, estimate_oe
 from greybox.estimation.output_setup import measured, output_model, output_predictor
 from greybox.estimation.refined import estimate_refined_iv
@@ -26,12 +25,13 @@ from greybox.estimation.result import Estimate
 from greybox.model.catalogue import get_structure
 from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import Predictor, Regime, build_predictor
-from greybox.model.simulation import simulate, stationary_disturbance
+from greybox.model.run.simulation import simulate, stationary_disturbance
 from greybox.rotation import ned_to_body
 from greybox.study.chapter6 import TRUE, pulse_commands
 from greybox.study.parallel import map_pieces
 from greybox.study.tables import Row, summarise
 from greybox.trial.log import TrialLog, make_log
+from greybox.validation.fit_single import estimate_iv
 from greybox.vessel.toml import load_vessel
 
 Array = NDArray[np.float64]

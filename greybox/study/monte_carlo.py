@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.model.predictor import Predictor
-from greybox.model.simulation import simulate
+from greybox.model.run.simulation import simulate
 
 Array = NDArray[np.float64]
 

@@ -30,6 +30,8 @@ _DEEP = 4.0
 # observers differ by one code
 _SEA = 2
 _MOST_NAMED = 3
+# share of the samples left out at either end of a range: single ones are outliers
+_TAIL = 1e-3
 
 
 @dataclass(frozen=True)
@@ -192,3 +194,30 @@ def _differ(name: str, one: Any, other: Any, draught: float | None) -> bool:
 def _ends(values: tuple[Any, ...]) -> tuple[Any, ...]:
     """Return least and greatest number, or all words."""
     return values if isinstance(values[0], str) or len(values) < 2 else (values[0], values[-1])
+
+
+def ranges(logs: Sequence[TrialLog], states: Sequence[str]) -> dict[str, tuple[float, float]]:
+    """Return the least and greatest value of each state and command.
+
+    Parameters
+    ----------
+    logs : sequence of TrialLog
+        Of one vessel.
+    states : sequence of str
+        Names of the states; commands are the vessel's.
+
+    Returns
+    -------
+    dict of str to (float, float)
+        Quantiles of 0.1 and 99.9 %, as wide as the widest log; channels that no log has are
+        left out [SI; propeller speeds in the unit of the log].
+    """
+    found: dict[str, tuple[float, float]] = {}
+    for log in logs:
+        for name in (*states, *log.vessel.commands):
+            if name not in log:
+                continue
+            low, high = (float(q) for q in np.quantile(log[name], [_TAIL, 1 - _TAIL]))
+            before = found.get(name, (low, high))
+            found[name] = min(low, before[0]), max(high, before[1])
+    return found

@@ -13,9 +13,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.model.changes import simulate_changing
 from greybox.model.model import ManoeuvringModel
 from greybox.model.run.inputs import LogInputs
+from greybox.model.run.simulation import simulate
 from greybox.regression.instruments import state_bound
 from greybox.trial.log import TrialLog
 from greybox.trial.segments import split_segments
@@ -251,13 +251,13 @@ def _pieces(
         n = last - first
         if process.any():
             pushes, push = process_noise(rng, push, memory, drive, n)
-        run = simulate_changing(
+        run = simulate(
             structure,
             theta,
-            model.changes,
             x,
             given.tau[first:last],
             log.sample_time,
+            changes=model.changes,
             first=begin + first * log.sample_time,
             psi=_noisy(rng, psi[first : last + 1], turned, runs) if psi is not None else None,
             psi0=psi0,

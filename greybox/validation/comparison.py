@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from greybox.errors import UsageError, suggestion
 from greybox.estimation.result import Estimate
-from greybox.keywords import known_keywords
-from greybox.model.changes import Change, simulate_changing
 from greybox.model.model import ManoeuvringModel
+from greybox.model.run.changes import Change
 from greybox.model.run.inputs import LogInputs
+from greybox.model.run.simulation import simulate
 from greybox.notebook import DisplayMixin, items, number, table
-from greybox.one_thread import one_thread
+from greybox.public import known_keywords, one_thread
 from greybox.regression.instruments import state_bound
 from greybox.trial.log import Logs, TrialLog, as_list
 from greybox.trial.segments import find_log_gaps
@@ -302,13 +302,13 @@ def errors_ahead(
         air = log.air if log.has_wind and structure.uses_air else None
         end = np.empty((len(starts), x.shape[1]))
         for rows in _alike(model.changes, starts * log.sample_time, steps * log.sample_time):
-            ahead = simulate_changing(
+            ahead = simulate(
                 structure,
                 model.theta,
-                model.changes,
                 x[starts[rows]],
                 tau[window[rows, :-1]],
                 log.sample_time,
+                changes=model.changes,
                 first=float(starts[rows[0]] * log.sample_time),
                 psi=None if psi is None else psi[window[rows]],
                 psi0=given.psi[starts[rows]],

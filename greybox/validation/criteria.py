@@ -7,6 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.numerics.lagged_moments import lagged_products
+
 Array = NDArray[np.float64]
 
 
@@ -60,8 +62,9 @@ def independent_samples(residuals: Sequence[Array]) -> Array:
     limit = 2 / np.sqrt(total)
     for i in np.flatnonzero(size > 0):
         memory = 1.0
+        one = [r[:, i][None] for r in centred]
         for lag in range(1, min(len(r) for r in residuals)):
-            rho = sum(float(r[lag:, i] @ r[:-lag, i]) for r in centred) / size[i]
+            rho = lagged_products(one, one, lag).item() / size[i]
             if rho < limit:
                 break
             memory += 2 * rho

@@ -17,7 +17,7 @@ from greybox.estimation.result import Estimate
 from greybox.model.catalogue import structure_for
 from greybox.model.disturbances import CURRENT, WIND
 from greybox.model.predictor import Column
-from greybox.one_thread import one_thread
+from greybox.public import one_thread
 from greybox.trial.log import Logs
 from greybox.trial.segments import as_segments
 from greybox.validation.criteria import independent_samples

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal, get_args
 
 from greybox.errors import UsageError, suggestion
 from greybox.estimation.closed_loop import Loop
-from greybox.estimation.estimate import Covariance
-from greybox.estimation.output_error import OutputErrorOptions
+from greybox.estimation.problem import EstimationOptions
 from greybox.estimation.registry import ESTIMATORS
-from greybox.model.model import ManoeuvringModel
+from greybox.estimation.solve import Covariance
 from greybox.model.predictor_kinds import PREDICTORS
 
 # methods that are another one with a prefilter
@@ -31,7 +30,7 @@ def _choices() -> dict[str, tuple[str, ...]]:
 
 
 @dataclass(frozen=True)
-class Request:
+class Request(EstimationOptions):
     """What to estimate; None leaves the choice to the data.
 
     Parameters
@@ -40,29 +39,10 @@ class Request:
     predictor : {"basic", "augmented", "wind", "basic+wind"}, optional
     structure : str, optional
         As `get_structure`.
-    margins : mapping of str to float, optional
-        |u|, |v| [m/s] below which samples are cut out.
-    covariance : {"ma", "hac", "white", "bootstrap"}, optional
-    heading : {"measured", "simulated"}
-        Heading inside the instruments.
-    loop : {"auto", "open", "closed"}
-        Whether a controller moved the thrusters.
-    zero_mean : bool
-        Whether instruments lose their mean (4.63).
-    refine : bool or int
-        Whether, or how many times at most, instruments are simulated again.
-    nominal : ManoeuvringModel, optional
-        Simulates the first instruments, or starts output error; least squares does
-        without it.
-    output_error : OutputErrorOptions
-        What only ``oe`` heeds.
-    seed : int
-    prefilter : {"auto", "noise", "none"}
-        ``noise`` for refined instrumental variables, ``none`` for plain ones.
-    judged : bool
-        Whether tests and verdict are asked for.
-    without : tuple of str
-        Bias-capturing columns to leave out, spelled ``state:function``.
+    margins, covariance, heading, loop, zero_mean, refine, nominal
+        As `estimate_model`.
+    output_error, seed, prefilter, judged, without
+        As `estimate_model`.
 
     Raises
     ------
@@ -73,18 +53,6 @@ class Request:
     method: str | None = None
     predictor: str | None = None
     structure: str | None = None
-    margins: dict[str, float] | None = None
-    covariance: Covariance | None = None
-    heading: Literal["measured", "simulated"] = "measured"
-    loop: Loop = "auto"
-    zero_mean: bool = True
-    refine: bool | int = True
-    nominal: ManoeuvringModel | None = None
-    output_error: OutputErrorOptions = field(default_factory=OutputErrorOptions)
-    seed: int = 0
-    prefilter: Literal["auto", "noise", "none"] = "auto"
-    judged: bool = True
-    without: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for name, choices in _choices().items():

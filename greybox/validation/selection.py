@@ -10,18 +10,17 @@ from typing import Literal
 
 import numpy as np
 
+from greybox.credibility.verdict import free_run_faults, misfit, weigh
 from greybox.errors import GreyboxError, UsageError
 from greybox.estimation.closed_loop import Loop
-from greybox.estimation.credibility.verdict import free_run_faults, misfit, weigh
 from greybox.estimation.efficiency_bounds import limits_of
-from greybox.estimation.estimate import Covariance
 from greybox.estimation.output_error import OutputErrorOptions
 from greybox.estimation.registry import ESTIMATORS, free_run_estimator
 from greybox.estimation.result import Estimate
+from greybox.estimation.solve import Covariance
 from greybox.estimation.verdict import TrustLevel, Verdict, refused
-from greybox.keywords import known_keywords
 from greybox.model.model import ManoeuvringModel
-from greybox.one_thread import one_thread
+from greybox.public import known_keywords, one_thread
 from greybox.regression.regression import common_sample_time
 from greybox.trial.log import Logs, TrialLog
 from greybox.trial.segments import as_segments
@@ -118,18 +117,18 @@ def estimate_model(
         method,
         predictor,
         structure,
-        None if margins is None else dict(margins),
-        covariance,
-        heading,
-        loop,
-        zero_mean,
-        refine,
-        nominal,
-        OutputErrorOptions() if output_error is None else output_error,
-        seed,
-        prefilter,
-        judged,
-        tuple(without),
+        margins=None if margins is None else dict(margins),
+        covariance=covariance,
+        heading=heading,
+        loop=loop,
+        zero_mean=zero_mean,
+        refine=refine,
+        nominal=nominal,
+        output_error=OutputErrorOptions() if output_error is None else output_error,
+        seed=seed,
+        prefilter=prefilter,
+        judged=judged,
+        without=tuple(without),
     )
     if request is not None:
         if asked != Request():

@@ -14,7 +14,7 @@ from greybox.estimation.registry import ESTIMATORS
 from greybox.estimation.result import Estimate
 from greybox.model.catalogue import structure_for
 from greybox.notebook import DisplayMixin
-from greybox.one_thread import one_thread
+from greybox.public import one_thread
 from greybox.trial.log import Logs, TrialLog
 from greybox.trial.segments import as_segments
 from greybox.validation.criteria import independent_samples, information_criteria

@@ -13,7 +13,7 @@ from experiment_design.contrast import Pair
 from experiment_design.discriminate import probability_right
 from experiment_design.request import build_problem
 from greybox.errors import UsageError
-from greybox.model.simulation import simulate
+from greybox.model.run.simulation import simulate
 
 
 def _rival(request, current=(0.0, 0.0), **parameters):

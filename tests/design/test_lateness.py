@@ -15,7 +15,7 @@ from experiment_design.prepare import Wishes, prepare_request
 from experiment_design.request import build_problem
 from experiment_design.result import LimitReport
 from experiment_design.rollout import Rollout
-from greybox.model.changes import Change
+from greybox.model.run.changes import Change
 from greybox.trial.log import make_log
 from greybox.validation.fit import run_model
 from greybox.vessel.vessel import Actuation

@@ -15,8 +15,8 @@ from experiment_design.noise import noise_levels
 from experiment_design.request import build_problem
 from greybox.errors import UsageError
 from greybox.model.noise import NoiseLevels
+from greybox.model.run.simulation import simulate
 from greybox.model.run.step import StepModel
-from greybox.model.simulation import simulate
 from greybox.study.monte_carlo import Batch, BatchRegression
 from greybox.vessel.toml import load_vessel
 

@@ -20,7 +20,7 @@ from experiment_design.sensitivities import SensitivityProgram
 from greybox.errors import UsageError
 from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import build_predictor
-from greybox.model.simulation import simulate
+from greybox.model.run.simulation import simulate
 from greybox.vessel.force import generalised_force
 
 REGIME = (("u", (1,)), ("v", (1,)), ("r", (1, -1)))

@@ -20,8 +20,8 @@ from greybox.diagnosis.ship import Change, LogRun, Sensors, Ship, shifted, wired
 from greybox.diagnosis.simulator import Simulator
 from greybox.diagnosis.waves import find_waves
 from greybox.model.catalogue import get_structure
+from greybox.model.run.simulation import simulate
 from greybox.model.run.step import StepModel
-from greybox.model.simulation import simulate
 from greybox.study.blind import draw
 from greybox.study.chapter6 import TRUE
 from greybox.trial.log import TrialLog

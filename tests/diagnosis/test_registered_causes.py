@@ -16,7 +16,7 @@ from greybox.diagnosis.causes import Context, known_causes
 from greybox.diagnosis.diagnose import DiagnosisOptions, diagnose
 from greybox.errors import UsageError
 from greybox.model.catalogue import get_structure
-from greybox.model.simulation import simulate
+from greybox.model.run.simulation import simulate
 from greybox.study.chapter6 import TRUE
 from greybox.study.inputs import smoothed_pulses
 from greybox.trial.log import make_log

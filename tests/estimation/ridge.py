@@ -6,11 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from greybox.estimation.estimate import Solved, solve_ls
-from greybox.estimation.post_estimation import with_tests
-from greybox.estimation.problem import EstimationProblem
+from greybox.estimation.problem import EstimationProblem, Fitted
 from greybox.estimation.registry import Estimator
-from greybox.estimation.result import Estimate
+from greybox.estimation.solve import Solved, solve_ls
 from greybox.model.predictor import Predictor
 from greybox.regression.problem import RegressionProblem
 
@@ -18,7 +16,7 @@ from greybox.regression.problem import RegressionProblem
 PENALTY = 0.01
 
 
-def fit(problem: EstimationProblem) -> Estimate:
+def fit(problem: EstimationProblem) -> Fitted:
     """Shrink the least-squares estimate towards zero, each coefficient by its information."""
 
     def solve(predictor: Predictor) -> Solved:
@@ -26,8 +24,8 @@ def fit(problem: EstimationProblem) -> Estimate:
             RegressionProblem(predictor, problem.logs, problem.margins, zero_mean=False)
         )
 
-    def shrink(solved: Solved, notes: list[str]) -> Estimate:
-        plain = solved.estimate(problem.covariance or "hac", problem.seed, tested=False)
+    def shrink(solved: Solved, notes: list[str]) -> Fitted:
+        plain = solved.estimate(problem.covariance or "hac", problem.seed)
         turn = np.eye(len(plain.theta))
         for state in plain.predictor.structure.states:
             mine = plain.predictor.equation(state)
@@ -38,7 +36,7 @@ def fit(problem: EstimationProblem) -> Estimate:
             )
         covariance = turn @ plain.covariance @ turn.T
         found = replace(plain, method="ridge", theta=turn @ plain.theta, covariance=covariance)
-        return with_tests(solved.problem, found) if problem.judged else found
+        return Fitted(found, solved.problem)
 
     return problem.fit_regression("ridge", problem.predictor(intercept=True), solve, shrink)
 

@@ -18,13 +18,13 @@ from greybox.estimation.error_variance_profile import (
     error_variance_profiles,
     fit_scaled_arma_noise,
 )
-from greybox.estimation.estimate import estimate_iv
 from greybox.model.catalogue import get_structure
 from greybox.model.predictor import build_predictor
 from greybox.regression.motion import measured_slopes
 from greybox.regression.regression import build_regression
 from greybox.study.chapter6 import TRUE
 from greybox.study.efficiency import CASES, virtual_trial
+from greybox.validation.fit_single import estimate_iv
 
 REGIME = (("u", (1,)), ("v", (1,)))
 

@@ -10,6 +10,7 @@ import statsmodels.api as sm
 from linearmodels.iv import IV2SLS
 from virtual import virtual_log
 
+from greybox.credibility.judge import run_tests
 from greybox.errors import ExcitationError, UsageError
 from greybox.estimation.covariance import (
     block_bootstrap,
@@ -18,16 +19,17 @@ from greybox.estimation.covariance import (
     score_covariance,
 )
 from greybox.estimation.disturbance import estimate_current
-from greybox.estimation.estimate import estimate_iv, estimate_ls
-from greybox.estimation.moments import solve_stacked
-from greybox.estimation.post_estimation import judge_estimate
+from greybox.estimation.normal_equations import solve_stacked
+from greybox.estimation.problem import Fitted
 from greybox.model.catalogue import get_structure
 from greybox.model.predictor import build_predictor
 from greybox.regression.instruments import build_instruments
+from greybox.regression.problem import RegressionProblem
 from greybox.regression.regression import build_regression
 from greybox.study.chapter6 import TRUE as STUDY
 from greybox.study.efficiency import CASES, virtual_trial
 from greybox.trial.log import make_log
+from greybox.validation.fit_single import estimate_iv, estimate_ls
 
 REGIME = (("u", (1,)), ("v", (1,)))
 
@@ -340,7 +342,7 @@ def test_a_refinement_that_does_not_settle_is_told(thesis, run, settles):
     assert (found.converged, told.passed) == (settles, settles)
     assert told.statistic == found.iterations > 0
     assert any("95 % intervals of such" in r for r in found.verdict.reasons) == (not settles)
-    again = judge_estimate(found, [log], wind="measured")
+    again = run_tests(Fitted(found, RegressionProblem(predictor, (log,), wind="measured")))
     assert [t.sentence for t in again.tests if t.name == "convergence"] == [told.sentence]
     once = estimate_iv(predictor, [log], refine=False, wind="measured")
     assert not any(t.name == "convergence" for t in once.tests)

@@ -9,12 +9,12 @@ import pytest
 import statsmodels.api as sm
 from linearmodels.iv import IV2SLS
 
+from greybox.credibility.evidence import Equation
+from greybox.credibility.score_statistic import score_test
+from greybox.credibility.weak import measure_strength
 from greybox.estimation.arma_noise import WHITE, fit_arma_noise
 from greybox.estimation.covariance import score_covariance
-from greybox.estimation.credibility.evidence import Equation
-from greybox.estimation.credibility.score_statistic import score_test
-from greybox.estimation.credibility.weak import measure_strength
-from greybox.estimation.moments import solve_stacked
+from greybox.estimation.normal_equations import solve_stacked
 
 ROWS = 400
 

@@ -15,7 +15,7 @@ from greybox.estimation import free_run, free_run_noise, output_error
 from greybox.estimation.efficiency_bounds import cramer_rao, information, noise_variances
 from greybox.estimation.free_run import _follows, fit_free_runs
 from greybox.estimation.free_run_errors import (
-    autocovariance,
+    flat_top_autocovariance,
     shared_score_covariance,
     slow_errors,
 )
@@ -33,7 +33,7 @@ from greybox.estimation.shooting import (
 from greybox.model.catalogue import get_structure
 from greybox.model.noise import NoiseLevels
 from greybox.model.output import OutputModel
-from greybox.model.output_runs import Filter, Observer, Simulator
+from greybox.model.run.output_runs import Filter, Observer, Simulator
 from greybox.study.chapter6 import TRUE
 from greybox.study.efficiency import CASES, determinant_efficiency, virtual_trial
 
@@ -621,7 +621,7 @@ class TestErrors:
         rng = np.random.default_rng(7)
         rows, r = rng.standard_normal((3, 60, 2)), rng.standard_normal((60, 2))
         r[1:] += 0.6 * r[:-1]
-        gamma = autocovariance([r], 3)
+        gamma = flat_top_autocovariance([r], 3)
         total = np.zeros((3, 3))
         for k in range(60):
             for j in range(60):
@@ -682,7 +682,7 @@ class TestCommand:
 @pytest.mark.parametrize("memory", [0.0, 20.0])
 def test_intervals_cover(predictor, memory):
     """White errors, and process noise that remembers: 95 % intervals hold."""
-    from greybox.model.simulation import simulate, stationary_disturbance
+    from greybox.model.run.simulation import simulate, stationary_disturbance
     from greybox.trial.log import make_log
     from greybox.vessel.toml import load_vessel
 

@@ -35,7 +35,7 @@ def counted(monkeypatch):
         "greybox.regression.problem", "build_instruments", lambda p, logs, theta: theta.tobytes()
     )
     count_calls("greybox.trial.log", "actuated_force")
-    count_calls("greybox.estimation.post_estimation", "assess")
+    count_calls("greybox.credibility.judge", "assess")
     count_calls("greybox.validation.selection", "weigh")
     return count
 

@@ -14,7 +14,6 @@ from greybox.errors import DivergenceError, ExcitationError, UsageError
 from greybox.estimation import refined as refinement
 from greybox.estimation.banded_covariance import ErrorBand, ErrorNoise
 from greybox.estimation.bound import iv_bound
-from greybox.estimation.estimate import estimate_iv, estimate_ls
 from greybox.estimation.gls_regression import solve_white, spread_columns, white_rows
 from greybox.estimation.noise import (
     ErrorLikelihood,
@@ -27,13 +26,13 @@ from greybox.model.catalogue import get_structure
 from greybox.model.model import model_from_dict
 from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import build_predictor
-from greybox.model.simulation import stationary_disturbance
+from greybox.model.run.simulation import stationary_disturbance
 from greybox.numerics.banded import factor_band
 from greybox.regression.motion import predicted_motion, smoothed_heading
 from greybox.regression.regression import build_regression
 from greybox.study.chapter6 import TRUE
 from greybox.study.efficiency import CASES, virtual_trial
-from greybox.validation.fit_single import estimate_once
+from greybox.validation.fit_single import estimate_iv, estimate_ls, estimate_once
 from greybox.validation.request import Request
 
 REGIME = (("u", (1,)), ("v", (1,)), ("r", (1, -1)))
@@ -407,7 +406,7 @@ def test_intervals_cover_and_the_bound_is_reached(thesis, true_theta, basic, cor
     """60 trials with process noise, white or slow: coverage, and efficiency where white."""
     from scipy.special import digamma
 
-    from greybox.model.simulation import simulate
+    from greybox.model.run.simulation import simulate
     from greybox.trial.log import make_log
 
     runs, samples = 60, 1200

@@ -10,9 +10,9 @@ import pytest
 
 from greybox.commands.main import main
 from greybox.errors import ModelFileError, StructureError
-from greybox.model.changes import Change, simulate_changing
 from greybox.model.model import ManoeuvringModel, load_model, model_from_dict
-from greybox.model.simulation import simulate
+from greybox.model.run.changes import Change
+from greybox.model.run.simulation import simulate
 from greybox.validation.bands import predict_bands
 from greybox.validation.comparison import errors_ahead
 from greybox.validation.fit import run_model
@@ -56,9 +56,9 @@ def test_a_changing_run_equals_steps(model, clean_log):
     np.testing.assert_allclose(got.x, want, rtol=1e-12, atol=1e-12)
     tau = log.forces(model.structure.inputs)
     starts = np.array([[1.5, 1.2, 0.0], [1.0, 0.9, 0.01]])
-    both = simulate_changing(
-        model.structure, np.stack([model.theta, 0.9 * model.theta]), CHANGES, starts, tau, 1.0,
-        psi0=np.array([0.0, 0.4]), d=np.array([0.2, 0.1, 0.0, 0.0]),
+    both = simulate(
+        model.structure, np.stack([model.theta, 0.9 * model.theta]), starts, tau, 1.0,
+        changes=CHANGES, psi0=np.array([0.0, 0.4]), d=np.array([0.2, 0.1, 0.0, 0.0]),
         process_noise=np.full((2, len(tau), 3), 1e-3),
     )  # fmt: skip
     for run, share in enumerate((1.0, 0.9)):
@@ -74,22 +74,25 @@ def test_a_changing_run_equals_steps(model, clean_log):
             np.testing.assert_allclose(both.psi[run, k + 1], psi, rtol=1e-11, atol=1e-12)
 
 
-def test_without_changes_it_is_the_plain_run(model, clean_log):
+@pytest.mark.parametrize("integrator", ["euler", "rk4"])
+def test_changes_that_change_nothing_leave_the_plain_run(model, clean_log, integrator):
     tau = clean_log.forces(model.structure.inputs)
     start = np.array([1.5, 1.2, 0.0])
-    plain = simulate(model.structure, model.theta, start, tau, 1.0)
-    same = (Change("Xu", 7.0, 1e9), Change("Xu", 1.0, -5.0))
+    gusts = np.random.default_rng(5).normal(2.0, 1.0, (len(tau), 2))
+    wind = {"integrator": integrator, "air": gusts}
+    plain = simulate(model.structure, model.theta, start, tau, 1.0, **wind)
+    same = (Change("Xu", 7.0, 1e9), Change("Xu", 1.0, -5.0), Change("Nr", 1.0, 60.0))
     for changes in ((), same):
-        run = simulate_changing(model.structure, model.theta, changes, start, tau, 1.0)
+        run = simulate(model.structure, model.theta, start, tau, 1.0, changes=changes, **wind)
         np.testing.assert_array_equal(run.x, plain.x)
         np.testing.assert_array_equal(run.psi, plain.psi)
 
 
 def test_a_run_that_diverges_after_a_change_says_where(model, clean_log):
     tau = clean_log.forces(model.structure.inputs)
-    run = simulate_changing(
-        model.structure, model.theta, (Change("Xu", -100.0, 50.0),), np.array([1.5, 1.2, 0.0]),
-        tau, 1.0, bound=np.full(3, 50.0),
+    run = simulate(
+        model.structure, model.theta, np.array([1.5, 1.2, 0.0]), tau, 1.0,
+        changes=(Change("Xu", -100.0, 50.0),), bound=np.full(3, 50.0),
     )  # fmt: skip
     assert 50 < run.diverged[0] < 60
 

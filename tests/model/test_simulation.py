@@ -9,8 +9,8 @@ from scipy.integrate import solve_ivp
 from greybox.errors import DivergenceError, StructureError, UsageError
 from greybox.model.catalogue import get_structure
 from greybox.model.run.kernels import MANY_RUNS
+from greybox.model.run.simulation import positions, simulate, stationary_disturbance
 from greybox.model.run.step import StepModel
-from greybox.model.simulation import positions, simulate, stationary_disturbance
 
 
 def slow_run(structure, theta, x0, psi0, tau, d):

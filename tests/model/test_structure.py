@@ -11,8 +11,7 @@ import pytest
 from greybox.errors import StructureError
 from greybox.model.catalogue import get_structure, structure_names
 from greybox.model.run.step import StepModel
-from greybox.model.terms import Factor, Term, parse_term
-from greybox.model.units import parameter_unit
+from greybox.model.terms import Factor, Term, parameter_unit, parse_term
 from greybox.numerics.vectorised import Vectorised
 
 

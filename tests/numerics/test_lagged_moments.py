@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from greybox.numerics.banded import factor_band, inverse_band
+from greybox.numerics.lagged_moments import convolve, lagged_products, lagged_sums
 from greybox.numerics.linalg import scaled_inverse
-from greybox.numerics.moments import convolve, lagged_products, lagged_sums
 
 
 def test_lagged_sums_are_the_diagonal_of_lagged_products():

@@ -13,8 +13,8 @@ from virtual import PARAMETERS, virtual_log
 
 from greybox.diagnosis.result import Diagnosis, Found, Gain, Quantity, Ranked, Runs, Symptom
 from greybox.model.catalogue import get_structure
-from greybox.model.changes import Change
 from greybox.model.model import ManoeuvringModel
+from greybox.model.run.changes import Change
 from greybox.report.diagnosed_causes import probability
 from greybox.report.diagnosis import diagnosis_page
 from greybox.report.diagnosis_figures import command_figure, most_followed

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 
 from greybox.errors import UsageError
 from greybox.model.catalogue import get_structure
-from greybox.model.simulation import simulate
+from greybox.model.run.simulation import simulate
 from greybox.study.blind import Order, draw, draw_many, write
 from greybox.study.blind_causes import CAUSES, Effect
 from greybox.study.blind_conditions import Conditions, blind_vessel

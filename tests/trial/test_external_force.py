@@ -8,7 +8,7 @@ from virtual import PARAMETERS
 
 from greybox.channels import CHANNELS
 from greybox.model.catalogue import get_structure
-from greybox.model.simulation import simulate
+from greybox.model.run.simulation import simulate
 from greybox.study.blind_sensors import gauss_markov
 from greybox.study.chapter6 import TRUE
 from greybox.study.inputs import smoothed_pulses

@@ -16,7 +16,7 @@ from greybox.estimation.output_setup import output_predictor
 from greybox.model.catalogue import get_structure
 from greybox.model.model import ManoeuvringModel, load_model
 from greybox.model.noise import NoiseLevels
-from greybox.model.simulation import simulate, stationary_disturbance
+from greybox.model.run.simulation import simulate, stationary_disturbance
 from greybox.study.chapter6 import TRUE
 from greybox.study.inputs import smoothed_pulses
 from greybox.trial.log import make_log

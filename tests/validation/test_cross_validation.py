@@ -123,7 +123,7 @@ def test_ways_that_fail_have_no_score(small, monkeypatch):
     def refuse(*_, **__):
         raise ExcitationError("nothing moves.")
 
-    monkeypatch.setattr("greybox.estimation.estimate.solve_iv", refuse)
+    monkeypatch.setattr("greybox.estimation.solve.solve_iv", refuse)
     partly = compare_estimators(found, logs, SMALL)
     assert np.isnan(partly.scores[1]).all()
     np.testing.assert_allclose(partly.scores[0], whole.scores[0])
@@ -165,8 +165,8 @@ def test_where_no_regression_can_be_solved_output_error_is_tried(monkeypatch):
     def singular(*_, **__):
         raise ExcitationError("the instruments are singular.")
 
-    monkeypatch.setattr("greybox.estimation.estimate.solve_iv", singular)
-    monkeypatch.setattr("greybox.estimation.estimate.solve_ls", singular)
+    monkeypatch.setattr("greybox.estimation.solve.solve_iv", singular)
+    monkeypatch.setattr("greybox.estimation.solve.solve_ls", singular)
     log = virtual_log(3, 400, spread=0.0)
     request = Request(structure="thesis", predictor="wind")
     assert estimate_requested([log], request).method == "oe"
@@ -176,9 +176,9 @@ def test_where_no_regression_can_be_solved_output_error_is_tried(monkeypatch):
 
 
 def test_scores_of_whole_logs_are_the_fit():
-    from greybox.estimation.estimate import estimate_ls
     from greybox.model.catalogue import get_structure
     from greybox.model.predictor import build_predictor
+    from greybox.validation.fit_single import estimate_ls
     from greybox.validation.held_out import score_runs
 
     log = virtual_log(3, 400, spread=0.0)

@@ -14,7 +14,6 @@ from greybox.commands.main import main
 from greybox.diagnosis.diagnose import DiagnosisOptions, diagnose
 from greybox.diagnosis.ship import LogRun, Ship
 from greybox.errors import UsageError
-from greybox.estimation.estimate import estimate_iv, estimate_ls
 from greybox.estimation.output_error import OutputErrorOptions, estimate_oe
 from greybox.estimation.output_setup import output_predictor
 from greybox.estimation.refined import estimate_refined_iv
@@ -26,6 +25,7 @@ from greybox.trial.segments import join_segments
 from greybox.validation.bands import predict_bands
 from greybox.validation.comparison import compare
 from greybox.validation.fit import fit_percent, run_model
+from greybox.validation.fit_single import estimate_iv, estimate_ls
 from greybox.validation.selection import estimate_model
 from greybox.vessel.toml import load_vessel
 

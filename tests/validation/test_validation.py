@@ -16,8 +16,8 @@ from greybox.errors import (
     StructureError,
     UsageError,
 )
-from greybox.estimation.estimate import UnexcitedBiasError, estimate_iv, estimate_ls
 from greybox.estimation.informative import heading_range, regime_of
+from greybox.estimation.solve import UnexcitedBiasError
 from greybox.estimation.verdict import NoRegression, TrustLevel, refused
 from greybox.model.catalogue import get_structure, structure_for
 from greybox.model.conversion import (
@@ -35,6 +35,7 @@ from greybox.model.predictor import build_predictor
 from greybox.trial.log import make_log
 from greybox.validation.comparison import compare, sign_test
 from greybox.validation.fit import fit_percent, run_model
+from greybox.validation.fit_single import estimate_iv, estimate_ls
 from greybox.validation.selection import estimate_model
 
 

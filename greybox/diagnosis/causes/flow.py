@@ -8,8 +8,7 @@ import numpy as np
 
 from greybox.diagnosis.atom import Atom, Parameter
 from greybox.diagnosis.causes.cause import Cause, Context
-from greybox.model.terms import parse_term
-from greybox.model.units import parameter_unit
+from greybox.model.terms import parameter_unit, parse_term
 
 # no current is stronger [m/s]
 _STRONGEST = 5.0

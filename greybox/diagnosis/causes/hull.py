@@ -6,8 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from greybox.diagnosis.atom import Atom, Parameter
 from greybox.diagnosis.causes.cause import Cause, Context
-from greybox.model.terms import parse_term
-from greybox.model.units import parameter_unit
+from greybox.model.terms import parameter_unit, parse_term
 
 _WORDS = {"u": "surge", "v": "sway", "r": "yaw"}
 

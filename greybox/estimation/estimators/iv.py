@@ -7,19 +7,19 @@ from typing import TYPE_CHECKING, Literal
 from greybox.estimation.registry import Estimator
 
 if TYPE_CHECKING:
-    from greybox.estimation.estimate import Solved
-    from greybox.estimation.problem import EstimationProblem
+    from greybox.estimation.problem import EstimationProblem, Fitted
     from greybox.estimation.result import Estimate
+    from greybox.estimation.solve import Solved
     from greybox.model.predictor import Predictor
 
 # process noise, in deviations of the measurements, from which on it counts
 _PUSHED = 0.05
 
 
-def _fit(problem: EstimationProblem) -> Estimate:
+def _fit(problem: EstimationProblem) -> Fitted:
     from greybox.estimation.closed_loop import CLOSED_LOOP_LAG
-    from greybox.estimation.estimate import solve_iv
-    from greybox.estimation.post_estimation import with_tests
+    from greybox.estimation.problem import Fitted
+    from greybox.estimation.solve import solve_iv
     from greybox.regression.instruments import WIND_WINDOW
     from greybox.regression.problem import RegressionProblem
 
@@ -34,10 +34,8 @@ def _fit(problem: EstimationProblem) -> Estimate:
         )
         return solve_iv(regression, start=problem.nominal_theta, refine=problem.refine)
 
-    def finish(solved: Solved, notes: list[str]) -> Estimate:
+    def finish(solved: Solved, notes: list[str]) -> Fitted:
         estimate = _prefiltered(solved, problem, closed, notes)
-        if problem.judged:
-            estimate = with_tests(solved.problem, estimate)
         if problem.kind.air_measured:
             notes.append(
                 f"the wind in the instruments is the measured one averaged over {WIND_WINDOW:g} s, "
@@ -48,7 +46,7 @@ def _fit(problem: EstimationProblem) -> Estimate:
                 "move the wind terms towards zero and, in a nearly steady wind, the current with "
                 "them. Give wind_std in [sensors] where there is some; the wind is then averaged."
             )
-        return estimate
+        return Fitted(estimate, solved.problem)
 
     predictor = problem.predictor(intercept=not problem.zero_mean)
     return problem.fit_regression("iv", predictor, plain, finish)

@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING
 from greybox.estimation.registry import Estimator
 
 if TYPE_CHECKING:
-    from greybox.estimation.estimate import Solved
-    from greybox.estimation.problem import EstimationProblem
-    from greybox.estimation.result import Estimate
+    from greybox.estimation.problem import EstimationProblem, Fitted
+    from greybox.estimation.solve import Solved
     from greybox.model.predictor import Predictor
 
 
-def _fit(problem: EstimationProblem) -> Estimate:
-    from greybox.estimation.estimate import solve_ls
+def _fit(problem: EstimationProblem) -> Fitted:
+    from greybox.estimation.problem import Fitted
+    from greybox.estimation.solve import solve_ls
     from greybox.regression.problem import RegressionProblem
 
     def fit(predictor: Predictor) -> Solved:
@@ -22,8 +22,9 @@ def _fit(problem: EstimationProblem) -> Estimate:
             RegressionProblem(predictor, problem.logs, problem.margins, zero_mean=False)
         )
 
-    def finish(solved: Solved, notes: list[str]) -> Estimate:
-        return solved.estimate(problem.covariance or "hac", problem.seed, tested=problem.judged)
+    def finish(solved: Solved, notes: list[str]) -> Fitted:
+        estimate = solved.estimate(problem.covariance or "hac", problem.seed)
+        return Fitted(estimate, solved.problem, solved)
 
     return problem.fit_regression("ls", problem.predictor(intercept=True), fit, finish)
 

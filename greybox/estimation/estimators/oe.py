@@ -8,19 +8,21 @@ from typing import TYPE_CHECKING
 from greybox.estimation.registry import Estimator
 
 if TYPE_CHECKING:
-    from greybox.estimation.problem import EstimationProblem
+    from greybox.estimation.problem import EstimationProblem, Fitted
     from greybox.estimation.result import Estimate
 
 # refinements of the instruments where a free-run fit starts
 _STARTING_REFINEMENTS = 1
 
 
-def _fit(problem: EstimationProblem) -> Estimate:
+def _fit(problem: EstimationProblem) -> Fitted:
     """Fit free runs, from the nominal model, else from an estimate by IV or least squares."""
     from greybox.errors import UsageError
     from greybox.estimation.output_error import estimate_oe
     from greybox.estimation.output_setup import output_predictor
-    from greybox.estimation.post_estimation import beside, with_tests
+    from greybox.estimation.problem import Fitted
+    from greybox.model.predictor import build_predictor
+    from greybox.regression.problem import RegressionProblem
 
     if problem.margins:
         raise UsageError(
@@ -48,14 +50,12 @@ def _fit(problem: EstimationProblem) -> Estimate:
     estimate, dropped = problem.drop_unexcited(
         predictor, lambda p: estimate_oe(p, problem.logs, start=start, options=options)
     )
-    if problem.judged:
-        estimate = with_tests(beside(estimate, problem.logs), estimate)
+    # a free run has the current in the model; a regression captures it by columns
+    own = estimate.predictor
+    captured = build_predictor(own.structure, own.kind, own.regime)
+    fitted = Fitted(estimate, RegressionProblem(captured, problem.logs))
     _, loop_test = problem.loop_test("oe")
-    return replace(
-        estimate,
-        tests=(*estimate.tests, loop_test),
-        notes=(*estimate.notes, *notes, *dropped),
-    )
+    return fitted.with_more(loop_test, [*notes, *dropped])
 
 
 def _quick_start(problem: EstimationProblem) -> tuple[Estimate | None, str]:
@@ -64,7 +64,7 @@ def _quick_start(problem: EstimationProblem) -> tuple[Estimate | None, str]:
     Bias-capturing terms are left out: the fit finds the current by itself.
     """
     from greybox.errors import DivergenceError, ExcitationError
-    from greybox.estimation.estimate import solve_iv, solve_ls
+    from greybox.estimation.solve import solve_iv, solve_ls
     from greybox.model.predictor import build_predictor
     from greybox.regression.problem import RegressionProblem
 

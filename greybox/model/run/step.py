@@ -254,6 +254,28 @@ def next_position(place: ca.SX, u: ca.SX, v: ca.SX, psi: ca.SX, dt: ca.SX | floa
     return place + dt * ca.vertcat(*body_to_ned(u, v, psi))
 
 
+def held(value: Array, integrator: Integrator, axis: int = 0) -> Array:
+    """Return what a step reads of a signal that is measured at the samples.
+
+    Euler's rule reads it at the start of the step. The classical Runge-Kutta rule, during
+    which the ship turns, reads the mean of both ends; the last value stands, since no next
+    one is known.
+
+    Parameters
+    ----------
+    value : ndarray
+        (..., N, ...)
+    integrator : {"euler", "rk4"}
+    axis : int
+        Of time.
+    """
+    if integrator == "euler":
+        return value
+    out = np.moveaxis(np.array(value, float), axis, -1)
+    out[..., :-1] = (out[..., :-1] + out[..., 1:]) / 2
+    return np.moveaxis(out, -1, axis)
+
+
 def integrated(rate: Array, steps: Array | float, rule: Rule, axis: int = 0) -> Array:
     """Integrate a rate that was run already, from zero.
 

@@ -1,0 +1,411 @@
+"""Solutions of the regressions of a predictor: least squares and instrumental variables."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.errors import ExcitationError, UsageError
+from greybox.estimation.covariance import (
+    CovarianceKind,
+    block_bootstrap,
+    score_covariance,
+)
+from greybox.estimation.disturbance import estimate_current
+from greybox.estimation.error_variance_profile import ErrorVarianceProfile, error_variance_profiles
+from greybox.estimation.normal_equations import Solution, solve_stacked
+from greybox.estimation.result import Estimate
+from greybox.estimation.values import Iteration, estimation_data
+from greybox.model.predictor import Predictor
+from greybox.numerics.linalg import scaled_inverse
+from greybox.regression.instruments import Instruments
+from greybox.regression.problem import RegressionProblem
+from greybox.regression.regression import Regression
+
+Array = NDArray[np.float64]
+Covariance = Literal["hac", "ma", "white", "bootstrap"]
+
+# scaled singular value below which a direction counts as not excited
+SINGULAR = 1e-8
+_NO_ITERATION = Iteration()
+_STRONGEST = "the estimate of the strongest instruments is given"
+_REFINE_TOLERANCE = 1e-4
+_MAX_REFINEMENTS = 30
+
+
+class UnexcitedBiasError(ExcitationError):
+    """A bias-capturing regressor, or its instrument, does not vary and can be left out."""
+
+    def __init__(self, column: int, label: str) -> None:
+        super().__init__(
+            f"the bias-capturing regressor {label} or its instrument does not vary over the whole "
+            f"log: leave it out of the predictor."
+        )
+        self.column = column
+
+
+def solve_ls(problem: RegressionProblem) -> Solved:
+    """Solve a problem by least squares.
+
+    Raises
+    ------
+    ExcitationError
+        Some direction is not excited; its parameters are named.
+
+    References
+    ----------
+    Ljungberg (2020), eq. 2.17.
+    """
+    instruments = _regressors_as_instruments(problem.regression)
+    return Solved("ls", problem, instruments, _solve(problem.regression, instruments))
+
+
+def solve_iv(
+    problem: RegressionProblem,
+    *,
+    start: Array | Estimate | None = None,
+    refine: bool | int = True,
+    metric: str = "moments",
+) -> Solved:
+    """Solve a problem by instrumental variables, experiments stacked (4.5).
+
+    Where an instrument simulation diverges, the step is halved. Where that does not help, or
+    the estimates never settle, an estimate spoils the model of the next instruments: the one
+    whose instruments explain most of the regressors is returned.
+
+    Parameters
+    ----------
+    problem : RegressionProblem
+    start : ndarray or Estimate, optional
+        (p,) parameters of the structure that simulate the first instruments: a nominal
+        model. By default the least-squares estimate (4.60).
+    refine : bool or int
+        Simulate the instruments again from each estimate until it stops moving, or as many
+        times at most.
+    metric : {"moments", "identity"}
+        How the stacked equations of several experiments are weighted.
+
+    Raises
+    ------
+    ExcitationError
+        Some direction is not excited, or even the first simulation diverges.
+    UsageError
+        Instruments keep their mean and the augmented predictor has no constant.
+
+    References
+    ----------
+    Ljungberg (2020), eqs. 4.5, 4.60-4.63; Young (2008).
+    """
+    predictor = problem.predictor
+    if (
+        not problem.zero_mean
+        and predictor.augmented
+        and "1" not in {c.name for c in predictor.columns}
+    ):
+        raise UsageError(
+            "instruments that keep their mean do not remove the constants that the augmented "
+            "predictor leaves out: build it with an intercept, or use zero-mean instruments."
+        )
+    regression = problem.regression
+    theta = _start(problem, start)
+    # the first model may be far off: rows are first cut by the measured states
+    instruments = problem.instruments(theta, problem.keep)
+    if instruments.diverged:
+        raise ExcitationError(
+            f"{instruments.diverged} already with the first model, so there are no instruments: "
+            f"give a nominal model that is stable, or use --method ls."
+        )
+    solutions = _solve(regression, instruments, metric)
+    iteration = Iteration(0, "one step, instruments not refined")
+    strongest = (_strength(solutions), theta, instruments, solutions)
+    if refine:
+        most = _MAX_REFINEMENTS if refine is True else int(refine)
+        iteration = Iteration(most, f"still moved after {most} steps", False, "the refinement ")
+        for count in range(1, most + 1):
+            previous = _coefficients(solutions)
+            target = _structure_theta(predictor, previous)
+            # rows are cut once by a refined model and then kept, or the cut would chatter
+            rows = None if count == 1 else instruments.keep
+            candidate, fresh = target, problem.instruments(target, rows)
+            for _ in range(4):
+                if not fresh.diverged:
+                    break
+                candidate = (candidate + theta) / 2
+                fresh = problem.instruments(candidate, rows)
+            if fresh.diverged:
+                ended = f"stopped after {count - 1} refinements: {fresh.diverged}; {_STRONGEST}"
+                iteration = Iteration(count, ended, False)
+                _, theta, instruments, solutions = strongest
+                break
+            theta, instruments = candidate, fresh
+            solutions = _solve(regression, instruments, metric)
+            strength = _strength(solutions)
+            if strength > strongest[0]:
+                strongest = (strength, theta, instruments, solutions)
+            moved = np.abs(_coefficients(solutions) - previous)
+            scale = np.abs(previous) + 1e-12
+            # a halfway model settles too, but not at an estimate that can be simulated
+            if candidate is target and (moved < _REFINE_TOLERANCE * scale).all():
+                iteration = Iteration(count, f"converged after {count} refinements")
+                break
+        else:
+            if refine is True:
+                iteration = replace(iteration, ended=f"{iteration.ended}; {_STRONGEST}")
+                _, theta, instruments, solutions = strongest
+    return Solved("iv", problem, instruments, solutions, iteration)
+
+
+@dataclass(frozen=True)
+class Solved:
+    """Equations that are solved, before standard errors.
+
+    Parameters
+    ----------
+    method : str
+    problem : RegressionProblem
+    instruments : Instruments
+        Those of the solution.
+    solutions : sequence of Solution
+        One an equation.
+    iteration : Iteration
+    """
+
+    method: str
+    problem: RegressionProblem
+    instruments: Instruments
+    solutions: Sequence[Solution]
+    iteration: Iteration = _NO_ITERATION
+
+    @property
+    def theta(self) -> Array:
+        """Coefficients of all columns, (p,)."""
+        return _coefficients(self.solutions)
+
+    @property
+    def keep(self) -> Sequence[NDArray[np.bool_]]:
+        """Rows that take part."""
+        return self.instruments.keep
+
+    @property
+    def simulated(self) -> Instruments:
+        """Simulated instruments: those of the solution, or by the model that it gives."""
+        if self.instruments.x:
+            return self.instruments
+        return self.problem.instruments(
+            _structure_theta(self.problem.predictor, self.theta), self.problem.keep
+        )
+
+    @property
+    def centred(self) -> bool:
+        """Whether constants of the experiments were removed: by zero-mean instruments."""
+        return self.problem.zero_mean
+
+    def estimate(self, covariance: Covariance | None, seed: int = 0) -> Estimate:
+        """Return the estimate.
+
+        Parameters
+        ----------
+        covariance : {"ma", "hac", "white", "bootstrap"}, optional
+            None leaves standard errors out, where they will not be looked at.
+        seed : int
+        """
+        problem, theta = self.problem, self.theta
+        predictor, logs = problem.predictor, problem.logs
+        projected, residuals = _masked(self)
+        kept = sum(int(k.sum()) for k in self.keep)
+        matrix, lags = np.full((len(theta), len(theta)), np.nan), 0
+        if covariance is not None:
+            shapes = (
+                error_variance_profiles(predictor, logs, theta, residuals, self.keep)
+                if covariance == "ma"
+                else ()
+            )
+            matrix, lags = _covariance(self, projected, residuals, covariance, seed, shapes)
+        return Estimate(
+            predictor=predictor,
+            method=self.method,
+            theta=theta,
+            covariance=matrix,
+            residual_std=np.array(
+                [np.sqrt(sum(float(e @ e) for e in each) / max(kept, 1)) for each in residuals]
+            ),
+            vessel=logs[0].vessel,
+            sample_time=problem.regression.sample_time,
+            data=estimation_data(
+                logs, predictor.structure.states, problem.regression.samples, kept
+            ),
+            covariance_kind=covariance or "",
+            lags=lags,
+            iteration=self.iteration,
+            current=estimate_current(
+                predictor,
+                theta,
+                matrix,
+                heading_std=logs[0].vessel.std("psi") or 0.0,
+                heading_measured=problem.heading == "measured",
+            )
+            if covariance is not None
+            else (),
+        )
+
+
+def _regressors_as_instruments(regression: Regression) -> Instruments:
+    return Instruments(
+        tuple(e.phi for e in regression.experiments), tuple(e.keep for e in regression.experiments)
+    )
+
+
+def _start(problem: RegressionProblem, start: Array | Estimate | None) -> Array:
+    if isinstance(start, Estimate):
+        return start.structure_theta()
+    if start is not None:
+        return np.asarray(start, float)
+    return _structure_theta(problem.predictor, solve_ls(problem).theta)
+
+
+def _structure_theta(predictor: Predictor, coefficients: Array) -> Array:
+    theta = np.zeros(len(predictor.structure.terms))
+    for i in predictor.parameter_columns:
+        theta[predictor.structure.index(predictor.columns[i].terms[0])] = coefficients[i]
+    return theta
+
+
+def _strength(solutions: Sequence[Solution]) -> float:
+    """Return half the log determinant of what the instruments explain of the regressors."""
+    with np.errstate(divide="ignore"):
+        return float(sum(np.log(s.singular_values).sum() for s in solutions))
+
+
+def _coefficients(solutions: Sequence[Solution]) -> Array:
+    return np.concatenate([s.theta for s in solutions])
+
+
+def _solve(
+    regression: Regression, instruments: Instruments, metric: str = "moments"
+) -> list[Solution]:
+    predictor = regression.predictor
+    solutions = []
+    for row, state in enumerate(predictor.structure.states):
+        mine = predictor.equation(state)
+        kept = sum(int(k.sum()) for k in instruments.keep)
+        if kept <= 2 * len(mine):
+            raise ExcitationError(
+                f"{kept} of {regression.samples} samples keep the margins and the {state} equation "
+                f"has {len(mine)} coefficients, more than {2 * len(mine)} are needed: use smaller "
+                f"margins or a longer log."
+            )
+        phi = [
+            e.phi[mine][:, k] for e, k in zip(regression.experiments, instruments.keep, strict=True)
+        ]
+        y = [e.y[row, k] for e, k in zip(regression.experiments, instruments.keep, strict=True)]
+        z = [z[mine][:, k] for z, k in zip(instruments.z, instruments.keep, strict=True)]
+        _require_excited(predictor, mine, phi, z)
+        solution = solve_stacked(z, phi, y, metric=metric)
+        if not solution.singular_values[-1] > SINGULAR * solution.singular_values[0]:
+            raise ExcitationError(_singular(predictor, mine, solution, regression))
+        solutions.append(solution)
+    return solutions
+
+
+def _require_excited(
+    predictor: Predictor, mine: list[int], phi: Sequence[Array], z: Sequence[Array]
+) -> None:
+    """Name the first parameter whose regressor or instrument does not vary at all."""
+    for i, column in enumerate(mine):
+        for rows, what in ((phi, "regressor"), (z, "instrument")):
+            largest = max(float(np.abs(r[i]).max(initial=0.0)) for r in rows)
+            if largest < 1e-13:
+                label = predictor.columns[column].label
+                if predictor.columns[column].is_bias:
+                    raise UnexcitedBiasError(column, label)
+                raise ExcitationError(
+                    f"parameter {label} is not excited: its {what} stays within {largest:.1g} "
+                    f"over the whole log. Move what it multiplies, or leave it out "
+                    f"(--structure '{predictor.structure.name}-{predictor.columns[column].name}')."
+                )
+
+
+def _singular(
+    predictor: Predictor, mine: list[int], solution: Solution, regression: Regression
+) -> str:
+    size = np.abs(solution.weakest)
+    involved = [predictor.columns[mine[i]].label for i in np.argsort(-size) if size[i] > 0.2]
+    ratio = solution.singular_values[-1] / solution.singular_values[0]
+    return (
+        f"the instruments are singular: {', '.join(involved)} cannot be told apart in the "
+        f"{predictor.columns[mine[0]].state} equation (relative singular value {ratio:.1e}, "
+        f"needs {SINGULAR:.0e}) on {regression.samples} samples. Excite them separately, or "
+        f"leave one out."
+    )
+
+
+def _masked(solved: Solved) -> tuple[list[list[Array]], list[list[Array]]]:
+    """Return projected instruments and residuals on all rows, zero where cut out.
+
+    Zero-mean instruments leave the constant of each experiment undetermined; it
+    belongs to the equation, not to the residual, so those are `centred`.
+    """
+    problem, centred = solved.problem, solved.centred
+    predictor = problem.predictor
+    projected, residuals = [], []
+    for row, (state, solution) in enumerate(
+        zip(predictor.structure.states, solved.solutions, strict=True)
+    ):
+        mine = predictor.equation(state)
+        hats, errors = [], []
+        for e, keep, hat in zip(
+            problem.regression.experiments, solved.keep, solution.projected, strict=True
+        ):
+            full = np.zeros((len(mine), len(keep)))
+            full[:, keep] = hat
+            error = e.y[row] - solution.theta @ e.phi[mine]
+            if centred and keep.any():
+                error = error - error[keep].mean()
+            error = np.where(keep, error, 0.0)
+            hats.append(full)
+            errors.append(error)
+        projected.append(hats)
+        residuals.append(errors)
+    return projected, residuals
+
+
+def _covariance(
+    solved: Solved,
+    projected: list[list[Array]],
+    residuals: list[list[Array]],
+    kind: Covariance,
+    seed: int,
+    shapes: Sequence[Sequence[ErrorVarianceProfile]],
+) -> tuple[Array, int]:
+    regression, predictor = solved.problem.regression, solved.problem.predictor
+    p = len(predictor.columns)
+    if kind == "bootstrap":
+        equations = []
+        for row, state in enumerate(predictor.structure.states):
+            mine = predictor.equation(state)
+            phi = [e.phi[mine] for e in regression.experiments]
+            y = [e.y[row] for e in regression.experiments]
+            if solved.centred:
+                # the constant of each experiment belongs to the equation, not to a block
+                phi = [f - f.mean(axis=1, keepdims=True) for f in phi]
+                y = [v - v.mean() for v in y]
+            equations.append((projected[row], phi, y))
+        draws = block_bootstrap(equations, np.random.default_rng(seed))
+        order = np.argsort(
+            np.concatenate([predictor.equation(s) for s in predictor.structure.states])
+        )
+        return np.cov(draws[:, order].T).reshape(p, p), 0
+    robust: CovarianceKind = kind
+    middle, lags = score_covariance(projected, residuals, robust, shapes=shapes)
+    inverse = np.zeros((p, p))
+    for state, solution in zip(predictor.structure.states, solved.solutions, strict=True):
+        mine = predictor.equation(state)
+        inverse[np.ix_(mine, mine)] = scaled_inverse(solution.information)
+    # degrees of freedom, as statsmodels counts them
+    rows = regression.kept
+    largest = max(len(predictor.equation(s)) for s in predictor.structure.states)
+    return inverse @ middle @ inverse.T * rows / max(rows - largest, 1), lags

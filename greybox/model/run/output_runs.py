@@ -1,0 +1,374 @@
+"""Runs of an output model side by side, with exact sensitivities.
+
+The run itself is a loop over the samples. Its derivatives are not: those of each step
+are computed at all samples at once, and their recursion is linear.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, TypeVar
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.model.output import OutputModel
+from greybox.model.run.kernels import along, bind
+from greybox.model.run.output_step import Walking, filtered, free, likelihood, observed
+from greybox.numerics.recursion import propagate
+from greybox.numerics.vectorised import Vectorised
+
+Array = NDArray[np.float64]
+
+# samples whose derivatives are computed at once: a long log needs no more memory than these
+_BLOCK = 8192
+
+
+@lru_cache(maxsize=32)
+def _pass(walk: Walking, model: OutputModel, steps: int, runs: int) -> ca.Function:
+    """Return the walk over samples of runs side by side, without derivatives."""
+    of = walk(model)
+    step = ca.Function(
+        "step", [*of.carried, of.read, *of.constant], [*of.after, *of.found], {"cse": True}
+    )
+    return along(step, len(of.carried), steps, runs)
+
+
+@dataclass(frozen=True)
+class _Table:
+    """Derivatives of one step, at any number of samples at once.
+
+    Parameters
+    ----------
+    program : Vectorised
+        Of the rows [∂z⁺/∂z, ∂z⁺/∂p, 0], and below them those of what is found unless
+        `same`.
+    shape : tuple of int
+    same : bool
+        What is found are the states themselves.
+    """
+
+    program: Vectorised
+    shape: tuple[int, int]
+    same: bool
+
+
+@lru_cache(maxsize=32)
+def _table(walk: Walking, model: OutputModel) -> _Table:
+    of = walk(model)
+    after, found = of.slope_after, of.slope_found
+    same = bool(found.by_z.is_eye()) and not found.by_p.nnz()
+    nz = after.by_z.size1()
+    rows = [ca.horzcat(s.by_z, s.by_p, ca.SX(s.by_z.size1(), nz)) for s in (after, found)]
+    matrix = rows[0] if same else ca.vertcat(*rows)
+    symbols = ca.vertcat(*of.carried, of.read, *of.constant)
+    program = Vectorised(ca.vertsplit(ca.vec(ca.densify(matrix).T)), ca.vertsplit(symbols))
+    return _Table(program, matrix.shape, same)
+
+
+class _Evaluator:
+    """Evaluates functions on NumPy arrays, in memory that each is given once."""
+
+    def __init__(self) -> None:
+        self._buffers: dict[int, tuple[ca.Function, Any, Callable[[], None]]] = {}
+
+    def __call__(
+        self, function: ca.Function, arguments: tuple[Array, ...], out: tuple[Array, ...]
+    ) -> None:
+        if id(function) not in self._buffers:
+            self._buffers[id(function)] = (function, *function.buffer())
+        _, buffer, trigger = self._buffers[id(function)]
+        held = [np.ascontiguousarray(a, float) for a in arguments]
+        for i, a in enumerate(held):
+            if a.size:
+                bind(buffer.set_arg, i, a)
+        for i, a in enumerate(out):
+            if a.size:
+                bind(buffer.set_res, i, a)
+        trigger()
+
+
+class _Runs:
+    """A walk along runs side by side, with derivatives and buffers.
+
+    Parameters
+    ----------
+    walk : callable
+    model : OutputModel
+    read : ndarray
+        (M, m, nr) what each step reads.
+    """
+
+    def __init__(self, walk: Walking, model: OutputModel, read: Array) -> None:
+        self._walk, self._model = walk, model
+        self.runs, self.steps = read.shape[:2]
+        self._read = np.ascontiguousarray(read, float)
+        self._evaluate = _Evaluator()
+        self._blocks: list[tuple[slice, list[Array], dict[int, Any]]] | None = None
+
+    def __call__(
+        self, carried: Sequence[Array], constant: Sequence[Array]
+    ) -> tuple[list[Array], list[Array]]:
+        """Return what is carried after each step, and what is found, each (M, m, ·)."""
+        of = self._walk(self._model)
+        function = _pass(self._walk, self._model, self.steps, self.runs)
+        out = [np.empty((self.runs, self.steps, x.numel())) for x in (*of.after, *of.found)]
+        self._evaluate(function, (*carried, self._read, *constant), tuple(out))
+        return out[: len(carried)], out[len(carried) :]
+
+    def _prepared(
+        self, table: _Table, first: int
+    ) -> list[tuple[slice, list[Array], dict[int, Any]]]:
+        """Return, of blocks of samples, what is read and all that depends on it alone."""
+        if self._blocks is None:
+            flat = self._read.reshape(self.runs * self.steps, self._read.shape[2]).T
+            self._blocks = []
+            for begin in range(0, flat.shape[1], _BLOCK):
+                block = slice(begin, begin + _BLOCK)
+                read = [np.ascontiguousarray(x[block]) for x in flat]
+                known = table.program.prepare({first + i: x for i, x in enumerate(read)})
+                self._blocks.append((block, read, known))
+        return self._blocks
+
+    def slopes(
+        self, carried: Sequence[Array], constant: Sequence[Array], after: Sequence[Array]
+    ) -> tuple[Array, Array]:
+        """Return derivatives in the parameters, then in the run's own first states.
+
+        Parameters
+        ----------
+        carried, constant : sequence of ndarray
+            As a call took them.
+        after : sequence of ndarray
+            What was carried after each step.
+
+        Returns
+        -------
+        tuple of ndarray
+            Of what is found first, (M, m, ny, q + nz), and of the states after the last
+            step, (M, nz, q + nz).
+        """
+        table = _table(self._walk, self._model)
+        rows, columns = table.shape
+        runs, steps, nz = after[0].shape
+        before = [
+            np.concatenate([x[:, None], y[:, :-1]], axis=1)
+            for x, y in zip(carried, after, strict=True)
+        ]
+        states = np.concatenate([x.reshape(runs * steps, x.shape[2]).T for x in before])
+        fixed = [float(x) for c in constant for x in c]
+        matrix = np.empty((runs * steps, rows * columns))
+        start = np.zeros((runs, nz, columns - nz))
+        start[:, :, columns - 2 * nz :] = np.eye(nz)
+        with np.errstate(all="ignore"):
+            for block, read, known in self._prepared(table, len(states)):
+                table.program([*states[:, block], *read, *fixed], matrix[block].T, known)
+            by = matrix.reshape(runs, steps, rows, columns)
+            slopes = propagate(by[:, :, :nz, :nz], by[:, :, :nz, nz:], start)
+            if table.same:
+                return slopes[:, :-1], slopes[:, -1]
+            shown = by[:, :, nz:, :nz] @ slopes[:, :-1]
+            shown += by[:, :, nz:, nz:]
+        return shown, slopes[:, -1]
+
+
+_Found = TypeVar("_Found", bound=tuple[Array, ...])
+
+
+def _kept(last: tuple[Array, Array, _Found] | None, z0: Array, p: Array) -> _Found | None:
+    """Return what was found last, if it was at this point."""
+    if last is None:
+        return None
+    return last[2] if np.array_equal(last[0], z0) and np.array_equal(last[1], p) else None
+
+
+def _fixed(*arrays: Array) -> Any:
+    """Return arrays that nothing can write to."""
+    for array in arrays:
+        array.flags.writeable = False
+    return arrays
+
+
+class Simulator:
+    """Free runs of equal length side by side, with sensitivities and buffers.
+
+    Parameters
+    ----------
+    model : OutputModel
+    w : ndarray
+        (M, m, nw) what each step reads, in the order of ``model.drivers``.
+
+    Notes
+    -----
+    Sensitivity columns are the parameters, then the run's own initial state.
+    """
+
+    def __init__(self, model: OutputModel, w: Array) -> None:
+        self.model = model
+        self._runs = _Runs(free, model, w)
+        # the latest run, and the latest whose derivatives were asked for
+        self._ran: tuple[Array, Array, tuple[Array, Array]] | None = None
+        self._last: tuple[Array, Array, tuple[Array, Array, Array, Array]] | None = None
+
+    def _run(self, z0: Array, p: Array) -> tuple[Array, Array]:
+        """Return outputs and the states after each step, not to be written to."""
+        found = _kept(self._ran, z0, p)
+        if found is None:
+            (states,), (y,) = self._runs([z0], [p])
+            found = _fixed(y, states)
+            self._ran = (z0.copy(), p.copy(), found)
+        return found
+
+    def __call__(self, z0: Array, p: Array) -> tuple[Array, Array]:
+        """Return outputs (M, m, ny) and the states after the last step (M, nz)."""
+        kept = _kept(self._last, z0, p)
+        if kept is not None:
+            return kept[0], kept[2]
+        y, states = self._run(z0, p)
+        return y, states[:, -1]
+
+    def sensitivities(self, z0: Array, p: Array) -> tuple[Array, Array, Array, Array]:
+        """Run with derivatives.
+
+        Parameters
+        ----------
+        z0 : ndarray
+            (M, nz) initial states.
+        p : ndarray
+            (q,) parameters.
+
+        Returns
+        -------
+        tuple of ndarray
+            Outputs (M, m, ny); their derivatives (M, m, ny, q + nz); states after
+            the last step (M, nz) and their derivatives (M, nz, q + nz). Not to be written
+            to: the latest are kept, for the same point is asked for with other weights.
+        """
+        kept = _kept(self._last, z0, p)
+        if kept is None:
+            y, states = self._run(z0, p)
+            rows, slope = self._runs.slopes([z0], [p], [states])
+            kept = _fixed(y, rows, states[:, -1], slope)
+            self._last = (z0.copy(), p.copy(), kept)
+        return kept
+
+
+class Observer:
+    """Runs whose measured states are drawn towards the measurements at every step.
+
+    Parameters
+    ----------
+    model : OutputModel
+    w, y, use : ndarray
+        As a `Filter` takes them.
+    """
+
+    def __init__(self, model: OutputModel, w: Array, y: Array, use: Array) -> None:
+        self.model = model
+        self._runs = _Runs(observed, model, np.concatenate([w, y, use[..., None]], axis=2))
+        self._unused = use == 0
+
+    def __call__(
+        self, z0: Array, p: Array, gain: float, *, sensitivities: bool = True
+    ) -> tuple[Array, Array]:
+        """Run from initial states, each step beginning at z + gain (y − z).
+
+        Parameters
+        ----------
+        z0 : ndarray
+            (M, nz)
+        p : ndarray
+            (q,)
+        gain : float
+            0 is the free run, 1 begins each step at the measurement.
+
+        Returns
+        -------
+        tuple
+            Errors y − h(z) before each correction (M, m, ny), and the derivatives of h(z)
+            (M, m, ny, q + nz), without columns where they are not asked for.
+        """
+        constant = [p, np.array([gain])]
+        states, (error,) = self._runs([z0], constant)
+        if not sensitivities:
+            return error, np.empty((*error.shape, 0))
+        rows, _ = self._runs.slopes([z0], constant, states)
+        if self._unused.any():
+            rows[self._unused] = 0.0
+        return error, rows
+
+
+class Filter:
+    """Extended Kalman filters over logs side by side, padded to one length.
+
+    Parameters
+    ----------
+    model : OutputModel
+    w : ndarray
+        (M, m, nw) what each step reads.
+    y : ndarray
+        (M, m, ny) measurements.
+    use : ndarray
+        (M, m) 1 for samples of a log, 0 for padding.
+    """
+
+    def __init__(self, model: OutputModel, w: Array, y: Array, use: Array) -> None:
+        self.model = model
+        self._w = np.ascontiguousarray(np.concatenate([w, y, use[..., None]], axis=2), float)
+        self._runs = _Runs(filtered, model, self._w)
+        self._evaluate = _Evaluator()
+
+    def __call__(
+        self, z0: Array, p: Array, noise: Array, *, sensitivities: bool = True
+    ) -> tuple[Array, Array, Array]:
+        """Filter from exactly known initial states.
+
+        Parameters
+        ----------
+        z0 : ndarray
+            (M, nz)
+        p : ndarray
+            (q,)
+        noise : ndarray
+            (ny + nz,) variances of the measurements and of what is added a step.
+
+        Returns
+        -------
+        tuple
+            Innovations of unit variance (M, m, ny); their sensitivities with the
+            gains held (M, m, ny, q + nz), negative derivatives of the innovations,
+            without columns where they are not asked for; and the logarithms of their
+            variances (M, m, ny).
+        """
+        nz = z0.shape[1]
+        carried = [z0, np.zeros((len(z0), nz * (nz + 1) // 2))]
+        after, (innovations, levels) = self._runs(carried, [p, noise])
+        if not sensitivities:
+            return innovations, np.empty((*innovations.shape, 0)), levels
+        rows, _ = self._runs.slopes(carried, [p, noise], after)
+        return innovations, rows, levels
+
+    def likelihood(self, z0: Array, p: Array, noise: Array) -> tuple[float, Array, Array]:
+        """Return the negative log-likelihood and its derivatives, gains included.
+
+        Parameters
+        ----------
+        z0, p, noise : ndarray
+            As a call takes them.
+
+        Returns
+        -------
+        tuple
+            −log L without its constant; its derivatives in `z0` (M, nz) and `p` (q,).
+
+        References
+        ----------
+        Ljung (1999), section 7.4; Åström (1980), eq. 4.6.
+        """
+        function = likelihood(self.model, *self._w.shape[1::-1])
+        out = (np.empty(1), np.empty(z0.shape), np.empty(p.shape))
+        self._evaluate(function, (z0, self._w, p, noise), out)
+        return float(out[0][0]), out[1], out[2]
