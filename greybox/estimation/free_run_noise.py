@@ -67,7 +67,7 @@ def noise_of_run(
     filtered = FilterRuns(model, whole, start)
     if not np.isfinite(filtered.value(p, nodes)[2]):
         return noise_of_sensors(runs)
-    found = fit_noise(filtered, p, nodes, np.zeros(len(start), bool))
+    found = fit_noise(filtered, p, nodes)
     mean = found.copy()
     for i in range(len(sigma), len(found)):
         mean[i] = mean_variance(filtered, p, nodes, found, i, sigma[i - len(sigma)])

@@ -36,8 +36,8 @@ Array = NDArray[np.float64]
 
 _ROUNDS = 12
 _NOISE_STEPS = 4
-# change of a logarithm for its derivative, and the largest in a step
-_DIFFERENCE, _LARGEST = 1e-4, 3.0
+# largest change of a logarithm in a step
+_LARGEST = 3.0
 # change of every noise deviation, and of the cost, below which the alternation ends
 _SETTLED, _COST = 0.02, 1e-3
 # variances between these shares of a step's mean square
@@ -54,13 +54,18 @@ class FilterRuns:
         One a log, none joined.
     noise : ndarray
         (ny + nz,) variances of the measurements and of what is added a step.
+    kalman : Filter, optional
+        Of the same logs.
     """
 
-    def __init__(self, model: OutputModel, segments: Segments, noise: Array) -> None:
+    def __init__(
+        self, model: OutputModel, segments: Segments, noise: Array, kalman: Filter | None = None
+    ) -> None:
         self.model = model
         self.segments = segments
         self.noise = noise
-        self._filter = Filter(model, segments.w, segments.y, segments.use)
+        logs = segments.w, segments.y, segments.use
+        self._filter = Filter(model, *logs) if kalman is None else kalman
 
     def linearise(self, p: Array, nodes: Array) -> Linearised:
         """Return innovations, their derivatives at fixed gains, and the exact gradient."""
@@ -89,13 +94,18 @@ class FilterRuns:
         r, _, levels = self._filter(nodes, p, noise, sensitivities=False)
         return r, levels
 
+    def by_noise(self, p: Array, nodes: Array, noise: Array) -> tuple[Array, Array]:
+        """Return the derivatives of what is `filtered` in the logarithms of the variances."""
+        by_r, by_level = self._filter.by_noise(nodes, p, noise)
+        return by_r * noise, by_level * noise
+
     def with_noise(self, noise: Array) -> FilterRuns:
         """Return the same logs with other variances."""
-        return FilterRuns(self.model, self.segments, noise)
+        return FilterRuns(self.model, self.segments, noise, self._filter)
 
 
-def fit_noise(runs: FilterRuns, p: Array, nodes: Array, known: NDArray[np.bool_]) -> Array:
-    """Maximise the likelihood over the variances.
+def fit_noise(runs: FilterRuns, p: Array, nodes: Array) -> Array:
+    """Maximise the likelihood over the variances, by scoring.
 
     Parameters
     ----------
@@ -103,41 +113,29 @@ def fit_noise(runs: FilterRuns, p: Array, nodes: Array, known: NDArray[np.bool_]
         Whose ``noise`` is the start.
     p, nodes : ndarray
         (q,) and (M, nz), held.
-    known : ndarray of bool
-        (ny + nz,) variances that stay as they are.
 
     Returns
     -------
     ndarray
         (ny + nz,)
     """
-    free = np.flatnonzero(~known)
-    if not len(free):
-        return runs.noise
     scale = _scale(runs.segments, nodes.shape[1])
-    low, high = np.log(_LOW * scale[free]), np.log(_HIGH * scale[free])
+    low, high = np.log(_LOW * scale), np.log(_HIGH * scale)
 
-    def at(logs: Array) -> tuple[float, Array, Array]:
-        noise = runs.noise.copy()
-        noise[free] = np.exp(logs)
-        r, levels = runs.filtered(p, nodes, noise)
+    def at(logs: Array) -> tuple[float, Array]:
+        r, levels = runs.filtered(p, nodes, np.exp(logs))
         value = (float((r**2).sum()) + float(levels.sum())) / 2
-        return (value if np.isfinite(value) else np.inf), r.ravel(), levels.ravel()
+        return (value if np.isfinite(value) else np.inf), r.ravel()
 
-    logs = np.clip(np.log(runs.noise[free]), low, high)
-    value, r, levels = at(logs)
+    logs = np.clip(np.log(runs.noise), low, high)
+    value, r = at(logs)
     for _ in range(_NOISE_STEPS):
-        by_r, by_level = np.empty((len(free), r.size)), np.empty((len(free), r.size))
-        for i in range(len(free)):
-            shifted = logs.copy()
-            shifted[i] += _DIFFERENCE
-            _, r_i, level_i = at(shifted)
-            by_level[i] = (level_i - levels) / _DIFFERENCE
-            # of the innovation itself, its deviation held
-            by_r[i] = (r_i - r) / _DIFFERENCE + r * by_level[i] / 2
+        by_r, by_level = (x.reshape(-1, len(logs)) for x in runs.by_noise(p, nodes, np.exp(logs)))
+        # of the innovation itself, its deviation held
+        by_r += r[:, None] * by_level / 2
         # scoring: the expected second derivatives of the Gaussian likelihood
-        information = by_level @ by_level.T / 2 + by_r @ by_r.T
-        downhill = -(by_level @ (1 - r**2) / 2 + by_r @ r)
+        information = by_level.T @ by_level / 2 + by_r.T @ by_r
+        downhill = -((1 - r**2) @ by_level / 2 + r @ by_r)
         step = solve_step(
             information,
             downhill,
@@ -152,12 +150,10 @@ def fit_noise(runs: FilterRuns, p: Array, nodes: Array, known: NDArray[np.bool_]
             break
         gained = value - found[0]
         logs = logs + share * step
-        value, r, levels = found
+        value, r = found
         if gained < _COST:
             break
-    noise = runs.noise.copy()
-    noise[free] = np.exp(logs)
-    return noise
+    return np.asarray(np.exp(logs))
 
 
 def _scale(segments: Segments, nz: int) -> Array:
@@ -184,8 +180,6 @@ def fit_innovations(
     p: Array,
     *,
     restrictions: Restrictions,
-    noise: Array | None = None,
-    known: NDArray[np.bool_] | None = None,
 ) -> tuple[ShootingFit, FilterRuns]:
     """Maximise the likelihood of the innovations over parameters, starts and variances.
 
@@ -196,10 +190,6 @@ def fit_innovations(
     p : ndarray
         (q,) start.
     restrictions : Restrictions
-    noise : ndarray, optional
-        (ny + nz,) first variances.
-    known : ndarray of bool, optional
-        Which of them are known and stay.
 
     Returns
     -------
@@ -207,9 +197,7 @@ def fit_innovations(
     """
     nz = len(model.states)
     whole = cut(logs, max(len(log.y) for log in logs))
-    noise = first_noise(logs, nz) if noise is None else noise
-    known = np.zeros(len(noise), bool) if known is None else known
-    runs = FilterRuns(model, whole, noise)
+    runs = FilterRuns(model, whole, first_noise(logs, nz))
     count = min(5, whole.y.shape[1])
     nodes = np.asarray(whole.y[:, :count, :nz].mean(axis=1))
     fit = ShootingFit(p, nodes, np.zeros((len(p), len(p))), np.inf, 0.0, 0, False)
@@ -217,7 +205,7 @@ def fit_innovations(
     for _ in range(_ROUNDS):
         fit = fit_segments(runs, fit.p, fit.nodes, restrictions, most=3)
         total += fit.iterations
-        again = fit_noise(runs, fit.p, fit.nodes, known)
+        again = fit_noise(runs, fit.p, fit.nodes)
         moved = np.abs(np.log(again / runs.noise)) * _weight(again, runs.noise)
         runs = runs.with_noise(again)
         if (fit.converged and (moved < _SETTLED).all()) or abs(before - fit.cost) < _COST:

@@ -15,7 +15,7 @@ from scipy.linalg.lapack import dtbtrs
 
 Array = NDArray[np.float64]
 
-# up to this many columns the banded system is the faster way
+# up to this many columns, of fewer states, the banded system is the faster way
 _FEW = 8
 # from this many runs on a step of all of them together is work enough
 _MANY = 16
@@ -48,7 +48,7 @@ def propagate(a: Array, b: Array, start: Array) -> Array:
         with np.errstate(over="ignore", invalid="ignore"):
             if out is not None:
                 _stepped(a, b, out)
-            elif columns <= _FEW:
+            elif columns <= _FEW and n < _FEW:
                 for each in zip(a, b, found, strict=True):
                     _banded(*each)
             else:

@@ -76,8 +76,8 @@ class Vectorised:
     def __init__(self, expressions: Sequence[ca.SX], symbols: Sequence[ca.SX]) -> None:
         function = ca.Function("f", list(symbols), [ca.vertcat(*expressions)], {"cse": True})
         self.size = len(expressions)
-        # (target, operation, sources); targets are numbered once, work slots are not reused
-        self._calls: list[tuple[int, Callable[..., Any], tuple[int, ...]]] = []
+        # (target, operation, sources); targets are numbered once
+        calls: list[tuple[int, Callable[..., Any], tuple[int, ...]]] = []
         self._inputs: list[tuple[int, int]] = []
         self._constants: dict[int, float] = {}
         self._outputs: list[tuple[int, int]] = []
@@ -95,15 +95,22 @@ class Vectorised:
             elif op == ca.OP_INPUT:
                 self._inputs.append((k, slots[0]))
             elif op in _UNARY:
-                self._calls.append((k, _UNARY[op], (holder[slots[0]],)))
+                calls.append((k, _UNARY[op], (holder[slots[0]],)))
             elif op in _BINARY:
-                self._calls.append((k, _BINARY[op], (holder[slots[0]], holder[slots[1]])))
+                calls.append((k, _BINARY[op], (holder[slots[0]], holder[slots[1]])))
             else:
                 raise StructureError(
                     f"an expression uses the CasADi operation {op}, which has no array form here: "
                     f"write the term with products, moduli and trigonometric functions."
                 )
             holder[target[0]] = k
+        last = {i: target for target, _, sources in calls for i in sources}
+        shown = {source for _, source in self._outputs}
+        # with what a call is the last to use: its memory is warm, and given to the next
+        self._calls = [
+            (*call, tuple(i for i in set(call[2]) if last[i] == call[0] and i not in shown))
+            for call in calls
+        ]
 
     def prepare(self, known: Mapping[int, Array | float]) -> dict[int, Any]:
         """Evaluate once what depends on some arguments only.
@@ -120,7 +127,7 @@ class Vectorised:
         """
         work: dict[int, Any] = dict(self._constants)
         work |= {k: known[i] for k, i in self._inputs if i in known}
-        for target, call, sources in self._calls:
+        for target, call, sources, _ in self._calls:
             if all(i in work for i in sources):
                 work[target] = call(*[work[i] for i in sources])
         return work
@@ -145,9 +152,11 @@ class Vectorised:
         work: dict[int, Any] = dict(self._constants if prepared is None else prepared)
         for k, i in self._inputs:
             work.setdefault(k, arrays[i])
-        for target, call, sources in self._calls:
+        for target, call, sources, spent in self._calls:
             if target not in work:
                 work[target] = call(*[work[i] for i in sources])
+                for i in spent:
+                    del work[i]
         if len(self._outputs) < self.size:
             out[...] = 0.0
         for row, source in self._outputs:

@@ -223,6 +223,35 @@ class TestSensitivities:
             assert by_p[j] == pytest.approx(slope, rel=1e-4, abs=1e-3 * np.abs(by_p).max())
         assert np.isfinite(by_start).all()
 
+    @pytest.mark.parametrize(
+        ("heading", "wind"), [("output", "input"), ("input", "input"), ("output", "output")]
+    )
+    def test_innovations_have_exact_derivatives_in_the_variances(
+        self, predictor, noisy, heading, wind
+    ):
+        """Against central differences; with a gap, and wind that depends on the states."""
+        model = output_model(predictor, 1.0, heading, wind)
+        data = measured(model, noisy)
+        p = np.array([*truth(predictor), *CURRENT, 2.0, -3.0])[: len(model.parameters)]
+        use = np.ones((2, 60))
+        use[0, 30:35], use[1, 50:] = 0, 0
+        w, y = (np.stack([x[:60], x[100:160]]) for x in (data.w, data.y))
+        kalman, start = Filter(model, w, y, use), y[:, 0, : len(model.states)]
+        size = {"u": 2e-4, "v": 2e-4, "r": 2e-4, "psi": 1e-4, "u_q": 0.1, "v_q": 0.1}
+        noise = np.array([size[n] for n in model.outputs] + [0.05 * size[n] for n in model.states])
+        found = kalman.by_noise(start, p, noise)
+        h = 1e-4
+        for j in range(len(noise)):
+            up, down = noise.copy(), noise.copy()
+            up[j] *= np.exp(h)
+            down[j] *= np.exp(-h)
+            above, below = kalman(start, p, up)[::2], kalman(start, p, down)[::2]
+            for exact, a, b in zip(found, above, below, strict=True):
+                expected = (a - b) / (2 * h)
+                # truncation h²/6 of the third derivative, rounding 1e-15/h of the innovations
+                tolerance = 1e-6 * np.abs(expected).max() + 1e-9
+                np.testing.assert_allclose(exact[..., j] * noise[j], expected, atol=tolerance)
+
     def test_likelihoods_of_several_logs_add(self, predictor, noisy):
         """Also where one is padded: rows beyond its end count for nothing."""
         model, data, p = problem(predictor, noisy)

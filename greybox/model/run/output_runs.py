@@ -17,7 +17,14 @@ from numpy.typing import NDArray
 
 from greybox.model.output import OutputModel
 from greybox.model.run.kernels import along, bind
-from greybox.model.run.output_step import Walking, filtered, free, likelihood, observed
+from greybox.model.run.output_step import (
+    Walking,
+    filtered,
+    filtered_by_noise,
+    free,
+    likelihood,
+    observed,
+)
 from greybox.numerics.recursion import propagate
 from greybox.numerics.vectorised import Vectorised
 
@@ -45,28 +52,37 @@ class _Table:
     ----------
     program : Vectorised
         Of the rows [∂z⁺/∂z, ∂z⁺/∂p, 0], and below them those of what is found unless
-        `same`.
+        `same`; the zeros are those of the run's own first states, where these are asked for.
     shape : tuple of int
+    states : int
+        How many z there are.
     same : bool
         What is found are the states themselves.
     """
 
     program: Vectorised
     shape: tuple[int, int]
+    states: int
     same: bool
 
 
 @lru_cache(maxsize=32)
-def _table(walk: Walking, model: OutputModel) -> _Table:
+def _table(walk: Walking, model: OutputModel, starts: bool) -> _Table:
     of = walk(model)
     after, found = of.slope_after, of.slope_found
     same = bool(found.by_z.is_eye()) and not found.by_p.nnz()
     nz = after.by_z.size1()
-    rows = [ca.horzcat(s.by_z, s.by_p, ca.SX(s.by_z.size1(), nz)) for s in (after, found)]
+    own = nz if starts else 0
+    rows = [ca.horzcat(s.by_z, s.by_p, ca.SX(s.by_z.size1(), own)) for s in (after, found)]
     matrix = rows[0] if same else ca.vertcat(*rows)
     symbols = ca.vertcat(*of.carried, of.read, *of.constant)
     program = Vectorised(ca.vertsplit(ca.vec(ca.densify(matrix).T)), ca.vertsplit(symbols))
-    return _Table(program, matrix.shape, same)
+    return _Table(program, matrix.shape, nz, same)
+
+
+def _samples(x: Array) -> Array:
+    """Return what runs hold (M, m, n) as one row of all samples for each (n, M·m)."""
+    return np.ascontiguousarray(x.reshape(-1, x.shape[2]).T)
 
 
 class _Evaluator:
@@ -107,7 +123,7 @@ class _Runs:
         self.runs, self.steps = read.shape[:2]
         self._read = np.ascontiguousarray(read, float)
         self._evaluate = _Evaluator()
-        self._blocks: list[tuple[slice, list[Array], dict[int, Any]]] | None = None
+        self._blocks: list[tuple[slice, Array, dict[int, Any]]] | None = None
 
     def __call__(
         self, carried: Sequence[Array], constant: Sequence[Array]
@@ -119,22 +135,25 @@ class _Runs:
         self._evaluate(function, (*carried, self._read, *constant), tuple(out))
         return out[: len(carried)], out[len(carried) :]
 
-    def _prepared(
-        self, table: _Table, first: int
-    ) -> list[tuple[slice, list[Array], dict[int, Any]]]:
-        """Return, of blocks of samples, what is read and all that depends on it alone."""
+    def _prepared(self, table: _Table, first: int) -> list[tuple[slice, Array, dict[int, Any]]]:
+        """Return, of stretches of all runs, what is read and all that depends on it alone."""
         if self._blocks is None:
-            flat = self._read.reshape(self.runs * self.steps, self._read.shape[2]).T
             self._blocks = []
-            for begin in range(0, flat.shape[1], _BLOCK):
-                block = slice(begin, begin + _BLOCK)
-                read = [np.ascontiguousarray(x[block]) for x in flat]
+            length = max(1, _BLOCK // self.runs)
+            for begin in range(0, self.steps, length):
+                block = slice(begin, begin + length)
+                read = _samples(self._read[:, block])
                 known = table.program.prepare({first + i: x for i, x in enumerate(read)})
                 self._blocks.append((block, read, known))
         return self._blocks
 
     def slopes(
-        self, carried: Sequence[Array], constant: Sequence[Array], after: Sequence[Array]
+        self,
+        carried: Sequence[Array],
+        constant: Sequence[Array],
+        after: Sequence[Array],
+        *,
+        starts: bool = True,
     ) -> tuple[Array, Array]:
         """Return derivatives in the parameters, then in the run's own first states.
 
@@ -144,6 +163,8 @@ class _Runs:
             As a call took them.
         after : sequence of ndarray
             What was carried after each step.
+        starts : bool
+            Whether those in the first states are asked for.
 
         Returns
         -------
@@ -151,38 +172,44 @@ class _Runs:
             Of what is found first, (M, m, ny, q + nz), and of the states after the last
             step, (M, nz, q + nz).
         """
-        table = _table(self._walk, self._model)
-        rows, columns = table.shape
-        runs, steps, nz = after[0].shape
-        before = [
-            np.concatenate([x[:, None], y[:, :-1]], axis=1)
-            for x, y in zip(carried, after, strict=True)
-        ]
-        states = np.concatenate([x.reshape(runs * steps, x.shape[2]).T for x in before])
+        table = _table(self._walk, self._model, starts)
+        (rows, columns), nz = table.shape, table.states
+        states = np.concatenate(
+            [
+                np.concatenate([x[:, None], y[:, :-1]], axis=1)
+                for x, y in zip(carried, after, strict=True)
+            ],
+            axis=2,
+        )
         fixed = [float(x) for c in constant for x in c]
-        matrix = np.empty((runs * steps, rows * columns))
-        start = np.zeros((runs, nz, columns - nz))
-        start[:, :, columns - 2 * nz :] = np.eye(nz)
+        found = nz if table.same else rows - nz
+        shown = np.empty((self.runs, self.steps, found, columns - nz))
+        slope = np.zeros((self.runs, nz, columns - nz))
+        if starts:
+            slope[:, :, columns - 2 * nz :] = np.eye(nz)
         with np.errstate(all="ignore"):
-            for block, read, known in self._prepared(table, len(states)):
-                table.program([*states[:, block], *read, *fixed], matrix[block].T, known)
-            by = matrix.reshape(runs, steps, rows, columns)
-            slopes = propagate(by[:, :, :nz, :nz], by[:, :, :nz, nz:], start)
-            if table.same:
-                return slopes[:, :-1], slopes[:, -1]
-            shown = by[:, :, nz:, :nz] @ slopes[:, :-1]
-            shown += by[:, :, nz:, nz:]
-        return shown, slopes[:, -1]
+            for block, read, known in self._prepared(table, states.shape[2]):
+                matrix = np.empty((read.shape[1], rows * columns))
+                table.program([*_samples(states[:, block]), *read, *fixed], matrix.T, known)
+                by = matrix.reshape(self.runs, -1, rows, columns)
+                slopes = propagate(by[:, :, :nz, :nz], by[:, :, :nz, nz:], slope)
+                slope = slopes[:, -1]
+                if table.same:
+                    shown[:, block] = slopes[:, :-1]
+                else:
+                    np.matmul(by[:, :, nz:, :nz], slopes[:, :-1], out=shown[:, block])
+                    shown[:, block] += by[:, :, nz:, nz:]
+        return shown, slope
 
 
 _Found = TypeVar("_Found", bound=tuple[Array, ...])
 
 
-def _kept(last: tuple[Array, Array, _Found] | None, z0: Array, p: Array) -> _Found | None:
+def _kept(last: tuple[tuple[Array, ...], _Found] | None, *point: Array) -> _Found | None:
     """Return what was found last, if it was at this point."""
     if last is None:
         return None
-    return last[2] if np.array_equal(last[0], z0) and np.array_equal(last[1], p) else None
+    return last[1] if all(map(np.array_equal, last[0], point)) else None
 
 
 def _fixed(*arrays: Array) -> Any:
@@ -210,8 +237,8 @@ class Simulator:
         self.model = model
         self._runs = _Runs(free, model, w)
         # the latest run, and the latest whose derivatives were asked for
-        self._ran: tuple[Array, Array, tuple[Array, Array]] | None = None
-        self._last: tuple[Array, Array, tuple[Array, Array, Array, Array]] | None = None
+        self._ran: tuple[tuple[Array, ...], tuple[Array, Array]] | None = None
+        self._last: tuple[tuple[Array, ...], tuple[Array, Array, Array, Array]] | None = None
 
     def _run(self, z0: Array, p: Array) -> tuple[Array, Array]:
         """Return outputs and the states after each step, not to be written to."""
@@ -219,7 +246,7 @@ class Simulator:
         if found is None:
             (states,), (y,) = self._runs([z0], [p])
             found = _fixed(y, states)
-            self._ran = (z0.copy(), p.copy(), found)
+            self._ran = (z0.copy(), p.copy()), found
         return found
 
     def __call__(self, z0: Array, p: Array) -> tuple[Array, Array]:
@@ -252,7 +279,7 @@ class Simulator:
             y, states = self._run(z0, p)
             rows, slope = self._runs.slopes([z0], [p], [states])
             kept = _fixed(y, rows, states[:, -1], slope)
-            self._last = (z0.copy(), p.copy(), kept)
+            self._last = (z0.copy(), p.copy()), kept
         return kept
 
 
@@ -319,7 +346,21 @@ class Filter:
         self.model = model
         self._w = np.ascontiguousarray(np.concatenate([w, y, use[..., None]], axis=2), float)
         self._runs = _Runs(filtered, model, self._w)
+        self._by_noise = _Runs(filtered_by_noise, model, self._w)
+        nz = len(model.states)
+        self._certain = np.zeros((len(w), nz * (nz + 1) // 2))
         self._evaluate = _Evaluator()
+        # the latest run: derivatives are asked for where it was run before
+        self._ran: tuple[tuple[Array, ...], tuple[Array, Array, Array, Array]] | None = None
+
+    def _run(self, z0: Array, p: Array, noise: Array) -> tuple[Array, Array, Array, Array]:
+        """Return innovations, log variances, states and covariances, not to be written to."""
+        found = _kept(self._ran, z0, p, noise)
+        if found is None:
+            after, shown = self._runs([z0, self._certain], [p, noise])
+            found = _fixed(*shown, *after)
+            self._ran = (z0.copy(), p.copy(), noise.copy()), found
+        return found
 
     def __call__(
         self, z0: Array, p: Array, noise: Array, *, sensitivities: bool = True
@@ -343,13 +384,30 @@ class Filter:
             without columns where they are not asked for; and the logarithms of their
             variances (M, m, ny).
         """
-        nz = z0.shape[1]
-        carried = [z0, np.zeros((len(z0), nz * (nz + 1) // 2))]
-        after, (innovations, levels) = self._runs(carried, [p, noise])
+        innovations, levels, *after = self._run(z0, p, noise)
         if not sensitivities:
             return innovations, np.empty((*innovations.shape, 0)), levels
-        rows, _ = self._runs.slopes(carried, [p, noise], after)
+        rows, _ = self._runs.slopes([z0, self._certain], [p, noise], after)
         return innovations, rows, levels
+
+    def by_noise(self, z0: Array, p: Array, noise: Array) -> tuple[Array, Array]:
+        """Return the exact derivatives of a call's results in the variances.
+
+        Parameters
+        ----------
+        z0, p, noise : ndarray
+            As a call takes them.
+
+        Returns
+        -------
+        tuple of ndarray
+            (M, m, ny, ny + nz) of the innovations of unit variance and of the logarithms of
+            their variances.
+        """
+        innovations, _, *after = self._run(z0, p, noise)
+        carried, ny = [z0, self._certain], innovations.shape[2]
+        rows, _ = self._by_noise.slopes(carried, [p, noise], after, starts=False)
+        return rows[:, :, :ny], rows[:, :, ny:]
 
     def likelihood(self, z0: Array, p: Array, noise: Array) -> tuple[float, Array, Array]:
         """Return the negative log-likelihood and its derivatives, gains included.

@@ -8,7 +8,7 @@ innovations.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import casadi as ca
@@ -186,6 +186,39 @@ def filtered(model: OutputModel) -> Walk:
         Slope(a, b).after(slope),
         Slope(ca.vertcat(*[r.by_z for r in rows]), ca.vertcat(*[r.by_p for r in rows])),
     )
+
+
+@lru_cache(maxsize=32)
+def filtered_by_noise(model: OutputModel) -> Walk:
+    """Return `filtered` with other derivatives: in the variances, gains and covariance included.
+
+    They are those of all that it carries and of all that it finds, stacked.
+    """
+    of, s = filtered(model), _step(model)
+    carried, noise = ca.vertcat(*of.carried), of.constant[1]
+
+    def slope(results: tuple[ca.SX, ...]) -> Slope:
+        stacked = ca.vertcat(*results)
+        return Slope(ca.jacobian(stacked, carried), ca.jacobian(stacked, noise))
+
+    after, nz = slope(of.after), s.z.numel()
+    if Slope.of(s.seen, s).by_z.is_eye():
+        # gains follow the covariance alone. A change D of it is a change D λ of the states, λ
+        # being what the innovations tell of them, and C D Cᵀ a step later, C = ∂z⁺/∂z: a
+        # tenth of what differentiating the Riccati step would compute
+        c, told = of.slope_after.by_z, of.slope_found.by_z.T @ of.found[0]
+        units = _symmetric_units(nz)
+        moved = ca.horzcat(*[d @ told for d in units])
+        onward = ca.horzcat(*[ca.tril(ca.densify(c @ d @ c.T)).nz[:] for d in units])
+        after.by_z[:nz, nz:] = c @ moved
+        after.by_z[nz:, nz:] = onward + after.by_z[nz:, :nz] @ moved
+    return replace(of, slope_after=after, slope_found=slope(of.found))
+
+
+def _symmetric_units(n: int) -> list[ca.SX]:
+    """Return the symmetric matrices with one entry of the lower triangle, column by column."""
+    low = ca.Sparsity.lower(n)
+    return [ca.tril2symm(ca.sparsify(ca.SX(low, x))) for x in ca.horzsplit(ca.DM.eye(low.nnz()))]
 
 
 @lru_cache(maxsize=16)
