@@ -10,7 +10,6 @@ import logging
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +18,7 @@ from greybox.errors import LogError, suggestion
 from greybox.files import sha256
 from greybox.trial.convert.channel_mapping import (
     canonical,
+    possible,
     table_columns,
     whole_recording,
     written_log,
@@ -46,8 +46,6 @@ _JITTER = 0.2
 _DRIFT = 0.6
 # wind of fewer rows than this share is none
 _LEAST_WIND = 0.5
-# largest number of a signal, positions and encoders included
-_LARGEST = 1e9
 _WIND = ("u_q", "v_q", "V_q", "gamma_q", "dir_q", "V_w", "dir_w", "dir_t")
 # share of steps past which gaps are another sample time
 _MOST_GAPS = 0.2
@@ -246,7 +244,7 @@ def _known_rows(
     holes, over which a run of the model goes on.
     """
     loop = vessel.closed_loop[0] if vessel.closed_loop else None
-    batch = {c: _possible(v) if c != assigned["t"].raw else v for c, v in batch.items()}
+    batch = {c: possible(v) if c != assigned["t"].raw else v for c, v in batch.items()}
     numbers = {n: np.isfinite(_floats(batch, a)) for n, a in assigned.items() if n != loop}
     # positions are not needed where velocities were logged, nor what moves no model
     spare = {"x_n", "y_n"} if {"u", "v"} <= assigned.keys() else set()
@@ -281,13 +279,6 @@ def _known_rows(
     return {n: values[keep] for n, values in batch.items()}, notes
 
 
-def _possible(values: NDArray[Any]) -> NDArray[Any]:
-    """Return a column without numbers that no signal of a ship has, which overflow in sums."""
-    if values.dtype == object or not (np.abs(values) > _LARGEST).any():
-        return values
-    return np.where(np.abs(values) > _LARGEST, np.nan, values)
-
-
 def _floats(batch: Batch, a: Assigned) -> Array:
     values = batch[a.raw]
     if values.dtype == object:
@@ -312,7 +303,7 @@ def _require_uniform(t: Array, table: TableFile) -> float:
     if len(wrong):
         k = int(wrong[0])
         raise LogError(
-            f"time in '{name}' goes from {t[k]:.6g} to {t[k + 1]:.6g} s in row "
+            f"time in '{name}' goes from {t[k]:.13g} to {t[k + 1]:.13g} s in row "
             f"{k + 1 + table.first_row}, it must increase: {importer} sorts the rows and drops "
             f"repeated ones."
         )
@@ -355,11 +346,13 @@ def _require(
     name: str,
     columns: list[str],
 ) -> None:
+    # what names another channel already is no misspelling
+    free = [c for c in columns if c not in channels]
     for column in vessel.commands:
         if column not in channels:
             raise LogError(
                 f"'{name}' has no column '{column}', which moves a thruster of "
-                f"'{vessel.name}'.{suggestion(column, columns)} Its columns: "
+                f"'{vessel.name}'.{suggestion(column, free)} Its columns: "
                 f"{', '.join(columns[:30])}."
             )
     for state in states:
@@ -367,10 +360,10 @@ def _require(
             need = "psi and x_n, y_n" if state in "uv" else "psi"
             raise LogError(
                 f"'{name}' has no '{state}' and it cannot be derived without {need}."
-                f"{suggestion(state, columns)} Map the columns in the vessel file's [columns]."
+                f"{suggestion(state, free)} Map the columns in the vessel file's [columns]."
             )
     if "psi" not in channels and set(states) & {"v", "r"}:
         raise LogError(
-            f"'{name}' has no heading 'psi'.{suggestion('psi', columns)} "
+            f"'{name}' has no heading 'psi'.{suggestion('psi', free)} "
             f"Map it in the vessel file's [columns] with its unit."
         )
