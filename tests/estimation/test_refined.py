@@ -490,3 +490,11 @@ def test_a_measured_heading_is_no_instrument_for_itself():
     # means of 40 have a standard error of 0.16
     assert np.abs(mean).max() < 0.16 * 3.5
     assert abs(mean[names.index("Ymu")]) < 0.2 + 0.16 * 1.5
+
+
+def test_a_stretch_in_which_nothing_can_be_used_changes_nothing(basic, still_log):
+    log, short = still_log.window(0, 400, "log"), still_log.window(500, 504, "short")
+    holes = replace(short, missing={"v": np.array([False, True, True, False])})
+    alone, beside = estimate_refined_iv(basic, [log]), estimate_refined_iv(basic, [log, holes])
+    assert beside.kept == alone.kept
+    np.testing.assert_allclose(beside.theta, alone.theta, rtol=1e-6, atol=1e-9)

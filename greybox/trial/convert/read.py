@@ -28,7 +28,7 @@ from greybox.trial.convert.convert import Conversion, cut_segments
 from greybox.trial.convert.deduplicate import clean_signals
 from greybox.trial.convert.options import ImportOptions
 from greybox.trial.convert.time_grid import MIN_SEGMENT, Plan
-from greybox.trial.convert.time_scale import time_scale
+from greybox.trial.convert.time_scale import LATEST, time_scale
 from greybox.trial.gaps import split_at_gaps
 from greybox.trial.log import Provenance, TrialLog
 from greybox.trial.raw_log import Recording
@@ -246,6 +246,7 @@ def _known_rows(
     loop = vessel.closed_loop[0] if vessel.closed_loop else None
     batch = {c: possible(v) if c != assigned["t"].raw else v for c, v in batch.items()}
     numbers = {n: np.isfinite(_floats(batch, a)) for n, a in assigned.items() if n != loop}
+    numbers["t"] = np.abs(_floats(batch, assigned["t"])) <= LATEST
     # positions are not needed where velocities were logged, nor what moves no model
     spare = {"x_n", "y_n"} if {"u", "v"} <= assigned.keys() else set()
     beside = set(vessel.recorded_columns) - set(vessel.commands)
