@@ -264,6 +264,15 @@ def test_a_longer_sample_time_keeps_how_velocities_were_made(tmp_path, velocitie
             lambda f: f.assign(t=1700000000.5 + np.r_[np.arange(19), 17]),
             r"from 1700000018.5 to 1700000017.5 s in row 21",
         ),
+        (
+            lambda f: f.assign(n=f["n"].where(f.index % 3 > 0), t=np.r_[np.arange(19), 17.0]),
+            r"from 17 to 17 s in row 21",
+        ),
+        (
+            lambda f: f.assign(n=f["n"].where(f.index % 3 > 0)),
+            "falls into 7 pieces, .*: 7 of 20 rows left out, the first row 2, where n hold no "
+            "finite number. Make one log of it with greybox import, which holds inputs",
+        ),
         (lambda f: f.assign(t=np.r_[np.arange(10), 10 + 2 * np.arange(10)]), "two sample times"),
         (lambda f: f.head(2), "has 2 samples, at least 3"),
         (

@@ -7,7 +7,7 @@ recorded, guesses nothing, and refuses what would have to be mended.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -195,13 +195,13 @@ def _clean_recording(
     assigned = table_columns(table, vessel, guess=False)
     _require_mapped(assigned, vessel, table, plan=plan)
     batch = read_columns(table, [a.raw for a in assigned.values()])
-    batch, notes = _known_rows(assigned, batch, vessel, table)
+    batch, rows, notes = _known_rows(assigned, batch, vessel, table)
     time = assigned["t"]
     scale = time_scale(batch[time.raw], time, table)
     if time.raw not in table.dates:
         # a log's own clock is kept as it is
         scale = replace(scale, zero=0.0, epoch=None)
-    sample_time = _require_uniform(scale.seconds(batch[time.raw]), table)
+    sample_time = _require_uniform(scale.seconds(batch[time.raw]), rows, table, notes)
     raw = whole_recording(table, batch, assigned, scale, vessel)
     recording = replace(canonical(raw, assigned, vessel), steps=(*known.steps, *raw.steps))
     return clean_signals(recording), sample_time, notes
@@ -237,8 +237,8 @@ def _require_mapped(
 
 def _known_rows(
     assigned: dict[str, Assigned], batch: Batch, vessel: Vessel, table: TableFile
-) -> tuple[Batch, list[str]]:
-    """Return the rows in which time, inputs and wind are numbers, and say which are left out.
+) -> tuple[Batch, NDArray[np.intp], list[str]]:
+    """Return the rows in which time, inputs and wind are numbers, which, and what is left out.
 
     Columns that hold none and are not needed are left out, in place. Motions keep their
     holes, over which a run of the model goes on.
@@ -269,15 +269,16 @@ def _known_rows(
             )
     needed = [n for n in numbers if n in {"t", *vessel.commands, *_WIND}]
     keep = np.all([numbers[n] for n in needed], axis=0)
+    rows = np.flatnonzero(keep)
     if keep.all():
-        return batch, notes
+        return batch, rows, notes
     first = int(np.flatnonzero(~keep)[0])
     lost = [assigned[n].raw for n in needed if not numbers[n].all()]
     notes.append(
         f"{int((~keep).sum())} of {len(keep)} rows left out, the first row "
         f"{first + table.first_row}, where {', '.join(lost)} hold no finite number"
     )
-    return {n: values[keep] for n, values in batch.items()}, notes
+    return {n: values[keep] for n, values in batch.items()}, rows, notes
 
 
 def _floats(batch: Batch, a: Assigned) -> Array:
@@ -292,8 +293,13 @@ def _importer(table: TableFile) -> str:
     return "recording_from_pandas" if table.format == "DataFrame" else "greybox import"
 
 
-def _require_uniform(t: Array, table: TableFile) -> float:
-    """Return the sample time [s]; refuse a table whose samples would have to be resampled."""
+def _require_uniform(
+    t: Array, rows: NDArray[np.intp], table: TableFile, left_out: Sequence[str]
+) -> float:
+    """Return the sample time [s]; refuse a table whose samples would have to be resampled.
+
+    Times are those of some `rows` of the table, and `left_out` says why there are no more.
+    """
     name, importer = table.path.name, _importer(table)
     if len(t) < MIN_SEGMENT:
         raise LogError(
@@ -305,16 +311,22 @@ def _require_uniform(t: Array, table: TableFile) -> float:
         k = int(wrong[0])
         raise LogError(
             f"time in '{name}' goes from {t[k]:.13g} to {t[k + 1]:.13g} s in row "
-            f"{k + 1 + table.first_row}, it must increase: {importer} sorts the rows and drops "
-            f"repeated ones."
+            f"{rows[k + 1] + table.first_row}, it must increase: {importer} sorts the rows and "
+            f"drops repeated ones."
         )
-    usual = float(np.median(steps))
+    beside = np.diff(rows) == 1
+    usual = float(np.median(steps[beside] if beside.any() else steps))
     found = split_at_gaps(t, usual)
     gaps = np.zeros(len(steps), bool)
     gaps[[a - 1 for a, _ in found[1:]]] = True
     off = np.abs(steps - np.round(steps / usual) * usual) > _JITTER * usual
     if off.any() or gaps.sum() > _MOST_GAPS * len(steps):
         k = int(np.flatnonzero(off | gaps)[0])
+        if not (off | gaps)[beside].any():
+            raise LogError(
+                f"'{name}' falls into {len(found)} pieces, too many for one log: {left_out[-1]}. "
+                f"Make one log of it with {importer}, which holds inputs over short holes."
+            )
         raise LogError(
             f"'{name}' has two sample times: {usual:.6g} s, but {steps[k]:.6g} s after "
             f"t = {t[k]:.6g} s ({int((off | gaps).sum())} of {len(steps)} steps differ). "
