@@ -62,6 +62,12 @@ def test_one_log_needs_no_list_and_old_calls_still_work():
     with pytest.warns(DeprecationWarning, match="compare\\({name: model}, logs\\)"):
         old = gb.compare_models([estimate.model()], ["a"], [[log]], bands=False)
     assert both.runs[0][0].fit == both.runs[1][0].fit == old.runs[0][0].fit
+    for logs in (log, [log], [[log], [log]]):
+        with (
+            pytest.warns(DeprecationWarning, match="compare_models"),
+            pytest.raises(UsageError, match=r"list of its own: write compare\({name: model}, logs"),
+        ):
+            gb.compare_models([estimate.model()], ["a"], logs, bands=False)
     by_name = gb.compare({"a": estimate}, {"a": [log], "c": []}, bands=False)
     assert by_name.names == ("a",)
     with pytest.raises(GreyboxError, match=r"the logs have no 'ab'\. Did you mean 'a'"):

@@ -172,7 +172,7 @@ class ErrorBand:
         if noise.memory.any():
             v -= noise.memory * self.before(values)
         out = v.reshape(len(v), -1)
-        for row in out:
+        for row in out if self.rows else ():
             dtbsv(len(factor) - 1, factor, row, lower=1, overwrite_x=1)
         return out
 

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from math import isfinite
+from numbers import Real
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,8 +35,12 @@ def confidence_intervals(values: Array, std: Array, level: float) -> Array:
     """
     from scipy.special import ndtri
 
-    if not 0 < level < 1:
-        raise UsageError(f"the level of an interval is {level:g}, give one between 0 and 1.")
+    given: Any = level
+    if not isinstance(given, Real) or not 0 < level < 1:
+        raise UsageError(
+            f"the level of an interval is {level!r:.40}, give a number between 0 and 1, such as "
+            f"0.95."
+        )
     reach = float(ndtri((1 + level) / 2)) * std
     return np.column_stack([values - reach, values + reach])
 
@@ -58,11 +65,17 @@ def restriction_matrix(
     if restrictions is None:
         restrictions = dict.fromkeys(names, 0.0)
     if isinstance(restrictions, Mapping):
+        given: Any
+        for name, given in restrictions.items():
+            if not isinstance(given, Real) or not isfinite(given):
+                raise UsageError(
+                    f"the restriction of {name!r:.40} is {given!r:.40}, a finite number is needed: "
+                    f"write {{'{names[0]}': 0.1}}, or '{names[0]} = 0.1'."
+                )
         told = [f"{name} = {float(value):g}" for name, value in restrictions.items()]
         rows = [({name: 1.0}, float(value)) for name, value in restrictions.items()]
     else:
-        texts = restrictions.split(",") if isinstance(restrictions, str) else restrictions
-        told = [" ".join(text.split()) for text in texts]
+        told = [" ".join(text.split()) for text in _texts(names, restrictions)]
         rows = [_restriction(text) for text in told]
     if not rows:
         raise UsageError("there is no restriction to test: write one as 'Xu = 2*Yv + 0.1'.")
@@ -72,9 +85,14 @@ def restriction_matrix(
             if name not in names:
                 raise UsageError(
                     f"the restriction '{told[i]}' names '{name}', which is no parameter."
-                    f"{suggestion(name, names)} Parameters: {', '.join(names)}."
+                    f"{suggestion(str(name), names)} Parameters: {', '.join(names)}."
                 )
             matrix[i, list(names).index(name)] = weight
+        if not matrix[i].any():
+            raise UsageError(
+                f"the restriction '{told[i]}' says nothing of a parameter: write it as "
+                f"'{names[0]} = 0.1'. Parameters: {', '.join(names)}."
+            )
         values[i] = value
     rank = int(np.linalg.matrix_rank(matrix))
     if rank < len(rows):
@@ -83,6 +101,20 @@ def restriction_matrix(
             f"only once."
         )
     return matrix, values, " and ".join(told)
+
+
+def _texts(names: Sequence[str], given: Any) -> list[str]:
+    """Return the restrictions one by one."""
+    if isinstance(given, str):
+        return given.split(",")
+    texts = list(given) if isinstance(given, Iterable) else [given]
+    for text in texts:
+        if not isinstance(text, str):
+            raise UsageError(
+                f"the restriction {text!r:.40} names no parameter: write '{names[0]} = 0.1' or "
+                f"{{'{names[0]}': 0.1}}. Parameters: {', '.join(names)}."
+            )
+    return texts
 
 
 def _restriction(text: str) -> tuple[dict[str, float], float]:

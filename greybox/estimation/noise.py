@@ -164,7 +164,8 @@ class ErrorLikelihood:
             dual = band.unwhiten(factor, own)
             by_covariance = inverse_band(covariance, len(covariance) - nx)
             for diagonal, entries in enumerate(by_covariance):
-                left, right = dual[:, diagonal:], dual[:, : dual.shape[1] - diagonal]
+                # a stretch of one or two rows is narrower than the band
+                left, right = dual[:, diagonal:], dual[:, : max(dual.shape[1] - diagonal, 0)]
                 entries[: right.shape[1]] -= np.einsum("qk,qk->k", left, right)
                 # both triangles, and ½ log det
                 entries *= 0.5 if diagonal == 0 else 1.0

@@ -47,7 +47,8 @@ def lagged_sums(a: Sequence[Array], b: Sequence[Array], reach: int) -> Array:
 
     total: Array | float = 0.0
     for x, y in zip(a, b, strict=True):
-        size = next_fast_len(x.shape[-1] + reach, real=True)
+        # as many lags of an experiment without samples: all are 0
+        size = next_fast_len(max(x.shape[-1], 1) + reach, real=True)
         left = rfft(x, size)
         right = left if y is x else rfft(y, size)
         total = total + irfft(left * right.conj(), size)[..., : reach + 1]

@@ -414,13 +414,29 @@ def compare_models(
     Returns
     -------
     Comparison
+
+    Raises
+    ------
+    UsageError
+        Models, names and lists of logs are not as many.
+    LogError
+        A model has no logs of its own.
     """
     warnings.warn(
         "compare_models(models, names, logs) is deprecated: write compare({name: model}, logs).",
         DeprecationWarning,
         stacklevel=2,
     )
-    return _compare(models, names, logs, heading, bands, seed)
+    given: Any = logs
+    flat = isinstance(given, TrialLog) or any(isinstance(mine, TrialLog) for mine in given)
+    if flat or not len(models) == len(names) == len(logs):
+        of_logs = "logs that stand in no list" if flat else f"{len(logs)} lists of logs"
+        raise UsageError(
+            f"{len(models)} models and {len(names)} names have {of_logs}, and each needs a list of "
+            f"its own: write compare({{name: model}}, logs), which takes one list for all."
+        )
+    lists = [as_list(mine) for mine in logs]
+    return _compare(models, names, lists, heading, bands, seed)
 
 
 @one_thread

@@ -22,7 +22,7 @@ from greybox.estimation.output_error import Weights
 from greybox.estimation.registry import ESTIMATORS, automatic_estimators
 from greybox.estimation.result import Estimate
 from greybox.trial.log import TrialLog
-from greybox.validation.fit import run_model
+from greybox.validation.fit import average_fit, run_model
 from greybox.validation.fit_single import estimate_once
 from greybox.validation.held_out import FLOOR, folds, score_runs, spread_of
 from greybox.validation.request import Request
@@ -231,7 +231,7 @@ def _estimates(
         estimate = found[variant]
         if estimate is not None and not free_run:
             runs = [run_model(estimate.model(), log) for log in logs]
-            level = float(np.mean([v for run in runs for v in run.fit.values()]))
+            level = float(np.mean(list(average_fit(runs).values())))
             if level > most and all(run.diverged < 0 for run in runs):
                 start, most = estimate, level
     return [found[variant] for variant in variants]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 _HUGE = 1e6
+# what the name of a segment has behind that of its log
+_SEGMENT = re.compile(r"\[\d+\]$")
 
 
 def fit_percent(measured: Array, simulated: Array) -> Array:
@@ -218,6 +221,33 @@ def run_model(
 
 
 def average_fit(fits: Sequence[LogFit]) -> dict[str, float]:
-    """Return the mean fit a state over logs [%]."""
-    states = fits[0].fit
-    return {s: float(np.mean([f.fit[s] for f in fits])) for s in states}
+    """Return the mean fit a state over logs [%]; segments between the gaps of one count as one."""
+    whole = [_joined(runs) for runs in _by_log(fits)]
+    return {s: float(np.mean([fit[s] for fit in whole])) for s in whole[0]}
+
+
+def _by_log(fits: Sequence[LogFit]) -> list[list[LogFit]]:
+    """Group the runs on neighbouring segments of one log."""
+    groups: list[list[LogFit]] = []
+    for run in fits:
+        before = groups[-1][-1].log if groups else None
+        if (
+            before is not None
+            and _SEGMENT.sub("", before.name) == _SEGMENT.sub("", run.log.name) != run.log.name
+            and before.provenance == run.log.provenance
+            and before.t[-1] < run.log.t[0]
+        ):
+            groups[-1].append(run)
+        else:
+            groups.append([run])
+    return groups
+
+
+def _joined(runs: Sequence[LogFit]) -> dict[str, float]:
+    """Return the fit of the runs on the segments of one log, against its mean over all."""
+    if len(runs) == 1:
+        return runs[0].fit
+    if any(r.diverged >= 0 for r in runs):
+        return dict.fromkeys(runs[0].fit, -np.inf)
+    log = join_segments([r.log for r in runs], runs[0].log.name)
+    return fit_on(log, tuple(runs[0].fit), np.concatenate([r.x for r in runs]))

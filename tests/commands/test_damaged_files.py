@@ -125,6 +125,32 @@ def test_estimates_of_damaged_logs(folder, method, capsys):
         )  # fmt: skip
 
 
+@pytest.mark.parametrize(
+    ("column", "rows", "cell"),
+    [
+        ("t", slice(50, 51), "1e308"),
+        ("n", slice(None), ""),
+        ("u", slice(30, 31), "1e300"),
+        ("alpha1", slice(40, 42), "-1e200"),
+    ],
+)
+def test_logs_with_columns_of_nothing_or_of_what_no_ship_does_are_checked(
+    folder, column, rows, cell, capsys
+):
+    names, values = json.loads((folder / "rows.json").read_text())
+    for row in values[rows]:
+        row[names.index(column)] = cell
+    log, found = write(folder / "blank.csv", names, values), folder / "found.json"
+    assert ended_well(["check", log, "--vessel", "thesis", "--json", str(found)], capsys)
+    findings = json.loads(found.read_text())["findings"]
+    assert [f["channel"] for f in findings if f["id"] == "nan"] == (
+        [column] if column != "t" else []
+    )
+    ended_well(
+        ["import", "--fix", log, "--vessel", "thesis", "--out", str(folder / "i.csv")], capsys
+    )
+
+
 def test_damaged_models_and_vessels(folder, capsys):
     log, out = str(folder / "clean.csv"), str(folder / "run.csv")
     done = []

@@ -72,6 +72,15 @@ def test_values_of_parameters_are_a_restriction_each(regression):
         ("Xuu = 0", "Did you mean 'Xu'"),
         ("Xu = 0, 2*Xu = 0", "2 restrictions hold 1 independent"),
         ({}, "there is no restriction to test"),
+        (0.1, "the restriction 0.1 names no parameter: write 'Xu = 0.1' or {'Xu': 0.1}"),
+        ([0.1, 0.2, 0.3], "the restriction 0.1 names no parameter"),
+        (np.eye(3), "names no parameter: write 'Xu = 0.1'"),
+        (("Xu = 0", 2), "the restriction 2 names no parameter"),
+        ("2 = 2", "'2 = 2' says nothing of a parameter: write it as 'Xu = 0.1'"),
+        ("Xu = Xu", "'Xu = Xu' says nothing of a parameter"),
+        ({0: 0.1}, "names '0', which is no parameter"),
+        ({"Xu": "fast"}, "restriction of 'Xu' is 'fast', a finite number is needed"),
+        ({"Xu": np.nan}, "restriction of 'Xu' is nan, a finite number is needed"),
     ],
 )
 def test_a_restriction_that_cannot_be_tested_says_so(restriction, told):
@@ -99,5 +108,7 @@ def test_results_are_labelled(estimate):
     assert tested.to_dict()["distribution"] == "χ²(2)"
     with pytest.raises(GreyboxError, match="level of an interval is 95"):
         estimate.conf_int(level=95)
+    with pytest.raises(GreyboxError, match="level of an interval is 'Xu', give a number"):
+        estimate.conf_int("Xu")
     with pytest.raises(KeyError, match=r"no parameter 'Xuv'\. Did you mean"):
         estimate["Xuv"]

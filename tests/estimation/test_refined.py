@@ -269,7 +269,8 @@ def test_the_restricted_likelihood_equals_dense_algebra():
 def test_slopes_of_the_likelihood_equal_differences(own, memory, restricted):
     rng = np.random.default_rng(0)
     bands, errors, regressors = [], [], []
-    for samples in (90, 60):
+    # the last log is narrower than the band of its covariance
+    for samples in (90, 60, 1):
         slopes = 0.5 * rng.standard_normal((samples, 3, 5))
         bands.append(ErrorBand(slopes, rng.random(samples) > 0.1))
         errors.append(rng.standard_normal((samples, 3)))
@@ -488,3 +489,11 @@ def test_a_measured_heading_is_no_instrument_for_itself():
     # means of 40 have a standard error of 0.16
     assert np.abs(mean).max() < 0.16 * 3.5
     assert abs(mean[names.index("Ymu")]) < 0.2 + 0.16 * 1.5
+
+
+def test_a_stretch_in_which_nothing_can_be_used_changes_nothing(basic, still_log):
+    log, short = still_log.window(0, 400, "log"), still_log.window(500, 504, "short")
+    holes = replace(short, missing={"v": np.array([False, True, True, False])})
+    alone, beside = estimate_refined_iv(basic, [log]), estimate_refined_iv(basic, [log, holes])
+    assert beside.kept == alone.kept
+    np.testing.assert_allclose(beside.theta, alone.theta, rtol=1e-6, atol=1e-9)

@@ -10,10 +10,11 @@ from greybox.numerics.linalg import scaled_inverse
 
 def test_lagged_sums_are_the_diagonal_of_lagged_products():
     rng = np.random.default_rng(0)
-    a = [rng.standard_normal((3, n)) for n in (40, 7)]
-    b = [rng.standard_normal((3, n)) for n in (40, 7)]
+    a = [rng.standard_normal((3, n)) for n in (40, 7, 0)]
+    b = [rng.standard_normal((3, n)) for n in (40, 7, 0)]
     expected = np.array([np.diag(lagged_products(a, b, lag)) for lag in range(12)]).T
     np.testing.assert_allclose(lagged_sums(a, b, 11), expected, rtol=1e-12, atol=1e-12)
+    np.testing.assert_array_equal(lagged_sums([np.zeros((2, 0))], [np.zeros((2, 0))], 18), 0.0)
     slow = sum(np.outer(x[:, k], y[:, k + 2]) for x, y in zip(a, b, strict=True)
                for k in range(x.shape[1] - 2))  # fmt: skip
     np.testing.assert_allclose(lagged_products(a, b, -2), slow, rtol=1e-12)

@@ -260,6 +260,19 @@ def test_a_longer_sample_time_keeps_how_velocities_were_made(tmp_path, velocitie
         ),
         (lambda f: f.assign(v="x"), "no finite number"),
         (lambda f: f.assign(t=f["t"][::-1].to_numpy()), "must increase"),
+        (
+            lambda f: f.assign(t=1700000000.5 + np.r_[np.arange(19), 17]),
+            r"from 1700000018.5 to 1700000017.5 s in row 21",
+        ),
+        (
+            lambda f: f.assign(n=f["n"].where(f.index % 3 > 0), t=np.r_[np.arange(19), 17.0]),
+            r"from 17 to 17 s in row 21",
+        ),
+        (
+            lambda f: f.assign(n=f["n"].where(f.index % 3 > 0)),
+            "falls into 7 pieces, .*: 7 of 20 rows left out, the first row 2, where n hold no "
+            "finite number. Make one log of it with greybox import, which holds inputs",
+        ),
         (lambda f: f.assign(t=np.r_[np.arange(10), 10 + 2 * np.arange(10)]), "two sample times"),
         (lambda f: f.head(2), "has 2 samples, at least 3"),
         (
@@ -271,6 +284,16 @@ def test_a_longer_sample_time_keeps_how_velocities_were_made(tmp_path, velocitie
 def test_bad_logs(tmp_path, change, message):
     with pytest.raises(LogError, match=message):
         read(change(table()), tmp_path)
+
+
+def test_a_column_that_another_thruster_has_is_no_misspelling(tmp_path):
+    thrusters = [{"type": "fixed", "speed": f"speed{k}"} for k in (1, 2)]
+    frame = table().rename(columns={"n": "speed1"})
+    with pytest.raises(LogError, match=r"no column 'speed2', which moves a thruster of 'S'\. Its"):
+        read(frame, tmp_path, SHIP | {"thruster": thrusters})
+    frame["speed_2"] = frame["speed1"]
+    with pytest.raises(LogError, match=r"no column 'speed2', .* Did you mean 'speed_2'\?"):
+        read(frame, tmp_path, SHIP | {"thruster": thrusters})
 
 
 def test_bad_files(tmp_path):

@@ -160,3 +160,21 @@ def test_a_single_log_with_gaps_is_estimated(log):
     assert [one["samples"] for one in estimate.logs] == [200, 190]
     with pytest.raises(UsageError, match=r"no parameter 'XU'\. Did you mean 'Xu'"):
         estimate["XU"]
+
+
+def test_the_fit_of_an_estimate_is_that_of_its_log_however_short_its_segments(log):
+    keep = np.r_[0:150, 153:157, 160:N]
+    gapped = log.window(0, N, "gapped")
+    gapped = replace(
+        gapped,
+        t=log.t[keep],
+        channels={n: a[keep] for n, a in log.channels.items()},
+        closed_loop=log.closed_loop[keep],
+    )
+    asked = {"method": "ls", "predictor": "basic", "structure": "linear"}
+    estimate = estimate_model(gapped, **asked)
+    run = run_model(estimate.model(), gapped)
+    assert estimate.fit == pytest.approx(run.fit, rel=1e-9)
+    both = estimate_model([gapped, log], **asked)
+    fits = [run_model(both.model(), part).fit for part in (gapped, log)]
+    assert both.fit == pytest.approx({s: np.mean([f[s] for f in fits]) for s in "uvr"}, rel=1e-9)

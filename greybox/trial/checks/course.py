@@ -123,6 +123,8 @@ def _pushed(recording: Recording, vessel: Vessel, angle: float) -> bool:
         return False
     commands = {c: recording[c].value[np.isfinite(recording[c].value)] for c in vessel.commands}
     size = min(len(v) for v in commands.values())
+    if not size:
+        return False
     made = generalised_force(vessel, {c: v[:size] for c, v in commands.items()})
     across = float(np.mean(made.get("tauy", np.zeros(1))))
     total = sum(float(np.mean(np.abs(v))) for v in made.values()) or 1.0

@@ -75,7 +75,9 @@ def response_findings(
     """
     if any(f.id == "frame" and not f.safe for f in findings):
         return []
-    commands = [c for c in vessel.commands if c in recording]
+    commands = [
+        c for c in vessel.commands if c in recording and np.isfinite(recording[c].value).any()
+    ]
     if len(commands) < len(vessel.commands):
         return []
     motion = make_motion(recording, _STATES)

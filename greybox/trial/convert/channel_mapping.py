@@ -43,6 +43,8 @@ _ALTERNATIVES = (
 
 # a position changes from row to row by less than this share of what it spreads over
 _SMOOTH = 0.2
+# largest number of a signal: encoders, and degrees of longitude times 1e7
+_LARGEST = 1e10
 _NO_MOTION = "no position, heading or velocity was recognised: map their columns in [columns]"
 
 
@@ -277,6 +279,13 @@ def _listed(columns: Sequence[str]) -> str:
     return ", ".join(f"'{c}'" for c in columns)
 
 
+def possible(values: NDArray[Any]) -> NDArray[Any]:
+    """Return a column without numbers that no signal of a ship has, which overflow in sums."""
+    if values.dtype == object or not (np.abs(values) > _LARGEST).any():
+        return values
+    return np.where(np.abs(values) > _LARGEST, np.nan, values)
+
+
 def batch_recording(
     table: TableFile,
     batch: Batch,
@@ -305,7 +314,7 @@ def batch_recording(
             source = (
                 f"column '{a.raw}'" if a.raw not in parts else f"columns {_listed(parts[a.raw])}"
             )
-            signals.append(Signal(a.raw, t, batch[a.raw], a.unit, source))
+            signals.append(Signal(a.raw, t, possible(batch[a.raw]), a.unit, source))
     used = {a.raw for a in assigned.values()}
     used |= {c for made, of in parts.items() if made in used for c in of}
     ignored = [c for c in table.columns if c not in used]

@@ -7,10 +7,9 @@ recorded, guesses nothing, and refuses what would have to be mended.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +18,7 @@ from greybox.errors import LogError, suggestion
 from greybox.files import sha256
 from greybox.trial.convert.channel_mapping import (
     canonical,
+    possible,
     table_columns,
     whole_recording,
     written_log,
@@ -28,7 +28,7 @@ from greybox.trial.convert.convert import Conversion, cut_segments
 from greybox.trial.convert.deduplicate import clean_signals
 from greybox.trial.convert.options import ImportOptions
 from greybox.trial.convert.time_grid import MIN_SEGMENT, Plan
-from greybox.trial.convert.time_scale import time_scale
+from greybox.trial.convert.time_scale import LATEST, time_scale
 from greybox.trial.gaps import split_at_gaps
 from greybox.trial.log import Provenance, TrialLog
 from greybox.trial.raw_log import Recording
@@ -46,8 +46,6 @@ _JITTER = 0.2
 _DRIFT = 0.6
 # wind of fewer rows than this share is none
 _LEAST_WIND = 0.5
-# largest number of a signal, positions and encoders included
-_LARGEST = 1e9
 _WIND = ("u_q", "v_q", "V_q", "gamma_q", "dir_q", "V_w", "dir_w", "dir_t")
 # share of steps past which gaps are another sample time
 _MOST_GAPS = 0.2
@@ -197,13 +195,13 @@ def _clean_recording(
     assigned = table_columns(table, vessel, guess=False)
     _require_mapped(assigned, vessel, table, plan=plan)
     batch = read_columns(table, [a.raw for a in assigned.values()])
-    batch, notes = _known_rows(assigned, batch, vessel, table)
+    batch, rows, notes = _known_rows(assigned, batch, vessel, table)
     time = assigned["t"]
     scale = time_scale(batch[time.raw], time, table)
     if time.raw not in table.dates:
         # a log's own clock is kept as it is
         scale = replace(scale, zero=0.0, epoch=None)
-    sample_time = _require_uniform(scale.seconds(batch[time.raw]), table)
+    sample_time = _require_uniform(scale.seconds(batch[time.raw]), rows, table, notes)
     raw = whole_recording(table, batch, assigned, scale, vessel)
     recording = replace(canonical(raw, assigned, vessel), steps=(*known.steps, *raw.steps))
     return clean_signals(recording), sample_time, notes
@@ -239,15 +237,16 @@ def _require_mapped(
 
 def _known_rows(
     assigned: dict[str, Assigned], batch: Batch, vessel: Vessel, table: TableFile
-) -> tuple[Batch, list[str]]:
-    """Return the rows in which time, inputs and wind are numbers, and say which are left out.
+) -> tuple[Batch, NDArray[np.intp], list[str]]:
+    """Return the rows in which time, inputs and wind are numbers, which, and what is left out.
 
     Columns that hold none and are not needed are left out, in place. Motions keep their
     holes, over which a run of the model goes on.
     """
     loop = vessel.closed_loop[0] if vessel.closed_loop else None
-    batch = {c: _possible(v) if c != assigned["t"].raw else v for c, v in batch.items()}
+    batch = {c: possible(v) if c != assigned["t"].raw else v for c, v in batch.items()}
     numbers = {n: np.isfinite(_floats(batch, a)) for n, a in assigned.items() if n != loop}
+    numbers["t"] = np.abs(_floats(batch, assigned["t"])) <= LATEST
     # positions are not needed where velocities were logged, nor what moves no model
     spare = {"x_n", "y_n"} if {"u", "v"} <= assigned.keys() else set()
     beside = set(vessel.recorded_columns) - set(vessel.commands)
@@ -270,22 +269,16 @@ def _known_rows(
             )
     needed = [n for n in numbers if n in {"t", *vessel.commands, *_WIND}]
     keep = np.all([numbers[n] for n in needed], axis=0)
+    rows = np.flatnonzero(keep)
     if keep.all():
-        return batch, notes
+        return batch, rows, notes
     first = int(np.flatnonzero(~keep)[0])
     lost = [assigned[n].raw for n in needed if not numbers[n].all()]
     notes.append(
         f"{int((~keep).sum())} of {len(keep)} rows left out, the first row "
         f"{first + table.first_row}, where {', '.join(lost)} hold no finite number"
     )
-    return {n: values[keep] for n, values in batch.items()}, notes
-
-
-def _possible(values: NDArray[Any]) -> NDArray[Any]:
-    """Return a column without numbers that no signal of a ship has, which overflow in sums."""
-    if values.dtype == object or not (np.abs(values) > _LARGEST).any():
-        return values
-    return np.where(np.abs(values) > _LARGEST, np.nan, values)
+    return {n: values[keep] for n, values in batch.items()}, rows, notes
 
 
 def _floats(batch: Batch, a: Assigned) -> Array:
@@ -300,8 +293,13 @@ def _importer(table: TableFile) -> str:
     return "recording_from_pandas" if table.format == "DataFrame" else "greybox import"
 
 
-def _require_uniform(t: Array, table: TableFile) -> float:
-    """Return the sample time [s]; refuse a table whose samples would have to be resampled."""
+def _require_uniform(
+    t: Array, rows: NDArray[np.intp], table: TableFile, left_out: Sequence[str]
+) -> float:
+    """Return the sample time [s]; refuse a table whose samples would have to be resampled.
+
+    Times are those of some `rows` of the table, and `left_out` says why there are no more.
+    """
     name, importer = table.path.name, _importer(table)
     if len(t) < MIN_SEGMENT:
         raise LogError(
@@ -312,17 +310,23 @@ def _require_uniform(t: Array, table: TableFile) -> float:
     if len(wrong):
         k = int(wrong[0])
         raise LogError(
-            f"time in '{name}' goes from {t[k]:.6g} to {t[k + 1]:.6g} s in row "
-            f"{k + 1 + table.first_row}, it must increase: {importer} sorts the rows and drops "
-            f"repeated ones."
+            f"time in '{name}' goes from {t[k]:.13g} to {t[k + 1]:.13g} s in row "
+            f"{rows[k + 1] + table.first_row}, it must increase: {importer} sorts the rows and "
+            f"drops repeated ones."
         )
-    usual = float(np.median(steps))
+    beside = np.diff(rows) == 1
+    usual = float(np.median(steps[beside] if beside.any() else steps))
     found = split_at_gaps(t, usual)
     gaps = np.zeros(len(steps), bool)
     gaps[[a - 1 for a, _ in found[1:]]] = True
     off = np.abs(steps - np.round(steps / usual) * usual) > _JITTER * usual
     if off.any() or gaps.sum() > _MOST_GAPS * len(steps):
         k = int(np.flatnonzero(off | gaps)[0])
+        if not (off | gaps)[beside].any():
+            raise LogError(
+                f"'{name}' falls into {len(found)} pieces, too many for one log: {left_out[-1]}. "
+                f"Make one log of it with {importer}, which holds inputs over short holes."
+            )
         raise LogError(
             f"'{name}' has two sample times: {usual:.6g} s, but {steps[k]:.6g} s after "
             f"t = {t[k]:.6g} s ({int((off | gaps).sum())} of {len(steps)} steps differ). "
@@ -355,11 +359,13 @@ def _require(
     name: str,
     columns: list[str],
 ) -> None:
+    # what names another channel already is no misspelling
+    free = [c for c in columns if c not in channels]
     for column in vessel.commands:
         if column not in channels:
             raise LogError(
                 f"'{name}' has no column '{column}', which moves a thruster of "
-                f"'{vessel.name}'.{suggestion(column, columns)} Its columns: "
+                f"'{vessel.name}'.{suggestion(column, free)} Its columns: "
                 f"{', '.join(columns[:30])}."
             )
     for state in states:
@@ -367,10 +373,10 @@ def _require(
             need = "psi and x_n, y_n" if state in "uv" else "psi"
             raise LogError(
                 f"'{name}' has no '{state}' and it cannot be derived without {need}."
-                f"{suggestion(state, columns)} Map the columns in the vessel file's [columns]."
+                f"{suggestion(state, free)} Map the columns in the vessel file's [columns]."
             )
     if "psi" not in channels and set(states) & {"v", "r"}:
         raise LogError(
-            f"'{name}' has no heading 'psi'.{suggestion('psi', columns)} "
+            f"'{name}' has no heading 'psi'.{suggestion('psi', free)} "
             f"Map it in the vessel file's [columns] with its unit."
         )

@@ -16,6 +16,8 @@ from greybox.units import is_unix_time, time_unit, unit_factor, unix_unit
 Array = NDArray[np.float64]
 
 _HEAD = 10_000
+# largest number of a time: those in UNIX nanoseconds are below 2e18
+LATEST = 1e19
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,8 @@ class TimeScale:
 
     def seconds(self, raw: Array) -> Array:
         """Return relative times [s], (N,)."""
+        if (np.abs(raw) > LATEST).any():
+            raw = np.where(np.abs(raw) > LATEST, np.nan, raw)
         # the difference first: UNIX nanoseconds do not fit a double
         return (raw - self.zero) * self.factor if self.zero else raw * self.factor
 
@@ -52,7 +56,7 @@ def time_scale(raw: Array, time: Assigned, table: TableFile) -> TimeScale:
     LogError
         It holds no number.
     """
-    finite = raw[np.isfinite(raw)]
+    finite = raw[np.abs(raw) <= LATEST]
     if not len(finite):
         raise LogError(
             f"column '{time.raw}' of '{table.path.name}' holds no number among its {len(raw)} "

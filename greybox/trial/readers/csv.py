@@ -74,7 +74,8 @@ class CsvFile:
         rows = 0
         try:
             clean = _Clean(self.path, self.encoding, blanks=self.delimiter == " ")
-            reader = arrow.open_csv(
+            # a reader left open reads ahead, and may outlive the interpreter
+            with arrow.open_csv(
                 clean,
                 read_options=arrow.ReadOptions(
                     block_size=limits().block_bytes,
@@ -91,10 +92,10 @@ class CsvFile:
                     strings_can_be_null=True,
                     check_utf8=False,
                 ),
-            )
-            for batch in reader:
-                rows += batch.num_rows
-                yield {c: self._values(batch.column(c), c, words, stamps) for c in columns}
+            ) as reader:
+                for batch in reader:
+                    rows += batch.num_rows
+                    yield {c: self._values(batch.column(c), c, words, stamps) for c in columns}
         except (pa.ArrowException, OSError, UnicodeError, ValueError) as error:
             if isinstance(error, LogError):
                 raise
