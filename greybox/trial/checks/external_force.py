@@ -47,9 +47,9 @@ _STEP, _MOST_STEPS = 2.0, 1500
 _LENGTHS, _LONGEST_SHARE = (30.0, 60.0, 120.0), 1 / 3
 # least length of all logs together [s]
 _LEAST_SECONDS = 240.0
-# chance of a false finding if the tail of usual stretches goes on as it begins, so small because
-# that of ships of another kind does not (see the manual); stretches that count for one of a scan
-_LEVEL, _OVERLAP = 1e-9, 3.0
+# chance of a false finding if the tail of usual stretches goes on as it begins, small because that
+# of ships of another kind does not (see the manual); stretches that count for one of a scan
+_LEVEL, _OVERLAP = 1e-7, 3.0
 # what matters: force over thrust at half speed
 _LEAST_SHARE = 0.08
 # the same of a ship that stands, of which the stretches in which it sails tell less
@@ -84,6 +84,8 @@ _ROUNDS = 8
 # Weibull tail by its mean excess over that size: (log 4 · excess)^-0.76 within 1 % from 1 to 2
 _TAIL, _SHAPE = 0.75, 0.76
 _LOG_TAIL = float(-np.log(1 - _TAIL))
+# that size of normal noise, of two degrees of freedom
+_OF_NOISE = float(np.sqrt(2 * _LOG_TAIL))
 # shifts by which stretches overlap, stretches that are judged at once, and steps after which
 # an innovation is forgotten
 _SHIFTS, _CHUNK, _REACH = 4, 200, 100
@@ -479,6 +481,16 @@ class _Equation:
         self.weight = np.sqrt(mean / np.maximum(around, 1e-3 * mean))
         self.estimate()
 
+    def without(self, part: slice, starts: tuple[tuple[int, int], ...]) -> _Equation:
+        """Return the equation fitted without some columns, its steps and weights kept."""
+        less = copy(self)
+        less.kind = np.delete(self.kind, part)
+        less.columns = np.delete(self.columns, part, axis=1)
+        less.size = np.delete(self.size, part)
+        less.starts = self.starts + starts
+        less.estimate()
+        return less
+
     def unexplained(self) -> Array:
         """Return the rate (N,) [m/s²] less all but steps and forces of their own."""
         kept = self.kind < _FREE
@@ -557,10 +569,8 @@ class _Scan:
                 break
             before, free = self.equations, self.free.copy()
             self._allow(event)
-            force, covariance = self.force(event)
-            gain = float(force @ np.linalg.solve(covariance, force))
             matters = self.share(event)[1] > _LEAST_SHARE
-            if not matters or self._chance(gain, event.fixed) > _LEVEL:
+            if not matters or self._chance(self._added(event, before), event.fixed) > _LEVEL:
                 self.equations, self.free = before, free
                 break
             found.append(event)
@@ -586,6 +596,21 @@ class _Scan:
         beside = event.last - event.first
         first = max(at, at + event.first - beside)
         self.free[first : min(self.ends[event.log + 1], at + event.last + beside + 1)] = False
+
+    def _added(self, event: _Event, before: Sequence[_Equation]) -> float:
+        """Return twice the log-likelihood that a force adds: 0 where all else explains as much.
+
+        Variances and the colour of the noise are fitted anew without it too: the force over its
+        standard error would take the colour that is left beside the force for known.
+        """
+        added = 0.0
+        assert event.at is not None
+        for equation, old, at in zip(self.equations, before, event.at, strict=True):
+            none = equation.without(slice(at, at + 2), old.starts)
+            own = equation.fit.covariance[at : at + 2, at : at + 2] / _VAGUE**2
+            added += 2 * (equation.fit.evidence - none.fit.evidence)
+            added -= float(np.linalg.slogdet(own)[1])
+        return max(added, 0.0)
 
     def force(self, event: _Event) -> tuple[Array, Array]:
         """Return the force per mass of an event (2,) [m/s²], and its covariance (2, 2)."""
@@ -657,8 +682,10 @@ class _Scan:
             usual = np.sqrt(self._scanned(frame)[2])
             if not len(usual):
                 return 1.0
-            tails[frame] = float(np.quantile(usual, _TAIL))
-            excess.append(usual[usual > tails[frame]] / tails[frame] - 1)
+            own = float(np.quantile(usual, _TAIL))
+            excess.append(usual[usual > own] / own - 1)
+            # noise alone explains as much, though few stretches may happen to explain less
+            tails[frame] = max(own, _OF_NOISE)
         # a Weibull tail: of normal noise of shape 2, of gusts and misfit longer
         beyond = _LOG_TAIL * float(np.concatenate(excess).mean())
         shape = min(2.0, float(beyond**-_SHAPE))
