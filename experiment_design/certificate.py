@@ -113,11 +113,6 @@ class Certificate(DisplayMixin):
     reason: str = ""
     wall_s: float = 0.0
 
-    @property
-    def available(self) -> bool:
-        """Whether there is a bound."""
-        return not self.reason
-
     def sentence(self) -> str:
         """Return one sentence for the summary of a design."""
         if self.efficiency_lower_bound is None:

@@ -124,17 +124,9 @@ def require_start(problem: TrialProblem, request: DesignRequest, trial: int) -> 
             )
 
 
-def require_stable(problem: TrialProblem, request: DesignRequest) -> None:
+def require_stable(request: DesignRequest) -> None:
     """Raise where the prior model runs away under any constant command."""
-    sentence = unstable_sentence(
-        request.vessel,
-        request.structure,
-        request.theta,
-        request.d,
-        problem.schedule,
-        request.starts[0],
-        request.integrator,
-    )
+    sentence = unstable_sentence(request, request.starts[0])
     if sentence:
         raise InfeasibleError(sentence)
 
@@ -153,7 +145,7 @@ def feasible_or_reason(
         chosen = best
     changes = least_change(problem, chosen)
     name, amount = changes[0]
-    more = _turning(problem, request) if name.kind is LimitKind.SEA_ROOM else ""
+    more = _turning(request) if name.kind is LimitKind.SEA_ROOM else ""
     if name.kind is LimitKind.MARGIN and request.d[:2].any():
         more += (
             f" Margins are kept through the water too, and a current of "
@@ -220,12 +212,9 @@ def tells_enough(request: DesignRequest) -> bool:
     return bool(2 * (share > _VAGUE).sum() <= share.size)
 
 
-def _turning(problem: TrialProblem, request: DesignRequest) -> str:
+def _turning(request: DesignRequest) -> str:
     """Return what the turning circle has to do with the sea room, where it has."""
-    steady = steady_motions(
-        request.vessel, request.structure, request.theta, request.d, problem.schedule,
-        integrator=request.integrator,
-    )  # fmt: skip
+    steady = steady_motions(request)
     signs = np.ones(len(steady.x), bool)
     for state, sign in request.regimes[0]:
         column = steady.x[:, request.structure.states.index(state)]

@@ -120,7 +120,7 @@ def _design(
     reference, kept = random_campaign(problems, request.seed)
     _log.info("%d random two-level sequences keep the limits", kept)
     if reference is None:
-        require_stable(problems[0], request)
+        require_stable(request)
     else:
         require_informative(request, problems, reference, hopeless=10.0)
     initial = reference

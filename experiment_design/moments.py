@@ -98,7 +98,7 @@ class MomentProgram:
         if predictor.air_measured:
             blow = ca.SX.sym("gust", 2)
             air = ca.vertcat(*measured_air(structure, d[2] + blow[0], d[3] + blow[1]))
-        x_next = s.after[: self.nx]
+        x_next = s.next_state[: self.nx]
         channels: list[tuple[ca.SX, float, int | None]] = [
             (s.x[i], float(noise.measurement[i]), i) for i in range(self.nx)
         ]

@@ -23,7 +23,6 @@ from experiment_design.regimes import (
     steady_start,
 )
 from experiment_design.request import DesignRequest, build_problem, full_structure
-from experiment_design.schedule import make_schedule
 from experiment_design.stability import unstable_sentence
 from greybox.errors import InfeasibleError, StructureError, UsageError
 from greybox.model.model import ManoeuvringModel
@@ -165,7 +164,6 @@ def prepare_request(
         )
     if wishes.trials < 1:
         raise UsageError(f"--trials is {wishes.trials}, it must be 1 or more.")
-    schedule = make_schedule(vessel, wishes.duration, wishes.hold, model.sample_time)
     noise = noise_levels(model, vessel, wishes.process_noise)
     notes.append(f"noise: {noise.source}")
     predictor = _predictor(model, structure, wishes, notes)
@@ -230,11 +228,9 @@ def prepare_request(
         seed=wishes.seed,
         effort=wishes.effort,
     )
-    steady = steady_motions(vessel, structure, theta, d, schedule, integrator=model.integrator)
+    steady = steady_motions(base)
     if not len(steady.x):
-        raise InfeasibleError(
-            unstable_sentence(vessel, structure, theta, d, schedule, integrator=model.integrator)
-        )
+        raise InfeasibleError(unstable_sentence(base))
     start = _start(wishes, structure)
     if wishes.regime.strip().lower() == "auto":
         regimes = _choose_regimes(base, steady, start, wishes, notes)

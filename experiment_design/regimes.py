@@ -8,12 +8,9 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from experiment_design.request import DesignRequest
 from experiment_design.rollout import Rollout
-from experiment_design.schedule import Schedule
 from greybox.errors import UsageError
-from greybox.model.run.step import Integrator
-from greybox.model.structure import Structure
-from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
 Signs = tuple[tuple[str, int], ...]
@@ -44,16 +41,16 @@ class Steady:
     unstable: int
 
 
-def steady_motions(
-    vessel: Vessel,
-    structure: Structure,
-    theta: Array,
-    d: Array,
-    schedule: Schedule,
-    start: Array | None = None,
-    integrator: Integrator = "euler",
-) -> Steady:
-    """Run constant commands on a grid of the limits until the motion has settled."""
+def steady_motions(request: DesignRequest, start: Array | None = None) -> Steady:
+    """Run constant commands on a grid of the limits until the motion has settled.
+
+    Parameters
+    ----------
+    request : DesignRequest
+    start : ndarray, optional
+        (nx + 1,) initial states and heading; by default nearly at rest.
+    """
+    schedule, structure = request.schedule, request.structure
     commands = len(schedule.commands)
     levels = next((n for n in (5, 3, 2) if n**commands <= _MOST), 2)
     grid = np.array(list(product(np.linspace(0, 1, levels), repeat=min(commands, 9))))[:_MOST]
@@ -64,8 +61,8 @@ def steady_motions(
     rest = np.zeros(len(structure.states) + 1)
     rest[0] = 0.1
     rollout = Rollout(
-        vessel, structure, theta, d, rest if start is None else start, schedule.sample_time,
-        integrator,
+        request.vessel, structure, request.theta, request.d, rest if start is None else start,
+        request.sample_time, request.integrator,
     )  # fmt: skip
     motion = rollout.run(np.repeat(values[:, None], samples, axis=1))
     nx = rollout.nx

@@ -114,10 +114,10 @@ class SensitivityProgram:
         self.weight = np.where(std > 0, 1 / np.where(std > 0, std, 1.0) ** 2, 0.0)
         step = StepModel.free(structure, integrator, air_measured=predictor.air_measured)
         s = step.symbolic
-        after = s.after[: self.size]
+        next_state = s.next_state[: self.size]
         z = ca.vertcat(s.x, *[s.psi] * heading)
-        slope = ca.jacobian(after, z)
-        by_theta = ca.jacobian(after, s.theta)
+        slope = ca.jacobian(next_state, z)
+        by_theta = ca.jacobian(next_state, s.theta)
         columns = [predictor.columns[i] for i in predictor.parameter_columns]
         directions = np.zeros((len(theta), len(columns)))
         for j, column in enumerate(columns):
@@ -128,7 +128,7 @@ class SensitivityProgram:
         parts = [ca.mtimes(by_theta, ca.DM(directions))]
         chosen = [structure.disturbances.index(n) for n in means]
         if chosen:
-            parts.append(ca.jacobian(after, s.d)[:, chosen])
+            parts.append(ca.jacobian(next_state, s.d)[:, chosen])
         entry = ca.densify(ca.horzcat(*parts))
         slope, entry = (s.at(e, d, theta, sample_time) for e in (slope, entry))
         if predictor.air_measured:

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from experiment_design.regimes import steady_motions
-from experiment_design.schedule import Schedule
-from greybox.model.run.step import Integrator
-from greybox.model.structure import Structure
-from greybox.vessel.vessel import Vessel
+from experiment_design.request import DesignRequest
 
 Array = NDArray[np.float64]
 
@@ -33,27 +30,20 @@ class Damping:
     needed: float
 
 
-def unstable_sentence(
-    vessel: Vessel,
-    structure: Structure,
-    theta: Array,
-    d: Array,
-    schedule: Schedule,
-    start: Array | None = None,
-    integrator: Integrator = "euler",
-) -> str:
+def unstable_sentence(request: DesignRequest, start: Array | None = None) -> str:
     """Return why no steady motion exists, empty where one does.
 
     Parameters
     ----------
+    request : DesignRequest
     start : ndarray, optional
         (nx + 1,) initial states and heading; by default nearly at rest.
     """
-    steady = steady_motions(vessel, structure, theta, d, schedule, start, integrator)
+    steady = steady_motions(request, start)
     if len(steady.x):
         return ""
-    least = least_damping(vessel, structure, theta, d, schedule, start, integrator)
-    names = [n for n in _DAMPING.values() if n in structure.parameters]
+    least = least_damping(request, start)
+    names = [n for n in _DAMPING.values() if n in request.structure.parameters]
     change = f"Lowering one of {', '.join(names)} alone does not help."
     if not names:
         change = "It has no linear damping that could be lowered."
@@ -69,27 +59,19 @@ def unstable_sentence(
     )
 
 
-def least_damping(
-    vessel: Vessel,
-    structure: Structure,
-    theta: Array,
-    d: Array,
-    schedule: Schedule,
-    start: Array | None = None,
-    integrator: Integrator = "euler",
-) -> Damping | None:
+def least_damping(request: DesignRequest, start: Array | None = None) -> Damping | None:
     """Return the linear damping that falls least before some constant command is settled under.
 
     Values down to the one that stops a motion within one sample are tried, one
     parameter at a time; None where none helps.
     """
+    structure, theta = request.structure, request.theta
     strongest = -1.0 if structure.increment else 0.0
 
     def settles(place: int, value: float) -> bool:
         changed = np.array(theta, float)
         changed[place] = value
-        steady = steady_motions(vessel, structure, changed, d, schedule, start, integrator)
-        return len(steady.x) > 0
+        return len(steady_motions(replace(request, theta=changed), start).x) > 0
 
     found: list[Damping] = []
     for name in _DAMPING.values():

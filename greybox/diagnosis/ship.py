@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.diagnosis.linear import Linear, sensitivities
-from greybox.diagnosis.simulator import Simulator
+from greybox.diagnosis.simulator import VaryingSimulator
 from greybox.model.run.step import Integrator, Rule, StepModel, held, integrated
 from greybox.model.structure import Structure
 from greybox.rotation import ned_to_body
@@ -146,7 +146,7 @@ class LogRun:
         self._air = held(air if air is not None else np.zeros((len(log), 2)), integrator)
         self._commands = {c: log[c] for c in log.vessel.commands}
         step = StepModel(structure, integrator, air_measured=self.air_measured)
-        self._simulator = Simulator(step, len(log))
+        self._simulator = VaryingSimulator(step, len(log))
         self._forces: tuple[Vessel, tuple[Wire, ...], Array] | None = None
 
     def forces(self, vessel: Vessel, wires: tuple[Wire, ...] = ()) -> Array:

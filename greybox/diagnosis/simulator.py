@@ -29,7 +29,7 @@ def _function(step: StepModel) -> ca.Function:
     return ca.Function("step", [s.x, w], [after], {"cse": True})
 
 
-class Simulator:
+class VaryingSimulator:
     """Runs of one length.
 
     Parameters

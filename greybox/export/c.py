@@ -47,8 +47,8 @@ def c_sources(model: ManoeuvringModel, sampled: SampledModel, path: Path) -> dic
         arguments,
         {
             f"{name}_generated_begin": sampled.baked(sampled.rest),
-            f"{name}_generated_step": sampled.baked(sampled.after),
-            f"{name}_generated_read": sampled.baked(sampled.seen),
+            f"{name}_generated_step": sampled.baked(sampled.x_next),
+            f"{name}_generated_read": sampled.baked(sampled.y),
         },
     )
     kinds = {"state": sampled.states, "input": sampled.inputs, "output": sampled.outputs}

@@ -33,7 +33,7 @@ def casadi_functions(sampled: SampledModel) -> dict[str, ca.Function]:
     options = {"cse": True}
     functions = {
         "step": ca.Function(
-            "step", given, [sampled.after, sampled.seen], names, ["x_next", "y"], options
+            "step", given, [sampled.x_next, sampled.y], names, ["x_next", "y"], options
         )
     }
     if sampled.rate is not None:

@@ -71,8 +71,8 @@ def make_fmu(
         [sampled.x, sampled.u, sampled.s, sampled.p],
         {
             f"{name}_model_begin": sampled.rest,
-            f"{name}_model_step": sampled.after,
-            f"{name}_model_read": sampled.seen,
+            f"{name}_model_step": sampled.x_next,
+            f"{name}_model_read": sampled.y,
         },
     )
     values = {

@@ -54,7 +54,7 @@ class Motion:
             return ca.if_else(on, self._psi(True), self._psi(False))
         return self._psi(self.heading == "measured")
 
-    def after(self, forces: Mapping[str, ca.SX]) -> list[ca.SX]:
+    def moved(self, forces: Mapping[str, ca.SX]) -> list[ca.SX]:
         """Return the states one sample later, under generalised inputs that are held.
 
         Positions follow as in `greybox.model.run.simulation.positions`, by Euler.
@@ -100,19 +100,19 @@ class Motion:
         psi = self.psi
         body = [n for n in self.states if n not in ("psi", "x_n", "y_n")]
         ports = [channel_port(n) for n in body]
-        seen = [self.states[n] for n in body]
+        values = [self.states[n] for n in body]
         ports.append(channel_port("psi"))
-        seen.append(psi)
+        values.append(psi)
         if "x_n" in self.states:
             north, east = self.over_ground(psi)
             ports += [channel_port(n) for n in ("x_n", "y_n", "v_n", "v_e")]
-            seen += [self.states["x_n"], self.states["y_n"], north, east]
+            values += [self.states["x_n"], self.states["y_n"], north, east]
         along, across = ned_to_body(self.current[0], self.current[1], psi)
         for name, flow, words in (("u", along, "forward"), ("v", across, "to starboard")):
             if name in self.states:
                 ports.append(Port(f"{name}_r", "m/s", f"velocity through the water, {words}"))
-                seen.append(self.states[name] - flow)
-        return ports, seen
+                values.append(self.states[name] - flow)
+        return ports, values
 
     @property
     def _x(self) -> ca.SX:

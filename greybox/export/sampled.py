@@ -57,11 +57,11 @@ class SampledModel:
     parameters, outputs : tuple of Port
     x, u, s, p : SX
         Symbols of states, inputs, switches and parameters.
-    after : SX
+    x_next : SX
         States one sample later.
     rest : SX
         States at the start: motion as given, thrusters at rest on the commands.
-    seen : SX
+    y : SX
         Outputs at the sample.
     rate : SX or None
         Change of the states [1/s] in continuous time.
@@ -83,9 +83,9 @@ class SampledModel:
     u: ca.SX
     s: ca.SX
     p: ca.SX
-    after: ca.SX
+    x_next: ca.SX
     rest: ca.SX
-    seen: ca.SX
+    y: ca.SX
     rate: ca.SX | None
     no_rate: str
     notes: tuple[str, ...]
@@ -157,7 +157,7 @@ def sampled_model(
         coefficients(model, p, sample),
     )
     place = column(motion.states.values())
-    outputs, seen = motion.outputs()
+    outputs, values = motion.outputs()
     rate, no_rate = None, ""
     if late.rate is None:
         no_rate = (
@@ -180,9 +180,9 @@ def sampled_model(
         u=u,
         s=s,
         p=p,
-        after=ca.densify(column([*motion.after(late.forces), late.after, sample + 1])),
+        x_next=ca.densify(column([*motion.moved(late.forces), late.next_memory, sample + 1])),
         rest=ca.densify(column([place, late.rest, ca.SX.zeros(len(count))])),
-        seen=ca.densify(column(seen)),
+        y=ca.densify(column(values)),
         rate=rate,
         no_rate=no_rate,
         notes=_notes(model, heading, wind),

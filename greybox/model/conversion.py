@@ -14,7 +14,6 @@ import numpy as np
 
 from greybox.errors import StructureError
 from greybox.model.structure import Structure
-from greybox.model.terms import Term
 
 # added mass in surge as a share of the mass, where nothing better is known;
 # slender-body values lie between 0.03 and 0.07 (Clarke, Gedling and Hine, 1983)
@@ -58,10 +57,6 @@ class Tie:
     sentence: str
 
 
-def _is_coriolis(term: Term) -> bool:
-    return term.name in ("Xvr", "Yur", "Nuv")
-
-
 def to_continuous(
     theta: Mapping[str, float], structure: Structure, sample_time: float, inertia: Inertia
 ) -> dict[str, float]:
@@ -87,36 +82,6 @@ def to_continuous(
         for t in structure.terms
         if t.name in theta
     }
-
-
-def to_discrete(
-    coefficients: Mapping[str, float], structure: Structure, sample_time: float, inertia: Inertia
-) -> dict[str, float]:
-    """Return discrete parameters from force coefficients; inverse of `to_continuous`.
-
-    Coriolis terms that `coefficients` lacks follow from the inertias:
-    Xvr = Ts (m−Y_v̇)/(m−X_u̇), Yur = −Ts (m−X_u̇)/(m−Y_v̇),
-    Nuv = −Ts (X_u̇−Y_v̇)/(I_z−N_ṙ).
-    """
-    found = {
-        t.name: coefficients[t.name] * sample_time / inertia.of(t.state)
-        for t in structure.terms
-        if t.name in coefficients
-    }
-    coriolis = {
-        "Xvr": inertia.sway / inertia.surge,
-        "Yur": -inertia.surge / inertia.sway,
-        "Nuv": -(inertia.sway - inertia.surge) / inertia.yaw,
-    }
-    for term in structure.terms:
-        if _is_coriolis(term) and term.name not in found:
-            found[term.name] = sample_time * coriolis[term.name]
-    return found
-
-
-def change_sample_time(theta: float, old: float, new: float) -> float:
-    """Return an increment parameter at another sample time: θ is proportional to Ts (2.6)."""
-    return theta * new / old
 
 
 def estimate_inertia(
@@ -232,18 +197,3 @@ def to_prime(
         regressor = float(np.prod([scale[f.signal] for f in term.factors]))
         found[term.name] = coefficients[term.name] * regressor / force
     return found
-
-
-def from_prime(
-    primes: Mapping[str, float],
-    structure: Structure,
-    *,
-    length: float,
-    speed: float,
-    density: float = 1025.0,
-) -> dict[str, float]:
-    """Return force coefficients from prime ones; inverse of `to_prime`."""
-    unit = to_prime(
-        dict.fromkeys(primes, 1.0), structure, length=length, speed=speed, density=density
-    )
-    return {name: primes[name] / unit[name] for name in unit}

@@ -36,7 +36,7 @@ class Helm:
         (nc,) propeller speed of each command at throttle 1; 0 for what does not propel.
     limits : tuple of Limits
         Of each command.
-    seen : float
+    angle_per_order : float
         The steering angle that `steering_angle` finds in a log, per steering order.
     """
 
@@ -45,7 +45,7 @@ class Helm:
     steer: Array
     drive: Array
     limits: tuple[Limits, ...]
-    seen: float = 1.0
+    angle_per_order: float = 1.0
 
     @property
     def steering_columns(self) -> tuple[str, ...]:
@@ -168,8 +168,8 @@ def find_helm(vessel: Vessel, thrusters: Sequence[str] = (), *, limited: bool = 
     stated = vessel.limits
     limits = tuple(stated[c] if limited else Limits(rate=stated[c].rate) for c in columns)
     steer = np.array([chosen.get(c, 0.0) for c in columns])
-    seen = len(chosen) / max(len(ways["azimuth"]), 1) if kind == "azimuth" else 1.0
-    return Helm(kind, columns, steer, _drive(vessel, columns), limits, seen)
+    angle_per_order = len(chosen) / max(len(ways["azimuth"]), 1) if kind == "azimuth" else 1.0
+    return Helm(kind, columns, steer, _drive(vessel, columns), limits, angle_per_order)
 
 
 def _ways(vessel: Vessel) -> dict[Steering, dict[str, float]]:

@@ -17,7 +17,7 @@ LEAST = 1 - (1 - LEVEL) / 2
 
 
 @dataclass(frozen=True)
-class Drawn(Quantity):
+class MonteCarloQuantity(Quantity):
     """A quantity whose interval is that of draws.
 
     Parameters
@@ -45,10 +45,10 @@ class Drawn(Quantity):
         """Whether enough draws reach the quantity for its interval to bound it."""
         return self.reached >= LEAST * self.draws
 
-    def scaled(self, factor: float, unit: Unit) -> Drawn:
+    def scaled(self, factor: float, unit: Unit) -> MonteCarloQuantity:
         """Return the quantity times a constant, such as in ship lengths."""
         ends = sorted((self.low * factor, self.high * factor))
-        return Drawn(
+        return MonteCarloQuantity(
             self.value * factor,
             self.std * abs(factor),
             unit,
@@ -69,7 +69,9 @@ class Drawn(Quantity):
         }
 
 
-def drawn(value: Quantity | None, others: Sequence[Quantity | None]) -> Drawn | None:
+def over_draws(
+    value: Quantity | None, others: Sequence[Quantity | None]
+) -> MonteCarloQuantity | None:
     """Return a quantity of the estimate with the interval of its draws.
 
     Parameters
@@ -83,11 +85,11 @@ def drawn(value: Quantity | None, others: Sequence[Quantity | None]) -> Drawn | 
         return None
     found = np.array([q.value for q in others if q is not None])
     if len(found) < 2:
-        return Drawn(value.value, math.inf, value.unit, math.inf, -math.inf, math.inf,
+        return MonteCarloQuantity(value.value, math.inf, value.unit, math.inf, -math.inf, math.inf,
                      len(found), len(others))  # fmt: skip
     tail = (1 - LEVEL) / 2
     low, high = np.quantile(found, [tail, 1 - tail], method="weibull")
-    return Drawn(
+    return MonteCarloQuantity(
         value.value,
         float(found.std(ddof=1)),
         value.unit,

@@ -12,7 +12,7 @@ from greybox.model.model import ManoeuvringModel
 from greybox.prediction.conditions import Conditions, Task
 from greybox.prediction.extrapolation import Extrapolation, extrapolation_notes
 from greybox.prediction.helm import Helm
-from greybox.prediction.monte_carlo import Drawn
+from greybox.prediction.monte_carlo import MonteCarloQuantity
 from greybox.prediction.result import Kind, PredictedManoeuvre
 from greybox.prediction.running import DrawnRuns
 from greybox.prediction.steady import Steady
@@ -29,7 +29,7 @@ def run_notes(
     own: Manoeuvre,
     runs: DrawnRuns,
     unheld: int,
-    values: Mapping[str, Drawn | None],
+    values: Mapping[str, MonteCarloQuantity | None],
     log: TrialLog,
     helm: Helm,
     steady: Steady,

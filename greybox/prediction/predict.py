@@ -23,7 +23,7 @@ from greybox.prediction.conditions import (
 from greybox.prediction.extrapolation import extrapolations
 from greybox.prediction.helm import Helm, find_helm
 from greybox.prediction.measuring import measure, quantities
-from greybox.prediction.monte_carlo import Drawn, drawn
+from greybox.prediction.monte_carlo import MonteCarloQuantity, over_draws
 from greybox.prediction.notes import model_notes, run_notes, trial_notes, trust_level
 from greybox.prediction.orders import Orders, Stop, Turn, ZigZagOrders
 from greybox.prediction.result import (
@@ -281,9 +281,9 @@ def _one(
     tables = [quantities(m) if m else {} for m in map(measured, range(1, len(kept)))]
     # draws without an approach reach nothing
     tables += [{}] * unheld
-    values = {n: drawn(v, [t.get(n) for t in tables]) for n, v in quantities(own).items()}
+    values = {n: over_draws(v, [t.get(n) for t in tables]) for n, v in quantities(own).items()}
     commands = {
-        name: drawn(
+        name: over_draws(
             Quantity(float(steady.commands[i, 0]), 0.0, "1"),
             [Quantity(float(c), 0.0, "1") for c in steady.commands[i, 1:]],
         )
@@ -351,7 +351,7 @@ def _process(model: ManoeuvringModel, asked: Conditions, runs: int) -> Iterator[
 
 
 def _criteria(
-    own: Manoeuvre, values: Mapping[str, Drawn | None], length: float
+    own: Manoeuvre, values: Mapping[str, MonteCarloQuantity | None], length: float
 ) -> tuple[Criterion, ...]:
     """Judge the limits that apply by the intervals of the draws."""
     made = []

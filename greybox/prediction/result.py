@@ -14,7 +14,7 @@ from greybox.estimation.verdict import TrustLevel
 from greybox.notebook import DisplayMixin, items, number, table
 from greybox.prediction.extrapolation import Extrapolation
 from greybox.prediction.measuring import LABELS
-from greybox.prediction.monte_carlo import Drawn
+from greybox.prediction.monte_carlo import MonteCarloQuantity
 from greybox.trial.log import TrialLog
 from greybox.trial.manoeuvres import Compliance, Criterion, Quantity
 from greybox.trial.manoeuvres.finding import Manoeuvre
@@ -49,7 +49,7 @@ class Compared:
     Parameters
     ----------
     name : str
-    predicted : Drawn
+    predicted : MonteCarloQuantity
     measured : Quantity
     difference : Quantity
         Measured minus predicted; its interval holds both.
@@ -58,9 +58,9 @@ class Compared:
     """
 
     name: str
-    predicted: Drawn
+    predicted: MonteCarloQuantity
     measured: Quantity
-    difference: Drawn
+    difference: MonteCarloQuantity
     agrees: bool
 
 
@@ -129,9 +129,9 @@ class PredictedManoeuvre:
     heading : float or None
         At which a zig-zag is reversed [rad].
     label : str
-    commands : dict of str to Drawn
+    commands : dict of str to MonteCarloQuantity
         Of the approach, in the unit of the log, angles [rad].
-    quantities : dict of str to Drawn or None
+    quantities : dict of str to MonteCarloQuantity or None
         None where the estimate itself does not reach it; `LABELS` says what they are.
     criteria : tuple of Criterion
     draws : int
@@ -154,8 +154,8 @@ class PredictedManoeuvre:
     order: float | None
     heading: float | None
     label: str
-    commands: dict[str, Drawn]
-    quantities: dict[str, Drawn | None]
+    commands: dict[str, MonteCarloQuantity]
+    quantities: dict[str, MonteCarloQuantity | None]
     criteria: tuple[Criterion, ...]
     draws: int
     diverged: int
@@ -355,7 +355,7 @@ def compared_line(row: Compared, length: float) -> str:
     )
 
 
-def _shown(value: Drawn, angle: bool) -> str:
+def _shown(value: MonteCarloQuantity, angle: bool) -> str:
     factor, unit = (180 / math.pi, " deg") if angle else (1.0, "")
     low, high = (b * factor for b in value.interval)
     return f"{value.value * factor:.4g}{unit} (95 %: {low:.4g} to {high:.4g})"

@@ -13,7 +13,7 @@ from greybox.model.model import ManoeuvringModel
 from greybox.model.run.step import integrated
 from greybox.prediction.helm import Helm, bounds
 from greybox.prediction.orders import Orders
-from greybox.prediction.ship import Ship
+from greybox.prediction.ship import ShipDraws
 from greybox.prediction.steady import Steady
 from greybox.rotation import body_to_ned
 
@@ -94,7 +94,7 @@ def sail(
         (nx, R) added to each next state.
     """
     step, length = model.sample_time, model.vessel.length
-    ship = Ship(model.structure, model.vessel, step, model.integrator, theta, d)
+    ship = ShipDraws(model.structure, model.vessel, step, model.integrator, theta, d)
     names = model.structure.states
     where = [names.index(n) if n in names else None for n in ("u", "v", "r")]
     nx = len(names)

@@ -18,7 +18,7 @@ from greybox.vessel.vessel import Actuation, Thruster, Vessel
 Array = NDArray[np.float64]
 
 
-class Ship:
+class ShipDraws:
     """The model's own step, with its actuators, for many parameters at once.
 
     Parameters
@@ -144,6 +144,6 @@ def _ship(
     return ca.Function(
         "ship",
         [ca.vertcat(s.x, s.psi, made.symbols), ca.vertcat(commands, s.d), s.theta, s.dt],
-        [ca.vertcat(moved, *[s.psi] * ("psi" not in step.states), made.after)],
+        [ca.vertcat(moved, *[s.psi] * ("psi" not in step.states), made.next_memory)],
         {"cse": True},
     )

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from greybox.errors import InfeasibleError, UsageError
 from greybox.model.model import ManoeuvringModel
 from greybox.prediction.helm import Helm, bounds
-from greybox.prediction.ship import Ship
+from greybox.prediction.ship import ShipDraws
 
 Array = NDArray[np.float64]
 
@@ -136,7 +136,7 @@ class _Problem:
         self.states = model.structure.states
         self.helm, self.heading, self.speed = helm, heading, speed
         self.order = [self.states.index(n) for n in ("u", "v", "r") if n in self.states]
-        self.ship = Ship(
+        self.ship = ShipDraws(
             model.structure,
             model.vessel,
             model.sample_time,

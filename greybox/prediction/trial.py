@@ -14,7 +14,7 @@ from greybox.model.model import ManoeuvringModel
 from greybox.prediction.conditions import Conditions, Task
 from greybox.prediction.helm import Helm
 from greybox.prediction.measuring import LABELS, quantities
-from greybox.prediction.monte_carlo import Drawn
+from greybox.prediction.monte_carlo import MonteCarloQuantity
 from greybox.prediction.result import Agreement, Compared, Kind, PredictedManoeuvre, Side
 from greybox.rotation import ned_to_body
 from greybox.trial.log import TrialLog
@@ -97,7 +97,7 @@ def _task(found: Manoeuvre, log: TrialLog, helm: Helm, asked: Conditions) -> Tas
     if isinstance(found, ZigZag):
         heading = float(np.mean([q.value for q in found.switch_headings]))
     if helm.angular and found.rudder is not None:
-        order = found.rudder / helm.seen
+        order = found.rudder / helm.angle_per_order
     else:
         order = _speeds(found, log, helm)
     return Task(side, order, heading, speed, course)
@@ -184,7 +184,7 @@ def compare(
         gap = value.value - beside.value
         below = math.hypot(value.value - low, beside.high - beside.value)
         above = math.hypot(high - value.value, beside.value - beside.low)
-        difference = Drawn(
+        difference = MonteCarloQuantity(
             gap, (below + above) / 2 / 1.96, value.unit, math.inf, gap - below, gap + above
         )
         rows.append(Compared(name, beside, value, difference, -above <= gap <= below))
@@ -256,5 +256,5 @@ def _history(found: Manoeuvre, log: TrialLog, helm: Helm, k: NDArray[np.intp]) -
         made["r"] = log["r"][k]
     steering = steering_angle(log) if helm.angular else None
     if steering is not None:
-        made["steering"] = steering[0][k] / helm.seen
+        made["steering"] = steering[0][k] / helm.angle_per_order
     return made

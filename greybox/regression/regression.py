@@ -117,10 +117,10 @@ def build_regression(
             )
         x = log.states(structure.states)
         y = (np.diff(x, axis=0) if structure.increment else x[1:]).T
-        seen = x if second_measurement is None else x + second_measurement[i]
+        measured = x if second_measurement is None else x + second_measurement[i]
         given = LogInputs.of(structure, log)
         phi = predictor.evaluate(
-            [np.ascontiguousarray(seen[:-1, j]) for j in range(seen.shape[1])],
+            [np.ascontiguousarray(measured[:-1, j]) for j in range(measured.shape[1])],
             given.psi[:-1],
             list(given.tau[:-1].T),
             (log["u_q"][:-1], log["v_q"][:-1]) if predictor.air_measured else None,

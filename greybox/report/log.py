@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from textwrap import fill
 from typing import Any, Literal
 
 import numpy as np
@@ -52,8 +51,8 @@ class _Panel:
     controlled: Sequence[tuple[float, float]] = field(default=())
 
 
-def log_figure(log: TrialLog, *, wind_arrows: bool = True) -> Figure:
-    """Draw one log as a whole: track, states, inputs and wind, as far as it has them.
+def page_figures(log: TrialLog) -> dict[str, Figure]:
+    """Draw one log, as far as it has the channels, in two parts that are legible on a phone.
 
     Gaps (steps above 1.5 sample times) interrupt the lines and are shaded. Long
     logs are drawn by their envelopes: about 2000 points a line, no peak lost.
@@ -61,79 +60,12 @@ def log_figure(log: TrialLog, *, wind_arrows: bool = True) -> Figure:
     Parameters
     ----------
     log : TrialLog
-    wind_arrows : bool
-        Whether arrows on the track show where the true wind blows.
-
-    Returns
-    -------
-    Figure
-        Track with north up beside the signals against time; without positions
-        the signals alone.
-    """
-    clock = _clock(log)
-    panels = [*_states(log), *_inputs(log, clock), *_wind(log)]
-    tracked = "x_n" in log and "y_n" in log
-    rows = max(len(panels), 1)
-    height = max(1.25 * rows + 0.9, 5.5 if tracked else 2.0)
-    left, covered = _room_for_track(log, rows, height - 1.5) if tracked else (0.0, 0)
-    right = (7.0 if tracked else 9.0) if panels else 0.0
-    figure = new_figure(left + right, height)
-    widths = [w for w in (left, right) if w]
-    grid = figure.add_gridspec(rows, len(widths), width_ratios=widths)
-    if tracked:
-        draw_track(figure.add_subplot(grid[:covered, 0]), log, clock.gaps, wind_arrows=wind_arrows)
-    axes: list[Any] = []
-    for i in range(len(panels)):
-        axes.append(figure.add_subplot(grid[i, -1], sharex=axes[0] if axes else None))
-    _draw(axes, panels, clock)
-    title = f"{log.name}: {log.vessel.name}", _facts(log, clock)
-    figure.suptitle("\n".join(fill(line, int(11 * (left + right))) for line in title), fontsize=10)
-    return figure
-
-
-def overview_figures(log: TrialLog, *, wind_arrows: bool = True) -> dict[str, Figure]:
-    """Draw the parts of `log_figure` apart, for pages that show them in turn.
-
-    Parameters
-    ----------
-    log : TrialLog
-    wind_arrows : bool
-        As in `log_figure`.
 
     Returns
     -------
     dict of str to Figure
-        Of ``track``, ``states``, ``inputs`` and ``wind`` those that the log has
-        channels for.
-    """
-    clock = _clock(log)
-    figures: dict[str, Figure] = {}
-    if "x_n" in log and "y_n" in log:
-        figures["track"] = new_figure(6.5, 6.5)
-        draw_track(figures["track"].subplots(), log, clock.gaps, wind_arrows=wind_arrows)
-    groups = {"states": _states(log), "inputs": _inputs(log, clock), "wind": _wind(log)}
-    for name, made in groups.items():
-        panels = list(made)
-        if panels:
-            figures[name] = new_figure(9, 1.5 * len(panels) + 0.6)
-            axes = figures[name].subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
-            _draw(list(axes), panels, clock)
-    for name, figure in figures.items():
-        figure.suptitle(f"{log.name}: {name}", fontsize=11)
-    return figures
-
-
-def page_figures(log: TrialLog) -> dict[str, Figure]:
-    """Draw `log_figure` in two parts that are legible on a phone.
-
-    Parameters
-    ----------
-    log : TrialLog
-
-    Returns
-    -------
-    dict of str to Figure
-        ``track`` where the log has positions, and ``signals`` with one time axis.
+        ``track`` with north up where the log has positions, and ``signals``, states, inputs
+        and wind, with one time axis.
     """
     clock = _clock(log)
     figures: dict[str, Figure] = {}
@@ -151,14 +83,6 @@ def page_figures(log: TrialLog) -> dict[str, Figure]:
 def facts(log: TrialLog) -> str:
     """Return how long a log is, and its gaps, in words."""
     return _facts(log, _clock(log))
-
-
-def _room_for_track(log: TrialLog, rows: int, height: float) -> tuple[float, int]:
-    """Return the width [inch] of the map and how many rows of panels it stands beside."""
-    north, east = (max(float(np.ptp(log[n])), 1e-3) for n in ("x_n", "y_n"))
-    width = float(np.clip(height * east / north, 4.4, 5.4))
-    tall = (width * north / east + 1.0) / height
-    return width, int(np.clip(np.ceil(rows * tall), min(rows, 3, np.ceil(rows / 2)), rows))
 
 
 def _clock(log: TrialLog) -> _Clock:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from greybox.estimation.verdict import TrustLevel
 from greybox.prediction.measuring import LABELS
-from greybox.prediction.monte_carlo import Drawn
+from greybox.prediction.monte_carlo import MonteCarloQuantity
 from greybox.prediction.result import (
     WORDS,
     ManoeuvrePrediction,
@@ -126,7 +126,7 @@ def _values(made: PredictedManoeuvre) -> Table:
     )
 
 
-def _cells(value: Drawn | None, length: float) -> list[str]:
+def _cells(value: MonteCarloQuantity | None, length: float) -> list[str]:
     if value is None:
         return ["not reached", "", ""]
     plain, interval = value.words()

@@ -29,9 +29,7 @@ _LONGEST_ARROW = 0.12
 _HULL = np.array([[0.5, 0], [0.22, 0.13], [-0.5, 0.13], [-0.5, -0.13], [0.22, -0.13]])
 
 
-def draw_track(
-    axes: Any, log: TrialLog, gaps: NDArray[np.intp], *, wind_arrows: bool = True
-) -> None:
+def draw_track(axes: Any, log: TrialLog, gaps: NDArray[np.intp]) -> None:
     """Draw the positions of a log as a map.
 
     Parameters
@@ -42,8 +40,6 @@ def draw_track(
         origin, and measured wind with ``u``, ``v`` the arrows.
     gaps : ndarray of int
         Samples after which the line is interrupted (dotted across).
-    wind_arrows : bool
-        Whether to draw where the true wind blows.
     """
     north, east = log["x_n"], log["y_n"]
     extent = max(float(np.ptp(north)), float(np.ptp(east)), 1e-3)
@@ -62,7 +58,7 @@ def draw_track(
     shown: list[Any] = []
     if "psi" in log:
         shown.append(_draw_ships(axes, log, chosen, step, extent))
-    if wind_arrows and log.has_wind and all(n in log for n in ("psi", "u", "v")):
+    if log.has_wind and all(n in log for n in ("psi", "u", "v")):
         shown += _draw_wind(axes, log, chosen, step, extent)
     for k, word, colour, marker in ((0, "start", GREEN, "o"), (-1, "end", VERMILION, "s")):
         axes.plot(

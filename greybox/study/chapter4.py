@@ -88,7 +88,7 @@ def virtual_batch(rng: np.random.Generator, case: MonteCarloSet, runs: int, samp
     Returns
     -------
     Batch
-        ``x`` holds y1; ``seen`` is y1 + y2 where the second measurement is used (4.13).
+        ``x`` holds y1; ``measured`` is y1 + y2 where the second measurement is used (4.13).
     """
     structure = get_structure("siso")
     given = offset_gaussian(np.random.default_rng([4, INPUT_SEED]), samples, case.floor)
@@ -97,12 +97,12 @@ def virtual_batch(rng: np.random.Generator, case: MonteCarloSet, runs: int, samp
     run = simulate(structure, TRUE, np.zeros(1), given[None, :, None], 1.0, d=v, process_noise=w)
     noise = np.sqrt(NOISE_VARIANCE)
     y1 = run.x + noise * rng.standard_normal(run.x.shape)
-    seen = None
+    measured = None
     if case.second:
         y2 = v + noise * rng.standard_normal(v.shape)
-        seen = y1.copy()
-        seen[:, :-1] += y2
-    return Batch(y1, 0.0, given[None, :, None], None, np.zeros(1), seen)
+        measured = y1.copy()
+        measured[:, :-1] += y2
+    return Batch(y1, 0.0, given[None, :, None], None, np.zeros(1), measured)
 
 
 def _piece(

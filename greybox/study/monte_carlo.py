@@ -40,7 +40,7 @@ class Batch:
         (R, N) each, measured velocity through the air [m/s].
     start : ndarray
         (nx,) or (R, nx) known initial state of simulated instruments.
-    seen : ndarray, optional
+    measured : ndarray, optional
         (R, N+1, nx) states as the regressors see them (4.13); by default `x`.
     """
 
@@ -49,7 +49,7 @@ class Batch:
     tau: Array
     air: tuple[Array, Array] | None
     start: Array
-    seen: Array | None = None
+    measured: Array | None = None
 
     @property
     def runs(self) -> int:
@@ -88,9 +88,9 @@ class BatchRegression:
         self._psi = batch.psi[:, :-1] if isinstance(batch.psi, np.ndarray) else batch.psi
         increments = np.diff(batch.x, axis=1) if structure.increment else batch.x[:, 1:]
         self._y = np.ascontiguousarray(np.moveaxis(increments, 2, 0))
-        seen = batch.x if batch.seen is None else batch.seen
+        measured = batch.x if batch.measured is None else batch.measured
         self._prepared = predictor.prepare(self._psi, self._tau, batch.air)
-        self.phi = self.regressors(seen[:, :-1])
+        self.phi = self.regressors(measured[:, :-1])
         self._phi_mean = self.phi.mean(axis=2).T
         self._y_mean = self._y.mean(axis=2).T
         self._equations = [predictor.equation(s) for s in structure.states]

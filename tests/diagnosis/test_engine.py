@@ -17,7 +17,7 @@ from greybox.diagnosis.noise import Colour, Noise, fit_noise
 from greybox.diagnosis.normal import bounded_step
 from greybox.diagnosis.point import Point
 from greybox.diagnosis.ship import Change, LogRun, Sensors, Ship, shifted, wired
-from greybox.diagnosis.simulator import Simulator
+from greybox.diagnosis.simulator import VaryingSimulator
 from greybox.diagnosis.waves import find_waves
 from greybox.model.catalogue import get_structure
 from greybox.model.run.simulation import simulate
@@ -263,7 +263,7 @@ def test_every_cause_says_what_it_is(log: TrialLog) -> None:
 
 
 def test_sensitivities_of_nothing_are_those_of_the_start(log: TrialLog) -> None:
-    simulator = Simulator(StepModel(WIDE), len(log))
+    simulator = VaryingSimulator(StepModel(WIDE), len(log))
     drivers = np.column_stack([log.forces(WIDE.inputs), log["psi"], np.zeros((len(log), 4))])
     x = simulator(np.array([1.5, 0.5, 0.0]), drivers, _theta(WIDE))
     linear = simulator.linearise(x, NOWHERE)

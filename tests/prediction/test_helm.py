@@ -49,7 +49,7 @@ def test_a_positive_order_turns_to_starboard(made, kind):
 def test_azimuths_aft_steer_unless_others_are_named():
     ferry = load_vessel("ferry")
     assert find_helm(ferry).steering_columns == ("alpha3", "alpha4")
-    assert find_helm(ferry).seen == 0.5
+    assert find_helm(ferry).angle_per_order == 0.5
     assert find_helm(ferry, ("alpha1", "alpha2")).steering_columns == ("alpha1", "alpha2")
     assert "alpha3 and alpha4" in find_helm(ferry).sentence
 

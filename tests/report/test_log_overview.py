@@ -10,7 +10,7 @@ import pytest
 from matplotlib.collections import PolyCollection
 
 from greybox.report.figures import to_svg
-from greybox.report.log import log_figure, overview_figures
+from greybox.report.log import facts, page_figures
 from greybox.report.thinning import find_gaps, longest, pick, thin
 from greybox.report.track import even_times
 from greybox.trial.log import make_log
@@ -40,14 +40,18 @@ def drawn_labels(figure):
     return [text for ax in figure.axes for text in (ax.get_xlabel(), ax.get_ylabel()) if text]
 
 
+def signals(log):
+    return page_figures(log)["signals"]
+
+
 def axis(figure, word):
     (found,) = [ax for ax in figure.axes if word in ax.get_ylabel()]
     return found
 
 
 def test_every_axis_has_its_unit(ship):
-    figure = log_figure(sailed(ship))
-    labels = drawn_labels(figure)
+    figures = page_figures(sailed(ship))
+    labels = [label for figure in figures.values() for label in drawn_labels(figure)]
     for label in labels:
         assert "[" in label, label
     text = " ".join(labels).replace("\n", " ")
@@ -58,12 +62,11 @@ def test_every_axis_has_its_unit(ship):
         "time from the first sample [s]",
     ):  # fmt: skip
         assert wanted in text
-    assert set(overview_figures(sailed(ship))) == {"track", "states", "inputs", "wind"}
 
 
 def test_angles_are_in_degrees_and_wind_from_where_it_comes(ship):
     log = sailed(ship)
-    figure = log_figure(log)
+    figure = signals(log)
     np.testing.assert_allclose(axis(figure, "heading").lines[0].get_ydata(), np.degrees(log["psi"]))
     np.testing.assert_allclose(axis(figure, "yaw rate").lines[0].get_ydata(), np.degrees(log["r"]))
     # 3 m/s towards north and 3 m/s towards west: from south-east
@@ -76,7 +79,7 @@ def test_angles_are_in_degrees_and_wind_from_where_it_comes(ship):
 
 def test_the_map_has_north_up_and_equal_axes(ship):
     log = sailed(ship)
-    figure = overview_figures(log)["track"]
+    figure = page_figures(log)["track"]
     (ax,) = figure.axes
     assert ax.get_aspect() == 1.0
     track = ax.lines[0]
@@ -93,14 +96,15 @@ def test_the_map_has_north_up_and_equal_axes(ship):
     assert {"start", "end"} <= set(words)
     assert any("ship every 10 s" in w for w in words)
     assert any("true wind blows, up to 4.2 m/s" in w for w in words)
-    without = overview_figures(log, wind_arrows=False)["track"].axes[0].get_legend().get_texts()
+    calm = {k: v for k, v in log.channels.items() if k not in ("u_q", "v_q")}
+    without = page_figures(replace(log, channels=calm))["track"].axes[0].get_legend().get_texts()
     assert not any("wind" in text.get_text() for text in without)
 
 
 def test_ships_stand_at_the_body_origin(ship):
     ahead = replace(ship, sensors={"antenna": (10.0, 0.0)})
     log = sailed(ahead)
-    hulls = overview_figures(log)["track"].axes[0].collections[0]
+    hulls = page_figures(log)["track"].axes[0].collections[0]
     outline = hulls.get_paths()[0].vertices[:-1]
     middle = (outline[0] + (outline[2] + outline[3]) / 2) / 2
     psi = log["psi"][0]
@@ -112,7 +116,7 @@ def test_ships_stand_at_the_body_origin(ship):
 def test_lines_break_and_shade_at_gaps(ship):
     keep = np.r_[0:100, 160:200, 203:300]
     log = sailed(ship, keep=keep)
-    figure = log_figure(log)
+    figure = signals(log)
     for word in ("velocity", "heading", "propeller", "speed [m/s]"):
         ax = axis(figure, word)
         for line in ax.lines:
@@ -122,9 +126,18 @@ def test_lines_break_and_shade_at_gaps(ship):
         (shades,) = [c for c in ax.collections if c.get_label() == "gap"]
         spans = [(p.vertices[:, 0].min(), p.vertices[:, 0].max()) for p in shades.get_paths()]
         np.testing.assert_allclose(spans, [(49.5, 80.0), (99.5, 101.5)])
-    assert np.isnan(figure.axes[0].lines[0].get_xdata()).sum() == 2
-    assert "2 gaps, 31.5 s missing" in figure.get_suptitle()
-    assert "no gaps" in log_figure(sailed(ship)).get_suptitle()
+    (track,) = page_figures(log)["track"].axes
+    assert np.isnan(track.lines[0].get_xdata()).sum() == 2
+    assert "2 gaps, 31.5 s missing" in facts(log)
+    assert "no gaps" in facts(sailed(ship))
+
+
+# words on the axes of each part
+DRAWN = {
+    "states": ("velocity", "yaw rate", "heading"),
+    "inputs": ("propeller", "thruster angle"),
+    "wind": ("wind",),
+}
 
 
 @pytest.mark.parametrize(
@@ -141,16 +154,20 @@ def test_lines_break_and_shade_at_gaps(ship):
 def test_missing_channels(ship, left_out, parts):
     log = sailed(ship)
     log = replace(log, channels={k: v for k, v in log.channels.items() if k not in left_out})
-    assert set(overview_figures(log)) == parts
-    figure = log_figure(log)
-    assert all("[" in label for label in drawn_labels(figure))
-    assert to_svg(figure, "missing").startswith("<svg")
+    figures = page_figures(log)
+    assert ("track" in figures) == ("track" in parts)
+    labels = drawn_labels(figures["signals"]) if "signals" in figures else []
+    for part, words in DRAWN.items():
+        assert any(w in label for label in labels for w in words) == (part in parts), part
+    assert all("[" in label for label in labels)
+    for name, figure in figures.items():
+        assert to_svg(figure, name).startswith("<svg")
 
 
 def test_wind_without_a_heading_is_apparent(ship):
     log = sailed(ship)
     log = replace(log, channels={k: log[k] for k in ("u_q", "v_q")})
-    labels = " ".join(drawn_labels(log_figure(log))).replace("\n", " ")
+    labels = " ".join(drawn_labels(signals(log))).replace("\n", " ")
     assert "apparent wind from [deg from bow]" in labels
 
 
@@ -168,8 +185,8 @@ def test_inputs_share_axes_by_unit():
     )
     wave = np.sin(np.arange(50.0))
     log = make_log(vessel, {"n": wave, "bow": wave, "delta": wave, "u": wave}, 1.0)
-    (figure,) = [overview_figures(log)["inputs"]]
-    assert [ax.get_ylabel() for ax in figure.axes] == [
+    assert [ax.get_ylabel() for ax in signals(log).axes] == [
+        "velocity over\nground [m/s]",
         "propeller speed n\n[rpm]",
         "propeller speed bow\n[unit of the log]",
         "rudder angle delta\n[deg]",
@@ -181,11 +198,11 @@ def test_a_controller_is_shown_where_the_log_tells_of_it(ship):
     on = np.zeros(len(log), bool)
     on[20:60] = True
     log = replace(log, closed_loop=on, loop_known=True)
-    figure = log_figure(log)
+    figure = signals(log)
     (bars,) = [c for c in axis(figure, "propeller").collections if c.get_label() == "controller on"]
     x = bars.get_paths()[0].vertices[:, 0]
     np.testing.assert_allclose([x.min(), x.max()], [10.0, 29.5])
-    assert "13 % under a controller" in figure.get_suptitle()
+    assert "13 % under a controller" in facts(log)
 
 
 def test_long_logs_are_small_and_drawn_fast(ship):
@@ -195,7 +212,7 @@ def test_long_logs_are_small_and_drawn_fast(ship):
     noisy["u"][123_456] = 50.0
     log = replace(log, channels=noisy)
     start = time.perf_counter()
-    figure = log_figure(log)
+    figure = signals(log)
     svg = to_svg(figure, "long")
     assert time.perf_counter() - start < 10
     assert len(svg) < 2_000_000

@@ -48,7 +48,7 @@ class Actuators:
         (m,) the memory.
     forces : mapping of str to SX
         Generalised inputs that act during the sample.
-    after, rest : SX
+    next_memory, rest : SX
         (m,) the memory one sample later, and at rest on the commands.
     rate : SX or None
         (m,) change of the memory [1/s]; None where there is a pure delay.
@@ -59,7 +59,7 @@ class Actuators:
     memory: tuple[Memory, ...]
     symbols: ca.SX
     forces: Mapping[str, ca.SX]
-    after: ca.SX
+    next_memory: ca.SX
     rest: ca.SX
     rate: ca.SX | None
     rate_forces: Mapping[str, ca.SX]
@@ -119,9 +119,9 @@ def actuators(
         for name, at_rest in forces(ca.vertsplit(commands)).items():
             if not made[name].is_constant():
                 made[name], at_instant[name] = follow(name, made[name], at_rest)
-    memory, symbols, after, rest = zip(*remembered, strict=True) if remembered else ((),) * 4
+    memory, symbols, later, rest = zip(*remembered, strict=True) if remembered else ((),) * 4
     return Actuators(
-        tuple(memory), column(symbols), made, column(after), column(rest),
+        tuple(memory), column(symbols), made, column(later), column(rest),
         None if late.delay else column(rate), at_instant,
     )  # fmt: skip
 

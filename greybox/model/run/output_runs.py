@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 from greybox.model.output import OutputModel
 from greybox.model.run.kernels import along, bind
 from greybox.model.run.output_step import (
-    Walking,
-    filtered,
-    filtered_by_noise,
-    free,
+    StepBuilder,
+    filter_step,
+    filter_step_by_noise,
+    free_run_step,
     likelihood,
-    observed,
+    observer_step,
 )
 from greybox.numerics.recursion import propagate
 from greybox.numerics.vectorised import Vectorised
@@ -35,11 +35,11 @@ _BLOCK = 8192
 
 
 @lru_cache(maxsize=32)
-def _pass(walk: Walking, model: OutputModel, steps: int, runs: int) -> ca.Function:
-    """Return the walk over samples of runs side by side, without derivatives."""
-    of = walk(model)
+def _along_runs(build: StepBuilder, model: OutputModel, steps: int, runs: int) -> ca.Function:
+    """Return the step taken over the samples of runs side by side, without derivatives."""
+    of = build(model)
     step = ca.Function(
-        "step", [*of.carried, of.read, *of.constant], [*of.after, *of.found], {"cse": True}
+        "step", [*of.carried, of.read, *of.constant], [*of.next, *of.results], {"cse": True}
     )
     return along(step, len(of.carried), steps, runs)
 
@@ -67,9 +67,9 @@ class _Table:
 
 
 @lru_cache(maxsize=32)
-def _table(walk: Walking, model: OutputModel, starts: bool) -> _Table:
-    of = walk(model)
-    after, found = of.slope_after, of.slope_found
+def _table(build: StepBuilder, model: OutputModel, starts: bool) -> _Table:
+    of = build(model)
+    after, found = of.next_jacobian, of.result_jacobian
     same = bool(found.by_z.is_eye()) and not found.by_p.nnz()
     nz = after.by_z.size1()
     own = nz if starts else 0
@@ -108,18 +108,19 @@ class _Evaluator:
 
 
 class _Runs:
-    """A walk along runs side by side, with derivatives and buffers.
+    """A step taken along runs side by side, with derivatives and buffers.
 
     Parameters
     ----------
-    walk : callable
+    build : callable
+        Of the step.
     model : OutputModel
     read : ndarray
         (M, m, nr) what each step reads.
     """
 
-    def __init__(self, walk: Walking, model: OutputModel, read: Array) -> None:
-        self._walk, self._model = walk, model
+    def __init__(self, build: StepBuilder, model: OutputModel, read: Array) -> None:
+        self._build, self._model = build, model
         self.runs, self.steps = read.shape[:2]
         self._read = np.ascontiguousarray(read, float)
         self._evaluate = _Evaluator()
@@ -129,9 +130,9 @@ class _Runs:
         self, carried: Sequence[Array], constant: Sequence[Array]
     ) -> tuple[list[Array], list[Array]]:
         """Return what is carried after each step, and what is found, each (M, m, ·)."""
-        of = self._walk(self._model)
-        function = _pass(self._walk, self._model, self.steps, self.runs)
-        out = [np.empty((self.runs, self.steps, x.numel())) for x in (*of.after, *of.found)]
+        of = self._build(self._model)
+        function = _along_runs(self._build, self._model, self.steps, self.runs)
+        out = [np.empty((self.runs, self.steps, x.numel())) for x in (*of.next, *of.results)]
         self._evaluate(function, (*carried, self._read, *constant), tuple(out))
         return out[: len(carried)], out[len(carried) :]
 
@@ -172,7 +173,7 @@ class _Runs:
             Of what is found first, (M, m, ny, q + nz), and of the states after the last
             step, (M, nz, q + nz).
         """
-        table = _table(self._walk, self._model, starts)
+        table = _table(self._build, self._model, starts)
         (rows, columns), nz = table.shape, table.states
         states = np.concatenate(
             [
@@ -235,7 +236,7 @@ class Simulator:
 
     def __init__(self, model: OutputModel, w: Array) -> None:
         self.model = model
-        self._runs = _Runs(free, model, w)
+        self._runs = _Runs(free_run_step, model, w)
         # the latest run, and the latest whose derivatives were asked for
         self._ran: tuple[tuple[Array, ...], tuple[Array, Array]] | None = None
         self._last: tuple[tuple[Array, ...], tuple[Array, Array, Array, Array]] | None = None
@@ -295,7 +296,7 @@ class Observer:
 
     def __init__(self, model: OutputModel, w: Array, y: Array, use: Array) -> None:
         self.model = model
-        self._runs = _Runs(observed, model, np.concatenate([w, y, use[..., None]], axis=2))
+        self._runs = _Runs(observer_step, model, np.concatenate([w, y, use[..., None]], axis=2))
         self._unused = use == 0
 
     def __call__(
@@ -345,8 +346,8 @@ class Filter:
     def __init__(self, model: OutputModel, w: Array, y: Array, use: Array) -> None:
         self.model = model
         self._w = np.ascontiguousarray(np.concatenate([w, y, use[..., None]], axis=2), float)
-        self._runs = _Runs(filtered, model, self._w)
-        self._by_noise = _Runs(filtered_by_noise, model, self._w)
+        self._runs = _Runs(filter_step, model, self._w)
+        self._by_noise = _Runs(filter_step_by_noise, model, self._w)
         nz = len(model.states)
         self._certain = np.zeros((len(w), nz * (nz + 1) // 2))
         self._evaluate = _Evaluator()

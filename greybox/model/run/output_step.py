@@ -26,8 +26,8 @@ class _Step:
     z: ca.SX
     w: ca.SX
     p: ca.SX
-    after: ca.SX
-    seen: ca.SX
+    next_state: ca.SX
+    outputs: ca.SX
 
 
 @lru_cache(maxsize=64)
@@ -48,7 +48,7 @@ def _step(model: OutputModel) -> _Step:
         state = {name: z[i] for i, name in enumerate(names)}
         air = ca.vertcat(*velocity_through(state, heading, *[mean[n] for n in WIND]))
     step = StepModel.of_predictor(predictor, "simulated" if turns else "measured")
-    after = step(
+    next_state = step(
         z[: len(names)],
         heading,
         ca.vertcat(*[given[n] for n in structure.inputs]),
@@ -57,19 +57,19 @@ def _step(model: OutputModel) -> _Step:
         p[:count],
         model.sample_time,
     )
-    seen = ca.vertcat(z, air) if model.wind == "output" else z
-    return _Step(z, w, p, ca.densify(after), ca.densify(seen))
+    outputs = ca.vertcat(z, air) if model.wind == "output" else z
+    return _Step(z, w, p, ca.densify(next_state), ca.densify(outputs))
 
 
 @dataclass(frozen=True)
-class Slope:
+class Jacobian:
     """Derivatives of an expression in the carried states and in the parameters."""
 
     by_z: ca.SX
     by_p: ca.SX
 
     @classmethod
-    def of(cls, expression: ca.SX, s: _Step) -> Slope:
+    def of(cls, expression: ca.SX, s: _Step) -> Jacobian:
         """Differentiate."""
         return cls(ca.jacobian(expression, s.z), ca.jacobian(expression, s.p))
 
@@ -78,13 +78,13 @@ class Slope:
         """Both."""
         return self.by_z, self.by_p
 
-    def after(self, before: Slope) -> Slope:
-        """Chain: this slope taken where the states have another already."""
-        return Slope(self.by_z @ before.by_z, self.by_z @ before.by_p + self.by_p)
+    def chained(self, before: Jacobian) -> Jacobian:
+        """Return it by the chain rule, where the states have derivatives already."""
+        return Jacobian(self.by_z @ before.by_z, self.by_z @ before.by_p + self.by_p)
 
 
 @dataclass(frozen=True)
-class Walk:
+class OutputStep:
     """A step in symbols, what is found at it, and the derivatives of both.
 
     Parameters
@@ -95,52 +95,52 @@ class Walk:
         What changes with the sample.
     constant : tuple of SX
         What does not, first the parameters.
-    after, found : tuple of SX
-        Next values of what is carried, and results.
-    slope_after, slope_found : Slope
+    next, results : tuple of SX
+        Next values of what is carried, and what is found at the sample.
+    next_jacobian, result_jacobian : Jacobian
         Of the next states, and of the first result.
     """
 
     carried: tuple[ca.SX, ...]
     read: ca.SX
     constant: tuple[ca.SX, ...]
-    after: tuple[ca.SX, ...]
-    found: tuple[ca.SX, ...]
-    slope_after: Slope
-    slope_found: Slope
+    next: tuple[ca.SX, ...]
+    results: tuple[ca.SX, ...]
+    next_jacobian: Jacobian
+    result_jacobian: Jacobian
 
 
-Walking = Callable[[OutputModel], Walk]
+StepBuilder = Callable[[OutputModel], OutputStep]
 
 
 @lru_cache(maxsize=32)
-def free(model: OutputModel) -> Walk:
-    """Return the free run, which shows its outputs before each step."""
+def free_run_step(model: OutputModel) -> OutputStep:
+    """Return the step of the free run, which shows its outputs before it."""
     s = _step(model)
-    after, seen = Slope.of(s.after, s), Slope.of(s.seen, s)
-    return Walk((s.z,), s.w, (s.p,), (s.after,), (s.seen,), after, seen)
+    jacobians = Jacobian.of(s.next_state, s), Jacobian.of(s.outputs, s)
+    return OutputStep((s.z,), s.w, (s.p,), (s.next_state,), (s.outputs,), *jacobians)
 
 
 @lru_cache(maxsize=32)
-def observed(model: OutputModel) -> Walk:
-    """Return a run whose steps begin at z + gain (y − z), and which shows y − h(z).
+def observer_step(model: OutputModel) -> OutputStep:
+    """Return the step of an observer, which begins at z + gain (y − z) and shows y − h(z).
 
     The derivatives of what is found are those of h.
     """
     s = _step(model)
-    nz, ny = s.z.numel(), s.seen.numel()
+    nz, ny = s.z.numel(), s.outputs.numel()
     y, use, gain = ca.SX.sym("y", ny), ca.SX.sym("use"), ca.SX.sym("gain")
     kept = 1 - use * gain
     corrected = kept * s.z + use * gain * y[:nz]
-    after = ca.substitute(s.after, s.z, corrected)
+    moved = ca.substitute(s.next_state, s.z, corrected)
     read = ca.vertcat(s.w, y, use)
-    error = use * (y - s.seen)
-    slopes = Slope.of(after, s), Slope.of(s.seen, s)
-    return Walk((s.z,), read, (s.p, gain), (after,), (error,), *slopes)
+    error = use * (y - s.outputs)
+    jacobians = Jacobian.of(moved, s), Jacobian.of(s.outputs, s)
+    return OutputStep((s.z,), read, (s.p, gain), (moved,), (error,), *jacobians)
 
 
 @lru_cache(maxsize=32)
-def filtered(model: OutputModel) -> Walk:
+def filter_step(model: OutputModel) -> OutputStep:
     """Return one sample of an extended Kalman filter.
 
     It carries the states and their covariance (its lower triangle), reads drivers,
@@ -149,14 +149,14 @@ def filtered(model: OutputModel) -> Walk:
     from the innovations.
     """
     s = _step(model)
-    nz, ny = s.z.numel(), s.seen.numel()
+    nz, ny = s.z.numel(), s.outputs.numel()
     y, use = ca.SX.sym("y", ny), ca.SX.sym("use")
     noise = ca.SX.sym("noise", ny + nz)
     # a covariance is carried by its lower triangle: half of what follows is never computed
     cov = ca.SX.sym("P", nz * (nz + 1) // 2)
-    at = ca.Function("seen", [s.z, s.w, s.p], [s.seen, *Slope.of(s.seen, s).parts])
+    at = ca.Function("outputs", [s.z, s.w, s.p], [s.outputs, *Jacobian.of(s.outputs, s).parts])
     z, spread = s.z, ca.tril2symm(ca.SX(ca.Sparsity.lower(nz), cov))
-    slope = Slope(ca.SX.eye(nz), ca.SX(nz, s.p.numel()))
+    jacobian = Jacobian(ca.SX.eye(nz), ca.SX(nz, s.p.numel()))
     innovations, rows, levels = [], [], []
     for i in range(ny):
         shown, by_z, by_p = at(z, s.w, s.p)
@@ -166,53 +166,53 @@ def filtered(model: OutputModel) -> Walk:
         # rows beyond the log's end change nothing
         gain = use * gain_row / variance
         error = y[i] - shown[i]
-        row = Slope(by_z[i, :], by_p[i, :]).after(slope)
+        row = Jacobian(by_z[i, :], by_p[i, :]).chained(jacobian)
         weight = use / ca.sqrt(variance)
         innovations.append(weight * error)
-        rows.append(Slope(weight * row.by_z, weight * row.by_p))
+        rows.append(Jacobian(weight * row.by_z, weight * row.by_p))
         levels.append(use * ca.log(variance))
         z = z + gain * error
-        slope = Slope(slope.by_z - gain @ row.by_z, slope.by_p - gain @ row.by_p)
+        jacobian = Jacobian(jacobian.by_z - gain @ row.by_z, jacobian.by_p - gain @ row.by_p)
         spread = ca.tril2symm(ca.tril(spread - gain @ gain_row.T))
-    step = ca.Function("after", [s.z, s.w, s.p], [s.after, *Slope.of(s.after, s).parts])
+    step = ca.Function("next", [s.z, s.w, s.p], [s.next_state, *Jacobian.of(s.next_state, s).parts])
     z_next, a, b = step(z, s.w, s.p)
     spread = a @ spread @ a.T + ca.diag(noise[ny:])
-    return Walk(
+    return OutputStep(
         (s.z, cov),
         ca.vertcat(s.w, y, use),
         (s.p, noise),
         (z_next, ca.tril(ca.densify(spread)).nz[:]),
         (ca.vertcat(*innovations), ca.vertcat(*levels)),
-        Slope(a, b).after(slope),
-        Slope(ca.vertcat(*[r.by_z for r in rows]), ca.vertcat(*[r.by_p for r in rows])),
+        Jacobian(a, b).chained(jacobian),
+        Jacobian(ca.vertcat(*[r.by_z for r in rows]), ca.vertcat(*[r.by_p for r in rows])),
     )
 
 
 @lru_cache(maxsize=32)
-def filtered_by_noise(model: OutputModel) -> Walk:
-    """Return `filtered` with other derivatives: in the variances, gains and covariance included.
+def filter_step_by_noise(model: OutputModel) -> OutputStep:
+    """Return `filter_step` with other derivatives: in the variances, gains and covariance included.
 
     They are those of all that it carries and of all that it finds, stacked.
     """
-    of, s = filtered(model), _step(model)
+    of, s = filter_step(model), _step(model)
     carried, noise = ca.vertcat(*of.carried), of.constant[1]
 
-    def slope(results: tuple[ca.SX, ...]) -> Slope:
+    def jacobian(results: tuple[ca.SX, ...]) -> Jacobian:
         stacked = ca.vertcat(*results)
-        return Slope(ca.jacobian(stacked, carried), ca.jacobian(stacked, noise))
+        return Jacobian(ca.jacobian(stacked, carried), ca.jacobian(stacked, noise))
 
-    after, nz = slope(of.after), s.z.numel()
-    if Slope.of(s.seen, s).by_z.is_eye():
+    following, nz = jacobian(of.next), s.z.numel()
+    if Jacobian.of(s.outputs, s).by_z.is_eye():
         # gains follow the covariance alone. A change D of it is a change D λ of the states, λ
         # being what the innovations tell of them, and C D Cᵀ a step later, C = ∂z⁺/∂z: a
         # tenth of what differentiating the Riccati step would compute
-        c, told = of.slope_after.by_z, of.slope_found.by_z.T @ of.found[0]
+        c, told = of.next_jacobian.by_z, of.result_jacobian.by_z.T @ of.results[0]
         units = _symmetric_units(nz)
         moved = ca.horzcat(*[d @ told for d in units])
         onward = ca.horzcat(*[ca.tril(ca.densify(c @ d @ c.T)).nz[:] for d in units])
-        after.by_z[:nz, nz:] = c @ moved
-        after.by_z[nz:, nz:] = onward + after.by_z[nz:, :nz] @ moved
-    return replace(of, slope_after=after, slope_found=slope(of.found))
+        following.by_z[:nz, nz:] = c @ moved
+        following.by_z[nz:, nz:] = onward + following.by_z[nz:, :nz] @ moved
+    return replace(of, next_jacobian=following, result_jacobian=jacobian(of.results))
 
 
 def _symmetric_units(n: int) -> list[ca.SX]:
@@ -228,19 +228,19 @@ def likelihood(model: OutputModel, steps: int, runs: int) -> ca.Function:
     The adjoint runs back over the samples by a step of its own; differentiating the whole
     accumulated filter would take four times as long.
     """
-    u = filtered(model)
+    u = filter_step(model)
     (z, cov), w, (p, noise) = u.carried, u.read, u.constant
-    innovations, levels = u.found
+    innovations, levels = u.results
     by_z, by_cov, by_p = (ca.SX.sym(f"by_{i}", x.numel()) for i, x in enumerate((z, cov, p)))
     own = (ca.sumsqr(innovations) + ca.sum1(levels)) / 2
-    onward = own + ca.dot(by_z, u.after[0]) + ca.dot(by_cov, u.after[1])
+    onward = own + ca.dot(by_z, u.next[0]) + ca.dot(by_cov, u.next[1])
     back = ca.Function(
         "back",
         [by_z, by_cov, by_p, z, cov, w, p, noise],
         [ca.gradient(onward, z), ca.gradient(onward, cov), by_p + ca.gradient(onward, p)],
         {"cse": True},
     )
-    forth = ca.Function("forth", [z, cov, w, p, noise], [*u.after, own], {"cse": True})
+    forth = ca.Function("forth", [z, cov, w, p, noise], [*u.next, own], {"cse": True})
     given = [ca.MX.sym("z0", z.numel()), ca.MX.sym("w", w.numel(), steps)]
     given += [ca.MX.sym("p", p.numel()), ca.MX.sym("noise", noise.numel())]
     start, read, *constant = given

@@ -45,7 +45,7 @@ class SymbolicStep:
         States (nx,) [m/s, rad/s], heading [rad], generalised inputs (nu,), disturbance
         means (nd,) and velocity through the air (2,) [m/s], coefficients (p,), and the
         sample time [s].
-    after : SX
+    next_state : SX
         (nx,) next states, and the next heading below them where it is simulated.
     """
 
@@ -56,12 +56,12 @@ class SymbolicStep:
     air: ca.SX
     theta: ca.SX
     dt: ca.SX
-    after: ca.SX
+    next_state: ca.SX
 
     @property
     def state(self) -> ca.SX:
         """What a step hands to the next one: `x`, and `psi` where it is simulated."""
-        simulated = self.after.numel() > self.x.numel()
+        simulated = self.next_state.numel() > self.x.numel()
         return ca.vertcat(self.x, self.psi) if simulated else self.x
 
     def at(self, expression: ca.SX, d: Array, theta: Array, dt: float) -> ca.SX:
@@ -169,7 +169,7 @@ class StepModel:
 
     @property
     def function(self) -> ca.Function:
-        """The step, ``(x, psi, tau, d, air, theta, dt) -> after``; see `SymbolicStep`."""
+        """The step, ``(x, psi, tau, d, air, theta, dt) -> next state``; see `SymbolicStep`."""
         return _function(self)
 
     def __call__(
@@ -183,8 +183,8 @@ class StepModel:
         dt: ca.SX | float,
     ) -> ca.SX:
         """Return the next states as an expression of others; see `SymbolicStep`."""
-        after = _function(self).call([ca.SX(a) for a in (x, psi, tau, d, air, theta, dt)])
-        return ca.SX(after[0])
+        found = _function(self).call([ca.SX(a) for a in (x, psi, tau, d, air, theta, dt)])
+        return ca.SX(found[0])
 
     @property
     def jacobians(self) -> ca.Function:
@@ -214,19 +214,19 @@ def _symbolic(step: StepModel) -> SymbolicStep:
     theta = s.theta if step.predictor is None else theta
     held = (s.tau, s.d, s.air, theta)
     if step.heading == "measured":
-        after = step.moved(lambda x: f(x, s.psi, *held), s.x)
+        next_state = step.moved(lambda x: f(x, s.psi, *held), s.x)
     else:
         turn = step.structure.states.index("r")
-        after = step.moved(
+        next_state = step.moved(
             lambda z: ca.vertcat(f(z[:nx], z[nx], *held), dt * z[turn]), ca.vertcat(s.x, s.psi)
         )
-    return SymbolicStep(s.x, s.psi, s.tau, s.d, s.air, theta, dt, ca.densify(after))
+    return SymbolicStep(s.x, s.psi, s.tau, s.d, s.air, theta, dt, ca.densify(next_state))
 
 
 @lru_cache(maxsize=128)
 def _function(step: StepModel) -> ca.Function:
     s = _symbolic(step)
-    return ca.Function("step", [s.x, s.psi, s.tau, s.d, s.air, s.theta, s.dt], [s.after])
+    return ca.Function("step", [s.x, s.psi, s.tau, s.d, s.air, s.theta, s.dt], [s.next_state])
 
 
 @lru_cache(maxsize=64)
@@ -235,7 +235,7 @@ def _jacobians(step: StepModel) -> ca.Function:
     return ca.Function(
         "jacobians",
         [s.x, s.psi, s.tau, s.d, s.air, s.theta, s.dt],
-        [ca.jacobian(s.after, v) for v in (s.x, s.tau, s.theta, s.d)],
+        [ca.jacobian(s.next_state, v) for v in (s.x, s.tau, s.theta, s.d)],
         ["x", "psi", "tau", "d", "air", "theta", "dt"],
         ["A", "B", "P", "E"],
     )

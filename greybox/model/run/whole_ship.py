@@ -70,8 +70,8 @@ def whole_step(model: ManoeuvringModel) -> ca.Function:
     moved = step(s.x, s.psi, tau, d, ca.SX(2, 1), model.theta, dt)
     place = next_position(position, s.x[0], s.x[1], s.psi, dt)
     x = ca.vertcat(s.x, s.psi, position, late.symbols)
-    after = ca.vertcat(moved, place, late.after)
-    return _function("step", model, x, command, wind, after, "x_next")
+    x_next = ca.vertcat(moved, place, late.next_memory)
+    return _function("step", model, x, command, wind, x_next, "x_next")
 
 
 def whole_rate(model: ManoeuvringModel) -> ca.Function:
