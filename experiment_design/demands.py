@@ -23,6 +23,7 @@ from experiment_design.search import Candidate, ascend, assess
 from experiment_design.stability import unstable_sentence
 from experiment_design.timing import telling_duration
 from greybox.errors import InfeasibleError
+from greybox.numerics.linalg import scaled
 
 Array = NDArray[np.float64]
 
@@ -264,7 +265,7 @@ def unexcited(problems: list[TrialProblem], units: list[Array], request: DesignR
                 f"no sequence within these limits moves {still}: its regressor varies by 0. "
                 f"Widen the limits, or leave it out of the structure."
             )
-        values, vectors = np.linalg.eigh(gram / np.outer(size, size))
+        values, vectors = np.linalg.eigh(scaled(gram)[0])
         if values[0] < worst:
             worst, state = float(values[0]), name
             label = predictor.columns[mine[int(np.abs(vectors[:, 0]).argmax())]].label
