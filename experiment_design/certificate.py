@@ -31,6 +31,7 @@ from experiment_design.problem import TrialProblem
 from experiment_design.search import ascend, draw_two_level, perturb
 from experiment_design.surge_bound import bound_surge, why_not_surge
 from greybox.notebook import DisplayMixin, text
+from greybox.numerics.linalg import scaled_inverse
 
 Array = NDArray[np.float64]
 
@@ -194,10 +195,7 @@ def _pseudo_inverse(score: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Return the inverse (R, p, p) on what is excited, and whether the sums are finite."""
     good = np.asarray(np.isfinite(score).all(axis=(1, 2)))
     score = np.where(good[:, None, None], score, 0.0)
-    size = np.sqrt(np.maximum(np.diagonal(score, axis1=1, axis2=2), 0.0))
-    size = np.where(size > 0, size, 1.0)
-    outer = size[:, :, None] * size[:, None, :]
-    return np.linalg.pinv(score / outer, rcond=_FLOOR, hermitian=True) / outer, good
+    return scaled_inverse(score, _FLOOR), good
 
 
 def _information(criterion: Criterion, moments: Moments, whole: bool) -> Array:

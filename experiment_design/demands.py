@@ -24,6 +24,7 @@ from experiment_design.stability import unstable_sentence
 from experiment_design.timing import telling_duration
 from greybox.errors import InfeasibleError
 from greybox.model.predictor_kinds import PREDICTORS
+from greybox.numerics.linalg import scaled
 
 Array = NDArray[np.float64]
 
@@ -256,7 +257,7 @@ def unexcited(problems: list[TrialProblem], units: list[Array], request: DesignR
                 f"no sequence within these limits moves {still}: its regressor varies by 0. "
                 f"Widen the limits, or leave it out of the structure."
             )
-        values, vectors = np.linalg.eigh(gram / np.outer(size, size))
+        values, vectors = np.linalg.eigh(scaled(gram)[0])
         if values[0] < worst:
             worst, state = float(values[0]), name
             label = predictor.columns[mine[int(np.abs(vectors[:, 0]).argmax())]].label

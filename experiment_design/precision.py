@@ -14,6 +14,7 @@ from experiment_design.moments import Moments
 from experiment_design.request import DesignRequest, build_problem, wanted_parameters
 from greybox.errors import ExcitationError, UsageError
 from greybox.notebook import DisplayMixin, items, number, table
+from greybox.numerics.linalg import scaled_logdet
 
 Array = NDArray[np.float64]
 
@@ -44,9 +45,7 @@ class PredictedPrecision(DisplayMixin):
     @property
     def logdet(self) -> float:
         """−log det of the covariance; larger is better."""
-        d = self.std
-        unit = self.covariance / np.outer(d, d)
-        return -float(np.linalg.slogdet(unit)[1] + 2 * np.log(d).sum())
+        return -float(scaled_logdet(self.covariance))
 
     def summary(self) -> str:
         """Return the predicted standard errors as text."""

@@ -28,6 +28,7 @@ from greybox.errors import InfeasibleError, StructureError, UsageError
 from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor_kinds import PREDICTORS
 from greybox.model.structure import Structure
+from greybox.numerics.linalg import scaled_inverse
 from greybox.vessel.actuation import with_actuators_of
 from greybox.vessel.vessel import Vessel
 
@@ -306,15 +307,13 @@ def _prior(model: ManoeuvringModel | None) -> tuple[tuple[str, ...], Array] | No
     if model is None:
         return None
     model = model.at_final_parameters()
-    d = model.std
-    if not (d > 0).all():
-        name = model.names[int(np.argmin(d))]
+    if not (model.std > 0).all():
+        name = model.names[int(np.argmin(model.std))]
         raise UsageError(
             f"the prior model gives {name} a standard error of 0, so nothing could be learnt of "
             f"it: use a model that was estimated."
         )
-    unit = model.covariance / np.outer(d, d)
-    return model.names, np.linalg.inv(unit) / np.outer(d, d)
+    return model.names, scaled_inverse(model.covariance)
 
 
 def _start(wishes: Wishes, structure: Structure) -> Array | None:

@@ -24,6 +24,7 @@ from greybox.model.predictor import Column, Predictor, Regime, build_predictor
 from greybox.model.run.simulation import stationary_disturbance
 from greybox.model.run.step import Integrator
 from greybox.model.structure import Structure
+from greybox.numerics.linalg import scaled_root
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
@@ -174,14 +175,10 @@ class DesignRequest:
         theta = np.asarray(self.theta, float)
         if self.covariance is None:
             return np.repeat(theta[None], count, axis=0)
-        scale = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
-        safe = np.where(scale > 0, scale, 1.0)
-        values, vectors = np.linalg.eigh(self.covariance / np.outer(safe, safe))
-        root = vectors * np.sqrt(np.maximum(values, 0.0)) * 1.0
         half = rng.standard_normal((-(-count // 2), theta.size))
         # pairs around the nominal model, so that few draws have its mean
         both = np.stack([half, -half], axis=1).reshape(-1, theta.size)[:count]
-        return np.asarray(theta + both @ root.T * scale)
+        return np.asarray(theta + both @ scaled_root(self.covariance).T)
 
     @property
     def uncertain(self) -> bool:

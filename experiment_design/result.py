@@ -19,6 +19,7 @@ from experiment_design.rollout import Motion
 from experiment_design.search import REFERENCE
 from greybox.files import replacing
 from greybox.notebook import DisplayMixin, interval, items, number, sparkline, table, text
+from greybox.numerics.linalg import scaled_logdet
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -269,10 +270,10 @@ class Design(DisplayMixin):
 
 def logdet_information(covariance: Array) -> float:
     """Return −log det of a covariance, scaled so that units cost no digits."""
-    d = np.sqrt(np.diag(covariance))
+    d = np.diag(covariance)
     if not np.isfinite(d).all() or not (d > 0).all():
         return float("-inf")
-    return -float(np.linalg.slogdet(covariance / np.outer(d, d))[1] + 2 * np.log(d).sum())
+    return -float(scaled_logdet(covariance))
 
 
 def write_plan(design: Design, path: str | Path) -> None:

@@ -10,6 +10,7 @@ from greybox.credibility.predetermined import moments_mean, noise_after_error
 from greybox.credibility.score_statistic import ScoreStatistic, score_test
 from greybox.credibility.score_test import Conclusion, ScoreTest
 from greybox.estimation.verdict import TestResult
+from greybox.numerics.linalg import scaled_inverse
 
 Array = NDArray[np.float64]
 
@@ -66,9 +67,7 @@ def endogeneity(equation: Equation, *, decisive: bool = True) -> TestResult:
 def _least_squares(equation: Equation) -> Array:
     gram = np.asarray(sum(f @ f.T for f in equation.phi))
     right = np.asarray(sum(f @ y for f, y in zip(equation.phi, equation.y, strict=True)))
-    size = np.sqrt(np.diag(gram))
-    found = np.linalg.lstsq(gram / np.outer(size, size), right / size, rcond=None)[0] / size
-    return np.asarray(found)
+    return np.asarray(scaled_inverse(gram) @ right)
 
 
 def _residuals(equation: Equation, theta: Array) -> list[Array]:

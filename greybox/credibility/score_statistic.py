@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from greybox.estimation.arma_noise import WHITE, ARMANoise
 from greybox.estimation.verdict import Distribution
 from greybox.numerics.lagged_moments import lagged_products
-from greybox.numerics.linalg import quadratic_form, sizes
+from greybox.numerics.linalg import quadratic_form, scaled_inverse
 
 Array = NDArray[np.float64]
 # directions with a smaller share of the largest variance rest on a few rows: left untested
@@ -61,9 +61,7 @@ def residualise(xi: Sequence[Array], phi: Sequence[Array], zhat: Sequence[Array]
     if not phi[0].shape[0]:
         return list(xi)
     cross = lagged_products(xi, phi, 0)
-    gram = lagged_products(zhat, phi, 0)
-    size = sizes(gram)
-    weights = np.linalg.solve((gram / np.outer(size, size)).T, (cross / size).T).T / size
+    weights = cross @ scaled_inverse(lagged_products(zhat, phi, 0))
     return [x - weights @ z for x, z in zip(xi, zhat, strict=True)]
 
 

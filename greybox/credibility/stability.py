@@ -9,6 +9,7 @@ from greybox.credibility.evidence import Evidence
 from greybox.estimation.verdict import TestResult, not_applicable
 from greybox.model.run.inputs import LogInputs
 from greybox.model.run.step import StepModel
+from greybox.numerics.linalg import scaled_root
 
 Array = NDArray[np.float64]
 
@@ -35,10 +36,8 @@ def stability(evidence: Evidence, seed: int = 0) -> TestResult:
     covariance = evidence.covariance[np.ix_(columns, columns)]
     if not (np.isfinite(theta).all() and np.isfinite(covariance).all()):
         return not_applicable(name, null, "the covariance of the estimate is not known")
-    size = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-    values, vectors = np.linalg.eigh(covariance / np.outer(size, size))
-    root = size[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
-    draws = theta + np.random.default_rng(seed).standard_normal((_DRAWS, len(theta))) @ root.T
+    normal = np.random.default_rng(seed).standard_normal((_DRAWS, len(theta)))
+    draws = theta + normal @ scaled_root(covariance).T
     largest = _spectral_radius(constant, slopes, np.vstack([theta, draws]))
     here = largest[0]
     share = float((np.median(largest[1:], axis=1) > 1).mean())

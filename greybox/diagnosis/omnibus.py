@@ -23,6 +23,7 @@ from greybox.diagnosis.held_out import Pair, Proof, proof_of
 from greybox.diagnosis.linear import NOWHERE, sensitivities
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.ship import LogRun, shifted, wired
+from greybox.numerics.linalg import scaled_inverse
 
 Array = NDArray[np.float64]
 
@@ -236,9 +237,8 @@ def disagreement(pairs: Sequence[Pair]) -> Disagreement:
             # a run at the edge of stability has no covariance: the fall alone decides
             distance = np.inf
             continue
-        size = np.sqrt(np.diag(spread))
-        away = (after - before) / size
-        distance += float(away @ np.linalg.pinv(spread / np.outer(size, size), 1e-10) @ away)
+        away = after - before
+        distance += float(away @ scaled_inverse(spread, 1e-10) @ away)
     return Disagreement(fall, float(chi2.sf(min(distance, fall / 2), count)))
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from greybox.model.disturbances import CURRENT
 from greybox.model.predictor import Predictor
+from greybox.numerics.linalg import scaled_inverse
 
 Array = NDArray[np.float64]
 
@@ -104,11 +105,9 @@ def estimate_current(
         sensitivity = -np.einsum("mcp,c->mp", derivative, current)
         sensitivity[np.arange(len(rows)), rows] += 1.0
         noise = sensitivity @ covariance @ sensitivity.T
-        scale = np.sqrt(np.maximum(np.diag(noise), 1e-300))
-        whiten = np.linalg.pinv(noise / np.outer(scale, scale), rcond=1e-10, hermitian=True)
-        aw = a / scale[:, None]
-        spread = np.asarray(np.linalg.pinv(aw.T @ whiten @ aw), float)
-        current = np.asarray(spread @ aw.T @ whiten @ (b / scale), float)
+        weights = scaled_inverse(noise, 1e-10)
+        spread = np.asarray(np.linalg.pinv(a.T @ weights @ a), float)
+        current = np.asarray(spread @ a.T @ weights @ b, float)
     std = np.sqrt(np.maximum(np.diag(spread), 0.0))
     rho = float(np.exp(-(heading_std**2) / 2))
     stretch = 1 / rho if heading_measured else rho

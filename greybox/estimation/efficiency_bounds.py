@@ -29,6 +29,7 @@ from greybox.estimation.values import EfficiencyBound
 from greybox.model.noise import NoiseLevels
 from greybox.model.output import OutputModel
 from greybox.model.run.output_runs import Simulator
+from greybox.numerics.linalg import scaled, scaled_inverse, scaled_logdet
 from greybox.trial.log import TrialLog
 
 Array = NDArray[np.float64]
@@ -118,21 +119,19 @@ def cramer_rao(
         Some direction of the parameters leaves the outputs unchanged.
     """
     f = information(model, logs, p, starts, noise)
-    scale = np.sqrt(np.diag(f))
-    if not (scale > 0).all():
-        lost = [n for n, s in zip(model.parameters, scale, strict=True) if not s > 0]
+    if not (np.diag(f) > 0).all():
+        lost = [n for n, s in zip(model.parameters, np.diag(f), strict=True) if not s > 0]
         raise ExcitationError(
             f"{', '.join(lost)} leaves the run unchanged, so its bound is infinite: leave it out."
         )
-    values, vectors = np.linalg.eigh(f / np.outer(scale, scale))
+    values, vectors = np.linalg.eigh(scaled(f)[0])
     if values[0] <= _RANK * values[-1]:
         worst = model.parameters[int(np.argmax(np.abs(vectors[:, 0])))]
         raise ExcitationError(
             f"the information is singular in {worst} (relative eigenvalue "
             f"{max(values[0] / values[-1], 0):.1e}, needs {_RANK:.0e}): leave it out."
         )
-    root = vectors / np.sqrt(values) / scale[:, None]
-    return np.asarray(root @ root.T)
+    return scaled_inverse(f)
 
 
 def _limit(names: Sequence[str], bound: Array, covariance: Array) -> EfficiencyBound:
@@ -141,9 +140,8 @@ def _limit(names: Sequence[str], bound: Array, covariance: Array) -> EfficiencyB
     efficiency = np.where(reported > 0, (std / np.where(reported > 0, reported, 1.0)) ** 2, 0.0)
     determinant = 0.0
     if (reported > 0).all():
-        scale = np.outer(reported, reported)
-        signs, logs = zip(*(np.linalg.slogdet(c / scale) for c in (bound, covariance)), strict=True)
-        if min(signs) > 0:
+        logs = scaled_logdet(np.array([bound, covariance]))
+        if np.isfinite(logs).all():
             determinant = float(np.exp((logs[0] - logs[1]) / len(names)))
     return EfficiencyBound(
         dict(zip(names, map(float, std), strict=True)),

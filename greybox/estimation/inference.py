@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from greybox.errors import UsageError, suggestion
 from greybox.estimation.verdict import Distribution, TestResult
+from greybox.numerics.linalg import scaled_inverse
 
 Array = NDArray[np.float64]
 # one restriction or several in words, or the value of each parameter
@@ -181,15 +182,14 @@ def wald_test(
     matrix, values, told = restriction_matrix(names, restrictions)
     away = matrix @ theta - values
     spread = matrix @ covariance @ matrix.T
-    size = np.sqrt(np.diag(spread))
+    variance = np.diag(spread)
     null = Distribution("chi2", (float(len(away)),))
-    if not (np.isfinite(size).all() and (size > 0).all()):
+    if not (np.isfinite(variance).all() and (variance > 0).all()):
         raise UsageError(
             f"the standard error of {told} is not known, so it cannot be tested: leave such "
             f"parameters out."
         )
-    unit = away / size
-    statistic = float(unit @ np.linalg.solve(spread / np.outer(size, size), unit))
+    statistic = float(away @ scaled_inverse(spread) @ away)
     p = null.sf(statistic)
     return TestResult(
         "wald",

@@ -45,6 +45,7 @@ from greybox.model.noise import NoiseLevels
 from greybox.model.output import OutputModel, Role
 from greybox.model.predictor import Predictor
 from greybox.model.run.output_runs import Simulator
+from greybox.numerics.linalg import scaled, scaled_inverse
 from greybox.public import known_keywords, one_thread
 from greybox.regression.regression import common_sample_time
 from greybox.trial.log import Logs, TrialLog
@@ -486,9 +487,8 @@ def _excitation_tests(
     1/(Hᵢᵢ (H⁻¹)ᵢᵢ), the inverse of its variance inflation.
     """
     free = np.flatnonzero(~bound)
-    scale = np.sqrt(np.diag(hessian)[free])
-    unit = hessian[np.ix_(free, free)] / np.outer(scale, scale)
-    share = 1 / np.diag(np.linalg.inv(unit))
+    unit, _ = scaled(hessian[np.ix_(free, free)])
+    share = 1 / np.diag(scaled_inverse(unit))
     columns = model.predictor.columns
     out = []
     for state in model.predictor.structure.states:
@@ -565,7 +565,7 @@ def _require_known(model: OutputModel, hessian: Array, bound: NDArray[np.bool_])
             f"parameter {', '.join(lost)} leaves the run unchanged over the whole log: move what "
             f"it multiplies, or leave it out."
         )
-    unit = hessian[np.ix_(free, free)] / np.outer(scale, scale)
+    unit, _ = scaled(hessian[np.ix_(free, free)])
     values, vectors = np.linalg.eigh((unit + unit.T) / 2)
     if values[0] > RANK * values[-1]:
         return
@@ -583,9 +583,8 @@ def _require_known(model: OutputModel, hessian: Array, bound: NDArray[np.bool_])
 
 def _sandwich(hessian: Array, middle: Array, bound: NDArray[np.bool_]) -> Array:
     free = np.flatnonzero(~bound)
-    scale = 1 / np.sqrt(np.diag(hessian)[free])
     part = np.ix_(free, free)
-    inverse = np.linalg.inv(hessian[part] * np.outer(scale, scale)) * np.outer(scale, scale)
+    inverse = scaled_inverse(hessian[part])
     out = np.zeros_like(hessian)
     out[part] = inverse @ middle[part] @ inverse
     return (out + out.T) / 2

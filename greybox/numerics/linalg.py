@@ -1,4 +1,4 @@
-"""Inverses and quadratic forms of matrices whose rows have units of their own."""
+"""Inverses, roots and forms of symmetric matrices whose rows have units of their own."""
 
 from __future__ import annotations
 
@@ -13,8 +13,16 @@ _TINY = 1e-300
 
 
 def sizes(matrix: Array) -> Array:
-    """Return the roots of the diagonal (n,), a tiny number where that is nothing."""
-    return np.asarray(np.sqrt(np.maximum(np.abs(np.diag(matrix)), _TINY)))
+    """Return the roots of the diagonal (..., n), a tiny number where that is nothing."""
+    diagonal = np.diagonal(matrix, axis1=-2, axis2=-1)
+    return np.asarray(np.sqrt(np.maximum(np.abs(diagonal), _TINY)))
+
+
+def scaled(matrix: Array) -> tuple[Array, Array]:
+    """Return the matrix with a diagonal of one (..., n, n), and what it was divided by."""
+    size = sizes(matrix)
+    outer = size[..., :, None] * size[..., None, :]
+    return matrix / outer, outer
 
 
 def scaled_inverse(matrix: Array, least: float = ROUNDING) -> Array:
@@ -23,12 +31,24 @@ def scaled_inverse(matrix: Array, least: float = ROUNDING) -> Array:
     Parameters
     ----------
     matrix : ndarray
-        (n, n) with a diagonal that tells the size of its rows.
+        (..., n, n) with a diagonal that tells the size of its rows.
     least : float
         Directions with less than this share of the largest singular value are left out.
     """
-    size = np.outer(*[sizes(matrix)] * 2)
-    return np.asarray(np.linalg.pinv(matrix / size, rcond=least) / size)
+    unit, outer = scaled(matrix)
+    return np.asarray(np.linalg.pinv(unit, rcond=least) / outer)
+
+
+def scaled_root(covariance: Array) -> Array:
+    """Return L (n, n) with L Lᵀ = C, what rounding made negative cut at zero."""
+    values, vectors = np.linalg.eigh(scaled(covariance)[0])
+    return np.asarray(sizes(covariance)[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
+def scaled_logdet(covariance: Array) -> Array:
+    """Return log det C (...), infinite where C is not positive definite."""
+    sign, found = np.linalg.slogdet(scaled(covariance)[0])
+    return np.where(sign > 0, found + 2 * np.log(sizes(covariance)).sum(axis=-1), np.inf)
 
 
 def quadratic_form(
@@ -43,8 +63,8 @@ def quadratic_form(
     used = np.flatnonzero(size > 1e-150)
     if not len(used):
         return 0.0, 0, np.zeros((0, len(moments)))
-    scaled = covariance[np.ix_(used, used)] / np.outer(size[used], size[used])
-    values, vectors = np.linalg.eigh((scaled + scaled.T) / 2)
+    unit, _ = scaled(covariance[np.ix_(used, used)])
+    values, vectors = np.linalg.eigh((unit + unit.T) / 2)
     good = values > least * values[-1]
     whitening = np.zeros((int(good.sum()), len(moments)))
     whitening[:, used] = (vectors[:, good] / np.sqrt(values[good])).T / size[used]

@@ -26,6 +26,7 @@ from greybox.model.catalogue import get_structure
 from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import Predictor, Regime, build_predictor
 from greybox.model.run.simulation import simulate, stationary_disturbance
+from greybox.numerics.linalg import scaled_logdet
 from greybox.rotation import ned_to_body
 from greybox.study.chapter6 import TRUE, pulse_commands
 from greybox.study.parallel import map_pieces
@@ -130,10 +131,7 @@ class CaseResult:
     def loss(self) -> tuple[float, list[float]]:
         """Return what the best instruments reach of the Cramér-Rao bound."""
         p = len(self.names)
-        scale = np.sqrt(np.diag(self.cramer_rao))
-        unit = np.outer(scale, scale)
-        first = np.linalg.slogdet(self.cramer_rao / unit)[1]
-        second = np.linalg.slogdet(self.optimal_iv / unit)[1]
+        first, second = scaled_logdet(np.array([self.cramer_rao, self.optimal_iv]))
         single = np.diag(self.cramer_rao) / np.diag(self.optimal_iv)
         return float(np.exp((first - second) / p)), [float(v) for v in single]
 
@@ -185,12 +183,11 @@ def determinant_efficiency(errors: Array, bound: Array) -> Share:
     """
     runs, p = errors.shape
     n = runs - 1
-    scale = np.sqrt(np.diag(bound))
-    found = np.linalg.slogdet(np.cov((errors / scale).T).reshape(p, p))[1]
+    found = float(scaled_logdet(np.cov(errors.T).reshape(p, p)))
     half = (n - np.arange(p)) / 2
     found -= float(psi(half).sum()) + p * np.log(2 / n)
     spread = 1.96 * np.sqrt(float(polygamma(1, half).sum())) / p
-    value = (np.linalg.slogdet(bound / np.outer(scale, scale))[1] - found) / p
+    value = (float(scaled_logdet(bound)) - found) / p
     return Share(float(np.exp(value)), float(np.exp(value - spread)), float(np.exp(value + spread)))
 
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from greybox.model.model import ManoeuvringModel
 from greybox.model.run.inputs import LogInputs
 from greybox.model.run.simulation import simulate
+from greybox.numerics.linalg import scaled_root
 from greybox.regression.instruments import state_bound
 from greybox.trial.log import TrialLog
 from greybox.trial.segments import split_segments
@@ -308,11 +309,7 @@ def draw_parameters(
 
 def _normal(rng: np.random.Generator, mean: Array, covariance: Array, runs: int) -> Array:
     """Draw (R, p) vectors; a covariance that rounding made indefinite is cut at zero."""
-    size = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    safe = np.where(size > 0, size, 1.0)
-    values, vectors = np.linalg.eigh(covariance / np.outer(safe, safe))
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
-    return np.asarray(mean + size * (rng.standard_normal((runs, len(mean))) @ root.T))
+    return np.asarray(mean + rng.standard_normal((runs, len(mean))) @ scaled_root(covariance).T)
 
 
 def _noisy(rng: np.random.Generator, value: Array, std: float, runs: int) -> Array:

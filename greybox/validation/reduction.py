@@ -17,6 +17,7 @@ from greybox.estimation.result import Estimate
 from greybox.model.catalogue import structure_for
 from greybox.model.disturbances import CURRENT, WIND
 from greybox.model.predictor import Column
+from greybox.numerics.linalg import scaled_inverse
 from greybox.public import one_thread
 from greybox.trial.log import Logs
 from greybox.trial.segments import as_segments
@@ -65,11 +66,8 @@ def wald(estimate: Estimate, columns: Sequence[int]) -> float:
     from scipy.special import chdtrc
 
     c = list(columns)
-    theta, size = estimate.theta[c], estimate.std[c]
-    safe = np.where(size > 0, size, np.inf)
-    unit = estimate.covariance[np.ix_(c, c)] / np.outer(safe, safe)
-    t = theta / safe
-    return float(chdtrc(len(c), float(t @ np.linalg.pinv(unit, hermitian=True) @ t)))
+    theta, inverse = estimate.theta[c], scaled_inverse(estimate.covariance[np.ix_(c, c)])
+    return float(chdtrc(len(c), float(theta @ inverse @ theta)))
 
 
 def least_earning(estimate: Estimate, missed: Collection[str] = ()) -> list[Candidate]:

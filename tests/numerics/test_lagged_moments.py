@@ -5,7 +5,7 @@ import pytest
 
 from greybox.numerics.banded import factor_band, inverse_band
 from greybox.numerics.lagged_moments import convolve, lagged_products, lagged_sums
-from greybox.numerics.linalg import scaled_inverse
+from greybox.numerics.linalg import scaled_inverse, scaled_logdet, scaled_root
 
 
 def test_lagged_sums_are_the_diagonal_of_lagged_products():
@@ -28,13 +28,20 @@ def test_convolution_equals_that_of_numpy(memory):
     np.testing.assert_allclose(convolve(rows, weights), expected, rtol=1e-12, atol=1e-12)
 
 
-def test_units_do_not_change_an_inverse():
+def test_units_do_not_change_inverses_roots_and_determinants():
     rng = np.random.default_rng(2)
-    root = rng.standard_normal((4, 6))
+    root = rng.standard_normal((3, 4, 6))
     units = np.diag([1.0, 1e-7, 1e6, 1e-3])
-    expected = np.linalg.inv(root @ root.T)
-    found = scaled_inverse(units @ root @ root.T @ units)
-    np.testing.assert_allclose(units @ found @ units, expected, rtol=1e-10)
+    plain = root @ root.transpose(0, 2, 1)
+    stack = units @ plain @ units
+    found = scaled_inverse(stack)
+    np.testing.assert_allclose(units @ found @ units, np.linalg.inv(plain), rtol=1e-9)
+    np.testing.assert_array_equal(scaled_inverse(stack[1]), found[1])
+    expected = np.linalg.slogdet(plain)[1] + 2 * np.log(1e-4)
+    np.testing.assert_allclose(scaled_logdet(stack), expected, rtol=1e-12)
+    assert scaled_logdet(np.array([[1.0, 2.0], [2.0, 1.0]])) == np.inf
+    half = np.linalg.inv(units) @ scaled_root(stack[0])
+    np.testing.assert_allclose(half @ half.T, plain[0], rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize(("size", "rows"), [(1, 9), (3, 60), (6, 62)])
