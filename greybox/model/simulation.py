@@ -186,7 +186,10 @@ def simulate(
     )
     out = np.empty((runs, samples + 1, nx + (heading == "simulated")))
     with np.errstate(all="ignore"):
-        if runs < MANY_RUNS:
+        if not samples:
+            # a log of one sample is its own start
+            out[:, 0] = np.column_stack([x0, start])[:, : out.shape[2]]
+        elif runs < MANY_RUNS:
             _few(step, series, x0, start, theta, sample_time, out)
         else:
             _many(step, series, x0, start, theta, sample_time, out)
