@@ -29,6 +29,7 @@ from greybox.trial.manoeuvres import (
 from greybox.trial.manoeuvres.finding import Manoeuvre
 from greybox.trial.manoeuvres.stopping import measure_stopping
 from greybox.trial.manoeuvres.track import make_track, without_antenna
+from greybox.trial.raw_log import shortened
 
 Array = NDArray[np.float64]
 
@@ -39,6 +40,8 @@ _POINTS = 1500
 _FAULTS = 2
 # share of an order in one sample that is no motion of a helm but a logged command
 _JUMP = 0.5
+# logs that a sentence names: one with gaps comes as many
+_MOST_NAMES = 4
 
 
 def found_in_trial(
@@ -55,11 +58,12 @@ def found_in_trial(
     made = [(_task(m, log, helm, asked), m, log) for m, log in there if _is(kind, m)]
     kept = [entry for entry in made if _wanted(entry[0], asked)]
     if not kept:
-        names = ", ".join(f"'{log.name}'" for log in logs)
-        found = "; ".join(m.label for m, _ in there) or "no manoeuvre"
+        names = shortened((f"'{log.name}'" for log in logs), _MOST_NAMES)
+        labels = "; ".join(m.label for m, _ in there)
+        found = f"but {labels}" if there else "nor any other"
         more = " of that side or angle" if made else ""
         raise LogError(
-            f"there is no {kind} manoeuvre{more} in {names}, but {found}: name another log, "
+            f"there is no {kind} manoeuvre{more} in {names}, {found}: name another log, "
             f"or predict without --trial."
         )
     return kept

@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 from designs import limited_ship, make_request
 
+from experiment_design.demands import feasible_or_reason
+from experiment_design.feasible import moved_constant
 from experiment_design.limits import Circle, LimitProgram, TrialLimits
 from experiment_design.request import build_problem
 from experiment_design.schedule import make_schedule
+from experiment_design.search import assess
 from greybox.errors import UsageError, VesselError
 from greybox.vessel.toml import load_vessel
 from greybox.vessel.vessel import Limits
@@ -174,3 +177,27 @@ def test_a_backoff_tightens_path_limits_only():
     np.testing.assert_allclose(
         tight.path_values(state) - plain.limits.path_values(state), [[0.1], [0.2]]
     )
+
+
+def test_a_steady_course_at_the_edge_of_its_limits_is_not_the_only_one_that_is_moved():
+    # what the first steady course of this seed reaches itself: every change of it loses some
+    edge = TrialLimits(margins={"u": 1.6947, "v": 1.06405})
+    found = moved_constant(build_problem(make_request(duration=200.0, limits=edge)), 0)
+    assert found is not None
+    assert found.feasible
+
+
+def test_where_only_what_tells_nothing_keeps_the_limits_the_limit_is_named():
+    request = make_request()
+    problem = build_problem(request)
+    (silent,) = assess(problem, np.full((1, *problem.shape), 0.5))
+    assert (silent.missed <= 0).all()
+    assert silent.value == -np.inf
+    telling = replace(silent, value=1.0, missed=np.array([0.2, 0.0]))
+    chosen, reason = feasible_or_reason(problem, request, 0, telling, silent)
+    assert chosen is telling
+    assert reason.startswith("the margin of surge, 0.5 m/s, cannot be kept: 0.300 m/s is the most")
+    _, reason = feasible_or_reason(problem, request, 0, replace(telling, value=-np.inf), silent)
+    assert "regressor" in reason
+    lively = replace(silent, value=1.0)
+    assert feasible_or_reason(problem, request, 0, telling, lively) == (lively, "")

@@ -75,6 +75,18 @@ def test_length_need_not_fill_the_unrolled_block(thesis, true_theta):
     np.testing.assert_array_equal(short.x[0], long.x[0, :8])
 
 
+@pytest.mark.parametrize("integrator", ["euler", "rk4"])
+@pytest.mark.parametrize("runs", [1, 64])
+def test_a_run_of_no_steps_is_its_start(thesis, true_theta, integrator, runs):
+    x0 = np.tile([1.5, 1.2, 0.1], (runs, 1))
+    for psi in (None, np.array([0.3])):
+        run = simulate(
+            thesis, true_theta, x0, np.zeros((0, 3)), 1.0, psi=psi, psi0=0.3, integrator=integrator
+        )
+        np.testing.assert_array_equal(run.x, x0[:, None])
+        np.testing.assert_array_equal(run.psi, np.full((runs, 1), 0.3))
+
+
 def test_rk4_follows_the_differential_equation(thesis, true_theta):
     step = StepModel(thesis).function
     tau = np.array([10.0, 8.0, 3.0])

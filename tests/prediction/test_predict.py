@@ -299,6 +299,9 @@ def test_prediction_and_trial_side_by_side():
     assert not row.agrees
     with pytest.raises(LogError, match="no turning manoeuvre in 'trial', but zig-zag 20/20"):
         predict_manoeuvre(model, "turning", trial=trial)
+    pieces = [trial.window(k, k + 5, f"trial[{k}]") for k in range(1, 8)]
+    with pytest.raises(LogError, match=r"in 'trial\[1\]', .* and 3 more, nor any other: name"):
+        predict_manoeuvre(model, "turning", trial=pieces)
     with pytest.raises(LogError, match="of that side or angle"):
         predict_manoeuvre(model, "zigzag", trial=trial, side="starboard")
 

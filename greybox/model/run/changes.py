@@ -84,6 +84,6 @@ def pieces(
     """
     # a time that is a whole number of samples may lie a rounding error beyond it
     starts = {ceil((c.time - first) / sample_time - 1e-6) for c in changes}
-    edges = [0, *sorted(k for k in starts if 0 < k < samples), samples]
+    edges = sorted({0, samples, *(k for k in starts if 0 < k < samples)})
     for a, b in pairwise(edges):
         yield a, b, factors_at(changes, names, first + (a + 1e-6) * sample_time)
