@@ -129,6 +129,27 @@ def test_lever_arm(arm, ship):
     assert not check_recording(apply_repairs(log, [found]), ship).findings
 
 
+@pytest.mark.parametrize(("seed", "late"), [(300431, 0.0), (300431, 1.5), (300233, 0.0)])
+def test_a_lever_arm_is_no_unit_of_the_sway_velocity(seed, late, ship):
+    """Where sway goes with turning, positions of an antenna look as if sway were in knots."""
+    columns = recorded(
+        seed, 2.0, seconds=300.0, wide=True, arm=(1.75, -0.5), late={"u": late, "v": late}
+    )
+    *clocks, arm = check_recording(as_recording(columns), ship).findings
+    assert [f.id for f in clocks] == ["clock_offset"] * (late > 0)
+    assert arm.id == "lever_arm"
+    np.testing.assert_allclose(arm.value, (1.75, -0.5), atol=0.2)
+
+
+def test_velocities_are_reversed_beside_a_lever_arm(ship):
+    columns = recorded(300431, 2.0, seconds=300.0, wide=True, arm=(1.75, -0.5))
+    reversed_ = {**columns, "u": -columns["u"], "v": -columns["v"]}
+    sign, arm = check_recording(as_recording(reversed_), ship).findings
+    assert (sign.id, set(sign.channels), sign.safe) == ("sign", {"u", "v"}, True)
+    assert arm.id == "lever_arm"
+    np.testing.assert_allclose(arm.value, (1.75, -0.5), atol=0.2)
+
+
 @pytest.mark.parametrize("degrees", [2.0, -5.0, 70.0])
 def test_heading_bias_is_not_taken_for_the_current(degrees, ship):
     log = as_recording(recorded(80, 2.0, heading_bias=np.radians(degrees)))

@@ -248,8 +248,8 @@ def _reading(
     changes = tuple(c for c in _changes([logs[k] for k in together], key) if mine.applies(c))
     if not changes:
         return ColumnReading((), motion, 0.0, together)
-    gain = sum(logs[k].gain(key) for k in together)
-    sure = not divided or mine.gain(key) >= _LEAST_GAIN * mine.sample_correlation_factor
+    gain = sum(logs[k].beside(key) for k in together)
+    sure = not divided or mine.beside(key) >= _LEAST_GAIN * mine.sample_correlation_factor
     return ColumnReading(changes, read(motion, changes), gain, together, sure)
 
 
@@ -265,11 +265,11 @@ def _decide(logs: Sequence[_Alternatives]) -> Key:
     gain = sum(log.gain(key) for log in logs)
     samples = sum(log.judging(changes) for log in logs)
     share = 1.0 - float(np.exp(-2 * gain / samples)) if samples else 0.0
-    # a turned compass or a late sensor is no frame, sign or unit: it is estimated later
-    if not changes or changes[0].group in _LATER or share < _LEAST_SHARE * costs[key]:
+    # a turned compass, a late sensor or an arm is no frame, sign or unit: it is estimated later
+    if share < _LEAST_SHARE * costs[key]:
         return ()
     kept = []
-    for change in changes:
+    for change in (c for c in changes if c.group not in _LATER):
         silent = _silent((change,))
         # whatever shrinks a channel shrinks its noise: it must explain more than nothing would
         lost = sum(
@@ -296,7 +296,7 @@ def _contradicts(log: _Alternatives, key: Key) -> bool:
         return False
     penalty = _LEAST_GAIN * log.sample_correlation_factor
     cost = log.ranked[own][2] - log.ranked[key][2] if key in log.ranked else 0.0
-    return log.gain(own) - log.gain(key) > penalty * (1.0 + cost)
+    return log.beside(own) - log.beside(key) > penalty * (1.0 + cost)
 
 
 def read(motion: Motion, changes: tuple[ColumnHypothesis, ...]) -> Motion:
@@ -364,17 +364,40 @@ def _turned(m: Motion) -> ColumnHypothesis:
     """Return the change that turns the heading by the angle that fits best."""
     angle = 0.0
     if m.positioned:
-        span = max(1, round(_TURN_SECONDS / m.step))
-        walked = integrate(to_ned(m["psi"], m["u"], m["v"]), m)
-        way = (m["x_n"] + 1j * m["y_n"])[span:] - (m["x_n"] + 1j * m["y_n"])[:-span]
-        by = (walked[:, 0] + 1j * walked[:, 1])[span:] - (walked[:, 0] + 1j * walked[:, 1])[:-span]
-        for a, _ in m.stretches[1:]:
-            way[max(a - span, 0) : a] = 0
-        angle = float(np.angle(np.vdot(by, way)))
+        way, walked, _ = _ways(m)
+        angle = float(np.angle(np.vdot(walked, way)))
     return ColumnHypothesis(
         "sign", "turned", ("psi",), lambda x: {**x, "psi": x["psi"] + angle}, (),
         f"turned by {angle:.6f}", "", angle, "rad", cost=1.3,
     )  # fmt: skip
+
+
+def _aside(m: Motion) -> ColumnHypothesis:
+    """Return the change that moves the positions by the lever arm that fits best."""
+    way, walked, swept = _ways(m)
+    power = float(np.vdot(swept, swept).real)
+    arm = complex(np.vdot(swept, way - walked)) / power if power else 0j
+
+    def apply(x: Values) -> Values:
+        out = arm * np.exp(1j * x["psi"])
+        return {**x, "x_n": x["x_n"] - out.real, "y_n": x["y_n"] - out.imag}
+
+    return ColumnHypothesis(
+        "sign", "aside", ("x_n", "y_n"), apply, (),
+        f"aside by {arm.real:.6f}, {arm.imag:.6f}", "", abs(arm), "m", cost=1.3,
+    )  # fmt: skip
+
+
+def _ways(m: Motion) -> tuple[NDArray[np.complex128], ...]:
+    """Return ways made by positions, by velocities, and of a point 1 m ahead against the ship."""
+    span = max(1, round(_TURN_SECONDS / m.step))
+    place = integrate(to_ned(m["psi"], m["u"], m["v"]), m)
+    moved = (m["x_n"] + 1j * m["y_n"], place[:, 0] + 1j * place[:, 1], np.exp(1j * m["psi"]))
+    ways = tuple(z[span:] - z[:-span] for z in moved)
+    for way in ways:
+        for a, _ in m.stretches[1:]:
+            way[max(a - span, 0) : a] = 0
+    return ways
 
 
 def _late(motion: Motion) -> list[ColumnHypothesis]:
@@ -420,7 +443,7 @@ def _silent(changes: tuple[ColumnHypothesis, ...]) -> ColumnHypothesis:
 
 # what a reading is called, in every log: the words of its changes
 Key = tuple[str, ...]
-_LATER = ("turned", "late")
+_LATER = ("turned", "late", "aside")
 
 
 class _Alternatives:
@@ -436,7 +459,9 @@ class _Alternatives:
         alternatives: dict[Key, tuple[ColumnHypothesis, ...]] = {(): ()}
         alternatives |= {_words((c,)): (c,) for c in usable}
         if motion.positioned:
-            alternatives[("turned",)] = (_turned(motion),)
+            alternatives |= {("turned",): (_turned(motion),), ("aside",): (_aside(motion),)}
+            for c in usable:
+                alternatives[*_words((c,)), "aside"] = (c, _aside(read(motion, (c,))))
             alternatives |= {_words((c,)): (c,) for c in _late(motion)}
         for a, b in combinations(usable, 2):
             if a.group != b.group and not set(a.channels) & set(b.channels):
@@ -452,6 +477,12 @@ class _Alternatives:
     def gain(self, key: Key) -> float:
         """Return the log-likelihood that a reading gains; nothing where it does not apply."""
         return self.ranked[key][1] if key in self.ranked else 0.0
+
+    def beside(self, key: Key) -> float:
+        """Return what a reading gains, or gains beside a lever arm where that tells more."""
+        if (*key, "aside") not in self.ranked:
+            return self.gain(key)
+        return max(self.gain(key), self.gain((*key, "aside")) - self.gain(("aside",)))
 
     def judging(self, changes: tuple[ColumnHypothesis, ...]) -> int:
         """Return how many residuals can tell about these changes."""
@@ -490,7 +521,7 @@ class _Alternatives:
 
 def _order(change: ColumnHypothesis) -> int:
     # the heading must be right before velocities are turned by it
-    if change.group in ("turned", "silent", "late"):
+    if change.group in (*_LATER, "silent"):
         return 2
     return 1 if change.id == "frame" and change.group == "velocity" else 0
 
