@@ -15,7 +15,6 @@ from greybox.errors import ExcitationError, UsageError
 from greybox.estimation.covariance import (
     block_bootstrap,
     correlation_lags,
-    flat_top,
     score_covariance,
 )
 from greybox.estimation.disturbance import estimate_current
@@ -103,11 +102,8 @@ def test_robust_covariance_equals_a_slow_sum():
     slow = np.zeros((3, 3))
     for i in range(80):
         for j in range(80):
-            slow += (
-                flat_top(abs(i - j), 3)
-                * np.outer(z[:, i] * e[i], z[:, j] * e[j])
-                * (abs(i - j) <= 6)
-            )
+            weight = min(1.0, max(0.0, (7 - abs(i - j)) / 4))
+            slow += weight * np.outer(z[:, i] * e[i], z[:, j] * e[j])
     if np.linalg.eigvalsh(slow)[0] > 0:
         np.testing.assert_allclose(fast, slow, rtol=1e-10)
     gamma = [float(e[k:] @ e[: 80 - k]) / (80 - k) for k in range(3)]
