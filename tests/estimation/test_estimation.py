@@ -25,10 +25,10 @@ from greybox.model.predictor import build_predictor
 from greybox.regression.instruments import build_instruments
 from greybox.regression.problem import RegressionProblem
 from greybox.regression.regression import build_regression
+from greybox.selection.fit_single import estimate_iv, estimate_ls
 from greybox.study.chapter6 import TRUE as STUDY
 from greybox.study.efficiency import CASES, virtual_trial
 from greybox.trial.log import make_log
-from greybox.validation.fit_single import estimate_iv, estimate_ls
 
 REGIME = (("u", (1,)), ("v", (1,)))
 
