@@ -57,6 +57,9 @@ from greybox.model.catalogue import get_structure, structure_for
 from greybox.model.model import ManoeuvringModel
 from greybox.model.output import OutputModel
 from greybox.model.predictor import build_predictor
+from greybox.selection.estimate import estimate_requested
+from greybox.selection.fit_single import estimate_iv, estimate_ls
+from greybox.selection.request import Request
 from greybox.study.chapter6 import TRUE
 from greybox.study.efficiency import CASES, CURRENT, virtual_trial
 from greybox.trial.convert.read import read_segments
@@ -64,9 +67,6 @@ from greybox.trial.kinematics import decimate
 from greybox.trial.log import TrialLog
 from greybox.trial.store import write_log
 from greybox.validation.fit import average_fit, run_model
-from greybox.validation.fit_single import estimate_iv, estimate_ls
-from greybox.validation.request import Request
-from greybox.validation.selection import estimate_requested
 from greybox.vessel.force import force_inputs
 
 Array = NDArray[np.float64]

@@ -27,6 +27,10 @@ from greybox.model.run.simulation import stationary_disturbance as stationary_di
 from greybox.model.structure import Structure as Structure
 from greybox.prediction.predict import predict_manoeuvre as predict_manoeuvre
 from greybox.prediction.result import ManoeuvrePrediction as ManoeuvrePrediction
+from greybox.selection.estimate import estimate_model as estimate_model
+from greybox.selection.fit_single import estimate_iv as estimate_iv
+from greybox.selection.fit_single import estimate_ls as estimate_ls
+from greybox.selection.request import Request as Request
 from greybox.trial.checks.check import check_files as check_files
 from greybox.trial.checks.check import check_recording as check_recording
 from greybox.trial.checks.check import check_recordings as check_recordings
@@ -54,10 +58,6 @@ from greybox.validation.comparison import compare as compare
 from greybox.validation.comparison import compare_models as compare_models
 from greybox.validation.fit import fit_percent as fit_percent
 from greybox.validation.fit import run_model as run_model
-from greybox.validation.fit_single import estimate_iv as estimate_iv
-from greybox.validation.fit_single import estimate_ls as estimate_ls
-from greybox.validation.request import Request as Request
-from greybox.validation.selection import estimate_model as estimate_model
 from greybox.vessel.toml import load_vessel as load_vessel
 from greybox.vessel.toml import vessel_from_dict as vessel_from_dict
 from greybox.vessel.vessel import Vessel as Vessel

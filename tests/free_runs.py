@@ -17,11 +17,11 @@ from greybox.model.predictor import build_predictor
 from greybox.model.run.changes import Change
 from greybox.model.run.simulation import positions
 from greybox.model.run.step import held
+from greybox.selection.fit_single import estimate_ls
 from greybox.trial.convert.read import read_log
 from greybox.trial.kinematics import decimate
 from greybox.trial.log import TrialLog
 from greybox.validation.fit import run_model
-from greybox.validation.fit_single import estimate_ls
 from greybox.vessel.force import force_inputs
 from greybox.vessel.thrust import ThrustLaw
 from greybox.vessel.toml import vessel_from_dict

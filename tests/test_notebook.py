@@ -13,11 +13,11 @@ import greybox as gb
 from greybox.diagnosis.result import Diagnosis, Found, Gain, Quantity, Symptom
 from greybox.estimation.verdict import SharedMoment
 from greybox.notebook import interval, number, sparkline, table
+from greybox.selection.structures import StructureChoice, StructureRow
 from greybox.trial.checks.finding import Outcome
 from greybox.trial.raw_log import Signal
 from greybox.trial.steps import Step
 from greybox.trial.trial_summary import Contents
-from greybox.validation.structures import StructureChoice, StructureRow
 
 HOSTILE = "<script>alert('x')</script>&\0\"]]>"
 

@@ -19,6 +19,7 @@ from greybox.estimation.result import Estimate
 from greybox.files import make_folder
 from greybox.model.catalogue import get_structure
 from greybox.model.model import ManoeuvringModel, load_model
+from greybox.selection.estimate import estimate_model
 from greybox.study.blind import Trial, sail
 from greybox.study.blind_causes import Effect
 from greybox.study.blind_inputs import pulses
@@ -28,7 +29,6 @@ from greybox.trial.checks.finding import CheckReport
 from greybox.trial.convert.read import read_log
 from greybox.trial.store import write_log
 from greybox.validation.comparison import Comparison, compare
-from greybox.validation.selection import estimate_model
 from greybox.vessel.toml import load_vessel
 
 Array = NDArray[np.float64]

@@ -20,9 +20,9 @@ from greybox.model.predictor_kinds import PREDICTORS
 from greybox.public import one_thread
 
 if TYPE_CHECKING:
+    from greybox.selection.request import Request
+    from greybox.selection.structures import StructureChoice
     from greybox.trial.log import TrialLog
-    from greybox.validation.request import Request
-    from greybox.validation.structures import StructureChoice
 
 HELP = "estimate a model from logs, with standard errors and whether to trust them"
 EXAMPLES = """examples:
@@ -232,8 +232,8 @@ def _choose(
 ) -> StructureChoice | None:
     """Choose a structure where the options ask for it."""
     from greybox.errors import UsageError
-    from greybox.validation.reduction import reduce_structure
-    from greybox.validation.structures import compare_structures
+    from greybox.selection.reduction import reduce_structure
+    from greybox.selection.structures import compare_structures
 
     if options.reduce:
         return reduce_structure(logs, request, progress("coefficients left out"))
@@ -257,8 +257,8 @@ def run(options: argparse.Namespace) -> None:
     from greybox.model.catalogue import get_structure
     from greybox.model.model import load_model
     from greybox.report.physical import physical_summary
-    from greybox.validation.request import Request
-    from greybox.validation.selection import estimate_requested
+    from greybox.selection.estimate import estimate_requested
+    from greybox.selection.request import Request
     from greybox.vessel.toml import load_vessel
 
     check_targets(options.out, options.json, options.report)

@@ -14,6 +14,7 @@ from greybox.diagnosis.noise import Noise, fit_noise
 from greybox.diagnosis.normal import bounded_step, inverse
 from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.ship import CURRENTS, LogRun
+from greybox.numerics.lagged_moments import bartlett, weighted_lags
 
 Array = NDArray[np.float64]
 
@@ -293,11 +294,7 @@ class Problem:
             scores = np.einsum("kic,ki->kc", rows, nu)
         if not (np.isfinite(normal).all() and np.isfinite(scores).all()):
             return fit.point.vector()[:free], np.full((free, free), np.inf)
-        middle = scores.T @ scores
-        lags = round(samples ** (1 / 3))
-        for lag in range(1, lags + 1):
-            part = scores[lag:].T @ scores[:-lag]
-            middle += (1 - lag / (lags + 1)) * (part + part.T)
+        middle = weighted_lags([scores.T], bartlett(round(samples ** (1 / 3))))
         spread = inverse(normal)
         robust = spread @ middle @ spread * samples / max(samples - q, 1)
         # rounding may leave nothing of a variance beside numbers that are hardly known

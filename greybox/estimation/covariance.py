@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.estimation.error_variance_profile import ErrorVarianceProfile, fit_scaled_arma_noise
-from greybox.numerics.lagged_moments import autocovariance, lagged_sums, weighted_lags
+from greybox.numerics.lagged_moments import autocovariance, flat_top, lagged_sums, weighted_lags
 
 Array = NDArray[np.float64]
 CovarianceKind = Literal["hac", "ma", "white"]
@@ -52,13 +52,6 @@ def correlation_lags(residuals: Sequence[Array], largest: int | None = None) -> 
         if small[m : m + look].all():
             return m
     return largest
-
-
-def flat_top(lag: int, m: int) -> float:
-    """Return the flat-top weight of a lag: 1 up to m, falling to 0 at 2m + 1."""
-    if lag <= m:
-        return 1.0
-    return max(0.0, (2 * m + 1 - lag) / (m + 1))
 
 
 def score_covariance(
@@ -106,14 +99,13 @@ def score_covariance(
     if kind == "ma":
         return clip_to_psd(_moving_average(projected, residuals, sizes, lags)), lags
     spread = np.repeat(np.arange(len(sizes)), sizes)
-    reach = 0 if kind == "white" else 2 * lags
     scores = [
         np.vstack(hats) * np.array(errors)[spread]
         for hats, errors in zip(
             zip(*projected, strict=True), zip(*residuals, strict=True), strict=True
         )
     ]
-    kernel = [flat_top(lag, lags) for lag in range(reach + 1)]
+    kernel = [1.0] if kind == "white" else flat_top(lags)
     return clip_to_psd(weighted_lags(scores, kernel)), lags
 
 

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.estimation.covariance import CovarianceKind, clip_to_psd, flat_top
-from greybox.numerics.lagged_moments import lagged_sums, weighted_lags
+from greybox.estimation.covariance import CovarianceKind, clip_to_psd
+from greybox.numerics.lagged_moments import flat_top, lagged_sums, weighted_lags
 
 Array = NDArray[np.float64]
 
@@ -52,8 +52,7 @@ def shared_score_covariance(
         found = [_filtered_products(rows, gamma[: len(r)]) for rows, r in scores]
         return clip_to_psd(np.sum(found, axis=0))
     products = [np.einsum("qkc,kc->qk", rows, residuals) for rows, residuals in scores]
-    reach = 0 if kind == "white" else 2 * lags
-    return clip_to_psd(weighted_lags(products, [flat_top(j, lags) for j in range(reach + 1)]))
+    return clip_to_psd(weighted_lags(products, [1.0] if kind == "white" else flat_top(lags)))
 
 
 def flat_top_autocovariance(residuals: Sequence[Array], lags: int) -> Array:
@@ -69,7 +68,7 @@ def flat_top_autocovariance(residuals: Sequence[Array], lags: int) -> Array:
     samples = max(sum(int(r.any(axis=1).sum()) for r in residuals), 1)
     reach = min(2 * lags, max(len(r) for r in residuals) - 1)
     gamma = lagged_sums([r.T[:, None] for r in residuals], [r.T[None] for r in residuals], reach)
-    weight = np.array([flat_top(lag, lags) for lag in range(reach + 1)])
+    weight = np.array(flat_top(lags)[: reach + 1])
     return np.asarray(np.moveaxis(gamma * weight, -1, 0) / samples)
 
 

@@ -57,31 +57,7 @@ class Fitted:
 class EstimationOptions:
     """What can be asked of an estimate beside its method; an estimator heeds what concerns it.
 
-    Parameters
-    ----------
-    margins : mapping of str to float, optional
-        |u|, |v| [m/s] below which samples are cut out.
-    covariance : {"ma", "hac", "white", "bootstrap"}, optional
-        What the standard errors allow for; by default the method's own.
-    heading : {"measured", "simulated"}
-        Heading inside the instruments.
-    loop : {"auto", "open", "closed"}
-        Whether a controller moved the thrusters.
-    zero_mean : bool
-        Whether instruments lose their mean (4.63).
-    refine : bool or int
-        Whether, or how many times at most, instruments are simulated again.
-    nominal : ManoeuvringModel, optional
-        Simulates the first instruments, or starts output error; least squares does without it.
-    output_error : OutputErrorOptions
-        What only ``oe`` heeds.
-    seed : int
-    prefilter : {"auto", "noise", "none"}
-        ``noise`` for refined instrumental variables, ``none`` for plain ones.
-    judged : bool
-        Whether tests and verdict are asked for.
-    without : tuple of str
-        Bias-capturing columns to leave out, spelled ``state:function``.
+    Fields are the keywords of `estimate_model`.
     """
 
     margins: dict[str, float] | None = None

@@ -49,17 +49,7 @@ class UnexcitedBiasError(ExcitationError):
 
 
 def solve_ls(problem: RegressionProblem) -> Solved:
-    """Solve a problem by least squares.
-
-    Raises
-    ------
-    ExcitationError
-        Some direction is not excited; its parameters are named.
-
-    References
-    ----------
-    Ljungberg (2020), eq. 2.17.
-    """
+    """Solve a problem by least squares; errors as `estimate_ls`."""
     instruments = _regressors_as_instruments(problem.regression)
     return Solved("ls", problem, instruments, _solve(problem.regression, instruments))
 
@@ -71,35 +61,7 @@ def solve_iv(
     refine: bool | int = True,
     metric: str = "moments",
 ) -> Solved:
-    """Solve a problem by instrumental variables, experiments stacked (4.5).
-
-    Where an instrument simulation diverges, the step is halved. Where that does not help, or
-    the estimates never settle, an estimate spoils the model of the next instruments: the one
-    whose instruments explain most of the regressors is returned.
-
-    Parameters
-    ----------
-    problem : RegressionProblem
-    start : ndarray or Estimate, optional
-        (p,) parameters of the structure that simulate the first instruments: a nominal
-        model. By default the least-squares estimate (4.60).
-    refine : bool or int
-        Simulate the instruments again from each estimate until it stops moving, or as many
-        times at most.
-    metric : {"moments", "identity"}
-        How the stacked equations of several experiments are weighted.
-
-    Raises
-    ------
-    ExcitationError
-        Some direction is not excited, or even the first simulation diverges.
-    UsageError
-        Instruments keep their mean and the augmented predictor has no constant.
-
-    References
-    ----------
-    Ljungberg (2020), eqs. 4.5, 4.60-4.63; Young (2008).
-    """
+    """Solve a problem by instrumental variables; parameters and errors as `estimate_iv`."""
     predictor = problem.predictor
     if (
         not problem.zero_mean

@@ -97,6 +97,16 @@ def autocovariance(
     ]
 
 
+def bartlett(lags: int) -> list[float]:
+    """Return the weights 1 − j/(lags + 1) of the lags j = 0 … lags (Newey and West, 1987)."""
+    return [1 - lag / (lags + 1) for lag in range(lags + 1)]
+
+
+def flat_top(lags: int) -> list[float]:
+    """Return the weights of the lags j = 0 … 2·lags, 1 up to `lags` (Politis, 2003)."""
+    return [min(1.0, (2 * lags + 1 - lag) / (lags + 1)) for lag in range(2 * lags + 1)]
+
+
 def weighted_lags(rows: Sequence[Array], weights: Sequence[float | Array]) -> Array:
     """Return Σ_j w(j) Σ_k r(k) r(k−j)ᵀ over lags of both signs and all experiments, (m, m).
 

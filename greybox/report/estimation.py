@@ -35,9 +35,9 @@ from greybox.report.model_difference import shown_unit
 from greybox.report.page import Page, Picture, Section, Table, computed
 from greybox.report.physical import physical_summary
 from greybox.report.thinning import points_for
+from greybox.selection.structures import StructureChoice
 from greybox.trial.log import TrialLog
 from greybox.validation.fit import run_model
-from greybox.validation.structures import StructureChoice
 
 Array = NDArray[np.float64]
 

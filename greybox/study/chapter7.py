@@ -22,6 +22,7 @@ from greybox.model.predictor import Predictor, build_predictor
 from greybox.model.run.simulation import positions, simulate, stationary_disturbance
 from greybox.model.structure import Structure
 from greybox.rotation import ned_to_body
+from greybox.selection.fit_single import estimate_iv, estimate_ls
 from greybox.study.chapter6 import TRUE
 from greybox.study.inputs import smoothed_pulses, zig_zag
 from greybox.study.tables import Row
@@ -29,7 +30,6 @@ from greybox.trial.kinematics import velocities_from_positions
 from greybox.trial.log import TrialLog, make_log
 from greybox.validation.comparison import SignTest, sign_test
 from greybox.validation.fit import run_model
-from greybox.validation.fit_single import estimate_iv, estimate_ls
 from greybox.vessel.force import force_inputs
 from greybox.vessel.toml import load_vessel
 

@@ -1,1 +1,1 @@
-"""Free runs against logs, comparisons, choices."""
+"""Free runs against logs: fits, bands, comparisons."""

@@ -270,7 +270,7 @@ def test_verbose_tells_what_is_read_on_stderr(folder, monkeypatch, capsys):
     assert "read vessel ship.toml: Thesis ship, 2 thruster(s)" in texts["estimate -v"]
     assert "in this order" not in texts["estimate -v"]
     for most in ("-v estimate -v", "estimate -vv"):
-        assert "greybox.validation.selection: in this order" in texts[most]
+        assert "greybox.selection.estimate: in this order" in texts[most]
 
 
 def test_verbosity_leaves_no_trace_in_records(folder, monkeypatch, capsys):

@@ -26,8 +26,8 @@ from greybox.model.predictor import build_predictor
 from greybox.model.terms import parse_term
 from greybox.regression.instruments import build_instruments
 from greybox.regression.regression import build_regression
-from greybox.validation.fit_single import estimate_iv, estimate_ls
-from greybox.validation.selection import estimate_model
+from greybox.selection.estimate import estimate_model
+from greybox.selection.fit_single import estimate_iv, estimate_ls
 
 REGIME = (("u", (1,)), ("v", (1,)))
 

@@ -22,9 +22,9 @@ from greybox.model.catalogue import get_structure
 from greybox.model.predictor import build_predictor
 from greybox.regression.motion import measured_slopes
 from greybox.regression.regression import build_regression
+from greybox.selection.fit_single import estimate_iv
 from greybox.study.chapter6 import TRUE
 from greybox.study.efficiency import CASES, virtual_trial
-from greybox.validation.fit_single import estimate_iv
 
 REGIME = (("u", (1,)), ("v", (1,)))
 

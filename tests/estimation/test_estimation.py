@@ -15,7 +15,6 @@ from greybox.errors import ExcitationError, UsageError
 from greybox.estimation.covariance import (
     block_bootstrap,
     correlation_lags,
-    flat_top,
     score_covariance,
 )
 from greybox.estimation.disturbance import estimate_current
@@ -26,10 +25,10 @@ from greybox.model.predictor import build_predictor
 from greybox.regression.instruments import build_instruments
 from greybox.regression.problem import RegressionProblem
 from greybox.regression.regression import build_regression
+from greybox.selection.fit_single import estimate_iv, estimate_ls
 from greybox.study.chapter6 import TRUE as STUDY
 from greybox.study.efficiency import CASES, virtual_trial
 from greybox.trial.log import make_log
-from greybox.validation.fit_single import estimate_iv, estimate_ls
 
 REGIME = (("u", (1,)), ("v", (1,)))
 
@@ -103,11 +102,8 @@ def test_robust_covariance_equals_a_slow_sum():
     slow = np.zeros((3, 3))
     for i in range(80):
         for j in range(80):
-            slow += (
-                flat_top(abs(i - j), 3)
-                * np.outer(z[:, i] * e[i], z[:, j] * e[j])
-                * (abs(i - j) <= 6)
-            )
+            weight = min(1.0, max(0.0, (7 - abs(i - j)) / 4))
+            slow += weight * np.outer(z[:, i] * e[i], z[:, j] * e[j])
     if np.linalg.eigvalsh(slow)[0] > 0:
         np.testing.assert_allclose(fast, slow, rtol=1e-10)
     gamma = [float(e[k:] @ e[: 80 - k]) / (80 - k) for k in range(3)]

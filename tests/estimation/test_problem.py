@@ -10,7 +10,7 @@ from virtual import virtual_log
 
 from greybox.model.predictor import build_predictor
 from greybox.regression.problem import RegressionProblem
-from greybox.validation.selection import estimate_model
+from greybox.selection.estimate import estimate_model
 
 REGIME = (("u", (1,)), ("v", (1,)), ("r", (1, -1)))
 
@@ -36,7 +36,7 @@ def counted(monkeypatch):
     )
     count_calls("greybox.trial.log", "actuated_force")
     count_calls("greybox.credibility.judge", "assess")
-    count_calls("greybox.validation.selection", "weigh")
+    count_calls("greybox.selection.estimate", "weigh")
     return count
 
 

@@ -30,10 +30,10 @@ from greybox.model.run.simulation import stationary_disturbance
 from greybox.numerics.banded import factor_band
 from greybox.regression.motion import predicted_motion, smoothed_heading
 from greybox.regression.regression import build_regression
+from greybox.selection.fit_single import estimate_iv, estimate_ls, estimate_once
+from greybox.selection.request import Request
 from greybox.study.chapter6 import TRUE
 from greybox.study.efficiency import CASES, virtual_trial
-from greybox.validation.fit_single import estimate_iv, estimate_ls, estimate_once
-from greybox.validation.request import Request
 
 REGIME = (("u", (1,)), ("v", (1,)), ("r", (1, -1)))
 STILL = {"wind": 0.0, "current": (0.0, 0.0), "spread": 0.0}

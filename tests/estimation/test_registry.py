@@ -14,8 +14,8 @@ from greybox.commands.main import main
 from greybox.errors import UsageError
 from greybox.estimation.registry import ESTIMATORS, Estimator
 from greybox.registry import Registry
-from greybox.validation.alternatives import alternatives_for
-from greybox.validation.cross_validation import EstimatorVariant, compare_estimators
+from greybox.selection.alternatives import alternatives_for
+from greybox.selection.cross_validation import EstimatorVariant, compare_estimators
 
 SMALL = {"structure": "surge", "predictor": "basic"}
 

@@ -16,7 +16,7 @@ from greybox.model.model import ManoeuvringModel, load_model, model_from_dict
 from greybox.model.predictor import build_predictor
 from greybox.model.run.changes import Change
 from greybox.model.versions import VERSION, upgraded
-from greybox.validation.fit_single import estimate_ls
+from greybox.selection.fit_single import estimate_ls
 from greybox.vessel.toml import load_vessel
 
 EARLIER = sorted((Path(__file__).parent / "files").glob("model-*.json"))

@@ -15,7 +15,7 @@ from greybox.estimation.verdict import Divergence, TrustLevel, Verdict, refused
 from greybox.report.estimation import estimation_page, headline
 from greybox.report.estimation_figures import regime_shares
 from greybox.report.page import computed, render
-from greybox.validation.selection import estimate_model
+from greybox.selection.estimate import estimate_model
 
 HOSTILE = '<script>alert("x")</script> & $x^$'
 

@@ -50,8 +50,8 @@ def test_identifiers_of_figures_do_not_collide():
 
 def test_comparison_figure_has_labels_and_units(clean_log, thesis, true_theta):
     from greybox.model.predictor import build_predictor
+    from greybox.selection.fit_single import estimate_ls
     from greybox.validation.fit import run_model
-    from greybox.validation.fit_single import estimate_ls
 
     model = estimate_ls(
         build_predictor(thesis, "basic", (("u", (1,)), ("v", (1,)))), [clean_log]

@@ -14,6 +14,7 @@ from greybox.commands.main import main
 from greybox.diagnosis.diagnose import DiagnosisOptions, diagnose
 from greybox.errors import LogError, VesselError
 from greybox.model.model import ManoeuvringModel, load_model, model_from_dict
+from greybox.selection.estimate import estimate_model
 from greybox.trial.convert.options import ImportOptions
 from greybox.trial.convert.read import read_log
 from greybox.trial.dataframe import log_from_pandas
@@ -23,7 +24,6 @@ from greybox.trial.log import make_log
 from greybox.trial.store import write_log
 from greybox.trial.validity import other_conditions, pooled_conditions
 from greybox.validation.comparison import compare
-from greybox.validation.selection import estimate_model
 from greybox.vessel.conditions import Conditions
 from greybox.vessel.toml import load_vessel, vessel_from_dict, vessel_to_dict
 

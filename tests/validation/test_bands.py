@@ -17,13 +17,13 @@ from greybox.model.catalogue import get_structure
 from greybox.model.model import ManoeuvringModel, load_model
 from greybox.model.noise import NoiseLevels
 from greybox.model.run.simulation import simulate, stationary_disturbance
+from greybox.selection.estimate import estimate_requested
+from greybox.selection.request import Request
 from greybox.study.chapter6 import TRUE
 from greybox.study.inputs import smoothed_pulses
 from greybox.trial.log import make_log
 from greybox.validation.bands import draw_parameters, predict_bands
 from greybox.validation.comparison import compare
-from greybox.validation.request import Request
-from greybox.validation.selection import estimate_requested
 from greybox.vessel.toml import load_vessel
 
 STATES = ("u", "v", "r")

@@ -20,13 +20,13 @@ from greybox.estimation.refined import estimate_refined_iv
 from greybox.model.catalogue import get_structure
 from greybox.model.predictor import build_predictor
 from greybox.regression.regression import build_regression
+from greybox.selection.estimate import estimate_model
+from greybox.selection.fit_single import estimate_iv, estimate_ls
 from greybox.trial.log import make_log
 from greybox.trial.segments import join_segments
 from greybox.validation.bands import predict_bands
 from greybox.validation.comparison import compare
 from greybox.validation.fit import fit_percent, run_model
-from greybox.validation.fit_single import estimate_iv, estimate_ls
-from greybox.validation.selection import estimate_model
 from greybox.vessel.toml import load_vessel
 
 N = 400

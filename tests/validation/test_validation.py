@@ -29,11 +29,11 @@ from greybox.model.conversion import (
 )
 from greybox.model.model import load_model, model_from_dict
 from greybox.model.predictor import build_predictor
+from greybox.selection.estimate import estimate_model
+from greybox.selection.fit_single import estimate_iv, estimate_ls
 from greybox.trial.log import make_log
 from greybox.validation.comparison import compare, sign_test
 from greybox.validation.fit import fit_percent, run_model
-from greybox.validation.fit_single import estimate_iv, estimate_ls
-from greybox.validation.selection import estimate_model
 
 
 @pytest.fixture(scope="module")
@@ -153,14 +153,14 @@ def test_output_error_takes_over_where_it_is_trusted_and_instruments_are_not():
 def test_output_error_that_is_judged_no_better_is_left(monkeypatch):
     log = virtual_log(4, 1500, spread=0.0)
     doubtful = refused([NoRegression("a reason")], ())
-    monkeypatch.setattr("greybox.validation.selection._verdict", lambda *_: doubtful)
+    monkeypatch.setattr("greybox.selection.estimate._verdict", lambda *_: doubtful)
     # of two that are not to be trusted the one that simulates is taken …
     e = estimate_model([log])
     assert e.method == "oe"
     assert "its free run is better than a constant in more of the states" in e.notes[-1]
     # … and the first where both do and nothing speaks against the model
-    monkeypatch.setattr("greybox.validation.selection._poor", lambda fit: [])
-    monkeypatch.setattr("greybox.validation.selection._at_fault", lambda *_: False)
+    monkeypatch.setattr("greybox.selection.estimate._poor", lambda fit: [])
+    monkeypatch.setattr("greybox.selection.estimate._at_fault", lambda *_: False)
     e = estimate_model([log])
     assert e.method == "iv"
     assert e.notes[-1] == (
@@ -174,7 +174,7 @@ def test_output_error_that_fails_is_told(monkeypatch):
 
     log = virtual_log(4, 1500, spread=0.0)
     monkeypatch.setattr("greybox.estimation.output_error.estimate_oe", fail)
-    monkeypatch.setattr("greybox.validation.selection._at_fault", lambda *_: False)
+    monkeypatch.setattr("greybox.selection.estimate._at_fault", lambda *_: False)
     e = estimate_model([log])
     assert e.method != "oe"
     assert "output error was tried too, and failed: the run leaves every bound." in e.notes

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.numerics.lagged_moments import bartlett, weighted_lags
 from greybox.trial.checks.motion import GAINS, outlier_weights, solve, whiten, without_starts
 from greybox.trial.checks.sensor_offsets.model import BIAS, CLOCKS, SIZE, KinematicModel, Residuals
 
@@ -250,12 +251,9 @@ def _robust(normal: Array, pull: Array, scores: Array, step: float) -> tuple[Arr
     scale[scale == 0] = 1.0
     unit = normal / np.outer(scale, scale) + 1e-9 * np.eye(size)
     root = np.linalg.cholesky(unit)
-    white = np.linalg.solve(root, (scores / scale).T).T
+    white = np.asarray(np.linalg.solve(root, (scores / scale).T), float)
     lags = int(min(max(_MEMORY / step, 4 * (n / 100) ** (2 / 9)), n / 5))
-    meat = white.T @ white
-    for lag in range(1, lags + 1):
-        cross = white[lag:].T @ white[:-lag]
-        meat += (1 - lag / (lags + 1)) * (cross + cross.T)
+    meat = weighted_lags([white], bartlett(lags))
     # a covariance of few blocks is drawn to its mean, and its inverse is too large by so much
     blocks = 1.5 * n / max(lags, 1)
     drawn = size / (size + blocks)

@@ -21,9 +21,9 @@ from greybox.model.predictor_kinds import PREDICTORS
 from greybox.model.structure import Structure
 from greybox.public import known_keywords, one_thread
 from greybox.regression.problem import RegressionProblem
+from greybox.selection.request import Request
 from greybox.trial.log import Logs, TrialLog
 from greybox.trial.segments import as_segments
-from greybox.validation.request import Request
 
 Array = NDArray[np.float64]
 

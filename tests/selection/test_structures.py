@@ -13,22 +13,22 @@ from greybox.commands.main import main
 from greybox.errors import ExcitationError, UsageError
 from greybox.model.catalogue import get_structure, structure_for
 from greybox.model.predictor import build_predictor
-from greybox.study.chapter7 import REDUCED_BIASES
-from greybox.trial.log import TrialLog
-from greybox.validation.criteria import independent_samples, information_criteria
-from greybox.validation.fit import run_model
-from greybox.validation.fit_single import estimate_once
-from greybox.validation.held_out import folds, rank, score_runs, spread_of
-from greybox.validation.reduction import (
+from greybox.selection.estimate import estimate_requested
+from greybox.selection.fit_single import estimate_once
+from greybox.selection.held_out import folds, rank, score_runs, spread_of
+from greybox.selection.reduction import (
     _step,
     bias_terms_without_current,
     least_earning,
     reduce_structure,
     wald,
 )
-from greybox.validation.request import Request
-from greybox.validation.selection import estimate_requested
-from greybox.validation.structures import CandidateFit, compare_structures
+from greybox.selection.request import Request
+from greybox.selection.structures import CandidateFit, compare_structures
+from greybox.study.chapter7 import REDUCED_BIASES
+from greybox.trial.log import TrialLog
+from greybox.validation.criteria import independent_samples, information_criteria
+from greybox.validation.fit import run_model
 from greybox.vessel.force import force_inputs
 
 ABSENT = ("Xkappa", "Yvr", "Nvv", "Wvv", "Wuv")

@@ -22,14 +22,14 @@ from greybox.estimation.verdict import TrustLevel, Verdict, refused
 from greybox.model.model import ManoeuvringModel
 from greybox.public import known_keywords, one_thread
 from greybox.regression.regression import common_sample_time
+from greybox.selection.alternatives import Alternative, alternatives_for
+from greybox.selection.cross_validation import EstimatorVariant, compare_estimators
+from greybox.selection.fit_single import estimate_once
+from greybox.selection.held_out import FLOOR
+from greybox.selection.request import Request, regression_only
 from greybox.trial.log import Logs, TrialLog
 from greybox.trial.segments import as_segments
-from greybox.validation.alternatives import Alternative, alternatives_for
-from greybox.validation.cross_validation import EstimatorVariant, compare_estimators
 from greybox.validation.fit import average_fit, run_model
-from greybox.validation.fit_single import estimate_once
-from greybox.validation.held_out import FLOOR
-from greybox.validation.request import Request, regression_only
 
 _log = logging.getLogger(__name__)
 

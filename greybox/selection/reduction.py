@@ -19,13 +19,10 @@ from greybox.model.disturbances import CURRENT, WIND
 from greybox.model.predictor import Column
 from greybox.numerics.linalg import scaled_inverse
 from greybox.public import one_thread
-from greybox.trial.log import Logs
-from greybox.trial.segments import as_segments
-from greybox.validation.criteria import independent_samples
-from greybox.validation.held_out import rank
-from greybox.validation.request import Request
-from greybox.validation.selection import estimate_requested
-from greybox.validation.structures import (
+from greybox.selection.estimate import estimate_requested
+from greybox.selection.held_out import rank
+from greybox.selection.request import Request
+from greybox.selection.structures import (
     CHOOSE,
     FOLDS,
     CandidateFit,
@@ -37,6 +34,9 @@ from greybox.validation.structures import (
     settle,
     told,
 )
+from greybox.trial.log import Logs
+from greybox.trial.segments import as_segments
+from greybox.validation.criteria import independent_samples
 from greybox.vessel.force import force_inputs
 
 # joint p-value above which columns are clearly insignificant and are left out at once

@@ -21,11 +21,11 @@ from greybox.errors import GreyboxError
 from greybox.estimation.output_error import Weights
 from greybox.estimation.registry import ESTIMATORS, automatic_estimators
 from greybox.estimation.result import Estimate
+from greybox.selection.fit_single import estimate_once
+from greybox.selection.held_out import FLOOR, folds, score_runs, spread_of
+from greybox.selection.request import Request
 from greybox.trial.log import TrialLog
 from greybox.validation.fit import average_fit, run_model
-from greybox.validation.fit_single import estimate_once
-from greybox.validation.held_out import FLOOR, folds, score_runs, spread_of
-from greybox.validation.request import Request
 
 Array = NDArray[np.float64]
 _log = logging.getLogger(__name__)

@@ -8,17 +8,17 @@ from virtual import virtual_log
 
 from greybox.errors import ExcitationError, UsageError
 from greybox.estimation.verdict import Misfit, NoRegression, TrustLevel, Verdict, refused
-from greybox.validation import selection
-from greybox.validation.cross_validation import (
+from greybox.selection import estimate as selecting
+from greybox.selection.cross_validation import (
     EstimatorComparison,
     EstimatorVariant,
     compare_estimators,
     parts_of,
 )
+from greybox.selection.estimate import estimate_model, estimate_requested
+from greybox.selection.held_out import FLOOR, spread_of
+from greybox.selection.request import Request
 from greybox.validation.fit import run_model
-from greybox.validation.held_out import FLOOR, spread_of
-from greybox.validation.request import Request
-from greybox.validation.selection import estimate_model, estimate_requested
 
 VARIANTS = (EstimatorVariant("iv"), EstimatorVariant("oe"), EstimatorVariant("oe", "deviation"))
 SMALL = Request(structure="linear", predictor="basic")
@@ -80,7 +80,7 @@ def test_an_estimate_to_be_trusted_is_compared_with_nothing(monkeypatch):
     def never(*_):
         raise AssertionError
 
-    monkeypatch.setattr(selection, "compare_estimators", never)
+    monkeypatch.setattr(selecting, "compare_estimators", never)
     assert estimate_model([virtual_log(3, 1500)]).verdict.text == "trust"
 
 
@@ -134,28 +134,28 @@ def test_a_misfit_that_was_found_is_not_forgotten(small, monkeypatch):
     """Output error of a wrong structure may look sound; the regression's tests have spoken."""
     logs = small[:3]
     lacks = Misfit({"input_independence": ("u",)}, {})
-    monkeypatch.setattr(selection, "misfit", lambda _: (lacks,))
+    monkeypatch.setattr(selecting, "misfit", lambda _: (lacks,))
     judged = refused([NoRegression("a reason")], ())
-    finish = selection._finished
+    finish = selecting._finished
 
     def sound(alternative, *rest):
         estimate, diverged = finish(alternative, *rest)
         verdict = Verdict(TrustLevel.TRUST) if alternative.method == "oe" else judged
-        return selection.replace(estimate, verdict=verdict), diverged
+        return selecting.replace(estimate, verdict=verdict), diverged
 
-    monkeypatch.setattr(selection, "_finished", sound)
+    monkeypatch.setattr(selecting, "_finished", sound)
     better = EstimatorComparison(
         (EstimatorVariant("iv"), EstimatorVariant("oe", "deviation")),
         np.array([[0.0] * 4, [9.0] * 4]),
     )
-    monkeypatch.setattr(selection, "compare_estimators", lambda *_: better)
+    monkeypatch.setattr(selecting, "compare_estimators", lambda *_: better)
     found = estimate_requested(logs, SMALL)
     assert found.method == "oe"
     assert "weighed by the deviation" in found.status
     assert found.verdict.because == (lacks,)
     assert found.notes[-1] == better.sentence()
     # one that follows its own logs less well than the regression is left
-    monkeypatch.setattr(selection, "_level", lambda e: -50.0 if e.method == "oe" else 0.0)
+    monkeypatch.setattr(selecting, "_level", lambda e: -50.0 if e.method == "oe" else 0.0)
     found = estimate_requested(logs, SMALL)
     assert found.method != "oe"
     assert "follows the whole logs less well" in found.notes[-1]
@@ -178,8 +178,8 @@ def test_where_no_regression_can_be_solved_output_error_is_tried(monkeypatch):
 def test_scores_of_whole_logs_are_the_fit():
     from greybox.model.catalogue import get_structure
     from greybox.model.predictor import build_predictor
-    from greybox.validation.fit_single import estimate_ls
-    from greybox.validation.held_out import score_runs
+    from greybox.selection.fit_single import estimate_ls
+    from greybox.selection.held_out import score_runs
 
     log = virtual_log(3, 400, spread=0.0)
     predictor = build_predictor(get_structure("thesis"), "basic+wind", (("u", (1,)), ("v", (1,))))

@@ -14,11 +14,11 @@ from greybox.estimation.registry import ESTIMATORS, automatic_estimators
 from greybox.model.catalogue import structure_for
 from greybox.model.predictor_kinds import PREDICTORS
 from greybox.model.structure import Structure
+from greybox.selection.fit_single import estimate_once
+from greybox.selection.held_out import rank, score_runs, spread_of
+from greybox.selection.request import Request
 from greybox.trial.log import TrialLog
 from greybox.validation.fit import run_model
-from greybox.validation.fit_single import estimate_once
-from greybox.validation.held_out import rank, score_runs, spread_of
-from greybox.validation.request import Request
 from greybox.vessel.force import force_inputs
 
 Array = NDArray[np.float64]

@@ -15,14 +15,14 @@ from greybox.estimation.result import Estimate
 from greybox.model.catalogue import structure_for
 from greybox.notebook import DisplayMixin
 from greybox.public import one_thread
+from greybox.selection.estimate import estimate_requested
+from greybox.selection.fit_single import estimate_once
+from greybox.selection.held_out import Ranking, folds, rank, score_runs, spread_of
+from greybox.selection.request import Request
 from greybox.trial.log import Logs, TrialLog
 from greybox.trial.segments import as_segments
 from greybox.validation.criteria import independent_samples, information_criteria
 from greybox.validation.fit import run_model
-from greybox.validation.fit_single import estimate_once
-from greybox.validation.held_out import Ranking, folds, rank, score_runs, spread_of
-from greybox.validation.request import Request
-from greybox.validation.selection import estimate_requested
 from greybox.vessel.force import force_inputs
 
 Array = NDArray[np.float64]
