@@ -172,11 +172,13 @@ def _likelihood(k: int, blocks: int) -> ca.Function:
     pole, dt = ca.SX.sym("pole"), ca.SX.sym("dt")
     constants = ca.vertcat(x, level, pole, dt)
     a, q, r, force = _system(k, pole, dt, x, level)
-    state = ca.SX.sym("state", n + n * n + 1)
+    # a covariance is carried by its lower triangle: half of what follows is never computed
+    half = ca.Sparsity.lower(n)
+    state = ca.SX.sym("state", n + half.nnz() + 1)
     data = ca.SX.sym("data", k + 1, _UNROLLED)
     now = state
     for j in range(_UNROLLED):
-        z, cov, total = now[:n], ca.reshape(now[n : n + n * n], n, n), now[-1]
+        z, cov, total = now[:n], ca.tril2symm(ca.SX(half, now[n:-1])), now[-1]
         use = data[k, j]
         for i in range(k):
             column = cov[:, i]
@@ -185,13 +187,13 @@ def _likelihood(k: int, blocks: int) -> ca.Function:
             total += use * (error**2 / variance + ca.log(variance))
             gain = use * column / variance
             z = z + gain * error
-            cov = cov - gain @ column.T
+            cov = ca.tril2symm(ca.tril(cov - gain @ column.T))
         cov = a @ cov @ a.T + q
-        now = ca.vertcat(a @ z, ca.vec((cov + cov.T) / 2), total)
+        now = ca.vertcat(a @ z, ca.tril(ca.densify(cov)).nz[:], total)
     step = ca.Function("step", [state, data, constants], [ca.densify(now)], {"cse": True})
     run = accumulate(step, blocks)
-    first = ca.SX.zeros(n + n * n + 1)
-    first[n + n * n - 1] = force
+    first = ca.SX.zeros(n + half.nnz() + 1)
+    first[n + half.nnz() - 1] = force
     begin = ca.Function("begin", [constants], [ca.densify(first)])
     given = ca.MX.sym("x", 2 + k)
     rest = ca.MX.sym("rest", k + 2)

@@ -151,7 +151,9 @@ class ErrorBand:
         measured = np.tensordot(self._same, same, axes=3) + np.tensordot(self._next, near, axes=3)
         return measured, process, memory
 
-    def whiten(self, factor: Array, noise: ErrorNoise, values: Array) -> Array:
+    def whiten(
+        self, factor: Array, noise: ErrorNoise, values: Array, *, overwrite: bool = False
+    ) -> Array:
         """Return values of all equations with the error made white.
 
         Parameters
@@ -160,6 +162,8 @@ class ErrorBand:
             Of `factor(noise)`.
         values : ndarray
             (q, N, nx)
+        overwrite : bool
+            Whether the values may be lost, which saves a copy where every row takes part.
 
         Returns
         -------
@@ -168,9 +172,11 @@ class ErrorBand:
         """
         from scipy.linalg.blas import dtbsv
 
-        v = np.take(values, self.keep, axis=1)
-        if noise.memory.any():
-            v -= noise.memory * self.before(values)
+        before = noise.memory * self.before(values) if noise.memory.any() else None
+        whole = overwrite and self.rows == values.shape[1]
+        v = values if whole else np.take(values, self.keep, axis=1)
+        if before is not None:
+            v -= before
         out = v.reshape(len(v), -1)
         for row in out if self.rows else ():
             dtbsv(len(factor) - 1, factor, row, lower=1, overwrite_x=1)

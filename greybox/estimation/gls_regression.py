@@ -90,15 +90,20 @@ def white_rows(
             f"the covariance of {band.rows} equation errors is singular at the noise levels "
             f"{noise.measurement} and {noise.process}: estimate without --prefilter."
         )
-    p = len(z)
-    constants = constant_rows(y.shape[1], own_constants(predictor))
-    values = np.concatenate(
-        [spread_columns(predictor, z), spread_columns(predictor, phi), y.T[None], constants]
-    )
-    white = band.whiten(factor, noise, values)
+    from scipy.linalg.blas import dgemm
+
+    p, own = len(z), own_constants(predictor)
+    values = np.zeros((2 * p + 1 + sum(own), *y.T.shape))
+    for i, state in enumerate(predictor.structure.states):
+        mine = np.array(predictor.equation(state))
+        values[mine, :, i], values[p + mine, :, i] = z[mine], phi[mine]
+    values[2 * p], values[2 * p + 1 :] = y.T, constant_rows(y.shape[1], own)
+    white = band.whiten(factor, noise, values, overwrite=True)
     basis = np.linalg.qr(white[2 * p + 1 :].T)[0].T
     white = white[: 2 * p + 1]
-    white -= (white @ basis.T) @ basis
+    if len(basis):
+        # white −= (white basisᵀ) basis, where it stands
+        dgemm(-1.0, basis.T, basis @ white.T, beta=1.0, c=white.T, overwrite_c=1)
     return WhiteRows(white[:p], white[p : 2 * p], white[2 * p], basis)
 
 

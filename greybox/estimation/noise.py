@@ -162,7 +162,7 @@ class ErrorLikelihood:
             own = rows[:, : band.rows * nx]
             # what each row is multiplied by where it meets an error: P = Ω⁻¹ − Σ v vᵀ
             dual = band.unwhiten(factor, own)
-            by_covariance = inverse_band(covariance, len(covariance) - nx)
+            by_covariance = inverse_band(covariance, len(covariance) - nx, factor)
             for diagonal, entries in enumerate(by_covariance):
                 # a stretch of one or two rows is narrower than the band
                 left, right = dual[:, diagonal:], dual[:, : max(dual.shape[1] - diagonal, 0)]

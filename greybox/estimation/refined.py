@@ -380,7 +380,8 @@ def _refine(
                 f"{sum(b.rows for b in bands)} samples: estimate without --prefilter, or leave "
                 f"out what is weakly determined."
             )
-        std = np.sqrt(np.sum([((inverse @ r.z) ** 2).sum(axis=1) for r in rows], axis=0))
+        spread = inverse @ np.sum([r.z @ r.z.T for r in rows], axis=0) @ inverse.T
+        std = np.sqrt(np.maximum(np.diag(spread), 0.0))
         moved, rounding = np.abs(new - theta), _RELATIVE * np.abs(theta)
         # a halfway motion settles too, but is not that of an estimate
         halfway = point.theta is not theta

@@ -260,11 +260,10 @@ def _solve(
                 f"has {len(mine)} coefficients, more than {2 * len(mine)} are needed: use smaller "
                 f"margins or a longer log."
             )
-        phi = [
-            e.phi[mine][:, k] for e, k in zip(regression.experiments, instruments.keep, strict=True)
-        ]
-        y = [e.y[row, k] for e, k in zip(regression.experiments, instruments.keep, strict=True)]
-        z = [z[mine][:, k] for z, k in zip(instruments.z, instruments.keep, strict=True)]
+        logs = list(zip(regression.experiments, instruments.keep, strict=True))
+        phi = [_part(e.phi, mine, k) for e, k in logs]
+        y = [e.y[row, k] for e, k in logs]
+        z = [_part(z, mine, k) for z, k in zip(instruments.z, instruments.keep, strict=True)]
         _require_excited(predictor, mine, phi, z)
         solution = solve_stacked(z, phi, y, metric=metric)
         if not solution.singular_values[-1] > SINGULAR * solution.singular_values[0]:
@@ -273,13 +272,20 @@ def _solve(
     return solutions
 
 
+def _part(rows: Array, mine: list[int], keep: NDArray[np.bool_]) -> Array:
+    """Return some rows at the samples that take part."""
+    own = rows[mine]
+    return own if keep.all() else own[:, keep]
+
+
 def _require_excited(
     predictor: Predictor, mine: list[int], phi: Sequence[Array], z: Sequence[Array]
 ) -> None:
     """Name the first parameter whose regressor or instrument does not vary at all."""
+    size = [np.max([np.abs(r).max(axis=1, initial=0.0) for r in x], axis=0) for x in (phi, z)]
     for i, column in enumerate(mine):
-        for rows, what in ((phi, "regressor"), (z, "instrument")):
-            largest = max(float(np.abs(r[i]).max(initial=0.0)) for r in rows)
+        for each, what in zip(size, ("regressor", "instrument"), strict=True):
+            largest = float(each[i])
             if largest < 1e-13:
                 label = predictor.columns[column].label
                 if predictor.columns[column].is_bias:

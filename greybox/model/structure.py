@@ -8,7 +8,7 @@ is a derivative or an evaluation of it.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 
 import casadi as ca
 
@@ -97,7 +97,7 @@ class Structure(DisplayMixin):
                 )
             keys[term.key] = term.name
 
-    @property
+    @cached_property
     def parameters(self) -> tuple[str, ...]:
         """Names of the parameters, in the order of ``theta``."""
         return tuple(term.name for term in self.terms)

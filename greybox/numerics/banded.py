@@ -22,7 +22,7 @@ def factor_band(band: Array) -> Array | None:
     return np.asarray(factor) if info == 0 and np.isfinite(factor[0]).all() else None
 
 
-def inverse_band(band: Array, size: int) -> Array:
+def inverse_band(band: Array, size: int, factor: Array | None = None) -> Array:
     """Return the band of the inverse of a symmetric positive block-tridiagonal matrix.
 
     With D⁺ the pivots of block elimination from the first block on and D⁻ those from the last
@@ -35,6 +35,8 @@ def inverse_band(band: Array, size: int) -> Array:
         (b + 1, n) lower band, the diagonal first.
     size : int
         Rows of a block: none but neighbouring blocks are tied.
+    factor : ndarray, optional
+        Cholesky factor of the matrix, where it is known (b + 1, n).
 
     Returns
     -------
@@ -47,9 +49,15 @@ def inverse_band(band: Array, size: int) -> Array:
     """
     width, n = band.shape
     count = -(-n // size)
-    whole = np.zeros((width, count * size))
-    whole[0] = 1.0
-    whole[:, :n] = band
+
+    def padded(x: Array) -> Array:
+        out = np.zeros((width, count * size))
+        out[0] = 1.0
+        out[:, :n] = x
+        return out
+
+    whole = padded(band)
+    root = factor_band(whole) if factor is None else padded(factor)
     reverse = np.zeros_like(whole)
     for d, entries in enumerate(whole):
         entries = entries[: whole.shape[1] - d]
@@ -57,7 +65,8 @@ def inverse_band(band: Array, size: int) -> Array:
     own = _blocks(whole, size)
     own += np.tril(np.ones((size, size)), -1).T[:, :, None] * own.transpose(1, 0, 2)
     tie = _blocks(whole, size, 1)[:, :, :-1]
-    forth, back = _pivots(whole, size), _pivots(reverse, size)[::-1, ::-1, ::-1]
+    forth = _pivots(root, whole.shape, size)
+    back = _pivots(factor_band(reverse), whole.shape, size)[::-1, ::-1, ::-1]
     same = _inverse(forth + back - own)
     below = -_times(_times(same[:, :, 1:], tie), _inverse(forth)[:, :, :-1])
     out = np.zeros((width, count, size))
@@ -82,10 +91,9 @@ def _blocks(band: Array, size: int, below: int = 0) -> Array:
     return out
 
 
-def _pivots(band: Array, size: int) -> Array:
+def _pivots(factor: Array | None, shape: tuple[int, ...], size: int) -> Array:
     """Return the blocks that elimination from the first one on leaves on the diagonal."""
-    factor = factor_band(band)
-    root = _blocks(np.full_like(band, np.nan) if factor is None else factor, size)
+    root = _blocks(np.full(shape, np.nan) if factor is None else factor, size)
     return _times(root, root.transpose(1, 0, 2))
 
 

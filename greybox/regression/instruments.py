@@ -225,8 +225,9 @@ def build_instruments(
         )
         if zero_mean and rows.any():
             # a constant keeps itself as instrument: its equation gives the mean residual
-            varying = np.setdiff1d(np.arange(len(z)), predictor.constants)
-            z[varying] -= z[np.ix_(varying, np.flatnonzero(rows))].mean(axis=1, keepdims=True)
+            mean = (z if rows.all() else z[:, rows]).mean(axis=1, keepdims=True)
+            mean[list(predictor.constants)] = 0.0
+            z -= mean
         zs.append(z)
         keeps.append(rows)
         xs.append(x)

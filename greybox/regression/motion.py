@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from greybox.model.predictor import Predictor
 from greybox.model.run.inputs import LogInputs
-from greybox.model.run.kernels import accumulate
+from greybox.model.run.kernels import FreeRunKernel
 from greybox.model.run.step import Heading, StepModel, integrated
 from greybox.numerics.vectorised import Vectorised
 from greybox.regression.instruments import initial_state, smoothed_wind, state_bound
@@ -63,8 +63,8 @@ def further_channels(predictor: Predictor) -> tuple[str, ...]:
 
 
 @lru_cache(maxsize=32)
-def _step(predictor: Predictor, samples: int, heading: Heading, relative: bool) -> ca.Function:
-    """Return ``samples`` steps ``(state, w, coefficients and constants and dt) -> states``.
+def _step(predictor: Predictor, heading: Heading, relative: bool) -> ca.Function:
+    """Return the step ``(state, w, coefficients and constants and dt) -> state``.
 
     ``w`` holds heading, inputs and air: the velocity through the air, or, where
     `relative`, the wind along the body axes, from which the state is taken.
@@ -85,13 +85,12 @@ def _step(predictor: Predictor, samples: int, heading: Heading, relative: bool) 
         s.theta,
         s.dt,
     )
-    one = ca.Function(
+    return ca.Function(
         "step",
         [state, ca.vertcat(psi, s.tau, air), ca.vertcat(s.theta, constants, s.dt)],
         [ca.vertcat(after[:nx] + constants, after[nx] if turns else state[nx])],
         {"cse": True},
     )
-    return accumulate(one, samples, name="motion")
 
 
 @lru_cache(maxsize=32)
@@ -197,10 +196,11 @@ def predicted_motion(
     elif predictor.air_measured:
         air = np.column_stack([log["u_q"][:-1], log["v_q"][:-1]])
     start = np.append(initial_state(log, structure.states), psi[0])
-    run = _step(predictor, samples, heading, blow is not None)
-    p = np.concatenate([theta, constants, [log.sample_time]])
-    after = run(start, np.column_stack([psi, tau, air]).T, ca.repmat(ca.DM(p), 1, samples))
-    whole = np.vstack([start, np.asarray(after.full()).T[:-1]])
+    run = FreeRunKernel(_step(predictor, heading, blow is not None), samples)
+    run.start[:] = start
+    run.read[:] = np.column_stack([psi, tau, air])
+    run.constants[0][:] = np.concatenate([theta, constants, [log.sample_time]])
+    whole = np.vstack([start, run()[:-1]])
     x = whole[:, :nx]
     with np.errstate(invalid="ignore"):
         outside = np.asarray(~(np.abs(x) <= state_bound(log, structure.states)).all(axis=1))
