@@ -357,8 +357,11 @@ def solve_step(
     # a direction that nothing determines stays where it is
     factor = np.vstack([factor, 1e-6 * np.eye(len(gradient))])
     target = np.concatenate([target, np.zeros(len(gradient))])
-    solved = lsq_linear(factor, target, bounds=(low * scale, high * scale), method="bvls")
-    return np.asarray(np.clip(solved.x / scale, low, high))
+    # where squares overflow there is no step
+    with np.errstate(over="ignore", invalid="ignore"):
+        solved = lsq_linear(factor, target, bounds=(low * scale, high * scale), method="bvls")
+    found = np.where(np.isfinite(solved.x), solved.x, 0.0)
+    return np.asarray(np.clip(found / scale, low, high))
 
 
 def _scales(runs: Runs, nz: int) -> Array:
