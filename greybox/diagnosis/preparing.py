@@ -119,9 +119,11 @@ def _long_enough(logs: Sequence[TrialLog]) -> list[TrialLog]:
     kept = [log for log in logs if len(log) >= SHORTEST]
     if not kept:
         longest = max(logs, key=len)
+        gaps = longest.name.endswith("]")
+        bridged = ", or bridge single missing rows by greybox import" if gaps else ""
         raise LogError(
             f"'{longest.name}' has {len(longest)} samples, a diagnosis needs at least {SHORTEST}: "
-            f"give a longer log."
+            f"give a longer log{bridged}."
         )
     return kept
 

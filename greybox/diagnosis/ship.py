@@ -138,8 +138,8 @@ class LogRun:
         self.states = structure.states
         self._turns = "r" in self.states and "psi" in log
         self.outputs = (*self.states, "psi") if self._turns else self.states
-        self.y = np.column_stack([log[n] for n in self.outputs])
         self._gaps = [(i, ~log.missing[n]) for i, n in enumerate(self.outputs) if n in log.missing]
+        self.y = self._across_gaps(np.column_stack([log[n] for n in self.outputs]))
         self._psi = held(log["psi"] if "psi" in log else np.zeros(len(log)), integrator)
         air = log.air
         self.air_measured = air is not None and structure.uses_air
@@ -202,15 +202,20 @@ class LogRun:
         return Shown(x, y)
 
     def _across_gaps(self, y: Array) -> Array:
-        """Return outputs (N, ny, ...) as the log has them in its gaps: straight between the ends.
+        """Return outputs (N, ny, ...) straight between the ends of gaps, level at the log's ends.
 
         So the error there is what lies between those beside it, and surprises no filter.
         """
         for i, known in self._gaps:
             k, rows = np.flatnonzero(known), np.flatnonzero(~known)
+            if not len(k):
+                y[:, i] = 0.0
+                continue
             right = np.searchsorted(k, rows)
-            left, right = k[right - 1], k[right]
-            share = ((rows - left) / (right - left)).reshape(-1, *[1] * (y.ndim - 2))
+            # a part of a log may begin or end within a gap
+            left, right = k[np.maximum(right - 1, 0)], k[np.minimum(right, len(k) - 1)]
+            share = (rows - left) / np.maximum(right - left, 1)
+            share = share.reshape(-1, *[1] * (y.ndim - 2))
             y[rows, i] = (1 - share) * y[left, i] + share * y[right, i]
         return y
 

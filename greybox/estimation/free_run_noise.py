@@ -99,4 +99,7 @@ def mean_variance(
     values = np.array(loss)
     values = np.where(np.isfinite(values), values, np.nanmax(values[np.isfinite(values)]))
     weight = np.exp(values.min() - PchipInterpolator(np.log(steps), values)(np.log(fine)))
+    if not weight.any():
+        # sharper than the grid
+        return float(steps[values.argmin()] ** 2)
     return float(weight @ fine**2 / weight.sum())

@@ -340,6 +340,9 @@ def solve_step(
     damping : float
         Levenberg-Marquardt share added to the diagonal.
     """
+    if not (np.isfinite(hessian).all() and np.isfinite(gradient).all()):
+        # where squares overflow there is no step
+        return np.asarray(np.clip(0.0, low, high))
     scale = np.sqrt(np.maximum(np.diag(hessian), 0.0))
     scale[scale == 0] = 1.0
     unit = hessian / np.outer(scale, scale)
@@ -357,8 +360,10 @@ def solve_step(
     # a direction that nothing determines stays where it is
     factor = np.vstack([factor, 1e-6 * np.eye(len(gradient))])
     target = np.concatenate([target, np.zeros(len(gradient))])
-    solved = lsq_linear(factor, target, bounds=(low * scale, high * scale), method="bvls")
-    return np.asarray(np.clip(solved.x / scale, low, high))
+    with np.errstate(over="ignore", invalid="ignore"):
+        solved = lsq_linear(factor, target, bounds=(low * scale, high * scale), method="bvls")
+    found = np.where(np.isfinite(solved.x), solved.x, 0.0)
+    return np.asarray(np.clip(found / scale, low, high))
 
 
 def _scales(runs: Runs, nz: int) -> Array:

@@ -119,6 +119,10 @@ def decimate(log: TrialLog, sample_time: float) -> TrialLog:
     made = [Step("decimate", tuple(channels), parameters={
         "measured": log.sample_time, "sample_time": sample_time})]  # fmt: skip
     made += _differences(log, channels, sample_time)
+    anew = {n for s in made[1:] for n in s.channels}
+    then = list(made[1:])
+    if any(_antenna(log)):
+        then.append(Step("move_velocity", ("u", "v"), ("r",)))
     out = replace(
         log,
         sample_time=sample_time,
@@ -126,7 +130,11 @@ def decimate(log: TrialLog, sample_time: float) -> TrialLog:
         channels=channels,
         closed_loop=log.closed_loop[centres],
         missing=carried_gaps(
-            _without_means(log.missing, centres - half, step), made[1:], sample_time
+            _without_means(
+                {n: gap for n, gap in log.missing.items() if n not in anew}, centres - half, step
+            ),
+            then,
+            sample_time,
         ),
         provenance=replace(log.provenance, steps=(*log.provenance.steps, *made)),
     )
@@ -166,11 +174,14 @@ def carried_gaps(
     for step in steps if missing else ():
         # velocities are moved with the yaw rate
         source = ("r",) if step.operation == "move_velocity" else step.source
-        gaps = [out[n] for n in source if n in out]
+        gaps = []
+        for n in out.keys() & set(source):
+            # velocities are turned by the heading of the sample alone
+            turned = step.operation == "difference" and n == "psi" and "r" not in step.channels
+            reach = 0 if turned else _reach(step, sample_time)
+            gaps.append(binary_dilation(out[n], iterations=reach) if reach else out[n])
         if gaps:
             gap = np.any(gaps, axis=0)
-            if reach := _reach(step, sample_time):
-                gap = binary_dilation(gap, iterations=reach)
             out |= {n: gap | out.get(n, False) for n in step.channels}
         if step.operation == "shift":
             late = step.number("late") / sample_time

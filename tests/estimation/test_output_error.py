@@ -549,6 +549,17 @@ class TestRestrictions:
         assert (np.abs(slope[(step > low) & (step < high)]) < 1e-5).all()
 
 
+@pytest.mark.parametrize("size", [np.nan, np.inf, 1e200])
+def test_where_squares_overflow_there_is_no_step(size):
+    low, high = np.array([-1.0, 0.5]), np.array([1.0, 2.0])
+    for hessian, gradient in (
+        (np.diag([1.0, size]), np.ones(2)),
+        (np.eye(2), np.array([1.0, size])),
+    ):
+        step = solve_step(hessian, gradient, low, high)
+        assert ((low <= step) & (step <= high)).all()
+
+
 class TestRefusals:
     def test_two_samples(self, predictor, noisy):
         with pytest.raises(ExcitationError, match="2 samples and 23 unknowns"):

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import pandas as pd
 import pytest
 from virtual import virtual_log, write_csv
 
 from greybox.errors import LogError
+from greybox.rotation import body_to_ned
 from greybox.trial.convert.options import ImportOptions
 from greybox.trial.convert.read import read_log, read_segments
 from greybox.trial.dataframe import log_from_pandas
@@ -115,6 +117,23 @@ def test_what_is_derived_of_a_gap_is_one(log, tmp_path):
     table.attrs.clear()
     found = log_from_pandas(table, log.vessel)
     assert found.t[np.isnan(found.measured("r"))].tolist() == [49.0, 50.0, 51.0, 52.0]
+
+
+def test_single_headings_that_are_missing_cost_no_mean(log):
+    psi = log["psi"].copy()
+    psi[np.arange(N) % 5 == 2] = np.nan
+    x, y = (np.cumsum(w) for w in body_to_ned(log["u"], log["v"], log["psi"]))
+    channels = {n: log[n] for n in ("n", "alpha1", "alpha2")} | {"x_n": x, "y_n": y, "psi": psi}
+    frame = pd.DataFrame({"t": log.t, **channels})
+    found = log_from_pandas(frame, log.vessel)
+    # turned by the heading of each sample alone, and differences of the positions of its neighbours
+    assert set(lost(found, "u")) == set(lost(found, "psi"))
+    assert len(lost(found, "r")) == 3 * len(lost(found, "psi"))
+    slow = decimate(found, 5.0)
+    assert slow.known(("u", "v", "r", "psi")).all()
+    frame.loc[50:69, "psi"] = np.nan
+    hole = decimate(log_from_pandas(frame, log.vessel), 5.0)
+    assert not hole.known(("u",))[(hole.t > 52) & (hole.t < 67)].any()
 
 
 def test_holes_of_positions_part_no_import(tmp_path, ship):

@@ -270,7 +270,7 @@ def test_a_longer_sample_time_keeps_how_velocities_were_made(tmp_path, velocitie
         ),
         (
             lambda f: f.assign(n=f["n"].where(f.index % 3 > 0)),
-            "falls into 7 pieces, .*: 7 of 20 rows left out, the first row 2, where n hold no "
+            "falls into 7 pieces, .*: 7 of 20 rows left out, the first row 2, where n holds no "
             "finite number. Make one log of it with greybox import, which holds inputs",
         ),
         (lambda f: f.assign(t=np.r_[np.arange(10), 10 + 2 * np.arange(10)]), "two sample times"),

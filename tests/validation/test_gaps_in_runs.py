@@ -131,6 +131,21 @@ def test_a_run_of_a_diagnosis_is_straight_across_a_gap(log, gapped, true_model):
         np.testing.assert_allclose(np.diff(two[149:181], 2, axis=0), 0, atol=1e-9)
 
 
+@pytest.mark.parametrize(("first", "stop", "known"), [(160, 300, 180), (40, 170, 149)])
+def test_a_part_of_a_log_may_begin_or_end_within_a_gap(gapped, true_model, first, stop, known):
+    part = gapped.window(first, stop, "part")
+    run = LogRun(true_model.structure, part, "euler")
+    shown = run.run(Ship(true_model.theta, np.zeros(2), gapped.vessel), run.start())
+    error = run.y - shown.y
+    rows = part.missing["u"]
+    assert 0 < rows.sum() < len(part)
+    np.testing.assert_allclose(error[rows], np.tile(error[known - first], (rows.sum(), 1)))
+    nothing = replace(part, missing=dict.fromkeys(part.missing, np.ones(len(part), bool)))
+    run = LogRun(true_model.structure, nothing, "euler")
+    shown = run.run(Ship(true_model.theta, np.zeros(2), gapped.vessel), run.start())
+    np.testing.assert_array_equal(run.y, shown.y)
+
+
 def test_a_short_log_is_diagnosed(log):
     found = diagnose(log.window(0, 150), options=DiagnosisOptions(causes=("current",)))
     assert found.verdict in ("none", "named", "unexplained")

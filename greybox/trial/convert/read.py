@@ -276,7 +276,8 @@ def _known_rows(
     lost = [assigned[n].raw for n in needed if not numbers[n].all()]
     notes.append(
         f"{int((~keep).sum())} of {len(keep)} rows left out, the first row "
-        f"{first + table.first_row}, where {', '.join(lost)} hold no finite number"
+        f"{first + table.first_row}, where {', '.join(lost)} hold{'s' * (len(lost) == 1)} no "
+        f"finite number"
     )
     return {n: values[keep] for n, values in batch.items()}, rows, notes
 
