@@ -33,6 +33,7 @@ from greybox.estimation.shooting import (
 from greybox.model.catalogue import get_structure
 from greybox.model.noise import NoiseLevels
 from greybox.model.output import OutputModel
+from greybox.model.run import output_runs
 from greybox.model.run.output_runs import Filter, Observer, Simulator
 from greybox.study.chapter6 import TRUE
 from greybox.study.efficiency import CASES, determinant_efficiency, virtual_trial
@@ -251,6 +252,30 @@ class TestSensitivities:
                 # truncation h²/6 of the third derivative, rounding 1e-15/h of the innovations
                 tolerance = 1e-6 * np.abs(expected).max() + 1e-9
                 np.testing.assert_allclose(exact[..., j] * noise[j], expected, atol=tolerance)
+
+    def test_long_logs_are_differentiated_a_stretch_at_a_time(self, predictor, noisy, monkeypatch):
+        model, data, p = problem(predictor, noisy)
+        both = cut(
+            [data.first(90), Measured(data.w[200:250], data.y[200:250], data.known[200:250])], 90
+        )
+        noise = np.array([2e-4, 2e-4, 2e-4, 1e-4, 1e-5, 1e-5, 1e-6, 1e-8])
+        starts = both.y[:, 0]
+
+        def derivatives():
+            kalman = Filter(model, both.w, both.y, both.use)
+            free = Simulator(model, both.w).sensitivities(starts, p)
+            return [
+                free[1],
+                free[3],
+                kalman(starts, p, noise)[1],
+                *kalman.by_noise(starts, p, noise),
+            ]
+
+        whole = derivatives()
+        monkeypatch.setattr(output_runs, "_BLOCK", 50)
+        for part, expected in zip(derivatives(), whole, strict=True):
+            size = np.abs(expected).max()
+            np.testing.assert_allclose(part, expected, rtol=1e-9, atol=1e-12 * size)
 
     def test_likelihoods_of_several_logs_add(self, predictor, noisy):
         """Also where one is padded: rows beyond its end count for nothing."""
