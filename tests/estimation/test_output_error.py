@@ -100,6 +100,15 @@ def test_levels_that_have_no_weight_are_not_tried(monkeypatch):
         assert found == pytest.approx(best[0] * 400 / 398, rel=0.03)
 
 
+def test_a_likelihood_sharper_than_its_grid_has_its_best_level_as_mean():
+    class Runs:
+        def filtered(self, p, nodes, noise):
+            return 1e6 * (np.sqrt(noise) - 0.05), np.zeros(1)
+
+    found = free_run_noise.mean_variance(Runs(), None, None, np.array([0.05**2]), 0, 1.0)
+    assert found == pytest.approx(0.05**2)
+
+
 @pytest.fixture(scope="module")
 def noisy():
     return virtual_log(3, 600, spread=0.0)
