@@ -367,8 +367,9 @@ def test_files_whose_clocks_contradict_each_other_are_refused(tmp_path, apart):
     assert f"{apart:.0f}" in str(error.value)
 
 
-@pytest.mark.parametrize("last", [1e12, 1e300])
-def test_times_beyond_every_calendar_are_refused_with_the_number(tmp_path, last):
+@pytest.mark.parametrize(("last", "told"), [(1e12, "1e+12 s"), (1e300, "2025-04-22 23:04:2")])
+def test_times_beyond_every_calendar_are_refused_with_the_number(tmp_path, last, told):
+    """One that no clock counts in any unit is no time: the clock is told without it."""
     paths = two_files(tmp_path, 400.0)
     table = pd.read_csv(paths[1])
     table["time"] = EPOCH + 1e6 + SHIP_RUN["t"]
@@ -376,7 +377,7 @@ def test_times_beyond_every_calendar_are_refused_with_the_number(tmp_path, last)
     table.to_csv(paths[1], index=False)
     with pytest.raises(LogError, match="no time zone") as error:
         read_trial(paths, PLAIN)
-    assert f"{last:g} s" in str(error.value)
+    assert told in str(error.value)
 
 
 def test_two_zones_of_recorders_are_refused(tmp_path):
