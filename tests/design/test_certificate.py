@@ -208,6 +208,7 @@ def test_a_campaign_of_two_trials(ship):
     assert found.bound >= best
 
 
+@pytest.mark.long
 def test_known_sums_and_scenarios(ship):
     problem = make_problem(ship, "surge", 40.0)
     units = surge_grid(4, 6)

@@ -289,6 +289,7 @@ def test_several_trials_are_several_pages(ship, thesis, true_theta, tmp_path):
     assert len(ids) == len(set(ids))
 
 
+@pytest.mark.long
 def test_same_design_same_bytes(short, tmp_path):
     for kind in ("pdf", "svg", "html"):
         for name in ("a", "b"):

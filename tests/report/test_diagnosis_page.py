@@ -389,7 +389,9 @@ def test_memory():
 
 
 @needs_browser
-@pytest.mark.parametrize("verdict", VERDICTS)
+@pytest.mark.parametrize(
+    "verdict", ["named", *(pytest.param(v, marks=pytest.mark.long) for v in VERDICTS[1:])]
+)
 def test_in_a_browser(tmp_path, pages, verdict):
     path = tmp_path / "page.html"
     write_page(pages[verdict], path)

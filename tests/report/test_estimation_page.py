@@ -64,6 +64,7 @@ def test_names_are_text(page):
     assert len(render(page)) < 5_000_000
 
 
+@pytest.mark.long
 def test_same_estimate_same_bytes(estimate, log, page):
     again = estimation_page(estimate, [log], {"program": "p"}, mass=1e5)
     assert render(again) == render(page)

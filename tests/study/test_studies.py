@@ -68,6 +68,7 @@ def test_chapter6(seed):
             assert 0.5 < r.sd / r.published_sd < 2, r
 
 
+@pytest.mark.long
 def test_chapter6_gives_the_same_bytes_for_the_same_seed():
     one = reproduce_chapter6(3, seed=7, samples=600, fit_runs=0, workers=1)
     two = reproduce_chapter6(3, seed=7, samples=600, fit_runs=0, workers=2)

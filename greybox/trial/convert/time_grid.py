@@ -310,7 +310,8 @@ def too_short(plan: Plan) -> LogError:
         f"'{plan.name}' has {plan.count} samples of {plan.sample_time:g} s but no "
         f"{plan.least} that follow each other in which "
         f"{', '.join(plan.reference_channels)} all have values (two more where "
-        f"velocities are derived): choose another sample time or --hole{other}."
+        f"velocities are derived): choose another sample time{other}, or bridge longer "
+        f"steps by greybox import --hole."
     )
 
 
