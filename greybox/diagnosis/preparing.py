@@ -21,6 +21,7 @@ from greybox.regression.regression import common_sample_time
 from greybox.trial.checks.finding import Finding
 from greybox.trial.convert.sensor_corrections import correct_log
 from greybox.trial.log import TrialLog
+from greybox.trial.segments import whole_name
 from greybox.vessel.force import force_inputs
 
 # samples that a diagnosis needs in every log
@@ -119,7 +120,7 @@ def _long_enough(logs: Sequence[TrialLog]) -> list[TrialLog]:
     kept = [log for log in logs if len(log) >= SHORTEST]
     if not kept:
         longest = max(logs, key=len)
-        gaps = longest.name.endswith("]")
+        gaps = whole_name(longest.name) != longest.name
         bridged = ", or bridge single missing rows by greybox import" if gaps else ""
         raise LogError(
             f"'{longest.name}' has {len(longest)} samples, a diagnosis needs at least {SHORTEST}: "

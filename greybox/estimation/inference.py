@@ -26,6 +26,11 @@ _PART = re.compile(
 )
 
 
+def _shown(value: Any) -> str:
+    """Return a value as a sentence shows it."""
+    return f"{float(value):g}" if isinstance(value, Real) else f"{value!r:.40}"
+
+
 def confidence_intervals(values: Array, std: Array, level: float) -> Array:
     """Return the limits (p, 2) of intervals from the normal distribution.
 
@@ -39,7 +44,7 @@ def confidence_intervals(values: Array, std: Array, level: float) -> Array:
     given: Any = level
     if not isinstance(given, Real) or not 0 < level < 1:
         raise UsageError(
-            f"the level of an interval is {level!r:.40}, give a number between 0 and 1, such as "
+            f"the level of an interval is {_shown(level)}, give a number between 0 and 1, such as "
             f"0.95."
         )
     reach = float(ndtri((1 + level) / 2)) * std
@@ -70,8 +75,8 @@ def restriction_matrix(
         for name, given in restrictions.items():
             if not isinstance(given, Real) or not isfinite(given):
                 raise UsageError(
-                    f"the restriction of {name!r:.40} is {given!r:.40}, a finite number is needed: "
-                    f"write {{'{names[0]}': 0.1}}, or '{names[0]} = 0.1'."
+                    f"the restriction of {name!r:.40} is {_shown(given)}, a finite number is "
+                    f"needed: write {{'{names[0]}': 0.1}}, or '{names[0]} = 0.1'."
                 )
         told = [f"{name} = {float(value):g}" for name, value in restrictions.items()]
         rows = [({name: 1.0}, float(value)) for name, value in restrictions.items()]

@@ -29,7 +29,7 @@ class Estimator:
     words : str
         What it is called.
     fit : callable
-        Estimates an `EstimationProblem`.
+        Estimates an `EstimationProblem` and returns `Fitted`: its tests are run by the package.
     free_run : bool
         Whether it fits free runs: the run itself feels the current, whose components
         are parameters, and no regression is solved.

@@ -15,11 +15,11 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.errors import GreyboxError, ModelFileError, StructureError, suggestion
+from greybox.errors import GreyboxError, ModelFileError, suggestion
 from greybox.files import nearest_file, plain, write_json
 from greybox.model.disturbances import DisturbanceKind
 from greybox.model.noise import NoiseLevels, noise_from_dict
-from greybox.model.run.changes import Change, factors_at
+from greybox.model.run.changes import Change, factors_at, require_parameters
 from greybox.model.run.step import Integrator
 from greybox.model.structure import Structure
 from greybox.model.terms import Factor, Term, parameter_unit
@@ -92,13 +92,7 @@ class ManoeuvringModel(DisplayMixin):
     conditions: Validity = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for change in self.changes:
-            if change.parameter not in self.names:
-                raise StructureError(
-                    f"a change is of '{change.parameter}', which is no parameter of structure "
-                    f"'{self.structure.name}'.{suggestion(change.parameter, self.names)} "
-                    f"It has: {', '.join(self.names)}."
-                )
+        require_parameters(self.changes, self.names, self.structure.name)
 
     def __eq__(self, other: object) -> bool:
         """Whether both are the same model: their files would hold the same."""

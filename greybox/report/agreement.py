@@ -18,7 +18,6 @@ from greybox.trial.checks.motion import Motion, smooth, to_ned
 
 Array = NDArray[np.float64]
 
-PAIRS = ("u", "v", "r")
 # noise that a derivative may keep, as a share of what it measures
 _NOISE = 0.01
 _ENDS = 1.5

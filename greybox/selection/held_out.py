@@ -119,21 +119,26 @@ def score_runs(runs: Sequence[LogFit], spread: dict[str, float], blocks: int = 1
 def folds(logs: Sequence[TrialLog], count: int) -> list[tuple[list[TrialLog], list[TrialLog]]]:
     """Return (to estimate on, held out) for each of `count` contiguous parts of every log.
 
+    Logs too short for parts, such as pieces between gaps, are always estimated on.
+
     Raises
     ------
     UsageError
-        The parts would be too short to run on.
+        The parts of every log would be too short to run on.
     """
-    shortest = min(len(log) for log in logs)
-    if shortest // count < _SHORTEST:
+    longest = max(logs, key=len)
+    if len(longest) // count < _SHORTEST:
         raise UsageError(
-            f"a log of {shortest} samples gives {count} parts of {shortest // count}, at least "
-            f"{_SHORTEST} samples are needed: use longer logs."
+            f"'{longest.name}' has {len(longest)} samples and gives {count} parts of "
+            f"{len(longest) // count}, at least {_SHORTEST} samples are needed: use longer logs."
         )
     out = []
     for k in range(count):
         fitting, held = [], []
         for log in logs:
+            if len(log) // count < _SHORTEST:
+                fitting.append(log)
+                continue
             edges = np.linspace(0, len(log), count + 1).astype(int)
             held.append(log.window(int(edges[k]), int(edges[k + 1]), log.name))
             for a, b in ((0, int(edges[k])), (int(edges[k + 1]), len(log))):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -17,6 +18,8 @@ from greybox.trial.log import Logs, TrialLog, as_list
 
 Array = NDArray[np.float64]
 
+# what the name of a segment has behind that of its log
+_SEGMENT = re.compile(r"\[\d+\]$")
 # standard errors by which a smoothed state must be inside its margin's width
 _SURE = 3.0
 # samples over which a state is averaged at most, where its noise is large beside the margin
@@ -71,6 +74,11 @@ def join_segments(segments: Sequence[TrialLog], name: str) -> TrialLog:
     )
 
 
+def whole_name(name: str) -> str:
+    """Return the name of the log of which `split_segments` named a segment, others as they are."""
+    return _SEGMENT.sub("", name)
+
+
 def split_segments(log: TrialLog) -> list[TrialLog]:
     """Return the segments between the gaps of a log's time; the log itself where it has none."""
     found = split_at_gaps(log.t, log.sample_time)
@@ -80,8 +88,12 @@ def split_segments(log: TrialLog) -> list[TrialLog]:
 
 
 def as_segments(logs: Logs, least: int = 1) -> list[TrialLog]:
-    """Return the segments between the gaps of one log or of several, as `as_list` takes them."""
-    return [segment for log in as_list(logs, least) for segment in split_segments(log)]
+    """Return the segments between the gaps of one log or of several, as `as_list` takes them.
+
+    Single samples are left out where there are others: they tell of no step.
+    """
+    found = [segment for log in as_list(logs, least) for segment in split_segments(log)]
+    return [s for s in found if len(s) > 1] or found
 
 
 @dataclass(frozen=True)

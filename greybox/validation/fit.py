@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
@@ -18,7 +17,7 @@ from greybox.notebook import DisplayMixin, number, sparkline, table
 from greybox.regression.instruments import simulate_log
 from greybox.trial.kinematics import decimate_segments
 from greybox.trial.log import TrialLog
-from greybox.trial.segments import join_segments, split_segments
+from greybox.trial.segments import join_segments, split_segments, whole_name
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -26,8 +25,6 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 _HUGE = 1e6
-# what the name of a segment has behind that of its log
-_SEGMENT = re.compile(r"\[\d+\]$")
 
 
 def fit_percent(measured: Array, simulated: Array) -> Array:
@@ -233,7 +230,7 @@ def _by_log(fits: Sequence[LogFit]) -> list[list[LogFit]]:
         before = groups[-1][-1].log if groups else None
         if (
             before is not None
-            and _SEGMENT.sub("", before.name) == _SEGMENT.sub("", run.log.name) != run.log.name
+            and whole_name(before.name) == whole_name(run.log.name) != run.log.name
             and before.provenance == run.log.provenance
             and before.t[-1] < run.log.t[0]
         ):

@@ -108,6 +108,8 @@ def test_results_are_labelled(estimate):
     assert tested.to_dict()["distribution"] == "χ²(2)"
     with pytest.raises(GreyboxError, match="level of an interval is 95"):
         estimate.conf_int(level=95)
+    with pytest.raises(GreyboxError, match="level of an interval is 2, give a number"):
+        estimate.conf_int(np.float64(2.0))
     with pytest.raises(GreyboxError, match="level of an interval is 'Xu', give a number"):
         estimate.conf_int("Xu")
     with pytest.raises(KeyError, match=r"no parameter 'Xuv'\. Did you mean"):

@@ -188,3 +188,10 @@ def test_commands_follow_a_change(model, tmp_path, capsys):
     found = json.loads((tmp_path / "c.json").read_text())
     fits = {m["model"]: m["fit"]["u"] for m in found["models"]}
     assert fits["changing"] > 95 > fits["plain"] + 10
+
+
+def test_a_change_of_no_parameter_is_refused_with_the_nearest(thesis, true_theta):
+    with pytest.raises(StructureError, match=r"'XU', which is no parameter.*Did you mean 'Xu'"):
+        simulate(
+            thesis, true_theta, np.zeros(3), np.zeros((5, 3)), 1.0, changes=[Change("XU", 2.0, 1.0)]
+        )

@@ -274,6 +274,10 @@ def test_a_longer_sample_time_keeps_how_velocities_were_made(tmp_path, velocitie
             "finite number. Make one log of it with greybox import, which holds inputs",
         ),
         (lambda f: f.assign(t=np.r_[np.arange(10), 10 + 2 * np.arange(10)]), "two sample times"),
+        (
+            lambda f: f.assign(n=f["n"].where(f.index != 10), t=f["t"] + 0.2 * (f.index > 10)),
+            "two sample times: 0.5 s, but 1.2 s after t = 4.5 s",
+        ),
         (lambda f: f.head(2), "has 2 samples, at least 3"),
         (
             lambda f: f.assign(t=np.r_[np.arange(10), 9 + 1.15 * np.arange(1, 11)]),

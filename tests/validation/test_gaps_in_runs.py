@@ -22,6 +22,8 @@ from greybox.model.predictor import build_predictor
 from greybox.regression.regression import build_regression
 from greybox.selection.estimate import estimate_model
 from greybox.selection.fit_single import estimate_iv, estimate_ls
+from greybox.selection.request import Request
+from greybox.selection.structures import compare_structures
 from greybox.trial.log import make_log
 from greybox.trial.segments import join_segments
 from greybox.validation.bands import predict_bands
@@ -175,6 +177,27 @@ def test_a_single_log_with_gaps_is_estimated(log):
     assert [one["samples"] for one in estimate.logs] == [200, 190]
     with pytest.raises(UsageError, match=r"no parameter 'XU'\. Did you mean 'Xu'"):
         estimate["XU"]
+
+
+@pytest.mark.parametrize(("method", "prefilter"), [("ls", "none"), ("iv", "none"), ("iv", "noise")])
+def test_a_single_sample_between_two_gaps_is_left_out(log, method, prefilter):
+    parts = [log.window(0, 150), log.window(160, 161), log.window(170, N)]
+    asked = {
+        "method": method, "prefilter": prefilter, "predictor": "basic", "structure": "thesis",
+        "seed": 0,
+    }  # fmt: skip
+    estimate = estimate_model(join_segments(parts, "three"), **asked)
+    assert [one["samples"] for one in estimate.logs] == [150, 230]
+
+
+def test_structures_are_compared_on_logs_with_a_short_piece(log):
+    pieces = [log.window(0, 200), log.window(205, 210), log.window(215, N)]
+    choice = compare_structures(
+        [join_segments(pieces, "three")],
+        ["linear", "thesis"],
+        Request(method="ls", predictor="basic"),
+    )
+    assert all(np.isfinite(row.behind) for row in choice.rows)
 
 
 def test_the_fit_of_an_estimate_is_that_of_its_log_however_short_its_segments(log):

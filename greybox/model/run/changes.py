@@ -10,7 +10,7 @@ from math import ceil, isfinite
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.errors import StructureError
+from greybox.errors import StructureError, suggestion
 
 Array = NDArray[np.float64]
 
@@ -49,6 +49,16 @@ class Change:
     def sentence(self) -> str:
         """The change in words."""
         return f"{self.parameter} is {self.factor:g} times its value from {self.time:g} s on"
+
+
+def require_parameters(changes: Sequence[Change], names: Sequence[str], structure: str) -> None:
+    """Raise `StructureError` where a change is of no parameter of a structure."""
+    for change in changes:
+        if change.parameter not in names:
+            raise StructureError(
+                f"a change is of '{change.parameter}', which is no parameter of structure "
+                f"'{structure}'.{suggestion(change.parameter, names)} It has: {', '.join(names)}."
+            )
 
 
 def factors_at(changes: Sequence[Change], names: Sequence[str], time: float) -> Array:

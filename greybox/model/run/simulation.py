@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import DivergenceError, UsageError
-from greybox.model.run.changes import Change, pieces
+from greybox.model.run.changes import Change, pieces, require_parameters
 from greybox.model.run.kernels import MANY_RUNS, FreeRunKernel, FreeRunStep, OverRunsKernel
 from greybox.model.run.step import Heading, Integrator, StepModel, held, integrated
 from greybox.model.structure import Structure
@@ -147,7 +147,10 @@ def simulate(
     ------
     UsageError
         The shapes of two arguments do not fit each other.
+    StructureError
+        A change is of no parameter of the structure.
     """
+    require_parameters(changes, structure.parameters, structure.name)
     theta, x0 = np.atleast_1d(np.asarray(theta, float)), np.atleast_1d(np.asarray(x0, float))
     tau = np.asarray(tau, float)
     nx = len(structure.states)

@@ -323,7 +323,7 @@ def _require_uniform(
     off = np.abs(steps - np.round(steps / usual) * usual) > _JITTER * usual
     if off.any() or gaps.sum() > _MOST_GAPS * len(steps):
         k = int(np.flatnonzero(off | gaps)[0])
-        if not (off | gaps)[beside].any():
+        if not off.any() and not gaps[beside].any():
             raise LogError(
                 f"'{name}' falls into {len(found)} pieces, too many for one log: {left_out[-1]}. "
                 f"Make one log of it with {importer}, which holds inputs over short holes."
