@@ -186,6 +186,7 @@ def test_help_imports_nothing_heavy():
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
 
 
+@pytest.mark.long
 def test_reproduce_writes_tables_figures_and_page(tmp_path, capsys):
     out = tmp_path / "c4"
     assert run("reproduce", "chapter4", "--runs", "2", "--workers", "1", "--out", out) == 0

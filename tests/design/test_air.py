@@ -82,6 +82,7 @@ def test_without_a_margin_the_share_of_doubtful_samples_is_told(free):
     assert "--margin-air" in note
 
 
+@pytest.mark.long
 def test_a_wind_sensor_of_unknown_noise():
     request = wind_request()
     silent = replace(request, noise=replace(request.noise, wind=0.0), duration=120.0)

@@ -63,6 +63,7 @@ def drifting_log(seed, drag, samples=700):
     return make_log(vessel, commands | noisy, 1.0, f"day {seed}")
 
 
+@pytest.mark.long
 def test_registered_cause_is_named(drift_drag):
     logs = [drifting_log(k, -0.02) for k in (1, 2)]
     found = diagnose(logs[:1], validate=logs[1:], options=DiagnosisOptions())

@@ -292,6 +292,7 @@ def test_runs_that_end_before_their_log():
     assert errors.regimes == (0,)
 
 
+@pytest.mark.long
 def test_causes_that_need_no_force_model():
     kinematic = replace(BIAS, key="heading_bias:kinematics", gain=0.0)
     shown = text_of(diagnosis_page(replace(diagnosis_of("named"), causes=(kinematic,)), RECORD))

@@ -208,6 +208,7 @@ def test_zoom_in_a_browser(tmp_path):
         assert [e["message"] for e in browser.get_log("browser")] == []
 
 
+@pytest.mark.long
 def test_a_finger_scrolls_the_page(tmp_path):
     """On a phone no tool takes a drag before it is asked to; nothing runs over the side."""
     path = tmp_path / "page.html"
