@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from greybox.credibility.evidence import Equation, Evidence
 from greybox.credibility.overidentification import delayed
-from greybox.credibility.score_statistic import ScoreStatistic, score_test
-from greybox.credibility.score_test import Conclusion, ScoreTest
+from greybox.credibility.score_statistic import ScoreStatistic
+from greybox.credibility.score_test import Conclusion, ScoreTest, equation_score
 from greybox.estimation.verdict import TestResult
 from greybox.model.run.inputs import LogInputs
 
@@ -41,13 +41,7 @@ def input_independence(evidence: Evidence, equation: Equation) -> TestResult:
     xi = _delayed_inputs(evidence, equation)
 
     def score() -> ScoreStatistic:
-        return score_test(
-            xi,
-            equation.phi,
-            equation.pooled.projected,
-            equation.pooled_residuals,
-            noise_model=equation.noise_model,
-        )
+        return equation_score(equation, xi)
 
     def conclude(score: ScoreStatistic, fine: bool) -> Conclusion:
         std = np.sqrt(np.maximum(np.diag(score.covariance), 0.0))

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.credibility.evidence import Equation
-from greybox.credibility.score_statistic import ScoreStatistic, score_test
-from greybox.credibility.score_test import Conclusion, ScoreTest
+from greybox.credibility.score_statistic import ScoreStatistic
+from greybox.credibility.score_test import Conclusion, ScoreTest, equation_score
 from greybox.estimation.verdict import TestResult
 
 Array = NDArray[np.float64]
@@ -57,13 +57,7 @@ def overidentification(
             xi = [np.vstack([d, f]) for d, f in zip(xi, further, strict=True)]
         if each_log and len(equation.z) > 1:
             xi = [np.vstack([s, d]) for s, d in zip(equation.stacked, xi, strict=True)]
-        return score_test(
-            xi,
-            equation.phi,
-            equation.pooled.projected,
-            equation.pooled_residuals,
-            noise_model=equation.noise_model,
-        )
+        return equation_score(equation, xi)
 
     return _TEST.apply(equation, score, _conclude)
 

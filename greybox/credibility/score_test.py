@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from greybox.credibility.evidence import Equation
-from greybox.credibility.score_statistic import ScoreStatistic
+from greybox.credibility.score_statistic import Array, ScoreStatistic, score_test
 from greybox.estimation.verdict import TestResult, not_applicable
 
 LEVEL = 0.05
+
+
+def equation_score(equation: Equation, xi: Sequence[Array]) -> ScoreStatistic:
+    """Test E ξ e = 0 in one equation, with the memory of its noise model."""
+    return score_test(
+        xi,
+        equation.phi,
+        equation.pooled.projected,
+        equation.pooled_residuals,
+        noise_model=equation.noise_model,
+    )
 
 
 @dataclass(frozen=True)
