@@ -100,7 +100,7 @@ def test_service_speed_is_where_thrust_balances_resistance(make):
         manoeuvres.steady(),
         100 * ship.time_scale,
         ship.time_scale / 10,
-        step=ship.time_scale / 40,
+        step=ship.time_scale / 10,
         start_speed=0.5 * root,
         noise=SILENT,
     )
