@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
 Array = NDArray[np.float64]
 GRAVITY = 9.81
@@ -67,40 +68,26 @@ def filtered(rng: np.random.Generator, steps: int, dt: float, time: float) -> Ar
     keep = math.exp(-dt / time)
     drive = math.sqrt(1 - keep**2) * rng.standard_normal(steps)
     drive[0] = rng.standard_normal()
-    out = np.empty(steps)
-    last = 0.0
-    for k, d in enumerate(drive):
-        last = keep * last + d
-        out[k] = last
-    return out
-
-
-def smooth(rng: np.random.Generator, steps: int, dt: float, time: float) -> Array:
-    """Return a process like `filtered`, but smooth enough for a derivative."""
-    lead = round(3 * time / dt)
-    raw = filtered(rng, steps + lead, dt, time)
-    gain = dt / time
-    out = np.empty(steps + lead)
-    last = raw[0] / math.sqrt(2)
-    for k, x in enumerate(raw):
-        last += gain * (x - last)
-        out[k] = last
-    return math.sqrt(2) * out[lead:]
+    return np.asarray(lfilter([1.0], [1.0, -keep], drive))
 
 
 def current_series(
     current: Current | None, rng: np.random.Generator, steps: int, dt: float
-) -> tuple[Array, Array]:
-    """Return the current (steps, 2) north and east [m/s], and its rate [m/s2]."""
+) -> Array:
+    """Return the current (steps, 2) north and east [m/s], filtered twice to vary smoothly."""
     if current is None:
-        return np.zeros((steps, 2)), np.zeros((steps, 2))
+        return np.zeros((steps, 2))
     mean = current.speed * np.array([math.cos(current.towards), math.sin(current.towards)])
     value = np.tile(mean, (steps, 1))
     if current.spread:
-        value = value + current.spread * np.column_stack(
-            [smooth(rng, steps, dt, current.time) for _ in range(2)]
-        )
-    return value, np.gradient(value, dt, axis=0)
+        lead = round(3 * current.time / dt)
+        keep = math.exp(-dt / current.time)
+        for axis in range(2):
+            raw = filtered(rng, steps + lead, dt, current.time)
+            # a second filter of the same time constant halves the variance
+            twice = lfilter([1 - keep], [1, -keep], raw)[lead:]
+            value[:, axis] += math.sqrt(2) * current.spread * twice
+    return value
 
 
 def wind_series(wind: Wind | None, rng: np.random.Generator, steps: int, dt: float) -> Array:

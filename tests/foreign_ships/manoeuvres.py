@@ -43,12 +43,11 @@ def turning_circle(
         course: list[float] = []
 
         def helm(motion: Motion) -> Sequence[float]:
-            if motion.t < start or motion.t > end:
-                if not course or motion.t < start:
-                    course[:] = course or [motion.psi]
-                return ship.helm(ahead, _steer(ship, motion, course[0]))
-            course.clear()
-            return ship.helm(ahead, turn)
+            if start <= motion.t <= end:
+                course.clear()
+                return ship.helm(ahead, turn)
+            course[:] = course or [motion.psi]
+            return ship.helm(ahead, _steer(ship, motion, course[0]))
 
         return helm
 
@@ -242,3 +241,23 @@ def table(times: Sequence[float], rows: Sequence[Sequence[float]]) -> Manoeuvre:
         ]
 
     return manoeuvre
+
+
+def kinds() -> dict[str, Manoeuvre]:
+    """Return the manoeuvres of a sea trial by name, to both sides where they have one."""
+    return {
+        "turn-starboard": turning_circle(1.0),
+        "turn-port": turning_circle(-1.0),
+        "turn-starboard-15": turning_circle(15 / 35, 0.8),
+        "turn-port-15": turning_circle(-15 / 35, 0.8),
+        "zigzag-10": zigzag(10, 10),
+        "zigzag-10-port": zigzag(-10, 10),
+        "zigzag-20": zigzag(20, 20),
+        "zigzag-20-port": zigzag(-20, 20),
+        "spiral": spiral(),
+        "speed-steps": speed_steps(),
+        "stopping": acceleration_and_stopping(),
+        "random": random_steps(),
+        "random-with-side": random_steps(side=0.6),
+        "everyday": everyday(),
+    }

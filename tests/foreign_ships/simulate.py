@@ -107,6 +107,10 @@ def simulate(
 ) -> Trial:
     """Sail a manoeuvre by Runge-Kutta steps of fourth order.
 
+    The water carries the ship along, also where it speeds up: the slope of the surface that
+    drives the current pushes a floating ship as it pushes the water, so the motion through the
+    water does not feel it.
+
     Parameters
     ----------
     ship : Ship
@@ -134,9 +138,9 @@ def simulate(
     h = dt / inner
     samples = round(duration / dt) + 1
     steps = (samples - 1) * inner + 1
-    currents, rates = current_series(current, sea, steps, h)
+    currents = current_series(current, sea, steps, h)
     winds = wind_series(wind, sea, steps, h)
-    flows, drifts, airs = currents.tolist(), rates.tolist(), winds.tolist()  # faster than arrays
+    flows, airs = currents.tolist(), winds.tolist()  # faster than arrays
     swell = None if waves is None else WaveForce(waves, sea, ship.length, ship.beam)
     speed = ship.service_speed if start_speed is None else start_speed
     heading = pilot.uniform(-math.pi, math.pi) if start_heading is None else start_heading
@@ -150,7 +154,7 @@ def simulate(
     first = 3 + moving
     limits = [a.limits for a in actuators]
     followers = [(1 / a.lag, a.rate) for a in actuators]
-    mass, x_g, _ = ship.inertia
+    mass, _, inertia = ship.inertia
     windage = ship.windage
     drag_x, drag_y = AIR / 2 * windage.frontal * windage.cx, AIR / 2 * windage.lateral * windage.cy
 
@@ -158,7 +162,6 @@ def simulate(
     orders = np.empty((samples, len(actuators)))
     for k in range(steps):
         flow_n, flow_e = flows[k]
-        drift_n, drift_e = drifts[k]
         air_n, air_e = airs[k]
         c, s = math.cos(state[2]), math.sin(state[2])
         ground_n = c * state[3] - s * state[4] + flow_n
@@ -182,15 +185,12 @@ def simulate(
             orders[k // inner] = order
         if k == steps - 1:
             break
-        # the water's own acceleration, felt by the ship's mass in the frame that drifts with it
-        push_x = -mass * (c * drift_n + s * drift_e)
-        push_y = -mass * (c * drift_e - s * drift_n)
-        push_n = x_g * push_y
+        push_x = push_y = push_n = 0.0
         if swell is not None:
             surge, sway, yaw = swell(k * h, state[0], state[1], state[2])
-            push_x += mass * surge
-            push_y += mass * sway
-            push_n += ship.inertia[2] * yaw
+            push_x = mass * surge
+            push_y = mass * sway
+            push_n = inertia * yaw
 
         def rate(y: list[float]) -> list[float]:
             c, s = math.cos(y[2]), math.sin(y[2])
