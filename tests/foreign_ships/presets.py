@@ -58,7 +58,7 @@ class Preset:
 
 def presets() -> dict[str, Preset]:
     """Return every ship by its name."""
-    model = Noise(position=0.01, heading=0.002, u=0.005, v=0.005, r=0.002, wind=0.2)
+    model = Noise(position=0.01, heading=0.002, u=0.003, v=0.003, r=0.001, wind=0.2)
     boat = Noise(position=0.02, heading=0.005, u=0.02, v=0.02, r=0.003, wind=0.3, speed=2.0)
     survey = Noise(position=0.05, heading=0.002, u=0.03, v=0.03, r=0.0005, wind=0.4, angle=0.003)
     bridge = Noise(position=0.5, heading=0.003, u=0.03, v=0.03, r=0.0002, wind=0.5)
@@ -67,7 +67,7 @@ def presets() -> dict[str, Preset]:
         "kvlcc2-7m": Preset(mmg.kvlcc2(noise=model), 0.1, 720.0),
         "kvlcc2-320m": Preset(mmg.kvlcc2(320.0, noise=bridge), 1.0, 3600.0),
         "training-ship-105m": Preset(mmg.training_ship(noise=bridge), 0.5, 1800.0),
-        "esso-osaka-3m": Preset(mmg.esso_osaka(noise=replace(model, u=0.01, v=0.01)), 0.1, 720.0),
+        "esso-osaka-3m": Preset(mmg.esso_osaka(noise=replace(model, u=0.005, v=0.005)), 0.1, 720.0),
         "survey-catamaran-1.2m": Preset(catamaran.survey_craft(1.2, noise=boat), 0.1, 600.0),
         "survey-catamaran-2m": Preset(catamaran.survey_craft(2.0, noise=boat), 0.2, 720.0),
         "research-catamaran-29m": Preset(catamaran.research_catamaran(noise=survey), 0.2, 1200.0),

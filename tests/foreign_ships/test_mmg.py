@@ -50,6 +50,7 @@ def test_agrees_with_shipmmg(name):
         assert np.abs(error).max() <= tolerance[kind] * np.abs(run[column]).max(), column
 
 
+@pytest.mark.filterwarnings("ignore")  # shipmmg is as old as the packages that it asks for
 @pytest.mark.skipif(importlib.util.find_spec("shipmmg") is None, reason="shipmmg is not installed")
 def test_the_reference_is_that_of_shipmmg():
     pytest.importorskip("scipy.misc", exc_type=ImportError)
