@@ -14,7 +14,7 @@ the truth and the log, `ship.vessel_toml()` the vessel file that a crew would wr
 
 from foreign_ships.environment import Current, Waves, Wind, Windage
 from foreign_ships.presets import DEVELOPMENT, FINAL, Preset, presets
-from foreign_ships.ship import SILENT, Actuator, Noise, Ship
+from foreign_ships.ship import SILENT, Actuator, Faults, Noise, Ship
 from foreign_ships.simulate import Manoeuvre, Motion, Trial, simulate
 
 __all__ = [
@@ -23,6 +23,7 @@ __all__ = [
     "SILENT",
     "Actuator",
     "Current",
+    "Faults",
     "Manoeuvre",
     "Motion",
     "Noise",

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -69,11 +69,6 @@ class Mechanisms:
     tunnel_loss: bool = True
     asymmetry: bool = True
     actuator_dynamics: bool = True
-
-    @classmethod
-    def none(cls) -> Mechanisms:
-        """Switch everything off."""
-        return cls(**{f.name: False for f in fields(cls)})
 
 
 @dataclass(frozen=True)

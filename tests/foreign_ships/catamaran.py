@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import cached_property
 
 from foreign_ships.environment import GRAVITY, Windage
@@ -60,11 +60,6 @@ class Mechanisms:
     advance: bool = True
     asymmetry: bool = True
     actuator_dynamics: bool = True
-
-    @classmethod
-    def none(cls) -> Mechanisms:
-        """Switch everything off."""
-        return cls(**{f.name: False for f in fields(cls)})
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import cached_property
 
 from scipy.optimize import brentq
@@ -64,11 +64,6 @@ class Mechanisms:
     asymmetry: bool = True
     propeller_walk: bool = True
     actuator_dynamics: bool = True
-
-    @classmethod
-    def none(cls) -> Mechanisms:
-        """Switch everything off."""
-        return cls(**{f.name: False for f in fields(cls)})
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Self
 
 from foreign_ships.environment import Windage
 
@@ -33,6 +34,28 @@ class Noise:
     wind: float = 0.3
     speed: float = 0.0
     angle: float = 0.0
+
+
+@dataclass(frozen=True)
+class Faults:
+    """What is wrong with the instruments, not with the ship.
+
+    Attributes
+    ----------
+    heading_bias : float
+        Measured minus true [rad].
+    antenna : tuple of float
+        Where the positions are measured, though the vessel file has the origin [m].
+    late : dict of str to float
+        Channels (x_n, y_n, psi, u, v, r, u_q, v_q, actuators' columns) that come late [s].
+    offset : dict of str to float
+        What is added to a channel, in its unit; an azimuth's zero for instance.
+    """
+
+    heading_bias: float = 0.0
+    antenna: tuple[float, float] = (0.0, 0.0)
+    late: dict[str, float] = field(default_factory=dict)
+    offset: dict[str, float] = field(default_factory=dict)
 
 
 SILENT = Noise(0, 0, 0, 0, 0, 0, 0, 0)
@@ -66,7 +89,21 @@ class Ship(ABC):
     service_speed: float  # m/s at full ahead
     noise: Noise
     windage: Windage
+    mechanisms: Any  # flags of the simulator, all on; see its `Mechanisms`
     rolls = False
+
+    def only(self, *mechanisms: str) -> Self:
+        """Return the ship with these mechanisms alone; with none of them it is linear."""
+        names = {f.name for f in fields(self.mechanisms)}
+        if not names >= set(mechanisms):
+            raise ValueError(f"{self.name} has no {set(mechanisms) - names}, only {names}")
+        flags = type(self.mechanisms)(**{n: n in mechanisms for n in names})
+        return replace(self, mechanisms=flags)  # type: ignore[type-var]
+
+    def without(self, *mechanisms: str) -> Self:
+        """Return the ship with these mechanisms switched off."""
+        flags = replace(self.mechanisms, **dict.fromkeys(mechanisms, False))
+        return replace(self, mechanisms=flags)  # type: ignore[type-var]
 
     @property
     @abstractmethod

@@ -20,7 +20,7 @@ from foreign_ships.environment import (
     current_series,
     wind_series,
 )
-from foreign_ships.ship import Noise, Ship
+from foreign_ships.ship import Faults, Noise, Ship
 
 Array = NDArray[np.float64]
 
@@ -84,10 +84,12 @@ class Trial:
         np.savetxt(path, table, delimiter=",", header=",".join(columns), comments="", fmt="%.9g")
         return Path(path)
 
-    def measured_again(self, seed: int, noise: Noise | None = None) -> Trial:
-        """Return the same run with other sensor noise."""
+    def measured_again(
+        self, seed: int, noise: Noise | None = None, faults: Faults | None = None
+    ) -> Trial:
+        """Return the same run with other sensor noise, or with faults of the instruments."""
         noise = self.ship.noise if noise is None else noise
-        return replace(self, measured=_measure(self.ship, self.true, noise, seed))
+        return replace(self, measured=_measure(self.ship, self.t, self.true, noise, faults, seed))
 
 
 def simulate(
@@ -100,6 +102,7 @@ def simulate(
     current: Current | None = None,
     waves: Waves | None = None,
     noise: Noise | None = None,
+    faults: Faults | None = None,
     seed: int = 0,
     start_speed: float | None = None,
     start_heading: float | None = None,
@@ -120,6 +123,8 @@ def simulate(
     wind, current, waves : optional
     noise : Noise, optional
         Of the sensors; that of the ship where not given.
+    faults : Faults, optional
+        Of the sensors; none where not given.
     seed : int
         Of the environment, of what chance the manoeuvre takes, and of the noise.
     start_speed : float, optional
@@ -227,8 +232,8 @@ def simulate(
             raise FloatingPointError(f"{ship.name} diverged after {k * h:.1f} s")
 
     true = _truth(ship, out, orders, currents[::inner], winds[::inner])
-    measured = _measure(ship, true, ship.noise if noise is None else noise, seed)
-    return Trial(ship, dt * np.arange(samples), true, measured)
+    trial = Trial(ship, dt * np.arange(samples), true, {})
+    return trial.measured_again(seed, noise, faults)
 
 
 def _truth(
@@ -254,8 +259,16 @@ def _truth(
     return true
 
 
-def _measure(ship: Ship, true: dict[str, Array], noise: Noise, seed: int) -> dict[str, Array]:
+def _measure(
+    ship: Ship,
+    t: Array,
+    true: dict[str, Array],
+    noise: Noise,
+    faults: Faults | None,
+    seed: int,
+) -> dict[str, Array]:
     rng = np.random.default_rng([seed, 3])
+    faults = faults or Faults()
     stds = {
         "x_n": noise.position,
         "y_n": noise.position,
@@ -267,4 +280,17 @@ def _measure(ship: Ship, true: dict[str, Array], noise: Noise, seed: int) -> dic
         "v_q": noise.wind,
     }
     stds |= {a.column: noise.angle if a.angle else noise.speed for a in ship.actuators}
-    return {n: true[n] + s * rng.standard_normal(len(true[n])) for n, s in stds.items()}
+    c, s = np.cos(true["psi"]), np.sin(true["psi"])
+    forward, starboard = faults.antenna
+    shown = true | {
+        "x_n": true["x_n"] + c * forward - s * starboard,
+        "y_n": true["y_n"] + s * forward + c * starboard,
+        "psi": true["psi"] + faults.heading_bias,
+    }
+    out = {}
+    for name, std in stds.items():
+        value = shown[name]
+        if name in faults.late:
+            value = np.interp(t - faults.late[name], t, value)
+        out[name] = value + faults.offset.get(name, 0.0) + std * rng.standard_normal(len(t))
+    return out

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import json
 import math
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -30,8 +29,7 @@ def test_agrees_with_shipmmg(name):
         x_P=-0.65,
         x_G=0.0 if place == "midship" else 0.25,
         service_speed=1.179,
-        mechanisms=mmg.Mechanisms(propeller_walk=False, actuator_dynamics=False),
-    )
+    ).without("propeller_walk", "actuator_dynamics")
     if kind == "turn":
         commands = manoeuvres.table([0.0], [(11.8, math.radians(float(degrees)))])
     else:
@@ -90,7 +88,7 @@ def test_zigzag_overshoots_as_a_tanker_does():
 @pytest.mark.parametrize("make", [mmg.kvlcc2, mmg.training_ship, mmg.esso_osaka])
 def test_service_speed_is_where_thrust_balances_resistance(make):
     """A brute-force search over speeds finds the speed that the simulation keeps."""
-    ship = make(mechanisms=mmg.Mechanisms(propeller_walk=False))
+    ship = make().without("propeller_walk")
     speeds = np.linspace(0.2, 1.6, 1401) * ship.service_speed
     n = ship.service_revolutions
     balance = [ship.forces((u, 0.0, 0.0), (n, 0.0))[0] for u in speeds]
@@ -110,7 +108,7 @@ def test_service_speed_is_where_thrust_balances_resistance(make):
 
 def test_with_everything_off_the_ship_is_linear():
     """The response to a step of rudder and propeller is that of the matrix exponential."""
-    ship = mmg.kvlcc2(mechanisms=mmg.Mechanisms.none())
+    ship = mmg.kvlcc2().only()
     n0, delta = ship.service_revolutions, 0.3
     U, L, unit = ship.service_speed, ship.length, 500 * 7.0 * 0.46
     hull = ship.hull
@@ -141,8 +139,7 @@ def test_with_everything_off_the_ship_is_linear():
 
 
 def test_port_mirrors_starboard_without_asymmetry():
-    flags = mmg.Mechanisms(asymmetry=False, propeller_walk=False)
-    ship = mmg.kvlcc2(mechanisms=flags)
+    ship = mmg.kvlcc2().without("asymmetry", "propeller_walk")
     a, b = (
         simulate(ship, manoeuvres.turning_circle(t), 100, 0.1, start_heading=0.0, noise=SILENT).true
         for t in (1.0, -1.0)
@@ -154,9 +151,8 @@ def test_port_mirrors_starboard_without_asymmetry():
 @pytest.mark.parametrize("flag", list(mmg.Mechanisms.__dataclass_fields__))
 def test_every_mechanism_changes_the_motion(flag):
     with_it = mmg.kvlcc2()
-    without = replace(with_it, mechanisms=replace(with_it.mechanisms, **{flag: False}))
     a, b = (
         simulate(s, manoeuvres.random_steps(), 40, 0.1, start_heading=0.0, noise=SILENT).true
-        for s in (with_it, without)
+        for s in (with_it, with_it.without(flag))
     )
     assert max(np.abs(a[n] - b[n]).max() / np.ptp(a[n]) for n in "uvr") > 1e-3

@@ -49,7 +49,7 @@ def test_a_steady_turn_balances_every_force(make):
 @pytest.mark.parametrize("make", CATAMARANS)
 def test_surge_settles_where_two_propellers_carry_two_hulls(make):
     """Straight ahead the balance is a quadratic equation: w = u/U at a pace of n."""
-    ship = make(mechanisms=twin.Mechanisms(asymmetry=False, actuator_dynamics=False))
+    ship = make().without("asymmetry", "actuator_dynamics")
     pace, loss, linear = 0.7, ship.loss, ship.linear_drag
     # (pace^2 - loss pace w) / (1 - loss) = linear w + (1 - linear) w^2
     a, b, c = 1 - linear, linear + loss * pace / (1 - loss), -(pace**2) / (1 - loss)
@@ -60,7 +60,7 @@ def test_surge_settles_where_two_propellers_carry_two_hulls(make):
 @pytest.mark.parametrize("make", AZIMUTHS)
 def test_strips_sum_to_the_integral_of_cross_flow(make):
     ship = make()
-    flat = replace(ship, mechanisms=replace(ship.mechanisms, crossflow=False))
+    flat = ship.without("crossflow")
     v, r = 0.3, -0.05
     difference = np.subtract(ship.hull(1.0, v, r), flat.hull(1.0, v, r))
 
@@ -83,9 +83,7 @@ def test_without_thrust_energy_only_falls(make):
     stiffness = ship.mass * 9.81 * ship.metacentric
     stopped = [0.0] * len(ship.actuators)
     # without the forces of heel and of the uneven hull, which the passing water pays for
-    ship = replace(
-        ship, heel_push=0.0, mechanisms=replace(ship.mechanisms, asymmetry=False, lift=True)
-    )
+    ship = replace(ship.without("asymmetry"), heel_push=0.0)
     for _ in range(200):
         u, v, r, phi, p = rng.normal(size=5) * [3.0, 0.5, 0.1, 0.1, 0.1]
         rates = ship.accelerations((u, v, r, phi, p), stopped, (0.0, 0.0, 0.0))
@@ -103,7 +101,7 @@ def test_without_thrust_energy_only_falls(make):
 
 @pytest.mark.parametrize("make", CATAMARANS)
 def test_without_thrust_the_catamaran_comes_to_rest(make):
-    ship = make(mechanisms=twin.Mechanisms(asymmetry=False))
+    ship = make().without("asymmetry")
     surge, sway, yaw, coupling = ship.masses
     end = sail(ship, manoeuvres.steady(0.0), 40)
     u, v, r = end["u_r"], end["v_r"], end["r"]
@@ -116,8 +114,7 @@ def test_without_thrust_the_catamaran_comes_to_rest(make):
 @pytest.mark.parametrize("make", CATAMARANS + AZIMUTHS)
 def test_with_everything_off_the_ship_is_linear(make):
     """A step of all propellers' speeds, azimuths ahead, gives the matrix exponential."""
-    kind = twin if make in CATAMARANS else azimuth
-    ship = make(mechanisms=kind.Mechanisms.none())
+    ship = make().only()
     m, L, U = ship.mass, ship.length, ship.service_speed
     spin = m * (ship.gyradius * L) ** 2
     surge, sway = m * (1 + ship.added[0]), m * (1 + ship.added[1])
@@ -131,7 +128,7 @@ def test_with_everything_off_the_ship_is_linear(make):
     A[2, 2] = -ship.yaw_damping * spin * U / L / yaw
     values, force = [], np.zeros(3)
     n0 = ship.service_revolutions
-    if kind is twin:
+    if make in CATAMARANS:
         _, y = ship.propeller
         values = [0.9 * n0, 0.6 * n0]
         force += drag / 2 * np.array([1.5, 0.0, 0.3 * y])
@@ -156,8 +153,7 @@ def test_with_everything_off_the_ship_is_linear(make):
 
 @pytest.mark.parametrize("make", CATAMARANS + AZIMUTHS)
 def test_port_mirrors_starboard_without_asymmetry(make):
-    kind = twin if make in CATAMARANS else azimuth
-    ship = make(mechanisms=kind.Mechanisms(asymmetry=False))
+    ship = make().without("asymmetry")
     a, b = (sail(ship, manoeuvres.steady(0.9, t, t / 2), 10) for t in (0.7, -0.7))
     for name, sign in {"u": 1, "v": -1, "r": -1, "psi": -1, "x_n": 1, "y_n": -1}.items():
         np.testing.assert_allclose(a[name], sign * b[name], atol=1e-9 * ship.length)
@@ -171,9 +167,8 @@ def test_port_mirrors_starboard_without_asymmetry(make):
 )
 def test_every_mechanism_changes_the_motion(make, flag):
     ship = make()
-    without = replace(ship, mechanisms=replace(ship.mechanisms, **{flag: False}))
     drive = manoeuvres.random_steps(side=0.8)
-    a, b = (sail(s, drive, 5) for s in (ship, without))
+    a, b = (sail(s, drive, 5) for s in (ship, ship.without(flag)))
     assert max(np.abs(a[n] - b[n]).max() / np.ptp(a[n]) for n in "uvr") > 1e-3
 
 

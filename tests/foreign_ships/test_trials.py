@@ -16,6 +16,7 @@ from foreign_ships import (
     FINAL,
     SILENT,
     Current,
+    Faults,
     Noise,
     Waves,
     Wind,
@@ -104,6 +105,19 @@ def test_noise_has_the_spread_that_was_asked_for():
     expected |= {"n_bow": 2.0, "alpha_port": 0.02}
     for column, std in expected.items():
         assert spread[column] == pytest.approx(std, rel=0.08), column
+
+
+def test_faults_are_those_of_the_instruments():
+    preset = SHIPS["workboat-12m"]
+    good = preset.sail(manoeuvres.everyday(), 60, noise=SILENT)
+    faults = Faults(0.05, (2.0, -1.0), {"u": 0.5}, {"alpha_port": 0.1})
+    bad = good.measured_again(1, SILENT, faults).measured
+    psi = good.true["psi"]
+    np.testing.assert_allclose(bad["psi"] - psi, 0.05)
+    np.testing.assert_allclose(bad["x_n"] - good.true["x_n"], 2 * np.cos(psi) + np.sin(psi))
+    np.testing.assert_allclose(bad["u"][5:], good.true["u"][:-5])
+    np.testing.assert_allclose(bad["alpha_port"] - good.true["alpha_port"], 0.1)
+    np.testing.assert_array_equal(bad["r"], good.true["r"])
 
 
 @pytest.mark.parametrize("name", SHIPS)
