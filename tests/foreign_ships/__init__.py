@@ -10,10 +10,12 @@ the truth and the log, `ship.vessel_toml()` the vessel file that a crew would wr
     trial = preset.sail(manoeuvres.zigzag(20, 20), seed=1)
     trial.write_csv("zigzag.csv")
     Path("ship.toml").write_text(preset.ship.vessel_toml())
+
+From a shell, ``PYTHONPATH=tests python -m foreign_ships kvlcc2-7m random zigzag-20 --out DIR``.
 """
 
 from foreign_ships.environment import Current, Waves, Wind, Windage
-from foreign_ships.presets import DEVELOPMENT, FINAL, Preset, presets
+from foreign_ships.presets import DEVELOPMENT, FINAL, Preset, presets, write_campaign
 from foreign_ships.ship import SILENT, Actuator, Faults, Noise, Ship
 from foreign_ships.simulate import Manoeuvre, Motion, Trial, simulate
 
@@ -35,4 +37,5 @@ __all__ = [
     "Windage",
     "presets",
     "simulate",
+    "write_campaign",
 ]

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from foreign_ships import azimuth_vessel, catamaran, mmg
 from foreign_ships.environment import GRAVITY, Current, Waves, Wind
+from foreign_ships.manoeuvres import kinds
 from foreign_ships.ship import Noise, Ship
 from foreign_ships.simulate import Manoeuvre, Trial, simulate
 
@@ -91,3 +94,53 @@ DEVELOPMENT: tuple[str, ...] = (
 # the vessels with azimuths are looked at only at the end, once, when nothing is changed any more;
 # until then their simulator is tested here and its logs are estimated nowhere
 FINAL: tuple[str, ...] = ("research-vessel-29m", "workboat-12m", "azimuth-ferry-18m")
+
+
+def write_campaign(
+    folder: str | Path,
+    name: str,
+    manoeuvres: Sequence[str],
+    seed: int,
+    *,
+    weather: float = 0.0,
+    waves: bool = False,
+    every: int = 1,
+    thrust: str | None = None,
+) -> tuple[Path, list[Path]]:
+    """Sail one trial for each named manoeuvre, and write the vessel file and the logs.
+
+    Parameters
+    ----------
+    folder : path
+        Made where it does not exist.
+    name : str
+        Of `presets`.
+    manoeuvres : sequence of str
+        Of `manoeuvres.kinds`.
+    seed : int
+        The trials draw their chance from it, each its own; one weather lasts for all.
+    weather, waves :
+        See `Preset.weather`; with wind the logs hold the apparent wind.
+    every : int
+        Only every so many samples are written.
+    thrust : str, optional
+        Thrust law of the vessel file.
+
+    Returns
+    -------
+    path
+        The vessel file.
+    list of path
+        The logs, numbered and named by manoeuvre.
+    """
+    preset = presets()[name]
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    vessel = folder / "vessel.toml"
+    vessel.write_text(preset.ship.vessel_toml(thrust))
+    where = preset.weather(seed, weather, waves) if weather else {}
+    logs = []
+    for i, kind in enumerate(manoeuvres):
+        trial = preset.sail(kinds()[kind], seed=1000 * seed + i, **where)
+        logs.append(trial.write_csv(folder / f"{i:02d}-{kind}.csv", every, wind=bool(weather)))
+    return vessel, logs

@@ -23,6 +23,7 @@ from foreign_ships import (
     manoeuvres,
     presets,
     simulate,
+    write_campaign,
 )
 from greybox.commands.main import main
 
@@ -153,6 +154,18 @@ def test_vessel_files_hold_what_a_crew_knows():
         assert "thrust" not in table["thruster"][0]
         given = tomllib.loads(preset.ship.vessel_toml(thrust="quadratic"))
         assert {t["thrust"] for t in given["thruster"]} == {"quadratic"}
+
+
+def test_a_campaign_is_a_vessel_file_and_a_log_for_each_manoeuvre(tmp_path):
+    kinds = ["turn-port", "random"]
+    vessel, logs = write_campaign(tmp_path, "kvlcc2-7m", kinds, 1, weather=0.5, every=10)
+    assert tomllib.loads(vessel.read_text())["length"] == 7
+    assert [log.stem for log in logs] == ["00-turn-port", "01-random"]
+    header = logs[0].read_text().split("\n")[0]
+    assert header == "t,x_n,y_n,psi,u,v,r,u_q,v_q,n,delta"
+    table = np.loadtxt(logs[0], delimiter=",", skiprows=1)
+    np.testing.assert_allclose(np.diff(table[:, 0]), 1.0)
+    assert table[-1, 3] < table[0, 3] - math.pi
 
 
 AXES = {"frame", "sign", "unit", "clock_offset", "lever_arm", "heading_bias", "heading_wrap"}
