@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -450,10 +450,9 @@ def workboat(**changes: object) -> AzimuthVessel:
 
 def ferry(**changes: object) -> AzimuthVessel:
     """Return a passenger ferry of 18 m with an azimuth at each corner."""
-    bow, stern = (
-        {"turn": math.radians(20), "side": math.radians(55)},
-        {"turn": -math.radians(30), "side": math.radians(55)},
-    )
+    side = math.radians(55)
+    bow = partial(Unit, depth=1.1, share=0.25, turn=math.radians(20), side=side)
+    stern = partial(Unit, depth=1.1, share=0.25, turn=-math.radians(30), side=side)
     entries: dict[str, object] = {
         "name": "Four-azimuth ferry 18 m",
         "length": 18.0,
@@ -468,10 +467,10 @@ def ferry(**changes: object) -> AzimuthVessel:
         "z_A": 0.55,
         "metacentric": 1.6,
         "units": (
-            Unit("1", 6.6, -2.1, 1.1, 0.25, **bow),
-            Unit("2", 6.6, 2.1, 1.1, 0.25, **bow),
-            Unit("3", -6.6, 2.1, 1.1, 0.25, **stern),
-            Unit("4", -6.6, -2.1, 1.1, 0.25, **stern),
+            bow("1", 6.6, -2.1),
+            bow("2", 6.6, 2.1),
+            stern("3", -6.6, 2.1),
+            stern("4", -6.6, -2.1),
         ),
         "windage": Windage(34.0, 78.0, arm=0.6),
         "sway_damping": 2.3,

@@ -232,7 +232,7 @@ def simulate(
             raise FloatingPointError(f"{ship.name} diverged after {k * h:.1f} s")
 
     true = _truth(ship, out, orders, currents[::inner], winds[::inner])
-    trial = Trial(ship, dt * np.arange(samples), true, {})
+    trial = Trial(ship, np.asarray(dt * np.arange(samples), np.float64), true, {})
     return trial.measured_again(seed, noise, faults)
 
 

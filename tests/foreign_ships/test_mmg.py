@@ -106,6 +106,17 @@ def test_service_speed_is_where_thrust_balances_resistance(make):
     assert trial.true["u_r"][-1] == pytest.approx(root, rel=2e-3)
 
 
+@pytest.mark.parametrize("make", [mmg.kvlcc2, mmg.training_ship, mmg.esso_osaka])
+def test_with_the_propeller_stopped_the_ship_slows_and_turns_no_more(make):
+    ship = make()
+    dt = ship.time_scale / 10
+    trial = simulate(ship, manoeuvres.steady(0.0), 60 * ship.time_scale, dt, step=dt, noise=SILENT)
+    u, v = trial.true["u_r"], trial.true["v_r"]
+    assert (np.diff(np.hypot(u, v)[10:]) < 0).all()
+    assert u[-1] < 0.4 * ship.service_speed
+    assert abs(v[-1]) < 0.3 * u[-1]
+
+
 def test_with_everything_off_the_ship_is_linear():
     """The response to a step of rudder and propeller is that of the matrix exponential."""
     ship = mmg.kvlcc2().only()
