@@ -480,7 +480,6 @@ def training_ship(**changes: object) -> MMG:
         "eta": 0.960,
         "hull": hull,
         "R_0": 0.016,
-        # the paper's X_vr holds m_y, which the equations of motion hold here too
         "m_x": 0.0167,
         "m_y": 0.1576,
         "J_z": 0.009,
@@ -511,8 +510,10 @@ def esso_osaka(**changes: object) -> MMG:
     """Return the Esso Osaka as a model of 3 m: a tanker with a hull for low speed.
 
     Towing-tank values as listed beside the trials of the same model (Miyauchi et al., 2022; the
-    list of AmaneSakanashi/1216-Baysian-SI-MMG). X_vr is that identified from free running, for
-    the one listed holds the added mass, which the equations of motion hold here.
+    list of AmaneSakanashi/1216-Baysian-SI-MMG, where Y_r and N_v stand in each other's row), with
+    two exceptions: X_vr is the value identified from free running, since the tank's 0.4535
+    exceeds the added mass that acts beside it, and the wake falls exponentially with drift. It
+    turns wider than the model on the pond does (r' 0.7 against 1.0 at full rudder).
     """
     hull = CrossflowHull(
         X_vr=-0.0769,
