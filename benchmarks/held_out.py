@@ -22,6 +22,7 @@ import csv
 import json
 import os
 import platform
+import resource
 import subprocess
 import sys
 import time
@@ -224,6 +225,12 @@ def estimate_ours(
     return "; ".join(wrong)
 
 
+def processor_time() -> float:
+    """Return the seconds of processor that ended programs of ours have used."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
 def estimate_peer(
     tool: str, split: Split, logs: Path, out: Path, python: str, budget: float, limit: float
 ) -> str:
@@ -287,7 +294,7 @@ def interval(logs: Array, seed: int = 0) -> tuple[float, float, float]:
 def summary(results: dict[str, dict[str, Any]], tools: Sequence[str]) -> dict[str, Any]:
     """Print errors a split, and our errors over those of the peers; return the ratios."""
     print(f"{'split':<14}{'tool':<12}" + "".join(f"{c + ' rmse':>11}{'fit':>7}" for c in CHANNELS)
-          + f"{'seconds':>9}")  # fmt: skip
+          + f"{'seconds':>9}{'cpu':>7}")  # fmt: skip
     rmse: dict[str, dict[str, Array]] = {}
     useful: dict[str, NDArray[np.bool_]] = {}
     for split, found in results.items():
@@ -299,8 +306,9 @@ def summary(results: dict[str, dict[str, Any]], tools: Sequence[str]) -> dict[st
                 f"{a:>11.4g}{100 * (1 - a / b):>6.1f}{' ' if ok else '-'}"
                 for a, b, ok in zip(e, spread, useful[split], strict=True)
             )
-            seconds, wrong = found[tool]["seconds"], found[tool]["wrong"]
-            print(f"{split:<14}{tool:<12}{cells}{seconds:>9.0f}  {wrong[:60]}")
+            record = found[tool]
+            times = f"{record['seconds']:>9.0f}{record['processor seconds']:>7.0f}"
+            print(f"{split:<14}{tool:<12}{cells}{times}  {record['wrong'][:60]}")
     print("'-': no tool beats the mean of the log, the channel is left out below\n")
     ratios: dict[str, Any] = {}
     peers = [t for t in tools if t != OURS]
@@ -357,7 +365,7 @@ def main() -> None:
     parser.add_argument("--peers", default=sys.executable, help="interpreter of the peers")
     parser.add_argument("--again", nargs="*", default=[], help="tools whose results are made anew")
     parser.add_argument("--options", default="", help="further options of greybox estimate")
-    parser.add_argument("--budget", type=float, default=60.0, help="of a peer's estimation [s]")
+    parser.add_argument("--budget", type=float, default=60.0, help="processor time of a peer [s]")
     parser.add_argument("--limit", type=float, default=900.0, help="a tool is ended after this [s]")
     parser.add_argument("--only-summary", action="store_true")
     asked = parser.parse_args()
@@ -374,7 +382,7 @@ def main() -> None:
                 out.mkdir(parents=True, exist_ok=True)
                 for old in out.glob("*"):
                     old.unlink()
-                began = time.perf_counter()
+                began, before = time.perf_counter(), processor_time()
                 if tool == OURS:
                     more = asked.options.split()
                     wrong = estimate_ours(split, logs, out, cache, more, asked.limit)
@@ -383,7 +391,12 @@ def main() -> None:
                         tool, split, logs, out, asked.peers, asked.budget, asked.limit
                     )
                 seconds = time.perf_counter() - began
-                said = {"seconds": seconds, "wrong": wrong, "load": os.getloadavg()[0]}
+                said = {
+                    "seconds": seconds,
+                    "processor seconds": processor_time() - before,
+                    "wrong": wrong,
+                    "load": os.getloadavg()[0],
+                }
                 record.write_text(json.dumps(said))
                 print(f"{name}, {tool}: {seconds:.0f} s {wrong}", file=sys.stderr)
             if record.exists():
