@@ -111,14 +111,18 @@ def read(path: Path, ship: str, step: float) -> tuple[list[Run], list[str]]:
 
 
 def folds(runs: list[Run], count: int = 4) -> list[tuple[list[Run], list[Run]]]:
-    """Return training and left-out runs: by logs, or by stretches where logs are few."""
+    """Return training and left-out runs: by logs, and by quarters too where logs are few."""
+
+    def split(parts: list[list[Run]]) -> list[tuple[list[Run], list[Run]]]:
+        return [([r for q in parts if q is not p for r in q], p) for p in parts]
+
+    found = split([runs[i::count] for i in range(min(count, len(runs)))]) if len(runs) > 1 else []
     if len(runs) < 3:
-        runs = [
-            r.window(i * len(r.t) // 4, (i + 1) * len(r.t) // 4) for r in runs for i in range(4)
-        ]
-    count = min(count, len(runs))
-    parts = [runs[i::count] for i in range(count)]
-    return [([r for q in parts if q is not p for r in q], p) for p in parts]
+        cuts = [[len(r.t) * i // 4 for i in range(5)] for r in runs]
+        found += split(
+            [[r.window(c[i], c[i + 1]) for r, c in zip(runs, cuts, strict=True)] for i in range(4)]
+        )
+    return found
 
 
 def judge(rmse: Sequence[Array]) -> float:

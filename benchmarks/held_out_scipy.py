@@ -145,7 +145,10 @@ def simulate(x0, y, w, driver, code, eq, theta, bound, reset, want):  # type: ig
 class Family:
     """Regressors and their scales on training logs: parameters are of order one."""
 
-    def __init__(self, chosen: list[tuple[int, str, str]], names: list[str], runs: list[Run]):
+    def __init__(
+        self, chosen: list[tuple[int, str, str]], names: list[str], runs: list[Run],
+        braked: bool = False,
+    ):  # fmt: skip
         self.terms = chosen
         self.eq = np.array([i for i, _, _ in chosen])
         self.driver = np.array([names.index(d) for _, d, _ in chosen])
@@ -158,13 +161,13 @@ class Family:
         )
         moved = np.concatenate([np.diff(r.y, axis=0) for r in runs]).std(axis=0)
         size = np.sqrt((phi**2).mean(axis=0))
-        # the ship's own damping brakes: these parameters stay at zero or below
-        damping = {(0, "x,,"), (0, "xa,,"), (0, "xxx,,"), (1, ",x,"), (1, ",xa,"), (1, ",xxx,"),
-                   (2, ",,x"), (2, ",,xa"), (2, ",,xxx"), (1, "a,x,"), (2, "a,,x")}  # fmt: skip
-        brakes = np.array([d == "" and (i, s) in damping for i, d, s in chosen])
-        self.upper = np.where(brakes, 0.0, np.inf)
         # a driver that never moves acts as none
         self.scale = np.where(size > 1e-9, moved[self.eq] / np.maximum(size, 1e-9), 0.0)
+        # the ship's own damping may not drive it: these parameters stay at zero or below
+        damping = {(0, "x,,"), (0, "xa,,"), (0, "xxx,,"), (1, ",x,"), (1, ",xa,"), (1, ",xxx,"),
+                   (2, ",,x"), (2, ",,xa"), (2, ",,xxx")}  # fmt: skip
+        held = np.array([braked and d == "" and (i, s) in damping for i, d, s in chosen])
+        self.upper = np.where(held, 0.0, np.inf)
 
     def regressors(self, y: Array, w: Array) -> Array:
         a = np.abs(y)
@@ -225,9 +228,19 @@ class Family:
             h, g = jac.T @ jac + load * np.eye(len(theta)), jac.T @ e + load * theta
             free = ~((theta >= self.upper[on]) & (g < 0))
             for _ in range(6):
-                step = np.zeros(len(theta))
-                loaded = h + damp * np.diag(np.diag(h) + 1e-9 * len(e))
-                step[free] = np.linalg.solve(loaded[free][:, free], -g[free])
+                loaded, moves = h + damp * np.diag(np.diag(h) + 1e-9 * len(e)), free.copy()
+                # what would pass its limit goes there, the others are solved again
+                for _ in range(3):
+                    room = np.where(moves, 0.0, self.upper[on] - theta)
+                    room[~np.isfinite(room)] = 0.0
+                    step = np.where(free, room, 0.0)
+                    step[moves] = np.linalg.solve(
+                        loaded[moves][:, moves], -(g + loaded @ step)[moves]
+                    )
+                    over = moves & (theta + step > self.upper[on])
+                    if not over.any():
+                        break
+                    moves &= ~over
                 trial = np.minimum(theta + step, self.upper[on])
                 then = self.errors(trial, runs, on, sigma, reset)
                 new = np.inf if then is None else float(then[0] @ then[0] + load * trial @ trial)
@@ -318,26 +331,28 @@ def scipy_output_error(job: dict[str, Any], load: Callable[[float], Loaded]) -> 
     ship, began = job["ship"], time.process_time()
     budget = job["budget"]
     tried: dict[str, float] = {}
-    plans: dict[str, tuple[float, list[tuple[int, str, str]], float, int]] = {}
+    # sample time, regressors, ridge, terms taken forward, whether damping has to brake
+    plans: dict[str, tuple[float, list[tuple[int, str, str]], float, int, bool]] = {}
 
-    def compare(step: float, kind: str, ridges: Sequence[float]) -> None:
+    def compare(step: float, kind: str, ridges: Sequence[float], braked: bool = False) -> None:
         runs, names, _ = load(step)
-        family = Family(terms(ship, kind, names), names, runs)
+        family = Family(terms(ship, kind, names), names, runs, braked)
         on = np.flatnonzero(family.scale > 0)
         for ridge in ridges:
             found = []
             for train, left in folds(runs):
                 theta, _ = family.best(train, on, ridge, False)
                 found.append(family.rmse(theta, left, on))
-            label = f"{kind} {step:g} s ridge {ridge:g}"
-            tried[label], plans[label] = judge(found), (step, family.terms, ridge, 0)
+            label = f"{kind}{' braked' * braked} {step:g} s ridge {ridge:g}"
+            tried[label], plans[label] = judge(found), (step, family.terms, ridge, 0, braked)
 
     steps = SAMPLE_TIMES[ship]
     for step in steps:
         compare(step, "modulus", (1e-6, 1e-3))
     step = plans[min(tried, key=lambda k: tried[k])][0]
-    for kind in ("cubic", "decoupled"):
-        compare(step, kind, (1e-6, 1e-3))
+    for kind, braked in (("cubic", False), ("modulus", True), ("decoupled", False)):
+        compare(step, kind, (1e-6, 1e-3), braked)
+    compare(step, "decoupled", (1e-6, 1e-3), True)
     runs, names, _ = load(step)
     family = Family(terms(ship, "family", names), names, runs)
     # from the second-order set, and from nearly nothing
@@ -359,18 +374,18 @@ def scipy_output_error(job: dict[str, Any], load: Callable[[float], Loaded]) -> 
             found = [family.rmse(path[size][1], left, path[size][0]) for path, left in paths]
             tried[name], plans[name] = (
                 judge(found),
-                (step, [family.terms[i] for i in on], 1e-5, size),
+                (step, [family.terms[i] for i in on], 1e-5, size, False),
             )
     if time.process_time() - began < budget:
         compare(step, "family", (1e-3, 1e-2))
     chosen = min(tried, key=lambda k: tried[k])
-    step, regressors, ridge, size = plans[chosen]
+    step, regressors, ridge, size, braked = plans[chosen]
     runs, names, held_out = load(step)
     if " of the family" in chosen:
         on = np.array([family.terms.index(t) for t in regressors])
         on, _ = family.forward(runs, on, size, ridge, np.inf)[-1]
     else:
-        family = Family(regressors, names, runs)
+        family = Family(regressors, names, runs, braked)
         on = np.flatnonzero(family.scale > 0)
     start, sigma = family.best(runs, on, ridge, True)
     root = np.sqrt(ridge * sum(len(r.y) for r in runs))
