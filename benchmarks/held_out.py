@@ -284,8 +284,10 @@ def pooled(scores: dict[str, dict[str, list[float]]], key: str) -> Array:
     return np.asarray(np.sqrt((np.array([s[key] for s in scores.values()]) * n).sum(0) / n.sum(0)))
 
 
-def interval(logs: Array, seed: int = 0) -> tuple[float, float, float]:
-    """Return the geometric mean of paired ratios with its 95 % bootstrap interval."""
+def interval(logs: Array, seed: int = 0) -> tuple[float, float | None, float | None]:
+    """Return the geometric mean of paired ratios with its 95 % bootstrap interval over splits."""
+    if len(logs) < 2:
+        return float(np.exp(logs.mean())), None, None
     drawn = np.random.default_rng(seed).integers(0, len(logs), (4000, len(logs)))
     low, high = np.quantile(logs[drawn].mean(axis=1), [0.025, 0.975])
     return float(np.exp(logs.mean())), float(np.exp(low)), float(np.exp(high))
@@ -335,7 +337,8 @@ def summary(results: dict[str, dict[str, Any]], tools: Sequence[str]) -> dict[st
             if row:
                 ratios.setdefault(group, {})[rival] = row
                 cells = "  ".join(
-                    f"{c} {m:.3f} ({a:.3f} to {b:.3f}, n={n})" for c, (m, a, b, n) in row.items()
+                    f"{c} {m:.3f} " + (f"(n={n})" if a is None else f"({a:.3f} to {b:.3f}, n={n})")
+                    for c, (m, a, b, n) in row.items()
                 )
                 print(f"our rmse over that of {rival:<11} {group:<9} {cells}")
     return ratios
