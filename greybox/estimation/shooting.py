@@ -210,6 +210,10 @@ class FreeRuns:
                 used[self.segments.use == 0] = 0.0
         return Linearised(self._weighted(y), by_sample(used), end, slope)
 
+    def outputs(self, p: Array, nodes: Array) -> Array:
+        """Return what the runs show (M, m, ny)."""
+        return self._simulator(nodes, p)[0]
+
     def value(self, p: Array, nodes: Array) -> tuple[Array, Array, float]:
         """Return residuals, ends and level without derivatives."""
         y, end = self._simulator(nodes, p)
@@ -263,7 +267,7 @@ def loss_value(r: Array, loss: Loss) -> float:
 
 
 @dataclass(frozen=True)
-class _Reduced:
+class Reduced:
     """The linearised problem in the parameters alone."""
 
     hessian: Array
@@ -275,7 +279,8 @@ class _Reduced:
     gap: Array
 
 
-def _reduce(at: Linearised, segments: Segments, nodes: Array, q: int, loss: Loss) -> _Reduced:
+def reduce_starts(at: Linearised, segments: Segments, nodes: Array, q: int, loss: Loss) -> Reduced:
+    """Return the linearised problem with the first states eliminated."""
     runs, nz = nodes.shape
     flat = at.r.reshape(runs, -1)
     # weights of one are not multiplied with
@@ -309,7 +314,7 @@ def _reduce(at: Linearised, segments: Segments, nodes: Array, q: int, loss: Loss
     starts, multipliers = solved[: runs * nz], solved[runs * nz :]
     hessian = normal[:, :q, :q].sum(axis=0) - cross.T @ starts[:, 1:] - by_p.T @ multipliers[:, 1:]
     gradient = right[:, :q].sum(axis=0) - cross.T @ starts[:, 0] - by_p.T @ multipliers[:, 0]
-    return _Reduced(
+    return Reduced(
         (hessian + hessian.T) / 2,
         gradient,
         starts[:, 0].reshape(runs, nz),
@@ -425,7 +430,7 @@ def fit_segments(
         if not all(np.isfinite(a).all() for a in (at.r, at.rows, at.slope)):
             break
         try:
-            reduced = _reduce(at, segments, nodes, len(p), loss)
+            reduced = reduce_starts(at, segments, nodes, len(p), loss)
         except RuntimeError:
             # a run that forgets its start at once leaves the start unknown
             break

@@ -9,9 +9,10 @@ from dataclasses import replace
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from greybox.credibility.verdict import free_run_faults, misfit, weigh
-from greybox.errors import GreyboxError, UsageError
+from greybox.errors import GreyboxError, LogError, UsageError
 from greybox.estimation.closed_loop import Loop
 from greybox.estimation.efficiency_bounds import limits_of
 from greybox.estimation.output_error import OutputErrorOptions
@@ -19,19 +20,34 @@ from greybox.estimation.registry import ESTIMATORS, free_run_estimator
 from greybox.estimation.result import Estimate
 from greybox.estimation.solve import Covariance
 from greybox.estimation.verdict import TrustLevel, Verdict, refused
+from greybox.model.catalogue import structure_for
 from greybox.model.model import ManoeuvringModel
+from greybox.model.structure import Structure
 from greybox.public import known_keywords, one_thread
 from greybox.regression.regression import common_sample_time
-from greybox.selection.alternatives import Alternative, alternatives_for
-from greybox.selection.cross_validation import EstimatorVariant, compare_estimators
+from greybox.selection.alternatives import Alternative, alternatives_for, ranking_request
+from greybox.selection.cross_validation import (
+    EstimatorVariant,
+    compare_estimators,
+    estimate_variant,
+)
 from greybox.selection.fit_single import estimate_once
 from greybox.selection.held_out import FLOOR
 from greybox.selection.request import Request, regression_only
+from greybox.selection.term_selection import select_terms
+from greybox.trial.kinematics import decimate_segments
 from greybox.trial.log import Logs, TrialLog
 from greybox.trial.segments import as_segments
 from greybox.validation.fit import average_fit, run_model
+from greybox.vessel.force import force_inputs
 
+Array = NDArray[np.float64]
 _log = logging.getLogger(__name__)
+
+# share of length over speed that a sample may take
+_SHARE = 0.1
+# errors of a free run up to this many times the sensors' noise leave nothing to select terms for
+_MORE_THAN_NOISE = 1.5
 
 
 @known_keywords
@@ -150,6 +166,8 @@ def estimate_requested(logs: Sequence[TrialLog], request: Request) -> Estimate:
     """Return what `estimate_model` does of a request."""
     common_sample_time(logs)
     notes: list[str] = []
+    if all(n is None for n in (request.method, *_named(request))):
+        logs = at_own_pace(logs, notes)
     alternatives = alternatives_for(logs, request, notes)
     _log.info("%d ways to estimate, first %s", len(alternatives), alternatives[0].label)
     _log.debug("in this order: %s", "; ".join(a.label for a in alternatives))
@@ -161,6 +179,8 @@ def estimate_requested(logs: Sequence[TrialLog], request: Request) -> Estimate:
         estimate = _without_regression(logs, alternatives, request, notes, error)
     if request.method is not None or not request.judged or regression_only(request):
         return estimate
+    if _open(request, estimate):
+        return _or_selected_terms(estimate, logs, request)
     if _rank(estimate)[0] == 0:
         return estimate
     tried: Estimate | None = None
@@ -170,6 +190,107 @@ def estimate_requested(logs: Sequence[TrialLog], request: Request) -> Estimate:
     if _at_fault(estimate, tried):
         return _by_held_out_runs(estimate, tried, logs, request, notes)
     return estimate
+
+
+def _open(request: Request, estimate: Estimate) -> bool:
+    """Whether everything is left to the data, which are a ship's."""
+    named = _named(request)
+    return all(n is None for n in named) and estimate.predictor.structure.marine
+
+
+def _named(request: Request) -> tuple[object, ...]:
+    """Return what a request may name of the model."""
+    return request.predictor, request.structure, request.nominal
+
+
+def at_own_pace(logs: Sequence[TrialLog], notes: list[str]) -> Sequence[TrialLog]:
+    """Return logs at a sample time that suits how fast the ship moves; `notes` are told.
+
+    A ship answers in times of the order of its length over its speed: a tenth of that shows
+    all of it, and more samples hold sensor noise and cost time.
+    """
+    speeds = [np.hypot(log["u"], log["v"]) for log in logs if {"u", "v"} <= log.channels.keys()]
+    if not speeds:
+        return logs
+    speed = float(np.sqrt(np.mean(np.concatenate(speeds) ** 2)))
+    length, own = logs[0].vessel.length, logs[0].sample_time
+    times = int(_SHARE * length / speed / own) if speed > 0 else 1
+    if times < 2:
+        return logs
+    try:
+        slower, left_out = decimate_segments(logs, times * own)
+    except LogError:
+        return logs
+    notes.append(
+        f"the logs were taken at {times * own:g} s instead of {own:g} s, the next multiple below "
+        f"a tenth of length over speed ({length:g} m, {speed:.3g} m/s); --sample-time sets it."
+    )
+    notes += left_out
+    return slower
+
+
+def _or_selected_terms(found: Estimate, logs: Sequence[TrialLog], request: Request) -> Estimate:
+    """Return the free run of terms that the data select, where it predicts better than `found`."""
+    if not leaves_more_than_noise(found, logs):
+        return found
+    quick = ranking_request(request)
+    free_run = ESTIMATORS[found.method].free_run
+
+    def refit(fitting: Sequence[TrialLog]) -> ManoeuvringModel:
+        variant = EstimatorVariant(found.method)
+        start = found if free_run else None
+        return estimate_variant(variant, fitting, found, quick, start).model()
+
+    before = f"{found.method} of structure '{found.predictor.structure.name}'"
+    try:
+        choice = select_terms(logs, before, len(found.predictor.parameter_columns), refit)
+    except GreyboxError as error:
+        return _noting(found, f"no terms were selected: {error}")
+    told = replace(found, notes=(*found.notes, choice.note))
+    if not choice.taken:
+        return told
+    inputs = force_inputs(choice.logs[0].vessel)
+    structure = structure_for(choice.structure, inputs)
+    method = free_run_estimator().name
+    asked = replace(
+        request,
+        nominal=nominal_model(structure, choice.start, choice.logs),
+        output_error=replace(
+            request.output_error, search=False, heading="input", damping="enforce"
+        ),
+    )
+    try:
+        estimate, diverged = _finished(
+            Alternative(structure, method, choice.kind), choice.logs, asked, [choice.note]
+        )
+    except GreyboxError as error:
+        return _noting(
+            told, f"the selected terms could not be estimated on the whole logs: {error}"
+        )
+    if diverged:
+        return _noting(told, "the selected terms diverge on the whole logs, and were left.")
+    return estimate
+
+
+def nominal_model(structure: Structure, theta: Array, logs: Sequence[TrialLog]) -> ManoeuvringModel:
+    """Return a model to start from, without anything known of its errors."""
+    return ManoeuvringModel(
+        structure, theta, np.zeros((len(theta), len(theta))), logs[0].sample_time, logs[0].vessel
+    )
+
+
+def leaves_more_than_noise(estimate: Estimate, logs: Sequence[TrialLog]) -> bool:
+    """Whether the free run's error is larger than what the sensors' noise explains."""
+    states = estimate.predictor.structure.states
+    model = estimate.model()
+    runs = [run_model(model, log) for log in logs]
+    if any(r.diverged >= 0 for r in runs):
+        return True
+    errors = np.sqrt(np.mean(np.concatenate([r.errors() for r in runs]) ** 2, axis=0))
+    change = np.concatenate([np.diff(log.states(states), axis=0) for log in logs])
+    # white noise changes by √2 of itself from sample to sample, and the ship moves too
+    noise = np.sqrt(np.mean(change**2, axis=0) / 2)
+    return bool((errors > _MORE_THAN_NOISE * noise).any())
 
 
 def _without_regression(

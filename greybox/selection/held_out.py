@@ -48,7 +48,9 @@ class Ranking:
     chosen: int
 
 
-def rank(scores: Sequence[Array | None], preferred: Sequence[int]) -> Ranking:
+def rank(
+    scores: Sequence[Array | None], preferred: Sequence[int], *, given_away: float = np.inf
+) -> Ranking:
     """Choose the most preferred alternative within one standard error of the best.
 
     Parameters
@@ -57,6 +59,8 @@ def rank(scores: Sequence[Array | None], preferred: Sequence[int]) -> Ranking:
         (parts,) an alternative [%]; None where it could not be estimated.
     preferred : sequence of int
         (A,) smaller is preferred: the number of parameters, or a rank.
+    given_away : float
+        Points that a preferred alternative may fall behind at most [%].
 
     Raises
     ------
@@ -76,7 +80,7 @@ def rank(scores: Sequence[Array | None], preferred: Sequence[int]) -> Ranking:
         gap = np.asarray(scores[best]) - np.asarray(scores[i])
         behind[i] = gap.mean()
         se[i] = gap.std(ddof=1) / np.sqrt(len(gap)) if len(gap) > 1 else 0.0
-    near = [i for i in known if behind[i] <= se[i]]
+    near = [i for i in known if behind[i] <= min(se[i], given_away)]
     chosen = min(near, key=lambda i: (preferred[i], behind[i]))
     return Ranking(mean, behind, se, best, chosen)
 
@@ -105,14 +109,22 @@ def score_runs(runs: Sequence[LogFit], spread: dict[str, float], blocks: int = 1
     ndarray
         (blocks,), at least −100.
     """
-    out = np.full(blocks, FLOOR)
     if any(r.diverged >= 0 for r in runs):
-        return out
-    moving = [(i, s) for i, s in enumerate(runs[0].fit) if spread[s] > 0]
+        return np.full(blocks, FLOOR)
     errors = np.concatenate([r.errors() for r in runs])
-    for b, part in enumerate(np.array_split(errors, blocks) if len(errors) >= blocks else []):
-        ratio = [float(np.sqrt(np.mean(part[:, i] ** 2))) / spread[s] for i, s in moving]
-        out[b] = np.mean([max(100 * (1 - r), FLOOR) for r in ratio])
+    return score_errors(errors, np.array([spread[s] for s in runs[0].fit]), blocks)
+
+
+def score_errors(errors: Array, spread: Array, blocks: int) -> Array:
+    """Return what `score_runs` does of the errors (N, nx) of runs, not finite where one escapes."""
+    out = np.full(blocks, FLOOR)
+    if not np.isfinite(errors).all() or len(errors) < blocks:
+        return out
+    moving = spread > 0
+    for b, part in enumerate(np.array_split(errors[:, moving], blocks)):
+        with np.errstate(over="ignore"):
+            ratio = np.sqrt(np.mean(part**2, axis=0)) / spread[moving]
+        out[b] = np.mean(np.maximum(100 * (1 - ratio), FLOOR))
     return out
 
 

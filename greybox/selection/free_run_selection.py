@@ -1,0 +1,346 @@
+"""Selection of terms by the free run itself: forward and backward, judged on what was left out.
+
+At a free run of the terms that are in, one set of sensitivities tells of every term that
+is out how much the squared error would fall (the score test of its coefficient, the other
+coefficients and the first states adjusted). The best one enters and the run is fitted
+again; a term that earns less than the one that came last leaves. A core that no run
+follows is first fitted, and added to, while an observer holds the run near the log.
+
+References
+----------
+Billings (2013), chapter 3, on forward selection in simulation; Pudil, Novovičová and
+Kittler (1994), on letting terms leave again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence, Set
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.errors import ExcitationError
+from greybox.estimation.fixed_gain_observer import ObservedRuns
+from greybox.estimation.free_run import changes
+from greybox.estimation.output_setup import deviations, measured, output_model, output_predictor
+from greybox.estimation.shooting import (
+    RANK,
+    FreeRuns,
+    Reduced,
+    Runs,
+    cut,
+    measured_starts,
+    reduce_starts,
+    solve_step,
+)
+from greybox.model.structure import Structure
+from greybox.numerics.linalg import scaled_inverse
+from greybox.regression.regression import common_sample_time
+from greybox.trial.log import TrialLog
+
+Array = NDArray[np.float64]
+
+# process over measurement variance of the observers before the free run
+_RATIOS = (0.3, 0.03, 3e-3, 3e-4)
+# terms that may come at each of them where no free run follows
+_AHEAD = 3
+# iterations of a first fit, and the share of the error below which a step ends it
+_FIRST, _SETTLED = 12, 3e-3
+# share of the squared error that a term must take away, and that its own direction must hold
+_EARNS, _OWN = 1e-3, 1e-3
+# squared error of a run without any, in deviations
+_LEAST = 1e-12
+# candidates that are tried, the most promising first
+_TRIED = 4
+# share of the last term's gain below which another one leaves
+_LEAVES = 0.5
+
+
+@dataclass(frozen=True)
+class _Point:
+    """Parameters and first states with the cost and its quadratic model there."""
+
+    p: Array
+    nodes: Array
+    cost: float
+    reduced: Reduced
+    most: Array
+
+    def solution(self, hessian: Array, gradient: Array, active: Array) -> Array:
+        """Return the step (q,) that minimises the quadratic model over the active parameters."""
+        step = np.zeros_like(self.p)
+        low, high = np.full(len(active), -np.inf), self.most[active] - self.p[active]
+        part = np.ix_(active, active)
+        step[active] = solve_step(hessian[part], gradient[active], low, np.maximum(high, 0.0))
+        return step
+
+
+@dataclass(frozen=True)
+class Selected:
+    """A set of terms with its fit.
+
+    Parameters
+    ----------
+    terms : tuple of str
+        Parameters that are in, disturbance means among them.
+    p : ndarray
+        (q,) all parameters of the family, zero where they are out.
+    cost : float
+        Mean squared error of the free runs in deviations of each output.
+    change : str
+        The term that came, ``+name``, or went, ``-name``.
+    """
+
+    terms: tuple[str, ...]
+    p: Array
+    cost: float
+    change: str = ""
+
+
+class FreeRunSelection:
+    """Free runs of a family of terms on logs, and the path of sets that selection takes.
+
+    Parameters
+    ----------
+    logs : sequence of TrialLog
+        Of one vessel and sample time.
+    family : Structure
+    kind : str
+        Predictor whose disturbance means may be selected too.
+    deviation : ndarray, optional
+        (ny,) what the error of each output is measured in; by default its own deviation.
+    """
+
+    def __init__(
+        self,
+        logs: Sequence[TrialLog],
+        family: Structure,
+        kind: str,
+        deviation: Array | None = None,
+    ) -> None:
+        self.model = output_model(output_predictor(family, kind, ()), common_sample_time(logs))
+        data = [measured(self.model, log) for log in logs]
+        self.deviation = deviations(data) if deviation is None else deviation
+        self._whole = cut(data, max(len(d.y) for d in data))
+        self._change = np.maximum(changes(data), 1e-9 * self.deviation)
+        self.runs = FreeRuns(self.model, self._whole, self.deviation)
+        self.starts = measured_starts(self._whole, len(self.model.states))
+        self.names = self.model.parameters
+        self._samples = float(self._whole.use.sum())
+        # damping takes energy out
+        self._most = np.full(len(self.names), np.inf)
+        for i in self.model.predictor.parameter_columns:
+            terms = [family.terms[family.index(t)] for t in self.model.columns[i].terms]
+            if all(t.dissipates for t in terms):
+                self._most[i] = 0.0
+
+    def path(
+        self, first: Sequence[str], stay: Sequence[str], most: int, *, earns: float = _EARNS
+    ) -> list[Selected]:
+        """Return the sets that selection passes through, each with its fit.
+
+        Parameters
+        ----------
+        first : sequence of str
+            Terms that it begins with.
+        stay : sequence of str
+            Those of them that never leave.
+        most : int
+            Terms at most.
+        earns : float
+            Share of the squared error that a term must take away.
+
+        Raises
+        ------
+        ExcitationError
+            No set of terms follows the logs.
+        """
+        active = sorted(self.names.index(n) for n in first if n in self.names)
+        kept = {self.names.index(n) for n in stay if n in self.names}
+        active, p, nodes = self._begun(active, most, earns)
+        at = self._fitted(self.runs, p, nodes, active)
+        if not np.isfinite(at.cost):
+            raise ExcitationError(
+                f"no free run of {len(active)} terms stays bounded on the {len(self.starts)} "
+                f"logs: use longer logs, or name a structure with --structure."
+            )
+        sets = [self._selected(active, at)]
+        seen = {frozenset(active)}
+        while len(active) < most:
+            found = self._with_one_more(self.runs, at, active, earns, seen)
+            if found is None:
+                break
+            came, moved = found
+            gain = at.cost - moved.cost
+            active, at = sorted([*active, came]), moved
+            left = self._without_one(at, active, kept | {came}, _LEAVES * gain, seen)
+            while left is not None:
+                gone, at = left
+                active = [i for i in active if i != gone]
+                seen.add(frozenset(active))
+                sets.append(self._selected(active, at, "-" + self.names[gone]))
+                left = self._without_one(at, active, kept | {came}, _LEAVES * gain, seen)
+            seen.add(frozenset(active))
+            sets.append(self._selected(active, at, "+" + self.names[came]))
+        return sets
+
+    def errors(self, p: Array) -> list[Array]:
+        """Return what a free run from each log's first samples leaves, (N, ny) a log.
+
+        Infinite where it escapes.
+        """
+        y = self.runs.outputs(p, self.starts)
+        return [
+            (log - run)[used > 0]
+            for log, run, used in zip(self._whole.y, y, self._whole.use, strict=True)
+        ]
+
+    def _begun(self, active: list[int], most: int, earns: float) -> tuple[list[int], Array, Array]:
+        """Return terms, parameters and first states near those of a free run."""
+        p, nodes = np.zeros(len(self.names)), self.starts
+        for ratio in _RATIOS:
+            runs = ObservedRuns(self.model, self._whole, self._change**2 / 2, ratio)
+            at = self._fitted(runs, p, nodes, active)
+            if not self._value(self.runs, at.p, self.starts) < 0:
+                # no run of these terms follows: what the observer's errors ask for comes first
+                for _ in range(_AHEAD):
+                    found = self._with_one_more(runs, at, active, earns, set())
+                    if found is None or len(active) >= most:
+                        break
+                    active, at = sorted([*active, found[0]]), found[1]
+            p, nodes = at.p, at.nodes
+        return active, p, nodes
+
+    def _selected(self, active: Sequence[int], at: _Point, change: str = "") -> Selected:
+        terms = tuple(self.names[i] for i in active)
+        return Selected(terms, at.p, self._share(at.cost), change)
+
+    def _share(self, cost: float) -> float:
+        """Return the mean squared error that a change of −log L stands for, as a share."""
+        return float(np.exp(2 * cost / (self._samples * len(self.model.outputs))))
+
+    def _noise(self, r: Array) -> Array:
+        """Return the mean squared residual of each output, (ny,)."""
+        return np.asarray((r**2).sum(axis=(0, 1)) / self._samples + _LEAST)
+
+    def _value(self, runs: Runs, p: Array, nodes: Array) -> float:
+        """Return −log L, the noise of each output concentrated, infinite where a run escapes."""
+        r, _, _ = runs.value(p, nodes)
+        if not np.isfinite(r).all():
+            return np.inf
+        with np.errstate(over="ignore"):
+            return 0.5 * self._samples * float(np.log(self._noise(r)).sum())
+
+    def _at(self, runs: Runs, p: Array, nodes: Array, cost: float) -> _Point:
+        at = runs.linearise(p, nodes)
+        weight = 1 / np.sqrt(self._noise(at.r))
+        by_output = at.rows.reshape(*at.r.shape, -1) * weight[:, None]
+        weighed = replace(at, r=at.r * weight, rows=by_output.reshape(at.rows.shape))
+        found = reduce_starts(weighed, self._whole, nodes, len(p), "gaussian")
+        return _Point(p, nodes, cost, found, self._most)
+
+    def _moved(self, runs: Runs, at: _Point, step: Array) -> _Point | None:
+        """Return where a step or a part of it leads downhill, None where it does not."""
+        for share in (1.0, 0.5, 0.2):
+            shift = at.reduced.starts - at.reduced.starts_by_p @ step
+            p, nodes = at.p + share * step, at.nodes + share * shift
+            cost = self._value(runs, p, nodes)
+            if cost < at.cost:
+                return self._at(runs, p, nodes, cost)
+        return None
+
+    def _fitted(
+        self, runs: Runs, p: Array, nodes: Array, active: Sequence[int], most: int = _FIRST
+    ) -> _Point:
+        """Return the fit of the active parameters, Levenberg-Marquardt where steps fail."""
+        index = np.array(active)
+        out = np.setdiff1d(np.arange(len(p)), index)
+        p = p.copy()
+        p[out] = 0.0
+        cost = self._value(runs, p, nodes)
+        if not np.isfinite(cost):
+            p, nodes = np.zeros_like(p), self.starts
+            cost = self._value(runs, p, nodes)
+        at = self._at(runs, p, nodes, cost)
+        for _ in range(most):
+            moved = self._damped(runs, at, index)
+            if moved is None:
+                break
+            done = self._share(moved.cost - at.cost) > 1 - _SETTLED
+            at = moved
+            if done:
+                break
+        return at
+
+    def _damped(self, runs: Runs, at: _Point, active: Array) -> _Point | None:
+        for damping in (0.0, 1e-3, 1e-1, 10.0):
+            hessian = at.reduced.hessian * (1 + damping * np.eye(len(at.p)))
+            moved = self._moved(runs, at, at.solution(hessian, at.reduced.gradient, active))
+            if moved is not None:
+                return moved
+        return None
+
+    def _with_one_more(
+        self,
+        runs: Runs,
+        at: _Point,
+        active: Sequence[int],
+        earns: float,
+        seen: Set[frozenset[int]],
+    ) -> tuple[int, _Point] | None:
+        """Return the term that lowers the error most and the fit with it, None if none earns."""
+        index = np.array(active)
+        hessian, gradient = at.reduced.hessian, at.reduced.gradient
+        inverse = scaled_inverse(hessian[np.ix_(index, index)], RANK)
+        out = np.setdiff1d(np.arange(len(at.p)), index)
+        cross = hessian[np.ix_(out, index)]
+        own = np.diag(hessian)[out]
+        left = own - np.einsum("ij,jk,ik->i", cross, inverse, cross)
+        slope = gradient[out] - cross @ (inverse @ gradient[index])
+        known = left > _OWN * np.maximum(own, 0.0)
+        known &= (self._most[out] > 0) | (slope < 0)
+        gains = np.where(known, 0.5 * slope**2 / np.where(known, left, 1.0), 0.0)
+        for i in np.argsort(-gains)[:_TRIED]:
+            if self._share(-gains[i]) > 1 - earns:
+                return None
+            tried = np.append(index, out[i])
+            if frozenset(tried.tolist()) in seen:
+                continue
+            moved = self._moved(runs, at, at.solution(hessian, gradient, tried))
+            if moved is None or self._share(moved.cost - at.cost) > 1 - earns:
+                continue
+            return int(out[i]), self._damped(runs, moved, tried) or moved
+        return None
+
+    def _without_one(
+        self,
+        at: _Point,
+        active: Sequence[int],
+        kept: Set[int],
+        allowed: float,
+        seen: Set[frozenset[int]],
+    ) -> tuple[int, _Point] | None:
+        """Return the term that earns least and the fit without it, None where all earn enough."""
+        index = np.array(active)
+        hessian, gradient = at.reduced.hessian, at.reduced.gradient
+        variance = np.diag(scaled_inverse(hessian[np.ix_(index, index)], RANK))
+        loss = 0.5 * at.p[index] ** 2 / variance
+        for i in np.argsort(loss):
+            gone = int(index[i])
+            if loss[i] > allowed:
+                return None
+            if gone in kept or frozenset(active) - {gone} in seen:
+                continue
+            rest = np.delete(index, i)
+            away = at.solution(hessian, gradient + hessian[:, gone] * at.p[gone], rest)
+            away[gone] = -at.p[gone]
+            shift = at.reduced.starts - at.reduced.starts_by_p @ away
+            p, nodes = at.p + away, at.nodes + shift
+            p[gone] = 0.0
+            cost = self._value(self.runs, p, nodes)
+            if not cost < at.cost + allowed:
+                return None
+            after = self._at(self.runs, p, nodes, cost)
+            return gone, self._damped(self.runs, after, rest) or after
+        return None

@@ -1,0 +1,256 @@
+"""Which terms, and how many: paths of the free run on all logs and on parts, judged by the rest.
+
+The path of sets is followed on all logs, and again without each part of them; every set of
+a part's path is run freely on what it left out. How many terms are worth having is what
+these runs say, and the set of that size on the path of all logs is taken.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.errors import GreyboxError
+from greybox.model.catalogue import structure_for
+from greybox.model.model import ManoeuvringModel
+from greybox.selection.cross_validation import parts_of
+from greybox.selection.family import family_for, first_terms, spell_structure
+from greybox.selection.free_run_selection import FreeRunSelection, Selected
+from greybox.selection.held_out import rank, score_errors, spread_of
+from greybox.trial.log import TrialLog
+from greybox.validation.fit import run_model
+from greybox.vessel.force import force_inputs
+from greybox.vessel.thrust import ThrustLaw
+from greybox.vessel.vessel import Vessel
+
+Array = NDArray[np.float64]
+_log = logging.getLogger(__name__)
+
+# terms at most, and those with which thrust laws are compared
+_MOST, _FEW = 40, 18
+# samples that a coefficient needs
+_SAMPLES = 20
+# share by which the error may be larger with the thrust that propeller theory gives, ~ n|n|
+_NEAR = 0.1
+# points of fit that a smaller model may give away
+_GIVEN_AWAY = 0.5
+# scores that a standard error needs
+_SCORES = 8
+# the speed of a propeller that varies by less than this share tells no law from another
+_VARIES = 0.05
+
+
+@dataclass(frozen=True)
+class TermChoice:
+    """The set of terms that held-out free runs choose, or None where the present model stays.
+
+    Parameters
+    ----------
+    structure : str
+        As `structure_for` takes it.
+    kind : str
+        Predictor.
+    start : ndarray
+        (p,) its parameters where the selection ended, in the order of the structure.
+    logs : tuple of TrialLog
+        With the thrust law that was chosen.
+    taken : bool
+        Whether it is better than the model that it was compared with.
+    rows : tuple of dict
+        What was tried: size, change, error on all logs, held-out score, how far behind, error.
+    note : str
+        The choice in words.
+    """
+
+    structure: str
+    kind: str
+    start: Array
+    logs: tuple[TrialLog, ...]
+    taken: bool
+    rows: tuple[dict[str, Any], ...]
+    note: str
+
+
+def select_terms(
+    logs: Sequence[TrialLog],
+    present: str,
+    size: int,
+    refit: Callable[[Sequence[TrialLog]], ManoeuvringModel],
+) -> TermChoice:
+    """Choose terms by free runs on parts that were left out, and compare with a present model.
+
+    Parameters
+    ----------
+    logs : sequence of TrialLog
+        Of one vessel and sample time.
+    present : str
+        The model that stands unless terms do better, in words.
+    size : int
+        Its coefficients.
+    refit : callable
+        Estimates it on other logs.
+
+    Raises
+    ------
+    UsageError
+        A single log is too short for parts.
+    ExcitationError
+        No free run of any set follows the logs.
+    """
+    inputs, wind = force_inputs(logs[0].vessel), all(log.has_wind for log in logs)
+    family = family_for(inputs, wind)
+    kind = "wind" if wind else "augmented"
+    first, stay = first_terms(inputs)
+    most = min(_MOST, sum(len(log) for log in logs) // _SAMPLES)
+    spread_by_state = spread_of(logs, family.states)
+    spread = np.array(list(spread_by_state.values()))
+
+    def path(of: Sequence[TrialLog], terms: int = most) -> tuple[FreeRunSelection, list[Selected]]:
+        selection = FreeRunSelection(of, family, kind)
+        return selection, selection.path(first, stay, terms)
+
+    laws = [tuple(map(_with(law), logs)) for law in _laws(logs)]
+    if len(laws) > 1:
+        errors = np.array([path(of, min(_FEW, most))[1][-1].cost for of in laws])
+        best_law = int(np.argmin(errors))
+        quadratic = len(laws) - 1
+        near = errors[quadratic] < (1 + _NEAR) * errors[best_law]
+        logs = laws[quadratic if near else best_law]
+    else:
+        logs = laws[0]
+    law = logs[0].vessel.thrusters[0].thrust
+    selection, sets = path(logs)
+    parts = parts_of(logs)
+    blocks = -(-_SCORES // max(len(logs), len(parts)))
+    sizes = sorted({len(s.terms) for s in sets})
+    scores: list[list[Array]] = [[] for _ in sizes]
+    own: list[Array] = []
+    for fitting, held in parts:
+        try:
+            _, found = path(fitting)
+        except GreyboxError as error:
+            _log.info("no path on a part: %s", error)
+            found = []
+        judged = FreeRunSelection(held, family, kind)
+        for k, count in enumerate(sizes):
+            small = _of_size(found, count)
+            runs = judged.errors(small.p) if small else [np.full((len(h), 3), np.inf) for h in held]
+            scores[k] += [score_errors(e, spread, blocks) for e in runs]
+        own += _present_scores(refit, fitting, held, spread_by_state, blocks)
+    alternatives = [np.concatenate(own), *(np.concatenate(s) for s in scores)]
+    # a published structure whose numbers were tested comes before terms chosen on the data
+    ranking = rank(alternatives, [0, *sizes], given_away=_GIVEN_AWAY)
+    counts = [size, *sizes]
+    chosen = ranking.chosen
+    shown = chosen or int(np.argmax(ranking.score[1:])) + 1
+    best = _of_size(sets, counts[shown])
+    assert best is not None
+    terms = tuple(n for n in best.terms if n not in selection.model.means)
+    structure = spell_structure(terms, inputs)
+    values = dict(zip(selection.names, best.p, strict=True))
+    in_order = structure_for(structure, inputs).parameters
+    rows = [
+        {
+            "model": f"{n} terms" if i else present,
+            "coefficients": n,
+            "score": float(ranking.score[i]),
+            "behind": float(ranking.behind[i]),
+            "se": float(ranking.se[i]),
+            "chosen": i == chosen,
+        }
+        for i, n in enumerate(counts)
+    ]
+    said = (
+        f"terms were selected by free runs on parts of the logs that were left out in turn: "
+        f"{counts[shown]} terms (thrust ~ {law_in_words(law)}) score "
+        f"{ranking.score[shown]:.1f} % and {present} {ranking.score[0]:.1f} % (mean fit over the "
+        f"channels, cut at -100); "
+        + (
+            f"the smallest set that falls behind the best by no more than one standard error and "
+            f"{_GIVEN_AWAY:g} points was taken."
+            if chosen
+            else f"{present} stays."
+        )
+    )
+    return TermChoice(
+        structure,
+        kind if len(terms) < len(best.terms) else "basic+wind" if wind else "basic",
+        np.array([values[n] for n in in_order]),
+        tuple(logs),
+        chosen > 0,
+        tuple(rows),
+        said,
+    )
+
+
+def law_in_words(law: ThrustLaw) -> str:
+    """Return how the force goes with the speed n."""
+    if law.kind == "linear":
+        return "n and n|n|" if 0 < law.quadratic_share < 1 else "n"
+    return "n|n|" if law.kind == "quadratic" else "a bollard table"
+
+
+def _of_size(sets: Sequence[Selected], size: int) -> Selected | None:
+    """Return the set of best fit with at most so many terms, None where there is none."""
+    small = [s for s in sets if len(s.terms) <= size]
+    return min(small, key=lambda s: s.cost, default=None)
+
+
+def _present_scores(
+    refit: Callable[[Sequence[TrialLog]], ManoeuvringModel],
+    fitting: Sequence[TrialLog],
+    held: Sequence[TrialLog],
+    spread: dict[str, float],
+    blocks: int,
+) -> list[Array]:
+    sizes = np.array(list(spread.values()))
+    try:
+        model = refit(fitting)
+    except GreyboxError as error:
+        _log.info("the present model on a part: %s", error)
+        return [score_errors(np.full((blocks, len(sizes)), np.inf), sizes, blocks) for _ in held]
+    found = []
+    for log in held:
+        run = run_model(model, log)
+        errors = run.errors() if run.diverged < 0 else np.full((blocks, len(sizes)), np.inf)
+        found.append(score_errors(errors, sizes, blocks))
+    return found
+
+
+def _laws(logs: Sequence[TrialLog]) -> list[ThrustLaw | None]:
+    """Return the thrust laws to compare, None the vessel's own.
+
+    A bollard table or a law other than force ~ n was somebody's decision; and a speed that
+    hardly varies cannot tell one from another.
+    """
+    vessel = logs[0].vessel
+    if any(t.thrust != ThrustLaw() for t in vessel.thrusters):
+        return [None]
+    speeds = [np.concatenate([log[t.speed] for log in logs]) for t in vessel.thrusters]
+    usual = [float(np.sqrt(np.mean(n**2))) for n in speeds]
+    if not any(np.std(np.abs(n)) > _VARIES * u for n, u in zip(speeds, usual, strict=True)):
+        return [None]
+    reference = float(np.max(usual))
+    return [
+        None,
+        ThrustLaw(quadratic_share=0.5, reference=reference),
+        ThrustLaw("quadratic"),
+    ]
+
+
+def _with(law: ThrustLaw | None) -> Callable[[TrialLog], TrialLog]:
+    """Return what gives a log's vessel a thrust law."""
+
+    def changed(log: TrialLog) -> TrialLog:
+        if law is None:
+            return log
+        vessel: Vessel = log.vessel
+        thrusters = tuple(replace(t, thrust=law) for t in vessel.thrusters)
+        return replace(log, vessel=replace(vessel, thrusters=thrusters))
+
+    return changed
