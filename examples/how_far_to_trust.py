@@ -8,7 +8,9 @@ from greybox.study.efficiency import CASES, virtual_trial
 log = virtual_trial(np.random.default_rng(4), CASES[0], 1500)
 for method in ("iv", "oe"):
     estimate = gb.estimate_model(log, method=method, predictor="wind")
-    print(f"{method}: {estimate.verdict.text}")
+    print(f"{method}: coefficients {estimate.verdict.text}")
+    if estimate.prediction is not None:
+        print(f"  prediction {estimate.prediction.text}")
     for reason in estimate.verdict.reasons[:3]:
         print(f"  {reason}")
     for name, limit in estimate.limits.items():

@@ -9,6 +9,8 @@ from greybox.diagnosis.result import Given as Given
 from greybox.estimation.output_error import OutputErrorOptions as OutputErrorOptions
 from greybox.estimation.output_error import estimate_oe as estimate_oe
 from greybox.estimation.output_setup import output_predictor as output_predictor
+from greybox.estimation.prediction_verdict import PredictionLevel as PredictionLevel
+from greybox.estimation.prediction_verdict import PredictionVerdict as PredictionVerdict
 from greybox.estimation.refined import estimate_refined_iv as estimate_refined_iv
 from greybox.estimation.result import Estimate as Estimate
 from greybox.estimation.verdict import TestResult as TestResult

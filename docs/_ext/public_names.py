@@ -25,7 +25,7 @@ STEPS = {
     "model": "get_structure structure_names Structure build_predictor output_predictor Predictor "
     "ManoeuvringModel load_model simulate stationary_disturbance",
     "estimate": "estimate_model Request estimate_ls estimate_iv estimate_refined_iv estimate_oe "
-    "OutputErrorOptions Estimate Verdict TrustLevel TestResult",
+    "OutputErrorOptions Estimate Verdict TrustLevel PredictionVerdict PredictionLevel TestResult",
     "compare": "run_model compare Comparison compare_models fit_percent",
     "diagnose": "diagnose DiagnosisOptions Diagnosis fit_given Given known_causes Cause",
     "design": "prepare_request Wishes TrialLimits Circle DesignRequest build_problem noise_levels "

@@ -232,7 +232,14 @@ def _estimated(estimate: Estimate) -> Step:
         "Estimate",
         f"greybox estimate trial.csv --vessel {VESSEL} --method oe --predictor basic "
         f"--out model.json",
-        (f"Verdict: {estimate.verdict.text}",),
+        (
+            *(
+                [f"Prediction: {estimate.prediction.text}"]
+                if estimate.prediction is not None
+                else []
+            ),
+            f"Coefficients: {estimate.verdict.text}",
+        ),
     )
 
 

@@ -31,6 +31,7 @@ EXAMPLES = """examples:
   greybox estimate trial.csv --vessel ship.toml --method oe --bound Xu=-0.2:0 --out m.json
   greybox estimate trial.csv --vessel ship.toml --structure 'thesis+N_|r|r-Xkappa' --out m.json
   greybox estimate trial.csv --vessel ship.toml --reduce --out m.json
+  greybox estimate a.csv b.csv --vessel ship.toml --validate c.csv --out m.json
   greybox estimate a.csv b.csv --vessel ship.toml --compare-structures thesis linear modulus
 """
 
@@ -96,6 +97,14 @@ def _add_data(parser: argparse.ArgumentParser) -> None:
         type=positive,
         metavar="S",
         help="decimate the logs to this sample time [s]; by default that of the logs",
+    )
+    group.add_argument(
+        "--validate",
+        nargs="+",
+        default=[],
+        metavar="LOG",
+        help="logs that judge the prediction and take no part in the estimate; by default the logs "
+        "are left out in turn",
     )
     group.add_argument(
         "--margin-u",
@@ -267,6 +276,7 @@ def run(options: argparse.Namespace) -> None:
     named = options.structure or (options.compare_structures or ["thesis"])[0]
     states = get_structure(named.split("+")[0].split("-")[0]).states
     logs, left_out = read_logs(options.logs, vessel, options.sample_time, states)
+    validate, no_part = read_logs(options.validate, vessel, options.sample_time, states)
     margins = {k: v for k, v in (("u", options.margin_u), ("v", options.margin_v)) if v is not None}
     request = Request(
         method=options.method,
@@ -291,10 +301,11 @@ def run(options: argparse.Namespace) -> None:
         prefilter=options.prefilter,
         nominal=load_model(options.nominal) if options.nominal else None,
         seed=options.seed,
+        validate=tuple(validate),
     )
     choice = _choose(logs, request, options)
     estimate = choice.estimate if choice else estimate_requested(logs, request)
-    estimate = replace(estimate, notes=(*left_out, *estimate.notes))
+    estimate = replace(estimate, notes=(*left_out, *no_part, *estimate.notes))
     model = estimate.model()
     told = {"structure_choice": choice.to_list()} if choice else {}
     made = provenance(options)

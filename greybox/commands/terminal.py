@@ -17,9 +17,11 @@ LOGGERS = ("greybox", "experiment_design")
 _QUIET: ContextVar[bool] = ContextVar("quiet", default=False)
 _RED, _GREEN, _YELLOW = "31", "32", "33"
 _VERDICT = re.compile(
-    r"^(?P<label>[Vv]erdict: )(?P<word>do not trust|trust except|\w+)", re.MULTILINE
+    r"^(?P<label>(?:[Vv]erdict|Prediction|Coefficients): )(?P<word>do not trust|trust except|\w+)",
+    re.MULTILINE,
 )
-_TONES = {"trust": _GREEN, "none": _GREEN, "do not trust": _RED, "unexplained": _RED}
+_TONES = {"trust": _GREEN, "good": _GREEN, "none": _GREEN, "do not trust": _RED, "poor": _RED,
+          "unexplained": _RED}  # fmt: skip
 
 
 def coloured(stream: TextIO) -> bool:

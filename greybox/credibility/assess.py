@@ -13,6 +13,7 @@ from greybox.credibility.heading import heading_independence
 from greybox.credibility.independence import input_independence
 from greybox.credibility.many import many_instruments
 from greybox.credibility.margins import margin_bias, sign_margins
+from greybox.credibility.movement import movement
 from greybox.credibility.overidentification import overidentification
 from greybox.credibility.residuals import whiteness
 from greybox.credibility.stability import damping_signs, stability
@@ -59,7 +60,12 @@ def assess(evidence: Evidence) -> tuple[TestResult, ...]:
         kept = sum(int(k.sum()) for k in evidence.keep)
         cut = evidence.regression.samples - kept
         tests += sign_margins(evidence.logs, states, evidence.margins, cut)
-    tests += [margin_bias(evidence), stability(evidence), damping_signs(evidence)]
+    tests += [
+        movement(evidence),
+        margin_bias(evidence),
+        stability(evidence),
+        damping_signs(evidence),
+    ]
     return tuple(tests)
 
 

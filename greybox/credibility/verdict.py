@@ -28,7 +28,7 @@ _FAMILY = 0.01
 # findings that concern some parameters and leave the others
 _OF_PARAMETERS = {
     "relevance", "weak_instruments", "many_instruments", "anderson_rubin", "damping_signs",
-    "margin_bias",
+    "margin_bias", "movement",
 }  # fmt: skip
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from greybox.errors import UnknownParameterError, suggestion
 from greybox.estimation.inference import Restrictions, confidence_intervals, wald_test
+from greybox.estimation.prediction_verdict import NOT_JUDGED
 from greybox.estimation.summary import estimated, summarise
 from greybox.estimation.values import EstimateValues
 from greybox.estimation.verdict import TestResult
@@ -57,6 +58,7 @@ class Estimate(EstimateValues, DisplayMixin):
         (0, 0) where only standard errors are known.
     tests : tuple of TestResult
     verdict : Verdict
+        On the coefficients: whether they mean what their names say.
     notes : tuple of str
         Choices made and warnings.
     fit : dict
@@ -67,6 +69,8 @@ class Estimate(EstimateValues, DisplayMixin):
         ``cramer_rao`` and ``optimal_iv`` beside the standard errors.
     prefilter : {"none", "noise"}
         Whether all equations were solved jointly with their error made white.
+    prediction : PredictionVerdict, optional
+        What the free run is good for on logs that took no part; None where not asked for.
     """
 
     @property
@@ -261,7 +265,10 @@ class Estimate(EstimateValues, DisplayMixin):
             "predictor": self.predictor.kind,
             "regime": {s: list(v) for s, v in self.predictor.regime},
             "fit": self.fit,
-            "verdict": self.verdict.to_dict(),
+            "verdict": {
+                "prediction": (self.prediction or NOT_JUDGED).to_dict(),
+                "coefficients": self.verdict.to_dict(),
+            },
             "tests": {t.name: t.to_dict() for t in self.tests},
             "notes": list(self.notes),
             "status": self.status,
@@ -297,7 +304,7 @@ class Estimate(EstimateValues, DisplayMixin):
         DataFrame
             Index ``parameter`` (labels, sums spelled out, then the current's components);
             columns ``theta`` and ``std``, ``ci_low`` and ``ci_high`` of the 95 % interval,
-            ``unit`` and ``per_second``. Verdict, method and sample time in ``attrs``.
+            ``unit`` and ``per_second``. Both verdicts, method and sample time in ``attrs``.
         """
         import pandas as pd
 
@@ -312,13 +319,17 @@ class Estimate(EstimateValues, DisplayMixin):
         frame["per_second"] = per_second
         frame.attrs = {
             "verdict": self.verdict.text,
+            "prediction": (self.prediction or NOT_JUDGED).text,
             "method": self.method,
             "sample_time": self.sample_time,
         }
         return frame
 
     def _line(self) -> str:
-        return f"estimate of {self.vessel.name} ({self.method}): {self.verdict.text}"
+        told = self.verdict.text
+        if self.prediction is not None:
+            told = f"prediction {self.prediction.text}; coefficients {told}"
+        return f"estimate of {self.vessel.name} ({self.method}): {told}"
 
     def _parts(self) -> tuple[str, ...]:
         current = [(n, v, s, "m/s") for n, v, s in self.current]

@@ -1,4 +1,4 @@
-"""An estimate as text: the verdict, the table, the tests in groups."""
+"""An estimate as text: the verdicts, the table, the tests in groups."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ WIDTH = 100
 # closed intervals, None for an infinite end
 Pieces = Sequence[Sequence[float | None]]
 _GROUPS = {
-    "What the log determines": ("excitation", "relevance", "weak_instruments", "anderson_rubin",
-                                "combinations"),
+    "What the log determines": ("movement", "excitation", "relevance", "weak_instruments",
+                                "anderson_rubin", "combinations"),
     "Whether the model explains it": ("input_independence", "heading_independence",
                                       "overidentification", "whiteness"),
     "What noise does to it": ("endogeneity", "many_instruments", "margin", "margin_bias",
@@ -33,15 +33,19 @@ _MARKS = {True: "ok", False: "!!", None: "  "}
 
 
 def summarise(estimate: EstimateValues) -> str:
-    """Return the verdict, the parameters in the manner of a regression table, and the tests."""
+    """Return the verdicts, the parameters in the manner of a regression table, and the tests."""
     lines = [f"{'Estimate of ' + estimate.vessel.name:^{WIDTH}}".rstrip(), "=" * WIDTH]
-    lines += _wrapped(f"Verdict: {estimate.verdict.text}", "  ")
+    if estimate.prediction is not None:
+        lines += _wrapped(f"Prediction: {estimate.prediction.text}", "  ")
+    lines += _wrapped(f"Coefficients: {estimate.verdict.text}", "  ")
     lines += ["=" * WIDTH, *_head(estimate), "=" * WIDTH, *_table(estimate), "=" * WIDTH]
     for name, value, std in estimate.current:
         lines.append(f"{name:<16}{value:>10.3f} ± {1.96 * std:.3f} m/s (95 %)")
     if estimate.fit:
         shown = ", ".join(f"{k} {v:.1f} %" for k, v in estimate.fit.items())
         lines.append(f"Free-run fit on the estimation logs: {shown}")
+    if estimate.prediction is not None:
+        lines += ["", "What its free run is good for", *estimate.prediction.table()]
     for name, limit in estimate.limits.items():
         lines += _wrapped(f"{BOUNDS[name]}: {limit.sentence}", "  ")
     if estimate.data.conditions.values:

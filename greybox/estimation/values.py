@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.estimation.prediction_verdict import PredictionVerdict
 from greybox.estimation.verdict import UNJUDGED, TestResult, Verdict
 from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import Predictor
@@ -154,3 +155,4 @@ class EstimateValues:
     noise: NoiseLevels | None = None
     limits: Mapping[str, EfficiencyBound] = field(default_factory=dict)
     prefilter: str = "none"
+    prediction: PredictionVerdict | None = None

@@ -401,7 +401,7 @@ class SharedMoment(Reason):
 
 @dataclass(frozen=True, repr=False)
 class Verdict(DisplayMixin):
-    """Whether to trust an estimate.
+    """Whether the coefficients of an estimate mean what their names say.
 
     Parameters
     ----------
@@ -425,6 +425,15 @@ class Verdict(DisplayMixin):
         return f"{self.level}: {'; '.join(fatal)}" if fatal else str(self.level)
 
     @property
+    def reason(self) -> str:
+        """Why this level, in one sentence without its stop."""
+        fatal = [r for r in self.because if r.fatal]
+        said = [r.sentence.rstrip(".") for r in fatal or self.because]
+        if not said and self.level is TrustLevel.NOT_JUDGED:
+            return "tests were not asked for"
+        return "; ".join(said) or "no test speaks against them"
+
+    @property
     def reasons(self) -> tuple[str, ...]:
         """One sentence a reason."""
         return tuple(r.sentence for r in self.because)
@@ -439,10 +448,10 @@ class Verdict(DisplayMixin):
     def to_dict(self) -> dict[str, Any]:
         """Return the fields for JSON."""
         return {
-            "text": self.text,
             "level": str(self.level),
-            "excepted": list(self.excepted),
-            "reasons": list(self.reasons),
+            "text": self.text,
+            "except": list(self.excepted),
+            "reason": self.reason,
             "because": [r.to_dict() for r in self.because],
         }
 

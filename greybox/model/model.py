@@ -205,14 +205,18 @@ class ManoeuvringModel(DisplayMixin):
 
     def _parts(self) -> tuple[str, ...]:
         judged = self.record.get("verdict")
-        said = judged.get("text", "") if isinstance(judged, dict) else ""
+        said = judged if isinstance(judged, dict) else {}
         rows = [
             (self.label(n), float(v), float(s), unit)
             for n, v, s, unit in zip(self.names, self.theta, self.std, self.units, strict=True)
         ]
         known = [(n, value, std, "m/s") for n, (value, std) in self.disturbances.items()]
         return (
-            text(f"Verdict of the estimate: {said}" if said else ""),
+            *(
+                text(f"{what.capitalize()} of the estimate: {said[what]['text']}")
+                for what in ("prediction", "coefficients")
+                if what in said
+            ),
             parameters([*rows, *known]),
             items("Changes", [c.sentence for c in self.changes]),
             text(f"Estimated at {in_words(self.conditions)}" if self.conditions else ""),

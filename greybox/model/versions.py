@@ -7,7 +7,7 @@ from typing import Any
 
 from greybox.errors import ModelFileError
 
-VERSION = 2
+VERSION = 3
 
 Tables = dict[str, Any]
 
@@ -28,8 +28,23 @@ def _from_1(data: Tables) -> Tables:
     }
 
 
+def _from_2(data: Tables) -> Tables:
+    """Version 2 had one verdict, on the coefficients, whose level was at first its text."""
+    old = data.get("verdict")
+    if not isinstance(old, dict):
+        return {**data, "version": 3}
+    said, reasons = str(old.get("text", "")), [str(r) for r in old.get("reasons", [])]
+    found = next((w for w in _LEVELS if said.startswith(w)), "not judged")
+    coefficients = {k: v for k, v in old.items() if k not in ("excepted", "reasons")} | {
+        "level": old.get("level", found),
+        "except": old.get("excepted", []),
+        "reason": "; ".join(reasons),
+    }
+    return {**data, "verdict": {"coefficients": coefficients}, "version": 3}
+
+
 # from each version to the next
-_STEPS: Mapping[int, Callable[[Tables], Tables]] = {1: _from_1}
+_STEPS: Mapping[int, Callable[[Tables], Tables]] = {1: _from_1, 2: _from_2}
 
 
 def upgraded(data: Tables, source: str) -> Tables:
@@ -60,14 +75,4 @@ def upgraded(data: Tables, source: str) -> Tables:
         )
     for step in range(version, VERSION):
         data = _STEPS[step](data)
-    return _with_level(data)
-
-
-def _with_level(data: Tables) -> Tables:
-    """Return the tables with the level of the estimate's verdict, which was at first its text."""
-    verdict = data.get("verdict")
-    if not isinstance(verdict, dict) or "level" in verdict:
-        return data
-    said = str(verdict.get("text", ""))
-    level = next((w for w in _LEVELS if said.startswith(w)), "not judged")
-    return {**data, "verdict": {**verdict, "level": level}}
+    return data

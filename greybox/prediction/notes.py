@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
+from greybox.estimation.prediction_verdict import PredictionLevel
 from greybox.estimation.verdict import TrustLevel
 from greybox.model.model import ManoeuvringModel
 from greybox.prediction.conditions import Conditions, Task
@@ -90,18 +92,27 @@ def run_notes(
 
 
 def trust_level(model: ManoeuvringModel) -> TrustLevel:
-    """Return the level of the verdict that the model's record holds."""
-    verdict = model.record.get("verdict")
-    level = verdict.get("level") if isinstance(verdict, Mapping) else None
+    """Return the level of the verdict on the coefficients that the model's record holds."""
+    level = _verdict(model, "coefficients").get("level")
     known = set(map(str, TrustLevel))
     return TrustLevel(level) if level in known else TrustLevel.NOT_JUDGED
+
+
+def _verdict(model: ManoeuvringModel, part: str) -> Mapping[str, Any]:
+    verdict = model.record.get("verdict")
+    found = verdict.get(part) if isinstance(verdict, Mapping) else None
+    return found if isinstance(found, Mapping) else {}
 
 
 def model_notes(model: ManoeuvringModel, helm: Helm, asked: Conditions) -> tuple[str, ...]:
     """Say what holds for all manoeuvres of a prediction."""
     told = []
     if trust_level(model) in (TrustLevel.DO_NOT_TRUST, TrustLevel.TRUST_EXCEPT):
-        told.append(f"the estimate's own verdict is '{model.record['verdict']['text']}'.")
+        said = _verdict(model, "coefficients")["text"]
+        told.append(f"the estimate's own verdict on its coefficients is '{said}'.")
+    said = str(_verdict(model, "prediction").get("text", ""))
+    if said.startswith((PredictionLevel.LIMITED, PredictionLevel.POOR)):
+        told.append(f"the estimate's own verdict on its predictions is '{said}'.")
     if not model.covariance.any():
         told.append("the model has no covariance, so its parameters were taken as exact.")
     if asked.disturbed and model.noise is None:

@@ -84,6 +84,7 @@ def estimation_page(
         title=f"How far to trust this model of {estimate.vessel.name}",
         headline=headline(estimate),
         sentences=_summary(estimate),
+        tables=_prediction(estimate),
         sections=[s for s in sections if s is not None],
         computed=computed(dict(record))
         | {
@@ -96,14 +97,15 @@ def estimation_page(
 
 
 def headline(estimate: Estimate) -> str:
-    """Return the verdict as a sentence, with how well the free run follows the logs."""
-    verdict = estimate.verdict
-    if verdict.level is TrustLevel.TRUST:
-        told = "Trust this model: no test speaks against it"
-    elif verdict.level is TrustLevel.TRUST_EXCEPT:
-        told = f"Trust this model, except for {', '.join(verdict.excepted)}"
+    """Return both verdicts as sentences, with how well the free run follows the logs."""
+    verdict, prediction = estimate.verdict, estimate.prediction
+    if verdict.level is TrustLevel.TRUST_EXCEPT:
+        told = f"Trust its coefficients, except for {', '.join(verdict.excepted)}"
     else:
-        told = verdict.text[:1].upper() + verdict.text[1:]
+        does = "Trust" if verdict.level is TrustLevel.TRUST else "Do not trust"
+        told = f"{does} its coefficients: {verdict.reason}"
+    if prediction is not None:
+        told = f"Prediction is {prediction.level}: {prediction.reason}. {told}"
     if not estimate.fit:
         return f"{told}."
     fit = ", ".join(
@@ -111,6 +113,16 @@ def headline(estimate: Estimate) -> str:
         for s, v in estimate.fit.items()
     )
     return f"{told}. Its free run fits the logs it was estimated on by {fit} (100 is perfect)."
+
+
+def _prediction(estimate: Estimate) -> list[Table]:
+    """Show what the free run is good for, a row a channel."""
+    prediction = estimate.prediction
+    if prediction is None:
+        return []
+    head, rows = prediction.rows()
+    caption = f"What the free run is good for: on {prediction.judged_words}"
+    return [Table(caption, head, [[c.replace("e-", "e−") for c in row] for row in rows])]
 
 
 def _summary(estimate: Estimate) -> list[str]:
@@ -124,6 +136,11 @@ def _summary(estimate: Estimate) -> list[str]:
         f"{estimate.samples} samples of {estimate.sample_time:g} s in {logs} "
         f"log{'s' * (logs != 1)}.",
         # the headline has the others
+        *(
+            _sentence(r.sentence)
+            for r in (estimate.prediction.because if estimate.prediction else ())
+            if not r.fatal
+        ),
         *(r.sentence for r in estimate.verdict.because if not r.fatal),
     ]
     if estimate.current:
@@ -160,7 +177,7 @@ def _run(estimate: Estimate, logs: Sequence[TrialLog]) -> Section:
         )
     sentences = [
         "These are the logs that the model was fitted to, so this shows what it cannot follow, "
-        "not how well it predicts: for that, run greybox compare on logs that took no part."
+        "not how well it predicts: for that, see the table above."
     ]
     if len(logs) > len(drawn):
         sentences.append(f"Of {len(logs)} logs the first {len(drawn)} are drawn.")

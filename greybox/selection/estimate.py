@@ -33,6 +33,7 @@ from greybox.selection.cross_validation import (
 )
 from greybox.selection.fit_single import estimate_once
 from greybox.selection.held_out import FLOOR
+from greybox.selection.prediction import with_prediction
 from greybox.selection.request import Request, regression_only
 from greybox.selection.term_selection import select_terms
 from greybox.trial.kinematics import decimate_segments
@@ -70,6 +71,7 @@ def estimate_model(
     prefilter: Literal["auto", "noise", "none"] = "auto",
     judged: bool = True,
     without: Sequence[str] = (),
+    validate: Logs = (),
 ) -> Estimate:
     """Estimate a model from logs, choosing what is left open, and say whether to trust it.
 
@@ -114,11 +116,14 @@ def estimate_model(
         Whether tests and verdict are asked for.
     without : sequence of str
         Bias-capturing columns to leave out, spelled ``state:function``.
+    validate : TrialLog or sequence of TrialLog
+        Logs that judge the prediction and take no part in the estimate; without them the
+        logs are left out in turn.
 
     Returns
     -------
     Estimate
-        With its free-run fit on `logs` and notes on every choice.
+        With its free-run fit on `logs`, both verdicts, and notes on every choice.
 
     Raises
     ------
@@ -145,6 +150,7 @@ def estimate_model(
         prefilter=prefilter,
         judged=judged,
         without=tuple(without),
+        validate=(validate,) if isinstance(validate, TrialLog) else tuple(validate),
     )
     if request is not None:
         if asked != Request():
@@ -164,6 +170,12 @@ def estimate_model(
 @one_thread
 def estimate_requested(logs: Sequence[TrialLog], request: Request) -> Estimate:
     """Return what `estimate_model` does of a request."""
+    estimate = _chosen(logs, request)
+    return with_prediction(estimate, logs, request) if request.judged else estimate
+
+
+def _chosen(logs: Sequence[TrialLog], request: Request) -> Estimate:
+    """Return the estimate of the way to estimate that tests and runs prefer."""
     common_sample_time(logs)
     notes: list[str] = []
     if all(n is None for n in (request.method, *_named(request))):

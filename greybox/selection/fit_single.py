@@ -182,7 +182,7 @@ def estimate_once(
         There is no such method.
     """
     estimator, predictor = ESTIMATORS[method], PREDICTORS[kind]
-    require_informative(logs, predictor)
+    require_informative(logs, predictor, structure)
     asked = {f.name: getattr(request, f.name) for f in fields(EstimationOptions)}
     fitted = estimator.fit(EstimationProblem(tuple(logs), structure, predictor, start, **asked))
     return run_tests(fitted) if request.judged else fitted.estimate

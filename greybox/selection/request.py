@@ -12,6 +12,7 @@ from greybox.estimation.problem import EstimationOptions
 from greybox.estimation.registry import ESTIMATORS
 from greybox.estimation.solve import Covariance
 from greybox.model.predictor_kinds import PREDICTORS
+from greybox.trial.log import TrialLog
 
 # methods that are another one with a prefilter
 _PREFILTERED: Mapping[str, tuple[str, Literal["noise"]]] = {"refined-iv": ("iv", "noise")}
@@ -43,6 +44,8 @@ class Request(EstimationOptions):
         As `estimate_model`.
     output_error, seed, prefilter, judged, without
         As `estimate_model`.
+    validate : tuple of TrialLog
+        Logs that judge the prediction and take no part in the estimate.
 
     Raises
     ------
@@ -53,6 +56,7 @@ class Request(EstimationOptions):
     method: str | None = None
     predictor: str | None = None
     structure: str | None = None
+    validate: tuple[TrialLog, ...] = ()
 
     def __post_init__(self) -> None:
         for name, choices in _choices().items():

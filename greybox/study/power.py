@@ -18,6 +18,7 @@ from greybox.diagnosis.diagnose import diagnose
 from greybox.diagnosis.given import fit_given
 from greybox.diagnosis.result import DiagnosisVerdict
 from greybox.errors import GreyboxError, UsageError
+from greybox.numerics.binomial import wilson_interval
 from greybox.study.blind import Order, Trial, draw_many
 from greybox.study.blind_causes import CAUSES, Effect
 from greybox.study.blind_conditions import Conditions
@@ -198,13 +199,7 @@ class Share:
     @property
     def interval(self) -> tuple[float, float]:
         """The interval of Wilson (1927)."""
-        n, p, z = self.runs, self.value, 1.959964
-        if n == 0:
-            return 0.0, 1.0
-        middle = (p + z**2 / (2 * n)) / (1 + z**2 / n)
-        half = z / (1 + z**2 / n) * np.sqrt(p * (1 - p) / n + z**2 / (4 * n**2))
-        # rounding must not push a bound past the share itself
-        return max(0.0, min(p, float(middle - half))), min(1.0, max(p, float(middle + half)))
+        return wilson_interval(self.value, self.runs)
 
     def __str__(self) -> str:
         if not self.runs:

@@ -13,17 +13,13 @@ from numpy.typing import NDArray
 from greybox.errors import UsageError, suggestion
 from greybox.estimation.result import Estimate
 from greybox.model.model import ManoeuvringModel
-from greybox.model.run.changes import Change
-from greybox.model.run.inputs import LogInputs
-from greybox.model.run.simulation import simulate
 from greybox.notebook import DisplayMixin, items, number, table
 from greybox.public import known_keywords, one_thread
-from greybox.regression.instruments import state_bound
 from greybox.trial.log import Logs, TrialLog, as_list
 from greybox.trial.segments import find_log_gaps
 from greybox.trial.validity import ConditionDifference, other_conditions
 from greybox.validation.bands import LEVEL, Bands, predict_bands
-from greybox.validation.fit import LogFit, run_model
+from greybox.validation.fit import LogFit, run_from, run_model
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -281,10 +277,8 @@ def errors_ahead(
         Horizon in seconds -> state -> error [m/s, rad/s]; horizons longer than
         half the log are left out.
     """
-    log, structure = run.log, model.structure
-    x, known = log.states(structure.states), log.known(structure.states)
-    given = LogInputs.of(structure, log)
-    tau, psi = given.tau, given.heading(structure, heading)
+    log, states = run.log, model.structure.states
+    x, known = log.states(states), log.known(states)
     found = {}
     for horizon in HORIZONS:
         steps = round(horizon / log.sample_time)
@@ -298,41 +292,12 @@ def errors_ahead(
         starts = starts[known[starts] & known[starts + steps] & unbroken]
         if not len(starts):
             continue
-        window = starts[:, None] + np.arange(steps + 1)
-        air = log.air if log.has_wind and structure.uses_air else None
-        end = np.empty((len(starts), x.shape[1]))
-        for rows in _alike(model.changes, starts * log.sample_time, steps * log.sample_time):
-            ahead = simulate(
-                structure,
-                model.theta,
-                x[starts[rows]],
-                tau[window[rows, :-1]],
-                log.sample_time,
-                changes=model.changes,
-                first=float(starts[rows[0]] * log.sample_time),
-                psi=None if psi is None else psi[window[rows]],
-                psi0=given.psi[starts[rows]],
-                d=model.d if model.disturbances else None,
-                air=None if air is None else air[window[rows, :-1]],
-                integrator=model.integrator,
-                bound=state_bound(log, structure.states),
-            )
-            end[rows] = np.where(ahead.diverged[:, None] < 0, ahead.x[:, -1], np.inf)
+        end = run_from(model, log, starts, steps, heading=heading)[:, -1]
         error = np.full(x.shape[1], np.inf)
         if np.isfinite(end).all():
             error = np.sqrt(((end - x[starts + steps]) ** 2).mean(axis=0))
-        found[f"{horizon:g}"] = dict(zip(structure.states, map(float, error), strict=True))
+        found[f"{horizon:g}"] = dict(zip(states, map(float, error), strict=True))
     return found
-
-
-def _alike(changes: Sequence[Change], starts: Array, horizon: float) -> list[NDArray[np.intp]]:
-    """Group runs that start at these times [s]: those with one set of parameters together."""
-    times = np.array(sorted({c.time for c in changes}))
-    before = np.searchsorted(times, starts, side="right")
-    crossing = np.searchsorted(times, starts + horizon, side="right") > before
-    groups = [np.flatnonzero(~crossing & (before == k)) for k in range(len(times) + 1)]
-    # each of the others meets its change after another number of samples
-    return [g for g in groups if len(g)] + [np.array([k]) for k in np.flatnonzero(crossing)]
 
 
 @known_keywords

@@ -42,13 +42,15 @@ def information_criteria(
     return minus + 2 * parameters, minus + parameters * float(np.log(n.mean()))
 
 
-def independent_samples(residuals: Sequence[Array]) -> Array:
+def independent_samples(residuals: Sequence[Array], about: Array | None = None) -> Array:
     """Return how many independent samples coloured residuals are worth, (m,).
 
     Parameters
     ----------
     residuals : sequence of ndarray
         (N, m) a log.
+    about : ndarray, optional
+        (m,) what they vary about; by default the mean of each log.
 
     Notes
     -----
@@ -56,7 +58,7 @@ def independent_samples(residuals: Sequence[Array]) -> Array:
     N at most.
     """
     total = sum(len(r) for r in residuals)
-    centred = [r - r.mean(axis=0) for r in residuals]
+    centred = [r - (r.mean(axis=0) if about is None else about) for r in residuals]
     size = np.sum([(r**2).sum(axis=0) for r in centred], axis=0)
     out = np.full(residuals[0].shape[1], float(total))
     limit = 2 / np.sqrt(total)

@@ -13,8 +13,11 @@ from numpy.typing import NDArray
 from greybox.channels import CHANNELS
 from greybox.errors import LogError
 from greybox.model.model import ManoeuvringModel
+from greybox.model.run.changes import Change
+from greybox.model.run.inputs import LogInputs
+from greybox.model.run.simulation import simulate
 from greybox.notebook import DisplayMixin, number, sparkline, table
-from greybox.regression.instruments import simulate_log
+from greybox.regression.instruments import simulate_log, state_bound
 from greybox.trial.kinematics import decimate_segments
 from greybox.trial.log import TrialLog
 from greybox.trial.segments import join_segments, split_segments, whole_name
@@ -215,6 +218,70 @@ def run_model(
         fit = dict.fromkeys(states, -np.inf)
         _log.info("the free run on %s leaves its bound at sample %d", log.name, diverged)
     return LogFit(log, x, psi, fit, diverged)
+
+
+def run_from(
+    model: ManoeuvringModel,
+    log: TrialLog,
+    starts: NDArray[np.intp],
+    steps: int,
+    *,
+    heading: Literal["measured", "simulated"] = "measured",
+) -> Array:
+    """Run a model from measured states of a log.
+
+    Parameters
+    ----------
+    model : ManoeuvringModel
+    log : TrialLog
+        At the model's sample time.
+    starts : ndarray of int
+        (R,) samples to start from.
+    steps : int
+        After each; none may leave the log.
+    heading : {"measured", "simulated"}
+
+    Returns
+    -------
+    ndarray
+        (R, steps + 1, nx) [m/s, rad/s]; infinite from where a run has diverged.
+    """
+    structure = model.structure
+    x, given = log.states(structure.states), LogInputs.of(structure, log)
+    psi = given.heading(structure, heading)
+    window = starts[:, None] + np.arange(steps + 1)
+    air = log.air if log.has_wind and structure.uses_air else None
+    out = np.empty((len(starts), steps + 1, x.shape[1]))
+    begin = np.asarray(starts * log.sample_time, float)
+    for rows in _alike(model.changes, begin, steps * log.sample_time):
+        run = simulate(
+            structure,
+            model.theta,
+            x[starts[rows]],
+            given.tau[window[rows, :-1]],
+            log.sample_time,
+            changes=model.changes,
+            first=float(begin[rows[0]]),
+            psi=None if psi is None else psi[window[rows]],
+            psi0=given.psi[starts[rows]],
+            d=model.d if model.disturbances else None,
+            air=None if air is None else air[window[rows, :-1]],
+            integrator=model.integrator,
+            bound=state_bound(log, structure.states),
+        )
+        left = (run.diverged[:, None] >= 0) & (np.arange(steps + 1) >= run.diverged[:, None])
+        out[rows] = np.where(left[:, :, None], np.inf, run.x)
+    return out
+
+
+def _alike(changes: Sequence[Change], starts: Array, horizon: float) -> list[NDArray[np.intp]]:
+    """Group runs that start at these times [s]: those with one set of parameters together."""
+    times = np.array(sorted({c.time for c in changes}))
+    before = np.searchsorted(times, starts, side="right")
+    crossing = np.searchsorted(times, starts + horizon, side="right") > before
+    groups = [np.flatnonzero(~crossing & (before == k)) for k in range(len(times) + 1)]
+    # each of the others meets its change after another number of samples
+    return [g for g in groups if len(g)] + [np.array([k]) for k in np.flatnonzero(crossing)]
 
 
 def average_fit(fits: Sequence[LogFit]) -> dict[str, float]:

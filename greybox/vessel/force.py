@@ -116,6 +116,51 @@ def generalised_force(vessel: Vessel, commands: dict[str, Array]) -> dict[str, A
     return dict(zip(names, out, strict=True))
 
 
+def input_movement(vessel: Vessel, commands: dict[str, Array]) -> dict[str, float]:
+    """Return how far each generalised input moves beside what its thrusters could make it.
+
+    Parameters
+    ----------
+    vessel : Vessel
+    commands : dict of str to ndarray
+        As `generalised_force`.
+
+    Returns
+    -------
+    dict of str to float
+        Root mean square of each input, over that of all thrusts were they its way (a moment: at
+        their distance from the origin; the inputs of a rudder: at an angle of one radian, whose
+        square enters the drags). It has no unit, and is as small as rounding where thrusts cancel.
+    """
+    inputs = generalised_force(vessel, commands)
+    arrays = [np.asarray(commands[c], float) for c in vessel.commands]
+    thrusts = _thrusts(vessel.thrusters)(
+        arrays, np.empty((len(vessel.thrusters), *arrays[0].shape))
+    )
+    steered = np.array([float(t.rudder is not None) for t in vessel.thrusters])
+    arms = np.array([float(np.hypot(t.x, t.y)) for t in vessel.thrusters])
+    ones = np.ones_like(arms)
+    out = {}
+    for name, value in inputs.items():
+        weights = {"taun": arms, "race": steered, "race_drag": steered}.get(name, ones)
+        whole = np.full(value.shape, steered.sum())
+        if not name.startswith("rudder"):
+            whole = np.tensordot(weights, thrusts, axes=1)
+        most = float(np.sqrt(np.mean(whole**2)))
+        share = float(np.sqrt(np.mean(value**2))) / most if most > 0 else 0.0
+        out[name] = share**0.5 if name.endswith("drag") else share
+    return out
+
+
+@lru_cache(maxsize=16)
+def _thrusts(thrusters: tuple[Thruster, ...]) -> Vectorised:
+    vessel = Vessel("", 1.0, thrusters)
+    commands = ca.SX.sym("commands", len(vessel.commands))
+    column = {name: commands[i] for i, name in enumerate(vessel.commands)}
+    made = [ca.fabs(t.gain * t.thrust.force(column[t.speed])) for t in thrusters]
+    return Vectorised(made, ca.vertsplit(commands))
+
+
 @lru_cache(maxsize=16)
 def _compiled(thrusters: tuple[Thruster, ...]) -> Vectorised:
     vessel = Vessel("", 1.0, thrusters)

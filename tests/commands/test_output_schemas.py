@@ -45,7 +45,7 @@ def test_check(folder):
     [
         ("check-1", {"findings": [{"id": "none"}], "provenance": {}}),
         ("diagnose-1", {"verdict": "perhaps"}),
-        ("model-2", {"format": "greybox-model", "version": 2}),
+        ("model-3", {"format": "greybox-model", "version": 3}),
     ],
 )
 def test_schemas_refuse_what_is_not_promised(name, change):

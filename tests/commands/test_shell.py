@@ -316,6 +316,9 @@ def on_a_terminal(code, **environment):
         ("verdict: named", "verdict: \x1b[1;33mnamed\x1b[0m"),
         ("verdict: none", "verdict: \x1b[1;32mnone\x1b[0m"),
         ("no Verdict: trust", "no Verdict: trust"),
+        ("Prediction: good", "Prediction: \x1b[1;32mgood\x1b[0m"),
+        ("Prediction: limited: x", "Prediction: \x1b[1;33mlimited\x1b[0m: x"),
+        ("Coefficients: do not trust: x", "Coefficients: \x1b[1;31mdo not trust\x1b[0m: x"),
     ],
 )
 def test_a_verdict_is_coloured_on_a_terminal_only(text, shown):

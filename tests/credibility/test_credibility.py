@@ -61,8 +61,8 @@ def good(thesis, noisy_log, true_theta):
 def test_a_good_estimate_is_trusted(good):
     assert good.verdict.text == "trust"
     assert good.verdict.excepted == ()
-    assert good.summary().splitlines()[2] == "Verdict: trust"
-    assert good.model().to_dict()["verdict"]["text"] == "trust"
+    assert good.summary().splitlines()[2] == "Coefficients: trust"
+    assert good.model().to_dict()["verdict"]["coefficients"]["text"] == "trust"
     for name in ("weak_instruments_u", "overidentification_v", "input_independence_r", "stability"):
         assert by_name(good)[name].passed
 
@@ -468,7 +468,9 @@ def test_a_verdict_is_data():
     ]
     assert told["because"][0]["p_values"] == {"input_independence_r": 1e-6}
     assert told["because"][1]["test"] == "weak_instruments_r"
-    assert told["reasons"] == [r["sentence"] for r in told["because"]]
+    assert told["except"] == ["Wuv"]
+    assert told["reason"] == told["because"][0]["sentence"]
+    assert list(verdict.reasons) == [r["sentence"] for r in told["because"]]
 
 
 def test_holm_steps_down():

@@ -732,7 +732,8 @@ class TestCommand:
         assert "Infinity" not in text
         data = json.loads(text)
         assert data["method"] == "oe"
-        assert data["verdict"]["text"].startswith(("trust", "do not trust"))
+        assert data["verdict"]["coefficients"]["level"].startswith(("trust", "do not trust"))
+        assert data["verdict"]["prediction"]["level"] in ("good", "limited", "poor")
         assert 0.3 < data["limits"]["cramer_rao"]["determinant_efficiency"] < 3
         assert set(data["noise"]["measurement"]) == {"u", "v", "r"}
         assert "slow_errors_psi" in data["tests"] or "slow_errors_r" in data["tests"]

@@ -34,16 +34,18 @@ def counted(monkeypatch):
     count_calls(
         "greybox.regression.problem", "build_instruments", lambda p, logs, theta: theta.tobytes()
     )
-    count_calls("greybox.trial.log", "actuated_force")
+    count_calls("greybox.trial.log", "actuated_force", lambda _, given, *__: given["n"].tobytes())
     count_calls("greybox.credibility.judge", "assess")
     count_calls("greybox.selection.estimate", "weigh")
     return count
 
 
 def test_one_estimate_forms_each_thing_once(counted):
-    log = virtual_log(31, 1000)
+    log, other = virtual_log(31, 1000), virtual_log(34, 100)
     counted.clear()
-    found = estimate_model([log], method="iv", predictor="augmented", structure="linear")
+    found = estimate_model(
+        [log], method="iv", predictor="augmented", structure="linear", validate=other
+    )
     assert found.prefilter == "noise"
     assert {name for name, _ in counted} == {
         "build_regression", "build_instruments", "actuated_force", "assess", "weigh"

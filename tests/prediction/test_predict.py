@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import replace
 
@@ -236,10 +237,11 @@ def test_the_verdict_of_an_older_model_file_is_known(said, level, tmp_path):
     """Files had its text only, without its level."""
     verdict = {"text": said, "excepted": [], "reasons": []}
     path = tmp_path / "model.json"
-    replace(linear_ship(), record={"verdict": verdict}).save(path)
+    older = replace(linear_ship(), record={"verdict": verdict}).to_dict() | {"version": 2}
+    path.write_text(json.dumps(older))
     made = predict_manoeuvre(load_model(path), "stopping", until=0.3, **FEW)
     assert made.trust is level
-    told = f"the estimate's own verdict is '{said}'."
+    told = f"the estimate's own verdict on its coefficients is '{said}'."
     assert (told in made.notes) == (level is not TrustLevel.TRUST)
     assert ("not to be trusted" in headline(made)) == (level is TrustLevel.DO_NOT_TRUST)
 

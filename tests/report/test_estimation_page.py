@@ -1,4 +1,4 @@
-"""The page of an estimate: the verdict first, every test told, escaped, the same every time."""
+"""The page of an estimate: the verdicts first, every test told, escaped, the same every time."""
 
 from __future__ import annotations
 
@@ -73,19 +73,24 @@ def test_same_estimate_same_bytes(estimate, log, page):
 @pytest.mark.parametrize(
     ("verdict", "first"),
     [
-        (Verdict(TrustLevel.TRUST), "Trust this model: no test speaks against it."),
-        (Verdict(TrustLevel.TRUST_EXCEPT, ("Xu", "Nr")), "Trust this model, except for Xu, Nr."),
+        (Verdict(TrustLevel.TRUST), "Trust its coefficients: no test speaks against them."),
+        (
+            Verdict(TrustLevel.TRUST_EXCEPT, ("Xu", "Nr")),
+            "Trust its coefficients, except for Xu, Nr.",
+        ),
         (
             refused([Divergence()], ()),
-            "Do not trust: its free run diverges on the estimation logs.",
+            "Do not trust its coefficients: its free run diverges on the estimation logs.",
         ),
     ],
 )
-def test_the_verdict_stands_first(estimate, verdict, first):
+def test_the_verdicts_stand_first(estimate, page, verdict, first):
     told = headline(replace(estimate, verdict=verdict))
-    assert told.startswith(first)
+    prediction = f"Prediction is {estimate.prediction.level}: {estimate.prediction.reason}. "
+    assert told.startswith(prediction + first)
     assert "(100 is perfect)" in told
-    assert headline(replace(estimate, verdict=verdict, fit={})) == first
+    assert headline(replace(estimate, verdict=verdict, fit={}, prediction=None)) == first
+    assert [row[0] for row in page.tables[0].rows] == ["surge", "sway", "yaw rate"]
 
 
 def test_without_tests_the_page_stands(estimate, log):

@@ -1,0 +1,566 @@
+"""What a model's free run is good for on logs that took no part, as values.
+
+The numbers come from `greybox.validation.judge_prediction`; here they are weighed
+against limits, and sentences are rendered from them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any, ClassVar
+
+import numpy as np
+
+from greybox.estimation.verdict import Reason
+from greybox.notebook import DisplayMixin, number, table
+
+_WORDS = {"u": "surge", "v": "sway", "r": "yaw rate"}
+
+
+def channel_words(channel: str) -> str:
+    """Return what a state is called, its symbol where it has no name."""
+    return _WORDS.get(channel, channel)
+
+
+class PredictionLevel(StrEnum):
+    """What a free run is good for; the values are the words that users read."""
+
+    GOOD = "good"
+    LIMITED = "limited"
+    POOR = "poor"
+    NOT_JUDGED = "not judged"
+
+
+class JudgedOn(StrEnum):
+    """Which logs a prediction was judged on; the values stand in files."""
+
+    HELD_OUT = "held-out"
+    VALIDATION = "validation"
+    OWN = "own"
+
+
+@dataclass(frozen=True)
+class PredictionLimits:
+    """The limits of the levels.
+
+    Parameters
+    ----------
+    good, usable : float
+        Greatest root mean square error of a free run as a share of the channel's own
+        standard deviation: three quarters, and half, of its variance explained. They are
+        the bounds of "very good" and "satisfactory" of Moriasi et al. (2007).
+    coverage : float
+        Least share of the measurements inside the bands of 95 %: beyond it misses are more
+        than three times as frequent as the bands say.
+    noise : float
+        Times the sensor's noise that a channel must move to count: below it noise alone
+        leaves an error of a third of the spread.
+    speed : float
+        Share of the ship's speed that a channel must move to count, the yaw rate times the
+        ship's length: 0.6 degrees of drift.
+
+    References
+    ----------
+    Moriasi et al. (2007), table 4: RSR at most 0.50 is very good, above 0.70 unsatisfactory.
+    """
+
+    good: float = 0.5
+    usable: float = 0.7
+    coverage: float = 0.85
+    noise: float = 3.0
+    speed: float = 0.01
+
+    def to_dict(self) -> dict[str, float]:
+        """Return the limits for JSON."""
+        return dict(vars(self))
+
+
+LIMITS = PredictionLimits()
+
+
+@dataclass(frozen=True)
+class BandShare:
+    """How many measurements lie inside the bands of 95 %.
+
+    Parameters
+    ----------
+    share : float
+    interval : tuple of float
+        Of Wilson (95 %), by `independent` trials.
+    samples : int
+    independent : float
+        Independent samples that these are worth: errors of one run are related.
+    """
+
+    share: float
+    interval: tuple[float, float]
+    samples: int
+    independent: float
+
+
+@dataclass(frozen=True)
+class ChannelPrediction:
+    """How well free runs predict one channel.
+
+    Parameters
+    ----------
+    channel, unit : str
+    rmse : float
+        Root mean square error of the free runs [unit]; infinite where one diverges.
+    spread : float
+        Root mean square deviation of the measurements from the mean of their log [unit]: the
+        error of the best constant.
+    noise : float or None
+        What the sensor's noise alone would leave of the error [unit]; None where not known.
+    moves : bool
+        Whether the channel moves by more than its noise, and enough to matter.
+    horizon : float
+        Up to which runs from measured states beat the constant [s].
+    lasting : bool
+        Whether they do so to the end of the logs.
+    bands : BandShare, optional
+    """
+
+    channel: str
+    unit: str
+    rmse: float
+    spread: float
+    noise: float | None
+    moves: bool
+    horizon: float
+    lasting: bool
+    bands: BandShare | None = None
+
+    @property
+    def error(self) -> float:
+        """The error as a share of the spread; infinite where nothing moved."""
+        return self.rmse / self.spread if self.spread > 0 else float("inf")
+
+    @property
+    def fit(self) -> float:
+        """The fit (6.12) of all logs together [%]."""
+        return 100 * (1 - self.error)
+
+    @property
+    def words(self) -> str:
+        """What the channel is called."""
+        return channel_words(self.channel)
+
+
+@dataclass(frozen=True)
+class RunsDiverge(Reason):
+    """Free runs leave their bound.
+
+    Parameters
+    ----------
+    logs : tuple of str
+    count : int
+        Of all runs.
+    after : float
+        Of the first to do so [s].
+    """
+
+    logs: tuple[str, ...]
+    count: int
+    after: float
+
+    kind: ClassVar[str] = "runs_diverge"
+
+    @property
+    def sentence(self) -> str:
+        """How many, and when."""
+        return (
+            f"its free run diverges on {len(self.logs)} of {self.count} held-out runs, first "
+            f"after {self.after:.3g} s"
+        )
+
+
+@dataclass(frozen=True)
+class LargeError(Reason):
+    """A channel is followed less well than asked.
+
+    Parameters
+    ----------
+    channel : str
+    error : float
+        As a share of the spread.
+    limit : float
+    horizon : float
+        Up to which a constant is beaten [s].
+    """
+
+    channel: str
+    error: float
+    limit: float
+    horizon: float
+
+    kind: ClassVar[str] = "large_error"
+
+    @property
+    def sentence(self) -> str:
+        """By how much, or from when on a constant is better."""
+        who = channel_words(self.channel)
+        if self.error >= 1:
+            when = f"after {self.horizon:.3g} s" if self.horizon > 0 else "from the start"
+            return f"{who} is worse than a constant {when}"
+        return (
+            f"the error of {who} is {100 * self.error:.0f} % of its spread "
+            f"(at most {100 * self.limit:.0f} asked)"
+        )
+
+
+@dataclass(frozen=True)
+class NarrowBands(Reason):
+    """Too many measurements lie outside the bands.
+
+    Parameters
+    ----------
+    channel : str
+    share : float
+    interval : tuple of float
+    limit : float
+    """
+
+    channel: str
+    share: float
+    interval: tuple[float, float]
+    limit: float
+
+    kind: ClassVar[str] = "narrow_bands"
+
+    @property
+    def sentence(self) -> str:
+        """How many the bands hold."""
+        return (
+            f"the 95 % bands of {channel_words(self.channel)} hold {100 * self.share:.0f} % "
+            f"({100 * self.interval[0]:.0f}-{100 * self.interval[1]:.0f}) of the measurements "
+            f"(at least {100 * self.limit:.0f} asked)"
+        )
+
+
+@dataclass(frozen=True)
+class NothingHeldOut(Reason):
+    """The model was judged on the logs that it was estimated on.
+
+    Parameters
+    ----------
+    because : str
+    """
+
+    because: str
+
+    kind: ClassVar[str] = "nothing_held_out"
+
+    @property
+    def sentence(self) -> str:
+        """Why, and what to do."""
+        return (
+            f"judged on its own logs, nothing was held out, because "
+            f"{self.because.rstrip('.')} (give logs to --validate)"
+        )
+
+
+@dataclass(frozen=True)
+class NotRefitted(Reason):
+    """Some parts could not be left out, because the others do not do for an estimate.
+
+    Parameters
+    ----------
+    parts, count : int
+        Of all parts.
+    because : str
+    """
+
+    parts: int
+    count: int
+    because: str
+
+    kind: ClassVar[str] = "not_refitted"
+    fatal: ClassVar[bool] = False
+
+    @property
+    def sentence(self) -> str:
+        """How many, and what the first lacks."""
+        return (
+            f"{self.parts} of {self.count} parts were not judged: without them the logs do not do "
+            f"for an estimate ({self.because.rstrip('.')})"
+        )
+
+
+@dataclass(frozen=True)
+class NothingMoved(Reason):
+    """No channel moved enough to tell anything."""
+
+    kind: ClassVar[str] = "nothing_moved"
+
+    @property
+    def sentence(self) -> str:
+        """What was seen."""
+        return "no channel moved beyond its noise, so its prediction was not put to the test"
+
+
+@dataclass(frozen=True)
+class HardlyMoved(Reason):
+    """A channel does not decide.
+
+    Parameters
+    ----------
+    channel, unit : str
+    spread : float
+    noise : float or None
+    """
+
+    channel: str
+    unit: str
+    spread: float
+    noise: float | None
+
+    kind: ClassVar[str] = "hardly_moved"
+    fatal: ClassVar[bool] = False
+
+    @property
+    def sentence(self) -> str:
+        """How little it moved."""
+        beside = "" if self.noise is None else f" beside a noise of {self.noise:.2g}"
+        return (
+            f"{channel_words(self.channel)} hardly moved ({self.spread:.2g} {self.unit}{beside}) "
+            f"and does not decide"
+        )
+
+
+@dataclass(frozen=True)
+class NoBands(Reason):
+    """The bands could not be judged.
+
+    Parameters
+    ----------
+    because : str
+    """
+
+    because: str
+
+    kind: ClassVar[str] = "no_bands"
+    fatal: ClassVar[bool] = False
+
+    @property
+    def sentence(self) -> str:
+        """Why."""
+        return f"there are no bands to judge: {self.because}"
+
+
+@dataclass(frozen=True, repr=False)
+class PredictionVerdict(DisplayMixin):
+    """What a model's free run is good for.
+
+    Parameters
+    ----------
+    level : PredictionLevel
+    because : tuple of Reason
+        Those that decide first.
+    channels : tuple of ChannelPrediction
+    judged_on : JudgedOn
+    logs : tuple of str
+        Names of the logs that were predicted.
+    parts : int
+        Groups of them that were left out in turn; 0 where none were.
+    samples : int
+    limits : PredictionLimits
+        That the level was found by.
+    """
+
+    level: PredictionLevel
+    because: tuple[Reason, ...] = ()
+    channels: tuple[ChannelPrediction, ...] = ()
+    judged_on: JudgedOn = JudgedOn.HELD_OUT
+    logs: tuple[str, ...] = ()
+    parts: int = 0
+    samples: int = 0
+    limits: PredictionLimits = field(default=LIMITS)
+
+    @property
+    def fit(self) -> dict[str, float]:
+        """Fit (6.12) a channel [%]."""
+        return {c.channel: c.fit for c in self.channels}
+
+    @property
+    def rmse(self) -> dict[str, float]:
+        """Error a channel [m/s, rad/s]."""
+        return {c.channel: c.rmse for c in self.channels}
+
+    @property
+    def coverage(self) -> dict[str, float]:
+        """Share of the measurements inside the bands, by channel that has some."""
+        return {c.channel: c.bands.share for c in self.channels if c.bands is not None}
+
+    @property
+    def reason(self) -> str:
+        """Why this level, in one sentence without its stop."""
+        decisive = [r.sentence for r in self.because if r.fatal]
+        if decisive:
+            return "; ".join(decisive)
+        if self.level is not PredictionLevel.GOOD:
+            return "tests and held-out runs were not asked for"
+        return (
+            f"the error of {', '.join(c.words for c in self.channels if c.moves)} is at most "
+            f"{100 * max(c.error for c in self.channels if c.moves):.0f} % of the spread "
+            f"({100 * self.limits.good:.0f} asked)"
+        )
+
+    @property
+    def text(self) -> str:
+        """``good``, ``limited: reason`` or ``poor: reason``."""
+        if self.level in (PredictionLevel.GOOD, PredictionLevel.NOT_JUDGED):
+            return str(self.level)
+        return f"{self.level}: {self.reason}"
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """One sentence a reason."""
+        return tuple(r.sentence for r in self.because)
+
+    @property
+    def judged_words(self) -> str:
+        """On what it was judged."""
+        several = len(set(self.logs)) > 1
+        return {
+            JudgedOn.HELD_OUT: f"{self.parts} parts of the log{'s' * several}, each left out of "
+            f"an estimate in turn",
+            JudgedOn.VALIDATION: f"{len(self.logs)} log{'s' * (len(self.logs) != 1)} that took no "
+            f"part in the estimate",
+            JudgedOn.OWN: f"the log{'s' * several} of the estimate",
+        }[self.judged_on]
+
+    def summary(self) -> str:
+        """Return the level, its reasons, and a row a channel as text."""
+        return "\n".join([self.text, *self.table()])
+
+    def table(self) -> list[str]:
+        """Return a row a channel as lines of text, and below them on what they were judged."""
+        head, rows = self.rows()
+        wide = [max(len(r[i]) for r in [head, *rows]) for i in range(len(head))]
+        lines = [
+            "  " + "  ".join(cell.ljust(w) for cell, w in zip(row, wide, strict=True)).rstrip()
+            for row in [head, *rows]
+        ]
+        return [
+            *lines,
+            f"  on {self.judged_words}",
+            *(f"  {r.sentence}" for r in self.because if not r.fatal),
+        ]
+
+    def rows(self) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+        """Return the head and a row a channel, as they stand in a table."""
+        head = ("channel", "error", "noise alone", "spread", "unit", "fit [%]", "in the 95 % band",
+                "beats a constant", "")  # fmt: skip
+        return head, [
+            (
+                c.words,
+                number(c.rmse, 3) if np.isfinite(c.rmse) else "diverged",
+                number(c.noise, 2),
+                number(c.spread, 3),
+                c.unit,
+                number(c.fit, 3),
+                "–"
+                if c.bands is None
+                else f"{100 * c.bands.share:.0f} % ({100 * c.bands.interval[0]:.0f}-"
+                f"{100 * c.bands.interval[1]:.0f})",
+                f"to the end ({c.horizon:.3g} s)" if c.lasting else f"{c.horizon:.3g} s",
+                "" if c.moves else "hardly moved",
+            )
+            for c in self.channels
+        ]
+
+    def _parts(self) -> tuple[str, ...]:
+        return (table(*self.rows()),)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fields for JSON."""
+        bands = {c.channel: c.bands for c in self.channels if c.bands is not None}
+        return {
+            "level": str(self.level),
+            "text": self.text,
+            "reason": self.reason,
+            "because": [r.to_dict() for r in self.because],
+            "fit": self.fit,
+            "coverage": self.coverage,
+            "coverage_interval": {n: list(b.interval) for n, b in bands.items()},
+            "independent_samples": {n: b.independent for n, b in bands.items()},
+            "rmse": self.rmse,
+            "noise": {c.channel: c.noise for c in self.channels},
+            "spread": {c.channel: c.spread for c in self.channels},
+            "moves": {c.channel: c.moves for c in self.channels},
+            "horizon": {c.channel: c.horizon for c in self.channels},
+            "lasting": {c.channel: c.lasting for c in self.channels},
+            "judged_on": str(self.judged_on),
+            "logs": list(self.logs),
+            "parts": self.parts,
+            "samples": self.samples,
+            "limits": self.limits.to_dict(),
+        }
+
+
+NOT_JUDGED = PredictionVerdict(PredictionLevel.NOT_JUDGED)
+
+
+def weigh_prediction(
+    channels: Sequence[ChannelPrediction],
+    judged_on: JudgedOn,
+    *,
+    logs: Sequence[str] = (),
+    parts: int = 0,
+    samples: int = 0,
+    found: Sequence[Reason] = (),
+    limits: PredictionLimits = LIMITS,
+) -> PredictionVerdict:
+    """Weigh what free runs did on logs against the limits.
+
+    Good: every channel that moves is followed, and its bands hold. Poor: a run diverges, or no
+    channel that moves is usable. Limited: all between, and whatever was judged on its own logs.
+
+    Parameters
+    ----------
+    channels : sequence of ChannelPrediction
+    judged_on : JudgedOn
+    logs, parts, samples
+        As `PredictionVerdict`.
+    found : sequence of Reason
+        What is known beside the channels, such as `RunsDiverge`.
+    limits : PredictionLimits
+    """
+    moving = [c for c in channels if c.moves]
+    diverges = [r for r in found if isinstance(r, RunsDiverge)]
+    large = [
+        LargeError(c.channel, c.error, limits.good, c.horizon)
+        for c in moving
+        if not c.error <= limits.good
+    ]
+    narrow = [
+        NarrowBands(c.channel, c.bands.share, c.bands.interval, limits.coverage)
+        for c in moving
+        if c.bands is not None and c.bands.interval[1] < limits.coverage
+    ]
+    decisive: list[Reason] = [
+        *diverges,
+        *(large if not diverges else []),
+        *narrow,
+        *([] if moving else [NothingMoved()]),
+        *(r for r in found if r.fatal and r not in diverges),
+    ]
+    usable = any(c.error <= limits.usable for c in moving)
+    if diverges or (moving and not usable):
+        level = PredictionLevel.POOR
+    else:
+        level = PredictionLevel.LIMITED if decisive else PredictionLevel.GOOD
+    told = [HardlyMoved(c.channel, c.unit, c.spread, c.noise) for c in channels if not c.moves]
+    return PredictionVerdict(
+        level,
+        (*decisive, *told, *(r for r in found if not r.fatal)),
+        tuple(channels),
+        judged_on,
+        tuple(logs),
+        parts,
+        samples,
+        limits,
+    )

@@ -1,0 +1,111 @@
+"""The verdict on an estimate's predictions, by logs that are left out of it in turn."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from greybox.errors import GreyboxError, UsageError
+from greybox.estimation.prediction_verdict import JudgedOn, NothingHeldOut, NotRefitted
+from greybox.estimation.registry import ESTIMATORS
+from greybox.estimation.result import Estimate
+from greybox.model.model import ManoeuvringModel
+from greybox.selection.alternatives import ranking_request
+from greybox.selection.cross_validation import EstimatorVariant, estimate_variant, parts_of
+from greybox.selection.request import Request
+from greybox.trial.log import TrialLog
+from greybox.trial.segments import as_segments
+from greybox.validation.judge_prediction import HeldOut, judge_prediction
+
+_log = logging.getLogger(__name__)
+
+# a model from some of the logs, chosen and estimated as that of all of them was
+Refit = Callable[[Sequence[TrialLog]], ManoeuvringModel]
+
+
+def with_prediction(
+    estimate: Estimate, logs: Sequence[TrialLog], request: Request, refit: Refit | None = None
+) -> Estimate:
+    """Return an estimate with what its free run is good for on logs that took no part.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    logs : sequence of TrialLog
+        Those it was estimated on; they are left out in turn, a single one in parts.
+    request : Request
+        Its ``validate`` logs judge instead, where there are some.
+    refit : callable, optional
+        Whatever the data chose must be chosen again in it. By default the same structure,
+        predictor and method.
+
+    Raises
+    ------
+    UsageError
+        A log that validates is one of those of the estimate.
+    """
+    model = estimate.model()
+    if request.validate:
+        _require_others(logs, request.validate)
+        held = [HeldOut.of(model, log) for log in as_segments(request.validate)]
+        verdict = judge_prediction(held, JudgedOn.VALIDATION, seed=request.seed)
+        return replace(estimate, prediction=verdict)
+    held, failed, parts = [], [], []
+    try:
+        parts = parts_of(logs)
+    except UsageError as error:
+        failed.append(str(error))
+    again = refit or refit_alike(estimate, request)
+    for fitting, left_out in parts:
+        try:
+            other = again(fitting)
+        except GreyboxError as error:
+            _log.info("without a part there is no estimate: %s", error)
+            failed.append(str(error))
+            continue
+        held += [HeldOut.of(other, log) for log in left_out]
+    if not held:
+        runs = [HeldOut.of(model, log) for log in logs]
+        found = [NothingHeldOut(failed[0])]
+        verdict = judge_prediction(runs, JudgedOn.OWN, found=found, seed=request.seed)
+        return replace(estimate, prediction=verdict)
+    told = [NotRefitted(len(failed), len(parts), failed[0])] if failed else []
+    verdict = judge_prediction(held, parts=len(parts) - len(failed), found=told, seed=request.seed)
+    _log.info("prediction: %s", verdict.text)
+    return replace(estimate, prediction=verdict)
+
+
+def _require_others(logs: Sequence[TrialLog], validate: Sequence[TrialLog]) -> None:
+    own = {log.provenance.sha256 for log in logs if log.provenance.sha256}
+    for log in validate:
+        if log.provenance.sha256 in own:
+            raise UsageError(
+                f"'{log.name}' is to be estimated on and to validate the estimate: a log that "
+                f"took part cannot judge. Name it once."
+            )
+
+
+def refit_alike(estimate: Estimate, request: Request) -> Refit:
+    """Return how to estimate the model of an estimate on fewer logs, from where it ended.
+
+    Standard errors and noise are those of the estimate, the former as fewer samples leave them.
+    """
+    quick = replace(
+        ranking_request(request),
+        output_error=replace(request.output_error, search=False, process_noise=False),
+        prefilter=request.prefilter if estimate.prefilter == "noise" else "none",
+        # a free run starts from the estimate itself, which has its current too
+        nominal=None if ESTIMATORS[estimate.method].free_run else estimate.model(),
+    )
+    variant = EstimatorVariant(estimate.method, request.output_error.weights)
+    whole = estimate.model()
+
+    def refit(logs: Sequence[TrialLog]) -> ManoeuvringModel:
+        model = estimate_variant(variant, logs, estimate, quick, estimate).model()
+        if model.names != whole.names:
+            return model
+        more = sum(x["samples"] for x in estimate.logs) / sum(map(len, logs))
+        return replace(model, covariance=more * whole.covariance, noise=whole.noise)
+
+    return refit

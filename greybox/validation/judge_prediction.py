@@ -1,0 +1,275 @@
+"""What free runs are good for on logs that took no part in the estimate of their model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.channels import CHANNELS
+from greybox.estimation.prediction_verdict import (
+    LIMITS,
+    BandShare,
+    ChannelPrediction,
+    JudgedOn,
+    NoBands,
+    PredictionLimits,
+    PredictionVerdict,
+    RunsDiverge,
+    weigh_prediction,
+)
+from greybox.estimation.verdict import Reason
+from greybox.model.model import ManoeuvringModel
+from greybox.numerics.binomial import wilson_interval
+from greybox.trial.log import TrialLog
+from greybox.trial.segments import split_segments, whole_name
+from greybox.validation.bands import predict_bands
+from greybox.validation.criteria import independent_samples
+from greybox.validation.fit import LogFit, run_from, run_model
+
+Array = NDArray[np.float64]
+
+# draws of a band that is only counted, and runs from measured states a log
+_DRAWS, _RESTARTS = 64, 12
+# variance of a third difference of white noise
+_THIRD = 20.0
+# of a normal distribution: standard deviation over median absolute deviation
+_MEDIAN = 1.4826
+# least width of a band, so that it divides
+_NONE = 1e-300
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """A free run on a log that took no part in the estimate of its model.
+
+    Parameters
+    ----------
+    model : ManoeuvringModel
+    run : LogFit
+    """
+
+    model: ManoeuvringModel
+    run: LogFit
+
+    @classmethod
+    def of(cls, model: ManoeuvringModel, log: TrialLog) -> HeldOut:
+        """Run the model on a log."""
+        return cls(model, run_model(model, log))
+
+
+def judge_prediction(
+    held: Sequence[HeldOut],
+    judged_on: JudgedOn = JudgedOn.HELD_OUT,
+    *,
+    parts: int = 0,
+    found: Sequence[Reason] = (),
+    limits: PredictionLimits = LIMITS,
+    seed: int = 0,
+) -> PredictionVerdict:
+    """Say what free runs are good for.
+
+    Parameters
+    ----------
+    held : sequence of HeldOut
+        At least one; models may differ, as where logs are left out in turn.
+    judged_on : JudgedOn
+    parts : int
+        Groups of logs that were left out in turn.
+    found : sequence of Reason
+        What is known already and is told with the rest.
+    limits : PredictionLimits
+    seed : int
+        Of the draws of the bands.
+
+    Returns
+    -------
+    PredictionVerdict
+        Errors are those of all runs together, against the mean of each log as the best
+        constant. Bands are those of each run's own model.
+    """
+    runs = [h.run for h in held]
+    states = tuple(runs[0].fit)
+    spread, rmse = _errors(runs, states)
+    noise = _noise(held, states)
+    moves = _moves(runs, states, spread, noise, held[0].model.vessel.length, limits)
+    longest = max(float(part.t[-1] - part.t[0]) for r in runs for part in split_segments(r.log))
+    beaten = moves & ~(rmse <= spread)
+    horizon = _horizons(held, spread) if beaten.any() else np.full(len(states), longest)
+    horizon = np.where(rmse <= spread, longest, horizon)
+    bands, told = _bands(held, states, seed)
+    channels = [
+        ChannelPrediction(
+            s,
+            CHANNELS[s].unit if s in CHANNELS else "",
+            float(rmse[i]),
+            float(spread[i]),
+            float(noise[i]) if np.isfinite(noise[i]) else None,
+            bool(moves[i]),
+            float(horizon[i]),
+            bool(rmse[i] <= spread[i]),
+            bands.get(s),
+        )
+        for i, s in enumerate(states)
+    ]
+    left = [r for r in runs if r.diverged >= 0]
+    reasons = list(found)
+    if left:
+        after = min(float(r.log.t[r.diverged] - r.log.t[0]) for r in left)
+        reasons.append(RunsDiverge(tuple(r.log.name for r in left), len(runs), after))
+    return weigh_prediction(
+        channels,
+        judged_on,
+        logs=[r.log.name for r in runs],
+        parts=parts,
+        samples=sum(len(r.log) for r in runs),
+        found=[*reasons, *told],
+        limits=limits,
+    )
+
+
+def _by_log(runs: Sequence[LogFit]) -> list[list[LogFit]]:
+    """Group the runs on parts of one log: of one name and origin, and never at the same time."""
+    groups: list[list[LogFit]] = []
+    for run in runs:
+        log = run.log
+        for group in groups:
+            first = group[0].log
+            if (
+                whole_name(first.name) == whole_name(log.name)
+                and first.provenance == log.provenance
+                and all(r.log.t[-1] < log.t[0] or log.t[-1] < r.log.t[0] for r in group)
+            ):
+                group.append(run)
+                break
+        else:
+            groups.append([run])
+    return groups
+
+
+def _errors(runs: Sequence[LogFit], states: tuple[str, ...]) -> tuple[Array, Array]:
+    """Return the deviation from the mean of each log, and the error, root mean square (nx,)."""
+    spread, error = np.zeros(len(states)), np.zeros(len(states))
+    for i, state in enumerate(states):
+        count = 0
+        for group in _by_log(runs):
+            measured = [r.log[state][r.log.known((state,))] for r in group]
+            whole = np.concatenate(measured)
+            if not len(whole):
+                continue
+            count += len(whole)
+            spread[i] += float(((whole - whole.mean()) ** 2).sum())
+            for run, y in zip(group, measured, strict=True):
+                x = run.x[run.log.known((state,)), i]
+                error[i] += np.inf if run.diverged >= 0 else float(((y - x) ** 2).sum())
+        spread[i], error[i] = np.sqrt(spread[i] / max(count, 1)), np.sqrt(error[i] / max(count, 1))
+    return spread, error
+
+
+def _noise(held: Sequence[HeldOut], states: tuple[str, ...]) -> Array:
+    """Return what the sensors' noise alone leaves (nx,), nan where nothing tells it.
+
+    The least of what the vessel file states, what the estimate found (its misfit may be in
+    it), and what neighbouring samples say: the third difference of a motion is small, that
+    of white noise is not.
+    """
+    out = np.full(len(states), np.nan)
+    vessel = held[0].run.log.vessel
+    levels = [h.model.noise.measurement for h in held if h.model.noise is not None]
+    for i, state in enumerate(states):
+        rough = [np.diff(h.run.log.measured(state), 3) for h in held if len(h.run.log) > 3]
+        known = np.concatenate([d[np.isfinite(d)] for d in rough]) if rough else np.zeros(0)
+        said = [vessel.std(state), *(float(level[i]) for level in levels[:1])]
+        if len(known):
+            said.append(_MEDIAN * float(np.median(np.abs(known))) / np.sqrt(_THIRD))
+        told = [v for v in said if v is not None]
+        if told:
+            out[i] = min(told)
+    return out
+
+
+def _moves(
+    runs: Sequence[LogFit],
+    states: tuple[str, ...],
+    spread: Array,
+    noise: Array,
+    length: float,
+    limits: PredictionLimits,
+) -> NDArray[np.bool_]:
+    """Return which channels move beyond their noise, and enough to matter beside the speed."""
+    least = limits.noise * np.nan_to_num(noise)
+    if {"u", "v"} <= set(states):
+        way = np.concatenate([r.log.states(("u", "v")) for r in runs])
+        speed = float(np.sqrt((way**2).sum(axis=1).mean()))
+        of = {"u": speed, "v": speed, "r": speed / length}
+        least = np.maximum(least, [limits.speed * of.get(s, 0.0) for s in states])
+    return np.asarray((spread > least) & (spread > 0))
+
+
+def _horizons(held: Sequence[HeldOut], spread: Array) -> Array:
+    """Return up to when runs from measured states have less error than the constant (nx,) [s].
+
+    Runs start all along the first half of each log and last half of it. Their error is that
+    of all samples up to a time; the horizon ends where it first exceeds the spread.
+    """
+    total, count, sample_time = np.zeros((1, len(spread))), np.zeros((1, len(spread))), 1.0
+    for h in held:
+        for log in split_segments(h.run.log):
+            states = h.model.structure.states
+            steps = len(log) // 2
+            known = np.stack([log.known((s,)) for s in states], axis=1)
+            starts = np.unique(np.linspace(0, len(log) - 1 - steps, _RESTARTS).astype(int))
+            starts = starts[known[starts].all(axis=1)]
+            if steps < 1 or not len(starts):
+                continue
+            sample_time = h.model.sample_time
+            x = run_from(h.model, log, starts, steps)
+            window = starts[:, None] + np.arange(steps + 1)
+            error = np.where(known[window], (x - log.states(states)[window]) ** 2, 0.0)
+            if len(total) < steps + 1:
+                more = ((0, steps + 1 - len(total)), (0, 0))
+                total, count = np.pad(total, more), np.pad(count, more)
+            total[: steps + 1] += error.sum(axis=0)
+            count[: steps + 1] += known[window].sum(axis=0)
+    # the start itself is measured
+    with np.errstate(invalid="ignore"):
+        mean = np.sqrt(np.cumsum(total[1:], axis=0) / np.maximum(np.cumsum(count[1:], axis=0), 1))
+    worse = ~(mean <= spread)
+    first = np.where(worse.any(axis=0), worse.argmax(axis=0), len(worse)) if len(worse) else 0
+    return np.asarray(np.broadcast_to(first * sample_time, spread.shape), float)
+
+
+def _bands(
+    held: Sequence[HeldOut], states: tuple[str, ...], seed: int
+) -> tuple[dict[str, BandShare], list[Reason]]:
+    """Return how many measurements the bands hold, by state, and why there are none."""
+    if all(h.model.noise is None for h in held):
+        return {}, [NoBands("the estimate has no noise levels (--method iv or oe has them)")]
+    # errors in half widths of the band
+    outward: dict[str, list[Array]] = {s: [] for s in states}
+    for h in held:
+        run = h.run
+        if h.model.noise is None or run.diverged >= 0:
+            continue
+        limits = predict_bands(h.model, run.log, seed=seed, runs=_DRAWS).measurement
+        if np.isnan(limits).any():
+            return {}, [NoBands("too many draws of its parameters diverge")]
+        for i, s in enumerate(states):
+            known = run.log.known((s,))
+            y = run.log[s]
+            middle, half = (
+                (limits[0, :, i] + limits[1, :, i]) / 2,
+                np.ptp(limits[:, :, i], axis=0) / 2,
+            )
+            if known.any():
+                outward[s].append(((y - middle) / np.maximum(half, _NONE))[known][:, None])
+    found = {}
+    for s, parts in outward.items():
+        if parts:
+            whole = np.concatenate(parts)
+            share = float((np.abs(whole) <= 1).mean())
+            worth = float(independent_samples(parts, np.zeros(1))[0])
+            found[s] = BandShare(share, wilson_interval(share, worth), len(whole), worth)
+    return found, []

@@ -1,0 +1,128 @@
+"""The verdict on predictions of an estimate: logs left out in turn, or given to validate."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from schemas import schema
+from virtual import virtual_log, write_csv
+
+from greybox.commands.main import main
+from greybox.errors import ExcitationError, UsageError
+from greybox.estimation.prediction_verdict import JudgedOn, PredictionLevel
+from greybox.selection.estimate import estimate_model
+from greybox.selection.prediction import refit_alike, with_prediction
+from greybox.selection.request import Request
+
+ASKED = {"structure": "thesis", "predictor": "basic"}
+CALM = {"wind": 0.0, "spread": 1e-12, "current": (0.0, 0.0)}
+
+
+@pytest.fixture(scope="module")
+def logs():
+    return [virtual_log(60 + k, 300, name=f"log{k}", **CALM) for k in range(5)]
+
+
+@pytest.fixture(scope="module")
+def estimate(logs):
+    return estimate_model(logs, method="oe", **ASKED)
+
+
+def test_an_estimate_in_its_family_predicts(estimate, logs):
+    found = estimate.prediction
+    assert found.text == "good"
+    assert found.judged_on is JudgedOn.HELD_OUT
+    assert found.parts == 4
+    assert sorted(found.logs) == [log.name for log in logs]
+    assert found.samples == 1500
+    assert set(found.fit) == set(found.coverage) == {"u", "v", "r"}
+    assert estimate.summary().splitlines()[2:4] == [
+        "Prediction: good", f"Coefficients: {estimate.verdict.text}"
+    ]  # fmt: skip
+
+
+def test_a_log_that_is_judged_took_no_part(estimate, logs):
+    seen = []
+
+    def refit(fitting):
+        seen.append({log.name for log in fitting})
+        return estimate.model()
+
+    found = with_prediction(estimate, logs, Request(), refit).prediction
+    every = {log.name for log in logs}
+    assert set().union(*(every - fitting for fitting in seen)) == every
+    assert len(found.logs) == len(logs)
+    # left out, a log is worth as much as on the whole model here
+    np.testing.assert_allclose(
+        list(found.rmse.values()), list(estimate.prediction.rmse.values()), rtol=0.05
+    )
+
+
+def test_parts_without_which_there_is_no_estimate_are_told(estimate, logs):
+    def refuse(fitting):
+        if "log0" not in {log.name for log in fitting}:
+            raise ExcitationError("nothing turns.")
+        return estimate.model()
+
+    found = with_prediction(estimate, logs, Request(), refuse).prediction
+    assert found.level is PredictionLevel.GOOD
+    assert found.parts == 3
+    assert "1 of 4 parts were not judged" in found.reasons[-1]
+    assert "nothing turns" in found.reasons[-1]
+
+    def never(_):
+        raise ExcitationError("nothing turns.")
+
+    own = with_prediction(estimate, logs, Request(), never).prediction
+    assert own.judged_on is JudgedOn.OWN
+    assert own.level is PredictionLevel.LIMITED
+    assert "nothing turns (give logs to --validate)" in own.text
+
+
+def test_a_log_too_short_for_parts_is_judged_on_itself(logs):
+    short = logs[0].window(0, 75, "short")
+    found = estimate_model(short, method="ls", structure="linear", predictor="basic").prediction
+    assert found.judged_on is JudgedOn.OWN
+    assert found.level in (PredictionLevel.LIMITED, PredictionLevel.POOR)
+    assert "judged on its own logs, nothing was held out" in found.text
+
+
+def test_logs_given_to_validate_judge(estimate, logs):
+    other = replace(logs[0], channels=logs[0].channels | {"v": logs[0]["v"][::-1].copy()})
+    found = with_prediction(estimate, logs, Request(validate=(other,))).prediction
+    assert found.judged_on is JudgedOn.VALIDATION
+    assert "sway" in found.text
+
+
+def test_a_refit_starts_where_the_estimate_ended(estimate, logs):
+    model = refit_alike(estimate, Request(method="oe", **ASKED))(logs[1:])
+    assert model.names == estimate.model().names
+    assert (model.theta != estimate.model().theta).any()
+    # as if the lost fifth had told as much as the rest
+    np.testing.assert_allclose(model.covariance, 1.25 * estimate.model().covariance)
+
+
+def test_by_command(tmp_path, logs, capsys):
+    a, b = (write_csv(log, tmp_path / f"{log.name}.csv") for log in logs[:2])
+    words = ["estimate", str(a), "--vessel", "thesis", "--method", "ls", "--predictor", "basic",
+             "--structure", "thesis", "--json", str(tmp_path / "m.json")]  # fmt: skip
+    assert main([*words, "--validate", str(b)]) == 0
+    assert "Prediction: " in capsys.readouterr().out
+    data = json.loads((tmp_path / "m.json").read_text())
+    schema("model-3").validate(data)
+    told = data["verdict"]["prediction"]
+    assert told["judged_on"] == "validation"
+    assert told["logs"] == ["log1"]
+    assert set(told["fit"]) == {"u", "v", "r"}
+    assert told["limits"]["good"] == 0.5
+    assert main([*words, "--validate", str(a)]) == 1
+    assert "a log that took part cannot judge" in capsys.readouterr().err
+
+
+def test_a_log_of_the_estimate_cannot_judge(estimate, logs):
+    own = replace(logs[0], provenance=replace(logs[0].provenance, sha256="ab"))
+    with pytest.raises(UsageError, match="Name it once"):
+        with_prediction(estimate, [own], Request(validate=(own,)))
