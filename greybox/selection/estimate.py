@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.credibility.verdict import free_run_faults, misfit, weigh
-from greybox.errors import GreyboxError, LogError, UsageError
+from greybox.errors import ExcitationError, GreyboxError, LogError, UsageError
 from greybox.estimation.closed_loop import Loop
 from greybox.estimation.efficiency_bounds import limits_of
 from greybox.estimation.output_error import OutputErrorOptions
@@ -20,27 +20,21 @@ from greybox.estimation.registry import ESTIMATORS, free_run_estimator
 from greybox.estimation.result import Estimate
 from greybox.estimation.solve import Covariance
 from greybox.estimation.verdict import TrustLevel, Verdict, refused
-from greybox.model.catalogue import structure_for
 from greybox.model.model import ManoeuvringModel
 from greybox.model.structure import Structure
 from greybox.public import known_keywords, one_thread
 from greybox.regression.regression import common_sample_time
 from greybox.selection.alternatives import Alternative, alternatives_for, ranking_request
-from greybox.selection.cross_validation import (
-    EstimatorVariant,
-    compare_estimators,
-    estimate_variant,
-)
+from greybox.selection.cross_validation import EstimatorVariant, compare_estimators
 from greybox.selection.fit_single import estimate_once
 from greybox.selection.held_out import FLOOR
-from greybox.selection.prediction import with_prediction
+from greybox.selection.prediction import Refit, refit_alike, with_prediction
 from greybox.selection.request import Request, regression_only
-from greybox.selection.term_selection import select_terms
+from greybox.selection.term_selection import Terms, select_terms
 from greybox.trial.kinematics import decimate_segments
 from greybox.trial.log import Logs, TrialLog
 from greybox.trial.segments import as_segments
 from greybox.validation.fit import average_fit, run_model
-from greybox.vessel.force import force_inputs
 
 Array = NDArray[np.float64]
 _log = logging.getLogger(__name__)
@@ -170,16 +164,21 @@ def estimate_model(
 @one_thread
 def estimate_requested(logs: Sequence[TrialLog], request: Request) -> Estimate:
     """Return what `estimate_model` does of a request."""
-    estimate = _chosen(logs, request)
-    return with_prediction(estimate, logs, request) if request.judged else estimate
-
-
-def _chosen(logs: Sequence[TrialLog], request: Request) -> Estimate:
-    """Return the estimate of the way to estimate that tests and runs prefer."""
     common_sample_time(logs)
     notes: list[str] = []
     if all(n is None for n in (request.method, *_named(request))):
         logs = at_own_pace(logs, notes)
+    estimate = _first_choice(logs, request, notes)
+    refit: Refit | None = None
+    if not request.judged:
+        return estimate
+    if _open(request, estimate):
+        estimate, logs, refit = _or_selected_terms(estimate, logs, request)
+    return with_prediction(estimate, logs, request, refit)
+
+
+def _first_choice(logs: Sequence[TrialLog], request: Request, notes: list[str]) -> Estimate:
+    """Return the estimate of a published structure that tests and runs prefer."""
     alternatives = alternatives_for(logs, request, notes)
     _log.info("%d ways to estimate, first %s", len(alternatives), alternatives[0].label)
     _log.debug("in this order: %s", "; ".join(a.label for a in alternatives))
@@ -191,9 +190,7 @@ def _chosen(logs: Sequence[TrialLog], request: Request) -> Estimate:
         estimate = _without_regression(logs, alternatives, request, notes, error)
     if request.method is not None or not request.judged or regression_only(request):
         return estimate
-    if _open(request, estimate):
-        return _or_selected_terms(estimate, logs, request)
-    if _rank(estimate)[0] == 0:
+    if _open(request, estimate) or _rank(estimate)[0] == 0:
         return estimate
     tried: Estimate | None = None
     if not ESTIMATORS[estimate.method].free_run and not misfit(estimate.tests):
@@ -205,9 +202,10 @@ def _chosen(logs: Sequence[TrialLog], request: Request) -> Estimate:
 
 
 def _open(request: Request, estimate: Estimate) -> bool:
-    """Whether everything is left to the data, which are a ship's."""
-    named = _named(request)
-    return all(n is None for n in named) and estimate.predictor.structure.marine
+    """Whether method, predictor and structure are left to the data, which are a ship's."""
+    named = (request.method, *_named(request))
+    ship = estimate.predictor.structure.marine
+    return ship and all(n is None for n in named) and not regression_only(request)
 
 
 def _named(request: Request) -> tuple[object, ...]:
@@ -241,47 +239,51 @@ def at_own_pace(logs: Sequence[TrialLog], notes: list[str]) -> Sequence[TrialLog
     return slower
 
 
-def _or_selected_terms(found: Estimate, logs: Sequence[TrialLog], request: Request) -> Estimate:
-    """Return the free run of terms that the data select, where it predicts better than `found`."""
+def _or_selected_terms(
+    found: Estimate, logs: Sequence[TrialLog], request: Request
+) -> tuple[Estimate, Sequence[TrialLog], Refit | None]:
+    """Return the free run of terms that the data select, where it predicts better than `found`.
+
+    With it the logs with the thrust law that it has, and how to choose terms on fewer logs.
+    """
     if not leaves_more_than_noise(found, logs):
-        return found
-    quick = ranking_request(request)
-    free_run = ESTIMATORS[found.method].free_run
+        return found, logs, None
+    before = f"{found.method} of structure '{found.predictor.structure.name}'"
+    size = len(found.predictor.parameter_columns)
+    try:
+        choice = select_terms(logs, before, size, refit_alike(found, request))
+    except GreyboxError as error:
+        return _noting(found, f"no terms were selected: {error}"), logs, None
+    told = _noting(found, choice.note)
+    if not choice.taken:
+        return told, logs, None
+    try:
+        estimate, diverged = _finished(*_of_terms(choice.terms, choice.logs, request, choice.note))
+    except GreyboxError as error:
+        note = f"the selected terms could not be estimated on the whole logs: {error}"
+        return _noting(told, note), logs, None
+    if diverged:
+        return _noting(told, "the selected terms diverge, and were left."), logs, None
+    remaining = iter(choice.parts)
 
     def refit(fitting: Sequence[TrialLog]) -> ManoeuvringModel:
-        variant = EstimatorVariant(found.method)
-        start = found if free_run else None
-        return estimate_variant(variant, fitting, found, quick, start).model()
+        terms = next(remaining)
+        if terms is None:
+            raise ExcitationError("no terms were selected on a part of the logs.")
+        way, on, asked, _ = _of_terms(terms, fitting, ranking_request(request))
+        return estimate_once(on, way.structure, way.method, way.kind, asked).model()
 
-    before = f"{found.method} of structure '{found.predictor.structure.name}'"
-    try:
-        choice = select_terms(logs, before, len(found.predictor.parameter_columns), refit)
-    except GreyboxError as error:
-        return _noting(found, f"no terms were selected: {error}")
-    told = replace(found, notes=(*found.notes, choice.note))
-    if not choice.taken:
-        return told
-    inputs = force_inputs(choice.logs[0].vessel)
-    structure = structure_for(choice.structure, inputs)
-    method = free_run_estimator().name
-    asked = replace(
-        request,
-        nominal=nominal_model(structure, choice.start, choice.logs),
-        output_error=replace(
-            request.output_error, search=False, heading="input", damping="enforce"
-        ),
-    )
-    try:
-        estimate, diverged = _finished(
-            Alternative(structure, method, choice.kind), choice.logs, asked, [choice.note]
-        )
-    except GreyboxError as error:
-        return _noting(
-            told, f"the selected terms could not be estimated on the whole logs: {error}"
-        )
-    if diverged:
-        return _noting(told, "the selected terms diverge on the whole logs, and were left.")
-    return estimate
+    return estimate, choice.logs, refit
+
+
+def _of_terms(
+    terms: Terms, logs: Sequence[TrialLog], request: Request, *notes: str
+) -> tuple[Alternative, Sequence[TrialLog], Request, Sequence[str]]:
+    """Return how selected terms are estimated: a free run from where their selection ended."""
+    options = replace(request.output_error, search=False, heading="input", damping="enforce")
+    start = nominal_model(terms.structure, terms.start, logs)
+    asked = replace(request, nominal=start, output_error=options)
+    return Alternative(terms.structure, free_run_estimator().name, terms.kind), logs, asked, notes
 
 
 def nominal_model(structure: Structure, theta: Array, logs: Sequence[TrialLog]) -> ManoeuvringModel:

@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 from greybox.errors import GreyboxError
 from greybox.model.catalogue import structure_for
 from greybox.model.model import ManoeuvringModel
+from greybox.model.predictor_kinds import PREDICTORS
+from greybox.model.structure import Structure
 from greybox.selection.cross_validation import parts_of
 from greybox.selection.family import family_for, first_terms, spell_structure
 from greybox.selection.free_run_selection import FreeRunSelection, Selected
@@ -46,17 +48,45 @@ _VARIES = 0.05
 
 
 @dataclass(frozen=True)
-class TermChoice:
-    """The set of terms that held-out free runs choose, or None where the present model stays.
+class Terms:
+    """A set of terms where its selection ended.
 
     Parameters
     ----------
-    structure : str
-        As `structure_for` takes it.
+    structure : Structure
     kind : str
         Predictor.
     start : ndarray
-        (p,) its parameters where the selection ended, in the order of the structure.
+        (p,) parameters in the order of the structure.
+    """
+
+    structure: Structure
+    kind: str
+    start: Array
+
+    @classmethod
+    def of(cls, found: Selected, selection: FreeRunSelection, inputs: tuple[str, ...]) -> Terms:
+        """Read them off a path."""
+        model = selection.model
+        names = tuple(n for n in found.terms if n not in model.means)
+        structure = structure_for(spell_structure(names, inputs), inputs)
+        values = dict(zip(selection.names, found.p, strict=True))
+        kind = PREDICTORS[model.predictor.kind]
+        if len(names) == len(found.terms):
+            kind = PREDICTORS[kind.plain]
+        return cls(structure, kind.name, np.array([values[n] for n in structure.parameters]))
+
+
+@dataclass(frozen=True)
+class TermChoice:
+    """The set of terms that held-out free runs choose, and whether it is to be taken.
+
+    Parameters
+    ----------
+    terms : Terms
+    parts : tuple of Terms or None
+        Those of the same number that each part's other logs choose, in the order of `parts_of`;
+        None where they choose none.
     logs : tuple of TrialLog
         With the thrust law that was chosen.
     taken : bool
@@ -67,9 +97,8 @@ class TermChoice:
         The choice in words.
     """
 
-    structure: str
-    kind: str
-    start: Array
+    terms: Terms
+    parts: tuple[Terms | None, ...]
     logs: tuple[TrialLog, ...]
     taken: bool
     rows: tuple[dict[str, Any], ...]
@@ -130,12 +159,14 @@ def select_terms(
     sizes = sorted({len(s.terms) for s in sets})
     scores: list[list[Array]] = [[] for _ in sizes]
     own: list[Array] = []
+    paths: list[list[Selected]] = []
     for fitting, held in parts:
         try:
-            _, found = path(fitting)
+            found = path(fitting)[1]
         except GreyboxError as error:
             _log.info("no path on a part: %s", error)
             found = []
+        paths.append(found)
         judged = FreeRunSelection(held, family, kind)
         for k, count in enumerate(sizes):
             small = _of_size(found, count)
@@ -150,10 +181,6 @@ def select_terms(
     shown = chosen or int(np.argmax(ranking.score[1:])) + 1
     best = _of_size(sets, counts[shown])
     assert best is not None
-    terms = tuple(n for n in best.terms if n not in selection.model.means)
-    structure = spell_structure(terms, inputs)
-    values = dict(zip(selection.names, best.p, strict=True))
-    in_order = structure_for(structure, inputs).parameters
     rows = [
         {
             "model": f"{n} terms" if i else present,
@@ -178,9 +205,11 @@ def select_terms(
         )
     )
     return TermChoice(
-        structure,
-        kind if len(terms) < len(best.terms) else "basic+wind" if wind else "basic",
-        np.array([values[n] for n in in_order]),
+        Terms.of(best, selection, inputs),
+        tuple(
+            None if one is None else Terms.of(one, selection, inputs)
+            for one in (_of_size(found, counts[shown]) for found in paths)
+        ),
         tuple(logs),
         chosen > 0,
         tuple(rows),
