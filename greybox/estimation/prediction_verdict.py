@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from greybox.estimation.verdict import Reason
+from greybox.estimation.verdict import Divergence, Reason
 from greybox.notebook import DisplayMixin, number, table
 
 _WORDS = {"u": "surge", "v": "sway", "r": "yaw rate"}
@@ -172,8 +172,8 @@ class RunsDiverge(Reason):
     def sentence(self) -> str:
         """How many, and when."""
         return (
-            f"its free run diverges on {len(self.logs)} of {self.count} held-out runs, first "
-            f"after {self.after:.3g} s"
+            f"its free run diverges in {len(self.logs)} of {self.count} runs, first after "
+            f"{self.after:.3g} s"
         )
 
 
@@ -530,7 +530,7 @@ def weigh_prediction(
     limits : PredictionLimits
     """
     moving = [c for c in channels if c.moves]
-    diverges = [r for r in found if isinstance(r, RunsDiverge)]
+    diverges = [r for r in found if isinstance(r, RunsDiverge | Divergence)]
     large = [
         LargeError(c.channel, c.error, limits.good, c.horizon)
         for c in moving

@@ -98,6 +98,13 @@ def trust_level(model: ManoeuvringModel) -> TrustLevel:
     return TrustLevel(level) if level in known else TrustLevel.NOT_JUDGED
 
 
+def prediction_level(model: ManoeuvringModel) -> PredictionLevel:
+    """Return the level of the verdict on the predictions that the model's record holds."""
+    level = _verdict(model, "prediction").get("level")
+    known = set(map(str, PredictionLevel))
+    return PredictionLevel(level) if level in known else PredictionLevel.NOT_JUDGED
+
+
 def _verdict(model: ManoeuvringModel, part: str) -> Mapping[str, Any]:
     verdict = model.record.get("verdict")
     found = verdict.get(part) if isinstance(verdict, Mapping) else None
@@ -110,8 +117,8 @@ def model_notes(model: ManoeuvringModel, helm: Helm, asked: Conditions) -> tuple
     if trust_level(model) in (TrustLevel.DO_NOT_TRUST, TrustLevel.TRUST_EXCEPT):
         said = _verdict(model, "coefficients")["text"]
         told.append(f"the estimate's own verdict on its coefficients is '{said}'.")
-    said = str(_verdict(model, "prediction").get("text", ""))
-    if said.startswith((PredictionLevel.LIMITED, PredictionLevel.POOR)):
+    if prediction_level(model) in (PredictionLevel.LIMITED, PredictionLevel.POOR):
+        said = _verdict(model, "prediction")["text"]
         told.append(f"the estimate's own verdict on its predictions is '{said}'.")
     if not model.covariance.any():
         told.append("the model has no covariance, so its parameters were taken as exact.")

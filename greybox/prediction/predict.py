@@ -24,7 +24,13 @@ from greybox.prediction.extrapolation import extrapolations
 from greybox.prediction.helm import Helm, find_helm
 from greybox.prediction.measuring import measure, quantities
 from greybox.prediction.monte_carlo import MonteCarloQuantity, over_draws
-from greybox.prediction.notes import model_notes, run_notes, trial_notes, trust_level
+from greybox.prediction.notes import (
+    model_notes,
+    prediction_level,
+    run_notes,
+    trial_notes,
+    trust_level,
+)
 from greybox.prediction.orders import Orders, Stop, Turn, ZigZagOrders
 from greybox.prediction.result import (
     CRITERIA,
@@ -209,6 +215,7 @@ def predict_manoeuvre(
         ),
         elsewhere,
         trust_level(model),
+        prediction_level(model),
     )
 
 

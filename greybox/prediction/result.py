@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.estimation.prediction_verdict import PredictionLevel
 from greybox.estimation.verdict import TrustLevel
 from greybox.notebook import DisplayMixin, items, number, table
 from greybox.prediction.extrapolation import Extrapolation
@@ -263,7 +264,9 @@ class ManoeuvrePrediction(DisplayMixin):
     conditions : tuple of ConditionDifference
         In what the trial differs from the logs that the model was estimated on.
     trust : TrustLevel
-        Of the estimate's verdict.
+        Of the estimate's verdict on its coefficients.
+    prediction : PredictionLevel
+        Of its verdict on its predictions.
     """
 
     kind: Kind
@@ -274,6 +277,7 @@ class ManoeuvrePrediction(DisplayMixin):
     notes: tuple[str, ...]
     conditions: tuple[ConditionDifference, ...] = ()
     trust: TrustLevel = TrustLevel.NOT_JUDGED
+    prediction: PredictionLevel = PredictionLevel.NOT_JUDGED
 
     def summary(self) -> str:
         """Return all manoeuvres as text."""

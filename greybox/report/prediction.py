@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.estimation.prediction_verdict import PredictionLevel
 from greybox.estimation.verdict import TrustLevel
 from greybox.prediction.measuring import LABELS
 from greybox.prediction.monte_carlo import MonteCarloQuantity
@@ -30,6 +31,11 @@ _TITLES = {
     "crash": "crash stop",
 }
 _DEGREES = 180 / math.pi
+
+_DOUBTS = {
+    PredictionLevel.LIMITED: ("the model's free run was of limited use on logs that took no part",),
+    PredictionLevel.POOR: ("the model's free run was poor on logs that took no part",),
+}
 
 
 def prediction_page(made: ManoeuvrePrediction, record: dict[str, Any]) -> Page:
@@ -76,7 +82,10 @@ def headline(made: ManoeuvrePrediction) -> str:
             f"intervals. {told}"
         )
     doubts = [
-        *["the estimate is not to be trusted"] * (made.trust is TrustLevel.DO_NOT_TRUST),
+        *_DOUBTS.get(made.prediction, ()),
+        # what logs that took no part say of predictions counts before tests of coefficients
+        *["the estimate is not to be trusted"]
+        * (made.prediction is PredictionLevel.NOT_JUDGED and made.trust is TrustLevel.DO_NOT_TRUST),
         *["the model is used beyond the motion that it was estimated on"]
         * any(m.extrapolated for m in made.manoeuvres),
     ]

@@ -6,10 +6,13 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from greybox.errors import GreyboxError, UsageError
 from greybox.estimation.prediction_verdict import JudgedOn, NothingHeldOut, NotRefitted
 from greybox.estimation.registry import ESTIMATORS
 from greybox.estimation.result import Estimate
+from greybox.estimation.verdict import Divergence, Reason
 from greybox.model.model import ManoeuvringModel
 from greybox.selection.alternatives import ranking_request
 from greybox.selection.cross_validation import EstimatorVariant, estimate_variant, parts_of
@@ -70,7 +73,9 @@ def with_prediction(
         found = [NothingHeldOut(failed[0])]
         verdict = judge_prediction(runs, JudgedOn.OWN, found=found, seed=request.seed)
         return replace(estimate, prediction=verdict)
-    told = [NotRefitted(len(failed), len(parts), failed[0])] if failed else []
+    told: list[Reason] = [NotRefitted(len(failed), len(parts), failed[0])] if failed else []
+    if any(v == -np.inf for v in estimate.fit.values()):
+        told.append(Divergence())
     verdict = judge_prediction(held, parts=len(parts) - len(failed), found=told, seed=request.seed)
     _log.info("prediction: %s", verdict.text)
     return replace(estimate, prediction=verdict)

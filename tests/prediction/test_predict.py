@@ -246,6 +246,19 @@ def test_the_verdict_of_an_older_model_file_is_known(said, level, tmp_path):
     assert ("not to be trusted" in headline(made)) == (level is TrustLevel.DO_NOT_TRUST)
 
 
+@pytest.mark.parametrize(
+    ("level", "doubt"), [("good", ""), ("limited", "limited use"), ("poor", "was poor")]
+)
+def test_what_logs_that_took_no_part_say_counts_before_the_tests(level, doubt):
+    coefficients = {"level": "do not trust", "text": "do not trust: it misfits", "except": []}
+    prediction = {"level": level, "text": f"{level}: sway is worse than a constant"}
+    record = {"verdict": {"prediction": prediction, "coefficients": coefficients}}
+    made = predict_manoeuvre(replace(linear_ship(), record=record), "stopping", until=0.3, **FEW)
+    assert "not to be trusted" not in headline(made)
+    assert doubt in headline(made)
+    assert any(prediction["text"] in n for n in made.notes) == (level != "good")
+
+
 def test_leaving_the_range_of_the_logs_is_said():
     model = replace(
         rudder_model(), record={"ranges": {"r": (-0.02, 0.02), "u": (0.0, 9.0), "n": (0.0, 15.0)}}

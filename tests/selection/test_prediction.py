@@ -82,6 +82,12 @@ def test_parts_without_which_there_is_no_estimate_are_told(estimate, logs):
     assert "nothing turns (give logs to --validate)" in own.text
 
 
+def test_a_model_that_diverges_on_its_own_logs_is_poor(estimate, logs):
+    left = replace(estimate, fit=dict.fromkeys("uvr", -np.inf))
+    found = with_prediction(left, logs, Request(), lambda _: estimate.model()).prediction
+    assert found.text.startswith("poor: its free run diverges on the estimation logs")
+
+
 def test_a_log_too_short_for_parts_is_judged_on_itself(logs):
     short = logs[0].window(0, 75, "short")
     found = estimate_model(short, method="ls", structure="linear", predictor="basic").prediction

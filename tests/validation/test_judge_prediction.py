@@ -150,7 +150,7 @@ def test_a_run_that_diverges_is_poor(log):
         [HeldOut.of(true_model(log), log), HeldOut.of(true_model(log, Nr=-30.0), log)]
     )
     assert found.level is PredictionLevel.POOR
-    assert found.text.startswith("poor: its free run diverges on 1 of 2 held-out runs, first after")
+    assert found.text.startswith("poor: its free run diverges in 1 of 2 runs, first after")
     told = json.loads(to_json(found.to_dict()))
     assert told["because"][0]["kind"] == "runs_diverge"
     assert told["fit"]["u"] is None
