@@ -8,6 +8,7 @@ from virtual import as_recording, recorded
 
 from greybox.errors import UsageError
 from greybox.trial.checks.check import check_files, check_recording
+from greybox.trial.checks.course import course_findings
 from greybox.trial.checks.finding import IDS
 from greybox.trial.raw_log import Recording, Signal
 from greybox.trial.repair import apply_repairs, repair
@@ -190,6 +191,19 @@ def test_without_a_velocity_sensor_a_bias_cannot_be_told(ship):
     said = {o.id: o for o in report.outcomes}
     assert said["heading_bias"].status == "cannot tell"
     assert "no velocity sensor of its own" in said["heading_bias"].sentence
+
+
+def test_thrusters_that_push_sideways_are_not_taken_for_a_turned_compass():
+    # the moment of azimuths 18 m apart is no part of the force that they make
+    t = np.arange(600.0)
+    course = 0.02 * t
+    level = {"n": 15.0, "alpha1": 0.6, "alpha2": -0.1}
+    columns = {"x_n": 100 * np.sin(course), "y_n": -100 * np.cos(course), "psi": course - 0.5}
+    columns |= {name: np.full(len(t), value) for name, value in level.items()}
+    recording = as_recording({"t": t, **columns})
+    found, (told,) = course_findings(recording, load_vessel("thesis"))
+    assert not found
+    assert "the thrusters push that way" in told.sentence
 
 
 def test_on_one_course_a_bias_cannot_be_told_from_a_current():

@@ -127,5 +127,7 @@ def _pushed(recording: Recording, vessel: Vessel, angle: float) -> bool:
         return False
     made = generalised_force(vessel, {c: v[:size] for c, v in commands.items()})
     across = float(np.mean(made.get("tauy", np.zeros(1))))
-    total = sum(float(np.mean(np.abs(v))) for v in made.values()) or 1.0
+    # a moment is no part of the force
+    forces = [made[name] for name in ("taux", "tauy") if name in made]
+    total = sum(float(np.mean(np.abs(f))) for f in forces) or 1.0
     return bool(across * np.sin(angle) > 0.05 * total)

@@ -4,19 +4,22 @@ A response model of the logs themselves leaves a remainder: the rate of change o
 sway is regressed on damping, thrust, wind and current (equations linear in their coefficients),
 and a force from outside is one more regressor, constant for 15 to 120 s in body axes or fixed to
 the earth. Model and force are fitted together, so a force costs no more certainty than it has in
-common with the regressors. Coefficients have a normal prior, one variance for each kind of term,
-and what remains is coloured noise (an ARMA process: misfit and gusts, and sensor noise that
-differences of velocities hold); variances and colour are those of the greatest evidence, so that
-nothing has to be known of the model's errors but that they are alike throughout the logs.
+common with the regressors. Hull and thrusters feel velocities through the water: the steady
+current of each log is found with the coefficients. These have a normal prior, one variance for
+each kind of term, and what remains is coloured noise (an ARMA process: misfit and gusts, and
+sensor noise that differences of velocities hold); variances and colour are those of the greatest
+evidence, so that nothing has to be known of the model's errors but that they are alike throughout
+the logs.
 
 References
 ----------
+Fossen (2011), Handbook of Marine Craft Hydrodynamics and Motion Control, 8.3: relative velocity.
 MacKay (1992), Bayesian interpolation: evidence and number of well-determined parameters.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from itertools import product
@@ -74,6 +77,8 @@ _FITTED = 5
 _MASSES, _MASSES_STD = 1.4, 0.4
 # prior standard deviation of a free coefficient, over that of the noise
 _VAGUE = 1e3
+# prior standard deviation of a current and a small change of one, over the top speed
+_CURRENT, _CURRENT_STEP = 0.2, 0.02
 # robust deviations from the steps around at which a step is one of the sensor, and steps around
 _JUMP, _AROUND, _ROUNDS_OF_JUMPS = 6.0, 9, 4
 # time over which wind and waves are alike [s]
@@ -134,7 +139,7 @@ def force_findings(
         )
         untold = Outcome("external_force", "cannot tell", short)
         return found, [t or untold for t in told]
-    scan = _Scan(logs)
+    scan = _Scan(logs, _mover(read, vessel, step))
     half, spread = scan.half_thrust()
     if half < _KNOWN * spread:
         vague = (
@@ -171,7 +176,8 @@ def _read(recording: Recording, vessel: Vessel) -> _Read | str:
     if earth:
         values["u"], values["v"] = ned_to_body(motion["v_n"], motion["v_e"], motion["psi"])
     # of slow turning the heading tells more than a rate gyro, whose noise adds up
-    values["r"] = _slope(denoise(motion["psi"], motion), motion)
+    values["psi"] = denoise(motion["psi"], motion)
+    values["r"] = _slope(values["psi"], motion)
     commands = {}
     for c in vessel.commands:
         signal = recording[c]
@@ -193,41 +199,65 @@ def _without_wind(x: _Read) -> _Read:
     return replace(x, motion=replace(x.motion, values={**x.motion.values, **none}))
 
 
+def _drifted(x: _Read, current: Array) -> _Read:
+    """Return a recording with its velocities through water that flows north and east [m/s]."""
+    motion = x.motion
+    along, across = ned_to_body(float(current[0]), float(current[1]), motion["psi"])
+    values = motion.values | {"u": motion["u"] - along, "v": motion["v"] - across}
+    return replace(x, motion=replace(motion, values=values))
+
+
 def _slope(value: Array, motion: Motion) -> Array:
     return np.concatenate([np.gradient(value[a:b], motion.step) for a, b in motion.stretches])
 
 
+def _mean_after(value: Array, motion: Motion) -> Array:
+    """Return means over the sample that follows each time, by the cubic through four samples."""
+    mean = value.copy()
+    for a, b in motion.stretches:
+        x = value[a:b]
+        mean[a : b - 1] = 0.5 * (x[:-1] + x[1:])
+        mean[a + 1 : b - 2] = (13 * (x[1:-2] + x[2:-1]) - x[:-3] - x[3:]) / 24
+    return mean
+
+
 def _terms(x: _Read, vessel: Vessel) -> tuple[NDArray[np.int64], Array]:
-    """Return the kinds (p,) and the samples (N, 2, p) of what may explain surge and sway."""
+    """Return the kinds of terms (p,), and what may explain surge and sway (N, 2, p).
+
+    Means over the sample that follows each time, as forces of held commands are.
+    """
     motion = x.motion
-    # noise within products of velocities would weaken their coefficients
-    u, v = (denoise(motion[s], motion) for s in _STATES)
-    r = motion["r"]
+    # as measured: a low-pass takes more from a turning ship than noise does from products
+    u, v, r = (motion[s] for s in (*_STATES, "r"))
     fast, aside, turn = np.abs(u), np.abs(v), np.abs(r)
     along = [u, u * fast, u**3, v * v, r * r]
     across = [v, r, u * v, v * aside, r * turn, aside * r, turn * v]
     fine = [u * v * v, u * r * r, u * v * r, fast * v * r]
     fine_across = [v**3, r**3, u * u * v, u * u * r, v * r * r, v * v * r]
+    along, across, fine, fine_across = (
+        [_mean_after(f, motion) for f in terms] for terms in (along, across, fine, fine_across)
+    )
+    ahead_mean, beside_mean, bend = (_mean_after(f, motion) for f in (u, v, u * fast))
     # thrust falls with the advance of the ship, its law may be another than the vessel file's, it
     # may come late, and each thruster may have a gain of its own
     for name, f in generalised_force(vessel, x.commands).items():
         ahead = name in ("taux", "race_drag", "rudder_drag")
-        bent = f * u * fast if name.startswith("rudder") else f * np.abs(f)
+        bent = f * bend if name.startswith("rudder") else f * np.abs(f)
         (along if ahead else across).append(f)
-        (fine if ahead else fine_across).extend((f * u, bent, _slope(f, motion)))
+        (fine if ahead else fine_across).extend((f * ahead_mean, bent, _slope(f, motion)))
     for thruster in vessel.thrusters:
         own = {c: x.commands[c] for c in thruster.columns}
         force = generalised_force(replace(vessel, thrusters=(thruster,)), own)
         parts = [force.get(name, np.zeros_like(u)) for name in ("taux", "tauy")]
         size = np.maximum(np.hypot(*parts), 1e-12)
-        advance = (u * parts[0] + v * parts[1]) / size
+        advance = (ahead_mean * parts[0] + beside_mean * parts[1]) / size
         for f, some in zip(parts, (fine, fine_across), strict=True):
             some.extend((f, f * advance, f * advance / np.sqrt(size), f / np.sqrt(size)))
     if _wind_measured(x):
         head, beam = motion["u_q"], motion["v_q"]
         air = np.hypot(head, beam)
-        along += [air * head, head * np.abs(head)]
-        across += [air * beam, head * beam]
+        along += [_mean_after(f, motion) for f in (air * head, head * np.abs(head))]
+        across += [_mean_after(f, motion) for f in (air * beam, head * beam)]
     c, s, one = np.cos(motion["psi"]), np.sin(motion["psi"]), np.ones_like(u)
     twice = [c * c - s * s, 2 * s * c]
     flow = [r * c, r * s, fast * c, fast * s, v * c, v * s, *twice]
@@ -236,8 +266,11 @@ def _terms(x: _Read, vessel: Vessel) -> tuple[NDArray[np.int64], Array]:
     fine_across += [np.zeros_like(u)] * more
     fine += [np.zeros_like(u)] * -more
     kinds = {_TURN: 1, _SHIP: 0, _ASKEW: 0, _FINE: len(fine), _FLOW: 3, _FLOW_FINE: len(flow)}
-    surge = [v * r, *along, *across, *fine, one, c, s, *flow]
-    sway = [u * r, *along, *across, *fine_across, one, -s, c, *flow_across]
+    turned, drifted, *shared = (_mean_after(f, motion) for f in (v * r, u * r, c, s))
+    surge = [turned, *along, *across, *fine, one, *shared]
+    surge += [_mean_after(f, motion) for f in flow]
+    sway = [drifted, *along, *across, *fine_across, one, -shared[1], shared[0]]
+    sway += [_mean_after(f, motion) for f in flow_across]
     kind = np.repeat(list(kinds), [kinds[k] for k in kinds])
     ship = np.repeat([_SHIP, _ASKEW], [len(along), len(across)])
     kind = np.insert(kind, 1, ship)
@@ -281,6 +314,16 @@ class _Log:
     speed: Array
     thrust: Array
 
+    def of(self, s: int) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """Return the kinds of terms (p,) in surge or sway, and which are of this log alone."""
+        swapped = np.array([_ASKEW, _SHIP, *range(_FINE, _FREE + 1)])
+        kind = swapped[self.kind] if s else self.kind
+        return kind, np.isin(kind, (_FLOW, _FLOW_FINE))
+
+    def rate_beside_turning(self, s: int) -> Array:
+        """Return the rate (K,) of surge or sway beside the usual force of turning [m/s²]."""
+        return np.asarray(self.rate[:, s] - (_MASSES, -1 / _MASSES)[s] * self.terms[:, s, 0])
+
 
 def _make_log(number: int, x: _Read, vessel: Vessel, step: float) -> _Log | str:
     """Return the rates of a recording, or why it has none."""
@@ -317,6 +360,22 @@ def _make_log(number: int, x: _Read, vessel: Vessel, step: float) -> _Log | str:
         made[:, 1],
         made[:, 2 : 2 + force.shape[1]],
     )
+
+
+def _mover(
+    read: Sequence[_Read | str], vessel: Vessel, step: float
+) -> Callable[[_Log, Array], _Log]:
+    """Return what makes a log anew with velocities through water that flows."""
+
+    def moved(log: _Log, current: Array) -> _Log:
+        x = read[log.number]
+        assert not isinstance(x, str)
+        made = _make_log(log.number, _drifted(x, current), vessel, step)
+        assert not isinstance(made, str)
+        # a ship stands by its speed over ground
+        return replace(made, speed=log.speed, stretches=log.stretches)
+
+    return moved
 
 
 def _between(x: Array, edges: NDArray[np.int64], count: int) -> Array:
@@ -446,8 +505,11 @@ class _Equation:
             inner = np.eye(len(kind)) + scale[:, None] * gram * scale
             inverse = np.linalg.inv(inner)
             covariance = scale[:, None] * inverse * scale
-            theta = covariance @ moment
-            variance = max((power - float(moment @ theta)) / n, 1e-12 * power / n)
+            weights = inverse @ (scale * moment)
+            theta = scale * weights
+            # no difference of large numbers, which well-known coefficients make less than nothing
+            variance = float(np.sum((y - x @ theta) ** 2) + np.sum(weights**2)) / n
+            variance = max(variance, 1e-12 * power / n)
             lost = np.bincount(kind, np.diag(inverse), _FREE + 1)[:_FITTED]
             own = np.bincount(kind, theta**2, _FREE + 1)[:_FITTED] / variance
             last, prior = prior, np.clip(own / np.maximum(count - lost, 1e-6), 1e-8, 1e6)
@@ -455,6 +517,22 @@ class _Equation:
                 break
         evidence = -0.5 * (n * np.log(variance) + float(np.linalg.slogdet(inner)[1]))
         return _Fit(noise, x, y - x @ theta, theta, covariance, variance, prior, evidence)
+
+    def of(self, rate: Array, columns: Array) -> _Equation:
+        """Return the equation with other rates and first columns, its noise and prior kept."""
+        other, first = copy(self), slice(columns.shape[1])
+        other.rate = rate
+        other.columns = self.columns.copy()
+        other.columns[:, first] = columns / self.size[first]
+        other.fit = other._posterior(self.fit.noise, self.prior)
+        return other
+
+    def whiten(self, columns: Array) -> Array:
+        """Return the innovations of columns (N, k), weighed."""
+        white = np.zeros_like(columns)
+        for a, b in self.stretches:
+            white[a:b] = self.fit.noise.whiten(columns[a:b])
+        return np.asarray(white * self.weight[:, None])
 
     def settle(self, width: float) -> None:
         """Fit all; single steps that stand out from those around them are of the sensor.
@@ -481,13 +559,14 @@ class _Equation:
         self.weight = np.sqrt(mean / np.maximum(around, 1e-3 * mean))
         self.estimate()
 
-    def without(self, part: slice, starts: tuple[tuple[int, int], ...]) -> _Equation:
-        """Return the equation fitted without some columns, its steps and weights kept."""
+    def without(self, part: slice, old: _Equation) -> _Equation:
+        """Return an older equation, without some columns, fitted with these steps and weights."""
         less = copy(self)
         less.kind = np.delete(self.kind, part)
         less.columns = np.delete(self.columns, part, axis=1)
         less.size = np.delete(self.size, part)
-        less.starts = self.starts + starts
+        less.rate, less.columns[:, : part.start] = old.rate, old.columns[:, : part.start]
+        less.starts = self.starts + old.starts
         less.estimate()
         return less
 
@@ -521,36 +600,98 @@ class _Event:
 
 
 class _Scan:
-    """The response model of all logs, and the stretches in which another force acts."""
+    """The response model of all logs, and the stretches in which another force acts.
 
-    def __init__(self, logs: Sequence[_Log]) -> None:
+    Parameters
+    ----------
+    logs : sequence of _Log
+    moved : callable
+        (log, current (2,) north and east [m/s]) -> log with velocities through that water.
+    """
+
+    def __init__(self, logs: Sequence[_Log], moved: Callable[[_Log, Array], _Log]) -> None:
+        self.moved, self.current = moved, np.zeros((len(logs), 2))
         self.top = float(np.quantile(np.abs(np.concatenate([x.speed for x in logs])), 0.95))
         self.standing = [_standing(x, _STANDING * self.top) for x in logs]
         # what holds a ship is not constant: it takes up all that the model says
         self.logs = logs = [_without(x, s) for x, s in zip(logs, self.standing, strict=True)]
         self.ends = np.cumsum([0, *(len(x.t) for x in logs)])
         self.psi = np.concatenate([x.psi for x in logs])
-        spans = [
-            (a + at, b + at)
-            for x, at in zip(logs, self.ends[:-1], strict=True)
-            for a, b in x.stretches
-        ]
-        rate = np.concatenate([x.rate for x in logs])
-        terms = np.concatenate([x.terms for x in logs])
-        self.free = np.ones(len(rate), bool)
+        self.free = np.ones(len(self.psi), bool)
+        self._fit()
+        self._follow_currents()
+        self._fit()
+
+    def _fit(self) -> None:
+        """Fit both equations to the logs in their currents."""
+        starts = zip(self.logs, self.ends[:-1], strict=True)
+        spans = [(a + at, b + at) for x, at in starts for a, b in x.stretches]
         self.equations = []
-        swapped = np.array([_ASKEW, _SHIP, *range(_FINE, _FREE + 1)])
-        for s, usual in enumerate((_MASSES, -1 / _MASSES)):
-            kind = swapped[logs[0].kind] if s else logs[0].kind
-            equation = _Equation(rate[:, s] - usual * terms[:, s, 0], spans)
-            own = np.isin(kind, (_FLOW, _FLOW_FINE))
-            equation.add(kind[~own], terms[:, s, ~own])
-            for k in range(len(logs)):
-                inside = np.arange(len(rate)) // 1
-                inside = (inside >= self.ends[k]) & (inside < self.ends[k + 1])
-                equation.add(kind[own], terms[:, s, own] * inside[:, None])
-            equation.settle(_ALIKE / logs[0].step)
+        for s in range(2):
+            rate, kind, columns = self._regression(s)
+            equation = _Equation(rate, spans)
+            equation.add(kind, columns)
+            equation.settle(_ALIKE / self.logs[0].step)
             self.equations.append(equation)
+
+    def _regression(self, s: int) -> tuple[Array, NDArray[np.int64], Array]:
+        """Return rates (N,) of surge or sway, and kinds and columns (N, p) of all logs."""
+        kind, own = self.logs[0].of(s)
+        terms = np.concatenate([x.terms[:, s] for x in self.logs])
+        rate = np.concatenate([x.rate_beside_turning(s) for x in self.logs])
+        log = np.repeat(np.arange(len(self.logs)), np.diff(self.ends))[:, None]
+        each = [terms[:, own] * (log == k) for k in range(len(self.logs))]
+        kinds = np.concatenate([kind[~own], *[kind[own]] * len(each)])
+        return rate, kinds, np.hstack([terms[:, ~own], *each])
+
+    def _follow_currents(self) -> None:
+        """Find the current of each log in which all explain most, noise and priors as they are.
+
+        Products of velocities of hull and thrusters hold products with a steady current that
+        terms linear in it do not. Gauss-Newton steps on the posterior of all currents.
+        """
+        spread, delta = _CURRENT * self.top, _CURRENT_STEP * self.top
+        for _ in range(_ROUNDS):
+            information = np.eye(self.current.size) / spread**2
+            score = -self.current.ravel() / spread**2
+            near = [
+                [self.moved(log, current + delta * towards) for towards in np.eye(2)]
+                for log, current in zip(self.logs, self.current, strict=True)
+            ]
+            for s, equation in enumerate(self.equations):
+                fit, white = equation.fit, equation.whiten(self._slopes(s, near) / delta)
+                shared = white.T @ fit.white
+                information += (white.T @ white - shared @ fit.covariance @ shared.T) / fit.variance
+                score -= white.T @ fit.rest / fit.variance
+            move = np.linalg.solve(information, score).reshape(-1, 2)
+            move *= np.minimum(1.0, spread / np.maximum(np.hypot(*move.T), 1e-12))[:, None]
+            self.current = self.current + move
+            pairs = zip(self.logs, self.current, strict=True)
+            self.logs = [self.moved(log, current) for log, current in pairs]
+            self.equations = [
+                equation.of(*self._regression(s)[::2]) for s, equation in enumerate(self.equations)
+            ]
+            if np.abs(move).max() < delta:
+                break
+
+    def _slopes(self, s: int, near: Sequence[Sequence[_Log]]) -> Array:
+        """Return how logs in currents near their own change what is left of rates (N, 2 K)."""
+        slopes = np.zeros((len(self.psi), self.current.size))
+        for k, (log, others) in enumerate(zip(self.logs, near, strict=True)):
+            rows, left = slice(self.ends[k], self.ends[k + 1]), self._left(s, k, log)
+            for i, other in enumerate(others):
+                slopes[rows, 2 * k + i] = self._left(s, k, other) - left
+        return slopes
+
+    def _left(self, s: int, k: int, log: _Log) -> Array:
+        """Return what of the rates of a log, in the place of the k-th, coefficients leave (K,)."""
+        fit, size = self.equations[s].fit, self.equations[s].size
+        _, own = log.of(s)
+        theta = fit.theta[: len(size)] / size
+        many, each = int(np.sum(~own)), int(np.sum(own))
+        flow = theta[many + k * each :][:each]
+        rate, terms = log.rate_beside_turning(s), log.terms[:, s]
+        return np.asarray(rate - terms[:, ~own] @ theta[:many] - terms[:, own] @ flow)
 
     def half_thrust(self) -> tuple[float, float]:
         """Return the thrust per mass that half of the top speed needs [m/s²], and its error."""
@@ -567,11 +708,12 @@ class _Scan:
             event = self._clearest()
             if event is None:
                 break
-            before, free = self.equations, self.free.copy()
+            before = copy(self)
             self._allow(event)
             matters = self.share(event)[1] > _LEAST_SHARE
             if not matters or self._chance(self._added(event, before), event.fixed) > _LEVEL:
-                self.equations, self.free = before, free
+                self.equations, self.free = before.equations, before.free
+                self.logs, self.current = before.logs, before.current
                 break
             found.append(event)
         return found
@@ -592,23 +734,32 @@ class _Scan:
         for s, equation in enumerate(self.equations):
             equation.add(np.full(2, _FREE), box * self._directions(s, event.fixed))
             equation.settle(_ALIKE / self.logs[0].step)
+        self._follow_currents()
+        for equation in self.equations:
+            equation.estimate()
         # what its begin and end leave beside it is not usual
         beside = event.last - event.first
         first = max(at, at + event.first - beside)
+        self.free = self.free.copy()
         self.free[first : min(self.ends[event.log + 1], at + event.last + beside + 1)] = False
 
-    def _added(self, event: _Event, before: Sequence[_Equation]) -> float:
+    def _added(self, event: _Event, before: _Scan) -> float:
         """Return twice the log-likelihood that a force adds: 0 where all else explains as much.
 
-        Variances and the colour of the noise are fitted anew without it too: the force over its
-        standard error would take the colour that is left beside the force for known.
+        Currents, variances and the colour of the noise are fitted anew without it too: the force
+        over its standard error would take what is left beside the force for known.
         """
-        added = 0.0
+        none, added = copy(before), 0.0
         assert event.at is not None
-        for equation, old, at in zip(self.equations, before, event.at, strict=True):
-            none = equation.without(slice(at, at + 2), old.starts)
+        none.equations = [
+            equation.without(slice(at, at + 2), old)
+            for equation, old, at in zip(self.equations, before.equations, event.at, strict=True)
+        ]
+        none._follow_currents()
+        for equation, less, at in zip(self.equations, none.equations, event.at, strict=True):
+            less.estimate()
             own = equation.fit.covariance[at : at + 2, at : at + 2] / _VAGUE**2
-            added += 2 * (equation.fit.evidence - none.fit.evidence)
+            added += 2 * (equation.fit.evidence - less.fit.evidence)
             added -= float(np.linalg.slogdet(own)[1])
         return max(added, 0.0)
 
@@ -665,10 +816,10 @@ class _Scan:
         at = (len(self.equations[0].kind), len(self.equations[1].kind))
         for fixed in (False, True):
             place, force, gain = self._scanned(fixed)
-            gain = np.where(np.hypot(*force.T) > least, gain, 0.0)
-            if not gain.any():
+            matters = np.where(np.hypot(*force.T) > least, gain, 0.0)
+            if not matters.any():
                 continue
-            k = int(np.argmax(gain))
+            k = int(np.argmax(matters))
             size = gain[k] / float(np.quantile(gain, _TAIL) + 1)
             if size > largest:
                 log, first, last = (int(x) for x in place[k])
