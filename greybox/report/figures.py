@@ -302,9 +302,11 @@ def to_svg(figure: Figure, title: str) -> str:
         layout = figure.get_layout_engine()
         if layout is not None:
             # placed here, or all would be drawn once more to nowhere
+            dpi = figure.get_dpi()
             figure.set_dpi(canvas.fixed_dpi)
             layout.execute(figure)
             figure.set_layout_engine("none")
+            figure.set_dpi(dpi)
         canvas.print_svg(out, metadata={"Date": None, "Creator": None})
     text = out.getvalue()
     text = text[text.index("<svg") :]
