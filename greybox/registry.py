@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from importlib import import_module
-from importlib.metadata import entry_points
+from functools import cache
+from importlib import import_module, metadata
 from pkgutil import iter_modules
 from typing import Protocol, TypeVar
 
 from greybox.errors import GreyboxError, UsageError, suggestion
+
+
+@cache
+def entry_points(group: str) -> metadata.EntryPoints:
+    """Return the entry points of a group; what is installed is looked through once."""
+    return metadata.entry_points(group=group)
 
 
 class Named(Protocol):
@@ -64,7 +70,7 @@ class Registry(Mapping[str, T]):
                 ]
                 found.sort(key=lambda e: int(getattr(e, "order", 0)))
             if self._group:
-                found += [point.load() for point in entry_points(group=self._group)]
+                found += [point.load() for point in metadata.entry_points(group=self._group)]
             self._entries = {e.name: e for e in found} | self._entries
         return self._entries
 

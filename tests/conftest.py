@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 
 # two test processes on two cores: threads of BLAS would only wait for each other
@@ -18,6 +19,12 @@ from greybox.model.catalogue import get_structure
 from greybox.study.chapter6 import NOMINAL, TRUE
 from greybox.trial.readers.limits import Limits
 from greybox.vessel.toml import load_vessel
+
+
+def pytest_collection_finish():
+    """Leave out what stays until the end, tests and libraries, whenever garbage is looked for."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture

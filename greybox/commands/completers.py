@@ -5,11 +5,11 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Callable, Iterable
-from importlib.metadata import entry_points
 from pathlib import Path
 
 from greybox.commands.argument_types import EXAMPLE_VESSELS, Kind, kind_of
 from greybox.commands.parser import sub_parsers
+from greybox.registry import entry_points
 
 # written out, since loading them takes longer than one waits for Tab; tests hold them to the truth
 STRUCTURES = ("thesis", "surge", "linear", "blanke", "modulus", "abkowitz", "siso")

@@ -8,13 +8,14 @@ import os
 import sys
 from collections.abc import Sequence
 from importlib import import_module
-from importlib.metadata import entry_points, version
+from importlib.metadata import version
 from pathlib import Path
 
 from greybox.commands.common import require_apart
 from greybox.commands.parser import Parser, short_usage, sub_parsers
 from greybox.commands.terminal import complain, telling
 from greybox.errors import GreyboxError
+from greybox.registry import entry_points
 
 GROUP = "greybox.commands"
 # as the work goes; commands of other packages follow

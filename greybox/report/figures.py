@@ -290,6 +290,7 @@ def overview_figure(signals: dict[str, Array], title: str, sample_time: float = 
 def to_svg(figure: Figure, title: str) -> str:
     """Return a figure as an SVG element for a page, with a title for screen readers."""
     import matplotlib as mpl
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
 
     for words in figure.findobj(Text):
         # a name may hold a dollar sign; what a logarithmic axis writes is a formula
@@ -297,7 +298,16 @@ def to_svg(figure: Figure, title: str) -> str:
             words.set_parse_math(False)
     out = io.StringIO()
     with mpl.rc_context({"svg.fonttype": "path", "svg.hashsalt": title}):
-        figure.savefig(out, format="svg", metadata={"Date": None, "Creator": None})
+        canvas = FigureCanvasSVG(figure)
+        layout = figure.get_layout_engine()
+        if layout is not None:
+            # placed here, or all would be drawn once more to nowhere
+            dpi = figure.get_dpi()
+            figure.set_dpi(canvas.fixed_dpi)
+            layout.execute(figure)
+            figure.set_layout_engine("none")
+            figure.set_dpi(dpi)
+        canvas.print_svg(out, metadata={"Date": None, "Creator": None})
     text = out.getvalue()
     text = text[text.index("<svg") :]
     # identifiers are local to a page with many figures

@@ -1,10 +1,21 @@
-"""Charts that can be zoomed: Bokeh documents, with the same identifiers every time."""
+"""Charts that can be zoomed: documents of BokehJS, with the same identifiers every time.
+
+Its Python package builds such a document some twenty times slower than it is
+written here, model by model; what is not named has the script's own default.
+"""
 
 from __future__ import annotations
 
+import gzip
+import json
 import re
+from base64 import b64encode
+from collections.abc import Sequence
 from functools import cache
+from importlib.metadata import version
 from importlib.resources import files
+from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,18 +33,31 @@ _LEGEND_ROW = 24
 _AXIS = 34
 # how a figure says that its seconds are written as minutes
 _MINUTES = "[min:s]"
+_DASHES = {"solid": [], "dashed": [6], "dotted": [2, 4], "dashdot": [6, 4, 2, 4]}
 
 
 @cache
 def library() -> str:
     """Return the script that draws charts, as it is installed."""
-    return (files("bokeh") / "server/static/js/bokeh.min.js").read_text(encoding="utf-8")
+    found = find_spec("bokeh")
+    assert found is not None
+    assert found.origin is not None
+    folder = Path(found.origin).parent
+    return (folder / "server/static/js/bokeh.min.js").read_text(encoding="utf-8")
 
 
 @cache
 def opener() -> str:
     """Return the script that opens and closes charts beneath their pictures."""
     return (files("greybox") / "report/zoom.js").read_text(encoding="utf-8")
+
+
+class _Model:
+    """A model of BokehJS and those of its properties that are not the default."""
+
+    def __init__(self, kind: str, **properties: Any) -> None:
+        self.kind = kind
+        self.properties = properties
 
 
 def chart_json(chart: Chart, name: str) -> str:
@@ -45,189 +69,239 @@ def chart_json(chart: Chart, name: str) -> str:
     name : str
         Of the element that will hold it; the same chart and name give the same bytes.
     """
-    from bokeh.core.json_encoder import serialize_json
-    from bokeh.embed import json_item
-    from bokeh.layouts import gridplot
-    from bokeh.models import Range1d, Span
-
-    ranges: dict[int, Any] = {}
-    cursors: dict[int, Any] = {}
+    ranges: dict[int, _Model] = {}
+    cursors: dict[int, _Model] = {}
     plots = []
     for i, panel in enumerate(chart.panels):
         first = panel.together
         if first == i:
-            ranges[i] = Range1d(*panel.x_range)
-            cursors[i] = Span(dimension="height", line_color=BLACK, line_dash="dotted")
+            ranges[i] = _range(panel.x_range)
+            cursors[i] = _Model("Span", dimension="height", **_POINTER)
         last = not any(p.together == first for p in chart.panels[i + 1 :])
         plots.append(_plot(panel, ranges[first], cursors[first], last, _tools(chart)))
-    grid = gridplot(
-        [[p] for p in plots],
+    names: dict[_Model, str] = {}
+    root = _Model(
+        "GridPlot",
         sizing_mode="stretch_width",
-        toolbar_location="above",
-        toolbar_options={"logo": None},
+        children=[[plot, row, 0] for row, plot in enumerate(plots)],
+        toolbar=_Model(
+            "Toolbar", tools=_moved_together(plots), logo=None, active_drag=None, active_scroll=None
+        ),
     )
-    item: Any = json_item(grid, name)
+    roots = [_encoded(root, names, name)]
+    made = version("bokeh")
+    config = _encoded(_Model("DocumentConfig"), names, name)
+    document = {"version": made, "title": "", "config": config, "roots": roots}
+    item = {"target_id": name, "root_id": names[root], "doc": document, "version": made}
+    text = json.dumps(item, allow_nan=False, separators=(",", ":"))
     # no script ends, begins or hides inside the text
-    text: str = serialize_json(_renamed(item, name))
-    for mark in "<>&\u2028\u2029":
+    for mark in "<>&":
         text = text.replace(mark, f"\\u{ord(mark):04x}")
     return text
 
 
-def _tools(chart: Chart) -> list[Any]:
-    """Return the tools of a panel: alike in all, or one button would not move them all."""
-    from bokeh.models import BoxZoomTool, PanTool, ResetTool, WheelZoomTool
+def _encoded(value: Any, names: dict[_Model, str], prefix: str) -> Any:
+    """Return what JSON can hold; a model that stands there already is named only."""
+    if isinstance(value, _Model):
+        if value in names:
+            return {"id": names[value]}
+        names[value] = f"{prefix}-{len(names)}"
+        head = {"type": "object", "name": value.kind, "id": names[value]}
+        properties = {k: _encoded(v, names, prefix) for k, v in value.properties.items()}
+        return head | ({"attributes": properties} if properties else {})
+    if isinstance(value, np.ndarray):
+        packed = gzip.compress(value.astype("<f4").tobytes(), compresslevel=2, mtime=0)
+        data = b64encode(packed).decode()
+        return {
+            "type": "ndarray", "array": {"type": "bytes", "data": data},
+            "shape": list(value.shape), "dtype": "float32", "order": "little",
+        }  # fmt: skip
+    if isinstance(value, dict):
+        return {k: _encoded(v, names, prefix) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_encoded(v, names, prefix) for v in value]
+    return value
 
+
+def _moved_together(plots: Sequence[_Model]) -> list[_Model]:
+    """Return one button for the tools of all panels that are alike."""
+    alike: dict[tuple[str, str], list[_Model]] = {}
+    for plot in plots:
+        for tool in plot.properties["toolbar"].properties["tools"]:
+            alike.setdefault((tool.kind, tool.properties.get("mode", "")), []).append(tool)
+    return [_Model("ToolProxy", tools=tools) for tools in alike.values()]
+
+
+_POINTER: dict[str, Any] = {"line_color": BLACK, "line_dash": _DASHES["dotted"]}
+
+
+def _range(ends: tuple[float, float]) -> _Model:
+    return _Model("Range1d", start=ends[0], end=ends[1])
+
+
+def _tools(chart: Chart) -> list[_Model]:
+    """Return the tools of a panel: alike in all, or one button would not move them all."""
     maps = [panel.equal for panel in chart.panels]
     wide = "both" if any(maps) else "width"
     return [
-        PanTool(dimensions=wide),
-        BoxZoomTool(match_aspect=all(maps)),
-        WheelZoomTool(dimensions=wide),
-        ResetTool(),
+        _Model("PanTool", dimensions=wide),
+        _Model("BoxZoomTool", match_aspect=all(maps)),
+        _Model("WheelZoomTool", dimensions=wide),
+        _Model("ResetTool"),
     ]
 
 
-def _plot(panel: Panel, x_range: Any, cursor: Any, last: bool, tools: list[Any]) -> Any:
-    from bokeh.models import CrosshairTool, DataRange1d, Legend, NumeralTickFormatter, Range1d, Span
-    from bokeh.plotting import figure
-
-    if panel.equal:
-        size: dict[str, Any] = {"match_aspect": True, "x_range": DataRange1d(),
-                                "y_range": DataRange1d(), "height": _MOST}  # fmt: skip
-    else:
-        height = int(np.clip(_SCALE * panel.height, _LEAST, _MOST)) + (_AXIS if last else 0)
-        size = {"x_range": x_range, "y_range": Range1d(*panel.y_range), "height": height}
-    clock = panel.x_label.endswith(_MINUTES)
-    plot = figure(
-        tools=[],
+def _plot(panel: Panel, x_range: _Model, cursor: _Model, last: bool, tools: list[_Model]) -> _Model:
+    x_label = panel.x_label.replace(_MINUTES, "[h:min:s]")
+    below = _axis(x_label, visible=last or panel.equal)
+    if x_label != panel.x_label:
+        below.properties["formatter"] = _Model("NumeralTickFormatter", format="00:00:00")
+    left = _axis(panel.y_label, ticker=_Model("BasicTicker", desired_num_ticks=4))
+    grids = [
+        _Model("Grid", dimension=k, axis=axis, grid_line_alpha=0.5)
+        for k, axis in enumerate((below, left))
+    ]
+    levels = [
+        _Model("Span", location=level, line_color=BLACK, line_alpha=0.6) for level in panel.levels
+    ]
+    legend: dict[str, list[_Model]] = {}
+    drawn: list[_Model] = []
+    hovered: list[_Model] = []
+    for strips in panel.strips:
+        drawn.append(_draw_strips(strips))
+        _note(legend, strips.label, drawn[-1])
+    for area in panel.areas:
+        drawn.append(_draw_area(area))
+        _note(legend, area.label, drawn[-1])
+    for line in panel.lines:
+        for made in _draw_line(line, line.label or panel.y_label.split("\n")[0]):
+            hovered.append(made)
+            _note(legend, line.label, made)
+    drawn += hovered
+    if panel.words:
+        drawn.append(_draw_words(panel.words))
+    level = _Model("Span", dimension="width", **_POINTER)
+    tools = [*tools, _Model("CrosshairTool", overlay=[cursor, level])]
+    if hovered:
+        tools.append(_hover(hovered, panel))
+    height = int(np.clip(_SCALE * panel.height, _LEAST, _MOST)) + (_AXIS if last else 0)
+    plot = _Model(
+        "Figure",
+        height=_MOST if panel.equal else height,
         sizing_mode="stretch_width",
         min_border_left=66,
         min_border_right=12,
-        x_axis_label=_plain(panel.x_label.replace(_MINUTES, "[h:min:s]")),
-        y_axis_label=_plain(panel.y_label),
-        **size,
+        outline_line_color=None,
+        match_aspect=panel.equal,
+        x_range=_Model("DataRange1d") if panel.equal else x_range,
+        y_range=_Model("DataRange1d") if panel.equal else _range(panel.y_range),
+        left=[left],
+        below=[below],
+        center=[*grids, *levels],
+        renderers=drawn,
+        # on a page that is scrolled, a figure must be asked before it takes a drag or a wheel
+        toolbar=_Model("Toolbar", tools=tools, active_drag=None, active_scroll=None),
+        toolbar_location=None,
     )
-    plot.outline_line_color = None
-    plot.grid.grid_line_alpha = 0.5
-    plot.axis.axis_label_text_font_style = "normal"
-    plot.axis.axis_label_text_font_size = "12px"
-    plot.axis.minor_tick_line_color = None
-    if clock:
-        plot.xaxis.formatter = NumeralTickFormatter(format="00:00:00")
-    plot.xaxis.visible = last or panel.equal
-    plot.yaxis.ticker.desired_num_ticks = 4
-    legend: dict[str, list[Any]] = {}
-    for strips in panel.strips:
-        _note(legend, strips.label, _draw_strips(plot, strips))
-    for area in panel.areas:
-        _note(legend, area.label, _draw_area(plot, area))
-    for level in panel.levels:
-        plot.add_layout(Span(location=level, dimension="width", line_color=BLACK, line_alpha=0.6))
-    drawn = []
-    for line in panel.lines:
-        made = _draw_line(plot, line, line.label or panel.y_label.split("\n")[0])
-        drawn += made
-        for glyph in made:
-            _note(legend, line.label, glyph)
-    if panel.words:
-        x, y, words = zip(*panel.words, strict=True)
-        plot.text(x=list(x), y=list(y), text=[_plain(w) for w in words], x_offset=5,
-                  text_font_size="11px")  # fmt: skip
-    level = Span(dimension="width", line_color=BLACK, line_dash="dotted")
-    plot.add_tools(*tools, CrosshairTool(overlay=[cursor, level]))
-    if drawn:
-        plot.add_tools(_hover(drawn, panel))
-    # on a page that is scrolled, a figure must be asked before it takes a drag or a wheel
-    plot.toolbar.active_drag = plot.toolbar.active_scroll = None
     if legend and panel.legend:
-        items: Any = list(legend.items())
-        plot.add_layout(
-            Legend(
-                items=items, orientation="horizontal", border_line_color=None, padding=0, margin=2,
-                label_text_font_size="11px", spacing=12, ncols=min(3, len(items)),
-            ),
-            "above",
-        )  # fmt: skip
-        plot.height += _LEGEND_ROW * -(-len(items) // 3)
+        plot.properties["above"] = [_legend(legend)]
+        plot.properties["height"] += _LEGEND_ROW * -(-len(legend) // 3)
     return plot
 
 
-def _hover(drawn: list[Any], panel: Panel) -> Any:
-    from bokeh.models import HoverTool
+def _axis(label: str, **properties: Any) -> _Model:
+    return _Model(
+        "LinearAxis",
+        axis_label=_plain(label),
+        axis_label_text_font_style="normal",
+        axis_label_text_font_size="12px",
+        minor_tick_line_color=None,
+        **properties,
+    )
 
+
+def _legend(shown: dict[str, list[_Model]]) -> _Model:
+    items = [
+        _Model("LegendItem", label=_value(label), renderers=drawn) for label, drawn in shown.items()
+    ]
+    return _Model(
+        "Legend", items=items, orientation="horizontal", border_line_color=None, padding=0,
+        margin=2, label_text_font_size="11px", spacing=12, ncols=min(3, len(items)),
+    )  # fmt: skip
+
+
+def _hover(drawn: list[_Model], panel: Panel) -> _Model:
     # the name stands in a cell that the library escapes
-    return HoverTool(
+    return _Model(
+        "HoverTool",
         renderers=drawn,
         mode="mouse" if panel.equal else "vline",
         tooltips=[("", "$name"), ("", "$snap_y{0.0000}  at  $snap_x{0.00}")],
     )
 
 
-def _draw_line(plot: Any, line: Line, name: str) -> list[Any]:
-    data = {"x": _single(line.x), "y": _single(line.y)}
+def _drawn(glyph: str, data: dict[str, Any], name: str | None = None, **style: Any) -> _Model:
+    """Return something drawn of columns of data, each of the glyph's property of its name."""
+    columns = {column: {"type": "field", "field": column} for column in data}
+    return _Model(
+        "GlyphRenderer",
+        name=name,
+        data_source=_Model("ColumnDataSource", data={"type": "map", "entries": list(data.items())}),
+        glyph=_Model(glyph, **columns, **style),
+    )
+
+
+def _value(value: Any) -> dict[str, Any]:
+    """Return one value for all that a glyph draws."""
+    return {"type": "value", "value": value}
+
+
+def _draw_line(line: Line, name: str) -> list[_Model]:
+    data = {"x": line.x, "y": line.y}
     made = []
     if line.dash:
-        made.append(plot.line(
-            "x", "y", source=data, line_color=line.colour, line_dash=line.dash,
-            line_width=max(line.width, 1.0), name=name,
+        made.append(_drawn(
+            "Line", data, name, line_color=line.colour, line_width=max(line.width, 1.0),
+            line_dash=_DASHES[line.dash],
         ))  # fmt: skip
     if line.marker:
-        made.append(plot.scatter(
-            "x", "y", source=data, color=line.colour, marker=line.marker, name=name,
-            size=max(1.3 * line.size, 3.0),
+        made.append(_drawn(
+            "Scatter", data, name, marker=_value(line.marker), line_color=_value(line.colour),
+            fill_color=_value(line.colour), size=_value(max(1.3 * line.size, 3.0)),
         ))  # fmt: skip
     return made
 
 
-def _draw_area(plot: Any, area: Area) -> Any:
-    data = {
-        "xs": [_single(p[:, 0]) for p in area.polygons],
-        "ys": [_single(p[:, 1]) for p in area.polygons],
-    }
-    return plot.patches(
-        "xs", "ys", source=data, fill_color=area.colour or None, fill_alpha=area.opacity,
-        line_color=area.outline or None, line_width=0.8,
+def _draw_area(area: Area) -> _Model:
+    data = {"xs": [p[:, 0] for p in area.polygons], "ys": [p[:, 1] for p in area.polygons]}
+    return _drawn(
+        "Patches", data, fill_color=_value(area.colour or None), fill_alpha=_value(area.opacity),
+        line_color=_value(area.outline or None), line_width=_value(0.8),
     )  # fmt: skip
 
 
-def _draw_strips(plot: Any, strips: Strips) -> Any:
-    data = {"x0": _single(strips.spans[:, 0]), "x1": _single(strips.spans[:, 1])}
-    return plot.vstrip(
-        "x0", "x1", source=data, fill_color=strips.colour, fill_alpha=strips.opacity,
-        line_color=strips.colour, line_alpha=strips.opacity,
+def _draw_strips(strips: Strips) -> _Model:
+    colour, opacity = _value(strips.colour), _value(strips.opacity)
+    return _drawn(
+        "VStrip", {"x0": strips.spans[:, 0], "x1": strips.spans[:, 1]}, fill_color=colour,
+        fill_alpha=opacity, line_color=colour, line_alpha=opacity,
     )  # fmt: skip
 
 
-def _note(legend: dict[str, list[Any]], label: str, glyph: Any) -> None:
+def _draw_words(shown: Sequence[tuple[float, float, str]]) -> _Model:
+    x, y, words = zip(*shown, strict=True)
+    data = {"x": np.array(x), "y": np.array(y), "text": [_plain(word) for word in words]}
+    return _drawn(
+        "Text", data, x_offset=_value(5), text_font_size=_value("11px"), text_color=_value("black")
+    )
+
+
+def _note(legend: dict[str, list[_Model]], label: str, glyph: _Model) -> None:
     if label:
         legend.setdefault(_plain(label), []).append(glyph)
-
-
-def _single(values: Array) -> NDArray[np.float32]:
-    return np.asarray(values, np.float32)
 
 
 def _plain(text: str) -> str:
     """Return text in which nothing is taken for a formula."""
     return re.sub(r"\$\$|\\\(|\\\[", lambda found: found.group()[0] + "\u200b" + found.group()[1],
                   text)  # fmt: skip
-
-
-def _renamed(item: Any, prefix: str) -> Any:
-    """Return a document with its identifiers numbered in the order they appear in."""
-    names: dict[str, str] = {}
-
-    def visit(value: Any) -> Any:
-        if isinstance(value, dict):
-            found = dict(value)
-            for key in ("id", "root_id"):
-                if isinstance(found.get(key), str):
-                    old = found[key]
-                    found[key] = names.setdefault(old, f"{prefix}-{len(names)}")
-            return {k: v if k in ("id", "root_id") else visit(v) for k, v in found.items()}
-        if isinstance(value, (list, tuple)):
-            return [visit(v) for v in value]
-        return value
-
-    return visit(item)

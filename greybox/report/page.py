@@ -5,6 +5,7 @@ from __future__ import annotations
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -12,6 +13,8 @@ from typing import TYPE_CHECKING, Any, Literal
 from greybox.files import write_text
 
 if TYPE_CHECKING:
+    from jinja2 import Template
+
     from greybox.report.chart import Chart
 
 
@@ -207,8 +210,6 @@ def render(page: Page) -> str:
     Its policy forbids the network and every script but its own two, which are
     there only where a picture can be zoomed.
     """
-    from jinja2 import Environment
-
     charts: dict[int, tuple[str, str]] = {}
     scripts: list[str] = []
     shown = [*page.pictures, *(p for section in page.sections for p in section.pictures)]
@@ -220,13 +221,19 @@ def render(page: Page) -> str:
             assert picture.chart is not None
             charts[id(picture)] = (f"zoom{i}", chart_json(picture.chart, f"zoom{i}"))
         scripts = [library(), opener()]
-    template = Environment(autoescape=True, trim_blocks=True).from_string(_TEMPLATE)
-    return template.render(
+    return _template().render(
         page=page,
         chart_of=lambda picture: charts.get(id(picture)),
         scripts=scripts,
         policy=_policy(scripts),
     )
+
+
+@cache
+def _template() -> Template:
+    from jinja2 import Environment
+
+    return Environment(autoescape=True, trim_blocks=True).from_string(_TEMPLATE)
 
 
 def _policy(scripts: Sequence[str]) -> str:

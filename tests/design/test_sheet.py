@@ -320,8 +320,14 @@ def test_other_endings_are_refused(known, tmp_path):
     assert sheet_kind("a.HTM") == ".html"
 
 
-def test_the_page_says_what_is_saved(unsure):
-    html = without_scripts(render(design_page(unsure, ["regime chosen"], {"program": "p"})))
+@pytest.fixture(scope="module")
+def page(unsure):
+    """The page of the design whose model is uncertain."""
+    return render(design_page(unsure, ["regime chosen"], {"program": "p"}))
+
+
+def test_the_page_says_what_is_saved(unsure, page):
+    html = without_scripts(page)
     assert "This plan saves 150 s of trial" in html
     assert "at least 0.7 of the best possible" in html
     assert html.count("<svg") == 4
@@ -334,8 +340,8 @@ def test_the_page_says_what_is_saved(unsure):
     assert "Regime chosen." in html
 
 
-def test_the_page_of_a_plan_that_nothing_equals(known):
-    design = replace(known, efficiency_vs_random=None)
+def test_the_page_of_a_plan_that_nothing_equals(short):
+    design = replace(short, efficiency_vs_random=None)
     page = design_page(design, [], {}, "Tells A from B.")
     assert page.headline == "Tells A from B."
     assert design_page(design, [], {}).headline.startswith("No random two-level sequence")
@@ -356,10 +362,10 @@ def test_command_writes_both(ship, thesis, true_theta, tmp_path, monkeypatch, sh
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no browser installed")
-def test_in_a_browser(unsure, tmp_path):
+def test_in_a_browser(unsure, page, tmp_path):
     """No complaint on the console, no sideways scrolling on a phone, one page when printed."""
     write_sheet(unsure, tmp_path / "sheet.html")
-    (tmp_path / "page.html").write_text(render(design_page(unsure, [], {"program": "p"})))
+    (tmp_path / "page.html").write_text(page)
     for name in ("sheet", "page"):
         require_legible(tmp_path / f"{name}.html", 390)
     printed = tmp_path / "printed.pdf"

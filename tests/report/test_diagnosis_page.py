@@ -163,13 +163,25 @@ def pages():
     return {v: diagnosis_page(diagnosis_of(v, HOSTILE), RECORD) for v in VERDICTS}
 
 
-def text_of(page):
-    return re.sub(r"<[^>]+>", "", re.sub(r"<svg.*?</svg>", "", render(page), flags=re.S))
+@pytest.fixture(scope="module")
+def written(pages):
+    """The pages as HTML, without the scripts that are their own."""
+    return {v: without_scripts(render(page)) for v, page in pages.items()}
+
+
+@pytest.fixture(scope="module")
+def told(written):
+    """What the pages say."""
+    return {v: text_of(html) for v, html in written.items()}
+
+
+def text_of(html):
+    return re.sub(r"<[^>]+>", "", re.sub(r"<svg.*?</svg>", "", html, flags=re.S))
 
 
 @pytest.mark.parametrize("verdict", VERDICTS)
-def test_story_in_its_order(pages, verdict):
-    shown = text_of(pages[verdict])
+def test_story_in_its_order(told, verdict):
+    shown = told[verdict]
     places = [shown.index(f"{k}. ") for k in range(1, 7)]
     assert places == sorted(places)
     assert f"Verdict: {verdict}, after 52 causes were tried." in shown
@@ -181,22 +193,21 @@ def test_story_in_its_order(pages, verdict):
 
 
 @pytest.mark.parametrize("verdict", VERDICTS)
-def test_names_from_logs_are_escaped(pages, verdict):
-    html = render(pages[verdict])
-    html = without_scripts(html)
+def test_names_from_logs_are_escaped(written, verdict):
+    html = written[verdict]
     assert "<script>" not in html
     assert "<b>" not in html
     assert "&lt;script&gt;alert(&#34;x&#34;)&lt;/script&gt; &amp; $x^$" in html
 
 
-def test_nothing_is_fetched(pages):
-    html = without_scripts(render(pages["named"]))
+def test_nothing_is_fetched(written):
+    html = written["named"]
     assert not re.search(r'(?:src|href)="(?!#)', html)
     assert not re.search(r"url\((?!#)", html)
 
 
-def test_named(pages):
-    shown = text_of(pages["named"])
+def test_named(pages, written, told):
+    shown = told["named"]
     assert pages["named"].headline.startswith("Current: the errors of surge and sway turn")
     assert "surge is over-predicted by 0.21 m/s when heading south" in shown
     assert "surge from 41.2 % to 88.1 %" in shown
@@ -207,20 +218,20 @@ def test_named(pages):
     assert "current_north is 0.2000 ± 0.0040 m/s; before, the water stood still." in shown
     assert "Extension for current: the mean current, north and east." in shown
     assert "43.0 to 50.1" in shown
-    assert "<ins>N_|r|r·|r|·r</ins>" in render(pages["named"])
+    assert "<ins>N_|r|r·|r|·r</ins>" in written["named"]
 
 
-def test_none(pages):
-    shown = text_of(pages["none"])
+def test_none(pages, written, told):
+    shown = told["none"]
     assert "Nothing is wrong beyond noise." in shown
     assert "52 causes were tried; none of them proved itself." in shown
     assert "The model stays as it is." in shown
-    assert "<ins>" not in render(pages["none"])
+    assert "<ins>" not in written["none"]
     assert "before and after" not in pages["none"].sections[0].pictures[0].caption
 
 
-def test_confused(pages):
-    shown = text_of(pages["confused"])
+def test_confused(told):
+    shown = told["confused"]
     assert "these logs cannot tell which it is: current or heading_bias." in shown
     assert "greybox design --between" in shown
     assert "heading_bias looks like sway in proportion to surge" in shown
@@ -228,8 +239,8 @@ def test_confused(pages):
     assert "drawn at the edge" in shown
 
 
-def test_unexplained(pages):
-    shown = text_of(pages["unexplained"])
+def test_unexplained(told):
+    shown = told["unexplained"]
     assert "None of the 52 causes that were tried explains the errors. These help" in shown
     assert "current: the errors of surge and sway" in shown
 
@@ -246,9 +257,9 @@ def test_every_picture_says_what_it_shows(pages):
 
 def test_logs_without_runs_or_gain():
     bare = replace(diagnosis_of("unexplained"), runs=(), gain={}, steps=((),), partial=())
-    shown = text_of(diagnosis_page(bare, RECORD))
-    assert "No gain was measured." in shown
-    assert "<svg" not in render(diagnosis_page(bare, RECORD))
+    html = render(diagnosis_page(bare, RECORD))
+    assert "No gain was measured." in text_of(html)
+    assert "<svg" not in html
 
 
 @pytest.mark.long
@@ -260,10 +271,10 @@ def test_runs_that_run_away_are_left_out_and_said_so():
     errors = gather(diagnosis.runs)
     assert errors.lost == 100
     assert np.isfinite(errors.rms("before", "u"))
-    assert "runs away at 100 of 1200 samples" in text_of(diagnosis_page(diagnosis, RECORD))
+    assert "runs away at 100 of 1200 samples" in text_of(render(diagnosis_page(diagnosis, RECORD)))
 
 
-def test_the_command_that_errors_follow_is_shown(pages):
+def test_the_command_that_errors_follow_is_shown(told):
     run = runs_of(("one",), False)[0]
     n = run.log["n"]
     # commands are held for long: an error that follows one of them, and a little of all else
@@ -280,7 +291,7 @@ def test_the_command_that_errors_follow_is_shown(pages):
     two = replace(errors, commands={"n": np.where(n > np.median(n), 5.0, 3.0)})
     assert len(command_figure(two, "n").axes[0].get_lines()[0].get_xdata()) == 2
     assert most_followed(replace(errors, commands={})) is None
-    assert "by the command that it goes with most" in text_of(pages["named"])
+    assert "by the command that it goes with most" in told["named"]
 
 
 def test_runs_that_end_before_their_log():
@@ -295,7 +306,9 @@ def test_runs_that_end_before_their_log():
 @pytest.mark.long
 def test_causes_that_need_no_force_model():
     kinematic = replace(BIAS, key="heading_bias:kinematics", gain=0.0)
-    shown = text_of(diagnosis_page(replace(diagnosis_of("named"), causes=(kinematic,)), RECORD))
+    shown = text_of(
+        render(diagnosis_page(replace(diagnosis_of("named"), causes=(kinematic,)), RECORD))
+    )
     assert "none needed" in shown
     assert "0.0 ± " not in shown
 

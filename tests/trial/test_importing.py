@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pandas as pd
@@ -286,6 +287,24 @@ def large(case, n=9000):
     return table
 
 
+@pytest.fixture(scope="module")
+def raw_file(tmp_path_factory):
+    """A large log as a file, written once for all options."""
+    folder = tmp_path_factory.mktemp("large")
+
+    @cache
+    def written(case, ending):
+        path = folder / case / f"raw.{ending}"
+        path.parent.mkdir(exist_ok=True)
+        if ending == "csv":
+            large(case).to_csv(path, index=False)
+        else:
+            large(case).to_parquet(path, index=False, row_group_size=1000)
+        return path
+
+    return written
+
+
 @pytest.mark.parametrize("case", ["plain", "gaps", "geographic", "disorder", "modes"])
 @pytest.mark.parametrize(
     "options",
@@ -298,7 +317,7 @@ def large(case, n=9000):
 )  # fmt: skip
 @pytest.mark.parametrize("ending", ["csv", "parquet"])
 def test_blocks_give_the_log_that_memory_gives(
-    tmp_path, monkeypatch, limited, case, options, ending
+    tmp_path, monkeypatch, limited, raw_file, case, options, ending
 ):
     loop = {"closed_loop": {"column": "mode", "values": ["dp"]}}
     thrusters = [
@@ -306,12 +325,7 @@ def test_blocks_give_the_log_that_memory_gives(
         for x, a in ((9, "alpha1"), (-9, "alpha2"))
     ]
     vessel = vessel_from_dict({"name": "S", "length": 30, "thruster": thrusters} | loop)
-    raw = tmp_path / f"raw.{ending}"
-    table = large(case)
-    if ending == "csv":
-        table.to_csv(raw, index=False)
-    else:
-        table.to_parquet(raw, index=False, row_group_size=1000)
+    raw = raw_file(case, ending)
     chosen = ImportOptions(**options)
     first = import_files([raw], vessel, tmp_path / "a.csv", chosen)
     monkeypatch.setattr(stream, "_LARGE_CELLS", 0)

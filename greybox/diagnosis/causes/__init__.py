@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from importlib.metadata import entry_points
-
 from greybox.diagnosis.causes.cause import Cause, Context
 from greybox.diagnosis.causes.change import ParameterChange
 from greybox.diagnosis.causes.flow import Current, Wind
@@ -24,6 +22,7 @@ from greybox.diagnosis.causes.thrusters import (
     ThrusterLag,
 )
 from greybox.errors import UsageError
+from greybox.registry import entry_points
 
 __all__ = ["Cause", "Context", "known_causes"]
 

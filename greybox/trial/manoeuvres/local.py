@@ -216,12 +216,10 @@ def _needs_quartic(x: Array, y: Array) -> bool:
     if n < 10:
         return False
     basis = np.vander(x / np.abs(x).max(), 5, increasing=True)
-    sums = []
-    for p in (3, 5):
-        q, _ = np.linalg.qr(basis[:, :p])
-        rest = y - q @ (q.T @ y)
-        sums.append(float(rest @ rest))
-    coarse, fine = sums
+    # the first three columns span the parabolas
+    q, _ = np.linalg.qr(basis)
+    shares = q.T @ y
+    coarse, fine = (float(rest @ rest) for rest in (y - q[:, :p] @ shares[:p] for p in (3, 5)))
     if fine <= 1e-24 * float(y @ y):
         return coarse > 1e-20 * float(y @ y)
     ratio = (coarse - fine) / 2 / (fine / (n - 5))

@@ -7,11 +7,11 @@ import re
 import stat
 from collections.abc import Callable
 from importlib import import_module
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, cast
 
 from greybox.errors import LogError, suggestion
+from greybox.registry import entry_points
 from greybox.trial.raw_log import Recording
 from greybox.trial.readers.table import TableFile
 from greybox.trial.readers.topic_files import as_topic
