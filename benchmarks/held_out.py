@@ -271,7 +271,8 @@ def score(log: Path, run: Path) -> dict[str, list[float]]:
         lost = np.inf
         if found is not None:
             x = np.interp(measured["t"], found["t"], found[name])
-            lost = float(np.mean((x - y)[known] ** 2))
+            with np.errstate(over="ignore", invalid="ignore"):
+                lost = float(np.mean((x - y)[known] ** 2))
         error.append(min(lost, _WORST**2 * power) if np.isfinite(lost) else _WORST**2 * power)
         spread.append(power)
         count.append(float(known.sum()))
