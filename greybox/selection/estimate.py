@@ -16,6 +16,7 @@ from greybox.errors import ExcitationError, GreyboxError, LogError, UsageError
 from greybox.estimation.closed_loop import Loop
 from greybox.estimation.efficiency_bounds import limits_of
 from greybox.estimation.output_error import OutputErrorOptions
+from greybox.estimation.prediction_verdict import PredictionLevel
 from greybox.estimation.registry import ESTIMATORS, free_run_estimator
 from greybox.estimation.result import Estimate
 from greybox.estimation.solve import Covariance
@@ -41,8 +42,6 @@ _log = logging.getLogger(__name__)
 
 # share of length over speed that a sample may take
 _SHARE = 0.1
-# errors of a free run up to this many times the sensors' noise leave nothing to select terms for
-_MORE_THAN_NOISE = 1.5
 
 
 @known_keywords
@@ -169,11 +168,15 @@ def estimate_requested(logs: Sequence[TrialLog], request: Request) -> Estimate:
     if all(n is None for n in (request.method, *_named(request))):
         logs = at_own_pace(logs, notes)
     estimate = _first_choice(logs, request, notes)
-    refit: Refit | None = None
     if not request.judged:
         return estimate
-    if _open(request, estimate):
-        estimate, logs, refit = _or_selected_terms(estimate, logs, request)
+    if not _open(request, estimate):
+        return with_prediction(estimate, logs, request)
+    if _rank(estimate)[0] < 2:
+        judged = with_prediction(estimate, logs, request)
+        if judged.prediction is not None and judged.prediction.level is PredictionLevel.GOOD:
+            return judged
+    estimate, logs, refit = _or_selected_terms(estimate, logs, request)
     return with_prediction(estimate, logs, request, refit)
 
 
@@ -246,8 +249,6 @@ def _or_selected_terms(
 
     With it the logs with the thrust law that it has, and how to choose terms on fewer logs.
     """
-    if not leaves_more_than_noise(found, logs):
-        return found, logs, None
     before = f"{found.method} of structure '{found.predictor.structure.name}'"
     size = len(found.predictor.parameter_columns)
     try:
@@ -291,20 +292,6 @@ def nominal_model(structure: Structure, theta: Array, logs: Sequence[TrialLog]) 
     return ManoeuvringModel(
         structure, theta, np.zeros((len(theta), len(theta))), logs[0].sample_time, logs[0].vessel
     )
-
-
-def leaves_more_than_noise(estimate: Estimate, logs: Sequence[TrialLog]) -> bool:
-    """Whether the free run's error is larger than what the sensors' noise explains."""
-    states = estimate.predictor.structure.states
-    model = estimate.model()
-    runs = [run_model(model, log) for log in logs]
-    if any(r.diverged >= 0 for r in runs):
-        return True
-    errors = np.sqrt(np.mean(np.concatenate([r.errors() for r in runs]) ** 2, axis=0))
-    change = np.concatenate([np.diff(log.states(states), axis=0) for log in logs])
-    # white noise changes by √2 of itself from sample to sample, and the ship moves too
-    noise = np.sqrt(np.mean(change**2, axis=0) / 2)
-    return bool((errors > _MORE_THAN_NOISE * noise).any())
 
 
 def _without_regression(

@@ -1,0 +1,163 @@
+"""Selection of terms by free runs: what enters, how many, and what of it is told."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from foreign_ships import presets, write_campaign
+from virtual import virtual_log
+
+from greybox.commands.common import read_logs
+from greybox.model.catalogue import get_structure, structure_for
+from greybox.model.run.simulation import simulate
+from greybox.selection.estimate import at_own_pace, estimate_model
+from greybox.selection.family import family_for, first_terms, spell_structure
+from greybox.selection.free_run_selection import FreeRunSelection
+from greybox.selection.term_selection import select_terms
+from greybox.trial.log import make_log
+from greybox.validation.fit import average_fit, run_model
+from greybox.vessel.force import force_inputs
+from greybox.vessel.thrust import ThrustLaw
+from greybox.vessel.toml import load_vessel, vessel_from_dict
+
+SHIPS = [("taux", "tauy", "taun"), ("taux", "taun"),
+         ("taux", "race", "rudder", "race_drag", "rudder_drag")]  # fmt: skip
+
+
+@pytest.mark.parametrize("inputs", SHIPS)
+@pytest.mark.parametrize("wind", [False, True])
+def test_any_set_of_the_family_has_a_name_that_gives_it_back(inputs, wind):
+    names = family_for(inputs, wind).parameters
+    rng = np.random.default_rng(1)
+    for share in (0.2, 0.5, 1.0):
+        chosen = tuple(n for n in names if rng.random() < share)
+        made = structure_for(spell_structure(chosen, inputs), inputs)
+        assert set(made.parameters) == set(chosen)
+    assert set(first_terms(inputs)[1]) <= set(names)
+
+
+@pytest.fixture(scope="module")
+def modulus_log():
+    """A log of a ship with two terms more than the selection begins with."""
+    vessel = load_vessel("thesis")
+    structure = get_structure("linear").with_terms("N_|r|r", "Xuu")
+    values = {"Xu": -0.02, "Xvr": 0.3, "Xmu": 1e-3, "Yv": -0.1, "Yur": -0.2, "Ymu": 1e-3,
+              "Nr": -0.1, "Nuv": -5e-4, "Nmu": 1e-4, "N_|r|r": -3.0, "Xuu": -0.01}  # fmt: skip
+    rng = np.random.default_rng(3)
+    samples = 700
+    steps = np.repeat(rng.uniform(-1, 1, (samples // 35, 3)), 35, axis=0)
+    commands = {"n": 15 + 5 * steps[:, 0], "alpha1": steps[:, 1], "alpha2": 0.8 * steps[:, 2]}
+    tau = make_log(vessel, commands, 1.0).forces(structure.inputs)
+    theta = np.array([values[n] for n in structure.parameters])
+    run = simulate(structure, theta, np.array([1.0, 0.0, 0.0]), tau[:-1], 1.0)
+    x = run.x[0] + rng.standard_normal((samples, 3)) * [0.02, 0.01, 1e-3]
+    channels = commands | dict(zip("uvr", x.T, strict=True)) | {"psi": run.psi[0]}
+    return make_log(vessel, channels, 1.0, "modulus")
+
+
+def test_the_terms_that_a_ship_has_enter_first(modulus_log):
+    inputs = force_inputs(modulus_log.vessel)
+    selection = FreeRunSelection([modulus_log], family_for(inputs, False), "augmented")
+    first, stay = first_terms(inputs)
+    sets = selection.path(first, stay, len(first) + 4)
+    assert "N_|r|r" in sets[-1].terms
+    grown = [s.cost for s in sets if s.change.startswith("+")]
+    assert grown == sorted(grown, reverse=True)
+
+
+def test_what_enters_is_what_lowers_the_error_most_of_all_that_are_fitted(modulus_log):
+    """Beside the score: every single term is fitted to the end."""
+    inputs = force_inputs(modulus_log.vessel)
+    family = family_for(inputs, False)
+    selection = FreeRunSelection([modulus_log], family, "augmented")
+    first, stay = first_terms(inputs)
+    chosen = selection.path(first, stay, len(first) + 1)[1]
+    assert chosen.change == "+N_|r|r"
+    least = {}
+    for name in ("N_|r|r", "Xuu", "Yvv", "Nvv", "Y_|r|r", "X_vv", "N_rrr", "X_uu"):
+        (only,) = FreeRunSelection([modulus_log], family, "augmented").path(
+            (*first, name), stay, len(first) + 1
+        )
+        least[name] = only.cost
+    assert min(least, key=least.__getitem__) == "N_|r|r"
+    assert chosen.cost == pytest.approx(min(least.values()), rel=0.01)
+
+
+def test_damping_never_drives_the_ship(modulus_log):
+    inputs = force_inputs(modulus_log.vessel)
+    family = family_for(inputs, False)
+    selection = FreeRunSelection([modulus_log], family, "augmented")
+    for one in selection.path(*first_terms(inputs), 20):
+        for term in family.terms:
+            if term.dissipates:
+                assert one.p[selection.names.index(term.name)] <= 0
+
+
+def test_a_published_structure_stays_where_it_follows_within_noise():
+    found = estimate_model([virtual_log(4, 600, wind=0.0, spread=1e-12, current=(0.0, 0.0))])
+    assert found.predictor.structure.name.startswith(("thesis", "linear"))
+    assert not any("selected" in note for note in found.notes)
+
+
+def test_logs_are_taken_at_the_pace_of_the_ship():
+    vessel = vessel_from_dict(
+        {"name": "boat", "length": 10.0, "thruster": [{"type": "fixed", "speed": "n"}]}
+    )
+    count = 400
+    channels = dict.fromkeys(("v", "r", "psi"), np.zeros(count))
+    channels |= {"u": np.full(count, 2.0), "n": np.ones(count)}
+    notes: list[str] = []
+    (slower,) = at_own_pace([make_log(vessel, channels, 0.1)], notes)
+    assert slower.sample_time == pytest.approx(0.5)  # a tenth of 10 m over 2 m/s
+    assert "0.5 s instead of 0.1 s" in notes[0]
+    notes.clear()
+    same = [make_log(vessel, channels, 0.4)]
+    assert at_own_pace(same, notes) is same
+    assert not notes
+
+
+@pytest.fixture(scope="module")
+def catamaran(tmp_path_factory):
+    """Logs of a ship that shares no structure with the package: those to estimate on, and one."""
+    folder = tmp_path_factory.mktemp("catamaran")
+    kinds = ["random", "zigzag-20", "everyday", "turn-35"]
+    file, paths = write_campaign(folder, "survey-catamaran-2m", kinds, seed=5, every=5)
+    vessel = load_vessel(file)
+    return [read_logs([str(p)], vessel)[0] for p in paths]
+
+
+def test_thrust_that_goes_with_the_square_of_the_speed_is_told(catamaran):
+    logs = [log.window(0, 500, log.name) for part in catamaran[:3] for log in part]
+    choice = select_terms(logs, "nothing", 0, lambda _: _still(logs[0].vessel))
+    assert choice.taken
+    assert choice.logs[0].vessel.thrusters[0].thrust != ThrustLaw()
+    assert "thrust ~ n|n|" in choice.note
+    assert len(choice.parts) == 3
+    assert sum(row["chosen"] for row in choice.rows) == 1
+
+
+def _still(vessel):
+    from greybox.model.model import ManoeuvringModel
+
+    structure = structure_for("linear", force_inputs(vessel))
+    count = len(structure.parameters)
+    return ManoeuvringModel(structure, np.zeros(count), np.zeros((count, count)), 0.5, vessel)
+
+
+@pytest.mark.long
+def test_the_default_predicts_a_foreign_ship_better_than_a_published_structure(catamaran):
+    training = [log for part in catamaran[:3] for log in part]
+    held = catamaran[3]
+    published = estimate_model(training, method="oe", structure="modulus", judged=False).model()
+    chosen = estimate_model(training)
+    model = chosen.model()
+
+    def fit(model):
+        runs = [run_model(model, replace(log, vessel=model.vessel)) for log in held]
+        return np.mean([max(v, -100) for v in average_fit(runs).values()])
+
+    assert fit(model) > fit(published)
+    assert "terms were selected" in " ".join(chosen.notes)
+    assert presets()["survey-catamaran-2m"].ship.length == model.vessel.length
