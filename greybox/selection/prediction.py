@@ -17,6 +17,7 @@ from greybox.model.model import ManoeuvringModel
 from greybox.selection.alternatives import ranking_request
 from greybox.selection.cross_validation import EstimatorVariant, estimate_variant, parts_of
 from greybox.selection.request import Request
+from greybox.trial.kinematics import decimate_segments
 from greybox.trial.log import TrialLog
 from greybox.trial.segments import as_segments
 from greybox.validation.judge_prediction import HeldOut, judge_prediction
@@ -49,12 +50,16 @@ def with_prediction(
         A log that validates is one of those of the estimate.
     """
     model = estimate.model()
+    told: list[Reason] = []
+    if any(v == -np.inf for v in estimate.fit.values()):
+        told.append(Divergence())
     if request.validate:
-        _require_others(logs, request.validate)
+        require_others(logs, request.validate)
         held = [HeldOut.of(model, log) for log in as_segments(request.validate)]
-        verdict = judge_prediction(held, JudgedOn.VALIDATION, seed=request.seed)
+        verdict = judge_prediction(held, JudgedOn.VALIDATION, found=told, seed=request.seed)
         return replace(estimate, prediction=verdict)
     held, failed, parts = [], [], []
+    logs = _at_rate(logs, estimate.sample_time)
     try:
         parts = parts_of(logs)
     except UsageError as error:
@@ -70,18 +75,31 @@ def with_prediction(
         held += [HeldOut.of(other, log) for log in left_out]
     if not held:
         runs = [HeldOut.of(model, log) for log in logs]
-        found = [NothingHeldOut(failed[0])]
-        verdict = judge_prediction(runs, JudgedOn.OWN, found=found, seed=request.seed)
+        told.append(NothingHeldOut(failed[0]))
+        verdict = judge_prediction(runs, JudgedOn.OWN, found=told, seed=request.seed)
         return replace(estimate, prediction=verdict)
-    told: list[Reason] = [NotRefitted(len(failed), len(parts), failed[0])] if failed else []
-    if any(v == -np.inf for v in estimate.fit.values()):
-        told.append(Divergence())
+    if failed:
+        told.append(NotRefitted(len(failed), len(parts), failed[0]))
     verdict = judge_prediction(held, parts=len(parts) - len(failed), found=told, seed=request.seed)
     _log.info("prediction: %s", verdict.text)
     return replace(estimate, prediction=verdict)
 
 
-def _require_others(logs: Sequence[TrialLog], validate: Sequence[TrialLog]) -> None:
+def _at_rate(logs: Sequence[TrialLog], sample_time: float) -> Sequence[TrialLog]:
+    """Return logs at the sample time that an estimate from them was made at."""
+    if abs(logs[0].sample_time - sample_time) < 1e-6 * sample_time:
+        return logs
+    return decimate_segments(logs, sample_time)[0]
+
+
+def require_others(logs: Sequence[TrialLog], validate: Sequence[TrialLog]) -> None:
+    """Refuse a log that is to be estimated on and to validate the estimate.
+
+    Raises
+    ------
+    UsageError
+        Names it.
+    """
     own = {log.provenance.sha256 for log in logs if log.provenance.sha256}
     for log in validate:
         if log.provenance.sha256 in own:

@@ -96,6 +96,20 @@ def test_a_log_too_short_for_parts_is_judged_on_itself(logs):
     assert "judged on its own logs, nothing was held out" in found.text
 
 
+def test_logs_faster_than_the_estimate_are_taken_at_its_rate(estimate, logs):
+    fast = [replace(log, t=log.t / 2, sample_time=0.5) for log in logs]
+    seen = []
+
+    def refit(fitting):
+        seen.extend(log.sample_time for log in fitting)
+        return estimate.model()
+
+    found = with_prediction(estimate, fast, Request(), refit).prediction
+    assert set(seen) == {1.0}
+    # half a window is lost at each log's end
+    assert found.samples == 5 * 149
+
+
 def test_logs_given_to_validate_judge(estimate, logs):
     other = replace(logs[0], channels=logs[0].channels | {"v": logs[0]["v"][::-1].copy()})
     found = with_prediction(estimate, logs, Request(validate=(other,))).prediction
