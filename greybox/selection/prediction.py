@@ -55,11 +55,12 @@ def with_prediction(
         told.append(Divergence())
     if request.validate:
         require_others(logs, request.validate)
-        held = [HeldOut.of(model, log) for log in as_segments(request.validate)]
+        others = _as_read(as_segments(request.validate), estimate)
+        held = [HeldOut.of(model, log) for log in others]
         verdict = judge_prediction(held, JudgedOn.VALIDATION, found=told, seed=request.seed)
         return replace(estimate, prediction=verdict)
     held, failed, parts = [], [], []
-    logs = _at_rate(logs, estimate.sample_time)
+    logs = _as_read(logs, estimate)
     try:
         parts = parts_of(logs)
     except UsageError as error:
@@ -85,11 +86,16 @@ def with_prediction(
     return replace(estimate, prediction=verdict)
 
 
-def _at_rate(logs: Sequence[TrialLog], sample_time: float) -> Sequence[TrialLog]:
-    """Return logs at the sample time that an estimate from them was made at."""
-    if abs(logs[0].sample_time - sample_time) < 1e-6 * sample_time:
-        return logs
-    return decimate_segments(logs, sample_time)[0]
+def _as_read(logs: Sequence[TrialLog], estimate: Estimate) -> Sequence[TrialLog]:
+    """Return logs as an estimate reads them: at its sample time, with its vessel.
+
+    The data may have chosen both: a step, and a thrust law.
+    """
+    own = [log if log.vessel == estimate.vessel else replace(log, vessel=estimate.vessel)
+           for log in logs]  # fmt: skip
+    if abs(own[0].sample_time - estimate.sample_time) < 1e-6 * estimate.sample_time:
+        return own
+    return decimate_segments(own, estimate.sample_time)[0]
 
 
 def require_others(logs: Sequence[TrialLog], validate: Sequence[TrialLog]) -> None:
