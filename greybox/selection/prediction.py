@@ -55,12 +55,12 @@ def with_prediction(
         told.append(Divergence())
     if request.validate:
         require_others(logs, request.validate)
-        others = _as_read(as_segments(request.validate), estimate)
+        others = as_read(as_segments(request.validate), estimate)
         held = [HeldOut.of(model, log) for log in others]
         verdict = judge_prediction(held, JudgedOn.VALIDATION, found=told, seed=request.seed)
         return replace(estimate, prediction=verdict)
     held, failed, parts = [], [], []
-    logs = _as_read(logs, estimate)
+    logs = as_read(logs, estimate)
     try:
         parts = parts_of(logs)
     except UsageError as error:
@@ -86,7 +86,7 @@ def with_prediction(
     return replace(estimate, prediction=verdict)
 
 
-def _as_read(logs: Sequence[TrialLog], estimate: Estimate) -> Sequence[TrialLog]:
+def as_read(logs: Sequence[TrialLog], estimate: Estimate) -> Sequence[TrialLog]:
     """Return logs as an estimate reads them: at its sample time, with its vessel.
 
     The data may have chosen both: a step, and a thrust law.
