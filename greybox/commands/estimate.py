@@ -318,8 +318,9 @@ def run(options: argparse.Namespace) -> None:
     if options.report:
         from greybox.report.estimation import estimation_page
         from greybox.report.page import write_page
+        from greybox.selection.prediction import as_read
 
-        page = estimation_page(estimate, logs, made, choice=choice, mass=mass)
+        page = estimation_page(estimate, as_read(logs, estimate), made, choice=choice, mass=mass)
         write_page(page, options.report)
     if options.json != "-":
         say(estimate.summary())

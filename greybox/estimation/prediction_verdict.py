@@ -350,6 +350,31 @@ class NoBands(Reason):
         return f"there are no bands to judge: {self.because}"
 
 
+@dataclass(frozen=True)
+class DrawsDiverge(Reason):
+    """Models within the standard errors diverge, so that there is no band.
+
+    Parameters
+    ----------
+    logs : tuple of str
+    count : int
+        Of all runs.
+    """
+
+    logs: tuple[str, ...]
+    count: int
+
+    kind: ClassVar[str] = "draws_diverge"
+
+    @property
+    def sentence(self) -> str:
+        """On how many logs."""
+        return (
+            f"in {len(self.logs)} of {self.count} runs half of the models within its standard "
+            f"errors diverge, so it has no bands"
+        )
+
+
 @dataclass(frozen=True, repr=False)
 class PredictionVerdict(DisplayMixin):
     """What a model's free run is good for.

@@ -29,7 +29,7 @@ from greybox.selection.alternatives import Alternative, alternatives_for, rankin
 from greybox.selection.cross_validation import EstimatorVariant, compare_estimators
 from greybox.selection.fit_single import estimate_once
 from greybox.selection.held_out import FLOOR
-from greybox.selection.prediction import Refit, refit_alike, with_prediction
+from greybox.selection.prediction import Refit, refit_alike, require_others, with_prediction
 from greybox.selection.request import Request, regression_only
 from greybox.selection.term_selection import Terms, select_terms
 from greybox.trial.kinematics import decimate_segments
@@ -163,6 +163,7 @@ def estimate_model(
 @one_thread
 def estimate_requested(logs: Sequence[TrialLog], request: Request) -> Estimate:
     """Return what `estimate_model` does of a request."""
+    require_others(logs, request.validate)
     common_sample_time(logs)
     notes: list[str] = []
     if all(n is None for n in (request.method, *_named(request))):

@@ -17,6 +17,7 @@ from greybox.model.model import ManoeuvringModel
 from greybox.selection.alternatives import ranking_request
 from greybox.selection.cross_validation import EstimatorVariant, estimate_variant, parts_of
 from greybox.selection.request import Request
+from greybox.trial.kinematics import decimate_segments
 from greybox.trial.log import TrialLog
 from greybox.trial.segments import as_segments
 from greybox.validation.judge_prediction import HeldOut, judge_prediction
@@ -49,12 +50,17 @@ def with_prediction(
         A log that validates is one of those of the estimate.
     """
     model = estimate.model()
+    told: list[Reason] = []
+    if any(v == -np.inf for v in estimate.fit.values()):
+        told.append(Divergence())
     if request.validate:
-        _require_others(logs, request.validate)
-        held = [HeldOut.of(model, log) for log in as_segments(request.validate)]
-        verdict = judge_prediction(held, JudgedOn.VALIDATION, seed=request.seed)
+        require_others(logs, request.validate)
+        others = as_read(as_segments(request.validate), estimate)
+        held = [HeldOut.of(model, log) for log in others]
+        verdict = judge_prediction(held, JudgedOn.VALIDATION, found=told, seed=request.seed)
         return replace(estimate, prediction=verdict)
     held, failed, parts = [], [], []
+    logs = as_read(logs, estimate)
     try:
         parts = parts_of(logs)
     except UsageError as error:
@@ -70,18 +76,36 @@ def with_prediction(
         held += [HeldOut.of(other, log) for log in left_out]
     if not held:
         runs = [HeldOut.of(model, log) for log in logs]
-        found = [NothingHeldOut(failed[0])]
-        verdict = judge_prediction(runs, JudgedOn.OWN, found=found, seed=request.seed)
+        told.append(NothingHeldOut(failed[0]))
+        verdict = judge_prediction(runs, JudgedOn.OWN, found=told, seed=request.seed)
         return replace(estimate, prediction=verdict)
-    told: list[Reason] = [NotRefitted(len(failed), len(parts), failed[0])] if failed else []
-    if any(v == -np.inf for v in estimate.fit.values()):
-        told.append(Divergence())
+    if failed:
+        told.append(NotRefitted(len(failed), len(parts), failed[0]))
     verdict = judge_prediction(held, parts=len(parts) - len(failed), found=told, seed=request.seed)
     _log.info("prediction: %s", verdict.text)
     return replace(estimate, prediction=verdict)
 
 
-def _require_others(logs: Sequence[TrialLog], validate: Sequence[TrialLog]) -> None:
+def as_read(logs: Sequence[TrialLog], estimate: Estimate) -> Sequence[TrialLog]:
+    """Return logs as an estimate reads them: at its sample time, with its vessel.
+
+    The data may have chosen both: a step, and a thrust law.
+    """
+    own = [log if log.vessel == estimate.vessel else replace(log, vessel=estimate.vessel)
+           for log in logs]  # fmt: skip
+    if abs(own[0].sample_time - estimate.sample_time) < 1e-6 * estimate.sample_time:
+        return own
+    return decimate_segments(own, estimate.sample_time)[0]
+
+
+def require_others(logs: Sequence[TrialLog], validate: Sequence[TrialLog]) -> None:
+    """Refuse a log that is to be estimated on and to validate the estimate.
+
+    Raises
+    ------
+    UsageError
+        Names it.
+    """
     own = {log.provenance.sha256 for log in logs if log.provenance.sha256}
     for log in validate:
         if log.provenance.sha256 in own:

@@ -13,6 +13,7 @@ from greybox.estimation.prediction_verdict import (
     LIMITS,
     BandShare,
     ChannelPrediction,
+    DrawsDiverge,
     JudgedOn,
     NoBands,
     PredictionLimits,
@@ -246,16 +247,18 @@ def _bands(
 ) -> tuple[dict[str, BandShare], list[Reason]]:
     """Return how many measurements the bands hold, by state, and why there are none."""
     if all(h.model.noise is None for h in held):
-        return {}, [NoBands("the estimate has no noise levels (--method iv or oe has them)")]
+        return {}, [NoBands("the estimate has no noise levels")]
     # errors in half widths of the band
     outward: dict[str, list[Array]] = {s: [] for s in states}
+    lost: list[str] = []
     for h in held:
         run = h.run
         if h.model.noise is None or run.diverged >= 0:
             continue
         limits = predict_bands(h.model, run.log, seed=seed, runs=_DRAWS).measurement
         if np.isnan(limits).any():
-            return {}, [NoBands("too many draws of its parameters diverge")]
+            lost.append(run.log.name)
+            continue
         for i, s in enumerate(states):
             known = run.log.known((s,))
             y = run.log[s]
@@ -272,4 +275,4 @@ def _bands(
             share = float((np.abs(whole) <= 1).mean())
             worth = float(independent_samples(parts, np.zeros(1))[0])
             found[s] = BandShare(share, wilson_interval(share, worth), len(whole), worth)
-    return found, []
+    return found, [DrawsDiverge(tuple(lost), len(held))] if lost else []

@@ -96,6 +96,33 @@ def test_a_log_too_short_for_parts_is_judged_on_itself(logs):
     assert "judged on its own logs, nothing was held out" in found.text
 
 
+def test_logs_faster_than_the_estimate_are_taken_at_its_rate(estimate, logs):
+    fast = [replace(log, t=log.t / 2, sample_time=0.5) for log in logs]
+    seen = []
+
+    def refit(fitting):
+        seen.extend(log.sample_time for log in fitting)
+        return estimate.model()
+
+    found = with_prediction(estimate, fast, Request(), refit).prediction
+    assert set(seen) == {1.0}
+    # half a window is lost at each log's end
+    assert found.samples == 5 * 149
+
+
+def test_logs_are_read_with_the_vessel_of_the_estimate(estimate, logs):
+    """Its thrust law may be another than that of the vessel file: here all push twice as much."""
+    thrusters = estimate.vessel.thrusters
+    stronger = replace(
+        estimate.vessel, thrusters=tuple(replace(t, gain=2 * t.gain) for t in thrusters)
+    )
+    double = [replace(log, vessel=stronger) for log in logs]
+    found = with_prediction(estimate, double, Request(), lambda _: estimate.model()).prediction
+    assert found.text == "good"
+    found = with_prediction(estimate, logs, Request(validate=tuple(double))).prediction
+    assert found.text == "good"
+
+
 def test_logs_given_to_validate_judge(estimate, logs):
     other = replace(logs[0], channels=logs[0].channels | {"v": logs[0]["v"][::-1].copy()})
     found = with_prediction(estimate, logs, Request(validate=(other,))).prediction

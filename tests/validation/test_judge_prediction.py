@@ -157,6 +157,19 @@ def test_a_run_that_diverges_is_poor(log):
     assert judged(channel(), found=[RunsDiverge(("a",), 8, 12.0)]).level is PredictionLevel.POOR
 
 
+def test_models_within_the_standard_errors_that_diverge_limit_it(log):
+    model = true_model(log)
+    wide = np.zeros_like(model.covariance)
+    i = model.names.index("Nr")
+    wide[i, i] = 30.0**2
+    found = judge_prediction([HeldOut.of(replace(model, covariance=wide), log)])
+    assert found.text == (
+        "limited: in 1 of 1 runs half of the models within its standard errors diverge, so it "
+        "has no bands"
+    )
+    assert found.coverage == {}
+
+
 def test_its_own_logs_never_make_a_model_good():
     own = NothingHeldOut("it has 50 samples.")
     found = judged(channel("u", 0.1), found=[own], judged_on=JudgedOn.OWN)
