@@ -71,6 +71,7 @@ def results(ship, thesis, true_theta):
         log,
         estimate,
         estimate.verdict,
+        gb.estimate_model([log], method="ls", predictor="basic").prediction,
         estimate.predictor,
         gb.TestResult("wald", HOSTILE, 1.0, 0.3, HOSTILE),
         gb.Verdict(gb.TrustLevel.TRUST_EXCEPT, (HOSTILE,), (SharedMoment(HOSTILE),)),
@@ -125,7 +126,7 @@ def test_public_results_are_all_there(results):
         "DesignRequest", "Rival", "TrialLimits", "Wishes",
     }  # fmt: skip
     promised = {n for p in (gb, ed) for n in p.__all__ if n[0].isupper()} - asked
-    promised -= {"Cause", "TrustLevel"}
+    promised -= {"Cause", "TrustLevel", "PredictionLevel"}
     assert promised <= shown
 
 

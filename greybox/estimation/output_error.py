@@ -106,8 +106,10 @@ class OutputErrorOptions:
         latter is for a model that leaves more than noise; the measured heading then
         drives the run unless it is asked for as an output.
     search : bool
-        Whether other ways are tried where errors stay large, and noise levels are sought;
-        without, the fit ends at the optimum that is nearest to its start.
+        Whether other ways are tried where errors stay large; without, the fit ends at the
+        optimum that is nearest to its start.
+    levels : bool
+        Whether the noise levels of sensors and process are sought once the fit has ended.
     """
 
     process_noise: bool = False
@@ -121,6 +123,7 @@ class OutputErrorOptions:
     covariance: Literal["ma", "hac", "white"] = "ma"
     weights: Weights = "noise"
     search: bool = True
+    levels: bool = True
 
 
 @known_keywords
@@ -469,11 +472,11 @@ def _result(fitted: _Fitted, logs: Sequence[TrialLog], options: OutputErrorOptio
         iteration=Iteration(fit.iterations, status, fit.converged),
         current=tuple((n, float(v), float(s)) for n, (v, s) in means.items() if n in CURRENT),
         current_covariance=covariance[np.ix_([*range(count), *flow], flow)],
-        noise=_noise_levels(fitted, logs, options.weights) if options.search else None,
+        noise=_noise_levels(fitted, logs, options.weights) if options.levels else None,
         notes=tuple(notes),
         tests=(
             *_excitation_tests(model, fitted.hessian, bound),
-            *(_slow_tests(fitted.slow) if options.search and not options.process_noise else ()),
+            *(_slow_tests(fitted.slow) if options.levels and not options.process_noise else ()),
         ),
     )
 

@@ -13,6 +13,8 @@ from greybox.model.terms import parameter_unit
 from greybox.trial.validity import in_words
 
 WIDTH = 100
+# of a value beside its label
+_CELL = 28
 # closed intervals, None for an infinite end
 Pieces = Sequence[Sequence[float | None]]
 _GROUPS = {
@@ -87,15 +89,22 @@ def _wrapped(text: str, indent: str) -> list[str]:
 
 def _head(estimate: EstimateValues) -> list[str]:
     method = estimate.method + (", prefiltered" if estimate.prefilter == "noise" else "")
+    structure = estimate.predictor.structure
+    name = structure.name
     rows = (
         ("Method:", method, "Samples:", f"{estimate.data.samples}"),
         ("Predictor:", estimate.predictor.kind, "Samples used:", f"{estimate.data.kept}"),
-        ("Structure:", estimate.predictor.structure.name, "Sample time:",
-         f"{estimate.sample_time:g} s"),
+        ("Structure:", name if len(name) < _CELL else f"{len(structure.terms)} terms (below)",
+         "Sample time:", f"{estimate.sample_time:g} s"),
         ("Std errors:", f"{estimate.covariance_kind}, {estimate.lags} lags", "Refinements:",
          f"{estimate.iteration.count}"),
     )  # fmt: skip
-    return [f"{a:<18}{b:<28}{c:<18}{d}" for a, b, c, d in rows]
+    lines = [f"{a:<18}{b:<{_CELL}}{c:<18}{d}" for a, b, c, d in rows]
+    if len(name) >= _CELL:
+        # where a line may break: before each term that came or went
+        told = name.replace("+", " +").replace("-", " -")
+        lines += _wrapped(f"Structure: {told}", "  ")
+    return lines
 
 
 def _table(estimate: EstimateValues) -> list[str]:

@@ -214,7 +214,7 @@ def _estimates(
         covariance="white",
         refine=_REFINEMENTS if request.refine else False,
         judged=False,
-        output_error=replace(request.output_error, search=False, process_noise=False),
+        output_error=replace(request.output_error, search=False, levels=False, process_noise=False),
     )
     found: dict[EstimatorVariant, Estimate | None] = {}
     start: Estimate | None = None

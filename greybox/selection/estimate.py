@@ -41,7 +41,7 @@ Array = NDArray[np.float64]
 _log = logging.getLogger(__name__)
 
 # share of length over speed that a sample may take
-_SHARE = 0.1
+_SHARE = 0.05
 
 
 @known_keywords
@@ -175,9 +175,9 @@ def estimate_requested(logs: Sequence[TrialLog], request: Request) -> Estimate:
         return with_prediction(estimate, logs, request)
     if _rank(estimate)[0] < 2:
         judged = with_prediction(estimate, logs, request)
-        if judged.prediction is not None and judged.prediction.level is PredictionLevel.GOOD:
+        if judged.prediction is None or judged.prediction.level is not PredictionLevel.POOR:
             return judged
-    estimate, logs, refit = _or_selected_terms(estimate, logs, request)
+    estimate, logs, refit = _or_selected_terms(estimate, logs, request, notes)
     return with_prediction(estimate, logs, request, refit)
 
 
@@ -194,13 +194,13 @@ def _first_choice(logs: Sequence[TrialLog], request: Request, notes: list[str]) 
         estimate = _without_regression(logs, alternatives, request, notes, error)
     if request.method is not None or not request.judged or regression_only(request):
         return estimate
-    if _open(request, estimate) or _rank(estimate)[0] == 0:
+    if _rank(estimate)[0] == 0:
         return estimate
     tried: Estimate | None = None
     if not ESTIMATORS[estimate.method].free_run and not misfit(estimate.tests):
         # what the structure lacks no other estimator mends
         estimate, tried = _or_output_error(estimate, logs, request, notes)
-    if _at_fault(estimate, tried):
+    if _at_fault(estimate, tried) and not _open(request, estimate):
         return _by_held_out_runs(estimate, tried, logs, request, notes)
     return estimate
 
@@ -220,8 +220,8 @@ def _named(request: Request) -> tuple[object, ...]:
 def at_own_pace(logs: Sequence[TrialLog], notes: list[str]) -> Sequence[TrialLog]:
     """Return logs at a sample time that suits how fast the ship moves; `notes` are told.
 
-    A ship answers in times of the order of its length over its speed: a tenth of that shows
-    all of it, and more samples hold sensor noise and cost time.
+    A ship answers in times of the order of its length over its speed: a twentieth of that
+    shows all of it, and more samples hold sensor noise and cost time.
     """
     speeds = [np.hypot(log["u"], log["v"]) for log in logs if {"u", "v"} <= log.channels.keys()]
     if not speeds:
@@ -237,14 +237,14 @@ def at_own_pace(logs: Sequence[TrialLog], notes: list[str]) -> Sequence[TrialLog
         return logs
     notes.append(
         f"the logs were taken at {times * own:g} s instead of {own:g} s, the next multiple below "
-        f"a tenth of length over speed ({length:g} m, {speed:.3g} m/s); --sample-time sets it."
+        f"a twentieth of length over speed ({length:g} m, {speed:.3g} m/s); --sample-time sets it."
     )
     notes += left_out
     return slower
 
 
 def _or_selected_terms(
-    found: Estimate, logs: Sequence[TrialLog], request: Request
+    found: Estimate, logs: Sequence[TrialLog], request: Request, notes: Sequence[str]
 ) -> tuple[Estimate, Sequence[TrialLog], Refit | None]:
     """Return the free run of terms that the data select, where it predicts better than `found`.
 
@@ -260,7 +260,9 @@ def _or_selected_terms(
     if not choice.taken:
         return told, logs, None
     try:
-        estimate, diverged = _finished(*_of_terms(choice.terms, choice.logs, request, choice.note))
+        estimate, diverged = _finished(
+            *_of_terms(choice.terms, choice.logs, request), [*notes, choice.note]
+        )
     except GreyboxError as error:
         note = f"the selected terms could not be estimated on the whole logs: {error}"
         return _noting(told, note), logs, None
@@ -269,23 +271,31 @@ def _or_selected_terms(
     remaining = iter(choice.parts)
 
     def refit(fitting: Sequence[TrialLog]) -> ManoeuvringModel:
+        """Estimate the terms that these logs choose, their noise that of all logs."""
         terms = next(remaining)
         if terms is None:
             raise ExcitationError("no terms were selected on a part of the logs.")
-        way, on, asked, _ = _of_terms(terms, fitting, ranking_request(request))
-        return estimate_once(on, way.structure, way.method, way.kind, asked).model()
+        way, on, asked = _of_terms(terms, fitting, ranking_request(request))
+        model = estimate_once(on, way.structure, way.method, way.kind, asked).model()
+        return replace(model, noise=estimate.noise)
 
     return estimate, choice.logs, refit
 
 
 def _of_terms(
-    terms: Terms, logs: Sequence[TrialLog], request: Request, *notes: str
-) -> tuple[Alternative, Sequence[TrialLog], Request, Sequence[str]]:
+    terms: Terms, logs: Sequence[TrialLog], request: Request
+) -> tuple[Alternative, Sequence[TrialLog], Request]:
     """Return how selected terms are estimated: a free run from where their selection ended."""
-    options = replace(request.output_error, search=False, heading="input", damping="enforce")
+    options = replace(
+        request.output_error,
+        search=False,
+        levels=request.judged,
+        heading="input",
+        damping="enforce",
+    )
     start = nominal_model(terms.structure, terms.start, logs)
     asked = replace(request, nominal=start, output_error=options)
-    return Alternative(terms.structure, free_run_estimator().name, terms.kind), logs, asked, notes
+    return Alternative(terms.structure, free_run_estimator().name, terms.kind), logs, asked
 
 
 def nominal_model(structure: Structure, theta: Array, logs: Sequence[TrialLog]) -> ManoeuvringModel:

@@ -122,7 +122,7 @@ def refit_alike(estimate: Estimate, request: Request) -> Refit:
     """
     quick = replace(
         ranking_request(request),
-        output_error=replace(request.output_error, search=False, process_noise=False),
+        output_error=replace(request.output_error, search=False, levels=False, process_noise=False),
         prefilter=request.prefilter if estimate.prefilter == "noise" else "none",
         # a free run starts from the estimate itself, which has its current too
         nominal=None if ESTIMATORS[estimate.method].free_run else estimate.model(),

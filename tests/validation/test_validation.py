@@ -155,13 +155,13 @@ def test_output_error_that_is_judged_no_better_is_left(monkeypatch):
     doubtful = refused([NoRegression("a reason")], ())
     monkeypatch.setattr("greybox.selection.estimate._verdict", lambda *_: doubtful)
     # of two that are not to be trusted the one that simulates is taken …
-    e = estimate_model([log])
+    e = estimate_model([log], structure="thesis")
     assert e.method == "oe"
     assert "its free run is better than a constant in more of the states" in e.notes[-1]
     # … and the first where both do and nothing speaks against the model
     monkeypatch.setattr("greybox.selection.estimate._poor", lambda fit: [])
     monkeypatch.setattr("greybox.selection.estimate._at_fault", lambda *_: False)
-    e = estimate_model([log])
+    e = estimate_model([log], structure="thesis")
     assert e.method == "iv"
     assert e.notes[-1] == (
         "output error was tried too, and is judged no better: 'do not trust: a reason'."
@@ -175,7 +175,7 @@ def test_output_error_that_fails_is_told(monkeypatch):
     log = virtual_log(4, 1500, spread=0.0)
     monkeypatch.setattr("greybox.estimation.output_error.estimate_oe", fail)
     monkeypatch.setattr("greybox.selection.estimate._at_fault", lambda *_: False)
-    e = estimate_model([log])
+    e = estimate_model([log], structure="thesis")
     assert e.method != "oe"
     assert "output error was tried too, and failed: the run leaves every bound." in e.notes
 
