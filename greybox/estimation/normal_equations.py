@@ -104,4 +104,6 @@ def solve_stacked(
         (row.T @ basis) * size[:, None] for row, basis in zip(rows, bases, strict=True)
     )
     information = (stacked.T @ stacked) * np.outer(size, size)
-    return Solution(theta, information, projected, values, vt[-1])
+    # where every row was cut no direction is the weakest
+    weakest = vt[-1] if len(vt) else np.zeros(p)
+    return Solution(theta, information, projected, values, weakest)
