@@ -8,6 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
+from foreign_ships import presets
+from foreign_ships.manoeuvres import kinds
 from virtual import as_recording, recorded
 
 from greybox.commands.main import main
@@ -19,7 +21,7 @@ from greybox.trial.checks.sensor_offsets.find import Tied, find_offsets
 from greybox.trial.import_files import import_files
 from greybox.trial.repair import repair
 from greybox.trial.steps import mend
-from greybox.vessel.toml import vessel_from_dict
+from greybox.vessel.toml import load_vessel, vessel_from_dict
 
 
 def logs_of(seeds, how=None, **common):
@@ -119,6 +121,17 @@ def test_without_thrusters_the_positions_are_moved(ship):
     (f,) = offsets([r], ship)[0].values()
     assert "unknown" in f.evidence
     assert f.repair[0].channels == ("x_n", "y_n")
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+def test_a_regular_zigzag_of_a_ship_that_hardly_drifts_has_no_late_clock(seed, tmp_path):
+    """Of ships by others: steps that fit the noise of one alignment only are taken back."""
+    preset = presets()["survey-catamaran-2m"]
+    file = tmp_path / "zigzag.csv"
+    preset.sail(kinds()["zigzag-10"], seed=seed).write_csv(file)
+    (tmp_path / "ship.toml").write_text(preset.ship.vessel_toml())
+    (report,) = check_files([file], load_vessel(tmp_path / "ship.toml"))
+    assert not {"clock_offset", "lever_arm", "heading_bias"} & {f.id for f in report.findings}
 
 
 def test_what_a_ship_cannot_have_is_asked(ship):

@@ -26,6 +26,8 @@ _ROUNDS = 15
 _SCAN_STEP = 1.4
 # a place found by the scan must fit this much better to be preferred, in log-likelihood
 _LEAST_GAIN = 8.0
+# in log-likelihood: a round that loses less has not gone wrong
+_LEAST_LOSS = 1.0
 # residuals may be coloured over this time [s]
 _MEMORY = 8.0
 # columns of what a log has of its own, see `Residuals`, and the place of the velocities' scale
@@ -58,9 +60,15 @@ class Likelihood:
         self.tie = tie
         self._blocks: list[tuple[float, float, Array]] = []
 
-    def adapt(self, residuals: Residuals) -> None:
-        """Estimate gains, standard deviations and weights of innovations at these residuals."""
-        self._blocks = []
+    def adapt(self, residuals: Residuals) -> float:
+        """Estimate gains, standard deviations and weights of innovations at these residuals.
+
+        Returns
+        -------
+        float
+            Minus the log-likelihood of the residuals, constants left out.
+        """
+        self._blocks, level = [], 0.0
         for z, x in self._parts(residuals):
             own = np.concatenate([z[:, :, None], x[:, :, SIZE:]], axis=2)
             found = min((self._tried(own, float(gain)) for gain in GAINS), key=_first)
@@ -69,6 +77,8 @@ class Likelihood:
             rest = white[:, 0] - white[:, 1:] @ solve(white[:, 1:], white[:, 0])
             std = float(np.sqrt(np.mean(rest**2)))
             self._blocks.append((gain, max(std, 1e-150), weight))
+            level += rest.size * float(np.log(max(std, 1e-150)))
+        return level
 
     def rows(self, residuals: Residuals, *, scaled: bool = True) -> tuple[Array, Array]:
         """Return whitened residuals (N, c) and columns (N, c, `SIZE`), a log's own projected out.
@@ -155,10 +165,17 @@ def fit(likelihood: Likelihood, start: Array, prior: Array) -> Array:
     def cost(at: Array) -> float:
         return likelihood.misfit(at) + 0.5 * float(np.sum(weight * (at - expected) ** 2))
 
+    best, least = offsets, np.inf
     for _ in range(_ROUNDS):
         tie.align(offsets)
         residuals = tie.residuals(offsets)
-        likelihood.adapt(residuals)
+        level = likelihood.adapt(residuals)
+        level += 0.5 * float(np.sum(weight * (offsets - expected) ** 2))
+        if level > least + _LEAST_LOSS:
+            # downhill for the weights of the round before only: channels were taken later by a
+            # whole sample, or their noise was weighed otherwise
+            return best
+        best, least = offsets, level
         y, x = likelihood.rows(residuals)
         flat = x.reshape(-1, SIZE)[:, free]
         normal = flat.T @ flat + np.diag(weight[free])
@@ -206,7 +223,20 @@ def search(
         if rough.misfit(found) > rough.misfit(best) - _LEAST_GAIN:
             break
         best = found
-    return fit(fine, best, prior)
+    start = prior[0] if near is None else near
+    found = fit(fine, best, prior)
+    if best is not start and _level(fine, start, prior) < _level(fine, found, prior):
+        # longer blocks misled
+        return fit(fine, start, prior)
+    return found
+
+
+def _level(likelihood: Likelihood, offsets: Array, prior: Array) -> float:
+    """Return minus the log-likelihood at some offsets, with what is expected of them."""
+    expected, weight = prior
+    likelihood.tie.align(offsets)
+    level = likelihood.adapt(likelihood.tie.residuals(offsets))
+    return level + 0.5 * float(np.sum(weight * (offsets - expected) ** 2))
 
 
 def _places(tie: KinematicModel, offsets: Array) -> list[tuple[Array, bool]]:
