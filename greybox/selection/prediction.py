@@ -24,6 +24,8 @@ from greybox.validation.judge_prediction import HeldOut, judge_prediction
 
 _log = logging.getLogger(__name__)
 
+# samples from which on plain instruments predict as well as those refined by the noise
+_MANY = 10_000
 # a model from some of the logs, chosen and estimated as that of all of them was
 Refit = Callable[[Sequence[TrialLog]], ManoeuvringModel]
 
@@ -120,10 +122,11 @@ def refit_alike(estimate: Estimate, request: Request) -> Refit:
 
     Standard errors and noise are those of the estimate, the former as fewer samples leave them.
     """
+    few = sum(x["samples"] for x in estimate.logs) < _MANY
     quick = replace(
         ranking_request(request),
         output_error=replace(request.output_error, search=False, levels=False, process_noise=False),
-        prefilter=request.prefilter if estimate.prefilter == "noise" else "none",
+        prefilter=request.prefilter if estimate.prefilter == "noise" and few else "none",
         # a free run starts from the estimate itself, which has its current too
         nominal=None if ESTIMATORS[estimate.method].free_run else estimate.model(),
     )
