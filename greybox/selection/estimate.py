@@ -26,7 +26,7 @@ from greybox.model.structure import Structure
 from greybox.public import known_keywords, one_thread
 from greybox.regression.regression import common_sample_time
 from greybox.selection.alternatives import Alternative, alternatives_for, ranking_request
-from greybox.selection.cross_validation import EstimatorVariant, compare_estimators
+from greybox.selection.cross_validation import EstimatorVariant, compare_estimators, parts_of
 from greybox.selection.fit_single import estimate_once
 from greybox.selection.held_out import FLOOR
 from greybox.selection.prediction import Refit, refit_alike, require_others, with_prediction
@@ -268,11 +268,14 @@ def _or_selected_terms(
         return _noting(told, note), logs, None
     if diverged:
         return _noting(told, "the selected terms diverge, and were left."), logs, None
-    remaining = iter(choice.parts)
+    chosen = {
+        _extent(fitting): terms
+        for (fitting, _), terms in zip(parts_of(choice.logs), choice.parts, strict=True)
+    }
 
     def refit(fitting: Sequence[TrialLog]) -> ManoeuvringModel:
         """Estimate the terms that these logs choose, their noise that of all logs."""
-        terms = next(remaining)
+        terms = chosen[_extent(fitting)]
         if terms is None:
             raise ExcitationError("no terms were selected on a part of the logs.")
         way, on, asked = _of_terms(terms, fitting, ranking_request(request))
@@ -280,6 +283,11 @@ def _or_selected_terms(
         return replace(model, noise=estimate.noise)
 
     return estimate, choice.logs, refit
+
+
+def _extent(logs: Sequence[TrialLog]) -> tuple[tuple[str, float, float], ...]:
+    """Return by what logs, or parts of them, are known: names, beginnings and ends."""
+    return tuple((log.name, float(log.t[0]), float(log.t[-1])) for log in logs)
 
 
 def _of_terms(

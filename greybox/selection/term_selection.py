@@ -28,7 +28,6 @@ from greybox.trial.log import TrialLog
 from greybox.validation.fit import run_model
 from greybox.vessel.force import force_inputs
 from greybox.vessel.thrust import ThrustLaw
-from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
 _log = logging.getLogger(__name__)
@@ -136,29 +135,25 @@ def select_terms(
     kind = "wind" if wind else "augmented"
     first, stay = first_terms(inputs)
     most = min(_MOST, sum(len(log) for log in logs) // _SAMPLES)
-    spread_by_state = spread_of(logs, family.states)
-    spread = np.array(list(spread_by_state.values()))
+    spread = np.array(list(spread_of(logs, family.states).values()))
 
     def path(of: Sequence[TrialLog], terms: int = most) -> tuple[FreeRunSelection, list[Selected]]:
         selection = FreeRunSelection(of, family, kind)
         return selection, selection.path(first, stay, terms)
 
-    laws = [tuple(map(_with(law), logs)) for law in _laws(logs)]
+    laws = _laws(logs)
+    law = laws[0]
     if len(laws) > 1:
-        errors = np.array([path(of, min(_FEW, most))[1][-1].cost for of in laws])
+        errors = [path(with_law(logs, of), min(_FEW, most))[1][-1].cost for of in laws]
         best_law = int(np.argmin(errors))
-        quadratic = len(laws) - 1
-        near = errors[quadratic] < (1 + _NEAR) * errors[best_law]
-        logs = laws[quadratic if near else best_law]
-    else:
-        logs = laws[0]
-    law = logs[0].vessel.thrusters[0].thrust
+        law = laws[-1] if errors[-1] < (1 + _NEAR) * errors[best_law] else laws[best_law]
+    own_logs, logs = logs, with_law(logs, law)
+    thrust = law_in_words(law)
     selection, sets = path(logs)
     parts = parts_of(logs)
     blocks = -(-_SCORES // max(len(logs), len(parts)))
     sizes = sorted({len(s.terms) for s in sets})
     scores: list[list[Array]] = [[] for _ in sizes]
-    own: list[Array] = []
     paths: list[list[Selected]] = []
     for fitting, held in parts:
         try:
@@ -170,9 +165,18 @@ def select_terms(
         judged = FreeRunSelection(held, family, kind)
         for k, count in enumerate(sizes):
             small = _of_size(found, count)
-            runs = judged.errors(small.p) if small else [np.full((len(h), 3), np.inf) for h in held]
+            runs = (
+                judged.errors(small.p)
+                if small
+                else [np.full_like(spread, np.inf)[None]] * len(held)
+            )
             scores[k] += [score_errors(e, spread, blocks) for e in runs]
-        own += _present_scores(refit, fitting, held, spread_by_state, blocks)
+    # the present model keeps the thrust law that it was estimated with
+    own = [
+        score
+        for fitting, held in parts_of(own_logs)
+        for score in _present_scores(refit, fitting, held, spread, blocks)
+    ]
     alternatives = [np.concatenate(own), *(np.concatenate(s) for s in scores)]
     # a published structure whose numbers were tested comes before terms chosen on the data
     ranking = rank(alternatives, [0, *sizes], given_away=_GIVEN_AWAY)
@@ -194,7 +198,7 @@ def select_terms(
     ]
     said = (
         f"terms were selected by free runs on parts of the logs that were left out in turn: "
-        f"{counts[shown]} terms (thrust ~ {law_in_words(law)}) score "
+        f"{counts[shown]} terms (thrust ~ {thrust}) score "
         f"{ranking.score[shown]:.1f} % and {present} {ranking.score[0]:.1f} % (mean fit over the "
         f"channels, cut at -100); "
         + (
@@ -234,52 +238,45 @@ def _present_scores(
     refit: Callable[[Sequence[TrialLog]], ManoeuvringModel],
     fitting: Sequence[TrialLog],
     held: Sequence[TrialLog],
-    spread: dict[str, float],
+    spread: Array,
     blocks: int,
 ) -> list[Array]:
-    sizes = np.array(list(spread.values()))
+    escaped = np.full_like(spread, np.inf)[None]
     try:
         model = refit(fitting)
     except GreyboxError as error:
         _log.info("the present model on a part: %s", error)
-        return [score_errors(np.full((blocks, len(sizes)), np.inf), sizes, blocks) for _ in held]
+        return [score_errors(escaped, spread, blocks) for _ in held]
     found = []
     for log in held:
         run = run_model(model, log)
-        errors = run.errors() if run.diverged < 0 else np.full((blocks, len(sizes)), np.inf)
-        found.append(score_errors(errors, sizes, blocks))
+        errors = run.errors() if run.diverged < 0 else escaped
+        found.append(score_errors(errors, spread, blocks))
     return found
 
 
-def _laws(logs: Sequence[TrialLog]) -> list[ThrustLaw | None]:
-    """Return the thrust laws to compare, None the vessel's own.
+def _laws(logs: Sequence[TrialLog]) -> list[ThrustLaw]:
+    """Return the thrust laws to compare, the vessel's own first and force ~ n|n| last.
 
     A bollard table or a law other than force ~ n was somebody's decision; and a speed that
     hardly varies cannot tell one from another.
     """
     vessel = logs[0].vessel
+    own = vessel.thrusters[0].thrust
     if any(t.thrust != ThrustLaw() for t in vessel.thrusters):
-        return [None]
+        return [own]
     speeds = [np.concatenate([log[t.speed] for log in logs]) for t in vessel.thrusters]
     usual = [float(np.sqrt(np.mean(n**2))) for n in speeds]
     if not any(np.std(np.abs(n)) > _VARIES * u for n, u in zip(speeds, usual, strict=True)):
-        return [None]
+        return [own]
     reference = float(np.max(usual))
-    return [
-        None,
-        ThrustLaw(quadratic_share=0.5, reference=reference),
-        ThrustLaw("quadratic"),
-    ]
+    return [own, ThrustLaw(quadratic_share=0.5, reference=reference), ThrustLaw("quadratic")]
 
 
-def _with(law: ThrustLaw | None) -> Callable[[TrialLog], TrialLog]:
-    """Return what gives a log's vessel a thrust law."""
-
-    def changed(log: TrialLog) -> TrialLog:
-        if law is None:
-            return log
-        vessel: Vessel = log.vessel
-        thrusters = tuple(replace(t, thrust=law) for t in vessel.thrusters)
-        return replace(log, vessel=replace(vessel, thrusters=thrusters))
-
-    return changed
+def with_law(logs: Sequence[TrialLog], law: ThrustLaw) -> Sequence[TrialLog]:
+    """Return logs of the vessel with a thrust law, as they are where it has it already."""
+    vessel = logs[0].vessel
+    if law == vessel.thrusters[0].thrust:
+        return logs
+    changed = replace(vessel, thrusters=tuple(replace(t, thrust=law) for t in vessel.thrusters))
+    return [replace(log, vessel=changed) for log in logs]

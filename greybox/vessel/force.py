@@ -143,12 +143,12 @@ def input_movement(vessel: Vessel, commands: dict[str, Array]) -> dict[str, floa
     out = {}
     for name, value in inputs.items():
         weights = {"taun": arms, "race": steered, "race_drag": steered}.get(name, ones)
-        whole = np.full(value.shape, steered.sum())
-        if not name.startswith("rudder"):
-            whole = np.tensordot(weights, thrusts, axes=1)
+        whole = np.tensordot(weights, thrusts, axes=1)
+        if name in ("rudder", "rudder_drag"):
+            whole = np.full(value.shape, steered.sum())
         most = float(np.sqrt(np.mean(whole**2)))
         share = float(np.sqrt(np.mean(value**2))) / most if most > 0 else 0.0
-        out[name] = share**0.5 if name.endswith("drag") else share
+        out[name] = share**0.5 if name in ("race_drag", "rudder_drag") else share
     return out
 
 
