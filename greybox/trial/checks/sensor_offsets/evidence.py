@@ -208,9 +208,10 @@ def search(
     """
     rough, fine = Likelihood(coarse), Likelihood(tie)
     start = prior[0] if near is None else near
-    # one instrument is wrong more often than several
-    starts = [start, _best_place(rough, start)[1]]
     best = fit(rough, start, prior)
+    # one instrument is wrong more often than several
+    gain, alone = _best_place(rough, start)
+    starts = [start, alone] if gain > _LEAST_GAIN else [start]
     for _ in range(2):
         gain, place = _best_place(rough, best)
         if gain < _LEAST_GAIN:
@@ -221,8 +222,12 @@ def search(
         if rough.misfit(found) > rough.misfit(best) - _LEAST_GAIN:
             break
         best = found
+    found = fit(fine, best, prior)
     # longer blocks may mislead, and steps from one start may end beside the best place
-    return min((fit(fine, s, prior) for s in (best, *starts)), key=lambda s: level(fine, s, prior))
+    for other in starts:
+        if other is not start or level(fine, other, prior) < level(fine, found, prior):
+            found = min(found, fit(fine, other, prior), key=lambda s: level(fine, s, prior))
+    return found
 
 
 def _best_place(likelihood: Likelihood, offsets: Array) -> tuple[float, Array]:
