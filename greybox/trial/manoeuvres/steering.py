@@ -17,6 +17,8 @@ Array = NDArray[np.float64]
 _TOLERANCE = math.radians(1.0)
 # angle between azimuth thrusters above which they push against one another [rad]
 _OPPOSED = math.radians(20)
+# share of a step that no command shows which is carried out at once
+_ON_THE_WAY = 0.05
 # share of a step within which its ramp is fitted
 _RAMP_LOW, _RAMP_HIGH = 0.2, 0.8
 
@@ -217,6 +219,12 @@ def execute_time(t: Array, y: Array, first: int, level: float, tolerance: float)
             return float(np.clip(time, t[i], t[ramp[0]]))
     if len(ramp) == 1:
         return float(t[max(0, ramp[0] - 1)])
-    # no sample on the way: a command that is held between samples took effect at this one
     there = inside[share >= _RAMP_HIGH]
-    return float(t[there[0] if len(there) else first])
+    k = int(there[0]) if len(there) else first
+    gone, come = (z[k - 1] - lowest) / step, (z[k] - lowest) / step
+    if k > i and max(gone, 1 - come) > _ON_THE_WAY and step * (1 - come) > tolerance:
+        # a helm that had left, or was not there yet, moved all the time between
+        left = float(t[k] - (t[k] - t[k - 1]) * come / (come - gone))
+        return max(left, float(t[max(i, k - 2)]))
+    # no sample on the way: a command that is held between samples took effect at this one
+    return float(t[k])
