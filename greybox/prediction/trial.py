@@ -111,14 +111,15 @@ def _task(found: Manoeuvre, log: TrialLog, helm: Helm, asked: Conditions) -> Tas
 
 def _speeds(found: Manoeuvre, log: TrialLog, helm: Helm) -> float:
     """Return the steering order that the speeds of a log amount to, positive."""
-    k = (log.t >= found.start) & (log.t <= found.stop)
-    steering = [i for i, s in enumerate(helm.steer) if s != 0]
-    speed = {i: float(np.median(log[helm.columns[i]][k])) for i in steering}
-    if helm.kind == "difference":
-        ahead = {i: math.copysign(1.0, helm.drive[i]) * n for i, n in speed.items()}
-        common = float(np.mean(list(ahead.values())))
-        return abs(float(np.mean([helm.steer[i] * n for i, n in ahead.items()])) / common)
-    return abs(float(np.mean([helm.steer[i] * n for i, n in speed.items()])))
+    made = []
+    for leg in _legs(found):
+        speed = np.array([_level(log, n, leg) for n in helm.columns])
+        steering = helm.steer != 0
+        order = float(np.mean((helm.steer * speed)[steering]))
+        if helm.kind == "difference":
+            order /= float(np.mean((np.sign(helm.drive) * speed)[steering]))
+        made.append(abs(order))
+    return float(np.mean(made))
 
 
 def as_in_trial(kind: Kind, asked: Conditions) -> bool:

@@ -7,13 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from manoeuvring import RUDDER, model_of, rudder_model, rudder_ship
+from manoeuvring import LENGTH, LINEAR, RUDDER, model_of, rudder_model, rudder_ship
 
-from greybox.model.catalogue import structure_for
+from greybox.model.catalogue import get_structure, structure_for
 from greybox.prediction.predict import predict_manoeuvre
 from greybox.rotation import ned_to_body
 from greybox.trial.log import make_log
+from greybox.trial.manoeuvres import find_manoeuvres
 from greybox.vessel.force import force_inputs
+from greybox.vessel.toml import vessel_from_dict
 
 DEG = math.pi / 180
 STEP = 0.25
@@ -186,3 +188,18 @@ def judged_on_run(model, log):
     ranges = {n: (float(log[n].min()), float(log[n].max())) for n in ("u", "v", "r", "n", "delta")}
     record = {"ranges": ranges, "verdict": {"prediction": verdict.to_dict()}}
     return replace(model, record=record)
+
+
+def test_a_zigzag_that_speeds_on_either_side_steer_is_found_and_predicted():
+    side = {"type": "fixed", "x": -8.0}
+    thrusters = [side | {"y": y, "speed": n} for y, n in ((-3.0, "port"), (3.0, "starboard"))]
+    vessel = vessel_from_dict({"name": "Catamaran", "length": LENGTH, "thruster": thrusters})
+    model = model_of(get_structure("linear"), LINEAR, vessel, 0.05)
+    asked = {"side": "port", "angles": [15 * DEG], "share": 0.4}
+    (source,) = predict_manoeuvre(model, "zigzag", **asked, **FEW).manoeuvres
+    (found,) = find_manoeuvres(source.log)
+    assert found.label == "zig-zag by speeds, reversed at 15 deg of heading, first to port"
+    assert [c.reason for c in found.criteria] == ["no angle steers"]
+    made = predict_manoeuvre(model, "zigzag", trial=source.log, draws=40)
+    assert made.manoeuvres[0].order == pytest.approx(-0.4, rel=0.02)
+    assert max(errors(made).values()) < 0.05, errors(made)
