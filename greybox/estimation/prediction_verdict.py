@@ -121,6 +121,10 @@ class ChannelPrediction:
     lasting : bool
         Whether they do so to the end of the logs.
     bands : BandShare, optional
+    memory : float, optional
+        Time over which the errors are related: their correlation, integrated [s].
+    own : float, optional
+        Root mean square error of free runs on the logs of the estimate itself [unit].
     """
 
     channel: str
@@ -132,6 +136,8 @@ class ChannelPrediction:
     horizon: float
     lasting: bool
     bands: BandShare | None = None
+    memory: float | None = None
+    own: float | None = None
 
     @property
     def error(self) -> float:
@@ -513,6 +519,8 @@ class PredictionVerdict(DisplayMixin):
             "coverage_interval": {n: list(b.interval) for n, b in bands.items()},
             "independent_samples": {n: b.independent for n, b in bands.items()},
             "rmse": self.rmse,
+            "own_rmse": {c.channel: c.own for c in self.channels if c.own is not None},
+            "memory": {c.channel: c.memory for c in self.channels if c.memory is not None},
             "noise": {c.channel: c.noise for c in self.channels},
             "spread": {c.channel: c.spread for c in self.channels},
             "moves": {c.channel: c.moves for c in self.channels},

@@ -10,7 +10,7 @@ import numpy as np
 
 from greybox.errors import UsageError, suggestion
 from greybox.model.model import ManoeuvringModel
-from greybox.prediction.helm import Helm, bounds
+from greybox.prediction.helm import ROUNDED, Helm, bounds
 from greybox.prediction.result import Kind, Side
 
 # steering angle of a turning circle where the limits allow it, and the two zig-zags [rad]
@@ -259,10 +259,12 @@ def _orders(
         found: list[tuple[float, float | None]] = [(a, None) for a, _ in asked.angles]
         found = found or [(min(_TURN, greatest), None)]
     else:
-        usual = [(a, None) for a in _ZIGZAGS if a <= greatest * (1 + 1e-9)] or [(_ZIGZAGS[0], None)]
+        usual = [(a, None) for a in _ZIGZAGS if a <= greatest * (1 + ROUNDED)] or [
+            (_ZIGZAGS[0], None)
+        ]
         found = [(a, a if h is None else h) for a, h in asked.angles or usual]
     for order, _ in found:
-        if order > greatest * (1 + 1e-9):
+        if order > greatest * (1 + ROUNDED):
             names = " and ".join(helm.steering_columns)
             raise UsageError(
                 f"an angle of {math.degrees(order):g} deg is beyond the limits of {names}, which "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -16,6 +16,8 @@ from greybox.vessel.vessel import Limits, Thruster, Vessel
 Array = NDArray[np.float64]
 Steering = Literal["rudder", "azimuth", "difference", "tunnel", "none"]
 
+# share of a limit by which a file may have rounded it, such as 35 degrees to 0.61 rad
+ROUNDED = 2e-3
 # least share of its thrust that a propelling thruster gives along the ship
 _ALONG = 0.5
 
@@ -87,6 +89,10 @@ class Helm:
             if s != 0 and low.lower is not None and low.upper is not None
         ]
         return min(reach, default=None)
+
+    def free(self) -> Helm:
+        """Return the helm without limits and rates."""
+        return replace(self, limits=(Limits(),) * len(self.limits))
 
     def commands(self, throttle: Array, order: Array | float) -> Array:
         """Return the commands (nc, R) at throttles (R,) and steering orders (R,)."""

@@ -15,6 +15,7 @@ from greybox.trial.manoeuvres import (
     measure_stopping,
     measure_turning_circle,
     measure_zigzag,
+    without_angle,
 )
 from greybox.trial.manoeuvres.finding import Manoeuvre
 
@@ -157,7 +158,7 @@ def measure(
     made = runs.t[runs.order] + sample_time * executes[executes >= 0]
     if len(made) < 2:
         return None
-    return measure_zigzag(
+    found = measure_zigzag(
         *arrays,
         # the last execute ends what the one before it began
         executes=[float(e) for e in (made[:-1] if len(made) == len(executes) else made)],
@@ -168,3 +169,4 @@ def measure(
         heading_std=0.0,
         position_std=0.0,
     )
+    return without_angle(found) if rudder is None else found

@@ -14,10 +14,11 @@ from greybox.model.model import ManoeuvringModel
 from greybox.prediction.conditions import Conditions, Task
 from greybox.prediction.extrapolation import Extrapolation, extrapolation_notes
 from greybox.prediction.helm import Helm
+from greybox.prediction.misfit import held_out_errors
 from greybox.prediction.monte_carlo import MonteCarloQuantity
 from greybox.prediction.result import Kind, PredictedManoeuvre
 from greybox.prediction.running import DrawnRuns
-from greybox.prediction.steady import Steady
+from greybox.prediction.start import Start
 from greybox.trial.log import TrialLog
 from greybox.trial.manoeuvres import Stopping, TurningCircle, ZigZag
 from greybox.trial.manoeuvres.finding import Manoeuvre
@@ -34,7 +35,7 @@ def run_notes(
     values: Mapping[str, MonteCarloQuantity | None],
     log: TrialLog,
     helm: Helm,
-    steady: Steady,
+    start: Start,
     longest: float,
     beyond: Sequence[Extrapolation] | None,
 ) -> tuple[str, ...]:
@@ -80,8 +81,8 @@ def run_notes(
             f"the estimate turns against the order to {task.side}: the sign of its steering is "
             f"wrong, in the vessel file or in the log."
         )
-    if abs(float(steady.trim[0])) > 1e-6:
-        trim = math.degrees(steady.trim[0]) if helm.angular else float(steady.trim[0])
+    if abs(start.trim) > 1e-6:
+        trim = math.degrees(start.trim) if helm.angular else start.trim
         unit = " deg" if helm.angular else ""
         told.append(f"the straight approach needs a steering order of {trim:.3g}{unit}.")
     if isinstance(own, TurningCircle) and own.unsteady:
@@ -131,7 +132,14 @@ def model_notes(model: ManoeuvringModel, helm: Helm, asked: Conditions) -> tuple
         told.append(
             "intervals hold what is uncertain of the parameters"
             + (" and of the current" if asked.current and model.disturbances else "")
-            + ", not what waves and gusts do to one trial (--disturbed adds it)."
+            + (
+                ", not how far the model misses logs that took no part, which the MODEL does not "
+                "say: estimate it again"
+                if held_out_errors(model) is None
+                else " and forces that the model lacks, as large as its free runs on logs that "
+                "took no part missed them"
+            )
+            + "; not what waves and gusts do to one trial (--disturbed adds it)."
         )
     if asked.current and not model.disturbances:
         told.append("the model has no current, so --current adds nothing.")
@@ -141,9 +149,16 @@ def model_notes(model: ManoeuvringModel, helm: Helm, asked: Conditions) -> tuple
 
 
 def trial_notes(
-    helm: Helm, predicted: PredictedManoeuvre, found: Manoeuvre, log: TrialLog, asked: Conditions
+    helm: Helm,
+    predicted: PredictedManoeuvre,
+    found: Manoeuvre,
+    log: TrialLog,
+    asked: Conditions,
+    *,
+    own_start: bool,
+    windy: bool,
 ) -> list[str]:
-    """Say with what commands the trial sailed, where they are not the predicted ones."""
+    """Say what the run took from the trial, and where its commands are others."""
     run = found.length / max(found.approach_speed.value, 1e-9)
     k = (log.t >= found.start - run) & (log.t < found.start)
     told = []
@@ -151,7 +166,18 @@ def trial_notes(
         north, east = true_wind(log["u_q"], log["v_q"], log["psi"], log["u"], log["v"])
         during = (log.t >= found.start) & (log.t <= found.stop)
         wind = math.hypot(float(north[during].mean()), float(east[during].mean()))
-        told.append(f"the trial had {wind:.2g} m/s of mean wind, the prediction is in still air.")
+        told.append(
+            f"sailed in the wind of the trial, {wind:.2g} m/s in the mean."
+            if windy
+            else f"the trial had {wind:.2g} m/s of mean wind, of which the model knows nothing."
+        )
+    if own_start:
+        told.append(
+            f"the run starts from the trial's own state at the order, "
+            f"{found.approach_speed.value:.3g} m/s over the ship length before it, at the trial's "
+            f"own commands."
+        )
+        return told
     if not k.any() or asked.command:
         return told
     for name, drive in zip(helm.columns, helm.drive, strict=True):

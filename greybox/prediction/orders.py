@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -20,6 +21,42 @@ _BEYOND = 0.1
 _FEWEST = 12
 
 
+@dataclass(frozen=True)
+class Legs:
+    """Commands of the legs of a manoeuvre.
+
+    Parameters
+    ----------
+    held : ndarray
+        (K, nc, R) commands that each leg asks for; the last two go on in turn.
+    logged : ndarray
+        (N, nc) commands of each sample from the order on, whatever the leg: nan where those
+        of the leg hold. The last row stands.
+    """
+
+    held: Array
+    logged: Array
+
+    @classmethod
+    def of(cls, *held: Array) -> Legs:
+        """Return legs without anything logged."""
+        return cls(np.stack(held), np.full((1, held[0].shape[0]), math.nan))
+
+    @property
+    def runs(self) -> int:
+        """R."""
+        return int(self.held.shape[2])
+
+    def at(self, k: int, leg: NDArray[np.int64]) -> Array:
+        """Return the commands (nc, R) at sample `k`, for runs that are on leg (R,)."""
+        last = len(self.held) - 1
+        beyond = np.where((leg - last) % 2 == 0, last, max(last - 1, 0))
+        which = np.where(leg <= last, leg, beyond)
+        wanted = self.held[which, :, np.arange(self.runs)].T
+        known = self.logged[min(k, len(self.logged) - 1)][:, None]
+        return np.where(np.isnan(known), wanted, known)
+
+
 class Orders(Protocol):
     """Orders that may follow the motion.
 
@@ -28,8 +65,8 @@ class Orders(Protocol):
 
     complete: NDArray[np.int64]
 
-    def targets(self, k: int, psi: Array, u: Array) -> tuple[Array, Array]:
-        """Return steering orders (R,) and throttles (R,) at sample `k` from the order on.
+    def targets(self, k: int, psi: Array, u: Array) -> Array:
+        """Return the commands (nc, R) that are asked for at sample `k` from the order on.
 
         Parameters
         ----------
@@ -59,21 +96,24 @@ class Orders(Protocol):
         ...
 
 
+# the orders of chosen runs, new each time
+Ordered = Callable[[NDArray[np.intp]], Orders]
+
+
 @dataclass
 class Turn:
-    """One steering order, held until the ship has turned twice around."""
+    """One leg, held until the ship has turned twice around."""
 
-    order: float
-    throttle: Array
+    legs: Legs
     complete: NDArray[np.int64] = field(init=False)
 
     def __post_init__(self) -> None:
-        self.complete = np.full(len(self.throttle), -1)
+        self.complete = np.full(self.legs.runs, -1)
 
-    def targets(self, k: int, psi: Array, u: Array) -> tuple[Array, Array]:
+    def targets(self, k: int, psi: Array, u: Array) -> Array:
         """Return the one order; see `Orders`."""
         self.complete[(self.complete < 0) & (np.abs(psi) >= TURNED)] = k
-        return np.full(len(psi), self.order), self.throttle
+        return self.legs.at(k, np.zeros(len(psi), int))
 
     def react(self, k: int, psi: Array, ahead: Array) -> None:
         """Nothing changes."""
@@ -82,36 +122,46 @@ class Turn:
 
 @dataclass
 class ZigZagOrders:
-    """Steering orders to alternate sides, reversed at a heading."""
+    """Legs to alternate sides, each reversed at its heading.
 
-    order: float
-    heading: float
-    throttle: Array
+    Parameters
+    ----------
+    side : {1, -1}
+        Of the first leg, 1 to starboard.
+    headings : ndarray
+        (EXECUTES − 1,) heading at which each leg ends, positive to its side [rad].
+    legs : Legs
+    """
+
+    side: float
+    headings: Array
+    legs: Legs
     complete: NDArray[np.int64] = field(init=False)
     executes: Array = field(init=False)
 
     def __post_init__(self) -> None:
-        runs = len(self.throttle)
+        runs = self.legs.runs
         self.complete = np.full(runs, -1)
         # (R, executes) samples since the first, between samples, −1 for those to come
         self.executes = np.full((runs, EXECUTES), -1.0)
         self.executes[:, 0] = 0
-        self._side = np.full(runs, math.copysign(1.0, self.order))
+        self._side = np.full(runs, self.side)
         self._count = np.ones(runs, int)
 
-    def targets(self, k: int, psi: Array, u: Array) -> tuple[Array, Array]:
+    def targets(self, k: int, psi: Array, u: Array) -> Array:
         """Return the order of the moment; see `Orders`."""
-        return abs(self.order) * self._side, self.throttle
+        return self.legs.at(k, self._count - 1)
 
     def react(self, k: int, psi: Array, ahead: Array) -> Array | None:
         """Reverse where the heading is reached, at the time between samples when it is."""
         before, after = self._side * psi, self._side * ahead
-        now = np.flatnonzero((after >= self.heading) & (self.complete < 0))
+        limit = self.headings[np.minimum(self._count, EXECUTES - 1) - 1]
+        now = np.flatnonzero((after >= limit) & (self.complete < 0))
         if len(now) == 0:
             return None
         share = np.ones(len(psi))
         gained = np.maximum(after[now] - before[now], 1e-12)
-        share[now] = np.clip((self.heading - before[now]) / gained, 0.0, 1.0)
+        share[now] = np.clip((limit[now] - before[now]) / gained, 0.0, 1.0)
         self.executes[now, self._count[now]] = k + share[now]
         self._side[now] *= -1
         self._count[now] += 1
@@ -121,23 +171,23 @@ class ZigZagOrders:
 
 @dataclass
 class Stop:
-    """Another throttle, held until the ship is slow enough."""
+    """One leg, held until the ship is slow enough."""
 
-    throttle: Array
+    legs: Legs
     until: Array
     complete: NDArray[np.int64] = field(init=False)
 
     def __post_init__(self) -> None:
-        self.complete = np.full(len(self.throttle), -1)
-        self._slow = np.full(len(self.throttle), -1)
+        self.complete = np.full(self.legs.runs, -1)
+        self._slow = np.full(self.legs.runs, -1)
 
-    def targets(self, k: int, psi: Array, u: Array) -> tuple[Array, Array]:
+    def targets(self, k: int, psi: Array, u: Array) -> Array:
         """Return the one order; see `Orders`."""
         self._slow[(self._slow < 0) & (u <= self.until)] = k
         beyond = np.maximum(_FEWEST, np.ceil(_BEYOND * self._slow))
         done = (self.complete < 0) & (self._slow >= 0) & (k >= self._slow + beyond)
         self.complete[done] = k
-        return np.zeros(len(u)), self.throttle
+        return self.legs.at(k, np.zeros(len(u), int))
 
     def react(self, k: int, psi: Array, ahead: Array) -> None:
         """Nothing changes."""

@@ -21,8 +21,9 @@ from greybox.prediction.conditions import (
     tasks,
 )
 from greybox.prediction.extrapolation import extrapolations
-from greybox.prediction.helm import Helm, find_helm
+from greybox.prediction.helm import ROUNDED, Helm, find_helm
 from greybox.prediction.measuring import measure, quantities
+from greybox.prediction.misfit import held_out_errors, misfit_of
 from greybox.prediction.monte_carlo import MonteCarloQuantity, over_draws
 from greybox.prediction.notes import (
     model_notes,
@@ -31,7 +32,7 @@ from greybox.prediction.notes import (
     trial_notes,
     trust_level,
 )
-from greybox.prediction.orders import Orders, Stop, Turn, ZigZagOrders
+from greybox.prediction.orders import EXECUTES, Legs, Ordered, Stop, Turn, ZigZagOrders
 from greybox.prediction.result import (
     CRITERIA,
     Kind,
@@ -39,10 +40,21 @@ from greybox.prediction.result import (
     PredictedManoeuvre,
     Side,
 )
-from greybox.prediction.running import sail
+from greybox.prediction.running import Push, sail
+from greybox.prediction.ship import WHERE_WIND
 from greybox.prediction.showing import bundle_of, log_of
+from greybox.prediction.start import steady_start, trial_start
 from greybox.prediction.steady import Steady, require_straight, straight_run
-from greybox.prediction.trial import compare, end_again, found_in_trial, with_rates
+from greybox.prediction.trial import (
+    as_in_trial,
+    compare,
+    end_again,
+    found_in_trial,
+    trial_orders,
+    wind_of,
+    with_rates,
+    within_trial,
+)
 from greybox.public import known_keywords
 from greybox.trial.log import TrialLog
 from greybox.trial.manoeuvres import Compliance, Criterion, Quantity, TurningCircle
@@ -190,12 +202,17 @@ def predict_manoeuvre(
     made = []
     for i, task in enumerate(todo):
         progress(i, len(todo))
-        predicted = _one(manoeuvre, model, helm, asked, task, theta, d)
-        if found:
-            _, measured, log = found[i]
+        beside = found[i][1:] if found else None
+        predicted = _one(manoeuvre, model, helm, asked, task, theta, d, beside)
+        if beside is not None:
+            measured, log = beside
             again = end_again(measured, log, stop_speed(manoeuvre, asked))
             agreement = compare(model, helm, again, log, predicted)
-            told = trial_notes(helm, predicted, measured, log, asked)
+            told = trial_notes(
+                helm, predicted, measured, log, asked,
+                own_start=as_in_trial(manoeuvre, asked),
+                windy=wind_of(model, measured, log) is not None,
+            )  # fmt: skip
             predicted = replace(predicted, agreement=agreement, notes=(*predicted.notes, *told))
         made.append(predicted)
     progress(len(todo), len(todo))
@@ -238,27 +255,42 @@ def _one(
     task: Task,
     theta: Array,
     d: Array,
+    beside: tuple[Manoeuvre, TrialLog] | None,
 ) -> PredictedManoeuvre:
-    steady = straight_run(model, helm, theta, d, task.course, task.speed)
-    kept = np.flatnonzero(steady.found)
-    unheld = len(steady.found) - len(kept)
-    theta, d = theta[kept], d[kept]
-    steady = Steady(
-        steady.x[:, kept],
-        steady.throttle[kept],
-        steady.trim[kept],
-        steady.commands[:, kept],
-        steady.speed[kept],
-        steady.found[kept],
-    )
-    orders, end = _orders(kind, helm, asked, task, steady)
-    longest = _LONGEST * model.vessel.length / float(steady.speed[0])
-    noise = _process(model, asked, len(kept)) if asked.disturbed else None
-    runs = sail(model, helm, steady, theta, d, task.course, orders, longest, noise)
+    unheld, d = 0, d.copy()
+    wind = None if beside is None else wind_of(model, *beside)
+    if wind is not None:
+        d[:, WHERE_WIND] = wind[0]
+    if beside is not None and as_in_trial(kind, asked):
+        measured_run, trial = beside
+        rng = np.random.default_rng([139, asked.seed])
+        start = trial_start(model, measured_run, trial, helm.columns, len(theta), rng)
+        helm = within_trial(helm, trial)
+        ordered = trial_orders(helm, task, measured_run, trial, model.sample_time)
+        end = None
+    else:
+        steady = straight_run(model, helm, theta, d, task.course, task.speed)
+        kept = np.flatnonzero(steady.found)
+        unheld = len(steady.found) - len(kept)
+        theta, d = theta[kept], d[kept]
+        steady = steady.kept(kept)
+        ordered, end = _orders(kind, helm, asked, task, steady)
+        start = steady_start(model, steady, task.course)
+    longest = _LONGEST * model.vessel.length / float(start.speed[0])
+    pushes = [_process(model, asked, len(theta))] if asked.disturbed else []
+    errors = held_out_errors(model)
+    if errors is not None:
+        only = np.zeros(1, int)
+        alone = (start.of(only), theta[:1], d[:1], task.course)
+        own_run = sail(model, helm, *alone, ordered(only), longest, (), wind)
+        args = (start, theta, d, task.course, wind, asked.seed)
+        pushes += [m for m in (misfit_of(model, helm, errors, own_run, *args),) if m is not None]
+    orders = ordered(np.arange(len(theta)))
+    runs = sail(model, helm, start, theta, d, task.course, orders, longest, pushes, wind)
     if runs.diverged[0]:
         raise InfeasibleError(
             f"the run of the estimate itself diverges within {runs.t[-1] - runs.t[runs.order]:.3g} "
-            f"s of the order of the {kind} manoeuvre at {steady.speed[0]:.3g} m/s: this model "
+            f"s of the order of the {kind} manoeuvre at {start.speed[0]:.3g} m/s: this model "
             f"cannot predict it. Estimate a smaller structure, or on a log with such motion."
         )
     executes = orders.executes if isinstance(orders, ZigZagOrders) else None
@@ -285,14 +317,14 @@ def _one(
             f"the estimate itself never swings back in the {_label(kind, helm, task, asked)} "
             f"within {longest:.3g} s: give another --angle."
         )
-    tables = [quantities(m) if m else {} for m in map(measured, range(1, len(kept)))]
+    tables = [quantities(m) if m else {} for m in map(measured, range(1, len(theta)))]
     # draws without an approach reach nothing
     tables += [{}] * unheld
     values = {n: over_draws(v, [t.get(n) for t in tables]) for n, v in quantities(own).items()}
     commands = {
         name: over_draws(
-            Quantity(float(steady.commands[i, 0]), 0.0, "1"),
-            [Quantity(float(c), 0.0, "1") for c in steady.commands[i, 1:]],
+            Quantity(float(start.commands[-1, i, 0]), 0.0, "1"),
+            [Quantity(float(c), 0.0, "1") for c in start.commands[-1, i, 1:]],
         )
         for i, name in enumerate(helm.columns)
     }
@@ -311,7 +343,7 @@ def _one(
         int(runs.diverged[1:].sum()),
         int(((runs.complete[1:] < 0) & ~runs.diverged[1:]).sum()),
         unheld,
-        run_notes(kind, task, model, own, runs, unheld, values, log, helm, steady, longest, beyond),
+        run_notes(kind, task, model, own, runs, unheld, values, log, helm, start, longest, beyond),
         log,
         float(runs.t[runs.order]),
         bundle_of(runs, helm, task.course, model.vessel.length),
@@ -321,40 +353,49 @@ def _one(
 
 def _orders(
     kind: Kind, helm: Helm, asked: Conditions, task: Task, steady: Steady
-) -> tuple[Orders, Array | None]:
-    """Return what is ordered, and the surge velocity at which a stop ends."""
+) -> tuple[Ordered, Array | None]:
+    """Return what is ordered of chosen runs, and the surge velocity at which a stop ends."""
     if task.order is None:
         end = stop_speed(kind, asked) * steady.speed
-        astern = stop_throttle(kind, helm, asked)
-        return Stop(np.full(len(steady.speed), astern), end), end
+        astern = np.full(len(steady.speed), stop_throttle(kind, helm, asked))
+        stop = helm.commands(astern, 0.0)
+        return lambda runs: Stop(Legs.of(stop[:, runs]), end[runs]), end
     order = task.sign * task.order
-    wanted = helm.commands(steady.throttle[:1], order)
-    outside = helm.outside(wanted)[:, 0]
-    for i in np.flatnonzero(outside):
+    legs = [helm.commands(steady.throttle, way * order) for way in (1.0, -1.0)]
+    for i in np.flatnonzero(helm.outside(legs[0][:, :1], ROUNDED)[:, 0]):
         limit = helm.limits[i]
         raise UsageError(
-            f"this needs {helm.columns[i]} = {wanted[i, 0]:.4g}, and the vessel file keeps it "
+            f"this needs {helm.columns[i]} = {legs[0][i, 0]:.4g}, and the vessel file keeps it "
             f"from {limit.lower} to {limit.upper}: give a smaller --angle or --share, a lower "
             f"--speed, or --no-limits."
         )
     if task.heading is None:
-        return Turn(order, steady.throttle), None
-    return ZigZagOrders(order, task.heading, steady.throttle), None
+        return lambda runs: Turn(Legs.of(legs[0][:, runs])), None
+    headings = np.full(EXECUTES - 1, task.heading)
+    return (
+        lambda runs: ZigZagOrders(task.sign, headings, Legs.of(*(leg[:, runs] for leg in legs))),
+        None,
+    )
 
 
-def _process(model: ManoeuvringModel, asked: Conditions, runs: int) -> Iterator[Array]:
-    """Yield process noise (nx, R) of each sample; none of the estimate's own run."""
+def _process(model: ManoeuvringModel, asked: Conditions, runs: int) -> Push:
+    """Return process noise (nx, R) of each sample; none of the estimate's own run."""
     noise = model.noise
     rng = np.random.default_rng([138, asked.seed])
     nx = len(model.structure.states)
     size = np.zeros(nx) if noise is None else noise.process
     memory = np.zeros(nx) if noise is None or not noise.memory.size else noise.memory
     drive = size * np.sqrt(1 - memory**2)
-    push = size * rng.standard_normal((runs, nx))
-    while True:
-        pushes, push = process_noise(rng, push, memory, drive, _STEPS)
-        pushes[0] = 0.0
-        yield from pushes.transpose(1, 2, 0)
+
+    def drawn() -> Iterator[Array]:
+        push = size * rng.standard_normal((runs, nx))
+        while True:
+            pushes, push = process_noise(rng, push, memory, drive, _STEPS)
+            pushes[0] = 0.0
+            yield from pushes.transpose(1, 2, 0)
+
+    samples = drawn()
+    return lambda k, state, commands: next(samples)
 
 
 def _criteria(

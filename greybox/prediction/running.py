@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,16 +14,15 @@ from greybox.model.run.step import integrated
 from greybox.prediction.helm import Helm, bounds
 from greybox.prediction.orders import Orders
 from greybox.prediction.ship import ShipDraws
-from greybox.prediction.steady import Steady
+from greybox.prediction.start import Start
 from greybox.rotation import body_to_ned
 
 Array = NDArray[np.float64]
+Push = Callable[[int, Array, Array], Array]
 
-# ship lengths sailed before the order
-APPROACH_LENGTHS = 2.5
-_FEWEST = 16
 # how many times the approach speed, and the rate of turn in one ship length, count as diverged
 _DIVERGED = 10.0
+_MOST = 10**7
 
 
 @dataclass(frozen=True)
@@ -67,21 +66,22 @@ class DrawnRuns:
 def sail(
     model: ManoeuvringModel,
     helm: Helm,
-    steady: Steady,
+    start: Start,
     theta: Array,
     d: Array,
     heading: float,
     orders: Orders,
     longest: float,
-    process: Iterator[Array] | None = None,
+    pushes: Sequence[Push] = (),
+    wind: Array | None = None,
 ) -> DrawnRuns:
-    """Sail from straight runs until all manoeuvres are complete.
+    """Sail on from a start until all manoeuvres are complete.
 
     Parameters
     ----------
     model : ManoeuvringModel
     helm : Helm
-    steady : Steady
+    start : Start
         Of the same R draws.
     theta, d : ndarray
         (R, p), (R, nd)
@@ -90,38 +90,40 @@ def sail(
     orders : Orders
     longest : float
         Time from the order after which what is not complete stays so [s].
-    process : iterator of ndarray, optional
-        (nx, R) added to each next state.
+    pushes : sequence of callable
+        Each gives what is added to the next states (nx, R) from the sample since the order,
+        the states and the commands (nc, R).
+    wind : ndarray, optional
+        (N, 2) wind north and east at each sample from the order on, the last stands [m/s];
+        that of `d` by default.
     """
     step, length = model.sample_time, model.vessel.length
     ship = ShipDraws(model.structure, model.vessel, step, model.integrator, theta, d)
     names = model.structure.states
     where = [names.index(n) if n in names else None for n in ("u", "v", "r")]
     nx = len(names)
-    speed = float(steady.speed[0])
-    before = max(_FEWEST, math.ceil(APPROACH_LENGTHS * length / (speed * step)))
-    most = before + max(1, math.ceil(longest / step))
+    speed = float(start.speed[0])
+    before = len(start.motion)
+    most = before + max(1, math.ceil(min(longest / step, _MOST)))
     delay = model.vessel.actuation.delay_samples(step)
-    state = ship.start(steady.x, heading, steady.commands)
+    state = ship.start(start.x, start.psi, start.commands[-1])
     low, high = (b[:, None] for b in bounds(helm.limits))
     rates = np.array([[math.inf if x.rate is None else x.rate] for x in helm.limits]) * step
     slow = np.isfinite(rates)
     limit = _DIVERGED * np.array([speed, speed, speed / length])[:, None]
     runs = theta.shape[0]
     diverged = np.zeros(runs, bool)
-    psi = [np.full(runs, heading)] * before
-    start = np.stack([np.zeros(runs) if i is None else steady.x[i] for i in where])
-    states = [start] * before
-    commands = [steady.commands] * before
-    at = steady.commands
+    psi, states, commands = list(start.heading), list(start.motion), list(start.commands)
+    at = start.commands[-1]
     with np.errstate(all="ignore"):
         for k in range(before, most):
             now = np.stack([np.zeros(runs) if i is None else state[i] for i in where])
             diverged |= ~(np.abs(now) <= limit).all(axis=0)
             since = k - before
             own = state[nx] - heading
-            order, throttle = orders.targets(since, own, now[0])
-            wanted = np.clip(helm.commands(throttle, order), low, high)
+            wanted = np.clip(orders.targets(since, own, now[0]), low, high)
+            if wind is not None:
+                ship.blow(wind[min(since, len(wind) - 1)])
             # a command that moves at a rate leaves its place at this sample, others jump
             moved = np.where(slow, at, wanted)
             states.append(now)
@@ -134,14 +136,13 @@ def sail(
             share = orders.react(since, own, after[nx] - heading)
             if share is not None:
                 # the sample is sailed again with the mean of both orders over it
-                order, throttle = orders.targets(since, own, now[0])
-                new = np.clip(helm.commands(throttle, order), low, high)
+                new = np.clip(orders.targets(since, own, now[0]), low, high)
                 commands[k] = np.where(slow, moved, share * moved + (1 - share) * new)
                 at = share * at + (1 - share) * (moved + np.clip(new - moved, -rates, rates))
                 after = ship(state, _earlier(commands, k, delay))
+            for push in pushes:
+                after[:nx] += push(since, state, commands[k])
             state = after
-            if process is not None:
-                state[:nx] += next(process)
     complete = np.where((orders.complete >= 0) & ~diverged, orders.complete + before, -1)
     return DrawnRuns(
         np.asarray(np.arange(len(psi)) * step, float),

@@ -9,6 +9,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.model.disturbances import WIND, disturbance_names
 from greybox.model.run.actuators import Actuators, actuators, column
 from greybox.model.run.kernels import bind, over_runs
 from greybox.model.run.step import Integrator, StepModel
@@ -16,6 +17,9 @@ from greybox.model.structure import Structure
 from greybox.vessel.vessel import Actuation, Thruster, Vessel
 
 Array = NDArray[np.float64]
+
+# where the wind stands among the disturbances of a ship at sea
+WHERE_WIND = np.array([disturbance_names("marine", ()).index(n) for n in WIND])
 
 
 class ShipDraws:
@@ -93,6 +97,10 @@ class ShipDraws:
         if late := len(state) - nx - 1:
             state[nx + 1 :] = np.asarray(self._rest.map(self.runs)(commands)).reshape(late, -1)
         return state
+
+    def blow(self, wind: Array) -> None:
+        """Take another wind from now on, north and east (2,) [m/s]."""
+        self._w[self.commands + WHERE_WIND] = wind[:, None]
 
     def __call__(self, state: Array, commands: Array) -> Array:
         """Return the state (n, R) one sample later.

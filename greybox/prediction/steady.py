@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,6 +50,10 @@ class Steady:
     commands: Array
     speed: Array
     found: NDArray[np.bool_]
+
+    def kept(self, which: NDArray[np.intp]) -> Steady:
+        """Return some of the ships."""
+        return Steady(*(getattr(self, f.name)[..., which] for f in fields(self)))
 
 
 def straight_run(

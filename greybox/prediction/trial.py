@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
 
 from greybox.errors import LogError
 from greybox.model.model import ManoeuvringModel
@@ -15,6 +17,7 @@ from greybox.prediction.conditions import Conditions, Task
 from greybox.prediction.helm import Helm
 from greybox.prediction.measuring import LABELS, quantities
 from greybox.prediction.monte_carlo import MonteCarloQuantity
+from greybox.prediction.orders import EXECUTES, Legs, Ordered, Turn, ZigZagOrders
 from greybox.prediction.result import Agreement, Compared, Kind, PredictedManoeuvre, Side
 from greybox.rotation import ned_to_body
 from greybox.trial.log import TrialLog
@@ -30,16 +33,15 @@ from greybox.trial.manoeuvres.finding import Manoeuvre
 from greybox.trial.manoeuvres.stopping import measure_stopping
 from greybox.trial.manoeuvres.track import make_track, without_antenna
 from greybox.trial.raw_log import shortened
+from greybox.trial.wind import true_wind
 
 Array = NDArray[np.float64]
 
 # how far angles may be from those asked for, to be the same manoeuvre [rad]
 _NEAR = math.radians(2.5)
 _POINTS = 1500
-# largest moves of a helm that are left out, as the two of one wrong sample
-_FAULTS = 2
-# share of an order in one sample that is no motion of a helm but a logged command
-_JUMP = 0.5
+# share of the greatest command that is a step, and of the way at which the helm has arrived
+_STEP, _ARRIVED = 0.25, 0.9
 # logs that a sentence names: one with gaps comes as many
 _MOST_NAMES = 4
 
@@ -109,50 +111,147 @@ def _task(found: Manoeuvre, log: TrialLog, helm: Helm, asked: Conditions) -> Tas
 
 def _speeds(found: Manoeuvre, log: TrialLog, helm: Helm) -> float:
     """Return the steering order that the speeds of a log amount to, positive."""
-    k = (log.t >= found.start) & (log.t <= found.stop)
-    steering = [i for i, s in enumerate(helm.steer) if s != 0]
-    speed = {i: float(np.median(log[helm.columns[i]][k])) for i in steering}
-    if helm.kind == "difference":
-        ahead = {i: math.copysign(1.0, helm.drive[i]) * n for i, n in speed.items()}
-        common = float(np.mean(list(ahead.values())))
-        return abs(float(np.mean([helm.steer[i] * n for i, n in ahead.items()])) / common)
-    return abs(float(np.mean([helm.steer[i] * n for i, n in speed.items()])))
+    made = []
+    for leg in _legs(found):
+        speed = np.array([_level(log, n, leg) for n in helm.columns])
+        steering = helm.steer != 0
+        order = float(np.mean((helm.steer * speed)[steering]))
+        if helm.kind == "difference":
+            order /= float(np.mean((np.sign(helm.drive) * speed)[steering]))
+        made.append(abs(order))
+    return float(np.mean(made))
+
+
+def as_in_trial(kind: Kind, asked: Conditions) -> bool:
+    """Whether a run starts from the state and the propellers that the trial had.
+
+    A stop starts from the steady run that it is found by, and so does what is asked for at
+    another speed.
+    """
+    return kind in ("turning", "zigzag") and asked.speed is None and not asked.command
+
+
+def _legs(found: Manoeuvre) -> list[tuple[float, float]]:
+    """Return from when to when each order of a manoeuvre held [s]."""
+    if isinstance(found, ZigZag):
+        return list(pairwise([*found.executes, found.stop]))
+    return [(found.start, found.stop)]
+
+
+def _level(log: TrialLog, name: str, leg: tuple[float, float]) -> float:
+    """Return the command of a leg, of its last half, when the helm has moved there."""
+    begin, end = leg
+    k = (log.t >= (begin + end) / 2) & (log.t < end)
+    return float(np.median(log[name][k])) if k.any() else float(np.interp(end, log.t, log[name]))
+
+
+def trial_orders(
+    helm: Helm, task: Task, found: Manoeuvre, log: TrialLog, sample_time: float
+) -> Ordered:
+    """Return the orders of a trial: its commands to either side, its headings of reversal.
+
+    What does not steer follows the log, and keeps its mean after the log's manoeuvre.
+    """
+    held = np.array(
+        [[_level(log, n, leg) for n in helm.columns] for leg in _legs(found)[:EXECUTES]]
+    )
+    if len(held) == 1 and isinstance(found, ZigZag):
+        held = np.vstack([held, held * np.where(helm.steer != 0, -1.0, 1.0)])
+    times = np.arange(found.start, found.stop, sample_time)
+    logged = np.stack([np.interp(times, log.t, log[n]) for n in helm.columns], axis=1)
+    logged = np.vstack([logged, logged.mean(axis=0)])
+    logged[:, helm.steer != 0] = np.nan
+
+    def legs(runs: NDArray[np.intp]) -> Legs:
+        return Legs(np.repeat(held[:, :, None], len(runs), axis=2), logged)
+
+    if not isinstance(found, ZigZag):
+        return lambda runs: Turn(legs(runs))
+    reversed_at = [q.value for q in found.switch_headings][: EXECUTES - 1]
+    usual = float(np.mean(reversed_at))
+    headings = np.array(reversed_at + [usual] * (EXECUTES - 1 - len(reversed_at)))
+    return lambda runs: ZigZagOrders(task.sign, headings, legs(runs))
+
+
+def within_trial(helm: Helm, log: TrialLog) -> Helm:
+    """Return a helm whose ranges hold the commands of a trial: the ship did obey them."""
+    limits = tuple(
+        replace(
+            x,
+            lower=None if x.lower is None else min(x.lower, float(log[n].min())),
+            upper=None if x.upper is None else max(x.upper, float(log[n].max())),
+        )
+        for n, x in zip(helm.columns, helm.limits, strict=True)
+    )
+    return replace(helm, limits=limits)
+
+
+def wind_of(model: ManoeuvringModel, found: Manoeuvre, log: TrialLog) -> Array | None:
+    """Return the wind of a trial at the model's samples from the order on (N, 2) [m/s].
+
+    Averaged over the time of one ship length; the mean of the manoeuvre stands after it. None
+    where none was measured, or the structure has no air.
+    """
+    if not (log.has_wind and model.structure.marine and model.structure.uses_air):
+        return None
+    wind = np.stack(true_wind(log["u_q"], log["v_q"], log["psi"], log["u"], log["v"]))
+    half = found.length / max(found.approach_speed.value, 1e-9) / 2
+    width = max(1, 2 * round(half / log.sample_time) + 1)
+    smooth = uniform_filter1d(wind, width, axis=1, mode="nearest")
+    times = np.arange(found.start, found.stop, model.sample_time)
+    blown = np.stack([np.interp(times, log.t, part) for part in smooth], axis=1)
+    return np.vstack([blown, blown.mean(axis=0)])
 
 
 def with_rates(
     helm: Helm, found: Sequence[tuple[Task, Manoeuvre, TrialLog]]
 ) -> tuple[Helm, list[str]]:
-    """Return a helm whose steering moves as fast as in the trial, where no rate is stated."""
+    """Return a helm whose steering moves as fast as in the trial, where no rate is stated.
+
+    The rate is that from a tenth to nine tenths of the way between two orders. A way of one
+    sample tells no rate: the helm moves at once.
+    """
     limits, told = list(helm.limits), []
     for i, name in enumerate(helm.columns):
-        if helm.steer[i] == 0 or limits[i].rate is not None or found[0][0].order is None:
+        if helm.steer[i] == 0 or limits[i].rate is not None:
             continue
-        steps = [
-            np.abs(np.diff(log[name][(log.t >= m.start - log.sample_time) & (log.t <= m.stop)]))
-            / log.sample_time
-            for _, m, log in found
-            if name in log
-        ]
-        moves = np.sort(np.concatenate([*steps, np.zeros(_FAULTS + 1)]))
-        # single steps are faults of the sensor, small ones its noise
-        fast = float(moves[-1 - _FAULTS])
-        if fast <= 0:
+        rates = [r for _, m, log in found if name in log for r in _rates(log, name, m)]
+        if not rates:
             continue
-        rate = float(np.median(moves[moves > fast / 2]))
-        smallest = min(abs(task.order) for task, _, _ in found if task.order is not None)
-        if rate * found[0][2].sample_time > _JUMP * smallest:
-            limits[i] = replace(limits[i], rate=math.inf)
-            told.append(
-                f"the vessel file states no rate of {name}; it moves at once, as in the trial."
-            )
-            continue
+        rate = float(np.median(rates))
         limits[i] = replace(limits[i], rate=rate)
         unit, factor = (" deg", 180 / math.pi) if helm.angular else ("", 1.0)
-        told.append(
-            f"the vessel file states no rate of {name}; it moves at {rate * factor:.3g}{unit} per "
-            f"second here, as in the trial."
-        )
+        how = f"at {rate * factor:.3g}{unit} per second here" if rate < math.inf else "at once"
+        told.append(f"the vessel file states no rate of {name}; it moves {how}, as in the trial.")
     return replace(helm, limits=tuple(limits)), told
+
+
+def _rates(log: TrialLog, name: str, found: Manoeuvre) -> list[float]:
+    """Return how fast a command moved to each order, infinite where within a sample [1/s]."""
+    run = found.length / max(found.approach_speed.value, 1e-9)
+    legs = _legs(found)
+    levels = [_level(log, name, (found.start - run, found.start))]
+    levels += [_level(log, name, leg) for leg in legs]
+    made = []
+    for (begin, end), (old, new) in zip(legs, pairwise(levels), strict=True):
+        step = new - old
+        if abs(step) < _STEP * max(map(abs, levels)):
+            continue
+        k = np.flatnonzero((log.t >= begin - 2 * log.sample_time) & (log.t <= end))
+        share = (log[name][k] - old) / step
+        there = int(np.argmax(share >= _ARRIVED))
+        if share[there] < _ARRIVED or there == 0:
+            continue
+        left = np.flatnonzero(share[:there] <= 1 - _ARRIVED)
+        if not len(left):
+            continue
+        a, b = int(left[-1]), there
+        # crossings between samples
+        gone = log.t[k[a]] + log.sample_time * (1 - _ARRIVED - share[a]) / (share[a + 1] - share[a])
+        come = log.t[k[b]] - log.sample_time * (share[b] - _ARRIVED) / (share[b] - share[b - 1])
+        quick = b - a <= 1
+        made.append(math.inf if quick else (2 * _ARRIVED - 1) * abs(step) / (come - gone))
+    return made
 
 
 def end_again(found: Manoeuvre, log: TrialLog, share: float) -> Manoeuvre:

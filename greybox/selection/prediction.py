@@ -83,7 +83,10 @@ def with_prediction(
         return replace(estimate, prediction=verdict)
     if failed:
         told.append(NotRefitted(len(failed), len(parts), failed[0]))
-    verdict = judge_prediction(held, parts=len(parts) - len(failed), found=told, seed=request.seed)
+    own = [HeldOut.of(model, log).run for log in logs]
+    verdict = judge_prediction(
+        held, parts=len(parts) - len(failed), found=told, own=own, seed=request.seed
+    )
     _log.info("prediction: %s", verdict.text)
     return replace(estimate, prediction=verdict)
 

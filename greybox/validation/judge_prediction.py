@@ -67,6 +67,7 @@ def judge_prediction(
     *,
     parts: int = 0,
     found: Sequence[Reason] = (),
+    own: Sequence[LogFit] = (),
     limits: PredictionLimits = LIMITS,
     seed: int = 0,
 ) -> PredictionVerdict:
@@ -81,6 +82,8 @@ def judge_prediction(
         Groups of logs that were left out in turn.
     found : sequence of Reason
         What is known already and is told with the rest.
+    own : sequence of LogFit
+        Runs on the logs of the estimate itself.
     limits : PredictionLimits
     seed : int
         Of the draws of the bands.
@@ -101,6 +104,8 @@ def judge_prediction(
     horizon = _horizons(held, spread) if beaten.any() else np.full(len(states), longest)
     horizon = np.where(rmse <= spread, longest, horizon)
     bands, told = _bands(held, states, seed)
+    memory = _memory(runs, states)
+    fitted = _errors(own, states)[1] if own else np.full(len(states), np.nan)
     channels = [
         ChannelPrediction(
             s,
@@ -112,6 +117,8 @@ def judge_prediction(
             float(horizon[i]),
             bool(rmse[i] <= spread[i]),
             bands.get(s),
+            float(memory[i]) if np.isfinite(memory[i]) else None,
+            float(fitted[i]) if np.isfinite(fitted[i]) else None,
         )
         for i, s in enumerate(states)
     ]
@@ -167,6 +174,18 @@ def _errors(runs: Sequence[LogFit], states: tuple[str, ...]) -> tuple[Array, Arr
                 error[i] += np.inf if run.diverged >= 0 else float(((y - x) ** 2).sum())
         spread[i], error[i] = np.sqrt(spread[i] / max(count, 1)), np.sqrt(error[i] / max(count, 1))
     return spread, error
+
+
+def _memory(runs: Sequence[LogFit], states: tuple[str, ...]) -> Array:
+    """Return the time over which errors are related (nx,) [s], nan where no run stays bounded."""
+    out = np.full(len(states), np.nan)
+    for i, state in enumerate(states):
+        good = [(r, r.log.known((state,))) for r in runs if r.diverged < 0]
+        errors = [(r.log[state] - r.x[:, i])[known][:, None] for r, known in good if known.any()]
+        if errors:
+            worth = float(independent_samples(errors, np.zeros(1))[0])
+            out[i] = sum(map(len, errors)) * good[0][0].log.sample_time / worth
+    return out
 
 
 def _noise(held: Sequence[HeldOut], states: tuple[str, ...]) -> Array:

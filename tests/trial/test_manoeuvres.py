@@ -515,6 +515,15 @@ def test_noisy_orders_have_a_time():
             assert t[0] <= held.execute <= t[held.first]
 
 
+@pytest.mark.parametrize("begun", [9.3, 9.85, 9.95])
+def test_a_helm_that_moves_between_coarse_samples_left_before_them(begun):
+    """Its sample after the order is neither amidships nor there yet."""
+    t = np.arange(60) * 1.0
+    angle = np.clip((t - begun) * 16 * DEG, 0.0, 20 * DEG)
+    order = next(h for h in held_angles(t, angle, 5.0) if abs(h.level) > 10 * DEG)
+    assert order.execute == pytest.approx(begun, abs=0.45)
+
+
 # standards and misuse
 
 

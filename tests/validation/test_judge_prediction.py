@@ -183,3 +183,11 @@ def test_the_summary_has_a_row_a_channel():
     assert shown[2].split()[:2] == ["surge", "0.2"]
     assert "12.5 s" in shown[3]
     assert shown[4] == "  on 4 parts of the log, each left out of an estimate in turn"
+
+
+def test_errors_on_the_own_logs_and_their_memory_are_kept(log):
+    wrong = HeldOut.of(true_model(log, Yv=1.5), log)
+    found = judge_prediction([wrong], own=[HeldOut.of(true_model(log), log).run]).to_dict()
+    assert found["own_rmse"]["v"] < 0.5 * found["rmse"]["v"]
+    assert found["memory"]["v"] > 2.0
+    assert judge_prediction([wrong]).to_dict()["own_rmse"] == {}

@@ -6,7 +6,7 @@ from greybox.trial.manoeuvres.standards import Compliance, Criterion
 from greybox.trial.manoeuvres.steering import held_angles, steering_angle
 from greybox.trial.manoeuvres.stopping import Stopping, measure_stopping
 from greybox.trial.manoeuvres.turning_circle import TurningCircle, measure_turning_circle
-from greybox.trial.manoeuvres.zig_zag import ZigZag, measure_zigzag
+from greybox.trial.manoeuvres.zig_zag import ZigZag, measure_zigzag, without_angle
 
 __all__ = [
     "Compliance",
@@ -22,4 +22,5 @@ __all__ = [
     "measure_turning_circle",
     "measure_zigzag",
     "steering_angle",
+    "without_angle",
 ]

@@ -13,11 +13,17 @@ from numpy.typing import NDArray
 from greybox.errors import LogError
 from greybox.trial.log import TrialLog
 from greybox.trial.manoeuvres.local import noise_std
-from greybox.trial.manoeuvres.steering import Held, held_angles, sideways, steering_angle
+from greybox.trial.manoeuvres.steering import (
+    Held,
+    held_angles,
+    sideways,
+    speed_difference,
+    steering_angle,
+)
 from greybox.trial.manoeuvres.stopping import Stopping, measure_stopping
 from greybox.trial.manoeuvres.track import without_antenna
 from greybox.trial.manoeuvres.turning_circle import TurningCircle, measure_turning_circle
-from greybox.trial.manoeuvres.zig_zag import ZigZag, measure_zigzag
+from greybox.trial.manoeuvres.zig_zag import ZigZag, measure_zigzag, without_angle
 
 Array = NDArray[np.float64]
 Manoeuvre = TurningCircle | ZigZag | Stopping
@@ -87,7 +93,7 @@ def find_manoeuvres(log: TrialLog, *, scale: float = 1.0) -> tuple[Manoeuvre, ..
     rudder reversed at equal headings to both sides; a stop is thrust taken off or
     reversed on a straight approach until the ship stands. A vessel without
     rudder or azimuth thrusters is searched for turning circles by its yaw rate,
-    and for stops.
+    for zig-zags by the difference of speeds on either side, and for stops.
 
     Parameters
     ----------
@@ -119,7 +125,13 @@ def find_manoeuvres(log: TrialLog, *, scale: float = 1.0) -> tuple[Manoeuvre, ..
     found: list[Manoeuvre] = []
     steering = steering_angle(log)
     if steering is None:
-        found += _turns_by_yaw_rate(log, signals)
+        zigzags = list(_zigzags_by_speeds(log, signals, scale))
+        found += zigzags
+        found += [
+            turn
+            for turn in _turns_by_yaw_rate(log, signals)
+            if not any(z.start < turn.stop and turn.start < z.stop for z in zigzags)
+        ]
     else:
         angle, greatest = steering
         opposed = sideways(log)
@@ -204,6 +216,15 @@ def _zigzags(
             continue
         yield zigzag
         i += len(run)
+
+
+def _zigzags_by_speeds(log: TrialLog, signals: _Signals, scale: float) -> Iterator[ZigZag]:
+    """Find zig-zags of a vessel that speeds on either side steer."""
+    share = speed_difference(log)
+    if share is not None:
+        held = held_angles(log.t, share, _HELD_LENGTHS * signals.ship_time)
+        for found in _zigzags(signals, share, held, scale, rudder=False):
+            yield without_angle(found)
 
 
 def _alternate(signals: _Signals, angle: Array, held: Sequence[Held], i: int) -> list[Held]:

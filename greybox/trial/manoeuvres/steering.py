@@ -17,6 +17,9 @@ Array = NDArray[np.float64]
 _TOLERANCE = math.radians(1.0)
 # angle between azimuth thrusters above which they push against one another [rad]
 _OPPOSED = math.radians(20)
+# least share of its thrust that a propeller gives along the ship, and of their greatest speed
+# with which propellers steer
+_ALONG, _RUNNING = 0.5, 0.1
 # share of a step within which its ramp is fitted
 _RAMP_LOW, _RAMP_HIGH = 0.2, 0.8
 
@@ -72,6 +75,30 @@ def steering_angle(log: TrialLog) -> tuple[Array, float | None] | None:
         ]
         return np.mean(parts, axis=0), None
     return None
+
+
+def speed_difference(log: TrialLog) -> Array | None:
+    """Return by which share of their speed fixed propellers on either side differ.
+
+    Returns
+    -------
+    ndarray or None
+        (N,) in [−1, 1], positive where those to port run faster, which turns to starboard;
+        zero where they hardly run. None for a vessel with rudders, azimuth thrusters or
+        propellers on one side only.
+    """
+    sides: dict[str, float] = {}
+    for t in log.vessel.thrusters:
+        if t.rudder is not None or isinstance(t.angle, str):
+            return None
+        if abs(math.cos(t.angle)) > _ALONG and t.y != 0 and t.speed in log:
+            sides[t.speed] = math.copysign(1.0, t.y) * math.copysign(1.0, math.cos(t.angle))
+    if len(set(np.sign(list(sides.values())))) < 2:
+        return None
+    apart = -np.sum([side * log[n] for n, side in sides.items()], axis=0)
+    total = np.sum([np.abs(log[n]) for n in sides], axis=0)
+    running = total > _RUNNING * float(total.max())
+    return np.asarray(np.where(running, apart / np.where(running, total, 1.0), 0.0))
 
 
 def sideways(log: TrialLog) -> NDArray[np.bool_]:
@@ -217,6 +244,12 @@ def execute_time(t: Array, y: Array, first: int, level: float, tolerance: float)
             return float(np.clip(time, t[i], t[ramp[0]]))
     if len(ramp) == 1:
         return float(t[max(0, ramp[0] - 1)])
-    # no sample on the way: a command that is held between samples took effect at this one
     there = inside[share >= _RAMP_HIGH]
-    return float(t[there[0] if len(there) else first])
+    k = int(there[0]) if len(there) else first
+    gone, come = (z[k - 1] - lowest) / step, (z[k] - lowest) / step
+    if k > i and step * max(gone, 1 - come) > tolerance:
+        # a helm that had left, or was not there yet, moved all the time between
+        left = float(t[k] - (t[k] - t[k - 1]) * come / (come - gone))
+        return max(left, float(t[max(i, k - 2)]))
+    # no sample on the way: a command that is held between samples took effect at this one
+    return float(t[k])

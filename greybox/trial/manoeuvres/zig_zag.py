@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,8 +46,10 @@ class ZigZag(DisplayMixin):
         Of the first turn, 1 to starboard.
     length : float
         Of the ship [m].
-    rudder, heading : float
-        Nominal angles [rad]: rudder, and heading at which it is reversed.
+    rudder : float or None
+        Nominal angle [rad], None where no angle steers.
+    heading : float
+        Nominal heading at which it is reversed [rad].
     executes : tuple of float
         When the rudder was moved [s].
     approach_heading, approach_speed : Quantity
@@ -80,7 +82,7 @@ class ZigZag(DisplayMixin):
     stop: float
     direction: int
     length: float
-    rudder: float
+    rudder: float | None
     heading: float
     executes: tuple[float, ...]
     approach_heading: Quantity
@@ -100,6 +102,9 @@ class ZigZag(DisplayMixin):
     def label(self) -> str:
         """What it is, in a few words."""
         side = "starboard" if self.direction > 0 else "port"
+        if self.rudder is None:
+            heading = f"{math.degrees(self.heading):.0f} deg of heading"
+            return f"zig-zag by speeds, reversed at {heading}, first to {side}"
         angles = f"{math.degrees(self.rudder):.0f}/{math.degrees(self.heading):.0f}"
         return f"zig-zag {angles}, first to {side}"
 
@@ -291,6 +296,13 @@ def measure_zigzag(
         criteria,
         tuple(notes),
     )
+
+
+def without_angle(found: ZigZag) -> ZigZag:
+    """Return a zig-zag that no angle steered: limits are for rudders."""
+    told = (not_applicable("overshoot", "no angle steers"),)
+    notes = tuple(n for n in found.notes if not n.startswith("the standard is for ships"))
+    return replace(found, rudder=None, criteria=told, notes=notes)
 
 
 def _nominal_rudder(rudder: float) -> float:
