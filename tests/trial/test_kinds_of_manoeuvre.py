@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 from foreign_ships import presets
 from foreign_ships.manoeuvres import kinds
@@ -55,6 +57,9 @@ def test_logs_of_one_kind_are_left_out_together(logs):
     assert set(kinds_left_out(several)) == {"zig-zag", "varied", "turn"}
     for fitting, held in parts_of(several):
         assert len(fitting) + len(held) == 4
+    # logs without a manoeuvre are like no other
+    varied = [logs["random"], logs["zigzag-20"], replace(logs["random"], name="again")]
+    assert [len(held) for _, held in parts_of(varied)] == [1, 1, 1]
     # of one kind, logs are left out
     alike = [logs[n] for n in ("zigzag-20", "zigzag-10-port")]
     assert [[log.name for log in held] for _, held in parts_of(alike)] in (

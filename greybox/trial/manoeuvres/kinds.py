@@ -54,10 +54,13 @@ class ManoeuvreKind:
         In words.
     shown : callable
         Whether a log is of it; the first kind in the registry that says so is a log's.
+    alike : bool
+        Whether two logs of it show much the same motion.
     """
 
     name: str
     shown: Callable[[_Seen], bool]
+    alike: bool = True
 
 
 # from the narrowest kind to the one that takes whatever is left
@@ -67,7 +70,7 @@ KINDS: Registry[ManoeuvreKind] = Registry(
     ManoeuvreKind("turn", lambda seen: seen.mostly(TurningCircle)),
     ManoeuvreKind("stop", lambda seen: seen.mostly(Stopping)),
     ManoeuvreKind("straight course", lambda seen: seen.straight),
-    ManoeuvreKind("varied", lambda seen: True),
+    ManoeuvreKind("varied", lambda seen: True, alike=False),
 )
 
 
@@ -77,9 +80,17 @@ def kind_of(log: TrialLog) -> ManoeuvreKind:
     return next(kind for kind in KINDS.values() if kind.shown(seen))
 
 
-def by_kind(logs: Sequence[TrialLog]) -> dict[str, list[int]]:
-    """Return which logs are of each kind, by its name, in the order in which they occur."""
-    out: dict[str, list[int]] = {}
+def alike(logs: Sequence[TrialLog]) -> list[tuple[ManoeuvreKind, list[int]]]:
+    """Return groups of logs that show much the same motion, each with its kind.
+
+    Logs of one kind of manoeuvre are a group; a log that is like no other is one by itself.
+    """
+    groups: list[tuple[ManoeuvreKind, list[int]]] = []
     for i, log in enumerate(logs):
-        out.setdefault(kind_of(log).name, []).append(i)
-    return out
+        kind = kind_of(log)
+        known = next((own for k, own in groups if k is kind and kind.alike), None)
+        if known is None:
+            groups.append((kind, [i]))
+        else:
+            known.append(i)
+    return groups
