@@ -26,6 +26,7 @@ from greybox.trial.kinematics import decimate_segments
 from greybox.trial.log import TrialLog
 from greybox.trial.segments import as_segments
 from greybox.validation.calibration import calibrate_bands, run_errors
+from greybox.validation.held_commands import held_commands_diverge
 from greybox.validation.judge_prediction import HeldOut, judge_prediction
 
 _log = logging.getLogger(__name__)
@@ -70,6 +71,8 @@ def with_prediction(
         parts = parts_of(logs)
     except UsageError as error:
         failed.append(str(error))
+    runs_away = held_commands_diverge(model, logs) if not told else None
+    told += [runs_away] if runs_away else []
     again = refit or refit_alike(estimate, request)
     for fitting, left_out in parts:
         try:
