@@ -6,7 +6,7 @@ against limits, and sentences are rendered from them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any, ClassVar
@@ -180,6 +180,33 @@ class RunsDiverge(Reason):
         return (
             f"its free run diverges in {len(self.logs)} of {self.count} runs, first after "
             f"{self.after:.3g} s"
+        )
+
+
+@dataclass(frozen=True)
+class HeldCommandsDiverge(Reason):
+    """The free run leaves its bound where commands are held at what the logs reached.
+
+    Parameters
+    ----------
+    commands : mapping of str to float
+        What they are held at, in the units of the log.
+    after : float
+        [s]
+    """
+
+    commands: Mapping[str, float]
+    after: float
+
+    kind: ClassVar[str] = "held_commands_diverge"
+
+    @property
+    def sentence(self) -> str:
+        """At which commands, and when."""
+        at = ", ".join(f"{name} {value:.3g}" for name, value in self.commands.items())
+        return (
+            f"its free run diverges after {self.after:.3g} s where commands are held at what the "
+            f"logs reached ({at})"
         )
 
 
@@ -549,8 +576,9 @@ def weigh_prediction(
 ) -> PredictionVerdict:
     """Weigh what free runs did on logs against the limits.
 
-    Good: every channel that moves is followed, and its bands hold. Poor: a run diverges, or no
-    channel that moves is usable. Limited: all between, and whatever was judged on its own logs.
+    Good: every channel that moves is followed, and its bands hold. Poor: a run diverges, on a
+    log or where commands are held, or no channel that moves is usable. Limited: all between,
+    and whatever was judged on its own logs.
 
     Parameters
     ----------
@@ -563,7 +591,7 @@ def weigh_prediction(
     limits : PredictionLimits
     """
     moving = [c for c in channels if c.moves]
-    diverges = [r for r in found if isinstance(r, RunsDiverge | Divergence)]
+    diverges = [r for r in found if isinstance(r, RunsDiverge | Divergence | HeldCommandsDiverge)]
     large = [
         LargeError(c.channel, c.error, limits.good, c.horizon)
         for c in moving

@@ -71,6 +71,8 @@ class Estimate(EstimateValues, DisplayMixin):
         Whether all equations were solved jointly with their error made white.
     prediction : PredictionVerdict, optional
         What the free run is good for on logs that took no part; None where not asked for.
+    calibration : BandCalibration, optional
+        How far bands must reach, by logs that were left out in turn.
     """
 
     @property
@@ -251,6 +253,7 @@ class Estimate(EstimateValues, DisplayMixin):
             ),
             residual_std=self.residual_std,
             noise=self.noise,
+            calibration=self.calibration,
             sums={c.name: c.terms for c in columns if len(c.terms) > 1},
             conditions=self.conditions.values,
             record=self.record(),

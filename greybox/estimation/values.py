@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from greybox.estimation.prediction_verdict import PredictionVerdict
 from greybox.estimation.verdict import UNJUDGED, TestResult, Verdict
-from greybox.model.noise import NoiseLevels
+from greybox.model.noise import BandCalibration, NoiseLevels
 from greybox.model.predictor import Predictor
 from greybox.trial.actuator_estimate import ActuatorEstimate, known_actuators
 from greybox.trial.log import TrialLog
@@ -156,3 +156,4 @@ class EstimateValues:
     limits: Mapping[str, EfficiencyBound] = field(default_factory=dict)
     prefilter: str = "none"
     prediction: PredictionVerdict | None = None
+    calibration: BandCalibration | None = None

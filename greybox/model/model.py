@@ -18,7 +18,12 @@ from numpy.typing import NDArray
 from greybox.errors import GreyboxError, ModelFileError, suggestion
 from greybox.files import nearest_file, plain, write_json
 from greybox.model.disturbances import DisturbanceKind
-from greybox.model.noise import NoiseLevels, noise_from_dict
+from greybox.model.noise import (
+    BandCalibration,
+    NoiseLevels,
+    calibration_from_dict,
+    noise_from_dict,
+)
 from greybox.model.run.changes import Change, factors_at, require_parameters
 from greybox.model.run.step import Integrator
 from greybox.model.structure import Structure
@@ -69,6 +74,8 @@ class ManoeuvringModel(DisplayMixin):
     conditions : mapping of str to tuple
         Draught, trim, loading, water depth and sea state of the logs that it was estimated
         on, as far as they state them: see `greybox.trial.validity`.
+    calibration : BandCalibration, optional
+        How far its bands must reach to hold what it lacks; None where nothing was held out.
 
     Raises
     ------
@@ -90,6 +97,7 @@ class ManoeuvringModel(DisplayMixin):
     record: Mapping[str, Any] = field(default_factory=dict)
     changes: tuple[Change, ...] = ()
     conditions: Validity = field(default_factory=dict)
+    calibration: BandCalibration | None = None
 
     def __post_init__(self) -> None:
         require_parameters(self.changes, self.names, self.structure.name)
@@ -262,6 +270,8 @@ class ManoeuvringModel(DisplayMixin):
             data["changes"] = [vars(c) for c in self.changes]
         if self.conditions:
             data["conditions"] = validity_to_dict(self.conditions)
+        if self.calibration is not None:
+            data["calibration"] = self.calibration.to_dict()
         out: dict[str, Any] = plain(data | dict(self.record))
         return out
 
@@ -274,7 +284,7 @@ _CORE = {
     "format", "version", "sample_time", "integrator", "structure", "names", "theta", "std",
     "units", "theta_per_second", "covariance", "sums", "disturbances",
     "disturbance_covariance", "residual_std", "noise", "vessel", "changes",
-    "conditions",
+    "conditions", "calibration",
 }  # fmt: skip
 
 
@@ -369,6 +379,11 @@ def model_from_dict(data: Any, source: str = "model") -> ManoeuvringModel:
             record={k: v for k, v in data.items() if k not in _CORE},
             changes=_changes(data.get("changes", []), structure.parameters, source),
             conditions=validity_from_dict(data.get("conditions", {})),
+            calibration=(
+                calibration_from_dict(data["calibration"], structure.states)
+                if data.get("calibration")
+                else None
+            ),
         )
     except ModelFileError:
         raise

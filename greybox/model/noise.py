@@ -85,6 +85,58 @@ class NoiseLevels(DisplayMixin):
         }
 
 
+@dataclass(frozen=True)
+class BandCalibration:
+    """How far free runs were off on logs that took no part, beside what draws of them say.
+
+    Parameters
+    ----------
+    states : tuple of str
+    factor : ndarray
+        (nx,) on the half width of the draws of a run.
+    misfit : ndarray
+        (2, nx) what the model lacks, as it shows in a free run: the standard deviation of a
+        normal error that reaches as far below the run, and above it [m/s, rad/s]. It is
+        added as squares.
+    runs : int
+        Free runs that it rests on.
+    kinds : tuple of str
+        Kinds of manoeuvre that were left out in turn; empty where logs or parts were.
+    """
+
+    states: tuple[str, ...]
+    factor: Array
+    misfit: Array
+    runs: int
+    kinds: tuple[str, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the calibration for JSON."""
+        return {
+            "factor": dict(zip(self.states, map(float, self.factor), strict=True)),
+            "misfit": dict(zip(self.states, self.misfit.T.tolist(), strict=True)),
+            "runs": self.runs,
+            "kinds": list(self.kinds),
+        }
+
+
+def calibration_from_dict(data: Mapping[str, Any], states: tuple[str, ...]) -> BandCalibration:
+    """Build a calibration from the tables of a model file.
+
+    Raises
+    ------
+    KeyError, TypeError, ValueError
+        The tables are incomplete.
+    """
+    return BandCalibration(
+        states,
+        np.array([float(data["factor"][s]) for s in states]),
+        np.array([[float(m) for m in data["misfit"][s]] for s in states]).reshape(-1, 2).T,
+        int(data["runs"]),
+        tuple(str(k) for k in data["kinds"]),
+    )
+
+
 def noise_from_dict(data: Mapping[str, Any], states: tuple[str, ...]) -> NoiseLevels:
     """Build levels from the tables of a model file.
 

@@ -63,6 +63,15 @@ class NoiseTable(_Table):
     memory: dict[str, Number] = {}
 
 
+class CalibrationTable(_Table):
+    """How far bands reach."""
+
+    factor: dict[str, Number]
+    misfit: dict[str, Annotated[list[Number], Field(min_length=2, max_length=2)]]
+    runs: int
+    kinds: list[str]
+
+
 class ModelTable(_Table):
     """A model file of this version."""
 
@@ -77,6 +86,7 @@ class ModelTable(_Table):
     noise: NoiseTable | None
     sums: dict[str, list[str]]
     vessel: dict[str, Any]
+    calibration: CalibrationTable | None = None
 
 
 def require_tables(data: Any, source: str) -> None:

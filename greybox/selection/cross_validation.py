@@ -25,6 +25,7 @@ from greybox.selection.fit_single import estimate_once
 from greybox.selection.held_out import FLOOR, folds, score_runs, spread_of
 from greybox.selection.request import Request
 from greybox.trial.log import TrialLog
+from greybox.trial.manoeuvres.kinds import alike
 from greybox.validation.fit import average_fit, run_model
 
 Array = NDArray[np.float64]
@@ -140,7 +141,10 @@ def _gain(difference: Array) -> tuple[float, float]:
 
 
 def parts_of(logs: Sequence[TrialLog]) -> list[tuple[list[TrialLog], list[TrialLog]]]:
-    """Return (to estimate on, held out): groups of logs in turn, or parts of a single log.
+    """Return (to estimate on, held out): kinds of manoeuvre, groups of logs, or parts of one.
+
+    What a model lacks shows where the ship moves as it did not before, so logs that are alike,
+    such as zig-zags, are left out together, unless all are.
 
     Raises
     ------
@@ -149,13 +153,22 @@ def parts_of(logs: Sequence[TrialLog]) -> list[tuple[list[TrialLog], list[TrialL
     """
     if len(logs) == 1:
         return folds(logs, _FOLDS)
-    groups: list[list[int]] = [[] for _ in range(min(len(logs), _FOLDS))]
-    for i in sorted(range(len(logs)), key=lambda i: -len(logs[i])):
-        min(groups, key=lambda g: sum(len(logs[j]) for j in g)).append(i)
+    pieces = [own for _, own in alike(logs)]
+    if len(pieces) == 1:
+        pieces = [[i] for i in pieces[0]]
+    groups: list[list[int]] = [[] for _ in range(min(len(pieces), _FOLDS))]
+    for piece in sorted(pieces, key=lambda piece: -sum(len(logs[i]) for i in piece)):
+        min(groups, key=lambda g: sum(len(logs[j]) for j in g)).extend(piece)
     return [
         ([log for i, log in enumerate(logs) if i not in group], [logs[i] for i in group])
         for group in groups
     ]
+
+
+def kinds_left_out(logs: Sequence[TrialLog]) -> tuple[str, ...]:
+    """Return the kinds of manoeuvre that `parts_of` leaves out; none where it leaves out logs."""
+    kinds = dict.fromkeys(kind.name for kind, _ in alike(logs)) if len(logs) > 1 else {}
+    return tuple(kinds) if len(kinds) > 1 else ()
 
 
 def compare_estimators(

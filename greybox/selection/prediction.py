@@ -15,11 +15,18 @@ from greybox.estimation.result import Estimate
 from greybox.estimation.verdict import Divergence, Reason
 from greybox.model.model import ManoeuvringModel
 from greybox.selection.alternatives import ranking_request
-from greybox.selection.cross_validation import EstimatorVariant, estimate_variant, parts_of
+from greybox.selection.cross_validation import (
+    EstimatorVariant,
+    estimate_variant,
+    kinds_left_out,
+    parts_of,
+)
 from greybox.selection.request import Request
 from greybox.trial.kinematics import decimate_segments
 from greybox.trial.log import TrialLog
 from greybox.trial.segments import as_segments
+from greybox.validation.calibration import calibrate_bands, run_errors
+from greybox.validation.held_commands import held_commands_diverge
 from greybox.validation.judge_prediction import HeldOut, judge_prediction
 
 _log = logging.getLogger(__name__)
@@ -41,7 +48,8 @@ def with_prediction(
     logs : sequence of TrialLog
         Those it was estimated on; they are left out in turn, a single one in parts.
     request : Request
-        Its ``validate`` logs judge instead, where there are some.
+        Its ``validate`` logs judge instead, where there are some; the logs left out in turn
+        then calibrate the bands alone.
     refit : callable, optional
         Whatever the data chose must be chosen again in it. By default the same structure,
         predictor and method.
@@ -57,16 +65,14 @@ def with_prediction(
         told.append(Divergence())
     if request.validate:
         require_others(logs, request.validate)
-        others = as_read(as_segments(request.validate), estimate)
-        held = [HeldOut.of(model, log) for log in others]
-        verdict = judge_prediction(held, JudgedOn.VALIDATION, found=told, seed=request.seed)
-        return replace(estimate, prediction=verdict)
     held, failed, parts = [], [], []
     logs = as_read(logs, estimate)
     try:
         parts = parts_of(logs)
     except UsageError as error:
         failed.append(str(error))
+    runs_away = held_commands_diverge(model, logs) if not told else None
+    told += [runs_away] if runs_away else []
     again = refit or refit_alike(estimate, request)
     for fitting, left_out in parts:
         try:
@@ -76,6 +82,17 @@ def with_prediction(
             failed.append(str(error))
             continue
         held += [HeldOut.of(other, log) for log in left_out]
+    errors = [run_errors(h.model, h.run, request.seed) for h in held]
+    calibration = calibrate_bands(
+        [e for e in errors if e is not None], model.structure.states, kinds_left_out(logs)
+    )
+    estimate = replace(estimate, calibration=calibration)
+    if request.validate:
+        model = replace(model, calibration=calibration)
+        others = as_read(as_segments(request.validate), estimate)
+        runs = [HeldOut.of(model, log) for log in others]
+        verdict = judge_prediction(runs, JudgedOn.VALIDATION, found=told, seed=request.seed)
+        return replace(estimate, prediction=verdict)
     if not held:
         runs = [HeldOut.of(model, log) for log in logs]
         told.append(NothingHeldOut(failed[0]))
@@ -85,7 +102,12 @@ def with_prediction(
         told.append(NotRefitted(len(failed), len(parts), failed[0]))
     own = [HeldOut.of(model, log).run for log in logs]
     verdict = judge_prediction(
-        held, parts=len(parts) - len(failed), found=told, own=own, seed=request.seed
+        held,
+        parts=len(parts) - len(failed),
+        found=told,
+        own=own,
+        seed=request.seed,
+        errors=errors,
     )
     _log.info("prediction: %s", verdict.text)
     return replace(estimate, prediction=verdict)

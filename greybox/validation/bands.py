@@ -20,7 +20,7 @@ from greybox.numerics.linalg import scaled_root
 from greybox.regression.instruments import state_bound
 from greybox.trial.log import TrialLog
 from greybox.trial.segments import split_segments
-from greybox.validation.fit import at_model_rate
+from greybox.validation.fit import at_model_rate, run_model
 
 Array = NDArray[np.float64]
 
@@ -28,7 +28,7 @@ LEVEL = 0.95
 RUNS = 256
 _LIMITS = ((1 - LEVEL) / 2, 0.5, (1 + LEVEL) / 2)
 # of a normal distribution
-_Z = 1.959963984540054
+Z = 1.959963984540054
 # steps simulated at once: bounds the memory, whatever the length of the log
 _STEPS = 2048
 # share of the draws that must stay bounded for their quantiles to mean something
@@ -137,18 +137,25 @@ def predict_bands(
     -------
     Bands
         The motion's limits are quantiles of the draws; the measurement's add its
-        noise, root of the sum of squares about the median.
+        noise, root of the sum of squares about the median. Where held-out runs calibrated
+        the model, limits lie about its own run, as far off as those runs say.
     """
     from scipy.special import ndtr
 
     log = at_model_rate(log, model)
     states = model.structure.states
     noise = np.zeros(len(states)) if model.noise is None else model.noise.measurement
-    reach = _Z * noise
+    reach = Z * noise
     motion, measurement = (np.full((2, len(log), len(states)), np.nan) for _ in range(2))
     inside, counted = np.zeros((runs, len(states))), 0
     good = np.ones(runs, bool)
     rng = np.random.default_rng([71, seed])
+    calibration = model.calibration
+    own = None if calibration is None else run_model(model, log, heading=heading).x
+    # what the model lacks moves a whole run, so that shares of the runs differ
+    misfit = np.zeros((2, len(states))) if calibration is None else calibration.misfit
+    off = np.random.default_rng([72, seed]).standard_normal((runs, len(states)))
+    off *= np.where(off < 0, *misfit)
     parts = split_segments(log)
     starts = np.cumsum([0, *map(len, parts)])
     drawn = (
@@ -164,6 +171,12 @@ def predict_bands(
         kept = x[good]
         low, middle, high = np.quantile(kept, _LIMITS, axis=0, method="weibull")
         piece = slice(first, first + x.shape[1])
+        if calibration is not None and own is not None:
+            kept = own[piece] + calibration.factor * (kept - middle) + off[good][:, None]
+            drawn = calibration.factor * (high - low) / 2
+            middle = own[piece]
+            low = middle - np.hypot(drawn, Z * misfit[0])
+            high = middle + np.hypot(drawn, Z * misfit[1])
         motion[:, piece] = low, high
         measurement[:, piece] = (
             middle - np.hypot(middle - low, reach),
@@ -175,7 +188,7 @@ def predict_bands(
         inside[good] += (ndtr((upper - kept) / spread) - ndtr((lower - kept) / spread)).sum(axis=1)
         counted += x.shape[1]
     coverage = {}
-    if model.noise is not None and counted == len(log):
+    if (model.noise is not None or calibration is not None) and counted == len(log):
         share = inside[good] / counted
         # which of the measurements lie inside is chance too
         chance = np.sqrt(share * (1 - share) / counted) * rng.standard_normal(share.shape)
@@ -204,7 +217,9 @@ def _coverage(state: str, share: float, usual: Array) -> Coverage:
 
 
 def _missing(model: ManoeuvringModel) -> tuple[str, ...]:
-    told = []
+    told: list[str] = []
+    if model.calibration is not None:
+        return ()
     if not model.covariance.any():
         told.append("the model has no covariance, so its parameters were taken as exact.")
     if model.noise is None:

@@ -27,6 +27,7 @@ from greybox.numerics.binomial import wilson_interval
 from greybox.trial.log import TrialLog
 from greybox.trial.segments import split_segments, whole_name
 from greybox.validation.bands import predict_bands
+from greybox.validation.calibration import RunErrors, cross_calibrated
 from greybox.validation.criteria import independent_samples
 from greybox.validation.fit import LogFit, run_from, run_model
 
@@ -38,8 +39,8 @@ _DRAWS, _RESTARTS = 64, 12
 _THIRD = 20.0
 # of a normal distribution: standard deviation over median absolute deviation
 _MEDIAN = 1.4826
-# least width of a band, so that it divides
-_NONE = 1e-300
+# least width of a band, so that it divides, and half widths beyond which an error is none of it
+_NONE, _FAR = 1e-300, 1e6
 
 
 @dataclass(frozen=True)
@@ -70,6 +71,7 @@ def judge_prediction(
     own: Sequence[LogFit] = (),
     limits: PredictionLimits = LIMITS,
     seed: int = 0,
+    errors: Sequence[RunErrors | None] | None = None,
 ) -> PredictionVerdict:
     """Say what free runs are good for.
 
@@ -87,12 +89,15 @@ def judge_prediction(
     limits : PredictionLimits
     seed : int
         Of the draws of the bands.
+    errors : sequence of RunErrors or None, optional
+        Of the runs, None where there is no band: the bands judged are then those that the
+        other runs calibrate.
 
     Returns
     -------
     PredictionVerdict
         Errors are those of all runs together, against the mean of each log as the best
-        constant. Bands are those of each run's own model.
+        constant. Without `errors` bands are those of each run's own model.
     """
     runs = [h.run for h in held]
     states = tuple(runs[0].fit)
@@ -103,7 +108,9 @@ def judge_prediction(
     beaten = moves & ~(rmse <= spread)
     horizon = _horizons(held, spread) if beaten.any() else np.full(len(states), longest)
     horizon = np.where(rmse <= spread, longest, horizon)
-    bands, told = _bands(held, states, seed)
+    bands, told = (
+        _bands(held, states, seed) if errors is None else _calibrated(held, states, errors)
+    )
     memory = _memory(runs, states)
     fitted = _errors(own, states)[1] if own else np.full(len(states), np.nan)
     channels = [
@@ -265,33 +272,55 @@ def _bands(
     held: Sequence[HeldOut], states: tuple[str, ...], seed: int
 ) -> tuple[dict[str, BandShare], list[Reason]]:
     """Return how many measurements the bands hold, by state, and why there are none."""
-    if all(h.model.noise is None for h in held):
+    if all(h.model.noise is None and h.model.calibration is None for h in held):
         return {}, [NoBands("the estimate has no noise levels")]
     # errors in half widths of the band
-    outward: dict[str, list[Array]] = {s: [] for s in states}
+    outward: list[Array] = []
     lost: list[str] = []
     for h in held:
         run = h.run
-        if h.model.noise is None or run.diverged >= 0:
+        if (h.model.noise is None and h.model.calibration is None) or run.diverged >= 0:
             continue
-        limits = predict_bands(h.model, run.log, seed=seed, runs=_DRAWS).measurement
-        if np.isnan(limits).any():
+        low, high = predict_bands(h.model, run.log, seed=seed, runs=_DRAWS).measurement
+        if np.isnan(low).any():
             lost.append(run.log.name)
             continue
-        for i, s in enumerate(states):
-            known = run.log.known((s,))
-            y = run.log[s]
-            middle, half = (
-                (limits[0, :, i] + limits[1, :, i]) / 2,
-                np.ptp(limits[:, :, i], axis=0) / 2,
-            )
-            if known.any():
-                outward[s].append(((y - middle) / np.maximum(half, _NONE))[known][:, None])
+        known = np.stack([run.log.known((s,)) for s in states], axis=1)
+        error = np.where(known, run.log.states(states) - (low + high) / 2, np.nan)
+        outward.append(error / np.maximum((high - low) / 2, _NONE))
+    return _shares(outward, states), [DrawsDiverge(tuple(lost), len(held))] if lost else []
+
+
+def _calibrated(
+    held: Sequence[HeldOut], states: tuple[str, ...], errors: Sequence[RunErrors | None]
+) -> tuple[dict[str, BandShare], list[Reason]]:
+    """Return how many measurements bands hold that the runs calibrate for one another."""
+    lost = tuple(
+        h.run.log.name
+        for h, e in zip(held, errors, strict=True)
+        if e is None and h.run.diverged < 0
+    )
+    told: list[Reason] = [DrawsDiverge(lost, len(held))] if lost else []
+    known = [e for e in errors if e is not None]
+    sides = cross_calibrated(known, states)
+    if not sides:
+        return {}, [*told, NoBands("a single run was left out, and none is left to calibrate it")]
+    outward = [
+        e.error / np.maximum(np.where(e.error < 0, *side), _NONE)
+        for e, side in zip(known, sides, strict=True)
+    ]
+    return _shares(outward, states), told
+
+
+def _shares(outward: Sequence[Array], states: tuple[str, ...]) -> dict[str, BandShare]:
+    """Return how many errors, in half widths of their band and nan where unknown, lie inside."""
     found = {}
-    for s, parts in outward.items():
+    for i, s in enumerate(states):
+        parts = [np.clip(e[~np.isnan(e[:, i]), i], -_FAR, _FAR)[:, None] for e in outward]
+        parts = [p for p in parts if len(p)]
         if parts:
             whole = np.concatenate(parts)
             share = float((np.abs(whole) <= 1).mean())
             worth = float(independent_samples(parts, np.zeros(1))[0])
             found[s] = BandShare(share, wilson_interval(share, worth), len(whole), worth)
-    return found, [DrawsDiverge(tuple(lost), len(held))] if lost else []
+    return found

@@ -12,10 +12,11 @@ from virtual import virtual_log, write_csv
 
 from greybox.commands.main import main
 from greybox.errors import ExcitationError, UsageError
-from greybox.estimation.prediction_verdict import JudgedOn, PredictionLevel
+from greybox.estimation.prediction_verdict import JudgedOn, PredictionLevel, weigh_prediction
 from greybox.selection.estimate import estimate_model
 from greybox.selection.prediction import refit_alike, with_prediction
 from greybox.selection.request import Request
+from greybox.validation.held_commands import held_commands_diverge
 
 ASKED = {"structure": "thesis", "predictor": "basic"}
 CALM = {"wind": 0.0, "spread": 1e-12, "current": (0.0, 0.0)}
@@ -159,3 +160,24 @@ def test_a_log_of_the_estimate_cannot_judge(estimate, logs):
     own = replace(logs[0], provenance=replace(logs[0].provenance, sha256="ab"))
     with pytest.raises(UsageError, match="Name it once"):
         with_prediction(estimate, [own], Request(validate=(own,)))
+
+
+def test_a_model_that_runs_away_where_commands_are_held_is_poor(estimate, logs):
+    """Its turning drives itself beyond yaw rates that the logs keep for moments only."""
+    model = estimate.model()
+    structure = model.structure.with_terms("N_rrr")
+    theta = np.append(model.theta, 0.0)
+    place = structure.parameters.index("N_rrr")
+    theta = np.insert(np.delete(theta, -1), place, 6.0)
+    unstable = replace(
+        model, structure=structure, theta=theta, covariance=np.zeros((len(theta),) * 2)
+    )
+    found = held_commands_diverge(unstable, logs)
+    assert found is not None
+    assert set(found.commands) == set(estimate.vessel.commands)
+    assert 0 < found.after < 300
+    assert "its free run diverges after" in found.sentence
+    assert held_commands_diverge(model, logs) is None
+    judged = weigh_prediction(estimate.prediction.channels, JudgedOn.HELD_OUT, found=[found])
+    assert judged.level is PredictionLevel.POOR
+    assert judged.text == f"poor: {found.sentence}"
