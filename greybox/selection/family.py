@@ -35,7 +35,7 @@ _FORCE = {
     "race_drag": ["X_race_drag"],
     "rudder_drag": ["X_rudder_drag", "X_|u|u*rudder_drag"],
 }
-# what every ship has, and what selection begins with and never takes away
+# what every ship has, and what selection never takes away
 _CORE = "Xu Yv Nr".split()
 
 
@@ -62,9 +62,15 @@ def family_for(inputs: tuple[str, ...], wind: bool) -> Structure:
     return Structure("family", ()).with_terms(*terms.values())
 
 
-def first_terms(inputs: tuple[str, ...]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the terms that selection begins with, and those of them that stay."""
-    return structure_for("linear", inputs).parameters, tuple(_CORE)
+def first_terms(inputs: tuple[str, ...]) -> tuple[tuple[tuple[str, ...], ...], tuple[str, ...]]:
+    """Return the sets of terms that selection may begin with, and the terms that always stay.
+
+    The smaller set has each velocity's own damping and the forces of the commands, none of
+    which grows with the motion: of its terms none drives the ship where the logs did not.
+    """
+    linear = structure_for("linear", inputs)
+    alone = tuple(t.name for t in linear.terms if len(t.factors) == 1)
+    return (alone, linear.parameters), tuple(_CORE)
 
 
 def spell_structure(terms: tuple[str, ...], inputs: tuple[str, ...]) -> str:
