@@ -2,7 +2,8 @@
 
 Hull forces of second order with and without moduli, the cubic ones that published models
 of tankers and catamarans use, constant forces, the cross terms of sway and yaw, thrust that
-speed takes from and that pushes beside its own axis, a rudder in the race and beside it, and
+speed takes from and that pushes beside its own axis, flow through propellers that damps
+whichever way they turn, a rudder in the race and beside it, and
 the wind where it was measured. Inertia that couples sway and yaw multiplies the forces of
 both equations by one matrix, so each force may push each of the two.
 
@@ -27,7 +28,7 @@ _HULL = (
 _WIND = "Wuu Wvv Wuv X_uq Y_vq N_vq X_|vq|uq Y_|uq|vq N_|uq|vq".split()
 # those of each generalised input
 _FORCE = {
-    "taux": "Xmu Xkappa Y_taux Y_v*taux Y_r*taux N_taux N_v*taux N_r*taux".split(),
+    "taux": "Xmu Xkappa X_|taux|u Y_taux Y_|taux|v Y_|taux|r N_taux N_|taux|v N_|taux|r".split(),
     "tauy": "Ymu Y_u*tauy N_tauy".split(),
     "taun": "Nmu N_u*taun Y_taun".split(),
     "race": "Y_race Y_u*race N_race N_u*race".split(),

@@ -48,7 +48,10 @@ _AHEAD = 3
 # iterations of a first fit, and the share of the error below which a step ends it
 _FIRST, _SETTLED = 12, 3e-3
 # share of the squared error that a term must take away, and that its own direction must hold
-_EARNS, _OWN = 1e-3, 1e-3
+_EARNS, _OWN = 4e-3, 1e-3
+# gain by which a term that may drive the ship must exceed that of one that only takes energy out:
+# u r and |u| r are one on logs ahead, and astern the one drives what the other brakes
+_BRAKES = 1.25
 # squared error of a run without any, in deviations
 _LEAST = 1e-12
 # candidates that are tried, the most promising first
@@ -235,9 +238,10 @@ class FreeRunSelection:
     def _at(self, runs: Runs, p: Array, cost: float) -> _Point:
         at = runs.linearise(p, self.starts)
         weight = 1 / np.sqrt(self._noise(at.r))
-        rows = at.rows.reshape(*at.r.shape, -1)[..., : len(p)] * weight[:, None]
-        rows = rows.reshape(-1, len(p))
-        return _Point(p, cost, rows.T @ rows, rows.T @ (at.r * weight).ravel(), self._most)
+        used = self._whole.use > 0
+        rows = at.rows.reshape(*at.r.shape, -1)[used, :, : len(p)] * weight[:, None]
+        rows, r = rows.reshape(-1, len(p)), (at.r[used] * weight).ravel()
+        return _Point(p, cost, rows.T @ rows, rows.T @ r, self._most)
 
     def _moved(self, runs: Runs, at: _Point, step: Array) -> _Point | None:
         """Return where a step or a part of it leads downhill, None where it does not."""
@@ -297,11 +301,9 @@ class FreeRunSelection:
         known = left > _OWN * np.maximum(own, 0.0)
         known &= (self._most[out] > 0) | (slope < 0)
         gains = np.where(known, 0.5 * slope**2 / np.where(known, left, 1.0), 0.0)
-        for i in np.argsort(-gains)[:_TRIED]:
-            if self._share(-gains[i]) > 1 - earns:
-                return None
+        for i in np.argsort(-gains * np.where(self._most[out] > 0, 1.0, _BRAKES))[:_TRIED]:
             tried = np.append(index, out[i])
-            if frozenset(tried.tolist()) in seen:
+            if self._share(-gains[i]) > 1 - earns or frozenset(tried.tolist()) in seen:
                 continue
             moved = self._moved(runs, at, at.solution(hessian, gradient, tried))
             if moved is None or self._share(moved.cost - at.cost) > 1 - earns:
