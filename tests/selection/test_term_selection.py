@@ -97,6 +97,18 @@ def test_damping_never_drives_the_ship(modulus_log):
                 assert one.p[selection.names.index(term.name)] <= 0
 
 
+def test_what_the_log_cannot_tell_from_damping_is_damping(modulus_log):
+    """u r and |u| r are one on a log ahead; astern the first would drive the ship."""
+    assert (modulus_log["u"] > 0).all()
+    inputs = force_inputs(modulus_log.vessel)
+    selection = FreeRunSelection([modulus_log], family_for(inputs, False), "augmented")
+    (alone, _), stay = first_terms(inputs)
+    sets = selection.path(alone, stay, len(alone) + 4)
+    assert any(len(one.terms) > len(alone) for one in sets)
+    for one in sets:
+        assert not {"X_uu", "Y_uv", "N_ur"} & set(one.terms)
+
+
 def test_a_published_structure_stays_where_it_follows_within_noise():
     found = estimate_model([virtual_log(4, 600, wind=0.0, spread=1e-12, current=(0.0, 0.0))])
     assert found.predictor.structure.name.startswith(("thesis", "linear"))
