@@ -43,7 +43,7 @@ _NEAR = 0.1
 _GIVEN_AWAY = 1.0
 # error of a run in deviations that is not told from an escape, and from none
 _WORST, _LEAST = 10.0, 1e-6
-# logs from which on whole ones judge alone
+# logs from which on whole ones judge alone, and one beginning does
 _ENOUGH = 4
 # the speed of a propeller that varies by less than this share tells no law from another
 _VARIES = 0.05
@@ -140,6 +140,9 @@ def select_terms(
         # a current on one heading is a constant force
         kind = PREDICTORS[kind].plain
     beginnings, stay = first_terms(inputs)
+    if len(logs) >= _ENOUGH:
+        # many manoeuvres show Coriolis terms too, which few must be told of
+        beginnings = beginnings[:1]
     most = min(_MOST, sum(len(log) for log in logs) // _SAMPLES)
     spread = np.array(list(spread_of(logs, family.states).values()))
 
