@@ -1,8 +1,8 @@
 """Which terms, and how many: paths of the free run on all logs and on parts, judged by the rest.
 
-The path of sets is followed on all logs, and again without each part of them; every set of
-a part's path is run freely on what it left out. How many terms are worth having is what
-these runs say, and the set of that size on the path of all logs is taken.
+From each of several sets, a path of sets is followed on all logs, and again without each part
+of them; every set of a part's path is run freely on what it left out. Which beginning and how
+many terms are worth having is what these runs say, and that set on the path of all logs is taken.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.errors import GreyboxError
+from greybox.errors import ExcitationError, GreyboxError, UsageError
+from greybox.estimation.informative import ADVISED_HEADING, heading_range
 from greybox.model.catalogue import structure_for
 from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor_kinds import PREDICTORS
@@ -23,7 +24,7 @@ from greybox.model.structure import Structure
 from greybox.selection.cross_validation import parts_of
 from greybox.selection.family import family_for, first_terms, spell_structure
 from greybox.selection.free_run_selection import FreeRunSelection, Selected
-from greybox.selection.held_out import rank, score_errors, spread_of
+from greybox.selection.held_out import folds, rank, spread_of
 from greybox.trial.log import TrialLog
 from greybox.validation.fit import run_model
 from greybox.vessel.force import force_inputs
@@ -38,10 +39,12 @@ _MOST, _FEW = 40, 18
 _SAMPLES = 20
 # share by which the error may be larger with the thrust that propeller theory gives, ~ n|n|
 _NEAR = 0.1
-# points of fit that a smaller model may give away
-_GIVEN_AWAY = 0.5
-# scores that a standard error needs
-_SCORES = 8
+# share of the error by which a smaller model may be worse [%]
+_GIVEN_AWAY = 1.0
+# error of a run in deviations that is not told from an escape, and from none
+_WORST, _LEAST = 10.0, 1e-6
+# logs from which on whole ones judge alone, and one beginning does
+_ENOUGH = 4
 # the speed of a propeller that varies by less than this share tells no law from another
 _VARIES = 0.05
 
@@ -133,63 +136,70 @@ def select_terms(
     inputs, wind = force_inputs(logs[0].vessel), all(log.has_wind for log in logs)
     family = family_for(inputs, wind)
     kind = "wind" if wind else "augmented"
-    first, stay = first_terms(inputs)
+    if heading_range(logs) < ADVISED_HEADING:
+        # a current on one heading is a constant force
+        kind = PREDICTORS[kind].plain
+    beginnings, stay = first_terms(inputs)
+    if len(logs) >= _ENOUGH:
+        # many manoeuvres show Coriolis terms too, which few must be told of
+        beginnings = beginnings[:1]
     most = min(_MOST, sum(len(log) for log in logs) // _SAMPLES)
     spread = np.array(list(spread_of(logs, family.states).values()))
-
-    def path(of: Sequence[TrialLog], terms: int = most) -> tuple[FreeRunSelection, list[Selected]]:
-        selection = FreeRunSelection(of, family, kind)
-        return selection, selection.path(first, stay, terms)
 
     laws = _laws(logs)
     law = laws[0]
     if len(laws) > 1:
-        errors = [path(with_law(logs, of), min(_FEW, most))[1][-1].cost for of in laws]
+        errors = [
+            FreeRunSelection(with_law(logs, of), family, kind)
+            .path(beginnings[0], stay, min(_FEW, most))[-1]
+            .cost
+            for of in laws
+        ]
         best_law = int(np.argmin(errors))
         law = laws[-1] if errors[-1] < (1 + _NEAR) * errors[best_law] else laws[best_law]
-    own_logs, logs = logs, with_law(logs, law)
+    own_parts = _judging_parts(logs)
+    logs = with_law(logs, law)
     thrust = law_in_words(law)
-    selection, sets = path(logs)
-    parts = parts_of(logs)
-    blocks = -(-_SCORES // max(len(logs), len(parts)))
-    sizes = sorted({len(s.terms) for s in sets})
-    scores: list[list[Array]] = [[] for _ in sizes]
-    paths: list[list[Selected]] = []
+    selection = FreeRunSelection(logs, family, kind)
+    whole = _paths(selection, beginnings, stay, most)
+    if not any(whole):
+        raise ExcitationError(
+            f"no free run of selected terms stays bounded on the {len(logs)} logs: use longer "
+            f"logs, or name a structure with --structure."
+        )
+    alternatives = [(b, n) for b, sets in enumerate(whole) for n in {len(s.terms) for s in sets}]
+    paths: list[list[list[Selected]]] = []
+    scores: list[list[float]] = [[] for _ in alternatives]
+    parts = _judging_parts(logs)
     for fitting, held in parts:
-        try:
-            found = path(fitting)[1]
-        except GreyboxError as error:
-            _log.info("no path on a part: %s", error)
-            found = []
-        paths.append(found)
+        paths.append(_paths(FreeRunSelection(fitting, family, kind), beginnings, stay, most))
         judged = FreeRunSelection(held, family, kind)
-        for k, count in enumerate(sizes):
-            small = _of_size(found, count)
-            runs = (
-                judged.errors(small.p)
-                if small
-                else [np.full_like(spread, np.inf)[None]] * len(held)
-            )
-            scores[k] += [score_errors(e, spread, blocks) for e in runs]
+        for (begun, size), score in zip(alternatives, scores, strict=True):
+            small = _of_size(paths[-1][begun], size)
+            score.append(_score(judged.errors(small.p) if small else [], spread))
     # the present model keeps the thrust law that it was estimated with
-    own = [
-        score
-        for fitting, held in parts_of(own_logs)
-        for score in _present_scores(refit, fitting, held, spread, blocks)
-    ]
-    alternatives = [np.concatenate(own), *(np.concatenate(s) for s in scores)]
-    # a published structure whose numbers were tested comes before terms chosen on the data
-    ranking = rank(alternatives, [0, *sizes], given_away=_GIVEN_AWAY)
-    counts = [size, *sizes]
+    present_score = [_present_score(refit, *part, spread) for part in own_parts]
+    # parts of logs count as much as whole logs
+    by_logs = len(parts_of(logs))
+    weight = np.ones(len(parts))
+    weight[by_logs:] = by_logs / max(len(parts) - by_logs, 1)
+    ranking = rank(
+        [np.array(s) * weight / weight.mean() for s in (present_score, *scores)],
+        [0, *(n for _, n in alternatives)],
+        given_away=_GIVEN_AWAY,
+    )
     chosen = ranking.chosen
     shown = chosen or int(np.argmax(ranking.score[1:])) + 1
-    best = _of_size(sets, counts[shown])
+    begun, size_shown = alternatives[shown - 1]
+    best = _of_size(whole[begun], size_shown)
     assert best is not None
+    fit = 100 * (1 - np.exp(-ranking.score / 100))
+    counts = [size, *(n for _, n in alternatives)]
     rows = [
         {
             "model": f"{n} terms" if i else present,
             "coefficients": n,
-            "score": float(ranking.score[i]),
+            "score": float(fit[i]),
             "behind": float(ranking.behind[i]),
             "se": float(ranking.se[i]),
             "chosen": i == chosen,
@@ -198,12 +208,12 @@ def select_terms(
     ]
     said = (
         f"terms were selected by free runs on parts of the logs that were left out in turn: "
-        f"{counts[shown]} terms (thrust ~ {thrust}) score "
-        f"{ranking.score[shown]:.1f} % and {present} {ranking.score[0]:.1f} % (mean fit over the "
-        f"channels, cut at -100); "
+        f"{size_shown} terms (thrust ~ {thrust}) have a fit of {fit[shown]:.1f} % and {present} "
+        f"{fit[0]:.1f} % (of the geometric mean error over channels and parts, in deviations of "
+        f"the logs); "
         + (
-            f"the smallest set that falls behind the best by no more than one standard error and "
-            f"{_GIVEN_AWAY:g} points was taken."
+            f"the smallest set whose error is larger than the least by no more than one standard "
+            f"error and {_GIVEN_AWAY:g} % was taken."
             if chosen
             else f"{present} stays."
         )
@@ -212,13 +222,57 @@ def select_terms(
         Terms.of(best, selection, inputs),
         tuple(
             None if one is None else Terms.of(one, selection, inputs)
-            for one in (_of_size(found, counts[shown]) for found in paths)
+            for one in (_of_size(found[begun], size_shown) for found in paths[:by_logs])
         ),
         tuple(logs),
         chosen > 0,
         tuple(rows),
         said,
     )
+
+
+def _judging_parts(
+    logs: Sequence[TrialLog],
+) -> list[tuple[list[TrialLog], list[TrialLog]]]:
+    """Return (to select on, held out): those of `parts_of`, and of few logs also parts of each.
+
+    What is left of two or three logs without one of them may hold no second manoeuvre.
+    """
+    parts = parts_of(logs)
+    if 1 < len(logs) < _ENOUGH:
+        try:
+            parts += folds(logs, _ENOUGH)
+        except UsageError as error:
+            _log.info("logs are not parted: %s", error)
+    return parts
+
+
+def _paths(
+    selection: FreeRunSelection,
+    beginnings: Sequence[Sequence[str]],
+    stay: Sequence[str],
+    most: int,
+) -> list[list[Selected]]:
+    """Return the path from each beginning, empty where none follows the logs."""
+    found = []
+    for first in beginnings:
+        try:
+            found.append(selection.path(first, stay, most))
+        except GreyboxError as error:
+            _log.info("no path from %d terms: %s", len(first), error)
+            found.append([])
+    return found
+
+
+def _score(errors: Sequence[Array], spread: Array) -> float:
+    """Return −100 times the mean log error over the channels, in deviations; cut at `_WORST`."""
+    moving = spread > 0
+    ratio = np.full(moving.sum(), _WORST)
+    if len(errors) and all(np.isfinite(e).all() for e in errors):
+        with np.errstate(over="ignore"):
+            ratio = np.sqrt(np.mean(np.concatenate(errors)[:, moving] ** 2, axis=0))
+        ratio = np.clip(ratio / spread[moving], _LEAST, _WORST)
+    return float(-100 * np.log(ratio).mean())
 
 
 def law_in_words(law: ThrustLaw) -> str:
@@ -234,25 +288,19 @@ def _of_size(sets: Sequence[Selected], size: int) -> Selected | None:
     return min(small, key=lambda s: s.cost, default=None)
 
 
-def _present_scores(
+def _present_score(
     refit: Callable[[Sequence[TrialLog]], ManoeuvringModel],
     fitting: Sequence[TrialLog],
     held: Sequence[TrialLog],
     spread: Array,
-    blocks: int,
-) -> list[Array]:
-    escaped = np.full_like(spread, np.inf)[None]
+) -> float:
     try:
         model = refit(fitting)
     except GreyboxError as error:
         _log.info("the present model on a part: %s", error)
-        return [score_errors(escaped, spread, blocks) for _ in held]
-    found = []
-    for log in held:
-        run = run_model(model, log)
-        errors = run.errors() if run.diverged < 0 else escaped
-        found.append(score_errors(errors, spread, blocks))
-    return found
+        return _score([], spread)
+    runs = [run_model(model, log) for log in held]
+    return _score([] if any(r.diverged >= 0 for r in runs) else [r.errors() for r in runs], spread)
 
 
 def _laws(logs: Sequence[TrialLog]) -> list[ThrustLaw]:
