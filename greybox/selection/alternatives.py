@@ -14,6 +14,7 @@ from greybox.estimation.registry import ESTIMATORS, automatic_estimators
 from greybox.model.catalogue import structure_for
 from greybox.model.predictor_kinds import PREDICTORS
 from greybox.model.structure import Structure
+from greybox.numerics.effort import OutOfTimeError, seconds_left, within
 from greybox.selection.fit_single import estimate_once
 from greybox.selection.held_out import rank, score_runs, spread_of
 from greybox.selection.request import Request
@@ -27,6 +28,8 @@ Array = NDArray[np.float64]
 _HELD_OUT = 1 / 3
 # parts of the held-out runs, for a standard error
 _BLOCKS = 6
+# share of the time that is left that the comparison may take
+_OF_ALL = 0.3
 # refinements of the instruments while alternatives are compared
 _RANKING_REFINEMENTS = 4
 # share of samples that must meet a sign condition
@@ -184,16 +187,20 @@ def _compare(
         held.append(log.window(cut, len(log), log.name))
     spread = spread_of(logs, alternatives[0].structure.states)
     scores: list[Array | None] = []
-    for alternative in alternatives:
-        try:
-            model = estimate_once(
-                fitting, alternative.structure, alternative.method, alternative.kind, request
-            ).model()
-            runs = [run_model(model, log) for log in held]
-            bounded = all(r.diverged < 0 for r in runs)
-            scores.append(score_runs(runs, spread, _BLOCKS) if bounded else None)
-        except GreyboxError:
-            scores.append(None)
+    without = ["diverged"] * len(alternatives)
+    with within(_OF_ALL * seconds_left()):
+        for i, alternative in enumerate(alternatives):
+            try:
+                model = estimate_once(
+                    fitting, alternative.structure, alternative.method, alternative.kind, request
+                ).model()
+                runs = [run_model(model, log) for log in held]
+                bounded = all(r.diverged < 0 for r in runs)
+                scores.append(score_runs(runs, spread, _BLOCKS) if bounded else None)
+            except GreyboxError as error:
+                scores.append(None)
+                if isinstance(error, OutOfTimeError):
+                    without[i] = "not tried, time was over (--effort)"
     if all(s is None for s in scores):
         notes.append("no alternative could be run on the last third of each log.")
         return alternatives
@@ -204,7 +211,7 @@ def _compare(
         + (
             f"{found.score[i]:.1f} ({found.behind[i]:.1f} ± {found.se[i]:.1f} behind)"
             if np.isfinite(found.score[i])
-            else "diverged"
+            else without[i]
         )
         for i in order
     )

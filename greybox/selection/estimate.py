@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import warnings
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import Literal
 
@@ -23,6 +24,7 @@ from greybox.estimation.solve import Covariance
 from greybox.estimation.verdict import TrustLevel, Verdict, refused
 from greybox.model.model import ManoeuvringModel
 from greybox.model.structure import Structure
+from greybox.numerics.effort import EFFORT, seconds_left, within, without_limit
 from greybox.public import known_keywords, one_thread
 from greybox.regression.regression import common_sample_time
 from greybox.selection.alternatives import Alternative, alternatives_for, ranking_request
@@ -42,6 +44,9 @@ _log = logging.getLogger(__name__)
 
 # share of length over speed that a sample may take
 _SHARE = 0.05
+# shares of the time that is left that output error may take beside a regression, and the
+# selection of terms, so that their estimate ends too; share of all that the verdict may
+_FOR_FREE_RUN, _FOR_TERMS, _FOR_VERDICT = 0.3, 0.7, 0.25
 
 
 @known_keywords
@@ -65,6 +70,7 @@ def estimate_model(
     judged: bool = True,
     without: Sequence[str] = (),
     validate: Logs = (),
+    effort: float = EFFORT,
 ) -> Estimate:
     """Estimate a model from logs, choosing what is left open, and say whether to trust it.
 
@@ -112,6 +118,10 @@ def estimate_model(
     validate : TrialLog or sequence of TrialLog
         Logs that judge the prediction and take no part in the estimate; without them the
         logs are left out in turn.
+    effort : float
+        Seconds that the choice of what is left open may take: what could not be tried is
+        named in the notes. The first estimate always ends, and where time is ample nothing
+        depends on it.
 
     Returns
     -------
@@ -144,6 +154,7 @@ def estimate_model(
         judged=judged,
         without=tuple(without),
         validate=(validate,) if isinstance(validate, TrialLog) else tuple(validate),
+        effort=effort,
     )
     if request is not None:
         if asked != Request():
@@ -165,6 +176,12 @@ def estimate_requested(logs: Sequence[TrialLog], request: Request) -> Estimate:
     """Return what `estimate_model` does of a request."""
     require_others(logs, request.validate)
     common_sample_time(logs)
+    with within(request.effort):
+        return _estimated(logs, request)
+
+
+def _estimated(logs: Sequence[TrialLog], request: Request) -> Estimate:
+    """Return the estimate that is chosen while time is left, the first one at any rate."""
     notes: list[str] = []
     if all(n is None for n in (request.method, *_named(request))):
         logs = at_own_pace(logs, notes)
@@ -172,13 +189,23 @@ def estimate_requested(logs: Sequence[TrialLog], request: Request) -> Estimate:
     if not request.judged:
         return estimate
     if not _open(request, estimate):
-        return with_prediction(estimate, logs, request)
+        return _judged(estimate, logs, request)
     if _rank(estimate)[0] < 2:
-        judged = with_prediction(estimate, logs, request)
+        judged = _judged(estimate, logs, request)
         if judged.prediction is None or judged.prediction.level is not PredictionLevel.POOR:
             return judged
     estimate, logs, refit = _or_selected_terms(estimate, logs, request, notes)
-    return with_prediction(estimate, logs, request, refit)
+    return _judged(estimate, logs, request, refit)
+
+
+def _judged(
+    estimate: Estimate, logs: Sequence[TrialLog], request: Request, refit: Refit | None = None
+) -> Estimate:
+    """Return the estimate with the verdict on its predictions, which has time of its own."""
+    least = request.effort * _FOR_VERDICT if request.method is None else np.inf
+    left = seconds_left()
+    with without_limit(), within(max(left, least)):
+        return with_prediction(estimate, logs, request, refit)
 
 
 def _first_choice(logs: Sequence[TrialLog], request: Request, notes: list[str]) -> Estimate:
@@ -253,7 +280,8 @@ def _or_selected_terms(
     before = f"{found.method} of structure '{found.predictor.structure.name}'"
     size = len(found.predictor.parameter_columns)
     try:
-        choice = select_terms(logs, before, size, refit_alike(found, request))
+        with within(_FOR_TERMS * seconds_left()):
+            choice = select_terms(logs, before, size, refit_alike(found, request))
     except GreyboxError as error:
         return _noting(found, f"no terms were selected: {error}"), logs, None
     told = _noting(found, choice.note)
@@ -369,7 +397,8 @@ def _or_output_error(
     other = free_run_estimator()
     way = Alternative(found.predictor.structure, other.name, found.predictor.kind)
     try:
-        tried, diverged = _finished(way, logs, request, notes)
+        with within(_FOR_FREE_RUN * seconds_left()):
+            tried, diverged = _finished(way, logs, request, notes)
     except GreyboxError as error:
         return _noting(found, f"{other.words} was tried too, and failed: {error}"), None
     if diverged:
@@ -449,8 +478,13 @@ def _first_that_runs(
     failures: list[GreyboxError] = []
     fallback: Estimate | None = None
     for alternative in alternatives:
+        if fallback is not None and seconds_left() <= 0:
+            notes.append(f"{alternative.label} was not tried: time was over (--effort).")
+            continue
         try:
-            estimate, diverged = _finished(alternative, logs, request, notes)
+            # the first one ends at any rate
+            with without_limit() if fallback is None else nullcontext():
+                estimate, diverged = _finished(alternative, logs, request, notes)
         except GreyboxError as error:
             _log.info("%s is left: %s", alternative.label, error)
             failures.append(error)

@@ -20,6 +20,7 @@ from greybox.model.catalogue import structure_for
 from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor_kinds import PREDICTORS
 from greybox.model.structure import Structure
+from greybox.numerics.effort import OutOfTimeError, Shares, seconds_left
 from greybox.selection.cross_validation import parts_of
 from greybox.selection.family import family_for, first_terms, spell_structure
 from greybox.selection.free_run_selection import FreeRunSelection, Selected
@@ -129,6 +130,8 @@ def select_terms(
         A single log is too short for parts.
     ExcitationError
         No free run of any set follows the logs.
+    OutOfTimeError
+        Time was over before every part had a set.
     """
     inputs, wind = force_inputs(logs[0].vessel), all(log.has_wind for log in logs)
     family = family_for(inputs, wind)
@@ -137,46 +140,67 @@ def select_terms(
     most = min(_MOST, sum(len(log) for log in logs) // _SAMPLES)
     spread = np.array(list(spread_of(logs, family.states).values()))
 
-    def path(of: Sequence[TrialLog], terms: int = most) -> tuple[FreeRunSelection, list[Selected]]:
-        selection = FreeRunSelection(of, family, kind)
-        return selection, selection.path(first, stay, terms)
-
     laws = _laws(logs)
-    law = laws[0]
-    if len(laws) > 1:
-        errors = [path(with_law(logs, of), min(_FEW, most))[1][-1].cost for of in laws]
-        best_law = int(np.argmin(errors))
-        law = laws[-1] if errors[-1] < (1 + _NEAR) * errors[best_law] else laws[best_law]
-    own_logs, logs = logs, with_law(logs, law)
-    thrust = law_in_words(law)
-    selection, sets = path(logs)
     parts = parts_of(logs)
     blocks = -(-_SCORES // max(len(logs), len(parts)))
+    shares = Shares(len(laws) * (len(laws) > 1) + 2 + len(parts))
+    # the present model keeps the thrust law that it was estimated with
+    with shares.next():
+        own = [
+            score
+            for fitting, held in parts
+            for score in _present_scores(refit, fitting, held, spread, blocks)
+        ]
+    cut: list[str] = []
+
+    def path(
+        of: Sequence[TrialLog], what: str, terms: int = most
+    ) -> tuple[FreeRunSelection, list[Selected]]:
+        selection = FreeRunSelection(of, family, kind)
+        with shares.next():
+            try:
+                return selection, selection.path(first, stay, terms)
+            finally:
+                if seconds_left() <= 0:
+                    cut.append(what)
+
+    def cost(of: ThrustLaw) -> float:
+        try:
+            name = f"thrust ~ {law_in_words(of)}"
+            return path(with_law(logs, of), name, min(_FEW, most))[1][-1].cost
+        except OutOfTimeError:
+            return np.inf
+
+    law = laws[0]
+    if len(laws) > 1:
+        errors = [cost(of) for of in laws]
+        best_law = int(np.argmin(errors))
+        law = laws[-1] if errors[-1] < (1 + _NEAR) * errors[best_law] else laws[best_law]
+    logs = with_law(logs, law)
+    thrust = law_in_words(law)
+    selection, sets = path(logs, "all logs")
     sizes = sorted({len(s.terms) for s in sets})
     scores: list[list[Array]] = [[] for _ in sizes]
     paths: list[list[Selected]] = []
-    for fitting, held in parts:
+    for k, (fitting, held) in enumerate(parts_of(logs), 1):
         try:
-            found = path(fitting)[1]
+            found = path(fitting, f"all but part {k}")[1]
+        except OutOfTimeError:
+            # what was not tried must not count as bad
+            raise
         except GreyboxError as error:
             _log.info("no path on a part: %s", error)
             found = []
         paths.append(found)
         judged = FreeRunSelection(held, family, kind)
-        for k, count in enumerate(sizes):
+        for runs_of, count in zip(scores, sizes, strict=True):
             small = _of_size(found, count)
             runs = (
                 judged.errors(small.p)
                 if small
                 else [np.full_like(spread, np.inf)[None]] * len(held)
             )
-            scores[k] += [score_errors(e, spread, blocks) for e in runs]
-    # the present model keeps the thrust law that it was estimated with
-    own = [
-        score
-        for fitting, held in parts_of(own_logs)
-        for score in _present_scores(refit, fitting, held, spread, blocks)
-    ]
+            runs_of += [score_errors(e, spread, blocks) for e in runs]
     alternatives = [np.concatenate(own), *(np.concatenate(s) for s in scores)]
     # a published structure whose numbers were tested comes before terms chosen on the data
     ranking = rank(alternatives, [0, *sizes], given_away=_GIVEN_AWAY)
@@ -208,6 +232,8 @@ def select_terms(
             else f"{present} stays."
         )
     )
+    if cut:
+        said += f" Time was over (--effort) before larger sets were tried on {', '.join(cut)}."
     return TermChoice(
         Terms.of(best, selection, inputs),
         tuple(
@@ -244,6 +270,8 @@ def _present_scores(
     escaped = np.full_like(spread, np.inf)[None]
     try:
         model = refit(fitting)
+    except OutOfTimeError:
+        raise
     except GreyboxError as error:
         _log.info("the present model on a part: %s", error)
         return [score_errors(escaped, spread, blocks) for _ in held]
