@@ -21,6 +21,7 @@ from greybox.errors import GreyboxError
 from greybox.estimation.output_error import Weights
 from greybox.estimation.registry import ESTIMATORS, automatic_estimators
 from greybox.estimation.result import Estimate
+from greybox.numerics.effort import OutOfTimeError
 from greybox.selection.fit_single import estimate_once
 from greybox.selection.held_out import FLOOR, folds, score_runs, spread_of
 from greybox.selection.request import Request
@@ -176,6 +177,8 @@ def compare_estimators(
 
     Raises
     ------
+    OutOfTimeError
+        Time was over before each was estimated without every part.
     UsageError
         A single log is too short to be parted.
     """
@@ -225,6 +228,8 @@ def _estimates(
         from_here = start or (spare if free_run else None)
         try:
             found[variant] = estimate_variant(variant, logs, like, request, from_here)
+        except OutOfTimeError:
+            raise
         except GreyboxError as error:
             _log.info("%s on a part: %s", variant.label, error)
             found[variant] = None
