@@ -71,6 +71,8 @@ class Estimate(EstimateValues, DisplayMixin):
         Whether all equations were solved jointly with their error made white.
     prediction : PredictionVerdict, optional
         What the free run is good for on logs that took no part; None where not asked for.
+    tried : tuple of Comparison
+        What was compared on the way to it, with every score.
     """
 
     @property
@@ -271,6 +273,7 @@ class Estimate(EstimateValues, DisplayMixin):
             },
             "tests": {t.name: t.to_dict() for t in self.tests},
             "notes": list(self.notes),
+            "tried": [c.to_dict() for c in self.tried],
             "status": self.status,
             "covariance_kind": self.covariance_kind,
             "lags": self.lags,

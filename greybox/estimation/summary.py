@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from greybox.estimation.tried import told
 from greybox.estimation.values import EstimateValues
 from greybox.estimation.verdict import TestResult
 from greybox.model.terms import parameter_unit
@@ -54,6 +55,7 @@ def summarise(estimate: EstimateValues) -> str:
         lines += _wrapped(f"Conditions: {in_words(estimate.data.conditions.values)}", "  ")
     for actuator in estimate.data.actuators:
         lines += _wrapped(f"Actuator: {actuator.sentence}", "  ")
+    lines += told(estimate.tried)
     lines += _tests(estimate.tests)
     if estimate.notes:
         lines += ["", "Notes"]

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.estimation.prediction_verdict import PredictionVerdict
+from greybox.estimation.tried import Comparison
 from greybox.estimation.verdict import UNJUDGED, TestResult, Verdict
 from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import Predictor
@@ -156,3 +157,4 @@ class EstimateValues:
     limits: Mapping[str, EfficiencyBound] = field(default_factory=dict)
     prefilter: str = "none"
     prediction: PredictionVerdict | None = None
+    tried: tuple[Comparison, ...] = ()

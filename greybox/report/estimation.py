@@ -18,6 +18,7 @@ from greybox.estimation.summary import (
     set_in_words,
     weak_safe_sets,
 )
+from greybox.estimation.tried import Comparison
 from greybox.estimation.verdict import TestResult, TrustLevel
 from greybox.model.terms import parameter_unit
 from greybox.report.chart import chart_of
@@ -28,6 +29,7 @@ from greybox.report.estimation_figures import (
     regime_shares,
     regimes_figure,
     residual_figure,
+    tried_figure,
     visited_figure,
 )
 from greybox.report.figures import comparison_figure, to_svg
@@ -412,7 +414,31 @@ def _chosen(estimate: Estimate, choice: StructureChoice | None) -> Section | Non
     if not estimate.notes and choice is None:
         return None
     texts = [("Structures compared", choice.summary())] if choice else []
-    return Section("6. What was chosen, and why", points=estimate.notes, texts=texts)
+    return Section(
+        "6. What was chosen, and why",
+        pictures=[p for i, c in enumerate(estimate.tried) for p in _tried_picture(c, i)],
+        tables=[Table(_tried_caption(c), *c.table()) for c in estimate.tried],
+        points=estimate.notes,
+        texts=texts,
+    )
+
+
+def _tried_caption(compared: Comparison) -> str:
+    return f"What was tried: {compared.title}, by {compared.judged_on}"
+
+
+def _tried_picture(compared: Comparison, place: int) -> list[Picture]:
+    """Draw the scores of what was compared, where there are some to compare."""
+    scores = [r for r in compared.ordered if r.score is not None]
+    if len(scores) < 2:
+        return []
+    caption = (
+        f"{_tried_caption(compared)}. Bars: one standard error of the distance to the best, which "
+        f"is dotted. {compared.decision}"
+    )
+    every = "; ".join(f"{r.label}: {r.result}" for r in scores)
+    figure = to_svg(tried_figure(compared), f"tried{place}")
+    return [Picture(figure, caption, f"{caption} {every}.", narrow=True)]
 
 
 def _equations(estimate: Estimate, mass: float | None) -> Section:

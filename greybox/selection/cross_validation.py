@@ -90,7 +90,7 @@ class EstimatorComparison:
 
         The limit is a standard error that allows for the number of parts.
         """
-        return tuple(_gain(row - self.scores[0]) for row in self.scores)
+        return tuple(gain(row - self.scores[0]) for row in self.scores)
 
     @property
     def best(self) -> int:
@@ -100,7 +100,7 @@ class EstimatorComparison:
     @property
     def chosen(self) -> int:
         """The best variant of those that gain more than a standard error, else the first."""
-        sure = [i for i, (gain, se) in enumerate(self.gains) if gain > se]
+        sure = [i for i, (by, se) in enumerate(self.gains) if by > se]
         return max(sure, key=lambda i: self.gains[i][0], default=0)
 
     def sentence(self) -> str:
@@ -113,10 +113,10 @@ class EstimatorComparison:
             for w, m in zip(self.variants, mean, strict=True)
         )
         i = self.chosen or self.best
-        gain, se = self.gains[i]
+        by, se = self.gains[i]
         first = self.variants[0].label
         told = (
-            f"{self.variants[i].label} is {gain:.1f} ± {se:.1f} better than {first}"
+            f"{self.variants[i].label} is {by:.1f} ± {se:.1f} better than {first}"
             if i
             else f"none is better than {first}"
         )
@@ -130,7 +130,11 @@ class EstimatorComparison:
         )
 
 
-def _gain(difference: Array) -> tuple[float, float]:
+def gain(difference: Array) -> tuple[float, float]:
+    """Return the mean of differences of scores, and its one-sided 84 % limit by Student's t [%].
+
+    Without a finite mean where fewer than half of the parts, or three, have a score.
+    """
     known = difference[np.isfinite(difference)]
     n = len(known)
     if 2 * n < len(difference) or n < _LEAST:

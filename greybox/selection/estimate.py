@@ -21,14 +21,25 @@ from greybox.estimation.prediction_verdict import PredictionLevel
 from greybox.estimation.registry import ESTIMATORS, free_run_estimator
 from greybox.estimation.result import Estimate
 from greybox.estimation.solve import Covariance
+from greybox.estimation.tried import Comparison
 from greybox.estimation.verdict import TrustLevel, Verdict, refused
 from greybox.model.model import ManoeuvringModel
 from greybox.model.structure import Structure
 from greybox.numerics.effort import EFFORT, seconds_left, within, without_limit
 from greybox.public import known_keywords, one_thread
 from greybox.regression.regression import common_sample_time
-from greybox.selection.alternatives import Alternative, alternatives_for, ranking_request
-from greybox.selection.cross_validation import EstimatorVariant, compare_estimators, parts_of
+from greybox.selection.alternatives import (
+    Alternative,
+    alternatives_for,
+    ranking_request,
+    tried_model,
+)
+from greybox.selection.compared import estimators_tried, terms_tried
+from greybox.selection.cross_validation import (
+    EstimatorVariant,
+    compare_estimators,
+    parts_of,
+)
 from greybox.selection.fit_single import estimate_once
 from greybox.selection.held_out import FLOOR
 from greybox.selection.prediction import Refit, refit_alike, require_others, with_prediction
@@ -210,7 +221,8 @@ def _judged(
 
 def _first_choice(logs: Sequence[TrialLog], request: Request, notes: list[str]) -> Estimate:
     """Return the estimate of a published structure that tests and runs prefer."""
-    alternatives = alternatives_for(logs, request, notes)
+    tried: list[Comparison] = []
+    alternatives = alternatives_for(logs, request, notes, tried)
     _log.info("%d ways to estimate, first %s", len(alternatives), alternatives[0].label)
     _log.debug("in this order: %s", "; ".join(a.label for a in alternatives))
     try:
@@ -219,16 +231,17 @@ def _first_choice(logs: Sequence[TrialLog], request: Request, notes: list[str]) 
         if request.method is not None or regression_only(request):
             raise
         estimate = _without_regression(logs, alternatives, request, notes, error)
+    estimate = replace(estimate, tried=tuple(tried))
     if request.method is not None or not request.judged or regression_only(request):
         return estimate
     if _rank(estimate)[0] == 0:
         return estimate
-    tried: Estimate | None = None
+    spare: Estimate | None = None
     if not ESTIMATORS[estimate.method].free_run and not misfit(estimate.tests):
         # what the structure lacks no other estimator mends
-        estimate, tried = _or_output_error(estimate, logs, request, notes)
-    if _at_fault(estimate, tried) and not _open(request, estimate):
-        return _by_held_out_runs(estimate, tried, logs, request, notes)
+        estimate, spare = _or_output_error(estimate, logs, request, notes)
+    if _at_fault(estimate, spare) and not _open(request, estimate):
+        return _by_held_out_runs(estimate, spare, logs, request, notes)
     return estimate
 
 
@@ -284,7 +297,8 @@ def _or_selected_terms(
             choice = select_terms(logs, before, size, refit_alike(found, request))
     except GreyboxError as error:
         return _noting(found, f"no terms were selected: {error}"), logs, None
-    told = _noting(found, choice.note)
+    compared = terms_tried(choice, found, logs)
+    told = _noting(found, choice.note, *compared)
     if not choice.taken:
         return told, logs, None
     try:
@@ -296,6 +310,7 @@ def _or_selected_terms(
         return _noting(told, note), logs, None
     if diverged:
         return _noting(told, "the selected terms diverge, and were left."), logs, None
+    estimate = replace(estimate, tried=told.tried)
     chosen = {
         _extent(fitting): terms
         for (fitting, _), terms in zip(parts_of(choice.logs), choice.parts, strict=True)
@@ -396,13 +411,29 @@ def _or_output_error(
     before = f"{found.method} of this predictor alone is judged '{found.verdict.text}'"
     other = free_run_estimator()
     way = Alternative(found.predictor.structure, other.name, found.predictor.kind)
+    first = Alternative(found.predictor.structure, found.method, found.predictor.kind)
+
+    def compared(taken: bool, result: str) -> Comparison:
+        return Comparison(
+            "output error beside the regression",
+            "the verdict on the coefficients",
+            "its verdict is better" if taken else "the other one's verdict is no better",
+            (
+                tried_model(first, logs, chosen=not taken, note=str(found.verdict.level)),
+                tried_model(way, logs, chosen=taken, note=result),
+            ),
+        )
+
     try:
         with within(_FOR_FREE_RUN * seconds_left()):
             tried, diverged = _finished(way, logs, request, notes)
     except GreyboxError as error:
-        return _noting(found, f"{other.words} was tried too, and failed: {error}"), None
+        note = f"{other.words} was tried too, and failed: {error}"
+        return _noting(found, note, compared(False, str(error))), None
     if diverged:
-        return _noting(found, f"{other.words} was tried too, and its free run diverges."), None
+        note = f"{other.words} was tried too, and its free run diverges."
+        return _noting(found, note, compared(False, "its run diverges")), None
+    tried = replace(tried, tried=found.tried)
     if _rank(tried) < _rank(found):
         why = f"it is judged '{tried.verdict.text}' and {before}"
         if _rank(tried)[0] == 2:
@@ -410,9 +441,10 @@ def _or_output_error(
                 f"its free run is better than a constant in more of the states, though neither "
                 f"is to be trusted: {before}"
             )
-        return _noting(tried, f"{other.words} was taken, because {why}."), tried
+        note = f"{other.words} was taken, because {why}."
+        return _noting(tried, note, compared(True, str(tried.verdict.level))), tried
     note = f"{other.words} was tried too, and is judged no better: '{tried.verdict.text}'."
-    return _noting(found, note), tried
+    return _noting(found, note, compared(False, str(tried.verdict.level))), tried
 
 
 def _by_held_out_runs(
@@ -427,7 +459,8 @@ def _by_held_out_runs(
         compared = compare_estimators(found, logs, request, spare)
     except GreyboxError as error:
         return _noting(found, f"estimators were not compared by held-out runs: {error}")
-    found = _noting(found, compared.sentence())
+    table = estimators_tried(compared, found, logs)
+    found = _noting(found, compared.sentence(), table)
     way = compared.variants[compared.chosen]
     if not compared.chosen:
         return found
@@ -452,7 +485,7 @@ def _by_held_out_runs(
     if lacks and _rank(other)[0] < 2:
         # output error hides a misfit that the regression's tests have found
         other = replace(other, verdict=refused(lacks, other.verdict.excepted))
-    return _noting(other, compared.sentence())
+    return _noting(replace(other, tried=found.tried), compared.sentence())
 
 
 def _level(estimate: Estimate) -> float:
@@ -464,8 +497,8 @@ def _diverges(estimate: Estimate) -> bool:
     return any(v == -np.inf for v in estimate.fit.values())
 
 
-def _noting(estimate: Estimate, note: str) -> Estimate:
-    return replace(estimate, notes=(*estimate.notes, note))
+def _noting(estimate: Estimate, note: str, *tried: Comparison) -> Estimate:
+    return replace(estimate, notes=(*estimate.notes, note), tried=(*estimate.tried, *tried))
 
 
 def _first_that_runs(

@@ -34,7 +34,7 @@ Array = NDArray[np.float64]
 _log = logging.getLogger(__name__)
 
 # terms at most, and those with which thrust laws are compared
-_MOST, _FEW = 40, 18
+_MOST, FEW = 40, 18
 # samples that a coefficient needs
 _SAMPLES = 20
 # share by which the error may be larger with the thrust that propeller theory gives, ~ n|n|
@@ -92,7 +92,11 @@ class TermChoice:
     taken : bool
         Whether it is better than the model that it was compared with.
     rows : tuple of dict
-        What was tried: size, change, error on all logs, held-out score, how far behind, error.
+        What was tried: the model in words, its coefficients, held-out score, how far behind,
+        the standard error of this, whether it was chosen.
+    laws : tuple of (ThrustLaw, float)
+        Thrust laws that were compared, each with the mean squared error of the free runs on all
+        logs in squared deviations; not finite where time was over.
     note : str
         The choice in words.
     """
@@ -102,6 +106,7 @@ class TermChoice:
     logs: tuple[TrialLog, ...]
     taken: bool
     rows: tuple[dict[str, Any], ...]
+    laws: tuple[tuple[ThrustLaw, float], ...]
     note: str
 
 
@@ -167,11 +172,11 @@ def select_terms(
     def cost(of: ThrustLaw) -> float:
         try:
             name = f"thrust ~ {law_in_words(of)}"
-            return path(with_law(logs, of), name, min(_FEW, most))[1][-1].cost
+            return path(with_law(logs, of), name, min(FEW, most))[1][-1].cost
         except OutOfTimeError:
             return np.inf
 
-    law = laws[0]
+    law, errors = laws[0], [np.nan]
     if len(laws) > 1:
         errors = [cost(of) for of in laws]
         best_law = int(np.argmin(errors))
@@ -243,6 +248,7 @@ def select_terms(
         tuple(logs),
         chosen > 0,
         tuple(rows),
+        tuple(zip(laws, errors, strict=True)),
         said,
     )
 
