@@ -14,7 +14,7 @@ from contextvars import ContextVar
 from greybox.errors import GreyboxError
 
 # seconds that a choice may take by default, ample for all but the longest logs
-EFFORT = 300.0
+EFFORT = 600.0
 
 _end: ContextVar[float] = ContextVar("end", default=float("inf"))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,8 +18,10 @@ from greybox.estimation.summary import (
     plain_estimates,
     set_in_words,
     weak_safe_sets,
+    whose,
 )
 from greybox.estimation.tried import Comparison
+from greybox.estimation.values import EstimateValues
 from greybox.estimation.verdict import TestResult, TrustLevel
 from greybox.model.terms import parameter_unit
 from greybox.report.chart import chart_of
@@ -76,9 +79,9 @@ def estimation_page(
     sections = [
         _run(estimate, logs),
         _parameters(estimate),
-        _residuals(estimate),
+        _residuals(estimate.meant),
         _visited(estimate, logs),
-        _tests(estimate),
+        _tests(estimate.meant),
         _chosen(estimate, choice),
         _equations(estimate, mass),
     ]
@@ -100,7 +103,7 @@ def estimation_page(
 
 def headline(estimate: Estimate) -> str:
     """Return both verdicts as sentences, with how well the free run follows the logs."""
-    verdict, prediction = estimate.verdict, estimate.prediction
+    verdict, prediction = estimate.meant.verdict, estimate.prediction
     if verdict.level is TrustLevel.TRUST_EXCEPT:
         told = f"Trust its coefficients, except for {', '.join(verdict.excepted)}"
     else:
@@ -143,8 +146,10 @@ def _summary(estimate: Estimate) -> list[str]:
             for r in (estimate.prediction.because if estimate.prediction else ())
             if not r.fatal
         ),
-        *(r.sentence for r in estimate.verdict.because if not r.fatal),
+        *(r.sentence for r in estimate.meant.verdict.because if not r.fatal),
     ]
+    if estimate.meant is not estimate:
+        told.append(whose(estimate))
     if estimate.current:
         shown = ", ".join(f"{n} {v:.3f} ± {1.96 * s:.3f} m/s" for n, v, s in estimate.current)
         told.append(f"Current found beside the parameters (± 95 %): {shown}.")
@@ -186,8 +191,9 @@ def _run(estimate: Estimate, logs: Sequence[TrialLog]) -> Section:
     return Section("1. Does its free run follow the log?", sentences, pictures)
 
 
-def _parameters(estimate: Estimate) -> Section:
-    """Show intervals, and which estimates hang together."""
+def _parameters(predicts: Estimate) -> Section:
+    """Show intervals, and which estimates hang together; the parameters that predict below."""
+    estimate = predicts.meant
     place = list(estimate.predictor.parameter_columns)
     theta, std = estimate.theta[place], estimate.std[place]
     labels, units = list(estimate.labels), _units(estimate)
@@ -238,13 +244,18 @@ def _parameters(estimate: Estimate) -> Section:
             )
         )
     told += [f"{BOUNDS[name]}: {limit.sentence}" for name, limit in estimate.limits.items()]
-    return Section(
-        "2. How well is each parameter known?", told, pictures,
-        [_parameter_table(estimate, labels, units, theta, std)],
-    )  # fmt: skip
+    if estimate.told_of_choice:
+        told.append(estimate.told_of_choice)
+    tables = [_parameter_table(estimate)]
+    if estimate is not predicts:
+        told.insert(0, whose(predicts))
+        table = _parameter_table(predicts)
+        beside = f". {predicts.told_of_choice}" if predicts.told_of_choice else ""
+        tables.append(replace(table, caption=f"What predicts: {table.caption}{beside}"))
+    return Section("2. How well is each parameter known?", told, pictures, tables)
 
 
-def _units(estimate: Estimate) -> list[str]:
+def _units(estimate: EstimateValues) -> list[str]:
     structure = estimate.predictor.structure
     return [
         shown_unit(
@@ -270,9 +281,10 @@ def _pairs(labels: Sequence[str], correlation: Array) -> list[str]:
     return [f"The log tells these pairs apart worst (correlation): {shown}."]
 
 
-def _parameter_table(
-    estimate: Estimate, labels: Sequence[str], units: Sequence[str], theta: Array, std: Array
-) -> Table:
+def _parameter_table(estimate: EstimateValues) -> Table:
+    place = list(estimate.predictor.parameter_columns)
+    theta, std = estimate.theta[place], estimate.std[place]
+    labels, units = estimate.labels, _units(estimate)
     sets, plain = weak_safe_sets(estimate.tests), plain_estimates(estimate)
     rows = []
     for name, unit, value, error in zip(labels, units, theta, std, strict=True):
@@ -301,7 +313,7 @@ def _by_state(tests: Sequence[TestResult], kind: str) -> dict[str, Mapping[str, 
     return {t.state: t.detail for t in tests if t.kind == kind and t.obstacle is None}
 
 
-def _residuals(estimate: Estimate) -> Section | None:
+def _residuals(estimate: EstimateValues) -> Section | None:
     states = estimate.predictor.structure.states
     own = _by_state(estimate.tests, "whiteness")
     moved = _by_state(estimate.tests, "input_independence")
@@ -385,7 +397,7 @@ def _sentence(text: str) -> str:
     return first + text[1:] + ("" if text.endswith(".") else ".")
 
 
-def _tests(estimate: Estimate) -> Section:
+def _tests(estimate: EstimateValues) -> Section:
     """List every test with its statistic."""
     tables = [
         Table(

@@ -70,7 +70,7 @@ def alternatives_for(
     """
     inputs = force_inputs(logs[0].vessel)
     wind = all(log.has_wind for log in logs)
-    names = [request.structure] if request.structure is not None else _structures(logs, wind)
+    names = [request.structure] if request.structure is not None else structures_to_try(logs, wind)
     structures = [structure_for(name, inputs) for name in names]
     estimators = (
         [ESTIMATORS[request.method]]
@@ -118,7 +118,7 @@ def alternatives_for(
     return alternatives
 
 
-def _structures(logs: Sequence[TrialLog], wind: bool) -> list[str]:
+def structures_to_try(logs: Sequence[TrialLog], wind: bool) -> list[str]:
     """Return the structures to try where the user names none, the fullest first.
 
     On a nearly constant heading an unmeasured wind or current is a constant

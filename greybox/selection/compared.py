@@ -10,8 +10,9 @@ import numpy as np
 from greybox.estimation.registry import free_run_estimator
 from greybox.estimation.result import Estimate
 from greybox.estimation.tried import Comparison
-from greybox.selection.alternatives import OVER, Alternative, tried_model
+from greybox.selection.alternatives import OVER, Alternative, scored, tried_model
 from greybox.selection.cross_validation import EstimatorComparison, gain
+from greybox.selection.held_out import Ranking
 from greybox.selection.term_selection import FEW, TermChoice, law_in_words
 from greybox.trial.log import TrialLog
 
@@ -75,3 +76,29 @@ def terms_tried(choice: TermChoice, found: Estimate, logs: Sequence[TrialLog]) -
         tuple(laws),
     )
     return [by_law, by_terms] if len(laws) > 1 else [by_terms]
+
+
+def runs_tried(
+    estimates: Sequence[Estimate],
+    found: Ranking,
+    logs: Sequence[TrialLog],
+) -> Comparison:
+    """Return the table of estimates whose runs over parts left out were compared."""
+    rows = [
+        scored(
+            tried_model(
+                Alternative(e.predictor.structure, e.method, e.predictor.kind),
+                logs,
+                chosen=i == found.chosen,
+            ),
+            found,
+            i,
+        )
+        for i, e in enumerate(estimates)
+    ]
+    return Comparison(
+        "ways to predict",
+        "free runs on parts of the logs that were left out in turn",
+        "the first estimate stays unless it falls behind the best by more than one standard error",
+        tuple(rows),
+    )

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -21,6 +21,7 @@ from greybox.errors import GreyboxError
 from greybox.estimation.output_error import Weights
 from greybox.estimation.registry import ESTIMATORS, automatic_estimators
 from greybox.estimation.result import Estimate
+from greybox.model.model import ManoeuvringModel
 from greybox.numerics.effort import OutOfTimeError
 from greybox.selection.fit_single import estimate_once
 from greybox.selection.held_out import FLOOR, folds, score_runs, spread_of
@@ -31,8 +32,9 @@ from greybox.validation.fit import average_fit, run_model
 Array = NDArray[np.float64]
 _log = logging.getLogger(__name__)
 
-# parts that are left out in turn, scores that are wanted, and that a standard error needs
-_FOLDS, _WANTED, _LEAST = 4, 4, 3
+# parts that are left out in turn, scores that are wanted of estimators, that a standard error of
+# them needs, and that are wanted of models
+_FOLDS, _WANTED, _LEAST, _SCORES = 4, 4, 3, 8
 # refinements of the instruments of a part
 _REFINEMENTS = 4
 
@@ -244,6 +246,47 @@ def _estimates(
             if level > most and all(run.diverged < 0 for run in runs):
                 start, most = estimate, level
     return [found[variant] for variant in variants]
+
+
+def score_refits(
+    refits: Sequence[Callable[[Sequence[TrialLog]], ManoeuvringModel]], logs: Sequence[TrialLog]
+) -> list[Array]:
+    """Return the scores of models over parts of the logs that are left out of them in turn.
+
+    Parameters
+    ----------
+    refits : sequence of callable
+        Each estimates a model on some of the logs; where it fails, its run counts as escaped.
+    logs : sequence of TrialLog
+
+    Raises
+    ------
+    OutOfTimeError
+        Time was over before each was run over every part.
+    UsageError
+        A single log is too short to be parted.
+    """
+    parts = parts_of(logs)
+    blocks = -(-_SCORES // max(len(logs), len(parts)))
+    found = []
+    for refit in refits:
+        scores: list[Array] = []
+        for fitting, held in parts:
+            spread = None
+            try:
+                model = refit(fitting)
+                spread = spread_of(logs, model.structure.states)
+            except OutOfTimeError:
+                raise
+            except GreyboxError as error:
+                _log.info("without a part there is no estimate: %s", error)
+            for log in held:
+                none = np.full(blocks, FLOOR)
+                scores.append(
+                    none if spread is None else score_runs([run_model(model, log)], spread, blocks)
+                )
+        found.append(np.concatenate(scores))
+    return found
 
 
 def estimate_variant(

@@ -17,38 +17,55 @@ from greybox.errors import ExcitationError, GreyboxError, LogError, UsageError
 from greybox.estimation.closed_loop import Loop
 from greybox.estimation.efficiency_bounds import limits_of
 from greybox.estimation.output_error import OutputErrorOptions
-from greybox.estimation.prediction_verdict import PredictionLevel
+from greybox.estimation.prediction_verdict import (
+    NOT_JUDGED,
+    LargeError,
+    PredictionLevel,
+    RunsDiverge,
+)
 from greybox.estimation.registry import ESTIMATORS, free_run_estimator
 from greybox.estimation.result import Estimate
 from greybox.estimation.solve import Covariance
 from greybox.estimation.tried import Comparison
-from greybox.estimation.verdict import TrustLevel, Verdict, refused
+from greybox.estimation.verdict import Divergence, TrustLevel, Verdict, refused
+from greybox.model.catalogue import structure_for
 from greybox.model.model import ManoeuvringModel
+from greybox.model.predictor_kinds import PREDICTORS
 from greybox.model.structure import Structure
-from greybox.numerics.effort import EFFORT, seconds_left, within, without_limit
+from greybox.numerics.effort import EFFORT, OutOfTimeError, seconds_left, within, without_limit
 from greybox.public import known_keywords, one_thread
 from greybox.regression.regression import common_sample_time
 from greybox.selection.alternatives import (
     Alternative,
     alternatives_for,
     ranking_request,
+    structures_to_try,
     tried_model,
 )
-from greybox.selection.compared import estimators_tried, terms_tried
+from greybox.selection.compared import estimators_tried, runs_tried, terms_tried
 from greybox.selection.cross_validation import (
     EstimatorVariant,
     compare_estimators,
     parts_of,
+    score_refits,
 )
 from greybox.selection.fit_single import estimate_once
-from greybox.selection.held_out import FLOOR
-from greybox.selection.prediction import Refit, refit_alike, require_others, with_prediction
+from greybox.selection.held_out import FLOOR, rank
+from greybox.selection.prediction import (
+    Refit,
+    extent,
+    refit_alike,
+    remembered,
+    require_others,
+    with_prediction,
+)
 from greybox.selection.request import Request, regression_only
 from greybox.selection.term_selection import Terms, select_terms
 from greybox.trial.kinematics import decimate_segments
 from greybox.trial.log import Logs, TrialLog
 from greybox.trial.segments import as_segments
 from greybox.validation.fit import average_fit, run_model
+from greybox.vessel.force import force_inputs
 
 Array = NDArray[np.float64]
 _log = logging.getLogger(__name__)
@@ -201,12 +218,108 @@ def _estimated(logs: Sequence[TrialLog], request: Request) -> Estimate:
         return estimate
     if not _open(request, estimate):
         return _judged(estimate, logs, request)
-    if _rank(estimate)[0] < 2:
-        judged = _judged(estimate, logs, request)
-        if judged.prediction is None or judged.prediction.level is not PredictionLevel.POOR:
-            return judged
-    estimate, logs, refit = _or_selected_terms(estimate, logs, request, notes)
-    return _judged(estimate, logs, request, refit)
+    trusted = _rank(estimate)[0] < 2
+    refit = remembered(refit_alike(estimate, request))
+    first = _judged(estimate, logs, request, refit) if trusted else estimate
+    good = _level_of(first) is PredictionLevel.GOOD
+    predicts = _or_better_run(first, refit, logs, request, notes, free_run=trusted and not good)
+    if predicts.method != first.method or predicts.predictor != first.predictor:
+        refit = remembered(refit_alike(predicts, request))
+        predicts = _judged(predicts, logs, request, refit) if trusted else predicts
+    if good or (trusted and not _misses(predicts)):
+        return _both(predicts, first)
+    selected, logs, again = _or_selected_terms(predicts, refit, logs, request, notes)
+    return _both(_judged(selected, logs, request, again or refit), first)
+
+
+def _level_of(estimate: Estimate) -> PredictionLevel:
+    return (estimate.prediction or NOT_JUDGED).level
+
+
+def _misses(estimate: Estimate) -> bool:
+    """Whether a free run on logs that took no part errs by more than a good one does."""
+    judged = estimate.prediction or NOT_JUDGED
+    return any(isinstance(r, LargeError | RunsDiverge | Divergence) for r in judged.because)
+
+
+def _both(predicts: Estimate, first: Estimate) -> Estimate:
+    """Return the estimate that predicts, with the first one's coefficients where they are better.
+
+    Those of a published structure stay where they are to be trusted, all or with exceptions.
+    """
+    same = predicts.method == first.method and np.array_equal(predicts.theta, first.theta)
+    if same or _rank(first)[0] == 2:
+        return predicts
+    return replace(predicts, coefficients=first)
+
+
+def _or_better_run(
+    found: Estimate,
+    refit: Refit,
+    logs: Sequence[TrialLog],
+    request: Request,
+    notes: Sequence[str],
+    *,
+    free_run: bool,
+) -> Estimate:
+    """Return the estimate whose runs over parts left out are best, `found` within an error.
+
+    Compared are plain least squares of each structure, where they follow the logs better than
+    `found` does, and with `free_run` output error of its own structure.
+    """
+    wind = all(log.has_wind for log in logs)
+    inputs = force_inputs(logs[0].vessel)
+    plain = PREDICTORS[found.predictor.kind].plain
+    ways = [
+        Alternative(structure_for(name, inputs), "ls", plain)
+        for name in structures_to_try(logs, wind)
+    ]
+    quick, estimates = ranking_request(request), [found]
+    try:
+        for way in ways:
+            other = _quickly(way, logs, quick)
+            if other is not None and _level(other) > _level(found):
+                estimates.append(other)
+        if free_run and not ESTIMATORS[found.method].free_run:
+            way = Alternative(
+                found.predictor.structure, free_run_estimator().name, found.predictor.kind
+            )
+            with within(_FOR_FREE_RUN * seconds_left()):
+                other = _quickly(way, logs, quick)
+            estimates += [other] if other is not None else []
+        if len(estimates) == 1:
+            return found
+        others = [refit_alike(e, request) for e in estimates[1:]]
+        scores = score_refits([refit, *others], logs)
+    except GreyboxError as error:
+        return _noting(found, f"other ways to predict were not compared: {error}")
+    ranking = rank(scores, range(len(estimates)))
+    compared = runs_tried(estimates, ranking, logs)
+    found = _noting(found, f"compared for prediction: {compared.decision}", compared)
+    if not ranking.chosen:
+        return found
+    best = estimates[ranking.chosen]
+    way = Alternative(best.predictor.structure, best.method, best.predictor.kind)
+    try:
+        taken, diverged = _finished(way, logs, request, notes)
+    except GreyboxError as error:
+        return _noting(found, f"{way.label} failed on the whole logs: {error}")
+    return found if diverged else replace(_noting(taken, found.notes[-1]), tried=found.tried)
+
+
+def _quickly(way: Alternative, logs: Sequence[TrialLog], request: Request) -> Estimate | None:
+    """Return an estimate with its fit and without tests, None where there is none to simulate."""
+    try:
+        found = estimate_once(logs, way.structure, way.method, way.kind, request)
+        runs = [run_model(found.model(), log) for log in logs]
+    except OutOfTimeError:
+        raise
+    except GreyboxError as error:
+        _log.info("%s: %s", way.label, error)
+        return None
+    if any(r.diverged >= 0 for r in runs):
+        return None
+    return replace(found, fit=average_fit(runs))
 
 
 def _judged(
@@ -284,7 +397,11 @@ def at_own_pace(logs: Sequence[TrialLog], notes: list[str]) -> Sequence[TrialLog
 
 
 def _or_selected_terms(
-    found: Estimate, logs: Sequence[TrialLog], request: Request, notes: Sequence[str]
+    found: Estimate,
+    refit_found: Refit,
+    logs: Sequence[TrialLog],
+    request: Request,
+    notes: Sequence[str],
 ) -> tuple[Estimate, Sequence[TrialLog], Refit | None]:
     """Return the free run of terms that the data select, where it predicts better than `found`.
 
@@ -294,7 +411,7 @@ def _or_selected_terms(
     size = len(found.predictor.parameter_columns)
     try:
         with within(_FOR_TERMS * seconds_left()):
-            choice = select_terms(logs, before, size, refit_alike(found, request))
+            choice = select_terms(logs, before, size, refit_found)
     except GreyboxError as error:
         return _noting(found, f"no terms were selected: {error}"), logs, None
     compared = terms_tried(choice, found, logs)
@@ -312,13 +429,13 @@ def _or_selected_terms(
         return _noting(told, "the selected terms diverge, and were left."), logs, None
     estimate = replace(estimate, tried=told.tried)
     chosen = {
-        _extent(fitting): terms
+        extent(fitting): terms
         for (fitting, _), terms in zip(parts_of(choice.logs), choice.parts, strict=True)
     }
 
     def refit(fitting: Sequence[TrialLog]) -> ManoeuvringModel:
         """Estimate the terms that these logs choose, their noise that of all logs."""
-        terms = chosen[_extent(fitting)]
+        terms = chosen[extent(fitting)]
         if terms is None:
             raise ExcitationError("no terms were selected on a part of the logs.")
         way, on, asked = _of_terms(terms, fitting, ranking_request(request))
@@ -326,11 +443,6 @@ def _or_selected_terms(
         return replace(model, noise=estimate.noise)
 
     return estimate, choice.logs, refit
-
-
-def _extent(logs: Sequence[TrialLog]) -> tuple[tuple[str, float, float], ...]:
-    """Return by what logs, or parts of them, are known: names, beginnings and ends."""
-    return tuple((log.name, float(log.t[0]), float(log.t[-1])) for log in logs)
 
 
 def _of_terms(

@@ -20,7 +20,7 @@ from greybox.model.catalogue import structure_for
 from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor_kinds import PREDICTORS
 from greybox.model.structure import Structure
-from greybox.numerics.effort import OutOfTimeError, Shares, seconds_left
+from greybox.numerics.effort import OutOfTimeError, Shares, seconds_left, within
 from greybox.selection.cross_validation import parts_of
 from greybox.selection.family import family_for, first_terms, spell_structure
 from greybox.selection.free_run_selection import FreeRunSelection, Selected
@@ -43,6 +43,8 @@ _NEAR = 0.1
 _GIVEN_AWAY = 0.5
 # scores that a standard error needs
 _SCORES = 8
+# share of the time that is left that the runs of the present model may take
+_FOR_PRESENT = 0.5
 # the speed of a propeller that varies by less than this share tells no law from another
 _VARIES = 0.05
 
@@ -148,9 +150,9 @@ def select_terms(
     laws = _laws(logs)
     parts = parts_of(logs)
     blocks = -(-_SCORES // max(len(logs), len(parts)))
-    shares = Shares(len(laws) * (len(laws) > 1) + 2 + len(parts))
+    shares = Shares(len(laws) * (len(laws) > 1) + 1 + len(parts))
     # the present model keeps the thrust law that it was estimated with
-    with shares.next():
+    with within(_FOR_PRESENT * seconds_left()):
         own = [
             score
             for fitting, held in parts
