@@ -88,6 +88,7 @@ def fit_free_runs(
     shooting: Shooting = "auto",
     near: bool = False,
     once: bool = False,
+    fixed: bool = False,
 ) -> tuple[ShootingFit, FreeRuns]:
     """Fit parameters and initial states to logs; the noise of each output with them.
 
@@ -114,6 +115,9 @@ def fit_free_runs(
         Whether `p` is near already, such as that of another heading.
     once : bool
         Whether the first end of whole runs is returned, however it is.
+    fixed : bool
+        Whether runs begin where the logs were measured to begin, as a prediction does; they are
+        whole then.
 
     Returns
     -------
@@ -126,14 +130,16 @@ def fit_free_runs(
     weights = np.maximum(change, floor) if sigma is None else sigma
     whole = cut(logs, max(len(log.y) for log in logs))
     starts = measured_starts(whole, len(model.states))
-    uncut = FreeRuns(model, whole, weights)
+    uncut = FreeRuns(model, whole, weights, fixed=fixed)
+    shooting = "single" if fixed else shooting
 
     def attempt(
-        p: Array, starts: Array, shooting: Shooting = shooting
+        p: Array, nodes: Array, shooting: Shooting = shooting
     ) -> tuple[ShootingFit, FreeRuns]:
+        nodes = starts if fixed else nodes
         single: ShootingFit | None = None
         if shooting != "multiple":
-            single, runs = _settle(uncut, p, starts, restrictions, loss, sigma is None, floor)
+            single, runs = _settle(uncut, p, nodes, restrictions, loss, sigma is None, floor)
             if single.converged or shooting == "single":
                 return single, runs
         segments = cut(logs, segment_length(logs))

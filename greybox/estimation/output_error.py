@@ -108,6 +108,10 @@ class OutputErrorOptions:
     search : bool
         Whether other ways are tried where errors stay large; without, the fit ends at the
         optimum that is nearest to its start.
+    starts : {"free", "measured"}
+        Whether first states are estimated too, or runs begin with the mean of the first
+        samples, as predictions do. Free ones are right where the model leaves no more than
+        noise; of a model that leaves more they make up for what it lacks.
     levels : bool
         Whether the noise levels of sensors and process are sought once the fit has ended.
     """
@@ -123,6 +127,7 @@ class OutputErrorOptions:
     covariance: Literal["ma", "hac", "white"] = "ma"
     weights: Weights = "noise"
     search: bool = True
+    starts: Literal["free", "measured"] = "free"
     levels: bool = True
 
 
@@ -248,7 +253,7 @@ def _fit(
             model, data, _first(model, start) if p is None else p,
             restrictions=restrictions, loss=options.loss, shooting=options.shooting,
             sigma=deviations(data) if options.weights == "deviation" else None,
-            near=p is not None or near, once=once,
+            near=p is not None or near, once=once, fixed=options.starts == "measured",
         )  # fmt: skip
         return _Fitted(model, data, fit, runs, restrictions, options.loss)
 

@@ -176,6 +176,8 @@ class FreeRuns:
     segments : Segments
     sigma : ndarray
         (ny,) noise of each output.
+    fixed : bool
+        Whether the starts stay where they are; segments are then whole logs.
     """
 
     def __init__(
@@ -184,16 +186,19 @@ class FreeRuns:
         segments: Segments,
         sigma: Array,
         simulator: Simulator | None = None,
+        *,
+        fixed: bool = False,
     ) -> None:
         self.model = model
         self.segments = segments
         self.sigma = sigma
+        self.fixed = fixed
         self._simulator = Simulator(model, segments.w) if simulator is None else simulator
         self._bound = _ESCAPED * np.abs(segments.y).max(axis=(0, 1), initial=0.0) + _ESCAPED * sigma
 
     def with_sigma(self, sigma: Array) -> FreeRuns:
         """Return the same runs with other weights."""
-        return FreeRuns(self.model, self.segments, sigma, self._simulator)
+        return FreeRuns(self.model, self.segments, sigma, self._simulator, fixed=self.fixed)
 
     def _weighted(self, y: Array) -> Array:
         use = self.segments.use[..., None] > 0
@@ -209,6 +214,8 @@ class FreeRuns:
             used = rows / self.sigma[:, None]
             if not self.segments.use.all():
                 used[self.segments.use == 0] = 0.0
+        if self.fixed:
+            used[..., len(p) :] = 0.0
         return Linearised(self._weighted(y), by_sample(used), end, slope)
 
     def outputs(self, p: Array, nodes: Array) -> Array:
@@ -288,7 +295,9 @@ def reduce_starts(at: Linearised, segments: Segments, nodes: Array, q: int, loss
     weighted = at.rows if loss == "gaussian" else at.rows * loss_weights(flat, loss)[..., None]
     normal = weighted.transpose(0, 2, 1) @ at.rows
     right = (flat[:, None] @ weighted)[:, 0] if at.downhill is None else at.downhill
-    own = block_diag(list(normal[:, q:, q:]), format="csc")
+    # a start on which nothing depends stays
+    idle = normal[:, range(q, q + nz), range(q, q + nz)] == 0
+    own = block_diag(list(normal[:, q:, q:] + idle[:, None] * np.eye(nz)), format="csc")
     cross = normal[:, q:, :q].reshape(runs * nz, q)
     links = np.flatnonzero(segments.joined)
     gap = (at.end - np.roll(nodes, -1, axis=0))[links]

@@ -65,8 +65,8 @@ def terms_tried(choice: TermChoice, found: Estimate, logs: Sequence[TrialLog]) -
     by_terms = Comparison(
         "number of terms",
         "free runs on parts of the logs that were left out in turn, the terms chosen without each",
-        "the fewest terms, the published structure first, that fall behind the best by no more "
-        "than one standard error and half a point",
+        "the fewest terms, the published structure first, whose error is larger than the least by "
+        "no more than one standard error and 1 %",
         tuple(rows),
     )
     by_law = Comparison(

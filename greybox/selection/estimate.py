@@ -452,6 +452,7 @@ def _of_terms(
     options = replace(
         request.output_error,
         search=False,
+        starts="measured",
         levels=request.judged,
         heading="input",
         damping="enforce",

@@ -2,7 +2,8 @@
 
 Hull forces of second order with and without moduli, the cubic ones that published models
 of tankers and catamarans use, constant forces, the cross terms of sway and yaw, thrust that
-speed takes from and that pushes beside its own axis, a rudder in the race and beside it, and
+speed takes from and that pushes beside its own axis, flow through propellers that damps
+whichever way they turn, a rudder in the race and beside it, and
 the wind where it was measured. Inertia that couples sway and yaw multiplies the forces of
 both equations by one matrix, so each force may push each of the two.
 
@@ -27,7 +28,7 @@ _HULL = (
 _WIND = "Wuu Wvv Wuv X_uq Y_vq N_vq X_|vq|uq Y_|uq|vq N_|uq|vq".split()
 # those of each generalised input
 _FORCE = {
-    "taux": "Xmu Xkappa Y_taux Y_v*taux Y_r*taux N_taux N_v*taux N_r*taux".split(),
+    "taux": "Xmu Xkappa X_|taux|u Y_taux Y_|taux|v Y_|taux|r N_taux N_|taux|v N_|taux|r".split(),
     "tauy": "Ymu Y_u*tauy N_tauy".split(),
     "taun": "Nmu N_u*taun Y_taun".split(),
     "race": "Y_race Y_u*race N_race N_u*race".split(),
@@ -35,7 +36,7 @@ _FORCE = {
     "race_drag": ["X_race_drag"],
     "rudder_drag": ["X_rudder_drag", "X_|u|u*rudder_drag"],
 }
-# what every ship has, and what selection begins with and never takes away
+# what every ship has, and what selection never takes away
 _CORE = "Xu Yv Nr".split()
 
 
@@ -62,9 +63,15 @@ def family_for(inputs: tuple[str, ...], wind: bool) -> Structure:
     return Structure("family", ()).with_terms(*terms.values())
 
 
-def first_terms(inputs: tuple[str, ...]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the terms that selection begins with, and those of them that stay."""
-    return structure_for("linear", inputs).parameters, tuple(_CORE)
+def first_terms(inputs: tuple[str, ...]) -> tuple[tuple[tuple[str, ...], ...], tuple[str, ...]]:
+    """Return the sets of terms that selection may begin with, and the terms that always stay.
+
+    The smaller set has each velocity's own damping and the forces of the commands, none of
+    which grows with the motion: of its terms none drives the ship where the logs did not.
+    """
+    linear = structure_for("linear", inputs)
+    alone = tuple(t.name for t in linear.terms if len(t.factors) == 1)
+    return (alone, linear.parameters), tuple(_CORE)
 
 
 def spell_structure(terms: tuple[str, ...], inputs: tuple[str, ...]) -> str:

@@ -2,9 +2,11 @@
 
 At a free run of the terms that are in, one set of sensitivities tells of every term that
 is out how much the squared error would fall (the score test of its coefficient, the other
-coefficients and the first states adjusted). The best one enters and the run is fitted
-again; a term that earns less than the one that came last leaves. A core that no run
-follows is first fitted, and added to, while an observer holds the run near the log.
+coefficients adjusted). The best one enters and the run is fitted again; a term that earns
+less than the one that came last leaves. A core that no run follows is first fitted, and
+added to, while an observer holds the run near the log. Runs begin where the log was
+measured to begin, as a prediction does: first states that are free to move would make up
+for forces that are missing.
 
 References
 ----------
@@ -15,7 +17,7 @@ Kittler (1994), on letting terms leave again.
 from __future__ import annotations
 
 from collections.abc import Sequence, Set
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,11 +29,9 @@ from greybox.estimation.output_setup import deviations, measured, output_model, 
 from greybox.estimation.shooting import (
     RANK,
     FreeRuns,
-    Reduced,
     Runs,
     cut,
     measured_starts,
-    reduce_starts,
     solve_step,
 )
 from greybox.model.structure import Structure
@@ -49,7 +49,10 @@ _AHEAD = 3
 # iterations of a first fit, and the share of the error below which a step ends it
 _FIRST, _SETTLED = 12, 3e-3
 # share of the squared error that a term must take away, and that its own direction must hold
-_EARNS, _OWN = 1e-3, 1e-3
+_EARNS, _OWN = 4e-3, 1e-3
+# gain by which a term that may drive the ship must exceed that of one that only takes energy out:
+# u r and |u| r are one on logs ahead, and astern the one drives what the other brakes
+_BRAKES = 1.25
 # squared error of a run without any, in deviations
 _LEAST = 1e-12
 # candidates that are tried, the most promising first
@@ -60,12 +63,12 @@ _LEAVES = 0.5
 
 @dataclass(frozen=True)
 class _Point:
-    """Parameters and first states with the cost and its quadratic model there."""
+    """Parameters with the cost and its quadratic model there."""
 
     p: Array
-    nodes: Array
     cost: float
-    reduced: Reduced
+    hessian: Array
+    gradient: Array
     most: Array
 
     def solution(self, hessian: Array, gradient: Array, active: Array) -> Array:
@@ -161,8 +164,8 @@ class FreeRunSelection:
         """
         active = sorted(self.names.index(n) for n in first if n in self.names)
         kept = {self.names.index(n) for n in stay if n in self.names}
-        active, p, nodes = self._begun(active, most, earns)
-        at = self._fitted(self.runs, p, nodes, active)
+        active, p = self._begun(active, most, earns)
+        at = self._fitted(self.runs, p, active)
         if not np.isfinite(at.cost):
             raise ExcitationError(
                 f"no free run of {len(active)} terms stays bounded on the {len(self.starts)} "
@@ -199,21 +202,21 @@ class FreeRunSelection:
             for log, run, used in zip(self._whole.y, y, self._whole.use, strict=True)
         ]
 
-    def _begun(self, active: list[int], most: int, earns: float) -> tuple[list[int], Array, Array]:
-        """Return terms, parameters and first states near those of a free run."""
-        p, nodes = np.zeros(len(self.names)), self.starts
+    def _begun(self, active: list[int], most: int, earns: float) -> tuple[list[int], Array]:
+        """Return terms, and parameters near those of a free run."""
+        p = np.zeros(len(self.names))
         for ratio in _RATIOS:
             runs = ObservedRuns(self.model, self._whole, self._change**2 / 2, ratio)
-            at = self._fitted(runs, p, nodes, active)
-            if not self._value(self.runs, at.p, self.starts) < 0:
+            at = self._fitted(runs, p, active)
+            if not self._value(self.runs, at.p) < 0:
                 # no run of these terms follows: what the observer's errors ask for comes first
                 for _ in range(_AHEAD):
                     found = self._with_one_more(runs, at, active, earns, set())
                     if found is None or len(active) >= most:
                         break
                     active, at = sorted([*active, found[0]]), found[1]
-            p, nodes = at.p, at.nodes
-        return active, p, nodes
+            p = at.p
+        return active, p
 
     def _selected(self, active: Sequence[int], at: _Point, change: str = "") -> Selected:
         terms = tuple(self.names[i] for i in active)
@@ -227,45 +230,42 @@ class FreeRunSelection:
         """Return the mean squared residual of each output, (ny,)."""
         return np.asarray((r**2).sum(axis=(0, 1)) / self._samples + _LEAST)
 
-    def _value(self, runs: Runs, p: Array, nodes: Array) -> float:
+    def _value(self, runs: Runs, p: Array) -> float:
         """Return −log L, the noise of each output concentrated, infinite where a run escapes."""
-        r, _, _ = runs.value(p, nodes)
+        r, _, _ = runs.value(p, self.starts)
         if not np.isfinite(r).all():
             return np.inf
         with np.errstate(over="ignore"):
             return 0.5 * self._samples * float(np.log(self._noise(r)).sum())
 
-    def _at(self, runs: Runs, p: Array, nodes: Array, cost: float) -> _Point:
-        at = runs.linearise(p, nodes)
+    def _at(self, runs: Runs, p: Array, cost: float) -> _Point:
+        at = runs.linearise(p, self.starts)
         weight = 1 / np.sqrt(self._noise(at.r))
-        by_output = at.rows.reshape(*at.r.shape, -1) * weight[:, None]
-        weighed = replace(at, r=at.r * weight, rows=by_output.reshape(at.rows.shape))
-        found = reduce_starts(weighed, self._whole, nodes, len(p), "gaussian")
-        return _Point(p, nodes, cost, found, self._most)
+        used = self._whole.use > 0
+        rows = at.rows.reshape(*at.r.shape, -1)[used, :, : len(p)] * weight[:, None]
+        rows, r = rows.reshape(-1, len(p)), (at.r[used] * weight).ravel()
+        return _Point(p, cost, rows.T @ rows, rows.T @ r, self._most)
 
     def _moved(self, runs: Runs, at: _Point, step: Array) -> _Point | None:
         """Return where a step or a part of it leads downhill, None where it does not."""
         for share in (1.0, 0.5, 0.2):
-            shift = at.reduced.starts - at.reduced.starts_by_p @ step
-            p, nodes = at.p + share * step, at.nodes + share * shift
-            cost = self._value(runs, p, nodes)
+            p = at.p + share * step
+            cost = self._value(runs, p)
             if cost < at.cost:
-                return self._at(runs, p, nodes, cost)
+                return self._at(runs, p, cost)
         return None
 
-    def _fitted(
-        self, runs: Runs, p: Array, nodes: Array, active: Sequence[int], most: int = _FIRST
-    ) -> _Point:
+    def _fitted(self, runs: Runs, p: Array, active: Sequence[int], most: int = _FIRST) -> _Point:
         """Return the fit of the active parameters, Levenberg-Marquardt where steps fail."""
         index = np.array(active)
         out = np.setdiff1d(np.arange(len(p)), index)
         p = p.copy()
         p[out] = 0.0
-        cost = self._value(runs, p, nodes)
+        cost = self._value(runs, p)
         if not np.isfinite(cost):
-            p, nodes = np.zeros_like(p), self.starts
-            cost = self._value(runs, p, nodes)
-        at = self._at(runs, p, nodes, cost)
+            p = np.zeros_like(p)
+            cost = self._value(runs, p)
+        at = self._at(runs, p, cost)
         for _ in range(most):
             require_time()
             moved = self._damped(runs, at, index)
@@ -279,8 +279,8 @@ class FreeRunSelection:
 
     def _damped(self, runs: Runs, at: _Point, active: Array) -> _Point | None:
         for damping in (0.0, 1e-3, 1e-1, 10.0):
-            hessian = at.reduced.hessian * (1 + damping * np.eye(len(at.p)))
-            moved = self._moved(runs, at, at.solution(hessian, at.reduced.gradient, active))
+            hessian = at.hessian * (1 + damping * np.eye(len(at.p)))
+            moved = self._moved(runs, at, at.solution(hessian, at.gradient, active))
             if moved is not None:
                 return moved
         return None
@@ -295,7 +295,7 @@ class FreeRunSelection:
     ) -> tuple[int, _Point] | None:
         """Return the term that lowers the error most and the fit with it, None if none earns."""
         index = np.array(active)
-        hessian, gradient = at.reduced.hessian, at.reduced.gradient
+        hessian, gradient = at.hessian, at.gradient
         inverse = scaled_inverse(hessian[np.ix_(index, index)], RANK)
         out = np.setdiff1d(np.arange(len(at.p)), index)
         cross = hessian[np.ix_(out, index)]
@@ -305,11 +305,9 @@ class FreeRunSelection:
         known = left > _OWN * np.maximum(own, 0.0)
         known &= (self._most[out] > 0) | (slope < 0)
         gains = np.where(known, 0.5 * slope**2 / np.where(known, left, 1.0), 0.0)
-        for i in np.argsort(-gains)[:_TRIED]:
-            if self._share(-gains[i]) > 1 - earns:
-                return None
+        for i in np.argsort(-gains * np.where(self._most[out] > 0, 1.0, _BRAKES))[:_TRIED]:
             tried = np.append(index, out[i])
-            if frozenset(tried.tolist()) in seen:
+            if self._share(-gains[i]) > 1 - earns or frozenset(tried.tolist()) in seen:
                 continue
             moved = self._moved(runs, at, at.solution(hessian, gradient, tried))
             if moved is None or self._share(moved.cost - at.cost) > 1 - earns:
@@ -327,7 +325,7 @@ class FreeRunSelection:
     ) -> tuple[int, _Point] | None:
         """Return the term that earns least and the fit without it, None where all earn enough."""
         index = np.array(active)
-        hessian, gradient = at.reduced.hessian, at.reduced.gradient
+        hessian, gradient = at.hessian, at.gradient
         variance = np.diag(scaled_inverse(hessian[np.ix_(index, index)], RANK))
         loss = 0.5 * at.p[index] ** 2 / variance
         for i in np.argsort(loss):
@@ -339,12 +337,11 @@ class FreeRunSelection:
             rest = np.delete(index, i)
             away = at.solution(hessian, gradient + hessian[:, gone] * at.p[gone], rest)
             away[gone] = -at.p[gone]
-            shift = at.reduced.starts - at.reduced.starts_by_p @ away
-            p, nodes = at.p + away, at.nodes + shift
+            p = at.p + away
             p[gone] = 0.0
-            cost = self._value(self.runs, p, nodes)
+            cost = self._value(self.runs, p)
             if not cost < at.cost + allowed:
                 return None
-            after = self._at(self.runs, p, nodes, cost)
+            after = self._at(self.runs, p, cost)
             return gone, self._damped(self.runs, after, rest) or after
         return None

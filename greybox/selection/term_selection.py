@@ -1,21 +1,23 @@
 """Which terms, and how many: paths of the free run on all logs and on parts, judged by the rest.
 
-The path of sets is followed on all logs, and again without each part of them; every set of
-a part's path is run freely on what it left out. How many terms are worth having is what
-these runs say, and the set of that size on the path of all logs is taken.
+From each of several sets, a path of sets is followed on all logs, and again without each part
+of them; every set of a part's path is run freely on what it left out. Which beginning and how
+many terms are worth having is what these runs say, and that set on the path of all logs is taken.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.errors import GreyboxError
+from greybox.errors import ExcitationError, GreyboxError, UsageError
+from greybox.estimation.informative import ADVISED_HEADING, heading_range
 from greybox.model.catalogue import structure_for
 from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor_kinds import PREDICTORS
@@ -24,7 +26,7 @@ from greybox.numerics.effort import OutOfTimeError, Shares, seconds_left, within
 from greybox.selection.cross_validation import parts_of
 from greybox.selection.family import family_for, first_terms, spell_structure
 from greybox.selection.free_run_selection import FreeRunSelection, Selected
-from greybox.selection.held_out import rank, score_errors, spread_of
+from greybox.selection.held_out import folds, rank, spread_of
 from greybox.trial.log import TrialLog
 from greybox.validation.fit import run_model
 from greybox.vessel.force import force_inputs
@@ -39,10 +41,12 @@ _MOST, FEW = 40, 18
 _SAMPLES = 20
 # share by which the error may be larger with the thrust that propeller theory gives, ~ n|n|
 _NEAR = 0.1
-# points of fit that a smaller model may give away
-_GIVEN_AWAY = 0.5
-# scores that a standard error needs
-_SCORES = 8
+# share of the error by which a smaller model may be worse [%]
+_GIVEN_AWAY = 1.0
+# error of a run in deviations that is not told from an escape, and from none
+_WORST, _LEAST = 10.0, 1e-6
+# logs from which on whole ones judge alone
+_ENOUGH = 4
 # share of the time that is left that the runs of the present model may take
 _FOR_PRESENT = 0.5
 # the speed of a propeller that varies by less than this share tells no law from another
@@ -143,38 +147,31 @@ def select_terms(
     inputs, wind = force_inputs(logs[0].vessel), all(log.has_wind for log in logs)
     family = family_for(inputs, wind)
     kind = "wind" if wind else "augmented"
-    first, stay = first_terms(inputs)
+    if heading_range(logs) < ADVISED_HEADING:
+        # a current on one heading is a constant force
+        kind = PREDICTORS[kind].plain
+    beginnings, stay = first_terms(inputs)
     most = min(_MOST, sum(len(log) for log in logs) // _SAMPLES)
     spread = np.array(list(spread_of(logs, family.states).values()))
 
     laws = _laws(logs)
-    parts = parts_of(logs)
-    blocks = -(-_SCORES // max(len(logs), len(parts)))
-    shares = Shares(len(laws) * (len(laws) > 1) + 1 + len(parts))
+    parts = _judging_parts(logs)
     # the present model keeps the thrust law that it was estimated with
     with within(_FOR_PRESENT * seconds_left()):
-        own = [
-            score
-            for fitting, held in parts
-            for score in _present_scores(refit, fitting, held, spread, blocks)
-        ]
-    cut: list[str] = []
+        present_score = [_present_score(refit, *part, spread) for part in parts]
+    watch = _Watch(len(laws) * (len(laws) > 1) + len(beginnings) * (1 + len(parts)))
 
-    def path(
-        of: Sequence[TrialLog], what: str, terms: int = most
-    ) -> tuple[FreeRunSelection, list[Selected]]:
+    def paths_of(
+        of: Sequence[TrialLog], what: str
+    ) -> tuple[FreeRunSelection, list[list[Selected]]]:
         selection = FreeRunSelection(of, family, kind)
-        with shares.next():
-            try:
-                return selection, selection.path(first, stay, terms)
-            finally:
-                if seconds_left() <= 0:
-                    cut.append(what)
+        return selection, _paths(selection, beginnings, stay, most, watch, what)
 
     def cost(of: ThrustLaw) -> float:
+        selection = FreeRunSelection(with_law(logs, of), family, kind)
         try:
-            name = f"thrust ~ {law_in_words(of)}"
-            return path(with_law(logs, of), name, min(FEW, most))[1][-1].cost
+            with watch.next(f"thrust ~ {law_in_words(of)}"):
+                return selection.path(beginnings[0], stay, min(FEW, most))[-1].cost
         except OutOfTimeError:
             return np.inf
 
@@ -185,67 +182,70 @@ def select_terms(
         law = laws[-1] if errors[-1] < (1 + _NEAR) * errors[best_law] else laws[best_law]
     logs = with_law(logs, law)
     thrust = law_in_words(law)
-    selection, sets = path(logs, "all logs")
-    sizes = sorted({len(s.terms) for s in sets})
-    scores: list[list[Array]] = [[] for _ in sizes]
-    paths: list[list[Selected]] = []
-    for k, (fitting, held) in enumerate(parts_of(logs), 1):
-        try:
-            found = path(fitting, f"all but part {k}")[1]
-        except OutOfTimeError:
-            # what was not tried must not count as bad
-            raise
-        except GreyboxError as error:
-            _log.info("no path on a part: %s", error)
-            found = []
-        paths.append(found)
+    selection, whole = paths_of(logs, "all logs")
+    if not any(whole):
+        raise ExcitationError(
+            f"no free run of selected terms stays bounded on the {len(logs)} logs: use longer "
+            f"logs, or name a structure with --structure."
+        )
+    alternatives = [(b, n) for b, sets in enumerate(whole) for n in {len(s.terms) for s in sets}]
+    paths: list[list[list[Selected]]] = []
+    scores: list[list[float]] = [[] for _ in alternatives]
+    for k, (fitting, held) in enumerate(_judging_parts(logs), 1):
+        paths.append(paths_of(fitting, f"all but part {k}")[1])
         judged = FreeRunSelection(held, family, kind)
-        for runs_of, count in zip(scores, sizes, strict=True):
-            small = _of_size(found, count)
-            runs = (
-                judged.errors(small.p)
-                if small
-                else [np.full_like(spread, np.inf)[None]] * len(held)
-            )
-            runs_of += [score_errors(e, spread, blocks) for e in runs]
-    alternatives = [np.concatenate(own), *(np.concatenate(s) for s in scores)]
-    # a published structure whose numbers were tested comes before terms chosen on the data
-    ranking = rank(alternatives, [0, *sizes], given_away=_GIVEN_AWAY)
-    counts = [size, *sizes]
+        for (begun, size_of_set), score in zip(alternatives, scores, strict=True):
+            small = _of_size(paths[-1][begun], size_of_set)
+            score.append(_score(judged.errors(small.p) if small else [], spread))
+    # parts of logs count as much as whole logs
+    by_logs = len(parts_of(logs))
+    weight = np.ones(len(parts))
+    weight[by_logs:] = by_logs / max(len(parts) - by_logs, 1)
+    ranking = rank(
+        [np.array(s) * weight / weight.mean() for s in (present_score, *scores)],
+        [0, *(n for _, n in alternatives)],
+        given_away=_GIVEN_AWAY,
+    )
     chosen = ranking.chosen
     shown = chosen or int(np.argmax(ranking.score[1:])) + 1
-    best = _of_size(sets, counts[shown])
+    begun, size_shown = alternatives[shown - 1]
+    best = _of_size(whole[begun], size_shown)
     assert best is not None
+    fit = 100 * (1 - np.exp(-ranking.score / 100))
+    counts = [size, *(n for _, n in alternatives)]
     rows = [
         {
             "model": f"{n} terms" if i else present,
             "coefficients": n,
-            "score": float(ranking.score[i]),
-            "behind": float(ranking.behind[i]),
-            "se": float(ranking.se[i]),
+            "score": float(fit[i]),
+            "behind": float(fit.max() - fit[i]),
+            # of the logarithm of the error, as points of fit
+            "se": float((1 - fit[i] / 100) * ranking.se[i]),
             "chosen": i == chosen,
         }
         for i, n in enumerate(counts)
     ]
     said = (
         f"terms were selected by free runs on parts of the logs that were left out in turn: "
-        f"{counts[shown]} terms (thrust ~ {thrust}) score "
-        f"{ranking.score[shown]:.1f} % and {present} {ranking.score[0]:.1f} % (mean fit over the "
-        f"channels, cut at -100); "
+        f"{size_shown} terms (thrust ~ {thrust}) have a fit of {fit[shown]:.1f} % and {present} "
+        f"{fit[0]:.1f} % (of the geometric mean error over channels and parts, in deviations of "
+        f"the logs); "
         + (
-            f"the smallest set that falls behind the best by no more than one standard error and "
-            f"{_GIVEN_AWAY:g} points was taken."
+            f"the smallest set whose error is larger than the least by no more than one standard "
+            f"error and {_GIVEN_AWAY:g} % was taken."
             if chosen
             else f"{present} stays."
         )
     )
-    if cut:
-        said += f" Time was over (--effort) before larger sets were tried on {', '.join(cut)}."
+    if watch.cut:
+        said += (
+            f" Time was over (--effort) before larger sets were tried on {', '.join(watch.cut)}."
+        )
     return TermChoice(
         Terms.of(best, selection, inputs),
         tuple(
             None if one is None else Terms.of(one, selection, inputs)
-            for one in (_of_size(found, counts[shown]) for found in paths)
+            for one in (_of_size(found[begun], size_shown) for found in paths[:by_logs])
         ),
         tuple(logs),
         chosen > 0,
@@ -253,6 +253,78 @@ def select_terms(
         tuple(zip(laws, errors, strict=True)),
         said,
     )
+
+
+def _judging_parts(
+    logs: Sequence[TrialLog],
+) -> list[tuple[list[TrialLog], list[TrialLog]]]:
+    """Return (to select on, held out): those of `parts_of`, and of few logs also parts of each.
+
+    What is left of two or three logs without one of them may hold no second manoeuvre.
+    """
+    parts = parts_of(logs)
+    if 1 < len(logs) < _ENOUGH:
+        try:
+            parts += folds(logs, _ENOUGH)
+        except UsageError as error:
+            _log.info("logs are not parted: %s", error)
+    return parts
+
+
+class _Watch:
+    """Shares of the time for paths, and the names of those that it cut."""
+
+    def __init__(self, paths: int) -> None:
+        self._shares = Shares(paths)
+        self.cut: dict[str, None] = {}
+
+    @contextmanager
+    def next(self, what: str) -> Iterator[None]:
+        with self._shares.next():
+            try:
+                yield
+            finally:
+                if seconds_left() <= 0:
+                    self.cut[what] = None
+
+
+def _paths(
+    selection: FreeRunSelection,
+    beginnings: Sequence[Sequence[str]],
+    stay: Sequence[str],
+    most: int,
+    watch: _Watch,
+    what: str,
+) -> list[list[Selected]]:
+    """Return the path from each beginning, empty where none follows the logs.
+
+    Raises
+    ------
+    OutOfTimeError
+        Time was over before a first set: what was not tried must not count as bad.
+    """
+    found = []
+    for first in beginnings:
+        try:
+            with watch.next(what):
+                found.append(selection.path(first, stay, most))
+        except OutOfTimeError:
+            raise
+        except GreyboxError as error:
+            _log.info("no path from %d terms: %s", len(first), error)
+            found.append([])
+    return found
+
+
+def _score(errors: Sequence[Array], spread: Array) -> float:
+    """Return −100 times the mean log error over the channels, in deviations; cut at `_WORST`."""
+    moving = spread > 0
+    ratio = np.full(moving.sum(), _WORST)
+    if len(errors) and all(np.isfinite(e).all() for e in errors):
+        with np.errstate(over="ignore"):
+            ratio = np.sqrt(np.mean(np.concatenate(errors)[:, moving] ** 2, axis=0))
+        ratio = np.clip(ratio / spread[moving], _LEAST, _WORST)
+    return float(-100 * np.log(ratio).mean())
 
 
 def law_in_words(law: ThrustLaw) -> str:
@@ -268,27 +340,21 @@ def _of_size(sets: Sequence[Selected], size: int) -> Selected | None:
     return min(small, key=lambda s: s.cost, default=None)
 
 
-def _present_scores(
+def _present_score(
     refit: Callable[[Sequence[TrialLog]], ManoeuvringModel],
     fitting: Sequence[TrialLog],
     held: Sequence[TrialLog],
     spread: Array,
-    blocks: int,
-) -> list[Array]:
-    escaped = np.full_like(spread, np.inf)[None]
+) -> float:
     try:
         model = refit(fitting)
     except OutOfTimeError:
         raise
     except GreyboxError as error:
         _log.info("the present model on a part: %s", error)
-        return [score_errors(escaped, spread, blocks) for _ in held]
-    found = []
-    for log in held:
-        run = run_model(model, log)
-        errors = run.errors() if run.diverged < 0 else escaped
-        found.append(score_errors(errors, spread, blocks))
-    return found
+        return _score([], spread)
+    runs = [run_model(model, log) for log in held]
+    return _score([] if any(r.diverged >= 0 for r in runs) else [r.errors() for r in runs], spread)
 
 
 def _laws(logs: Sequence[TrialLog]) -> list[ThrustLaw]:

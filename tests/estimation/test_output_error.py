@@ -363,6 +363,25 @@ class TestFit:
         assert fit.cost <= found.cost * (1 + 1e-12)
         np.testing.assert_allclose((fit.p - p) / scale, found.x[:-3], atol=2e-3)
 
+    def test_starts_that_are_measured_stay_and_the_rest_is_fitted(self, predictor, noisy):
+        from scipy.optimize import least_squares
+
+        model, data, p = problem(predictor, noisy, "input")
+        sigma = np.full(3, np.sqrt(2e-4))
+        fit, _ = fit_free_runs(model, [data], 0 * p, sigma=sigma, fixed=True)
+        begin = data.y[:5].mean(axis=0)
+        np.testing.assert_allclose(fit.nodes[0], begin, rtol=1e-12)
+        simulator = Simulator(model, data.w[None])
+        scale = np.sqrt(np.diag(np.linalg.inv(fit.hessian)))
+
+        def residuals(x):
+            y, _ = simulator(begin[None], p + x * scale)
+            return ((data.y - y[0]) / sigma).ravel()
+
+        found = least_squares(residuals, (fit.p - p) / scale, xtol=1e-12, ftol=1e-12, gtol=1e-12)
+        assert fit.converged
+        assert fit.cost == pytest.approx(found.cost, rel=1e-9)
+
     def test_segments_that_join_give_the_same_optimum(self, predictor, noisy):
         model, data, p = problem(predictor, noisy, "input")
         one, single = fit_free_runs(model, [data], p, shooting="single")
