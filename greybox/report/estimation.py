@@ -26,6 +26,7 @@ from greybox.estimation.verdict import TestResult, TrustLevel
 from greybox.model.terms import parameter_unit
 from greybox.report.chart import chart_of
 from greybox.report.estimation_figures import (
+    MOST_DRAWN,
     REACH,
     correlation_figure,
     forest_figure,
@@ -448,6 +449,8 @@ def _tried_picture(compared: Comparison, place: int) -> list[Picture]:
         f"{_tried_caption(compared)}. Bars: one standard error of the distance to the best, which "
         f"is dotted. {compared.decision}"
     )
+    if len(scores) > MOST_DRAWN:
+        caption += f" Of {len(scores)} the best {MOST_DRAWN} are drawn; all are in the table."
     every = "; ".join(f"{r.label}: {r.result}" for r in scores)
     figure = to_svg(tried_figure(compared), f"tried{place}")
     return [Picture(figure, caption, f"{caption} {every}.", narrow=True)]

@@ -33,7 +33,8 @@ _NARROW = 4.4
 # of the value: an interval that reaches further is drawn to the edge [%]
 REACH = 200.0
 _DOTS = 3000
-# letters of the label of an alternative
+# alternatives that a picture has room for, the best ones; letters of their labels
+MOST_DRAWN = 30
 _LABEL = 40
 _MARKERS = ("o", "s", "^", "D", "v", "x")
 
@@ -104,7 +105,8 @@ def tried_figure(comparison: Comparison) -> Figure:
 
     An alternative whose bar reaches the line is as good as the best by one standard error.
     """
-    rows = [r for r in comparison.ordered if r.score is not None]
+    scored = [r for r in comparison.ordered if r.score is not None]
+    rows = [r for i, r in enumerate(scored) if i < MOST_DRAWN or r.chosen]
     figure = new_figure(_WIDTH, (0.3 if len(rows) < 15 else 0.2) * len(rows) + 1.1)
     ax = figure.subplots()
     scores = np.array([r.score for r in rows], float)
