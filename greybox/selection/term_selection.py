@@ -45,7 +45,7 @@ _NEAR = 0.1
 _GIVEN_AWAY = 1.0
 # error of a run in deviations that is not told from an escape, and from none
 _WORST, _LEAST = 10.0, 1e-6
-# logs from which on whole ones judge alone
+# logs from which on whole ones judge alone, and one beginning does
 _ENOUGH = 4
 # share of the time that is left that the runs of the present model may take
 _FOR_PRESENT = 0.5
@@ -151,6 +151,9 @@ def select_terms(
         # a current on one heading is a constant force
         kind = PREDICTORS[kind].plain
     beginnings, stay = first_terms(inputs)
+    if len(logs) >= _ENOUGH:
+        # many manoeuvres show Coriolis terms too, which few must be told of
+        beginnings = beginnings[:1]
     most = min(_MOST, sum(len(log) for log in logs) // _SAMPLES)
     spread = np.array(list(spread_of(logs, family.states).values()))
 
