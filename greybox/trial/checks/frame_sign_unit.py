@@ -33,6 +33,8 @@ _TURN_SECONDS = 10.0
 _EXCERPT = 8000
 # and in means over so many seconds of a fast one
 _STEP = 0.5
+# lateness that is no frame or unit, near enough for a small ship's zig-zag [s]
+_LATENESS = (-3.0, *(k / 4 for k in range(-8, 9) if k), 3.0, 4.5)
 # residuals whitened together hold about so many numbers
 _AT_ONCE = 100_000
 _DEG = np.pi / 180
@@ -259,15 +261,18 @@ def _decide(logs: Sequence[_Alternatives]) -> Key:
     for log in logs:
         costs |= {key: cost for key, (_, _, cost) in log.ranked.items()}
     penalty = _LEAST_GAIN * max(log.sample_correlation_factor for log in logs)
-    worth = {key: sum(log.gain(key) for log in logs) - penalty * c for key, c in costs.items()}
-    key = max(worth, key=lambda k: worth[k])
+    gains = {key: sum(log.gain(key) for log in logs) for key in costs}
+
+    def beyond(key: Key, other: Key) -> bool:
+        """Whether a reading shrinks the residual enough for what it costs more than another."""
+        samples = sum(log.judging(_changes(logs, key)) for log in logs)
+        share = 1.0 - float(np.exp(-2 * (gains[key] - gains[other]) / max(samples, 1)))
+        return share >= _LEAST_SHARE * (costs[key] - costs[other])
+
+    ordered = sorted(costs, key=lambda k: penalty * costs[k] - gains[k])
+    # a late sensor may explain nearly as much as a unit and an arm do
+    key = next(k for k in ordered if all(beyond(k, o) for o in costs if costs[o] < costs[k]))
     changes = _changes(logs, key)
-    gain = sum(log.gain(key) for log in logs)
-    samples = sum(log.judging(changes) for log in logs)
-    share = 1.0 - float(np.exp(-2 * gain / samples)) if samples else 0.0
-    # a turned compass, a late sensor or an arm is no frame, sign or unit: it is estimated later
-    if share < _LEAST_SHARE * costs[key]:
-        return ()
     kept = []
     for change in (c for c in changes if c.group not in _LATER):
         silent = _silent((change,))
@@ -418,8 +423,7 @@ def _late(motion: Motion) -> list[ColumnHypothesis]:
 
     found = []
     for names in (("psi",), ("u", "v"), ("x_n", "y_n")):
-        delays = (-3.0, -2.0, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0, 3.0, 4.5)
-        for late in delays:
+        for late in _LATENESS:
             # steps of logs differ, what is tried does not
             steps = round(late / motion.step)
             words = f"{' and '.join(names)} {late:g} s late"

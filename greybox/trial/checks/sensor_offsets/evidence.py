@@ -172,8 +172,7 @@ def fit(likelihood: Likelihood, start: Array, prior: Array) -> Array:
         level = likelihood.adapt(residuals)
         level += 0.5 * float(np.sum(weight * (offsets - expected) ** 2))
         if level > least + _LEAST_LOSS:
-            # downhill for the weights of the round before only: channels were taken later by a
-            # whole sample, or their noise was weighed otherwise
+            # downhill for the weights of the round before only
             return best
         best, least = offsets, level
         y, x = likelihood.rows(residuals)
@@ -208,35 +207,43 @@ def search(
         Where to begin; what is expected by default.
     """
     rough, fine = Likelihood(coarse), Likelihood(tie)
-    best = fit(rough, prior[0] if near is None else near, prior)
+    start = prior[0] if near is None else near
+    # one instrument is wrong more often than several
+    starts = [start, _best_place(rough, start)[1]]
+    best = fit(rough, start, prior)
     for _ in range(2):
-        coarse.align(best)
-        rough.adapt(coarse.residuals(best))
-        places = _places(coarse, best)
-        # half a turn and a negative scale are the same
-        free = [(rough.misfit(p, scaled=scaled), k) for k, (p, scaled) in enumerate(places)]
-        least, k = min(free)
-        if least > rough.misfit(best, scaled=places[k][1]) - _LEAST_GAIN:
+        gain, place = _best_place(rough, best)
+        if gain < _LEAST_GAIN:
             break
-        found = fit(rough, places[k][0], prior)
+        found = fit(rough, place, prior)
+        coarse.align(best)
         rough.adapt(coarse.residuals(best))
         if rough.misfit(found) > rough.misfit(best) - _LEAST_GAIN:
             break
         best = found
-    start = prior[0] if near is None else near
-    found = fit(fine, best, prior)
-    if best is not start and _level(fine, start, prior) < _level(fine, found, prior):
-        # longer blocks misled
-        return fit(fine, start, prior)
-    return found
+    # longer blocks may mislead, and steps from one start may end beside the best place
+    return min((fit(fine, s, prior) for s in (best, *starts)), key=lambda s: level(fine, s, prior))
 
 
-def _level(likelihood: Likelihood, offsets: Array, prior: Array) -> float:
+def _best_place(likelihood: Likelihood, offsets: Array) -> tuple[float, Array]:
+    """Return the place of a scan around some offsets that fits best, and what it gains."""
+    tie = likelihood.tie
+    tie.align(offsets)
+    likelihood.adapt(tie.residuals(offsets))
+    # half a turn and a negative scale are the same
+    tried = [
+        (likelihood.misfit(p, scaled=scaled), p, scaled) for p, scaled in _places(tie, offsets)
+    ]
+    least, place, scaled = min(tried, key=lambda t: t[0])
+    return likelihood.misfit(offsets, scaled=scaled) - least, place
+
+
+def level(likelihood: Likelihood, offsets: Array, prior: Array) -> float:
     """Return minus the log-likelihood at some offsets, with what is expected of them."""
     expected, weight = prior
     likelihood.tie.align(offsets)
-    level = likelihood.adapt(likelihood.tie.residuals(offsets))
-    return level + 0.5 * float(np.sum(weight * (offsets - expected) ** 2))
+    found = likelihood.adapt(likelihood.tie.residuals(offsets))
+    return found + 0.5 * float(np.sum(weight * (offsets - expected) ** 2))
 
 
 def _places(tie: KinematicModel, offsets: Array) -> list[tuple[Array, bool]]:

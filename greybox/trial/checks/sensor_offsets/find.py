@@ -11,17 +11,27 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from greybox.trial.checks.finding import Finding, Outcome
 from greybox.trial.checks.motion import Motion
-from greybox.trial.checks.sensor_offsets.evidence import Evidence, coarse_tie, expand, search
+from greybox.trial.checks.sensor_offsets.evidence import (
+    Evidence,
+    Likelihood,
+    coarse_tie,
+    expand,
+    level,
+    search,
+)
 from greybox.trial.checks.sensor_offsets.findings import IDS, Campaign, campaign_findings
 from greybox.trial.checks.sensor_offsets.model import ARM, KinematicModel
 from greybox.trial.checks.sensor_offsets.pool import pool
-from greybox.trial.checks.sensor_offsets.select import score_hypotheses
+from greybox.trial.checks.sensor_offsets.select import Judged, score_hypotheses
 from greybox.trial.checks.sensor_offsets.thresholds import SIGMAS, expected, least
 from greybox.trial.raw_log import Recording
 from greybox.vessel.vessel import Vessel
+
+Array = NDArray[np.float64]
 
 # means over blocks of at most this time [s]: ties are slower than samples, and what a receiver's
 # filter does to its noise within a block is no motion
@@ -115,10 +125,27 @@ def _campaigns(
                 recordings=tuple(logs[i].recording for i in campaign.logs),
                 evidence=tuple(evidence[i] for i in campaign.logs),
                 pooled=campaign,
-                judged=judged,
+                judged=_upheld(judged, members, prior),
                 others=len(ties) - len(campaign.logs),
                 turned_over=max(float(np.ptp(t.motion["psi"])) for t in members),
                 step=max(m.step for i in campaign.logs if (m := logs[i].motion) is not None),
             )
         )
     return found
+
+
+def _upheld(judged: list[Judged], ties: Sequence[KinematicModel], prior: Array) -> list[Judged]:
+    """Leave out the hypotheses at the head that the logs do not bear out.
+
+    They are ranked by the quadratic likelihood around one place. The likelihood itself, at what a
+    hypothesis says, must gain what it costs: along a valley of rival mends it may not.
+    """
+
+    def loss(offsets: Array) -> float:
+        return sum(level(Likelihood(tie), offsets, prior) for tie in ties)
+
+    nothing = loss(prior[0])
+    for k, h in enumerate(judged):
+        if not h.defects or nothing - loss(h.offsets) >= h.cost:
+            return judged[k:]
+    return judged

@@ -22,8 +22,10 @@ ARM = slice(len(CLOCKS), len(CLOCKS) + 2)
 BIAS = len(CLOCKS) + 2
 SIZE = BIAS + 1
 
-# beyond this time the heading's own noise is averaged out
-_HEADING_WINDOW = 5.0
+# beyond this time a channel's own noise is averaged out [s]
+_NOISE_WINDOW = 5.0
+# in standard deviations: what is beyond is no noise, but a bad sample
+_USUAL = 4.0
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,6 @@ class KinematicModel:
             n: denoise(v, motion) for n, v in motion.values.items() if n not in ("x_n", "y_n")
         }
         self.drift = (motion.t - motion.t[0]) / max(float(np.ptp(motion.t)), 1e-9)
-        self._whole: dict[str, int] = {}
         self.align(np.zeros(SIZE))
 
     @property
@@ -70,18 +71,12 @@ class KinematicModel:
         return np.array(found + ([*range(ARM.start, SIZE)] if self.positioned else []))
 
     def align(self, offsets: Array) -> None:
-        """Take channels as late as they are: by whole samples, and the noise-free heading.
-
-        What is moved by less must not know its own noise, or moving it would seem to explain that
-        noise: the fast part of the noise-free heading is the rate's.
-        """
-        late = self._late(offsets)
-        self._whole = {n: round(late[n] / self.motion.step) for n in self.smooth}
+        """Take the noise-free heading as it is at some offsets: its fast part is the rate's."""
         if not self.turned:
             return
         behind = offsets[CLOCKS.index("psi")] - offsets[CLOCKS.index("r")]
         swept = self._moved(integrate(self.smooth["r"], self.motion), -behind)
-        seconds = max(_HEADING_WINDOW, 5 * self.motion.step)
+        seconds = max(_NOISE_WINDOW, 5 * self.motion.step)
         self.smooth["psi"] = swept + smooth(self.motion["psi"] - swept, self.motion, seconds)
 
     def residuals(self, offsets: Array) -> Residuals:
@@ -90,7 +85,7 @@ class KinematicModel:
         n = len(m)
         late = self._late(offsets)
         slow = {k: self._moved(self.smooth[k], late[k]) for k in ("psi", "u", "v", "r") if k in m}
-        now = {k: self._now(k, slow[k]) for k in slow}
+        now = {k: self._now(k, slow[k], late[k]) for k in slow}
         rate = {k: self._slope(v) for k, v in slow.items()}
         position, columns = np.zeros((n, 2)), np.zeros((n, 2, SIZE + 4))
         if self.positioned:
@@ -103,9 +98,11 @@ class KinematicModel:
             aside = to_ned(psi, np.zeros(n), rate["v"])
             velocity = to_ned(psi, slow["u"], slow["v"])
             across = np.column_stack([-velocity[:, 1], velocity[:, 0]])
+            seconds = max(_NOISE_WINDOW, 5 * m.step)
+            steady = to_ned(psi, smooth(slow["u"], m, seconds), smooth(slow["v"], m, seconds))
             levered = np.column_stack([-lever[:, 1], lever[:, 0]])
             turning = rate["psi"][:, None]
-            ways = integrate(np.hstack([ahead, aside, across * turning, across, velocity]), m)
+            ways = integrate(np.hstack([ahead, aside, across * turning, across, steady]), m)
             columns[:, :, CLOCKS.index("u")] = ways[:, 0:2]
             columns[:, :, CLOCKS.index("v")] = ways[:, 2:4]
             columns[:, :, CLOCKS.index("psi")] = ways[:, 4:6] + levered * turning
@@ -131,18 +128,20 @@ class KinematicModel:
         late = {n: float(x) for n, x in zip(CLOCKS, offsets[: len(CLOCKS)], strict=True)}
         return late if self.positioned else late | {"psi": 0.0}
 
-    def _now(self, name: str, slow: Array) -> Array:
-        """Return a channel as it would be were it not late, its noise as it was recorded.
+    def _now(self, name: str, slow: Array, late: float) -> Array:
+        """Return a channel as it would be were it not late, its noise moved along.
 
-        By whole samples with its noise; for the rest only the noise-free part is moved, since
-        interpolation between samples would shrink the noise and so seem to explain it.
+        Noise is moved in the frequency domain: interpolation between samples would shrink it, and
+        so seem to explain it, and noise that stays behind seems to be a motion that comes late.
         """
         out = slow.copy()
         for a, b in self.motion.stretches:
-            rows = np.arange(a, b) + self._whole[name]
-            inside = (rows >= a) & (rows < b)
-            rows = rows[inside]
-            out[a:b][inside] += self.motion[name][rows] - self.smooth[name][rows]
+            noise = self.motion[name][a:b] - self.smooth[name][a:b]
+            usual = _USUAL * 1.4826 * float(np.median(np.abs(noise)))
+            # a single bad sample would ring
+            body = np.clip(noise, -usual, usual)
+            samples = late / self.motion.step
+            out[a:b] += _advanced(body, samples) + np.roll(noise - body, -round(samples))
         return out
 
     def _walked(self, psi: Array, u: Array, v: Array) -> Array:
@@ -166,11 +165,22 @@ class KinematicModel:
         return out
 
 
+def _advanced(value: Array, samples: float) -> Array:
+    """Return a signal without trend earlier by a number of samples, its power kept."""
+    if samples == 0.0:
+        return value
+    shift = np.exp(2j * np.pi * np.fft.rfftfreq(len(value)) * samples)
+    return np.asarray(np.fft.irfft(np.fft.rfft(value) * shift, len(value)))
+
+
 def _beyond(at: Array, t: Array, value: Array) -> Array:
-    """Interpolate, and go on straight beyond the ends."""
-    out = np.interp(at, t, value)
+    """Interpolate by a cubic spline, and go on straight beyond the ends."""
+    # SciPy's splines take a while to load, and a log on one clock needs none
+    from scipy.interpolate import CubicSpline
+
+    out = np.asarray(CubicSpline(t, value)(at) if len(t) > 3 else np.interp(at, t, value))
     reach = min(5, len(t) - 1)
     for inside, k, j in ((at < t[0], 0, reach), (at > t[-1], -1, -1 - reach)):
         slope = (value[k] - value[j]) / (t[k] - t[j])
         out[inside] = value[k] + slope * (at[inside] - t[k])
-    return np.asarray(out)
+    return out

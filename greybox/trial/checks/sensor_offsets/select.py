@@ -111,6 +111,7 @@ class Judged:
     hypothesis : Hypothesis
     score : float
         Log-likelihood less the cost of its offsets.
+    cost : float
     offsets : ndarray
         (`SIZE`,)
     covariance : ndarray
@@ -121,6 +122,7 @@ class Judged:
 
     hypothesis: Hypothesis
     score: float
+    cost: float
     offsets: Array
     covariance: Array
     defects: tuple[Defect, ...]
@@ -186,8 +188,9 @@ def score_hypotheses(
             spread = taken @ covariance @ taken.T
             explained = float(pull @ inner @ pull)
         defects = _defects(h, estimate + null, spread)
-        score = 0.5 * (explained - whole) - _cost(h, defects, vessel)
-        found.append(Judged(h, score, estimate + null, spread, defects))
+        cost = _cost(h, defects, vessel)
+        score = 0.5 * (explained - whole) - cost
+        found.append(Judged(h, score, cost, estimate + null, spread, defects))
     return sorted(found, key=_score, reverse=True)
 
 
