@@ -222,7 +222,7 @@ def run(options: argparse.Namespace) -> None:
         sheet_kind(options.sheet)
     if options.between is None and options.model is None:
         raise UsageError("--model is missing: name a prior model, or two with --between A B.")
-    model = load_model(options.between[0] if options.between else options.model)
+    model = load_model(options.between[0] if options.between else options.model).coefficient_model()
     vessel = load_vessel(options.vessel)
     if options.duration is None:
         raise UsageError("--duration is missing: say how long the trial may last, in seconds.")
@@ -274,7 +274,7 @@ def _run_between(options: argparse.Namespace, request: Any, notes: tuple[str, ..
     first, second = (Path(p).stem for p in options.between)
     if first == second:
         first, second = options.between
-    other = load_model(options.between[1])
+    other = load_model(options.between[1]).coefficient_model()
     if other.sample_time != request.sample_time:
         raise UsageError(
             f"'{first}' has the sample time {request.sample_time:g} s and '{second}' "
@@ -383,7 +383,7 @@ def _wishes(options: argparse.Namespace, model: Any) -> Any:
         gust=options.gust,
         process_noise=process,
         limits=limits,
-        prior=None if options.prior is None else load_model(options.prior),
+        prior=None if options.prior is None else load_model(options.prior).coefficient_model(),
         robust=options.robust,
         worst_case=options.worst_case,
         probability=options.probability,

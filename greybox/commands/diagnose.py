@@ -70,7 +70,7 @@ def run(options: argparse.Namespace) -> None:
 
     check_targets(options.out, options.json, options.report)
     vessel = load_vessel(options.vessel)
-    model = load_model(options.model) if options.model else None
+    model = load_model(options.model).coefficient_model() if options.model else None
     structure = get_structure(options.structure) if model is None else model.structure
     sample_time = options.sample_time or (model.sample_time if model else None)
     logs, left_out = read_logs(options.logs, vessel, sample_time, structure.states)

@@ -17,6 +17,7 @@ from greybox.commands.common import (
 )
 from greybox.estimation.registry import ESTIMATORS
 from greybox.model.predictor_kinds import PREDICTORS
+from greybox.numerics.effort import EFFORT
 from greybox.public import one_thread
 
 if TYPE_CHECKING:
@@ -66,6 +67,14 @@ def _add_model(parser: argparse.ArgumentParser) -> None:
         metavar="NAME",
         help="thesis, surge, linear, blanke, modulus, abkowitz; +TERM and -TERM change it; "
         "by default chosen",
+    )
+    group.add_argument(
+        "--effort",
+        type=positive,
+        default=EFFORT,
+        metavar="SECONDS",
+        help="what is left open is chosen within this time; what could not be tried is named, and "
+        f"the first estimate always ends ({EFFORT:g})",
     )
     chosen = group.add_mutually_exclusive_group()
     chosen.add_argument(
@@ -302,6 +311,7 @@ def run(options: argparse.Namespace) -> None:
         nominal=load_model(options.nominal) if options.nominal else None,
         seed=options.seed,
         validate=tuple(validate),
+        effort=options.effort,
     )
     choice = _choose(logs, request, options)
     estimate = choice.estimate if choice else estimate_requested(logs, request)

@@ -42,6 +42,7 @@ from greybox.estimation.solve import Covariance, solve_iv, solve_ls
 from greybox.estimation.values import Iteration
 from greybox.estimation.verdict import UNJUDGED
 from greybox.model.predictor import Predictor
+from greybox.numerics.effort import require_time
 from greybox.public import known_keywords, one_thread
 from greybox.regression.motion import Motion, further_channels, predicted_motion, smoothed_heading
 from greybox.regression.problem import RegressionProblem
@@ -362,6 +363,7 @@ def _refine(
     fit = work.first_levels(point, keep, theta)
     settling, settled, converged = False, False, False
     for rounds in range(1, _MOST + 1):
+        require_time()
         bands = work.bands(point, keep)
         if settling:
             # errors of coefficients that are still far off would decide wrongly, and were the

@@ -73,6 +73,11 @@ class Estimate(EstimateValues, DisplayMixin):
         What the free run is good for on logs that took no part; None where not asked for.
     calibration : BandCalibration, optional
         How far bands must reach, by logs that were left out in turn.
+    tried : tuple of Comparison
+        What was compared on the way to it, with every score.
+    coefficients : Estimate, optional
+        The estimate that the coefficients' verdict speaks of, where another one predicts
+        better: this one is then what simulates.
     """
 
     @property
@@ -119,16 +124,6 @@ class Estimate(EstimateValues, DisplayMixin):
     def names(self) -> tuple[str, ...]:
         """Names of the parameters, biases left out."""
         return self.predictor.parameter_names
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """Labels of the parameters, sums spelled out, such as ``Xuu+Wuu``."""
-        return tuple(self.predictor.columns[i].label for i in self.predictor.parameter_columns)
-
-    @property
-    def std(self) -> Array:
-        """Standard errors of all columns, (p,)."""
-        return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
 
     def __getitem__(self, name: str) -> float:
         """Return the value of a parameter by name.
@@ -270,10 +265,18 @@ class Estimate(EstimateValues, DisplayMixin):
             "fit": self.fit,
             "verdict": {
                 "prediction": (self.prediction or NOT_JUDGED).to_dict(),
-                "coefficients": self.verdict.to_dict(),
+                "coefficients": self.meant.verdict.to_dict()
+                | {"of": "theta" if self.coefficients is None else "coefficients"},
             },
             "tests": {t.name: t.to_dict() for t in self.tests},
             "notes": list(self.notes),
+            "tried": [c.to_dict() for c in self.tried],
+            "chosen_on_data": list(self.chosen_on_data),
+            **(
+                {"coefficients": self.coefficients.model().to_dict()}
+                if isinstance(self.coefficients, Estimate)
+                else {}
+            ),
             "status": self.status,
             "covariance_kind": self.covariance_kind,
             "lags": self.lags,
@@ -321,7 +324,7 @@ class Estimate(EstimateValues, DisplayMixin):
         per_second.iloc[len(self.names) :] = np.nan
         frame["per_second"] = per_second
         frame.attrs = {
-            "verdict": self.verdict.text,
+            "verdict": self.meant.verdict.text,
             "prediction": (self.prediction or NOT_JUDGED).text,
             "method": self.method,
             "sample_time": self.sample_time,
@@ -329,7 +332,7 @@ class Estimate(EstimateValues, DisplayMixin):
         return frame
 
     def _line(self) -> str:
-        told = self.verdict.text
+        told = self.meant.verdict.text
         if self.prediction is not None:
             told = f"prediction {self.prediction.text}; coefficients {told}"
         return f"estimate of {self.vessel.name} ({self.method}): {told}"

@@ -28,6 +28,7 @@ from scipy.sparse.linalg import splu
 
 from greybox.model.output import OutputModel
 from greybox.model.run.output_runs import Simulator
+from greybox.numerics.effort import require_time
 
 Array = NDArray[np.float64]
 Loss = Literal["gaussian", "huber"]
@@ -435,6 +436,7 @@ def fit_segments(
         return total if np.isfinite(total) else np.inf
 
     while taken < most:
+        require_time()
         taken += 1
         if not all(np.isfinite(a).all() for a in (at.r, at.rows, at.slope)):
             break

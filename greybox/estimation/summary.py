@@ -5,8 +5,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Mapping, Sequence
 
-import numpy as np
-
+from greybox.estimation.tried import told
 from greybox.estimation.values import EstimateValues
 from greybox.estimation.verdict import TestResult
 from greybox.model.terms import parameter_unit
@@ -39,8 +38,12 @@ def summarise(estimate: EstimateValues) -> str:
     lines = [f"{'Estimate of ' + estimate.vessel.name:^{WIDTH}}".rstrip(), "=" * WIDTH]
     if estimate.prediction is not None:
         lines += _wrapped(f"Prediction: {estimate.prediction.text}", "  ")
-    lines += _wrapped(f"Coefficients: {estimate.verdict.text}", "  ")
+    meant = estimate.meant
+    lines += _wrapped(f"Coefficients: {meant.verdict.text}", "  ")
+    if meant is not estimate:
+        lines += _wrapped(whose(estimate), "  ")
     lines += ["=" * WIDTH, *_head(estimate), "=" * WIDTH, *_table(estimate), "=" * WIDTH]
+    lines += _wrapped(estimate.told_of_choice, "  ")
     for name, value, std in estimate.current:
         lines.append(f"{name:<16}{value:>10.3f} ± {1.96 * std:.3f} m/s (95 %)")
     if estimate.fit:
@@ -48,13 +51,18 @@ def summarise(estimate: EstimateValues) -> str:
         lines.append(f"Free-run fit on the estimation logs: {shown}")
     if estimate.prediction is not None:
         lines += ["", "What its free run is good for", *estimate.prediction.table()]
-    for name, limit in estimate.limits.items():
+    if meant is not estimate:
+        lines += ["", f"{'The estimate of the coefficients':^{WIDTH}}".rstrip(), "=" * WIDTH]
+        lines += [*_head(meant), "=" * WIDTH, *_table(meant), "=" * WIDTH]
+        lines += _wrapped(meant.told_of_choice, "  ")
+    for name, limit in meant.limits.items():
         lines += _wrapped(f"{BOUNDS[name]}: {limit.sentence}", "  ")
     if estimate.data.conditions.values:
         lines += _wrapped(f"Conditions: {in_words(estimate.data.conditions.values)}", "  ")
     for actuator in estimate.data.actuators:
         lines += _wrapped(f"Actuator: {actuator.sentence}", "  ")
-    lines += _tests(estimate.tests)
+    lines += told(estimate.tried)
+    lines += _tests(meant.tests)
     if estimate.notes:
         lines += ["", "Notes"]
     for note in estimate.notes:
@@ -62,10 +70,30 @@ def summarise(estimate: EstimateValues) -> str:
     return "\n".join(lines)
 
 
+def whose(estimate: EstimateValues) -> str:
+    """Return which numbers are whose, where two estimates stand beside each other."""
+    own, meant = (
+        f"{e.method} of {_structure(e)}, predictor '{e.predictor.kind}'"
+        for e in (estimate, estimate.meant)
+    )
+    return (
+        f"Two estimates stand beside each other: the free run, its fit and the verdict on the "
+        f"prediction are those of {own}; coefficients, their tests and their verdict are those of "
+        f"{meant}."
+    )
+
+
+def _structure(estimate: EstimateValues) -> str:
+    structure = estimate.predictor.structure
+    if len(structure.name) < _CELL:
+        return f"structure '{structure.name}'"
+    return f"{len(structure.terms)} selected terms"
+
+
 def estimated(estimate: EstimateValues) -> list[tuple[str, float, float, str]]:
     """Return label, value, standard error and unit of each parameter, biases left out."""
     unit, structure = estimate.vessel.force_unit, estimate.predictor.structure
-    columns, std = estimate.predictor.columns, _std(estimate)
+    columns, std = estimate.predictor.columns, estimate.std
     return [
         (
             columns[i].label,
@@ -75,10 +103,6 @@ def estimated(estimate: EstimateValues) -> list[tuple[str, float, float, str]]:
         )
         for i in estimate.predictor.parameter_columns
     ]
-
-
-def _std(estimate: EstimateValues) -> np.ndarray:
-    return np.asarray(np.sqrt(np.maximum(np.diag(estimate.covariance), 0.0)))
 
 
 def _wrapped(text: str, indent: str) -> list[str]:
@@ -117,7 +141,7 @@ def _table(estimate: EstimateValues) -> list[str]:
         f"{'plain IV' if plain else '':>{beside}}{'weak-safe 95 %' if sets else '':>{safe}}"
         f"{'per second':>11}  unit"
     ]
-    unit, errors = estimate.vessel.force_unit, _std(estimate)
+    unit, errors = estimate.vessel.force_unit, estimate.std
     structure = estimate.predictor.structure
     for state in structure.states:
         lines.append("-" * WIDTH)

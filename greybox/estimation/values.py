@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.estimation.prediction_verdict import PredictionVerdict
+from greybox.estimation.tried import Comparison
 from greybox.estimation.verdict import UNJUDGED, TestResult, Verdict
 from greybox.model.noise import BandCalibration, NoiseLevels
 from greybox.model.predictor import Predictor
@@ -19,6 +20,14 @@ from greybox.trial.validity import PooledConditions, pooled_conditions, ranges
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
+
+# what an alternative may differ in, in words
+_CHOSEN = {
+    "structure": "structure or terms",
+    "predictor": "predictor",
+    "method": "method",
+    "thrust": "thrust law",
+}
 
 
 @dataclass(frozen=True)
@@ -157,3 +166,42 @@ class EstimateValues:
     prefilter: str = "none"
     prediction: PredictionVerdict | None = None
     calibration: BandCalibration | None = None
+    tried: tuple[Comparison, ...] = ()
+    coefficients: EstimateValues | None = None
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Labels of the parameters, sums spelled out, such as ``Xuu+Wuu``."""
+        return tuple(self.predictor.columns[i].label for i in self.predictor.parameter_columns)
+
+    @property
+    def std(self) -> Array:
+        """Standard errors of all columns, (p,)."""
+        return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+
+    @property
+    def meant(self) -> EstimateValues:
+        """The estimate whose numbers mean what their names say, as far as any does."""
+        return self if self.coefficients is None else self.coefficients
+
+    @property
+    def chosen_on_data(self) -> tuple[str, ...]:
+        """What free runs over parts of the same logs chose: intervals do not allow for it."""
+        found = {
+            words: None
+            for compared in self.tried
+            for key, words in _CHOSEN.items()
+            if len({getattr(r, key) for r in compared.rows if r.score is not None}) > 1
+        }
+        return tuple(found)
+
+    @property
+    def told_of_choice(self) -> str:
+        """What is said beside the intervals, nothing where nothing was chosen on the data."""
+        chosen = self.chosen_on_data
+        if not chosen:
+            return ""
+        return (
+            f"Chosen on the same logs: {', '.join(chosen)}. The intervals do not allow for that "
+            f"choice: the true ones are wider."
+        )

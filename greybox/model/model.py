@@ -149,6 +149,14 @@ class ManoeuvringModel(DisplayMixin):
         covariance = self.covariance * np.outer(now, now)
         return replace(self, theta=self.theta * now, covariance=covariance, changes=())
 
+    def coefficient_model(self) -> ManoeuvringModel:
+        """Return the model whose coefficients mean what their names say, as far as any does.
+
+        It is this one, unless its file holds a second estimate beside the one that predicts.
+        """
+        other = self.record.get("coefficients")
+        return self if not isinstance(other, dict) else model_from_dict(other, "coefficients")
+
     def settled(self) -> ManoeuvringModel:
         """Return `at_final_parameters` under its former name, which is deprecated."""
         warnings.warn(

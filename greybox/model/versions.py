@@ -7,7 +7,7 @@ from typing import Any
 
 from greybox.errors import ModelFileError
 
-VERSION = 3
+VERSION = 4
 
 Tables = dict[str, Any]
 
@@ -43,8 +43,13 @@ def _from_2(data: Tables) -> Tables:
     return {**data, "verdict": {"coefficients": coefficients}, "version": 3}
 
 
+def _from_3(data: Tables) -> Tables:
+    """Version 3 had one estimate, for coefficients and prediction."""
+    return {**data, "version": 4}
+
+
 # from each version to the next
-_STEPS: Mapping[int, Callable[[Tables], Tables]] = {1: _from_1, 2: _from_2}
+_STEPS: Mapping[int, Callable[[Tables], Tables]] = {1: _from_1, 2: _from_2, 3: _from_3}
 
 
 def upgraded(data: Tables, source: str) -> Tables:

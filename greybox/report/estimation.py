@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,17 +18,22 @@ from greybox.estimation.summary import (
     plain_estimates,
     set_in_words,
     weak_safe_sets,
+    whose,
 )
+from greybox.estimation.tried import Comparison
+from greybox.estimation.values import EstimateValues
 from greybox.estimation.verdict import TestResult, TrustLevel
 from greybox.model.terms import parameter_unit
 from greybox.report.chart import chart_of
 from greybox.report.estimation_figures import (
+    MOST_DRAWN,
     REACH,
     correlation_figure,
     forest_figure,
     regime_shares,
     regimes_figure,
     residual_figure,
+    tried_figure,
     visited_figure,
 )
 from greybox.report.figures import comparison_figure, to_svg
@@ -74,9 +80,9 @@ def estimation_page(
     sections = [
         _run(estimate, logs),
         _parameters(estimate),
-        _residuals(estimate),
+        _residuals(estimate.meant),
         _visited(estimate, logs),
-        _tests(estimate),
+        _tests(estimate.meant),
         _chosen(estimate, choice),
         _equations(estimate, mass),
     ]
@@ -98,7 +104,7 @@ def estimation_page(
 
 def headline(estimate: Estimate) -> str:
     """Return both verdicts as sentences, with how well the free run follows the logs."""
-    verdict, prediction = estimate.verdict, estimate.prediction
+    verdict, prediction = estimate.meant.verdict, estimate.prediction
     if verdict.level is TrustLevel.TRUST_EXCEPT:
         told = f"Trust its coefficients, except for {', '.join(verdict.excepted)}"
     else:
@@ -141,8 +147,10 @@ def _summary(estimate: Estimate) -> list[str]:
             for r in (estimate.prediction.because if estimate.prediction else ())
             if not r.fatal
         ),
-        *(r.sentence for r in estimate.verdict.because if not r.fatal),
+        *(r.sentence for r in estimate.meant.verdict.because if not r.fatal),
     ]
+    if estimate.meant is not estimate:
+        told.append(whose(estimate))
     if estimate.current:
         shown = ", ".join(f"{n} {v:.3f} ± {1.96 * s:.3f} m/s" for n, v, s in estimate.current)
         told.append(f"Current found beside the parameters (± 95 %): {shown}.")
@@ -184,8 +192,9 @@ def _run(estimate: Estimate, logs: Sequence[TrialLog]) -> Section:
     return Section("1. Does its free run follow the log?", sentences, pictures)
 
 
-def _parameters(estimate: Estimate) -> Section:
-    """Show intervals, and which estimates hang together."""
+def _parameters(predicts: Estimate) -> Section:
+    """Show intervals, and which estimates hang together; the parameters that predict below."""
+    estimate = predicts.meant
     place = list(estimate.predictor.parameter_columns)
     theta, std = estimate.theta[place], estimate.std[place]
     labels, units = list(estimate.labels), _units(estimate)
@@ -236,13 +245,18 @@ def _parameters(estimate: Estimate) -> Section:
             )
         )
     told += [f"{BOUNDS[name]}: {limit.sentence}" for name, limit in estimate.limits.items()]
-    return Section(
-        "2. How well is each parameter known?", told, pictures,
-        [_parameter_table(estimate, labels, units, theta, std)],
-    )  # fmt: skip
+    if estimate.told_of_choice:
+        told.append(estimate.told_of_choice)
+    tables = [_parameter_table(estimate)]
+    if estimate is not predicts:
+        told.insert(0, whose(predicts))
+        table = _parameter_table(predicts)
+        beside = f". {predicts.told_of_choice}" if predicts.told_of_choice else ""
+        tables.append(replace(table, caption=f"What predicts: {table.caption}{beside}"))
+    return Section("2. How well is each parameter known?", told, pictures, tables)
 
 
-def _units(estimate: Estimate) -> list[str]:
+def _units(estimate: EstimateValues) -> list[str]:
     structure = estimate.predictor.structure
     return [
         shown_unit(
@@ -268,9 +282,10 @@ def _pairs(labels: Sequence[str], correlation: Array) -> list[str]:
     return [f"The log tells these pairs apart worst (correlation): {shown}."]
 
 
-def _parameter_table(
-    estimate: Estimate, labels: Sequence[str], units: Sequence[str], theta: Array, std: Array
-) -> Table:
+def _parameter_table(estimate: EstimateValues) -> Table:
+    place = list(estimate.predictor.parameter_columns)
+    theta, std = estimate.theta[place], estimate.std[place]
+    labels, units = estimate.labels, _units(estimate)
     sets, plain = weak_safe_sets(estimate.tests), plain_estimates(estimate)
     rows = []
     for name, unit, value, error in zip(labels, units, theta, std, strict=True):
@@ -299,7 +314,7 @@ def _by_state(tests: Sequence[TestResult], kind: str) -> dict[str, Mapping[str, 
     return {t.state: t.detail for t in tests if t.kind == kind and t.obstacle is None}
 
 
-def _residuals(estimate: Estimate) -> Section | None:
+def _residuals(estimate: EstimateValues) -> Section | None:
     states = estimate.predictor.structure.states
     own = _by_state(estimate.tests, "whiteness")
     moved = _by_state(estimate.tests, "input_independence")
@@ -383,7 +398,7 @@ def _sentence(text: str) -> str:
     return first + text[1:] + ("" if text.endswith(".") else ".")
 
 
-def _tests(estimate: Estimate) -> Section:
+def _tests(estimate: EstimateValues) -> Section:
     """List every test with its statistic."""
     tables = [
         Table(
@@ -412,7 +427,33 @@ def _chosen(estimate: Estimate, choice: StructureChoice | None) -> Section | Non
     if not estimate.notes and choice is None:
         return None
     texts = [("Structures compared", choice.summary())] if choice else []
-    return Section("6. What was chosen, and why", points=estimate.notes, texts=texts)
+    return Section(
+        "6. What was chosen, and why",
+        pictures=[p for i, c in enumerate(estimate.tried) for p in _tried_picture(c, i)],
+        tables=[Table(_tried_caption(c), *c.table()) for c in estimate.tried],
+        points=estimate.notes,
+        texts=texts,
+    )
+
+
+def _tried_caption(compared: Comparison) -> str:
+    return f"What was tried: {compared.title}, by {compared.judged_on}"
+
+
+def _tried_picture(compared: Comparison, place: int) -> list[Picture]:
+    """Draw the scores of what was compared, where there are some to compare."""
+    scores = [r for r in compared.ordered if r.score is not None]
+    if len(scores) < 2:
+        return []
+    caption = (
+        f"{_tried_caption(compared)}. Bars: one standard error of the distance to the best, which "
+        f"is dotted. {compared.decision}"
+    )
+    if len(scores) > MOST_DRAWN:
+        caption += f" Of {len(scores)} the best {MOST_DRAWN} are drawn; all are in the table."
+    every = "; ".join(f"{r.label}: {r.result}" for r in scores)
+    figure = to_svg(tried_figure(compared), f"tried{place}")
+    return [Picture(figure, caption, f"{caption} {every}.", narrow=True)]
 
 
 def _equations(estimate: Estimate, mass: float | None) -> Section:

@@ -11,6 +11,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 from numpy.typing import NDArray
 
 from greybox.estimation.summary import Pieces
+from greybox.estimation.tried import Comparison
 from greybox.report.figures import (
     BLACK,
     BLUE,
@@ -20,6 +21,7 @@ from greybox.report.figures import (
     SKY,
     VERMILION,
     new_figure,
+    shorten,
     tidy,
 )
 
@@ -31,6 +33,9 @@ _NARROW = 4.4
 # of the value: an interval that reaches further is drawn to the edge [%]
 REACH = 200.0
 _DOTS = 3000
+# alternatives that a picture has room for, the best ones; letters of their labels
+MOST_DRAWN = 30
+_LABEL = 40
 _MARKERS = ("o", "s", "^", "D", "v", "x")
 
 
@@ -89,6 +94,37 @@ def forest_figure(
     ax.set_ylim(len(labels) - 0.5, -0.5)
     ax.xaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:+.0f}" if v else "0"))
     ax.set_xlabel("distance from the estimate [% of it], zero at −100 %", fontsize=8.5)
+    ax.tick_params(axis="x", labelsize=8)
+    _legend(figure, ax, 3)
+    tidy(ax)
+    return figure
+
+
+def tried_figure(comparison: Comparison) -> Figure:
+    """Draw the score of each alternative with its standard error, the best as a line.
+
+    An alternative whose bar reaches the line is as good as the best by one standard error.
+    """
+    scored = [r for r in comparison.ordered if r.score is not None]
+    rows = [r for i, r in enumerate(scored) if i < MOST_DRAWN or r.chosen]
+    figure = new_figure(_WIDTH, (0.3 if len(rows) < 15 else 0.2) * len(rows) + 1.1)
+    ax = figure.subplots()
+    scores = np.array([r.score for r in rows], float)
+    errors = np.array([r.se or 0.0 for r in rows])
+    taken = np.array([r.chosen for r in rows])
+    for which, colour, marker, said in (
+        (~taken, BLUE, "o", "tried"), (taken, VERMILION, "D", "taken"),
+    ):  # fmt: skip
+        if which.any():
+            ax.errorbar(
+                scores[which], np.flatnonzero(which), xerr=errors[which], fmt=marker, color=colour,
+                markersize=5, capsize=3, linewidth=1.3, label=said,
+            )  # fmt: skip
+    ax.axvline(scores.max(), color=BLACK, linewidth=0.8, linestyle=":", label="best")
+    labels = [shorten(r.label, _LABEL) for r in rows]
+    ax.set_yticks(range(len(rows)), labels, fontsize=8, parse_math=False)
+    ax.set_ylim(len(rows) - 0.5, -0.5)
+    ax.set_xlabel("free-run fit, mean over the channels [%]", fontsize=8.5)
     ax.tick_params(axis="x", labelsize=8)
     _legend(figure, ax, 3)
     tidy(ax)

@@ -8,15 +8,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.errors import GreyboxError, LogError
+from greybox.errors import DivergenceError, GreyboxError, LogError
 from greybox.estimation.informative import ADVISED_HEADING, heading_range
 from greybox.estimation.registry import ESTIMATORS, automatic_estimators
+from greybox.estimation.tried import Comparison, TriedModel
 from greybox.model.catalogue import structure_for
 from greybox.model.predictor_kinds import PREDICTORS
 from greybox.model.structure import Structure
+from greybox.numerics.effort import OutOfTimeError, seconds_left, within
 from greybox.selection.fit_single import estimate_once
-from greybox.selection.held_out import rank, score_runs, spread_of
+from greybox.selection.held_out import Ranking, rank, score_runs, spread_of
 from greybox.selection.request import Request
+from greybox.selection.term_selection import law_in_words
 from greybox.trial.log import TrialLog
 from greybox.validation.fit import run_model
 from greybox.vessel.force import force_inputs
@@ -27,6 +30,10 @@ Array = NDArray[np.float64]
 _HELD_OUT = 1 / 3
 # parts of the held-out runs, for a standard error
 _BLOCKS = 6
+# said of what could not be tried
+OVER = "not tried: time was over (--effort)"
+# share of the time that is left that the comparison may take
+_OF_ALL = 0.3
 # refinements of the instruments while alternatives are compared
 _RANKING_REFINEMENTS = 4
 # share of samples that must meet a sign condition
@@ -49,12 +56,12 @@ class Alternative:
 
 
 def alternatives_for(
-    logs: Sequence[TrialLog], request: Request, notes: list[str]
+    logs: Sequence[TrialLog], request: Request, notes: list[str], tried: list[Comparison]
 ) -> list[Alternative]:
     """Return the ways to estimate, the preferred one first.
 
     Where the conditions of consistency hold that is the one that theory names,
-    elsewhere the one whose held-out run is best; `notes` are told.
+    elsewhere the one whose held-out run is best; `notes` and `tried` are told.
 
     Raises
     ------
@@ -63,7 +70,7 @@ def alternatives_for(
     """
     inputs = force_inputs(logs[0].vessel)
     wind = all(log.has_wind for log in logs)
-    names = [request.structure] if request.structure is not None else _structures(logs, wind)
+    names = [request.structure] if request.structure is not None else structures_to_try(logs, wind)
     structures = [structure_for(name, inputs) for name in names]
     estimators = (
         [ESTIMATORS[request.method]]
@@ -107,11 +114,11 @@ def alternatives_for(
             )
             alternatives = [*first, *[a for a in alternatives if a.label != first[0].label]]
         else:
-            alternatives = _compare(logs, alternatives, request, notes)
+            alternatives = _compare(logs, alternatives, request, notes, tried)
     return alternatives
 
 
-def _structures(logs: Sequence[TrialLog], wind: bool) -> list[str]:
+def structures_to_try(logs: Sequence[TrialLog], wind: bool) -> list[str]:
     """Return the structures to try where the user names none, the fullest first.
 
     On a nearly constant heading an unmeasured wind or current is a constant
@@ -174,6 +181,7 @@ def _compare(
     alternatives: list[Alternative],
     request: Request,
     notes: list[str],
+    tried: list[Comparison],
 ) -> list[Alternative]:
     """Put first the earliest alternative whose held-out run is within an error of the best."""
     request = ranking_request(request)
@@ -184,37 +192,61 @@ def _compare(
         held.append(log.window(cut, len(log), log.name))
     spread = spread_of(logs, alternatives[0].structure.states)
     scores: list[Array | None] = []
-    for alternative in alternatives:
-        try:
-            model = estimate_once(
-                fitting, alternative.structure, alternative.method, alternative.kind, request
-            ).model()
-            runs = [run_model(model, log) for log in held]
-            bounded = all(r.diverged < 0 for r in runs)
-            scores.append(score_runs(runs, spread, _BLOCKS) if bounded else None)
-        except GreyboxError:
-            scores.append(None)
+    without = ["its run diverges"] * len(alternatives)
+    with within(_OF_ALL * seconds_left()):
+        for i, alternative in enumerate(alternatives):
+            try:
+                model = estimate_once(
+                    fitting, alternative.structure, alternative.method, alternative.kind, request
+                ).model()
+                runs = [run_model(model, log) for log in held]
+                bounded = all(r.diverged < 0 for r in runs)
+                scores.append(score_runs(runs, spread, _BLOCKS) if bounded else None)
+            except GreyboxError as error:
+                scores.append(None)
+                if isinstance(error, OutOfTimeError):
+                    without[i] = OVER
+                elif not isinstance(error, DivergenceError):
+                    without[i] = str(error)
     if all(s is None for s in scores):
         notes.append("no alternative could be run on the last third of each log.")
         return alternatives
     found = rank(scores, range(len(alternatives)))
     order = sorted(range(len(alternatives)), key=lambda i: (i != found.chosen, -found.score[i]))
-    shown = ", ".join(
-        f"{alternatives[i].label} "
-        + (
-            f"{found.score[i]:.1f} ({found.behind[i]:.1f} ± {found.se[i]:.1f} behind)"
-            if np.isfinite(found.score[i])
-            else "diverged"
-        )
-        for i in order
+    rule = (
+        "the fullest structure and the method least biased by noise that fall behind the best by "
+        "no more than one standard error"
     )
-    notes.append(
-        f"chosen by the free run on the last third of each log when estimated on the first two "
-        f"(mean fit in % of the whole logs' spread, cut at −100; the fullest structure and the "
-        f"method least biased by noise that fall behind the best by no more than one standard "
-        f"error): {shown}."
-    )
+    on = "the free run on the last third of each log when estimated on the first two"
+    rows = []
+    for i, a in enumerate(alternatives):
+        row = tried_model(a, logs, chosen=i == found.chosen)
+        rows.append(replace(row, note=without[i]) if scores[i] is None else scored(row, found, i))
+    tried.append(Comparison("published structures", on, rule, tuple(rows)))
+    notes.append(f"chosen by {on}: {rule}.")
     return [alternatives[i] for i in order]
+
+
+def tried_model(
+    alternative: Alternative, logs: Sequence[TrialLog], *, chosen: bool = False, note: str = ""
+) -> TriedModel:
+    """Return an alternative as the table of what was tried has it, without a score."""
+    return TriedModel(
+        alternative.structure.name,
+        alternative.kind,
+        alternative.method,
+        logs[0].sample_time,
+        law_in_words(logs[0].vessel.thrusters[0].thrust),
+        len(alternative.structure.parameters),
+        chosen=chosen,
+        note=note,
+    )
+
+
+def scored(row: TriedModel, found: Ranking, i: int) -> TriedModel:
+    """Return a row with what a ranking says of its place `i`."""
+    score, behind, se = (float(x[i]) for x in (found.score, found.behind, found.se))
+    return replace(row, score=score, behind=behind, se=se)
 
 
 def ranking_request(request: Request) -> Request:

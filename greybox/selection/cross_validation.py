@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -21,6 +21,8 @@ from greybox.errors import GreyboxError
 from greybox.estimation.output_error import Weights
 from greybox.estimation.registry import ESTIMATORS, automatic_estimators
 from greybox.estimation.result import Estimate
+from greybox.model.model import ManoeuvringModel
+from greybox.numerics.effort import OutOfTimeError
 from greybox.selection.fit_single import estimate_once
 from greybox.selection.held_out import FLOOR, folds, score_runs, spread_of
 from greybox.selection.request import Request
@@ -31,8 +33,9 @@ from greybox.validation.fit import average_fit, run_model
 Array = NDArray[np.float64]
 _log = logging.getLogger(__name__)
 
-# parts that are left out in turn, scores that are wanted, and that a standard error needs
-_FOLDS, _WANTED, _LEAST = 4, 4, 3
+# parts that are left out in turn, scores that are wanted of estimators, that a standard error of
+# them needs, and that are wanted of models
+_FOLDS, _WANTED, _LEAST, _SCORES = 4, 4, 3, 8
 # refinements of the instruments of a part
 _REFINEMENTS = 4
 
@@ -90,7 +93,7 @@ class EstimatorComparison:
 
         The limit is a standard error that allows for the number of parts.
         """
-        return tuple(_gain(row - self.scores[0]) for row in self.scores)
+        return tuple(gain(row - self.scores[0]) for row in self.scores)
 
     @property
     def best(self) -> int:
@@ -100,7 +103,7 @@ class EstimatorComparison:
     @property
     def chosen(self) -> int:
         """The best variant of those that gain more than a standard error, else the first."""
-        sure = [i for i, (gain, se) in enumerate(self.gains) if gain > se]
+        sure = [i for i, (by, se) in enumerate(self.gains) if by > se]
         return max(sure, key=lambda i: self.gains[i][0], default=0)
 
     def sentence(self) -> str:
@@ -113,10 +116,10 @@ class EstimatorComparison:
             for w, m in zip(self.variants, mean, strict=True)
         )
         i = self.chosen or self.best
-        gain, se = self.gains[i]
+        by, se = self.gains[i]
         first = self.variants[0].label
         told = (
-            f"{self.variants[i].label} is {gain:.1f} ± {se:.1f} better than {first}"
+            f"{self.variants[i].label} is {by:.1f} ± {se:.1f} better than {first}"
             if i
             else f"none is better than {first}"
         )
@@ -130,7 +133,11 @@ class EstimatorComparison:
         )
 
 
-def _gain(difference: Array) -> tuple[float, float]:
+def gain(difference: Array) -> tuple[float, float]:
+    """Return the mean of differences of scores, and its one-sided 84 % limit by Student's t [%].
+
+    Without a finite mean where fewer than half of the parts, or three, have a score.
+    """
     known = difference[np.isfinite(difference)]
     n = len(known)
     if 2 * n < len(difference) or n < _LEAST:
@@ -189,6 +196,8 @@ def compare_estimators(
 
     Raises
     ------
+    OutOfTimeError
+        Time was over before each was estimated without every part.
     UsageError
         A single log is too short to be parted.
     """
@@ -238,6 +247,8 @@ def _estimates(
         from_here = start or (spare if free_run else None)
         try:
             found[variant] = estimate_variant(variant, logs, like, request, from_here)
+        except OutOfTimeError:
+            raise
         except GreyboxError as error:
             _log.info("%s on a part: %s", variant.label, error)
             found[variant] = None
@@ -248,6 +259,47 @@ def _estimates(
             if level > most and all(run.diverged < 0 for run in runs):
                 start, most = estimate, level
     return [found[variant] for variant in variants]
+
+
+def score_refits(
+    refits: Sequence[Callable[[Sequence[TrialLog]], ManoeuvringModel]], logs: Sequence[TrialLog]
+) -> list[Array]:
+    """Return the scores of models over parts of the logs that are left out of them in turn.
+
+    Parameters
+    ----------
+    refits : sequence of callable
+        Each estimates a model on some of the logs; where it fails, its run counts as escaped.
+    logs : sequence of TrialLog
+
+    Raises
+    ------
+    OutOfTimeError
+        Time was over before each was run over every part.
+    UsageError
+        A single log is too short to be parted.
+    """
+    parts = parts_of(logs)
+    blocks = -(-_SCORES // max(len(logs), len(parts)))
+    found = []
+    for refit in refits:
+        scores: list[Array] = []
+        for fitting, held in parts:
+            spread = None
+            try:
+                model = refit(fitting)
+                spread = spread_of(logs, model.structure.states)
+            except OutOfTimeError:
+                raise
+            except GreyboxError as error:
+                _log.info("without a part there is no estimate: %s", error)
+            for log in held:
+                none = np.full(blocks, FLOOR)
+                scores.append(
+                    none if spread is None else score_runs([run_model(model, log)], spread, blocks)
+                )
+        found.append(np.concatenate(scores))
+    return found
 
 
 def estimate_variant(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import warnings
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import Literal
 
@@ -16,32 +17,64 @@ from greybox.errors import ExcitationError, GreyboxError, LogError, UsageError
 from greybox.estimation.closed_loop import Loop
 from greybox.estimation.efficiency_bounds import limits_of
 from greybox.estimation.output_error import OutputErrorOptions
-from greybox.estimation.prediction_verdict import PredictionLevel
+from greybox.estimation.prediction_verdict import (
+    NOT_JUDGED,
+    LargeError,
+    PredictionLevel,
+    RunsDiverge,
+)
 from greybox.estimation.registry import ESTIMATORS, free_run_estimator
 from greybox.estimation.result import Estimate
 from greybox.estimation.solve import Covariance
-from greybox.estimation.verdict import TrustLevel, Verdict, refused
+from greybox.estimation.tried import Comparison
+from greybox.estimation.verdict import Divergence, TrustLevel, Verdict, refused
+from greybox.model.catalogue import structure_for
 from greybox.model.model import ManoeuvringModel
+from greybox.model.predictor_kinds import PREDICTORS
 from greybox.model.structure import Structure
+from greybox.numerics.effort import EFFORT, OutOfTimeError, seconds_left, within, without_limit
 from greybox.public import known_keywords, one_thread
 from greybox.regression.regression import common_sample_time
-from greybox.selection.alternatives import Alternative, alternatives_for, ranking_request
-from greybox.selection.cross_validation import EstimatorVariant, compare_estimators, parts_of
+from greybox.selection.alternatives import (
+    Alternative,
+    alternatives_for,
+    ranking_request,
+    structures_to_try,
+    tried_model,
+)
+from greybox.selection.compared import estimators_tried, runs_tried, terms_tried
+from greybox.selection.cross_validation import (
+    EstimatorVariant,
+    compare_estimators,
+    parts_of,
+    score_refits,
+)
 from greybox.selection.fit_single import estimate_once
-from greybox.selection.held_out import FLOOR
-from greybox.selection.prediction import Refit, refit_alike, require_others, with_prediction
+from greybox.selection.held_out import FLOOR, rank
+from greybox.selection.prediction import (
+    Refit,
+    extent,
+    refit_alike,
+    remembered,
+    require_others,
+    with_prediction,
+)
 from greybox.selection.request import Request, regression_only
 from greybox.selection.term_selection import Terms, select_terms
 from greybox.trial.kinematics import decimate_segments
 from greybox.trial.log import Logs, TrialLog
 from greybox.trial.segments import as_segments
 from greybox.validation.fit import average_fit, run_model
+from greybox.vessel.force import force_inputs
 
 Array = NDArray[np.float64]
 _log = logging.getLogger(__name__)
 
 # share of length over speed that a sample may take
 _SHARE = 0.05
+# shares of the time that is left that output error may take beside a regression, and the
+# selection of terms, so that their estimate ends too; share of all that the verdict may
+_FOR_FREE_RUN, _FOR_TERMS, _FOR_VERDICT = 0.3, 0.7, 0.25
 
 
 @known_keywords
@@ -65,6 +98,7 @@ def estimate_model(
     judged: bool = True,
     without: Sequence[str] = (),
     validate: Logs = (),
+    effort: float = EFFORT,
 ) -> Estimate:
     """Estimate a model from logs, choosing what is left open, and say whether to trust it.
 
@@ -112,6 +146,10 @@ def estimate_model(
     validate : TrialLog or sequence of TrialLog
         Logs that judge the prediction and take no part in the estimate; without them the
         logs are left out in turn.
+    effort : float
+        Seconds that the choice of what is left open may take: what could not be tried is
+        named in the notes. The first estimate always ends, and where time is ample nothing
+        depends on it.
 
     Returns
     -------
@@ -144,6 +182,7 @@ def estimate_model(
         judged=judged,
         without=tuple(without),
         validate=(validate,) if isinstance(validate, TrialLog) else tuple(validate),
+        effort=effort,
     )
     if request is not None:
         if asked != Request():
@@ -165,6 +204,12 @@ def estimate_requested(logs: Sequence[TrialLog], request: Request) -> Estimate:
     """Return what `estimate_model` does of a request."""
     require_others(logs, request.validate)
     common_sample_time(logs)
+    with within(request.effort):
+        return _estimated(logs, request)
+
+
+def _estimated(logs: Sequence[TrialLog], request: Request) -> Estimate:
+    """Return the estimate that is chosen while time is left, the first one at any rate."""
     notes: list[str] = []
     if all(n is None for n in (request.method, *_named(request))):
         logs = at_own_pace(logs, notes)
@@ -172,18 +217,125 @@ def estimate_requested(logs: Sequence[TrialLog], request: Request) -> Estimate:
     if not request.judged:
         return estimate
     if not _open(request, estimate):
-        return with_prediction(estimate, logs, request)
-    if _rank(estimate)[0] < 2:
-        judged = with_prediction(estimate, logs, request)
-        if judged.prediction is None or judged.prediction.level is not PredictionLevel.POOR:
-            return judged
-    estimate, logs, refit = _or_selected_terms(estimate, logs, request, notes)
-    return with_prediction(estimate, logs, request, refit)
+        return _judged(estimate, logs, request)
+    trusted = _rank(estimate)[0] < 2
+    refit = remembered(refit_alike(estimate, request))
+    first = _judged(estimate, logs, request, refit) if trusted else estimate
+    good = _level_of(first) is PredictionLevel.GOOD
+    predicts = _or_better_run(first, refit, logs, request, notes, free_run=trusted and not good)
+    if predicts.method != first.method or predicts.predictor != first.predictor:
+        refit = remembered(refit_alike(predicts, request))
+        predicts = _judged(predicts, logs, request, refit) if trusted else predicts
+    if good or (trusted and not _misses(predicts)):
+        return _both(predicts, first)
+    selected, logs, again = _or_selected_terms(predicts, refit, logs, request, notes)
+    return _both(_judged(selected, logs, request, again or refit), first)
+
+
+def _level_of(estimate: Estimate) -> PredictionLevel:
+    return (estimate.prediction or NOT_JUDGED).level
+
+
+def _misses(estimate: Estimate) -> bool:
+    """Whether a free run on logs that took no part errs by more than a good one does."""
+    judged = estimate.prediction or NOT_JUDGED
+    return any(isinstance(r, LargeError | RunsDiverge | Divergence) for r in judged.because)
+
+
+def _both(predicts: Estimate, first: Estimate) -> Estimate:
+    """Return the estimate that predicts, with the first one's coefficients where they are better.
+
+    Those of a published structure stay where they are to be trusted, all or with exceptions.
+    """
+    same = predicts.method == first.method and np.array_equal(predicts.theta, first.theta)
+    if same or _rank(first)[0] == 2:
+        return predicts
+    return replace(predicts, coefficients=first)
+
+
+def _or_better_run(
+    found: Estimate,
+    refit: Refit,
+    logs: Sequence[TrialLog],
+    request: Request,
+    notes: Sequence[str],
+    *,
+    free_run: bool,
+) -> Estimate:
+    """Return the estimate whose runs over parts left out are best, `found` within an error.
+
+    Compared are plain least squares of each structure, where they follow the logs better than
+    `found` does, and with `free_run` output error of its own structure.
+    """
+    wind = all(log.has_wind for log in logs)
+    inputs = force_inputs(logs[0].vessel)
+    plain = PREDICTORS[found.predictor.kind].plain
+    ways = [
+        Alternative(structure_for(name, inputs), "ls", plain)
+        for name in structures_to_try(logs, wind)
+    ]
+    quick, estimates = ranking_request(request), [found]
+    try:
+        for way in ways:
+            other = _quickly(way, logs, quick)
+            if other is not None and _level(other) > _level(found):
+                estimates.append(other)
+        if free_run and not ESTIMATORS[found.method].free_run:
+            way = Alternative(
+                found.predictor.structure, free_run_estimator().name, found.predictor.kind
+            )
+            with within(_FOR_FREE_RUN * seconds_left()):
+                other = _quickly(way, logs, quick)
+            estimates += [other] if other is not None else []
+        if len(estimates) == 1:
+            return found
+        others = [refit_alike(e, request) for e in estimates[1:]]
+        scores = score_refits([refit, *others], logs)
+    except GreyboxError as error:
+        return _noting(found, f"other ways to predict were not compared: {error}")
+    ranking = rank(scores, range(len(estimates)))
+    compared = runs_tried(estimates, ranking, logs)
+    found = _noting(found, f"compared for prediction: {compared.decision}", compared)
+    if not ranking.chosen:
+        return found
+    best = estimates[ranking.chosen]
+    way = Alternative(best.predictor.structure, best.method, best.predictor.kind)
+    try:
+        taken, diverged = _finished(way, logs, request, notes)
+    except GreyboxError as error:
+        return _noting(found, f"{way.label} failed on the whole logs: {error}")
+    return found if diverged else replace(_noting(taken, found.notes[-1]), tried=found.tried)
+
+
+def _quickly(way: Alternative, logs: Sequence[TrialLog], request: Request) -> Estimate | None:
+    """Return an estimate with its fit and without tests, None where there is none to simulate."""
+    try:
+        found = estimate_once(logs, way.structure, way.method, way.kind, request)
+        runs = [run_model(found.model(), log) for log in logs]
+    except OutOfTimeError:
+        raise
+    except GreyboxError as error:
+        _log.info("%s: %s", way.label, error)
+        return None
+    if any(r.diverged >= 0 for r in runs):
+        return None
+    return replace(found, fit=average_fit(runs))
+
+
+def _judged(
+    estimate: Estimate, logs: Sequence[TrialLog], request: Request, refit: Refit | None = None
+) -> Estimate:
+    """Return the estimate with the verdict on its predictions, which has time of its own."""
+    least = request.effort * _FOR_VERDICT if request.method is None else np.inf
+    left = seconds_left()
+    with without_limit(), within(max(left, least)):
+        return with_prediction(estimate, logs, request, refit)
 
 
 def _first_choice(logs: Sequence[TrialLog], request: Request, notes: list[str]) -> Estimate:
     """Return the estimate of a published structure that tests and runs prefer."""
-    alternatives = alternatives_for(logs, request, notes)
+    tried: list[Comparison] = []
+    alternatives = alternatives_for(logs, request, notes, tried)
     _log.info("%d ways to estimate, first %s", len(alternatives), alternatives[0].label)
     _log.debug("in this order: %s", "; ".join(a.label for a in alternatives))
     try:
@@ -192,16 +344,17 @@ def _first_choice(logs: Sequence[TrialLog], request: Request, notes: list[str]) 
         if request.method is not None or regression_only(request):
             raise
         estimate = _without_regression(logs, alternatives, request, notes, error)
+    estimate = replace(estimate, tried=tuple(tried))
     if request.method is not None or not request.judged or regression_only(request):
         return estimate
     if _rank(estimate)[0] == 0:
         return estimate
-    tried: Estimate | None = None
+    spare: Estimate | None = None
     if not ESTIMATORS[estimate.method].free_run and not misfit(estimate.tests):
         # what the structure lacks no other estimator mends
-        estimate, tried = _or_output_error(estimate, logs, request, notes)
-    if _at_fault(estimate, tried) and not _open(request, estimate):
-        return _by_held_out_runs(estimate, tried, logs, request, notes)
+        estimate, spare = _or_output_error(estimate, logs, request, notes)
+    if _at_fault(estimate, spare) and not _open(request, estimate):
+        return _by_held_out_runs(estimate, spare, logs, request, notes)
     return estimate
 
 
@@ -244,7 +397,11 @@ def at_own_pace(logs: Sequence[TrialLog], notes: list[str]) -> Sequence[TrialLog
 
 
 def _or_selected_terms(
-    found: Estimate, logs: Sequence[TrialLog], request: Request, notes: Sequence[str]
+    found: Estimate,
+    refit_found: Refit,
+    logs: Sequence[TrialLog],
+    request: Request,
+    notes: Sequence[str],
 ) -> tuple[Estimate, Sequence[TrialLog], Refit | None]:
     """Return the free run of terms that the data select, where it predicts better than `found`.
 
@@ -253,10 +410,12 @@ def _or_selected_terms(
     before = f"{found.method} of structure '{found.predictor.structure.name}'"
     size = len(found.predictor.parameter_columns)
     try:
-        choice = select_terms(logs, before, size, refit_alike(found, request))
+        with within(_FOR_TERMS * seconds_left()):
+            choice = select_terms(logs, before, size, refit_found)
     except GreyboxError as error:
         return _noting(found, f"no terms were selected: {error}"), logs, None
-    told = _noting(found, choice.note)
+    compared = terms_tried(choice, found, logs)
+    told = _noting(found, choice.note, *compared)
     if not choice.taken:
         return told, logs, None
     try:
@@ -268,14 +427,15 @@ def _or_selected_terms(
         return _noting(told, note), logs, None
     if diverged:
         return _noting(told, "the selected terms diverge, and were left."), logs, None
+    estimate = replace(estimate, tried=told.tried)
     chosen = {
-        _extent(fitting): terms
+        extent(fitting): terms
         for (fitting, _), terms in zip(parts_of(choice.logs), choice.parts, strict=True)
     }
 
     def refit(fitting: Sequence[TrialLog]) -> ManoeuvringModel:
         """Estimate the terms that these logs choose, their noise that of all logs."""
-        terms = chosen[_extent(fitting)]
+        terms = chosen[extent(fitting)]
         if terms is None:
             raise ExcitationError("no terms were selected on a part of the logs.")
         way, on, asked = _of_terms(terms, fitting, ranking_request(request))
@@ -283,11 +443,6 @@ def _or_selected_terms(
         return replace(model, noise=estimate.noise)
 
     return estimate, choice.logs, refit
-
-
-def _extent(logs: Sequence[TrialLog]) -> tuple[tuple[str, float, float], ...]:
-    """Return by what logs, or parts of them, are known: names, beginnings and ends."""
-    return tuple((log.name, float(log.t[0]), float(log.t[-1])) for log in logs)
 
 
 def _of_terms(
@@ -369,12 +524,29 @@ def _or_output_error(
     before = f"{found.method} of this predictor alone is judged '{found.verdict.text}'"
     other = free_run_estimator()
     way = Alternative(found.predictor.structure, other.name, found.predictor.kind)
+    first = Alternative(found.predictor.structure, found.method, found.predictor.kind)
+
+    def compared(taken: bool, result: str) -> Comparison:
+        return Comparison(
+            "output error beside the regression",
+            "the verdict on the coefficients",
+            "its verdict is better" if taken else "the other one's verdict is no better",
+            (
+                tried_model(first, logs, chosen=not taken, note=str(found.verdict.level)),
+                tried_model(way, logs, chosen=taken, note=result),
+            ),
+        )
+
     try:
-        tried, diverged = _finished(way, logs, request, notes)
+        with within(_FOR_FREE_RUN * seconds_left()):
+            tried, diverged = _finished(way, logs, request, notes)
     except GreyboxError as error:
-        return _noting(found, f"{other.words} was tried too, and failed: {error}"), None
+        note = f"{other.words} was tried too, and failed: {error}"
+        return _noting(found, note, compared(False, str(error))), None
     if diverged:
-        return _noting(found, f"{other.words} was tried too, and its free run diverges."), None
+        note = f"{other.words} was tried too, and its free run diverges."
+        return _noting(found, note, compared(False, "its run diverges")), None
+    tried = replace(tried, tried=found.tried)
     if _rank(tried) < _rank(found):
         why = f"it is judged '{tried.verdict.text}' and {before}"
         if _rank(tried)[0] == 2:
@@ -382,9 +554,10 @@ def _or_output_error(
                 f"its free run is better than a constant in more of the states, though neither "
                 f"is to be trusted: {before}"
             )
-        return _noting(tried, f"{other.words} was taken, because {why}."), tried
+        note = f"{other.words} was taken, because {why}."
+        return _noting(tried, note, compared(True, str(tried.verdict.level))), tried
     note = f"{other.words} was tried too, and is judged no better: '{tried.verdict.text}'."
-    return _noting(found, note), tried
+    return _noting(found, note, compared(False, str(tried.verdict.level))), tried
 
 
 def _by_held_out_runs(
@@ -399,7 +572,8 @@ def _by_held_out_runs(
         compared = compare_estimators(found, logs, request, spare)
     except GreyboxError as error:
         return _noting(found, f"estimators were not compared by held-out runs: {error}")
-    found = _noting(found, compared.sentence())
+    table = estimators_tried(compared, found, logs)
+    found = _noting(found, compared.sentence(), table)
     way = compared.variants[compared.chosen]
     if not compared.chosen:
         return found
@@ -424,7 +598,7 @@ def _by_held_out_runs(
     if lacks and _rank(other)[0] < 2:
         # output error hides a misfit that the regression's tests have found
         other = replace(other, verdict=refused(lacks, other.verdict.excepted))
-    return _noting(other, compared.sentence())
+    return _noting(replace(other, tried=found.tried), compared.sentence())
 
 
 def _level(estimate: Estimate) -> float:
@@ -436,8 +610,8 @@ def _diverges(estimate: Estimate) -> bool:
     return any(v == -np.inf for v in estimate.fit.values())
 
 
-def _noting(estimate: Estimate, note: str) -> Estimate:
-    return replace(estimate, notes=(*estimate.notes, note))
+def _noting(estimate: Estimate, note: str, *tried: Comparison) -> Estimate:
+    return replace(estimate, notes=(*estimate.notes, note), tried=(*estimate.tried, *tried))
 
 
 def _first_that_runs(
@@ -450,8 +624,13 @@ def _first_that_runs(
     failures: list[GreyboxError] = []
     fallback: Estimate | None = None
     for alternative in alternatives:
+        if fallback is not None and seconds_left() <= 0:
+            notes.append(f"{alternative.label} was not tried: time was over (--effort).")
+            continue
         try:
-            estimate, diverged = _finished(alternative, logs, request, notes)
+            # the first one ends at any rate
+            with without_limit() if fallback is None else nullcontext():
+                estimate, diverged = _finished(alternative, logs, request, notes)
         except GreyboxError as error:
             _log.info("%s is left: %s", alternative.label, error)
             failures.append(error)

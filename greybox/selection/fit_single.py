@@ -19,6 +19,7 @@ from greybox.estimation.solve import Covariance, Solved, solve_iv, solve_ls
 from greybox.model.predictor import Predictor
 from greybox.model.predictor_kinds import PREDICTORS
 from greybox.model.structure import Structure
+from greybox.numerics.effort import require_time
 from greybox.public import known_keywords, one_thread
 from greybox.regression.problem import RegressionProblem
 from greybox.selection.request import Request
@@ -178,9 +179,12 @@ def estimate_once(
         The logs cannot determine the parameters.
     LogError
         A channel is missing.
+    OutOfTimeError
+        The seconds that it was given are over.
     UsageError
         There is no such method.
     """
+    require_time()
     estimator, predictor = ESTIMATORS[method], PREDICTORS[kind]
     require_informative(logs, predictor, structure)
     asked = {f.name: getattr(request, f.name) for f in fields(EstimationOptions)}

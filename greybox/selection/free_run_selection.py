@@ -35,6 +35,7 @@ from greybox.estimation.shooting import (
     solve_step,
 )
 from greybox.model.structure import Structure
+from greybox.numerics.effort import require_time, seconds_left
 from greybox.numerics.linalg import scaled_inverse
 from greybox.regression.regression import common_sample_time
 from greybox.trial.log import TrialLog
@@ -158,6 +159,8 @@ class FreeRunSelection:
         ------
         ExcitationError
             No set of terms follows the logs.
+        OutOfTimeError
+            Time was over before the first set; later the sets so far are returned.
         """
         active = sorted(self.names.index(n) for n in first if n in self.names)
         kept = {self.names.index(n) for n in stay if n in self.names}
@@ -170,7 +173,7 @@ class FreeRunSelection:
             )
         sets = [self._selected(active, at)]
         seen = {frozenset(active)}
-        while len(active) < most:
+        while len(active) < most and seconds_left() > 0:
             found = self._with_one_more(self.runs, at, active, earns, seen)
             if found is None:
                 break
@@ -264,6 +267,7 @@ class FreeRunSelection:
             cost = self._value(runs, p)
         at = self._at(runs, p, cost)
         for _ in range(most):
+            require_time()
             moved = self._damped(runs, at, index)
             if moved is None:
                 break

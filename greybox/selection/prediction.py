@@ -142,6 +142,24 @@ def require_others(logs: Sequence[TrialLog], validate: Sequence[TrialLog]) -> No
             )
 
 
+def extent(logs: Sequence[TrialLog]) -> tuple[tuple[str, float, float], ...]:
+    """Return by what logs, or parts of them, are known: names, beginnings and ends."""
+    return tuple((log.name, float(log.t[0]), float(log.t[-1])) for log in logs)
+
+
+def remembered(refit: Refit) -> Refit:
+    """Return a refit that estimates on the same logs, or parts of them, once."""
+    known: dict[tuple[tuple[str, float, float], ...], ManoeuvringModel] = {}
+
+    def again(logs: Sequence[TrialLog]) -> ManoeuvringModel:
+        key = extent(logs)
+        if key not in known:
+            known[key] = refit(logs)
+        return known[key]
+
+    return again
+
+
 def refit_alike(estimate: Estimate, request: Request) -> Refit:
     """Return how to estimate the model of an estimate on fewer logs, from where it ended.
 

@@ -196,7 +196,8 @@ def reduce_structure(
     chosen = rank(accepted, [t.size for t in tried]).chosen
     found = replace(rank([t.scores for t in tried], [t.size for t in tried]), chosen=chosen)
     estimate = estimate_requested(logs, tried[found.chosen].request)
-    return StructureChoice(told(estimate, found), rows_of(tried, found))
+    rows = rows_of(tried, found)
+    return StructureChoice(told(estimate, found, rows), rows)
 
 
 def _candidates(estimate: Estimate, missed: Collection[str]) -> list[Candidate]:

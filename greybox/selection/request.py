@@ -12,6 +12,7 @@ from greybox.estimation.problem import EstimationOptions
 from greybox.estimation.registry import ESTIMATORS
 from greybox.estimation.solve import Covariance
 from greybox.model.predictor_kinds import PREDICTORS
+from greybox.numerics.effort import EFFORT
 from greybox.trial.log import TrialLog
 
 # methods that are another one with a prefilter
@@ -46,6 +47,8 @@ class Request(EstimationOptions):
         As `estimate_model`.
     validate : tuple of TrialLog
         Logs that judge the prediction and take no part in the estimate.
+    effort : float
+        Seconds that the choice of what is left open may take.
 
     Raises
     ------
@@ -57,6 +60,7 @@ class Request(EstimationOptions):
     predictor: str | None = None
     structure: str | None = None
     validate: tuple[TrialLog, ...] = ()
+    effort: float = EFFORT
 
     def __post_init__(self) -> None:
         for name, choices in _choices().items():
@@ -66,6 +70,11 @@ class Request(EstimationOptions):
                     f"'{value}' is no {name}.{suggestion(str(value), choices)} It is one of "
                     f"{', '.join(choices)}."
                 )
+        if not self.effort > 0:
+            raise UsageError(
+                f"effort is {self.effort:g} s and must be positive: give the seconds that a "
+                f"choice may take."
+            )
         if self.method is not None and self.method in _PREFILTERED:
             method, prefilter = _PREFILTERED[self.method]
             if self.prefilter == "none":

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from greybox.errors import GreyboxError, UsageError
 from greybox.estimation.registry import ESTIMATORS
 from greybox.estimation.result import Estimate
+from greybox.estimation.tried import Comparison, TriedModel
 from greybox.model.catalogue import structure_for
 from greybox.notebook import DisplayMixin
 from greybox.public import one_thread
@@ -19,6 +20,7 @@ from greybox.selection.estimate import estimate_requested
 from greybox.selection.fit_single import estimate_once
 from greybox.selection.held_out import Ranking, folds, rank, score_runs, spread_of
 from greybox.selection.request import Request
+from greybox.selection.term_selection import law_in_words
 from greybox.trial.log import Logs, TrialLog
 from greybox.trial.segments import as_segments
 from greybox.validation.criteria import independent_samples, information_criteria
@@ -284,15 +286,32 @@ def compare_structures(
     progress(len(names), len(names))
     found = rank([t.scores for t in tried], [t.size for t in tried])
     estimate = estimate_requested(logs, tried[found.chosen].request)
-    return StructureChoice(told(estimate, found), rows_of(tried, found))
+    rows = rows_of(tried, found)
+    return StructureChoice(told(estimate, found, rows), rows)
 
 
-def told(estimate: Estimate, found: Ranking) -> Estimate:
-    """Return the estimate with a note on how its structure was chosen."""
+def told(estimate: Estimate, found: Ranking, rows: Sequence[StructureRow]) -> Estimate:
+    """Return the estimate with a note on how its structure was chosen, and the table of it."""
     note = (
         f"structure '{estimate.predictor.structure.name}' is the smallest of {len(found.score)} "
         f"whose held-out free run is within one standard error of the best "
         f"({found.behind[found.chosen]:.2f} ± {found.se[found.chosen]:.2f} % behind); its "
         f"standard errors do not know that it was chosen on the same logs."
     )
-    return replace(estimate, notes=(*estimate.notes, note))
+    own = TriedModel(
+        "", estimate.predictor.kind, estimate.method, estimate.sample_time,
+        law_in_words(estimate.vessel.thrusters[0].thrust), 0,
+    )  # fmt: skip
+    compared = Comparison(
+        "structures",
+        f"free runs on {FOLDS} held-out parts of each log",
+        "the smallest that falls behind the best by no more than one standard error",
+        tuple(
+            replace(
+                own, structure=r.structure, terms=r.parameters or 0, score=r.score,
+                behind=r.behind, se=r.se, chosen=r.chosen, note=r.note,
+            )
+            for r in rows
+        ),
+    )  # fmt: skip
+    return replace(estimate, notes=(*estimate.notes, note), tried=(*estimate.tried, compared))

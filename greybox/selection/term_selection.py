@@ -8,7 +8,8 @@ many terms are worth having is what these runs say, and that set on the path of 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,6 +22,7 @@ from greybox.model.catalogue import structure_for
 from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor_kinds import PREDICTORS
 from greybox.model.structure import Structure
+from greybox.numerics.effort import OutOfTimeError, Shares, seconds_left, within
 from greybox.selection.cross_validation import parts_of
 from greybox.selection.family import family_for, first_terms, spell_structure
 from greybox.selection.free_run_selection import FreeRunSelection, Selected
@@ -34,7 +36,7 @@ Array = NDArray[np.float64]
 _log = logging.getLogger(__name__)
 
 # terms at most, and those with which thrust laws are compared
-_MOST, _FEW = 40, 18
+_MOST, FEW = 40, 18
 # samples that a coefficient needs
 _SAMPLES = 20
 # share by which the error may be larger with the thrust that propeller theory gives, ~ n|n|
@@ -45,6 +47,8 @@ _GIVEN_AWAY = 1.0
 _WORST, _LEAST = 10.0, 1e-6
 # logs from which on whole ones judge alone, and one beginning does
 _ENOUGH = 4
+# share of the time that is left that the runs of the present model may take
+_FOR_PRESENT = 0.5
 # the speed of a propeller that varies by less than this share tells no law from another
 _VARIES = 0.05
 
@@ -94,7 +98,11 @@ class TermChoice:
     taken : bool
         Whether it is better than the model that it was compared with.
     rows : tuple of dict
-        What was tried: size, change, error on all logs, held-out score, how far behind, error.
+        What was tried: the model in words, its coefficients, held-out score, how far behind,
+        the standard error of this, whether it was chosen.
+    laws : tuple of (ThrustLaw, float)
+        Thrust laws that were compared, each with the mean squared error of the free runs on all
+        logs in squared deviations; not finite where time was over.
     note : str
         The choice in words.
     """
@@ -104,6 +112,7 @@ class TermChoice:
     logs: tuple[TrialLog, ...]
     taken: bool
     rows: tuple[dict[str, Any], ...]
+    laws: tuple[tuple[ThrustLaw, float], ...]
     note: str
 
 
@@ -132,6 +141,8 @@ def select_terms(
         A single log is too short for parts.
     ExcitationError
         No free run of any set follows the logs.
+    OutOfTimeError
+        Time was over before every part had a set.
     """
     inputs, wind = force_inputs(logs[0].vessel), all(log.has_wind for log in logs)
     family = family_for(inputs, wind)
@@ -147,21 +158,34 @@ def select_terms(
     spread = np.array(list(spread_of(logs, family.states).values()))
 
     laws = _laws(logs)
-    law = laws[0]
+    parts = _judging_parts(logs)
+    # the present model keeps the thrust law that it was estimated with
+    with within(_FOR_PRESENT * seconds_left()):
+        present_score = [_present_score(refit, *part, spread) for part in parts]
+    watch = _Watch(len(laws) * (len(laws) > 1) + len(beginnings) * (1 + len(parts)))
+
+    def paths_of(
+        of: Sequence[TrialLog], what: str
+    ) -> tuple[FreeRunSelection, list[list[Selected]]]:
+        selection = FreeRunSelection(of, family, kind)
+        return selection, _paths(selection, beginnings, stay, most, watch, what)
+
+    def cost(of: ThrustLaw) -> float:
+        selection = FreeRunSelection(with_law(logs, of), family, kind)
+        try:
+            with watch.next(f"thrust ~ {law_in_words(of)}"):
+                return selection.path(beginnings[0], stay, min(FEW, most))[-1].cost
+        except OutOfTimeError:
+            return np.inf
+
+    law, errors = laws[0], [np.nan]
     if len(laws) > 1:
-        errors = [
-            FreeRunSelection(with_law(logs, of), family, kind)
-            .path(beginnings[0], stay, min(_FEW, most))[-1]
-            .cost
-            for of in laws
-        ]
+        errors = [cost(of) for of in laws]
         best_law = int(np.argmin(errors))
         law = laws[-1] if errors[-1] < (1 + _NEAR) * errors[best_law] else laws[best_law]
-    own_parts = _judging_parts(logs)
     logs = with_law(logs, law)
     thrust = law_in_words(law)
-    selection = FreeRunSelection(logs, family, kind)
-    whole = _paths(selection, beginnings, stay, most)
+    selection, whole = paths_of(logs, "all logs")
     if not any(whole):
         raise ExcitationError(
             f"no free run of selected terms stays bounded on the {len(logs)} logs: use longer "
@@ -170,15 +194,12 @@ def select_terms(
     alternatives = [(b, n) for b, sets in enumerate(whole) for n in {len(s.terms) for s in sets}]
     paths: list[list[list[Selected]]] = []
     scores: list[list[float]] = [[] for _ in alternatives]
-    parts = _judging_parts(logs)
-    for fitting, held in parts:
-        paths.append(_paths(FreeRunSelection(fitting, family, kind), beginnings, stay, most))
+    for k, (fitting, held) in enumerate(_judging_parts(logs), 1):
+        paths.append(paths_of(fitting, f"all but part {k}")[1])
         judged = FreeRunSelection(held, family, kind)
-        for (begun, size), score in zip(alternatives, scores, strict=True):
-            small = _of_size(paths[-1][begun], size)
+        for (begun, size_of_set), score in zip(alternatives, scores, strict=True):
+            small = _of_size(paths[-1][begun], size_of_set)
             score.append(_score(judged.errors(small.p) if small else [], spread))
-    # the present model keeps the thrust law that it was estimated with
-    present_score = [_present_score(refit, *part, spread) for part in own_parts]
     # parts of logs count as much as whole logs
     by_logs = len(parts_of(logs))
     weight = np.ones(len(parts))
@@ -200,8 +221,9 @@ def select_terms(
             "model": f"{n} terms" if i else present,
             "coefficients": n,
             "score": float(fit[i]),
-            "behind": float(ranking.behind[i]),
-            "se": float(ranking.se[i]),
+            "behind": float(fit.max() - fit[i]),
+            # of the logarithm of the error, as points of fit
+            "se": float((1 - fit[i] / 100) * ranking.se[i]),
             "chosen": i == chosen,
         }
         for i, n in enumerate(counts)
@@ -218,6 +240,10 @@ def select_terms(
             else f"{present} stays."
         )
     )
+    if watch.cut:
+        said += (
+            f" Time was over (--effort) before larger sets were tried on {', '.join(watch.cut)}."
+        )
     return TermChoice(
         Terms.of(best, selection, inputs),
         tuple(
@@ -227,6 +253,7 @@ def select_terms(
         tuple(logs),
         chosen > 0,
         tuple(rows),
+        tuple(zip(laws, errors, strict=True)),
         said,
     )
 
@@ -247,17 +274,45 @@ def _judging_parts(
     return parts
 
 
+class _Watch:
+    """Shares of the time for paths, and the names of those that it cut."""
+
+    def __init__(self, paths: int) -> None:
+        self._shares = Shares(paths)
+        self.cut: dict[str, None] = {}
+
+    @contextmanager
+    def next(self, what: str) -> Iterator[None]:
+        with self._shares.next():
+            try:
+                yield
+            finally:
+                if seconds_left() <= 0:
+                    self.cut[what] = None
+
+
 def _paths(
     selection: FreeRunSelection,
     beginnings: Sequence[Sequence[str]],
     stay: Sequence[str],
     most: int,
+    watch: _Watch,
+    what: str,
 ) -> list[list[Selected]]:
-    """Return the path from each beginning, empty where none follows the logs."""
+    """Return the path from each beginning, empty where none follows the logs.
+
+    Raises
+    ------
+    OutOfTimeError
+        Time was over before a first set: what was not tried must not count as bad.
+    """
     found = []
     for first in beginnings:
         try:
-            found.append(selection.path(first, stay, most))
+            with watch.next(what):
+                found.append(selection.path(first, stay, most))
+        except OutOfTimeError:
+            raise
         except GreyboxError as error:
             _log.info("no path from %d terms: %s", len(first), error)
             found.append([])
@@ -296,6 +351,8 @@ def _present_score(
 ) -> float:
     try:
         model = refit(fitting)
+    except OutOfTimeError:
+        raise
     except GreyboxError as error:
         _log.info("the present model on a part: %s", error)
         return _score([], spread)

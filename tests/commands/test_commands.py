@@ -34,7 +34,7 @@ def test_estimate_simulate_compare(tmp_path, capsys):
     shown = capsys.readouterr().out
     assert "Estimate of Thesis ship" in shown
     data = json.loads(model.read_text())
-    schema("model-3").validate(data)
+    schema("model-4").validate(data)
     assert data["names"][0] == "Xu"
     assert data["sample_time"] == 1.0
     assert data["provenance"]["command"]["vessel"] == "thesis"

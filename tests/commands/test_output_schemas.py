@@ -45,7 +45,7 @@ def test_check(folder):
     [
         ("check-1", {"findings": [{"id": "none"}], "provenance": {}}),
         ("diagnose-1", {"verdict": "perhaps"}),
-        ("model-3", {"format": "greybox-model", "version": 3}),
+        ("model-4", {"format": "greybox-model", "version": 4}),
     ],
 )
 def test_schemas_refuse_what_is_not_promised(name, change):

@@ -60,7 +60,7 @@ def test_command_writes_what_the_contract_says(written: Path, capsys) -> None:
     assert before["independence"]["detail"]["explicable"] >= 0
     page = (written / "d.html").read_text()
     assert page.count("the free-run error of surge is white") == 2
-    schema("model-3").validate(json.loads((written / "m.json").read_text()))
+    schema("model-4").validate(json.loads((written / "m.json").read_text()))
     model = load_model(written / "m.json")
     assert model.disturbances["current_north"][0] == cause["parameters"]["current_north"]["value"]
     # the extended model is an ordinary one: compare gives the same fit

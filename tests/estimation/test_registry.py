@@ -13,6 +13,7 @@ import greybox as gb
 from greybox.commands.main import main
 from greybox.errors import UsageError
 from greybox.estimation.registry import ESTIMATORS, Estimator
+from greybox.estimation.tried import Comparison
 from greybox.registry import Registry
 from greybox.selection.alternatives import alternatives_for
 from greybox.selection.cross_validation import EstimatorVariant, compare_estimators
@@ -56,9 +57,9 @@ def test_the_shell_and_the_library_run_a_new_estimator(ridge, log, tmp_path, cap
 
 def test_a_new_estimator_is_compared_and_can_be_chosen(ridge, log):
     request = gb.Request(**SMALL)
-    notes: list[str] = []
-    assert {a.method for a in alternatives_for([log], request, notes)} == {"iv", "ls", "ridge"}
-    assert "ridge with predictor 'basic'" in notes[0]
+    tried: list[Comparison] = []
+    assert {a.method for a in alternatives_for([log], request, [], tried)} == {"iv", "ls", "ridge"}
+    assert "ridge" in {row.method for row in tried[0].rows}
     found = gb.estimate_model(log, method="ls", **SMALL)
     compared = compare_estimators(found, [log], request)
     assert EstimatorVariant("ridge") in compared.variants

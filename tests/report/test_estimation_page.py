@@ -11,6 +11,7 @@ from browser import needs_browser, require_legible, without_scripts
 from virtual import virtual_log
 
 from greybox.commands.main import main
+from greybox.estimation.tried import Comparison, TriedModel
 from greybox.estimation.verdict import Divergence, TrustLevel, Verdict, refused
 from greybox.report.estimation import estimation_page, headline
 from greybox.report.estimation_figures import regime_shares
@@ -51,10 +52,25 @@ def test_all_is_told(estimate, page):
 
 def test_every_picture_says_what_it_shows(page):
     pictures = [p for s in page.sections for p in s.pictures]
-    assert len(pictures) == 6
+    assert len(pictures) == 7
     assert all(len(p.alternative) > len(p.caption) for p in pictures if p.alternative != p.caption)
     assert all(p.alternative for p in pictures)
-    assert [p.chart is not None for p in pictures] == [True] + 5 * [False]
+    assert [p.chart is not None for p in pictures] == [True] + 6 * [False]
+
+
+def test_what_was_tried_is_a_picture_and_a_table(estimate, log):
+    rows = tuple(
+        TriedModel(f"linear+{n}", "basic", "ls", 1.0, "n", n, 50.0 + n, 3.0 - n, 0.5, n == 3)
+        for n in range(4)
+    )
+    compared = Comparison("structures", "held-out runs", "the best", rows)
+    shown = estimation_page(replace(estimate, tried=(compared,)), [log], {"program": "p"})
+    section = next(s for s in shown.sections if "chosen" in s.title)
+    (picture,), (one,) = section.pictures, section.tables
+    for row in rows:
+        assert row.label in picture.alternative
+    assert compared.decision in picture.caption
+    assert [r[0] for r in one.rows] == ["linear+3", "linear+2", "linear+1", "linear+0"]
 
 
 def test_names_are_text(page):

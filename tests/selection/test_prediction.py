@@ -146,7 +146,7 @@ def test_by_command(tmp_path, logs, capsys):
     assert main([*words, "--validate", str(b)]) == 0
     assert "Prediction: " in capsys.readouterr().out
     data = json.loads((tmp_path / "m.json").read_text())
-    schema("model-3").validate(data)
+    schema("model-4").validate(data)
     told = data["verdict"]["prediction"]
     assert told["judged_on"] == "validation"
     assert told["logs"] == ["log1"]

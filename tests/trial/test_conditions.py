@@ -200,7 +200,7 @@ def test_logs_of_other_conditions_are_not_pooled_without_a_word(logs, estimate):
     data = json.loads(json.dumps(model.to_dict()))
     assert data["conditions"] == {"draught": [1.2, 1.5], "sea_state": 2}
     assert [d["condition"] for d in data["condition_differences"]] == ["draught"]
-    schema("model-3").validate(data)
+    schema("model-4").validate(data)
     assert dict(model_from_dict(data).conditions) == {"draught": (1.2, 1.5), "sea_state": (2,)}
     alike = estimate_model(logs[:1], method="ls", structure="thesis")
     assert not alike.conditions.differences

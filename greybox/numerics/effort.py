@@ -1,0 +1,81 @@
+"""Seconds that a choice may take: long computations ask between their steps whether time is left.
+
+The limit stands for everything that is computed inside a ``with within(seconds)``. Where there
+is none, or where it is ample, nothing that is computed depends on the clock.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+
+from greybox.errors import GreyboxError
+
+# seconds that a choice may take by default, ample for all but the longest logs
+EFFORT = 600.0
+
+_end: ContextVar[float] = ContextVar("end", default=float("inf"))
+
+
+class OutOfTimeError(GreyboxError, TimeoutError):
+    """What was to be tried did not end within the seconds that it was given."""
+
+
+def seconds_left() -> float:
+    """Return the seconds that are left, infinite where there is no limit."""
+    return _end.get() - time.monotonic()
+
+
+def require_time() -> None:
+    """Go on only while time is left.
+
+    Raises
+    ------
+    OutOfTimeError
+        The limit is over.
+    """
+    if seconds_left() <= 0:
+        raise OutOfTimeError("its time was over; more --effort gives it more.")
+
+
+@contextmanager
+def within(seconds: float) -> Iterator[None]:
+    """Limit what follows to some seconds, or to what is left where that is less."""
+    token = _end.set(min(_end.get(), time.monotonic() + seconds))
+    try:
+        yield
+    finally:
+        _end.reset(token)
+
+
+@contextmanager
+def without_limit() -> Iterator[None]:
+    """Let what follows end, however long it takes: there must be something to give."""
+    token = _end.set(float("inf"))
+    try:
+        yield
+    finally:
+        _end.reset(token)
+
+
+class Shares:
+    """Equal shares of the time that is left, for tasks one after another.
+
+    What a task does not use goes to those after it.
+
+    Parameters
+    ----------
+    tasks : int
+    """
+
+    def __init__(self, tasks: int) -> None:
+        self._tasks = tasks
+
+    @contextmanager
+    def next(self) -> Iterator[None]:
+        """Limit the next task to its share."""
+        with within(seconds_left() / max(self._tasks, 1)):
+            self._tasks -= 1
+            yield
