@@ -374,7 +374,7 @@ def test_a_crash_stop_is_no_jump(name, seed):
     """A ship of others, stopped hard: in earth axes, or beside its thrusters, the way bends."""
     preset = presets()[name]
     vessel = vessel_from_dict(tomllib.loads(preset.ship.vessel_toml()))
-    trial = preset.sail(kinds()["stopping"], seed=seed)
+    trial = preset.sail(kinds()["stopping"], seed=seed, step=1.0)
     columns = trial.columns()
     assert not jump_findings(as_recording(columns), vessel)
     # ten standard errors of a position, where the ship goes astern
