@@ -41,8 +41,9 @@ def clear() -> None:
 
 
 def complain(text: str) -> None:
-    """Tell the user what stopped a command."""
+    """Tell the user in one line what stopped a command, whatever names a damaged file holds."""
     clear()
+    text = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
     if coloured(sys.stderr):
         who, sign, what = text.partition(": ")
         text = _paint(who + sign.rstrip(), _RED) + " " * bool(sign) + what

@@ -200,6 +200,12 @@ def _resampled(step: Step) -> str:
     return f"{_names(step)} {how} at a sample time of {step.number('sample_time'):g} s"
 
 
+def _held(step: Step) -> str:
+    counts = dict(zip(step.channels, step.numbers("rows"), strict=False))
+    said = [f"{name} in {count:.0f}" for name, count in counts.items()]
+    return f"of {step.number('of'):.0f} rows the value before is held: {', '.join(said)}"
+
+
 # how each operation reads in a record, on a page and in the terminal
 OPERATIONS: dict[str, Callable[[Step], str]] = {
     # signals on their own clocks
@@ -223,6 +229,7 @@ OPERATIONS: dict[str, Callable[[Step], str]] = {
     "polar": lambda s: f"{_names(s)} from speed and direction ({', '.join(s.source)})",
     # channels on the clock of the log
     "resample": _resampled,
+    "hold": _held,
     "difference": lambda s: f"{_names(s)} from {_sources(s)} by central differences (3.57)",
     "local_polynomials": lambda s: (
         f"{_names(s)} from {_sources(s)} by Savitzky-Golay over {s.number('window'):g} s"

@@ -292,6 +292,18 @@ def test_the_library_is_silent_by_itself(folder):
     assert done.stdout == done.stderr == ""
 
 
+def test_names_of_a_damaged_file_break_no_line(tmp_path, monkeypatch, capsys):
+    from scipy.io import savemat
+
+    monkeypatch.chdir(tmp_path)
+    savemat("raw.mat", {"p\r\n\x1b[2J\x85": [[1.0, 2.0]]})
+    assert main(["import", "raw.mat", "--vessel", "thesis", "--out", "log.csv"]) == 1
+    said = capsys.readouterr().err
+    assert (len(said.splitlines()), said.count("\n"), "\x1b" in said) == (1, 1, False)
+    assert "p\\r\\n\\x1b[2J" in said
+    assert [p.name for p in tmp_path.iterdir()] == ["raw.mat"]
+
+
 SAY = "from greybox.commands.terminal import complain, say\n"
 
 

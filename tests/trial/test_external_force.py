@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import tomllib
+
 import numpy as np
 import pytest
+from foreign_ships import presets
+from foreign_ships.manoeuvres import kinds
 from virtual import PARAMETERS, as_recording, recorded
 
 from greybox.channels import CHANNELS
@@ -17,7 +21,7 @@ from greybox.trial.checks.external_force import force_findings
 from greybox.trial.log import make_log
 from greybox.trial.raw_log import Recording, Signal
 from greybox.trial.repair import apply_repairs
-from greybox.vessel.toml import load_vessel
+from greybox.vessel.toml import load_vessel, vessel_from_dict
 
 SECONDS, LENGTH, FINE, WIND = 1200, 60, 0.5, 5.0
 VESSEL = load_vessel("thesis")
@@ -183,6 +187,18 @@ def test_a_push_is_found_and_clean_logs_are_clean():
         false += bool(found)
     assert hits / 60 > 0.8 - 3 * np.sqrt(0.8 * 0.2 / 60)
     assert false / 60 < 0.02 + 3 * np.sqrt(0.02 * 0.98 / 60)
+
+
+@pytest.mark.long
+def test_what_a_ship_does_once_is_no_force_from_outside():
+    """A tanker of others turns hard once: what the model lacks there is no push."""
+    preset = presets()["kvlcc2-320m"]
+    vessel = vessel_from_dict(tomllib.loads(preset.ship.vessel_toml()))
+    trials = ("zigzag-20", "turn-starboard", "turn-starboard-15", "zigzag-20-port")
+    logs = [
+        as_recording(preset.sail(kinds()[k], seed=100, step=1.0).columns(every=4)) for k in trials
+    ]
+    assert force_findings(logs, vessel) == ([[]] * 4, [None] * 4)
 
 
 def test_wind_that_one_log_measures_and_another_does_not():

@@ -89,6 +89,31 @@ def test_a_command_that_is_logged_when_it_changes_is_held():
     np.testing.assert_array_equal(log["n"], np.searchsorted(at, log.t, side="right") - 1)
 
 
+@pytest.mark.parametrize("cells", [20_000_000, 0])
+def test_the_record_says_in_how_many_rows_an_input_is_held(tmp_path, monkeypatch, cells):
+    """Every input, also one whose gap alone was bridged; what comes at every row is not."""
+    data = columns()
+    data["n"][np.arange(400) % 4 != 0] = np.nan
+    data["alpha1"][~np.isin(np.arange(400), [0, 3, 50, 333])] = np.nan
+    monkeypatch.setattr(stream, "_LARGE_CELLS", cells)
+    monkeypatch.setattr(stream, "_BLOCK_ROWS", 100)
+    said = import_files([to_csv(data, tmp_path / "raw.csv")], VESSEL, tmp_path / "log.csv")
+    record = json.loads((tmp_path / "log.csv.json").read_text())
+    (step,) = (s for s in record["steps"] if s["operation"] == "hold")
+    rows = sum(count for _, _, count in record["segments"])
+    # the slow input ends a few rows before the log would
+    held = dict(zip(step["channels"], step["parameters"]["rows"], strict=True))
+    assert rows == step["parameters"]["of"] == 397
+    assert held == {"n": 297, "alpha1": 393}
+    sentence = "of 397 rows the value before is held: n in 297, alpha1 in 393"
+    assert sentence in record["derived"]
+    assert sentence in said
+    (log,) = read_segments(tmp_path / "log.csv", VESSEL)
+    assert Step("hold", ("n", "alpha1"), (), {"rows": (297.0, 393.0), "of": 397.0}) in (
+        log.provenance.steps
+    )
+
+
 def test_a_sensor_that_died_does_not_take_the_trial_with_it():
     data = columns()
     data["u_q"][50:] = np.nan

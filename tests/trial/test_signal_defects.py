@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import tomllib
+
 import numpy as np
 import pytest
+from foreign_ships import presets
+from foreign_ships.manoeuvres import kinds
 from virtual import as_recording, recorded
 
 from greybox import check_files, import_files, read_segments
@@ -362,6 +366,21 @@ def test_all_at_once_each_is_named_once(ship):
     joined = np.concatenate([s["psi"] for s in made])
     at = np.concatenate([s.t for s in made])
     assert np.abs(wrapped(joined - np.interp(at, true["t"], true["psi"]), -np.pi)).max() < 0.06
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("name", "seed"), [("kvlcc2-320m", 102), ("training-ship-105m", 101)])
+def test_a_crash_stop_is_no_jump(name, seed):
+    """A ship of others, stopped hard: in earth axes, or beside its thrusters, the way bends."""
+    preset = presets()[name]
+    vessel = vessel_from_dict(tomllib.loads(preset.ship.vessel_toml()))
+    trial = preset.sail(kinds()["stopping"], seed=seed, step=1.0)
+    columns = trial.columns()
+    assert not jump_findings(as_recording(columns), vessel)
+    # ten standard errors of a position, where the ship goes astern
+    columns["x_n"] = columns["x_n"] + 10 * preset.ship.noise.position * (trial.t >= 1000.0)
+    (found,) = jump_findings(as_recording(columns), vessel)
+    assert times(found) == (1000.0,)
 
 
 # how often

@@ -9,7 +9,8 @@ current of each log is found with the coefficients. These have a normal prior, o
 each kind of term, and what remains is coloured noise (an ARMA process: misfit and gusts, and
 sensor noise that differences of velocities hold); variances and colour are those of the greatest
 evidence, so that nothing has to be known of the model's errors but that they are alike throughout
-the logs.
+the logs. Where they are not, in motion that is like no other in the logs, a smooth function of
+motion and thrust (a Gaussian process) stands beside model and force.
 
 References
 ----------
@@ -71,14 +72,17 @@ _DIFFERENCED = (0.0, 0.4, 0.7, 0.85, 0.93, 0.97)
 # kinds of terms: of a ship alike to port and starboard, what such a ship has not, finer terms of
 # hull and thrusters, current and wind, their products; and with a prior that is not estimated:
 # turning, starts of stretches, steps and forces of their own
-_SHIP, _ASKEW, _FINE, _FLOW, _FLOW_FINE, _TURN, _START, _FREE = range(8)
-_FITTED = 5
+_SHIP, _ASKEW, _FINE, _FLOW, _FLOW_FINE, _MISFIT, _TURN, _START, _FREE = range(9)
+_FITTED = 6
 # mass that accelerates in sway over that in surge (Coriolis forces of rigid body and added mass)
 _MASSES, _MASSES_STD = 1.4, 0.4
 # prior standard deviation of a free coefficient, over that of the noise
 _VAGUE = 1e3
 # prior standard deviation of a current and a small change of one, over the top speed
 _CURRENT, _CURRENT_STEP = 0.2, 0.02
+# places of motion and thrust at which a smooth remainder of the model is told, and the distance
+# over which it is alike, over the standard deviation of each
+_PLACES, _SMOOTH = 60, 1.0
 # robust deviations from the steps around at which a step is one of the sensor, and steps around
 _JUMP, _AROUND, _ROUNDS_OF_JUMPS = 6.0, 9, 4
 # time over which wind and waves are alike [s]
@@ -300,7 +304,9 @@ class _Log:
     psi, speed : ndarray
         (K,) heading [rad] and surge [m/s].
     thrust : ndarray
-        (K, q) generalised forces, to look at.
+        (K, q) generalised forces.
+    motion : ndarray
+        (K, 3) surge and sway [m/s] and rate of turn [rad/s].
     """
 
     number: int
@@ -313,6 +319,7 @@ class _Log:
     psi: Array
     speed: Array
     thrust: Array
+    motion: Array
 
     def of(self, s: int) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """Return the kinds of terms (p,) in surge or sway, and which are of this log alone."""
@@ -332,7 +339,8 @@ def _make_log(number: int, x: _Read, vessel: Vessel, step: float) -> _Log | str:
     count = max(1, round(step / motion.step))
     measured = np.column_stack([motion["u"], motion["v"]])
     force = np.column_stack(list(generalised_force(vessel, x.commands).values()))
-    beside = np.column_stack([motion["psi"], motion["u"], force, terms.reshape(len(motion), -1)])
+    states = np.column_stack([motion[n] for n in ("psi", *_STATES, "r")])
+    beside = np.column_stack([states, force, terms.reshape(len(motion), -1)])
     rate, times, means, stretches, at = [], [], [], [], 0
     for a, b in motion.stretches:
         m = (b - a) // count
@@ -355,10 +363,11 @@ def _make_log(number: int, x: _Read, vessel: Vessel, step: float) -> _Log | str:
         tuple(stretches),
         np.concatenate(rate),
         kind,
-        made[:, 2 + force.shape[1] :].reshape(-1, 2, len(kind)),
+        made[:, 4 + force.shape[1] :].reshape(-1, 2, len(kind)),
         made[:, 0],
         made[:, 1],
-        made[:, 2 : 2 + force.shape[1]],
+        made[:, 4 : 4 + force.shape[1]],
+        made[:, 1:4],
     )
 
 
@@ -704,18 +713,21 @@ class _Scan:
     def events(self) -> list[_Event]:
         """Return the stretches with a force of their own, the clearest first."""
         found = [e for e in self._held() if self.share(e)[1] > _LEAST_HELD]
-        while len(found) < _MOST_EVENTS:
+        for _ in range(_MOST_EVENTS - len(found)):
             event = self._clearest()
             if event is None:
                 break
             before = copy(self)
             self._allow(event)
-            matters = self.share(event)[1] > _LEAST_SHARE
-            if not matters or self._chance(self._added(event, before), event.fixed) > _LEVEL:
-                self.equations, self.free = before.equations, before.free
-                self.logs, self.current = before.logs, before.current
+            likely = self.share(event)[1] > _LEAST_SHARE and not self._by_chance(event, before)
+            if likely and not self._lacking(event, before):
+                found.append(event)
+                continue
+            self.equations = before.equations
+            self.logs, self.current = before.logs, before.current
+            if not likely:
+                self.free = before.free
                 break
-            found.append(event)
         return found
 
     def _held(self) -> list[_Event]:
@@ -742,6 +754,24 @@ class _Scan:
         first = max(at, at + event.first - beside)
         self.free = self.free.copy()
         self.free[first : min(self.ends[event.log + 1], at + event.last + beside + 1)] = False
+
+    def _by_chance(self, event: _Event, before: _Scan) -> bool:
+        """Whether logs without other forces have one that explains as much."""
+        return self._chance(self._added(event, before), event.fixed) > _LEVEL
+
+    def _lacking(self, event: _Event, before: _Scan) -> bool:
+        """Whether the force may be what the model lacks in motion that is like no other.
+
+        A smooth function of motion and thrust stands beside the model: where a ship does a
+        thing once, such as begin a hard turn, it explains what the model does not.
+        """
+        wide = copy(self)
+        places = _places(np.concatenate([np.hstack([x.motion, x.thrust]) for x in self.logs]))
+        wide.equations = [copy(equation) for equation in self.equations]
+        for equation in wide.equations:
+            equation.add(np.full(places.shape[1], _MISFIT), places)
+            equation.estimate()
+        return wide._by_chance(event, before)
 
     def _added(self, event: _Event, before: _Scan) -> float:
         """Return twice the log-likelihood that a force adds: 0 where all else explains as much.
@@ -912,6 +942,26 @@ class _Scan:
                 score[:, i] += white[i].T @ fit.rest[rows] / fit.variance
         force = np.asarray(np.linalg.solve(information, score[:, :, None])[:, :, 0])
         return force, np.sum(force * score, axis=1)
+
+
+def _places(states: Array) -> Array:
+    """Return the columns (N, M) of a smooth function of states (N, q): a Gaussian process.
+
+    By its values at places as far from each other as there are (Nyström).
+    """
+    scale = states.std(axis=0)
+    x = (states - states.mean(axis=0))[:, scale > 0] / scale[scale > 0] / _SMOOTH
+    apart = np.sum((x - x.mean(axis=0)) ** 2, axis=1)
+    chosen: list[int] = []
+    for _ in range(min(_PLACES, len(x))):
+        chosen.append(int(np.argmax(apart if chosen else -apart)))
+        from_it = np.sum((x - x[chosen[-1]]) ** 2, axis=1)
+        apart = np.minimum(apart, from_it) if len(chosen) > 1 else from_it
+    places = x[chosen]
+    squares = np.sum(x**2, axis=1)[:, None] + np.sum(places**2, axis=1) - 2 * x @ places.T
+    alike = np.exp(-0.5 * np.maximum(squares, 0.0))
+    root = np.linalg.cholesky(alike[chosen] + 1e-6 * np.eye(len(chosen)))
+    return np.asarray(np.linalg.solve(root, alike.T).T)
 
 
 def _standing(log: _Log, slow: float) -> list[tuple[int, int]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import product
@@ -166,13 +167,14 @@ def _jumps(track: Track, recording: Recording, vessel: Vessel | None) -> list[_J
     if psi is not None and vessel is not None and alone[-1] is not None:
         pushes = _pushes(recording, vessel, middle)
         alone += [_beside(alone[-1], pushes, whole, rounded)] if pushes is not None else []
-    views = sorted((v for v in alone if v is not None), key=_spread)[:1]
+    ranked = sorted((v for v in alone if v is not None), key=_spread)
+    views = [(v, ranked[1:]) for v in ranked[:1]]
     if rest is not None:
-        views += [v for v in [_view(rest, zero, whole, rounded)] if v is not None]
+        views += [(v, []) for v in [_view(rest, zero, whole, rounded)] if v is not None]
     found: dict[int, tuple[Array, float]] = {}
-    for view in views:
+    for view, others in views:
         # velocities that were made of the positions hide a jump, those of a sensor show it
-        more = search.jumps(view)
+        more = search.jumps(view, others)
         found |= {k: x for k, x in more.items() if all(abs(k - j) > _RETURN for j in found)}
     return [
         _Jump(float(t[k]), float(t[k + 1]), (float(size[0]), float(size[1])), error)
@@ -377,8 +379,13 @@ class _Search:
     seconds: float
     rounding: float
 
-    def jumps(self, view: _View) -> dict[int, tuple[Array, float]]:
-        """Return size north and east, and standard error, of the jumps by increment."""
+    def jumps(self, view: _View, others: Sequence[_View]) -> dict[int, tuple[Array, float]]:
+        """Return size north and east, and standard error, of the jumps by increment.
+
+        A jump is there in `others`, too, where they are sharp enough to show it: in earth and in
+        body axes, with and without what thrusters explain. What a ship that is stopped or turned
+        hard bends there is not.
+        """
         way, lasting = view.way.copy(), self.lasting.copy()
         clear = view.level < len(view.halves)
         most = view.halves[0]
@@ -386,6 +393,7 @@ class _Search:
         vague = [_vagueness(way, self.whole, w) for w in windows]
         slip = np.column_stack(ned_to_body(self.slip[:, 0], self.slip[:, 1], view.psi))
         found: dict[int, Array] = {}
+        ways = [other.way.copy() for other in others]
 
         def look() -> tuple[Array, Array]:
             size = view.steps(way)
@@ -396,6 +404,19 @@ class _Search:
         def take(k: int, jump: Array) -> None:
             way[k] -= jump
             lasting[k] -= _to_earth(jump, view.psi[k])
+            for other, beside in zip(others, ways, strict=True):
+                beside[k] -= _turned(jump, other.psi[k] - view.psi[k])
+
+        def bends(k: int, size: Array) -> bool:
+            for other, beside in zip(others, ways, strict=True):
+                turn = other.psi[k] - view.psi[k]
+                if _norm(_turned(size, turn) / other.scale[k]) < noise:
+                    continue
+                # both views hold the same noise: what one of them adds is motion
+                same = _turned(other.steps(beside)[k], -turn)
+                if _norm(same / view.scale[k]) < least:
+                    return True
+            return False
 
         def holds(k: int, size: Array) -> bool:
             # rounding alone makes steps of its own size
@@ -423,7 +444,7 @@ class _Search:
             k = int(np.argmax(distance))
             if distance[k] < least:
                 break
-            if holds(k, size[k]):
+            if holds(k, size[k]) and not bends(k, size[k]):
                 found[k] = size[k]
                 take(k, size[k])
             else:
@@ -505,6 +526,11 @@ def _vagueness(way: Array, whole: Mask, window: _Window) -> float:
 
 def _norm(step: Array) -> float:
     return float(np.hypot(*step))
+
+
+def _turned(step: Array, angle: float) -> Array:
+    """Return a step in axes turned by an angle [rad]."""
+    return np.array(ned_to_body(step[0], step[1], angle))
 
 
 def _to_earth(step: Array, psi: float) -> Array:

@@ -7,8 +7,9 @@ inherit no defect that is known.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,17 @@ from greybox.notebook import DisplayMixin, items, table
 from greybox.trial.convert.deduplicate import clean_signals
 from greybox.trial.convert.derived_signals import complete_channels
 from greybox.trial.convert.options import ImportOptions
-from greybox.trial.convert.resample import Clock, clock, hold, hold_mean, interpolate
+from greybox.trial.convert.resample import (
+    AVERAGED,
+    HELD,
+    Clock,
+    clock,
+    held_rows,
+    hold,
+    hold_mean,
+    interpolate,
+    resampled_by,
+)
 from greybox.trial.convert.sensor_corrections import clock_shift_error, correct_channels
 from greybox.trial.convert.time_grid import (
     MIN_SEGMENT,
@@ -31,7 +42,7 @@ from greybox.trial.convert.time_grid import (
 from greybox.trial.kinematics import carried_gaps
 from greybox.trial.log import Provenance, TrialLog
 from greybox.trial.raw_log import Recording
-from greybox.trial.steps import Step
+from greybox.trial.steps import Step, Value
 from greybox.vessel.conditions import Conditions
 from greybox.vessel.vessel import Vessel
 
@@ -107,6 +118,8 @@ class Cut:
         Stretches that were too short.
     late : bool
         Whether some of them were, since clocks had to be moved.
+    held : mapping of str to ndarray
+        Times of the rows in which a channel holds the value before [s].
     """
 
     segments: list[TrialLog]
@@ -114,6 +127,13 @@ class Cut:
     notes: tuple[str, ...] = ()
     short: int = 0
     late: bool = False
+    held: Mapping[str, Array] = field(default_factory=dict)
+
+    def held_in(self, log: TrialLog) -> dict[str, int]:
+        """Return in how many rows of a log, cut out of these segments, each channel is held."""
+        half = 0.5 * log.sample_time
+        low, high = log.t[0] - half, log.t[-1] + half
+        return {n: int(np.count_nonzero((t > low) & (t < high))) for n, t in self.held.items()}
 
     def refusal(self, conversion: Conversion) -> LogError:
         """Return why there is no segment."""
@@ -158,11 +178,22 @@ def import_recording(
     if not segments:
         raise cut.refusal(conversion)
     notes = (*clean.notes, *plan.notes, *gap_notes(spans, cut.short, plan.least), *cut.notes)
-    made = replace(clean, notes=notes).with_steps(*cut.steps)
+    held: Counter[str] = Counter()
+    for s in segments:
+        held.update(cut.held_in(s))
+    rows = sum(map(len, segments))
+    made = replace(clean, notes=notes).with_steps(*cut.steps, *hold_steps(held, rows))
     provenance = make_provenance(made, options, vessel.conditions)
     segments = [replace(s, provenance=provenance) for s in segments]
     done = made.steps[len(recording.steps) :]
     return Imported(tuple(segments), (*notes, *(s.sentence for s in done)))
+
+
+def hold_steps(held: Mapping[str, int], rows: int) -> tuple[Step, ...]:
+    """Return the step that says in how many of some rows each channel holds the value before."""
+    counts = {n: float(count) for n, count in held.items() if count}
+    parameters: dict[str, Value] = {"rows": tuple(counts.values()), "of": float(rows)}
+    return (Step("hold", tuple(counts), parameters=parameters),) if counts else ()
 
 
 def make_provenance(
@@ -222,7 +253,7 @@ def cut_segments(
         # a whole block without one signal is a gap in it
         return Cut([])
     clocks = signal_clocks(used, conversion.options, plan.periods)
-    channels = _resample(used, clocks, vessel, grid, plan.sample_time)
+    channels, kept = _resample(used, clocks, vessel, grid, plan.sample_time)
     everything = plan.stretches(grid, clocks, recording.cuts)
     held = {n: (clock(t), words) for n, (t, words) in recording.text.items() if len(t)}
     gaps = plan.gaps(grid, used, clocks)
@@ -260,7 +291,7 @@ def cut_segments(
         log = _between_known(log)
         if len(log) >= MIN_SEGMENT:
             segments.append(log)
-    return Cut(segments, steps, notes, len(everything) - len(segments), late)
+    return Cut(segments, steps, notes, len(everything) - len(segments), late, kept)
 
 
 def _between_known(log: TrialLog) -> TrialLog:
@@ -277,8 +308,10 @@ def _resample(
     vessel: Vessel,
     grid: Array,
     sample_time: float,
-) -> dict[str, Array]:
+) -> tuple[dict[str, Array], dict[str, Array]]:
+    """Return the channels on a grid, and the times at which they hold the value before."""
     channels: dict[str, Array] = {}
+    held: dict[str, Array] = {}
     commands = set(vessel.recorded_columns)
     for s in recording.signals:
         name, of, value = s.name, clocks[s.name], s.value
@@ -286,11 +319,15 @@ def _resample(
             value = np.unwrap(value)
         if len(s.t) == len(grid) and np.abs(s.t - grid).max() < 0.01 * sample_time:
             channels[name] = np.asarray(value, float)
-        elif name in commands:
+            continue
+        how = resampled_by(of.period, sample_time, held=name in commands)
+        if name in commands:
             channels[name] = hold_mean(of, value, grid, sample_time)
         else:
             channels[name] = interpolate(of, value, grid, sample_time)
-    return channels
+        if name in commands or how == HELD:
+            held[name] = grid[held_rows(of, grid, sample_time, averaged=how == AVERAGED)]
+    return channels, held
 
 
 def _loop(

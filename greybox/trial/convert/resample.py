@@ -218,6 +218,28 @@ def hold_mean(of: Clock, value: Array, grid: Array, sample_time: float) -> Array
     return (integral(grid + sample_time) - integral(grid)) / sample_time
 
 
+def held_rows(of: Clock, grid: Array, sample_time: float, *, averaged: bool) -> Mask:
+    """Return the times of a grid to which a held signal brings no value since the time before.
+
+    Parameters
+    ----------
+    of : Clock
+    grid : ndarray
+        (M,) [s], spaced by `sample_time`.
+    sample_time : float
+        [s]
+    averaged : bool
+        Whether each time stands for the mean over the sample that follows it (`hold_mean`).
+    """
+    slack = 1e-6 * max(of.period, 1e-9) + 1e-9
+    if averaged:
+        low, high = grid - slack, grid + sample_time - slack
+    else:
+        low, high = grid - sample_time + slack, grid + slack
+    before, now = (np.searchsorted(of.t, x, side="right") for x in (low, high))
+    return np.asarray(before == now)
+
+
 def runs(keep: Mask) -> list[tuple[int, int]]:
     """Return (start, stop) of each run of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], keep, [False]])))

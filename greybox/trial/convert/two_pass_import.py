@@ -6,6 +6,7 @@ the second goes the way of every import (`greybox.trial.convert.convert`) block 
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import chain, islice
@@ -29,7 +30,13 @@ from greybox.trial.convert.channel_mapping import (
     written_log,
 )
 from greybox.trial.convert.column_names import Assigned, is_short_pair
-from greybox.trial.convert.convert import Conversion, Cut, cut_segments, make_provenance
+from greybox.trial.convert.convert import (
+    Conversion,
+    Cut,
+    cut_segments,
+    hold_steps,
+    make_provenance,
+)
 from greybox.trial.convert.deduplicate import clean_signals
 from greybox.trial.convert.derived_signals import derive_signals
 from greybox.trial.convert.options import ImportOptions
@@ -304,7 +311,8 @@ class Stream:
         self.scan = scan_table(table, vessel, options)
         self.moved = Recording(table.path.stem, ())
         self.first: TrialLog | None = None
-        self.steps: tuple[Step, ...] = ()
+        self._steps: tuple[Step, ...] = ()
+        self._held: Counter[str] = Counter()
         self.said: tuple[str, ...] = ()
         self.late = False
         self.done = 0
@@ -329,6 +337,11 @@ class Stream:
     def spans(self) -> list[tuple[float, float, int]]:
         """First and last time [s] and samples of each segment so far."""
         return joined_spans(self._spans, self.scan.plan.sample_time)
+
+    @property
+    def steps(self) -> tuple[Step, ...]:
+        """What was done to the channels so far."""
+        return (*self._steps, *hold_steps(self._held, sum(count for _, _, count in self._spans)))
 
     def provenance(self) -> Provenance:
         """Return where the log came from, with all that is known by now."""
@@ -411,7 +424,7 @@ class Stream:
         span = (max(self.done - margin, 0), min(stop + margin, plan.count))
         cut = cut_segments(clean, self._conversion(clean.steps), span)
         made = (*clean.steps[len(scan.before) :], *cut.steps)
-        self.steps += new_steps(self.steps, made)
+        self._steps += new_steps(self._steps, made)
         self.said = tuple(dict.fromkeys([*self.said, *cut.notes]))
         self.late |= cut.late
         low, high = plan.grid(self.done, self.done + 1)[0], plan.grid(stop, stop + 1)[0]
@@ -425,6 +438,7 @@ class Stream:
             if self.first is None:
                 piece = replace(piece, provenance=self.provenance())
                 self.first = piece
+            self._held.update(cut.held_in(piece))
             self._spans.append((float(piece.t[0]), float(piece.t[-1]), len(piece)))
             pieces.append(piece)
         return pieces
