@@ -109,7 +109,6 @@ def sail(
     state = ship.start(start.x, start.psi, start.commands[-1])
     low, high = (b[:, None] for b in bounds(helm.limits))
     rates = np.array([[math.inf if x.rate is None else x.rate] for x in helm.limits]) * step
-    slow = np.isfinite(rates)
     limit = _DIVERGED * np.array([speed, speed, speed / length])[:, None]
     runs = theta.shape[0]
     diverged = np.zeros(runs, bool)
@@ -124,22 +123,22 @@ def sail(
             wanted = np.clip(orders.targets(since, own, now[0]), low, high)
             if wind is not None:
                 ship.blow(wind[min(since, len(wind) - 1)])
-            # a command that moves at a rate leaves its place at this sample, others jump
-            moved = np.where(slow, at, wanted)
+            after_order, moved = _moved(at, wanted, rates, 1.0)
             states.append(now)
             psi.append(state[nx].copy())
             commands.append(moved)
             if np.all((orders.complete >= 0) | diverged):
                 break
             after = ship(state, _earlier(commands, k, delay))
-            at = moved + np.clip(wanted - moved, -rates, rates)
             share = orders.react(since, own, after[nx] - heading)
             if share is not None:
                 # the sample is sailed again with the mean of both orders over it
                 new = np.clip(orders.targets(since, own, now[0]), low, high)
-                commands[k] = np.where(slow, moved, share * moved + (1 - share) * new)
-                at = share * at + (1 - share) * (moved + np.clip(new - moved, -rates, rates))
+                reached, first = _moved(at, wanted, rates, share)
+                after_order, second = _moved(reached, new, rates, 1 - share)
+                commands[k] = share * first + (1 - share) * second
                 after = ship(state, _earlier(commands, k, delay))
+            at = after_order
             for push in pushes:
                 after[:nx] += push(since, state, commands[k])
             state = after
@@ -153,6 +152,15 @@ def sail(
         complete,
         diverged,
     )
+
+
+def _moved(at: Array, wanted: Array, rates: Array, share: Array | float) -> tuple[Array, Array]:
+    """Move commands at their rates for a share of a sample; return where to, and their mean."""
+    way = np.clip(wanted - at, -rates * share, rates * share)
+    end = at + np.where(np.isfinite(rates), way, wanted - at)
+    under_way = np.where(np.isfinite(rates), np.abs(way) / rates, 0.0)
+    mean = end - (end - at) * under_way / 2 / np.maximum(share, 1e-12)
+    return end, mean
 
 
 def _earlier(commands: list[Array], k: int, delay: tuple[int, float]) -> Array:

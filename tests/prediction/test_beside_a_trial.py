@@ -203,3 +203,11 @@ def test_a_zigzag_that_speeds_on_either_side_steer_is_found_and_predicted():
     made = predict_manoeuvre(model, "zigzag", trial=source.log, draws=40)
     assert made.manoeuvres[0].order == pytest.approx(-0.4, rel=0.02)
     assert max(errors(made).values()) < 0.05, errors(made)
+
+
+def test_a_helm_that_moves_acts_by_its_mean_over_each_sample():
+    """A rate of 0.1 rad/s to 0.2 rad: half of each tenth at a sample of 1 s."""
+    model = rudder_model(step=1.0, rudder_rate=0.1)
+    (turn,) = predict_manoeuvre(model, "turning", side="starboard", angles=[0.2], **FEW).manoeuvres
+    k = int(np.searchsorted(turn.log.t, turn.order_time - 1e-9))
+    np.testing.assert_allclose(turn.log["delta"][k - 1 : k + 4], [0, 0.05, 0.15, 0.2, 0.2])
