@@ -68,6 +68,10 @@ Progress = Callable[[int, int], None]
 
 # times of one ship length after which a manoeuvre that is not complete stays so
 _LONGEST = 200.0
+_UNSIZED = (
+    "pushed as hard as the model missed other logs, all draws diverge: its forces beyond the "
+    "parameters' errors are in no interval. Estimate on logs of such motion."
+)
 # steps of process noise drawn at once
 _STEPS = 1024
 
@@ -279,12 +283,15 @@ def _one(
     longest = _LONGEST * model.vessel.length / float(start.speed[0])
     pushes = [_process(model, asked, len(theta))] if asked.disturbed else []
     errors = held_out_errors(model)
+    unsized: tuple[str, ...] = ()
     if errors is not None:
         only = np.zeros(1, int)
         alone = (start.of(only), theta[:1], d[:1], task.course)
         own_run = sail(model, helm, *alone, ordered(only), longest, (), wind)
         args = (start, theta, d, task.course, wind, asked.seed)
-        pushes += [m for m in (misfit_of(model, helm, errors, own_run, *args),) if m is not None]
+        misfit = misfit_of(model, helm, errors, own_run, *args)
+        pushes += [] if misfit is None else [misfit]
+        unsized = (_UNSIZED,) if misfit is None else ()
     orders = ordered(np.arange(len(theta)))
     runs = sail(model, helm, start, theta, d, task.course, orders, longest, pushes, wind)
     if runs.diverged[0]:
@@ -343,7 +350,12 @@ def _one(
         int(runs.diverged[1:].sum()),
         int(((runs.complete[1:] < 0) & ~runs.diverged[1:]).sum()),
         unheld,
-        run_notes(kind, task, model, own, runs, unheld, values, log, helm, start, longest, beyond),
+        (
+            *unsized,
+            *run_notes(
+                kind, task, model, own, runs, unheld, values, log, helm, start, longest, beyond
+            ),
+        ),
         log,
         float(runs.t[runs.order]),
         bundle_of(runs, helm, task.course, model.vessel.length),
