@@ -47,6 +47,10 @@ class ExportError(GreyboxError, RuntimeError):
     """A model cannot be written for another program; a compiler failed."""
 
 
+class OutOfTimeError(GreyboxError, TimeoutError):
+    """What was to be tried did not end within the seconds that it was given."""
+
+
 class UsageError(GreyboxError, ValueError):
     """Options that exclude one another, or that need another one beside them."""
 

@@ -11,16 +11,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 
-from greybox.errors import GreyboxError
+from greybox.errors import OutOfTimeError
 
 # seconds that a choice may take by default, ample for all but the longest logs
 EFFORT = 600.0
 
 _end: ContextVar[float] = ContextVar("end", default=float("inf"))
-
-
-class OutOfTimeError(GreyboxError, TimeoutError):
-    """What was to be tried did not end within the seconds that it was given."""
 
 
 def seconds_left() -> float:

@@ -8,14 +8,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.errors import DivergenceError, GreyboxError, LogError
+from greybox.errors import DivergenceError, GreyboxError, LogError, OutOfTimeError
 from greybox.estimation.informative import ADVISED_HEADING, heading_range
 from greybox.estimation.registry import ESTIMATORS, automatic_estimators
 from greybox.estimation.tried import Comparison, TriedModel
 from greybox.model.catalogue import structure_for
 from greybox.model.predictor_kinds import PREDICTORS
 from greybox.model.structure import Structure
-from greybox.numerics.effort import OutOfTimeError, seconds_left, within
+from greybox.numerics.effort import seconds_left, within
 from greybox.selection.fit_single import estimate_once
 from greybox.selection.held_out import Ranking, rank, score_runs, spread_of
 from greybox.selection.request import Request

@@ -17,12 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, stdtrit
 
-from greybox.errors import GreyboxError
+from greybox.errors import GreyboxError, OutOfTimeError
 from greybox.estimation.output_error import Weights
 from greybox.estimation.registry import ESTIMATORS, automatic_estimators
 from greybox.estimation.result import Estimate
 from greybox.model.model import ManoeuvringModel
-from greybox.numerics.effort import OutOfTimeError
 from greybox.selection.fit_single import estimate_once
 from greybox.selection.held_out import FLOOR, folds, score_runs, spread_of
 from greybox.selection.request import Request

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.credibility.verdict import free_run_faults, misfit, weigh
-from greybox.errors import ExcitationError, GreyboxError, LogError, UsageError
+from greybox.errors import ExcitationError, GreyboxError, LogError, OutOfTimeError, UsageError
 from greybox.estimation.closed_loop import Loop
 from greybox.estimation.efficiency_bounds import limits_of
 from greybox.estimation.output_error import OutputErrorOptions
@@ -32,7 +32,7 @@ from greybox.model.catalogue import structure_for
 from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor_kinds import PREDICTORS
 from greybox.model.structure import Structure
-from greybox.numerics.effort import EFFORT, OutOfTimeError, seconds_left, within, without_limit
+from greybox.numerics.effort import EFFORT, seconds_left, within, without_limit
 from greybox.public import known_keywords, one_thread
 from greybox.regression.regression import common_sample_time
 from greybox.selection.alternatives import (

@@ -16,13 +16,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.errors import ExcitationError, GreyboxError, UsageError
+from greybox.errors import ExcitationError, GreyboxError, OutOfTimeError, UsageError
 from greybox.estimation.informative import ADVISED_HEADING, heading_range
 from greybox.model.catalogue import structure_for
 from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor_kinds import PREDICTORS
 from greybox.model.structure import Structure
-from greybox.numerics.effort import OutOfTimeError, Shares, seconds_left, within
+from greybox.numerics.effort import Shares, seconds_left, within
 from greybox.selection.cross_validation import parts_of
 from greybox.selection.family import family_for, first_terms, spell_structure
 from greybox.selection.free_run_selection import FreeRunSelection, Selected

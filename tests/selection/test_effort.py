@@ -8,9 +8,9 @@ from types import SimpleNamespace
 import pytest
 from virtual import virtual_log
 
-from greybox.errors import GreyboxError, UsageError
+from greybox.errors import GreyboxError, OutOfTimeError, UsageError
 from greybox.numerics import effort
-from greybox.numerics.effort import OutOfTimeError, Shares, require_time, seconds_left, within
+from greybox.numerics.effort import Shares, require_time, seconds_left, within
 from greybox.selection.estimate import estimate_model
 from greybox.selection.request import Request
 from greybox.selection.term_selection import select_terms
