@@ -23,8 +23,9 @@ from greybox.validation.fit import LogFit
 
 Array = NDArray[np.float64]
 
-# factors on the half width of the draws that are tried
-_FACTORS = (0.0, 0.5, 1.0, 2.0, 4.0)
+# factors on the half width of the draws that are tried beside 1, and the share of the interval
+# score that they must save: where noise hides the motion, its draws are believed
+_FACTORS, _SAVED = (0.0, 0.5, 2.0, 4.0), 0.02
 # draws of a band that only calibrates
 _DRAWS = 64
 # independent errors that a run is worth: what it is off by, how that changes, and the rest
@@ -78,7 +79,8 @@ def calibrate_bands(
 
     For each factor on the draws the misfit is the one with which 2.5 % of the errors lie
     beyond either side; of the factors, that of the least interval score is taken. Few runs
-    know the misfit badly: all is wider by the ratio of Student's quantile to the normal one.
+    know misfit and factor badly: these are larger by the ratio of Student's quantile to the
+    normal one.
 
     Parameters
     ----------
@@ -108,17 +110,17 @@ def calibrate_bands(
         error = error[known]
         drawn = np.concatenate([r.half[:, i] for r in runs])[known]
         noise = np.concatenate([np.full(len(r.error), r.noise[i]) for r in runs])[known]
-        level = (Z * float(noise.mean())) ** 2
-        best = np.inf
-        for f in _FACTORS:
+        best, first = np.inf, np.inf
+        for f in (1.0, *_FACTORS):
             own = (f * drawn) ** 2 + (Z * noise) ** 2
             lack = _lacking(error, own)
             half = np.sqrt(own + lack[:, None])
             beyond = np.maximum(np.maximum(-error - half[0], error - half[1]), 0.0)
             score = float((half.sum(axis=0) + 2 / (1 - LEVEL) * beyond).mean())
-            if score < best:
-                best, factor[i] = score, wider * f
-                misfit[:, i] = np.sqrt(np.maximum(wider**2 * (lack + level) - level, 0.0)) / Z
+            if score < best * (1.0 if best < first else 1.0 - _SAVED):
+                best, factor[i] = score, f if f == 1.0 else wider * f
+                misfit[:, i] = wider * np.sqrt(lack) / Z
+            first = score if f == 1.0 else first
     return BandCalibration(states, factor, misfit, len(runs), tuple(kinds))
 
 
