@@ -206,23 +206,26 @@ def wind_of(model: ManoeuvringModel, found: Manoeuvre, log: TrialLog) -> Array |
 def with_rates(
     helm: Helm, found: Sequence[tuple[Task, Manoeuvre, TrialLog]]
 ) -> tuple[Helm, list[str]]:
-    """Return a helm whose steering moves as fast as in the trial, where no rate is stated.
+    """Return a helm whose steering moves as fast as in the trial, and as the vessel file allows.
 
     The rate is that from a tenth to nine tenths of the way between two orders. A way of one
     sample tells no rate: the helm moves at once.
     """
     limits, told = list(helm.limits), []
     for i, name in enumerate(helm.columns):
-        if helm.steer[i] == 0 or limits[i].rate is not None:
+        if helm.steer[i] == 0:
             continue
         rates = [r for _, m, log in found if name in log for r in _rates(log, name, m)]
         if not rates:
             continue
-        rate = float(np.median(rates))
+        rate, stated = float(np.median(rates)), limits[i].rate
+        if stated is not None and rate >= stated:
+            continue
         limits[i] = replace(limits[i], rate=rate)
         unit, factor = (" deg", 180 / math.pi) if helm.angular else ("", 1.0)
         how = f"at {rate * factor:.3g}{unit} per second here" if rate < math.inf else "at once"
-        told.append(f"the vessel file states no rate of {name}; it moves {how}, as in the trial.")
+        known = "no rate" if stated is None else f"a rate of {stated * factor:.3g}{unit} per second"
+        told.append(f"the vessel file states {known} of {name}; it moves {how}, as in the trial.")
     return replace(helm, limits=tuple(limits)), told
 
 

@@ -211,3 +211,11 @@ def test_a_helm_that_moves_acts_by_its_mean_over_each_sample():
     (turn,) = predict_manoeuvre(model, "turning", side="starboard", angles=[0.2], **FEW).manoeuvres
     k = int(np.searchsorted(turn.log.t, turn.order_time - 1e-9))
     np.testing.assert_allclose(turn.log["delta"][k - 1 : k + 4], [0, 0.05, 0.15, 0.2, 0.2])
+
+
+def test_a_helm_slower_than_its_file_says_is_as_slow_as_in_the_trial():
+    log = trial(rudder_model(step=STEP), (20 * DEG,), (), lasts=150.0, rate=0.05)
+    model = rudder_model(step=STEP, rudder_rate=0.5)
+    made = predict_manoeuvre(model, "turning", trial=log, draws=40)
+    assert any("a rate of 28.6 deg per second of delta; it moves at 2.86" in n for n in made.notes)
+    assert max(errors(made).values()) < 0.05
