@@ -263,15 +263,17 @@ def _decide(logs: Sequence[_Alternatives]) -> Key:
     penalty = _LEAST_GAIN * max(log.sample_correlation_factor for log in logs)
     gains = {key: sum(log.gain(key) for log in logs) for key in costs}
 
-    def beyond(key: Key, other: Key) -> bool:
-        """Whether a reading shrinks the residual enough for what it costs more than another."""
-        samples = sum(log.judging(_changes(logs, key)) for log in logs)
-        share = 1.0 - float(np.exp(-2 * (gains[key] - gains[other]) / max(samples, 1)))
-        return share >= _LEAST_SHARE * (costs[key] - costs[other])
+    def earned(key: Key) -> bool:
+        """Whether a reading shrinks the residual enough for what it costs more than others."""
+        samples = max(sum(log.judging(_changes(logs, key)) for log in logs), 1)
+        return all(
+            1.0 - np.exp(-2 * (gains[key] - gains[other]) / samples) >= _LEAST_SHARE * more
+            for other, cost in costs.items()
+            if (more := costs[key] - cost) > 0
+        )
 
-    ordered = sorted(costs, key=lambda k: penalty * costs[k] - gains[k])
     # a late sensor may explain nearly as much as a unit and an arm do
-    key = next(k for k in ordered if all(beyond(k, o) for o in costs if costs[o] < costs[k]))
+    key = next(filter(earned, sorted(costs, key=lambda k: penalty * costs[k] - gains[k])))
     changes = _changes(logs, key)
     kept = []
     for change in (c for c in changes if c.group not in _LATER):

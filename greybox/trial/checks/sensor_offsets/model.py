@@ -8,6 +8,7 @@ positions and heading, and their derivatives, are taken at given values of all.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,10 @@ SIZE = BIAS + 1
 _NOISE_WINDOW = 5.0
 # in standard deviations: what is beyond is no noise, but a bad sample
 _USUAL = 4.0
+# of a normal distribution: standard deviation over median absolute deviation
+_MEDIAN = 1.4826
+# samples that a cubic spline needs more than
+_SPLINE = 3
 
 
 @dataclass(frozen=True)
@@ -60,6 +65,7 @@ class KinematicModel:
             n: denoise(v, motion) for n, v in motion.values.items() if n not in ("x_n", "y_n")
         }
         self.drift = (motion.t - motion.t[0]) / max(float(np.ptp(motion.t)), 1e-9)
+        self._channels: dict[str, _Channel] = {}
         self.align(np.zeros(SIZE))
 
     @property
@@ -75,17 +81,19 @@ class KinematicModel:
         if not self.turned:
             return
         behind = offsets[CLOCKS.index("psi")] - offsets[CLOCKS.index("r")]
-        swept = self._moved(integrate(self.smooth["r"], self.motion), -behind)
+        whole = integrate(self.smooth["r"], self.motion)
+        swept = _Channel(whole, whole, self.motion).slow(-behind)
         seconds = max(_NOISE_WINDOW, 5 * self.motion.step)
         self.smooth["psi"] = swept + smooth(self.motion["psi"] - swept, self.motion, seconds)
+        self._channels.pop("psi", None)
 
     def residuals(self, offsets: Array) -> Residuals:
         """Return residuals and minus their derivatives at some offsets (`SIZE`,)."""
         m = self.motion
         n = len(m)
         late = self._late(offsets)
-        slow = {k: self._moved(self.smooth[k], late[k]) for k in ("psi", "u", "v", "r") if k in m}
-        now = {k: self._now(k, slow[k], late[k]) for k in slow}
+        slow = {k: self._channel(k).slow(late[k]) for k in CLOCKS if k in m}
+        now = {k: slow[k] + self._channel(k).noise(late[k]) for k in slow}
         rate = {k: self._slope(v) for k, v in slow.items()}
         position, columns = np.zeros((n, 2)), np.zeros((n, 2, SIZE + 4))
         if self.positioned:
@@ -128,35 +136,14 @@ class KinematicModel:
         late = {n: float(x) for n, x in zip(CLOCKS, offsets[: len(CLOCKS)], strict=True)}
         return late if self.positioned else late | {"psi": 0.0}
 
-    def _now(self, name: str, slow: Array, late: float) -> Array:
-        """Return a channel as it would be were it not late, its noise moved along.
-
-        Noise is moved in the frequency domain: interpolation between samples would shrink it, and
-        so seem to explain it, and noise that stays behind seems to be a motion that comes late.
-        """
-        out = slow.copy()
-        for a, b in self.motion.stretches:
-            noise = self.motion[name][a:b] - self.smooth[name][a:b]
-            usual = _USUAL * 1.4826 * float(np.median(np.abs(noise)))
-            # a single bad sample would ring
-            body = np.clip(noise, -usual, usual)
-            samples = late / self.motion.step
-            out[a:b] += _advanced(body, samples) + np.roll(noise - body, -round(samples))
-        return out
+    def _channel(self, name: str) -> _Channel:
+        if name not in self._channels:
+            self._channels[name] = _Channel(self.motion[name], self.smooth[name], self.motion)
+        return self._channels[name]
 
     def _walked(self, psi: Array, u: Array, v: Array) -> Array:
         """Return the way made by velocities and heading (N, 2) [m]."""
         return integrate(to_ned(psi, u, v), self.motion)
-
-    def _moved(self, value: Array, late: float) -> Array:
-        """Return a noise-free channel as it would be were it not late."""
-        if late == 0.0:
-            return value
-        out = np.empty_like(value)
-        for a, b in self.motion.stretches:
-            t = self.motion.t[a:b]
-            out[a:b] = _beyond(t + late, t, value[a:b])
-        return out
 
     def _slope(self, value: Array) -> Array:
         out = np.empty_like(value)
@@ -165,22 +152,53 @@ class KinematicModel:
         return out
 
 
-def _advanced(value: Array, samples: float) -> Array:
-    """Return a signal without trend earlier by a number of samples, its power kept."""
-    if samples == 0.0:
-        return value
-    shift = np.exp(2j * np.pi * np.fft.rfftfreq(len(value)) * samples)
-    return np.asarray(np.fft.irfft(np.fft.rfft(value) * shift, len(value)))
+class _Channel:
+    """One channel as it would be were it not late: its noise-free part, and its noise.
 
+    Noise is moved in the frequency domain: interpolation between samples would shrink it, and so
+    seem to explain it, and noise that stays behind seems to be a motion that comes late.
+    """
 
-def _beyond(at: Array, t: Array, value: Array) -> Array:
-    """Interpolate by a cubic spline, and go on straight beyond the ends."""
-    # SciPy's splines take a while to load, and a log on one clock needs none
-    from scipy.interpolate import CubicSpline
+    def __init__(self, value: Array, smooth: Array, motion: Motion) -> None:
+        # SciPy's splines take a while to load
+        from scipy.interpolate import CubicSpline
 
-    out = np.asarray(CubicSpline(t, value)(at) if len(t) > 3 else np.interp(at, t, value))
-    reach = min(5, len(t) - 1)
-    for inside, k, j in ((at < t[0], 0, reach), (at > t[-1], -1, -1 - reach)):
-        slope = (value[k] - value[j]) / (t[k] - t[j])
-        out[inside] = value[k] + slope * (at[inside] - t[k])
-    return out
+        self.smooth, self.motion = smooth, motion
+        self.splines, self.spectra, self.spikes = [], [], []
+        for a, b in motion.stretches:
+            t, noise = motion.t[a:b], value[a:b] - smooth[a:b]
+            usual = _USUAL * _MEDIAN * float(np.median(np.abs(noise)))
+            # a single bad sample would ring
+            body = np.clip(noise, -usual, usual)
+            self.splines.append(
+                CubicSpline(t, smooth[a:b])
+                if b - a > _SPLINE
+                else partial(np.interp, xp=t, fp=smooth[a:b])
+            )
+            self.spectra.append(np.fft.rfft(body))
+            self.spikes.append(noise - body)
+
+    def slow(self, late: float) -> Array:
+        """Return the noise-free part (N,), straight beyond the ends of each stretch."""
+        if late == 0.0:
+            return self.smooth
+        out = np.empty_like(self.smooth)
+        for (a, b), spline in zip(self.motion.stretches, self.splines, strict=True):
+            t, value = self.motion.t[a:b], self.smooth[a:b]
+            at, moved = t + late, out[a:b]
+            moved[:] = spline(at)
+            reach = min(5, b - a - 1)
+            for inside, k, j in ((at < t[0], 0, reach), (at > t[-1], -1, -1 - reach)):
+                slope = (value[k] - value[j]) / (t[k] - t[j])
+                moved[inside] = value[k] + slope * (at[inside] - t[k])
+        return out
+
+    def noise(self, late: float) -> Array:
+        """Return the noise (N,), its power kept, bad samples moved by whole ones."""
+        out = np.empty_like(self.smooth)
+        samples = late / self.motion.step
+        for k, (a, b) in enumerate(self.motion.stretches):
+            shift = np.exp(2j * np.pi * np.fft.rfftfreq(b - a) * samples)
+            out[a:b] = np.fft.irfft(self.spectra[k] * shift, b - a)
+            out[a:b] += np.roll(self.spikes[k], -round(samples))
+        return out
