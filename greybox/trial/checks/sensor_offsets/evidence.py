@@ -222,12 +222,9 @@ def search(
         if rough.misfit(found) > rough.misfit(best) - _LEAST_GAIN:
             break
         best = found
-    found = fit(fine, best, prior)
     # longer blocks may mislead, and steps from one start may end beside the best place
-    for other in starts:
-        if other is not start or level(fine, other, prior) < level(fine, found, prior):
-            found = min(found, fit(fine, other, prior), key=lambda s: level(fine, s, prior))
-    return found
+    ends = [fit(fine, s, prior) for s in (best, *starts)]
+    return min(ends, key=lambda s: level(fine, s, prior))
 
 
 def _best_place(likelihood: Likelihood, offsets: Array) -> tuple[float, Array]:
