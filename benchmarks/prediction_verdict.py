@@ -146,6 +146,7 @@ def shown(verdict: PredictionVerdict) -> dict[str, Any]:
     channels = {
         c.channel: {
             "error": c.error if np.isfinite(c.error) else 1e9,
+            "elsewhere": None if c.elsewhere is None else c.elsewhere / c.spread,
             "moves": c.moves,
             "share": c.bands.share if c.bands else None,
         }
@@ -215,6 +216,20 @@ def report(rows: Sequence[dict[str, Any]]) -> None:
             low, high = wilson_interval(row[level] / n, n)
             print(f"truly {level:<8} {n:4d}: {row}, agreement {100 * row[level] / n:.0f} % "
                   f"({100 * low:.0f}-{100 * high:.0f})")  # fmt: skip
+    for what, key in (("parts", "error"), ("kinds of manoeuvre", "elsewhere")):
+        pairs = [
+            (verdict.get(key), c["truth"]["channels"][name]["error"])
+            for c in known
+            for name, verdict in c["verdict"]["channels"].items()
+            if c["truth"]["channels"][name]["moves"]
+        ]
+        # beyond twice the spread a model is of no use, however far
+        logs = [np.log(np.clip(pair, 0.02, 2.0)) for pair in pairs if pair[0] is not None]
+        if logs:
+            off = np.subtract(*np.transpose(logs))
+            print(f"error by {what} left out over that on new trials: median factor "
+                  f"{np.exp(np.median(off)):.2f}, spread {np.exp(off.std()):.2f} ({len(off)} "
+                  f"channels)")  # fmt: skip
     for which in (True, False, None):
         runs = [r for c in known for r in c["runs"] if which is None or r["seen"] is which]
         if not runs:

@@ -125,6 +125,9 @@ class ChannelPrediction:
         Time over which the errors are related: their correlation, integrated [s].
     own : float, optional
         Root mean square error of free runs on the logs of the estimate itself [unit].
+    elsewhere : float, optional
+        That where whole logs, of a kind of manoeuvre where there are several, were left out of
+        an estimate in turn [unit].
     """
 
     channel: str
@@ -138,6 +141,7 @@ class ChannelPrediction:
     bands: BandShare | None = None
     memory: float | None = None
     own: float | None = None
+    elsewhere: float | None = None
 
     @property
     def error(self) -> float:
@@ -181,6 +185,78 @@ class RunsDiverge(Reason):
             f"its free run diverges in {len(self.logs)} of {self.count} runs, first after "
             f"{self.after:.3g} s"
         )
+
+
+@dataclass(frozen=True)
+class RefitsDiverge(Reason):
+    """Free runs of models that were estimated without a part of the logs leave their bound.
+
+    Parameters
+    ----------
+    logs : tuple of str
+    count : int
+        Of all runs.
+    after : float
+        Of the first to do so [s].
+    """
+
+    logs: tuple[str, ...]
+    count: int
+    after: float
+
+    kind: ClassVar[str] = "refits_diverge"
+    fatal: ClassVar[bool] = False
+
+    @property
+    def sentence(self) -> str:
+        """How many, and when."""
+        return (
+            f"estimated without a part of the logs its free run on this part diverges in "
+            f"{len(self.logs)} of {self.count} runs, first after {self.after:.3g} s"
+        )
+
+
+@dataclass(frozen=True)
+class Elsewhere(Reason):
+    """Motions that the other logs do not show are followed less well than asked.
+
+    Parameters
+    ----------
+    kinds : tuple of str
+        Of manoeuvres that were left out of an estimate in turn; none where logs were.
+    whole : bool
+        Whether whole logs were left out, not parts of a single one.
+    errors : mapping of str to float
+        A channel that moves, as a share of its spread.
+    diverged, count : int
+        Runs that leave their bound, and all.
+    """
+
+    kinds: tuple[str, ...]
+    whole: bool
+    errors: Mapping[str, float]
+    diverged: int
+    count: int
+
+    kind: ClassVar[str] = "elsewhere"
+    fatal: ClassVar[bool] = False
+
+    @property
+    def sentence(self) -> str:
+        """What was left out, and how far the error went."""
+        if self.kinds:
+            what = f"a kind of manoeuvre that its estimate never saw ({', '.join(self.kinds)})"
+        else:
+            what = f"{'a log' if self.whole else 'parts of the log'} that its estimate never saw"
+        if self.diverged:
+            far = f"its free run diverges in {self.diverged} of {self.count} runs"
+        else:
+            worst = max(self.errors, key=lambda c: self.errors[c])
+            far = (
+                f"the error of {channel_words(worst)} is {100 * self.errors[worst]:.0f} % of its "
+                f"spread"
+            )
+        return f"on {what}, each left out in turn, {far}: give it logs of what it is to predict"
 
 
 @dataclass(frozen=True)
@@ -547,6 +623,9 @@ class PredictionVerdict(DisplayMixin):
             "independent_samples": {n: b.independent for n, b in bands.items()},
             "rmse": self.rmse,
             "own_rmse": {c.channel: c.own for c in self.channels if c.own is not None},
+            "elsewhere_rmse": {
+                c.channel: c.elsewhere for c in self.channels if c.elsewhere is not None
+            },
             "memory": {c.channel: c.memory for c in self.channels if c.memory is not None},
             "noise": {c.channel: c.noise for c in self.channels},
             "spread": {c.channel: c.spread for c in self.channels},

@@ -63,6 +63,9 @@ def held_out_errors(model: ManoeuvringModel) -> HeldOutErrors | None:
     noise, spread, held_out = (
         _sizes(found.get(key), states) for key in ("noise", "spread", "rmse")
     )
+    # motions of another kind than the estimate saw
+    apart = _sizes(found.get("elsewhere_rmse"), states)
+    held_out = np.where(np.isfinite(apart), apart, held_out)
     noise = np.nan_to_num(noise)
     error, own = (
         np.sqrt(np.maximum(e**2 - noise**2, 0.0))

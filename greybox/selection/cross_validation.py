@@ -158,7 +158,7 @@ def parts_of(logs: Sequence[TrialLog]) -> list[tuple[list[TrialLog], list[TrialL
         A single log is too short.
     """
     if len(logs) == 1:
-        return folds(logs, _FOLDS)
+        return stretches_of(logs)
     pieces = [own for _, own in alike(logs)]
     if len(pieces) == 1:
         pieces = [[i] for i in pieces[0]]
@@ -169,6 +169,19 @@ def parts_of(logs: Sequence[TrialLog]) -> list[tuple[list[TrialLog], list[TrialL
         ([log for i, log in enumerate(logs) if i not in group], [logs[i] for i in group])
         for group in groups
     ]
+
+
+def stretches_of(logs: Sequence[TrialLog]) -> list[tuple[list[TrialLog], list[TrialLog]]]:
+    """Return (to estimate on, held out): a stretch of each log is held out in turn.
+
+    What is left shows all that the logs show, so that its model stands for that of all logs.
+
+    Raises
+    ------
+    UsageError
+        No log is long enough.
+    """
+    return folds(logs, _FOLDS)
 
 
 def kinds_left_out(logs: Sequence[TrialLog]) -> tuple[str, ...]:

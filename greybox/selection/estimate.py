@@ -19,8 +19,10 @@ from greybox.estimation.efficiency_bounds import limits_of
 from greybox.estimation.output_error import OutputErrorOptions
 from greybox.estimation.prediction_verdict import (
     NOT_JUDGED,
+    Elsewhere,
     LargeError,
     PredictionLevel,
+    RefitsDiverge,
     RunsDiverge,
 )
 from greybox.estimation.registry import ESTIMATORS, free_run_estimator
@@ -46,14 +48,12 @@ from greybox.selection.compared import estimators_tried, runs_tried, terms_tried
 from greybox.selection.cross_validation import (
     EstimatorVariant,
     compare_estimators,
-    parts_of,
     score_refits,
 )
 from greybox.selection.fit_single import estimate_once
 from greybox.selection.held_out import FLOOR, rank
 from greybox.selection.prediction import (
     Refit,
-    extent,
     refit_alike,
     remembered,
     require_others,
@@ -221,7 +221,7 @@ def _estimated(logs: Sequence[TrialLog], request: Request) -> Estimate:
     trusted = _rank(estimate)[0] < 2
     refit = remembered(refit_alike(estimate, request))
     first = _judged(estimate, logs, request, refit) if trusted else estimate
-    good = _level_of(first) is PredictionLevel.GOOD
+    good = _level_of(first) is PredictionLevel.GOOD and not _misses(first)
     predicts = _or_better_run(first, refit, logs, request, notes, free_run=trusted and not good)
     if predicts.method != first.method or predicts.predictor != first.predictor:
         refit = remembered(refit_alike(predicts, request))
@@ -237,9 +237,10 @@ def _level_of(estimate: Estimate) -> PredictionLevel:
 
 
 def _misses(estimate: Estimate) -> bool:
-    """Whether a free run on logs that took no part errs by more than a good one does."""
+    """Whether a free run on what took no part errs by more than a good one does."""
     judged = estimate.prediction or NOT_JUDGED
-    return any(isinstance(r, LargeError | RunsDiverge | Divergence) for r in judged.because)
+    told = LargeError | RunsDiverge | RefitsDiverge | Divergence | Elsewhere
+    return any(isinstance(r, told) for r in judged.because)
 
 
 def _both(predicts: Estimate, first: Estimate) -> Estimate:
@@ -428,14 +429,10 @@ def _or_selected_terms(
     if diverged:
         return _noting(told, "the selected terms diverge, and were left."), logs, None
     estimate = replace(estimate, tried=told.tried)
-    chosen = {
-        extent(fitting): terms
-        for (fitting, _), terms in zip(parts_of(choice.logs), choice.parts, strict=True)
-    }
 
     def refit(fitting: Sequence[TrialLog]) -> ManoeuvringModel:
         """Estimate the terms that these logs choose, their noise that of all logs."""
-        terms = chosen[extent(fitting)]
+        terms = choice.again(fitting)
         if terms is None:
             raise ExcitationError("no terms were selected on a part of the logs.")
         way, on, asked = _of_terms(terms, fitting, ranking_request(request))

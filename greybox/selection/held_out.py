@@ -128,6 +128,11 @@ def score_errors(errors: Array, spread: Array, blocks: int) -> Array:
     return out
 
 
+def extent(logs: Sequence[TrialLog]) -> tuple[tuple[str, float, float], ...]:
+    """Return by what logs, or parts of them, are known: names, beginnings and ends."""
+    return tuple((log.name, float(log.t[0]), float(log.t[-1])) for log in logs)
+
+
 def folds(logs: Sequence[TrialLog], count: int) -> list[tuple[list[TrialLog], list[TrialLog]]]:
     """Return (to estimate on, held out) for each of `count` contiguous parts of every log.
 

@@ -20,7 +20,9 @@ from greybox.selection.cross_validation import (
     estimate_variant,
     kinds_left_out,
     parts_of,
+    stretches_of,
 )
+from greybox.selection.held_out import extent
 from greybox.selection.request import Request
 from greybox.trial.kinematics import decimate_segments
 from greybox.trial.log import TrialLog
@@ -46,7 +48,8 @@ def with_prediction(
     ----------
     estimate : Estimate
     logs : sequence of TrialLog
-        Those it was estimated on; they are left out in turn, a single one in parts.
+        Those it was estimated on. A stretch of each is left out in turn and tells what the free
+        run is good for; kinds of manoeuvre, or logs, are left out too, and calibrate the bands.
     request : Request
         Its ``validate`` logs judge instead, where there are some; the logs left out in turn
         then calibrate the bands alone.
@@ -65,26 +68,16 @@ def with_prediction(
         told.append(Divergence())
     if request.validate:
         require_others(logs, request.validate)
-    held, failed, parts = [], [], []
+    failed: list[str] = []
     logs = as_read(logs, estimate)
-    try:
-        parts = parts_of(logs)
-    except UsageError as error:
-        failed.append(str(error))
     runs_away = held_commands_diverge(model, logs) if not told else None
     told += [runs_away] if runs_away else []
-    again = refit or refit_alike(estimate, request)
-    for fitting, left_out in parts:
-        try:
-            other = again(fitting)
-        except GreyboxError as error:
-            _log.info("without a part there is no estimate: %s", error)
-            failed.append(str(error))
-            continue
-        held += [HeldOut.of(other, log) for log in left_out]
-    errors = [run_errors(h.model, h.run, request.seed) for h in held]
+    again = remembered(refit or refit_alike(estimate, request))
+    elsewhere, _ = _left_out(parts_of, logs, again, failed)
+    errors = [run_errors(h.model, h.run, request.seed) for h in elsewhere]
+    kinds = kinds_left_out(logs)
     calibration = calibrate_bands(
-        [e for e in errors if e is not None], model.structure.states, kinds_left_out(logs)
+        [e for e in errors if e is not None], model.structure.states, kinds
     )
     estimate = replace(estimate, calibration=calibration)
     if request.validate:
@@ -93,24 +86,54 @@ def with_prediction(
         runs = [HeldOut.of(model, log) for log in others]
         verdict = judge_prediction(runs, JudgedOn.VALIDATION, found=told, seed=request.seed)
         return replace(estimate, prediction=verdict)
+    failed.clear()
+    held, parts = _left_out(stretches_of, logs, again, failed)
     if not held:
         runs = [HeldOut.of(model, log) for log in logs]
         told.append(NothingHeldOut(failed[0]))
         verdict = judge_prediction(runs, JudgedOn.OWN, found=told, seed=request.seed)
         return replace(estimate, prediction=verdict)
     if failed:
-        told.append(NotRefitted(len(failed), len(parts), failed[0]))
-    own = [HeldOut.of(model, log).run for log in logs]
+        told.append(NotRefitted(len(failed), parts, failed[0]))
     verdict = judge_prediction(
         held,
-        parts=len(parts) - len(failed),
+        parts=parts - len(failed),
         found=told,
-        own=own,
+        own=[HeldOut.of(model, log) for log in logs],
+        elsewhere=elsewhere,
+        kinds=kinds,
         seed=request.seed,
         errors=errors,
     )
     _log.info("prediction: %s", verdict.text)
     return replace(estimate, prediction=verdict)
+
+
+def _left_out(
+    parting: Callable[[Sequence[TrialLog]], Sequence[tuple[list[TrialLog], list[TrialLog]]]],
+    logs: Sequence[TrialLog],
+    again: Refit,
+    failed: list[str],
+) -> tuple[list[HeldOut], int]:
+    """Return runs over parts of the logs without which a model was estimated, and their number.
+
+    `failed` is told why a part is missing.
+    """
+    held: list[HeldOut] = []
+    try:
+        parts = parting(logs)
+    except UsageError as error:
+        failed.append(str(error))
+        return held, 0
+    for k, (fitting, left_out) in enumerate(parts):
+        try:
+            other = again(fitting)
+        except GreyboxError as error:
+            _log.info("without a part there is no estimate: %s", error)
+            failed.append(str(error))
+            continue
+        held += [HeldOut.of(other, log, k) for log in left_out]
+    return held, len(parts)
 
 
 def as_read(logs: Sequence[TrialLog], estimate: Estimate) -> Sequence[TrialLog]:
@@ -140,11 +163,6 @@ def require_others(logs: Sequence[TrialLog], validate: Sequence[TrialLog]) -> No
                 f"'{log.name}' is to be estimated on and to validate the estimate: a log that "
                 f"took part cannot judge. Name it once."
             )
-
-
-def extent(logs: Sequence[TrialLog]) -> tuple[tuple[str, float, float], ...]:
-    """Return by what logs, or parts of them, are known: names, beginnings and ends."""
-    return tuple((log.name, float(log.t[0]), float(log.t[-1])) for log in logs)
 
 
 def remembered(refit: Refit) -> Refit:

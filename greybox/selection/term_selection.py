@@ -26,7 +26,7 @@ from greybox.numerics.effort import Shares, seconds_left, within
 from greybox.selection.cross_validation import parts_of
 from greybox.selection.family import family_for, first_terms, spell_structure
 from greybox.selection.free_run_selection import FreeRunSelection, Selected
-from greybox.selection.held_out import folds, rank, spread_of
+from greybox.selection.held_out import extent, folds, rank, spread_of
 from greybox.trial.log import TrialLog
 from greybox.validation.fit import run_model
 from greybox.vessel.force import force_inputs
@@ -90,9 +90,9 @@ class TermChoice:
     Parameters
     ----------
     terms : Terms
-    parts : tuple of Terms or None
-        Those of the same number that each part's other logs choose, in the order of `parts_of`;
-        None where they choose none.
+    again : callable
+        Returns those of the same number, from the same beginning, that other logs choose, as
+        parts of these; None where they choose none.
     logs : tuple of TrialLog
         With the thrust law that was chosen.
     taken : bool
@@ -108,7 +108,7 @@ class TermChoice:
     """
 
     terms: Terms
-    parts: tuple[Terms | None, ...]
+    again: Callable[[Sequence[TrialLog]], Terms | None]
     logs: tuple[TrialLog, ...]
     taken: bool
     rows: tuple[dict[str, Any], ...]
@@ -244,12 +244,27 @@ def select_terms(
         said += (
             f" Time was over (--effort) before larger sets were tried on {', '.join(watch.cut)}."
         )
+    known = {
+        extent(fitting): found[begun]
+        for (fitting, _), found in zip(_judging_parts(logs), paths, strict=True)
+    }
+
+    def again(of: Sequence[TrialLog]) -> Terms | None:
+        """Follow the path anew on logs that were no part."""
+        found = known.get(extent(of))
+        if found is None:
+            other = FreeRunSelection(of, family, kind)
+            try:
+                found = other.path(beginnings[begun], stay, size_shown)
+            except ExcitationError as error:
+                _log.info("no path on a part: %s", error)
+                found = []
+        one = _of_size(found, size_shown)
+        return None if one is None else Terms.of(one, selection, inputs)
+
     return TermChoice(
         Terms.of(best, selection, inputs),
-        tuple(
-            None if one is None else Terms.of(one, selection, inputs)
-            for one in (_of_size(found[begun], size_shown) for found in paths[:by_logs])
-        ),
+        again,
         tuple(logs),
         chosen > 0,
         tuple(rows),

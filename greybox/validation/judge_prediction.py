@@ -14,10 +14,12 @@ from greybox.estimation.prediction_verdict import (
     BandShare,
     ChannelPrediction,
     DrawsDiverge,
+    Elsewhere,
     JudgedOn,
     NoBands,
     PredictionLimits,
     PredictionVerdict,
+    RefitsDiverge,
     RunsDiverge,
     weigh_prediction,
 )
@@ -39,6 +41,9 @@ _DRAWS, _RESTARTS = 64, 12
 _THIRD = 20.0
 # of a normal distribution: standard deviation over median absolute deviation
 _MEDIAN = 1.4826
+# weight of errors on what was left out beside those on the own logs: the share of the samples
+# that a bootstrap draws; and error of a run, in spreads, beyond which it is lost whatever it is
+_LEFT_OUT, _LOST = 1 - np.exp(-1.0), 3.0
 # least width of a band, so that it divides, and half widths beyond which an error is none of it
 _NONE, _FAR = 1e-300, 1e6
 
@@ -51,15 +56,18 @@ class HeldOut:
     ----------
     model : ManoeuvringModel
     run : LogFit
+    part : int
+        Of the logs that it belongs to: parts of one log share their mean within it.
     """
 
     model: ManoeuvringModel
     run: LogFit
+    part: int = 0
 
     @classmethod
-    def of(cls, model: ManoeuvringModel, log: TrialLog) -> HeldOut:
+    def of(cls, model: ManoeuvringModel, log: TrialLog, part: int = 0) -> HeldOut:
         """Run the model on a log."""
-        return cls(model, run_model(model, log))
+        return cls(model, run_model(model, log), part)
 
 
 def judge_prediction(
@@ -68,7 +76,9 @@ def judge_prediction(
     *,
     parts: int = 0,
     found: Sequence[Reason] = (),
-    own: Sequence[LogFit] = (),
+    own: Sequence[HeldOut] = (),
+    elsewhere: Sequence[HeldOut] = (),
+    kinds: Sequence[str] = (),
     limits: PredictionLimits = LIMITS,
     seed: int = 0,
     errors: Sequence[RunErrors | None] | None = None,
@@ -84,24 +94,44 @@ def judge_prediction(
         Groups of logs that were left out in turn.
     found : sequence of Reason
         What is known already and is told with the rest.
-    own : sequence of LogFit
-        Runs on the logs of the estimate itself.
+    own : sequence of HeldOut
+        Runs of the model that is judged on the logs of its estimate; `held` are then those of
+        models estimated without a part, and only stand for it.
+    elsewhere : sequence of HeldOut
+        Runs of models estimated without whole logs, on these: how far the model reaches beyond
+        what its logs show.
+    kinds : sequence of str
+        Of manoeuvres that were left out in `elsewhere`, none where logs were.
     limits : PredictionLimits
     seed : int
         Of the draws of the bands.
     errors : sequence of RunErrors or None, optional
-        Of the runs, None where there is no band: the bands judged are then those that the
-        other runs calibrate.
+        Of the runs `elsewhere`, None where there is no band: the bands judged are then those
+        that the other runs calibrate.
 
     Returns
     -------
     PredictionVerdict
-        Errors are those of all runs together, against the mean of each log as the best
-        constant. Without `errors` bands are those of each run's own model.
+        Errors are those of all runs together, against the mean of each log, or part of one, as
+        the best constant. A model estimated without a part is worse than that of all logs, its
+        errors on its own logs are too small: with `own`, squared errors and spreads are 0.632
+        times those of what was left out and 0.368 times those of its own logs. Without `errors`
+        bands are those of each run's own model.
+
+    References
+    ----------
+    Efron (1983), section 6: the .632 estimator.
     """
     runs = [h.run for h in held]
     states = tuple(runs[0].fit)
-    spread, rmse = _errors(runs, states)
+    spread, rmse = _errors(held, states, _LOST if own else np.inf)
+    fitted = np.full(len(states), np.nan)
+    if own:
+        whole, fitted = _errors(own, states)
+        spread, rmse = (
+            np.sqrt(_LEFT_OUT * left**2 + (1 - _LEFT_OUT) * mine**2)
+            for left, mine in ((spread, whole), (rmse, fitted))
+        )
     noise = _noise(held, states)
     moves = _moves(runs, states, spread, noise, held[0].model.vessel.length, limits)
     longest = max(float(part.t[-1] - part.t[0]) for r in runs for part in split_segments(r.log))
@@ -109,10 +139,11 @@ def judge_prediction(
     horizon = _horizons(held, spread) if beaten.any() else np.full(len(states), longest)
     horizon = np.where(rmse <= spread, longest, horizon)
     bands, told = (
-        _bands(held, states, seed) if errors is None else _calibrated(held, states, errors)
+        _bands(held, states, seed) if errors is None else _calibrated(elsewhere, states, errors)
     )
-    memory = _memory(runs, states)
-    fitted = _errors(own, states)[1] if own else np.full(len(states), np.nan)
+    apart = [h.run for h in elsewhere]
+    memory = _memory(apart or runs, states)
+    wide, far = _errors(elsewhere or held, states)
     channels = [
         ChannelPrediction(
             s,
@@ -126,6 +157,7 @@ def judge_prediction(
             bands.get(s),
             float(memory[i]) if np.isfinite(memory[i]) else None,
             float(fitted[i]) if np.isfinite(fitted[i]) else None,
+            float(far[i]) if elsewhere and np.isfinite(far[i]) else None,
         )
         for i, s in enumerate(states)
     ]
@@ -133,11 +165,17 @@ def judge_prediction(
     reasons = list(found)
     if left:
         after = min(float(r.log.t[r.diverged] - r.log.t[0]) for r in left)
-        reasons.append(RunsDiverge(tuple(r.log.name for r in left), len(runs), after))
+        names = tuple(r.log.name for r in left)
+        reasons.append((RefitsDiverge if own else RunsDiverge)(names, len(runs), after))
+    lost = sum(r.diverged >= 0 for r in apart)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        beyond = {s: float(v) for s, v, m in zip(states, far / wide, moves, strict=True) if m}
+    if apart and (lost or any(not v <= limits.good for v in beyond.values())):
+        reasons.append(Elsewhere(tuple(kinds), len(own) > 1, beyond, lost, len(apart)))
     return weigh_prediction(
         channels,
         judged_on,
-        logs=[r.log.name for r in runs],
+        logs=[h.run.log.name for h in own or held],
         parts=parts,
         samples=sum(len(r.log) for r in runs),
         found=[*reasons, *told],
@@ -164,22 +202,33 @@ def _by_log(runs: Sequence[LogFit]) -> list[list[LogFit]]:
     return groups
 
 
-def _errors(runs: Sequence[LogFit], states: tuple[str, ...]) -> tuple[Array, Array]:
-    """Return the deviation from the mean of each log, and the error, root mean square (nx,)."""
+def _errors(
+    held: Sequence[HeldOut], states: tuple[str, ...], lost: float = np.inf
+) -> tuple[Array, Array]:
+    """Return the deviation from the mean of each log, and the error, root mean square (nx,).
+
+    A run that diverges, or errs by more than `lost` times that deviation, errs by so much.
+    """
+    parts = dict.fromkeys(h.part for h in held)
+    groups = [g for p in parts for g in _by_log([h.run for h in held if h.part == p])]
     spread, error = np.zeros(len(states)), np.zeros(len(states))
     for i, state in enumerate(states):
-        count = 0
-        for group in _by_log(runs):
+        squares: list[tuple[float, int]] = []
+        for group in groups:
             measured = [r.log[state][r.log.known((state,))] for r in group]
             whole = np.concatenate(measured)
             if not len(whole):
                 continue
-            count += len(whole)
             spread[i] += float(((whole - whole.mean()) ** 2).sum())
             for run, y in zip(group, measured, strict=True):
                 x = run.x[run.log.known((state,)), i]
-                error[i] += np.inf if run.diverged >= 0 else float(((y - x) ** 2).sum())
-        spread[i], error[i] = np.sqrt(spread[i] / max(count, 1)), np.sqrt(error[i] / max(count, 1))
+                away = np.inf if run.diverged >= 0 else float(((y - x) ** 2).sum())
+                squares.append((away, len(y)))
+        count = max(sum(n for _, n in squares), 1)
+        spread[i] = np.sqrt(spread[i] / count)
+        worst = (lost * spread[i]) ** 2 if np.isfinite(lost) else np.inf
+        total = sum(away if away <= worst * n else worst * n for away, n in squares if n)
+        error[i] = np.sqrt(total / count)
     return spread, error
 
 

@@ -97,6 +97,32 @@ def test_parts_of_one_log_share_its_mean(log):
     assert judge_prediction(two).channels[0].spread == pytest.approx(np.std(log["u"]))
 
 
+def test_errors_left_out_and_own_ones_are_weighed(log):
+    """Efron's .632 estimator; what diverges is lost, but is not the model that is judged."""
+    model, wrong = true_model(log), true_model(log, Ymu=1.3)
+    own, left = HeldOut.of(model, log), HeldOut.of(wrong, log)
+    found = judge_prediction([left], own=[own])
+    for state in STATES:
+        mine, other = (judge_prediction([h]).rmse[state] for h in (own, left))
+        share = 1 - np.exp(-1)
+        assert found.rmse[state] == pytest.approx(np.sqrt(share * other**2 + (1 - share) * mine**2))
+    away = HeldOut.of(true_model(log, Nr=-30.0), log)
+    found = judge_prediction([away], own=[own])
+    assert found.channels[2].error == pytest.approx(3 * np.sqrt(share), rel=0.05)
+    assert found.because[0].kind == "large_error"
+    assert "refits_diverge" in {r.kind for r in found.because}
+
+
+def test_what_kinds_of_manoeuvre_left_out_show_is_told_beside_the_level(log):
+    own = HeldOut.of(true_model(log), log)
+    wrong = HeldOut.of(true_model(log, Ymu=2.5), log)
+    found = judge_prediction([own], own=[own, own], elsewhere=[wrong], kinds=["turn"])
+    assert found.level is PredictionLevel.GOOD
+    assert "a kind of manoeuvre that its estimate never saw (turn)" in found.reasons[-1]
+    told = found.to_dict()
+    assert told["elsewhere_rmse"]["v"] > 2 * told["rmse"]["v"]
+
+
 def test_units_change_nothing(log):
     """A ship in other units of speed and force is the same ship."""
     small = {n: log[n] * (1e-3 if n in STATES else 1.0) for n in log.channels}
@@ -187,7 +213,7 @@ def test_the_summary_has_a_row_a_channel():
 
 def test_errors_on_the_own_logs_and_their_memory_are_kept(log):
     wrong = HeldOut.of(true_model(log, Yv=1.5), log)
-    found = judge_prediction([wrong], own=[HeldOut.of(true_model(log), log).run]).to_dict()
+    found = judge_prediction([wrong], own=[HeldOut.of(true_model(log), log)]).to_dict()
     assert found["own_rmse"]["v"] < 0.5 * found["rmse"]["v"]
     assert found["memory"]["v"] > 2.0
     assert judge_prediction([wrong]).to_dict()["own_rmse"] == {}
