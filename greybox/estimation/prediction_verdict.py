@@ -60,6 +60,9 @@ class PredictionLimits:
     speed : float
         Share of the ship's speed that a channel must move to count, the yaw rate times the
         ship's length: 0.6 degrees of drift.
+    held : float
+        Greatest share of command settings of the logs with which, where they are held, a free
+        run diverges: two of sixteen, since these are the outermost ones.
 
     References
     ----------
@@ -71,6 +74,7 @@ class PredictionLimits:
     coverage: float = 0.85
     noise: float = 3.0
     speed: float = 0.01
+    held: float = 0.125
 
     def to_dict(self) -> dict[str, float]:
         """Return the limits for JSON."""
@@ -261,18 +265,22 @@ class Elsewhere(Reason):
 
 @dataclass(frozen=True)
 class HeldCommandsDiverge(Reason):
-    """The free run leaves its bound where commands are held at what the logs reached.
+    """The free run leaves its bound where commands are held as they once were in the logs.
 
     Parameters
     ----------
     commands : mapping of str to float
-        What they are held at, in the units of the log.
+        What they are held at in the first run that does, in the units of the log.
     after : float
         [s]
+    count, settings : int
+        Runs that do, and all.
     """
 
     commands: Mapping[str, float]
     after: float
+    count: int
+    settings: int
 
     kind: ClassVar[str] = "held_commands_diverge"
 
@@ -281,9 +289,16 @@ class HeldCommandsDiverge(Reason):
         """At which commands, and when."""
         at = ", ".join(f"{name} {value:.3g}" for name, value in self.commands.items())
         return (
-            f"its free run diverges after {self.after:.3g} s where commands are held at what the "
-            f"logs reached ({at})"
+            f"its free run diverges with {self.count} of {self.settings} settings of the logs "
+            f"held, first after {self.after:.3g} s ({at})"
         )
+
+
+class SomeHeldDiverge(HeldCommandsDiverge):
+    """As `HeldCommandsDiverge`, with so few settings that it does not decide."""
+
+    kind: ClassVar[str] = "some_held_commands_diverge"
+    fatal: ClassVar[bool] = False
 
 
 @dataclass(frozen=True)
@@ -670,7 +685,8 @@ def weigh_prediction(
     limits : PredictionLimits
     """
     moving = [c for c in channels if c.moves]
-    diverges = [r for r in found if isinstance(r, RunsDiverge | Divergence | HeldCommandsDiverge)]
+    away = RunsDiverge | Divergence | HeldCommandsDiverge
+    diverges = [r for r in found if r.fatal and isinstance(r, away)]
     large = [
         LargeError(c.channel, c.error, limits.good, c.horizon)
         for c in moving

@@ -1,4 +1,4 @@
-"""Whether a model stays bounded where commands are held at what the logs reached.
+"""Whether a model stays bounded where commands are held as they once were in the logs.
 
 A regression may follow its own logs and those left out, and run away in the first long turn:
 what it lacks is damping where the logs never stayed. Held commands ask for no measurement.
@@ -6,30 +6,28 @@ what it lacks is damping where the logs never stayed. Held commands ask for no m
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from itertools import product
 
 import numpy as np
+from numpy.typing import NDArray
 
-from greybox.estimation.prediction_verdict import HeldCommandsDiverge
+from greybox.estimation.prediction_verdict import LIMITS, HeldCommandsDiverge, SomeHeldDiverge
 from greybox.model.model import ManoeuvringModel
 from greybox.trial.log import TrialLog
 from greybox.validation.fit import run_model
 
-# share of the samples beyond a command's usual range, to either side
-_RARE = 0.01
-# combinations of outermost commands that are run at most, else commands go one at a time
-_MOST = 16
+# settings that are held
+_SETTINGS = 16
 
 
 def held_commands_diverge(
     model: ManoeuvringModel, logs: Sequence[TrialLog]
 ) -> HeldCommandsDiverge | None:
-    """Return with which commands held a free run leaves its bound, the first to do so.
+    """Return how many free runs with commands held leave their bound, and the first to do so.
 
-    Each command is held at the low or the high end of what the logs reached (1 and 99 % of
-    the samples), all in all combinations, for as long as the longest log.
+    Held are settings of all commands that the logs had at one time, 16 of them as unlike one
+    another as the logs allow, for as long as the longest log.
 
     Parameters
     ----------
@@ -40,32 +38,34 @@ def held_commands_diverge(
     Returns
     -------
     HeldCommandsDiverge or None
-        None where all runs stay bounded.
+        None where all runs stay bounded; `SomeHeldDiverge` where few do not.
     """
     longest = max(logs, key=len)
-    ends: dict[str, tuple[float, float]] = {}
-    for name in longest.vessel.commands:
-        if all(name in log for log in logs):
-            low, high = np.quantile(np.concatenate([log[name] for log in logs]), [_RARE, 1 - _RARE])
-            ends[name] = (float(low), float(high))
-    worst: HeldCommandsDiverge | None = None
-    for held in _combinations(ends, logs):
-        constant = {name: np.full(len(longest), value) for name, value in held.items()}
+    names = [n for n in longest.vessel.commands if all(n in log for log in logs)]
+    if not names:
+        return None
+    left: list[tuple[float, dict[str, float]]] = []
+    settings = _unlike(np.concatenate([np.stack([g[n] for n in names], 1) for g in logs]))
+    for values in settings:
+        held = {n: float(v) for n, v in zip(names, values, strict=True)}
+        constant = {n: np.full(len(longest), v) for n, v in held.items()}
         run = run_model(model, replace(longest, channels={**longest.channels, **constant}))
         if run.diverged >= 0:
-            after = float(run.log.t[run.diverged] - run.log.t[0])
-            if worst is None or after < worst.after:
-                worst = HeldCommandsDiverge(held, after)
-    return worst
+            left.append((float(run.log.t[run.diverged] - run.log.t[0]), held))
+    if not left:
+        return None
+    after, commands = min(left, key=lambda found: found[0])
+    many = len(left) > LIMITS.held * len(settings)
+    told = HeldCommandsDiverge if many else SomeHeldDiverge
+    return told(commands, after, len(left), len(settings))
 
 
-def _combinations(
-    ends: Mapping[str, tuple[float, float]], logs: Sequence[TrialLog]
-) -> list[dict[str, float]]:
-    """Return what each run holds its commands at."""
-    if not ends:
-        return []
-    if 2 ** len(ends) <= _MOST:
-        return [dict(zip(ends, values, strict=True)) for values in product(*ends.values())]
-    usual = {n: float(np.median(np.concatenate([log[n] for log in logs]))) for n in ends}
-    return [{**usual, name: end} for name, both in ends.items() for end in both]
+def _unlike(settings: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return those of the (N, nc) settings that are farthest from one another, in deviations."""
+    scaled = (settings - settings.mean(axis=0)) / np.maximum(settings.std(axis=0), 1e-12)
+    chosen = [int(np.argmax((scaled**2).sum(axis=1)))]
+    away = ((scaled - scaled[chosen[0]]) ** 2).sum(axis=1)
+    while len(chosen) < _SETTINGS and away.max() > 0:
+        chosen.append(int(np.argmax(away)))
+        away = np.minimum(away, ((scaled - scaled[chosen[-1]]) ** 2).sum(axis=1))
+    return settings[chosen]
