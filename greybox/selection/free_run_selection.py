@@ -131,7 +131,8 @@ class FreeRunSelection:
         self.runs = FreeRuns(self.model, self._whole, self.deviation)
         self.starts = measured_starts(self._whole, len(self.model.states))
         self.names = self.model.parameters
-        self._samples = float(self._whole.use.sum())
+        self._used = self._whole.use.ravel() > 0
+        self._samples = float(self._used.sum())
         # damping takes energy out
         self._most = np.full(len(self.names), np.inf)
         for i in self.model.predictor.parameter_columns:
@@ -240,11 +241,17 @@ class FreeRunSelection:
 
     def _at(self, runs: Runs, p: Array, cost: float) -> _Point:
         at = runs.linearise(p, self.starts)
-        weight = 1 / np.sqrt(self._noise(at.r))
-        used = self._whole.use > 0
-        rows = at.rows.reshape(*at.r.shape, -1)[used, :, : len(p)] * weight[:, None]
-        rows, r = rows.reshape(-1, len(p)), (at.r[used] * weight).ravel()
-        return _Point(p, cost, rows.T @ rows, rows.T @ r, self._most)
+        ny = at.r.shape[-1]
+        rows, r, used = at.rows.reshape(-1, ny, at.rows.shape[-1]), at.r.reshape(-1, ny), self._used
+        if not used.all():
+            rows, r = rows[used], r[used]
+        hessian, gradient = np.zeros((len(p), len(p))), np.zeros(len(p))
+        for i, weight in enumerate(1 / self._noise(at.r)):
+            # contiguous, and one output at a time: the rows of all are large
+            own = np.ascontiguousarray(rows[:, i, : len(p)])
+            hessian += weight * (own.T @ own)
+            gradient += weight * (own.T @ r[:, i])
+        return _Point(p, cost, hessian, gradient, self._most)
 
     def _moved(self, runs: Runs, at: _Point, step: Array) -> _Point | None:
         """Return where a step or a part of it leads downhill, None where it does not."""
