@@ -90,9 +90,9 @@ def _add_model(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         "--covariance",
-        choices=("ma", "hac", "white", "bootstrap"),
-        help="standard errors: moving average (default of iv), robust to coloured residuals "
-        "(default of ls), white, block bootstrap",
+        choices=("cluster", "ma", "hac", "white", "bootstrap"),
+        help="standard errors: by the spread between segments where that is larger (default), "
+        "moving average, robust to coloured residuals, white, block bootstrap",
     )
     group.add_argument(
         "--mass", type=positive, metavar="KG", help="mass [kg], for physical coefficients"

@@ -8,13 +8,15 @@ solution of one quadratic inequality: an interval, two rays, or the whole line.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.credibility.evidence import Equation
+from greybox.credibility.evidence import Equation, Evidence
 from greybox.estimation.covariance import correlation_lags
+from greybox.estimation.gls_regression import WhiteEquations
 from greybox.estimation.verdict import TestResult, not_applicable
 from greybox.numerics.lagged_moments import lagged_sums, pairs
 from greybox.numerics.linalg import scaled_inverse
@@ -23,6 +25,9 @@ Array = NDArray[np.float64]
 
 # a set this many times as wide as the ordinary interval contradicts it
 _WIDER = 1.5
+# share of a standard error by which the instruments of an iteration's end may move an estimate
+_SAME = 0.02
+_PLAIN = "plain instrumental variables"
 
 
 @dataclass(frozen=True)
@@ -88,13 +93,18 @@ def solve_quadratic(estimate: float, v00: float, v01: float, v11: float, c: floa
     return ConfidenceSet(((-np.inf, ends[0]), (ends[1], np.inf)))
 
 
-def confidence_sets(equation: Equation, level: float = 0.95) -> list[ConfidenceSet]:
+def confidence_sets(
+    equation: Equation, level: float = 0.95, std: Array | None = None
+) -> list[ConfidenceSet]:
     """Return the set of each parameter of an equation, robust to the moving average.
 
     Parameters
     ----------
     equation : Equation
     level : float
+    std : ndarray, optional
+        (p,) standard errors of its estimate that allow for more than the noise model, and by
+        as much the sets do.
 
     Returns
     -------
@@ -123,27 +133,67 @@ def confidence_sets(equation: Equation, level: float = 0.95) -> list[ConfidenceS
     weights = [noise_model.adjoint(w, log) for log, w in enumerate(weights)]
     lost = equation.rows / freedom
     v00 = lost * sum(((w * e) ** 2).sum(axis=1) for w, e in zip(weights, errors, strict=True))
-    v01, v11 = _of_shift(equation, weights, errors, shift, lost)
+    v01, v11 = _of_shift(equation.keep, weights, errors, shift, lost)
     v11 = np.maximum(v11, v01**2 / np.where(v00 > 0, v00, np.inf))
     c = fdtri(1, known, level)
+    if std is not None:
+        c = c * np.maximum(std**2 / np.where(v00 > 0, v00, np.inf), 1.0)
     return [
         solve_quadratic(float(solution.theta[i]), v00[i], v01[i], v11[i], float(c[i]))
         for i in range(p)
     ]
 
 
+def refined_confidence_sets(
+    white: WhiteEquations, theta: Array, std: Array, level: float = 0.95
+) -> list[ConfidenceSet]:
+    """Return the set of each parameter of a refined estimate, all equations together.
+
+    Where instruments are strong it is the interval of `std`.
+
+    Parameters
+    ----------
+    white : WhiteEquations
+    theta, std : ndarray
+        (p,) the refined estimate and its standard errors.
+    level : float
+    """
+    from scipy.special import chdtri
+
+    follow = white.inverse / np.diag(white.inverse)
+    v01, v11 = np.zeros(len(theta)), np.zeros(len(theta))
+    for i in range(white.equations):
+        every = slice(i, None, white.equations)
+        weights = [white.inverse @ r.z[:, every] for r in white.rows]
+        errors = [(r.y - theta @ r.phi)[every] for r in white.rows]
+        shift = [follow.T @ (r.phi - r.z)[:, every] for r in white.rows]
+        keep = [np.ones(len(e), bool) for e in errors]
+        both, own = _of_shift(keep, weights, errors, shift, 1.0)
+        v01, v11 = v01 + both, v11 + own
+    v00 = std**2
+    v11 = np.maximum(v11, v01**2 / np.where(v00 > 0, v00, np.inf))
+    c = float(chdtri(1, 1 - level))
+    return [
+        solve_quadratic(float(t), float(a), float(b), float(d), c)
+        for t, a, b, d in zip(theta, v00, v01, v11, strict=True)
+    ]
+
+
 def _of_shift(
-    equation: Equation, weights: list[Array], errors: list[Array], shift: list[Array], lost: float
+    keep: Sequence[NDArray[np.bool_]],
+    weights: list[Array],
+    errors: list[Array],
+    shift: list[Array],
+    lost: float,
 ) -> tuple[Array, Array]:
     """Return Σ Σ w w E(e b) and Σ Σ w w E(b b), after whitening by the residuals' model."""
-    p = len(equation.labels)
     lags = max(
-        correlation_lags([b[i, k] for b, k in zip(shift, equation.keep, strict=True)])
-        for i in range(p)
+        correlation_lags([b[i, k] for b, k in zip(shift, keep, strict=True)])
+        for i in range(len(shift[0]))
     )
     memory = lagged_sums(weights, weights, lags) * lost
     memory[:, 1:] *= 2.0
-    memory /= np.maximum([pairs(equation.keep, lag) for lag in range(lags + 1)], 1)
+    memory /= np.maximum([pairs(keep, lag) for lag in range(lags + 1)], 1)
     single = [e[None] for e in errors]
     both = (lagged_sums(shift, single, lags) + lagged_sums(single, shift, lags)) / 2
     return (memory * both).sum(axis=1), (memory * lagged_sums(shift, shift, lags)).sum(axis=1)
@@ -161,22 +211,36 @@ def _unexplained(equation: Equation) -> list[Array]:
     return out
 
 
-def anderson_rubin(
-    equation: Equation, biases: frozenset[str]
-) -> tuple[TestResult, dict[str, ConfidenceSet]]:
+def anderson_rubin(evidence: Evidence, equation: Equation, biases: frozenset[str]) -> TestResult:
     """Compare the sets with the ordinary intervals of instrumental variables.
+
+    The sets are those of the estimate itself where it comes from instruments; of another
+    one they are those of the plain instrumental variables beside it, and the detail says so.
 
     Parameters
     ----------
+    evidence : Evidence
     equation : Equation
     biases : frozenset of str
     """
     null = "intervals that hold under weak instruments are as wide as the ordinary ones"
     if equation.obstacle:
-        return not_applicable("anderson_rubin", null, equation.obstacle, equation.state), {}
-    sets = dict(zip(equation.labels, confidence_sets(equation), strict=True))
+        return not_applicable("anderson_rubin", null, equation.obstacle, equation.state)
+    mine = list(equation.columns)
+    theta, std = equation.solution.theta, equation.std
+    own = evidence.white is not None or _is_solution(evidence, equation)
+    if evidence.white is not None:
+        theta, std = evidence.theta[mine], evidence.std[mine]
+        every = refined_confidence_sets(evidence.white, evidence.theta, evidence.std)
+        found_sets = [every[i] for i in mine]
+    elif own:
+        std = np.maximum(std, evidence.std[mine])
+        found_sets = confidence_sets(equation, std=std)
+    else:
+        found_sets = confidence_sets(equation)
+    sets = dict(zip(equation.labels, found_sets, strict=True))
     wide, ratios = [], []
-    for label, s in zip(equation.labels, equation.std, strict=True):
+    for label, s in zip(equation.labels, std, strict=True):
         if label in biases:
             continue
         found = sets[label]
@@ -188,26 +252,34 @@ def anderson_rubin(
             wide.append(label)
     shown = "; ".join(f"{n}: {sets[n].words()}" for n in wide)
     worst = max(ratios, default=1.0)
-    result = TestResult(
+    told = (
+        f"sets that hold under weak instruments (95 %) are at most {worst:.2f} times as wide."
+        if not wide
+        else f"under weak instruments only these sets are safe (95 %): {shown}."
+    )
+    return TestResult(
         "anderson_rubin",
         null,
         worst if np.isfinite(worst) else None,
         None,
-        f"sets that hold under weak instruments (95 %) are at most {worst:.2f} times as wide."
-        if not wide
-        else f"under weak instruments only these sets are safe (95 %): {shown}.",
+        told if own else f"of {_PLAIN} beside this estimate: {told}",
         _WIDER,
         not wide,
         tuple(wide),
         {
             "sets": {n: s.to_list() for n, s in sets.items() if n not in biases},
-            # whose sets they are, which a refined estimate is not
+            "of": "estimate" if own else _PLAIN,
             "estimates": {
-                n: float(v)
-                for n, v in zip(equation.labels, equation.solution.theta, strict=True)
-                if n not in biases
+                n: float(v) for n, v in zip(equation.labels, theta, strict=True) if n not in biases
             },
         },
         state=equation.state,
     )
-    return result, sets
+
+
+def _is_solution(evidence: Evidence, equation: Equation) -> bool:
+    """Whether the estimate is the plain instrumental-variable solution of an equation."""
+    if not evidence.estimator.instruments:
+        return False
+    away = np.abs(evidence.theta[list(equation.columns)] - equation.solution.theta)
+    return bool((away <= _SAME * equation.std).all())

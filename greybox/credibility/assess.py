@@ -87,7 +87,7 @@ def _of_equation(evidence: Evidence, equation: Equation) -> list[TestResult]:
     return [
         excitation(equation),
         *weak_instruments(equation, biases),
-        anderson_rubin(equation, biases)[0],
+        anderson_rubin(evidence, equation, biases),
         overidentification(equation, biases),
         input_independence(evidence, equation),
         *_still_water(evidence, equation),

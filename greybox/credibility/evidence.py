@@ -20,6 +20,7 @@ from greybox.estimation.error_variance_profile import (
     error_variance_profiles,
     fit_scaled_arma_noise,
 )
+from greybox.estimation.gls_regression import WhiteEquations
 from greybox.estimation.normal_equations import Solution, solve_stacked
 from greybox.estimation.registry import ESTIMATORS, Estimator
 from greybox.model.predictor import Predictor
@@ -180,6 +181,8 @@ class Evidence:
     solved : bool
         Whether the estimate solves the normal equations of its residuals, as least squares
         and plain instrumental variables do.
+    white : WhiteEquations, optional
+        The equations of a refined estimate, with their error made white.
     """
 
     predictor: Predictor
@@ -194,6 +197,7 @@ class Evidence:
     zero_mean: bool = True
     margins: Mapping[str, float] | None = None
     solved: bool = True
+    white: WhiteEquations | None = None
 
     @property
     def estimator(self) -> Estimator:

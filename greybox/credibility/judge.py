@@ -60,6 +60,7 @@ def run_tests(fitted: Fitted) -> Estimate:
         problem.zero_mean,
         problem.margins,
         solved=solved is not None,
+        white=fitted.white,
     )
     own = {t.name: t for t in estimate.tests}
     tests: list[TestResult] = [own.pop(t.name, t) for t in assess(evidence)]

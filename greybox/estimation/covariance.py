@@ -3,12 +3,14 @@
 The equation error of (4.3) holds the measurement noise of two neighbouring
 samples, so it is a moving average even where everything else is white; process
 noise and wind add longer memory. A white-noise formula is off by up to a factor
-six (FORMULAS).
+six (FORMULAS). Where the structure is only nearly right the residuals also depend on
+the motion: then scores are summed over segments of the logs, and their spread counts.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -16,9 +18,23 @@ from numpy.typing import NDArray
 
 from greybox.estimation.error_variance_profile import ErrorVarianceProfile, fit_scaled_arma_noise
 from greybox.numerics.lagged_moments import autocovariance, flat_top, lagged_sums, weighted_lags
+from greybox.numerics.linalg import sizes
 
 Array = NDArray[np.float64]
 CovarianceKind = Literal["hac", "ma", "white"]
+Covariance = Literal["cluster", "hac", "ma", "white", "bootstrap"]
+
+# segments that logs are cut into, at least, where the memory of the residuals allows it, and
+# where it does not
+_SEGMENTS, _FEWEST = 30, 10
+# lengths of the residuals' memory that a segment holds at least
+_MEMORIES = 4
+# half-width of a normal 95 % interval, in standard errors
+_NORMAL = 1.959964
+# share of an equation's information from which on a segment alone determines a direction
+_ALONE = 1e-6
+# degrees of freedom that count as certain
+_SURE = 1e4
 
 
 def correlation_lags(residuals: Sequence[Array], largest: int | None = None) -> int:
@@ -160,6 +176,166 @@ def clip_to_psd(matrix: Array) -> Array:
     floor = 1e-6 * values[-1]
     fixed = (vectors * np.maximum(values, floor)) @ vectors.T
     return np.asarray(fixed * np.outer(scale, scale))
+
+
+def segment_length(samples: Sequence[int], lags: int) -> int:
+    """Return how many samples a segment of logs holds, several times the residuals' memory.
+
+    Parameters
+    ----------
+    samples : sequence of int
+        Of each log.
+    lags : int
+        Memory of the residuals.
+    """
+    total = sum(samples)
+    return max(1, round(min(max(total / _SEGMENTS, _MEMORIES * lags), total / _FEWEST)))
+
+
+def segment_sums(
+    rows: Sequence[Array], residuals: Sequence[Array], lags: int
+) -> tuple[Array, Array]:
+    """Return the scores Σ ẑ e and the moments Σ ẑ ẑᵀ of each segment, (G, p) and (G, p, p).
+
+    A segment is a log, or a part of one where that leaves more segments. Parts hold several
+    times the memory of the residuals, so that scores of different segments are nearly
+    independent.
+
+    Parameters
+    ----------
+    rows : sequence of ndarray
+        (p, N) or (p, N, ny) an experiment, zero in rows that do not take part.
+    residuals : sequence of ndarray
+        (N,) or (N, ny).
+    lags : int
+        Memory of the residuals in samples.
+    """
+    length = segment_length([len(r) for r in residuals], lags)
+    scores, moments = [], []
+    for z, e in zip(rows, residuals, strict=True):
+        edges = np.linspace(0, len(e), max(1, round(len(e) / length)) + 1).astype(int)
+        for start, stop in pairwise(edges):
+            own = z[:, start:stop].reshape(len(z), -1)
+            scores.append(own @ e[start:stop].ravel())
+            moments.append(own @ own.T)
+    return np.array(scores), np.array(moments)
+
+
+def cluster_std(scores: Array, moments: Array, bread: Array) -> tuple[Array, Array]:
+    """Return standard errors by the spread of the scores between segments, and their freedom.
+
+    Parameters
+    ----------
+    scores, moments : ndarray
+        (G, p) and (G, p, p) of `segment_sums`.
+    bread : ndarray
+        (p, p), which maps a score to a change of the estimate.
+
+    Returns
+    -------
+    tuple of ndarray
+        (p,) standard errors (CR2), unbiased where errors are in truth white, and (p,)
+        Satterthwaite's degrees of freedom of their squares in that case.
+
+    References
+    ----------
+    Bell and McCaffrey (2002); Pustejovsky and Tipton (2018).
+    """
+    whole = moments.sum(axis=0)
+    # rows and columns of a score in units in which the information is the identity
+    size = sizes(whole)
+    values, vectors = np.linalg.eigh(whole / np.outer(size, size))
+    known = values > _ALONE**2 * values[-1]
+    root = vectors[:, known] * np.sqrt(values[known])
+    into = (vectors[:, known] / np.sqrt(values[known])).T / size
+    share = into @ moments @ into.T
+    left, axes = np.linalg.eigh(np.eye(len(into)) - share)
+    # what one segment alone determines leaves no residual to judge by
+    grown = np.where(left > _ALONE, 1 / np.sqrt(np.maximum(left, _ALONE)), 0.0)
+    adjust = axes * grown[:, None] @ axes.transpose(0, 2, 1)
+    map_ = bread @ (size[:, None] * root)
+    # (G, p, k) weights of the scores in each coefficient
+    weights = map_ @ adjust
+    away = np.einsum("gck,gk->gc", weights, scores @ into.T)
+    variance = (away**2).sum(axis=0)
+    seen = weights @ share
+    own = np.einsum("gck,gck->gc", seen, weights)
+    # Ω_gh = δ_gh wᵀ S_g w − wᵀ S_g S_h w, coefficient by coefficient
+    trace = own.sum(axis=0) - (seen**2).sum(axis=(0, 2))
+    cross = np.einsum("gck,hck->cgh", seen, seen)
+    square = (cross**2).sum(axis=(1, 2)) + (own**2 - 2 * own * np.einsum("cgg->gc", cross)).sum(
+        axis=0
+    )
+    freedom = trace**2 / np.maximum(square, 1e-300)
+    return np.sqrt(variance), freedom
+
+
+def moderated(ratio: Array, freedom: Array) -> tuple[Array, Array]:
+    """Return ratios of variances drawn together as far as their own freedom explains the scatter.
+
+    Few segments make each ratio uncertain; that of many coefficients together is not. Where
+    the ratios scatter no more than their degrees of freedom say, their common value is taken.
+
+    Parameters
+    ----------
+    ratio, freedom : ndarray
+        (p,) of coefficients: the variance by segments over that without, and its degrees of
+        freedom.
+
+    Returns
+    -------
+    tuple of ndarray
+        (p,) and (p,), the ratios and their degrees of freedom.
+
+    References
+    ----------
+    Smyth (2004), section 6: empirical Bayes, prior from all of them by moments of log F.
+    """
+    from scipy.optimize import brentq
+    from scipy.special import digamma, polygamma
+
+    def centre(d: Array | float) -> Array:
+        return np.asarray(digamma(d / 2) - np.log(d / 2))
+
+    logs = np.log(ratio) - centre(freedom)
+    beyond = 0.0
+    if len(logs) > 1:
+        beyond = float(logs.var(ddof=1) - polygamma(1, freedom / 2).mean())
+    prior = _SURE
+    if beyond > polygamma(1, _SURE / 2):
+        prior = 2 * float(brentq(lambda x: polygamma(1, x) - beyond, 1e-3, _SURE))
+    common = np.exp(logs.mean() + centre(prior))
+    return (prior * common + freedom * ratio) / (prior + freedom), prior + freedom
+
+
+def allow_for_segments(
+    covariance: Array, sums: Sequence[tuple[Array, Array]], breads: Sequence[Array]
+) -> Array:
+    """Return a covariance that is no smaller than the spread between segments says.
+
+    Standard errors grow where `cluster_std` finds more, by so much that 1.96 of them are the
+    95 % interval of Student's t; correlations stay.
+
+    Parameters
+    ----------
+    covariance : ndarray
+        (p, p); columns of zeros are left as they are.
+    sums : sequence of tuple
+        Of `segment_sums`, one an equation, whose columns follow each other.
+    breads : sequence of ndarray
+        As `cluster_std`, likewise.
+    """
+    from scipy.special import stdtrit
+
+    found = [cluster_std(*s, b) for s, b in zip(sums, breads, strict=True)]
+    std, freedom = (np.concatenate(x) for x in zip(*found, strict=True))
+    before = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    known = np.flatnonzero((before > 0) & (std > 0))
+    factor = np.ones(len(covariance))
+    if len(known):
+        ratio, sure = moderated((std / before)[known] ** 2, np.maximum(freedom[known], 1.0))
+        factor[known] = np.maximum(np.sqrt(ratio) * stdtrit(sure, 0.975) / _NORMAL, 1.0)
+    return covariance * np.outer(factor, factor)
 
 
 def block_bootstrap(

@@ -14,7 +14,13 @@ from numpy.typing import NDArray
 
 from greybox.errors import ExcitationError
 from greybox.estimation.banded_covariance import ErrorBand, ErrorNoise
-from greybox.estimation.covariance import CovarianceKind, block_bootstrap, score_covariance
+from greybox.estimation.covariance import (
+    CovarianceKind,
+    allow_for_segments,
+    block_bootstrap,
+    score_covariance,
+    segment_sums,
+)
 from greybox.estimation.noise import constant_rows
 from greybox.model.predictor import Predictor
 from greybox.numerics.banded import factor_band
@@ -43,6 +49,25 @@ class WhiteRows:
     phi: Array
     y: Array
     constants: Array
+
+
+@dataclass(frozen=True)
+class WhiteEquations:
+    """All equations of an estimate together, with their error made white.
+
+    Parameters
+    ----------
+    rows : tuple of WhiteRows
+        One a log.
+    inverse : ndarray
+        (p, p) of Σ z φᵀ.
+    equations : int
+        How many there are: values of one sample stand together.
+    """
+
+    rows: tuple[WhiteRows, ...]
+    inverse: Array
+    equations: int
 
 
 def own_constants(predictor: Predictor) -> list[bool]:
@@ -141,10 +166,11 @@ def white_covariance(
 
     Parameters
     ----------
-    kind : {"ma", "hac", "white", "bootstrap"}
+    kind : {"cluster", "ma", "hac", "white", "bootstrap"}
         ``white`` believes the noise model. The others do not: what colour the
         innovations keep counts, by their autocovariance (``ma``), by that of the
-        scores (``hac``) or by blocks of rows.
+        scores (``hac``) or by blocks of rows; ``cluster`` is ``ma``, or more where
+        scores differ more between segments.
     samples : sequence of int
         N of each log.
     """
@@ -176,4 +202,9 @@ def white_covariance(
         middle = blocks.reshape(nx, p, nx, p).sum(axis=(0, 2))
         count = sum(band.rows for band in bands)
         middle *= count / max(count - (p + nx) / nx, 1)
-    return inverse @ middle @ inverse.T, lags
+    found = inverse @ middle @ inverse.T
+    if kind == "cluster":
+        z = [r.z.reshape(p, -1, nx) for r in rows]
+        sums = segment_sums(z, [e.reshape(-1, nx) for e in errors], lags)
+        found = allow_for_segments(found, [sums], [inverse])
+    return found, lags

@@ -15,7 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import ExcitationError, UsageError, suggestion
-from greybox.estimation.covariance import correlation_lags
+from greybox.estimation.covariance import (
+    Covariance,
+    allow_for_segments,
+    block_bootstrap,
+    correlation_lags,
+    segment_length,
+    segment_sums,
+)
 from greybox.estimation.free_run import Shooting, changes, fit_free_runs, in_doubt
 from greybox.estimation.free_run_errors import (
     memory_correction,
@@ -97,9 +104,12 @@ class OutputErrorOptions:
         Mean and standard deviation known before, by name.
     damping : {"warn", "enforce"}
         Whether damping terms are kept from driving the ship.
-    covariance : {"ma", "hac", "white"}
+    covariance : {"cluster", "ma", "hac", "white", "bootstrap"}
         ``ma``: residuals with a memory of their own, independent of the inputs;
-        ``hac``: robust also to a variance that changes; ``white``: none.
+        ``cluster``: as ``ma``, or more where scores differ more between segments of the
+        logs, as they do where the residuals depend on the motion; ``hac``: robust to a
+        variance that changes; ``white``: none; ``bootstrap``: one step from resampled
+        blocks of the logs.
     weights : {"noise", "deviation"}
         What an output's error is measured in: its noise, as found with the fit, which is
         the likelihood; or its own deviation over the logs, as the fit (6.12) does. The
@@ -114,6 +124,8 @@ class OutputErrorOptions:
         noise; of a model that leaves more they make up for what it lacks.
     levels : bool
         Whether the noise levels of sensors and process are sought once the fit has ended.
+    seed : int
+        For the bootstrap.
     """
 
     process_noise: bool = False
@@ -124,11 +136,12 @@ class OutputErrorOptions:
     bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     priors: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     damping: Damping = "warn"
-    covariance: Literal["ma", "hac", "white"] = "ma"
+    covariance: Covariance = "cluster"
     weights: Weights = "noise"
     search: bool = True
     starts: Literal["free", "measured"] = "free"
     levels: bool = True
+    seed: int = 0
 
 
 @known_keywords
@@ -430,16 +443,10 @@ def _result(fitted: _Fitted, logs: Sequence[TrialLog], options: OutputErrorOptio
         if not options.process_noise:
             # a weak but long memory stays below every single lag's limit
             lags = max(lags, round(min(len(r) for r in residuals) ** (1 / 3)))
-    middle = shared_score_covariance(
-        list(zip(rows, residuals, strict=True)), options.covariance, lags
-    )
     samples = sum(int(d.known.sum()) for d in data)
     # degrees of freedom, as a regression counts them
-    middle *= samples * ny / max(samples * ny - q - nz * len(data), 1)
-    covariance = _sandwich(fitted.hessian, middle + np.diag(restrictions.precision), bound)
-    if options.covariance == "ma" and lags:
-        factor = memory_correction(rows, fitted.hessian, residuals, lags)
-        covariance *= np.outer(factor, factor)
+    lost = samples * ny / max(samples * ny - q - nz * len(data), 1)
+    covariance = _covariance(fitted, rows, residuals, options, lags, bound, lost)
     count = len(predictor.columns)
     means = {n: (fit.p[count + i], covariance[count + i, count + i] ** 0.5)
              for i, n in enumerate(model.means)}  # fmt: skip
@@ -484,6 +491,54 @@ def _result(fitted: _Fitted, logs: Sequence[TrialLog], options: OutputErrorOptio
             *(_slow_tests(fitted.slow) if options.levels and not options.process_noise else ()),
         ),
     )
+
+
+def _covariance(
+    fitted: _Fitted,
+    rows: Sequence[Array],
+    residuals: Sequence[Array],
+    options: OutputErrorOptions,
+    lags: int,
+    bound: NDArray[np.bool_],
+    lost: float,
+) -> Array:
+    """Return the covariance of parameters and means, (q, q), zero at bounds.
+
+    Parameters
+    ----------
+    rows, residuals : sequence of ndarray
+        (q, N, ny) and (N, ny) a log.
+    lags : int
+        Memory of the residuals in samples.
+    bound : ndarray of bool
+        (q,)
+    lost : float
+        Values over values less what was estimated.
+    """
+    kind, free = options.covariance, np.flatnonzero(~bound)
+    own = [e[free] for e in rows]
+    if kind == "bootstrap":
+        flat = [e.reshape(len(free), -1) for e in own]
+        draws = block_bootstrap(
+            [(flat, flat, [r.ravel() for r in residuals])], np.random.default_rng(options.seed),
+            block=residuals[0].shape[1] * segment_length([len(r) for r in residuals], lags),
+        )  # fmt: skip
+        out = np.zeros_like(fitted.hessian)
+        out[np.ix_(free, free)] = np.cov(draws.T).reshape(len(free), len(free))
+        return out
+    base = "ma" if kind == "cluster" else kind
+    middle = shared_score_covariance(list(zip(rows, residuals, strict=True)), base, lags) * lost
+    prior = np.diag(fitted.restrictions.precision)
+    covariance = _sandwich(fitted.hessian, middle + prior, bound)
+    if base == "ma" and lags:
+        factor = memory_correction(rows, fitted.hessian, residuals, lags)
+        covariance *= np.outer(factor, factor)
+    if kind == "cluster":
+        part = np.ix_(free, free)
+        bread = scaled_inverse(fitted.hessian[part])
+        sums = segment_sums(own, residuals, lags)
+        covariance[part] = allow_for_segments(covariance[part], [sums], [bread])
+    return covariance
 
 
 def _excitation_tests(

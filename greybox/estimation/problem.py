@@ -11,10 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.estimation.closed_loop import Loop, assess_loop
+from greybox.estimation.covariance import Covariance
+from greybox.estimation.gls_regression import WhiteEquations
 from greybox.estimation.informative import regime_of
 from greybox.estimation.output_error import OutputErrorOptions
 from greybox.estimation.result import Estimate
-from greybox.estimation.solve import Covariance, Solved, UnexcitedBiasError
+from greybox.estimation.solve import Solved, UnexcitedBiasError
 from greybox.estimation.verdict import TestResult
 from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor import Predictor, Regime, build_predictor
@@ -40,11 +42,14 @@ class Fitted:
     solved : Solved, optional
         The equations that the estimate solves as they stand, as least squares and plain
         instrumental variables do.
+    white : WhiteEquations, optional
+        The equations that a refined estimate solves.
     """
 
     estimate: Estimate
     regression: RegressionProblem
     solved: Solved | None = None
+    white: WhiteEquations | None = None
 
     def with_more(self, test: TestResult, notes: Sequence[str]) -> Fitted:
         """Return it with a test and notes behind those of the estimate."""

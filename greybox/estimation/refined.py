@@ -18,8 +18,10 @@ from numpy.typing import NDArray
 
 from greybox.errors import ExcitationError
 from greybox.estimation.banded_covariance import ErrorBand
+from greybox.estimation.covariance import Covariance
 from greybox.estimation.disturbance import estimate_current
 from greybox.estimation.gls_regression import (
+    WhiteEquations,
     WhiteRows,
     own_constants,
     solve_white,
@@ -38,7 +40,7 @@ from greybox.estimation.noise import (
 )
 from greybox.estimation.registry import ESTIMATORS
 from greybox.estimation.result import Estimate
-from greybox.estimation.solve import Covariance, solve_iv, solve_ls
+from greybox.estimation.solve import solve_iv, solve_ls
 from greybox.estimation.values import Iteration
 from greybox.estimation.verdict import UNJUDGED
 from greybox.model.predictor import Predictor
@@ -193,7 +195,7 @@ def estimate_refined_iv(
     heading: Literal["measured", "simulated"] = "measured",
     wind: Literal["smoothed", "measured"] = "smoothed",
     margins: dict[str, float] | None = None,
-    covariance: Covariance = "ma",
+    covariance: Covariance = "cluster",
     seed: int = 0,
 ) -> Estimate:
     """Estimate the parameters by refined instrumental variables, all equations jointly.
@@ -214,7 +216,7 @@ def estimate_refined_iv(
     heading, wind, margins, seed
         As `estimate_iv`; a measured heading is smoothed along the predicted yaw rate, so that
         its noise does not stand in the instruments too.
-    covariance : {"ma", "hac", "white", "bootstrap"}
+    covariance : {"cluster", "ma", "hac", "white", "bootstrap"}
         ``white`` believes the noise model, which is then as efficient as it says;
         the others allow for innovations that keep some colour.
 
@@ -242,15 +244,16 @@ def estimate_refined_iv(
     plain = start if isinstance(start, Estimate) and own else None
     if plain is None:
         plain = solve_iv(problem, start=start).estimate(None)
-    return refine_by_noise(problem, plain, covariance, seed)
+    return refine_by_noise(problem, plain, covariance, seed)[0]
 
 
 def refine_by_noise(
-    problem: RegressionProblem, plain: Estimate, covariance: Covariance = "ma", seed: int = 0
-) -> Estimate:
+    problem: RegressionProblem, plain: Estimate, covariance: Covariance = "cluster", seed: int = 0
+) -> tuple[Estimate, WhiteEquations]:
     """Refine a plain estimate of a problem, whose standard errors may be left out.
 
-    Parameters and errors are those of `estimate_refined_iv`.
+    Parameters and errors are those of `estimate_refined_iv`; the equations that the refined
+    estimate solves are returned with it.
     """
     logs, regression = problem.logs, problem.regression
     work = _Refinement(problem)
@@ -269,7 +272,7 @@ def refine_by_noise(
         seed=seed,
     )
     vessel = logs[0].vessel
-    return replace(
+    estimate = replace(
         plain,
         theta=theta,
         covariance=matrix,
@@ -296,6 +299,7 @@ def refine_by_noise(
         prefilter="noise",
         noise=noise_levels_of(found.fit, states, vessel, regression.sample_time),
     )
+    return estimate, WhiteEquations(tuple(found.rows), found.inverse, len(states))
 
 
 @dataclass(frozen=True)

@@ -4,20 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import ExcitationError, UsageError
 from greybox.estimation.covariance import (
+    Covariance,
     CovarianceKind,
+    allow_for_segments,
     block_bootstrap,
     score_covariance,
+    segment_sums,
 )
 from greybox.estimation.disturbance import estimate_current
 from greybox.estimation.error_variance_profile import ErrorVarianceProfile, error_variance_profiles
 from greybox.estimation.normal_equations import Solution, solve_stacked
+from greybox.estimation.registry import ESTIMATORS
 from greybox.estimation.result import Estimate
 from greybox.estimation.values import Iteration, estimation_data
 from greybox.model.predictor import Predictor
@@ -27,8 +30,6 @@ from greybox.regression.problem import RegressionProblem
 from greybox.regression.regression import Regression
 
 Array = NDArray[np.float64]
-Covariance = Literal["hac", "ma", "white", "bootstrap"]
-
 # scaled singular value below which a direction counts as not excited
 SINGULAR = 1e-8
 _NO_ITERATION = Iteration()
@@ -171,7 +172,7 @@ class Solved:
 
         Parameters
         ----------
-        covariance : {"ma", "hac", "white", "bootstrap"}, optional
+        covariance : {"cluster", "ma", "hac", "white", "bootstrap"}, optional
             None leaves standard errors out, where they will not be looked at.
         seed : int
         """
@@ -183,7 +184,7 @@ class Solved:
         if covariance is not None:
             shapes = (
                 error_variance_profiles(predictor, logs, theta, residuals, self.keep)
-                if covariance == "ma"
+                if _base(self.method, covariance) == "ma"
                 else ()
             )
             matrix, lags = _covariance(self, projected, residuals, covariance, seed, shapes)
@@ -367,13 +368,24 @@ def _covariance(
             np.concatenate([predictor.equation(s) for s in predictor.structure.states])
         )
         return np.cov(draws[:, order].T).reshape(p, p), 0
-    robust: CovarianceKind = kind
-    middle, lags = score_covariance(projected, residuals, robust, shapes=shapes)
+    base = _base(solved.method, kind)
+    middle, lags = score_covariance(projected, residuals, base, shapes=shapes)
     inverse = np.zeros((p, p))
-    for state, solution in zip(predictor.structure.states, solved.solutions, strict=True):
-        mine = predictor.equation(state)
+    own = [predictor.equation(s) for s in predictor.structure.states]
+    for mine, solution in zip(own, solved.solutions, strict=True):
         inverse[np.ix_(mine, mine)] = scaled_inverse(solution.information)
     # degrees of freedom, as statsmodels counts them
     rows = regression.kept
-    largest = max(len(predictor.equation(s)) for s in predictor.structure.states)
-    return inverse @ middle @ inverse.T * rows / max(rows - largest, 1), lags
+    largest = max(map(len, own))
+    found = inverse @ middle @ inverse.T * rows / max(rows - largest, 1)
+    if kind == "cluster":
+        sums = [segment_sums(z, e, lags) for z, e in zip(projected, residuals, strict=True)]
+        found = allow_for_segments(found, sums, [inverse[np.ix_(m, m)] for m in own])
+    return found, lags
+
+
+def _base(method: str, kind: Covariance) -> CovarianceKind:
+    """Return what the spread between segments is laid over: a noise model only where it holds."""
+    if kind == "cluster" or kind == "bootstrap":
+        return "hac" if ESTIMATORS[method].biased_by_noise else "ma"
+    return kind

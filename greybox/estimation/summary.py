@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 from greybox.estimation.tried import told
 from greybox.estimation.values import EstimateValues
@@ -132,13 +132,12 @@ def _head(estimate: EstimateValues) -> list[str]:
 
 
 def _table(estimate: EstimateValues) -> list[str]:
-    sets, plain = weak_safe_sets(estimate.tests), plain_estimates(estimate)
+    sets = weak_safe_sets(estimate.tests)
     # only instruments can be weak
-    beside = 10 if plain else 0
-    safe = (23 if plain else 24) if sets else 0
+    safe = 24 if sets else 0
     lines = [
         f"{'parameter':<12}{'value':>10}{'std err':>9}{'[0.025':>11}{'0.975]':>11}"
-        f"{'plain IV' if plain else '':>{beside}}{'weak-safe 95 %' if sets else '':>{safe}}"
+        f"{'weak-safe 95 %' if sets else '':>{safe}}"
         f"{'per second':>11}  unit"
     ]
     unit, errors = estimate.vessel.force_unit, estimate.std
@@ -153,7 +152,7 @@ def _table(estimate: EstimateValues) -> list[str]:
             term = structure.terms[structure.index(column.terms[0])]
             lines.append(
                 f"{column.label:<12}{value:>10.4g}{std:>9.2g}{value - 1.96 * std:>11.4g}"
-                f"{value + 1.96 * std:>11.4g}{own_value(plain, column.label):>{beside}}"
+                f"{value + 1.96 * std:>11.4g}"
                 f"{set_in_words(sets.get(column.label)):>{safe}}"
                 f"{value / estimate.sample_time:>11.4g}  {parameter_unit(term, unit)}"
             )
@@ -161,27 +160,15 @@ def _table(estimate: EstimateValues) -> list[str]:
 
 
 def weak_safe_sets(tests: Sequence[TestResult]) -> dict[str, Pieces]:
-    """Return the sets (95 %) that hold however weak the instruments are, by parameter."""
+    """Return the sets (95 %) that hold however weak the instruments are, by parameter.
+
+    Those that belong to another estimate than the one tested are left out.
+    """
     sets: dict[str, Pieces] = {}
     for test in tests:
-        if test.kind == "anderson_rubin":
-            sets |= test.detail.get("sets", {})
+        if test.kind == "anderson_rubin" and test.detail.get("of") == "estimate":
+            sets |= test.detail["sets"]
     return sets
-
-
-def plain_estimates(estimate: EstimateValues) -> dict[str, float]:
-    """Return the plain estimates that those sets belong to, where the estimate is another one."""
-    own: dict[str, float] = {}
-    if estimate.prefilter == "noise":
-        for test in estimate.tests:
-            if test.kind == "anderson_rubin":
-                own |= test.detail.get("estimates", {})
-    return own
-
-
-def own_value(plain: Mapping[str, float], label: str) -> str:
-    """Return a plain estimate as it stands in a table: nothing where there is none."""
-    return f"{plain[label]:.4g}" if label in plain else ""
 
 
 def set_in_words(pieces: Pieces | None) -> str:

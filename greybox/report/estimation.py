@@ -14,8 +14,6 @@ from greybox.estimation.result import Estimate
 from greybox.estimation.summary import (
     BOUNDS,
     grouped,
-    own_value,
-    plain_estimates,
     set_in_words,
     weak_safe_sets,
     whose,
@@ -207,10 +205,7 @@ def _parameters(predicts: Estimate) -> Section:
     ]  # fmt: skip
     caption = "95 % intervals relative to each value; at −100 % a parameter would be zero."
     if sets:
-        caption += (
-            " Light: what the instruments alone allow, before any refinement, safe even where "
-            "they are weak."
-        )
+        caption += " Light: what the instruments allow, safe even where they are weak."
     if wide:
         caption += f" Wider than drawn: {', '.join(wide)}."
     worst = "; ".join(
@@ -286,13 +281,12 @@ def _parameter_table(estimate: EstimateValues) -> Table:
     place = list(estimate.predictor.parameter_columns)
     theta, std = estimate.theta[place], estimate.std[place]
     labels, units = estimate.labels, _units(estimate)
-    sets, plain = weak_safe_sets(estimate.tests), plain_estimates(estimate)
+    sets = weak_safe_sets(estimate.tests)
     rows = []
     for name, unit, value, error in zip(labels, units, theta, std, strict=True):
         row = [
             name, f"{value:.4g}", f"{error:.2g}",
             f"{value - 1.96 * error:.4g} to {value + 1.96 * error:.4g}",
-            *([own_value(plain, name)] if plain else []),
             *([set_in_words(sets.get(name))] if sets else []),
             f"{value / estimate.sample_time:.4g}", unit,
             "not to rely on" if name in estimate.verdict.excepted else "",
@@ -302,7 +296,7 @@ def _parameter_table(estimate: EstimateValues) -> Table:
         f"Parameters per sample of {estimate.sample_time:g} s, and per second",
         [
             "parameter", "value", "std error", "95 % interval",
-            *(["plain IV"] if plain else []), *(["safe if weak"] if sets else []),
+            *(["safe if weak"] if sets else []),
             "per second", "unit per sample", "",
         ],
         rows,

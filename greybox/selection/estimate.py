@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from greybox.credibility.verdict import free_run_faults, misfit, weigh
 from greybox.errors import ExcitationError, GreyboxError, LogError, OutOfTimeError, UsageError
 from greybox.estimation.closed_loop import Loop
+from greybox.estimation.covariance import Covariance
 from greybox.estimation.efficiency_bounds import limits_of
 from greybox.estimation.output_error import OutputErrorOptions
 from greybox.estimation.prediction_verdict import (
@@ -27,7 +28,6 @@ from greybox.estimation.prediction_verdict import (
 )
 from greybox.estimation.registry import ESTIMATORS, free_run_estimator
 from greybox.estimation.result import Estimate
-from greybox.estimation.solve import Covariance
 from greybox.estimation.tried import Comparison
 from greybox.estimation.verdict import Divergence, TrustLevel, Verdict, refused
 from greybox.model.catalogue import structure_for
@@ -122,8 +122,8 @@ def estimate_model(
         As `get_structure`; by default chosen.
     margins : mapping of str to float, optional
         |u|, |v| [m/s] below which samples are cut out.
-    covariance : {"ma", "hac", "white", "bootstrap"}, optional
-        What the standard errors allow for; by default the method's own.
+    covariance : {"cluster", "ma", "hac", "white", "bootstrap"}, optional
+        What the standard errors allow for; by default ``cluster``.
     heading : {"measured", "simulated"}
         Heading inside the instruments.
     loop : {"auto", "open", "closed"}

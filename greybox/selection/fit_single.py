@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 
 from greybox.credibility.judge import run_tests
 from greybox.credibility.verdict import weigh
+from greybox.estimation.covariance import Covariance
 from greybox.estimation.informative import require_informative
 from greybox.estimation.problem import EstimationOptions, EstimationProblem, Fitted
 from greybox.estimation.registry import ESTIMATORS
 from greybox.estimation.result import Estimate
-from greybox.estimation.solve import Covariance, Solved, solve_iv, solve_ls
+from greybox.estimation.solve import Solved, solve_iv, solve_ls
 from greybox.model.predictor import Predictor
 from greybox.model.predictor_kinds import PREDICTORS
 from greybox.model.structure import Structure
@@ -36,7 +37,7 @@ def estimate_ls(
     logs: Logs,
     *,
     margins: dict[str, float] | None = None,
-    covariance: Covariance = "hac",
+    covariance: Covariance = "cluster",
     seed: int = 0,
     judged: bool = True,
 ) -> Estimate:
@@ -51,8 +52,9 @@ def estimate_ls(
         One experiment each.
     margins : dict of str to float, optional
         Rows with |state| below are left out (Remark 4.2) [m/s, rad/s].
-    covariance : {"hac", "ma", "white", "bootstrap"}
-        ``hac`` by default: regressors that hold the noise rule ``ma`` out.
+    covariance : {"cluster", "hac", "ma", "white", "bootstrap"}
+        ``cluster``: the larger of ``hac`` and of the spread of the scores between segments
+        of the logs (CR2, Student's t). Regressors that hold the noise rule ``ma`` out.
     seed : int
         For the bootstrap.
     judged : bool
@@ -89,7 +91,7 @@ def estimate_iv(
     wind: Literal["smoothed", "measured"] = "smoothed",
     lag: int = 0,
     margins: dict[str, float] | None = None,
-    covariance: Covariance = "ma",
+    covariance: Covariance = "cluster",
     metric: str = "moments",
     seed: int = 0,
     judged: bool = True,
@@ -115,10 +117,11 @@ def estimate_iv(
         Wind in the instruments, as `build_instruments`.
     lag : int
         Delay of the instruments in samples, for logs in closed loop.
-    covariance : {"ma", "hac", "white", "bootstrap"}
-        ``ma`` by default, C = G⁻¹ (Σ Z R Zᵀ) G⁻ᵀ: the equation error is a moving
-        average and the instruments are independent of it. ``hac`` where the
-        noise changes its size along the log; it is noisier.
+    covariance : {"cluster", "ma", "hac", "white", "bootstrap"}
+        ``ma``, C = G⁻¹ (Σ Z R Zᵀ) G⁻ᵀ: the equation error is a moving average and the
+        instruments are independent of it. ``cluster`` is that, or more where the scores
+        differ more between segments of the logs, as they do where the structure is only
+        nearly right. ``hac`` where the noise changes its size along the log.
     margins, seed, judged
         As `estimate_ls`.
     metric : {"moments", "identity"}

@@ -8,9 +8,9 @@ from typing import Literal, get_args
 
 from greybox.errors import UsageError, suggestion
 from greybox.estimation.closed_loop import Loop
+from greybox.estimation.covariance import Covariance
 from greybox.estimation.problem import EstimationOptions
 from greybox.estimation.registry import ESTIMATORS
-from greybox.estimation.solve import Covariance
 from greybox.model.predictor_kinds import PREDICTORS
 from greybox.numerics.effort import EFFORT
 from greybox.trial.log import TrialLog
@@ -88,9 +88,4 @@ class Request(EstimationOptions):
 
 def regression_only(request: Request) -> bool:
     """Whether the request holds what only an estimate from one-step equations can heed."""
-    return (
-        bool(request.margins)
-        or request.covariance == "bootstrap"
-        or request.prefilter == "noise"
-        or not request.zero_mean
-    )
+    return bool(request.margins) or request.prefilter == "noise" or not request.zero_mean

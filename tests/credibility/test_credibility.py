@@ -419,7 +419,10 @@ def result(kind, passed, parameters=(), p=None, state="", **detail):
 def test_the_summary_keeps_to_a_hundred_columns(good):
     rays = replace(
         by_name(good)["anderson_rubin_u"],
-        detail={"sets": {"Xu": [[None, -0.00257], [0.00251, None]], "Xvr": [[None, None]]}},
+        detail={
+            "sets": {"Xu": [[None, -0.00257], [0.00251, None]], "Xvr": [[None, None]]},
+            "of": "estimate",
+        },
     )
     text = replace(good, tests=(*good.tests, rays), notes=("a note " * 40,)).summary()
     assert max(len(line) for line in text.splitlines()) <= 100

@@ -13,7 +13,7 @@ from greybox.credibility.evidence import Equation
 from greybox.credibility.score_statistic import score_test
 from greybox.credibility.weak import measure_strength
 from greybox.estimation.arma_noise import WHITE, fit_arma_noise
-from greybox.estimation.covariance import score_covariance
+from greybox.estimation.covariance import cluster_std, score_covariance, segment_sums
 from greybox.estimation.normal_equations import solve_stacked
 
 ROWS = 400
@@ -93,6 +93,53 @@ def test_least_squares_with_memory_equals_statsmodels():
     inverse = np.linalg.inv(solution.information)
     np.testing.assert_allclose(solution.theta, oracle.params, rtol=1e-8)
     np.testing.assert_allclose(inverse @ middle @ inverse, oracle.cov_params(), rtol=1e-8)
+
+
+def clustered(x, y, lengths):
+    """Residuals, segment sums (logs of these lengths) and bread of least squares on x (p, N)."""
+    residual = y - np.linalg.lstsq(x.T, y, rcond=None)[0] @ x
+    ends = np.cumsum(lengths)[:-1]
+    sums = segment_sums(np.split(x, ends, axis=1), np.split(residual, ends), 0)
+    return residual, sums, np.linalg.inv(x @ x.T)
+
+
+def test_alike_segments_equal_the_clusters_of_statsmodels():
+    """Where all segments move alike, CR2 is the sandwich times G/(G - 1)."""
+    rng = np.random.default_rng(6)
+    x = np.tile(rng.normal(size=(3, 12)), 30)
+    y = np.array([1.0, -2.0, 0.5]) @ x + np.repeat(rng.normal(size=30), 12) * x[0]
+    y += rng.normal(size=360)
+    groups = np.repeat(np.arange(30), 12)
+    kwds = {"groups": groups, "use_correction": False}
+    oracle = sm.OLS(y, x.T).fit(cov_type="cluster", cov_kwds=kwds)
+    _, sums, bread = clustered(x, y, [12] * 30)
+    assert len(sums[0]) == 30
+    std, freedom = cluster_std(*sums, bread)
+    np.testing.assert_allclose(std, oracle.bse * np.sqrt(30 / 29), rtol=1e-8)
+    np.testing.assert_allclose(freedom, 29, rtol=1e-8)
+
+
+def test_segments_equal_bell_and_mccaffrey_by_matrices_of_rows():
+    """Logs of two lengths, cut into 13 and 17 segments; units far apart."""
+    rng = np.random.default_rng(7)
+    x = rng.normal(size=(3, 240)) * [[1.0], [1.0], [1e4]] * np.linspace(0.2, 2, 240)
+    y = np.array([1.0, 2.0, 3e-4]) @ x + rng.normal(size=240)
+    residual, sums, bread = clustered(x, y, [104, 136])
+    std, freedom = cluster_std(*sums, bread)
+    edges = [*np.linspace(0, 104, 14).astype(int), *(104 + np.linspace(0, 136, 18).astype(int))]
+    hat = np.eye(240) - x.T @ bread @ x
+    variance, weights = np.zeros(3), []
+    for a, b in pairwise(edges):
+        if a == b:
+            continue
+        values, vectors = np.linalg.eigh(hat[a:b, a:b])
+        into = bread @ x[:, a:b] @ (vectors / np.sqrt(values)) @ vectors.T
+        variance += (into @ residual[a:b]) ** 2
+        weights.append(into @ hat[a:b])
+    np.testing.assert_allclose(std, np.sqrt(variance), rtol=1e-8)
+    omega = np.einsum("gpn,hpn->pgh", weights, weights)
+    expected = np.trace(omega, axis1=1, axis2=2) ** 2 / (omega**2).sum(axis=(1, 2))
+    np.testing.assert_allclose(freedom, expected, rtol=1e-8)
 
 
 def test_sargan_and_its_robust_form():

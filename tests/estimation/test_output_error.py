@@ -762,7 +762,6 @@ class TestCommand:
         [
             (["--bound", "Xu=1"], "write NAME=LOW:HIGH"),
             (["--margin-u", "0.1"], "a free run needs every one"),
-            (["--covariance", "bootstrap"], "use --covariance ma, hac or white"),
         ],
     )
     def test_wrong_options_are_said(self, tmp_path, noisy, capsys, words, said):

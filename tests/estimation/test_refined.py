@@ -22,6 +22,7 @@ from greybox.estimation.noise import (
     fit_noise,
 )
 from greybox.estimation.refined import estimate_refined_iv, with_noise
+from greybox.estimation.summary import weak_safe_sets
 from greybox.model.catalogue import get_structure
 from greybox.model.model import model_from_dict
 from greybox.model.noise import NoiseLevels
@@ -79,7 +80,7 @@ def basic(thesis):
 
 @pytest.fixture(scope="module")
 def refined(basic, still_log):
-    return estimate_refined_iv(basic, [still_log])
+    return estimate_refined_iv(basic, [still_log], covariance="ma")
 
 
 @pytest.mark.parametrize("remembers", [False, True])
@@ -189,7 +190,7 @@ def test_two_logs_halve_the_variance_bound(basic, still_log, true_theta):
     np.testing.assert_allclose(two, one / 2, rtol=1e-8)
 
 
-@pytest.mark.parametrize("kind", ["hac", "white", "bootstrap"])
+@pytest.mark.parametrize("kind", ["cluster", "hac", "white", "bootstrap"])
 def test_other_covariances_agree(basic, still_log, refined, kind):
     plain = estimate_iv(basic, [still_log])
     other = estimate_refined_iv(basic, [still_log], start=plain, covariance=kind)
@@ -317,20 +318,30 @@ def test_a_short_log_is_estimated(basic):
     assert (estimate.std > 0).all()
 
 
-def test_sets_that_hold_under_weak_instruments_stand_beside_their_own_estimate(thesis):
+def sets_shown(estimate):
+    """Sets that hold under weak instruments, as the summary shows them."""
+    sets = weak_safe_sets(estimate.tests)
+    assert ("weak-safe" in estimate.summary()) == bool(sets)
+    return sets
+
+
+@pytest.mark.parametrize("prefilter", ["noise", "none"])
+def test_sets_that_hold_under_weak_instruments_belong_to_the_estimate(thesis, prefilter):
     log = virtual_log(11, 700)
-    found = estimate_once([log], thesis, "iv", "augmented", Request(prefilter="noise"))
-    shown = 0
-    for test in found.tests:
-        if test.kind == "anderson_rubin":
-            for label, pieces in test.detail["sets"].items():
-                own = test.detail["estimates"][label]
-                assert any((a is None or a <= own) and (b is None or own <= b) for a, b in pieces)
-                assert f"{own:.4g}" in found.summary()
-                shown += 1
-    assert shown == len(found.labels)
-    assert "plain IV" in found.summary()
-    assert "plain IV" not in estimate_iv(found.predictor, [log]).summary()
+    found = estimate_once([log], thesis, "iv", "augmented", Request(prefilter=prefilter))
+    sets = sets_shown(found)
+    assert set(sets) == set(found.labels)
+    for label, value, std in zip(found.labels, found.params, found.std_errors, strict=True):
+        assert any((a is None or a <= value) and (b is None or value <= b) for a, b in sets[label])
+        low, high = sets[label][0]
+        # never surer than the interval beside it
+        assert low is None or high is None or high - low > 2 * 1.9 * std
+
+
+def test_no_other_estimate_shows_sets_of_instruments(basic, still_log):
+    assert not sets_shown(estimate_ls(basic, [still_log]))
+    test = next(t for t in estimate_ls(basic, [still_log]).tests if t.kind == "anderson_rubin")
+    assert test.sentence.startswith("of plain instrumental variables beside this estimate")
 
 
 def test_the_choice_says_why_it_does_not_refine(thesis, still_log):

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Literal
 from greybox.estimation.registry import Estimator
 
 if TYPE_CHECKING:
+    from greybox.estimation.gls_regression import WhiteEquations
     from greybox.estimation.problem import EstimationProblem, Fitted
     from greybox.estimation.result import Estimate
     from greybox.estimation.solve import Solved
@@ -35,7 +36,7 @@ def _fit(problem: EstimationProblem) -> Fitted:
         return solve_iv(regression, start=problem.nominal_theta, refine=problem.refine)
 
     def finish(solved: Solved, notes: list[str]) -> Fitted:
-        estimate = _prefiltered(solved, problem, closed, notes)
+        estimate, white = _prefiltered(solved, problem, closed, notes)
         if problem.kind.air_measured:
             notes.append(
                 f"the wind in the instruments is the measured one averaged over {WIND_WINDOW:g} s, "
@@ -46,7 +47,7 @@ def _fit(problem: EstimationProblem) -> Fitted:
                 "move the wind terms towards zero and, in a nearly steady wind, the current with "
                 "them. Give wind_std in [sensors] where there is some; the wind is then averaged."
             )
-        return Fitted(estimate, solved.problem)
+        return Fitted(estimate, solved.problem, white=white)
 
     predictor = problem.predictor(intercept=not problem.zero_mean)
     return problem.fit_regression("iv", predictor, plain, finish)
@@ -57,7 +58,7 @@ def _prefiltered(
     problem: EstimationProblem,
     closed: bool,
     notes: list[str],
-) -> Estimate:
+) -> tuple[Estimate, WhiteEquations | None]:
     """Refine a plain IV estimate by its noise, unless something speaks against it.
 
     Raises
@@ -70,7 +71,7 @@ def _prefiltered(
     from greybox.errors import ExcitationError, UsageError
     from greybox.estimation.refined import add_noise, refine_by_noise
 
-    kind = problem.covariance or "ma"
+    kind = problem.covariance or "cluster"
     against = ""
     if closed:
         against = "instruments are delayed for the closed loop, which a prefilter would undo"
@@ -84,12 +85,14 @@ def _prefiltered(
     if problem.prefilter != "none" and not against:
         try:
             # standard errors of the plain estimate would be those of another one
-            refined = refine_by_noise(solved.problem, solved.estimate(None), kind, problem.seed)
+            refined, white = refine_by_noise(
+                solved.problem, solved.estimate(None), kind, problem.seed
+            )
             if problem.prefilter == "noise":
-                return refined
+                return refined, white
             mixed = solved.problem.wind == "measured" and _pushed_through_air(refined)
             if problem.stays_bounded(refined) and not mixed:
-                return refined
+                return refined, white
             against = (
                 "something beside the model moves the ship, and the measured wind, which holds "
                 "that motion, would be mixed into its neighbours (give wind_std in [sensors])"
@@ -103,7 +106,7 @@ def _prefiltered(
     if against and problem.prefilter == "auto":
         notes.append(f"the instruments were not refined by the noise: {against}.")
     plain = solved.estimate(kind, problem.seed)
-    return add_noise(solved.problem, plain) if problem.judged else plain
+    return add_noise(solved.problem, plain) if problem.judged else plain, None
 
 
 def _pushed_through_air(estimate: Estimate) -> bool:

@@ -23,7 +23,7 @@ def _fit(problem: EstimationProblem) -> Fitted:
         )
 
     def finish(solved: Solved, notes: list[str]) -> Fitted:
-        estimate = solved.estimate(problem.covariance or "hac", problem.seed)
+        estimate = solved.estimate(problem.covariance or "cluster", problem.seed)
         return Fitted(estimate, solved.problem, solved)
 
     return problem.fit_regression("ls", problem.predictor(intercept=True), fit, finish)

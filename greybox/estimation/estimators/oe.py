@@ -29,14 +29,9 @@ def _fit(problem: EstimationProblem) -> Fitted:
             f"margins cut samples out of a regression, and a free run needs every one: leave "
             f"--margin-{min(problem.margins)} out, or use --method iv."
         )
-    if problem.covariance == "bootstrap":
-        raise UsageError(
-            "the block bootstrap resamples rows of a regression: use --covariance ma, hac or white "
-            "with --method oe."
-        )
     options = problem.output_error
     if problem.covariance is not None:
-        options = replace(options, covariance=problem.covariance)
+        options = replace(options, covariance=problem.covariance, seed=problem.seed)
     start = problem.nominal_theta if problem.start is None else problem.start
     notes = ["it started from the nominal model."]
     if problem.nominal_theta is not None:
