@@ -121,7 +121,11 @@ def _residuals(
     states = predictor.structure.states
     found: list[list[Array]] = [[] for _ in states]
     free_run = ESTIMATORS[estimate.method].free_run
-    model = output_model(predictor, estimate.sample_time) if free_run else None
+    model = (
+        output_model(predictor, estimate.sample_time, integrator=estimate.integrator)
+        if free_run
+        else None
+    )
     current = {n: v for n, v, _ in estimate.current}
     for e, log, rows in zip(regression.experiments, logs, keep, strict=True):
         if model is not None:

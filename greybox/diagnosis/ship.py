@@ -134,6 +134,7 @@ class LogRun:
     ) -> None:
         self.structure, self.log, self.integrator = structure, log, integrator
         self.samples, self.sample_time = len(log), log.sample_time
+        self._logged_time = log.logged_time
         self.time = log.t - (log.t[0] if origin is None else origin)
         self.states = structure.states
         self._turns = "r" in self.states and "psi" in log
@@ -153,7 +154,8 @@ class LogRun:
         """Return the generalised inputs (N, nu) as the vessel's thrusters give them."""
         known = self._forces
         if known is None or known[0] is not vessel or known[1] != wires:
-            made = actuated_force(vessel, wired(self._commands, wires), self.sample_time)
+            commands = wired(self._commands, wires)
+            made = actuated_force(vessel, commands, self.sample_time, self._logged_time)
             zero = np.zeros(self.samples)
             tau = np.column_stack([made.get(n, zero) for n in self.structure.inputs])
             self._forces = known = (vessel, wires, tau)

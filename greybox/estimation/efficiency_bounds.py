@@ -27,7 +27,7 @@ from greybox.estimation.result import Estimate
 from greybox.estimation.shooting import Measured, Segments, cut
 from greybox.estimation.values import EfficiencyBound
 from greybox.model.noise import NoiseLevels
-from greybox.model.output import OutputModel
+from greybox.model.output import OutputModel, Role
 from greybox.model.run.output_runs import Simulator
 from greybox.numerics.linalg import scaled, scaled_inverse, scaled_logdet
 from greybox.trial.log import TrialLog
@@ -199,7 +199,8 @@ def _parameter_bound(estimate: Estimate, logs: Sequence[TrialLog], noise: NoiseL
         predictor = output_predictor(own.structure, own.kind, own.regime)
     turns = own.structure.turns
     seen = turns and noise.heading > 0 and all("psi" in log for log in logs)
-    model = output_model(predictor, estimate.sample_time, "output" if seen else "input")
+    heading: Role = "output" if seen else "input"
+    model = output_model(predictor, estimate.sample_time, heading, integrator=estimate.integrator)
     p = np.zeros(len(model.parameters))
     theta = dict(zip(own.structure.parameters, estimate.structure_theta(), strict=True))
     for i in predictor.parameter_columns:

@@ -52,6 +52,7 @@ from greybox.model.noise import NoiseLevels
 from greybox.model.output import OutputModel, Role
 from greybox.model.predictor import Predictor
 from greybox.model.run.output_runs import Simulator
+from greybox.model.run.step import Integrator
 from greybox.numerics.linalg import scaled, scaled_inverse
 from greybox.public import known_keywords, one_thread
 from greybox.regression.regression import common_sample_time
@@ -126,6 +127,8 @@ class OutputErrorOptions:
         Whether the noise levels of sensors and process are sought once the fit has ended.
     seed : int
         For the bootstrap.
+    integrator : {"euler", "rk4"}
+        Of the runs, and of the model that is estimated.
     """
 
     process_noise: bool = False
@@ -142,6 +145,7 @@ class OutputErrorOptions:
     starts: Literal["free", "measured"] = "free"
     levels: bool = True
     seed: int = 0
+    integrator: Integrator = "euler"
 
 
 @known_keywords
@@ -258,7 +262,7 @@ def _fit(
     near = not options.search or (options.weights == "deviation" and start is not None)
 
     def free_run(heading: Role, p: Array | None = None, *, once: bool = False) -> _Fitted:
-        model = output_model(predictor, sample_time, heading, options.wind)
+        model = output_model(predictor, sample_time, heading, options.wind, options.integrator)
         data = [measured(model, log) for log in logs]
         _require_rows(model, data)
         restrictions = _restrictions(model, options)
@@ -486,6 +490,7 @@ def _result(fitted: _Fitted, logs: Sequence[TrialLog], options: OutputErrorOptio
         current_covariance=covariance[np.ix_([*range(count), *flow], flow)],
         noise=_noise_levels(fitted, logs, options.weights) if options.levels else None,
         notes=tuple(notes),
+        integrator=options.integrator,
         tests=(
             *_excitation_tests(model, fitted.hessian, bound),
             *(_slow_tests(fitted.slow) if options.levels and not options.process_noise else ()),

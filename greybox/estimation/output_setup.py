@@ -15,6 +15,7 @@ from greybox.model.output import OutputModel, Role, current_means
 from greybox.model.predictor import Predictor, Regime, build_predictor
 from greybox.model.predictor_kinds import PREDICTORS
 from greybox.model.run.inputs import LogInputs
+from greybox.model.run.step import Integrator, held
 from greybox.model.structure import Structure
 from greybox.trial.log import TrialLog
 
@@ -49,7 +50,11 @@ def output_predictor(structure: Structure, kind: str, regime: Regime) -> Predict
 
 
 def output_model(
-    predictor: Predictor, sample_time: float, heading: Role = "input", wind: Role = "input"
+    predictor: Predictor,
+    sample_time: float,
+    heading: Role = "input",
+    wind: Role = "input",
+    integrator: Integrator = "euler",
 ) -> OutputModel:
     """Return the simulator of a predictor's kind, its unknown means as parameters."""
     means: tuple[str, ...] = ()
@@ -57,7 +62,7 @@ def output_model(
         means = current_means(predictor)
     if wind == "output":
         means = (*means, *WIND)
-    return OutputModel(predictor, sample_time, heading, wind, means)
+    return OutputModel(predictor, sample_time, heading, wind, means, integrator)
 
 
 def measured(model: OutputModel, log: TrialLog) -> Measured:
@@ -81,8 +86,12 @@ def measured(model: OutputModel, log: TrialLog) -> Measured:
     def signal(name: str) -> Array:
         return np.asarray(given[name] if name in given else log[name])
 
+    def driver(name: str) -> Array:
+        value = signal(name)
+        return value if name in structure.inputs else held(value, model.integrator)
+
     return Measured(
-        np.column_stack([signal(n) for n in model.drivers]),
+        np.column_stack([driver(n) for n in model.drivers]),
         np.column_stack([signal(n) for n in model.outputs]),
         log.known(model.outputs),
     )

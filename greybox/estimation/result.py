@@ -75,6 +75,8 @@ class Estimate(EstimateValues, DisplayMixin):
         How far bands must reach, by logs that were left out in turn.
     tried : tuple of Comparison
         What was compared on the way to it, with every score.
+    integrator : {"euler", "rk4"}
+        Of the model's steps.
     coefficients : Estimate, optional
         The estimate that the coefficients' verdict speaks of, where another one predicts
         better: this one is then what simulates.
@@ -242,6 +244,7 @@ class Estimate(EstimateValues, DisplayMixin):
             covariance=self.covariance[np.ix_(keep, keep)],
             sample_time=self.sample_time,
             vessel=self.vessel,
+            integrator=self.integrator,
             disturbances={n: (v, s) for n, v, s in self.current},
             disturbance_covariance=(
                 shared[[*keep, *range(len(self.theta), len(shared))]] if len(shared) else shared

@@ -27,6 +27,9 @@ class TriedModel:
         How the force goes with the speed n of a propeller.
     terms : int
         Parameters of the model.
+    integrator : {"euler", "rk4"}
+    commands : {"held", "interpolated"}
+        What logged commands do between samples.
     score : float or None
         Mean fit of the free runs over the channels [%], each cut at −100; None where there is
         none.
@@ -48,6 +51,8 @@ class TriedModel:
     se: float | None = None
     chosen: bool = False
     note: str = ""
+    integrator: str = "euler"
+    commands: str = "held"
 
     @property
     def label(self) -> str:
@@ -129,11 +134,11 @@ class Comparison(DisplayMixin):
     def table(self) -> tuple[list[str], list[list[str]]]:
         """Return head and rows as they stand in a table."""
         head = ["structure", "taken", "terms", "method", "predictor", "thrust ~", "step [s]",
-                "score [%]", "behind", "std error", ""]  # fmt: skip
+                "integrator", "commands", "score [%]", "behind", "std error", ""]  # fmt: skip
         return head, [
             [
                 r.structure, "taken" if r.chosen else "", str(r.terms), r.method, r.predictor,
-                r.thrust, f"{r.sample_time:g}",
+                r.thrust, f"{r.sample_time:g}", r.integrator, r.commands,
                 *("–" if v is None else f"{v:.1f}" for v in (r.score, r.behind, r.se)),
                 r.note,
             ]

@@ -14,6 +14,7 @@ from greybox.estimation.tried import Comparison
 from greybox.estimation.verdict import UNJUDGED, TestResult, Verdict
 from greybox.model.noise import BandCalibration, NoiseLevels
 from greybox.model.predictor import Predictor
+from greybox.model.run.step import Integrator
 from greybox.trial.actuator_estimate import ActuatorEstimate, known_actuators
 from greybox.trial.log import TrialLog
 from greybox.trial.validity import PooledConditions, pooled_conditions, ranges
@@ -27,6 +28,8 @@ _CHOSEN = {
     "predictor": "predictor",
     "method": "method",
     "thrust": "thrust law",
+    "integrator": "integrator",
+    "commands": "commands between samples",
 }
 
 
@@ -167,6 +170,7 @@ class EstimateValues:
     prediction: PredictionVerdict | None = None
     calibration: BandCalibration | None = None
     tried: tuple[Comparison, ...] = ()
+    integrator: Integrator = "euler"
     coefficients: EstimateValues | None = None
 
     @property

@@ -277,6 +277,11 @@ def _notes(model: ManoeuvringModel, heading: Heading, wind: Wind) -> tuple[str, 
             "a measured heading or wind is held over the step; greybox simulate takes the mean "
             "of this sample and the next"
         )
+    if model.vessel.actuation.between == "interpolated":
+        notes.append(
+            "a command is held over the step; greybox simulate moves those of a log on a straight "
+            "line: give the mean of this sample and the next where they are measured"
+        )
     if model.changes:
         notes.append(
             f"{'; '.join(c.sentence for c in model.changes)}: the time counts from the start of "

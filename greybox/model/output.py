@@ -35,6 +35,7 @@ class OutputModel:
         a constant wind.
     means : tuple of str
         Disturbance means that are parameters, such as the current.
+    integrator : {"euler", "rk4"}
     """
 
     predictor: Predictor
@@ -42,6 +43,7 @@ class OutputModel:
     heading: Role = "input"
     wind: Role = "input"
     means: tuple[str, ...] = ()
+    integrator: Literal["euler", "rk4"] = "euler"
 
     def __post_init__(self) -> None:
         structure = self.predictor.structure

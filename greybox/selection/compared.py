@@ -75,7 +75,29 @@ def terms_tried(choice: TermChoice, found: Estimate, logs: Sequence[TrialLog]) -
         "n|n|, as propeller theory has it, unless another leaves an error that is 10 % smaller",
         tuple(laws),
     )
-    return [by_law, by_terms] if len(laws) > 1 else [by_terms]
+    usable = [s for s in choice.steps if np.isfinite(s[1])]
+    taken = next((s[0] for s in usable if s[2] <= s[3]), None)
+    by_step = Comparison(
+        "integrator, and commands between samples",
+        "free runs of these terms on parts of the logs that were left out in turn",
+        "the first stays unless it falls behind the best by more than one standard error",
+        tuple(
+            replace(
+                selected,
+                structure=f"steps by {step.integrator}, commands {step.commands}",
+                integrator=step.integrator,
+                commands=step.commands,
+                score=score if np.isfinite(score) else None,
+                behind=behind if np.isfinite(score) else None,
+                se=se if np.isfinite(score) else None,
+                chosen=step == taken,
+                note="" if np.isfinite(score) else OVER,
+            )
+            for step, score, behind, se in choice.steps
+        ),
+    )
+    tables = [(by_law, len(laws) > 1), (by_terms, True), (by_step, bool(choice.steps))]
+    return [compared for compared, shown in tables if shown]
 
 
 def runs_tried(

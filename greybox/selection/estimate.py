@@ -453,6 +453,7 @@ def _of_terms(
         levels=request.judged,
         heading="input",
         damping="enforce",
+        integrator=terms.integrator,
     )
     start = nominal_model(terms.structure, terms.start, logs)
     asked = replace(request, nominal=start, output_error=options)

@@ -34,6 +34,7 @@ from greybox.estimation.shooting import (
     measured_starts,
     solve_step,
 )
+from greybox.model.run.step import Integrator
 from greybox.model.structure import Structure
 from greybox.numerics.effort import require_time, seconds_left
 from greybox.numerics.linalg import scaled_inverse
@@ -112,8 +113,7 @@ class FreeRunSelection:
     family : Structure
     kind : str
         Predictor whose disturbance means may be selected too.
-    deviation : ndarray, optional
-        (ny,) what the error of each output is measured in; by default its own deviation.
+    integrator : {"euler", "rk4"}
     """
 
     def __init__(
@@ -121,11 +121,12 @@ class FreeRunSelection:
         logs: Sequence[TrialLog],
         family: Structure,
         kind: str,
-        deviation: Array | None = None,
+        integrator: Integrator = "euler",
     ) -> None:
-        self.model = output_model(output_predictor(family, kind, ()), common_sample_time(logs))
+        predictor, step = output_predictor(family, kind, ()), common_sample_time(logs)
+        self.model = output_model(predictor, step, integrator=integrator)
         data = [measured(self.model, log) for log in logs]
-        self.deviation = deviations(data) if deviation is None else deviation
+        self.deviation = deviations(data)
         self._whole = cut(data, max(len(d.y) for d in data))
         self._change = np.maximum(changes(data), 1e-9 * self.deviation)
         self.runs = FreeRuns(self.model, self._whole, self.deviation)
@@ -191,6 +192,11 @@ class FreeRunSelection:
             seen.add(frozenset(active))
             sets.append(self._selected(active, at, "+" + self.names[came]))
         return sets
+
+    def fitted(self, found: Selected) -> Selected:
+        """Return a set of terms with the parameters that fit these logs, from those that it has."""
+        active = [i for i, name in enumerate(self.names) if name in found.terms]
+        return self._selected(active, self._fitted(self.runs, found.p, active), found.change)
 
     def errors(self, p: Array) -> list[Array]:
         """Return what a free run from each log's first samples leaves, (N, ny) a log.

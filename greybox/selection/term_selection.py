@@ -21,6 +21,7 @@ from greybox.estimation.informative import ADVISED_HEADING, heading_range
 from greybox.model.catalogue import structure_for
 from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor_kinds import PREDICTORS
+from greybox.model.run.step import Integrator
 from greybox.model.structure import Structure
 from greybox.numerics.effort import Shares, seconds_left, within
 from greybox.selection.cross_validation import parts_of
@@ -31,6 +32,7 @@ from greybox.trial.log import TrialLog
 from greybox.validation.fit import run_model
 from greybox.vessel.force import force_inputs
 from greybox.vessel.thrust import ThrustLaw
+from greybox.vessel.vessel import Between
 
 Array = NDArray[np.float64]
 _log = logging.getLogger(__name__)
@@ -64,11 +66,13 @@ class Terms:
         Predictor.
     start : ndarray
         (p,) parameters in the order of the structure.
+    integrator : {"euler", "rk4"}
     """
 
     structure: Structure
     kind: str
     start: Array
+    integrator: Integrator = "euler"
 
     @classmethod
     def of(cls, found: Selected, selection: FreeRunSelection, inputs: tuple[str, ...]) -> Terms:
@@ -81,6 +85,14 @@ class Terms:
         if len(names) == len(found.terms):
             kind = PREDICTORS[kind.plain]
         return cls(structure, kind.name, np.array([values[n] for n in structure.parameters]))
+
+
+@dataclass(frozen=True)
+class Step:
+    """How a model goes over a sample, and what logged commands do during it."""
+
+    integrator: Integrator = "euler"
+    commands: Between = "held"
 
 
 @dataclass(frozen=True)
@@ -103,6 +115,9 @@ class TermChoice:
     laws : tuple of (ThrustLaw, float)
         Thrust laws that were compared, each with the mean squared error of the free runs on all
         logs in squared deviations; not finite where time was over.
+    steps : tuple of (Step, float, float, float)
+        Ways over a sample that were compared for these terms: held-out score, how far behind and
+        its standard error, not finite where time was over. The first stays within an error.
     note : str
         The choice in words.
     """
@@ -113,6 +128,7 @@ class TermChoice:
     taken: bool
     rows: tuple[dict[str, Any], ...]
     laws: tuple[tuple[ThrustLaw, float], ...]
+    steps: tuple[tuple[Step, float, float, float], ...]
     note: str
 
 
@@ -214,6 +230,24 @@ def select_terms(
     begun, size_shown = alternatives[shown - 1]
     best = _of_size(whole[begun], size_shown)
     assert best is not None
+    shorter = [_of_size(found[begun], size_shown) for found in paths]
+
+    def score_step(step: Step) -> Array:
+        """Return the weighted scores of these terms, fitted again on each part's other logs."""
+        score = []
+        for found, part in zip(shorter, _judging_parts(logs), strict=True):
+            fitting, held = (
+                FreeRunSelection(with_commands(of, step.commands), family, kind, step.integrator)
+                for of in part
+            )
+            errors = held.errors(fitting.fitted(found).p) if found else []
+            score.append(_score(errors, spread))
+        return np.asarray(np.array(score) * weight / weight.mean())
+
+    own, *others = _steps(logs)
+    steps = _compare_steps([own, *others], score_step) if chosen else []
+    step = next((s for s, _, behind, se in steps if behind <= se), own)
+    logs = with_commands(logs, step.commands)
     fit = 100 * (1 - np.exp(-ranking.score / 100))
     counts = [size, *(n for _, n in alternatives)]
     rows = [
@@ -240,35 +274,42 @@ def select_terms(
             else f"{present} stays."
         )
     )
+    if step != own:
+        said += (
+            f" Steps by {step.integrator} with commands {step.commands} between samples predict "
+            f"better by more than one standard error, and were taken."
+        )
     if watch.cut:
         said += (
             f" Time was over (--effort) before larger sets were tried on {', '.join(watch.cut)}."
         )
     known = {
-        extent(fitting): found[begun]
-        for (fitting, _), found in zip(_judging_parts(logs), paths, strict=True)
+        extent(fitting): found
+        for (fitting, _), found in zip(_judging_parts(logs), shorter, strict=True)
     }
 
     def again(of: Sequence[TrialLog]) -> Terms | None:
         """Follow the path anew on logs that were no part."""
         found = known.get(extent(of))
-        if found is None:
-            other = FreeRunSelection(of, family, kind)
+        if extent(of) not in known:
+            other = FreeRunSelection(of, family, kind, step.integrator)
             try:
-                found = other.path(beginnings[begun], stay, size_shown)
+                found = _of_size(other.path(beginnings[begun], stay, size_shown), size_shown)
             except ExcitationError as error:
                 _log.info("no path on a part: %s", error)
-                found = []
-        one = _of_size(found, size_shown)
-        return None if one is None else Terms.of(one, selection, inputs)
+        return None if found is None else terms(found)
+
+    def terms(found: Selected) -> Terms:
+        return replace(Terms.of(found, selection, inputs), integrator=step.integrator)
 
     return TermChoice(
-        Terms.of(best, selection, inputs),
+        terms(best),
         again,
         tuple(logs),
         chosen > 0,
         tuple(rows),
         tuple(zip(laws, errors, strict=True)),
+        tuple(steps),
         said,
     )
 
@@ -391,6 +432,49 @@ def _laws(logs: Sequence[TrialLog]) -> list[ThrustLaw]:
         return [own]
     reference = float(np.max(usual))
     return [own, ThrustLaw(quadratic_share=0.5, reference=reference), ThrustLaw("quadratic")]
+
+
+def _steps(logs: Sequence[TrialLog]) -> list[Step]:
+    """Return the ways over a sample to compare, the usual one first.
+
+    Measured angles and speeds moved between their samples, orders did not.
+    """
+    vessel = logs[0].vessel
+    measured = all(t.drive == "feedback" for t in vessel.thrusters)
+    own = vessel.actuation.between
+    other: Between = "held" if own == "interpolated" else "interpolated"
+    found = [Step(commands=own), *([Step(commands=other)] if measured else ())]
+    return [*found, *(replace(s, integrator="rk4") for s in found)]
+
+
+def _compare_steps(
+    steps: Sequence[Step], score: Callable[[Step], Array]
+) -> list[tuple[Step, float, float, float]]:
+    """Return ways over a sample with their scores, how far behind they are and its error."""
+    scores: list[Array | None] = []
+    for step in steps:
+        try:
+            scores.append(score(step))
+        except OutOfTimeError:
+            scores.append(None)
+    if scores[0] is None:
+        return []
+    found = rank(scores, range(len(steps)))
+    fit = 100 * (1 - np.exp(-found.score / 100))
+    points = 1 - fit[found.best] / 100
+    return [
+        (s, float(f), float(points * b), float(points * e))
+        for s, f, b, e in zip(steps, fit, found.behind, found.se, strict=True)
+    ]
+
+
+def with_commands(logs: Sequence[TrialLog], between: Between) -> Sequence[TrialLog]:
+    """Return logs of the vessel with commands that are held or interpolated between samples."""
+    vessel = logs[0].vessel
+    if between == vessel.actuation.between:
+        return logs
+    changed = replace(vessel, actuation=replace(vessel.actuation, between=between))
+    return [replace(log, vessel=changed) for log in logs]
 
 
 def with_law(logs: Sequence[TrialLog], law: ThrustLaw) -> Sequence[TrialLog]:

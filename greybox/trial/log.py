@@ -209,7 +209,7 @@ class TrialLog(DisplayMixin):
     def forces(self, inputs: tuple[str, ...]) -> Array:
         """Return the generalised inputs of (3.46) as (N, nu); zero where none can be made.
 
-        They follow the commands as late as the vessel's `actuation` says.
+        They follow the commands as the vessel's `actuation` says.
         """
         made = self._made_forces
         return np.column_stack([made.get(n, np.zeros(len(self))) for n in inputs])
@@ -218,7 +218,14 @@ class TrialLog(DisplayMixin):
     def _made_forces(self) -> Mapping[str, Array]:
         """Generalised forces by name, of the commands as the thrusters follow them."""
         commands = {c: self[c] for c in self.vessel.commands}
-        return actuated_force(self.vessel, commands, self.sample_time)
+        return actuated_force(self.vessel, commands, self.sample_time, self.logged_time)
+
+    @property
+    def logged_time(self) -> float:
+        """Sample time at which the commands were logged, before they were averaged [s]."""
+        averaged = (s for s in self.provenance.steps if s.operation == "decimate")
+        first = next(averaged, None)
+        return self.sample_time if first is None else first.number("measured")
 
     @property
     def has_wind(self) -> bool:

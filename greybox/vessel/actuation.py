@@ -20,19 +20,23 @@ __all__ = ["Actuation", "actuated_force", "delayed", "lagged", "with_actuators_o
 
 
 def actuated_force(
-    vessel: Vessel, commands: dict[str, Array], sample_time: float
+    vessel: Vessel, commands: dict[str, Array], sample_time: float, logged: float | None = None
 ) -> dict[str, Array]:
-    """Evaluate the generalised inputs on commands that act late.
+    """Evaluate the generalised inputs on commands as they act over each sample.
 
     Parameters
     ----------
     vessel : Vessel
-        Its `actuation` says how late.
+        Its `actuation` says how late, and what commands are between samples: of one that moves
+        on a straight line the mean over a sample is its value half a sample later.
     commands : dict of str to ndarray
         (..., N) each column of `Vessel.commands`, time last. What was commanded
         before is taken as the first value.
     sample_time : float
         [s]
+    logged : float, optional
+        Sample time at which the commands were logged, before they were averaged over samples of
+        `sample_time` [s]; by default the latter.
 
     Returns
     -------
@@ -40,9 +44,10 @@ def actuated_force(
         (..., N) each input of `force_inputs`.
     """
     late = vessel.actuation
-    if not late:
-        return generalised_force(vessel, commands)
-    moved = {c: delayed(commands[c], late.delay / sample_time) for c in vessel.commands}
+    delay = late.delay
+    if late.between == "interpolated":
+        delay -= (sample_time if logged is None else logged) / 2
+    moved = {c: delayed(commands[c], delay / sample_time) for c in vessel.commands}
     if late.lag == 0:
         return generalised_force(vessel, moved)
     samples = late.lag / sample_time
@@ -66,7 +71,7 @@ def with_actuators_of(vessel: Vessel, known: Vessel) -> Vessel:
 
     Thrust laws, gains, angle offsets, lag and delay are taken over: parameters
     that were estimated with them mean nothing without. Places, limits, columns
-    and sensors stay.
+    and sensors stay, and commands are held, as those of a plan are.
 
     Parameters
     ----------
@@ -85,7 +90,8 @@ def with_actuators_of(vessel: Vessel, known: Vessel) -> Vessel:
         replace(t, thrust=k.thrust, gain=k.gain, angle_offset=k.angle_offset)
         for t, k in zip(vessel.thrusters, known.thrusters, strict=True)
     )
-    return replace(vessel, thrusters=thrusters, actuation=known.actuation)
+    actuation = replace(known.actuation, between="held")
+    return replace(vessel, thrusters=thrusters, actuation=actuation)
 
 
 def delayed(value: Array, samples: float) -> Array:

@@ -146,12 +146,13 @@ class SensorsTable(Table):
 
 
 class ActuationTable(Table):
-    """How late the force follows the commands."""
+    """How the force follows the commands."""
 
     lag: Number = 0.0
     lag_on: str = "force"
     delay: Number = 0.0
     lag_held: str = "start"
+    between: str = "held"
 
 
 class ClosedLoopTable(Table):

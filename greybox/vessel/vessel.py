@@ -153,6 +153,7 @@ class Thruster:
 
 LagOn = Literal["force", "speed", "command"]
 LagHeld = Literal["start", "mean", "end"]
+Between = Literal["held", "interpolated"]
 
 
 # a delay this close to whole samples has no share of the next one
@@ -161,7 +162,7 @@ _WHOLE = 1e-9
 
 @dataclass(frozen=True)
 class Actuation:
-    """How late the force follows the logged commands.
+    """How the force follows the logged commands: how late, and what they are between samples.
 
     Parameters
     ----------
@@ -174,17 +175,21 @@ class Actuation:
         Pure delay of all commands [s].
     lag_held : {"start", "mean", "end"}
         Which value of what follows slowly acts during a sample.
+    between : {"held", "interpolated"}
+        Whether a logged command stays as it is until the next one, as orders do, or moves on a
+        straight line towards it, as measured angles and speeds do.
 
     Raises
     ------
     VesselError
-        A time is negative or not finite, or `lag_on` or `lag_held` is none of the three.
+        A time is negative or not finite, or `lag_on`, `lag_held` or `between` is none of those.
     """
 
     lag: float = 0.0
     lag_on: LagOn = "force"
     delay: float = 0.0
     lag_held: LagHeld = "start"
+    between: Between = "held"
 
     def __post_init__(self) -> None:
         for name, value in (("lag", self.lag), ("delay", self.delay)):
@@ -196,6 +201,7 @@ class Actuation:
         for key, chosen, known in (
             ("lag_on", self.lag_on, get_args(LagOn)),
             ("lag_held", self.lag_held, get_args(LagHeld)),
+            ("between", self.between, get_args(Between)),
         ):
             if chosen not in known:
                 raise VesselError(
@@ -219,7 +225,8 @@ class Actuation:
         of = {"force": "each force", "speed": "the propeller speeds", "command": "all commands"}
         parts = [f"a lag of {self.lag:g} s of {of[self.lag_on]}"] if self.lag else []
         parts += [f"a delay of {self.delay:g} s"] if self.delay else []
-        return " and ".join(parts) or "no lag and no delay"
+        late = " and ".join(parts) or "no lag and no delay"
+        return late if self.between == "held" else f"{late}, interpolated between samples"
 
 
 @dataclass(frozen=True)

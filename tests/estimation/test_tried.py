@@ -39,4 +39,4 @@ def test_json_has_every_alternative():
     data = json.loads(json.dumps(plain(COMPARED.to_dict())))
     assert [r["score"] for r in data["rows"]] == [80.0, 80.5, None]
     assert {"structure", "predictor", "method", "sample_time", "thrust", "terms", "score", "behind",
-            "se", "chosen", "note"} == set(data["rows"][0])  # fmt: skip
+            "se", "chosen", "note", "integrator", "commands"} == set(data["rows"][0])  # fmt: skip

@@ -20,6 +20,7 @@ from greybox.export.ports import base_units, command_ports
 from greybox.model.catalogue import get_structure
 from greybox.model.model import ManoeuvringModel
 from greybox.vessel.toml import load_vessel, vessel_from_dict
+from greybox.vessel.vessel import Actuation
 
 
 @pytest.fixture(scope="module")
@@ -125,10 +126,12 @@ def test_ports_say_what_the_log_was_corrected_for(model):
 
 def test_notes_of_corrected_sensors(model, tmp_path):
     sensors = {"reversed": ("n", "r"), "clock": {"n": 1.5}, "heading_bias": 0.1}
-    odd = replace(model, vessel=replace(model.vessel, sensors=sensors), integrator="rk4")
+    actuation = Actuation(between="interpolated")
+    vessel = replace(model.vessel, sensors=sensors, actuation=actuation)
+    odd = replace(model, vessel=vessel, integrator="rk4")
     notes = export_model(odd, "c", tmp_path / "x.c", heading="measured").notes
     for part in ("turns the sign of the log's n:", "n is 1.5 s late", "shows 0.1 rad more",
-                 "is held over the step"):  # fmt: skip
+                 "heading or wind is held over the step", "a command is held over"):  # fmt: skip
         assert sum(part in n for n in notes) == 1
     assert not any("rad more" in n for n in export_model(odd, "c", tmp_path / "x.c").notes)
 

@@ -10,7 +10,9 @@ from foreign_ships import presets, write_campaign
 from virtual import virtual_log
 
 from greybox.commands.common import read_logs
+from greybox.estimation.output_error import OutputErrorOptions
 from greybox.model.catalogue import get_structure, structure_for
+from greybox.model.model import load_model
 from greybox.model.run.simulation import simulate
 from greybox.selection.cross_validation import parts_of
 from greybox.selection.estimate import at_own_pace, estimate_model
@@ -22,6 +24,7 @@ from greybox.validation.fit import average_fit, run_model
 from greybox.vessel.force import force_inputs
 from greybox.vessel.thrust import ThrustLaw
 from greybox.vessel.toml import load_vessel, vessel_from_dict
+from greybox.vessel.vessel import Actuation
 
 SHIPS = [("taux", "tauy", "taun"), ("taux", "taun"),
          ("taux", "race", "rudder", "race_drag", "rudder_drag")]  # fmt: skip
@@ -151,6 +154,41 @@ def test_thrust_that_goes_with_the_square_of_the_speed_is_told(catamaran):
     assert "thrust ~ n|n|" in choice.note
     assert all(choice.again(fitting) is not None for fitting, _ in parts_of(choice.logs))
     assert sum(row["chosen"] for row in choice.rows) == 1
+
+
+@pytest.mark.long
+def test_commands_that_move_between_samples_are_told_and_kept(modulus_log, tmp_path):
+    """A ship whose commands follow a line and which sails by Runge and Kutta's rule."""
+    vessel, structure = modulus_log.vessel, get_structure("linear")
+    values = {"Xu": -0.1, "Xvr": 0.3, "Xmu": 5e-3, "Yv": -0.3, "Yur": -0.2, "Ymu": 5e-3,
+              "Nr": -0.3, "Nuv": -5e-4, "Nmu": 3e-4}  # fmt: skip
+    rng = np.random.default_rng(4)
+    knots = np.arange(0, 401, 8)
+    n, a, b = (np.interp(np.arange(400), knots, rng.uniform(-1, 1, len(knots))) for _ in range(3))
+    commands = {"n": 15 + 5 * n, "alpha1": a, "alpha2": 0.8 * b}
+    moving = replace(vessel, actuation=Actuation(between="interpolated"))
+    tau = make_log(moving, commands, 1.0).forces(structure.inputs)
+    theta = np.array([values[name] for name in structure.parameters])
+    run = simulate(structure, theta, np.array([0.8, 0.0, 0.0]), tau[:-1], 1.0, integrator="rk4")
+    x = run.x[0] + rng.standard_normal((400, 3)) * [2e-3, 1e-3, 1e-4]
+    channels = commands | dict(zip("uvr", x.T, strict=True)) | {"psi": run.psi[0]}
+    log = make_log(vessel, channels, 1.0, "moving")
+    choice = select_terms([log], "nothing", 0, lambda _: _still(log))
+    assert choice.logs[0].vessel.actuation.between == "interpolated"
+    assert choice.terms.integrator == "rk4"
+    assert [(s.integrator, s.commands) for s, *_ in choice.steps] == [
+        ("euler", "held"), ("euler", "interpolated"), ("rk4", "held"), ("rk4", "interpolated")
+    ]  # fmt: skip
+    named = {"method": "oe", "structure": "linear", "predictor": "basic"}
+    options = OutputErrorOptions(integrator="rk4")
+    found = estimate_model([replace(log, vessel=moving)], output_error=options, **named)
+    found.model().save(tmp_path / "model.json")
+    model = load_model(tmp_path / "model.json")
+    assert (model.integrator, model.vessel.actuation.between) == ("rk4", "interpolated")
+    assert np.abs((model.theta - theta) / model.std).max() < 4
+    plain = estimate_model([log], **named)
+    off = [abs(m["Nr"] - values["Nr"]) for m in (found, plain)]
+    assert off[1] > 4 * off[0]
 
 
 def _still(log):

@@ -16,7 +16,7 @@ import casadi as ca
 from greybox.model.disturbances import WIND, velocity_through
 from greybox.model.output import OutputModel
 from greybox.model.run.kernels import accumulate
-from greybox.model.run.step import StepModel
+from greybox.model.run.step import Heading, StepModel
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,8 @@ def _step(model: OutputModel) -> _Step:
     if model.wind == "output":
         state = {name: z[i] for i, name in enumerate(names)}
         air = ca.vertcat(*velocity_through(state, heading, *[mean[n] for n in WIND]))
-    step = StepModel.of_predictor(predictor, "simulated" if turns else "measured")
+    role: Heading = "simulated" if turns else "measured"
+    step = StepModel.of_predictor(predictor, role, model.integrator)
     next_state = step(
         z[: len(names)],
         heading,

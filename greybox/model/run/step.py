@@ -112,11 +112,17 @@ class StepModel:
             )
 
     @classmethod
-    def of_predictor(cls, predictor: Predictor, heading: Heading = "measured") -> StepModel:
+    def of_predictor(
+        cls,
+        predictor: Predictor,
+        heading: Heading = "measured",
+        integrator: Integrator = "euler",
+    ) -> StepModel:
         """Return the step of a predictor with its own coefficients."""
         return cls(
             predictor.structure,
-            heading=heading,
+            integrator,
+            heading,
             air_measured=predictor.air_measured,
             predictor=predictor,
         )
