@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from scipy.optimize import nnls
 from greybox.estimation.prediction_verdict import JudgedOn
 from greybox.model.model import ManoeuvringModel
 from greybox.prediction.helm import Helm
-from greybox.prediction.orders import Legs
+from greybox.prediction.orders import Legs, replay
 from greybox.prediction.running import DrawnRuns, Push, sail
 from greybox.prediction.start import Start
 
@@ -148,28 +148,6 @@ class Misfit:
         return np.asarray(self.size * beyond * waves)
 
 
-@dataclass
-class _Replay:
-    """The commands of a run again, whatever the motion."""
-
-    legs: Legs
-    samples: int
-    complete: NDArray[np.int64] = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.complete = np.full(self.legs.runs, -1)
-
-    def targets(self, k: int, psi: Array, u: Array) -> Array:
-        """Return the commands; see `Orders`."""
-        if k >= self.samples:
-            self.complete[:] = k
-        return self.legs.at(k, np.zeros(self.legs.runs, int))
-
-    def react(self, k: int, psi: Array, ahead: Array) -> None:
-        """Nothing changes."""
-        return
-
-
 def misfit_of(
     model: ManoeuvringModel,
     helm: Helm,
@@ -221,7 +199,7 @@ def misfit_of(
     free = helm.free()
     runs = sail(
         model, free, start.of(rows), theta[rows], d[rows], course,
-        _Replay(legs, len(sailed) - 1), math.inf,
+        replay(legs, len(sailed) - 1), math.inf,
         [Misfit.drawn(errors, size, step, rng, grows=False)], wind,
     )  # fmt: skip
     where = [("u", "v", "r").index(s) for s in model.structure.states]
