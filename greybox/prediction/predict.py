@@ -376,7 +376,8 @@ def _one(
         alone = (start.of(only), theta[:1], d[:1], task.course)
         own_run = sail(model, helm, *alone, ordered(only), longest, (), wind)
         args = (start, theta, d, task.course, wind, asked.seed)
-        misfit = misfit_of(model, helm, errors, own_run, *args)
+        goes_on = task.order is not None
+        misfit = misfit_of(model, helm, errors, own_run, *args, goes_on=goes_on)
         pushes += [] if misfit is None else [misfit]
         unsized = (_UNSIZED,) if misfit is None else ()
     orders = ordered(np.arange(len(theta)))
