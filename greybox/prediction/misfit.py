@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from scipy.optimize import nnls
 from greybox.estimation.prediction_verdict import JudgedOn
 from greybox.model.model import ManoeuvringModel
 from greybox.prediction.helm import Helm
-from greybox.prediction.orders import Legs
+from greybox.prediction.orders import Legs, replay
 from greybox.prediction.running import DrawnRuns, Push, sail
 from greybox.prediction.start import Start
 
@@ -25,6 +25,8 @@ _WAVES = 24
 _BOTH_SIDES = math.sqrt(2 * math.pi)
 # draws of each state's misfit, and of the parameters, by which its size is found
 _DRAWS = 24
+# standard deviations of their memory after which errors grow no more
+_STATIONARY = 8.0
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,10 @@ class HeldOutErrors:
         (nx,) of each state, sensors' noise taken off [m/s, rad/s].
     memory : ndarray
         (nx,) time over which these errors are related [s], infinite where not known.
+    logs : int
+        Whose runs these are; 0 where not known.
+    lasts : float
+        Mean length of these runs [s], 0 where not known.
     centre, reach : ndarray
         (nx + nc,) middle and half of the range of each state and command in the logs of
         the estimate, zero among them.
@@ -44,6 +50,8 @@ class HeldOutErrors:
 
     rmse: Array
     memory: Array
+    logs: int
+    lasts: float
     centre: Array
     reach: Array
 
@@ -82,7 +90,9 @@ def held_out_errors(model: ManoeuvringModel) -> HeldOutErrors | None:
     low, high = np.array([(min(0.0, *ranges[n]), max(0.0, *ranges[n])) for n in names], float).T
     # what never moved says nothing of how the misfit depends on it
     reach = np.where(high > low, high - low, math.inf) / 2
-    return HeldOutErrors(error, memory, (low + high) / 2, reach)
+    logs = len(found.get("logs", ()))
+    lasts = found.get("samples", 0) * model.sample_time / max(logs, 1)
+    return HeldOutErrors(error, memory, logs, lasts, (low + high) / 2, reach)
 
 
 def _sizes(of: object, states: tuple[str, ...]) -> Array:
@@ -151,28 +161,6 @@ class Misfit:
         return np.asarray(self.size * beyond * waves)
 
 
-@dataclass
-class _Replay:
-    """The commands of a run again, whatever the motion."""
-
-    legs: Legs
-    samples: int
-    complete: NDArray[np.int64] = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.complete = np.full(self.legs.runs, -1)
-
-    def targets(self, k: int, psi: Array, u: Array) -> Array:
-        """Return the commands; see `Orders`."""
-        if k >= self.samples:
-            self.complete[:] = k
-        return self.legs.at(k, np.zeros(self.legs.runs, int))
-
-    def react(self, k: int, psi: Array, ahead: Array) -> None:
-        """Nothing changes."""
-        return
-
-
 def misfit_of(
     model: ManoeuvringModel,
     helm: Helm,
@@ -184,12 +172,16 @@ def misfit_of(
     course: float,
     wind: Array | None,
     seed: int,
+    *,
+    goes_on: bool,
 ) -> Push | None:
     """Return the misfit of all runs of a manoeuvre, none of the estimate's own.
 
     Its size is such that runs on the commands of the estimate's own run differ from it, by
     misfit and parameters together, as much as those on logs that took no part differed from
-    their logs.
+    their logs. Errors grow from a measured start, so the commands are given again until these
+    runs last as long as those. Each log shows one misfit of each equation: draws hold how badly
+    so many of them tell its size, by its chi-squared distribution.
 
     Parameters
     ----------
@@ -207,11 +199,14 @@ def misfit_of(
     wind : ndarray or None
         See `sail`.
     seed : int
+    goes_on : bool
+        Whether the commands may be given again: a stop ends.
     """
     if own.diverged[0]:
         return None
     rng = np.random.default_rng([140, seed])
     nx, step = len(errors.rmse), model.sample_time
+    remembered = np.isfinite(errors.memory)
     # a force that would make the error in the time of one ship length
     unit = errors.rmse * min(1.0, step * float(start.speed[0]) / model.vessel.length)
     drawn = 1 + np.arange(min(_DRAWS, len(theta) - 1))
@@ -220,11 +215,15 @@ def misfit_of(
     for i in range(nx):
         size[i, 1 + i * _DRAWS : 1 + (i + 1) * _DRAWS] = unit[i]
     sailed = own.commands[own.order :, :, 0]
+    if goes_on:
+        known_to = _STATIONARY * float(np.max(errors.memory, initial=0.0, where=remembered))
+        wanted_to = min(errors.lasts, known_to) / step
+        sailed = np.tile(sailed, (max(1, math.ceil(wanted_to / len(sailed))), 1))
     legs = Legs(np.repeat(sailed[:1, :, None], len(rows), axis=2), sailed)
     free = helm.free()
     runs = sail(
         model, free, start.of(rows), theta[rows], d[rows], course,
-        _Replay(legs, len(sailed) - 1), math.inf,
+        replay(legs, len(sailed) - 1), math.inf,
         [Misfit.drawn(errors, size, step, rng, grows=False)], wind,
     )  # fmt: skip
     where = [("u", "v", "r").index(s) for s in model.structure.states]
@@ -240,5 +239,7 @@ def misfit_of(
         return None
     share, _ = nnls(response / scale[:, None], np.maximum(wanted - known, 0.0) / scale)
     size = np.repeat((unit * np.sqrt(share))[:, None], len(theta), axis=1)
+    if errors.logs:
+        size *= np.sqrt(errors.logs / rng.chisquare(errors.logs, size.shape))
     size[:, 0] = 0.0
     return Misfit.drawn(errors, size, step, rng, grows=True)

@@ -19,6 +19,7 @@ from greybox.prediction.monte_carlo import MonteCarloQuantity
 from greybox.prediction.result import Kind, PredictedManoeuvre
 from greybox.prediction.running import DrawnRuns
 from greybox.prediction.start import Start
+from greybox.prediction.trial import TrialCurrent
 from greybox.trial.log import TrialLog
 from greybox.trial.manoeuvres import Stopping, TurningCircle, ZigZag
 from greybox.trial.manoeuvres.finding import Manoeuvre
@@ -157,6 +158,7 @@ def trial_notes(
     *,
     own_start: bool,
     windy: bool,
+    current: TrialCurrent | None,
 ) -> list[str]:
     """Say what the run took from the trial, and where its commands are others."""
     run = found.length / max(found.approach_speed.value, 1e-9)
@@ -171,6 +173,8 @@ def trial_notes(
             if windy
             else f"the trial had {wind:.2g} m/s of mean wind, of which the model knows nothing."
         )
+    if current is not None:
+        told.append(current.sentence)
     if own_start:
         told.append(
             f"the run starts from the trial's own state at the order, "

@@ -101,10 +101,18 @@ Ordered = Callable[[NDArray[np.intp]], Orders]
 
 
 @dataclass
-class Turn:
-    """One leg, held until the ship has turned twice around."""
+class OneLeg:
+    """One leg, held until the run ends it.
+
+    Parameters
+    ----------
+    legs : Legs
+    ended : callable
+        ``(k, psi, u)`` as `Orders.targets` has them: which runs have come to the end (R,).
+    """
 
     legs: Legs
+    ended: Callable[[int, Array, Array], NDArray[np.bool_]]
     complete: NDArray[np.int64] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -112,12 +120,34 @@ class Turn:
 
     def targets(self, k: int, psi: Array, u: Array) -> Array:
         """Return the one order; see `Orders`."""
-        self.complete[(self.complete < 0) & (np.abs(psi) >= TURNED)] = k
+        self.complete[(self.complete < 0) & self.ended(k, psi, u)] = k
         return self.legs.at(k, np.zeros(len(psi), int))
 
     def react(self, k: int, psi: Array, ahead: Array) -> None:
         """Nothing changes."""
         return
+
+
+def turn(legs: Legs) -> OneLeg:
+    """Return one leg, held until the ship has turned twice around."""
+    return OneLeg(legs, lambda k, psi, u: np.abs(psi) >= TURNED)
+
+
+def replay(legs: Legs, samples: int) -> OneLeg:
+    """Return commands for so many samples, whatever the motion."""
+    return OneLeg(legs, lambda k, psi, u: np.full(len(psi), k >= samples))
+
+
+def stop(legs: Legs, until: Array) -> OneLeg:
+    """Return one leg, held until the surge velocity is down to `until` (R,) [m/s], and beyond."""
+    slow = np.full(legs.runs, -1)
+
+    def ended(k: int, psi: Array, u: Array) -> NDArray[np.bool_]:
+        slow[(slow < 0) & (u <= until)] = k
+        beyond = np.maximum(_FEWEST, np.ceil(_BEYOND * slow))
+        return np.asarray((slow >= 0) & (k >= slow + beyond))
+
+    return OneLeg(legs, ended)
 
 
 @dataclass
@@ -167,28 +197,3 @@ class ZigZagOrders:
         self._count[now] += 1
         self.complete[now[self._count[now] == EXECUTES]] = k + 1
         return share
-
-
-@dataclass
-class Stop:
-    """One leg, held until the ship is slow enough."""
-
-    legs: Legs
-    until: Array
-    complete: NDArray[np.int64] = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.complete = np.full(self.legs.runs, -1)
-        self._slow = np.full(self.legs.runs, -1)
-
-    def targets(self, k: int, psi: Array, u: Array) -> Array:
-        """Return the one order; see `Orders`."""
-        self._slow[(self._slow < 0) & (u <= self.until)] = k
-        beyond = np.maximum(_FEWEST, np.ceil(_BEYOND * self._slow))
-        done = (self.complete < 0) & (self._slow >= 0) & (k >= self._slow + beyond)
-        self.complete[done] = k
-        return self.legs.at(k, np.zeros(len(u), int))
-
-    def react(self, k: int, psi: Array, ahead: Array) -> None:
-        """Nothing changes."""
-        return

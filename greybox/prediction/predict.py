@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +32,7 @@ from greybox.prediction.notes import (
     trial_notes,
     trust_level,
 )
-from greybox.prediction.orders import EXECUTES, Legs, Ordered, Stop, Turn, ZigZagOrders
+from greybox.prediction.orders import EXECUTES, Legs, Ordered, ZigZagOrders, stop, turn
 from greybox.prediction.result import (
     CRITERIA,
     Kind,
@@ -41,12 +41,14 @@ from greybox.prediction.result import (
     Side,
 )
 from greybox.prediction.running import Push, sail
-from greybox.prediction.ship import WHERE_WIND
+from greybox.prediction.ship import WHERE_CURRENT, WHERE_WIND
 from greybox.prediction.showing import bundle_of, log_of
-from greybox.prediction.start import steady_start, trial_start
+from greybox.prediction.start import Start, steady_start, trial_start
 from greybox.prediction.steady import Steady, require_straight, straight_run
 from greybox.prediction.trial import (
+    TrialCurrent,
     as_in_trial,
+    circles,
     compare,
     end_again,
     found_in_trial,
@@ -203,19 +205,25 @@ def predict_manoeuvre(
             helm = driven(helm, model, asked)
         todo = [task for task, _, _ in found]
     theta, d = _draws(model, asked)
+    flow = None
+    if trial is not None and as_in_trial(asked):
+        flow = _trial_current(model, helm, asked, logs, theta, d)
+    if flow is not None:
+        d[:, WHERE_CURRENT] = 0.0
     made = []
     for i, task in enumerate(todo):
         progress(i, len(todo))
         beside = found[i][1:] if found else None
-        predicted = _one(manoeuvre, model, helm, asked, task, theta, d, beside)
+        predicted = _one(manoeuvre, model, helm, asked, task, theta, d, beside, flow)
         if beside is not None:
             measured, log = beside
             again = end_again(measured, log, stop_speed(manoeuvre, asked))
             agreement = compare(model, helm, again, log, predicted)
             told = trial_notes(
                 helm, predicted, measured, log, asked,
-                own_start=as_in_trial(manoeuvre, asked),
+                own_start=as_in_trial(asked),
                 windy=wind_of(model, measured, log) is not None,
+                current=flow,
             )  # fmt: skip
             predicted = replace(predicted, agreement=agreement, notes=(*predicted.notes, *told))
         made.append(predicted)
@@ -251,7 +259,26 @@ def _draws(model: ManoeuvringModel, asked: Conditions) -> tuple[Array, Array]:
     return np.vstack([model.theta, theta]), acting
 
 
-def _one(
+@dataclass(frozen=True)
+class _Setting:
+    """What the runs of a manoeuvre sail with: see `sail`.
+
+    `end` (R,) is the surge velocity at which a stop ends, and `unheld` how many draws had no
+    approach.
+    """
+
+    helm: Helm
+    start: Start
+    theta: Array
+    d: Array
+    ordered: Ordered
+    longest: float
+    wind: Array | None = None
+    end: Array | None = None
+    unheld: int = 0
+
+
+def _setting(
     kind: Kind,
     model: ManoeuvringModel,
     helm: Helm,
@@ -260,18 +287,24 @@ def _one(
     theta: Array,
     d: Array,
     beside: tuple[Manoeuvre, TrialLog] | None,
-) -> PredictedManoeuvre:
+    flow: TrialCurrent | None = None,
+) -> _Setting:
+    """Return how the runs start and what is ordered, as in a trial where there is one."""
     unheld, d = 0, d.copy()
     wind = None if beside is None else wind_of(model, *beside)
     if wind is not None:
         d[:, WHERE_WIND] = wind[0]
-    if beside is not None and as_in_trial(kind, asked):
-        measured_run, trial = beside
+    end: Array | None = None
+    if beside is not None and as_in_trial(asked):
+        measured, trial = beside
         rng = np.random.default_rng([139, asked.seed])
-        start = trial_start(model, measured_run, trial, helm.columns, len(theta), rng)
+        start = trial_start(model, measured, trial, helm.columns, len(theta), rng)
+        if flow is not None:
+            start = replace(start, current=flow.drawn(rng, len(theta)))
         helm = within_trial(helm, trial)
-        ordered = trial_orders(helm, task, measured_run, trial, model.sample_time)
-        end = None
+        until = stop_speed(kind, asked) * measured.approach_speed.value
+        ordered = trial_orders(helm, task, measured, trial, model.sample_time, until)
+        end = None if task.order is not None else np.full(len(theta), until)
     else:
         steady = straight_run(model, helm, theta, d, task.course, task.speed)
         kept = np.flatnonzero(steady.found)
@@ -281,6 +314,60 @@ def _one(
         ordered, end = _orders(kind, helm, asked, task, steady)
         start = steady_start(model, steady, task.course)
     longest = _LONGEST * model.vessel.length / float(start.speed[0])
+    return _Setting(helm, start, theta, d, ordered, longest, wind, end, unheld)
+
+
+def _trial_current(
+    model: ManoeuvringModel,
+    helm: Helm,
+    asked: Conditions,
+    logs: Sequence[TrialLog],
+    theta: Array,
+    d: Array,
+) -> TrialCurrent | None:
+    """Return the current of a trial, None where no turn of its logs tells one.
+
+    What the wind moves the model's circles by, in no current, is taken off their set.
+    """
+    if not model.structure.marine:
+        return None
+    still = d.copy()
+    still[:, WHERE_CURRENT] = 0.0
+    sets = []
+    for task, found, log in circles(logs, helm, asked):
+        at = _setting("turning", model, helm, asked, task, theta, still, (found, log))
+        runs = sail(
+            model, at.helm, at.start, at.theta, at.d, task.course,
+            at.ordered(np.arange(len(theta))), at.longest, (), at.wind,
+        )  # fmt: skip
+        if runs.diverged[0]:
+            continue
+        length = model.vessel.length
+        own = [
+            measure(
+                runs, i, length, rudder=None, full_rudder=None, executes=None, end_speed=None,
+                reversed_thrust=False, scale=1.0,
+            )
+            for i in np.flatnonzero(~runs.diverged).tolist()
+        ]  # fmt: skip
+        sets.append((found, [m for m in own if isinstance(m, TurningCircle)]))
+    return TrialCurrent.of(sets)
+
+
+def _one(
+    kind: Kind,
+    model: ManoeuvringModel,
+    helm: Helm,
+    asked: Conditions,
+    task: Task,
+    theta: Array,
+    d: Array,
+    beside: tuple[Manoeuvre, TrialLog] | None,
+    flow: TrialCurrent | None,
+) -> PredictedManoeuvre:
+    at = _setting(kind, model, helm, asked, task, theta, d, beside, flow)
+    helm, start, theta, d, wind, end = at.helm, at.start, at.theta, at.d, at.wind, at.end
+    ordered, longest, unheld = at.ordered, at.longest, at.unheld
     pushes = [_process(model, asked, len(theta))] if asked.disturbed else []
     errors = held_out_errors(model)
     unsized: tuple[str, ...] = ()
@@ -289,7 +376,8 @@ def _one(
         alone = (start.of(only), theta[:1], d[:1], task.course)
         own_run = sail(model, helm, *alone, ordered(only), longest, (), wind)
         args = (start, theta, d, task.course, wind, asked.seed)
-        misfit = misfit_of(model, helm, errors, own_run, *args)
+        goes_on = task.order is not None
+        misfit = misfit_of(model, helm, errors, own_run, *args, goes_on=goes_on)
         pushes += [] if misfit is None else [misfit]
         unsized = (_UNSIZED,) if misfit is None else ()
     orders = ordered(np.arange(len(theta)))
@@ -370,8 +458,8 @@ def _orders(
     if task.order is None:
         end = stop_speed(kind, asked) * steady.speed
         astern = np.full(len(steady.speed), stop_throttle(kind, helm, asked))
-        stop = helm.commands(astern, 0.0)
-        return lambda runs: Stop(Legs.of(stop[:, runs]), end[runs]), end
+        held = helm.commands(astern, 0.0)
+        return lambda runs: stop(Legs.of(held[:, runs]), end[runs]), end
     order = task.sign * task.order
     legs = [helm.commands(steady.throttle, way * order) for way in (1.0, -1.0)]
     for i in np.flatnonzero(helm.outside(legs[0][:, :1], ROUNDED)[:, 0]):
@@ -382,7 +470,7 @@ def _orders(
             f"--speed, or --no-limits."
         )
     if task.heading is None:
-        return lambda runs: Turn(Legs.of(legs[0][:, runs])), None
+        return lambda runs: turn(Legs.of(legs[0][:, runs])), None
     headings = np.full(EXECUTES - 1, task.heading)
     return (
         lambda runs: ZigZagOrders(task.sign, headings, Legs.of(*(leg[:, runs] for leg in legs))),

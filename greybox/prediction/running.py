@@ -13,9 +13,9 @@ from greybox.model.model import ManoeuvringModel
 from greybox.model.run.step import integrated
 from greybox.prediction.helm import Helm, bounds
 from greybox.prediction.orders import Orders
-from greybox.prediction.ship import ShipDraws
+from greybox.prediction.ship import WHERE_WIND, ShipDraws
 from greybox.prediction.start import Start
-from greybox.rotation import body_to_ned
+from greybox.rotation import body_to_ned, ned_to_body
 
 Array = NDArray[np.float64]
 Push = Callable[[int, Array, Array], Array]
@@ -96,8 +96,17 @@ def sail(
     wind : ndarray, optional
         (N, 2) wind north and east at each sample from the order on, the last stands [m/s];
         that of `d` by default.
+
+    Notes
+    -----
+    In water that flows (``start.current``) the equations hold for velocities through it, in
+    which a constant current is no force (Fossen, 2011, property 8.1).
     """
     step, length = model.sample_time, model.vessel.length
+    flow = np.zeros((2, len(theta))) if start.current is None else start.current
+    if start.current is not None and d.shape[1]:
+        d = d.copy()
+        d[:, WHERE_WIND] -= flow.T
     ship = ShipDraws(model.structure, model.vessel, step, model.integrator, theta, d)
     names = model.structure.states
     where = [names.index(n) if n in names else None for n in ("u", "v", "r")]
@@ -106,7 +115,13 @@ def sail(
     before = len(start.motion)
     most = before + max(1, math.ceil(min(longest / step, _MOST)))
     delay = model.vessel.actuation.delay_samples(step)
-    state = ship.start(start.x, start.psi, start.commands[-1])
+
+    def carried(psi: Array) -> Array:
+        """Return what the flow adds to u, v, r (3, R)."""
+        return np.stack([*ned_to_body(flow[0], flow[1], psi), np.zeros(len(psi))])
+
+    begin = start.x - carried(start.psi)[[("u", "v", "r").index(n) for n in names]]
+    state = ship.start(begin, start.psi, start.commands[-1])
     low, high = (b[:, None] for b in bounds(helm.limits))
     rates = np.array([[math.inf if x.rate is None else x.rate] for x in helm.limits]) * step
     limit = _DIVERGED * np.array([speed, speed, speed / length])[:, None]
@@ -117,12 +132,13 @@ def sail(
     with np.errstate(all="ignore"):
         for k in range(before, most):
             now = np.stack([np.zeros(runs) if i is None else state[i] for i in where])
+            now += carried(state[nx])
             diverged |= ~(np.abs(now) <= limit).all(axis=0)
             since = k - before
             own = state[nx] - heading
             wanted = np.clip(orders.targets(since, own, now[0]), low, high)
             if wind is not None:
-                ship.blow(wind[min(since, len(wind) - 1)])
+                ship.blow(wind[min(since, len(wind) - 1)][:, None] - flow)
             after_order, moved = _moved(at, wanted, rates, 1.0)
             states.append(now)
             psi.append(state[nx].copy())

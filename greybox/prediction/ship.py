@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.model.disturbances import WIND, disturbance_names
+from greybox.model.disturbances import CURRENT, WIND, disturbance_names
 from greybox.model.run.actuators import Actuators, actuators, column
 from greybox.model.run.kernels import bind, over_runs
 from greybox.model.run.step import Integrator, StepModel
@@ -18,8 +18,10 @@ from greybox.vessel.vessel import Actuation, Thruster, Vessel
 
 Array = NDArray[np.float64]
 
-# where the wind stands among the disturbances of a ship at sea
-WHERE_WIND = np.array([disturbance_names("marine", ()).index(n) for n in WIND])
+# where current and wind stand among the disturbances of a ship at sea
+WHERE_CURRENT, WHERE_WIND = (
+    np.array([disturbance_names("marine", ()).index(n) for n in names]) for names in (CURRENT, WIND)
+)
 
 
 class ShipDraws:
@@ -99,8 +101,8 @@ class ShipDraws:
         return state
 
     def blow(self, wind: Array) -> None:
-        """Take another wind from now on, north and east (2,) [m/s]."""
-        self._w[self.commands + WHERE_WIND] = wind[:, None]
+        """Take another wind from now on, north and east (2, R) [m/s]."""
+        self._w[self.commands + WHERE_WIND] = wind
 
     def __call__(self, state: Array, commands: Array) -> Array:
         """Return the state (n, R) one sample later.

@@ -41,6 +41,9 @@ class Start:
         (B, nc, R) in the unit of the log, angles [rad].
     trim : float
         Steering order that keeps the estimate straight.
+    current : ndarray or None
+        (2, R) velocity north and east of the water that they sail in [m/s], beyond the current
+        among their disturbances.
     """
 
     x: Array
@@ -49,6 +52,7 @@ class Start:
     heading: Array
     commands: Array
     trim: float = 0.0
+    current: Array | None = None
 
     @property
     def speed(self) -> Array:
@@ -64,6 +68,7 @@ class Start:
             self.heading[:, runs],
             self.commands[..., runs],
             self.trim,
+            None if self.current is None else self.current[:, runs],
         )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
 from greybox.errors import LogError
+from greybox.estimation.prediction_verdict import LIMITS
 from greybox.model.model import ManoeuvringModel
 from greybox.prediction.conditions import Conditions, Task
 from greybox.prediction.helm import Helm
 from greybox.prediction.measuring import LABELS, quantities
 from greybox.prediction.monte_carlo import MonteCarloQuantity
-from greybox.prediction.orders import EXECUTES, Legs, Ordered, Turn, ZigZagOrders
+from greybox.prediction.orders import EXECUTES, Legs, Ordered, ZigZagOrders, stop, turn
 from greybox.prediction.result import Agreement, Compared, Kind, PredictedManoeuvre, Side
 from greybox.rotation import ned_to_body
 from greybox.trial.log import TrialLog
@@ -40,6 +41,8 @@ Array = NDArray[np.float64]
 # how far angles may be from those asked for, to be the same manoeuvre [rad]
 _NEAR = math.radians(2.5)
 _POINTS = 1500
+# of chi-squared with two degrees of freedom, at 5 %
+_CURRENT = 5.99
 # share of the greatest command that is a step, and of the way at which the helm has arrived
 _STEP, _ARRIVED = 0.25, 0.9
 # logs that a sentence names: one with gaps comes as many
@@ -122,13 +125,13 @@ def _speeds(found: Manoeuvre, log: TrialLog, helm: Helm) -> float:
     return float(np.mean(made))
 
 
-def as_in_trial(kind: Kind, asked: Conditions) -> bool:
+def as_in_trial(asked: Conditions) -> bool:
     """Whether a run starts from the state and the propellers that the trial had.
 
-    A stop starts from the steady run that it is found by, and so does what is asked for at
-    another speed.
+    What is asked for at another speed, or another thrust astern, starts from the steady run
+    that it is found by.
     """
-    return kind in ("turning", "zigzag") and asked.speed is None and not asked.command
+    return asked.speed is None and not asked.command and asked.astern is None
 
 
 def _legs(found: Manoeuvre) -> list[tuple[float, float]]:
@@ -146,11 +149,13 @@ def _level(log: TrialLog, name: str, leg: tuple[float, float]) -> float:
 
 
 def trial_orders(
-    helm: Helm, task: Task, found: Manoeuvre, log: TrialLog, sample_time: float
+    helm: Helm, task: Task, found: Manoeuvre, log: TrialLog, sample_time: float, until: float
 ) -> Ordered:
     """Return the orders of a trial: its commands to either side, its headings of reversal.
 
-    What does not steer follows the log, and keeps its mean after the log's manoeuvre.
+    What does not steer follows the log, and keeps its mean after the log's manoeuvre. In a
+    stop, which ends at the surge velocity `until` [m/s], all commands follow the log, and keep
+    what they were in the last half of it.
     """
     held = np.array(
         [[_level(log, n, leg) for n in helm.columns] for leg in _legs(found)[:EXECUTES]]
@@ -159,14 +164,19 @@ def trial_orders(
         held = np.vstack([held, held * np.where(helm.steer != 0, -1.0, 1.0)])
     times = np.arange(found.start, found.stop, sample_time)
     logged = np.stack([np.interp(times, log.t, log[n]) for n in helm.columns], axis=1)
-    logged = np.vstack([logged, logged.mean(axis=0)])
-    logged[:, helm.steer != 0] = np.nan
+    if isinstance(found, Stopping):
+        logged = np.vstack([logged, held[0]])
+    else:
+        logged = np.vstack([logged, logged.mean(axis=0)])
+        logged[:, helm.steer != 0] = np.nan
 
     def legs(runs: NDArray[np.intp]) -> Legs:
         return Legs(np.repeat(held[:, :, None], len(runs), axis=2), logged)
 
+    if isinstance(found, Stopping):
+        return lambda runs: stop(legs(runs), np.full(len(runs), until))
     if not isinstance(found, ZigZag):
-        return lambda runs: Turn(legs(runs))
+        return lambda runs: turn(legs(runs))
     reversed_at = [q.value for q in found.switch_headings][: EXECUTES - 1]
     usual = float(np.mean(reversed_at))
     headings = np.array(reversed_at + [usual] * (EXECUTES - 1 - len(reversed_at)))
@@ -201,6 +211,95 @@ def wind_of(model: ManoeuvringModel, found: Manoeuvre, log: TrialLog) -> Array |
     times = np.arange(found.start, found.stop, model.sample_time)
     blown = np.stack([np.interp(times, log.t, part) for part in smooth], axis=1)
     return np.vstack([blown, blown.mean(axis=0)])
+
+
+@dataclass(frozen=True)
+class TrialCurrent:
+    """The current of a trial: the set of its turning circles.
+
+    Parameters
+    ----------
+    value, std : ndarray
+        (2,) north and east, and standard errors [m/s].
+    """
+
+    value: Array
+    std: Array
+
+    @classmethod
+    def of(
+        cls, sets: Sequence[tuple[TurningCircle, Sequence[TurningCircle]]]
+    ) -> TrialCurrent | None:
+        """Return what the sets of circles are beyond those of runs in no current.
+
+        Parameters
+        ----------
+        sets : sequence of (TurningCircle, sequence of TurningCircle)
+            Each circle of the trial with its runs, that of the estimate first.
+
+        Returns
+        -------
+        TrialCurrent or None
+            The mean over the circles, weighted by their errors: an error of what wind does is
+            taken to be as large as that itself. None where there is no circle, its errors alone
+            may make it, at 5 %, or it is less than the share of the speed that counts as motion.
+        """
+        values, variances, speeds = [], [], []
+        for found, runs in sets:
+            known = np.array([_set_of(m) for m in runs])
+            known = known[np.isfinite(known).all(axis=1)]
+            measured = (found.set_north, found.set_east)
+            if len(known) < 2 or None in measured:
+                continue
+            values.append([q.value for q in measured if q is not None] - known[0])
+            error = np.array([q.std for q in measured if q is not None])
+            speeds.append(found.approach_speed.value)
+            variances.append(error**2 + known[0] ** 2 + known[1:].var(axis=0))
+        if not values:
+            return None
+        value, weight = np.array(values), 1 / np.maximum(variances, 1e-12)
+        mean = (weight * value).sum(axis=0) / weight.sum(axis=0)
+        beyond = (weight * (value - mean) ** 2).sum() / max(1, 2 * (len(value) - 1))
+        std = np.sqrt(max(1.0, float(beyond)) / weight.sum(axis=0))
+        least = LIMITS.speed * float(np.mean(speeds))
+        if ((mean / std) ** 2).sum() <= _CURRENT or math.hypot(*mean) < least:
+            return None
+        return cls(mean, std)
+
+    def drawn(self, rng: np.random.Generator, runs: int) -> Array:
+        """Return currents (2, R), the first without error [m/s]."""
+        error = rng.standard_normal((2, runs))
+        error[:, 0] = 0.0
+        return np.asarray(self.value[:, None] + self.std[:, None] * error)
+
+    @property
+    def sentence(self) -> str:
+        """What it is, in words."""
+        speed = math.hypot(*self.value)
+        error = math.sqrt(float(((self.value / speed) ** 2 * self.std**2).sum()))
+        towards = math.degrees(math.atan2(self.value[1], self.value[0])) % 360
+        return (
+            f"sailed in the current of the trial, {speed:.2g} ± {1.96 * error:.1g} m/s towards "
+            f"{towards:.0f} deg, by which its turning circle drifts."
+        )
+
+
+def _set_of(circle: TurningCircle) -> tuple[float, float]:
+    if circle.set_north is None or circle.set_east is None:
+        return math.nan, math.nan
+    return circle.set_north.value, circle.set_east.value
+
+
+def circles(
+    logs: Sequence[TrialLog], helm: Helm, asked: Conditions
+) -> list[tuple[Task, TurningCircle, TrialLog]]:
+    """Return the turning circles of a trial that are long enough to tell their set."""
+    return [
+        (_task(m, log, helm, asked), m, log)
+        for log in logs
+        for m in find_manoeuvres(log, scale=asked.scale)
+        if isinstance(m, TurningCircle) and m.set_north is not None
+    ]
 
 
 def with_rates(

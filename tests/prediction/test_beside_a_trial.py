@@ -31,10 +31,21 @@ def windy_model():
     return model_of(structure, values, vessel, STEP)
 
 
-def trial(model, sides, reversed_at, speed=2.4, approach=30.0, lasts=300.0, rate=math.inf, n=12.0):
+def trial(
+    model,
+    sides,
+    reversed_at,
+    speed=2.4,
+    approach=30.0,
+    lasts=300.0,
+    rate=math.inf,
+    n=12.0,
+    then=12.0,
+):
     """Sail the model's own step as a trial: rudder angles in turn, each until its heading.
 
-    The propeller speed is held from the first sample on, whatever the ship's speed is then.
+    The propeller speed is held from the first sample on, whatever the ship's speed is then,
+    and another one from the order on.
     """
     step = model.step_function()
     windy = step.n_in() > 2
@@ -51,6 +62,7 @@ def trial(model, sides, reversed_at, speed=2.4, approach=30.0, lasts=300.0, rate
             leg += way * psi >= reversed_at[leg % 2]
         wanted = 0.0 if leg < 0 else sides[leg % 2]
         air = np.array([u, v]) - np.stack(ned_to_body(*WIND, psi))
+        n = n if leg < 0 else then
         rows.append((k * STEP, u, v, r, psi, north, east, n, delta, *air))
         delta += np.clip(wanted - delta, -rate * STEP, rate * STEP)
         x = np.array(step(x, [n, delta], *([WIND] if windy else []))).ravel()
@@ -92,6 +104,38 @@ def test_a_turn_is_sailed_in_the_wind_of_its_trial():
     calm = trial(rudder_model(step=STEP), (25 * DEG,), (), lasts=220.0)
     assert not any("wind" in n for n in predict_manoeuvre(
         rudder_model(step=STEP), "turning", trial=calm, draws=40).notes)  # fmt: skip
+
+
+def in_current(log, north, east):
+    """Return a log as it would be in water that flows [m/s]."""
+    u, v = ned_to_body(north, east, log["psi"])
+    moved = {"u": u, "v": v, "x_n": north * log.t, "y_n": east * log.t}
+    channels = {n: c + moved.get(n, 0.0) for n, c in log.channels.items()}
+    return make_log(log.vessel, channels, log.sample_time, log.name)
+
+
+def test_a_turn_is_sailed_in_the_current_of_its_trial():
+    """By which the circle drifts: the model itself knows of none."""
+    model = rudder_model(step=STEP)
+    still = trial(model, (25 * DEG,), (), lasts=220.0)
+    made = predict_manoeuvre(model, "turning", trial=in_current(still, 0.2, -0.3), draws=40)
+    assert max(errors(made).values()) < 0.05, errors(made)
+    (told,) = (n for n in made.notes if "in the current of the trial" in n)
+    assert "0.36 ±" in told
+    assert "towards 304 deg" in told
+    calm = predict_manoeuvre(model, "turning", trial=still, draws=40)
+    assert not any("current" in n for n in calm.notes)
+
+
+def test_a_stop_starts_as_the_trial_did_though_the_ship_still_accelerates():
+    """At its own propeller speeds, with which it would go faster yet."""
+    model = rudder_model(step=STEP)
+    log = trial(model, (0.02,), (), speed=2.0, approach=15.0, lasts=150.0, then=-6.0)
+    made = predict_manoeuvre(model, "crash", trial=log, draws=40)
+    found = errors(made)
+    assert max(found[n] for n in ("head_reach", "track_reach", "stopping_time")) < 0.02, found
+    assert made.manoeuvres[0].commands["n"].value == pytest.approx(12.0)
+    assert any("starts from the trial's own state" in n for n in made.notes)
 
 
 @pytest.mark.parametrize(("rate", "told"), [(math.inf, "at once"), (0.1, "at 5.73 deg per second")])
