@@ -8,8 +8,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from greybox.errors import GreyboxError, UsageError
-from greybox.estimation.prediction_verdict import JudgedOn, NothingHeldOut, NotRefitted
+from greybox.errors import GreyboxError, OutOfTimeError, UsageError
+from greybox.estimation.prediction_verdict import (
+    TOO_SHORT,
+    JudgedOn,
+    NothingHeldOut,
+    NotRefitted,
+)
 from greybox.estimation.registry import ESTIMATORS
 from greybox.estimation.result import Estimate
 from greybox.estimation.verdict import Divergence, Reason
@@ -79,7 +84,7 @@ def with_prediction(
             other = again(fitting)
         except GreyboxError as error:
             _log.info("without a part there is no estimate: %s", error)
-            failed.append(str(error))
+            failed.append(TOO_SHORT if isinstance(error, OutOfTimeError) else str(error))
             continue
         held += [HeldOut.of(other, log) for log in left_out]
     errors = [run_errors(h.model, h.run, request.seed) for h in held]
@@ -99,7 +104,7 @@ def with_prediction(
         verdict = judge_prediction(runs, JudgedOn.OWN, found=told, seed=request.seed)
         return replace(estimate, prediction=verdict)
     if failed:
-        told.append(NotRefitted(len(failed), len(parts), failed[0]))
+        told.append(NotRefitted(len(failed), len(parts), failed[0], TOO_SHORT not in failed))
     own = [HeldOut.of(model, log).run for log in logs]
     verdict = judge_prediction(
         held,
