@@ -14,7 +14,7 @@ from pathlib import Path
 from greybox.commands.common import require_apart
 from greybox.commands.parser import Parser, short_usage, sub_parsers
 from greybox.commands.terminal import complain, telling
-from greybox.errors import GreyboxError
+from greybox.errors import GreyboxError, UsageError
 from greybox.registry import entry_points
 
 GROUP = "greybox.commands"
@@ -98,6 +98,8 @@ def _parse(given: list[str]) -> argparse.Namespace:
     ------
     ConfigurationError
         The configuration file is at fault.
+    UsageError
+        The folder that the command is run in does not exist.
     """
     command = next((a for a in given if not a.startswith("-")), None)
     if command == "help":
@@ -116,12 +118,23 @@ def _parse(given: list[str]) -> argparse.Namespace:
     from greybox.commands.configuration import find_configuration, read_configuration
     from greybox.commands.defaults import Defaults
 
-    path = find_configuration(Path.cwd(), os.environ)
+    path = find_configuration(_folder(), os.environ)
     if path is None:
         return parser.parse_args(given)
     names = tuple(n for n in known if n != "help")
     defaults = Defaults(read_configuration(path), command, known[command], names, build_parser)
     return defaults.fill(parser.parse_args(given))
+
+
+def _folder() -> Path:
+    """Return the folder that the command is run in."""
+    try:
+        return Path.cwd()
+    except FileNotFoundError:
+        raise UsageError(
+            "the folder that this is run in was deleted, so paths lead nowhere: change to a "
+            "folder that exists."
+        ) from None
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -163,6 +176,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> None:
+    _folder()
     used = getattr(options, "configuration", None)
     if used is not None:
         _log.info("configuration %s gives %s", used["file"], ", ".join(used["options"]))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from greybox.credibility.evidence import Evidence
-from greybox.estimation.informative import movements
+from greybox.estimation.informative import is_noise, movements
 from greybox.estimation.verdict import TestResult, not_applicable
 
 # share of what its thrusters could push, or of the ship's speed, below which nothing moved:
@@ -32,6 +32,9 @@ def movement(evidence: Evidence) -> TestResult:
     if not predictor.structure.marine:
         return not_applicable(name, null, "what is no ship has no speed to measure by")
     share = movements(evidence.logs, predictor.structure)
+    for force in set(predictor.structure.inputs) & share.keys():
+        if share[force] >= _LEAST and is_noise(evidence.logs, force, share[force]):
+            share[force] = 0.0
     for i, state in enumerate(predictor.structure.states):
         # a measured velocity holds noise too, a simulated one does not
         x = [run[:, i] for run in evidence.instruments.x if np.isfinite(run[:, i]).all()]

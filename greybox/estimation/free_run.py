@@ -33,6 +33,7 @@ from greybox.estimation.shooting import (
     unrestricted,
 )
 from greybox.model.output import OutputModel
+from greybox.numerics.robust import FROM_MEDIAN
 
 Array = NDArray[np.float64]
 Shooting = Literal["auto", "single", "multiple"]
@@ -73,7 +74,7 @@ def noise_of(r: Array, sigma: Array, use: Array, loss: Loss, floor: Array) -> Ar
     if loss == "gaussian":
         found = np.sqrt((errors**2).mean(axis=0))
     else:
-        found = 1.4826 * np.median(np.abs(errors), axis=0)
+        found = FROM_MEDIAN * np.median(np.abs(errors), axis=0)
     return np.asarray(np.maximum(found, floor))
 
 

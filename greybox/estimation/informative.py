@@ -5,19 +5,26 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from greybox.errors import ExcitationError
 from greybox.model.predictor import Regime
 from greybox.model.predictor_kinds import PredictorKind
 from greybox.model.structure import Structure
+from greybox.numerics.robust import white_noise
 from greybox.trial.log import TrialLog
 from greybox.vessel.force import input_movement
+
+Array = NDArray[np.float64]
 
 # heading range that current north and east need to be told apart; least and advised [rad]
 LEAST_HEADING, ADVISED_HEADING = np.deg2rad(20), np.deg2rad(90)
 
 # share of its thrusters' push below which a force is what rounding leaves of it
 _ROUNDING = 1e-9
+# a command is held where it moves by less than this share of its size (an angle, of 1 rad), and by
+# no more than so many times the white noise that neighbouring samples show
+_STEADY, _WHITE = 0.02, 1.3
 
 
 def heading_range(logs: Sequence[TrialLog]) -> float:
@@ -65,6 +72,49 @@ def movements(logs: Sequence[TrialLog], structure: Structure) -> dict[str, float
     return found
 
 
+def _held(values: Sequence[Array], angle: bool) -> float | None:
+    """Return by how much a command moves that is held but for its sensor's noise, else None."""
+    whole = np.concatenate(values)
+    if np.ptp(whole) == 0.0:
+        return 0.0
+    spread, size = float(np.std(whole)), 1.0 if angle else float(np.sqrt(np.mean(whole**2)))
+    steady = spread < _STEADY * size and spread < _WHITE * (white_noise(values) or 0.0)
+    return spread if steady else None
+
+
+def unexcited(structure: Structure, lost: Sequence[str], why: str) -> str:
+    """Return the sentence that parameters are not excited, and what to do.
+
+    Parameters
+    ----------
+    structure : Structure
+    lost : sequence of str
+        Names of terms, or of disturbances, which no structure can leave out.
+    why : str
+        What was seen.
+    """
+    many = len(lost) > 1
+    kept = {t.state for t in structure.terms if t.name not in lost}
+    smaller = kept == set(structure.states) and set(lost) <= set(structure.parameters)
+    leave = f"-{'-'.join(lost)}"
+    return (
+        f"parameter{'s' * many} {', '.join(lost)} {'are' if many else 'is'} not excited: {why}. "
+        f"Move what {'they multiply' if many else 'it multiplies'}"
+        + (
+            f", or leave {'them' if many else 'it'} out (--structure '{structure.name}{leave}')."
+            if smaller
+            else "."
+        )
+    )
+
+
+def is_noise(logs: Sequence[TrialLog], name: str, share: float) -> bool:
+    """Whether an input of this share (`movements`) is but the noise of commands that cancel."""
+    values = [log.forces((name,)).ravel() for log in logs]
+    size = float(np.sqrt(np.mean(np.concatenate(values) ** 2)))
+    return share < _STEADY and size < _WHITE * (white_noise(values) or 0.0)
+
+
 def require_informative(
     logs: Sequence[TrialLog], predictor: PredictorKind, structure: Structure
 ) -> None:
@@ -73,33 +123,42 @@ def require_informative(
     Raises
     ------
     ExcitationError
-        No thruster command changes, thrusts cancel but for rounding, or the heading
-        does not change for a predictor that must tell current north from east.
+        No thruster command changes by more than its noise, the ship does not move, thrusts
+        cancel but for rounding, or the heading does not change for a predictor that must tell
+        current north from east.
     """
     commands = logs[0].vessel.commands
-    moved = {
-        c: max(float(np.ptp(log[c])) for log in logs)
-        + float(np.ptp([float(log[c][0]) for log in logs]))
-        for c in commands
-    }
-    if all(v == 0.0 for v in moved.values()):
+    angles = logs[0].vessel.angle_commands
+    held = {c: _held([log[c] for log in logs], c in angles) for c in commands}
+    if None not in held.values():
+        noisy = [f"{c} by {spread:.2g}" for c, spread in held.items() if spread]
         raise ExcitationError(
-            f"every thruster command is constant over the log ({', '.join(commands)}), so its "
-            f"effect cannot be told from a constant: change the commands during the trial."
+            f"every thruster command is constant over the log ({', '.join(commands)}"
+            + (f"; but for noise, which moves {', '.join(noisy)}" if noisy else "")
+            + "), so its effect cannot be told from a constant: change the commands during the "
+            "trial."
+        )
+    if all(float(np.ptp(log[s])) == 0.0 for log in logs for s in structure.states):
+        raise ExcitationError(
+            f"{', '.join(structure.states)} do not change over the whole log, so no motion tells "
+            f"what the commands do: see whether the columns hold what was measured (greybox "
+            f"check), and give a log in which the ship moves."
         )
     if structure.marine:
         share = movements(logs, structure)
-        for term in structure.terms:
-            for factor in term.factors:
-                # one that is exactly zero is named by the equations
-                if factor.signal in structure.inputs and 0 < share[factor.signal] < _ROUNDING:
-                    raise ExcitationError(
-                        f"parameter {term.name} is not excited: {factor.signal} is "
-                        f"{share[factor.signal]:.1g} of what its thrusters push, which is rounding "
-                        f"(at least {_ROUNDING:g} is needed), so its thrusts cancel over the whole "
-                        f"log. Move what it multiplies, or leave it out (--structure "
-                        f"'{structure.name}-{term.name}')."
-                    )
+        # one that is exactly zero is named by the equations
+        still = [s for s in structure.inputs if 0 < share.get(s, 1.0) < _ROUNDING]
+        lost = [t.name for t in structure.terms if any(f.signal in still for f in t.factors)]
+        if lost:
+            raise ExcitationError(
+                unexcited(
+                    structure,
+                    lost,
+                    f"{', '.join(f'{s} is {share[s]:.1g}' for s in still)} of what its thrusters "
+                    f"push, which is rounding (at least {_ROUNDING:g} is needed), so its thrusts "
+                    f"cancel over the whole log",
+                )
+            )
     if predictor.captures:
         turned = heading_range(logs)
         if turned < LEAST_HEADING:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from greybox.estimation.banded_covariance import ErrorBand, ErrorNoise
 from greybox.model.noise import NoiseLevels
 from greybox.numerics.banded import factor_band, inverse_band
+from greybox.numerics.effort import require_time
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
@@ -278,6 +279,7 @@ class ErrorLikelihood:
         ends = np.array(bounds) * unit
 
         def scaled(p: Array) -> tuple[float, Array]:
+            require_time()
             loss, slope = at(p / unit)
             return loss, slope / unit
 

@@ -30,6 +30,7 @@ from greybox.estimation.free_run_errors import (
     slow_errors,
 )
 from greybox.estimation.free_run_noise import noise_of_run, noise_of_sensors, residual_noise
+from greybox.estimation.informative import unexcited
 from greybox.estimation.innovations import FilterRuns, fit_innovations
 from greybox.estimation.output_setup import deviations, measured, output_model, turns
 from greybox.estimation.result import Estimate
@@ -627,11 +628,18 @@ def _require_known(model: OutputModel, hessian: Array, bound: NDArray[np.bool_])
             raise UnexcitedBiasError(column, model.parameters[column])
 
     if not (scale > 0).all():
-        lost = [n for n, s in zip(names, scale, strict=True) if not s > 0]
+        lost = [
+            model.predictor.columns[i].name if i < len(model.predictor.columns) else n
+            for i, n, s in zip(free, names, scale, strict=True)
+            if not s > 0
+        ]
         require_parameter(int(free[np.argmin(scale)]))
         raise ExcitationError(
-            f"parameter {', '.join(lost)} leaves the run unchanged over the whole log: move what "
-            f"it multiplies, or leave it out."
+            unexcited(
+                model.predictor.structure,
+                lost,
+                f"without {'them' if len(lost) > 1 else 'it'} the run of the whole log is the same",
+            )
         )
     unit, _ = scaled(hessian[np.ix_(free, free)])
     values, vectors = np.linalg.eigh((unit + unit.T) / 2)

@@ -82,6 +82,8 @@ class PredictionLimits:
 
 
 LIMITS = PredictionLimits()
+# why parts were not left out where seconds were few
+TOO_SHORT = "time was too short to estimate without a part (more --effort gives it more)"
 
 
 @dataclass(frozen=True)
@@ -388,18 +390,21 @@ class NothingHeldOut(Reason):
 
 @dataclass(frozen=True)
 class NotRefitted(Reason):
-    """Some parts could not be left out, because the others do not do for an estimate.
+    """Some parts could not be left out: the others do not do for an estimate, or time was short.
 
     Parameters
     ----------
     parts, count : int
         Of all parts.
     because : str
+    in_time : bool
+        Whether there was time to see what the others do for.
     """
 
     parts: int
     count: int
     because: str
+    in_time: bool = True
 
     kind: ClassVar[str] = "not_refitted"
     fatal: ClassVar[bool] = False
@@ -407,6 +412,8 @@ class NotRefitted(Reason):
     @property
     def sentence(self) -> str:
         """How many, and what the first lacks."""
+        if not self.in_time:
+            return f"{self.parts} of {self.count} parts were not judged: {TOO_SHORT}"
         return (
             f"{self.parts} of {self.count} parts were not judged: without them the logs do not do "
             f"for an estimate ({self.because.rstrip('.')})"
@@ -671,7 +678,7 @@ def weigh_prediction(
     """Weigh what free runs did on logs against the limits.
 
     Good: every channel that moves is followed, and its bands hold. Poor: a run diverges, on a
-    log or where commands are held, or no channel that moves is usable. Limited: all between,
+    log or where commands are held, or no channel moves and is usable. Limited: all between,
     and whatever was judged on its own logs.
 
     Parameters
@@ -705,7 +712,7 @@ def weigh_prediction(
         *(r for r in found if r.fatal and r not in diverges),
     ]
     usable = any(c.error <= limits.usable for c in moving)
-    if diverges or (moving and not usable):
+    if diverges or not usable:
         level = PredictionLevel.POOR
     else:
         level = PredictionLevel.LIMITED if decisive else PredictionLevel.GOOD

@@ -19,6 +19,7 @@ from greybox.estimation.covariance import (
 )
 from greybox.estimation.disturbance import estimate_current
 from greybox.estimation.error_variance_profile import ErrorVarianceProfile, error_variance_profiles
+from greybox.estimation.informative import unexcited
 from greybox.estimation.normal_equations import Solution, solve_stacked
 from greybox.estimation.registry import ESTIMATORS
 from greybox.estimation.result import Estimate
@@ -32,6 +33,8 @@ from greybox.regression.regression import Regression
 Array = NDArray[np.float64]
 # scaled singular value below which a direction counts as not excited
 SINGULAR = 1e-8
+# size below which a regressor is nothing
+_STILL = 1e-13
 _NO_ITERATION = Iteration()
 _STRONGEST = "the estimate of the strongest instruments is given"
 _REFINE_TOLERANCE = 1e-4
@@ -252,6 +255,7 @@ def _solve(
 ) -> list[Solution]:
     predictor = regression.predictor
     solutions = []
+    _require_excited(regression, instruments)
     for row, state in enumerate(predictor.structure.states):
         mine = predictor.equation(state)
         kept = sum(int(k.sum()) for k in instruments.keep)
@@ -265,7 +269,6 @@ def _solve(
         phi = [_part(e.phi, mine, k) for e, k in logs]
         y = [e.y[row, k] for e, k in logs]
         z = [_part(z, mine, k) for z, k in zip(instruments.z, instruments.keep, strict=True)]
-        _require_excited(predictor, mine, phi, z)
         solution = solve_stacked(z, phi, y, metric=metric)
         if not solution.singular_values[-1] > SINGULAR * solution.singular_values[0]:
             raise ExcitationError(_singular(predictor, mine, solution, regression))
@@ -279,23 +282,32 @@ def _part(rows: Array, mine: list[int], keep: NDArray[np.bool_]) -> Array:
     return own if keep.all() else own[:, keep]
 
 
-def _require_excited(
-    predictor: Predictor, mine: list[int], phi: Sequence[Array], z: Sequence[Array]
-) -> None:
-    """Name the first parameter whose regressor or instrument does not vary at all."""
-    size = [np.max([np.abs(r).max(axis=1, initial=0.0) for r in x], axis=0) for x in (phi, z)]
-    for i, column in enumerate(mine):
-        for each, what in zip(size, ("regressor", "instrument"), strict=True):
-            largest = float(each[i])
-            if largest < 1e-13:
-                label = predictor.columns[column].label
-                if predictor.columns[column].is_bias:
-                    raise UnexcitedBiasError(column, label)
-                raise ExcitationError(
-                    f"parameter {label} is not excited: its {what} stays within {largest:.1g} "
-                    f"over the whole log. Move what it multiplies, or leave it out "
-                    f"(--structure '{predictor.structure.name}-{predictor.columns[column].name}')."
+def _require_excited(regression: Regression, instruments: Instruments) -> None:
+    """Name the parameters whose regressors, or else instruments, do not vary at all."""
+    predictor, keep = regression.predictor, instruments.keep
+    for rows, what in (([e.phi for e in regression.experiments], "regressor"),
+                       (instruments.z, "instrument")):  # fmt: skip
+        size = np.max(
+            [
+                np.abs(row if k.all() else row[:, k]).max(axis=1, initial=0.0)
+                for row, k in zip(rows, keep, strict=True)
+            ],
+            axis=0,
+        )[: len(predictor.columns)]
+        lost = np.flatnonzero(size < _STILL)
+        bias = next((int(i) for i in lost if predictor.columns[i].is_bias), None)
+        if bias is not None:
+            raise UnexcitedBiasError(bias, predictor.columns[bias].label)
+        if len(lost):
+            many = len(lost) > 1
+            raise ExcitationError(
+                unexcited(
+                    predictor.structure,
+                    [predictor.columns[i].name for i in lost],
+                    f"{'their' if many else 'its'} {what}{'s stay' if many else ' stays'} within "
+                    f"{size[lost].max():.1g} over the whole log",
                 )
+            )
 
 
 def _singular(

@@ -17,6 +17,8 @@ from greybox.errors import OutOfTimeError
 EFFORT = 600.0
 
 _end: ContextVar[float] = ContextVar("end", default=float("inf"))
+# the end that was asked for, also where what must end heeds none
+_asked: ContextVar[float] = ContextVar("asked", default=float("inf"))
 
 
 def seconds_left() -> float:
@@ -39,7 +41,19 @@ def require_time() -> None:
 @contextmanager
 def within(seconds: float) -> Iterator[None]:
     """Limit what follows to some seconds, or to what is left where that is less."""
-    token = _end.set(min(_end.get(), time.monotonic() + seconds))
+    end = min(_end.get(), time.monotonic() + seconds)
+    token, asked = _end.set(end), _asked.set(end)
+    try:
+        yield
+    finally:
+        _end.reset(token)
+        _asked.reset(asked)
+
+
+@contextmanager
+def without_limit() -> Iterator[None]:
+    """Let what follows end, however long it takes: there must be something to give."""
+    token = _end.set(float("inf"))
     try:
         yield
     finally:
@@ -47,9 +61,9 @@ def within(seconds: float) -> Iterator[None]:
 
 
 @contextmanager
-def without_limit() -> Iterator[None]:
-    """Let what follows end, however long it takes: there must be something to give."""
-    token = _end.set(float("inf"))
+def optional() -> Iterator[None]:
+    """Limit what may be left out of what must end."""
+    token = _end.set(min(_end.get(), _asked.get()))
     try:
         yield
     finally:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.numerics.robust import white_noise
 from greybox.rotation import body_to_ned, ned_to_body
 from greybox.trial.checks.motion import Motion, smooth, to_ned
 
@@ -121,8 +122,8 @@ def find_widths(motion: Motion) -> Widths:
 
 def _noise(motion: Motion, name: str) -> float:
     """Return the standard deviation of white noise from third differences."""
-    parts = [np.diff(motion[name][a:b], 3) for a, b in motion.stretches]
-    return float(1.4826 * np.median(np.abs(np.concatenate(parts))) / np.sqrt(20))
+    parts = [motion[name][a:b] for a, b in motion.stretches]
+    return white_noise(parts) or 0.0
 
 
 def _width(noise: float, size: float, step: float) -> float:

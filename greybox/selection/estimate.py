@@ -327,9 +327,8 @@ def _judged(
     estimate: Estimate, logs: Sequence[TrialLog], request: Request, refit: Refit | None = None
 ) -> Estimate:
     """Return the estimate with the verdict on its predictions, which has time of its own."""
-    least = request.effort * _FOR_VERDICT if request.method is None else np.inf
-    left = seconds_left()
-    with without_limit(), within(max(left, least)):
+    seconds = max(seconds_left(), request.effort * _FOR_VERDICT)
+    with without_limit(), within(seconds):
         return with_prediction(estimate, logs, request, refit)
 
 

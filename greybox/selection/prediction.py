@@ -8,8 +8,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from greybox.errors import GreyboxError, UsageError
-from greybox.estimation.prediction_verdict import JudgedOn, NothingHeldOut, NotRefitted
+from greybox.errors import GreyboxError, OutOfTimeError, UsageError
+from greybox.estimation.prediction_verdict import (
+    TOO_SHORT,
+    JudgedOn,
+    NothingHeldOut,
+    NotRefitted,
+)
 from greybox.estimation.registry import ESTIMATORS
 from greybox.estimation.result import Estimate
 from greybox.estimation.verdict import Divergence, Reason
@@ -73,7 +78,15 @@ def with_prediction(
     runs_away = held_commands_diverge(model, logs) if not told else None
     told += [runs_away] if runs_away else []
     again = remembered(refit or refit_alike(estimate, request))
-    elsewhere, _ = _left_out(parts_of, logs, again, failed)
+    held: list[HeldOut] = []
+    parts = 0
+    if not request.validate:
+        held, parts = _left_out(stretches_of, logs, again, failed)
+    lost: list[str] = []
+    elsewhere, groups = _left_out(parts_of, logs, again, lost)
+    if not held and not request.validate:
+        # logs too short for parts are left out whole
+        held, parts, failed = elsewhere, groups, lost or failed
     errors = [run_errors(h.model, h.run, request.seed) for h in elsewhere]
     kinds = kinds_left_out(logs)
     calibration = calibrate_bands(
@@ -86,15 +99,13 @@ def with_prediction(
         runs = [HeldOut.of(model, log) for log in others]
         verdict = judge_prediction(runs, JudgedOn.VALIDATION, found=told, seed=request.seed)
         return replace(estimate, prediction=verdict)
-    failed.clear()
-    held, parts = _left_out(stretches_of, logs, again, failed)
     if not held:
         runs = [HeldOut.of(model, log) for log in logs]
         told.append(NothingHeldOut(failed[0]))
         verdict = judge_prediction(runs, JudgedOn.OWN, found=told, seed=request.seed)
         return replace(estimate, prediction=verdict)
     if failed:
-        told.append(NotRefitted(len(failed), parts, failed[0]))
+        told.append(NotRefitted(len(failed), parts, failed[0], TOO_SHORT not in failed))
     verdict = judge_prediction(
         held,
         parts=parts - len(failed),
@@ -130,7 +141,7 @@ def _left_out(
             other = again(fitting)
         except GreyboxError as error:
             _log.info("without a part there is no estimate: %s", error)
-            failed.append(str(error))
+            failed.append(TOO_SHORT if isinstance(error, OutOfTimeError) else str(error))
             continue
         held += [HeldOut.of(other, log, k) for log in left_out]
     return held, len(parts)

@@ -17,24 +17,28 @@ from greybox.estimation.result import Estimate
 from greybox.model.catalogue import structure_for
 from greybox.model.disturbances import CURRENT, WIND
 from greybox.model.predictor import Column
+from greybox.numerics.effort import seconds_left, within
 from greybox.numerics.linalg import scaled_inverse
 from greybox.public import one_thread
+from greybox.selection.alternatives import OVER
 from greybox.selection.estimate import estimate_requested
 from greybox.selection.held_out import rank
 from greybox.selection.request import Request
 from greybox.selection.structures import (
     CHOOSE,
     FOLDS,
+    FOR_COMPARISON,
     CandidateFit,
     CrossValidation,
     Progress,
     StructureChoice,
     criteria_of,
+    rank_tried,
     rows_of,
     settle,
     told,
 )
-from greybox.trial.log import Logs
+from greybox.trial.log import Logs, TrialLog
 from greybox.trial.segments import as_segments
 from greybox.validation.criteria import independent_samples
 from greybox.vessel.force import force_inputs
@@ -176,12 +180,30 @@ def reduce_structure(
         The full structure cannot be estimated on the parts.
     """
     logs = as_segments(logs)
-    settled = settle(logs, request)
+    with within(request.effort):
+        return _reduced(logs, settle(logs, request), progress)
+
+
+def _reduced(logs: Sequence[TrialLog], settled: Request, progress: Progress) -> StructureChoice:
     states = structure_for(str(settled.structure), force_inputs(logs[0].vessel)).states
     validation = CrossValidation(logs, states)
+    with within(FOR_COMPARISON * seconds_left()):
+        tried = _steps(validation, settled, progress)
+    accepted = [t if not t.note or t.note == OVER else replace(t, scores=None) for t in tried]
+    chosen = rank_tried(accepted).chosen
+    found = replace(rank_tried(tried), chosen=chosen)
+    estimate = estimate_requested(logs, tried[found.chosen].request)
+    rows = rows_of(tried, found)
+    return StructureChoice(told(estimate, found, rows), rows)
+
+
+def _steps(validation: CrossValidation, settled: Request, progress: Progress) -> list[CandidateFit]:
+    """Return what was tried in turn, the full structure first, as far as time allows."""
     current: CandidateFit | None = validation.fit(settled, full=True)
     assert current is not None
     full = current
+    if full.note == OVER:
+        return [full]
     if full.scores is None:
         raise ExcitationError(
             f"'{settled.structure}' cannot be estimated on {FOLDS - 1} of {FOLDS} parts of the "
@@ -192,12 +214,7 @@ def reduce_structure(
         progress(full.size - current.size, full.size)
         current = _step(validation, tried, current, missed)
     progress(full.size, full.size)
-    accepted = [None if t.note else t.scores for t in tried]
-    chosen = rank(accepted, [t.size for t in tried]).chosen
-    found = replace(rank([t.scores for t in tried], [t.size for t in tried]), chosen=chosen)
-    estimate = estimate_requested(logs, tried[found.chosen].request)
-    rows = rows_of(tried, found)
-    return StructureChoice(told(estimate, found, rows), rows)
+    return tried
 
 
 def _candidates(estimate: Estimate, missed: Collection[str]) -> list[Candidate]:
@@ -218,6 +235,9 @@ def _step(
             if candidate.absent and any(t.note and t.dropped == tuple(dropped) for t in tried):
                 continue
             found = validation.fit(request, full=True, dropped=tuple(dropped))
+            if found.note == OVER:
+                tried.append(found)
+                return None
             rows = [*(t for t in tried if not t.note), found]
             ranking = rank([t.scores for t in rows], [t.size for t in rows])
             near = found.scores is not None and ranking.behind[-1] <= ranking.se[-1]

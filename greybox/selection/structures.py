@@ -9,13 +9,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.errors import GreyboxError, UsageError
+from greybox.errors import GreyboxError, OutOfTimeError, UsageError
 from greybox.estimation.registry import ESTIMATORS
 from greybox.estimation.result import Estimate
 from greybox.estimation.tried import Comparison, TriedModel
 from greybox.model.catalogue import structure_for
 from greybox.notebook import DisplayMixin
+from greybox.numerics.effort import Shares, seconds_left, within
 from greybox.public import one_thread
+from greybox.selection.alternatives import OVER
 from greybox.selection.estimate import estimate_requested
 from greybox.selection.fit_single import estimate_once
 from greybox.selection.held_out import Ranking, folds, rank, score_runs, spread_of
@@ -31,6 +33,8 @@ Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 
 FOLDS = 5
+# shares of the time that is left that choosing method and predictor may take, and comparing
+_FOR_SETTLING, FOR_COMPARISON = 0.3, 0.7
 # leaves all to the data
 CHOOSE = Request()
 
@@ -167,7 +171,8 @@ class CrossValidation:
             scores = self.scores(request)
             estimate = self.once(self.logs, request if full else _without_errors(request))
         except GreyboxError as error:
-            return CandidateFit(request, None, None, None, dropped, str(error))
+            why = OVER if isinstance(error, OutOfTimeError) else str(error)
+            return CandidateFit(request, None, None, None, dropped, why)
         model = estimate.model()
         runs = [run_model(model, log) for log in self.logs]
         errors = None
@@ -218,11 +223,20 @@ def rows_of(tried: Sequence[CandidateFit], found: Ranking) -> tuple[StructureRow
     return tuple(rows)
 
 
+def rank_tried(tried: Sequence[CandidateFit]) -> Ranking:
+    """Return the choice of the smallest near the best, the first where there was time for none."""
+    if any(t.note == OVER for t in tried) and all(t.scores is None for t in tried):
+        none = np.full(len(tried), np.inf)
+        return Ranking(-none, none, np.zeros(len(tried)), 0, 0)
+    return rank([t.scores for t in tried], [t.size for t in tried])
+
+
 def settle(logs: Sequence[TrialLog], request: Request) -> Request:
     """Return the request with method, predictor and structure as the data choose them."""
     if request.method and request.predictor and request.structure:
         return request
-    first = estimate_requested(logs, replace(request, judged=False))
+    with within(_FOR_SETTLING * seconds_left()):
+        first = estimate_requested(logs, replace(request, judged=False))
     return replace(
         request,
         method=first.method,
@@ -277,27 +291,38 @@ def compare_structures(
             f"'{names[0]}' has the states {', '.join(states[names[0]])} and '{other}' "
             f"{', '.join(states[other])}: compare structures of the same states."
         )
-    settled = settle(logs, replace(request, structure=names[0]))
-    validation = CrossValidation(logs, states[names[0]])
-    tried = []
-    for i, name in enumerate(names):
-        progress(i, len(names))
-        tried.append(validation.fit(replace(settled, structure=name)))
-    progress(len(names), len(names))
-    found = rank([t.scores for t in tried], [t.size for t in tried])
-    estimate = estimate_requested(logs, tried[found.chosen].request)
+    with within(request.effort):
+        settled = settle(logs, replace(request, structure=names[0]))
+        validation = CrossValidation(logs, states[names[0]])
+        tried = []
+        with within(FOR_COMPARISON * seconds_left()):
+            shares = Shares(len(names))
+            for i, name in enumerate(names):
+                progress(i, len(names))
+                with shares.next():
+                    tried.append(validation.fit(replace(settled, structure=name)))
+        progress(len(names), len(names))
+        found = rank_tried(tried)
+        estimate = estimate_requested(logs, tried[found.chosen].request)
     rows = rows_of(tried, found)
     return StructureChoice(told(estimate, found, rows), rows)
 
 
 def told(estimate: Estimate, found: Ranking, rows: Sequence[StructureRow]) -> Estimate:
     """Return the estimate with a note on how its structure was chosen, and the table of it."""
-    note = (
-        f"structure '{estimate.predictor.structure.name}' is the smallest of {len(found.score)} "
-        f"whose held-out free run is within one standard error of the best "
-        f"({found.behind[found.chosen]:.2f} ± {found.se[found.chosen]:.2f} % behind); its "
-        f"standard errors do not know that it was chosen on the same logs."
-    )
+    name = estimate.predictor.structure.name
+    untried = sum(r.note == OVER for r in rows)
+    if np.isfinite(found.behind[found.chosen]):
+        note = (
+            f"structure '{name}' is the smallest of {len(rows) - untried} whose held-out free run "
+            f"is within one standard error of the best ({found.behind[found.chosen]:.2f} ± "
+            f"{found.se[found.chosen]:.2f} % behind); its standard errors do not know that it was "
+            f"chosen on the same logs."
+        )
+        if untried:
+            note += f" {untried} more could not be tried: time was over (--effort)."
+    else:
+        note = f"structure '{name}' was compared with no other: time was over (--effort)."
     own = TriedModel(
         "", estimate.predictor.kind, estimate.method, estimate.sample_time,
         law_in_words(estimate.vessel.thrusters[0].thrust), 0,

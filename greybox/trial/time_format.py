@@ -11,6 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.numerics.robust import robust_deviation
+
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
@@ -141,7 +143,7 @@ def unpadded_numbers(t: Array) -> Unpadded:
     # the last fall of each second
     last = dict(zip(group.tolist(), falls.tolist(), strict=True))
     grid = _decimals(x)
-    scatter = 1.4826 * float(np.median(np.abs(steps - usual)))
+    scatter = robust_deviation(steps - usual)
     for k in _out_of_step(x, starts, stops, usual, grid):
         last.setdefault(k, int(starts[k]))
     # no nearer than stamps are rounded

@@ -65,7 +65,7 @@ def independent_samples(residuals: Sequence[Array], about: Array | None = None) 
     for i in np.flatnonzero(size > 0):
         memory = 1.0
         one = [r[:, i][None] for r in centred]
-        for lag in range(1, min(len(r) for r in residuals)):
+        for lag in range(1, max(len(r) for r in residuals)):
             rho = lagged_products(one, one, lag).item() / size[i]
             if rho < limit:
                 break

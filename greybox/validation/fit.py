@@ -285,9 +285,14 @@ def _alike(changes: Sequence[Change], starts: Array, horizon: float) -> list[NDA
 
 
 def average_fit(fits: Sequence[LogFit]) -> dict[str, float]:
-    """Return the mean fit a state over logs [%]; segments between the gaps of one count as one."""
-    whole = [_joined(runs) for runs in _by_log(fits)]
-    return {s: float(np.mean([fit[s] for fit in whole])) for s in whole[0]}
+    """Return the mean fit a state over logs, each by its samples [%].
+
+    Segments between the gaps of one log count as one.
+    """
+    groups = _by_log(fits)
+    whole = [_joined(runs) for runs in groups]
+    samples = [sum(len(r.log) for r in runs) for runs in groups]
+    return {s: float(np.average([fit[s] for fit in whole], weights=samples)) for s in whole[0]}
 
 
 def _by_log(fits: Sequence[LogFit]) -> list[list[LogFit]]:

@@ -26,6 +26,7 @@ from greybox.estimation.prediction_verdict import (
 from greybox.estimation.verdict import Reason
 from greybox.model.model import ManoeuvringModel
 from greybox.numerics.binomial import wilson_interval
+from greybox.numerics.robust import white_noise
 from greybox.trial.log import TrialLog
 from greybox.trial.segments import split_segments, whole_name
 from greybox.validation.bands import predict_bands
@@ -37,10 +38,6 @@ Array = NDArray[np.float64]
 
 # draws of a band that is only counted, and runs from measured states a log
 _DRAWS, _RESTARTS = 64, 12
-# variance of a third difference of white noise
-_THIRD = 20.0
-# of a normal distribution: standard deviation over median absolute deviation
-_MEDIAN = 1.4826
 # weight of errors on what was left out beside those on the own logs: the share of the samples
 # that a bootstrap draws; and error of a run, in spreads, beyond which it is lost whatever it is
 _LEFT_OUT, _LOST = 1 - np.exp(-1.0), 3.0
@@ -255,11 +252,11 @@ def _noise(held: Sequence[HeldOut], states: tuple[str, ...]) -> Array:
     vessel = held[0].run.log.vessel
     levels = [h.model.noise.measurement for h in held if h.model.noise is not None]
     for i, state in enumerate(states):
-        rough = [np.diff(h.run.log.measured(state), 3) for h in held if len(h.run.log) > 3]
-        known = np.concatenate([d[np.isfinite(d)] for d in rough]) if rough else np.zeros(0)
-        said = [vessel.std(state), *(float(level[i]) for level in levels[:1])]
-        if len(known):
-            said.append(_MEDIAN * float(np.median(np.abs(known))) / np.sqrt(_THIRD))
+        said = [
+            vessel.std(state),
+            *(float(level[i]) for level in levels[:1]),
+            white_noise([h.run.log.measured(state) for h in held]),
+        ]
         told = [v for v in said if v is not None]
         if told:
             out[i] = min(told)

@@ -292,6 +292,21 @@ def test_the_library_is_silent_by_itself(folder):
     assert done.stdout == done.stderr == ""
 
 
+@pytest.mark.parametrize("more", [[], ["--no-config"]])
+def test_a_folder_that_was_deleted_is_one_sentence(tmp_path, monkeypatch, capsys, more):
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    assert main(["check", "trial.csv", "--vessel", "thesis", *more]) == 1
+    told = capsys.readouterr().err
+    assert "the folder that this is run in was deleted" in told
+    assert told.count("\n") == 1
+    with pytest.raises(SystemExit) as ended:
+        main(["check", "--help"])
+    assert ended.value.code == 0
+
+
 def test_names_of_a_damaged_file_break_no_line(tmp_path, monkeypatch, capsys):
     from scipy.io import savemat
 

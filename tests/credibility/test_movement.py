@@ -66,6 +66,31 @@ def test_a_force_below_any_misalignment_is_excepted(method, units):
     )
 
 
+def test_a_force_that_is_the_noise_of_thrusters_that_cancel_is_excepted():
+    found = estimate_model(crossed(0.006), method="iv", **ASKED)
+    assert "Ymu" in found.verdict.excepted
+
+
+def test_all_parameters_that_are_not_excited_are_named_at_once():
+    log = crossed(0.3)
+    still = log.channels | {"r": np.zeros(len(log))}
+    with pytest.raises(ExcitationError) as told:
+        estimate_model(make_log(log.vessel, still, 1.0, "still"), method="ls", **ASKED)
+    assert "parameters Xvr, Yur, Yvr, Nr, Nvr are not excited" in str(told.value)
+    assert "leave them out (--structure 'thesis-Xvr-Yur-Yvr-Nr-Nvr')" in str(told.value)
+
+
+def test_commands_that_move_by_their_noise_alone_are_refused():
+    log, rng = crossed(0.3), np.random.default_rng(5)
+    held = {c: 0.7 + 0.003 * rng.standard_normal(len(log)) for c in ("alpha1", "alpha2")}
+    held["n"] = 15 + 0.05 * rng.standard_normal(len(log))
+    with pytest.raises(ExcitationError, match=r"but for noise, which moves n by 0\.0"):
+        estimate_model(make_log(log.vessel, log.channels | held, 1.0, "held"), **ASKED)
+    still = log.channels | dict.fromkeys(STATES, np.ones(len(log)))
+    with pytest.raises(ExcitationError, match="u, v, r do not change over the whole log"):
+        estimate_model(make_log(log.vessel, still, 1.0, "still"), **ASKED)
+
+
 def test_what_moves_passes():
     found = estimate_model(crossed(0.3), method="iv", **ASKED)
     (told,) = [t for t in found.tests if t.kind == "movement"]

@@ -12,7 +12,9 @@ from greybox.errors import GreyboxError, OutOfTimeError, UsageError
 from greybox.numerics import effort
 from greybox.numerics.effort import Shares, require_time, seconds_left, within
 from greybox.selection.estimate import estimate_model
+from greybox.selection.reduction import reduce_structure
 from greybox.selection.request import Request
+from greybox.selection.structures import compare_structures
 from greybox.selection.term_selection import select_terms
 
 
@@ -64,6 +66,25 @@ def test_where_time_is_over_at_once_the_first_estimate_ends_and_the_rest_is_name
     assert "estimators were not compared by held-out runs: its time was over" in told
     with within(1), pytest.raises(OutOfTimeError):
         select_terms([log], "none", 0, lambda logs: found.model())
+
+
+@pytest.mark.parametrize(
+    "choose",
+    [lambda *a: compare_structures(a[0], ["linear", "thesis"], a[1]), reduce_structure],
+    ids=["compare", "reduce"],
+)
+def test_structures_are_compared_within_the_time_too(monkeypatch, choose):
+    ticks = itertools.count(0, 1000)
+    monkeypatch.setattr(effort, "time", SimpleNamespace(monotonic=lambda: next(ticks)))
+    log = virtual_log(1, 200, wind=0.0, current=(0.0, 0.0))
+    asked = Request(method="iv", predictor="basic", structure="linear", effort=10)
+    choice = choose(log, asked)
+    assert choice.rows[0].chosen
+    assert "time was over (--effort)" in choice.rows[0].note
+    told = "\n".join(choice.estimate.notes)
+    assert "'linear' was compared with no other: time was over (--effort)" in told
+    assert "not refined by the noise: time was too short for it (--effort)" in told
+    assert "nothing was held out, because time was too short" in choice.estimate.prediction.text
 
 
 def test_ample_time_changes_nothing():

@@ -215,4 +215,6 @@ def test_the_fit_of_an_estimate_is_that_of_its_log_however_short_its_segments(lo
     assert estimate.fit == pytest.approx(run.fit, rel=1e-9)
     both = estimate_model([gapped, log], **asked)
     fits = [run_model(both.model(), part).fit for part in (gapped, log)]
-    assert both.fit == pytest.approx({s: np.mean([f[s] for f in fits]) for s in "uvr"}, rel=1e-9)
+    samples = [len(gapped), len(log)]
+    mean = {s: np.average([f[s] for f in fits], weights=samples) for s in "uvr"}
+    assert both.fit == pytest.approx(mean, rel=1e-9)

@@ -68,8 +68,9 @@ def _prefiltered(
     ExcitationError
         The refinement that the problem asks for fails.
     """
-    from greybox.errors import ExcitationError, UsageError
+    from greybox.errors import ExcitationError, OutOfTimeError, UsageError
     from greybox.estimation.refined import add_noise, refine_by_noise
+    from greybox.numerics.effort import optional
 
     kind = problem.covariance or "cluster"
     against = ""
@@ -85,9 +86,9 @@ def _prefiltered(
     if problem.prefilter != "none" and not against:
         try:
             # standard errors of the plain estimate would be those of another one
-            refined, white = refine_by_noise(
-                solved.problem, solved.estimate(None), kind, problem.seed
-            )
+            plain = solved.estimate(None)
+            with optional():
+                refined, white = refine_by_noise(solved.problem, plain, kind, problem.seed)
             if problem.prefilter == "noise":
                 return refined, white
             mixed = solved.problem.wind == "measured" and _pushed_through_air(refined)
@@ -103,6 +104,10 @@ def _prefiltered(
             if problem.prefilter == "noise":
                 raise
             against = str(error).rstrip(".")
+        except OutOfTimeError:
+            if problem.prefilter == "noise" or not problem.judged:
+                raise
+            against = "time was too short for it (--effort)"
     if against and problem.prefilter == "auto":
         notes.append(f"the instruments were not refined by the noise: {against}.")
     plain = solved.estimate(kind, problem.seed)

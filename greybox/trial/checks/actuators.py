@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.numerics.recursion import propagate
+from greybox.numerics.robust import robust_deviation
 from greybox.trial.actuator_estimate import ActuatorEstimate, Measured
 from greybox.trial.checks.finding import Finding, Outcome
 from greybox.trial.convert.derived_signals import continuous
@@ -273,7 +274,7 @@ def _rest(theta: Array, pairs: Sequence[_Pair], kind: ActuatorKind) -> Array:
 
 
 def _scale(rest: Array) -> float:
-    return 1.4826 * float(np.median(np.abs(rest - np.median(rest))))
+    return robust_deviation(rest - np.median(rest))
 
 
 def _huber(rest: Array, scale: float) -> float:

@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.numerics.recursion import decay
+from greybox.numerics.robust import robust_deviation
 from greybox.rotation import ned_to_body
 from greybox.trial.checks.finding import Finding, Outcome
 from greybox.trial.checks.motion import Motion, denoise, make_motion
@@ -554,7 +555,7 @@ class _Equation:
         for _ in range(_ROUNDS_OF_JUMPS):
             rest = self.rate - self.columns @ self.fit.theta[: len(self.kind)]
             apart = np.abs(rest - median_filter(rest, _AROUND, mode="nearest"))
-            usual = 1.4826 * float(np.median(np.abs(rest[self.inside])))
+            usual = robust_deviation(rest[self.inside])
             jumps = np.flatnonzero(self.inside & (apart > _JUMP * usual))
             if not len(jumps):
                 break

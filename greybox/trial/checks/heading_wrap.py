@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.numerics.robust import robust_deviation
 from greybox.trial.checks.finding import Finding
 from greybox.trial.checks.signal_quality import quantum
 from greybox.trial.raw_log import Recording
@@ -159,7 +160,7 @@ def _noise(t: Array, psi: Array) -> float:
             bend = _wrapped(psi[2 * lag :] - psi[lag:-lag]) - _wrapped(
                 psi[lag:-lag] - psi[: -2 * lag]
             )
-            found = max(found, 1.4826 * float(np.median(np.abs(bend))) / np.sqrt(6))
+            found = max(found, robust_deviation(bend) / np.sqrt(6))
     return found
 
 

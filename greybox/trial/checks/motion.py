@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.numerics.recursion import decay
+from greybox.numerics.robust import robust_deviation
 from greybox.rotation import body_to_ned
 from greybox.trial.convert.derived_signals import continuous
 from greybox.trial.convert.resample import clock, stretches
@@ -261,7 +262,7 @@ def outlier_weights(size: Array) -> Array:
     size : ndarray
         (N,) absolute innovations, of several components the largest.
     """
-    scale = float(np.median(size)) * 1.4826
+    scale = robust_deviation(size)
     if scale <= 0:
         return np.ones(len(size))
     return np.asarray(np.minimum(1.0, _ROBUST * scale / np.maximum(size, 1e-300)))

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.numerics.robust import robust_deviation
 from greybox.trial.checks.finding import Finding
 from greybox.trial.checks.signal_quality import (
     STUCK_SAMPLES,
@@ -188,7 +189,7 @@ def _speed(
     if len(at) > 2:
         share = ((at[1:-1] - at[:-2]) / (at[2:] - at[:-2]))[:, None]
         off = there[1:-1] - (1 - share) * there[:-2] - share * there[2:]
-        noise = 1.4826 * float(np.median(np.abs(off))) / np.sqrt(1.5)
+        noise = robust_deviation(off) / np.sqrt(1.5)
     else:
         noise = 0.0
     return way / np.maximum(time, period), way > _UNDER_WAY * np.sqrt(2) * noise

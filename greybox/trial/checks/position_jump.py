@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.numerics.recursion import decay
+from greybox.numerics.robust import FROM_MEDIAN
 from greybox.rotation import body_to_ned, ned_to_body
 from greybox.trial.checks.finding import Finding
 from greybox.trial.checks.position_hold import Track, position_track
@@ -601,4 +602,4 @@ def _scale(size: Array, clear: Mask, half: int) -> Array:
         np.maximum(np.interp(at - away, centre, x), np.interp(at + away, centre, x))
         for x in level.T
     ]
-    return np.asarray(1.4826 * np.maximum(np.column_stack(local), overall))
+    return np.asarray(FROM_MEDIAN * np.maximum(np.column_stack(local), overall))

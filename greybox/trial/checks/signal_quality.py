@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.channels import ANGLES
+from greybox.numerics.robust import FROM_MEDIAN, robust_deviation
 from greybox.rotation import body_to_ned
 from greybox.trial.checks.finding import Finding
 from greybox.trial.convert.derived_signals import continuous
@@ -257,14 +258,14 @@ def _spikes(value: Array) -> tuple[NDArray[np.int64], float, Array]:
     pairs = ((1, 2), (1, 3), (2, 3), (2, 4), (3, 4))
     predicted = [(b * b * mean[a] - a * a * mean[b]) / (b * b - a * a) for a, b in pairs]
     gap = value - np.median(predicted, axis=0)
-    scale = 1.4826 * float(np.median(np.abs(gap)))
+    scale = robust_deviation(gap)
     step = quantum(value)
     scale = max(scale, step / np.sqrt(12), 1e-12 * max(float(np.abs(value).max()), 1e-300))
     out = np.abs(gap) > _SPIKE * scale + 2 * step
     if out.any():
         from scipy.ndimage import median_filter
 
-        local = 1.4826 * median_filter(np.abs(gap), size=51, mode="nearest")
+        local = FROM_MEDIAN * median_filter(np.abs(gap), size=51, mode="nearest")
         out &= np.abs(gap) > _LOCAL_SPIKE * local + 2 * step
     wide = [
         k

@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from greybox.numerics.robust import robust_deviation
+
 Array = NDArray[np.float64]
 Side = Literal["both", "before", "after"]
 
@@ -102,7 +104,7 @@ def noise_std(t: Array, y: Array) -> float:
     values = [y[0:-4], y[1:-3], y[3:-1], y[4:]]
     miss = y[2:-2] - sum(w * v for w, v in zip(weights, values, strict=True))
     miss /= np.sqrt(1 + sum(w**2 for w in weights))
-    return float(1.4826 * np.median(np.abs(miss)))
+    return robust_deviation(miss)
 
 
 def residual_inflation(residual: Array) -> float:

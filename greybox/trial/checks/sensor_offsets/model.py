@@ -13,6 +13,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.numerics.robust import robust_deviation
 from greybox.trial.checks.motion import Motion, denoise, integrate, smooth, to_ned
 
 Array = NDArray[np.float64]
@@ -27,8 +28,6 @@ SIZE = BIAS + 1
 _NOISE_WINDOW = 5.0
 # in standard deviations: what is beyond is no noise, but a bad sample
 _USUAL = 4.0
-# of a normal distribution: standard deviation over median absolute deviation
-_MEDIAN = 1.4826
 # samples that a cubic spline needs more than
 _SPLINE = 3
 
@@ -167,7 +166,7 @@ class _Channel:
         self.splines, self.spectra, self.spikes = [], [], []
         for a, b in motion.stretches:
             t, noise = motion.t[a:b], value[a:b] - smooth[a:b]
-            usual = _USUAL * _MEDIAN * float(np.median(np.abs(noise)))
+            usual = _USUAL * robust_deviation(noise)
             # a single bad sample would ring
             body = np.clip(noise, -usual, usual)
             self.splines.append(

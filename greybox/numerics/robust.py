@@ -1,0 +1,40 @@
+"""Spread and noise by medians, which few outliers do not move."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+# of a normal distribution: standard deviation over the median of the absolute value
+FROM_MEDIAN = 1.4826
+# variance of a third difference of white noise of variance 1
+_THIRD = 20.0
+
+
+def robust_deviation(values: Array) -> float:
+    """Return the standard deviation about 0 of normal values, from their median size."""
+    return FROM_MEDIAN * float(np.median(np.abs(values)))
+
+
+def white_noise(parts: Sequence[Array]) -> float | None:
+    """Return the standard deviation of the white noise of a signal, from its third differences.
+
+    That of a motion is small, that of white noise is not.
+
+    Parameters
+    ----------
+    parts : sequence of ndarray
+        (N,) stretches of equally spaced samples, nan where unknown.
+
+    Returns
+    -------
+    float or None
+        None where fewer than four neighbouring samples are known.
+    """
+    rough = [np.diff(part, 3) for part in parts if len(part) > 3]
+    known = np.concatenate([d[np.isfinite(d)] for d in rough]) if rough else np.zeros(0)
+    return robust_deviation(known) / float(np.sqrt(_THIRD)) if len(known) else None
