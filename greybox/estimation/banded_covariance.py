@@ -190,6 +190,8 @@ class ErrorBand:
 
     def adjoint(self, factor: Array, noise: ErrorNoise, white: Array) -> Array:
         """Return Wᵀ v (rows, nx) of white values (rows·nx,), where `whiten` gives W."""
+        if not self.rows:
+            return np.zeros((0, self.nx))
         out = self.unwhiten(factor, white[None])[0].reshape(self.rows, self.nx)
         out[:-1] -= self._one[1:, None] * noise.memory * out[1:].copy()
         return np.asarray(out)

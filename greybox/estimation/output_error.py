@@ -20,7 +20,6 @@ from greybox.estimation.covariance import (
     allow_for_segments,
     block_bootstrap,
     correlation_lags,
-    curved,
     segment_length,
     segment_sums,
 )
@@ -80,8 +79,6 @@ _WEAK, _SHOWN = 1e-3, 0.3
 _WANDERS = 0.01
 # deviations above what a fit to white noise leaves, from which on the heading drifts
 _DRIFTS = 5.0
-# standard errors over which derivatives of the gradient are taken
-_STEP = 0.1
 
 
 @dataclass(frozen=True)
@@ -240,32 +237,6 @@ class _Fitted:
             counted = e * (loss_weights(r, self.loss) >= 1.0)
             total = total + counted.reshape(len(e), -1) @ e.reshape(len(e), -1).T
         return total
-
-    @cached_property
-    def curvature(self) -> Array:
-        """Σ (∂E/∂p_j) r in column j, (q, q), first states moving along; 0 where unknown.
-
-        By finite differences of the gradient over tenths of standard errors.
-        """
-        q, runs = len(self.fit.p), self.runs
-        change = np.zeros((q, q))
-        if not isinstance(runs, FreeRuns) or runs.segments.joined.any():
-            return change
-        inverse = scaled_inverse(self.hessian)
-        sides = log_rows(runs.linearise(self.fit.p, self.fit.nodes), runs.segments, q)
-        gradient = sum(without_start(e, q) @ r for e, r in sides)
-        for j, step in enumerate(_STEP * np.sqrt(np.maximum(np.diag(inverse), 0.0))):
-            if not step > 0:
-                continue
-            p, nodes = self.fit.p.copy(), self.fit.nodes.copy()
-            p[j] += step
-            if not runs.fixed:
-                nodes -= step * np.array([starts_by(e, q)[:, j] for e, _ in sides])
-            moved = log_rows(runs.linearise(p, nodes), runs.segments, q)
-            found = sum(without_start(e, q) @ r for e, r in moved)
-            if np.isfinite(found).all():
-                change[:, j] = (found - gradient) / step + self.hessian[:, j]
-        return change - np.diag(self.restrictions.precision)
 
     @cached_property
     def slow(self) -> dict[str, tuple[float, float]]:
@@ -458,11 +429,6 @@ def without_start(rows: Array, q: int) -> Array:
     return np.asarray(rows[:q] - (rows[:q] @ unit.T) @ unit)
 
 
-def starts_by(rows: Array, q: int) -> Array:
-    """Return (nz, q) how much of each first state imitates a parameter, rows as `log_rows`."""
-    return np.asarray(scaled_inverse(rows[q:] @ rows[q:].T) @ (rows[q:] @ rows[:q].T))
-
-
 def _result(fitted: _Fitted, logs: Sequence[TrialLog], options: OutputErrorOptions) -> Estimate:
     model, data, fit, runs = fitted.model, fitted.data, fitted.fit, fitted.runs
     predictor, restrictions = model.predictor, fitted.restrictions
@@ -570,7 +536,7 @@ def _covariance(
     if kind == "cluster":
         part = np.ix_(free, free)
         hessian = fitted.hessian[part]
-        bread = curved(scaled_inverse(hessian), hessian, fitted.curvature[part])
+        bread = scaled_inverse(hessian)
         sums = segment_sums(own, residuals, lags)
         covariance[part] = allow_for_segments(covariance[part], [sums], [bread])
     return covariance
