@@ -180,7 +180,7 @@ class ErrorBand:
         out = v.reshape(len(v), -1)
         for row in out if self.rows else ():
             dtbsv(len(factor) - 1, factor, row, lower=1, overwrite_x=1)
-        return out
+        return np.asarray(out)
 
     def unwhiten(self, factor: Array, white: Array) -> Array:
         """Return the transposed factor's inverse times white rows (q, rows·nx): Ω⁻¹ v."""
@@ -188,11 +188,19 @@ class ErrorBand:
 
         return np.array([dtbsv(len(factor) - 1, factor, row, lower=1, trans=1) for row in white])
 
+    def adjoint(self, factor: Array, noise: ErrorNoise, white: Array) -> Array:
+        """Return Wᵀ v (rows, nx) of white values (rows·nx,), where `whiten` gives W."""
+        if not self.rows:
+            return np.zeros((0, self.nx))
+        out = self.unwhiten(factor, white[None])[0].reshape(self.rows, self.nx)
+        out[:-1] -= self._one[1:, None] * noise.memory * out[1:].copy()
+        return np.asarray(out)
+
     def before(self, values: Array) -> Array:
         """Return the values (q, N, nx) of the row before each, zero where none is."""
         out = np.zeros((len(values), self.rows, self.nx))
         np.multiply(self._one[1:, None], np.take(values, self.keep[:-1], axis=1), out=out[:, 1:])
-        return out
+        return np.asarray(out)
 
 
 def _following(values: Array) -> Array:

@@ -33,6 +33,8 @@ _MEMORIES = 4
 _NORMAL = 1.959964
 # share of an equation's information from which on a segment alone determines a direction
 _ALONE = 1e-6
+# share of the information that the curvature of a misfit may not take
+_LEFT = 0.2
 # degrees of freedom that count as certain
 _SURE = 1e4
 
@@ -268,6 +270,39 @@ def cluster_std(scores: Array, moments: Array, bread: Array) -> tuple[Array, Arr
     )
     freedom = trace**2 / np.maximum(square, 1e-300)
     return np.sqrt(variance), freedom
+
+
+def curved(bread: Array, moments: Array, change: Array) -> Array:
+    """Return the bread of an estimate whose instruments or sensitivities move with it.
+
+    Residuals of a model that is only nearly right do not average out of Σ (∂ẑ/∂θ) e.
+
+    Parameters
+    ----------
+    bread : ndarray
+        (p, p), the inverse of Σ ẑ φᵀ.
+    moments : ndarray
+        (p, p) Σ ẑ ẑᵀ.
+    change : ndarray
+        (p, p) Σ (∂ẑ/∂θ_j) e in column j.
+
+    Returns
+    -------
+    ndarray
+        (p, p) the inverse of Σ ẑ φᵀ less the change, as far as that leaves a fifth of what the
+        logs tell of each direction.
+
+    References
+    ----------
+    White (1982), the sandwich of an M-estimate.
+    """
+    size = sizes(moments)
+    values, vectors = np.linalg.eigh(moments / np.outer(size, size))
+    root = np.sqrt(np.maximum(values, values[-1] * 1e-15))
+    into, back = (vectors / root).T / size, size[:, None] * vectors * root
+    u, kept, vt = np.linalg.svd(np.eye(len(bread)) - into @ change @ bread @ back)
+    inverse = (vt.T / np.maximum(kept, _LEFT)) @ u.T
+    return np.asarray(bread @ back @ inverse @ into)
 
 
 def moderated(ratio: Array, freedom: Array) -> tuple[Array, Array]:

@@ -18,6 +18,7 @@ from greybox.estimation.covariance import (
     CovarianceKind,
     allow_for_segments,
     block_bootstrap,
+    curved,
     score_covariance,
     segment_sums,
 )
@@ -161,6 +162,7 @@ def white_covariance(
     *,
     samples: Sequence[int],
     seed: int = 0,
+    change: Array | None = None,
 ) -> tuple[Array, int]:
     """Return the covariance of the estimate and the lags it allows for.
 
@@ -173,6 +175,8 @@ def white_covariance(
         scores differ more between segments.
     samples : sequence of int
         N of each log.
+    change : ndarray, optional
+        (p, p) of `curved`, for ``cluster``.
     """
     p, nx = len(theta), bands[0].nx
     errors = [r.y - theta @ r.phi for r in rows]
@@ -206,5 +210,8 @@ def white_covariance(
     if kind == "cluster":
         z = [r.z.reshape(p, -1, nx) for r in rows]
         sums = segment_sums(z, [e.reshape(-1, nx) for e in errors], lags)
-        found = allow_for_segments(found, [sums], [inverse])
+        bread = inverse
+        if change is not None:
+            bread = curved(inverse, np.sum([r.z @ r.z.T for r in rows], axis=0), change)
+        found = allow_for_segments(found, [sums], [bread])
     return found, lags

@@ -541,7 +541,8 @@ def _covariance(
         covariance *= np.outer(factor, factor)
     if kind == "cluster":
         part = np.ix_(free, free)
-        bread = scaled_inverse(fitted.hessian[part])
+        hessian = fitted.hessian[part]
+        bread = scaled_inverse(hessian)
         sums = segment_sums(own, residuals, lags)
         covariance[part] = allow_for_segments(covariance[part], [sums], [bread])
     return covariance

@@ -44,6 +44,7 @@ from greybox.estimation.solve import solve_iv, solve_ls
 from greybox.estimation.values import Iteration
 from greybox.estimation.verdict import UNJUDGED
 from greybox.model.predictor import Predictor
+from greybox.numerics.banded import factor_band
 from greybox.numerics.effort import require_time
 from greybox.public import known_keywords, one_thread
 from greybox.regression.motion import Motion, further_channels, predicted_motion, smoothed_heading
@@ -60,6 +61,10 @@ _RELATIVE = 1e-6
 _MOST = 30
 # share of the increments' spread below which errors are rounding
 _EXACT = 1e-6
+# memory of process noise over a sample where the other kind is tried
+_SLOW = 0.9
+# standard errors over which derivatives of the motion are taken
+_STEP = 0.1
 # rounds after which the noise is settled at the latest
 _NOISE_ROUNDS = 6
 
@@ -270,7 +275,13 @@ def refine_by_noise(
         covariance,
         samples=[len(k) for k in found.keep],
         seed=seed,
+        change=_change(work, found) if covariance == "cluster" else None,
     )
+    if covariance == "cluster":
+        # of two ways to weigh that would agree if the model held, either might have been taken
+        half = (_by_other_memory(work, found) - theta) / 2
+        factor = np.sqrt(1 + half**2 / np.diag(matrix))
+        matrix = matrix * np.outer(factor, factor)
     vessel = logs[0].vessel
     estimate = replace(
         plain,
@@ -411,6 +422,58 @@ def _refine(
             break
         point = following
     return _Refined(theta, inverse, rows, bands, fit, rounds, status, converged, keep)
+
+
+def _change(work: _Refinement, found: _Refined) -> Array:
+    """Return Σ (∂z/∂θ_j) Ω⁻¹ e in column j, (p, p), by finite differences of the motion."""
+    theta, noise = found.theta, found.fit.noise
+    equations = [work.predictor.equation(s) for s in work.predictor.structure.states]
+    errors = []
+    for row, band in zip(found.rows, found.bands, strict=True):
+        factor = factor_band(band.covariance(noise))
+        assert factor is not None
+        errors.append(band.adjoint(factor, noise, row.y - theta @ row.phi))
+
+    def scores(at: Array) -> Array:
+        point = work.point(at, work.constants(at, found.keep))
+        out = np.zeros(len(at))
+        if point.diverged >= 0:
+            return out * np.nan
+        for motion, band, error in zip(point.motions, found.bands, errors, strict=True):
+            for i, mine in enumerate(equations):
+                out[mine] += motion.z[mine][:, band.keep] @ error[:, i]
+        return out
+
+    still = scores(theta)
+    change = np.zeros((len(theta), len(theta)))
+    moments = found.inverse @ np.sum([r.z @ r.z.T for r in found.rows], axis=0) @ found.inverse.T
+    for j, step in enumerate(_STEP * np.sqrt(np.maximum(np.diag(moments), 0.0))):
+        moved = theta.copy()
+        moved[j] += step
+        slope = (scores(moved) - still) / step if step > 0 else np.zeros(len(theta))
+        change[:, j] = np.where(np.isfinite(slope), slope, 0.0)
+    return change
+
+
+def _by_other_memory(work: _Refinement, found: _Refined) -> Array:
+    """Return the coefficients with process noise that remembers where it did not, or the reverse.
+
+    Those found where these cannot be solved.
+    """
+    point = work.point(found.theta, work.constants(found.theta, found.keep))
+    if point.diverged >= 0:
+        return found.theta
+    noise = found.fit.noise
+    memory = np.full(len(noise.memory), 0.0 if found.fit.remembers else _SLOW)
+    start = replace(
+        found.fit, noise=replace(noise, memory=memory), remembers=not found.fit.remembers
+    )
+    likelihood = work.likelihood(point, found.keep, found.theta)
+    if likelihood.exact:
+        return found.theta
+    other = likelihood.fit(start)[0]
+    theta = solve_white(work.rows(found.bands, other, point))[0]
+    return theta if np.isfinite(theta).all() else found.theta
 
 
 def _spread(errors: Sequence[Array], keep: Sequence[NDArray[np.bool_]]) -> Array:

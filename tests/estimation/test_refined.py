@@ -101,6 +101,9 @@ def test_the_band_equals_the_dense_covariance(remembers, cut):
     np.testing.assert_allclose(
         white @ white.T, flat @ np.linalg.solve(omega, flat.T), rtol=1e-10, atol=1e-9
     )
+    other = rng.normal(size=white.shape[1])
+    back = band.adjoint(factor, noise, other)
+    np.testing.assert_allclose(flat @ back.ravel(), white @ other, rtol=1e-10, atol=1e-9)
     np.testing.assert_allclose(2 * np.log(factor[0]).sum(), np.linalg.slogdet(omega)[1], rtol=1e-12)
 
 
