@@ -13,7 +13,7 @@ from greybox.estimation.tried import Comparison
 from greybox.selection.alternatives import OVER, Alternative, scored, tried_model
 from greybox.selection.cross_validation import EstimatorComparison, gain
 from greybox.selection.held_out import Ranking
-from greybox.selection.term_selection import FEW, TermChoice, law_in_words
+from greybox.selection.term_selection import FEW, Step, TermChoice, law_in_words
 from greybox.trial.log import TrialLog
 
 
@@ -75,12 +75,11 @@ def terms_tried(choice: TermChoice, found: Estimate, logs: Sequence[TrialLog]) -
         "n|n|, as propeller theory has it, unless another leaves an error that is 10 % smaller",
         tuple(laws),
     )
-    usable = [s for s in choice.steps if np.isfinite(s[1])]
-    taken = next((s[0] for s in usable if s[2] <= s[3]), None)
+    taken = Step(choice.terms.integrator, choice.logs[0].vessel.actuation.between)
     by_step = Comparison(
         "integrator, and commands between samples",
         "free runs of these terms on parts of the logs that were left out in turn",
-        "the first stays unless it falls behind the best by more than one standard error",
+        "the first stays unless it falls behind the best by more than one standard error and 1 %",
         tuple(
             replace(
                 selected,

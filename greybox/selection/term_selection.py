@@ -117,7 +117,7 @@ class TermChoice:
         logs in squared deviations; not finite where time was over.
     steps : tuple of (Step, float, float, float)
         Ways over a sample that were compared for these terms: held-out score, how far behind and
-        its standard error, not finite where time was over. The first stays within an error.
+        its standard error, not finite where time was over.
     note : str
         The choice in words.
     """
@@ -231,22 +231,29 @@ def select_terms(
     best = _of_size(whole[begun], size_shown)
     assert best is not None
     shorter = [_of_size(found[begun], size_shown) for found in paths]
+    named = {name for found in shorter if found for name in found.terms}
+    few = replace(family, terms=tuple(t for t in family.terms if t.name in named))
 
     def score_step(step: Step) -> Array:
         """Return the weighted scores of these terms, fitted again on each part's other logs."""
         score = []
         for found, part in zip(shorter, _judging_parts(logs), strict=True):
             fitting, held = (
-                FreeRunSelection(with_commands(of, step.commands), family, kind, step.integrator)
+                FreeRunSelection(with_commands(of, step.commands), few, kind, step.integrator)
                 for of in part
             )
-            errors = held.errors(fitting.fitted(found).p) if found else []
+            errors: list[Array] = []
+            if found is not None:
+                place = [selection.names.index(name) for name in fitting.names]
+                errors = held.errors(fitting.fitted(replace(found, p=found.p[place])).p)
             score.append(_score(errors, spread))
         return np.asarray(np.array(score) * weight / weight.mean())
 
     own, *others = _steps(logs)
     steps = _compare_steps([own, *others], score_step) if chosen else []
-    step = next((s for s, _, behind, se in steps if behind <= se), own)
+    error = 100 - max((score for _, score, _, _ in steps), default=0.0)
+    near = _GIVEN_AWAY / 100 * error
+    step = next((s for s, _, behind, se in steps if behind <= max(se, near)), own)
     logs = with_commands(logs, step.commands)
     fit = 100 * (1 - np.exp(-ranking.score / 100))
     counts = [size, *(n for _, n in alternatives)]
@@ -277,7 +284,8 @@ def select_terms(
     if step != own:
         said += (
             f" Steps by {step.integrator} with commands {step.commands} between samples predict "
-            f"better by more than one standard error, and were taken."
+            f"better by more than one standard error and {_GIVEN_AWAY:g} % of the error, and were "
+            f"taken."
         )
     if watch.cut:
         said += (
