@@ -180,8 +180,8 @@ def misfit_of(
     Its size is such that runs on the commands of the estimate's own run differ from it, by
     misfit and parameters together, as much as those on logs that took no part differed from
     their logs. Errors grow from a measured start, so the commands are given again until these
-    runs last as long as those. Each log shows one misfit of each equation: draws hold how badly
-    so many of them tell its size, by its chi-squared distribution.
+    runs last as long as those. Each log shows one misfit of all equations: draws hold how
+    badly so many of them tell its size, as a multivariate Student distribution does.
 
     Parameters
     ----------
@@ -240,6 +240,6 @@ def misfit_of(
     share, _ = nnls(response / scale[:, None], np.maximum(wanted - known, 0.0) / scale)
     size = np.repeat((unit * np.sqrt(share))[:, None], len(theta), axis=1)
     if errors.logs:
-        size *= np.sqrt(errors.logs / rng.chisquare(errors.logs, size.shape))
+        size *= np.sqrt(errors.logs / rng.chisquare(errors.logs, len(theta)))
     size[:, 0] = 0.0
     return Misfit.drawn(errors, size, step, rng, grows=True)

@@ -199,6 +199,10 @@ def test_intervals_are_as_wide_as_runs_on_other_logs_missed():
     # logs that were left out in turn say too much of a model that had them all
     less = width(judged_model(0.1, own=0.02))
     assert less == pytest.approx(0.6 * large, rel=0.3)
+    # and two logs tell its size badly: Student's quantile at 2 is twice that of the normal one
+    verdict = judged_model(0.1, judged_on="validation")
+    verdict.record["verdict"]["prediction"] |= {"logs": ["a", "b"], "samples": 800}
+    assert width(verdict) > 1.3 * large
 
 
 @pytest.mark.long
