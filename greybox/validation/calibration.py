@@ -28,8 +28,8 @@ Array = NDArray[np.float64]
 _FACTORS, _SAVED = (0.0, 0.5, 2.0, 4.0), 0.02
 # draws of a band that only calibrates
 _DRAWS = 64
-# independent errors that a run is worth: what it is off by, how that changes, and the rest
-_FREEDOM = 3
+# independent errors that a run is worth: what it is off by, and how that changes
+_FREEDOM = 2
 
 
 @dataclass(frozen=True)

@@ -368,5 +368,19 @@ def _shares(outward: Sequence[Array], states: tuple[str, ...]) -> dict[str, Band
             whole = np.concatenate(parts)
             share = float((np.abs(whole) <= 1).mean())
             worth = float(independent_samples(parts, np.zeros(1))[0])
+            worth = min(worth, _worth_of_runs([np.abs(p) <= 1 for p in parts]))
             found[s] = BandShare(share, wilson_interval(share, worth), len(whole), worth)
     return found
+
+
+def _worth_of_runs(inside: Sequence[NDArray[np.bool_]]) -> float:
+    """Return how many independent samples have a share that varies as that of the runs does.
+
+    Infinite where runs do not differ, or there is one.
+    """
+    runs = len(inside)
+    size = np.array([len(p) for p in inside], float) / sum(map(len, inside))
+    share = np.array([p.mean() for p in inside])
+    whole = float(size @ share)
+    between = float(size**2 @ (share - whole) ** 2) * runs / max(runs - 1, 1)
+    return whole * (1 - whole) / between if between > 0 else np.inf

@@ -113,6 +113,18 @@ def test_errors_left_out_and_own_ones_are_weighed(log):
     assert "refits_diverge" in {r.kind for r in found.because}
 
 
+def test_a_share_that_differs_between_runs_is_known_by_so_many_runs(log):
+    """One run inside its bands and one outside: two opinions, however many samples."""
+    one, other = (HeldOut.of(true_model(log, Ymu=m), log) for m in (1.0, 1.4))
+    apart = [judge_prediction([h]).channels[1].bands for h in (one, other)]
+    both = judge_prediction([one, other]).channels[1].bands
+    assert both.share == pytest.approx(np.mean([b.share for b in apart]))
+    off = np.diff([b.share for b in apart])[0] / 2
+    # the variance of a mean of two is that of their difference over four
+    assert both.independent == pytest.approx(both.share * (1 - both.share) / off**2)
+    assert both.independent < 2 < apart[0].independent
+
+
 def test_what_kinds_of_manoeuvre_left_out_show_is_told_beside_the_level(log):
     own = HeldOut.of(true_model(log), log)
     wrong = HeldOut.of(true_model(log, Ymu=2.5), log)
