@@ -27,7 +27,8 @@ from experiment_design.search import (
     limit_scale,
     within_reach,
 )
-from greybox.study.parallel import map_pieces, processors
+from greybox.numerics.forked import processors
+from greybox.study.parallel import map_pieces
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]

@@ -17,13 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, stdtrit
 
-from greybox.errors import GreyboxError, OutOfTimeError
+from greybox.errors import ExcitationError, GreyboxError, OutOfTimeError
 from greybox.estimation.output_error import Weights
 from greybox.estimation.registry import ESTIMATORS, automatic_estimators
 from greybox.estimation.result import Estimate
 from greybox.model.model import ManoeuvringModel
+from greybox.numerics.forked import map_forked
 from greybox.selection.fit_single import estimate_once
-from greybox.selection.held_out import FLOOR, folds, score_runs, spread_of
+from greybox.selection.held_out import FLOOR, extent, folds, score_runs, spread_of
 from greybox.selection.request import Request
 from greybox.trial.log import TrialLog
 from greybox.trial.manoeuvres.kinds import alike
@@ -273,15 +274,72 @@ def _estimates(
     return [found[variant] for variant in variants]
 
 
-def score_refits(
-    refits: Sequence[Callable[[Sequence[TrialLog]], ManoeuvringModel]], logs: Sequence[TrialLog]
-) -> list[Array]:
+class Refit:
+    """A model from some of the logs, chosen and estimated as that of all of them was.
+
+    The same logs, or parts of them, are estimated on once.
+
+    Parameters
+    ----------
+    estimate : callable
+        Returns the model.
+    """
+
+    def __init__(self, estimate: Callable[[Sequence[TrialLog]], ManoeuvringModel]) -> None:
+        self._estimate = estimate
+        self._known: dict[tuple[tuple[str, float, float], ...], ManoeuvringModel | str] = {}
+
+    def __call__(self, logs: Sequence[TrialLog]) -> ManoeuvringModel:
+        """Return the model of logs.
+
+        Raises
+        ------
+        ExcitationError
+            There is none.
+        OutOfTimeError
+            Time was over before.
+        """
+        key = extent(logs)
+        if key not in self._known:
+            self._known[key] = self._tried(logs)
+        found = self._known[key]
+        if isinstance(found, str):
+            raise ExcitationError(found)
+        return found
+
+    def _tried(self, logs: Sequence[TrialLog]) -> ManoeuvringModel | str:
+        """Return the model, or why there is none."""
+        try:
+            return self._estimate(logs)
+        except OutOfTimeError:
+            raise
+        except GreyboxError as error:
+            return str(error)
+
+    def _in_time(self, logs: Sequence[TrialLog]) -> ManoeuvringModel | str | None:
+        try:
+            return self._tried(logs)
+        except OutOfTimeError:
+            return None
+
+    @staticmethod
+    def ahead(refits: Sequence[Refit], parts: Sequence[Sequence[TrialLog]]) -> None:
+        """Estimate on each of the parts where that is still to be done, on all processors."""
+        tasks = [(r, p) for r in refits for p in parts if extent(p) not in r._known]
+        for (refit, part), found in zip(
+            tasks, map_forked(lambda task: task[0]._in_time(task[1]), tasks), strict=True
+        ):
+            if found is not None:
+                refit._known[extent(part)] = found
+
+
+def score_refits(refits: Sequence[Refit], logs: Sequence[TrialLog]) -> list[Array]:
     """Return the scores of models over parts of the logs that are left out of them in turn.
 
     Parameters
     ----------
-    refits : sequence of callable
-        Each estimates a model on some of the logs; where it fails, its run counts as escaped.
+    refits : sequence of Refit
+        Where one fails, its run counts as escaped.
     logs : sequence of TrialLog
 
     Raises
@@ -293,6 +351,7 @@ def score_refits(
     """
     parts = parts_of(logs)
     blocks = -(-_SCORES // max(len(logs), len(parts)))
+    Refit.ahead(refits, [fitting for fitting, _ in parts])
     found = []
     for refit in refits:
         scores: list[Array] = []

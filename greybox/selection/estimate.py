@@ -47,15 +47,14 @@ from greybox.selection.alternatives import (
 from greybox.selection.compared import estimators_tried, runs_tried, terms_tried
 from greybox.selection.cross_validation import (
     EstimatorVariant,
+    Refit,
     compare_estimators,
     score_refits,
 )
 from greybox.selection.fit_single import estimate_once
 from greybox.selection.held_out import FLOOR, rank
 from greybox.selection.prediction import (
-    Refit,
     refit_alike,
-    remembered,
     require_others,
     with_prediction,
 )
@@ -219,12 +218,12 @@ def _estimated(logs: Sequence[TrialLog], request: Request) -> Estimate:
     if not _open(request, estimate):
         return _judged(estimate, logs, request)
     trusted = _rank(estimate)[0] < 2
-    refit = remembered(refit_alike(estimate, request))
+    refit = refit_alike(estimate, request)
     first = _judged(estimate, logs, request, refit) if trusted else estimate
     good = _level_of(first) is PredictionLevel.GOOD and not _misses(first)
     predicts = _or_better_run(first, refit, logs, request, notes, free_run=trusted and not good)
     if predicts.method != first.method or predicts.predictor != first.predictor:
-        refit = remembered(refit_alike(predicts, request))
+        refit = refit_alike(predicts, request)
         predicts = _judged(predicts, logs, request, refit) if trusted else predicts
     if good or (trusted and not _misses(predicts)):
         return _both(predicts, first)
@@ -438,7 +437,7 @@ def _or_selected_terms(
         model = estimate_once(on, way.structure, way.method, way.kind, asked).model()
         return replace(model, noise=estimate.noise)
 
-    return estimate, choice.logs, refit
+    return estimate, choice.logs, Refit(refit)
 
 
 def _of_terms(

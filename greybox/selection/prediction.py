@@ -22,12 +22,12 @@ from greybox.model.model import ManoeuvringModel
 from greybox.selection.alternatives import ranking_request
 from greybox.selection.cross_validation import (
     EstimatorVariant,
+    Refit,
     estimate_variant,
     kinds_left_out,
     parts_of,
     stretches_of,
 )
-from greybox.selection.held_out import extent
 from greybox.selection.request import Request
 from greybox.trial.kinematics import decimate_segments
 from greybox.trial.log import TrialLog
@@ -40,8 +40,6 @@ _log = logging.getLogger(__name__)
 
 # samples from which on plain instruments predict as well as those refined by the noise
 _MANY = 10_000
-# a model from some of the logs, chosen and estimated as that of all of them was
-Refit = Callable[[Sequence[TrialLog]], ManoeuvringModel]
 
 
 def with_prediction(
@@ -58,7 +56,7 @@ def with_prediction(
     request : Request
         Its ``validate`` logs judge instead, where there are some; the logs left out in turn
         then calibrate the bands alone.
-    refit : callable, optional
+    refit : Refit, optional
         Whatever the data chose must be chosen again in it. By default the same structure,
         predictor and method.
 
@@ -77,7 +75,7 @@ def with_prediction(
     logs = as_read(logs, estimate)
     runs_away = held_commands_diverge(model, logs) if not told else None
     told += [runs_away] if runs_away else []
-    again = remembered(refit or refit_alike(estimate, request))
+    again = refit or refit_alike(estimate, request)
     held: list[HeldOut] = []
     parts = 0
     if not request.validate:
@@ -136,6 +134,7 @@ def _left_out(
     except UsageError as error:
         failed.append(str(error))
         return held, 0
+    Refit.ahead([again], [fitting for fitting, _ in parts])
     for k, (fitting, left_out) in enumerate(parts):
         try:
             other = again(fitting)
@@ -176,19 +175,6 @@ def require_others(logs: Sequence[TrialLog], validate: Sequence[TrialLog]) -> No
             )
 
 
-def remembered(refit: Refit) -> Refit:
-    """Return a refit that estimates on the same logs, or parts of them, once."""
-    known: dict[tuple[tuple[str, float, float], ...], ManoeuvringModel] = {}
-
-    def again(logs: Sequence[TrialLog]) -> ManoeuvringModel:
-        key = extent(logs)
-        if key not in known:
-            known[key] = refit(logs)
-        return known[key]
-
-    return again
-
-
 def refit_alike(estimate: Estimate, request: Request) -> Refit:
     """Return how to estimate the model of an estimate on fewer logs, from where it ended.
 
@@ -212,4 +198,4 @@ def refit_alike(estimate: Estimate, request: Request) -> Refit:
         more = sum(x["samples"] for x in estimate.logs) / sum(map(len, logs))
         return replace(model, covariance=more * whole.covariance, noise=whole.noise)
 
-    return refit
+    return Refit(refit)

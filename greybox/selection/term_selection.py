@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 from greybox.errors import ExcitationError, GreyboxError, OutOfTimeError, UsageError
 from greybox.estimation.informative import ADVISED_HEADING, heading_range
 from greybox.model.catalogue import structure_for
-from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor_kinds import PREDICTORS
 from greybox.model.run.step import Integrator
 from greybox.model.structure import Structure
 from greybox.numerics.effort import Shares, seconds_left, within
-from greybox.selection.cross_validation import parts_of
+from greybox.numerics.forked import Piece, Result, lanes, map_forked
+from greybox.selection.cross_validation import Refit, parts_of
 from greybox.selection.family import family_for, first_terms, spell_structure
 from greybox.selection.free_run_selection import FreeRunSelection, Selected
 from greybox.selection.held_out import extent, folds, rank, spread_of
@@ -136,7 +136,7 @@ def select_terms(
     logs: Sequence[TrialLog],
     present: str,
     size: int,
-    refit: Callable[[Sequence[TrialLog]], ManoeuvringModel],
+    refit: Refit,
 ) -> TermChoice:
     """Choose terms by free runs on parts that were left out, and compare with a present model.
 
@@ -148,7 +148,7 @@ def select_terms(
         The model that stands unless terms do better, in words.
     size : int
         Its coefficients.
-    refit : callable
+    refit : Refit
         Estimates it on other logs.
 
     Raises
@@ -177,14 +177,15 @@ def select_terms(
     parts = _judging_parts(logs)
     # the present model keeps the thrust law that it was estimated with
     with within(_FOR_PRESENT * seconds_left()):
+        Refit.ahead([refit], [fitting for fitting, _ in parts])
         present_score = [_present_score(refit, *part, spread) for part in parts]
-    watch = _Watch(len(laws) * (len(laws) > 1) + len(beginnings) * (1 + len(parts)))
+    turns = -(-len(laws) // lanes()) * (len(laws) > 1)
+    watch = _Watch(turns + len(beginnings) * -(-(1 + len(parts)) // lanes()))
 
-    def paths_of(
-        of: Sequence[TrialLog], what: str
-    ) -> tuple[FreeRunSelection, list[list[Selected]]]:
-        selection = FreeRunSelection(of, family, kind)
-        return selection, _paths(selection, beginnings, stay, most, watch, what)
+    def paths_of(task: tuple[Sequence[TrialLog], str]) -> list[list[Selected]]:
+        of, what = task
+        chosen_on = selection if of is logs else FreeRunSelection(of, family, kind)
+        return _paths(chosen_on, beginnings, stay, most, watch, what)
 
     def cost(of: ThrustLaw) -> float:
         selection = FreeRunSelection(with_law(logs, of), family, kind)
@@ -196,25 +197,26 @@ def select_terms(
 
     law, errors = laws[0], [np.nan]
     if len(laws) > 1:
-        errors = [cost(of) for of in laws]
+        errors = watch.over(cost, laws)
         best_law = int(np.argmin(errors))
         law = laws[-1] if errors[-1] < (1 + _NEAR) * errors[best_law] else laws[best_law]
     logs = with_law(logs, law)
     thrust = law_in_words(law)
-    selection, whole = paths_of(logs, "all logs")
+    selection = FreeRunSelection(logs, family, kind)
+    tasks = [(logs, "all logs")]
+    tasks += [(part[0], f"all but part {k}") for k, part in enumerate(_judging_parts(logs), 1)]
+    whole, *paths = watch.over(paths_of, tasks)
     if not any(whole):
         raise ExcitationError(
             f"no free run of selected terms stays bounded on the {len(logs)} logs: use longer "
             f"logs, or name a structure with --structure."
         )
     alternatives = [(b, n) for b, sets in enumerate(whole) for n in {len(s.terms) for s in sets}]
-    paths: list[list[list[Selected]]] = []
     scores: list[list[float]] = [[] for _ in alternatives]
-    for k, (fitting, held) in enumerate(_judging_parts(logs), 1):
-        paths.append(paths_of(fitting, f"all but part {k}")[1])
+    for path, (_, held) in zip(paths, _judging_parts(logs), strict=True):
         judged = FreeRunSelection(held, family, kind)
         for (begun, size_of_set), score in zip(alternatives, scores, strict=True):
-            small = _of_size(paths[-1][begun], size_of_set)
+            small = _of_size(path[begun], size_of_set)
             score.append(_score(judged.errors(small.p) if small else [], spread))
     # parts of logs count as much as whole logs
     by_logs = len(parts_of(logs))
@@ -230,7 +232,7 @@ def select_terms(
     begun, size_shown = alternatives[shown - 1]
     best = _of_size(whole[begun], size_shown)
     assert best is not None
-    shorter = [_of_size(found[begun], size_shown) for found in paths]
+    shorter = [_of_size(path[begun], size_shown) for path in paths]
     named = {name for found in shorter if found for name in found.terms}
     few = replace(family, terms=tuple(t for t in family.terms if t.name in named))
 
@@ -249,8 +251,8 @@ def select_terms(
             score.append(_score(errors, spread))
         return np.asarray(np.array(score) * weight / weight.mean())
 
-    own, *others = _steps(logs)
-    steps = _compare_steps([own, *others], score_step) if chosen else []
+    own, *rest = _steps(logs)
+    steps = _compare_steps([own, *rest], score_step) if chosen else []
     error = 100 - max((score for _, score, _, _ in steps), default=0.0)
     near = _GIVEN_AWAY / 100 * error
     step = next((s for s, _, behind, se in steps if behind <= max(se, near)), own)
@@ -339,11 +341,24 @@ def _judging_parts(
 
 
 class _Watch:
-    """Shares of the time for paths, and the names of those that it cut."""
+    """Shares of the time for paths, and the names of those that it cut.
 
-    def __init__(self, paths: int) -> None:
-        self._shares = Shares(paths)
+    Parameters
+    ----------
+    stages : int
+        Paths that are followed one after another.
+    """
+
+    def __init__(self, stages: int) -> None:
+        self._shares = Shares(stages)
         self.cut: dict[str, None] = {}
+
+    def over(self, function: Callable[[Piece], Result], pieces: Sequence[Piece]) -> list[Result]:
+        """Apply a function that follows paths to pieces, on all processors."""
+        found = map_forked(lambda piece: (function(piece), dict(self.cut)), pieces)
+        for _, cut in found:
+            self.cut |= cut
+        return [result for result, _ in found]
 
     @contextmanager
     def next(self, what: str) -> Iterator[None]:
@@ -408,7 +423,7 @@ def _of_size(sets: Sequence[Selected], size: int) -> Selected | None:
 
 
 def _present_score(
-    refit: Callable[[Sequence[TrialLog]], ManoeuvringModel],
+    refit: Refit,
     fitting: Sequence[TrialLog],
     held: Sequence[TrialLog],
     spread: Array,
@@ -459,12 +474,14 @@ def _compare_steps(
     steps: Sequence[Step], score: Callable[[Step], Array]
 ) -> list[tuple[Step, float, float, float]]:
     """Return ways over a sample with their scores, how far behind they are and its error."""
-    scores: list[Array | None] = []
-    for step in steps:
+
+    def in_time(step: Step) -> Array | None:
         try:
-            scores.append(score(step))
+            return score(step)
         except OutOfTimeError:
-            scores.append(None)
+            return None
+
+    scores = map_forked(in_time, steps)
     if scores[0] is None:
         return []
     found = rank(scores, range(len(steps)))

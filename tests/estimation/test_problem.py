@@ -10,6 +10,7 @@ from virtual import virtual_log
 
 from greybox.model.predictor import build_predictor
 from greybox.regression.problem import RegressionProblem
+from greybox.selection.cross_validation import Refit
 from greybox.selection.estimate import estimate_model
 
 REGIME = (("u", (1,)), ("v", (1,)), ("r", (1, -1)))
@@ -47,7 +48,7 @@ def test_one_estimate_forms_each_thing_once(counted, monkeypatch):
     log, other = virtual_log(31, 1000), virtual_log(34, 100)
     # estimates on parts of the log, which calibrate the bands, form their own
     monkeypatch.setattr(
-        "greybox.selection.prediction.refit_alike", lambda found, _: lambda _: found.model()
+        "greybox.selection.prediction.refit_alike", lambda found, _: Refit(lambda _: found.model())
     )
     counted.clear()
     found = estimate_model(

@@ -11,6 +11,7 @@ from virtual import virtual_log
 from greybox.errors import GreyboxError, OutOfTimeError, UsageError
 from greybox.numerics import effort
 from greybox.numerics.effort import Shares, require_time, seconds_left, within
+from greybox.selection.cross_validation import Refit
 from greybox.selection.estimate import estimate_model
 from greybox.selection.reduction import reduce_structure
 from greybox.selection.request import Request
@@ -65,7 +66,7 @@ def test_where_time_is_over_at_once_the_first_estimate_ends_and_the_rest_is_name
     assert "output error was tried too, and failed: its time was over; more --effort" in told
     assert "estimators were not compared by held-out runs: its time was over" in told
     with within(1), pytest.raises(OutOfTimeError):
-        select_terms([log], "none", 0, lambda logs: found.model())
+        select_terms([log], "none", 0, Refit(lambda _: found.model()))
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from virtual import virtual_log, write_csv
 from greybox.commands.main import main
 from greybox.errors import ExcitationError, UsageError
 from greybox.estimation.prediction_verdict import JudgedOn, PredictionLevel, weigh_prediction
+from greybox.selection.cross_validation import Refit
 from greybox.selection.estimate import estimate_model
 from greybox.selection.prediction import refit_alike, with_prediction
 from greybox.selection.request import Request
@@ -45,6 +46,13 @@ def test_an_estimate_in_its_family_predicts(estimate, logs):
     ]  # fmt: skip
 
 
+@pytest.fixture
+def here(monkeypatch):
+    """Refits run in this process, which sees what they are given."""
+    monkeypatch.setattr("greybox.numerics.forked.lanes", lambda: 1)
+
+
+@pytest.mark.usefixtures("here")
 def test_a_log_that_is_judged_took_no_part(estimate, logs):
     seen = []
 
@@ -52,7 +60,7 @@ def test_a_log_that_is_judged_took_no_part(estimate, logs):
         seen.append({log.name for log in fitting})
         return estimate.model()
 
-    found = with_prediction(estimate, logs, Request(), refit).prediction
+    found = with_prediction(estimate, logs, Request(), Refit(refit)).prediction
     every = {log.name for log in logs}
     assert set().union(*(every - fitting for fitting in seen)) == every
     assert len(found.logs) == len(logs)
@@ -68,7 +76,7 @@ def test_parts_without_which_there_is_no_estimate_are_told(estimate, logs):
             raise ExcitationError("nothing turns.")
         return estimate.model()
 
-    found = with_prediction(estimate, logs, Request(), refuse).prediction
+    found = with_prediction(estimate, logs, Request(), Refit(refuse)).prediction
     assert found.level is PredictionLevel.GOOD
     assert found.parts == 3
     assert "1 of 4 parts were not judged" in found.reasons[-1]
@@ -77,7 +85,7 @@ def test_parts_without_which_there_is_no_estimate_are_told(estimate, logs):
     def never(_):
         raise ExcitationError("nothing turns.")
 
-    own = with_prediction(estimate, logs, Request(), never).prediction
+    own = with_prediction(estimate, logs, Request(), Refit(never)).prediction
     assert own.judged_on is JudgedOn.OWN
     assert own.level is PredictionLevel.LIMITED
     assert "nothing turns (give logs to --validate)" in own.text
@@ -85,7 +93,7 @@ def test_parts_without_which_there_is_no_estimate_are_told(estimate, logs):
 
 def test_a_model_that_diverges_on_its_own_logs_is_poor(estimate, logs):
     left = replace(estimate, fit=dict.fromkeys("uvr", -np.inf))
-    found = with_prediction(left, logs, Request(), lambda _: estimate.model()).prediction
+    found = with_prediction(left, logs, Request(), Refit(lambda _: estimate.model())).prediction
     assert found.text.startswith("poor: its free run diverges on the estimation logs")
 
 
@@ -97,6 +105,7 @@ def test_a_log_too_short_for_parts_is_judged_on_itself(logs):
     assert "judged on its own logs, nothing was held out" in found.text
 
 
+@pytest.mark.usefixtures("here")
 def test_logs_faster_than_the_estimate_are_taken_at_its_rate(estimate, logs):
     fast = [replace(log, t=log.t / 2, sample_time=0.5) for log in logs]
     seen = []
@@ -105,7 +114,7 @@ def test_logs_faster_than_the_estimate_are_taken_at_its_rate(estimate, logs):
         seen.extend(log.sample_time for log in fitting)
         return estimate.model()
 
-    found = with_prediction(estimate, fast, Request(), refit).prediction
+    found = with_prediction(estimate, fast, Request(), Refit(refit)).prediction
     assert set(seen) == {1.0}
     # half a window is lost at each log's end
     assert found.samples == 5 * 149
@@ -118,7 +127,9 @@ def test_logs_are_read_with_the_vessel_of_the_estimate(estimate, logs):
         estimate.vessel, thrusters=tuple(replace(t, gain=2 * t.gain) for t in thrusters)
     )
     double = [replace(log, vessel=stronger) for log in logs]
-    found = with_prediction(estimate, double, Request(), lambda _: estimate.model()).prediction
+    found = with_prediction(
+        estimate, double, Request(), Refit(lambda _: estimate.model())
+    ).prediction
     assert found.text == "good"
     found = with_prediction(estimate, logs, Request(validate=tuple(double))).prediction
     assert found.text == "good"

@@ -14,7 +14,7 @@ from greybox.estimation.output_error import OutputErrorOptions
 from greybox.model.catalogue import get_structure, structure_for
 from greybox.model.model import load_model
 from greybox.model.run.simulation import simulate
-from greybox.selection.cross_validation import parts_of
+from greybox.selection.cross_validation import Refit, parts_of
 from greybox.selection.estimate import at_own_pace, estimate_model
 from greybox.selection.family import family_for, first_terms, spell_structure
 from greybox.selection.free_run_selection import FreeRunSelection
@@ -148,7 +148,7 @@ def catamaran(tmp_path_factory):
 
 def test_thrust_that_goes_with_the_square_of_the_speed_is_told(catamaran):
     logs = [log.window(0, 500, log.name) for part in catamaran[:3] for log in part]
-    choice = select_terms(logs, "nothing", 0, lambda _: _still(logs[0]))
+    choice = select_terms(logs, "nothing", 0, Refit(lambda _: _still(logs[0])))
     assert choice.taken
     assert choice.logs[0].vessel.thrusters[0].thrust != ThrustLaw()
     assert "thrust ~ n|n|" in choice.note
@@ -173,7 +173,7 @@ def test_commands_that_move_between_samples_are_told_and_kept(modulus_log, tmp_p
     x = run.x[0] + rng.standard_normal((400, 3)) * [2e-3, 1e-3, 1e-4]
     channels = commands | dict(zip("uvr", x.T, strict=True)) | {"psi": run.psi[0]}
     log = make_log(vessel, channels, 1.0, "moving")
-    choice = select_terms([log], "nothing", 0, lambda _: _still(log))
+    choice = select_terms([log], "nothing", 0, Refit(lambda _: _still(log)))
     assert choice.logs[0].vessel.actuation.between == "interpolated"
     assert choice.terms.integrator == "rk4"
     assert [(s.integrator, s.commands) for s, *_ in choice.steps] == [

@@ -72,8 +72,8 @@ def test_what_is_off_to_one_side_widens_that_side():
 
 def test_few_runs_make_wide_bands_and_units_change_nothing():
     few, many = (calibrate_bands(runs_of(drawn(7, n, 2000)), STATES) for n in (2, 40))
-    # Student's quantile of six degrees of freedom over the normal one
-    np.testing.assert_allclose(few.misfit, 2.447 / 1.96, rtol=0.05)
+    # Student's quantile of four degrees of freedom over the normal one
+    np.testing.assert_allclose(few.misfit, 2.776 / 1.96, rtol=0.05)
     assert (few.misfit > many.misfit).all()
     scaled = calibrate_bands(runs_of(drawn(7, 2, 2000, 1e-3)), STATES)
     np.testing.assert_allclose(scaled.misfit, 1e-3 * few.misfit)
