@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -44,6 +46,10 @@ class ObservedRuns:
         with np.errstate(over="ignore", invalid="ignore"):
             weighted = by_sample(rows / self.sigma[:, None])
             return Linearised(error / self.sigma, weighted, np.zeros_like(nodes), none)
+
+    def by_parameters(self, p: Array, nodes: Array, only: Sequence[int]) -> Array:
+        """Return derivatives of what is expected in some parameters, (M, m, ny, len(only))."""
+        return self._observer.by_parameters(nodes, p, self.gain, only)
 
     def value(self, p: Array, nodes: Array) -> tuple[Array, Array, float]:
         """Return errors, without ends and level."""

@@ -218,6 +218,10 @@ class FreeRuns:
             used[..., len(p) :] = 0.0
         return Linearised(self._weighted(y), by_sample(used), end, slope)
 
+    def by_parameters(self, p: Array, nodes: Array, only: Sequence[int]) -> Array:
+        """Return derivatives of the outputs in some parameters, (M, m, ny, len(only))."""
+        return self._simulator.by_parameters(nodes, p, only)
+
     def outputs(self, p: Array, nodes: Array) -> Array:
         """Return what the runs show (M, m, ny)."""
         return self._simulator(nodes, p)[0]

@@ -137,8 +137,9 @@ class Vectorised:
         arrays: Sequence[Array | float],
         out: Array,
         prepared: Mapping[int, Any] | None = None,
+        wanted: Sequence[int] | None = None,
     ) -> Array:
-        """Fill ``out[i]`` with expression i evaluated on `arrays`.
+        """Fill ``out[i]`` with expression i, or i of those wanted, evaluated on `arrays`.
 
         Parameters
         ----------
@@ -148,17 +149,28 @@ class Vectorised:
             (size, ...) array to fill; returned.
         prepared : mapping, optional
             What `prepare` returned for some of the same arguments.
+        wanted : sequence of int, optional
+            Expressions to evaluate; by default all.
         """
+        outputs, calls = self._outputs, self._calls
+        if wanted is not None:
+            place = {i: row for row, i in enumerate(wanted)}
+            outputs = [(place[i], source) for i, source in outputs if i in place]
+            needed = {source for _, source in outputs}
+            for target, _, sources, _ in reversed(calls):
+                if target in needed:
+                    needed.update(sources)
+            calls = [call for call in calls if call[0] in needed]
         work: dict[int, Any] = dict(self._constants if prepared is None else prepared)
         for k, i in self._inputs:
             work.setdefault(k, arrays[i])
-        for target, call, sources, spent in self._calls:
+        for target, call, sources, spent in calls:
             if target not in work:
                 work[target] = call(*[work[i] for i in sources])
                 for i in spent:
                     del work[i]
-        if len(self._outputs) < self.size:
+        if len(outputs) < len(out):
             out[...] = 0.0
-        for row, source in self._outputs:
+        for row, source in outputs:
             out[row] = work[source]
         return out

@@ -29,7 +29,6 @@ from greybox.estimation.output_setup import deviations, measured, output_model, 
 from greybox.estimation.shooting import (
     RANK,
     FreeRuns,
-    Runs,
     cut,
     measured_starts,
     solve_step,
@@ -42,6 +41,7 @@ from greybox.regression.regression import common_sample_time
 from greybox.trial.log import TrialLog
 
 Array = NDArray[np.float64]
+_Runs = FreeRuns | ObservedRuns
 
 # process over measurement variance of the observers before the free run
 _RATIOS = (0.3, 0.03, 3e-3, 3e-4)
@@ -64,10 +64,11 @@ _LEAVES = 0.5
 
 @dataclass(frozen=True)
 class _Point:
-    """Parameters with the cost and its quadratic model there."""
+    """Parameters with the cost and its quadratic model there, in those that are `known`."""
 
     p: Array
     cost: float
+    known: Sequence[int]
     hessian: Array
     gradient: Array
     most: Array
@@ -237,7 +238,7 @@ class FreeRunSelection:
         """Return the mean squared residual of each output, (ny,)."""
         return np.asarray((r**2).sum(axis=(0, 1)) / self._samples + _LEAST)
 
-    def _value(self, runs: Runs, p: Array) -> float:
+    def _value(self, runs: _Runs, p: Array) -> float:
         """Return −log L, the noise of each output concentrated, infinite where a run escapes."""
         r, _, _ = runs.value(p, self.starts)
         if not np.isfinite(r).all():
@@ -245,30 +246,35 @@ class FreeRunSelection:
         with np.errstate(over="ignore"):
             return 0.5 * self._samples * float(np.log(self._noise(r)).sum())
 
-    def _at(self, runs: Runs, p: Array, cost: float) -> _Point:
-        at = runs.linearise(p, self.starts)
-        ny = at.r.shape[-1]
-        rows, r, used = at.rows.reshape(-1, ny, at.rows.shape[-1]), at.r.reshape(-1, ny), self._used
+    def _at(self, runs: _Runs, p: Array, cost: float, known: Sequence[int]) -> _Point:
+        """Return the quadratic model in some of the parameters, which takes a share of the time."""
+        weighted, _, _ = runs.value(p, self.starts)
+        slopes = runs.by_parameters(p, self.starts, known)
+        ny, used = weighted.shape[-1], self._used
+        rows, r = slopes.reshape(-1, ny, len(known)), weighted.reshape(-1, ny)
         if not used.all():
             rows, r = rows[used], r[used]
+        normal, right = np.zeros((len(known), len(known))), np.zeros(len(known))
+        with np.errstate(over="ignore", invalid="ignore"):
+            for i, noise in enumerate(self._noise(weighted)):
+                # contiguous, and one output at a time: the rows of all are large
+                own = np.ascontiguousarray(rows[:, i])
+                normal += (own.T @ own) / (noise * runs.sigma[i] ** 2)
+                right += (own.T @ r[:, i]) / (noise * runs.sigma[i])
         hessian, gradient = np.zeros((len(p), len(p))), np.zeros(len(p))
-        for i, weight in enumerate(1 / self._noise(at.r)):
-            # contiguous, and one output at a time: the rows of all are large
-            own = np.ascontiguousarray(rows[:, i, : len(p)])
-            hessian += weight * (own.T @ own)
-            gradient += weight * (own.T @ r[:, i])
-        return _Point(p, cost, hessian, gradient, self._most)
+        hessian[np.ix_(known, known)], gradient[known] = normal, right
+        return _Point(p, cost, known, hessian, gradient, self._most)
 
-    def _moved(self, runs: Runs, at: _Point, step: Array) -> _Point | None:
+    def _moved(self, runs: _Runs, at: _Point, step: Array, known: Sequence[int]) -> _Point | None:
         """Return where a step or a part of it leads downhill, None where it does not."""
         for share in (1.0, 0.5, 0.2):
             p = at.p + share * step
             cost = self._value(runs, p)
             if cost < at.cost:
-                return self._at(runs, p, cost)
+                return self._at(runs, p, cost, known)
         return None
 
-    def _fitted(self, runs: Runs, p: Array, active: Sequence[int], most: int = _FIRST) -> _Point:
+    def _fitted(self, runs: _Runs, p: Array, active: Sequence[int], most: int = _FIRST) -> _Point:
         """Return the fit of the active parameters, Levenberg-Marquardt where steps fail."""
         index = np.array(active)
         out = np.setdiff1d(np.arange(len(p)), index)
@@ -278,7 +284,7 @@ class FreeRunSelection:
         if not np.isfinite(cost):
             p = np.zeros_like(p)
             cost = self._value(runs, p)
-        at = self._at(runs, p, cost)
+        at = self._at(runs, p, cost, index.tolist())
         for _ in range(most):
             require_time()
             moved = self._damped(runs, at, index)
@@ -290,17 +296,19 @@ class FreeRunSelection:
                 break
         return at
 
-    def _damped(self, runs: Runs, at: _Point, active: Array) -> _Point | None:
+    def _damped(self, runs: _Runs, at: _Point, active: Array) -> _Point | None:
         for damping in (0.0, 1e-3, 1e-1, 10.0):
             hessian = at.hessian * (1 + damping * np.eye(len(at.p)))
-            moved = self._moved(runs, at, at.solution(hessian, at.gradient, active))
+            moved = self._moved(
+                runs, at, at.solution(hessian, at.gradient, active), active.tolist()
+            )
             if moved is not None:
                 return moved
         return None
 
     def _with_one_more(
         self,
-        runs: Runs,
+        runs: _Runs,
         at: _Point,
         active: Sequence[int],
         earns: float,
@@ -308,6 +316,8 @@ class FreeRunSelection:
     ) -> tuple[int, _Point] | None:
         """Return the term that lowers the error most and the fit with it, None if none earns."""
         index = np.array(active)
+        if len(at.known) < len(at.p):
+            at = self._at(runs, at.p, at.cost, range(len(at.p)))
         hessian, gradient = at.hessian, at.gradient
         inverse = scaled_inverse(hessian[np.ix_(index, index)], RANK)
         out = np.setdiff1d(np.arange(len(at.p)), index)
@@ -322,7 +332,7 @@ class FreeRunSelection:
             tried = np.append(index, out[i])
             if self._share(-gains[i]) > 1 - earns or frozenset(tried.tolist()) in seen:
                 continue
-            moved = self._moved(runs, at, at.solution(hessian, gradient, tried))
+            moved = self._moved(runs, at, at.solution(hessian, gradient, tried), tried.tolist())
             if moved is None or self._share(moved.cost - at.cost) > 1 - earns:
                 continue
             return int(out[i]), self._damped(runs, moved, tried) or moved
@@ -355,6 +365,6 @@ class FreeRunSelection:
             cost = self._value(self.runs, p)
             if not cost < at.cost + allowed:
                 return None
-            after = self._at(self.runs, p, cost)
+            after = self._at(self.runs, p, cost, rest.tolist())
             return gone, self._damped(self.runs, after, rest) or after
         return None

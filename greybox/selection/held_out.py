@@ -22,6 +22,8 @@ Array = NDArray[np.float64]
 
 # score of a run that is worse than this, or diverges [%]
 FLOOR = -100.0
+# where one part alone differs the mean gap is its own standard error, and rounding must not decide
+_AT_MOST = 1 + 1e-9
 # pieces with fewer samples are no experiment of their own
 _SHORTEST = 20
 
@@ -79,7 +81,7 @@ def rank(
     for i in known:
         gap = np.asarray(scores[best]) - np.asarray(scores[i])
         behind[i] = gap.mean()
-        se[i] = gap.std(ddof=1) / np.sqrt(len(gap)) if len(gap) > 1 else 0.0
+        se[i] = _AT_MOST * gap.std(ddof=1) / np.sqrt(len(gap)) if len(gap) > 1 else 0.0
     near = [i for i in known if behind[i] <= min(se[i], given_away)]
     chosen = min(near, key=lambda i: (preferred[i], behind[i]))
     return Ranking(mean, behind, se, best, chosen)

@@ -152,6 +152,17 @@ class TestSensitivities:
             expected = (runs(z0 + shift, p)[0] - runs(z0 - shift, p)[0]) / 2e-6
             np.testing.assert_allclose(rows[..., len(p) + j], expected, atol=1e-6)
 
+    def test_of_some_parameters_are_columns_of_all(self, predictor, noisy):
+        model, data, p = problem(predictor, noisy)
+        z0, w, only = data.y[:1], data.w[None], [len(p) - 1, 0, 3]
+        runs, use = Simulator(model, w), np.ones((1, len(data.y)))
+        rows = runs.sensitivities(z0, p)[1][..., only]
+        np.testing.assert_allclose(runs.by_parameters(z0, p, only), rows, rtol=1e-9, atol=1e-9)
+        observer = Observer(model, w, data.y[None], use)
+        rows = observer(z0, p, 0.3)[1][..., only]
+        found = observer.by_parameters(z0, p, 0.3, only)
+        np.testing.assert_allclose(found, rows, rtol=1e-9, atol=1e-9)
+
     def test_a_filter_without_process_noise_is_the_free_run(self, predictor, noisy):
         model, data, p = problem(predictor, noisy)
         sigma2 = np.full(4, 2e-4)

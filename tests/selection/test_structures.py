@@ -61,6 +61,10 @@ def test_one_standard_error_rule_on_a_table():
     assert (found.best, found.chosen) == (0, 3)
     # without the one that scatters, no smaller one is near enough
     assert rank(scores[:3], [9, 8, 7]).chosen == 0
+    # one part alone differs, so that the gap is its own standard error: rounding decides nothing
+    for gap in (0.1, 0.3, 0.7):
+        other = scores[0] - np.array([0.0, 0.0, gap, 0.0])
+        assert rank([scores[0], other], [5, 4]).chosen == 1
     # equal ones: the smaller
     assert rank([scores[0], scores[0]], [5, 4]).chosen == 1
     with pytest.raises(UsageError, match="none of the 2 alternatives"):

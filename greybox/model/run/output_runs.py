@@ -124,7 +124,7 @@ class _Runs:
         self.runs, self.steps = read.shape[:2]
         self._read = np.ascontiguousarray(read, float)
         self._evaluate = _Evaluator()
-        self._blocks: list[tuple[slice, Array, dict[int, Any]]] | None = None
+        self._blocks: dict[bool, list[tuple[slice, Array, dict[int, Any]]]] = {}
 
     def __call__(
         self, carried: Sequence[Array], constant: Sequence[Array]
@@ -136,17 +136,19 @@ class _Runs:
         self._evaluate(function, (*carried, self._read, *constant), tuple(out))
         return out[: len(carried)], out[len(carried) :]
 
-    def _prepared(self, table: _Table, first: int) -> list[tuple[slice, Array, dict[int, Any]]]:
+    def _prepared(
+        self, table: _Table, first: int, starts: bool
+    ) -> list[tuple[slice, Array, dict[int, Any]]]:
         """Return, of stretches of all runs, what is read and all that depends on it alone."""
-        if self._blocks is None:
-            self._blocks = []
+        if starts not in self._blocks:
+            self._blocks[starts] = []
             length = max(1, _BLOCK // self.runs)
             for begin in range(0, self.steps, length):
                 block = slice(begin, begin + length)
                 read = _samples(self._read[:, block])
                 known = table.program.prepare({first + i: x for i, x in enumerate(read)})
-                self._blocks.append((block, read, known))
-        return self._blocks
+                self._blocks[starts].append((block, read, known))
+        return self._blocks[starts]
 
     def slopes(
         self,
@@ -155,6 +157,7 @@ class _Runs:
         after: Sequence[Array],
         *,
         starts: bool = True,
+        only: Sequence[int] | None = None,
     ) -> tuple[Array, Array]:
         """Return derivatives in the parameters, then in the run's own first states.
 
@@ -166,6 +169,8 @@ class _Runs:
             What was carried after each step.
         starts : bool
             Whether those in the first states are asked for.
+        only : sequence of int, optional
+            Columns that are asked for; by default all.
 
         Returns
         -------
@@ -175,6 +180,11 @@ class _Runs:
         """
         table = _table(self._build, self._model, starts)
         (rows, columns), nz = table.shape, table.states
+        wanted: list[int] | None = None
+        if only is not None:
+            asked = [*range(nz), *(nz + i for i in only)]
+            wanted = [row * columns + column for row in range(rows) for column in asked]
+            columns = len(asked)
         states = np.concatenate(
             [
                 np.concatenate([x[:, None], y[:, :-1]], axis=1)
@@ -189,9 +199,10 @@ class _Runs:
         if starts:
             slope[:, :, columns - 2 * nz :] = np.eye(nz)
         with np.errstate(all="ignore"):
-            for block, read, known in self._prepared(table, states.shape[2]):
+            for block, read, known in self._prepared(table, states.shape[2], starts):
                 matrix = np.empty((read.shape[1], rows * columns))
-                table.program([*_samples(states[:, block]), *read, *fixed], matrix.T, known)
+                arguments = [*_samples(states[:, block]), *read, *fixed]
+                table.program(arguments, matrix.T, known, wanted)
                 by = matrix.reshape(self.runs, -1, rows, columns)
                 slopes = propagate(by[:, :, :nz, :nz], by[:, :, :nz, nz:], slope)
                 slope = slopes[:, -1]
@@ -258,6 +269,11 @@ class Simulator:
         y, states = self._run(z0, p)
         return y, states[:, -1]
 
+    def by_parameters(self, z0: Array, p: Array, only: Sequence[int]) -> Array:
+        """Return derivatives of the outputs in some parameters, (M, m, ny, len(only))."""
+        _, states = self._run(z0, p)
+        return self._runs.slopes([z0], [p], [states], starts=False, only=only)[0]
+
     def sensitivities(self, z0: Array, p: Array) -> tuple[Array, Array, Array, Array]:
         """Run with derivatives.
 
@@ -298,6 +314,26 @@ class Observer:
         self.model = model
         self._runs = _Runs(observer_step, model, np.concatenate([w, y, use[..., None]], axis=2))
         self._unused = use == 0
+        # the latest run: derivatives are asked for where it was run before
+        self._ran: tuple[tuple[Array, ...], tuple[Array, Array]] | None = None
+
+    def _run(self, z0: Array, p: Array, gain: Array) -> tuple[Array, Array]:
+        """Return errors and the states after each step, not to be written to."""
+        found = _kept(self._ran, z0, p, gain)
+        if found is None:
+            (states,), (error,) = self._runs([z0], [p, gain])
+            found = _fixed(error, states)
+            self._ran = (z0.copy(), p.copy(), gain.copy()), found
+        return found
+
+    def by_parameters(self, z0: Array, p: Array, gain: float, only: Sequence[int]) -> Array:
+        """Return derivatives of h(z) in some parameters, (M, m, ny, len(only))."""
+        constant = [p, np.array([gain])]
+        _, states = self._run(z0, *constant)
+        rows, _ = self._runs.slopes([z0], constant, [states], starts=False, only=only)
+        if self._unused.any():
+            rows[self._unused] = 0.0
+        return rows
 
     def __call__(
         self, z0: Array, p: Array, gain: float, *, sensitivities: bool = True
@@ -320,10 +356,10 @@ class Observer:
             (M, m, ny, q + nz), without columns where they are not asked for.
         """
         constant = [p, np.array([gain])]
-        states, (error,) = self._runs([z0], constant)
+        error, states = self._run(z0, *constant)
         if not sensitivities:
             return error, np.empty((*error.shape, 0))
-        rows, _ = self._runs.slopes([z0], constant, states)
+        rows, _ = self._runs.slopes([z0], constant, [states])
         if self._unused.any():
             rows[self._unused] = 0.0
         return error, rows
