@@ -34,7 +34,7 @@ _NORMAL = 1.959964
 # share of an equation's information from which on a segment alone determines a direction
 _ALONE = 1e-6
 # share of the information that the curvature of a misfit may not take
-_LEFT = 0.2
+LEFT = 0.2
 # degrees of freedom that count as certain
 _SURE = 1e4
 
@@ -301,7 +301,7 @@ def curved(bread: Array, moments: Array, change: Array) -> Array:
     root = np.sqrt(np.maximum(values, values[-1] * 1e-15))
     into, back = (vectors / root).T / size, size[:, None] * vectors * root
     u, kept, vt = np.linalg.svd(np.eye(len(bread)) - into @ change @ bread @ back)
-    inverse = (vt.T / np.maximum(kept, _LEFT)) @ u.T
+    inverse = (vt.T / np.maximum(kept, LEFT)) @ u.T
     return np.asarray(bread @ back @ inverse @ into)
 
 

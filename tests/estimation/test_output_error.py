@@ -784,6 +784,56 @@ class TestCommand:
         assert said in capsys.readouterr().err
 
 
+def test_standard_errors_agree_where_the_model_holds(predictor, noisy):
+    """With white errors: those of the information, of segments, and of blocks drawn again."""
+    found = {
+        kind: estimate_oe(
+            predictor, [noisy], options=OutputErrorOptions(heading="input", covariance=kind)
+        ).std
+        for kind in ("white", "cluster", "bootstrap")
+    }
+    # 500 draws of some 30 blocks know a standard deviation to about 15 %
+    assert np.median(found["bootstrap"] / found["white"]) == pytest.approx(1.0, abs=0.25)
+    assert (found["cluster"] > 0.9 * found["white"]).all()
+    assert np.median(found["cluster"] / found["white"]) < 1.3
+
+
+def test_the_curvature_of_a_misfit_widens_intervals(noisy):
+    """A structure too small: its inverse Hessian is that of the likelihood, found by refits."""
+    small = output_predictor(get_structure("linear"), "basic", REGIME)
+    fits = []
+    keep = output_error._inverse_hessian
+
+    def kept(fitted, free, *, concentrated):
+        fits.append((fitted, free, keep(fitted, free, concentrated=concentrated)))
+        return fits[-1][-1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(output_error, "_inverse_hessian", kept)
+        estimate_oe(small, [noisy], options=OutputErrorOptions(heading="input"))
+    fitted, free, inverse = fits[-1]
+
+    def cost(p):
+        """Return −log L with the noise of each output and the starts fitted."""
+        starts = fitted.fit.nodes
+        for _ in range(3):
+            at = fitted.runs.linearise(p, starts)
+            slopes = at.rows[0][:, len(p) :]
+            starts = starts + np.linalg.lstsq(slopes, at.r[0].ravel(), rcond=1e-10)[0]
+        r = fitted.runs.linearise(p, starts).r
+        n = fitted.runs.segments.use.sum()
+        return 0.5 * n * float(np.log((r**2).sum(axis=(0, 1)) / n).sum())
+
+    # along a direction of one standard error −log L rises by half its square
+    for j in range(len(free)):
+        step = inverse[:, j] / np.sqrt(inverse[j, j])
+        p = [fitted.fit.p.copy() for _ in range(3)]
+        p[0][free] -= step
+        p[2][free] += step
+        rise = cost(p[0]) + cost(p[2]) - 2 * cost(p[1])
+        assert rise == pytest.approx(1.0, rel=0.25)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("memory", [0.0, 20.0])
 def test_intervals_cover(predictor, memory):
