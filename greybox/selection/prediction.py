@@ -185,9 +185,8 @@ def require_distinct(logs: Sequence[TrialLog]) -> None:
     """
     for i, log in enumerate(logs):
         for other in logs[:i]:
-            if np.array_equal(log.t, other.t) and all(
-                np.array_equal(log[c], other.channels.get(c)) for c in log.channels
-            ):
+            alike = np.array_equal(log.t, other.t) and log.channels.keys() == other.channels.keys()
+            if alike and all(np.array_equal(log[c], other[c]) for c in log.channels):
                 raise UsageError(
                     f"'{other.name}' and '{log.name}' hold the same {len(log)} samples, which "
                     f"would count as two trials: name each trial once."

@@ -70,7 +70,8 @@ class _Signals:
 
     def rate(self, start: float, stop: float) -> float:
         """Return the mean yaw rate between two times [rad/s]."""
-        first, end = np.searchsorted(self.t, start), np.searchsorted(self.t, stop, side="right")
+        first = int(np.searchsorted(self.t, start))
+        end = int(np.searchsorted(self.t, stop, side="right"))
         if end - first < 3:
             first, end = max(0, first - 3), end + 3
         x = self.t[first:end] - self.t[first:end].mean()
