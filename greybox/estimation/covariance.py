@@ -368,7 +368,7 @@ def allow_for_segments(
     known = np.flatnonzero((before > 0) & (std > 0))
     factor = np.ones(len(covariance))
     if len(known):
-        ratio, sure = moderated((std / before)[known] ** 2, np.maximum(freedom[known], 1.0))
+        ratio, sure = moderated((std[known] / before[known]) ** 2, np.maximum(freedom[known], 1.0))
         factor[known] = np.maximum(np.sqrt(ratio) * stdtrit(sure, 0.975) / _NORMAL, 1.0)
     return covariance * np.outer(factor, factor)
 

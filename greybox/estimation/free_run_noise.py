@@ -90,7 +90,9 @@ def mean_variance(
         trial = noise.copy()
         trial[i] = step**2
         r, levels = runs.filtered(p, nodes, trial)
-        loss.append((float((r**2).sum()) + float(levels.sum())) / 2)
+        # a variance under which the run escapes is not likely at all
+        with np.errstate(over="ignore"):
+            loss.append((float((r**2).sum()) + float(levels.sum())) / 2)
         if step > np.sqrt(noise[i]) and loss[-1] > min(loss) + _UNLIKELY:
             # larger ones are less likely still
             break

@@ -146,8 +146,9 @@ def require_informative(
         )
     if structure.marine:
         share = movements(logs, structure)
-        # one that is exactly zero is named by the equations
-        still = [s for s in structure.inputs if 0 < share.get(s, 1.0) < _ROUNDING]
+        # a rudder amidships, or a propeller at rest, is named by the equations
+        still = [s for s in structure.inputs if share.get(s, 1.0) < _ROUNDING]
+        still = [s for s in still if share[s] > 0 or s in ("taux", "tauy", "taun")]
         lost = [t.name for t in structure.terms if any(f.signal in still for f in t.factors)]
         if lost:
             raise ExcitationError(
@@ -156,7 +157,7 @@ def require_informative(
                     lost,
                     f"{', '.join(f'{s} is {share[s]:.1g}' for s in still)} of what its thrusters "
                     f"push, which is rounding (at least {_ROUNDING:g} is needed), so its thrusts "
-                    f"cancel over the whole log",
+                    f"cancel over the whole log, or push another way (see [[thruster]])",
                 )
             )
     if predictor.captures:

@@ -55,6 +55,7 @@ from greybox.selection.fit_single import estimate_once
 from greybox.selection.held_out import FLOOR, rank
 from greybox.selection.prediction import (
     refit_alike,
+    require_distinct,
     require_others,
     with_prediction,
 )
@@ -201,6 +202,7 @@ def estimate_model(
 @one_thread
 def estimate_requested(logs: Sequence[TrialLog], request: Request) -> Estimate:
     """Return what `estimate_model` does of a request."""
+    require_distinct(logs)
     require_others(logs, request.validate)
     common_sample_time(logs)
     with within(request.effort):

@@ -350,7 +350,10 @@ class FreeRunSelection:
         index = np.array(active)
         hessian, gradient = at.hessian, at.gradient
         variance = np.diag(scaled_inverse(hessian[np.ix_(index, index)], RANK))
-        loss = 0.5 * at.p[index] ** 2 / variance
+        # what moves nothing earns nothing
+        loss = np.divide(
+            0.5 * at.p[index] ** 2, variance, out=np.zeros(len(index)), where=variance > 0
+        )
         for i in np.argsort(loss):
             gone = int(index[i])
             if loss[i] > allowed:

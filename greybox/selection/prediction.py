@@ -175,6 +175,24 @@ def require_others(logs: Sequence[TrialLog], validate: Sequence[TrialLog]) -> No
             )
 
 
+def require_distinct(logs: Sequence[TrialLog]) -> None:
+    """Refuse logs of equal samples: copies count as new trials, and judge what they took part in.
+
+    Raises
+    ------
+    UsageError
+        Names two of them.
+    """
+    for i, log in enumerate(logs):
+        for other in logs[:i]:
+            alike = np.array_equal(log.t, other.t) and log.channels.keys() == other.channels.keys()
+            if alike and all(np.array_equal(log[c], other[c]) for c in log.channels):
+                raise UsageError(
+                    f"'{other.name}' and '{log.name}' hold the same {len(log)} samples, which "
+                    f"would count as two trials: name each trial once."
+                )
+
+
 def refit_alike(estimate: Estimate, request: Request) -> Refit:
     """Return how to estimate the model of an estimate on fewer logs, from where it ended.
 

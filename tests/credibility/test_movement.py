@@ -52,6 +52,11 @@ def test_a_force_that_is_rounding_is_refused(method, units):
     assert "--structure 'thesis-Ymu'" in str(told.value)
 
 
+def test_thrusters_that_cancel_to_nothing_are_named_as_the_cause():
+    with pytest.raises(ExcitationError, match=r"Ymu is not .*tauy is 0 of .*its thrusts cancel"):
+        estimate_model(crossed(0.0))
+
+
 @pytest.mark.parametrize("units", [1.0, 60.0])
 @pytest.mark.parametrize("method", ["iv", "oe"])
 def test_a_force_below_any_misalignment_is_excepted(method, units):

@@ -18,6 +18,7 @@ from greybox.credibility.score_statistic import score_test
 from greybox.credibility.weak import measure_strength
 from greybox.estimation.arma_noise import WHITE, fit_arma_noise
 from greybox.estimation.covariance import (
+    allow_for_segments,
     cluster_std,
     curved,
     moderated,
@@ -127,6 +128,21 @@ def test_alike_segments_equal_the_clusters_of_statsmodels():
     std, freedom = cluster_std(*sums, bread)
     np.testing.assert_allclose(std, oracle.bse * np.sqrt(30 / 29), rtol=1e-8)
     np.testing.assert_allclose(freedom, 29, rtol=1e-8)
+
+
+def test_a_coefficient_without_errors_stays_without():
+    """A channel that never moves leaves equations that hold exactly."""
+    rng = np.random.default_rng(8)
+    x = rng.normal(size=(2, 120))
+    _, sums, bread = clustered(x, x[0] + rng.normal(size=120), [120])
+    still = (np.zeros_like(sums[0]), sums[1])
+    found = allow_for_segments(np.diag([0.01, 0.01, 0.0, 0.0]), [sums, still], [bread, bread])
+    assert (found[2:] == 0).all()
+    assert (np.diag(found)[:2] >= 0.01).all()
+    found = allow_for_segments(np.diag([0.0, 0.0, 0.01, 0.01]), [sums, still], [bread, bread])
+    np.testing.assert_array_equal(found, np.diag([0.0, 0.0, 0.01, 0.01]))
+    mixed = allow_for_segments(np.diag([0.0, 0.01]), [sums], [bread])
+    assert mixed[0, 0] == 0.0
 
 
 def test_segments_equal_bell_and_mccaffrey_by_matrices_of_rows():

@@ -109,6 +109,15 @@ def test_a_likelihood_sharper_than_its_grid_has_its_best_level_as_mean():
     assert found == pytest.approx(0.05**2)
 
 
+def test_levels_under_which_the_run_escapes_have_no_weight():
+    class Runs:
+        def filtered(self, p, nodes, noise):
+            return np.where(noise < 1e-3, 1e200, 1.0), np.log(noise)
+
+    found = free_run_noise.mean_variance(Runs(), None, None, np.array([0.05**2]), 0, 1.0)
+    assert 1e-3 < found < 10.0
+
+
 @pytest.fixture(scope="module")
 def noisy():
     return virtual_log(3, 600, spread=0.0)

@@ -173,6 +173,11 @@ def test_a_log_of_the_estimate_cannot_judge(estimate, logs):
         with_prediction(estimate, [own], Request(validate=(own,)))
 
 
+def test_a_copy_of_a_log_is_no_second_trial(logs):
+    with pytest.raises(UsageError, match=r"'copy' hold the same \d+ samples.*name each trial once"):
+        estimate_model([*logs, replace(logs[0], name="copy")])
+
+
 def test_a_model_that_runs_away_where_commands_are_held_is_poor(estimate, logs):
     """Its turning drives itself beyond yaw rates that the logs keep for moments only."""
     model = estimate.model()

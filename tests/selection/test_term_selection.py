@@ -101,6 +101,16 @@ def test_damping_never_drives_the_ship(modulus_log):
                 assert one.p[selection.names.index(term.name)] <= 0
 
 
+def test_a_channel_that_never_moves_lets_its_terms_leave(modulus_log):
+    log = replace(modulus_log, channels=modulus_log.channels | {"v": 0 * modulus_log["v"]})
+    inputs = force_inputs(log.vessel)
+    selection = FreeRunSelection([log], family_for(inputs, False), "basic")
+    (_, first), stay = first_terms(inputs)
+    sets = selection.path(first, stay, len(first) + 2)
+    assert np.isfinite(sets[-1].cost)
+    assert not {"Yv", "Nuv", "Xvr"} & {n for n in sets[-1].terms if n not in stay}
+
+
 def test_what_the_log_cannot_tell_from_damping_is_damping(modulus_log):
     """u r and |u| r are one on a log ahead; astern the first would drive the ship."""
     assert (modulus_log["u"] > 0).all()

@@ -44,6 +44,16 @@ def test_a_log_is_of_the_kind_that_takes_most_of_it(logs, name):
     assert kind_of(logs[name]).name == SAILED[name]
 
 
+def test_a_log_may_end_at_any_sample_of_a_zigzag(tmp_path):
+    """Speeds on either side steer, and are held for a sample or two."""
+    preset = presets()["survey-catamaran-2m"]
+    (tmp_path / "ship.toml").write_text(preset.ship.vessel_toml())
+    path = preset.sail(kinds()["zigzag-20"], 60.0, seed=5001).write_csv(tmp_path / "a.csv", 5)
+    log = read_log(path, load_vessel(tmp_path / "ship.toml"))
+    for end in range(len(log) - 30, len(log) + 1):
+        assert kind_of(log.window(0, end, "cut")) in KINDS.values()
+
+
 def test_every_log_is_of_a_kind(logs):
     without = logs["random"].window(0, 10, "short")
     assert kind_of(without) in KINDS.values()

@@ -70,11 +70,12 @@ class _Signals:
 
     def rate(self, start: float, stop: float) -> float:
         """Return the mean yaw rate between two times [rad/s]."""
-        k = np.flatnonzero((self.t >= start) & (self.t <= stop))
-        if len(k) < 3:
-            k = np.arange(max(0, k[0] - 3) if len(k) else 0, (k[-1] if len(k) else 0) + 4)
-        x = self.t[k] - self.t[k].mean()
-        return float(x @ self.psi[k] / (x @ x))
+        first = int(np.searchsorted(self.t, start))
+        end = int(np.searchsorted(self.t, stop, side="right"))
+        if end - first < 3:
+            first, end = max(0, first - 3), end + 3
+        x = self.t[first:end] - self.t[first:end].mean()
+        return float(x @ self.psi[first:end] / (x @ x))
 
     def heading(self, time: float) -> float:
         """Return the heading, averaged over a tenth of the time for one ship length [rad]."""
