@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from greybox.estimation.fixed_gain_observer import ObservedRuns
 from greybox.estimation.shooting import (
+    TOLERANCE,
     FreeRuns,
     Loss,
     Measured,
@@ -90,6 +91,7 @@ def fit_free_runs(
     near: bool = False,
     once: bool = False,
     fixed: bool = False,
+    tolerance: float = TOLERANCE,
 ) -> tuple[ShootingFit, FreeRuns]:
     """Fit parameters and initial states to logs; the noise of each output with them.
 
@@ -119,6 +121,8 @@ def fit_free_runs(
     fixed : bool
         Whether runs begin where the logs were measured to begin, as a prediction does; they are
         whole then.
+    tolerance : float
+        Length of the last step in standard errors.
 
     Returns
     -------
@@ -132,6 +136,10 @@ def fit_free_runs(
     whole = cut(logs, max(len(log.y) for log in logs))
     starts = measured_starts(whole, len(model.states))
     uncut = FreeRuns(model, whole, weights, fixed=fixed)
+    if near and sigma is None and loss == "gaussian":
+        r, _, _ = uncut.value(p, starts)
+        if np.isfinite(r).all():
+            uncut = uncut.with_sigma(noise_of(r, weights, whole.use, loss, floor))
     shooting = "single" if fixed else shooting
 
     def attempt(
@@ -140,13 +148,15 @@ def fit_free_runs(
         nodes = starts if fixed else nodes
         single: ShootingFit | None = None
         if shooting != "multiple":
-            single, runs = _settle(uncut, p, nodes, restrictions, loss, sigma is None, floor)
+            single, runs = _settle(
+                uncut, p, nodes, restrictions, loss, sigma is None, floor, tolerance
+            )
             if single.converged or shooting == "single":
                 return single, runs
         segments = cut(logs, segment_length(logs))
         fit, joined = _settle(
             FreeRuns(model, segments, weights), p, measured_starts(segments, len(model.states)),
-            restrictions, loss, sigma is None, floor,
+            restrictions, loss, sigma is None, floor, tolerance,
         )  # fmt: skip
         if single is not None and not fit.converged and np.isfinite(single.cost):
             return single, runs
@@ -263,25 +273,26 @@ def _settle(
     loss: Loss,
     estimate_noise: bool,
     floor: Array,
+    tolerance: float,
     rounds: int = 12,
 ) -> tuple[ShootingFit, FreeRuns]:
     """Alternate between the fit and the noise of the outputs until both stay."""
     if not estimate_noise:
-        return fit_segments(runs, p, nodes, restrictions, loss=loss), runs
-    total = 0
+        return fit_segments(runs, p, nodes, restrictions, loss=loss, tolerance=tolerance), runs
+    total, settled = 0, max(_SETTLED, tolerance)
     fit = ShootingFit(p, nodes, np.zeros((len(p), len(p))), np.inf, np.inf, 0, False)
     for turn in range(rounds):
         # a few steps at a time while the weights are still rough
         fit = fit_segments(
             runs, fit.p, fit.nodes, restrictions, loss=loss,
-            most=_ROUGH if turn < 5 else _FINE,
+            most=_ROUGH if turn < 5 else _FINE, tolerance=tolerance,
         )  # fmt: skip
         total += fit.iterations
         r, _, _ = runs.value(fit.p, fit.nodes)
         if not np.isfinite(r).all():
             break
         sigma = noise_of(r, runs.sigma, runs.segments.use, loss, floor)
-        if fit.converged and (np.abs(sigma / runs.sigma - 1) < _SETTLED).all():
+        if fit.converged and (np.abs(sigma / runs.sigma - 1) < settled).all():
             break
         stuck = not fit.converged and fit.iterations < 4
         runs = runs.with_sigma(sigma)

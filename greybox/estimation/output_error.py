@@ -37,6 +37,7 @@ from greybox.estimation.output_setup import deviations, measured, output_model, 
 from greybox.estimation.result import Estimate
 from greybox.estimation.shooting import (
     RANK,
+    TOLERANCE,
     FreeRuns,
     Linearised,
     Loss,
@@ -129,6 +130,8 @@ class OutputErrorOptions:
         noise; of a model that leaves more they make up for what it lacks.
     levels : bool
         Whether the noise levels of sensors and process are sought once the fit has ended.
+    tolerance : float
+        Length of the last step in standard errors.
     seed : int
         For the bootstrap.
     integrator : {"euler", "rk4"}
@@ -148,6 +151,7 @@ class OutputErrorOptions:
     search: bool = True
     starts: Literal["free", "measured"] = "free"
     levels: bool = True
+    tolerance: float = TOLERANCE
     seed: int = 0
     integrator: Integrator = "euler"
 
@@ -275,6 +279,7 @@ def _fit(
             restrictions=restrictions, loss=options.loss, shooting=options.shooting,
             sigma=deviations(data) if options.weights == "deviation" else None,
             near=p is not None or near, once=once, fixed=options.starts == "measured",
+            tolerance=options.tolerance,
         )  # fmt: skip
         return _Fitted(model, data, fit, runs, restrictions, options.loss)
 

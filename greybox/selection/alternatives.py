@@ -36,6 +36,8 @@ OVER = "not tried: time was over (--effort)"
 _OF_ALL = 0.3
 # refinements of the instruments while alternatives are compared
 _RANKING_REFINEMENTS = 4
+# length of the last step of a free run's fit, in standard errors, while alternatives are compared
+_RANKING_TOLERANCE = 0.01
 # share of samples that must meet a sign condition
 _KEPT = 0.9
 
@@ -257,4 +259,5 @@ def ranking_request(request: Request) -> Request:
         refine=_RANKING_REFINEMENTS,
         prefilter="none",
         judged=False,
+        output_error=replace(request.output_error, tolerance=_RANKING_TOLERANCE),
     )

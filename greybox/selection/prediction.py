@@ -199,9 +199,10 @@ def refit_alike(estimate: Estimate, request: Request) -> Refit:
     Standard errors and noise are those of the estimate, the former as fewer samples leave them.
     """
     few = sum(x["samples"] for x in estimate.logs) < _MANY
+    quick = ranking_request(request)
     quick = replace(
-        ranking_request(request),
-        output_error=replace(request.output_error, search=False, levels=False, process_noise=False),
+        quick,
+        output_error=replace(quick.output_error, search=False, levels=False, process_noise=False),
         prefilter=request.prefilter if estimate.prefilter == "noise" and few else "none",
         # a free run starts from the estimate itself, which has its current too
         nominal=None if ESTIMATORS[estimate.method].free_run else estimate.model(),
