@@ -137,6 +137,7 @@ def fit_free_runs(
     starts = measured_starts(whole, len(model.states))
     uncut = FreeRuns(model, whole, weights, fixed=fixed)
     if near and sigma is None and loss == "gaussian":
+        # what the start leaves is its noise; a robust scale far off tells nothing
         r, _, _ = uncut.value(p, starts)
         if np.isfinite(r).all():
             uncut = uncut.with_sigma(noise_of(r, weights, whole.use, loss, floor))

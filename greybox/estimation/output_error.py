@@ -586,14 +586,15 @@ def _inverse_hessian(fitted: _Fitted, free: NDArray[np.intp], *, concentrated: b
     values, vectors = np.linalg.eigh(information / np.outer(size, size))
     # columns are directions of one standard error
     root = vectors / np.sqrt(np.maximum(values, values[-1] * 1e-15)) / size[:, None]
-    change = np.empty_like(root)
-    for j, direction in enumerate(_BESIDE * root.T):
-        ends = []
-        for step in (direction, -direction):
-            p = fit.p.copy()
-            p[free] += step
-            ends.append(_score(runs, p, fit.nodes, concentrated=concentrated)[free])
-        change[:, j] = (ends[1] - ends[0]) / (2 * _BESIDE)
+
+    def score(step: Array) -> Array:
+        p = fit.p.copy()
+        p[free] += step
+        return _score(runs, p, fit.nodes, concentrated=concentrated)[free]
+
+    steps = _BESIDE * root.T
+    ends = np.array([score(step) for step in (*steps, *-steps)])
+    change = ((ends[len(steps) :] - ends[: len(steps)]) / (2 * _BESIDE)).T
     hessian = root.T @ change + root.T @ (fitted.restrictions.precision[free, None] * root)
     if not np.isfinite(hessian).all():
         return plain
@@ -605,18 +606,16 @@ def _inverse_hessian(fitted: _Fitted, free: NDArray[np.intp], *, concentrated: b
 def _score(runs: FreeRuns, p: Array, nodes: Array, *, concentrated: bool) -> Array:
     """Return the derivatives of log L (q,) at parameters, with the likeliest starts."""
     q = len(p)
-    for last in (False, True):
-        at = runs.linearise(p, nodes)
-        if not np.isfinite(at.r).all():
-            return np.full(q, np.nan)
-        if not last and not runs.fixed:
-            residuals = at.r.reshape(len(nodes), -1)
-            nodes = nodes + np.array(
-                [
-                    np.linalg.lstsq(e[:, q:], r, rcond=1e-10)[0]
-                    for e, r in zip(at.rows, residuals, strict=True)
-                ]
-            )
+    at = runs.linearise(p, nodes)
+    if not runs.fixed and np.isfinite(at.r).all():
+        residuals = at.r.reshape(len(nodes), -1)
+        starts = [
+            np.linalg.lstsq(e[:, q:], r, rcond=1e-10)[0]
+            for e, r in zip(at.rows, residuals, strict=True)
+        ]
+        at = runs.linearise(p, nodes + np.array(starts))
+    if not np.isfinite(at.r).all():
+        return np.full(q, np.nan)
     level = (at.r**2).sum(axis=(0, 1)) / runs.segments.use.sum() if concentrated else 1.0
     weighted = (at.r / level).reshape(len(nodes), -1)
     return np.asarray(np.einsum("gkq,gk->q", at.rows[:, :, :q], weighted))

@@ -302,7 +302,8 @@ def select_terms(
         """Follow the path anew on logs that were no part."""
         found = known.get(extent(of))
         if extent(of) not in known:
-            other = FreeRunSelection(of, family, kind, step.integrator)
+            # terms were chosen before the step was
+            other = FreeRunSelection(of, family, kind)
             try:
                 found = _of_size(other.path(beginnings[begun], stay, size_shown), size_shown)
             except ExcitationError as error:
