@@ -74,6 +74,9 @@ class Atom:
         them.
     variants : tuple of Atom
         The same with other conventions of sampling, of which the likeliest is kept.
+    arguments : tuple of str
+        Columns of commands that its force is a function of at the same moment, where it has an
+        `apply` and is one.
     afresh : bool
         Whether the coefficients must be sought anew: what it changes is too much for
         derivatives.
@@ -87,6 +90,7 @@ class Atom:
     starts: tuple[tuple[float, ...], ...] = ()
     variants: tuple[Atom, ...] = ()
     beside: tuple[str, ...] = ()
+    arguments: tuple[str, ...] = ()
     afresh: bool = False
 
     @property

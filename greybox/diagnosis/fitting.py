@@ -119,6 +119,12 @@ class Problem:
 
     def rows(self, point: Point, noise: Noise) -> list[Array]:
         """Return whitened derivatives of the outputs in the free numbers, (N, ny, q) a log."""
+        # of a run at the edge of stability the derivatives may leave every number's range
+        with np.errstate(over="ignore", invalid="ignore"):
+            return [noise.whiten(slopes) for slopes in self.slopes(point)]
+
+    def slopes(self, point: Point) -> list[Array]:
+        """Return derivatives of the outputs in the free numbers, (N, ny, q) a log."""
         ship = point.ship
         places = np.array(point.places, int)
         own, starts = len(places), sum(map(len, point.starts))
@@ -139,9 +145,7 @@ class Problem:
                 for i in range(len(value)):
                     rows[:, :, k] = self._difference(point, vector, run, start, k, atom, i)
                     k += 1
-            # of a run at the edge of stability the derivatives may leave every number's range
-            with np.errstate(over="ignore", invalid="ignore"):
-                out.append(noise.whiten(rows))
+            out.append(rows)
         return out
 
     def _difference(

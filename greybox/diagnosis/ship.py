@@ -141,7 +141,8 @@ class LogRun:
         self.outputs = (*self.states, "psi") if self._turns else self.states
         self._gaps = [(i, ~log.missing[n]) for i, n in enumerate(self.outputs) if n in log.missing]
         self.y = self._across_gaps(np.column_stack([log[n] for n in self.outputs]))
-        self._psi = held(log["psi"] if "psi" in log else np.zeros(len(log)), integrator)
+        self.heading = log["psi"] if "psi" in log else np.zeros(len(log))
+        self._psi = held(self.heading, integrator)
         air = log.air
         self.air_measured = air is not None and structure.uses_air
         self._air = held(air if air is not None else np.zeros((len(log), 2)), integrator)

@@ -12,9 +12,9 @@ from changing import FACTOR, MOMENT, changed_log, fitted
 from greybox.diagnosis.diagnose import diagnose
 from greybox.diagnosis.held_out import Pair
 from greybox.diagnosis.noise import fit_noise
-from greybox.diagnosis.omnibus import features, knots_of
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.refitting import loosened
+from greybox.diagnosis.remainder import features, knots_of
 from greybox.diagnosis.verdict import _drifts
 from greybox.study.blind import draw
 from greybox.trial.log import TrialLog
@@ -83,7 +83,7 @@ def test_forces_that_begin_at_a_speed_are_among_the_features(changed: TrialLog) 
     assert knots.shape == (3, 3)
     assert (np.diff(knots, axis=1) > 0).all()
     run, start = problem.runs[0], fit.point.starts[0]
-    made = features(run, fit, start, knots)
+    made = features(run, fit, start, knots).values
     surge = np.abs(run.run(fit.point.ship, start).x[:, 0])
     wanted = np.maximum(surge - knots[0, 1], 0.0)
     assert wanted.any()

@@ -34,6 +34,12 @@ def _steered_by(thruster: Thruster) -> str | None:
     return thruster.angle if isinstance(thruster.angle, str) else thruster.rudder
 
 
+def _driven_by(thruster: Thruster) -> tuple[str, ...]:
+    """Return the columns that a thruster's force is a function of."""
+    angle = _steered_by(thruster)
+    return (thruster.speed,) if angle is None else (thruster.speed, angle)
+
+
 class ThrusterGain(Cause):
     """One thruster weaker than the others' model says."""
 
@@ -57,7 +63,12 @@ class ThrusterGain(Cause):
 
             name = f"gain_{thruster.speed}"
             key = f"{self.id}:{thruster.speed}:{_steered_by(thruster) or i}"
-            out.append(Atom(self.id, key, (Parameter(name, "1", 0.85, 0.0, 1.0, 1.0),), (), apply))
+            out.append(
+                Atom(
+                    self.id, key, (Parameter(name, "1", 0.85, 0.0, 1.0, 1.0),), (), apply,
+                    arguments=_driven_by(thruster),
+                )
+            )  # fmt: skip
         return out
 
     def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
@@ -169,7 +180,8 @@ class QuadraticThrust(Cause):
             return ship
 
         parameter = Parameter("quadratic_share", "1", 0.3, 0.0, 1.0)
-        return (Atom(self.id, self.id, (parameter,), (), apply),)
+        driven = dict.fromkeys(c for i in linear for c in _driven_by(context.vessel.thrusters[i]))
+        return (Atom(self.id, self.id, (parameter,), (), apply, arguments=tuple(driven)),)
 
     def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
         """Say the share."""
@@ -203,7 +215,8 @@ class AngleOffset(Cause):
                 return with_thruster(ship, i, angle_offset=own + float(value[0]))
 
             parameter = Parameter(f"offset_{column}", "rad", 0.0, -0.8, 0.8)
-            out.append(Atom(self.id, f"{self.id}:{column}:{i}", (parameter,), (), apply))
+            key = f"{self.id}:{column}:{i}"
+            out.append(Atom(self.id, key, (parameter,), (), apply, arguments=_driven_by(thruster)))
         return out
 
     def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
