@@ -15,14 +15,10 @@ from numpy.typing import NDArray
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.held_out import HeldOut, proof_of
 from greybox.diagnosis.search import Candidate
+from greybox.diagnosis.thresholds import CHANCE, DECISIVE
 from greybox.model.run.step import Integrator
 
 Array = NDArray[np.float64]
-
-# rivals closer than chance in held-out likelihood are as good, with so much probability
-_CHANCE = 0.05
-# difference of −2 log L on all logs that decides by itself, whatever its standard error
-_DECISIVE = 12.0
 
 
 def rivals(
@@ -56,7 +52,7 @@ def rivals(
         held = proof_of(there)
         total = float(here.sum() + there.sum())
         all_logs = proof_of(np.concatenate([here, there]))
-        alike_held = held.p_value > _CHANCE
-        if alike_held and (total < _DECISIVE or all_logs.p_value > _CHANCE / 2):
+        alike_held = held.p_value > CHANCE
+        if alike_held and (total < DECISIVE or all_logs.p_value > CHANCE / 2):
             out.append(other)
     return out

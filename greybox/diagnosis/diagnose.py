@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from greybox.diagnosis.kinematics import causes_of
 from greybox.diagnosis.preparing import SHORTEST, prepare
 from greybox.diagnosis.result import Diagnosis
-from greybox.diagnosis.search import search
+from greybox.diagnosis.search import search, weighed
 from greybox.diagnosis.telling import Report
 from greybox.diagnosis.waves import find_waves, found_waves
 from greybox.model.model import ManoeuvringModel
@@ -92,6 +92,8 @@ def diagnose(
     base = ready.base()
     problem = case.problem(base.integrator)
     found = search(case, base, ready.atoms, progress=options.progress)
+    say("a generic force beside the causes")
+    found = weighed(case, found)
     say("what is left")
     names, final = problem.runs[0].outputs, found.final
     lines = [find_waves(f.nu, f.errors, names, problem.sample_time) for f in (base, final)]

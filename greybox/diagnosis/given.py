@@ -78,8 +78,7 @@ def fit_given(
     report = Report(case, ready.structure, ready.causes, search, None, seed, ())
     record = {"method": "given causes", "causes": list(ids)}
     before, after = (report.model(f, record) for f in (base, final))
-    pairs = case.held_out(final.integrator).pairs(final)
-    gain, _, after = report.gain(before, after, ready.validate, pairs)
+    gain, _, after = report.gain(before, after, ready.validate, final)
     fall = 1.0 - _squares(final) / max(_squares(base), 1e-300)
     return Given(tuple(ids), before, after, fall, gain, report.where(ready.validate))
 

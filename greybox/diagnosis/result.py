@@ -23,6 +23,7 @@ class DiagnosisVerdict(StrEnum):
     """What a diagnosis ends with; equal to the words that its JSON holds."""
 
     NAMED = "named"
+    PARTLY = "partly"
     NONE = "none"
     CONFUSED = "confused"
     UNEXPLAINED = "unexplained"
@@ -30,6 +31,7 @@ class DiagnosisVerdict(StrEnum):
 
 _SAID = {
     DiagnosisVerdict.NAMED: "what is wrong has a name",
+    DiagnosisVerdict.PARTLY: "a part of what is wrong has a name",
     DiagnosisVerdict.NONE: "nothing is wrong beyond noise",
     DiagnosisVerdict.CONFUSED: "something is wrong, and several causes explain it equally well",
     DiagnosisVerdict.UNEXPLAINED: "something is wrong, and no known cause explains it",
@@ -174,7 +176,7 @@ class Diagnosis(DisplayMixin):
     ----------
     verdict : DiagnosisVerdict
     causes : tuple of Found
-        In the order found.
+        Those that stand, in the order found.
     groups : tuple of tuple of str
         Causes that explain the logs equally well.
     gain : mapping of str to Gain
@@ -182,7 +184,7 @@ class Diagnosis(DisplayMixin):
     wrong : tuple of Symptom
         Largest first.
     partial : tuple of Found
-        Causes that help where the verdict is `unexplained`.
+        Causes that help, and do no more than a force without a name would.
     candidates : tuple of Found
         Members of the groups, each as it would be by itself.
     base, model : ManoeuvringModel
@@ -233,8 +235,11 @@ class Diagnosis(DisplayMixin):
     @property
     def headline(self) -> str:
         """The verdict in one sentence."""
+        told = "; ".join(f"{c.title}: {c.evidence}" for c in self.causes) + "."
         if self.verdict == DiagnosisVerdict.NAMED:
-            return "; ".join(f"{c.title}: {c.evidence}" for c in self.causes) + "."
+            return told
+        if self.verdict == DiagnosisVerdict.PARTLY:
+            return f"{told} {self.remaining}"
         if self.verdict == DiagnosisVerdict.CONFUSED:
             return (
                 f"Something is wrong, and these logs cannot tell which it is: "
@@ -275,7 +280,7 @@ class Diagnosis(DisplayMixin):
         lines += [f"  {s.sentence}" for s in self.wrong] or ["  nothing beyond noise"]
         lines += [f"  {t.sentence}" for t in self.residuals.get("before", ()) if not t.passed]
         for title, causes in (
-            ("Causes", self.causes), ("Helps, but does not explain all", self.partial),
+            ("Causes", self.causes), ("Helps no more than a force without a name", self.partial),
             ("Each would explain it", self.candidates),
         ):  # fmt: skip
             if causes:

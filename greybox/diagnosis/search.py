@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from greybox.diagnosis.atom import Atom
 from greybox.diagnosis.base import Case
+from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.held_out import HeldOut, Proof, proof_of
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.refitting import (
@@ -28,20 +29,16 @@ from greybox.diagnosis.refitting import (
     slow,
 )
 from greybox.diagnosis.scores import MOMENTS, Directions, Score, score_atoms
+from greybox.diagnosis.standing import Standing, standing
+from greybox.diagnosis.thresholds import BACKWARDS, MOST_CAUSES, PROVEN, RELEVANT, SIGNIFICANT
 from greybox.model.run.step import Integrator
 
 Array = NDArray[np.float64]
 
-MOST_CAUSES = 4
-# coefficients that are positive where thrusters push as the vessel file says, and the
-# price of a negative one in numbers
-_THRUST, _BACKWARDS = ("Xmu", "Ymu", "Nmu"), 3
+# coefficients that are positive where thrusters push as the vessel file says
+_THRUST = ("Xmu", "Ymu", "Nmu")
 # other causes that are tried in the place of one of several
 _INSTEAD = 2
-# significance after correction, of a cause and of its effect on held-out logs
-SIGNIFICANT, PROVEN = 0.01, 0.05
-# fall of −2 log L, a measured number, from which on a cause matters
-RELEVANT = 0.005
 
 _log = logging.getLogger(__name__)
 
@@ -65,6 +62,8 @@ class Candidate:
         Of the coefficients.
     tried : int
         Causes that the p-value is corrected for.
+    standing : Standing or None
+        What it does beside a generic force; None until that is asked.
     """
 
     atom: Atom
@@ -75,6 +74,7 @@ class Candidate:
     proof: Proof
     names: tuple[str, ...] = ()
     tried: int = 1
+    standing: Standing | None = None
 
     @property
     def relevant(self) -> bool:
@@ -132,6 +132,8 @@ class Search:
         In the order found, without those that later ones made needless.
     tried : int
         Atoms that were scored.
+    leaning : tuple of Candidate
+        Causes that help, and do no more than a generic force would: no part of `final`.
     """
 
     base: Fit
@@ -139,6 +141,7 @@ class Search:
     steps: tuple[Step, ...]
     causes: tuple[Candidate, ...]
     tried: int
+    leaning: tuple[Candidate, ...] = ()
 
     def proof(self, held_out: Callable[[Integrator], HeldOut]) -> float:
         """Return the fall of −2 log L of held-out logs by all causes, each fit as it is run."""
@@ -271,7 +274,7 @@ def _merit(candidate: Candidate) -> float:
     reversed columns may otherwise be taken for each other.
     """
     samples = sum(len(e) for e in candidate.fit.errors)
-    price = _dof(candidate.atom) + _BACKWARDS * len(backwards(candidate.fit, candidate.names))
+    price = _dof(candidate.atom) + BACKWARDS * len(backwards(candidate.fit, candidate.names))
     return candidate.fit.cost - candidate.proof.gain + price * float(np.log(samples))
 
 
@@ -302,13 +305,49 @@ def _backward(
     kept = list(causes)
     problem, held_out = case.problem(fit.integrator), case.held_out(fit.integrator)
     for cause in causes[:-1]:
-        without = problem.settle(
-            problem.fit(problem.drop(fit.point, cause.atom), fit.noise, most=FIRST), 2
-        )
+        without = _without(problem, fit, cause)
         if not assess_candidate(held_out, without, fit, cause.atom, tried).holds:
             fit = without
             kept = [c for c in kept if c.atom.key != cause.atom.key]
     return fit, kept
+
+
+def weighed(case: Case, found: Search) -> Search:
+    """Return the search without causes that do not stand beside a generic force.
+
+    The least of them goes first: what it imitated may be another's once it is gone.
+    """
+    fit, kept, leaning = found.final, list(found.causes), []
+    while kept:
+        problem, held_out = case.problem(fit.integrator), case.held_out(fit.integrator)
+        pairs = held_out.pairs(fit)
+        tried = []
+        for cause in kept:
+            without = _without(problem, fit, cause)
+            stands = standing(problem, cause.atom, fit, pairs, held_out.pairs(without))
+            tried.append((replace(cause, fit=fit, standing=stands), without))
+        kept = [cause for cause, _ in tried]
+        fallen = [(cause, without) for cause, without in tried if not _stands(cause)]
+        if not fallen:
+            break
+        least, fit = min(fallen, key=lambda item: _beyond(item[0]))
+        leaning.append(least)
+        kept = [c for c in kept if c.atom.key != least.atom.key]
+        fit = case.problem(fit.integrator).settle(fit, SETTLE)
+    return replace(found, final=fit, causes=tuple(kept), leaning=tuple(leaning))
+
+
+def _stands(cause: Candidate) -> bool:
+    return cause.standing is not None and cause.standing.stands
+
+
+def _beyond(cause: Candidate) -> float:
+    return -np.inf if cause.standing is None else cause.standing.beyond.gain
+
+
+def _without(problem: Problem, fit: Fit, cause: Candidate) -> Fit:
+    point = problem.drop(fit.point, cause.atom)
+    return problem.settle(problem.fit(point, fit.noise, most=FIRST), 2)
 
 
 def instead(

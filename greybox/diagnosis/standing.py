@@ -12,13 +12,9 @@ from greybox.diagnosis.atom import Atom
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.held_out import Pair, Proof, proof_of
 from greybox.diagnosis.point import Fit
-from greybox.diagnosis.remainder import (
-    Use,
-    contributions_beside,
-    generic_force,
-    motion_and_commands,
-)
+from greybox.diagnosis.remainder import Use, contributions_beside, generic_force
 from greybox.diagnosis.ship import CURRENTS
+from greybox.diagnosis.thresholds import LEAST_SHARE, OWN_SHARE, PROVEN
 from greybox.model.terms import parse_term
 
 Array = NDArray[np.float64]
@@ -37,15 +33,25 @@ class Standing:
         What the cause alone takes of the fall that a generic force of its own arguments brings;
         None where it is no function of motion and present commands.
     half : float
-        One-sided p-value of a share below one half.
-    shift : float
-        How far its values move when the generic force joins, in standard errors.
+        One-sided p-value of a share no larger than `LEAST_SHARE`.
+    moved : ndarray
+        How far each of its numbers moves when the generic force joins.
+    clear : float
+        p-value of the null (Wald), what it moves by counted as uncertainty.
     """
 
     beyond: Proof
     share: float | None
     half: float
-    shift: float
+    moved: Array
+    clear: float
+
+    @property
+    def stands(self) -> bool:
+        """Whether the cause does what no force without a name does as well."""
+        gains = self.beyond.gain > 0 and self.beyond.p_value < PROVEN
+        own = self.share is not None and self.share >= OWN_SHARE and self.half < PROVEN
+        return (gains or own) and self.clear < PROVEN
 
 
 def standing(problem: Problem, atom: Atom, with_it: Fit, pairs: Sequence[Pair],
@@ -61,11 +67,11 @@ def standing(problem: Problem, atom: Atom, with_it: Fit, pairs: Sequence[Pair],
     pairs, without : sequence of Pair
         That fit, and the one without the cause, on what is held out.
     """
+    moved, clear = _moved(problem, atom, with_it, pairs)
     if any(p.held_fit.escaped or p.fit.escaped for p in (*pairs, *without)):
         better = not any(p.held_fit.escaped for p in pairs)
-        none = np.zeros(1)
-        return Standing(Proof(np.inf if better else -np.inf, 0.0, 0.0 if better else 1.0, none),
-                        None, 1.0, 0.0)  # fmt: skip
+        proof = proof_of(np.array([np.inf if better else -np.inf]))
+        return Standing(proof, None, 1.0, moved, clear)
     beside = [contributions_beside(p) for p in pairs]
     beyond = proof_of(np.concatenate([contributions_beside(p) for p in without])
                       - np.concatenate(beside))  # fmt: skip
@@ -77,18 +83,32 @@ def standing(problem: Problem, atom: Atom, with_it: Fit, pairs: Sequence[Pair],
         generic = np.concatenate([contributions_beside(p, use) for p in without])
         gained, could = plain - own, plain - generic
         share = float(gained.sum() / could.sum()) if could.sum() > 0 else np.inf
-        half = proof_of(gained - 0.5 * could).p_value
-    return Standing(beyond, share, half, _shift(problem, atom, with_it, pairs))
+        half = proof_of(gained - LEAST_SHARE * could).p_value
+    return Standing(beyond, share, half, moved, clear)
 
 
-def _shift(problem: Problem, atom: Atom, fit: Fit, pairs: Sequence[Pair]) -> float:
+def _moved(problem: Problem, atom: Atom, fit: Fit, pairs: Sequence[Pair]) -> tuple[Array, float]:
+    """Return how far an atom's numbers move, and the p-value of their null."""
+    from scipy.stats import chi2
+
     where = problem.numbers_of(fit.point, atom)
-    if not where:
-        return 0.0
-    _, covariance = problem.covariance(fit)
-    std = np.sqrt(np.diag(covariance)[where])
-    moved = np.mean([generic_force(p, motion_and_commands).moved[where] for p in pairs], axis=0)
-    return float(np.max(np.abs(moved) / np.maximum(std, 1e-300)))
+    bounded = [p for p in pairs if not (p.fit.escaped or p.held_fit.escaped)]
+    if not where or not bounded:
+        return np.zeros(len(where)), 0.0
+    moved = np.mean([generic_force(p).moved[where] for p in bounded], axis=0)
+    numbers, covariance = problem.covariance(fit)
+    own = covariance[np.ix_(where, where)] + np.outer(moved, moved)
+    null = np.zeros(len(where))
+    tested = np.ones(len(where), bool)
+    if atom.apply is not None:
+        null = np.array([p.null for p in atom.parameters])
+        # a number with many hills has no null
+        tested = np.array([p.reach == 0 for p in atom.parameters])
+    if not np.isfinite(own).all() or not tested.any():
+        return np.abs(moved), 1.0 if tested.any() else 0.0
+    away = (numbers[where] - null)[tested]
+    wald = float(away @ np.linalg.pinv(own[np.ix_(tested, tested)]) @ away)
+    return np.abs(moved), float(chi2.sf(wald, int(tested.sum())))
 
 
 def _own_arguments(problem: Problem, atom: Atom) -> Use | None:

@@ -20,7 +20,6 @@ from greybox.diagnosis.point import Fit
 from greybox.diagnosis.residuals import residual_tests
 from greybox.diagnosis.result import (
     Diagnosis,
-    DiagnosisVerdict,
     Found,
     Gain,
     Quantity,
@@ -28,10 +27,10 @@ from greybox.diagnosis.result import (
     Runs,
     Symptom,
 )
+from greybox.diagnosis.ruling import rule
 from greybox.diagnosis.search import Candidate, Search, backwards, instead
 from greybox.diagnosis.ship import CURRENTS
 from greybox.diagnosis.symptoms import find_symptoms
-from greybox.diagnosis.verdict import rule
 from greybox.diagnosis.waves import Waves
 from greybox.model.model import ManoeuvringModel
 from greybox.model.structure import Structure
@@ -70,7 +69,7 @@ class Report:
             return self.given
         return made
 
-    def cause(self, candidate: Candidate, fit: Fit, tried: int) -> Found:
+    def cause(self, candidate: Candidate, fit: Fit) -> Found:
         """Return a candidate as it stands in a fit."""
         cause = self.causes[candidate.atom.cause]
         quantities = self.quantities(candidate, fit)
@@ -96,13 +95,16 @@ class Report:
         if not index:
             return {atom.key.split(":", 1)[1]: Quantity(-1.0, 0.0, "1")}
         wide = problem.spread(fit, atom)
+        weighed = candidate.standing
+        # what a generic force would move a number by is a part of what is not known of it
+        moved = np.zeros(len(index)) if weighed is None else weighed.moved[: len(index)]
         return {
             p.name: Quantity(
                 float(values[i]),
-                float(np.hypot(max(std[i], wide.get(p.name, 0.0)), p.coarse)),
+                float(np.linalg.norm([max(std[i], wide.get(p.name, 0.0)), p.coarse, by])),
                 p.unit,
             )
-            for p, i in zip(atom.parameters, index, strict=True)
+            for p, i, by in zip(atom.parameters, index, moved, strict=True)
         }
 
     def made(
@@ -114,52 +116,33 @@ class Report:
     ) -> Diagnosis:
         """Return the diagnosis."""
         found, case = self.found, self.case
-        held = case.held_out(found.final.integrator)
         groups = self._groups()
-        ruling = rule(found, case.held_out, groups, known)
-        named = [c for c in found.causes if not _grouped(c, groups)]
+        before = self.model(found.base, self.record(()))
+        after = self.model(found.final, self.record(found.causes)) if found.causes else before
+        gain, runs, after = self.gain(before, after, validate, found.final)
+        ruling = rule(found, case.held_out, groups, known, gain)
+        final = found.final
+        if not (ruling.named or groups) and found.causes:
+            final = found.base
+            gain, runs, after = self.gain(before, before, validate, final)
         members = [c for pair in groups for c in pair]
-        record = {
-            "method": "diagnosis",
-            "causes": [c.atom.key for c in found.causes],
-            "logs": [
-                {"name": log.name, "sha256": log.provenance.sha256, "samples": len(log)}
-                for log in case.logs
-            ],
-            "ranges": ranges(case.logs, self.structure.states),
-        }
-        before = self.model(found.base, record | {"causes": []})
-        after = self.model(found.final, record) if found.causes else before
-        alternatives = {c.atom.cause: self.model(c.fit, record) for c in members}
-        shown = [self.cause(c, found.final, tried) for c in named]
-        gain, runs, after = self.gain(before, after, validate, held.pairs(found.final))
-        notes = self._notes(after)
-        verdict = ruling.verdict
-        if found.causes and sum(g.after - g.before for g in gain.values()) < 0:
-            # likelier errors are no better simulation: nothing is extended by them
-            helped = ", ".join(c.atom.cause for c in found.causes)
-            notes.append(
-                f"{helped} made the held-out errors likelier but the free run no better, so the "
-                f"model was not extended."
-            )
-            gain, runs, after = self.gain(before, before, validate, held.pairs(found.base))
-            verdict = DiagnosisVerdict.UNEXPLAINED
-        unexplained = verdict is DiagnosisVerdict.UNEXPLAINED
+        alternatives = {c.atom.cause: self.model(c.fit, self.record((c,))) for c in members}
+        notes = [*self._notes(after), *ruling.notes]
         problem = case.problem(found.base.integrator)
         return Diagnosis(
-            verdict=verdict,
-            causes=(*known, *([] if unexplained else shown)),
+            verdict=ruling.verdict,
+            causes=(*known, *(self.cause(c, final) for c in ruling.named)),
             groups=tuple(tuple(c.atom.cause for c in pair) for pair in groups),
             gain=gain,
             wrong=_symptoms(problem, found),
             residuals={
                 "before": residual_tests(problem, found.base, ruling.before, lines[0]),
                 "after": residual_tests(
-                    case.problem(found.final.integrator), found.final, ruling.omnibus, lines[1]
+                    case.problem(final.integrator), final, ruling.omnibus, lines[1]
                 ),
             },
-            partial=tuple(shown if unexplained else ()),
-            candidates=tuple(self.cause(c, c.fit, tried) for c in members),
+            partial=tuple(self.cause(c, c.fit) for c in ruling.leaning),
+            candidates=tuple(self.cause(c, c.fit) for c in members),
             base=before,
             model=after,
             alternatives=alternatives,
@@ -170,8 +153,21 @@ class Report:
             runs=tuple(runs),
             notes=tuple(notes),
             tried=tried,
-            record=record,
+            record=self.record(found.causes),
         )
+
+    def record(self, causes: Sequence[Candidate]) -> dict[str, Any]:
+        """Return what a model file tells beside."""
+        logs = self.case.logs
+        return {
+            "method": "diagnosis",
+            "causes": [c.atom.key for c in causes],
+            "logs": [
+                {"name": log.name, "sha256": log.provenance.sha256, "samples": len(log)}
+                for log in logs
+            ],
+            "ranges": ranges(logs, self.structure.states),
+        }
 
     def _groups(self) -> list[list[Candidate]]:
         out = []
@@ -194,7 +190,7 @@ class Report:
         before: ManoeuvringModel,
         after: ManoeuvringModel,
         validate: Sequence[TrialLog],
-        pairs: Sequence[Pair],
+        final: Fit,
     ) -> tuple[dict[str, Gain], list[Runs], ManoeuvringModel]:
         """Return the gain on what is held out, all runs, and the model as those logs saw it."""
         logs = list(validate)
@@ -204,7 +200,7 @@ class Report:
             two = [self._as_seen(run_on(after, log), log) for log in logs]
         else:
             one = _held_runs(self.case.held_out(self.found.base.integrator).pairs(self.found.base))
-            two = _held_runs(pairs)
+            two = _held_runs(self.case.held_out(final.integrator).pairs(final))
         runs = [
             Runs(
                 a.log, held,
@@ -266,10 +262,6 @@ class Report:
         for change in after.changes:
             out.append(f"the extended model tells the log's own clock: {change.sentence}.")
         return out
-
-
-def _grouped(candidate: Candidate, groups: Sequence[Sequence[Candidate]]) -> bool:
-    return any(c.atom.key == candidate.atom.key for pair in groups for c in pair)
 
 
 def _ranked(scores: Sequence[Any], candidates: Sequence[Candidate]) -> tuple[Ranked, ...]:

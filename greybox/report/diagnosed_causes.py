@@ -20,12 +20,13 @@ def cause_section(diagnosis: Diagnosis) -> Section:
     """Show why: causes, their numbers, groups that look alike, and the search."""
     told = {
         DiagnosisVerdict.NAMED: "",
+        DiagnosisVerdict.PARTLY: f"These stand, and something remains. {diagnosis.remaining}",
         DiagnosisVerdict.NONE: f"{diagnosis.tried} causes were tried; none of them proved itself.",
         DiagnosisVerdict.CONFUSED: "Each of these explains the logs about as well as the others. "
         "A model with the wrong one fits these logs, and may fail on the next.",
         DiagnosisVerdict.UNEXPLAINED: f"None of the {diagnosis.tried} causes that were tried "
         "explains the errors."
-        + (" These help, but leave errors beyond noise:" if diagnosis.partial else ""),
+        + (" These help no more than a force without a name would:" if diagnosis.partial else ""),
     }[diagnosis.verdict]
     found = _all_found(diagnosis)
     points = [f"{_called(c)}: {c.evidence}." for c in found]

@@ -42,7 +42,7 @@ class Judgement:
 
     Parameters
     ----------
-    verdict : {"named", "none", "confused", "unexplained"}
+    verdict : {"named", "partly", "none", "confused", "unexplained"}
     ids : tuple of str
         Causes in the order found.
     groups : tuple of tuple of str
@@ -152,7 +152,7 @@ class Outcome:
     def answer(self) -> str:
         """How the judgement compares with the truth.
 
-        ``right``: all causes named and no other; an effect that has no name left
+        ``right``: all causes named, no other, and nothing left; an effect that has no name left
         unexplained; nothing found where nothing is. ``part``: some of them named, or
         others beside them. ``group``: confused, every cause being in a group. ``failed``,
         ``none``, ``unexplained`` and ``wrong`` are what is left.
@@ -169,7 +169,7 @@ class Outcome:
             return "right" if nameless else "unexplained"
         if verdict == DiagnosisVerdict.CONFUSED:
             return "group" if true and true <= ids | members else "wrong"
-        if ids == true:
+        if ids == true and verdict == DiagnosisVerdict.NAMED:
             return "right"
         return "part" if ids & true else "wrong"
 
@@ -180,7 +180,7 @@ class Outcome:
             return "failed"
         if self.judgement.verdict == DiagnosisVerdict.CONFUSED:
             return "group with it" if self.answer == "group" else "group without"
-        if self.judgement.verdict == DiagnosisVerdict.NAMED:
+        if self.judgement.verdict in (DiagnosisVerdict.NAMED, DiagnosisVerdict.PARTLY):
             return self.judgement.ids[0]
         return self.judgement.verdict
 

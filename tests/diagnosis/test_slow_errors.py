@@ -15,7 +15,7 @@ from greybox.diagnosis.noise import fit_noise
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.refitting import loosened
 from greybox.diagnosis.remainder import features, knots_of
-from greybox.diagnosis.verdict import _drifts
+from greybox.diagnosis.ruling import _drifts
 from greybox.study.blind import draw
 from greybox.trial.log import TrialLog
 

@@ -1,0 +1,221 @@
+"""The ruling on what a search found, and on what it left."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.diagnosis.held_out import HeldOut, Pair
+from greybox.diagnosis.omnibus import Omnibus, disagreement, omnibus
+from greybox.diagnosis.point import Fit
+from greybox.diagnosis.result import DiagnosisVerdict, Found, Gain
+from greybox.diagnosis.search import Candidate, Search
+from greybox.diagnosis.symptoms import coloured, word
+from greybox.diagnosis.thresholds import (
+    APART,
+    BESIDE,
+    EACH,
+    GUST,
+    LARGE,
+    LEFT_OVER,
+    LONGER,
+    MOST_OF,
+    RELEVANT,
+    SENSORS,
+    SURE,
+    WORTH,
+)
+from greybox.model.run.step import Integrator
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Ruling:
+    """The verdict with what is left and what to do next.
+
+    Parameters
+    ----------
+    verdict : DiagnosisVerdict
+    named : tuple of Candidate
+        Causes that stand and have no rival, in the order found.
+    leaning : tuple of Candidate
+        Causes that help and do not stand.
+    remaining : str
+    next_steps : list of str
+    before, omnibus : Omnibus
+        Of the model without causes, and of what was found.
+    notes : tuple of str
+    """
+
+    verdict: DiagnosisVerdict
+    named: tuple[Candidate, ...]
+    leaning: tuple[Candidate, ...]
+    remaining: str
+    next_steps: list[str]
+    before: Omnibus
+    omnibus: Omnibus
+    notes: tuple[str, ...] = ()
+
+
+def rule(
+    found: Search,
+    held_out: Callable[[Integrator], HeldOut],
+    groups: Sequence[Sequence[Candidate]],
+    known: Sequence[Found],
+    gain: Mapping[str, Gain],
+) -> Ruling:
+    """Decide what may be said.
+
+    Parameters
+    ----------
+    found : Search
+    held_out : callable
+        Of an integrator.
+    groups : sequence of sequence of Candidate
+        Causes that do equally well.
+    known : sequence of Found
+        Causes that the log proves without forces.
+    gain : mapping of str to Gain
+        Fit of the held-out free run without causes and with them.
+    """
+    final, stand, leaning, notes = found.final, found.causes, found.leaning, []
+    if stand and sum(g.after - g.before for g in gain.values()) < 0:
+        # likelier errors are no better simulation: nothing is extended by them
+        helped = ", ".join(c.atom.cause for c in stand)
+        notes.append(
+            f"{helped} made the held-out errors likelier but the free run no better, so the "
+            f"model was not extended."
+        )
+        final, stand, leaning, groups = found.base, (), (*stand, *leaning), ()
+    pairs = held_out(final.integrator).pairs(final)
+    first = omnibus(held_out(found.base.integrator).pairs(found.base))
+    left = omnibus(pairs)
+    explained = max(found.proof(held_out), 0.0) if stand else 0.0
+    why = _wrong(found.base, final, pairs, left, explained, bool(stand))
+    named = tuple(c for c in stand if not _grouped(c, groups))
+    if named or known:
+        verdict = DiagnosisVerdict.PARTLY if why else DiagnosisVerdict.NAMED
+    elif groups:
+        verdict = DiagnosisVerdict.CONFUSED
+    else:
+        verdict = DiagnosisVerdict.UNEXPLAINED if why else DiagnosisVerdict.NONE
+    return Ruling(
+        verdict, named, tuple(leaning), _remaining(final, pairs, left, why),
+        _next(verdict, groups), first, left, tuple(notes),
+    )  # fmt: skip
+
+
+def _wrong(
+    base: Fit, final: Fit, pairs: Sequence[Pair], left: Omnibus, explained: float, found: bool
+) -> str:
+    """Return what is wrong with what a model leaves; nothing where nothing is."""
+    numbers = sum(nu.size for pair in pairs for nu in pair.held_fit.nu)
+    if left.proof.p_value < SURE and left.gain > max(WORTH * numbers, LEFT_OVER * explained):
+        return (
+            f"forces that no cause stands for would explain another "
+            f"{100 * left.explicable:.1f} % of the squared errors of logs that they were not "
+            f"fitted to (p = {left.proof.p_value:.1g})"
+        )
+    other = disagreement(pairs)
+    if other.p_value < APART and other.fall > RELEVANT * numbers + BESIDE * explained:
+        return "the coefficients that these logs ask for do not hold for the held-out ones"
+    before, after = _excess(base, final), _excess(final, final)
+    # a cause that leaves much of the error where it was is not what is wrong, or not alone
+    if found and after > LARGE and after > MOST_OF * before:
+        return f"the causes leave {100 * after / before:.0f} % of the squared error"
+    if not found and before > LARGE and _drifts(pairs):
+        return (
+            f"a force moves the ship in all logs that is remembered for longer than gusts "
+            f"({GUST:g} s): a current that changes, or something that no cause stands for"
+        )
+    missed = _missed(pairs)
+    if missed and max(missed.values()) > SENSORS:
+        told = ", ".join(f"{word(s)} by {m:.1f}" for s, m in missed.items() if m > SENSORS)
+        return (
+            f"the held-out free run misses {told} times what its sensor's noise explains, and a "
+            f"model that nothing is wrong with no more than {SENSORS:g} times"
+        )
+    return ""
+
+
+def _missed(pairs: Sequence[Pair]) -> dict[str, float]:
+    """Return the root mean square held-out error of each state in its sensor's deviations."""
+    out = {}
+    names = pairs[0].problem.runs[0].outputs
+    for k, group in enumerate(pairs[0].held_fit.noise.groups):
+        i = group.outputs[0]
+        total = sum(float((e[:, i] ** 2).sum()) for p in pairs for e in p.held_fit.errors)
+        noise = sum(
+            float(p.held_fit.noise.groups[k].sensor[0] ** 2) * sum(map(len, p.held_fit.errors))
+            for p in pairs
+        )
+        out[names[i]] = float(np.sqrt(total / max(noise, 1e-300)))
+    return out
+
+
+def _grouped(candidate: Candidate, groups: Sequence[Sequence[Candidate]]) -> bool:
+    return any(c.atom.key == candidate.atom.key for pair in groups for c in pair)
+
+
+def _drifts(pairs: Sequence[Pair]) -> bool:
+    """Whether what moves a channel beside the model is slower than gusts, in every log."""
+    every = [one for p in pairs for one in ((p.problem, p.fit), (p.held, p.held_fit))]
+    falls = []
+    for problem, fit in every:
+        if fit.escaped:
+            return False
+        longest = GUST / problem.sample_time
+        short, free = (problem.forgetful(fit, memory) for memory in (longest, np.inf))
+        falls.append(problem.costs(short) - problem.costs(free))
+    of_channels = np.array(falls)
+    slow = (of_channels.min(axis=0) > EACH) & (of_channels.sum(axis=0) > LONGER * len(pairs))
+    return bool(slow.any())
+
+
+def _excess(fit: Fit, final: Fit) -> float:
+    """Return the mean squared error of the states in the sensors' variances, less their own."""
+    sensor, places = [], []
+    for group in final.noise.groups:
+        sensor.append(group.sensor[0])
+        places.append(group.outputs[0])
+    errors = np.concatenate(fit.errors)[:, places]
+    return float(((errors / np.maximum(sensor, 1e-300)) ** 2).mean()) - 1.0
+
+
+def _remaining(final: Fit, pairs: Sequence[Pair], left: Omnibus, why: str) -> str:
+    moved = coloured(final, pairs[0].problem.runs[0].outputs)
+    tail = f" In these logs {moved}." if moved else ""
+    if why:
+        return f"What is left is not noise: {why}.{tail}"
+    if left.proof.p_value < SURE and left.explicable > 0:
+        return (
+            f"What is left is hardly more than noise: forces that no cause stands for would "
+            f"explain another {100 * left.explicable:.1f} % of the squared errors "
+            f"(p = {left.proof.p_value:.1g}), too little to matter.{tail}"
+        )
+    return f"What is left is not told from noise.{tail}"
+
+
+def _next(verdict: DiagnosisVerdict, groups: Sequence[Sequence[Candidate]]) -> list[str]:
+    out = [
+        f"design a trial that tells {' from '.join(c.atom.cause for c in pair)}: greybox design "
+        f"--between {' '.join(f'MODEL.{c.atom.cause}.json' for c in pair[:2])}"
+        for pair in groups
+    ]
+    if verdict in (DiagnosisVerdict.UNEXPLAINED, DiagnosisVerdict.PARTLY):
+        out.append(
+            "measure what the model does not know (wind, depth, draught, propeller and rudder as "
+            "they really moved), repeat a run of these logs, and diagnose both together"
+        )
+    if verdict in (DiagnosisVerdict.NAMED, DiagnosisVerdict.PARTLY):
+        out.append(
+            "design the next trial with the extended model, so that its least certain "
+            "coefficients move: greybox design --model MODEL"
+        )
+    if verdict is DiagnosisVerdict.NONE:
+        out.append("the model may be used as it is; a trial in other conditions would tell more")
+    return out
