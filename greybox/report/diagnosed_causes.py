@@ -20,14 +20,16 @@ def cause_section(diagnosis: Diagnosis) -> Section:
     """Show why: causes, their numbers, groups that look alike, and the search."""
     told = {
         DiagnosisVerdict.NAMED: "",
-        DiagnosisVerdict.PARTLY: f"These stand, and something remains. {diagnosis.remaining}",
+        DiagnosisVerdict.PARTLY: "These stand, and something remains.",
         DiagnosisVerdict.NONE: f"{diagnosis.tried} causes were tried; none of them proved itself.",
         DiagnosisVerdict.CONFUSED: "Each of these explains the logs about as well as the others. "
         "A model with the wrong one fits these logs, and may fail on the next.",
         DiagnosisVerdict.UNEXPLAINED: f"None of the {diagnosis.tried} causes that were tried "
-        "explains the errors."
-        + (" These help no more than a force without a name would:" if diagnosis.partial else ""),
+        "explains the errors.",
     }[diagnosis.verdict]
+    if diagnosis.partial:
+        helping = ", ".join(c.key for c in diagnosis.partial)
+        told = f"{told} No more than a force without a name would help: {helping}.".strip()
     found = _all_found(diagnosis)
     points = [f"{_called(c)}: {c.evidence}." for c in found]
     return Section(

@@ -34,7 +34,7 @@ from greybox.vessel.vessel import Actuation
 
 HOSTILE = '<script>alert("x")</script> & $x^$'
 SIDE = {"v": -1, "r": -1, "psi": -1}
-VERDICTS = ("named", "none", "confused", "unexplained")
+VERDICTS = ("named", "partly", "none", "confused", "unexplained")
 RECORD = {"program": "greybox-marine 0.1.0", "command": {"logs": ["day1.csv"], "seed": 0},
           "logs": ["day1.csv 0123456789ab"]}  # fmt: skip
 
@@ -133,7 +133,7 @@ def diagnosis_of(verdict, name="day 2"):
     }
     return Diagnosis(
         verdict=verdict,
-        causes=(CURRENT, BIAS) if verdict == "named" else (),
+        causes={"named": (CURRENT, BIAS), "partly": (CURRENT,)}.get(verdict, ()),
         groups=(("current", "heading_bias"),) if verdict == "confused" else (),
         gain=gain,
         wrong=()
@@ -142,7 +142,7 @@ def diagnosis_of(verdict, name="day 2"):
             Symptom("surge is over-predicted by 0.21 m/s when heading south", "u", 14.2),
             Symptom("sway is under-predicted by 0.19 m/s when heading east", "v", 12.9),
         ),
-        partial=(CURRENT,) if verdict == "unexplained" else (),
+        partial={"unexplained": (CURRENT,), "partly": (BIAS,)}.get(verdict, ()),
         candidates=(CURRENT, BIAS) if verdict == "confused" else (),
         base=base,
         model=base if same else flown(),
@@ -241,8 +241,19 @@ def test_confused(told):
 
 def test_unexplained(told):
     shown = told["unexplained"]
-    assert "None of the 52 causes that were tried explains the errors. These help" in shown
+    assert "None of the 52 causes that were tried explains the errors. No more than a force "
+    assert "without a name would help: current." in shown
     assert "current: the errors of surge and sway" in shown
+
+
+def test_partly(pages, told):
+    shown = told["partly"]
+    # causes first, then what remains
+    headline = pages["partly"].headline
+    assert headline.startswith("Current: the errors of surge and sway turn")
+    assert headline.endswith("What remains of the error is noise (p = 0.41).")
+    assert "These stand, and something remains." in shown
+    assert "No more than a force without a name would help: heading_bias." in shown
 
 
 def test_every_picture_says_what_it_shows(pages):
