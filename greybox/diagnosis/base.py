@@ -21,6 +21,7 @@ from greybox.model.predictor import Predictor, Regime, build_predictor
 from greybox.model.predictor_kinds import PREDICTORS
 from greybox.model.run.step import Integrator
 from greybox.model.structure import Structure
+from greybox.model.terms import parse_term
 from greybox.regression.regression import build_regression
 from greybox.rotation import body_to_ned
 from greybox.trial.log import TrialLog
@@ -70,6 +71,27 @@ class Case:
         self.kind, self.regime = kind, regime
         self._problems: dict[Integrator, Problem] = {}
         self._held: dict[Integrator, HeldOut] = {}
+
+    def wider(self, names: Sequence[str]) -> Case:
+        """Return the case with more terms that a hypothesis may use."""
+        known = {t.key for t in self.universe.terms}
+        more = [n for n in names if parse_term(n).key not in known]
+        return Case(
+            self.structure, self.universe.with_terms(*more), self.logs, self.held_out_logs,
+            self.kind, self.regime,
+        )  # fmt: skip
+
+    def carried(self, fit: Fit) -> Fit:
+        """Return a fit of a case with fewer terms as one of this."""
+        base, problem = fit.point.base, self.problem(fit.integrator)
+        more = len(problem.structure.parameters) - len(base.theta)
+        if more == 0:
+            return fit
+        theta = np.concatenate([base.theta, np.zeros(more)])
+        # currents stand behind the coefficients
+        places = tuple(i if i < len(base.theta) else i + more for i in fit.point.places)
+        point = replace(fit.point, base=replace(base, theta=theta), places=places)
+        return replace(fit, point=point)
 
     def problem(self, integrator: Integrator) -> Problem:
         """Return the estimation logs, ready to be run."""
@@ -216,7 +238,8 @@ class Case:
         Those of a model that lacked a cause may lie beyond a hill of the likelihood; these
         are of the logs as they would be without what the fit knows of sensors and thrusters.
         """
-        if self._near(fit):
+        own = {self.problem(fit.integrator).place(n) for n in self.structure.parameters}
+        if self._near(fit) or not own <= set(fit.point.places):
             return fit
         logs = [_as_it_should_be(log, fit.point.ship) for log in self.logs]
         first = rough(self.structure, logs, self.kind, self.regime)[0]

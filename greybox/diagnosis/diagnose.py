@@ -6,9 +6,11 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
+from greybox.diagnosis.chosen import from_chosen
 from greybox.diagnosis.kinematics import causes_of
 from greybox.diagnosis.preparing import SHORTEST, prepare
 from greybox.diagnosis.result import Diagnosis
+from greybox.diagnosis.ruling import leaves_more
 from greybox.diagnosis.search import search, weighed
 from greybox.diagnosis.telling import Report
 from greybox.diagnosis.waves import find_waves, found_waves
@@ -94,6 +96,12 @@ def diagnose(
     found = search(case, base, ready.atoms, progress=options.progress)
     say("a generic force beside the causes")
     found = weighed(case, found)
+    if model is None and leaves_more(found, case.held_out):
+        chosen = from_chosen(ready, found, say)
+        if chosen is not None:
+            case, found = chosen
+            found = weighed(case, found)
+            problem = case.problem(found.base.integrator)
     say("what is left")
     names, final = problem.runs[0].outputs, found.final
     lines = [find_waves(f.nu, f.errors, names, problem.sample_time) for f in (base, final)]

@@ -150,6 +150,11 @@ def _structure(name: str, logs: Sequence[TrialLog], model: ManoeuvringModel | No
     return for_inputs(structure.without(*still), inputs) if still else structure
 
 
+def context_of(structure: Structure, ready: Prepared) -> Context:
+    """Return what causes are told of a prepared case, with another structure."""
+    return _context(structure, [*ready.case.logs, *ready.case.held_out_logs], ready.model)
+
+
 def _context(
     structure: Structure, logs: Sequence[TrialLog], model: ManoeuvringModel | None
 ) -> Context:

@@ -109,6 +109,14 @@ def rule(
     )  # fmt: skip
 
 
+def leaves_more(found: Search, held_out: Callable[[Integrator], HeldOut]) -> bool:
+    """Whether what was found leaves more than noise."""
+    pairs = held_out(found.final.integrator).pairs(found.final)
+    explained = max(found.proof(held_out), 0.0) if found.causes else 0.0
+    left = omnibus(pairs)
+    return bool(_wrong(found.base, found.final, pairs, left, explained, bool(found.causes)))
+
+
 def _wrong(
     base: Fit, final: Fit, pairs: Sequence[Pair], left: Omnibus, explained: float, found: bool
 ) -> str:

@@ -159,6 +159,7 @@ def search(
     base: Fit,
     atoms: Sequence[Atom],
     *,
+    begun: Sequence[Candidate] = (),
     most: int = MOST_CAUSES,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Search:
@@ -170,14 +171,17 @@ def search(
     base : Fit
         Of the model without any cause, its noise settled.
     atoms : sequence of Atom
+    begun : sequence of Candidate
+        Causes that are in force from the beginning.
     most : int
-        Causes at most.
+        Causes at most beside those.
     progress : callable
         Told what is being done.
     """
     steps: list[Step] = []
     fit = base
-    causes: list[Candidate] = []
+    causes: list[Candidate] = list(begun)
+    most += len(causes)
     known: set[frozenset[str]] = set()
     while len(causes) < most and frozenset(c.atom.key for c in causes) not in known:
         # causes that take each other's place would go round for ever
@@ -302,13 +306,26 @@ def _backward(
     case: Case, fit: Fit, causes: list[Candidate], tried: int
 ) -> tuple[Fit, list[Candidate]]:
     """Drop causes that a later one made needless."""
+    fit, kept = pruned(case, fit, causes[:-1], tried)
+    return fit, [*kept, causes[-1]]
+
+
+def pruned(
+    case: Case, fit: Fit, causes: Sequence[Candidate], tried: int
+) -> tuple[Fit, list[Candidate]]:
+    """Leave out causes that do not hold, one after another; those kept are told against that."""
     kept = list(causes)
     problem, held_out = case.problem(fit.integrator), case.held_out(fit.integrator)
-    for cause in causes[:-1]:
+    for cause in causes:
         without = _without(problem, fit, cause)
-        if not assess_candidate(held_out, without, fit, cause.atom, tried).holds:
+        alone = assess_candidate(held_out, without, fit, cause.atom, tried, cause.names)
+        place = [c.atom.key for c in kept].index(cause.atom.key)
+        if alone.holds:
+            kept[place] = alone
+        else:
+            _log.info("%s is left out", cause.atom.key)
             fit = without
-            kept = [c for c in kept if c.atom.key != cause.atom.key]
+            del kept[place]
     return fit, kept
 
 

@@ -1,0 +1,180 @@
+"""The model that the data choose, taken apart into causes that have a name.
+
+Where (3.51) with a few causes leaves more than noise, `estimate`'s choice of terms begins: each
+that stands for a cause is in force as one, is tested by leaving it out, and what else is wrong is
+sought beside them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.diagnosis.atom import Atom, Parameter
+from greybox.diagnosis.base import Case
+from greybox.diagnosis.fitting import Problem
+from greybox.diagnosis.held_out import proof_of
+from greybox.diagnosis.point import Fit, Point
+from greybox.diagnosis.preparing import Prepared, context_of
+from greybox.diagnosis.refitting import SETTLE
+from greybox.diagnosis.search import Search, assess_candidate, pruned, search
+from greybox.diagnosis.ship import CURRENTS, Ship
+from greybox.diagnosis.thresholds import PROVEN
+from greybox.errors import ExcitationError, GreyboxError
+from greybox.model.structure import Structure
+from greybox.model.terms import Term, parameter_unit
+from greybox.selection.cross_validation import Refit
+from greybox.selection.estimate import at_own_pace
+from greybox.selection.term_selection import TermChoice, select_terms
+from greybox.trial.log import TrialLog
+
+Array = NDArray[np.float64]
+
+_AIR = {"uq", "vq"}
+_FLOW = {"v", "r"}
+_QUADRATIC = "quadratic_thrust"
+
+
+def from_chosen(
+    ready: Prepared, found: Search, progress: Callable[[str], None]
+) -> tuple[Case, Search] | None:
+    """Search from the terms that the data choose; None where that predicts no better.
+
+    Parameters
+    ----------
+    ready : Prepared
+        Without a model of its own.
+    found : Search
+        From (3.51).
+    progress : callable
+    """
+    progress("terms that the data choose")
+    try:
+        choice = _choice(ready.case.logs)
+    except GreyboxError:
+        return None
+    terms = choice.terms.structure
+    case = ready.case.wider(terms.parameters)
+    base = case.carried(found.base)
+    problem = case.problem(base.integrator)
+    named, atoms = _hypotheses(ready, case, choice)
+    in_force = {n for a in named for n in a.columns}
+    places = tuple(problem.place(n) for n in terms.parameters if n not in in_force)
+    start = Point(_ship(problem, choice, base), base.point.starts, places)
+    for atom in named:
+        value = None if atom.apply is None else np.array([_share(choice)])
+        start = problem.add(start, atom, value)
+    begun = problem.fit(start, base.noise)
+    if begun.escaped:
+        return None
+    fit = case.other_integrator(problem.settle(begun, SETTLE))
+    held_out = case.held_out(fit.integrator)
+    if any(p.held_fit.escaped for p in held_out.pairs(fit)):
+        return None
+    causes = [assess_candidate(held_out, base, fit, a, len(atoms), problem.names) for a in named]
+    fit, causes = pruned(case, fit, causes, len(atoms))
+    other = search(case, fit, [a for a in atoms if a not in named], begun=causes, progress=progress)
+    mine = replace(other, base=base, steps=other.steps, tried=len(atoms))
+    return (case, mine) if _better(case, mine, case.carried(found.final)) else None
+
+
+def _choice(logs: Sequence[TrialLog]) -> TermChoice:
+    def none(_: Sequence[TrialLog]) -> None:
+        raise ExcitationError("no model stands before.")
+
+    return select_terms(at_own_pace(logs, []), "no model", 0, Refit(none))  # type: ignore[arg-type]
+
+
+def _better(case: Case, mine: Search, other: Fit) -> bool:
+    """Whether held-out logs prefer what was found from the chosen terms."""
+    one, two = (case.held_out(f.integrator).contributions(f) for f in (other, mine.final))
+    with np.errstate(invalid="ignore"):
+        proof = proof_of(one - two)
+    return proof.gain > 0 and proof.p_value < PROVEN
+
+
+def _hypotheses(ready: Prepared, case: Case, choice: TermChoice) -> tuple[list[Atom], list[Atom]]:
+    """Return the causes that the chosen terms stand for, and all that are to be tried."""
+    structure, terms = ready.structure, choice.terms.structure
+    vessel = case.logs[0].vessel
+    grouped: dict[tuple[str, str], list[Term]] = {}
+    for term in terms.terms:
+        cause = _cause_of(term, structure)
+        if cause is not None and cause in ready.causes:
+            alone = cause in ("cubic_damping", "crossflow")
+            grouped.setdefault((cause, term.name if alone else ""), []).append(term)
+    named = [
+        Atom(
+            cause,
+            cause if cause == "wind" else f"{cause}:{'+'.join(t.name for t in mine)}",
+            tuple(Parameter(t.name, parameter_unit(t, vessel.force_unit), 0.0) for t in mine),
+            columns=tuple(t.name for t in mine),
+        )
+        for (cause, _), mine in grouped.items()
+    ]
+    # what the chosen terms hold is no hypothesis of its own
+    context = context_of(structure.with_terms(*_lacking(structure, terms)), ready)
+    others = [a for c in ready.causes.values() for a in c.atoms(context)]
+    if "current" in ready.causes and choice.terms.kind in ("wind", "augmented"):
+        named += [replace(a, beside=()) for a in others if a.cause == "current" and not a.apply]
+        others = [a for a in others if a.cause != "current"]
+    if choice.logs[0].vessel.thrusters[0].thrust != vessel.thrusters[0].thrust:
+        named += [a for a in others if a.cause == _QUADRATIC]
+        others = [a for a in others if a.cause != _QUADRATIC]
+    return named, [*named, *others]
+
+
+def _lacking(structure: Structure, terms: Structure) -> list[str]:
+    keys = {t.key for t in structure.terms}
+    return [t.name for t in terms.terms if t.key not in keys]
+
+
+def _cause_of(term: Term, structure: Structure) -> str | None:
+    """Return the cause that a term stands for where a structure lacks it."""
+    if any(t.key == term.key for t in structure.terms):
+        return None
+    signals = [f.signal for f in term.factors]
+    if not signals:
+        return None if term.state == "u" else "asymmetry"
+    if set(signals) <= _AIR:
+        return "wind"
+    if signals == [term.state] * 3:
+        return "cubic_damping"
+    if term.name == "N_|r|r":
+        return "quadratic_yaw_damping"
+    if term.state in _FLOW and len(signals) == 2 and set(signals) <= _FLOW:
+        return "crossflow"
+    if len(signals) == 2 and "u" in signals and set(signals) & {"taux", "tauy", "taun"}:
+        own = {"u": "taux", "v": "tauy", "r": "taun"}[term.state]
+        return "advance_speed" if own in signals else None
+    return None
+
+
+def _share(choice: TermChoice) -> float:
+    law = choice.logs[0].vessel.thrusters[0].thrust
+    return 1.0 if law.kind == "quadratic" else law.quadratic_share
+
+
+def _ship(problem: Problem, choice: TermChoice, base: Fit) -> Ship:
+    """Return the chosen coefficients at the sample time and thrust of the diagnosis."""
+    terms = choice.terms
+    ship = base.point.base
+    scale = problem.sample_time / choice.logs[0].sample_time
+    pushed = _push(choice, base)
+    theta = np.zeros(len(ship.theta))
+    for term, value in zip(terms.structure.terms, terms.start, strict=True):
+        of_thrust = any(f.signal in problem.structure.inputs for f in term.factors)
+        theta[problem.place(term.name)] = value * scale * (pushed if of_thrust else 1.0)
+    return replace(ship, theta=theta, current=np.zeros(len(CURRENTS)))
+
+
+def _push(choice: TermChoice, base: Fit) -> float:
+    """Return the chosen law's force in that of the diagnosis's, where n|n| is over a reference."""
+    law = choice.logs[0].vessel.thrusters[0].thrust
+    own = base.point.base.vessel
+    if law == own.thrusters[0].thrust or law.kind != "quadratic":
+        return 1.0
+    return float(np.mean([np.median(np.abs(choice.logs[0][t.speed])) for t in own.thrusters]))
