@@ -82,6 +82,16 @@ class Problem:
         first = len(point.places) + sum(map(len, point.values[:k]))
         return list(range(first, first + len(point.values[k])))
 
+    def bounds(self, point: Point) -> tuple[Array, Array]:
+        """Return least and largest values of the free numbers of a point."""
+        size = len(point.vector())
+        low, high = np.full(size, -np.inf), np.full(size, np.inf)
+        for atom in point.atoms:
+            # coefficients that only become free beside it have no bounds
+            for k, parameter in zip(self.numbers_of(point, atom), atom.parameters, strict=False):
+                low[k], high[k] = parameter.low, parameter.high
+        return low, high
+
     def drop(self, point: Point, atom: Atom) -> Point:
         """Return the point without an atom, its coefficients at zero."""
         k = [a.key for a in point.atoms].index(atom.key)
@@ -159,11 +169,13 @@ class Problem:
             moved = vector.copy()
             moved[k] = end
             shown.append(run.run(point.at(moved).ship, start).y)
-        return np.asarray((shown[1] - shown[0]) / (ends[1] - ends[0]))
+        # beside a run within bounds may stand one that leaves them
+        with np.errstate(invalid="ignore"):
+            return np.asarray((shown[1] - shown[0]) / (ends[1] - ends[0]))
 
     def fit(self, point: Point, noise: Noise, most: int = _MOST) -> Fit:
         """Minimise −2 log L over the free numbers at a given noise."""
-        low, high = point.bounds()
+        low, high = self.bounds(point)
         vector = np.clip(point.vector(), low, high)
         point = point.at(vector)
         errors = self.errors(point)

@@ -14,7 +14,7 @@ from greybox.diagnosis.preparing import prepare
 from greybox.diagnosis.refitting import likelier, polished, refit, seen_as_slow, slow
 from greybox.diagnosis.result import Given
 from greybox.diagnosis.scores import Directions, score_atoms
-from greybox.diagnosis.search import Search
+from greybox.diagnosis.search import Search, freed
 from greybox.diagnosis.telling import Report
 from greybox.public import known_keywords, one_thread
 from greybox.trial.log import Logs
@@ -100,7 +100,7 @@ def _likeliest(case: Case, fit: Fit, atoms: Sequence[Atom]) -> tuple[Atom, Fit] 
 
     def merit(found: tuple[Atom, Fit]) -> tuple[bool, float]:
         atom, its = found
-        price = max(len(atom.parameters), 1) * float(np.log(samples))
+        price = freed(fit, its, atom) * float(np.log(samples))
         return not atom.afresh, its.cost + price
 
     atom, best = min(fits, key=merit)

@@ -16,10 +16,6 @@ from greybox.diagnosis.ship import Ship
 Array = NDArray[np.float64]
 
 
-# gain against a run that leaves every bound
-_FAR = 1e6
-
-
 @dataclass(frozen=True)
 class Proof:
     """Fall of −2 log L of held-out logs.
@@ -27,8 +23,9 @@ class Proof:
     Parameters
     ----------
     gain : float
+        Infinite where one of the two runs leaves every bound.
     std : float
-        Its standard error, the errors' memory counted.
+        Its standard error, the errors' memory counted; not a number with such a gain.
     p_value : float
         One-sided, of no gain.
     samples : ndarray
@@ -107,7 +104,7 @@ def proof_of(difference: Array) -> Proof:
     if not np.isfinite(difference).all():
         # one of the two runs away: no sum tells more than which
         better = bool((difference > 0).all())
-        return Proof(_FAR if better else -_FAR, 0.0, 0.0 if better else 1.0, difference)
+        return Proof(np.inf if better else -np.inf, np.nan, float(not better), difference)
     gain = float(difference.sum())
     std = float(np.sqrt(long_run_variance(difference) * len(difference)))
     p = float(norm.sf(gain / std)) if std > 0 else float(gain <= 0)

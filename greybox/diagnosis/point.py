@@ -69,18 +69,6 @@ class Point:
             m += len(old)
         return replace(self, base=base, values=tuple(values), starts=tuple(starts))
 
-    def bounds(self) -> tuple[Array, Array]:
-        """Return least and largest values of the free numbers."""
-        size = len(self.places) + sum(map(len, self.values)) + sum(map(len, self.starts))
-        low, high = np.full(size, -np.inf), np.full(size, np.inf)
-        m = len(self.places)
-        for atom, value in zip(self.atoms, self.values, strict=True):
-            if atom.apply is not None:
-                for i, parameter in enumerate(atom.parameters):
-                    low[m + i], high[m + i] = parameter.low, parameter.high
-                m += len(value)
-        return low, high
-
 
 @dataclass(frozen=True)
 class Fit:

@@ -38,6 +38,11 @@ _SAID = {
 }
 
 
+def finite(value: float) -> float | None:
+    """Return a number for JSON, None where there is none."""
+    return float(value) if np.isfinite(value) else None
+
+
 def _shown(p: float) -> str:
     """Return a p-value with its sign of relation; what underflows is no zero."""
     return f"= {p:.2g}" if p > 0 else "< 1e-300"
@@ -73,7 +78,8 @@ class Found:
     gain : float
         Fall of −2 log L of the estimation logs.
     held_out, held_out_std : float
-        Fall of −2 log L of logs it was not fitted to, and its standard error.
+        Fall of −2 log L of logs it was not fitted to, and its standard error; infinite where
+        their run leaves every bound without it, and minus that with it.
     """
 
     id: str
@@ -100,8 +106,20 @@ class Found:
             "extension": self.extension,
             "place": self.key,
             "likelihood_gain": self.gain,
-            "held_out_gain": {"value": self.held_out, "std": self.held_out_std},
+            "held_out_gain": {
+                "value": finite(self.held_out),
+                "std": finite(self.held_out_std),
+                "sentence": self.proved,
+            },
         }
+
+    @property
+    def proved(self) -> str:
+        """What the cause does for logs that it was not fitted to, in words."""
+        if np.isfinite(self.held_out):
+            return f"held-out −2 log L falls by {self.held_out:.0f} ± {self.held_out_std:.0f}"
+        which = "without" if self.held_out > 0 else "with"
+        return f"the held-out free run leaves every bound {which} it"
 
 
 @dataclass(frozen=True)
@@ -292,8 +310,7 @@ class Diagnosis(DisplayMixin):
                     for name, q in c.parameters.items()
                 ]
                 lines.append(
-                    f"    adjusted p {_shown(c.p_adjusted)} ({self.tried} causes tried); held-out "
-                    f"−2 log L falls by {c.held_out:.0f} ± {c.held_out_std:.0f}"
+                    f"    adjusted p {_shown(c.p_adjusted)} ({self.tried} causes tried); {c.proved}"
                 )
         if self.gain:
             lines += ["", *_gain_lines(self.gain, self.validated_on)]

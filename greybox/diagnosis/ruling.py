@@ -23,6 +23,7 @@ from greybox.diagnosis.thresholds import (
     LEFT_OVER,
     LONGER,
     MOST_OF,
+    NEAR,
     RELEVANT,
     SENSORS,
     SURE,
@@ -94,7 +95,7 @@ def rule(
     pairs = held_out(final.integrator).pairs(final)
     first = omnibus(held_out(found.base.integrator).pairs(found.base))
     left = omnibus(pairs)
-    explained = max(found.proof(held_out), 0.0) if stand else 0.0
+    explained = _explained(found, held_out) if stand else 0.0
     why = _wrong(found.base, final, pairs, left, explained, bool(stand))
     named = tuple(c for c in stand if not _grouped(c, groups))
     if named or known:
@@ -112,9 +113,16 @@ def rule(
 def leaves_more(found: Search, held_out: Callable[[Integrator], HeldOut]) -> bool:
     """Whether what was found leaves more than noise."""
     pairs = held_out(found.final.integrator).pairs(found.final)
-    explained = max(found.proof(held_out), 0.0) if found.causes else 0.0
+    explained = _explained(found, held_out) if found.causes else 0.0
     left = omnibus(pairs)
     return bool(_wrong(found.base, found.final, pairs, left, explained, bool(found.causes)))
+
+
+def _explained(found: Search, held_out: Callable[[Integrator], HeldOut]) -> float:
+    """Return the fall of −2 log L by the causes, of held-out logs where their runs are bounded."""
+    gain = found.proof(held_out)
+    fall = gain if np.isfinite(gain) else found.base.cost - found.final.cost
+    return max(fall, 0.0) if np.isfinite(fall) else 0.0
 
 
 def _wrong(
@@ -140,14 +148,39 @@ def _wrong(
             f"a force moves the ship in all logs that is remembered for longer than gusts "
             f"({GUST:g} s): a current that changes, or something that no cause stands for"
         )
-    missed = _missed(pairs)
-    if missed and max(missed.values()) > SENSORS:
-        told = ", ".join(f"{word(s)} by {m:.1f}" for s, m in missed.items() if m > SENSORS)
+    return _no_prediction(pairs)
+
+
+def _no_prediction(pairs: Sequence[Pair]) -> str:
+    """Return how far held-out free runs are from what sensors show; nothing where they are near."""
+    if any(p.held_fit.escaped for p in pairs):
+        return "the held-out free run leaves every bound"
+    missed, constant = _missed(pairs), _against_constant(pairs)
+    far = {s: m for s, m in missed.items() if m > SENSORS}
+    if far:
+        told = ", ".join(f"{word(s)} by {m:.0f}" for s, m in far.items())
         return (
-            f"the held-out free run misses {told} times what its sensor's noise explains, and a "
-            f"model that nothing is wrong with no more than {SENSORS:g} times"
+            f"the held-out free run misses {told} times what its sensor's noise explains; up to "
+            f"{SENSORS:g} times may be gusts"
+        )
+    poor = [s for s, m in missed.items() if m > NEAR and constant[s] > 1]
+    if poor:
+        return (
+            f"the held-out free run of {' and '.join(map(word, poor))} is worse than a constant, "
+            f"and that is not noise"
         )
     return ""
+
+
+def _against_constant(pairs: Sequence[Pair]) -> dict[str, float]:
+    """Return the squared held-out error of each state in the variance of its motion."""
+    names = pairs[0].problem.structure.states
+    errors = np.concatenate([e for p in pairs for e in p.held_fit.errors])
+    moved = np.concatenate([run.y - run.y.mean(axis=0) for p in pairs for run in p.held.runs])
+    return {
+        s: float((errors[:, i] ** 2).sum() / max((moved[:, i] ** 2).sum(), 1e-300))
+        for i, s in enumerate(names)
+    }
 
 
 def _missed(pairs: Sequence[Pair]) -> dict[str, float]:

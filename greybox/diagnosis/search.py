@@ -62,6 +62,8 @@ class Candidate:
         Of the coefficients.
     tried : int
         Causes that the p-value is corrected for.
+    freed : int
+        Numbers that the cause frees.
     standing : Standing or None
         What it does beside a generic force; None until that is asked.
     """
@@ -74,6 +76,7 @@ class Candidate:
     proof: Proof
     names: tuple[str, ...] = ()
     tried: int = 1
+    freed: int = 1
     standing: Standing | None = None
 
     @property
@@ -150,8 +153,13 @@ class Search:
             return proof_of(one - two).gain
 
 
-def _dof(atom: Atom) -> int:
-    return max(len(atom.parameters), 1)
+def freed(before: Fit, after: Fit, atom: Atom) -> int:
+    """Return how many numbers a cause frees, those that come beside it counted; at least one.
+
+    A fit from first coefficients of its own is of the same structure.
+    """
+    numbers = [len(f.point.places) + sum(map(len, f.point.values)) for f in (before, after)]
+    return max(numbers[1] - numbers[0], len(atom.parameters), 1)
 
 
 def search(
@@ -270,7 +278,7 @@ def _names(atom: Atom) -> list[str]:
     return [p.name for p in atom.parameters] or [atom.key]
 
 
-def _merit(candidate: Candidate) -> float:
+def _merit(candidate: Candidate) -> tuple[float, float]:
     """Return −2 log L of all logs with the price of each number (Schwarz, 1978).
 
     What a cause does for held-out logs counts as much as what it was fitted to: there
@@ -278,8 +286,11 @@ def _merit(candidate: Candidate) -> float:
     reversed columns may otherwise be taken for each other.
     """
     samples = sum(len(e) for e in candidate.fit.errors)
-    price = _dof(candidate.atom) + BACKWARDS * len(backwards(candidate.fit, candidate.names))
-    return candidate.fit.cost - candidate.proof.gain + price * float(np.log(samples))
+    price = candidate.freed + BACKWARDS * len(backwards(candidate.fit, candidate.names))
+    gain = candidate.proof.gain
+    value = candidate.fit.cost + price * float(np.log(samples))
+    # first comes what keeps a held-out run within bounds that left them before
+    return (0.0, value - gain) if np.isfinite(gain) else (-np.sign(gain), value)
 
 
 def backwards(fit: Fit, names: Sequence[str]) -> list[str]:
@@ -295,11 +306,12 @@ def assess_candidate(
     from scipy.stats import chi2
 
     gain = before.cost - fit.cost if np.isfinite(fit.cost) else -np.inf
-    p = float(chi2.sf(max(gain, 0.0), _dof(atom)))
+    numbers = freed(before, fit, atom)
+    p = float(chi2.sf(max(gain, 0.0), numbers))
     proof = held_out.prove(before, fit)
     # the best of many moments is likelier than any one
     tried *= MOMENTS if any(parameter.reach > 0 for parameter in atom.parameters) else 1
-    return Candidate(atom, fit, gain, p, min(1.0, p * tried), proof, names, tried)
+    return Candidate(atom, fit, gain, p, min(1.0, p * tried), proof, names, tried, numbers)
 
 
 def _backward(

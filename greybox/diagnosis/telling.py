@@ -26,6 +26,7 @@ from greybox.diagnosis.result import (
     Ranked,
     Runs,
     Symptom,
+    finite,
 )
 from greybox.diagnosis.ruling import rule
 from greybox.diagnosis.search import Candidate, Search, backwards, instead
@@ -271,8 +272,8 @@ def _ranked(scores: Sequence[Any], candidates: Sequence[Candidate]) -> tuple[Ran
     keys = dict.fromkeys([*fitted, *promised])
     return tuple(
         Ranked(
-            key, float(promised.get(key, 0.0)), fitted[key].gain, fitted[key].proof.gain,
-            fitted[key].proof.std,
+            key, float(promised.get(key, 0.0)), fitted[key].gain,
+            finite(fitted[key].proof.gain), finite(fitted[key].proof.std),
         )
         if key in fitted
         else Ranked(key, float(promised[key]))

@@ -79,6 +79,8 @@ def _proofs(found: Sequence[Found], tried: int) -> Table | None:
 def _falls(cause: Found) -> list[str]:
     if not cause.gain:
         return _OUTSIDE
+    if not np.isfinite(cause.held_out):
+        return [f"{cause.gain:.1f}", cause.proved]
     return [f"{cause.gain:.1f}", f"{cause.held_out:.1f} ± {cause.held_out_std:.1f}"]
 
 

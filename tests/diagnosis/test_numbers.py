@@ -1,0 +1,95 @@
+"""Bounds, counts and proofs: the numbers that a ruling stands on."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from changing import MOMENT, changed_log, fitted
+
+from greybox.diagnosis.atom import Atom, Parameter
+from greybox.diagnosis.held_out import proof_of
+from greybox.diagnosis.preparing import prepare
+from greybox.diagnosis.result import Found, Quantity
+from greybox.diagnosis.search import freed
+from greybox.study.blind import draw
+
+
+@pytest.fixture(scope="module")
+def ready():
+    trial = draw(np.random.default_rng([3, 4]), samples=400)
+    return prepare([trial.estimation], [trial.validation], None, "thesis", ["current"])
+
+
+def test_coefficients_and_currents_of_a_cause_have_its_bounds(ready) -> None:
+    problem = ready.case.problem("rk4")
+    base = ready.base()
+    (atom,) = ready.atoms
+    point = problem.add(base.point, atom)
+    low, high = problem.bounds(point)
+    where = problem.numbers_of(point, atom)[: len(atom.parameters)]
+    np.testing.assert_array_equal(low[where], [p.low for p in atom.parameters])
+    np.testing.assert_array_equal(high[where], [p.high for p in atom.parameters])
+    # all else is free
+    others = np.setdiff1d(np.arange(len(low)), where)
+    assert np.isinf(low[others]).all()
+    assert np.isinf(high[others]).all()
+
+
+def test_a_fit_stays_within_the_bounds_of_a_coefficient(ready) -> None:
+    base = ready.base()
+    problem = ready.case.problem(base.integrator)
+    name = "Xu"
+    value = base.point.base.theta[problem.place(name)]
+    # a bound that the logs would like to leave
+    bounded = Parameter(name, "1", 0.0, low=value / 2, high=0.0)
+    atom = Atom("cubic_damping", "cubic_damping:Xu", (bounded,), columns=(name,))
+    found = problem.fit(problem.add(base.point, atom), base.noise)
+    assert found.point.base.theta[problem.place(name)] == pytest.approx(value / 2)
+
+
+def test_what_comes_beside_a_cause_counts_as_freed(ready) -> None:
+    base = ready.base()
+    problem = ready.case.problem(base.integrator)
+    (atom,) = ready.atoms
+    with_it = replace(base, point=problem.add(base.point, atom))
+    assert len(atom.beside) == 3
+    assert freed(base, with_it, atom) == 2 + 3
+    # what was free already costs nothing
+    again = replace(atom, beside=(*atom.beside, "Xu"))
+    assert freed(base, replace(base, point=problem.add(base.point, again)), again) == 2 + 3
+
+
+def test_a_run_that_leaves_every_bound_is_said_in_words() -> None:
+    proof = proof_of(np.array([np.inf, np.inf]))
+    assert proof.gain == np.inf
+    assert proof.p_value == 0.0
+    found = Found(
+        "current", "current", "current", {"current_north": Quantity(0.2, 0.1, "m/s")}, 1e-9, 1e-8,
+        "e", "x", "r", 12.0, proof.gain, proof.std,
+    )  # fmt: skip
+    told = found.to_dict()["held_out_gain"]
+    assert told["value"] is None
+    assert told["std"] is None
+    assert told["sentence"] == "the held-out free run leaves every bound without it"
+    json.dumps(told, allow_nan=False)
+    worse = proof_of(np.array([-np.inf, 1.0]))
+    assert worse.gain == -np.inf
+    assert worse.p_value == 1.0
+
+
+def test_a_derivative_beside_a_run_that_escapes_warns_nobody(monkeypatch) -> None:
+    problem, _, fit = fitted(changed_log(), MOMENT)
+    run, start = problem.runs[0], fit.point.starts[0]
+    escaped = replace(run.run(fit.point.ship, start), y=np.full_like(run.y, np.inf))
+    monkeypatch.setattr(run, "run", lambda *_: escaped)
+    atom = fit.point.atoms[0]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        vector = fit.point.vector()
+        k = problem.numbers_of(fit.point, atom)[0]
+        rows = problem._difference(fit.point, vector, run, start, k, atom, 0)
+    assert not np.isfinite(rows).any()
