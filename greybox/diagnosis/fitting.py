@@ -65,7 +65,7 @@ class Problem:
             return replace(
                 point, atoms=(*point.atoms, atom), values=(*point.values, np.array(value, float))
             )
-        places = [self.place(n) for n in (*atom.columns, *atom.beside)]
+        places = self.numbers_at(atom)
         new = [i for i in places if i not in point.places]
         return replace(
             point,
@@ -74,10 +74,14 @@ class Problem:
             places=(*point.places, *new),
         )
 
+    def numbers_at(self, atom: Atom) -> list[int]:
+        """Return the coefficients and currents that an atom frees."""
+        return [self.place(n) for n in (*atom.columns, *atom.beside)]
+
     def numbers_of(self, point: Point, atom: Atom) -> list[int]:
         """Return where the numbers that an atom brings stand among the free ones of a point."""
         if atom.apply is None:
-            return [point.places.index(self.place(n)) for n in (*atom.columns, *atom.beside)]
+            return [point.places.index(i) for i in self.numbers_at(atom)]
         k = [a.key for a in point.atoms].index(atom.key)
         first = len(point.places) + sum(map(len, point.values[:k]))
         return list(range(first, first + len(point.values[k])))
@@ -98,7 +102,7 @@ class Problem:
         base = point.base
         places = point.places
         if atom.apply is None:
-            gone = [self.place(n) for n in (*atom.columns, *atom.beside)]
+            gone = self.numbers_at(atom)
             for i in gone:
                 base = base.with_value(i, 0.0)
             places = tuple(i for i in places if i not in gone)

@@ -51,9 +51,7 @@ def gains(
         for one, two in zip(before, after, strict=True):
             size = min(len(one.log), len(two.log))
             parts = [_squares(run, i, state, size) for run in (one, two)]
-            length = int(np.clip(_BLOCK / sample_time, 1, max(size // _LEAST_BLOCKS, 1)))
-            count = -(-size // length)
-            start = rng.integers(0, size - length + 1, (_DRAWS, count))
+            start, length = blocks(size, sample_time, _DRAWS, rng)
             for k, (error, spread) in enumerate(parts):
                 sums = [(np.cumsum(np.concatenate([[0.0], v]))) for v in (error, spread)]
                 e, s = ((c[start + length] - c[start]).sum(axis=1) for c in sums)
@@ -62,6 +60,15 @@ def gains(
         low, high = np.quantile(draws[1] - draws[0], [0.025, 0.975])
         out[state] = Gain(float(point[0]), float(point[1]), (float(low), float(high)))
     return out
+
+
+def blocks(
+    size: int, sample_time: float, draws: int, rng: np.random.Generator
+) -> tuple[NDArray[np.intp], int]:
+    """Return where moving blocks of a bootstrap begin (draws, count), and their length."""
+    length = int(np.clip(_BLOCK / sample_time, 1, max(size // _LEAST_BLOCKS, 1)))
+    count = -(-size // length)
+    return rng.integers(0, size - length + 1, (draws, count)), length
 
 
 def _fit(error: Array | float, spread: Array | float) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
@@ -36,6 +36,10 @@ _SAID = {
     DiagnosisVerdict.CONFUSED: "something is wrong, and several causes explain it equally well",
     DiagnosisVerdict.UNEXPLAINED: "something is wrong, and no known cause explains it",
 }
+
+
+# share of the squared error from which on a part is worth a line of text
+_SHOWN = 0.005
 
 
 def finite(value: float) -> float | None:
@@ -136,6 +140,38 @@ class Gain:
 
 
 @dataclass(frozen=True)
+class BudgetPart:
+    """A part of the squared held-out error.
+
+    Parameters
+    ----------
+    part : str
+        "sensor noise", the id of a cause, "motion and commands", "slow force", "waves", or
+        "not split".
+    share : mapping of str to float
+        By state, of the squared error before the causes are mended.
+    ci : mapping of str to (float, float)
+        95 % intervals of the shares.
+    after : mapping of str to float
+        What is left of it once they are, of the same squared error.
+    """
+
+    part: str
+    share: Mapping[str, float]
+    ci: Mapping[str, tuple[float, ...]]
+    after: Mapping[str, float]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the part for JSON."""
+        return {
+            "part": self.part,
+            "share": dict(self.share),
+            "ci": {k: list(v) for k, v in self.ci.items()},
+            "after": dict(self.after),
+        }
+
+
+@dataclass(frozen=True)
 class Ranked:
     """How a cause did at one step of the search, for pictures and tables.
 
@@ -227,6 +263,8 @@ class Diagnosis(DisplayMixin):
         Tests of the free run's errors ``before`` and ``after``.
     conditions : tuple of ConditionDifference
         In what the logs differ from each other, and from those of the model.
+    budget : tuple of BudgetPart
+        Whose the squared held-out error is; empty where a run leaves every bound.
     """
 
     verdict: DiagnosisVerdict
@@ -249,6 +287,7 @@ class Diagnosis(DisplayMixin):
     record: Mapping[str, Any] = field(default_factory=dict)
     residuals: Mapping[str, tuple[TestResult, ...]] = field(default_factory=dict)
     conditions: tuple[ConditionDifference, ...] = ()
+    budget: tuple[BudgetPart, ...] = ()
 
     @property
     def headline(self) -> str:
@@ -278,6 +317,7 @@ class Diagnosis(DisplayMixin):
             "groups": [list(g) for g in self.groups],
             "gain": {k: g.to_dict() for k, g in self.gain.items()},
             "wrong": [s.sentence for s in self.wrong],
+            "budget": [part.to_dict() for part in self.budget],
             "headline": self.headline,
             "residuals": {
                 when: {t.name: t.to_dict() for t in tests} for when, tests in self.residuals.items()
@@ -314,6 +354,7 @@ class Diagnosis(DisplayMixin):
                 )
         if self.gain:
             lines += ["", *_gain_lines(self.gain, self.validated_on)]
+        lines += _budget_lines(self.budget)
         lines += ["", self.remaining, *(f"next: {n}" for n in self.next_steps)]
         lines += [f"note: {n}" for n in self.notes]
         return "\n".join(lines)
@@ -374,6 +415,25 @@ class Given(DisplayMixin):
 
     def _parts(self) -> tuple[str, ...]:
         return (_gain_table(self.gain, self.validated_on),)
+
+
+def _budget_lines(budget: Sequence[BudgetPart]) -> list[str]:
+    if not budget:
+        return []
+    states = list(budget[0].share)
+    shown = [p for p in budget if any(abs(v) >= _SHOWN for v in (*p.share.values(),))]
+    head = "".join(f"{s:>24}" for s in states)
+    return [
+        "",
+        "Whose the squared held-out error is [%], before mending (95 %):",
+        f"  {'':<22}{head}",
+        *(f"  {p.part:<22}" + "".join(f"{_share(p, s):>24}" for s in states) for p in shown),
+    ]
+
+
+def _share(part: BudgetPart, state: str) -> str:
+    low, high = part.ci[state]
+    return f"{100 * part.share[state]:.1f} ({100 * low:.1f} to {100 * high:.1f})"
 
 
 def _gain_lines(gain: Mapping[str, Gain], where: str) -> list[str]:

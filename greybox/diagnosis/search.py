@@ -137,6 +137,8 @@ class Search:
         Atoms that were scored.
     leaning : tuple of Candidate
         Causes that help, and do no more than a generic force would: no part of `final`.
+    without : tuple of Fit
+        The fit without each of the causes that stand.
     """
 
     base: Fit
@@ -145,6 +147,7 @@ class Search:
     causes: tuple[Candidate, ...]
     tried: int
     leaning: tuple[Candidate, ...] = ()
+    without: tuple[Fit, ...] = ()
 
     def proof(self, held_out: Callable[[Integrator], HeldOut]) -> float:
         """Return the fall of −2 log L of held-out logs by all causes, each fit as it is run."""
@@ -347,6 +350,7 @@ def weighed(case: Case, found: Search) -> Search:
     The least of them goes first: what it imitated may be another's once it is gone.
     """
     fit, kept, leaning = found.final, list(found.causes), []
+    left: list[Fit] = []
     while kept:
         problem, held_out = case.problem(fit.integrator), case.held_out(fit.integrator)
         pairs = held_out.pairs(fit)
@@ -355,7 +359,7 @@ def weighed(case: Case, found: Search) -> Search:
             without = _without(problem, fit, cause)
             stands = standing(problem, cause.atom, fit, pairs, held_out.pairs(without))
             tried.append((replace(cause, fit=fit, standing=stands), without))
-        kept = [cause for cause, _ in tried]
+        kept, left = [cause for cause, _ in tried], [without for _, without in tried]
         fallen = [(cause, without) for cause, without in tried if not _stands(cause)]
         if not fallen:
             break
@@ -363,7 +367,9 @@ def weighed(case: Case, found: Search) -> Search:
         leaning.append(least)
         kept = [c for c in kept if c.atom.key != least.atom.key]
         fit = case.problem(fit.integrator).settle(fit, SETTLE)
-    return replace(found, final=fit, causes=tuple(kept), leaning=tuple(leaning))
+    return replace(
+        found, final=fit, causes=tuple(kept), leaning=tuple(leaning), without=tuple(left)
+    )
 
 
 def _stands(cause: Candidate) -> bool:

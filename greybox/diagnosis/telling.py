@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.diagnosis.base import FOLDS, Case
+from greybox.diagnosis.budget import Taken, error_budget
 from greybox.diagnosis.causes import Cause
 from greybox.diagnosis.confusion import rivals
 from greybox.diagnosis.extension import extended_model
@@ -19,6 +20,7 @@ from greybox.diagnosis.held_out import Pair
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.residuals import residual_tests
 from greybox.diagnosis.result import (
+    BudgetPart,
     Diagnosis,
     Found,
     Gain,
@@ -155,6 +157,32 @@ class Report:
             notes=tuple(notes),
             tried=tried,
             record=self.record(found.causes),
+            budget=self._budget(final, ruling.named, lines[1]),
+        )
+
+    def _budget(
+        self, final: Fit, named: Sequence[Candidate], waves: Waves | None
+    ) -> tuple[BudgetPart, ...]:
+        """Return whose the held-out error is; what stands for several causes is not split."""
+        found, held_out = self.found, self.case.held_out
+        own = dict(zip((c.atom.key for c in found.causes), found.without, strict=False))
+
+        def run(fit: Fit) -> Sequence[Pair]:
+            return held_out(fit.integrator).pairs(fit)
+
+        causes = []
+        for c in named:
+            others = [fit for key, fit in own.items() if key != c.atom.key]
+            # of two causes each is alone where the other is left out
+            alone = [final, *others][-1]
+            first = run(alone) if len(others) < 2 else ()
+            relative = _relative(self.quantities(c, final))
+            causes.append(Taken(c.atom.cause, run(own[c.atom.key]), first, relative))
+        numbers = set(final.point.places) - set(found.base.point.places)
+        problem = self.case.problem(final.integrator)
+        numbers -= {i for c in found.causes for i in problem.numbers_at(c.atom)}
+        return error_budget(
+            run(found.base), run(final), causes, waves, self.seed, nameless=bool(numbers)
         )
 
     def record(self, causes: Sequence[Candidate]) -> dict[str, Any]:
@@ -263,6 +291,12 @@ class Report:
         for change in after.changes:
             out.append(f"the extended model tells the log's own clock: {change.sentence}.")
         return out
+
+
+def _relative(quantities: Mapping[str, Quantity]) -> float:
+    """Return the standard error of a cause's size as a share of it, of its surest number."""
+    known = [q.std / abs(q.value) for q in quantities.values() if q.value]
+    return min([1.0, *known])
 
 
 def _ranked(scores: Sequence[Any], candidates: Sequence[Candidate]) -> tuple[Ranked, ...]:

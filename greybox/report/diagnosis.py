@@ -19,6 +19,7 @@ from greybox.report.diagnosis_figures import (
     run_figure,
     speed_figure,
 )
+from greybox.report.error_budget import budget_figure, budget_table, largest, negative
 from greybox.report.free_run_errors import REGIMES, Errors, gather, simulations
 from greybox.report.model_difference import (
     coefficient_table,
@@ -115,10 +116,23 @@ def _wrong(diagnosis: Diagnosis) -> Section:
     return Section(
         "1. What the simulation gets wrong",
         sentences,
-        pictures,
-        _tests(diagnosis, "before"),
+        [*pictures, *_budget(diagnosis)],
+        [*_tests(diagnosis, "before"), *([budget_table(b)] if (b := diagnosis.budget) else [])],
         points=[s.sentence for s in diagnosis.wrong],
     )
+
+
+def _budget(diagnosis: Diagnosis) -> Iterator[Picture]:
+    """Yield whose the squared error is."""
+    if diagnosis.budget:
+        caption = (
+            "Whose the squared error of the held-out free run is, before what was found is mended "
+            "and after."
+        )
+        if negative(diagnosis.budget):
+            caption += " Parts that take from each other have a negative share, which is not drawn."
+        told = f"{caption} Largest part of {largest(diagnosis.budget)}."
+        yield narrow(budget_figure(diagnosis.budget), "budget", caption, told)
 
 
 def _tests(diagnosis: Diagnosis, when: str) -> list[Table]:

@@ -11,7 +11,16 @@ import pytest
 from browser import needs_browser, require_legible, without_scripts
 from virtual import PARAMETERS, virtual_log
 
-from greybox.diagnosis.result import Diagnosis, Found, Gain, Quantity, Ranked, Runs, Symptom
+from greybox.diagnosis.result import (
+    BudgetPart,
+    Diagnosis,
+    Found,
+    Gain,
+    Quantity,
+    Ranked,
+    Runs,
+    Symptom,
+)
 from greybox.model.catalogue import get_structure
 from greybox.model.model import ManoeuvringModel
 from greybox.model.run.changes import Change
@@ -228,6 +237,22 @@ def test_none(pages, written, told):
     assert "The model stays as it is." in shown
     assert "<ins>" not in written["none"]
     assert "before and after" not in pages["none"].sections[0].pictures[0].caption
+
+
+def test_whose_the_error_is_stands_in_bars_and_numbers(told):
+    parts = {"sensor noise": 0.1, "current": 0.7, "not split": 0.2}
+    budget = tuple(
+        BudgetPart(
+            name, dict.fromkeys("uvr", share), dict.fromkeys("uvr", (share - 0.05, share + 0.05)),
+            dict.fromkeys("uvr", 0.0 if name == "current" else share),
+        )
+        for name, share in parts.items()
+    )  # fmt: skip
+    page = diagnosis_page(replace(diagnosis_of("named"), budget=budget), RECORD)
+    (bars,) = (p for p in page.sections[0].pictures if "Whose the squared error" in p.caption)
+    assert "surge u: current 70 %" in bars.alternative
+    assert "70.0 (65.0 to 75.0)" in text_of(without_scripts(render(page)))
+    assert "Whose the squared" not in told["named"]
 
 
 def test_confused(told):
