@@ -138,7 +138,7 @@ def _cause_of(term: Term, structure: Structure) -> str | None:
         return None
     signals = [f.signal for f in term.factors]
     if not signals:
-        return None if term.state == "u" else "asymmetry"
+        return None if term.state == "u" else "side_force"
     if set(signals) <= _AIR:
         return "wind"
     if signals == [term.state] * 3:

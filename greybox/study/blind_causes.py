@@ -241,7 +241,7 @@ CAUSES: dict[str, Kind] = {
     "cubic_damping": Kind(_relative("X_uuu", "Y_vvv", "N_rrr"), _with_terms),
     "quadratic_yaw_damping": Kind(_relative("N_|r|r"), _with_terms),
     "crossflow": Kind(_relative("Y_|r|r", "Y_|r|v", "N_|r|v"), _with_terms),
-    "asymmetry": Kind(_aside, _with_terms),
+    "side_force": Kind(_aside, _with_terms),
     "heading_bias": Kind(_heading_bias),
     "lever_arm": Kind(_lever_arm),
     "angle_offset": Kind(_angle_offset),

@@ -86,7 +86,7 @@ UNKNOWN: dict[str, Kind] = {
 }
 EFFECTS = CAUSES | UNKNOWN
 # those that add terms to the equations, so that several may stand together
-_TERMS = ("cubic_damping", "quadratic_yaw_damping", "crossflow", "asymmetry")
+_TERMS = ("cubic_damping", "quadratic_yaw_damping", "crossflow", "side_force")
 
 
 def shows(name: str, kind: str) -> bool:

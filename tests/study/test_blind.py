@@ -116,7 +116,7 @@ def corrected(name, trial):
             ("N_u*taun", -loss * trial.ship["Nmu"]),
         )
         return one_step(trial, terms=terms)
-    if name in ("cubic_damping", "quadratic_yaw_damping", "crossflow", "asymmetry"):
+    if name in ("cubic_damping", "quadratic_yaw_damping", "crossflow", "side_force"):
         return one_step(trial, terms=tuple(p.items()))
     if name == "parameter_change":
         (key,) = (k for k in p if k.endswith("_factor"))

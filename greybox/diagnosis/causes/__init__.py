@@ -5,7 +5,7 @@ from __future__ import annotations
 from greybox.diagnosis.causes.cause import Cause, Context
 from greybox.diagnosis.causes.change import ParameterChange
 from greybox.diagnosis.causes.flow import Current, Wind
-from greybox.diagnosis.causes.hull import Asymmetry, Crossflow, CubicDamping, QuadraticYawDamping
+from greybox.diagnosis.causes.hull import Crossflow, CubicDamping, QuadraticYawDamping, SideForce
 from greybox.diagnosis.causes.motion import Waves
 from greybox.diagnosis.causes.sensors import (
     ClockOffset,
@@ -28,7 +28,7 @@ __all__ = ["Cause", "Context", "known_causes"]
 
 _OWN: tuple[type[Cause], ...] = (
     Current, Wind, ThrusterGain, ThrusterLag, InputDelay, QuadraticThrust, AdvanceSpeed,
-    CubicDamping, QuadraticYawDamping, Crossflow, Asymmetry, HeadingBias, LeverArm, AngleOffset,
+    CubicDamping, QuadraticYawDamping, Crossflow, SideForce, HeadingBias, LeverArm, AngleOffset,
     ClockOffset, Sign, ParameterChange, Waves,
 )  # fmt: skip
 GROUP = "greybox.causes"

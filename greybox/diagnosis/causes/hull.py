@@ -93,10 +93,10 @@ class Crossflow(Cause):
         )
 
 
-class Asymmetry(Cause):
+class SideForce(Cause):
     """A constant side force and moment."""
 
-    id = "asymmetry"
+    id = "side_force"
     kind = "force"
     title = "constant side force or moment"
     signature = "the ship drifts and turns to one side, whatever its heading and speed"
