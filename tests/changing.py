@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from greybox.diagnosis.atom import Atom
 from greybox.diagnosis.causes import Context, known_causes
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.held_out import proof_of
+from greybox.diagnosis.hypothesis import Hypothesis
 from greybox.diagnosis.noise import fit_noise
 from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.search import Candidate
@@ -40,27 +40,27 @@ def changed_log() -> TrialLog:
     )
 
 
-def change_of(log: TrialLog) -> Atom:
+def change_of(log: TrialLog) -> Hypothesis:
     """Return the cause that the sway damping changes."""
     context = Context(
         BASE, log.vessel, ("u", "v", "r", "psi"), False, float(log.t[-1]), 1.0,
         dict.fromkeys(("n1", "n2"), 15.0),
     )  # fmt: skip
-    atoms = known_causes()["parameter_change"].atoms(context)
-    return next(a for a in atoms if a.key.endswith(":Yv"))
+    hypotheses = known_causes()["parameter_change"].hypotheses(context)
+    return next(a for a in hypotheses if a.key.endswith(":Yv"))
 
 
-def fitted(log: TrialLog, moment: float) -> tuple[Problem, Atom, Fit]:
+def fitted(log: TrialLog, moment: float) -> tuple[Problem, Hypothesis, Fit]:
     """Return the log's problem, the cause, and a fit whose change began at a moment."""
     problem = Problem([LogRun(BASE, log, "rk4")])
-    atom = change_of(log)
+    hypothesis = change_of(log)
     theta = np.array([TRUE[n] for n in BASE.parameters])
     point = Point(
         Ship(theta, np.zeros(2), log.vessel), (problem.runs[0].start(),), tuple(range(len(theta)))
     )
-    point = problem.add(point, atom, np.array([1.4, moment]))
+    point = problem.add(point, hypothesis, np.array([1.4, moment]))
     noise = fit_noise(problem.errors(point), problem.poles(point), 1.0, problem.groups, longest=3.0)
-    return problem, atom, problem.fit(point, noise, most=12)
+    return problem, hypothesis, problem.fit(point, noise, most=12)
 
 
 class OneProblem:
@@ -73,7 +73,7 @@ class OneProblem:
         return self._problem
 
 
-def candidate(problem: Problem, atom: Atom, fit: Fit, tried: int = 50) -> Candidate:
+def candidate(problem: Problem, hypothesis: Hypothesis, fit: Fit, tried: int = 50) -> Candidate:
     """Return a fitted cause that nothing speaks against yet."""
     proof = proof_of(np.full(100, 1.0) + 0.1 * np.sin(np.arange(100)))
-    return Candidate(atom, fit, 400.0, 1e-80, 1e-78, proof, problem.names, tried)
+    return Candidate(hypothesis, fit, 400.0, 1e-80, 1e-78, proof, problem.names, tried)

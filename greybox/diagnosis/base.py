@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.atom import Atom
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.held_out import Folds, HeldOut, OtherLogs
+from greybox.diagnosis.hypothesis import Hypothesis
 from greybox.diagnosis.noise import fit_noise
 from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.ship import LogRun, Ship, shifted, wired
@@ -33,7 +33,7 @@ INTEGRATORS: tuple[Integrator, ...] = ("euler", "rk4")
 _BETTER = 6.0
 # fall of the one-step errors' −2 log L from which on a rewired log is worth a fit
 _REWIRED = 20.0
-# and atoms, of those whose runs leave every bound, that get one
+# and hypotheses, of those whose runs leave every bound, that get one
 _RESCUED = 2
 # free-run errors, in the sensors' deviations, up to which a first fit needs no second
 _NEAR = 3.0
@@ -211,15 +211,15 @@ class Case:
         coefficients: Mapping[str, float],
         current: Array,
         integrator: Integrator,
-        atom: Atom | None = None,
+        hypothesis: Hypothesis | None = None,
     ) -> Fit | None:
         problem = self.problem(integrator)
         theta = np.array([coefficients.get(n, 0.0) for n in self.universe.parameters])
         places = tuple(problem.place(n) for n in self.structure.parameters)
         starts = tuple(run.start() for run in problem.runs)
         point = Point(Ship(theta, current, self.logs[0].vessel), starts, places)
-        if atom is not None:
-            point = problem.add(point, atom)
+        if hypothesis is not None:
+            point = problem.add(point, hypothesis)
             starts = tuple(
                 np.where([n in point.ship.sensors.reversed for n in run.outputs], -s, s)
                 for run, s in zip(problem.runs, starts, strict=True)
@@ -232,7 +232,7 @@ class Case:
         noise = fit_noise(errors, problem.poles(point), problem.sample_time, problem.groups)
         return replace(problem.settle(problem.fit(point, noise), 3), integrator=integrator)
 
-    def anew(self, fit: Fit) -> Fit:
+    def refit_from_least_squares(self, fit: Fit) -> Fit:
         """Return the fit from least-squares coefficients, if that ends lower.
 
         Those of a model that lacked a cause may lie beyond a hill of the likelihood; these
@@ -267,20 +267,24 @@ class Case:
         better = not found.escaped and found.cost < fit.cost - _BETTER
         return replace(found, integrator=other) if better else fit
 
-    def likeliest_variant(self, fit: Fit, atom: Atom) -> Fit:
+    def likeliest_variant(self, fit: Fit, hypothesis: Hypothesis) -> Fit:
         """Return the fit with the convention of sampling that the logs ask for."""
         problem = self.problem(fit.integrator)
-        for variant in atom.variants:
-            atoms = tuple(variant if a.key == atom.key else a for a in fit.point.atoms)
-            found = problem.settle(problem.fit(replace(fit.point, atoms=atoms), fit.noise), 1)
+        for variant in hypothesis.variants:
+            hypotheses = tuple(
+                variant if a.key == hypothesis.key else a for a in fit.point.hypotheses
+            )
+            found = problem.settle(
+                problem.fit(replace(fit.point, hypotheses=hypotheses), fit.noise), 1
+            )
             if not found.escaped and found.cost < fit.cost - _BETTER:
                 fit = found
         return fit
 
-    def begun_again(
-        self, fit: Fit, atoms: Sequence[Atom], escaped: Sequence[Atom] = ()
-    ) -> list[tuple[Atom, Fit]]:
-        """Return fits from first coefficients of their own, for atoms that need them.
+    def restart(
+        self, fit: Fit, hypotheses: Sequence[Hypothesis], escaped: Sequence[Hypothesis] = ()
+    ) -> list[tuple[Hypothesis, Fit]]:
+        """Return fits from first coefficients of their own, for hypotheses that need them.
 
         Only those whose one-step errors by least squares are clearly smaller than
         those of the log as it stands.
@@ -289,34 +293,34 @@ class Case:
         ----------
         fit : Fit
             Without any cause.
-        atoms : sequence of Atom
+        hypotheses : sequence of Hypothesis
             Of which those count that ask for it.
-        escaped : sequence of Atom
+        escaped : sequence of Hypothesis
             With which the run of these coefficients leaves every bound, however likely
             they are with others; the most promising of them are tried.
         """
-        asked = [a for a in atoms if a.afresh]
-        moved = [a for a in escaped if a.apply is not None and not a.afresh]
+        asked = [a for a in hypotheses if a.refit_from_scratch]
+        moved = [a for a in escaped if a.apply is not None and not a.refit_from_scratch]
         if not asked and not moved:
             return []
         level = rough(self.structure, self.logs, self.kind, self.regime)[1]
-        ranked: list[tuple[float, Atom, Mapping[str, float]]] = []
-        for atom in (*asked, *moved):
-            ship = self.problem(fit.integrator).add(fit.point, atom).ship
+        ranked: list[tuple[float, Hypothesis, Mapping[str, float]]] = []
+        for hypothesis in (*asked, *moved):
+            ship = self.problem(fit.integrator).add(fit.point, hypothesis).ship
             logs = [_as_it_should_be(log, ship) for log in self.logs]
             values, own = rough(self.structure, logs, self.kind, self.regime)
             if level - own >= _REWIRED:
-                ranked.append((own, atom, values))
+                ranked.append((own, hypothesis, values))
         ranked.sort(key=lambda item: item[0])
-        worth = [item for item in ranked if item[1].afresh]
-        worth += [item for item in ranked if not item[1].afresh][:_RESCUED]
+        worth = [item for item in ranked if item[1].refit_from_scratch]
+        worth += [item for item in ranked if not item[1].refit_from_scratch][:_RESCUED]
         out = []
-        for _, atom, first in worth:
+        for _, hypothesis, first in worth:
             current = fit.point.base.current
-            found = [self._fit(first, current, i, atom) for i in INTEGRATORS]
+            found = [self._fit(first, current, i, hypothesis) for i in INTEGRATORS]
             bounded = [f for f in found if f is not None and not f.escaped]
             if bounded:
-                out.append((atom, min(bounded, key=lambda f: f.cost)))
+                out.append((hypothesis, min(bounded, key=lambda f: f.cost)))
         return out
 
 

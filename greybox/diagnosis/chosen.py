@@ -13,10 +13,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.atom import Atom, Parameter
 from greybox.diagnosis.base import Case
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.held_out import proof_of
+from greybox.diagnosis.hypothesis import Hypothesis, Parameter
 from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.preparing import Prepared, context_of
 from greybox.diagnosis.refitting import SETTLE
@@ -60,13 +60,13 @@ def from_chosen(
     case = ready.case.wider(terms.parameters)
     base = case.carried(found.base)
     problem = case.problem(base.integrator)
-    named, atoms = _hypotheses(ready, case, choice)
+    named, hypotheses = _hypotheses(ready, case, choice)
     in_force = {n for a in named for n in a.columns}
     places = tuple(problem.place(n) for n in terms.parameters if n not in in_force)
     start = Point(_ship(problem, choice, base), base.point.starts, places)
-    for atom in named:
-        value = None if atom.apply is None else np.array([_share(choice)])
-        start = problem.add(start, atom, value)
+    for hypothesis in named:
+        value = None if hypothesis.apply is None else np.array([_share(choice)])
+        start = problem.add(start, hypothesis, value)
     begun = problem.fit(start, base.noise)
     if begun.escaped:
         return None
@@ -74,10 +74,14 @@ def from_chosen(
     held_out = case.held_out(fit.integrator)
     if any(p.held_fit.escaped for p in held_out.pairs(fit)):
         return None
-    causes = [assess_candidate(held_out, base, fit, a, len(atoms), problem.names) for a in named]
-    fit, causes = pruned(case, fit, causes, len(atoms))
-    other = search(case, fit, [a for a in atoms if a not in named], begun=causes, progress=progress)
-    mine = replace(other, base=base, steps=other.steps, tried=len(atoms))
+    causes = [
+        assess_candidate(held_out, base, fit, a, len(hypotheses), problem.names) for a in named
+    ]
+    fit, causes = pruned(case, fit, causes, len(hypotheses))
+    other = search(
+        case, fit, [a for a in hypotheses if a not in named], begun=causes, progress=progress
+    )
+    mine = replace(other, base=base, steps=other.steps, tried=len(hypotheses))
     return (case, mine) if _better(case, mine, case.carried(found.final)) else None
 
 
@@ -96,7 +100,9 @@ def _better(case: Case, mine: Search, other: Fit) -> bool:
     return proof.gain > 0 and proof.p_value < PROVEN
 
 
-def _hypotheses(ready: Prepared, case: Case, choice: TermChoice) -> tuple[list[Atom], list[Atom]]:
+def _hypotheses(
+    ready: Prepared, case: Case, choice: TermChoice
+) -> tuple[list[Hypothesis], list[Hypothesis]]:
     """Return the causes that the chosen terms stand for, and all that are to be tried."""
     structure, terms = ready.structure, choice.terms.structure
     vessel = case.logs[0].vessel
@@ -107,7 +113,7 @@ def _hypotheses(ready: Prepared, case: Case, choice: TermChoice) -> tuple[list[A
             alone = cause in ("cubic_damping", "crossflow")
             grouped.setdefault((cause, term.name if alone else ""), []).append(term)
     named = [
-        Atom(
+        Hypothesis(
             cause,
             cause if cause == "wind" else f"{cause}:{'+'.join(t.name for t in mine)}",
             tuple(Parameter(t.name, parameter_unit(t, vessel.force_unit), 0.0) for t in mine),
@@ -117,9 +123,9 @@ def _hypotheses(ready: Prepared, case: Case, choice: TermChoice) -> tuple[list[A
     ]
     # what the chosen terms hold is no hypothesis of its own
     context = context_of(structure.with_terms(*_lacking(structure, terms)), ready)
-    others = [a for c in ready.causes.values() for a in c.atoms(context)]
+    others = [a for c in ready.causes.values() for a in c.hypotheses(context)]
     if "current" in ready.causes and choice.terms.kind in ("wind", "augmented"):
-        named += [replace(a, beside=()) for a in others if a.cause == "current" and not a.apply]
+        named += [replace(a, co_freed=()) for a in others if a.cause == "current" and not a.apply]
         others = [a for a in others if a.cause != "current"]
     if choice.logs[0].vessel.thrusters[0].thrust != vessel.thrusters[0].thrust:
         named += [a for a in others if a.cause == _QUADRATIC]

@@ -39,9 +39,9 @@ def rivals(
     """
     out: list[Candidate] = []
     for other in others:
-        if other.atom.cause == best.atom.cause or not other.holds:
+        if other.hypothesis.cause == best.hypothesis.cause or not other.holds:
             continue
-        if any(o.atom.cause == other.atom.cause for o in out):
+        if any(o.hypothesis.cause == other.hypothesis.cause for o in out):
             continue
         fitted = [
             np.concatenate(problem_of(c.fit.integrator).contributions(c.fit)) for c in (other, best)

@@ -93,7 +93,7 @@ def diagnose(
     say("model without causes")
     base = ready.base()
     problem = case.problem(base.integrator)
-    found = search(case, base, ready.atoms, progress=options.progress)
+    found = search(case, base, ready.hypotheses, progress=options.progress)
     say("a generic force beside the causes")
     found = weighed(case, found)
     if model is None and leaves_more(found, case.held_out):

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.atom import Atom, Parameter
+from greybox.diagnosis.hypothesis import Hypothesis, Parameter
 from greybox.diagnosis.linear import NOWHERE
 from greybox.diagnosis.noise import Noise, fit_noise
 from greybox.diagnosis.normal import bounded_step, inverse
@@ -58,31 +58,33 @@ class Problem:
         """Return the index of a coefficient or current."""
         return self.names.index(name)
 
-    def add(self, point: Point, atom: Atom, value: Array | None = None) -> Point:
-        """Return the point with one more atom in force."""
-        value = atom.start if value is None else value
-        if atom.apply is not None:
+    def add(self, point: Point, hypothesis: Hypothesis, value: Array | None = None) -> Point:
+        """Return the point with one more hypothesis in force."""
+        value = hypothesis.start if value is None else value
+        if hypothesis.apply is not None:
             return replace(
-                point, atoms=(*point.atoms, atom), values=(*point.values, np.array(value, float))
+                point,
+                hypotheses=(*point.hypotheses, hypothesis),
+                values=(*point.values, np.array(value, float)),
             )
-        places = self.numbers_at(atom)
+        places = self.numbers_at(hypothesis)
         new = [i for i in places if i not in point.places]
         return replace(
             point,
-            atoms=(*point.atoms, atom),
+            hypotheses=(*point.hypotheses, hypothesis),
             values=(*point.values, np.zeros(0)),
             places=(*point.places, *new),
         )
 
-    def numbers_at(self, atom: Atom) -> list[int]:
-        """Return the coefficients and currents that an atom frees."""
-        return [self.place(n) for n in (*atom.columns, *atom.beside)]
+    def numbers_at(self, hypothesis: Hypothesis) -> list[int]:
+        """Return the coefficients and currents that a hypothesis frees."""
+        return [self.place(n) for n in (*hypothesis.columns, *hypothesis.co_freed)]
 
-    def numbers_of(self, point: Point, atom: Atom) -> list[int]:
-        """Return where the numbers that an atom brings stand among the free ones of a point."""
-        if atom.apply is None:
-            return [point.places.index(i) for i in self.numbers_at(atom)]
-        k = [a.key for a in point.atoms].index(atom.key)
+    def numbers_of(self, point: Point, hypothesis: Hypothesis) -> list[int]:
+        """Return where the numbers of a hypothesis stand among the free ones of a point."""
+        if hypothesis.apply is None:
+            return [point.places.index(i) for i in self.numbers_at(hypothesis)]
+        k = [a.key for a in point.hypotheses].index(hypothesis.key)
         first = len(point.places) + sum(map(len, point.values[:k]))
         return list(range(first, first + len(point.values[k])))
 
@@ -90,19 +92,21 @@ class Problem:
         """Return least and largest values of the free numbers of a point."""
         size = len(point.vector())
         low, high = np.full(size, -np.inf), np.full(size, np.inf)
-        for atom in point.atoms:
+        for hypothesis in point.hypotheses:
             # coefficients that only become free beside it have no bounds
-            for k, parameter in zip(self.numbers_of(point, atom), atom.parameters, strict=False):
+            for k, parameter in zip(
+                self.numbers_of(point, hypothesis), hypothesis.parameters, strict=False
+            ):
                 low[k], high[k] = parameter.low, parameter.high
         return low, high
 
-    def drop(self, point: Point, atom: Atom) -> Point:
-        """Return the point without an atom, its coefficients at zero."""
-        k = [a.key for a in point.atoms].index(atom.key)
+    def drop(self, point: Point, hypothesis: Hypothesis) -> Point:
+        """Return the point without a hypothesis, its coefficients at zero."""
+        k = [a.key for a in point.hypotheses].index(hypothesis.key)
         base = point.base
         places = point.places
-        if atom.apply is None:
-            gone = self.numbers_at(atom)
+        if hypothesis.apply is None:
+            gone = self.numbers_at(hypothesis)
             for i in gone:
                 base = base.with_value(i, 0.0)
             places = tuple(i for i in places if i not in gone)
@@ -110,7 +114,7 @@ class Problem:
             point,
             base=base,
             places=places,
-            atoms=point.atoms[:k] + point.atoms[k + 1 :],
+            hypotheses=point.hypotheses[:k] + point.hypotheses[k + 1 :],
             values=point.values[:k] + point.values[k + 1 :],
         )
 
@@ -155,18 +159,25 @@ class Problem:
             rows[:, :, first : first + len(start)] = slopes[:, :, own:]
             before += len(start)
             k = own
-            for atom, value in zip(point.atoms, point.values, strict=True):
+            for hypothesis, value in zip(point.hypotheses, point.values, strict=True):
                 for i in range(len(value)):
-                    rows[:, :, k] = self._difference(point, vector, run, start, k, atom, i)
+                    rows[:, :, k] = self._difference(point, vector, run, start, k, hypothesis, i)
                     k += 1
             out.append(rows)
         return out
 
     def _difference(
-        self, point: Point, vector: Array, run: LogRun, start: Array, k: int, atom: Atom, i: int
+        self,
+        point: Point,
+        vector: Array,
+        run: LogRun,
+        start: Array,
+        k: int,
+        hypothesis: Hypothesis,
+        i: int,
     ) -> Array:
-        step = atom.parameters[i].step
-        low, high = atom.parameters[i].low, atom.parameters[i].high
+        step = hypothesis.parameters[i].step
+        low, high = hypothesis.parameters[i].low, hypothesis.parameters[i].high
         ends = np.clip([vector[k] - step, vector[k] + step], low, high)
         shown = []
         for end in ends:
@@ -241,9 +252,9 @@ class Problem:
                 out[i] = float(stacked @ stacked - own @ own)
         return out
 
-    def scan(self, fit: Fit, atom: Atom) -> Fit:
-        """Return the fit with the numbers of an atom moved over the hills of their likelihood."""
-        for k, parameter in self._hilly(fit, atom):
+    def scan(self, fit: Fit, hypothesis: Hypothesis) -> Fit:
+        """Return the fit with a hypothesis moved over the hills of its likelihood."""
+        for k, parameter in self._hilly(fit, hypothesis):
             vector = fit.point.vector()
             tried = np.linspace(-parameter.reach, parameter.reach, _HILLS) + vector[k]
             tried = np.clip(tried, parameter.low, parameter.high)
@@ -252,13 +263,13 @@ class Problem:
             fit = found if found.cost < fit.cost else fit
         return fit
 
-    def spread(self, fit: Fit, atom: Atom) -> dict[str, float]:
-        """Return standard errors of an atom's numbers whose likelihood has hills.
+    def spread(self, fit: Fit, hypothesis: Hypothesis) -> dict[str, float]:
+        """Return standard errors of a hypothesis's numbers whose likelihood has hills.
 
         A third of the distance within which −2 log L rises by nine.
         """
         out = {}
-        for k, parameter in self._hilly(fit, atom):
+        for k, parameter in self._hilly(fit, hypothesis):
             now = fit.point.vector()[k]
             tried = now + np.linspace(-parameter.reach, parameter.reach, 2 * _HILLS - 1)
             inside = (tried >= parameter.low) & (tried <= parameter.high)
@@ -267,9 +278,9 @@ class Problem:
             out[parameter.name] = float(np.abs(near - now).max()) / 3
         return out
 
-    def _hilly(self, fit: Fit, atom: Atom) -> list[tuple[int, Parameter]]:
-        places = self.numbers_of(fit.point, atom)
-        found = zip(places, atom.parameters, strict=False)
+    def _hilly(self, fit: Fit, hypothesis: Hypothesis) -> list[tuple[int, Parameter]]:
+        places = self.numbers_of(fit.point, hypothesis)
+        found = zip(places, hypothesis.parameters, strict=False)
         return [] if fit.escaped else [(k, p) for k, p in found if p.reach > 0]
 
     def fit_starts(self, point: Point, noise: Noise) -> Fit:
@@ -278,7 +289,7 @@ class Problem:
             point,
             base=replace(point.base),
             places=(),
-            atoms=(),
+            hypotheses=(),
             values=(),
             starts=tuple(run.start() for run in self.runs),
         )

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.atom import Atom
 from greybox.diagnosis.base import Case
+from greybox.diagnosis.hypothesis import Hypothesis
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.preparing import prepare
-from greybox.diagnosis.refitting import likelier, polished, refit, seen_as_slow, slow
+from greybox.diagnosis.refitting import final_refit, likelier, refit, seen_as_slow, slow
 from greybox.diagnosis.result import Given
-from greybox.diagnosis.scores import Directions, score_atoms
+from greybox.diagnosis.scores import ProjectedScores, score_hypotheses
 from greybox.diagnosis.search import Search, freed
 from greybox.diagnosis.telling import Report
 from greybox.public import known_keywords, one_thread
@@ -67,9 +67,9 @@ def fit_given(
     ready = prepare(logs, validate, None, structure, ids)
     case, base = ready.case, ready.base()
     final = base
-    left = {a.cause for a in ready.atoms}
+    left = {a.cause for a in ready.hypotheses}
     while left:
-        found = _likeliest(case, final, [a for a in ready.atoms if a.cause in left])
+        found = _likeliest(case, final, [a for a in ready.hypotheses if a.cause in left])
         if found is None:
             break
         final = found[1]
@@ -83,28 +83,30 @@ def fit_given(
     return Given(tuple(ids), before, after, fall, gain, report.where(ready.validate))
 
 
-def _likeliest(case: Case, fit: Fit, atoms: Sequence[Atom]) -> tuple[Atom, Fit] | None:
+def _likeliest(
+    case: Case, fit: Fit, hypotheses: Sequence[Hypothesis]
+) -> tuple[Hypothesis, Fit] | None:
     problem = case.problem(fit.integrator)
-    near = [a for a in atoms if not a.afresh]
-    scores = score_atoms(Directions(problem, fit), near)
-    fits = [(s.atom, refit(problem, fit, s)) for s in scores[:_FORMS]]
+    near = [a for a in hypotheses if not a.refit_from_scratch]
+    scores = score_hypotheses(ProjectedScores(problem, fit), near)
+    fits = [(s.hypothesis, refit(problem, fit, s)) for s in scores[:_FORMS]]
     if slow(fit):
         fits = likelier(fits, seen_as_slow(problem, fit, near))
-    if not fit.point.atoms:
+    if not fit.point.hypotheses:
         # coefficients of their own forget the causes before: only the first can have them
-        fits += case.begun_again(fit, atoms, [s.atom for s in scores if s.gain == -np.inf])
+        fits += case.restart(fit, hypotheses, [s.hypothesis for s in scores if s.gain == -np.inf])
     fits = [(a, f) for a, f in fits if not f.escaped]
     if not fits:
         return None
     samples = sum(len(e) for e in fit.errors)
 
-    def merit(found: tuple[Atom, Fit]) -> tuple[bool, float]:
-        atom, its = found
-        price = freed(fit, its, atom) * float(np.log(samples))
-        return not atom.afresh, its.cost + price
+    def merit(found: tuple[Hypothesis, Fit]) -> tuple[bool, float]:
+        hypothesis, its = found
+        price = freed(fit, its, hypothesis) * float(np.log(samples))
+        return not hypothesis.refit_from_scratch, its.cost + price
 
-    atom, best = min(fits, key=merit)
-    return atom, polished(case, best, atom)
+    hypothesis, best = min(fits, key=merit)
+    return hypothesis, final_refit(case, best, hypothesis)
 
 
 def _squares(fit: Fit) -> float:

@@ -142,17 +142,20 @@ class OtherLogs(HeldOut):
     def _pairs(self, fit: Fit) -> list[Pair]:
         # a coefficient that changed during the estimation may have changed before these
         # logs, or within them: the likelier counts
-        points = [replace(fit.point, base=ship, atoms=(), values=()) for ship in stories(fit.point)]
+        points = [
+            replace(fit.point, base=ship, hypotheses=(), values=())
+            for ship in change_scenarios(fit.point)
+        ]
         best = min(
             (self.problem.fit_starts(p, fit.noise) for p in points), key=lambda found: found.cost
         )
         return [Pair(self.fitting, fit, self.problem, best)]
 
     def _ways(self, fit: Fit) -> int:
-        return len(stories(fit.point))
+        return len(change_scenarios(fit.point))
 
 
-def stories(point: Point) -> list[Ship]:
+def change_scenarios(point: Point) -> list[Ship]:
     """Return the ship with its changes within the log, and with them made before."""
     ship = point.ship
     if not ship.changes:

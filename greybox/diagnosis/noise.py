@@ -40,7 +40,7 @@ _MOST_STEPS, _NEAR_STEPS = 40, 20
 
 
 @dataclass(frozen=True)
-class Colour:
+class NoiseModel:
     """Innovations form of the errors of one group of channels.
 
     ``e = C x + v``, ``x⁺ = A x + w``: ``closed`` = A − K C, ``gain`` = K and
@@ -113,13 +113,13 @@ class Noise:
 
     Parameters
     ----------
-    groups : tuple of Colour
+    groups : tuple of NoiseModel
         Whose outputs together are all channels.
     parameters : tuple of ndarray
         Logarithms and memory that each was made from.
     """
 
-    groups: tuple[Colour, ...]
+    groups: tuple[NoiseModel, ...]
     parameters: tuple[Array, ...]
 
     def whiten(self, e: Array) -> Array:
@@ -206,7 +206,7 @@ def _likelihood(k: int, blocks: int) -> ca.Function:
 
 def _innovations_form(
     group: tuple[int, ...], pole: float, sample_time: float, level: Array, x: Array
-) -> Colour:
+) -> NoiseModel:
     k = len(group)
     a, q, r = (np.array(m) for m in _matrices(k)(pole, sample_time, x, level))
     c = np.eye(k, k + 1)
@@ -214,7 +214,7 @@ def _innovations_form(
     s = c @ p @ c.T + r
     gain = np.linalg.solve(s, c @ p @ a.T).T
     sensor = level * np.exp(x[2:])
-    return Colour(
+    return NoiseModel(
         group, c, a - gain @ c, gain, cholesky(s, lower=True), sensor,
         float(np.exp(x[0]) * sensor[0]), float(a[-1, -1]),
     )  # fmt: skip
@@ -263,7 +263,7 @@ def _fit_group(
     sample_time: float,
     start: Array | None,
     longest: float,
-) -> tuple[Array, Colour]:
+) -> tuple[Array, NoiseModel]:
     """Return the logarithms and memory of one group, and its innovations form."""
     from scipy.optimize import minimize
 

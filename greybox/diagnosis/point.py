@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.atom import Atom
+from greybox.diagnosis.hypothesis import Hypothesis
 from greybox.diagnosis.noise import Noise
 from greybox.diagnosis.ship import Ship
 from greybox.model.run.step import Integrator
@@ -22,34 +22,34 @@ class Point:
     Parameters
     ----------
     base : Ship
-        Coefficients, currents and the vessel before the atoms with `apply`.
+        Coefficients, currents and the vessel before the hypotheses with `apply`.
     starts : tuple of ndarray
         Start of each log.
     places : tuple of int
         Free coefficients and currents.
-    atoms : tuple of Atom
+    hypotheses : tuple of Hypothesis
         In force; those with columns have them among `places`.
     values : tuple of ndarray
-        Of the atoms with `apply`, empty for the others.
+        Of the hypotheses with `apply`, empty for the others.
     """
 
     base: Ship
     starts: tuple[Array, ...]
     places: tuple[int, ...]
-    atoms: tuple[Atom, ...] = ()
+    hypotheses: tuple[Hypothesis, ...] = ()
     values: tuple[Array, ...] = ()
 
     @property
     def ship(self) -> Ship:
-        """The ship with every atom applied."""
+        """The ship with every hypothesis applied."""
         ship = self.base
-        for atom, value in zip(self.atoms, self.values, strict=True):
-            if atom.apply is not None:
-                ship = atom.apply(ship, value)
+        for hypothesis, value in zip(self.hypotheses, self.values, strict=True):
+            if hypothesis.apply is not None:
+                ship = hypothesis.apply(ship, value)
         return ship
 
     def vector(self) -> Array:
-        """Return all free numbers: coefficients, then the atoms' values, then starts."""
+        """Return all free numbers: coefficients, then the hypotheses' values, then starts."""
         full = np.concatenate([self.base.theta, self.base.current])
         return np.concatenate([full[list(self.places)], *self.values, *self.starts])
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from greybox.diagnosis.atom import Atom
 from greybox.diagnosis.base import Case
 from greybox.diagnosis.causes import Cause, Context, known_causes
+from greybox.diagnosis.hypothesis import Hypothesis
 from greybox.diagnosis.kinematics import kinematic_findings, mended
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.ship import CURRENTS
@@ -39,7 +39,7 @@ class Prepared:
     structure : Structure
         Without any cause.
     causes : mapping of str to Cause
-    atoms : tuple of Atom
+    hypotheses : tuple of Hypothesis
         Of those causes, as far as these logs can show them.
     findings : tuple of Finding
         What the kinematics of the logs tell already; the logs are mended by them.
@@ -53,7 +53,7 @@ class Prepared:
     case: Case
     structure: Structure
     causes: Mapping[str, Cause]
-    atoms: tuple[Atom, ...]
+    hypotheses: tuple[Hypothesis, ...]
     findings: tuple[Finding, ...]
     validate: tuple[TrialLog, ...]
     short: tuple[str, ...]
@@ -62,7 +62,7 @@ class Prepared:
     @property
     def tried(self) -> int:
         """How many hypotheses are tried, for which p-values are corrected."""
-        return len(self.atoms) + len(self.findings)
+        return len(self.hypotheses) + len(self.findings)
 
     def base(self) -> Fit:
         """Return the fit without causes."""
@@ -109,10 +109,17 @@ def prepare(
     validate = [correct_log(log, vessel) for log in validate]
     start = _structure(structure, logs, model)
     context = _context(start, [*logs, *validate], model)
-    atoms = [a for c in causes.values() for a in c.atoms(context)]
-    case = _case(start, atoms, logs, validate)
+    hypotheses = [a for c in causes.values() for a in c.hypotheses(context)]
+    case = _case(start, hypotheses, logs, validate)
     return Prepared(
-        case, start, causes, tuple(atoms), tuple(findings), tuple(validate), tuple(short), model
+        case,
+        start,
+        causes,
+        tuple(hypotheses),
+        tuple(findings),
+        tuple(validate),
+        tuple(short),
+        model,
     )
 
 
@@ -174,11 +181,11 @@ def _context(
 
 def _case(
     structure: Structure,
-    atoms: Sequence[Atom],
+    hypotheses: Sequence[Hypothesis],
     logs: Sequence[TrialLog],
     validate: Sequence[TrialLog],
 ) -> Case:
-    names = dict.fromkeys(n for a in atoms for n in (*a.columns, *a.beside))
+    names = dict.fromkeys(n for a in hypotheses for n in (*a.columns, *a.co_freed))
     added = [n for n in names if n not in structure.parameters and n not in CURRENTS]
     universe = structure.with_terms(*added)
     wind = universe.uses_air and all(log.has_wind for log in [*logs, *validate])

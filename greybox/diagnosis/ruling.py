@@ -86,7 +86,7 @@ def rule(
     final, stand, leaning, notes = found.final, found.causes, found.leaning, []
     if stand and sum(g.after - g.before for g in gain.values()) < 0:
         # likelier errors are no better simulation: nothing is extended by them
-        helped = ", ".join(c.atom.cause for c in stand)
+        helped = ", ".join(c.hypothesis.cause for c in stand)
         notes.append(
             f"{helped} made the held-out errors likelier but the free run no better, so the "
             f"model was not extended."
@@ -199,7 +199,7 @@ def _missed(pairs: Sequence[Pair]) -> dict[str, float]:
 
 
 def _grouped(candidate: Candidate, groups: Sequence[Sequence[Candidate]]) -> bool:
-    return any(c.atom.key == candidate.atom.key for pair in groups for c in pair)
+    return any(c.hypothesis.key == candidate.hypothesis.key for pair in groups for c in pair)
 
 
 def _drifts(pairs: Sequence[Pair]) -> bool:
@@ -243,9 +243,9 @@ def _remaining(final: Fit, pairs: Sequence[Pair], left: Omnibus, why: str) -> st
 
 def _next(verdict: DiagnosisVerdict, groups: Sequence[Sequence[Candidate]]) -> list[str]:
     out = [
-        f"design a trial that tells {' from '.join(c.atom.cause for c in pair)}: greybox design "
-        f"--between {' '.join(f'MODEL.{c.atom.cause}.json' for c in pair[:2])}"
-        for pair in groups
+        f"design a trial that tells {' from '.join(ids)}: greybox design "
+        f"--between {' '.join(f'MODEL.{i}.json' for i in ids[:2])}"
+        for ids in ([c.hypothesis.cause for c in pair] for pair in groups)
     ]
     if verdict in (DiagnosisVerdict.UNEXPLAINED, DiagnosisVerdict.PARTLY):
         out.append(

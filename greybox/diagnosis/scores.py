@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.atom import Atom
 from greybox.diagnosis.fitting import Problem
+from greybox.diagnosis.hypothesis import Hypothesis
 from greybox.diagnosis.linear import sensitivities
 from greybox.diagnosis.noise import Noise
 from greybox.diagnosis.point import Fit, Point
@@ -36,19 +36,19 @@ class Score:
 
     Parameters
     ----------
-    atom : Atom
+    hypothesis : Hypothesis
     value : ndarray
         Where its fit should begin.
     gain : float
         Predicted fall of −2 log L.
     """
 
-    atom: Atom
+    hypothesis: Hypothesis
     value: Array
     gain: float
 
 
-class Directions:
+class ProjectedScores:
     """Innovations and directions with the nuisance taken out.
 
     Parameters
@@ -98,26 +98,26 @@ def _stacked(parts: Sequence[Array]) -> Array:
     return np.concatenate([p.reshape(-1, p.shape[2]) if p.ndim == 3 else p.ravel() for p in parts])
 
 
-def score_atoms(directions: Directions, atoms: Sequence[Atom]) -> list[Score]:
-    """Score every atom at a fit, the most promising first.
+def score_hypotheses(directions: ProjectedScores, hypotheses: Sequence[Hypothesis]) -> list[Score]:
+    """Score every hypothesis at a fit, the most promising first.
 
     Parameters
     ----------
-    directions : Directions
-    atoms : sequence of Atom
+    directions : ProjectedScores
+    hypotheses : sequence of Hypothesis
         Not in force yet.
     """
     out = [
-        *_score_columns(directions, [a for a in atoms if a.apply is None]),
-        *_score_moves(directions, [a for a in atoms if a.apply and a.cause != CHANGE]),
-        *_score_changes(directions, [a for a in atoms if a.cause == CHANGE]),
+        *_score_columns(directions, [a for a in hypotheses if a.apply is None]),
+        *_score_moves(directions, [a for a in hypotheses if a.apply and a.cause != CHANGE]),
+        *_score_changes(directions, [a for a in hypotheses if a.cause == CHANGE]),
     ]
     return sorted(out, key=lambda s: -s.gain)
 
 
-def _score_columns(directions: Directions, atoms: Sequence[Atom]) -> list[Score]:
+def _score_columns(directions: ProjectedScores, hypotheses: Sequence[Hypothesis]) -> list[Score]:
     problem, point = directions.problem, directions.fit.point
-    names = list(dict.fromkeys(n for a in atoms for n in a.columns))
+    names = list(dict.fromkeys(n for a in hypotheses for n in a.columns))
     if not names:
         return []
     places = np.array([problem.place(n) for n in names])
@@ -128,15 +128,15 @@ def _score_columns(directions: Directions, atoms: Sequence[Atom]) -> list[Score]
         slopes.append(run.columns(ship, shown, places)[:, :, : len(names)])
     cleared, before = directions.clear(slopes)
     out = []
-    for atom in atoms:
-        index = [names.index(n) for n in atom.columns]
+    for hypothesis in hypotheses:
+        index = [names.index(n) for n in hypothesis.columns]
         gain, _ = directions.gain(cleared[:, index], before[index])
-        out.append(Score(atom, np.zeros(0), gain))
+        out.append(Score(hypothesis, np.zeros(0), gain))
     return out
 
 
-def _score_moves(directions: Directions, atoms: Sequence[Atom]) -> list[Score]:
-    """Score atoms by how the run moves from the null to where their search begins."""
+def _score_moves(directions: ProjectedScores, hypotheses: Sequence[Hypothesis]) -> list[Score]:
+    """Score hypotheses by how the run moves from the null to where their search begins."""
     problem, point = directions.problem, directions.fit.point
     now = [r.run(point.ship, s).y for r, s in zip(problem.runs, point.starts, strict=True)]
 
@@ -148,18 +148,18 @@ def _score_moves(directions: Directions, atoms: Sequence[Atom]) -> list[Score]:
         return parts if all(np.isfinite(p).all() for p in parts) else None
 
     out = []
-    for atom in atoms:
-        best = Score(atom, atom.start, -np.inf)
-        for value in (atom.start, *(np.array(s) for s in atom.starts)):
+    for hypothesis in hypotheses:
+        best = Score(hypothesis, hypothesis.start, -np.inf)
+        for value in (hypothesis.start, *(np.array(s) for s in hypothesis.starts)):
             parts = []
             if not len(value):
-                one = moved(problem.add(point, atom, value))
+                one = moved(problem.add(point, hypothesis, value))
                 parts = [one] if one is not None else []
-            for i, parameter in enumerate(atom.parameters):
-                trial = np.array([p.null for p in atom.parameters])
+            for i, parameter in enumerate(hypothesis.parameters):
+                trial = np.array([p.null for p in hypothesis.parameters])
                 off = value[i] != parameter.null
                 trial[i] = value[i] if off else parameter.null + parameter.step
-                one = moved(problem.add(point, atom, trial))
+                one = moved(problem.add(point, hypothesis, trial))
                 if one is not None:
                     parts.append([p / (1.0 if off else parameter.step) for p in one])
             if not parts:
@@ -172,20 +172,20 @@ def _score_moves(directions: Directions, atoms: Sequence[Atom]) -> list[Score]:
                 # a channel is reversed or it is not
                 gain = float(2 * cleared[:, 0] @ directions.nu - cleared[:, 0] @ cleared[:, 0])
             if gain > best.gain:
-                best = Score(atom, value, gain)
+                best = Score(hypothesis, value, gain)
         out.append(best)
     return out
 
 
-def _score_changes(directions: Directions, atoms: Sequence[Atom]) -> list[Score]:
+def _score_changes(directions: ProjectedScores, hypotheses: Sequence[Hypothesis]) -> list[Score]:
     """Score changes of coefficients at many moments at once."""
     problem, point = directions.problem, directions.fit.point
-    if not atoms:
+    if not hypotheses:
         return []
     ship = point.ship
     least = min(run.time[-1] for run in problem.runs)
     moments = np.linspace(0.05, 0.95, MOMENTS) * least
-    names = [a.parameters[0].name.removesuffix("_factor") for a in atoms]
+    names = [a.parameters[0].name.removesuffix("_factor") for a in hypotheses]
     index = np.array([problem.structure.index(n) for n in names])
     columns = []
     for run, start in zip(problem.runs, point.starts, strict=True):
@@ -202,10 +202,10 @@ def _score_changes(directions: Directions, atoms: Sequence[Atom]) -> list[Score]
     with np.errstate(divide="ignore", invalid="ignore"):
         gain = np.where(squares > _OWN * before, along**2 / squares, 0.0)
         factor = np.where(squares > _OWN * before, along / squares, 0.0)
-    gain, factor = gain.reshape(len(atoms), -1), factor.reshape(len(atoms), -1)
+    gain, factor = gain.reshape(len(hypotheses), -1), factor.reshape(len(hypotheses), -1)
     out = []
-    for k, atom in enumerate(atoms):
+    for k, hypothesis in enumerate(hypotheses):
         j = int(np.argmax(gain[k]))
         first = float(np.clip(1 + factor[k, j], _LEAST_FACTOR, _MOST_FACTOR))
-        out.append(Score(atom, np.array([first, moments[j]]), float(gain[k, j])))
+        out.append(Score(hypothesis, np.array([first, moments[j]]), float(gain[k, j])))
     return out

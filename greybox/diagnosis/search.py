@@ -13,22 +13,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.atom import Atom
 from greybox.diagnosis.base import Case
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.held_out import HeldOut, Proof, proof_of
+from greybox.diagnosis.hypothesis import Hypothesis
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.refitting import (
     FIRST,
     SETTLE,
+    final_refit,
     likelier,
-    polished,
     refit,
     seen_as_slow,
     shortlist,
     slow,
 )
-from greybox.diagnosis.scores import MOMENTS, Directions, Score, score_atoms
+from greybox.diagnosis.scores import MOMENTS, ProjectedScores, Score, score_hypotheses
 from greybox.diagnosis.standing import Standing, standing
 from greybox.diagnosis.thresholds import BACKWARDS, MOST_CAUSES, PROVEN, RELEVANT, SIGNIFICANT
 from greybox.model.run.step import Integrator
@@ -49,7 +49,7 @@ class Candidate:
 
     Parameters
     ----------
-    atom : Atom
+    hypothesis : Hypothesis
     fit : Fit
         With all earlier causes and this one.
     gain : float
@@ -68,7 +68,7 @@ class Candidate:
         What it does beside a generic force; None until that is asked.
     """
 
-    atom: Atom
+    hypothesis: Hypothesis
     fit: Fit
     gain: float
     p_value: float
@@ -89,12 +89,13 @@ class Candidate:
     @property
     def unresolved(self) -> bool:
         """Whether sampling itself would look alike."""
-        if self.atom.apply is None:
+        if self.hypothesis.apply is None:
             return False
-        k = [a.key for a in self.fit.point.atoms].index(self.atom.key)
+        k = [a.key for a in self.fit.point.hypotheses].index(self.hypothesis.key)
         values = self.fit.point.values[k]
         return any(
-            abs(v - p.null) < p.least for v, p in zip(values, self.atom.parameters, strict=True)
+            abs(v - p.null) < p.least
+            for v, p in zip(values, self.hypothesis.parameters, strict=True)
         )
 
     @property
@@ -134,7 +135,7 @@ class Search:
     causes : tuple of Candidate
         In the order found, without those that later ones made needless.
     tried : int
-        Atoms that were scored.
+        Hypotheses that were scored.
     leaning : tuple of Candidate
         Causes that help, and do no more than a generic force would: no part of `final`.
     without : tuple of Fit
@@ -156,19 +157,19 @@ class Search:
             return proof_of(one - two).gain
 
 
-def freed(before: Fit, after: Fit, atom: Atom) -> int:
+def freed(before: Fit, after: Fit, hypothesis: Hypothesis) -> int:
     """Return how many numbers a cause frees, those that come beside it counted; at least one.
 
     A fit from first coefficients of its own is of the same structure.
     """
     numbers = [len(f.point.places) + sum(map(len, f.point.values)) for f in (before, after)]
-    return max(numbers[1] - numbers[0], len(atom.parameters), 1)
+    return max(numbers[1] - numbers[0], len(hypothesis.parameters), 1)
 
 
 def search(
     case: Case,
     base: Fit,
-    atoms: Sequence[Atom],
+    hypotheses: Sequence[Hypothesis],
     *,
     begun: Sequence[Candidate] = (),
     most: int = MOST_CAUSES,
@@ -181,7 +182,7 @@ def search(
     case : Case
     base : Fit
         Of the model without any cause, its noise settled.
-    atoms : sequence of Atom
+    hypotheses : sequence of Hypothesis
     begun : sequence of Candidate
         Causes that are in force from the beginning.
     most : int
@@ -194,54 +195,56 @@ def search(
     causes: list[Candidate] = list(begun)
     most += len(causes)
     known: set[frozenset[str]] = set()
-    while len(causes) < most and frozenset(c.atom.key for c in causes) not in known:
+    while len(causes) < most and frozenset(c.hypothesis.key for c in causes) not in known:
         # causes that take each other's place would go round for ever
-        known.add(frozenset(c.atom.key for c in causes))
-        step = take_step(case, fit, causes, atoms)
+        known.add(frozenset(c.hypothesis.key for c in causes))
+        step = take_step(case, fit, causes, hypotheses)
         steps.append(step)
         progress(f"step {len(steps)}: {len(step.scores)} causes scored")
         _log.info(
             "step %d: %d causes scored, %s", len(steps), len(step.scores),
-            "none holds" if step.taken is None else f"{step.taken.atom.cause} holds",
+            "none holds" if step.taken is None else f"{step.taken.hypothesis.cause} holds",
         )  # fmt: skip
         if step.taken is None:
             break
         causes = [*causes, step.taken]
-        fit, causes = _backward(case, step.taken.fit, causes, len(atoms))
+        fit, causes = _backward(case, step.taken.fit, causes, len(hypotheses))
         # what a better noise would gain must not count for the next cause
         fit = case.problem(fit.integrator).settle(fit, SETTLE)
-    return Search(base, fit, tuple(steps), tuple(causes), len(atoms))
+    return Search(base, fit, tuple(steps), tuple(causes), len(hypotheses))
 
 
-def take_step(case: Case, fit: Fit, causes: Sequence[Candidate], atoms: Sequence[Atom]) -> Step:
+def take_step(
+    case: Case, fit: Fit, causes: Sequence[Candidate], hypotheses: Sequence[Hypothesis]
+) -> Step:
     """Score what is left, refit the best, and take the likeliest if it holds."""
-    left = [a for a in atoms if not _taken(a, causes)]
+    left = [a for a in hypotheses if not _taken(a, causes)]
     problem, held_out = case.problem(fit.integrator), case.held_out(fit.integrator)
-    near = [a for a in left if not a.afresh]
-    scores = score_atoms(Directions(problem, fit), near)
-    fits = [(s.atom, refit(problem, fit, s)) for s in shortlist(scores)]
+    near = [a for a in left if not a.refit_from_scratch]
+    scores = score_hypotheses(ProjectedScores(problem, fit), near)
+    fits = [(s.hypothesis, refit(problem, fit, s)) for s in shortlist(scores)]
     if slow(fit):
         fits = likelier(fits, seen_as_slow(problem, fit, near))
     if not causes:
-        fits += case.begun_again(fit, left, [s.atom for s in scores if s.gain == -np.inf])
+        fits += case.restart(fit, left, [s.hypothesis for s in scores if s.gain == -np.inf])
     candidates = sorted(
         (
-            assess_candidate(held_out, fit, found, atom, len(left), problem.names)
-            for atom, found in fits
+            assess_candidate(held_out, fit, found, hypothesis, len(left), problem.names)
+            for hypothesis, found in fits
         ),
-        key=_merit,
+        key=_bic,
     )
-    sure = (_sure(case, c) for c in candidates if c.holds)
+    sure = (_wald_checked(case, c) for c in candidates if c.holds)
     taken = next((c for c in sure if c.holds), None)
     if taken is not None:
-        better = polished(case, taken.fit, taken.atom)
-        taken = _sure(case, replace(taken, fit=better))
+        better = final_refit(case, taken.fit, taken.hypothesis)
+        taken = _wald_checked(case, replace(taken, fit=better))
         if not taken.holds:
             taken = None
     return Step(fit, tuple(scores), tuple(candidates), taken)
 
 
-def _sure(case: Case, candidate: Candidate) -> Candidate:
+def _wald_checked(case: Case, candidate: Candidate) -> Candidate:
     """Return the candidate with p-values that its robust covariance bears out, too (Wald).
 
     Where errors have another colour than theirs, or come in bursts, the likelihood falls
@@ -250,13 +253,15 @@ def _sure(case: Case, candidate: Candidate) -> Candidate:
     """
     from scipy.stats import chi2
 
-    atom, fit = candidate.atom, candidate.fit
+    hypothesis, fit = candidate.hypothesis, candidate.fit
     problem = case.problem(fit.integrator)
-    where = problem.numbers_of(fit.point, atom)
-    if atom.apply is None:
+    where = problem.numbers_of(fit.point, hypothesis)
+    if hypothesis.apply is None:
         null = [0.0] * len(where)
     else:
-        tested = [(k, p.null) for k, p in zip(where, atom.parameters, strict=True) if not p.reach]
+        tested = [
+            (k, p.null) for k, p in zip(where, hypothesis.parameters, strict=True) if not p.reach
+        ]
         where, null = [k for k, _ in tested], [value for _, value in tested]
     if not where:
         return candidate
@@ -268,20 +273,23 @@ def _sure(case: Case, candidate: Candidate) -> Candidate:
     return replace(candidate, p_value=p, p_adjusted=min(1.0, p * candidate.tried))
 
 
-def _taken(atom: Atom, causes: Sequence[Candidate]) -> bool:
-    """Whether an atom, or another form of it, is in force."""
+def _taken(hypothesis: Hypothesis, causes: Sequence[Candidate]) -> bool:
+    """Whether a hypothesis, or another form of it, is in force."""
     return any(
-        atom.key == c.atom.key
-        or (atom.cause == c.atom.cause and set(_names(atom)) & set(_names(c.atom)))
+        hypothesis.key == c.hypothesis.key
+        or (
+            hypothesis.cause == c.hypothesis.cause
+            and set(_names(hypothesis)) & set(_names(c.hypothesis))
+        )
         for c in causes
     )
 
 
-def _names(atom: Atom) -> list[str]:
-    return [p.name for p in atom.parameters] or [atom.key]
+def _names(hypothesis: Hypothesis) -> list[str]:
+    return [p.name for p in hypothesis.parameters] or [hypothesis.key]
 
 
-def _merit(candidate: Candidate) -> tuple[float, float]:
+def _bic(candidate: Candidate) -> tuple[float, float]:
     """Return −2 log L of all logs with the price of each number (Schwarz, 1978).
 
     What a cause does for held-out logs counts as much as what it was fitted to: there
@@ -303,18 +311,23 @@ def backwards(fit: Fit, names: Sequence[str]) -> list[str]:
 
 
 def assess_candidate(
-    held_out: HeldOut, before: Fit, fit: Fit, atom: Atom, tried: int, names: tuple[str, ...] = ()
+    held_out: HeldOut,
+    before: Fit,
+    fit: Fit,
+    hypothesis: Hypothesis,
+    tried: int,
+    names: tuple[str, ...] = (),
 ) -> Candidate:
     """Return a refitted cause with its significance and what it does for held-out logs."""
     from scipy.stats import chi2
 
     gain = before.cost - fit.cost if np.isfinite(fit.cost) else -np.inf
-    numbers = freed(before, fit, atom)
+    numbers = freed(before, fit, hypothesis)
     p = float(chi2.sf(max(gain, 0.0), numbers))
     proof = held_out.prove(before, fit)
     # the best of many moments is likelier than any one
-    tried *= MOMENTS if any(parameter.reach > 0 for parameter in atom.parameters) else 1
-    return Candidate(atom, fit, gain, p, min(1.0, p * tried), proof, names, tried, numbers)
+    tried *= MOMENTS if any(parameter.reach > 0 for parameter in hypothesis.parameters) else 1
+    return Candidate(hypothesis, fit, gain, p, min(1.0, p * tried), proof, names, tried, numbers)
 
 
 def _backward(
@@ -333,12 +346,12 @@ def pruned(
     problem, held_out = case.problem(fit.integrator), case.held_out(fit.integrator)
     for cause in causes:
         without = _without(problem, fit, cause)
-        alone = assess_candidate(held_out, without, fit, cause.atom, tried, cause.names)
-        place = [c.atom.key for c in kept].index(cause.atom.key)
+        alone = assess_candidate(held_out, without, fit, cause.hypothesis, tried, cause.names)
+        place = [c.hypothesis.key for c in kept].index(cause.hypothesis.key)
         if alone.holds:
             kept[place] = alone
         else:
-            _log.info("%s is left out", cause.atom.key)
+            _log.info("%s is left out", cause.hypothesis.key)
             fit = without
             del kept[place]
     return fit, kept
@@ -357,7 +370,7 @@ def weighed(case: Case, found: Search) -> Search:
         tried = []
         for cause in kept:
             without = _without(problem, fit, cause)
-            stands = standing(problem, cause.atom, fit, pairs, held_out.pairs(without))
+            stands = standing(problem, cause.hypothesis, fit, pairs, held_out.pairs(without))
             tried.append((replace(cause, fit=fit, standing=stands), without))
         kept, left = [cause for cause, _ in tried], [without for _, without in tried]
         fallen = [(cause, without) for cause, without in tried if not _stands(cause)]
@@ -365,7 +378,7 @@ def weighed(case: Case, found: Search) -> Search:
             break
         least, fit = min(fallen, key=lambda item: _beyond(item[0]))
         leaning.append(least)
-        kept = [c for c in kept if c.atom.key != least.atom.key]
+        kept = [c for c in kept if c.hypothesis.key != least.hypothesis.key]
         fit = case.problem(fit.integrator).settle(fit, SETTLE)
     return replace(
         found, final=fit, causes=tuple(kept), leaning=tuple(leaning), without=tuple(left)
@@ -381,7 +394,7 @@ def _beyond(cause: Candidate) -> float:
 
 
 def _without(problem: Problem, fit: Fit, cause: Candidate) -> Fit:
-    point = problem.drop(fit.point, cause.atom)
+    point = problem.drop(fit.point, cause.hypothesis)
     return problem.settle(problem.fit(point, fit.noise, most=FIRST), 2)
 
 
@@ -390,14 +403,14 @@ def instead(
 ) -> tuple[Candidate, list[Candidate]]:
     """Return one of several causes, and others in its place, all beside the remaining causes."""
     problem, held_out = case.problem(fit.integrator), case.held_out(fit.integrator)
-    rest = problem.drop(fit.point, best.atom)
+    rest = problem.drop(fit.point, best.hypothesis)
     without = problem.settle(problem.fit(rest, fit.noise, most=FIRST), 1)
     out = []
     for other in others[:_INSTEAD]:
-        k = [a.key for a in other.fit.point.atoms].index(other.atom.key)
+        k = [a.key for a in other.fit.point.hypotheses].index(other.hypothesis.key)
         value = other.fit.point.values[k]
-        score = Score(other.atom, value, other.gain)
+        score = Score(other.hypothesis, value, other.gain)
         out.append(
-            assess_candidate(held_out, without, refit(problem, without, score), other.atom, 1)
+            assess_candidate(held_out, without, refit(problem, without, score), other.hypothesis, 1)
         )
-    return assess_candidate(held_out, without, fit, best.atom, 1), out
+    return assess_candidate(held_out, without, fit, best.hypothesis, 1), out

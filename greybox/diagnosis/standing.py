@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.atom import Atom
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.held_out import Pair, Proof, proof_of
+from greybox.diagnosis.hypothesis import Hypothesis
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.remainder import Use, contributions_beside, generic_force
 from greybox.diagnosis.ship import CURRENTS
@@ -54,20 +54,20 @@ class Standing:
         return (gains or own) and self.clear < PROVEN
 
 
-def standing(problem: Problem, atom: Atom, with_it: Fit, pairs: Sequence[Pair],
+def standing(problem: Problem, hypothesis: Hypothesis, with_it: Fit, pairs: Sequence[Pair],
              without: Sequence[Pair]) -> Standing:  # fmt: skip
     """Weigh a cause against a generic force.
 
     Parameters
     ----------
     problem : Problem
-    atom : Atom
+    hypothesis : Hypothesis
     with_it : Fit
         With the cause in force.
     pairs, without : sequence of Pair
         That fit, and the one without the cause, on what is held out.
     """
-    moved, clear = _moved(problem, atom, with_it, pairs)
+    moved, clear = _moved(problem, hypothesis, with_it, pairs)
     if any(p.held_fit.escaped or p.fit.escaped for p in (*pairs, *without)):
         better = not any(p.held_fit.escaped for p in pairs)
         proof = proof_of(np.array([np.inf if better else -np.inf]))
@@ -76,7 +76,7 @@ def standing(problem: Problem, atom: Atom, with_it: Fit, pairs: Sequence[Pair],
     beyond = proof_of(np.concatenate([contributions_beside(p) for p in without])
                       - np.concatenate(beside))  # fmt: skip
     share, half = None, 1.0
-    use = _own_arguments(problem, atom)
+    use = _own_arguments(problem, hypothesis)
     if use is not None:
         plain = np.concatenate([np.concatenate(p.held.contributions(p.held_fit)) for p in without])
         own = np.concatenate([np.concatenate(p.held.contributions(p.held_fit)) for p in pairs])
@@ -87,11 +87,13 @@ def standing(problem: Problem, atom: Atom, with_it: Fit, pairs: Sequence[Pair],
     return Standing(beyond, share, half, moved, clear)
 
 
-def _moved(problem: Problem, atom: Atom, fit: Fit, pairs: Sequence[Pair]) -> tuple[Array, float]:
-    """Return how far an atom's numbers move, and the p-value of their null."""
+def _moved(
+    problem: Problem, hypothesis: Hypothesis, fit: Fit, pairs: Sequence[Pair]
+) -> tuple[Array, float]:
+    """Return how far a hypothesis's numbers move, and the p-value of their null."""
     from scipy.stats import chi2
 
-    where = problem.numbers_of(fit.point, atom)
+    where = problem.numbers_of(fit.point, hypothesis)
     bounded = [p for p in pairs if not (p.fit.escaped or p.held_fit.escaped)]
     if not where or not bounded:
         return np.zeros(len(where)), 0.0
@@ -100,10 +102,10 @@ def _moved(problem: Problem, atom: Atom, fit: Fit, pairs: Sequence[Pair]) -> tup
     own = covariance[np.ix_(where, where)] + np.outer(moved, moved)
     null = np.zeros(len(where))
     tested = np.ones(len(where), bool)
-    if atom.apply is not None:
-        null = np.array([p.null for p in atom.parameters])
+    if hypothesis.apply is not None:
+        null = np.array([p.null for p in hypothesis.parameters])
         # a number with many hills has no null
-        tested = np.array([p.reach == 0 for p in atom.parameters])
+        tested = np.array([p.reach == 0 for p in hypothesis.parameters])
     if not np.isfinite(own).all() or not tested.any():
         return np.abs(moved), 1.0 if tested.any() else 0.0
     away = (numbers[where] - null)[tested]
@@ -111,19 +113,19 @@ def _moved(problem: Problem, atom: Atom, fit: Fit, pairs: Sequence[Pair]) -> tup
     return np.abs(moved), float(chi2.sf(wald, int(tested.sum())))
 
 
-def _own_arguments(problem: Problem, atom: Atom) -> Use | None:
-    """Return which generic forces are functions of an atom's arguments; None where none is."""
-    if atom.apply is not None:
-        if not atom.arguments:
+def _own_arguments(problem: Problem, hypothesis: Hypothesis) -> Use | None:
+    """Return which generic forces are functions of a hypothesis's arguments; None where none is."""
+    if hypothesis.apply is not None:
+        if not hypothesis.arguments:
             return None
-        columns = frozenset(atom.arguments)
+        columns = frozenset(hypothesis.arguments)
         return lambda state, arguments: bool(arguments) and arguments <= columns
-    if set(atom.columns) & {*CURRENTS}:
+    if set(hypothesis.columns) & {*CURRENTS}:
         return None
     commands = frozenset(problem.runs[0].log.vessel.commands)
     known = {*problem.structure.states}
     own: dict[str, frozenset[str]] = {}
-    for name in atom.columns:
+    for name in hypothesis.columns:
         term = parse_term(name)
         signals: set[str] = set()
         for factor in term.factors:

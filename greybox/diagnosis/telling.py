@@ -74,11 +74,11 @@ class Report:
 
     def cause(self, candidate: Candidate, fit: Fit) -> Found:
         """Return a candidate as it stands in a fit."""
-        cause = self.causes[candidate.atom.cause]
+        cause = self.causes[candidate.hypothesis.cause]
         quantities = self.quantities(candidate, fit)
         told = {k: (q.value, q.std) for k, q in quantities.items()}
         return Found(
-            candidate.atom.cause, candidate.atom.key, cause.title, quantities,
+            candidate.hypothesis.cause, candidate.hypothesis.key, cause.title, quantities,
             candidate.p_value, candidate.p_adjusted, cause.evidence(told), cause.extension,
             cause.reference, candidate.gain, candidate.proof.gain, candidate.proof.std,
         )  # fmt: skip
@@ -88,16 +88,16 @@ class Report:
         problem = self.case.problem(fit.integrator)
         values, covariance = problem.covariance(fit)
         std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-        atom = candidate.atom
-        if atom.apply is None:
-            index = [fit.point.places.index(problem.place(n)) for n in atom.columns]
+        hypothesis = candidate.hypothesis
+        if hypothesis.apply is None:
+            index = [fit.point.places.index(problem.place(n)) for n in hypothesis.columns]
         else:
-            k = [a.key for a in fit.point.atoms].index(atom.key)
+            k = [a.key for a in fit.point.hypotheses].index(hypothesis.key)
             first = len(fit.point.places) + sum(map(len, fit.point.values[:k]))
             index = list(range(first, first + len(fit.point.values[k])))
         if not index:
-            return {atom.key.split(":", 1)[1]: Quantity(-1.0, 0.0, "1")}
-        wide = problem.spread(fit, atom)
+            return {hypothesis.key.split(":", 1)[1]: Quantity(-1.0, 0.0, "1")}
+        wide = problem.spread(fit, hypothesis)
         weighed = candidate.standing
         # what a generic force would move a number by is a part of what is not known of it
         moved = np.zeros(len(index)) if weighed is None else weighed.moved[: len(index)]
@@ -107,7 +107,7 @@ class Report:
                 float(np.linalg.norm([max(std[i], wide.get(p.name, 0.0)), p.coarse, by])),
                 p.unit,
             )
-            for p, i, by in zip(atom.parameters, index, moved, strict=True)
+            for p, i, by in zip(hypothesis.parameters, index, moved, strict=True)
         }
 
     def made(
@@ -129,13 +129,13 @@ class Report:
             final = found.base
             gain, runs, after = self.gain(before, before, validate, final)
         members = [c for pair in groups for c in pair]
-        alternatives = {c.atom.cause: self.model(c.fit, self.record((c,))) for c in members}
+        alternatives = {c.hypothesis.cause: self.model(c.fit, self.record((c,))) for c in members}
         notes = [*self._notes(after), *ruling.notes]
         problem = case.problem(found.base.integrator)
         return Diagnosis(
             verdict=ruling.verdict,
             causes=(*known, *(self.cause(c, final) for c in ruling.named)),
-            groups=tuple(tuple(c.atom.cause for c in pair) for pair in groups),
+            groups=tuple(tuple(c.hypothesis.cause for c in pair) for pair in groups),
             gain=gain,
             wrong=_symptoms(problem, found),
             residuals={
@@ -165,22 +165,22 @@ class Report:
     ) -> tuple[BudgetPart, ...]:
         """Return whose the held-out error is; what stands for several causes is not split."""
         found, held_out = self.found, self.case.held_out
-        own = dict(zip((c.atom.key for c in found.causes), found.without, strict=False))
+        own = dict(zip((c.hypothesis.key for c in found.causes), found.without, strict=False))
 
         def run(fit: Fit) -> Sequence[Pair]:
             return held_out(fit.integrator).pairs(fit)
 
         causes = []
         for c in named:
-            others = [fit for key, fit in own.items() if key != c.atom.key]
+            others = [fit for key, fit in own.items() if key != c.hypothesis.key]
             # of two causes each is alone where the other is left out
             alone = [final, *others][-1]
             first = run(alone) if len(others) < 2 else ()
             relative = _relative(self.quantities(c, final))
-            causes.append(Taken(c.atom.cause, run(own[c.atom.key]), first, relative))
+            causes.append(Taken(c.hypothesis.cause, run(own[c.hypothesis.key]), first, relative))
         numbers = set(final.point.places) - set(found.base.point.places)
         problem = self.case.problem(final.integrator)
-        numbers -= {i for c in found.causes for i in problem.numbers_at(c.atom)}
+        numbers -= {i for c in found.causes for i in problem.numbers_at(c.hypothesis)}
         return error_budget(
             run(found.base), run(final), causes, waves, self.seed, nameless=bool(numbers)
         )
@@ -190,7 +190,7 @@ class Report:
         logs = self.case.logs
         return {
             "method": "diagnosis",
-            "causes": [c.atom.key for c in causes],
+            "causes": [c.hypothesis.key for c in causes],
             "logs": [
                 {"name": log.name, "sha256": log.provenance.sha256, "samples": len(log)}
                 for log in logs
@@ -201,12 +201,14 @@ class Report:
     def _groups(self) -> list[list[Candidate]]:
         out = []
         causes = self.found.causes
-        ids = {c.atom.cause for c in causes}
+        ids = {c.hypothesis.cause for c in causes}
         for step in self.found.steps:
-            if step.taken is None or not any(c.atom.key == step.taken.atom.key for c in causes):
+            if step.taken is None or not any(
+                c.hypothesis.key == step.taken.hypothesis.key for c in causes
+            ):
                 continue
-            best = next(c for c in step.candidates if c.atom.key == step.taken.atom.key)
-            others = [c for c in step.candidates if c.atom.cause not in ids]
+            best = next(c for c in step.candidates if c.hypothesis.key == step.taken.hypothesis.key)
+            others = [c for c in step.candidates if c.hypothesis.cause not in ids]
             if len(causes) > 1:
                 best, others = instead(self.case, self.found.final, best, others)
             like = rivals(self.case.problem, self.case.held_out, best, others)
@@ -301,8 +303,8 @@ def _relative(quantities: Mapping[str, Quantity]) -> float:
 
 def _ranked(scores: Sequence[Any], candidates: Sequence[Candidate]) -> tuple[Ranked, ...]:
     # a cause whose run leaves every bound at first promises nothing that can be drawn
-    promised = {s.atom.key: max(float(s.gain), 0.0) for s in scores}
-    fitted = {c.atom.key: c for c in candidates}
+    promised = {s.hypothesis.key: max(float(s.gain), 0.0) for s in scores}
+    fitted = {c.hypothesis.key: c for c in candidates}
     keys = dict.fromkeys([*fitted, *promised])
     return tuple(
         Ranked(

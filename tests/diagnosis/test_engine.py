@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from greybox.diagnosis.atom import Atom, Parameter
 from greybox.diagnosis.base import _as_it_should_be
 from greybox.diagnosis.causes import Context, known_causes
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.held_out import long_run_variance, proof_of
+from greybox.diagnosis.hypothesis import Hypothesis, Parameter
 from greybox.diagnosis.linear import NOWHERE, sensitivities
-from greybox.diagnosis.noise import Colour, Noise, fit_noise
+from greybox.diagnosis.noise import Noise, NoiseModel, fit_noise
 from greybox.diagnosis.normal import bounded_step
 from greybox.diagnosis.point import Point
 from greybox.diagnosis.ship import Change, LogRun, Sensors, Ship, shifted, wired
@@ -184,7 +184,9 @@ def test_fit_equals_least_squares(log: TrialLog) -> None:
     point = _point(run, log)
     one = np.ones((1, 1))
     sigma = (0.014, 0.014, 0.014, 0.01)
-    white = (Colour((i,), one, 0 * one, 0 * one, s * one, s * one[0]) for i, s in enumerate(sigma))
+    white = (
+        NoiseModel((i,), one, 0 * one, 0 * one, s * one, s * one[0]) for i, s in enumerate(sigma)
+    )
     noise = Noise(tuple(white), ())
     fit = problem.fit(point, noise)
     scale = np.maximum(np.abs(point.vector()), 1e-3)
@@ -214,7 +216,9 @@ def test_bounded_step_equals_a_library() -> None:
 def test_adding_and_dropping_an_atom_changes_nothing_else(log: TrialLog) -> None:
     problem = Problem([LogRun(WIDE, log, "euler")])
     point = _point(problem.runs[0], log)
-    columns = Atom("quadratic_yaw_damping", "q", (Parameter("N_|r|r", "1", 0.0),), ("N_|r|r",))
+    columns = Hypothesis(
+        "quadratic_yaw_damping", "q", (Parameter("N_|r|r", "1", 0.0),), ("N_|r|r",)
+    )
     moved = problem.add(point, columns)
     assert len(moved.vector()) == len(point.vector()) + 1
     again = problem.drop(moved, columns)
@@ -254,10 +258,10 @@ def test_every_cause_says_what_it_is(log: TrialLog) -> None:
     for name, cause in known_causes().items():
         assert cause.id == name
         assert all([cause.title, cause.signature, cause.extension, cause.reference])
-        for atom in cause.atoms(context):
-            keys.append(atom.key)
-            told = {p.name: (p.start, 0.1) for p in atom.parameters}
-            sentence = cause.evidence(told or {atom.key.split(":", 1)[1]: (-1.0, 0.0)})
+        for hypothesis in cause.hypotheses(context):
+            keys.append(hypothesis.key)
+            told = {p.name: (p.start, 0.1) for p in hypothesis.parameters}
+            sentence = cause.evidence(told or {hypothesis.key.split(":", 1)[1]: (-1.0, 0.0)})
             assert len(sentence) > 20
     assert len(keys) == len(set(keys)) > 40
 

@@ -16,7 +16,7 @@ from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.held_out import OtherLogs, Pair, proof_of
 from greybox.diagnosis.omnibus import disagreement
 from greybox.diagnosis.scores import MOMENTS
-from greybox.diagnosis.search import Step, _sure, assess_candidate
+from greybox.diagnosis.search import Step, _wald_checked, assess_candidate
 from greybox.diagnosis.ship import LogRun
 from greybox.numerics.recursion import propagate
 from greybox.study.blind import draw
@@ -34,21 +34,23 @@ def test_a_change_counts_for_as_many_causes_as_moments_were_tried(changed: Trial
         def prove(self, before, after):
             return None
 
-    _, atom, fit = fitted(changed, MOMENT)
+    _, hypothesis, fit = fitted(changed, MOMENT)
     worse = replace(fit, cost=fit.cost + 20.0)
-    found = assess_candidate(Nowhere(), worse, fit, atom, 10)
+    found = assess_candidate(Nowhere(), worse, fit, hypothesis, 10)
     assert found.p_adjusted == pytest.approx(found.p_value * 10 * MOMENTS)
-    plain = replace(atom, parameters=tuple(replace(p, reach=0.0) for p in atom.parameters))
+    plain = replace(
+        hypothesis, parameters=tuple(replace(p, reach=0.0) for p in hypothesis.parameters)
+    )
     assert assess_candidate(Nowhere(), worse, fit, plain, 10).p_adjusted == pytest.approx(
         10 * found.p_value
     )
 
 
 def test_the_robust_covariance_must_bear_a_cause_out(changed: TrialLog) -> None:
-    problem, atom, fit = fitted(changed, MOMENT)
-    found = problem.settle(problem.scan(fit, atom), 2)
-    real = _sure(OneProblem(problem), candidate(problem, atom, found))
-    k = problem.numbers_of(found.point, atom)[0]
+    problem, hypothesis, fit = fitted(changed, MOMENT)
+    found = problem.settle(problem.scan(fit, hypothesis), 2)
+    real = _wald_checked(OneProblem(problem), candidate(problem, hypothesis, found))
+    k = problem.numbers_of(found.point, hypothesis)[0]
     numbers, covariance = problem.covariance(found)
     expected = chi2.sf((numbers[k] - 1.0) ** 2 / covariance[k, k], 1)
     assert real.holds
@@ -61,14 +63,14 @@ def test_the_robust_covariance_must_bear_a_cause_out(changed: TrialLog) -> None:
     errors = problem.errors(point)
     nu, cost = problem.whitened(found.noise, errors)
     still = replace(found, point=point, cost=cost, nu=tuple(nu), errors=tuple(errors))
-    none = _sure(OneProblem(problem), candidate(problem, atom, still))
+    none = _wald_checked(OneProblem(problem), candidate(problem, hypothesis, still))
     assert none.p_value > 0.3
     assert not none.holds
 
 
 def test_the_likelier_of_two_stories_counts_twice(changed: TrialLog) -> None:
-    problem, atom, fit = fitted(changed, MOMENT)
-    plain = problem.fit(problem.drop(fit.point, atom), fit.noise)
+    problem, hypothesis, fit = fitted(changed, MOMENT)
+    plain = problem.fit(problem.drop(fit.point, hypothesis), fit.noise)
     # two models alike on the held-out log but for a little: neither proves much
     held = OtherLogs(problem, problem)
     close = problem.fit(fit.point.at(fit.point.vector()), fit.noise)
@@ -94,15 +96,16 @@ def test_held_out_errors_have_a_colour_of_their_own(changed: TrialLog) -> None:
 def test_causes_that_take_each_others_place_end_the_search(
     changed: TrialLog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    problem, atom, fit = fitted(changed, MOMENT)
+    problem, hypothesis, fit = fitted(changed, MOMENT)
     one, two = (
-        replace(candidate(problem, atom, fit), atom=replace(atom, key=key)) for key in ("a", "b")
+        replace(candidate(problem, hypothesis, fit), hypothesis=replace(hypothesis, key=key))
+        for key in ("a", "b")
     )
     steps = []
 
-    def take(case, fit, causes, atoms):
-        steps.append([c.atom.key for c in causes])
-        taken = two if causes and causes[0].atom.key == "a" else one
+    def take(case, fit, causes, hypotheses):
+        steps.append([c.hypothesis.key for c in causes])
+        taken = two if causes and causes[0].hypothesis.key == "a" else one
         return Step(fit, (), (taken,), taken)
 
     def newest_alone(case, fit, causes, tried):
@@ -112,7 +115,7 @@ def test_causes_that_take_each_others_place_end_the_search(
     monkeypatch.setattr(searching, "_backward", newest_alone)
     found = searching.search(OneProblem(problem), fit, [])
     assert steps == [[], ["a"], ["b"]]
-    assert [c.atom.key for c in found.causes] == ["a"]
+    assert [c.hypothesis.key for c in found.causes] == ["a"]
 
 
 def test_a_run_whose_squares_leave_every_number_ends_the_fit(
@@ -129,14 +132,14 @@ def test_a_run_whose_squares_leave_every_number_ends_the_fit(
 def test_a_run_without_a_covariance_is_judged_without_it(
     changed: TrialLog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    problem, atom, fit = fitted(changed, MOMENT)
+    problem, hypothesis, fit = fitted(changed, MOMENT)
     rows = problem.rows(fit.point, fit.noise)
     monkeypatch.setattr(Problem, "rows", lambda *_: [1e200 * r for r in rows])
     numbers, covariance = problem.covariance(fit)
     assert covariance.shape == (len(numbers),) * 2
     assert np.isinf(covariance).all()
     # nothing speaks for a cause whose numbers have no covariance
-    assert _sure(OneProblem(problem), candidate(problem, atom, fit)).p_value == 1.0
+    assert _wald_checked(OneProblem(problem), candidate(problem, hypothesis, fit)).p_value == 1.0
     monkeypatch.setattr(Problem, "settle", lambda self, fit, rounds=2: replace(fit, cost=0.0))
     pair = Pair(problem, fit, problem, replace(fit, cost=60.0))
     found = disagreement([pair])

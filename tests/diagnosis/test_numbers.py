@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from changing import MOMENT, changed_log, fitted
 
-from greybox.diagnosis.atom import Atom, Parameter
 from greybox.diagnosis.held_out import proof_of
+from greybox.diagnosis.hypothesis import Hypothesis, Parameter
 from greybox.diagnosis.preparing import prepare
 from greybox.diagnosis.result import Found, Quantity
 from greybox.diagnosis.search import freed
@@ -27,12 +27,12 @@ def ready():
 def test_coefficients_and_currents_of_a_cause_have_its_bounds(ready) -> None:
     problem = ready.case.problem("rk4")
     base = ready.base()
-    (atom,) = ready.atoms
-    point = problem.add(base.point, atom)
+    (hypothesis,) = ready.hypotheses
+    point = problem.add(base.point, hypothesis)
     low, high = problem.bounds(point)
-    where = problem.numbers_of(point, atom)[: len(atom.parameters)]
-    np.testing.assert_array_equal(low[where], [p.low for p in atom.parameters])
-    np.testing.assert_array_equal(high[where], [p.high for p in atom.parameters])
+    where = problem.numbers_of(point, hypothesis)[: len(hypothesis.parameters)]
+    np.testing.assert_array_equal(low[where], [p.low for p in hypothesis.parameters])
+    np.testing.assert_array_equal(high[where], [p.high for p in hypothesis.parameters])
     # all else is free
     others = np.setdiff1d(np.arange(len(low)), where)
     assert np.isinf(low[others]).all()
@@ -46,20 +46,20 @@ def test_a_fit_stays_within_the_bounds_of_a_coefficient(ready) -> None:
     value = base.point.base.theta[problem.place(name)]
     # a bound that the logs would like to leave
     bounded = Parameter(name, "1", 0.0, low=value / 2, high=0.0)
-    atom = Atom("cubic_damping", "cubic_damping:Xu", (bounded,), columns=(name,))
-    found = problem.fit(problem.add(base.point, atom), base.noise)
+    hypothesis = Hypothesis("cubic_damping", "cubic_damping:Xu", (bounded,), columns=(name,))
+    found = problem.fit(problem.add(base.point, hypothesis), base.noise)
     assert found.point.base.theta[problem.place(name)] == pytest.approx(value / 2)
 
 
 def test_what_comes_beside_a_cause_counts_as_freed(ready) -> None:
     base = ready.base()
     problem = ready.case.problem(base.integrator)
-    (atom,) = ready.atoms
-    with_it = replace(base, point=problem.add(base.point, atom))
-    assert len(atom.beside) == 3
-    assert freed(base, with_it, atom) == 2 + 3
+    (hypothesis,) = ready.hypotheses
+    with_it = replace(base, point=problem.add(base.point, hypothesis))
+    assert len(hypothesis.co_freed) == 3
+    assert freed(base, with_it, hypothesis) == 2 + 3
     # what was free already costs nothing
-    again = replace(atom, beside=(*atom.beside, "Xu"))
+    again = replace(hypothesis, co_freed=(*hypothesis.co_freed, "Xu"))
     assert freed(base, replace(base, point=problem.add(base.point, again)), again) == 2 + 3
 
 
@@ -86,10 +86,10 @@ def test_a_derivative_beside_a_run_that_escapes_warns_nobody(monkeypatch) -> Non
     run, start = problem.runs[0], fit.point.starts[0]
     escaped = replace(run.run(fit.point.ship, start), y=np.full_like(run.y, np.inf))
     monkeypatch.setattr(run, "run", lambda *_: escaped)
-    atom = fit.point.atoms[0]
+    hypothesis = fit.point.hypotheses[0]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         vector = fit.point.vector()
-        k = problem.numbers_of(fit.point, atom)[0]
-        rows = problem._difference(fit.point, vector, run, start, k, atom, 0)
+        k = problem.numbers_of(fit.point, hypothesis)[0]
+        rows = problem._difference(fit.point, vector, run, start, k, hypothesis, 0)
     assert not np.isfinite(rows).any()

@@ -77,11 +77,11 @@ def test_registered_cause_is_named(drift_drag):
 def test_registered_cause_keeps_out_where_its_term_stands(drift_drag):
     structure = get_structure("thesis")
     context = Context(structure, load_vessel("thesis"), ("u", "v", "r"), False, 900.0, 1.0, {})
-    assert [a.key for a in drift_drag().atoms(context)] == ["drift_drag"]
+    assert [a.key for a in drift_drag().hypotheses(context)] == ["drift_drag"]
     taken = Context(
         structure.with_terms("X_vv"), context.vessel, context.outputs, False, 900.0, 1.0, {}
     )
-    assert drift_drag().atoms(taken) == []
+    assert drift_drag().hypotheses(taken) == []
 
 
 def test_classes_and_objects_register(drift_drag, monkeypatch):
@@ -120,6 +120,6 @@ def test_lacking_terms_have_the_names_that_the_extended_structure_gives_them():
     linear, vessel = get_structure("linear"), load_vessel("thesis")
     context = Context(linear, vessel, ("u", "v", "r"), False, 900.0, 1.0, {})
     for cause in known_causes().values():
-        for atom in cause.atoms(context):
-            terms = [n for n in atom.columns if not n.startswith("current_")]
-            assert set(terms) <= set(linear.with_terms(*terms).parameters), atom.key
+        for hypothesis in cause.hypotheses(context):
+            terms = [n for n in hypothesis.columns if not n.startswith("current_")]
+            assert set(terms) <= set(linear.with_terms(*terms).parameters), hypothesis.key

@@ -27,16 +27,16 @@ def changed() -> TrialLog:
 
 
 def test_a_moment_far_off_is_found_by_scanning(changed: TrialLog) -> None:
-    problem, atom, fit = fitted(changed, MOMENT - 18.0)
-    found = problem.settle(problem.scan(fit, atom), 2)
-    factor, moment = problem.scan(found, atom).point.values[0]
+    problem, hypothesis, fit = fitted(changed, MOMENT - 18.0)
+    found = problem.settle(problem.scan(fit, hypothesis), 2)
+    factor, moment = problem.scan(found, hypothesis).point.values[0]
     assert moment == pytest.approx(MOMENT, abs=2.0)
     assert factor == pytest.approx(FACTOR, rel=0.1)
 
 
 def test_the_profile_is_the_least_squares_of_the_other_numbers(changed: TrialLog) -> None:
-    problem, atom, fit = fitted(changed, MOMENT)
-    k = problem.numbers_of(fit.point, atom)[1]
+    problem, hypothesis, fit = fitted(changed, MOMENT)
+    k = problem.numbers_of(fit.point, hypothesis)[1]
     vector = fit.point.vector()
     rows = np.concatenate([r.reshape(-1, r.shape[2]) for r in problem.rows(fit.point, fit.noise)])
     others = np.delete(rows, k, axis=1)
@@ -55,11 +55,11 @@ def test_the_profile_is_the_least_squares_of_the_other_numbers(changed: TrialLog
 def test_the_interval_of_a_moment_holds_it_and_reaches_no_further_than_was_looked(
     changed: TrialLog,
 ) -> None:
-    problem, atom, fit = fitted(changed, MOMENT)
-    found = problem.settle(problem.scan(fit, atom), 2)
-    spread = problem.spread(found, atom)
+    problem, hypothesis, fit = fitted(changed, MOMENT)
+    found = problem.settle(problem.scan(fit, hypothesis), 2)
+    spread = problem.spread(found, hypothesis)
     assert set(spread) == {"Yv_time"}
-    reach = atom.parameters[1].reach
+    reach = hypothesis.parameters[1].reach
     assert 0 <= spread["Yv_time"] <= reach / 3
     assert abs(found.point.values[0][1] - MOMENT) <= 3 * spread["Yv_time"] + 1.5
 
@@ -130,8 +130,8 @@ def test_a_strong_wind_is_not_left_to_the_colour_of_the_errors() -> None:
 
 
 def test_a_fit_that_is_held_by_slow_errors_isloosened(changed: TrialLog) -> None:
-    problem, atom, fit = fitted(changed, MOMENT)
-    good = problem.settle(problem.scan(fit, atom), 2)
+    problem, hypothesis, fit = fitted(changed, MOMENT)
+    good = problem.settle(problem.scan(fit, hypothesis), 2)
     assert loosened(problem, good) is good
     slow = 0.5 * np.sin(np.arange(len(changed)) / 60)
     wrong = [np.asarray(e) + slow[:, None] for e in good.errors]

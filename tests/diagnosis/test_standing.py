@@ -43,9 +43,9 @@ def sailed():
     ready = prepare([trial.estimation], [trial.validation], None, "thesis", None)
     base = ready.base()
     problem = ready.case.problem(base.integrator)
-    atom = next(a for a in ready.atoms if a.cause == "current")
-    fit = problem.settle(problem.fit(problem.add(base.point, atom), base.noise, most=FIRST))
-    return ready, base, problem, atom, fit
+    hypothesis = next(a for a in ready.hypotheses if a.cause == "current")
+    fit = problem.settle(problem.fit(problem.add(base.point, hypothesis), base.noise, most=FIRST))
+    return ready, base, problem, hypothesis, fit
 
 
 def test_features_are_functions_of_what_they_say(sailed) -> None:
@@ -73,12 +73,12 @@ def test_heading_time_and_past_commands_are_no_part_of_the_rival(sailed) -> None
 
 
 def test_a_current_stands_because_no_force_of_motion_knows_the_heading(sailed) -> None:
-    ready, base, problem, atom, fit = sailed
+    ready, base, problem, hypothesis, fit = sailed
     held = ready.case.held_out(fit.integrator)
-    found = standing(problem, atom, fit, held.pairs(fit), held.pairs(base))
+    found = standing(problem, hypothesis, fit, held.pairs(fit), held.pairs(base))
     assert found.stands
     assert found.share is None
-    assert found.moved.shape == (len(problem.numbers_of(fit.point, atom)),)
+    assert found.moved.shape == (len(problem.numbers_of(fit.point, hypothesis)),)
 
 
 def test_a_generic_force_takes_most_of_what_no_term_is_there_for() -> None:
@@ -96,14 +96,14 @@ def test_a_generic_force_takes_most_of_what_no_term_is_there_for() -> None:
 
 def test_own_arguments_are_those_of_the_terms_factors(sailed) -> None:
     ready, _, problem, _, _ = sailed
-    atoms = {a.key: a for a in ready.atoms}
-    use = _own_arguments(problem, atoms["cubic_damping:X_uuu"])
+    hypotheses = {a.key: a for a in ready.hypotheses}
+    use = _own_arguments(problem, hypotheses["cubic_damping:X_uuu"])
     assert use is not None
     assert use("u", frozenset({"u"}))
     assert not use("u", frozenset({"u", "v"}))
     assert not use("r", frozenset({"u"}))
-    assert _own_arguments(problem, atoms["current"]) is None
-    assert _own_arguments(problem, atoms["thruster_lag:force"]) is None
+    assert _own_arguments(problem, hypotheses["current"]) is None
+    assert _own_arguments(problem, hypotheses["thruster_lag:force"]) is None
 
 
 def test_a_search_without_causes_is_left_as_it_is(sailed) -> None:

@@ -10,7 +10,7 @@ from typing import ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.atom import Atom
+from greybox.diagnosis.hypothesis import Hypothesis
 from greybox.model.structure import Structure
 from greybox.notebook import DisplayMixin, table
 from greybox.vessel.vessel import Vessel
@@ -74,7 +74,7 @@ class Context:
 class Cause(DisplayMixin):
     """A reason why a simulation may disagree with the sea.
 
-    A subclass states the class variables and gives its atoms. It becomes known to
+    A subclass states the class variables and gives its hypotheses. It becomes known to
     every diagnosis by an entry point of the group ``greybox.causes``.
 
     Attributes
@@ -116,7 +116,7 @@ class Cause(DisplayMixin):
         return (table(("what", "is"), self._said()),)
 
     @abstractmethod
-    def atoms(self, context: Context) -> Sequence[Atom]:
+    def hypotheses(self, context: Context) -> Sequence[Hypothesis]:
         """Return the ways in which this cause may be at work; none where it cannot."""
 
     @abstractmethod

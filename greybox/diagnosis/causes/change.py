@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.atom import Atom, Parameter
 from greybox.diagnosis.causes.cause import Cause, Context
+from greybox.diagnosis.hypothesis import Hypothesis, Parameter
 from greybox.diagnosis.ship import Change, Ship
 
 Array = NDArray[np.float64]
@@ -31,7 +31,7 @@ class ParameterChange(Cause):
     extension = "the coefficient with its value before and after that moment"
     reference = "Andrews (1993)"
 
-    def atoms(self, context: Context) -> Sequence[Atom]:
+    def hypotheses(self, context: Context) -> Sequence[Hypothesis]:
         """Return one a coefficient; where in time, a scan has to tell."""
         out = []
         for i, term in enumerate(context.structure.terms):
@@ -49,7 +49,7 @@ class ParameterChange(Cause):
                     reach=_REACH * context.duration,
                 ),
             )  # fmt: skip
-            out.append(Atom(self.id, f"{self.id}:{term.name}", parameters, (), apply))
+            out.append(Hypothesis(self.id, f"{self.id}:{term.name}", parameters, (), apply))
         return out
 
     def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from greybox.diagnosis.atom import Atom, Parameter
 from greybox.diagnosis.causes.cause import Cause, Context
+from greybox.diagnosis.hypothesis import Hypothesis, Parameter
 from greybox.model.terms import parameter_unit, parse_term
 
 # no current is stronger [m/s]
@@ -27,12 +27,12 @@ class Current(Cause):
     extension = "the mean current, north and east; forces see the velocity through the water"
     reference = "Ljungberg (2020), eq. 5.2; Fossen (2011), section 8.3"
 
-    def atoms(self, context: Context) -> Sequence[Atom]:
+    def hypotheses(self, context: Context) -> Sequence[Hypothesis]:
         """Return the two components together."""
         if context.current_known or not context.structure.marine:
             return ()
         return (
-            Atom(
+            Hypothesis(
                 self.id, self.id,
                 tuple(
                     Parameter(n, "m/s", 0.0, -_STRONGEST, _STRONGEST)
@@ -40,7 +40,7 @@ class Current(Cause):
                 ),
                 columns=("current_north", "current_east"),
                 # in still air the hull feels its velocity over ground, not through the water
-                beside=() if context.has_wind else context.lacking("Wuu", "Wvv", "Wuv"),
+                co_freed=() if context.has_wind else context.lacking("Wuu", "Wvv", "Wuv"),
             ),
         )  # fmt: skip
 
@@ -64,14 +64,14 @@ class Wind(Cause):
     extension = "the wind terms of (3.51) on the measured velocity through the air"
     reference = "Ljungberg (2020), eq. 3.51; Blendermann (1994)"
 
-    def atoms(self, context: Context) -> Sequence[Atom]:
+    def hypotheses(self, context: Context) -> Sequence[Hypothesis]:
         """Return the lacking wind terms together, where the wind was measured."""
         lacking = context.lacking("Wuu", "Wvv", "Wuv") if context.has_wind else ()
         if not lacking:
             return ()
         unit = context.vessel.force_unit
         return (
-            Atom(
+            Hypothesis(
                 self.id, self.id,
                 tuple(Parameter(n, parameter_unit(parse_term(n), unit), 0.0) for n in lacking),
                 columns=lacking,

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from greybox.diagnosis.atom import Atom, Parameter
 from greybox.diagnosis.causes.cause import Cause, Context
+from greybox.diagnosis.hypothesis import Hypothesis, Parameter
 from greybox.model.terms import parameter_unit, parse_term
 
 _WORDS = {"u": "surge", "v": "sway", "r": "yaw"}
 
 
-def term_atom(cause: str, names: Sequence[str], context: Context) -> Atom:
-    """Return an atom of terms that enter together."""
+def term_hypothesis(cause: str, names: Sequence[str], context: Context) -> Hypothesis:
+    """Return a hypothesis of terms that enter together."""
     unit = context.vessel.force_unit
     parameters = tuple(Parameter(n, parameter_unit(parse_term(n), unit), 0.0) for n in names)
-    return Atom(cause, f"{cause}:{'+'.join(names)}", parameters, columns=tuple(names))
+    return Hypothesis(cause, f"{cause}:{'+'.join(names)}", parameters, columns=tuple(names))
 
 
 def listed(values: Mapping[str, tuple[float, float]]) -> str:
@@ -38,10 +38,11 @@ class CubicDamping(Cause):
     extension = "a term in the cube of surge, sway or yaw rate"
     reference = "Abkowitz (1964)"
 
-    def atoms(self, context: Context) -> Sequence[Atom]:
+    def hypotheses(self, context: Context) -> Sequence[Hypothesis]:
         """Return one an equation."""
         return [
-            term_atom(self.id, (n,), context) for n in context.lacking("X_uuu", "Y_vvv", "N_rrr")
+            term_hypothesis(self.id, (n,), context)
+            for n in context.lacking("X_uuu", "Y_vvv", "N_rrr")
         ]
 
     def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
@@ -59,9 +60,9 @@ class QuadraticYawDamping(Cause):
     extension = "the term N_|r|r"
     reference = "Fedyaevsky and Sobolev (1964); Norrbin (1970)"
 
-    def atoms(self, context: Context) -> Sequence[Atom]:
+    def hypotheses(self, context: Context) -> Sequence[Hypothesis]:
         """Return the term, where the structure lacks it."""
-        return [term_atom(self.id, (n,), context) for n in context.lacking("N_|r|r")]
+        return [term_hypothesis(self.id, (n,), context) for n in context.lacking("N_|r|r")]
 
     def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
         """Say its size."""
@@ -78,12 +79,12 @@ class Crossflow(Cause):
     extension = "terms in |r|v, |v|r, |v|v or |r|r"
     reference = "Fossen (2011), section 6.4.3; Hooft (1994)"
 
-    def atoms(self, context: Context) -> Sequence[Atom]:
+    def hypotheses(self, context: Context) -> Sequence[Hypothesis]:
         """Return one a term."""
         names = context.lacking(
             "Y_|v|v", "Y_|v|r", "Y_|r|v", "Y_|r|r", "N_|v|v", "N_|v|r", "N_|r|v"
         )
-        return [term_atom(self.id, (n,), context) for n in names]
+        return [term_hypothesis(self.id, (n,), context) for n in names]
 
     def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
         """Say in which equation."""
@@ -103,10 +104,10 @@ class SideForce(Cause):
     extension = "constants in the sway and yaw equations"
     reference = "Fossen (2011), section 10.1"
 
-    def atoms(self, context: Context) -> Sequence[Atom]:
+    def hypotheses(self, context: Context) -> Sequence[Hypothesis]:
         """Return both constants together."""
         names = context.lacking("Y_0", "N_0")
-        return [term_atom(self.id, names, context)] if names else []
+        return [term_hypothesis(self.id, names, context)] if names else []
 
     def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
         """Say their sizes."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from greybox.diagnosis.atom import Atom
 from greybox.diagnosis.causes.cause import Cause, Context
+from greybox.diagnosis.hypothesis import Hypothesis
 
 
 class Waves(Cause):
@@ -18,7 +18,7 @@ class Waves(Cause):
     extension = "none in the equations: motion at that frequency is the sea's, not the model's"
     reference = "Fossen (2011), section 8.2"
 
-    def atoms(self, context: Context) -> Sequence[Atom]:
+    def hypotheses(self, context: Context) -> Sequence[Hypothesis]:
         """Return none: the spectrum of the innovations tells, no parameter of a run."""
         return ()
 

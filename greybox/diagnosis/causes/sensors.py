@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.atom import Atom, Parameter
 from greybox.diagnosis.causes.cause import Cause, Context
+from greybox.diagnosis.hypothesis import Hypothesis, Parameter
 from greybox.diagnosis.ship import Ship, Wire
 
 Array = NDArray[np.float64]
@@ -34,7 +34,7 @@ class HeadingBias(Cause):
     extension = "the bias of the compass in the vessel; logs are turned back when read"
     reference = "Fossen (2011), section 2.2"
 
-    def atoms(self, context: Context) -> Sequence[Atom]:
+    def hypotheses(self, context: Context) -> Sequence[Hypothesis]:
         """Return the turn of u and v."""
         if not _has_velocities(context):
             return ()
@@ -43,7 +43,7 @@ class HeadingBias(Cause):
             return replace(ship, sensors=replace(ship.sensors, turned=float(value[0])))
 
         parameter = Parameter("heading_bias", "rad", 0.0, -np.pi / 2, np.pi / 2)
-        return (Atom(self.id, self.id, (parameter,), (), apply),)
+        return (Hypothesis(self.id, self.id, (parameter,), (), apply),)
 
     def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
         """Say by how much."""
@@ -64,7 +64,7 @@ class LeverArm(Cause):
     extension = "the place of the antenna in the vessel"
     reference = "Fossen (2011), section 2.2"
 
-    def atoms(self, context: Context) -> Sequence[Atom]:
+    def hypotheses(self, context: Context) -> Sequence[Hypothesis]:
         """Return both coordinates together."""
         if not _has_velocities(context):
             return ()
@@ -76,7 +76,7 @@ class LeverArm(Cause):
 
         names = ("lever_arm_x", "lever_arm_y")
         parameters = tuple(Parameter(n, "m", 0.0, -most, most, step=1e-3) for n in names)
-        return (Atom(self.id, self.id, parameters, (), apply),)
+        return (Hypothesis(self.id, self.id, parameters, (), apply),)
 
     def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
         """Say where the antenna is."""
@@ -97,7 +97,7 @@ class ClockOffset(Cause):
     extension = "the latency of the channel in the vessel; logs are shifted back when read"
     reference = "Ljung (1999), section 14.3"
 
-    def atoms(self, context: Context) -> Sequence[Atom]:
+    def hypotheses(self, context: Context) -> Sequence[Hypothesis]:
         """Return one a channel."""
         most = min(_LATEST, 0.1 * context.duration)
         out = []
@@ -112,7 +112,7 @@ class ClockOffset(Cause):
                 step=0.1 * context.sample_time, least=UNRESOLVED * context.sample_time,
             )  # fmt: skip
             out.append(
-                Atom(
+                Hypothesis(
                     self.id, f"{self.id}:{name}", (parameter,), (), apply,
                     starts=((3 * context.sample_time,), (-2 * context.sample_time,)),
                 )
@@ -138,7 +138,7 @@ class Sign(Cause):
     extension = "the channel with its sign turned"
     reference = "Fossen (2011), table 2.1"
 
-    def atoms(self, context: Context) -> Sequence[Atom]:
+    def hypotheses(self, context: Context) -> Sequence[Hypothesis]:
         """Return each channel reversed, and commands of one kind exchanged."""
         out = [_reversed(self.id, n) for n in context.outputs]
         commands = context.vessel.commands
@@ -161,16 +161,16 @@ class Sign(Cause):
         return f"{name.removeprefix('sign_')} has the opposite sign of what the motion shows"
 
 
-def _reversed(cause: str, name: str) -> Atom:
+def _reversed(cause: str, name: str) -> Hypothesis:
     def apply(ship: Ship, value: Array) -> Ship:
         turned = (*ship.sensors.reversed, name)
         return replace(ship, sensors=replace(ship.sensors, reversed=turned))
 
-    return Atom(cause, f"{cause}:sign_{name}", (), (), apply, afresh=True)
+    return Hypothesis(cause, f"{cause}:sign_{name}", (), (), apply, refit_from_scratch=True)
 
 
-def _wired(cause: str, key: str, wires: tuple[Wire, ...]) -> Atom:
+def _wired(cause: str, key: str, wires: tuple[Wire, ...]) -> Hypothesis:
     def apply(ship: Ship, value: Array) -> Ship:
         return replace(ship, wires=(*ship.wires, *wires))
 
-    return Atom(cause, f"{cause}:{key}", (), (), apply, afresh=True)
+    return Hypothesis(cause, f"{cause}:{key}", (), (), apply, refit_from_scratch=True)

@@ -9,10 +9,10 @@ from typing import get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.atom import Atom, Parameter
 from greybox.diagnosis.causes.cause import Cause, Context
-from greybox.diagnosis.causes.hull import listed, term_atom
+from greybox.diagnosis.causes.hull import listed, term_hypothesis
 from greybox.diagnosis.causes.sensors import UNRESOLVED
+from greybox.diagnosis.hypothesis import Hypothesis, Parameter
 from greybox.diagnosis.ship import Ship
 from greybox.vessel.vessel import LagHeld, LagOn, Thruster
 
@@ -50,7 +50,7 @@ class ThrusterGain(Cause):
     extension = "the thruster's gain in the vessel"
     reference = "Fossen (2011), section 12.3"
 
-    def atoms(self, context: Context) -> Sequence[Atom]:
+    def hypotheses(self, context: Context) -> Sequence[Hypothesis]:
         """Return one a thruster, where there are several to compare with."""
         if len(context.vessel.thrusters) < 2:
             return ()
@@ -64,7 +64,7 @@ class ThrusterGain(Cause):
             name = f"gain_{thruster.speed}"
             key = f"{self.id}:{thruster.speed}:{_steered_by(thruster) or i}"
             out.append(
-                Atom(
+                Hypothesis(
                     self.id, key, (Parameter(name, "1", 0.85, 0.0, 1.0, 1.0),), (), apply,
                     arguments=_driven_by(thruster),
                 )
@@ -90,7 +90,7 @@ class ThrusterLag(Cause):
     extension = "a first-order lag between commands and forces"
     reference = "Fossen (2011), section 9.1"
 
-    def atoms(self, context: Context) -> Sequence[Atom]:
+    def hypotheses(self, context: Context) -> Sequence[Hypothesis]:
         """Return a lag of the forces, the propeller speeds, or all commands."""
         longest = min(_LONGEST, _SHARE * context.duration)
         first = 2 * context.sample_time
@@ -98,12 +98,12 @@ class ThrusterLag(Cause):
             "lag", "s", first, 1e-3, longest, step=1e-3, least=UNRESOLVED * context.sample_time
         )
 
-        def lag(on: LagOn, held: LagHeld, variants: tuple[Atom, ...] = ()) -> Atom:
+        def lag(on: LagOn, held: LagHeld, variants: tuple[Hypothesis, ...] = ()) -> Hypothesis:
             def apply(ship: Ship, value: Array) -> Ship:
                 late = replace(ship.vessel.actuation, lag=float(value[0]), lag_on=on, lag_held=held)
                 return replace(ship, vessel=replace(ship.vessel, actuation=late))
 
-            return Atom(
+            return Hypothesis(
                 self.id, f"{self.id}:{on}", (parameter,), (), apply, ((4 * first,),), variants
             )
 
@@ -127,7 +127,7 @@ class InputDelay(Cause):
     extension = "a delay of all commands"
     reference = "Ljung (1999), section 14.3"
 
-    def atoms(self, context: Context) -> Sequence[Atom]:
+    def hypotheses(self, context: Context) -> Sequence[Hypothesis]:
         """Return one delay of all commands."""
         longest = min(_LONGEST, _SHARE * context.duration)
 
@@ -139,7 +139,9 @@ class InputDelay(Cause):
         parameter = Parameter("delay", "s", first, 0.0, longest, step=0.1 * context.sample_time,
                               least=UNRESOLVED * context.sample_time)  # fmt: skip
         return (
-            Atom(self.id, self.id, (parameter,), (), apply, starts=((3 * first,), (6 * first,))),
+            Hypothesis(
+                self.id, self.id, (parameter,), (), apply, starts=((3 * first,), (6 * first,))
+            ),
         )
 
     def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
@@ -158,7 +160,7 @@ class QuadraticThrust(Cause):
     extension = "a share of n|n| in the thrust law"
     reference = "Fossen (2011), section 9.1"
 
-    def atoms(self, context: Context) -> Sequence[Atom]:
+    def hypotheses(self, context: Context) -> Sequence[Hypothesis]:
         """Return one share for all thrusters with a linear law."""
         linear = [
             i for i, t in enumerate(context.vessel.thrusters)
@@ -181,7 +183,7 @@ class QuadraticThrust(Cause):
 
         parameter = Parameter("quadratic_share", "1", 0.3, 0.0, 1.0)
         driven = dict.fromkeys(c for i in linear for c in _driven_by(context.vessel.thrusters[i]))
-        return (Atom(self.id, self.id, (parameter,), (), apply, arguments=tuple(driven)),)
+        return (Hypothesis(self.id, self.id, (parameter,), (), apply, arguments=tuple(driven)),)
 
     def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
         """Say the share."""
@@ -202,7 +204,7 @@ class AngleOffset(Cause):
     extension = "the offset of the thruster's angle in the vessel"
     reference = "Ljungberg (2020), eq. 3.46"
 
-    def atoms(self, context: Context) -> Sequence[Atom]:
+    def hypotheses(self, context: Context) -> Sequence[Hypothesis]:
         """Return one a steered thruster."""
         out = []
         for i, thruster in enumerate(context.vessel.thrusters):
@@ -216,7 +218,9 @@ class AngleOffset(Cause):
 
             parameter = Parameter(f"offset_{column}", "rad", 0.0, -0.8, 0.8)
             key = f"{self.id}:{column}:{i}"
-            out.append(Atom(self.id, key, (parameter,), (), apply, arguments=_driven_by(thruster)))
+            out.append(
+                Hypothesis(self.id, key, (parameter,), (), apply, arguments=_driven_by(thruster))
+            )
         return out
 
     def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
@@ -238,11 +242,11 @@ class AdvanceSpeed(Cause):
     extension = "products of the surge velocity with the thrust"
     reference = "Blanke (1981); Fossen (2011), section 9.1"
 
-    def atoms(self, context: Context) -> Sequence[Atom]:
+    def hypotheses(self, context: Context) -> Sequence[Hypothesis]:
         """Return the lacking products, one by one and together."""
         names = context.lacking("X_u*taux", "Y_u*tauy", "N_u*taun")
-        singles = [term_atom(self.id, (n,), context) for n in names]
-        return singles + ([term_atom(self.id, names, context)] if len(names) > 1 else [])
+        singles = [term_hypothesis(self.id, (n,), context) for n in names]
+        return singles + ([term_hypothesis(self.id, names, context)] if len(names) > 1 else [])
 
     def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
         """Say the coefficients."""

@@ -52,7 +52,7 @@ class Parameter:
 
 
 @dataclass(frozen=True)
-class Atom:
+class Hypothesis:
     """A cause with its place: which thruster, which coefficient, which channel.
 
     Parameters
@@ -60,7 +60,7 @@ class Atom:
     cause : str
         Id of the cause.
     key : str
-        Unique among all atoms, such as ``thruster_gain:n1``.
+        Unique among all hypotheses, such as ``thruster_gain:n1``.
     parameters : tuple of Parameter
     columns : tuple of str
         Coefficients or currents that the parameters are, in their order; empty
@@ -69,15 +69,15 @@ class Atom:
         ``(ship, values) -> ship``.
     starts : tuple of tuple of float
         Further values to begin from, where the likelihood has several hills.
-    beside : tuple of str
+    co_freed : tuple of str
         Coefficients that become free with the cause, because without it others imitate
         them.
-    variants : tuple of Atom
+    variants : tuple of Hypothesis
         The same with other conventions of sampling, of which the likeliest is kept.
     arguments : tuple of str
         Columns of commands that its force is a function of at the same moment, where it has an
         `apply` and is one.
-    afresh : bool
+    refit_from_scratch : bool
         Whether the coefficients must be sought anew: what it changes is too much for
         derivatives.
     """
@@ -88,10 +88,10 @@ class Atom:
     columns: tuple[str, ...] = ()
     apply: Callable[[Ship, Array], Ship] | None = None
     starts: tuple[tuple[float, ...], ...] = ()
-    variants: tuple[Atom, ...] = ()
-    beside: tuple[str, ...] = ()
+    variants: tuple[Hypothesis, ...] = ()
+    co_freed: tuple[str, ...] = ()
     arguments: tuple[str, ...] = ()
-    afresh: bool = False
+    refit_from_scratch: bool = False
 
     @property
     def start(self) -> Array:
