@@ -26,7 +26,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--model",
         metavar="MODEL",
-        help="model to diagnose; by default (3.51) in still water and air, estimated on the logs",
+        help="model to diagnose as it is; by default (3.51) in still water and air, estimated on "
+        "the logs, and the terms that the data choose",
     )
     parser.add_argument(
         "--validate",

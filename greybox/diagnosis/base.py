@@ -206,6 +206,20 @@ class Case:
         yield lambda: steady(self.structure, self.logs, self.regime), True
         yield lambda: careful(*case, self.kind, self.regime), True
 
+    def as_given(
+        self, coefficients: Mapping[str, float], current: Array, integrator: Integrator
+    ) -> Fit | None:
+        """Return a model as it is, its starts alone fitted; None where its run has no bound."""
+        problem = self.problem(integrator)
+        theta = np.array([coefficients.get(n, 0.0) for n in self.universe.parameters])
+        starts = tuple(run.start() for run in problem.runs)
+        point = Point(Ship(theta, current, self.logs[0].vessel), starts, ())
+        errors = problem.errors(point)
+        if not all(np.isfinite(e).all() for e in errors):
+            return None
+        noise = fit_noise(errors, problem.poles(point), problem.sample_time, problem.groups)
+        return replace(problem.settle(problem.fit(point, noise), 2), integrator=integrator)
+
     def _fit(
         self,
         coefficients: Mapping[str, float],

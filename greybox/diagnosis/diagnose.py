@@ -62,7 +62,8 @@ def diagnose(
         To estimate on.
     model : ManoeuvringModel, optional
         To diagnose; by default (3.51) in still water and air, estimated on the logs.
-        Its coefficients are estimated anew, so that a cause is what they cannot mend.
+        It is judged as it is; beside a cause its coefficients are estimated anew, so that a
+        cause is what they cannot mend.
     validate : sequence of TrialLog
         Where causes prove themselves and the gain is measured; parts of `logs` held out
         in turn by default.
@@ -95,7 +96,7 @@ def diagnose(
     problem = case.problem(base.integrator)
     found = search(case, base, ready.hypotheses, progress=options.progress)
     say("a generic force beside the causes")
-    found = weighed(case, found)
+    found = replace(weighed(case, found), given=ready.as_given())
     if model is None and leaves_more(found, case.held_out):
         chosen = from_chosen(ready, found, say)
         if chosen is not None:
@@ -104,7 +105,7 @@ def diagnose(
             problem = case.problem(found.base.integrator)
     say("what is left")
     names, final = problem.runs[0].outputs, found.final
-    lines = [find_waves(f.nu, f.errors, names, problem.sample_time) for f in (base, final)]
+    lines = [find_waves(f.nu, f.errors, names, problem.sample_time) for f in (found.before, final)]
     say("gain")
     notes = []
     if ready.short:

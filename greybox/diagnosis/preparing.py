@@ -69,8 +69,18 @@ class Prepared:
         model = self.model
         if model is None:
             return self.case.base(None, np.zeros(2))
-        known = dict(zip(model.names, map(float, model.theta), strict=True))
-        return self.case.base(known, model.d[:2])
+        return self.case.base(self._coefficients(model), model.d[:2])
+
+    def as_given(self) -> Fit | None:
+        """Return the model as it was given; None where there is none, or its run has no bound."""
+        model = self.model
+        if model is None:
+            return None
+        return self.case.as_given(self._coefficients(model), model.d[:2], model.integrator)
+
+    @staticmethod
+    def _coefficients(model: ManoeuvringModel) -> dict[str, float]:
+        return dict(zip(model.names, map(float, model.theta), strict=True))
 
 
 def prepare(

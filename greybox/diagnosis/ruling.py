@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.held_out import HeldOut, Pair
+from greybox.diagnosis.held_out import HeldOut, Pair, proof_of
 from greybox.diagnosis.omnibus import Omnibus, disagreement, omnibus
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.result import DiagnosisVerdict, Found, Gain
@@ -93,10 +93,13 @@ def rule(
         )
         final, stand, leaning, groups = found.base, (), (*stand, *leaning), ()
     pairs = held_out(final.integrator).pairs(final)
-    first = omnibus(held_out(found.base.integrator).pairs(found.base))
+    diagnosed = held_out(found.before.integrator).pairs(found.before)
+    first = omnibus(diagnosed)
     left = omnibus(pairs)
     explained = _explained(found, held_out) if stand else 0.0
     why = _wrong(found.base, final, pairs, left, explained, bool(stand))
+    if found.given is not None and not why:
+        why = _other_coefficients(diagnosed, held_out(found.base.integrator).pairs(found.base))
     named = tuple(c for c in stand if not _grouped(c, groups))
     if named or known:
         verdict = DiagnosisVerdict.PARTLY if why else DiagnosisVerdict.NAMED
@@ -149,6 +152,31 @@ def _wrong(
             f"({GUST:g} s): a current that changes, or something that no cause stands for"
         )
     return _no_prediction(pairs)
+
+
+def _other_coefficients(given: Sequence[Pair], anew: Sequence[Pair]) -> str:
+    """Return how far the coefficients of a given model are from those that the logs ask for."""
+    if any(p.held_fit.escaped for p in given):
+        return "the model as it was given leaves every bound on these logs"
+    if any(p.held_fit.escaped for p in anew):
+        return ""
+    one, two = (
+        np.concatenate([c for p in pairs for c in p.held.contributions(p.held_fit)])
+        for pairs in (given, anew)
+    )
+    count = len(given[0].held.structure.states)
+    squares = [
+        sum((e[:, :count] ** 2).sum(axis=0) for p in pairs for e in p.held_fit.errors)
+        for pairs in (given, anew)
+    ]
+    fall = 1 - float(np.min(squares[1] / np.maximum(squares[0], 1e-300)))
+    proof = proof_of(one - two)
+    if proof.p_value > APART or fall < WORTH:
+        return ""
+    return (
+        f"estimated anew, the coefficients of the model lower the squared error of the held-out "
+        f"logs by {100 * fall:.0f} %: those that it was given do not hold here"
+    )
 
 
 def _no_prediction(pairs: Sequence[Pair]) -> str:

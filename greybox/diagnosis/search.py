@@ -136,6 +136,8 @@ class Search:
         In the order found, without those that later ones made needless.
     tried : int
         Hypotheses that were scored.
+    given : Fit or None
+        The model as it was given, no coefficient of it estimated; None where there was none.
     leaning : tuple of Candidate
         Causes that help, and do no more than a generic force would: no part of `final`.
     without : tuple of Fit
@@ -147,8 +149,14 @@ class Search:
     steps: tuple[Step, ...]
     causes: tuple[Candidate, ...]
     tried: int
+    given: Fit | None = None
     leaning: tuple[Candidate, ...] = ()
     without: tuple[Fit, ...] = ()
+
+    @property
+    def before(self) -> Fit:
+        """What is diagnosed: the model as it was given, or else the fit without causes."""
+        return self.base if self.given is None else self.given
 
     def proof(self, held_out: Callable[[Integrator], HeldOut]) -> float:
         """Return the fall of −2 log L of held-out logs by all causes, each fit as it is run."""

@@ -131,15 +131,16 @@ class Report:
         members = [c for pair in groups for c in pair]
         alternatives = {c.hypothesis.cause: self.model(c.fit, self.record((c,))) for c in members}
         notes = [*self._notes(after), *ruling.notes]
-        problem = case.problem(found.base.integrator)
         return Diagnosis(
             verdict=ruling.verdict,
             causes=(*known, *(self.cause(c, final) for c in ruling.named)),
             groups=tuple(tuple(c.hypothesis.cause for c in pair) for pair in groups),
             gain=gain,
-            wrong=_symptoms(problem, found),
+            wrong=_symptoms(case.problem(found.before.integrator), found),
             residuals={
-                "before": residual_tests(problem, found.base, ruling.before, lines[0]),
+                "before": residual_tests(
+                    case.problem(found.before.integrator), found.before, ruling.before, lines[0]
+                ),
                 "after": residual_tests(
                     case.problem(final.integrator), final, ruling.omnibus, lines[1]
                 ),
@@ -182,7 +183,7 @@ class Report:
         problem = self.case.problem(final.integrator)
         numbers -= {i for c in found.causes for i in problem.numbers_at(c.hypothesis)}
         return error_budget(
-            run(found.base), run(final), causes, waves, self.seed, nameless=bool(numbers)
+            run(found.before), run(final), causes, waves, self.seed, nameless=bool(numbers)
         )
 
     def record(self, causes: Sequence[Candidate]) -> dict[str, Any]:
@@ -275,8 +276,8 @@ class Report:
         out = list(self.notes)
         if self.given is not None:
             out.append(
-                "the coefficients of the model were estimated anew on these logs before causes "
-                "were judged; 'before' is the model as it was given."
+                "the model is judged as it was given, which is 'before'; beside a cause its "
+                "coefficients are estimated anew, so that a cause is what they cannot mend."
             )
         turned = backwards(self.found.final, self.case.universe.parameters)
         if turned:
@@ -349,7 +350,7 @@ def _as_shown(before: LogFit, after: LogFit) -> dict[str, Array]:
 
 
 def _symptoms(problem: Problem, found: Search) -> tuple[Symptom, ...]:
-    told = find_symptoms(problem, found.base)
+    told = find_symptoms(problem, found.before)
     if not told and found.causes:
         told = [
             Symptom(

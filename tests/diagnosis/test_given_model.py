@@ -1,0 +1,44 @@
+"""A model that was given is judged as it is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from greybox.diagnosis.diagnose import DiagnosisOptions, diagnose
+from greybox.study.blind import draw
+
+QUICK = DiagnosisOptions(causes=["current"])
+
+
+@pytest.fixture(scope="module")
+def sailed():
+    trial = draw(np.random.default_rng([3, 11]), samples=900)
+    found = diagnose([trial.estimation], validate=[trial.validation], options=QUICK)
+    assert found.verdict == "none"
+    return trial, found.model
+
+
+def test_the_model_of_these_logs_has_nothing_wrong(sailed) -> None:
+    trial, model = sailed
+    found = diagnose([trial.estimation], model=model, validate=[trial.validation], options=QUICK)
+    assert found.verdict == "none"
+    assert found.model.theta.tolist() == model.theta.tolist()
+    assert any("judged as it was given" in n for n in found.notes)
+
+
+def test_coefficients_that_do_not_hold_here_are_wrong(sailed) -> None:
+    trial, model = sailed
+    scale = np.ones(len(model.theta))
+    scale[model.names.index("Nr")] = 1.4
+    other = replace(model, theta=model.theta * scale)
+    found = diagnose([trial.estimation], model=other, validate=[trial.validation], options=QUICK)
+    assert found.verdict == "unexplained"
+    assert "estimated anew, the coefficients of the model lower the squared error" in (
+        found.remaining
+    )
+    # what is told to be wrong is of the model as it is, not of one that was mended
+    assert any("yaw rate" in s.sentence for s in found.wrong)
+    assert found.model.theta.tolist() == other.theta.tolist()
