@@ -37,7 +37,8 @@ class Standing:
     moved : ndarray
         How far each of its numbers moves when the generic force joins.
     clear : float
-        p-value of the null (Wald), what it moves by counted as uncertainty.
+        p-value of the null (Wald), where it is and where the generic force moves it to, the
+        larger.
     """
 
     beyond: Proof
@@ -99,7 +100,7 @@ def _moved(
         return np.zeros(len(where)), 0.0
     moved = np.mean([generic_force(p).moved[where] for p in bounded], axis=0)
     numbers, covariance = problem.covariance(fit)
-    own = covariance[np.ix_(where, where)] + np.outer(moved, moved)
+    own = covariance[np.ix_(where, where)]
     null = np.zeros(len(where))
     tested = np.ones(len(where), bool)
     if hypothesis.apply is not None:
@@ -108,8 +109,9 @@ def _moved(
         tested = np.array([p.reach == 0 for p in hypothesis.parameters])
     if not np.isfinite(own).all() or not tested.any():
         return np.abs(moved), 1.0 if tested.any() else 0.0
-    away = (numbers[where] - null)[tested]
-    wald = float(away @ np.linalg.pinv(own[np.ix_(tested, tested)]) @ away)
+    inverse = np.linalg.pinv(own[np.ix_(tested, tested)])
+    ends = (numbers[where] - null, numbers[where] + moved - null)
+    wald = min(float(away[tested] @ inverse @ away[tested]) for away in ends)
     return np.abs(moved), float(chi2.sf(wald, int(tested.sum())))
 
 

@@ -171,19 +171,18 @@ class Report:
         def run(fit: Fit) -> Sequence[Pair]:
             return held_out(fit.integrator).pairs(fit)
 
+        problem = self.case.problem(final.integrator)
+        more = set(final.point.places) - set(found.base.point.places)
+        nameless = bool(more - {i for c in found.causes for i in problem.numbers_at(c.hypothesis)})
         causes = []
         for c in named:
             others = [fit for key, fit in own.items() if key != c.hypothesis.key]
-            # of two causes each is alone where the other is left out
-            alone = [final, *others][-1]
-            first = run(alone) if len(others) < 2 else ()
+            # of two causes each is alone where the other is left out, and no term stays beside
+            alone = run([final, *others][-1]) if len(others) < 2 and not nameless else ()
             relative = _relative(self.quantities(c, final))
-            causes.append(Taken(c.hypothesis.cause, run(own[c.hypothesis.key]), first, relative))
-        numbers = set(final.point.places) - set(found.base.point.places)
-        problem = self.case.problem(final.integrator)
-        numbers -= {i for c in found.causes for i in problem.numbers_at(c.hypothesis)}
+            causes.append(Taken(c.hypothesis.cause, run(own[c.hypothesis.key]), alone, relative))
         return error_budget(
-            run(found.before), run(final), causes, waves, self.seed, nameless=bool(numbers)
+            run(found.before), run(final), causes, waves, self.seed, nameless=nameless
         )
 
     def record(self, causes: Sequence[Candidate]) -> dict[str, Any]:
