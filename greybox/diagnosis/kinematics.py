@@ -79,8 +79,11 @@ def found_by_checks(finding: Finding, cause: Cause, tried: int) -> Found:
         parameters[name] = Quantity(float(value), float(std), finding.unit)
         z = max(z, abs(value) / std)
     p = float(2 * norm.sf(min(z, 37.0)))
+    # of two late clocks, or reversed channels, each has its place
+    place = () if finding.id in _NAMES else finding.channels or (finding.channel,)
+    key = ":".join([finding.id, *place, "kinematics"])
     return Found(
-        finding.id, f"{finding.id}:kinematics", cause.title, parameters, p, min(1.0, p * tried),
+        finding.id, key, cause.title, parameters, p, min(1.0, p * tried),
         finding.evidence, cause.extension, cause.reference,
     )  # fmt: skip
 
@@ -108,9 +111,10 @@ def mended(vessel: Vessel, findings: Sequence[Finding]) -> Vessel:
 
 
 def causes_of(findings: Sequence[Finding], causes: Mapping[str, Cause], tried: int) -> list[Found]:
-    """Return findings as causes, each id once."""
-    out: list[Found] = []
+    """Return findings as causes, each place once."""
+    out: dict[str, Found] = {}
     for finding in findings:
-        if finding.id in causes and not any(f.id == finding.id for f in out):
-            out.append(found_by_checks(finding, causes[finding.id], tried))
-    return [f for f in out if all(np.isfinite(q.value) for q in f.parameters.values())]
+        if finding.id in causes:
+            found = found_by_checks(finding, causes[finding.id], tried)
+            out.setdefault(found.key, found)
+    return [f for f in out.values() if all(np.isfinite(q.value) for q in f.parameters.values())]

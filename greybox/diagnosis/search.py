@@ -408,8 +408,11 @@ def _without(problem: Problem, fit: Fit, cause: Candidate) -> Fit:
 
 def instead(
     case: Case, fit: Fit, best: Candidate, others: Sequence[Candidate]
-) -> tuple[Candidate, list[Candidate]]:
-    """Return one of several causes, and others in its place, all beside the remaining causes."""
+) -> tuple[Fit, Candidate, list[Candidate]]:
+    """Return the fit without one of several causes, that cause, and others in its place.
+
+    All stand beside the remaining causes.
+    """
     problem, held_out = case.problem(fit.integrator), case.held_out(fit.integrator)
     rest = problem.drop(fit.point, best.hypothesis)
     without = problem.settle(problem.fit(rest, fit.noise, most=FIRST), 1)
@@ -421,4 +424,4 @@ def instead(
         out.append(
             assess_candidate(held_out, without, refit(problem, without, score), other.hypothesis, 1)
         )
-    return assess_candidate(held_out, without, fit, best.hypothesis, 1), out
+    return without, assess_candidate(held_out, without, fit, best.hypothesis, 1), out

@@ -33,6 +33,7 @@ from greybox.diagnosis.result import (
 from greybox.diagnosis.ruling import rule
 from greybox.diagnosis.search import Candidate, Search, backwards, instead
 from greybox.diagnosis.ship import CURRENTS
+from greybox.diagnosis.standing import standing
 from greybox.diagnosis.symptoms import find_symptoms
 from greybox.diagnosis.waves import Waves
 from greybox.model.model import ManoeuvringModel
@@ -209,12 +210,20 @@ class Report:
                 continue
             best = next(c for c in step.candidates if c.hypothesis.key == step.taken.hypothesis.key)
             others = [c for c in step.candidates if c.hypothesis.cause not in ids]
-            if len(causes) > 1:
-                best, others = instead(self.case, self.found.final, best, others)
+            without = step.before
+            if len(causes) > 1 or self.found.leaning:
+                without, best, others = instead(self.case, self.found.final, best, others)
             like = rivals(self.case.problem, self.case.held_out, best, others)
+            like = [c for c in like if self._stands(c, without)]
             if like:
                 out.append([best, *like])
         return out
+
+    def _stands(self, rival: Candidate, without: Fit) -> bool:
+        """Whether a rival, too, does more than a generic force."""
+        pairs = [self.case.held_out(f.integrator).pairs(f) for f in (rival.fit, without)]
+        problem = self.case.problem(rival.fit.integrator)
+        return standing(problem, rival.hypothesis, rival.fit, *pairs).stands
 
     def gain(
         self,
