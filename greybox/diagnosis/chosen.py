@@ -139,7 +139,8 @@ def _hypotheses(
     ]
     # what the chosen terms hold is no hypothesis of its own
     context = context_of(structure.with_terms(*_lacking(structure, terms)), ready)
-    others = [a for c in ready.causes.values() for a in c.hypotheses(context)]
+    sought = [c for name, c in ready.causes.items() if name not in ready.agreeing]
+    others = [a for c in sought for a in c.hypotheses(context)]
     if "current" in ready.causes and choice.terms.kind in ("wind", "augmented"):
         named += [replace(a, co_freed=()) for a in others if a.cause == "current" and not a.apply]
         others = [a for a in others if a.cause != "current"]

@@ -7,7 +7,7 @@ find there with certainty is taken out before forces are judged.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import norm
@@ -39,22 +39,45 @@ def recording_of(log: TrialLog) -> Recording:
     return Recording(log.name, signals, steps=log.provenance.steps)
 
 
-def kinematic_findings(logs: Sequence[TrialLog]) -> list[Finding]:
-    """Return what the logs prove themselves: lever arms, heading biases, reversed motions.
+@dataclass(frozen=True)
+class Kinematics:
+    """What the logs tell of their sensors without any force model.
+
+    Parameters
+    ----------
+    findings : tuple of Finding
+        What they prove.
+    agreeing : frozenset of str
+        Causes of which they show nothing though they could: the sensors agree with each other.
+        Only a defect that all of them share would not show.
+    """
+
+    findings: tuple[Finding, ...] = ()
+    agreeing: frozenset[str] = frozenset()
+
+
+def judged_by_kinematics(logs: Sequence[TrialLog]) -> Kinematics:
+    """Return what the logs tell of lever arms, heading biases and reversed motions.
 
     Clocks of what forces act on, and thrusters, are left to the force model, which sees
     them more sharply. Several logs are judged together and must all have it; the first one's
     values are taken.
     """
     if not logs or not all(set(_POSITIONS) <= log.channels.keys() for log in logs):
-        return []
+        return Kinematics()
     try:
         reports = check_recordings([recording_of(log) for log in logs], logs[0].vessel)
     except GreyboxError:
-        return []
+        return Kinematics()
     each = [[f for f in report.findings if _kinematic(f)] for report in reports]
     shared = set.intersection(*({f.id for f in found} for found in each))
-    return [f for f in each[0] if f.id in shared]
+    clean = [
+        {o.id for o in report.outcomes if o.status == "clean" and o.id in _NAMES}
+        for report in reports
+    ]
+    return Kinematics(
+        tuple(f for f in each[0] if f.id in shared), frozenset(set.intersection(*clean))
+    )
 
 
 def _kinematic(finding: Finding) -> bool:
@@ -71,7 +94,8 @@ def found_by_checks(finding: Finding, cause: Cause, tried: int) -> Found:
     values = finding.value if isinstance(finding.value, tuple) else (finding.value,)
     cis = finding.ci if isinstance(finding.value, tuple) else (finding.ci,)
     what = "sign" if finding.id == "sign" else "clock"
-    names = _NAMES.get(finding.id, tuple(f"{what}_{c}" for c in finding.channels))
+    channels = finding.channels or (finding.channel,)
+    names = _NAMES.get(finding.id, tuple(f"{what}_{c}" for c in channels))
     parameters = {}
     z = 0.0
     for name, value, ci in zip(names, values, cis, strict=False):
@@ -80,7 +104,7 @@ def found_by_checks(finding: Finding, cause: Cause, tried: int) -> Found:
         z = max(z, abs(value) / std)
     p = float(2 * norm.sf(min(z, 37.0)))
     # of two late clocks, or reversed channels, each has its place
-    place = () if finding.id in _NAMES else finding.channels or (finding.channel,)
+    place = () if finding.id in _NAMES else channels
     key = ":".join([finding.id, *place, "kinematics"])
     return Found(
         finding.id, key, cause.title, parameters, p, min(1.0, p * tried),

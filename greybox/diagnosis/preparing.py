@@ -10,7 +10,7 @@ import numpy as np
 from greybox.diagnosis.base import Case
 from greybox.diagnosis.causes import Cause, Context, known_causes
 from greybox.diagnosis.hypothesis import Hypothesis
-from greybox.diagnosis.kinematics import kinematic_findings, mended
+from greybox.diagnosis.kinematics import judged_by_kinematics, mended
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.ship import CURRENTS
 from greybox.errors import LogError, UsageError, suggestion
@@ -48,6 +48,8 @@ class Prepared:
         Names of logs left out.
     model : ManoeuvringModel or None
         As it was given.
+    agreeing : frozenset of str
+        Causes of which the kinematics show nothing though they could.
     """
 
     case: Case
@@ -58,6 +60,12 @@ class Prepared:
     validate: tuple[TrialLog, ...]
     short: tuple[str, ...]
     model: ManoeuvringModel | None
+    agreeing: frozenset[str] = frozenset()
+
+    @property
+    def of_forces(self) -> tuple[Hypothesis, ...]:
+        """The hypotheses without those of which sensors that agree show nothing."""
+        return tuple(h for h in self.hypotheses if h.cause not in self.agreeing)
 
     @property
     def tried(self) -> int:
@@ -113,7 +121,8 @@ def prepare(
     logs = _long_enough(logs)
     validate = _long_enough(validate) if validate else []
     causes = _chosen(ids)
-    findings = [f for f in kinematic_findings([*logs, *validate]) if f.id in causes]
+    kinematics = judged_by_kinematics([*logs, *validate])
+    findings = [f for f in kinematics.findings if f.id in causes]
     vessel = mended(logs[0].vessel if model is None else model.vessel, findings)
     logs = [correct_log(log, vessel) for log in logs]
     validate = [correct_log(log, vessel) for log in validate]
@@ -130,6 +139,7 @@ def prepare(
         tuple(validate),
         tuple(short),
         model,
+        kinematics.agreeing,
     )
 
 
