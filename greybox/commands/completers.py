@@ -15,7 +15,8 @@ from greybox.registry import entry_points
 STRUCTURES = ("thesis", "surge", "linear", "blanke", "modulus", "abkowitz", "siso")
 CAUSES = (
     "current", "wind", "thruster_gain", "thruster_lag", "input_delay", "quadratic_thrust",
-    "advance_speed", "cubic_damping", "quadratic_yaw_damping", "crossflow", "side_force",
+    "advance_speed", "cubic_damping", "quadratic_yaw_damping", "crossflow", "inertia_coupling",
+    "side_force", "asymmetry",
     "heading_bias", "lever_arm", "angle_offset", "clock_offset", "sign", "parameter_change",
     "waves",
 )  # fmt: skip

@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.diagnosis.base import Case
+from greybox.diagnosis.causes.hull import term_parameters
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.held_out import proof_of
-from greybox.diagnosis.hypothesis import Hypothesis, Parameter
+from greybox.diagnosis.hypothesis import Hypothesis
 from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.preparing import Prepared, context_of
 from greybox.diagnosis.refitting import SETTLE
@@ -25,7 +26,7 @@ from greybox.diagnosis.ship import CURRENTS, Ship
 from greybox.diagnosis.thresholds import PROVEN
 from greybox.errors import ExcitationError, GreyboxError
 from greybox.model.structure import Structure
-from greybox.model.terms import Term, parameter_unit
+from greybox.model.terms import Term
 from greybox.selection.cross_validation import Refit
 from greybox.selection.estimate import at_own_pace
 from greybox.selection.term_selection import TermChoice, select_terms
@@ -35,6 +36,7 @@ Array = NDArray[np.float64]
 
 _AIR = {"uq", "vq"}
 _FLOW = {"v", "r"}
+_COUPLED = {("v", "r"), ("r", "v"), ("v", "taun"), ("r", "tauy")}
 _QUADRATIC = "quadratic_thrust"
 
 
@@ -122,6 +124,8 @@ def _hypotheses(
     """Return the causes that the chosen terms stand for, and all that are to be tried."""
     structure, terms = ready.structure, choice.terms.structure
     vessel = case.logs[0].vessel
+    # what the chosen terms hold is no hypothesis of its own
+    context = context_of(structure.with_terms(*_lacking(structure, terms)), ready)
     grouped: dict[tuple[str, str], list[Term]] = {}
     for term in terms.terms:
         cause = _cause_of(term, structure)
@@ -132,13 +136,11 @@ def _hypotheses(
         Hypothesis(
             cause,
             cause if cause == "wind" else f"{cause}:{'+'.join(t.name for t in mine)}",
-            tuple(Parameter(t.name, parameter_unit(t, vessel.force_unit), 0.0) for t in mine),
+            term_parameters([t.name for t in mine], context),
             columns=tuple(t.name for t in mine),
         )
         for (cause, _), mine in grouped.items()
     ]
-    # what the chosen terms hold is no hypothesis of its own
-    context = context_of(structure.with_terms(*_lacking(structure, terms)), ready)
     sought = [c for name, c in ready.causes.items() if name not in ready.agreeing]
     others = [a for c in sought for a in c.hypotheses(context)]
     if "current" in ready.causes and choice.terms.kind in ("wind", "augmented"):
@@ -168,6 +170,10 @@ def _cause_of(term: Term, structure: Structure) -> str | None:
         return "cubic_damping"
     if term.name == "N_|r|r":
         return "quadratic_yaw_damping"
+    if (term.state, *signals) in _COUPLED:
+        return "inertia_coupling"
+    if term.state in _FLOW and term.even:
+        return "asymmetry"
     if term.state in _FLOW and len(signals) == 2 and set(signals) <= _FLOW:
         return "crossflow"
     if len(signals) == 2 and "u" in signals and set(signals) & {"taux", "tauy", "taun"}:

@@ -18,6 +18,8 @@ from greybox.errors import StructureError, suggestion
 
 # velocity through the air -> the state it would be in still air
 _AIR = {"uq": "u", "vq": "v"}
+# signals that change their sign when port and starboard change places
+_TURNED = {"v", "r", "vq", "tauy", "taun", "race", "rudder"}
 # equation letter of SNAME -> state whose increment the equation gives
 EQUATIONS = {"X": "u", "Y": "v", "N": "r"}
 
@@ -93,6 +95,12 @@ class Term:
     def key(self) -> tuple[str, tuple[tuple[str, bool], ...]]:
         """Equation and factors without order: equal for terms that are the same function."""
         return self.state, tuple(sorted((f.signal, f.modulus) for f in self.factors))
+
+    @property
+    def even(self) -> bool:
+        """Whether the regressor stays the same when port and starboard change places."""
+        turned = [f for f in self.factors if not f.modulus and f.signal in _TURNED]
+        return len(turned) % 2 == 0
 
     @property
     def dissipates(self) -> bool:

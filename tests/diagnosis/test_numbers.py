@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 from changing import MOMENT, changed_log, fitted
 
+from greybox.diagnosis.causes import known_causes
 from greybox.diagnosis.held_out import proof_of
 from greybox.diagnosis.hypothesis import Hypothesis, Parameter
-from greybox.diagnosis.preparing import prepare
+from greybox.diagnosis.preparing import context_of, prepare
 from greybox.diagnosis.result import Found, Quantity
 from greybox.diagnosis.search import freed
+from greybox.model.terms import parse_term
 from greybox.study.blind import draw
 
 
@@ -93,3 +95,40 @@ def test_a_derivative_beside_a_run_that_escapes_warns_nobody(monkeypatch) -> Non
         k = problem.numbers_of(fit.point, hypothesis)[0]
         rows = problem._difference(fit.point, vector, run, start, k, hypothesis, 0)
     assert not np.isfinite(rows).any()
+
+
+def test_damping_brakes_and_cross_terms_have_no_sign(ready) -> None:
+    causes = known_causes()
+    context = context_of(ready.structure, ready)
+    most = {
+        p.name: p.high
+        for name in ("cubic_damping", "quadratic_yaw_damping", "crossflow", "inertia_coupling")
+        for h in causes[name].hypotheses(context)
+        for p in h.parameters
+    }
+    assert {n for n, high in most.items() if high == 0} == {"X_uuu", "Y_vvv", "N_rrr", "N_|r|r"}
+    assert {"Y_|r|v", "Y_|r|r", "N_|r|v", "Y_r", "N_v"} <= {n for n, h in most.items() if h > 0}
+
+
+def test_a_cubic_force_that_drives_is_not_called_damping(ready) -> None:
+    base = ready.base()
+    problem = ready.case.wider(["X_uuu"]).problem(base.integrator)
+    found = known_causes()["cubic_damping"].hypotheses(context_of(ready.structure, ready))
+    hypothesis = next(h for h in found if h.columns == ("X_uuu",))
+    carried = ready.case.wider(["X_uuu"]).carried(base)
+    k = problem.place("X_uuu")
+    # what these logs would show of a ship that a cubic force drives
+    driving = replace(carried.point, base=carried.point.base.with_value(k, 0.004))
+    for run, start in zip(problem.runs, driving.starts, strict=True):
+        run.y = run.run(driving.ship, start).y
+    found = problem.fit(problem.add(carried.point, hypothesis), base.noise)
+    assert found.point.base.theta[k] <= 0.0
+
+
+@pytest.mark.parametrize(
+    ("name", "even"),
+    [("Y_0", True), ("Y_taux", True), ("N_|u|u", True), ("N_|taun|", True), ("Y_|r|v", False),
+     ("Nmu", False), ("N_u*taun", False), ("Nuv", False)],
+)  # fmt: skip
+def test_what_stays_when_port_and_starboard_change_places(name: str, even: bool) -> None:
+    assert parse_term(name).even is even

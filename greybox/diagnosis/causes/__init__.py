@@ -5,7 +5,14 @@ from __future__ import annotations
 from greybox.diagnosis.causes.cause import Cause, Context
 from greybox.diagnosis.causes.change import ParameterChange
 from greybox.diagnosis.causes.flow import Current, Wind
-from greybox.diagnosis.causes.hull import Crossflow, CubicDamping, QuadraticYawDamping, SideForce
+from greybox.diagnosis.causes.hull import (
+    Asymmetry,
+    Crossflow,
+    CubicDamping,
+    InertiaCoupling,
+    QuadraticYawDamping,
+    SideForce,
+)
 from greybox.diagnosis.causes.motion import Waves
 from greybox.diagnosis.causes.sensors import (
     ClockOffset,
@@ -28,8 +35,8 @@ __all__ = ["Cause", "Context", "known_causes"]
 
 _OWN: tuple[type[Cause], ...] = (
     Current, Wind, ThrusterGain, ThrusterLag, InputDelay, QuadraticThrust, AdvanceSpeed,
-    CubicDamping, QuadraticYawDamping, Crossflow, SideForce, HeadingBias, LeverArm, AngleOffset,
-    ClockOffset, Sign, ParameterChange, Waves,
+    CubicDamping, QuadraticYawDamping, Crossflow, InertiaCoupling, SideForce, Asymmetry,
+    HeadingBias, LeverArm, AngleOffset, ClockOffset, Sign, ParameterChange, Waves,
 )  # fmt: skip
 GROUP = "greybox.causes"
 

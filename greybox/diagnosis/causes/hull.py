@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+import numpy as np
+
 from greybox.diagnosis.causes.cause import Cause, Context
 from greybox.diagnosis.hypothesis import Hypothesis, Parameter
 from greybox.model.terms import parameter_unit, parse_term
@@ -11,11 +13,19 @@ from greybox.model.terms import parameter_unit, parse_term
 _WORDS = {"u": "surge", "v": "sway", "r": "yaw"}
 
 
+def term_parameters(names: Sequence[str], context: Context) -> tuple[Parameter, ...]:
+    """Return coefficients of terms; damping that would drive the ship is none."""
+    unit = context.vessel.force_unit
+    return tuple(
+        Parameter(n, parameter_unit(t, unit), 0.0, high=0.0 if t.dissipates else np.inf)
+        for n, t in ((n, parse_term(n)) for n in names)
+    )
+
+
 def term_hypothesis(cause: str, names: Sequence[str], context: Context) -> Hypothesis:
     """Return a hypothesis of terms that enter together."""
-    unit = context.vessel.force_unit
-    parameters = tuple(Parameter(n, parameter_unit(parse_term(n), unit), 0.0) for n in names)
-    return Hypothesis(cause, f"{cause}:{'+'.join(names)}", parameters, columns=tuple(names))
+    key = f"{cause}:{'+'.join(names)}"
+    return Hypothesis(cause, key, term_parameters(names, context), columns=tuple(names))
 
 
 def listed(values: Mapping[str, tuple[float, float]]) -> str:
@@ -92,6 +102,60 @@ class Crossflow(Cause):
             f"the error of {equations(values)} follows the cross-flow of drift and turn "
             f"({listed(values)})"
         )
+
+
+class InertiaCoupling(Cause):
+    """Inertia, and forces at an arm, that couple sway and yaw."""
+
+    id = "inertia_coupling"
+    kind = "force"
+    title = "coupled inertia of sway and yaw"
+    signature = (
+        "sway answers to the yaw rate and yaw to the drift at every speed, and each to the other's "
+        "thrust, as where the centre of gravity is not at the origin"
+    )
+    extension = "the yaw rate and moment in sway, the sway velocity and force in yaw"
+    reference = "Fossen (2011), section 3.3"
+
+    def hypotheses(self, context: Context) -> Sequence[Hypothesis]:
+        """Return the linear cross terms together; thrust's where several thrusters tell it."""
+        names = ["Y_r", "N_v"]
+        if len(context.vessel.thrusters) > 1:
+            # the force of one rudder, or one thruster, is its moment over a constant arm
+            names += ["Y_taun", "N_tauy"]
+        lacking = context.lacking(*names)
+        return [term_hypothesis(self.id, lacking, context)] if lacking else []
+
+    def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
+        """Say the coefficients."""
+        return f"sway and yaw push each other at every speed ({listed(values)})"
+
+
+class Asymmetry(Cause):
+    """Port and starboard that are not alike."""
+
+    id = "asymmetry"
+    kind = "force"
+    title = "port and starboard not alike"
+    signature = (
+        "the ship is pushed aside the more the faster it goes or its propeller turns, or steers "
+        "better to one side than to the other"
+    )
+    extension = "terms of sway and yaw that do not change sign from port to starboard"
+    reference = "Yasukawa and Yoshimura (2015)"
+
+    def hypotheses(self, context: Context) -> Sequence[Hypothesis]:
+        """Return the push of the thrust, that of the hull, and uneven steering."""
+        pairs = (
+            ("Y_taux", "N_taux"), ("Y_|u|u", "N_|u|u"), ("Y_|tauy|", "N_|taun|"),
+            ("Y_|rudder|", "N_|rudder|"),
+        )  # fmt: skip
+        found = [context.lacking(*pair) for pair in pairs]
+        return [term_hypothesis(self.id, names, context) for names in found if names]
+
+    def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
+        """Say in which equations."""
+        return f"{equations(values)} differ between port and starboard ({listed(values)})"
 
 
 class SideForce(Cause):
