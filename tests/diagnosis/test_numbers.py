@@ -106,8 +106,9 @@ def test_damping_brakes_and_cross_terms_have_no_sign(ready) -> None:
         for h in causes[name].hypotheses(context)
         for p in h.parameters
     }
-    assert {n for n, high in most.items() if high == 0} == {"X_uuu", "Y_vvv", "N_rrr", "N_|r|r"}
-    assert {"Y_|r|v", "Y_|r|r", "N_|r|v", "Y_r", "N_v"} <= {n for n, h in most.items() if h > 0}
+    braking = {"X_uuu", "Y_vvv", "N_rrr", "N_|r|r", "Y_|r|v"}
+    assert {n for n, high in most.items() if high == 0} == braking
+    assert {"Y_|r|r", "N_|r|v", "Y_r", "N_v"} <= {n for n, h in most.items() if h > 0}
 
 
 def test_a_cubic_force_that_drives_is_not_called_damping(ready) -> None:
