@@ -160,33 +160,15 @@ class Problem:
             before += len(start)
             k = own
             for hypothesis, value in zip(point.hypotheses, point.values, strict=True):
-                for i in range(len(value)):
-                    rows[:, :, k] = self._difference(point, vector, run, start, k, hypothesis, i)
+                for parameter in hypothesis.parameters[: len(value)]:
+                    step = parameter.step * np.array([-1, 1])
+                    ends = np.clip(vector[k] + step, parameter.low, parameter.high)
+                    ships = [point.at(_with(vector, k, end)).ship for end in ends]
+                    change = run.difference(ship, shown, *ships)
+                    rows[:, :, k] = change / (ends[1] - ends[0])
                     k += 1
             out.append(rows)
         return out
-
-    def _difference(
-        self,
-        point: Point,
-        vector: Array,
-        run: LogRun,
-        start: Array,
-        k: int,
-        hypothesis: Hypothesis,
-        i: int,
-    ) -> Array:
-        step = hypothesis.parameters[i].step
-        low, high = hypothesis.parameters[i].low, hypothesis.parameters[i].high
-        ends = np.clip([vector[k] - step, vector[k] + step], low, high)
-        shown = []
-        for end in ends:
-            moved = vector.copy()
-            moved[k] = end
-            shown.append(run.run(point.at(moved).ship, start).y)
-        # beside a run within bounds may stand one that leaves them
-        with np.errstate(invalid="ignore"):
-            return np.asarray((shown[1] - shown[0]) / (ends[1] - ends[0]))
 
     def fit(self, point: Point, noise: Noise, most: int = _MOST) -> Fit:
         """Minimise −2 log L over the free numbers at a given noise."""
@@ -369,3 +351,9 @@ class Problem:
             if before - fit.cost < 0.5:
                 break
         return fit
+
+
+def _with(vector: Array, k: int, value: float) -> Array:
+    moved = vector.copy()
+    moved[k] = value
+    return moved

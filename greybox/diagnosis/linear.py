@@ -48,6 +48,9 @@ def means(d: ca.SX, current: ca.SX) -> ca.SX:
 class Slopes:
     """Derivatives of a step in a current.
 
+    Those of a step of several stages follow from the rate's at the middle of the step, as the
+    exponential of its Jacobian to third order: right to the second power of the step's length.
+
     Parameters
     ----------
     step : StepModel
@@ -57,22 +60,14 @@ class Slopes:
     def __init__(self, step: StepModel) -> None:
         self._step = step
         s, f = step.symbolic, step.increment
-        self._states = s.x.numel()
         current = ca.SX.sym("current", 2)
-        others = (s.psi, s.tau, means(s.d, current), s.air, s.theta)
-        slopes = ca.jacobian(f(s.x, *others), ca.vertcat(s.x, s.theta, current))
-        symbols = [s.x, s.tau, s.psi, s.air, current, s.theta]
-        of_slopes = ca.Function("slopes", symbols, [ca.densify(slopes)])
-        stages: list[ca.SX] = []
-
-        def stage(x: ca.SX) -> ca.SX:
-            stages.append(of_slopes(x, *symbols[1:]))
-            return f(x, *others)
-
-        step.moved(stage, s.x)
-        self._shape = (len(stages), *slopes.shape)
-        flat = ca.vertcat(*[ca.vec(stage.T) for stage in stages])
-        self._program = Vectorised(ca.vertsplit(flat), ca.vertsplit(ca.vertcat(*symbols)))
+        rate = f(s.x, s.psi, s.tau, means(s.d, current), s.air, s.theta)
+        slopes = ca.jacobian(rate, ca.vertcat(s.x, s.theta, current, s.tau))
+        symbols = ca.vertcat(s.x, s.tau, s.psi, s.air, current, s.theta)
+        self._states, self._columns = slopes.shape
+        self._program = Vectorised(
+            ca.vertsplit(ca.densify(ca.vec(slopes.T))), ca.vertsplit(symbols)
+        )
 
     def __call__(self, x: Array, drivers: Array, theta: Array, places: Array) -> Linear:
         """Return the derivatives along a run.
@@ -87,38 +82,26 @@ class Slopes:
         theta : ndarray
             (p,) or (N, p)
         places : ndarray of int
-            (m,) coefficients, and past them the current north and east.
+            (m,) coefficients, past them the current north and east, and past those the
+            generalised inputs.
         """
         steps, nx = len(x) - 1, self._states
-        values: list[Array | float] = [*x[:-1].T.copy(), *drivers[:-1].T.copy()]
+        euler = self._step.integrator == "euler"
+        at = x[:-1] if euler else (x[:-1] + x[1:]) / 2
+        values: list[Array | float] = [*at.T.copy(), *drivers[:-1].T.copy()]
         values += list(map(float, theta)) if theta.ndim == 1 else list(theta[:-1].T.copy())
-        out = self._program(values, np.empty((int(np.prod(self._shape)), steps)))
-        stages = out.reshape(*self._shape, steps)
-        wanted = np.concatenate([np.arange(nx), nx + np.asarray(places, int)])
-        total = self._chained(stages[:, :, wanted])
-        return Linear(
-            np.ascontiguousarray(total[:, :nx].transpose(2, 0, 1)),
-            np.ascontiguousarray(total[:, nx:].transpose(2, 0, 1)),
-        )
-
-    def _chained(self, stages: Array) -> Array:
-        """Return ∂x⁺ (nx, nx + m, N−1) from the rate's derivatives at each stage."""
-        nx = self._states
-        own = np.arange(nx)
-        start = np.zeros(stages.shape[1:])
-        start[own, own] = 1.0
-        at = iter(stages)
-
-        def slope(by: Array) -> Array:
-            """Return the derivatives of a stage's slope, its state having those given."""
-            stage = next(at)
-            if by is start:
-                return np.array(stage)
-            after = np.einsum("ijn,jmn->imn", stage[:, :nx], by)
-            after[:, nx:] += stage[:, nx:]
-            return np.asarray(after)
-
-        return self._step.moved(slope, start)
+        columns = np.concatenate([np.arange(nx), nx + np.asarray(places, int)])
+        wanted = (np.arange(nx)[:, None] * self._columns + columns).ravel()
+        out = self._program(values, np.empty((len(wanted), steps)), wanted=wanted.tolist())
+        moved = out.reshape(nx, len(columns), steps).transpose(2, 0, 1)
+        own, driven = (np.ascontiguousarray(part) for part in np.split(moved, [nx], axis=2))
+        if not self._step.structure.increment:
+            return Linear(own, driven)
+        one = np.eye(nx)
+        if euler:
+            return Linear(one + own, driven)
+        ahead = one + own @ (one / 2 + own / 6)
+        return Linear(one + own @ ahead, ahead @ driven)
 
 
 @lru_cache(maxsize=32)

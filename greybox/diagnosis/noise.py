@@ -10,14 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cholesky, solve_discrete_are, solve_triangular
 
-from greybox.model.run.kernels import accumulate
+from greybox.diagnosis.normal import bounded_step
 
 Array = NDArray[np.float64]
 
@@ -30,28 +29,40 @@ _LEAST = 1e-5
 _SHARE, _MEMORY, _LEVEL = (-7.0, 3.0), (-4.0, 6.0), (-3.0, 3.0)
 _STARTS = ((-3.0, 1.0), (-1.0, 2.5))
 _PRIOR, _PRIOR_WEIGHT = 1.0, 0.02
-_UNROLLED = 10
-# how far each number of a colour commonly moves in a search, which makes its hills round
-_SCALE, _LEVEL_SCALE = (0.1, 0.3), 0.02
+# how often the Riccati equation's horizon is doubled: a filter's memory of 2²⁰ samples is reached
+_DOUBLINGS = 20
 # share of the sensors' deviation from which on what moves the ship beside the model is seen
 SEEN = 0.2
-# iterations of a search, and of one that begins near
-_MOST_STEPS, _NEAR_STEPS = 40, 20
+# iterations of a search, and of one that begins near; a fall of −2 log L that ends it
+_MOST_STEPS, _NEAR_STEPS, _ENOUGH = 40, 12, 0.02
+_DAMPING_LIMIT = 1e6
 
 
 @dataclass(frozen=True)
 class NoiseModel:
     """Innovations form of the errors of one group of channels.
 
-    ``e = C x + v``, ``x⁺ = A x + w``: ``closed`` = A − K C, ``gain`` = K and
-    ``root`` with root·rootᵀ the covariance of the innovations; ``sensor`` (k,) deviation
-    of v, ``force`` of w, and its ``memory`` from sample to sample.
+    ``e = C x + v``, ``x⁺ = A x + w``, and the innovations by the stationary Kalman gain K:
+    L⁻¹ (I − C (z − A + K C)⁻¹ K) e with L Lᵀ their covariance before.
+
+    Parameters
+    ----------
+    outputs : tuple of int
+    numerators : ndarray
+        (k, k, n+1) of that transfer function, in powers of the delay.
+    denominator : ndarray
+        (n+1,)
+    root : ndarray
+        (k, k) L.
+    sensor : ndarray
+        (k,) deviation of v.
+    force, memory : float
+        Deviation of what moves the ship beside the model, and its share left after a sample.
     """
 
     outputs: tuple[int, ...]
-    c: Array
-    closed: Array
-    gain: Array
+    numerators: Array
+    denominator: Array
     root: Array
     sensor: Array
     force: float = 0.0
@@ -67,29 +78,12 @@ class NoiseModel:
         """
         from scipy.signal import lfilter
 
-        numerators, denominator = self._transfer
         out = np.zeros(e.shape)
-        for i, row in enumerate(numerators):
+        for i, row in enumerate(self.numerators):
             for j, numerator in enumerate(row):
                 if numerator.any():
-                    out[:, i] += lfilter(numerator, denominator, e[:, j], axis=0)
+                    out[:, i] += lfilter(numerator, self.denominator, e[:, j], axis=0)
         return out
-
-    @cached_property
-    def _transfer(self) -> tuple[Array, Array]:
-        """Numerators (k, k, n+1) and denominator (n+1,) of root⁻¹ (I − C (z − A + K C)⁻¹ K)."""
-        k, n = self.c.shape
-        inverse = solve_triangular(self.root, np.eye(k), lower=True)
-        # Faddeev and LeVerrier: the adjugate of z − F by powers of z
-        denominator = np.ones(n + 1)
-        term = np.eye(n)
-        numerators = np.zeros((k, k, n + 1))
-        for power in range(1, n + 1):
-            numerators[:, :, power] = -inverse @ self.c @ term @ self.gain
-            moved = self.closed @ term
-            denominator[power] = -np.trace(moved) / power
-            term = moved + denominator[power] * np.eye(n)
-        return numerators + inverse[:, :, None] * denominator, denominator
 
     @property
     def remembered(self) -> float:
@@ -157,67 +151,135 @@ def _system(
 
 
 @lru_cache(maxsize=4)
-def _matrices(k: int) -> ca.Function:
-    pole, sample_time = ca.SX.sym("pole"), ca.SX.sym("dt")
-    x, level = ca.SX.sym("x", 2 + k), ca.SX.sym("level", k)
-    parts = [ca.densify(m) for m in _system(k, pole, sample_time, x, level)[:3]]
-    return ca.Function("system", [pole, sample_time, x, level], parts)
+def _filter(k: int, slopes: bool = False) -> ca.Function:
+    """Return ``(x, level, pole, dt) -> transfer, L, memory, force``, or ``∂ transfer`` in x.
 
+    ``transfer`` holds numerators, denominator and the logarithms of L's diagonal. The
+    covariance of the prediction solves the Riccati equation by doubling.
 
-@lru_cache(maxsize=32)
-def _likelihood(k: int, blocks: int) -> ca.Function:
-    """Return ``(x, pole, dt, level, [e; use]) -> −2 log L, gradient in x`` by a Kalman filter."""
+    References
+    ----------
+    Anderson (1978); Chu, Fan and Lin (2005), the structure-preserving form.
+    """
     n = k + 1
     x, level = ca.SX.sym("x", 2 + k), ca.SX.sym("level", k)
     pole, dt = ca.SX.sym("pole"), ca.SX.sym("dt")
-    constants = ca.vertcat(x, level, pole, dt)
     a, q, r, force = _system(k, pole, dt, x, level)
-    # a covariance is carried by its lower triangle: half of what follows is never computed
-    half = ca.Sparsity.lower(n)
-    state = ca.SX.sym("state", n + half.nnz() + 1)
-    data = ca.SX.sym("data", k + 1, _UNROLLED)
-    now = state
-    for j in range(_UNROLLED):
-        z, cov, total = now[:n], ca.tril2symm(ca.SX(half, now[n:-1])), now[-1]
-        use = data[k, j]
-        for i in range(k):
-            column = cov[:, i]
-            variance = column[i] + r[i, i]
-            error = data[i, j] - z[i]
-            total += use * (error**2 / variance + ca.log(variance))
-            gain = use * column / variance
-            z = z + gain * error
-            cov = ca.tril2symm(ca.tril(cov - gain @ column.T))
-        cov = a @ cov @ a.T + q
-        now = ca.vertcat(a @ z, ca.tril(ca.densify(cov)).nz[:], total)
-    step = ca.Function("step", [state, data, constants], [ca.densify(now)], {"cse": True})
-    run = accumulate(step, blocks)
-    first = ca.SX.zeros(n + half.nnz() + 1)
-    first[n + half.nnz() - 1] = force
-    begin = ca.Function("begin", [constants], [ca.densify(first)])
-    given = ca.MX.sym("x", 2 + k)
-    rest = ca.MX.sym("rest", k + 2)
-    series = ca.MX.sym("e", k + 1, _UNROLLED * blocks)
-    constant = ca.vertcat(given, rest)
-    end = run(begin(constant), series, ca.repmat(constant, 1, blocks))
-    value = end[-1, -1]
-    return ca.Function("likelihood", [given, rest, series], [value, ca.gradient(value, given)])
-
-
-def _innovations_form(
-    group: tuple[int, ...], pole: float, sample_time: float, level: Array, x: Array
-) -> NoiseModel:
-    k = len(group)
-    a, q, r = (np.array(m) for m in _matrices(k)(pole, sample_time, x, level))
-    c = np.eye(k, k + 1)
-    p = solve_discrete_are(a.T, c.T, q, r, balanced=True)
+    c = ca.horzcat(ca.SX.eye(k), ca.SX.zeros(k, 1))
+    move, informed, p = a.T, c.T @ ca.diag(1 / ca.diag(r)) @ c, q
+    for _ in range(_DOUBLINGS):
+        shrunk = ca.inv_minor(ca.densify(ca.SX.eye(n) + informed @ p))
+        later = p + move.T @ p @ shrunk @ move
+        informed = _symmetric(informed + move @ shrunk @ informed @ move.T)
+        p, move = _symmetric(later), move @ shrunk @ move
     s = c @ p @ c.T + r
-    gain = np.linalg.solve(s, c @ p @ a.T).T
-    sensor = level * np.exp(x[2:])
+    gain = a @ p @ c.T @ ca.inv_minor(ca.densify(s))
+    root = ca.chol(s).T
+    # Faddeev and LeVerrier: the adjugate of z − F by powers of z
+    closed, inverse = a - gain @ c, ca.inv_minor(ca.densify(root))
+    powers, denominator, term = [inverse], [ca.SX(1)], ca.SX.eye(n)
+    for power in range(1, n + 1):
+        powers.append(-inverse @ c @ term @ gain)
+        moved = closed @ term
+        denominator.append(-ca.trace(moved) / power)
+        term = moved + denominator[power] * ca.SX.eye(n)
+    numerators = [
+        powers[power][i, j] + (inverse[i, j] * denominator[power] if power else 0)
+        for i in range(k)
+        for j in range(k)
+        for power in range(n + 1)
+    ]
+    transfer = ca.densify(ca.vertcat(*numerators, *denominator, ca.log(ca.diag(root))))
+    found = [ca.jacobian(transfer, x)] if slopes else [transfer, root, a[-1, -1], ca.sqrt(force)]
+    return ca.Function("filter", [x, level, pole, dt], list(map(ca.densify, found)), {"cse": True})
+
+
+def _symmetric(matrix: ca.SX) -> ca.SX:
+    return (matrix + matrix.T) / 2
+
+
+def _transfer(k: int, values: Array) -> tuple[Array, Array, Array]:
+    """Return numerators (k, k, n+1, ...), denominator (n+1, ...) and log diagonal (k, ...)."""
+    n = k + 1
+    ends = np.cumsum([k * k * (n + 1), n + 1])
+    numerators, denominator, logs = np.split(values, ends)
+    return numerators.reshape(k, k, n + 1, *values.shape[1:]), denominator, logs
+
+
+def _colour(group: tuple[int, ...], rest: tuple[Array, float, float], x: Array) -> NoiseModel:
+    k = len(group)
+    transfer, root, memory, force = (np.array(m) for m in _filter(k)(x, *rest))
+    numerators, denominator, _ = _transfer(k, transfer[:, 0])
+    sensor = rest[0] * np.exp(x[2:])
     return NoiseModel(
-        group, c, a - gain @ c, gain, cholesky(s, lower=True), sensor,
-        float(np.exp(x[0]) * sensor[0]), float(a[-1, -1]),
-    )  # fmt: skip
+        group, numerators, denominator, root, sensor, float(force[0, 0]), float(memory[0, 0])
+    )
+
+
+def _delays(series: Array, count: int) -> Array:
+    """Return a series (N,) as of 0 to count − 1 samples earlier, zero before it began."""
+    out = np.zeros((len(series), count))
+    for j in range(count):
+        out[j:, j] = series[: len(series) - j]
+    return out
+
+
+class Likelihood:
+    """−2 log L of the errors of a group, its gradient and Fisher information.
+
+    Parameters
+    ----------
+    parts : sequence of ndarray
+        (N, k) errors of each log.
+    rest : tuple
+        Scale of each channel (k,), what is left of its own error after a sample, sample time [s].
+    """
+
+    def __init__(self, parts: Sequence[Array], rest: tuple[Array, float, float]) -> None:
+        self.parts, self.rest, self.k = parts, rest, parts[0].shape[1]
+        self.samples = sum(map(len, parts))
+
+    def _transfer(self, x: Array) -> tuple[Array, Array, Array]:
+        return _transfer(self.k, np.array(_filter(self.k)(x, *self.rest)[0])[:, 0])
+
+    def value(self, x: Array) -> float:
+        """Return −2 log L at x, and the price of a memory far from what is usual."""
+        numerators, denominator, logs = self._transfer(x)
+        cost = _PRIOR_WEIGHT * float(x[1] - _PRIOR) ** 2 + 2 * self.samples * float(logs.sum())
+        for part in self.parts:
+            cost += float((_innovations(numerators, denominator, part) ** 2).sum())
+        return cost
+
+    def slopes(self, x: Array) -> tuple[Array, Array]:
+        """Return the gradient (q,) and the Fisher information (q, q) of −2 log L at x."""
+        from scipy.signal import lfilter
+
+        k = self.k
+        numerators, denominator, _ = self._transfer(x)
+        slope_n, slope_d, slope_l = _transfer(k, np.array(_filter(k, True)(x, *self.rest)))
+        order = len(denominator)
+        gradient, information = 2 * self.samples * slope_l.sum(axis=0), np.zeros((len(x), len(x)))
+        information += 2 * self.samples * slope_l.T @ slope_l
+        for part in self.parts:
+            past = [_delays(lfilter([1.0], denominator, e), order) for e in part.T]
+            for i in range(k):
+                nu = sum(past[j] @ numerators[i, j] for j in range(k))
+                own = _delays(lfilter([1.0], denominator, nu), order)
+                rows = sum(past[j] @ slope_n[i, j] for j in range(k)) - own @ slope_d
+                gradient += 2 * rows.T @ nu
+                information += 2 * rows.T @ rows
+        gradient[1] += 2 * _PRIOR_WEIGHT * (x[1] - _PRIOR)
+        information[1, 1] += 2 * _PRIOR_WEIGHT
+        return gradient, information
+
+
+def _innovations(numerators: Array, denominator: Array, e: Array) -> Array:
+    from scipy.signal import lfilter
+
+    if e.shape[1] == 1:
+        return np.asarray(lfilter(numerators[0, 0], denominator, e[:, 0]))
+    past = [_delays(lfilter([1.0], denominator, one), len(denominator)) for one in e.T]
+    return np.stack([sum(p @ n for p, n in zip(past, row, strict=True)) for row in numerators])
 
 
 def fit_noise(
@@ -265,47 +327,44 @@ def _fit_group(
     longest: float,
 ) -> tuple[Array, NoiseModel]:
     """Return the logarithms and memory of one group, and its innovations form."""
-    from scipy.optimize import minimize
-
     k = len(group)
     change = np.sqrt(np.mean(np.vstack([np.diff(p, axis=0) ** 2 for p in parts]), axis=0) / 2)
     # a channel without noise still needs a scale
     level = np.maximum(change, 1e-12)
-    pole = float(np.clip(pole, 0.0, _LONGEST))
-    rest = np.concatenate([level, [pole, sample_time]])
-    padded = []
-    for part in parts:
-        blocks = -(-len(part) // _UNROLLED)
-        series = np.zeros((k + 1, blocks * _UNROLLED))
-        series[:k, : len(part)] = part.T
-        series[k, : len(part)] = 1.0
-        padded.append((_likelihood(k, blocks), series))
-
-    scale = np.array([*_SCALE, *[_LEVEL_SCALE] * k])
-
-    def loss(scaled: Array) -> tuple[float, Array]:
-        x = scaled * scale
-        value = _PRIOR_WEIGHT * float(x[1] - _PRIOR) ** 2
-        slope = np.zeros(len(x))
-        slope[1] = 2 * _PRIOR_WEIGHT * (x[1] - _PRIOR)
-        for function, series in padded:
-            v, s = function(x, rest, series)
-            value += float(v)
-            slope += np.array(s).ravel()
-        return value, slope * scale
-
+    rest = (level, float(np.clip(pole, 0.0, _LONGEST)), sample_time)
     memory = _MEMORY
     if np.isfinite(longest):
         rho = float(np.exp(-1 / longest))
         memory = (_MEMORY[0], min(_MEMORY[1], float(np.log(rho / (_LONGEST - rho)))))
-    bounds = np.array([_SHARE, memory, *[_LEVEL] * k]) / scale[:, None]
+    bounds = np.array([_SHARE, memory, *[_LEVEL] * k])
     firsts = [np.array([*s, *np.zeros(k)]) for s in _STARTS] if start is None else [start]
-    results = [
-        minimize(
-            loss, x0 / scale, jac=True, method="L-BFGS-B", bounds=bounds,
-            options={"maxiter": _MOST_STEPS if start is None else _NEAR_STEPS, "ftol": 1e-6},
-        )
-        for x0 in firsts
-    ]  # fmt: skip
-    best = scale * np.asarray(min(results, key=lambda result: float(result.fun)).x, float)
-    return best, _innovations_form(group, pole, sample_time, level, best)
+    most = _MOST_STEPS if start is None else _NEAR_STEPS
+    likelihood = Likelihood(parts, rest)
+    found = [_minimised(likelihood, x0, bounds, most) for x0 in firsts]
+    x = min(found, key=lambda item: item[0])[1]
+    return x, _colour(group, rest, x)
+
+
+def _minimised(
+    likelihood: Likelihood, start: Array, bounds: Array, most: int
+) -> tuple[float, Array]:
+    """Return the least −2 log L and where it is, by damped Fisher scoring within bounds."""
+    x = np.clip(start, bounds[:, 0], bounds[:, 1])
+    cost, damping = likelihood.value(x), 1e-3
+    for _ in range(most):
+        gradient, information = likelihood.slopes(x)
+        if not (np.isfinite(information).all() and np.isfinite(gradient).all()):
+            break
+        fall = 0.0
+        while damping <= _DAMPING_LIMIT:
+            low, high = (bounds - x[:, None]).T
+            step = bounded_step(information, -gradient, low, high, damping)
+            trial = likelihood.value(x + step)
+            if trial < cost:
+                fall, cost, x = cost - trial, trial, x + step
+                damping = max(damping / 10, 1e-6)
+                break
+            damping *= 10
+        if fall < _ENOUGH:
+            break
+    return cost, x

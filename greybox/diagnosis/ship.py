@@ -106,10 +106,13 @@ class Shown:
         (N, nx) states.
     y : ndarray
         (N, ny) outputs, the heading last where it is one.
+    start : ndarray
+        (nx [+ 1],) that it was made from.
     """
 
     x: Array
     y: Array
+    start: Array
 
 
 class LogRun:
@@ -194,15 +197,41 @@ class LogRun:
         )
         x = self._simulator(start[:nx], drivers, self.parameters(ship))
         if not np.isfinite(x).all():
-            return Shown(x, np.full((self.samples, len(self.outputs)), np.inf))
+            return Shown(x, np.full((self.samples, len(self.outputs)), np.inf), start)
+        return Shown(x, self._show(ship.sensors, x, start), start)
+
+    def _show(self, sensors: Sensors, x: Array, start: Array) -> Array:
+        """Return the outputs (N, ny) of states (N, nx)."""
+        nx = len(self.states)
         full = x
         if self._turns:
             full = np.column_stack([x, start[nx] + self._heading(x[:, self.states.index("r")])])
-        y = self._across_gaps(self.sense(ship.sensors, full[..., None])[..., 0])
-        if ship.sensors.late:
-            # a run tells nothing of what was before its first sample
-            y = self.y + self.within(ship.sensors) * (y - self.y)
-        return Shown(x, y)
+        y = self._across_gaps(self.sense(sensors, full[..., None])[..., 0])
+        # a run tells nothing of what was before its first sample
+        return self.y + self.within(sensors) * (y - self.y) if sensors.late else y
+
+    def difference(self, ship: Ship, shown: Shown, one: Ship, two: Ship) -> Array:
+        """Return how outputs change from one ship to another to first order, (N, ny).
+
+        Both lie near `ship`, whose run `shown` was made last.
+        """
+        slope = np.zeros((self.samples, len(self.states), 1))
+        tau = self.forces(two.vessel, two.wires) - self.forces(one.vessel, one.wires)
+        theta = np.broadcast_to(
+            self.parameters(two) - self.parameters(one), (self.samples, len(ship.theta))
+        )
+        current = np.broadcast_to(two.current - one.current, (self.samples, 2))
+        change = np.hstack([theta, current, tau])[:-1]
+        places = np.flatnonzero(change.any(axis=0))
+        if len(places):
+            linear = self._simulator.linearise(shown.x, places)
+            driven = np.einsum("nim,nm->ni", linear.driven, change[:, places])
+            slope = sensitivities(Linear(linear.a, driven[:, :, None]))[:, :, :1]
+        out = self.seen(ship, slope)[:, :, 0]
+        if one.sensors != two.sensors:
+            shows = [self._show(s.sensors, shown.x, shown.start) for s in (one, two)]
+            out = out + shows[1] - shows[0]
+        return np.asarray(out)
 
     def _across_gaps(self, y: Array) -> Array:
         """Return outputs (N, ny, ...) straight between the ends of gaps, level at the log's ends.

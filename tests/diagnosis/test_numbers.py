@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import json
-import warnings
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from changing import MOMENT, changed_log, fitted
 
 from greybox.diagnosis.causes import known_causes
 from greybox.diagnosis.held_out import proof_of
@@ -81,20 +79,6 @@ def test_a_run_that_leaves_every_bound_is_said_in_words() -> None:
     worse = proof_of(np.array([-np.inf, 1.0]))
     assert worse.gain == -np.inf
     assert worse.p_value == 1.0
-
-
-def test_a_derivative_beside_a_run_that_escapes_warns_nobody(monkeypatch) -> None:
-    problem, _, fit = fitted(changed_log(), MOMENT)
-    run, start = problem.runs[0], fit.point.starts[0]
-    escaped = replace(run.run(fit.point.ship, start), y=np.full_like(run.y, np.inf))
-    monkeypatch.setattr(run, "run", lambda *_: escaped)
-    hypothesis = fit.point.hypotheses[0]
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        vector = fit.point.vector()
-        k = problem.numbers_of(fit.point, hypothesis)[0]
-        rows = problem._difference(fit.point, vector, run, start, k, hypothesis, 0)
-    assert not np.isfinite(rows).any()
 
 
 def test_damping_brakes_and_cross_terms_have_no_sign(ready) -> None:
