@@ -6,6 +6,7 @@ a step of several stages follows from them by the chain rule.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -45,6 +46,14 @@ def means(d: ca.SX, current: ca.SX) -> ca.SX:
     return ca.vertcat(current, ca.SX.zeros(max(unknown - 2, 0)))[:unknown]
 
 
+def with_zeros(values: ca.SX, places: Sequence[int], size: int) -> ca.SX:
+    """Return a vector (size,) of values at some places and zeros elsewhere."""
+    out = ca.SX.zeros(size)
+    for k, place in enumerate(places):
+        out[place] = values[k]
+    return out
+
+
 class Slopes:
     """Derivatives of a step in a current.
 
@@ -55,19 +64,23 @@ class Slopes:
     ----------
     step : StepModel
         With the measured heading.
+    active : sequence of int
+        Coefficients that are not zero.
     """
 
-    def __init__(self, step: StepModel) -> None:
-        self._step = step
+    def __init__(self, step: StepModel, active: Sequence[int]) -> None:
+        self._step, self._active = step, np.array(active, int)
         s, f = step.symbolic, step.increment
         current = ca.SX.sym("current", 2)
         rate = f(s.x, s.psi, s.tau, means(s.d, current), s.air, s.theta)
         slopes = ca.jacobian(rate, ca.vertcat(s.x, s.theta, current, s.tau))
-        symbols = ca.vertcat(s.x, s.tau, s.psi, s.air, current, s.theta)
         self._states, self._columns = slopes.shape
-        self._program = Vectorised(
-            ca.vertsplit(ca.densify(ca.vec(slopes.T))), ca.vertsplit(symbols)
-        )
+        drivers = [s.x, s.tau, s.psi, s.air, current]
+        of_all = ca.Function("slopes", [*drivers, s.theta], [ca.densify(ca.vec(slopes.T))])
+        own = ca.SX.sym("theta", len(active))
+        # what only products with zeros lead to is not computed
+        found = of_all(*drivers, with_zeros(own, active, s.theta.numel()))
+        self._program = Vectorised(ca.vertsplit(found), ca.vertsplit(ca.vertcat(*drivers, own)))
 
     def __call__(self, x: Array, drivers: Array, theta: Array, places: Array) -> Linear:
         """Return the derivatives along a run.
@@ -89,25 +102,26 @@ class Slopes:
         euler = self._step.integrator == "euler"
         at = x[:-1] if euler else (x[:-1] + x[1:]) / 2
         values: list[Array | float] = [*at.T.copy(), *drivers[:-1].T.copy()]
-        values += list(map(float, theta)) if theta.ndim == 1 else list(theta[:-1].T.copy())
+        own = theta[..., self._active]
+        values += list(map(float, own)) if own.ndim == 1 else list(own[:-1].T.copy())
         columns = np.concatenate([np.arange(nx), nx + np.asarray(places, int)])
         wanted = (np.arange(nx)[:, None] * self._columns + columns).ravel()
         out = self._program(values, np.empty((len(wanted), steps)), wanted=wanted.tolist())
         moved = out.reshape(nx, len(columns), steps).transpose(2, 0, 1)
-        own, driven = (np.ascontiguousarray(part) for part in np.split(moved, [nx], axis=2))
+        state, driven = (np.ascontiguousarray(part) for part in np.split(moved, [nx], axis=2))
         if not self._step.structure.increment:
-            return Linear(own, driven)
+            return Linear(state, driven)
         one = np.eye(nx)
         if euler:
-            return Linear(one + own, driven)
-        ahead = one + own @ (one / 2 + own / 6)
-        return Linear(one + own @ ahead, ahead @ driven)
+            return Linear(one + state, driven)
+        ahead = one + state @ (one / 2 + state / 6)
+        return Linear(one + state @ ahead, ahead @ driven)
 
 
-@lru_cache(maxsize=32)
-def slopes_of(step: StepModel) -> Slopes:
+@lru_cache(maxsize=128)
+def slopes_of(step: StepModel, active: tuple[int, ...]) -> Slopes:
     """Return the derivatives of a step, built once."""
-    return Slopes(step)
+    return Slopes(step, active)
 
 
 def sensitivities(linear: Linear) -> Array:

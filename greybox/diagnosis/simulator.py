@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.linear import Linear, means, slopes_of
+from greybox.diagnosis.linear import Linear, means, slopes_of, with_zeros
 from greybox.model.run.kernels import FreeRunKernel
 from greybox.model.run.step import StepModel
 
@@ -18,15 +18,25 @@ Array = NDArray[np.float64]
 _ESCAPED = 1e3
 
 
-@lru_cache(maxsize=32)
-def _function(step: StepModel) -> ca.Function:
-    """Return ``(x, [tau, psi, air, current, theta]) -> x⁺``."""
+# lengths of log and sets of terms that a simulator keeps at hand
+_KEPT = 16
+Active = tuple[int, ...]
+
+
+@lru_cache(maxsize=256)
+def _function(step: StepModel, active: Active, changing: bool) -> ca.Function:
+    """Return ``(x, [tau, psi, air, current], theta) -> x⁺`` of the coefficients that are not zero.
+
+    With `changing` these are read at each step, as the drivers are.
+    """
     s = step.symbolic
     nu = s.tau.numel()
-    w = ca.SX.sym("w", nu + 5 + s.theta.numel())
-    d = means(s.d, w[nu + 3 : nu + 5])
-    after = step(s.x, w[nu], w[:nu], d, w[nu + 1 : nu + 3], w[nu + 5 :], 1.0)
-    return ca.Function("step", [s.x, w], [after], {"cse": True})
+    drivers, own = ca.SX.sym("drivers", nu + 5), ca.SX.sym("theta", len(active))
+    theta = with_zeros(own, active, s.theta.numel())
+    d = means(s.d, drivers[nu + 3 : nu + 5])
+    after = step(s.x, drivers[nu], drivers[:nu], d, drivers[nu + 1 : nu + 3], theta, 1.0)
+    given = [ca.vertcat(drivers, own)] if changing else [drivers, own]
+    return ca.Function("step", [s.x, *given], [ca.densify(after)], {"cse": True})
 
 
 class VaryingSimulator:
@@ -41,9 +51,21 @@ class VaryingSimulator:
     """
 
     def __init__(self, step: StepModel, samples: int) -> None:
-        self._kernel = FreeRunKernel(_function(step), samples - 1)
-        self._slopes = slopes_of(step)
+        self._step, self._samples = step, samples
+        self._kernels: dict[tuple[Active, bool], FreeRunKernel] = {}
         self._theta, self._drivers = np.zeros(0), np.zeros((0, 0))
+        self._active: Active = ()
+
+    def _kernel(self, changing: bool) -> FreeRunKernel:
+        key = (self._active, changing)
+        # the sets of terms that are compared come again and again; those of old steps do not
+        kernel = self._kernels.pop(key, None)
+        if kernel is None:
+            kernel = FreeRunKernel(_function(self._step, *key), self._samples - 1)
+        self._kernels[key] = kernel
+        if len(self._kernels) > _KEPT:
+            del self._kernels[next(iter(self._kernels))]
+        return kernel
 
     def __call__(self, x0: Array, drivers: Array, theta: Array) -> Array:
         """Run from x0.
@@ -64,9 +86,15 @@ class VaryingSimulator:
             (N, nx); infinite where the run escaped.
         """
         self._drivers, self._theta = drivers, theta
-        kernel, split = self._kernel, drivers.shape[1]
+        changing = theta.ndim == 2
+        used = np.flatnonzero(theta.any(axis=0) if changing else theta)
+        self._active = tuple(used.tolist())
+        kernel, split = self._kernel(changing), drivers.shape[1]
         kernel.read[:, :split] = drivers[:-1]
-        kernel.read[:, split:] = theta[:-1] if theta.ndim == 2 else theta
+        if changing:
+            kernel.read[:, split:] = theta[:-1, used]
+        else:
+            kernel.constants[0][:] = theta[used]
         kernel.start[:] = x0
         out = np.vstack([x0, kernel()])
         with np.errstate(invalid="ignore"):
@@ -84,4 +112,5 @@ class VaryingSimulator:
         places : ndarray of int
             (m,) coefficients, and past them the current north and east.
         """
-        return self._slopes(x, self._drivers, self._theta, places)
+        slopes = slopes_of(self._step, self._active)
+        return slopes(x, self._drivers, self._theta, places)
