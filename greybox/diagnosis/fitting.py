@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,8 @@ Array = NDArray[np.float64]
 # a step that promises less than this of −2 log L ends the search
 _ENOUGH = 0.02
 _MOST = 25
+# a point that −2 log L tells from another by less than this has its derivatives
+_NEAR = 1.0
 _DAMPING_LIMIT = 1e6
 # values at which hills of a likelihood are looked for
 _HILLS = 25
@@ -38,6 +40,27 @@ def groups_of(run: LogRun) -> list[tuple[int, ...]]:
     return out
 
 
+@dataclass(frozen=True)
+class _Normal:
+    """Whitened derivatives (n, q) at a vector (q,) of free numbers, and their squares (q, q)."""
+
+    at: Array
+    rows: Array
+    matrix: Array
+
+    @classmethod
+    def of(cls, at: Array, noise: Noise, slopes: Sequence[Array]) -> _Normal:
+        # of a run at the edge of stability the derivatives may leave every number's range
+        with np.errstate(over="ignore", invalid="ignore"):
+            rows = np.concatenate([noise.whiten(s).reshape(-1, s.shape[2]) for s in slopes])
+            return cls(at, rows, rows.T @ rows)
+
+    def near(self, vector: Array) -> bool:
+        """Whether these derivatives do for a vector, too."""
+        away = vector - self.at
+        return bool(away @ self.matrix @ away < _NEAR)
+
+
 class Problem:
     """Logs, ready to be explained.
 
@@ -53,6 +76,7 @@ class Problem:
         self.sample_time = runs[0].sample_time
         self.groups = groups_of(runs[0])
         self.names = (*self.structure.parameters, *CURRENTS)
+        self._known: tuple[Point, list[Array]] | None = None
 
     def place(self, name: str) -> int:
         """Return the index of a coefficient or current."""
@@ -179,21 +203,19 @@ class Problem:
         nu, cost = self.whitened(noise, errors)
         converged = not np.isfinite(cost)
         damping = 0.0
+        normal: _Normal | None = None
         for _ in range(most):
             if converged:
                 break
-            rows = np.concatenate([r.reshape(-1, r.shape[2]) for r in self.rows(point, noise)])
-            if not np.isfinite(rows).all():
+            if normal is None:
+                normal = self._normal(point, vector, noise)
+            if not np.isfinite(normal.matrix).all():
                 break
-            residual = np.concatenate([n.ravel() for n in nu])
-            with np.errstate(over="ignore", invalid="ignore"):
-                normal, gradient = rows.T @ rows, rows.T @ residual
-            if not np.isfinite(normal).all():
-                break
+            gradient = normal.rows.T @ np.concatenate([n.ravel() for n in nu])
             accepted = False
             while damping <= _DAMPING_LIMIT:
-                step = bounded_step(normal, gradient, low - vector, high - vector, damping)
-                promise = float(2 * gradient @ step - step @ normal @ step)
+                step = bounded_step(normal.matrix, gradient, low - vector, high - vector, damping)
+                promise = float(2 * gradient @ step - step @ normal.matrix @ step)
                 if promise < _ENOUGH and damping < 1:
                     converged = True
                     break
@@ -213,7 +235,19 @@ class Problem:
             damping = damping / 10 if damping > 1e-5 else 0.0
             if little:
                 converged = True
+            if not normal.near(vector):
+                normal = None
         return Fit(point, noise, cost, tuple(nu), tuple(errors), converged, self.runs[0].integrator)
+
+    def _normal(self, point: Point, vector: Array, noise: Noise) -> _Normal:
+        """Return the normal equations at a point, by derivatives made at it or near to it."""
+        known = self._known
+        if known is not None and known[0].alike(point):
+            normal = _Normal.of(known[0].vector(), noise, known[1])
+            if normal.near(vector):
+                return normal
+        self._known = (point, self.slopes(point))
+        return _Normal.of(vector, noise, self._known[1])
 
     def profile(self, fit: Fit, k: int, values: Array) -> Array:
         """Return −2 log L at values (m,) of the free number k, the others following to first order.

@@ -53,6 +53,22 @@ class Point:
         full = np.concatenate([self.base.theta, self.base.current])
         return np.concatenate([full[list(self.places)], *self.values, *self.starts])
 
+    def alike(self, other: Point) -> bool:
+        """Whether another point has the same free numbers, and all that is not free the same."""
+        mine, its = self.base, other.base
+        held = np.ones(len(mine.theta) + len(mine.current), bool)
+        held[list(self.places)] = False
+        full = [np.concatenate([ship.theta, ship.current])[held] for ship in (mine, its)]
+        return (
+            self.places == other.places
+            and [h.key for h in self.hypotheses] == [h.key for h in other.hypotheses]
+            and list(map(len, self.values)) == list(map(len, other.values))
+            and list(map(len, self.starts)) == list(map(len, other.starts))
+            and np.array_equal(*full)
+            and mine.vessel == its.vessel
+            and (mine.changes, mine.sensors, mine.wires) == (its.changes, its.sensors, its.wires)
+        )
+
     def at(self, vector: Array) -> Point:
         """Return the point with other free numbers."""
         m = len(self.places)
