@@ -54,6 +54,8 @@ CAUSES = {
     "quadratic_yaw_damping": (4, "r", lambda g, run: run[:, 2], "simulated yaw rate [rad/s]"),
     "crossflow": (5, "v", lambda g, run: np.abs(g["r"]) * g["v"], "|r| v [m rad/s²]"),
     "side_force": (2, "v", lambda g, run: np.degrees(g["psi"]) % 360, "heading [deg]"),
+    "inertia_coupling": (1, "v", lambda g, run: g["r"], "yaw rate [rad/s]"),
+    "asymmetry": (1, "v", lambda g, run: push(g), "force along the bow"),
     "heading_bias": (1, "v", lambda g, run: g["u"], "surge [m/s]"),
     "lever_arm": (6, "v", lambda g, run: g["r"], "yaw rate [rad/s]"),
     "clock_offset": (3, "u", lambda g, run: change(g["u"]) / 10, "mean rate of u in 10 s [m/s²]"),

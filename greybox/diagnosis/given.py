@@ -11,7 +11,7 @@ from greybox.diagnosis.base import Case
 from greybox.diagnosis.hypothesis import Hypothesis
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.preparing import prepare
-from greybox.diagnosis.refitting import final_refit, likelier, refit, seen_as_slow, slow
+from greybox.diagnosis.refitting import final_refit, likelier, refits, seen_as_slow, slow
 from greybox.diagnosis.result import Given
 from greybox.diagnosis.scores import ProjectedScores, score_hypotheses
 from greybox.diagnosis.search import Search, freed
@@ -89,9 +89,10 @@ def _likeliest(
     problem = case.problem(fit.integrator)
     near = [a for a in hypotheses if not a.refit_from_scratch]
     scores = score_hypotheses(ProjectedScores(problem, fit), near)
-    fits = [(s.hypothesis, refit(problem, fit, s)) for s in scores[:_FORMS]]
+    asked = [(fit, score) for score in scores[:_FORMS]]
     if slow(fit):
-        fits = likelier(fits, seen_as_slow(problem, fit, near))
+        asked += seen_as_slow(problem, fit, near)
+    fits = likelier(refits(problem, asked))
     if not fit.point.hypotheses:
         # coefficients of their own forget the causes before: only the first can have them
         fits += case.restart(fit, hypotheses, [s.hypothesis for s in scores if s.gain == -np.inf])

@@ -82,7 +82,7 @@ class Slopes:
         found = of_all(*drivers, with_zeros(own, active, s.theta.numel()))
         self._program = Vectorised(ca.vertsplit(found), ca.vertsplit(ca.vertcat(*drivers, own)))
 
-    def __call__(self, x: Array, drivers: Array, theta: Array, places: Array) -> Linear:
+    def __call__(self, x: Array, drivers: Array, theta: Array, places: NDArray[np.int_]) -> Linear:
         """Return the derivatives along a run.
 
         Parameters

@@ -58,13 +58,13 @@ class Point:
         mine, its = self.base, other.base
         held = np.ones(len(mine.theta) + len(mine.current), bool)
         held[list(self.places)] = False
-        full = [np.concatenate([ship.theta, ship.current])[held] for ship in (mine, its)]
+        one, two = (np.concatenate([ship.theta, ship.current])[held] for ship in (mine, its))
         return (
             self.places == other.places
             and [h.key for h in self.hypotheses] == [h.key for h in other.hypotheses]
             and list(map(len, self.values)) == list(map(len, other.values))
             and list(map(len, self.starts)) == list(map(len, other.starts))
-            and np.array_equal(*full)
+            and np.array_equal(one, two)
             and mine.vessel == its.vessel
             and (mine.changes, mine.sensors, mine.wires) == (its.changes, its.sensors, its.wires)
         )

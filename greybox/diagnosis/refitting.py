@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from greybox.diagnosis.base import Case
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.hypothesis import Hypothesis
 from greybox.diagnosis.noise import SEEN
-from greybox.diagnosis.point import Fit
+from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.scores import ProjectedScores, Score, score_hypotheses
+from greybox.numerics.forked import map_forked
+
+Array = NDArray[np.float64]
+Told = TypeVar("Told")
 
 # hypotheses that are refitted at a step, and promised fall of −2 log L below which none is
 _SHORTLIST, _LEAST_GAIN = 7, 9.0
@@ -29,6 +38,37 @@ def refit(problem: Problem, fit: Fit, score: Score) -> Fit:
     point = problem.add(fit.point, score.hypothesis, score.value if len(score.value) else None)
     first = problem.fit(point, fit.noise, most=FIRST)
     return problem.settle(problem.scan(first, score.hypothesis), 1)
+
+
+def refits(problem: Problem, asked: Sequence[tuple[Fit, Score]]) -> list[tuple[Hypothesis, Fit]]:
+    """Return the fits with one more hypothesis each."""
+    points = [problem.add(fit.point, score.hypothesis) for fit, score in asked]
+    found = on_all_processors(points, lambda k: (refit(problem, *asked[k]), None))
+    return [(score.hypothesis, fit) for (_, score), (fit, _) in zip(asked, found, strict=True)]
+
+
+def on_all_processors(
+    points: Sequence[Point], work: Callable[[int], tuple[Fit, Told]]
+) -> list[tuple[Fit, Told]]:
+    """Return what a work finds for each of several points, with the fit that it ends at.
+
+    What a hypothesis applies is a function, which no other process can send: fits come back
+    as numbers, and are put in the place of those of the points.
+
+    Parameters
+    ----------
+    points : sequence of Point
+        With the free numbers that the fits end with.
+    work : callable
+        Of a point's index.
+    """
+
+    def numbers(k: int) -> tuple[Array, Fit, Told]:
+        fit, told = work(k)
+        return fit.point.vector(), replace(fit, point=replace(fit.point, hypotheses=())), told
+
+    found = zip(points, map_forked(numbers, range(len(points))), strict=True)
+    return [(replace(fit, point=point.at(v)), told) for point, (v, fit, told) in found]
 
 
 def shortlist(scores: Sequence[Score]) -> list[Score]:
@@ -65,23 +105,21 @@ def loosened(problem: Problem, fit: Fit) -> Fit:
 
 def seen_as_slow(
     problem: Problem, fit: Fit, hypotheses: Sequence[Hypothesis]
-) -> list[tuple[Hypothesis, Fit]]:
-    """Return refits that begin with errors that forget, judged with their likeliest colour.
+) -> list[tuple[Fit, Score]]:
+    """Return what to refit from errors that forget, to be judged with their likeliest colour.
 
     A force with a long memory imitates most causes; where it was taken for one, what
     a cause promises is hidden, and its search ends where it began.
     """
     plain = problem.forgetful(fit, _FORGOTTEN)
     promising = shortlist(score_hypotheses(ProjectedScores(problem, plain), hypotheses))
-    return [(s.hypothesis, refit(problem, plain, s)) for s in promising[:_SECOND]]
+    return [(plain, score) for score in promising[:_SECOND]]
 
 
-def likelier(
-    fits: Sequence[tuple[Hypothesis, Fit]], others: Sequence[tuple[Hypothesis, Fit]]
-) -> list[tuple[Hypothesis, Fit]]:
+def likelier(fits: Sequence[tuple[Hypothesis, Fit]]) -> list[tuple[Hypothesis, Fit]]:
     """Return the likeliest fit of each hypothesis."""
     best: dict[str, tuple[Hypothesis, Fit]] = {}
-    for hypothesis, fit in (*fits, *others):
+    for hypothesis, fit in fits:
         if hypothesis.key not in best or fit.cost < best[hypothesis.key][1].cost:
             best[hypothesis.key] = (hypothesis, fit)
     return list(best.values())

@@ -17,6 +17,7 @@ from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.hypothesis import Hypothesis
 from greybox.diagnosis.linear import sensitivities
 from greybox.diagnosis.noise import Noise
+from greybox.diagnosis.normal import bounded_step
 from greybox.diagnosis.point import Fit, Point
 
 Array = NDArray[np.float64]
@@ -83,15 +84,32 @@ class ProjectedScores:
         rows = _stacked([self.noise.whiten(c) for c in columns])
         return self._clear(rows), (rows**2).sum(axis=0)
 
-    def gain(self, cleared: Array, before: Array) -> tuple[float, Array]:
-        """Return the fall of −2 log L and the coefficients of directions taken together."""
+    def gain(
+        self, cleared: Array, before: Array, bounds: Array | None = None
+    ) -> tuple[float, Array]:
+        """Return the fall of −2 log L and the coefficients of directions taken together.
+
+        Parameters
+        ----------
+        cleared, before : ndarray
+            (n, m) and (m,), see `clear`.
+        bounds : ndarray, optional
+            (m, 2) least and largest coefficient.
+        """
         own = (cleared**2).sum(axis=0) > _OWN * before
         coefficients = np.zeros(cleared.shape[1])
         if not own.any():
             return 0.0, coefficients
-        found = np.linalg.lstsq(cleared[:, own], self.nu, rcond=1e-8)[0]
+        rows = cleared[:, own]
+        if bounds is None:
+            found = np.linalg.lstsq(rows, self.nu, rcond=1e-8)[0]
+        else:
+            # a cause whose bounds exclude what the errors ask for promises nothing
+            low, high = np.minimum(bounds[own, 0], 0.0), np.maximum(bounds[own, 1], 0.0)
+            found = bounded_step(rows.T @ rows, rows.T @ self.nu, low, high, 0.0)
         coefficients[own] = found
-        return float(self.nu @ (cleared[:, own] @ found)), coefficients
+        taken = rows @ found
+        return float(2 * self.nu @ taken - taken @ taken), coefficients
 
 
 def _stacked(parts: Sequence[Array]) -> Array:
@@ -130,7 +148,10 @@ def _score_columns(directions: ProjectedScores, hypotheses: Sequence[Hypothesis]
     out = []
     for hypothesis in hypotheses:
         index = [names.index(n) for n in hypothesis.columns]
-        gain, _ = directions.gain(cleared[:, index], before[index])
+        free = [(-np.inf, np.inf)] * len(index)
+        # those that are freed with it have no bounds
+        bounds = np.array([*((p.low, p.high) for p in hypothesis.parameters), *free][: len(index)])
+        gain, _ = directions.gain(cleared[:, index], before[index], bounds)
         out.append(Score(hypothesis, np.zeros(0), gain))
     return out
 
@@ -151,7 +172,7 @@ def _score_moves(directions: ProjectedScores, hypotheses: Sequence[Hypothesis]) 
     for hypothesis in hypotheses:
         best = Score(hypothesis, hypothesis.start, -np.inf)
         for value in (hypothesis.start, *(np.array(s) for s in hypothesis.starts)):
-            parts = []
+            parts, bounds = [], []
             if not len(value):
                 one = moved(problem.add(point, hypothesis, value))
                 parts = [one] if one is not None else []
@@ -162,12 +183,15 @@ def _score_moves(directions: ProjectedScores, hypotheses: Sequence[Hypothesis]) 
                 one = moved(problem.add(point, hypothesis, trial))
                 if one is not None:
                     parts.append([p / (1.0 if off else parameter.step) for p in one])
+                    size = value[i] - parameter.null if off else parameter.step
+                    ends = (parameter.low - parameter.null, parameter.high - parameter.null)
+                    bounds.append(sorted(end / size for end in ends))
             if not parts:
                 continue
             columns = [np.stack([p[k] for p in parts], axis=2) for k in range(len(now))]
             cleared, before = directions.clear(columns)
             if len(value):
-                gain, _ = directions.gain(cleared, before)
+                gain, _ = directions.gain(cleared, before, np.array(bounds))
             else:
                 # a channel is reversed or it is not
                 gain = float(2 * cleared[:, 0] @ directions.nu - cleared[:, 0] @ cleared[:, 0])

@@ -23,7 +23,9 @@ from greybox.diagnosis.refitting import (
     SETTLE,
     final_refit,
     likelier,
+    on_all_processors,
     refit,
+    refits,
     seen_as_slow,
     shortlist,
     slow,
@@ -230,9 +232,10 @@ def take_step(
     problem, held_out = case.problem(fit.integrator), case.held_out(fit.integrator)
     near = [a for a in left if not a.refit_from_scratch]
     scores = score_hypotheses(ProjectedScores(problem, fit), near)
-    fits = [(s.hypothesis, refit(problem, fit, s)) for s in shortlist(scores)]
+    asked = [(fit, score) for score in shortlist(scores)]
     if slow(fit):
-        fits = likelier(fits, seen_as_slow(problem, fit, near))
+        asked += seen_as_slow(problem, fit, near)
+    fits = likelier(refits(problem, asked))
     if not causes:
         fits += case.restart(fit, left, [s.hypothesis for s in scores if s.gain == -np.inf])
     candidates = sorted(
@@ -373,13 +376,7 @@ def weighed(case: Case, found: Search) -> Search:
     fit, kept, leaning = found.final, list(found.causes), []
     left: list[Fit] = []
     while kept:
-        problem, held_out = case.problem(fit.integrator), case.held_out(fit.integrator)
-        pairs = held_out.pairs(fit)
-        tried = []
-        for cause in kept:
-            without = _without(problem, fit, cause)
-            stands = standing(problem, cause.hypothesis, fit, pairs, held_out.pairs(without))
-            tried.append((replace(cause, fit=fit, standing=stands), without))
+        tried = _stood(case, fit, kept)
         kept, left = [cause for cause, _ in tried], [without for _, without in tried]
         fallen = [(cause, without) for cause, without in tried if not _stands(cause)]
         if not fallen:
@@ -391,6 +388,23 @@ def weighed(case: Case, found: Search) -> Search:
     return replace(
         found, final=fit, causes=tuple(kept), leaning=tuple(leaning), without=tuple(left)
     )
+
+
+def _stood(case: Case, fit: Fit, causes: Sequence[Candidate]) -> list[tuple[Candidate, Fit]]:
+    """Return causes with what each does beside a generic force, and the fits without them."""
+    problem, held_out = case.problem(fit.integrator), case.held_out(fit.integrator)
+    pairs = held_out.pairs(fit)
+
+    def work(k: int) -> tuple[Fit, Standing]:
+        without = _without(problem, fit, causes[k])
+        hypothesis = causes[k].hypothesis
+        return without, standing(problem, hypothesis, fit, pairs, held_out.pairs(without))
+
+    found = on_all_processors([problem.drop(fit.point, c.hypothesis) for c in causes], work)
+    return [
+        (replace(cause, fit=fit, standing=weight), without)
+        for cause, (without, weight) in zip(causes, found, strict=True)
+    ]
 
 
 def _stands(cause: Candidate) -> bool:

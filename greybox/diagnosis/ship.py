@@ -297,7 +297,7 @@ class LogRun:
             y[:, i] = -y[:, i]
         return y
 
-    def linearise(self, ship: Ship, shown: Shown, places: Array) -> Linear:
+    def linearise(self, ship: Ship, shown: Shown, places: NDArray[np.int_]) -> Linear:
         """Return the derivatives along the run that was made last.
 
         Parameters
@@ -313,7 +313,7 @@ class LogRun:
                 linear.driven[:, :, here] *= factor[:, None, None]
         return linear
 
-    def columns(self, ship: Ship, shown: Shown, places: Array) -> Array:
+    def columns(self, ship: Ship, shown: Shown, places: NDArray[np.int_]) -> Array:
         """Return ∂y of coefficients and currents at `places`, then of the start.
 
         Parameters

@@ -102,7 +102,7 @@ class VaryingSimulator:
                 out = np.full_like(out, np.inf)
         return out
 
-    def linearise(self, x: Array, places: Array) -> Linear:
+    def linearise(self, x: Array, places: NDArray[np.int_]) -> Linear:
         """Return the derivatives along the run that was made last.
 
         Parameters

@@ -181,7 +181,28 @@ def _aside(rng: np.random.Generator, size: float, typical: Typical) -> dict[str,
     }
 
 
-def _with_terms(ship: Ship, effect: Effect, later: bool) -> Ship:
+def _coupled(rng: np.random.Generator, size: float, typical: Typical) -> dict[str, Value]:
+    # shares of what damps the sway and the turn
+    side, turn = (size * _signed(rng, 0.3, 0.6) for _ in range(2))
+    return {
+        "Y_r": side * typical.value("Yv") * typical.v / typical.r,
+        "N_v": turn * typical.value("Nr") * typical.r / typical.v,
+    }
+
+
+def _uneven(rng: np.random.Generator, size: float, typical: Typical) -> dict[str, Value]:
+    side, turn = (size * _signed(rng, 0.2, 0.5) for _ in range(2))
+    # along the thrust that holds the typical speed, or along its square
+    thrust = -typical.value("Xu") * typical.u / typical.value("Xmu")
+    of, scale = [("taux", thrust), ("|u|u", typical.u**2)][int(rng.integers(2))]
+    return {
+        f"Y_{of}": side * typical.value("Yv") * typical.v / scale,
+        f"N_{of}": turn * typical.value("Nr") * typical.r / scale,
+    }
+
+
+def with_terms(ship: Ship, effect: Effect, later: bool) -> Ship:
+    """Add terms to the ship's equations."""
     return replace(ship, extra=tuple(float(effect.parameters.get(n, 0.0)) for n in EXTRA))
 
 
@@ -238,10 +259,12 @@ CAUSES: dict[str, Kind] = {
     "input_delay": Kind(_delay, _delayed),
     "quadratic_thrust": Kind(_quadratic, _squared),
     "advance_speed": Kind(uniform("loss", 0.04, 0.12), _advancing),
-    "cubic_damping": Kind(_relative("X_uuu", "Y_vvv", "N_rrr"), _with_terms),
-    "quadratic_yaw_damping": Kind(_relative("N_|r|r"), _with_terms),
-    "crossflow": Kind(_relative("Y_|r|r", "Y_|r|v", "N_|r|v"), _with_terms),
-    "side_force": Kind(_aside, _with_terms),
+    "cubic_damping": Kind(_relative("X_uuu", "Y_vvv", "N_rrr"), with_terms),
+    "quadratic_yaw_damping": Kind(_relative("N_|r|r"), with_terms),
+    "crossflow": Kind(_relative("Y_|r|r", "Y_|r|v", "N_|r|v"), with_terms),
+    "side_force": Kind(_aside, with_terms),
+    "inertia_coupling": Kind(_coupled, with_terms),
+    "asymmetry": Kind(_uneven, with_terms),
     "heading_bias": Kind(_heading_bias),
     "lever_arm": Kind(_lever_arm),
     "angle_offset": Kind(_angle_offset),

@@ -7,7 +7,15 @@ from dataclasses import replace
 import numpy as np
 
 from greybox.errors import UsageError, suggestion
-from greybox.study.blind_causes import CAUSES, Effect, Kind, Typical, Value, uniform
+from greybox.study.blind_causes import (
+    CAUSES,
+    Effect,
+    Kind,
+    Typical,
+    Value,
+    uniform,
+    with_terms,
+)
 from greybox.study.blind_ship import Ship
 
 
@@ -86,7 +94,7 @@ UNKNOWN: dict[str, Kind] = {
 }
 EFFECTS = CAUSES | UNKNOWN
 # those that add terms to the equations, so that several may stand together
-_TERMS = ("cubic_damping", "quadratic_yaw_damping", "crossflow", "side_force")
+_TERMS = tuple(name for name, kind in CAUSES.items() if kind.act is with_terms)
 
 
 def shows(name: str, kind: str) -> bool:

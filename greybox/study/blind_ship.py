@@ -24,6 +24,7 @@ NAMES = (
 )  # fmt: skip
 EXTRA = (
     "X_uuu", "Y_vvv", "N_rrr", "N_|r|r", "Y_|r|r", "Y_|r|v", "N_|r|v", "Y_0", "N_0",
+    "Y_r", "N_v", "Y_taux", "N_taux", "Y_|u|u", "N_|u|u",
 )  # fmt: skip
 STEP = 0.1
 # seconds that a ship runs before its log begins: late sensors and commands have a past
@@ -51,7 +52,7 @@ class Ship:
     current : (float, float)
         North and east [m/s].
     extra : tuple of float
-        (9,) coefficients of `EXTRA`.
+        (15,) coefficients of `EXTRA`.
     gain : (float, float)
         Of each thruster.
     speed_lag, force_lag, delay : float
@@ -195,8 +196,10 @@ class _Fleet:
             du += e[0] * ur**3 + self.shallow[0] * beyond**2 * np.sign(ur)
             du += push * np.cos(self.swell[2] - psi)
             dv += e[1] * vr**3 + e[4] * turn * r + e[5] * turn * vr + e[7]
+            dv += e[9] * r + e[11] * tau[0] + e[13] * np.abs(ur) * ur
             dv += self.unevenness * Yv * np.maximum(vr, 0.0) + push * np.sin(self.swell[2] - psi)
             dr += e[2] * r**3 + e[3] * turn * r + e[6] * turn * vr + e[8]
+            dr += e[10] * vr + e[12] * tau[0] + e[14] * np.abs(ur) * ur
         return np.array([du, dv, dr, r])
 
 

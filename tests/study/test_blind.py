@@ -13,7 +13,7 @@ from greybox.errors import UsageError
 from greybox.model.catalogue import get_structure
 from greybox.model.run.simulation import simulate
 from greybox.study.blind import Order, draw, draw_many, write
-from greybox.study.blind_causes import CAUSES, Effect
+from greybox.study.blind_causes import CAUSES, Effect, with_terms
 from greybox.study.blind_conditions import Conditions, blind_vessel
 from greybox.study.blind_effects import EFFECTS, UNKNOWN, act
 from greybox.study.blind_inputs import KINDS
@@ -116,7 +116,7 @@ def corrected(name, trial):
             ("N_u*taun", -loss * trial.ship["Nmu"]),
         )
         return one_step(trial, terms=terms)
-    if name in ("cubic_damping", "quadratic_yaw_damping", "crossflow", "side_force"):
+    if name in CAUSES and CAUSES[name].act is with_terms:
         return one_step(trial, terms=tuple(p.items()))
     if name == "parameter_change":
         (key,) = (k for k in p if k.endswith("_factor"))
