@@ -122,9 +122,9 @@ def test_a_run_whose_squares_leave_every_number_ends_the_fit(
     changed: TrialLog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     problem, _, fit = fitted(changed, MOMENT)
-    rows = problem.rows(fit.point, fit.noise)
-    monkeypatch.setattr(Problem, "rows", lambda *_: [1e200 * r for r in rows])
-    found = problem.fit(fit.point, fit.noise)
+    slopes = problem.slopes(fit.point)
+    monkeypatch.setattr(Problem, "slopes", lambda *_: [1e200 * s for s in slopes])
+    found = Problem(problem.runs).fit(fit.point, fit.noise)
     assert not found.converged
     np.testing.assert_array_equal(found.point.vector(), fit.point.vector())
 
