@@ -64,7 +64,9 @@ def from_chosen(
     problem = case.problem(base.integrator)
     named, hypotheses = _hypotheses(ready, case, choice)
     in_force = {n for a in named for n in a.columns}
-    places = tuple(problem.place(n) for n in terms.parameters if n not in in_force)
+    # what (3.51) has is free though it was not chosen: a cause is what that cannot do
+    free = dict.fromkeys((*ready.structure.parameters, *terms.parameters))
+    places = tuple(problem.place(n) for n in free if n not in in_force)
     start = Point(_ship(problem, choice, base), base.point.starts, places)
     for hypothesis in named:
         value = None if hypothesis.apply is None else np.array([_share(choice)])

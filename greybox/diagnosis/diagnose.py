@@ -106,9 +106,11 @@ def diagnose(
     if model is None and leaves_more(found, case.held_out):
         chosen = from_chosen(ready, found, say)
         if chosen is not None:
-            case, found = chosen
-            found = weighed(case, found)
-            problem = case.problem(found.base.integrator)
+            wider, mine = chosen
+            mine = weighed(wider, mine)
+            if mine.causes:
+                case, found = wider, mine
+                problem = case.problem(found.base.integrator)
     say("what is left")
     names, final = problem.runs[0].outputs, found.final
     lines = [find_waves(f.nu, f.errors, names, problem.sample_time) for f in (found.before, final)]

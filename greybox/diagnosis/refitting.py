@@ -135,5 +135,6 @@ def final_refit(case: Case, fit: Fit, hypothesis: Hypothesis) -> Fit:
     better = case.likeliest_variant(case.other_integrator(better), hypothesis)
     # what a sample holds decides how it is best stepped, too
     better = case.other_integrator(better)
+    problem = case.problem(better.integrator)
     # with errors as small as they are now, its hills are steeper
-    return case.problem(better.integrator).scan(better, hypothesis)
+    return problem.scan(loosened(problem, better), hypothesis)

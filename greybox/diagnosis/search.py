@@ -382,6 +382,9 @@ def weighed(case: Case, found: Search) -> Search:
         if not fallen:
             break
         least, fit = min(fallen, key=lambda item: _beyond(item[0]))
+        if fit.escaped:
+            # what does not stand holds the run within bounds: nothing of it can be told
+            return replace(found, final=found.base, causes=(), leaning=(*leaning, *kept))
         leaning.append(least)
         kept = [c for c in kept if c.hypothesis.key != least.hypothesis.key]
         fit = case.problem(fit.integrator).settle(fit, SETTLE)

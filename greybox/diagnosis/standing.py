@@ -37,8 +37,7 @@ class Standing:
     moved : ndarray
         How far each of its numbers moves when the generic force joins.
     clear : float
-        p-value of the null (Wald), where it is and where the generic force moves it to, the
-        larger.
+        p-value of the null (Wald), the movement counted among the standard errors.
     """
 
     beyond: Proof
@@ -109,10 +108,10 @@ def _moved(
         tested = np.array([p.reach == 0 for p in hypothesis.parameters])
     if not np.isfinite(own).all() or not tested.any():
         return np.abs(moved), 1.0 if tested.any() else 0.0
-    inverse = np.linalg.pinv(own[np.ix_(tested, tested)])
-    ends = (numbers[where] - null, numbers[where] + moved - null)
-    wald = min(float(away[tested] @ inverse @ away[tested]) for away in ends)
-    return np.abs(moved), float(chi2.sf(wald, int(tested.sum())))
+    # what is told of the numbers holds how far they move, and must exclude the null
+    away, far = (numbers[where] - null)[tested], moved[tested]
+    spread = np.linalg.pinv(own[np.ix_(tested, tested)] + np.outer(far, far))
+    return np.abs(moved), float(chi2.sf(float(away @ spread @ away), int(tested.sum())))
 
 
 def _own_arguments(problem: Problem, hypothesis: Hypothesis) -> Use | None:
