@@ -18,6 +18,7 @@ from greybox.diagnosis.causes.hull import term_parameters
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.held_out import proof_of
 from greybox.diagnosis.hypothesis import Hypothesis
+from greybox.diagnosis.kinematics import denied
 from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.preparing import Prepared, context_of
 from greybox.diagnosis.refitting import SETTLE
@@ -26,7 +27,7 @@ from greybox.diagnosis.ship import CURRENTS, Ship
 from greybox.diagnosis.thresholds import PROVEN
 from greybox.errors import ExcitationError, GreyboxError
 from greybox.model.structure import Structure
-from greybox.model.terms import Term
+from greybox.model.terms import Term, parse_term
 from greybox.selection.cross_validation import Refit
 from greybox.selection.estimate import at_own_pace
 from greybox.selection.term_selection import TermChoice, select_terms
@@ -64,8 +65,7 @@ def from_chosen(
     problem = case.problem(base.integrator)
     named, hypotheses = _hypotheses(ready, case, choice)
     in_force = {n for a in named for n in a.columns}
-    # what (3.51) has is free though it was not chosen: a cause is what that cannot do
-    free = dict.fromkeys((*ready.structure.parameters, *terms.parameters))
+    free = dict.fromkeys((*terms.parameters, *_replaced(ready.structure, named)))
     places = tuple(problem.place(n) for n in free if n not in in_force)
     start = Point(_ship(problem, choice, base), base.point.starts, places)
     for hypothesis in named:
@@ -143,8 +143,8 @@ def _hypotheses(
         )
         for (cause, _), mine in grouped.items()
     ]
-    sought = [c for name, c in ready.causes.items() if name not in ready.agreeing]
-    others = [a for c in sought for a in c.hypotheses(context)]
+    tried = [a for c in ready.causes.values() for a in c.hypotheses(context)]
+    others = [a for a in tried if not denied(a.key, ready.agreeing)]
     if "current" in ready.causes and choice.terms.kind in ("wind", "augmented"):
         named += [replace(a, co_freed=()) for a in others if a.cause == "current" and not a.apply]
         others = [a for a in others if a.cause != "current"]
@@ -152,6 +152,18 @@ def _hypotheses(
         named += [a for a in others if a.cause == _QUADRATIC]
         others = [a for a in others if a.cause != _QUADRATIC]
     return named, [*named, *others]
+
+
+def _replaced(structure: Structure, named: Sequence[Hypothesis]) -> list[str]:
+    """Return terms of (3.51) that chosen ones stand in for: a cause is what they cannot do."""
+    columns = [name for cause in named for name in cause.columns]
+    chosen = [parse_term(name) for name in columns if name not in CURRENTS]
+
+    def alike(one: Term, two: Term) -> bool:
+        mine, its = ({f.signal for f in t.factors} for t in (one, two))
+        return one.state == two.state and bool(mine and its) and (mine <= its or its <= mine)
+
+    return [t.name for t in structure.terms if any(alike(t, other) for other in chosen)]
 
 
 def _lacking(structure: Structure, terms: Structure) -> list[str]:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 from greybox.diagnosis.chosen import from_chosen
-from greybox.diagnosis.kinematics import causes_of
+from greybox.diagnosis.kinematics import causes_of, denied
 from greybox.diagnosis.preparing import SHORTEST, prepare
 from greybox.diagnosis.result import Diagnosis
 from greybox.diagnosis.ruling import leaves_more
@@ -97,7 +97,8 @@ def diagnose(
     found = search(case, base, ready.hypotheses, progress=options.progress)
     say("a generic force beside the causes")
     found = weighed(case, found)
-    apart = sorted({c.hypothesis.cause for c in found.causes} & ready.agreeing)
+    keys = [c.hypothesis.key for c in found.causes]
+    apart = sorted(key for key in keys if denied(key, ready.agreeing))
     if apart and leaves_more(found, case.held_out):
         # a defect that all sensors share would leave nothing; this one imitates what forces do
         say("causes without those that the sensors deny")
@@ -116,7 +117,7 @@ def diagnose(
     lines = [find_waves(f.nu, f.errors, names, problem.sample_time) for f in (found.before, final)]
     say("gain")
     notes = []
-    if apart and not any(c.hypothesis.cause in apart for c in found.causes):
+    if apart and not any(c.hypothesis.key in apart for c in found.causes):
         notes.append(
             f"{', '.join(apart)} would help, but positions, heading and velocities of these logs "
             f"agree without it, and with it more than noise is left: it was not taken."

@@ -6,7 +6,7 @@ find there with certainty is taken out before forces are judged.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +17,7 @@ from greybox.diagnosis.causes import Cause
 from greybox.diagnosis.result import Found, Quantity
 from greybox.errors import GreyboxError
 from greybox.trial.checks.check import check_recordings
-from greybox.trial.checks.finding import Finding
+from greybox.trial.checks.finding import Finding, Outcome
 from greybox.trial.log import TrialLog
 from greybox.trial.raw_log import Recording, Signal
 from greybox.vessel.vessel import Vessel
@@ -48,8 +48,8 @@ class Kinematics:
     findings : tuple of Finding
         What they prove.
     agreeing : frozenset of str
-        Causes of which they show nothing though they could: the sensors agree with each other.
-        Only a defect that all of them share would not show.
+        Causes, or their places, of which they show nothing though they could: the sensors agree
+        with each other. Only a defect that all of them share would not show.
     """
 
     findings: tuple[Finding, ...] = ()
@@ -72,12 +72,23 @@ def judged_by_kinematics(logs: Sequence[TrialLog]) -> Kinematics:
     each = [[f for f in report.findings if _kinematic(f)] for report in reports]
     shared = set.intersection(*({f.id for f in found} for found in each))
     clean = [
-        {o.id for o in report.outcomes if o.status == "clean" and o.id in _NAMES}
+        {place for o in report.outcomes if o.status == "clean" for place in _places(o)}
         for report in reports
     ]
     return Kinematics(
         tuple(f for f in each[0] if f.id in shared), frozenset(set.intersection(*clean))
     )
+
+
+def denied(key: str, agreeing: Collection[str]) -> bool:
+    """Whether sensors that agree deny a hypothesis of this key."""
+    return key in agreeing or key.split(":", 1)[0] in agreeing
+
+
+def _places(outcome: Outcome) -> list[str]:
+    if outcome.id == "clock_offset":
+        return [f"{outcome.id}:{channel}" for channel in outcome.channels if channel in _MOTIONS]
+    return [outcome.id] if outcome.id in _NAMES else []
 
 
 def _kinematic(finding: Finding) -> bool:

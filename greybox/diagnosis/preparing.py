@@ -10,7 +10,7 @@ import numpy as np
 from greybox.diagnosis.base import Case
 from greybox.diagnosis.causes import Cause, Context, known_causes
 from greybox.diagnosis.hypothesis import Hypothesis
-from greybox.diagnosis.kinematics import judged_by_kinematics, mended
+from greybox.diagnosis.kinematics import denied, judged_by_kinematics, mended
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.ship import CURRENTS
 from greybox.errors import LogError, UsageError, suggestion
@@ -49,7 +49,7 @@ class Prepared:
     model : ManoeuvringModel or None
         As it was given.
     agreeing : frozenset of str
-        Causes of which the kinematics show nothing though they could.
+        Causes or places of which the kinematics show nothing though they could.
     """
 
     case: Case
@@ -65,7 +65,7 @@ class Prepared:
     @property
     def of_forces(self) -> tuple[Hypothesis, ...]:
         """The hypotheses without those of which sensors that agree show nothing."""
-        return tuple(h for h in self.hypotheses if h.cause not in self.agreeing)
+        return tuple(h for h in self.hypotheses if not denied(h.key, self.agreeing))
 
     @property
     def tried(self) -> int:

@@ -373,7 +373,8 @@ def weighed(case: Case, found: Search) -> Search:
 
     The least of them goes first: what it imitated may be another's once it is gone.
     """
-    fit, kept, leaning = found.final, list(found.causes), []
+    fit, kept = found.final, list(found.causes)
+    leaning: list[Candidate] = []
     left: list[Fit] = []
     while kept:
         tried = _stood(case, fit, kept)

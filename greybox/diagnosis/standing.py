@@ -37,7 +37,9 @@ class Standing:
     moved : ndarray
         How far each of its numbers moves when the generic force joins.
     clear : float
-        p-value of the null (Wald), the movement counted among the standard errors.
+        p-value of the null (Wald) where it is likeliest on the way that the generic force moves
+        the numbers, or that of the surest of them with its movement counted as a standard error,
+        the larger.
     """
 
     beyond: Proof
@@ -108,10 +110,16 @@ def _moved(
         tested = np.array([p.reach == 0 for p in hypothesis.parameters])
     if not np.isfinite(own).all() or not tested.any():
         return np.abs(moved), 1.0 if tested.any() else 0.0
-    # what is told of the numbers holds how far they move, and must exclude the null
     away, far = (numbers[where] - null)[tested], moved[tested]
-    spread = np.linalg.pinv(own[np.ix_(tested, tested)] + np.outer(far, far))
-    return np.abs(moved), float(chi2.sf(float(away @ spread @ away), int(tested.sum())))
+    inverse = np.linalg.pinv(own[np.ix_(tested, tested)])
+    # the null must not lie on the way, either
+    size = float(far @ inverse @ far)
+    share = float(np.clip(-(away @ inverse @ far) / size, 0.0, 1.0)) if size > 0 else 0.0
+    near = away + share * far
+    passed = float(chi2.sf(float(near @ inverse @ near), int(tested.sum())))
+    # nor within the interval of each of them, which holds how far they move
+    told = away**2 / np.maximum(np.diag(own)[tested] + far**2, 1e-300)
+    return np.abs(moved), max(passed, float(chi2.sf(told.max(), 1)))
 
 
 def _own_arguments(problem: Problem, hypothesis: Hypothesis) -> Use | None:

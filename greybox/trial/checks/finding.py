@@ -105,11 +105,14 @@ class Outcome:
     status : {"clean", "found", "cannot tell"}
     sentence : str
         What was looked at, or why nothing in the log can show it.
+    channels : tuple of str
+        Of a check of several channels, those that would have shown it.
     """
 
     id: str
     status: Literal["clean", "found", "cannot tell"]
     sentence: str
+    channels: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, repr=False)

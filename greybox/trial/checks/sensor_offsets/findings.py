@@ -377,6 +377,7 @@ def _clock_outcome(campaign: Campaign, information: Array, basis: Array, togethe
     """Say how well each clock is known, and which cannot be told."""
     known: list[str] = []
     vague: list[str] = []
+    sharp: tuple[str, ...] = ()
     seen = sum(np.diag(e.information) for e in campaign.evidence) > np.zeros(SIZE)
     for channels in _OWN_CLOCKS:
         column = np.zeros((SIZE, 1))
@@ -387,13 +388,14 @@ def _clock_outcome(campaign: Campaign, information: Array, basis: Array, togethe
         column[rows] = 1.0
         std = float(_error(information, basis, column)[0])
         (vague if std > _VAGUE_CLOCK else known).append(f"{', '.join(channels)} {std:.2g} s")
+        sharp += channels if std <= _VAGUE_CLOCK else ()
     if not known:
         said = f"this motion tells no clock apart (standard errors: {'; '.join(vague)})"
         return Outcome("clock_offset", "cannot tell", said)
     said = f"standard errors: {'; '.join(known)}{together}"
     if vague:
         said += f"; cannot tell: {'; '.join(vague)}"
-    return Outcome("clock_offset", "clean", said)
+    return Outcome("clock_offset", "clean", said, sharp)
 
 
 def _error(information: Array, basis: Array, more: Array) -> Array:
