@@ -57,10 +57,9 @@ class Kinematics:
 
 
 def judged_by_kinematics(logs: Sequence[TrialLog]) -> Kinematics:
-    """Return what the logs tell of lever arms, heading biases and reversed motions.
+    """Return what the logs tell of clocks, lever arms, heading biases and reversed motions.
 
-    Clocks of what forces act on, and thrusters, are left to the force model, which sees
-    them more sharply. Several logs are judged together and must all have it; the first one's
+    Thrusters are left to the force model. Several logs are judged together and must all have it; the first one's
     values are taken.
     """
     if not logs or not all(set(_POSITIONS) <= log.channels.keys() for log in logs):
@@ -94,7 +93,7 @@ def _places(outcome: Outcome) -> list[str]:
 def _kinematic(finding: Finding) -> bool:
     channels = set(finding.channels or (finding.channel,))
     if finding.id == "clock_offset":
-        return channels <= {*_POSITIONS, "x", "y"}
+        return channels <= {*_POSITIONS, "x", "y", *_MOTIONS}
     if finding.id == "sign":
         return channels <= _MOTIONS
     return finding.id in _NAMES
