@@ -130,7 +130,9 @@ def diagnose(
     if model is not None:
         conditions = (*conditions, *other_conditions(model.conditions, case.logs))
     notes += [d.sentence for d in conditions]
-    report = Report(case, ready.structure, ready.causes, found, model, options.seed, notes)
+    report = Report(
+        case, ready.structure, ready.causes, found, model, options.seed, notes, ready.agreeing
+    )
     causes = causes_of(ready.findings, ready.causes, ready.tried)
     if lines[1] is not None and "waves" in ready.causes:
         causes.append(found_waves(lines[1], ready.causes["waves"], ready.tried))

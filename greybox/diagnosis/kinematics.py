@@ -59,8 +59,8 @@ class Kinematics:
 def judged_by_kinematics(logs: Sequence[TrialLog]) -> Kinematics:
     """Return what the logs tell of clocks, lever arms, heading biases and reversed motions.
 
-    Thrusters are left to the force model. Several logs are judged together and must all have it; the first one's
-    values are taken.
+    Thrusters are left to the force model. Several logs are judged together and must all have
+    it; the first one's values are taken.
     """
     if not logs or not all(set(_POSITIONS) <= log.channels.keys() for log in logs):
         return Kinematics()
@@ -77,6 +77,18 @@ def judged_by_kinematics(logs: Sequence[TrialLog]) -> Kinematics:
     return Kinematics(
         tuple(f for f in each[0] if f.id in shared), frozenset(set.intersection(*clean))
     )
+
+
+def decided(findings: Sequence[Finding]) -> frozenset[str]:
+    """Return causes, or their places, whose values the kinematics give: no force model may."""
+    places = set()
+    for finding in findings:
+        channels = finding.channels or (finding.channel,)
+        if finding.id == "clock_offset":
+            places |= {f"{finding.id}:{channel}" for channel in channels}
+        elif finding.id in _NAMES:
+            places.add(finding.id)
+    return frozenset(places)
 
 
 def denied(key: str, agreeing: Collection[str]) -> bool:

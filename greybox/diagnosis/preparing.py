@@ -10,7 +10,7 @@ import numpy as np
 from greybox.diagnosis.base import Case
 from greybox.diagnosis.causes import Cause, Context, known_causes
 from greybox.diagnosis.hypothesis import Hypothesis
-from greybox.diagnosis.kinematics import denied, judged_by_kinematics, mended
+from greybox.diagnosis.kinematics import decided, denied, judged_by_kinematics, mended
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.ship import CURRENTS
 from greybox.errors import LogError, UsageError, suggestion
@@ -49,7 +49,7 @@ class Prepared:
     model : ManoeuvringModel or None
         As it was given.
     agreeing : frozenset of str
-        Causes or places of which the kinematics show nothing though they could.
+        Causes or places of which the kinematics show nothing though they could, or all there is.
     """
 
     case: Case
@@ -128,7 +128,9 @@ def prepare(
     validate = [correct_log(log, vessel) for log in validate]
     start = _structure(structure, logs, model)
     context = _context(start, [*logs, *validate], model)
-    hypotheses = [a for c in causes.values() for a in c.hypotheses(context)]
+    told = decided(findings)
+    known = [a for c in causes.values() for a in c.hypotheses(context)]
+    hypotheses = [a for a in known if not denied(a.key, told)]
     case = _case(start, hypotheses, logs, validate)
     return Prepared(
         case,
@@ -139,7 +141,7 @@ def prepare(
         tuple(validate),
         tuple(short),
         model,
-        kinematics.agreeing,
+        kinematics.agreeing | told,
     )
 
 

@@ -17,6 +17,7 @@ from greybox.diagnosis.extension import extended_model
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.gain import gains, run_on
 from greybox.diagnosis.held_out import Pair
+from greybox.diagnosis.kinematics import denied
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.residuals import residual_tests
 from greybox.diagnosis.result import (
@@ -57,8 +58,9 @@ class Report:
         given: ManoeuvringModel | None,
         seed: int,
         notes: Sequence[str],
+        agreeing: frozenset[str] = frozenset(),
     ) -> None:
-        self.notes = list(notes)
+        self.notes, self.agreeing = list(notes), agreeing
         self.case, self.structure, self.causes = case, structure, causes
         self.found, self.given, self.seed = found, given, seed
         self.current: dict[str, tuple[float, float]] = {}
@@ -214,7 +216,10 @@ class Report:
             if len(causes) > 1 or self.found.leaning:
                 without, best, others = instead(self.case, self.found.final, best, others)
             like = rivals(self.case.problem, self.case.held_out, best, others)
-            like = [c for c in like if self._stands(c, without)]
+            like = [
+                c for c in like
+                if not denied(c.hypothesis.key, self.agreeing) and self._stands(c, without)
+            ]  # fmt: skip
             if like:
                 out.append([best, *like])
         return out
