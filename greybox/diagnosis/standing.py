@@ -14,7 +14,7 @@ from greybox.diagnosis.hypothesis import Hypothesis
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.remainder import Use, contributions_beside, generic_force
 from greybox.diagnosis.ship import CURRENTS
-from greybox.diagnosis.thresholds import LEAST_SHARE, OWN_SHARE, PROVEN
+from greybox.diagnosis.thresholds import LEAST_SHARE, OWN_SHARE, PROVEN, SAME
 from greybox.model.terms import parse_term
 
 Array = NDArray[np.float64]
@@ -38,8 +38,9 @@ class Standing:
         How far each of its numbers moves when the generic force joins.
     clear : float
         p-value of the null (Wald) where it is likeliest on the way that the generic force moves
-        the numbers, or that of the surest of them with its movement counted as a standard error,
-        the larger.
+        the numbers.
+    told : float
+        That of the surest of the numbers with its movement counted as a standard error.
     """
 
     beyond: Proof
@@ -47,13 +48,16 @@ class Standing:
     half: float
     moved: Array
     clear: float
+    told: float
 
     @property
     def stands(self) -> bool:
         """Whether the cause does what no force without a name does as well."""
         gains = self.beyond.gain > 0 and self.beyond.p_value < PROVEN
         own = self.share is not None and self.share >= OWN_SHARE and self.half < PROVEN
-        return (gains or own) and self.clear < PROVEN
+        # that a run leaves every bound without it tells nothing of a cause's size
+        sure = self.told < (SAME if np.isfinite(self.beyond.gain) else PROVEN)
+        return (gains or own) and self.clear < PROVEN and sure
 
 
 def standing(problem: Problem, hypothesis: Hypothesis, with_it: Fit, pairs: Sequence[Pair],
@@ -69,11 +73,11 @@ def standing(problem: Problem, hypothesis: Hypothesis, with_it: Fit, pairs: Sequ
     pairs, without : sequence of Pair
         That fit, and the one without the cause, on what is held out.
     """
-    moved, clear = _moved(problem, hypothesis, with_it, pairs)
+    moved, *sure = _moved(problem, hypothesis, with_it, pairs)
     if any(p.held_fit.escaped or p.fit.escaped for p in (*pairs, *without)):
         better = not any(p.held_fit.escaped for p in pairs)
         proof = proof_of(np.array([np.inf if better else -np.inf]))
-        return Standing(proof, None, 1.0, moved, clear)
+        return Standing(proof, None, 1.0, moved, *sure)
     beside = [contributions_beside(p) for p in pairs]
     beyond = proof_of(np.concatenate([contributions_beside(p) for p in without])
                       - np.concatenate(beside))  # fmt: skip
@@ -86,19 +90,19 @@ def standing(problem: Problem, hypothesis: Hypothesis, with_it: Fit, pairs: Sequ
         gained, could = plain - own, plain - generic
         share = float(gained.sum() / could.sum()) if could.sum() > 0 else np.inf
         half = proof_of(gained - LEAST_SHARE * could).p_value
-    return Standing(beyond, share, half, moved, clear)
+    return Standing(beyond, share, half, moved, *sure)
 
 
 def _moved(
     problem: Problem, hypothesis: Hypothesis, fit: Fit, pairs: Sequence[Pair]
-) -> tuple[Array, float]:
-    """Return how far a hypothesis's numbers move, and the p-value of their null."""
+) -> tuple[Array, float, float]:
+    """Return how far a hypothesis's numbers move, and two p-values of their null."""
     from scipy.stats import chi2
 
     where = problem.numbers_of(fit.point, hypothesis)
     bounded = [p for p in pairs if not (p.fit.escaped or p.held_fit.escaped)]
     if not where or not bounded:
-        return np.zeros(len(where)), 0.0
+        return np.zeros(len(where)), 0.0, 0.0
     moved = np.mean([generic_force(p).moved[where] for p in bounded], axis=0)
     numbers, covariance = problem.covariance(fit)
     own = covariance[np.ix_(where, where)]
@@ -109,7 +113,7 @@ def _moved(
         # a number with many hills has no null
         tested = np.array([p.reach == 0 for p in hypothesis.parameters])
     if not np.isfinite(own).all() or not tested.any():
-        return np.abs(moved), 1.0 if tested.any() else 0.0
+        return np.abs(moved), *[1.0 if tested.any() else 0.0] * 2
     away, far = (numbers[where] - null)[tested], moved[tested]
     inverse = np.linalg.pinv(own[np.ix_(tested, tested)])
     # the null must not lie on the way, either
@@ -117,9 +121,8 @@ def _moved(
     share = float(np.clip(-(away @ inverse @ far) / size, 0.0, 1.0)) if size > 0 else 0.0
     near = away + share * far
     passed = float(chi2.sf(float(near @ inverse @ near), int(tested.sum())))
-    # nor within the interval of each of them, which holds how far they move
     told = away**2 / np.maximum(np.diag(own)[tested] + far**2, 1e-300)
-    return np.abs(moved), max(passed, float(chi2.sf(told.max(), 1)))
+    return np.abs(moved), passed, float(chi2.sf(told.max(), 1))
 
 
 def _own_arguments(problem: Problem, hypothesis: Hypothesis) -> Use | None:

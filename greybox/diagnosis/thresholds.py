@@ -24,6 +24,9 @@ BACKWARDS = 3
 # share of what a generic force of the cause's own arguments gains that the cause must take, with
 # fewer numbers, and the share that the 95 % interval must lie above
 OWN_SHARE, LEAST_SHARE = 0.8, 0.5
+# significance of a number whose movement beside that force counts as a standard error: one standard
+# error. Foreign ships in wind: at 5 % a true coupling fell at 0.053, and with it the wind
+SAME = 0.32
 
 # -- causes do equally well (confusion) --------------------------------------------------------
 # probability with which chance makes rivals differ so much on held-out logs
