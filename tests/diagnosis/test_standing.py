@@ -18,21 +18,27 @@ def proof(gain: float, p: float) -> Proof:
 
 
 @pytest.mark.parametrize(
-    ("beyond", "share", "half", "clear", "stands"),
+    ("beyond", "share", "half", "clear", "told", "stands"),
     [
-        ((50.0, 1e-9), None, 1.0, 1e-9, True),
+        ((50.0, 1e-9), None, 1.0, 1e-9, 1e-9, True),
         # no better than the force without a name, which is no function of what it is
-        ((3.0, 0.2), None, 1.0, 1e-9, False),
+        ((3.0, 0.2), None, 1.0, 1e-9, 1e-9, False),
         # as good as a force of its own arguments
-        ((-4.0, 0.8), 0.9, 1e-4, 1e-9, True),
-        ((-4.0, 0.8), 0.7, 1e-4, 1e-9, False),
-        ((-4.0, 0.8), 0.9, 0.2, 1e-9, False),
+        ((-4.0, 0.8), 0.9, 1e-4, 1e-9, 1e-9, True),
+        ((-4.0, 0.8), 0.7, 1e-4, 1e-9, 1e-9, False),
+        ((-4.0, 0.8), 0.9, 0.2, 1e-9, 1e-9, False),
         # its value may be null once that force is there
-        ((50.0, 1e-9), 0.9, 1e-4, 0.3, False),
+        ((50.0, 1e-9), 0.9, 1e-4, 0.3, 1e-9, False),
+        # it moves by less than it is, or by more
+        ((50.0, 1e-9), 0.9, 1e-4, 1e-9, 0.1, True),
+        ((50.0, 1e-9), 0.9, 1e-4, 1e-9, 0.4, False),
+        # where it holds the run within bounds, nothing else speaks for it
+        ((np.inf, 0.0), None, 1.0, 1e-9, 0.01, True),
+        ((np.inf, 0.0), None, 1.0, 1e-9, 0.1, False),
     ],
 )
-def test_what_makes_a_cause_stand(beyond, share, half, clear, stands) -> None:
-    found = Standing(proof(*beyond), share, half, np.zeros(1), clear)
+def test_what_makes_a_cause_stand(beyond, share, half, clear, told, stands) -> None:
+    found = Standing(proof(*beyond), share, half, np.zeros(1), clear, told)
     assert found.stands is stands
 
 
