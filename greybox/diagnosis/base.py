@@ -8,10 +8,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.fitting import Problem
+from greybox.diagnosis.fitting import Metric, Problem
 from greybox.diagnosis.held_out import Folds, HeldOut, OtherLogs
 from greybox.diagnosis.hypothesis import Hypothesis
-from greybox.diagnosis.noise import fit_noise
 from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.ship import LogRun, Ship, shifted, wired
 from greybox.errors import ExcitationError
@@ -55,6 +54,8 @@ class Case:
     kind : str
         Predictor of the first coefficients.
     regime : Regime
+    metric : {"coloured", "free run"}
+        See `Problem`.
     """
 
     def __init__(
@@ -65,28 +66,28 @@ class Case:
         held_out: Sequence[TrialLog],
         kind: str,
         regime: Regime,
+        metric: Metric = "coloured",
     ) -> None:
         self.structure, self.universe = structure, universe
+        self.metric: Metric = metric
         self.logs, self.held_out_logs = list(logs), list(held_out)
         self.kind, self.regime = kind, regime
         self._problems: dict[Integrator, Problem] = {}
         self._held: dict[Integrator, HeldOut] = {}
 
-    def wider(self, names: Sequence[str]) -> Case:
-        """Return the case with more terms that a hypothesis may use."""
+    def wider(self, names: Sequence[str], metric: Metric) -> Case:
+        """Return the case with more terms that a hypothesis may use, and errors weighed anew."""
         known = {t.key for t in self.universe.terms}
         more = [n for n in names if parse_term(n).key not in known]
         return Case(
             self.structure, self.universe.with_terms(*more), self.logs, self.held_out_logs,
-            self.kind, self.regime,
+            self.kind, self.regime, metric,
         )  # fmt: skip
 
     def carried(self, fit: Fit) -> Fit:
         """Return a fit of a case with fewer terms as one of this."""
-        base, problem = fit.point.base, self.problem(fit.integrator)
-        more = len(problem.structure.parameters) - len(base.theta)
-        if more == 0:
-            return fit
+        base = fit.point.base
+        more = len(self.universe.parameters) - len(base.theta)
         theta = np.concatenate([base.theta, np.zeros(more)])
         # currents stand behind the coefficients
         places = tuple(i if i < len(base.theta) else i + more for i in fit.point.places)
@@ -120,7 +121,8 @@ class Case:
             [
                 LogRun(self.universe, log, integrator, None if origins is None else origins[i])
                 for i, log in enumerate(logs)
-            ]
+            ],
+            self.metric,
         )
 
     def _folds(self, integrator: Integrator) -> list[tuple[Problem, Problem]]:
@@ -217,7 +219,7 @@ class Case:
         errors = problem.errors(point)
         if not all(np.isfinite(e).all() for e in errors):
             return None
-        noise = fit_noise(errors, problem.poles(point), problem.sample_time, problem.groups)
+        noise = problem.noise_of(errors, point)
         return replace(problem.settle(problem.fit(point, noise), 2), integrator=integrator)
 
     def _fit(
@@ -243,7 +245,7 @@ class Case:
         if not all(np.isfinite(e).all() for e in errors):
             return None
         # errors of a model far off look like a force with a memory, and weigh little as that
-        noise = fit_noise(errors, problem.poles(point), problem.sample_time, problem.groups)
+        noise = problem.noise_of(errors, point)
         return replace(problem.settle(problem.fit(point, noise), 3), integrator=integrator)
 
     def refit_from_least_squares(self, fit: Fit) -> Fit:
@@ -269,7 +271,7 @@ class Case:
         errors = problem.errors(point)
         if not all(np.isfinite(e).all() for e in errors):
             return fit
-        noise = fit_noise(errors, problem.poles(point), problem.sample_time, problem.groups)
+        noise = problem.noise_of(errors, point)
         found = problem.settle(problem.fit(point, noise), 3)
         return found if found.cost < fit.cost - _BETTER else fit
 

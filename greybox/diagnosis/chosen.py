@@ -60,9 +60,10 @@ def from_chosen(
     except GreyboxError:
         return None
     terms = choice.terms.structure
-    case = ready.case.wider(terms.parameters)
+    case = ready.case.wider(terms.parameters, "free run")
     base = case.carried(found.base)
     problem = case.problem(base.integrator)
+    plain = problem.settle(base)
     named, hypotheses = _hypotheses(ready, case, choice)
     in_force = {n for a in named for n in a.columns}
     free = dict.fromkeys((*terms.parameters, *_replaced(ready.structure, named)))
@@ -71,7 +72,7 @@ def from_chosen(
     for hypothesis in named:
         value = None if hypothesis.apply is None else np.array([_share(choice)])
         start = problem.add(start, hypothesis, value)
-    begun = problem.fit(start, base.noise)
+    begun = problem.fit(start, plain.noise)
     if begun.escaped:
         return None
     fit = case.other_integrator(problem.settle(begun, SETTLE))
@@ -79,7 +80,7 @@ def from_chosen(
     if any(p.held_fit.escaped for p in held_out.pairs(fit)):
         return None
     causes = [
-        assess_candidate(held_out, base, fit, a, len(hypotheses), problem.names) for a in named
+        assess_candidate(held_out, plain, fit, a, len(hypotheses), problem.names) for a in named
     ]
     fit, causes = pruned(case, fit, causes, len(hypotheses))
     other = search(
@@ -101,23 +102,13 @@ def _better(case: Case, mine: Search, other: Fit) -> bool:
 
     A likelihood that takes slow errors for the sea's own may rise while the run gets worse.
     """
-    squares = [_squares(case, fit) for fit in (other, mine.final)]
-    if not np.log(squares[1] / np.maximum(squares[0], 1e-300)).sum() < 0:
+    held_out = case.held_out(mine.final.integrator)
+    if other.integrator == mine.final.integrator and not held_out.worse(mine.final, other) < 0:
         return False
     one, two = (case.held_out(f.integrator).contributions(f) for f in (other, mine.final))
     with np.errstate(invalid="ignore"):
         proof = proof_of(one - two)
     return proof.gain > 0 and proof.p_value < PROVEN
-
-
-def _squares(case: Case, fit: Fit) -> Array:
-    """Return the squared held-out error of each state, (nx,); infinite where a run has no bound."""
-    count = len(case.structure.states)
-    pairs = case.held_out(fit.integrator).pairs(fit)
-    total = np.zeros(count)
-    for errors in (e for p in pairs for e in p.held_fit.errors):
-        total += (errors[:, :count] ** 2).sum(axis=0)
-    return np.maximum(np.where(np.isfinite(total), total, np.inf), 1e-300)
 
 
 def _hypotheses(

@@ -6,6 +6,8 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
+import numpy as np
+
 from greybox.diagnosis.chosen import from_chosen
 from greybox.diagnosis.kinematics import causes_of, denied
 from greybox.diagnosis.preparing import SHORTEST, prepare
@@ -114,7 +116,11 @@ def diagnose(
                 problem = case.problem(found.base.integrator)
     say("what is left")
     names, final = problem.runs[0].outputs, found.final
-    lines = [find_waves(f.nu, f.errors, names, problem.sample_time) for f in (found.before, final)]
+    lines = []
+    for fit in (found.before, final):
+        # narrow bands are looked for in innovations, whatever the fit was weighed by
+        white = problem.forgetful(fit, np.inf)
+        lines.append(find_waves(white.nu, white.errors, names, problem.sample_time))
     say("gain")
     notes = []
     if apart and not any(c.hypothesis.key in apart for c in found.causes):

@@ -78,6 +78,8 @@ def extended_model(
             i = where[name]
             disturbances[name] = (float(ship.current[k]), float(np.sqrt(covariance[i, i])))
     names = problem.structure.parameters
+    # levels of noise are those of the errors' colour, whatever the fit was weighed by
+    white = problem.forgetful(fit, np.inf)
     summed = {
         name: parts for name, parts in _SUMS.items()
         if name in wide.parameters and parts[1] not in wide.parameters
@@ -90,8 +92,8 @@ def extended_model(
         vessel=extended_vessel(ship.vessel, ship.sensors, ship.wires, logs[0]),
         integrator=fit.integrator,
         disturbances=disturbances,
-        residual_std=_one_step(problem, fit),
-        noise=_noise(problem, fit),
+        residual_std=_one_step(problem, white),
+        noise=_noise(problem, white),
         sums=summed,
         changes=tuple(Change(names[c.index], c.factor, c.time) for c in ship.changes),
         conditions=pooled_conditions(logs).values,

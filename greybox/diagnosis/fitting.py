@@ -4,19 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from greybox.diagnosis.hypothesis import Hypothesis, Parameter
 from greybox.diagnosis.linear import NOWHERE
-from greybox.diagnosis.noise import Noise, fit_noise
+from greybox.diagnosis.noise import Noise, fit_noise, free_run_noise
 from greybox.diagnosis.normal import bounded_step, inverse
 from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.ship import CURRENTS, LogRun
-from greybox.numerics.lagged_moments import bartlett, weighted_lags
+from greybox.numerics.lagged_moments import automatic_lags, bartlett_sums
 
 Array = NDArray[np.float64]
+Metric = Literal["coloured", "free run"]
 
 # a step that promises less than this of −2 log L ends the search
 _ENOUGH = 0.02
@@ -68,10 +70,13 @@ class Problem:
     ----------
     runs : sequence of LogRun
         Of one structure and sample time.
+    metric : {"coloured", "free run"}
+        What errors are weighed by: their colour, by maximum likelihood, or their size alone, by
+        least squares, where a misfit would pass for colour.
     """
 
-    def __init__(self, runs: Sequence[LogRun]) -> None:
-        self.runs = tuple(runs)
+    def __init__(self, runs: Sequence[LogRun], metric: Metric = "coloured") -> None:
+        self.runs, self.metric = tuple(runs), metric
         self.structure = runs[0].structure
         self.sample_time = runs[0].sample_time
         self.groups = groups_of(runs[0])
@@ -341,7 +346,8 @@ class Problem:
             scores = np.einsum("kic,ki->kc", rows, nu)
         if not (np.isfinite(normal).all() and np.isfinite(scores).all()):
             return fit.point.vector()[:free], np.full((free, free), np.inf)
-        middle = weighted_lags([scores.T], bartlett(round(samples ** (1 / 3))))
+        lags = max(round(samples ** (1 / 3)), automatic_lags(nu))
+        middle = bartlett_sums(scores, lags)
         spread = inverse(normal)
         robust = spread @ middle @ spread * samples / max(samples - q, 1)
         # rounding may leave nothing of a variance beside numbers that are hardly known
@@ -363,8 +369,16 @@ class Problem:
         mean = np.mean(found, axis=0)
         return np.array([mean[i, i] if i < nx else 1.0 for i in range(len(self.runs[0].outputs))])
 
+    def noise_of(
+        self, errors: Sequence[Array], point: Point, start: Noise | None = None
+    ) -> Noise:
+        """Return what errors are weighed by."""
+        if self.metric == "free run":
+            return free_run_noise(errors, self.groups, start)
+        return fit_noise(errors, self.poles(point), self.sample_time, self.groups, start)
+
     def forgetful(self, fit: Fit, longest: float) -> Fit:
-        """Return the fit with errors whose colour forgets, whatever they look like."""
+        """Return the fit with the colour of its errors, which forgets after so many samples."""
         noise = fit_noise(
             fit.errors, self.poles(fit.point), self.sample_time, self.groups, longest=longest
         )
@@ -376,10 +390,7 @@ class Problem:
         for _ in range(rounds):
             if fit.escaped:
                 return fit
-            noise = fit_noise(
-                fit.errors, self.poles(fit.point), self.sample_time, self.groups,
-                fit.noise,
-            )  # fmt: skip
+            noise = self.noise_of(fit.errors, fit.point, fit.noise)
             before = self.whitened(noise, fit.errors)[1]
             fit = self.fit(fit.point, noise)
             if before - fit.cost < 0.5:

@@ -12,8 +12,12 @@ from numpy.typing import NDArray
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.ship import Ship
+from greybox.numerics.lagged_moments import correlation_factor
 
 Array = NDArray[np.float64]
+
+# blocks at least, of samples with a long memory
+_FEWEST = 12
 
 
 @dataclass(frozen=True)
@@ -85,6 +89,22 @@ class HeldOut(ABC):
                 out += pair.held.contributions(pair.held_fit)
         return np.concatenate(out)
 
+    def squares(self, fit: Fit) -> Array:
+        """Return the squared error of each state, (nx,); infinite where a run has no bound."""
+        pairs = self.pairs(fit)
+        count = len(pairs[0].held.structure.states)
+        total = np.zeros(count)
+        for errors in (e for p in pairs for e in p.held_fit.errors):
+            total += (errors[:, :count] ** 2).sum(axis=0)
+        return np.maximum(np.where(np.isfinite(total), total, np.inf), 1e-300)
+
+    def worse(self, fit: Fit, than: Fit) -> float:
+        """Return the mean logarithm of the ratio of squared errors of two fits."""
+        one, two = self.squares(fit), self.squares(than)
+        if not np.isfinite(two).all():
+            return -np.inf if np.isfinite(one).all() else 0.0
+        return float(np.log(one / two).mean())
+
     def prove(self, before: Fit, after: Fit) -> Proof:
         """Return what the second hypothesis gains on the first."""
         one, two = self.contributions(before), self.contributions(after)
@@ -99,7 +119,7 @@ class HeldOut(ABC):
 
 def proof_of(difference: Array) -> Proof:
     """Return the proof that differences of each sample (N,) give."""
-    from scipy.stats import norm
+    from scipy.stats import t
 
     if not np.isfinite(difference).all():
         # one of the two runs away: no sum tells more than which
@@ -107,18 +127,25 @@ def proof_of(difference: Array) -> Proof:
         return Proof(np.inf if better else -np.inf, np.nan, float(not better), difference)
     gain = float(difference.sum())
     std = float(np.sqrt(long_run_variance(difference) * len(difference)))
-    p = float(norm.sf(gain / std)) if std > 0 else float(gain <= 0)
+    blocks = len(difference) // _block(difference)
+    p = float(t.sf(gain / std, max(blocks - 1, 1))) if std > 0 else float(gain <= 0)
     return Proof(gain, std, p, difference)
 
 
+def _block(series: Array) -> int:
+    """Return how many samples a block has: N^(1/2), or four times their memory."""
+    memory = 4 * correlation_factor(series[:, None])
+    return int(min(max(5, round(len(series) ** 0.5), memory), max(len(series) // _FEWEST, 5)))
+
+
 def long_run_variance(series: Array) -> float:
-    """Return the variance per sample of a sum, by blocks of N^(1/2) samples.
+    """Return the variance per sample of a sum, by blocks.
 
     References
     ----------
     Carlstein (1986), non-overlapping blocks.
     """
-    size = max(5, round(len(series) ** 0.5))
+    size = _block(series)
     count = len(series) // size
     if count < 2:
         return float(np.var(series)) if len(series) > 1 else 0.0

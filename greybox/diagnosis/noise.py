@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.diagnosis.normal import bounded_step
+from greybox.numerics.robust import white_noise
 
 Array = NDArray[np.float64]
 
@@ -110,7 +111,7 @@ class Noise:
     groups : tuple of NoiseModel
         Whose outputs together are all channels.
     parameters : tuple of ndarray
-        Logarithms and memory that each was made from.
+        Logarithms and memory that each was made from; empty where no colour was fitted.
     """
 
     groups: tuple[NoiseModel, ...]
@@ -308,14 +309,49 @@ def fit_noise(
         Samples that what moves the ship beside the model is remembered at most.
     """
     found, chosen = [], []
+    known = () if start is None else start.parameters
     for g, group in enumerate(groups):
         x, colour = _fit_group(
             [e[:, list(group)] for e in errors], group, float(poles[group[0]]), sample_time,
-            None if start is None else start.parameters[g], longest,
+            known[g] if known else None, longest,
         )  # fmt: skip
         found.append(colour)
         chosen.append(x)
     return Noise(tuple(found), tuple(chosen))
+
+
+def free_run_noise(
+    errors: Sequence[Array], groups: Sequence[tuple[int, ...]], start: Noise | None = None
+) -> Noise:
+    """Return the metric of least squares: each channel's errors in their own deviation.
+
+    What a misfit leaves is slow, and a colour that takes it for the sea's own hides every slow
+    cause. Here nothing is hidden; tests and standard errors must count the errors' memory.
+
+    Parameters
+    ----------
+    errors : sequence of ndarray
+        (N, ny) free-run errors of each log.
+    groups : sequence of tuple of int
+        As of `fit_noise`.
+    start : Noise, optional
+        Whose sensors' deviations are kept; by default those of third differences.
+    """
+    every = np.concatenate(errors)
+    size = np.maximum(np.sqrt((every**2).mean(axis=0)), 1e-12)
+    made = []
+    for g, group in enumerate(groups):
+        k = len(group)
+        own = size[list(group)]
+        sensor = (
+            np.array([max(white_noise([e[:, i] for e in errors]) or 0.0, 1e-12) for i in group])
+            if start is None
+            else start.groups[g].sensor
+        )
+        numerators = np.zeros((k, k, 1))
+        numerators[:, :, 0] = np.diag(1 / own)
+        made.append(NoiseModel(group, numerators, np.ones(1), np.diag(own), sensor))
+    return Noise(tuple(made), ())
 
 
 def _fit_group(

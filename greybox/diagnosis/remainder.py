@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.held_out import Pair
 from greybox.diagnosis.linear import NOWHERE, sensitivities
-from greybox.diagnosis.noise import fit_noise
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.ship import LogRun, shifted, wired
+from greybox.numerics.lagged_moments import correlation_factor
 from greybox.rotation import ned_to_body
 
 Array = NDArray[np.float64]
@@ -194,7 +194,9 @@ def generic_force(pair: Pair, use: Use = motion_and_commands) -> GenericForce:
     raw /= size
     along = left.T @ raw
     nu = np.concatenate([n.ravel() for n in fit.nu])
-    delta = _ridge(raw - left @ along, nu - left @ (left.T @ nu))
+    # of errors with a memory fewer tell anything new
+    alike = np.sqrt(correlation_factor(np.concatenate(fit.nu)))
+    delta = _ridge((raw - left @ along) / alike, (nu - left @ (left.T @ nu)) / alike)
     # what the coefficients give back, where they can imitate
     back = (-((right[kept].T / values[kept]) @ (along @ delta)) / scale)[:free]
     moved, _ = _pushed(held, held_fit, knots, use, scales)
@@ -221,9 +223,7 @@ def contributions_beside(pair: Pair, use: Use = motion_and_commands) -> Array:
     """Return what each held-out sample adds to −2 log L with a generic force beside, (N,)."""
     held, held_fit = pair.held, pair.held_fit
     errors = generic_force(pair, use).errors
-    noise = fit_noise(
-        errors, held.poles(held_fit.point), held.sample_time, held.groups, held_fit.noise
-    )
+    noise = held.noise_of(errors, held_fit.point, held_fit.noise)
     nu, _ = held.whitened(noise, errors)
     return np.concatenate([(n**2).sum(axis=1) + noise.log_det for n in nu])
 

@@ -256,7 +256,8 @@ def _excess(fit: Fit, final: Fit) -> float:
 
 
 def _remaining(final: Fit, pairs: Sequence[Pair], left: Omnibus, why: str) -> str:
-    moved = coloured(final, pairs[0].problem.runs[0].outputs)
+    problem = pairs[0].problem
+    moved = coloured(problem.forgetful(final, np.inf), problem.runs[0].outputs)
     tail = f" In these logs {moved}." if moved else ""
     if why:
         return f"What is left is not noise: {why}.{tail}"

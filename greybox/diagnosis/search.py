@@ -17,6 +17,7 @@ from greybox.diagnosis.base import Case
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.held_out import HeldOut, Proof, proof_of
 from greybox.diagnosis.hypothesis import Hypothesis
+from greybox.diagnosis.normal import bounded_step
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.refitting import (
     FIRST,
@@ -32,7 +33,14 @@ from greybox.diagnosis.refitting import (
 )
 from greybox.diagnosis.scores import MOMENTS, ProjectedScores, Score, score_hypotheses
 from greybox.diagnosis.standing import Standing, standing
-from greybox.diagnosis.thresholds import BACKWARDS, MOST_CAUSES, PROVEN, RELEVANT, SIGNIFICANT
+from greybox.diagnosis.thresholds import (
+    BACKWARDS,
+    MOST_CAUSES,
+    PROVEN,
+    RELEVANT,
+    SIGNIFICANT,
+    WORTH,
+)
 from greybox.model.run.step import Integrator
 
 Array = NDArray[np.float64]
@@ -358,20 +366,27 @@ def pruned(
     for cause in causes:
         without = _without(problem, fit, cause)
         alone = assess_candidate(held_out, without, fit, cause.hypothesis, tried, cause.names)
+        alone = _wald_checked(case, alone) if alone.holds else alone
         place = [c.hypothesis.key for c in kept].index(cause.hypothesis.key)
         if alone.holds:
             kept[place] = alone
         else:
             _log.info("%s is left out", cause.hypothesis.key)
-            fit = without
+            fit = fit if _needed(case, fit, without) else without
             del kept[place]
     return fit, kept
+
+
+def _needed(case: Case, fit: Fit, without: Fit) -> bool:
+    """Whether held-out runs are worse without a term, by more than is told of a deviation."""
+    return without.escaped or case.held_out(fit.integrator).worse(without, fit) > np.log1p(WORTH)
 
 
 def weighed(case: Case, found: Search) -> Search:
     """Return the search without causes that do not stand beside a generic force.
 
-    The least of them goes first: what it imitated may be another's once it is gone.
+    The least of them goes first: what it imitated may be another's once it is gone. Terms
+    without which held-out runs are worse stay in the model, and lose their name.
     """
     fit, kept = found.final, list(found.causes)
     leaning: list[Candidate] = []
@@ -382,13 +397,16 @@ def weighed(case: Case, found: Search) -> Search:
         fallen = [(cause, without) for cause, without in tried if not _stands(cause)]
         if not fallen:
             break
-        least, fit = min(fallen, key=lambda item: _beyond(item[0]))
-        if fit.escaped:
-            # what does not stand holds the run within bounds: nothing of it can be told
-            return replace(found, final=found.base, causes=(), leaning=(*leaning, *kept))
+        least, without = min(fallen, key=lambda item: _beyond(item[0]))
         leaning.append(least)
         kept = [c for c in kept if c.hypothesis.key != least.hypothesis.key]
-        fit = case.problem(fit.integrator).settle(fit, SETTLE)
+        if _needed(case, fit, without):
+            if least.hypothesis.apply is not None and without.escaped:
+                # what does not stand holds the run within bounds: nothing of it can be told
+                return replace(found, final=found.base, causes=(), leaning=(*leaning, *kept))
+            if least.hypothesis.apply is None:
+                continue
+        fit = case.problem(fit.integrator).settle(without, SETTLE)
     return replace(
         found, final=fit, causes=tuple(kept), leaning=tuple(leaning), without=tuple(left)
     )
@@ -420,8 +438,34 @@ def _beyond(cause: Candidate) -> float:
 
 
 def _without(problem: Problem, fit: Fit, cause: Candidate) -> Fit:
-    point = problem.drop(fit.point, cause.hypothesis)
+    """Return the fit without a cause, from where the others make up for it to first order."""
+    found = []
+    for vector in (_at_null(problem, fit, cause.hypothesis), fit.point.vector()):
+        point = problem.drop(fit.point.at(vector), cause.hypothesis)
+        cost = problem.whitened(fit.noise, problem.errors(point))[1]
+        found.append((cost, point))
+    point = min(found, key=lambda item: item[0])[1]
     return problem.settle(problem.fit(point, fit.noise, most=FIRST), 2)
+
+
+def _at_null(problem: Problem, fit: Fit, hypothesis: Hypothesis) -> Array:
+    """Return the free numbers where those of a cause are at their null values."""
+    vector = fit.point.vector()
+    where = np.array(problem.numbers_of(fit.point, hypothesis), int)
+    null = np.zeros(len(where))
+    for k, parameter in enumerate(hypothesis.parameters[: len(where)]):
+        null[k] = vector[where[k]] if parameter.reach else parameter.null
+    rows = np.concatenate([r.reshape(-1, r.shape[2]) for r in problem.rows(fit.point, fit.noise)])
+    rest = np.setdiff1d(np.arange(len(vector)), where)
+    change = null - vector[where]
+    if np.isfinite(rows).all() and len(where):
+        normal, across = rows[:, rest].T @ rows[:, rest], rows[:, rest].T @ rows[:, where]
+        moved = bounded_step(
+            normal, -across @ change, *(b[rest] - vector[rest] for b in problem.bounds(fit.point)), 0.0
+        )
+        vector[rest] += moved
+    vector[where] = null
+    return vector
 
 
 def instead(

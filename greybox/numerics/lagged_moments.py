@@ -131,3 +131,42 @@ def weighted_lags(rows: Sequence[Array], weights: Sequence[float | Array]) -> Ar
         block = weight * lagged_products(rows, rows, lag)
         total += block if lag == 0 else block + block.T
     return total
+
+
+def bartlett_sums(rows: Array, lags: int) -> Array:
+    """Return `weighted_lags` of rows (N, m) with the weights of `bartlett`, in one product.
+
+    The mean over all windows of ``lags + 1`` samples of the square of their sum.
+    """
+    width = min(lags, len(rows) - 1) + 1
+    sums = np.cumsum(np.pad(rows, ((width, width - 1), (0, 0))), axis=0)
+    windows = sums[width:] - sums[:-width]
+    return np.asarray(windows.T @ windows / width)
+
+
+def _memory(series: Array) -> Array:
+    """Return the lag-one correlation of each column of a series (N, m), (m,)."""
+    square = (series**2).sum(axis=0)
+    square[square == 0] = 1.0
+    return np.asarray((series[1:] * series[:-1]).sum(axis=0) / square)
+
+
+def correlation_factor(series: Array) -> float:
+    """Return by how much memory raises the variance of a mean of a series (N, m); at least 1.
+
+    That of a first-order autoregression with the lag-one correlation, averaged over columns.
+    """
+    rho = np.clip(_memory(series), 0.0, 1 - 1 / max(len(series), 2))
+    return float(np.mean((1 + rho) / (1 - rho)))
+
+
+def automatic_lags(series: Array) -> int:
+    """Return the lags of `bartlett` that suit the memory of a series (N, m).
+
+    References
+    ----------
+    Andrews (1991), eq. 6.2 and 6.4, a first-order autoregression for each column.
+    """
+    rho = np.clip(_memory(series), -0.99, 0.99)
+    alpha = np.mean(4 * rho**2 / ((1 - rho) ** 2 * (1 + rho) ** 2))
+    return int(min(np.ceil(1.1447 * (alpha * len(series)) ** (1 / 3)), len(series) // 4))
