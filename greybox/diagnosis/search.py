@@ -378,7 +378,12 @@ def pruned(
 
 
 def _needed(case: Case, fit: Fit, without: Fit) -> bool:
-    """Whether held-out runs are worse without a term, by more than is told of a deviation."""
+    """Whether a model that the data chose predicts worse without what has no name in it.
+
+    By more of the squared error than is told of a deviation.
+    """
+    if case.metric != "free run":
+        return False
     return without.escaped or case.held_out(fit.integrator).worse(without, fit) > np.log1p(WORTH)
 
 
@@ -401,11 +406,10 @@ def weighed(case: Case, found: Search) -> Search:
         leaning.append(least)
         kept = [c for c in kept if c.hypothesis.key != least.hypothesis.key]
         if _needed(case, fit, without):
-            if least.hypothesis.apply is not None and without.escaped:
-                # what does not stand holds the run within bounds: nothing of it can be told
-                return replace(found, final=found.base, causes=(), leaning=(*leaning, *kept))
-            if least.hypothesis.apply is None:
-                continue
+            continue
+        if without.escaped:
+            # what does not stand holds the run within bounds: nothing of it can be told
+            return replace(found, final=found.base, causes=(), leaning=(*leaning, *kept))
         fit = case.problem(fit.integrator).settle(without, SETTLE)
     return replace(
         found, final=fit, causes=tuple(kept), leaning=tuple(leaning), without=tuple(left)
@@ -461,7 +465,10 @@ def _at_null(problem: Problem, fit: Fit, hypothesis: Hypothesis) -> Array:
     if np.isfinite(rows).all() and len(where):
         normal, across = rows[:, rest].T @ rows[:, rest], rows[:, rest].T @ rows[:, where]
         moved = bounded_step(
-            normal, -across @ change, *(b[rest] - vector[rest] for b in problem.bounds(fit.point)), 0.0
+            normal,
+            -across @ change,
+            *(b[rest] - vector[rest] for b in problem.bounds(fit.point)),
+            0.0,
         )
         vector[rest] += moved
     vector[where] = null
