@@ -21,7 +21,7 @@ from greybox.diagnosis.kinematics import denied
 from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.preparing import Prepared, context_of
 from greybox.diagnosis.refitting import SETTLE
-from greybox.diagnosis.search import Search, assess_candidate, pruned, search
+from greybox.diagnosis.search import Search, assess_candidate, search
 from greybox.diagnosis.ship import CURRENTS, Ship
 from greybox.errors import ExcitationError, GreyboxError
 from greybox.model.structure import Structure
@@ -77,10 +77,9 @@ def from_chosen(
     held_out = case.held_out(fit.integrator)
     if any(p.held_fit.escaped for p in held_out.pairs(fit)):
         return None
-    causes = [
-        assess_candidate(held_out, plain, fit, a, len(hypotheses), problem.names) for a in named
-    ]
-    fit, causes = pruned(case, fit, causes, len(hypotheses))
+    proof = held_out.prove(plain, fit)
+    # each is weighed at the end, by leaving it out
+    causes = [assess_candidate(proof, plain, fit, a, len(hypotheses), problem.names) for a in named]
     other = search(
         case, fit, [a for a in hypotheses if a not in named], begun=causes, progress=progress
     )
