@@ -192,6 +192,10 @@ def _generic_force(pair: Pair, use: Use) -> GenericForce:
     free = nuisance.shape[1] - sum(map(len, fit.point.starts))
     scale = np.sqrt((nuisance**2).sum(axis=0))
     scale[scale == 0] = 1.0
+    if not np.isfinite(nuisance).all():
+        # a run at the edge of stability has no derivatives
+        seen = np.concatenate([n.ravel() for n in held_fit.nu])
+        return GenericForce(np.zeros_like(seen), seen, held_fit.errors, np.zeros(free))
     left, values, right = tall_svd(nuisance / scale, _UNKNOWN)
     knots = knots_of(problem)
     pushed, scales = _pushed(problem, fit, knots, use, None)

@@ -31,8 +31,8 @@ from greybox.diagnosis.refitting import (
     shortlist,
     slow,
 )
-from greybox.diagnosis.scores import MOMENTS, ProjectedScores, Score, score_hypotheses
 from greybox.diagnosis.remainder import contributions_beside
+from greybox.diagnosis.scores import MOMENTS, ProjectedScores, Score, score_hypotheses
 from greybox.diagnosis.standing import Standing, standing
 from greybox.diagnosis.thresholds import (
     BACKWARDS,
