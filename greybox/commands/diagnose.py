@@ -53,7 +53,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--causes", nargs="+", metavar="ID", help="look for these causes only (all that are known)"
     )
     parser.add_argument(
-        "--sample-time", type=positive, metavar="S", help="decimate the logs to this sample time"
+        "--sample-time",
+        type=positive,
+        metavar="S",
+        help="decimate the logs to this sample time; by default that of MODEL, or what suits the "
+        "ship's pace",
     )
     add_seed(parser)
 
@@ -84,6 +88,7 @@ def run(options: argparse.Namespace) -> None:
             structure=options.structure,
             causes=options.causes,
             seed=options.seed,
+            own_pace=options.sample_time is None,
             progress=activity(),
         ),
     )

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.base import Case
+from greybox.diagnosis.base import INTEGRATORS, Case
 from greybox.diagnosis.causes.hull import term_parameters
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.hypothesis import Hypothesis
@@ -27,7 +27,6 @@ from greybox.errors import ExcitationError, GreyboxError
 from greybox.model.structure import Structure
 from greybox.model.terms import Term, parse_term
 from greybox.selection.cross_validation import Refit
-from greybox.selection.estimate import at_own_pace
 from greybox.selection.term_selection import TermChoice, select_terms
 from greybox.trial.log import TrialLog
 
@@ -70,13 +69,16 @@ def from_chosen(
     for hypothesis in named:
         value = None if hypothesis.apply is None else np.array([_share(choice)])
         start = problem.add(start, hypothesis, value)
-    begun = problem.fit(start, plain.noise)
-    if begun.escaped:
+    fits = []
+    for integrator in INTEGRATORS:
+        its = case.problem(integrator)
+        begun = replace(its.settle(its.fit(start, plain.noise), SETTLE), integrator=integrator)
+        if not begun.escaped and np.isfinite(case.held_out(integrator).squares(begun)).all():
+            fits.append(begun)
+    if not fits:
         return None
-    fit = case.other_integrator(problem.settle(begun, SETTLE))
+    fit = min(fits, key=lambda f: f.cost)
     held_out = case.held_out(fit.integrator)
-    if any(p.held_fit.escaped for p in held_out.pairs(fit)):
-        return None
     proof = held_out.prove(plain, fit)
     # each is weighed at the end, by leaving it out
     causes = [assess_candidate(proof, plain, fit, a, len(hypotheses), problem.names) for a in named]
@@ -91,7 +93,7 @@ def _choice(logs: Sequence[TrialLog]) -> TermChoice:
     def none(_: Sequence[TrialLog]) -> None:
         raise ExcitationError("no model stands before.")
 
-    return select_terms(at_own_pace(logs, []), "no model", 0, Refit(none))  # type: ignore[arg-type]
+    return select_terms(logs, "no model", 0, Refit(none))  # type: ignore[arg-type]
 
 
 def _better(case: Case, mine: Search, other: Fit) -> bool:

@@ -18,7 +18,10 @@ from greybox.diagnosis.telling import Report
 from greybox.diagnosis.waves import find_waves, found_waves
 from greybox.model.model import ManoeuvringModel
 from greybox.public import known_keywords, one_thread
-from greybox.trial.log import Logs
+from greybox.regression.regression import common_sample_time
+from greybox.selection.estimate import at_own_pace
+from greybox.trial.kinematics import decimate_segments
+from greybox.trial.log import Logs, TrialLog
 from greybox.trial.segments import as_segments
 from greybox.trial.validity import other_conditions, pooled_conditions
 
@@ -37,6 +40,9 @@ class DiagnosisOptions:
         Ids to look for; all that are known by default.
     seed : int
         Of the bootstrap.
+    own_pace : bool
+        Whether logs that are sampled faster than the ship moves are taken at a longer sample
+        time, as an estimate takes them; not where a model has its own.
     progress : callable
         Told what is being done.
     """
@@ -44,6 +50,7 @@ class DiagnosisOptions:
     structure: str = "thesis"
     causes: Sequence[str] | None = None
     seed: int = 0
+    own_pace: bool = True
     progress: Callable[[str], None] = field(default=lambda _: None)
 
 
@@ -91,6 +98,9 @@ def diagnose(
 
     say("log checks")
     logs, validate = as_segments(logs), as_segments(validate, 0)
+    paced: list[str] = []
+    if model is None and options.own_pace:
+        logs, validate = _at_own_pace(logs, validate, paced)
     ready = prepare(logs, validate, model, options.structure, options.causes)
     case = ready.case
     say("model without causes")
@@ -111,7 +121,7 @@ def diagnose(
         if chosen is not None:
             wider, mine = chosen
             mine = weighed(wider, mine)
-            if mine.causes:
+            if mine.causes or not found.causes:
                 case, found = wider, mine
                 problem = case.problem(found.base.integrator)
     say("what is left")
@@ -122,7 +132,7 @@ def diagnose(
         white = problem.forgetful(fit, np.inf)
         lines.append(find_waves(white.nu, white.errors, names, problem.sample_time))
     say("gain")
-    notes = []
+    notes = paced
     if apart and not any(c.hypothesis.key in apart for c in found.causes):
         notes.append(
             f"{', '.join(apart)} would help, but positions, heading and velocities of these logs "
@@ -144,3 +154,17 @@ def diagnose(
         causes.append(found_waves(lines[1], ready.causes["waves"], ready.tried))
     made = report.made(causes, ready.validate, ready.tried, lines)
     return replace(made, conditions=conditions)
+
+
+def _at_own_pace(
+    logs: Sequence[TrialLog], validate: Sequence[TrialLog], notes: list[str]
+) -> tuple[list[TrialLog], list[TrialLog]]:
+    """Return all logs at the sample time that suits how fast the ship of the first ones moves."""
+    common_sample_time([*logs, *validate])
+    slower = list(at_own_pace(logs, notes))
+    step = slower[0].sample_time
+    if step == logs[0].sample_time or not validate:
+        return slower, list(validate)
+    held, left_out = decimate_segments(validate, step)
+    notes += left_out
+    return slower, held

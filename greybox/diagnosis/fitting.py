@@ -121,6 +121,12 @@ class Problem:
         """Return least and largest values of the free numbers of a point."""
         size = len(point.vector())
         low, high = np.full(size, -np.inf), np.full(size, np.inf)
+        if self.metric == "free run":
+            # chosen damping takes energy out, as its choice had it
+            terms = self.structure.terms
+            high[
+                [k for k, i in enumerate(point.places) if i < len(terms) and terms[i].dissipates]
+            ] = 0.0
         for hypothesis in point.hypotheses:
             # coefficients that only become free beside it have no bounds
             for k, parameter in zip(

@@ -127,6 +127,11 @@ class Noise:
         return out
 
     @property
+    def coloured(self) -> bool:
+        """Whether errors are weighed by a colour that was fitted, and not by their size alone."""
+        return bool(self.parameters)
+
+    @property
     def log_det(self) -> float:
         """Of all groups."""
         return sum(g.log_det for g in self.groups)

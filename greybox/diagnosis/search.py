@@ -33,11 +33,10 @@ from greybox.diagnosis.refitting import (
 )
 from greybox.diagnosis.remainder import contributions_beside
 from greybox.diagnosis.scores import MOMENTS, ProjectedScores, Score, score_hypotheses
-from greybox.diagnosis.standing import Standing, standing
+from greybox.diagnosis.standing import Standing, level_of, standing
 from greybox.diagnosis.thresholds import (
     BACKWARDS,
     MOST_CAUSES,
-    PROVEN,
     RELEVANT,
     SIGNIFICANT,
     WORTH,
@@ -112,7 +111,8 @@ class Candidate:
     @property
     def holds(self) -> bool:
         """Whether the cause matters, is significant, and predicts."""
-        return self.relevant and self.p_adjusted < SIGNIFICANT and self.proof.p_value < PROVEN
+        proven = self.proof.p_value < level_of(self.fit)
+        return self.relevant and self.p_adjusted < SIGNIFICANT and proven
 
 
 @dataclass(frozen=True)

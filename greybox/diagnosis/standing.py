@@ -14,7 +14,7 @@ from greybox.diagnosis.hypothesis import Hypothesis
 from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.remainder import Use, contributions_beside, generic_force
 from greybox.diagnosis.ship import CURRENTS
-from greybox.diagnosis.thresholds import LEAST_SHARE, OWN_SHARE, PROVEN, SAME
+from greybox.diagnosis.thresholds import AS_CHOSEN, LEAST_SHARE, OWN_SHARE, PROVEN, SAME
 from greybox.model.terms import parse_term
 
 Array = NDArray[np.float64]
@@ -45,6 +45,8 @@ class Standing:
         the numbers.
     told : float
         That of the surest of the numbers with its movement counted as a standard error.
+    level : float
+        Significance that a gain on held-out logs must have.
     """
 
     beyond: Proof
@@ -53,12 +55,13 @@ class Standing:
     moved: Array
     clear: float
     told: float
+    level: float = PROVEN
 
     @property
     def stands(self) -> bool:
         """Whether the cause does what no force without a name does as well."""
-        gains = self.beyond.gain > 0 and self.beyond.p_value < PROVEN
-        own = self.share is not None and self.share >= OWN_SHARE and self.half < PROVEN
+        gains = self.beyond.gain > 0 and self.beyond.p_value < self.level
+        own = self.share is not None and self.share >= OWN_SHARE and self.half < self.level
         # that a run leaves every bound without it tells nothing of a cause's size
         sure = self.told < (SAME if np.isfinite(self.beyond.gain) else PROVEN)
         return (gains or own) and self.clear < PROVEN and sure
@@ -81,7 +84,7 @@ def standing(problem: Problem, hypothesis: Hypothesis, with_it: Fit, pairs: Sequ
     if any(p.held_fit.escaped or p.fit.escaped for p in (*pairs, *without)):
         better = not any(p.held_fit.escaped for p in pairs)
         proof = proof_of(np.array([np.inf if better else -np.inf]))
-        return Standing(proof, None, 1.0, moved, *sure)
+        return Standing(proof, None, 1.0, moved, *sure, level_of(with_it))
     beside = [contributions_beside(p) for p in pairs]
     beyond = proof_of(np.concatenate([contributions_beside(p) for p in without])
                       - np.concatenate(beside))  # fmt: skip
@@ -94,7 +97,12 @@ def standing(problem: Problem, hypothesis: Hypothesis, with_it: Fit, pairs: Sequ
         gained, could = plain - own, plain - generic
         share = float(gained.sum() / could.sum()) if could.sum() > 0 else np.inf
         half = proof_of(gained - LEAST_SHARE * could).p_value
-    return Standing(beyond, share, half, moved, *sure)
+    return Standing(beyond, share, half, moved, *sure, level_of(with_it))
+
+
+def level_of(fit: Fit) -> float:
+    """Return the significance that a gain on held-out logs must have."""
+    return PROVEN if fit.noise.coloured else AS_CHOSEN
 
 
 def _moved(

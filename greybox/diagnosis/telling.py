@@ -124,12 +124,12 @@ class Report:
         found, case = self.found, self.case
         groups = self._groups()
         before = self.model(found.base, self.record(()))
-        after = self.model(found.final, self.record(found.causes)) if found.causes else before
+        changed = found.final is not found.base
+        after = self.model(found.final, self.record(found.causes)) if changed else before
         gain, runs, after = self.gain(before, after, validate, found.final)
         ruling = rule(found, case.held_out, groups, known, gain)
-        final = found.final
-        if not (ruling.named or groups) and found.causes:
-            final = found.base
+        final = ruling.final
+        if final is not found.final:
             gain, runs, after = self.gain(before, before, validate, final)
         members = [c for pair in groups for c in pair]
         alternatives = {c.hypothesis.cause: self.model(c.fit, self.record((c,))) for c in members}
