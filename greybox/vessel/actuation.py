@@ -2,7 +2,9 @@
 
 A command c held from sample to sample moves a first-order lag of time constant
 T, ẋ = (c − x)/T, exactly by x[k+1] = a x[k] + (1 − a) c[k] with a = exp(−Ts/T).
-One that moves no faster than a rate ρ follows by x[k] = x[k−1] + clip(c[k] − x[k−1], ±ρTs).
+One that moves no faster than a rate ρ is at x[k] = x[k−1] + d[k], d[k] = clip(c[k] − x[k−1],
+±ρTs), at the end of the sample; under way for |d|/ρ of it, it acts by its mean
+x[k] − d[k]|d[k]|/(2ρTs).
 """
 
 from __future__ import annotations
@@ -123,14 +125,19 @@ def lagged(value: Array, samples: float, held: LagHeld = "start") -> Array:
 
 
 def limited(value: Array, most: float) -> Array:
-    """Return a signal (..., N) that moves towards another by at most so much a sample."""
+    """Return the mean over each sample of a signal (..., N) that follows by so much at most.
+
+    It is at rest on the first value.
+    """
     value = np.asarray(value, float)
 
     def follow(now: float, wanted: float) -> float:
         return now + min(max(wanted - now, -most), most)
 
     rows = [list(accumulate(row, follow)) for row in value.reshape(-1, value.shape[-1]).tolist()]
-    return np.array(rows).reshape(value.shape)
+    end = np.array(rows).reshape(value.shape)
+    way = np.diff(end, axis=-1, prepend=end[..., :1])
+    return np.asarray(end - way * np.abs(way) / (2 * most))
 
 
 def decay(samples: float) -> float:

@@ -104,8 +104,10 @@ def actuators(
     if late.rate_on is not None and late.rate_limit is not None:
         i, most = vessel.commands.index(late.rate_on), late.rate_limit * sample_time
         symbol = ca.SX.sym("limited")
-        slow[i] = symbol + ca.fmin(ca.fmax(slow[i] - symbol, -most), most)
-        remembered.append((Memory(late.rate_on, 0, limited=True), symbol, slow[i], commands[i]))
+        way = ca.fmin(ca.fmax(slow[i] - symbol, -most), most)
+        slow[i] = symbol + way - way * ca.fabs(way) / (2 * most)
+        limited = Memory(late.rate_on, 0, limited=True)
+        remembered.append((limited, symbol, symbol + way, commands[i]))
 
     def follow(name: str, value: ca.SX, at_rest: ca.SX) -> tuple[ca.SX, ca.SX]:
         """Return what acts during the sample, and at an instant."""

@@ -108,9 +108,9 @@ def whole_rate(model: ManoeuvringModel) -> ca.Function:
         )
     if late.rate_limit is not None:
         raise UsageError(
-            f"the rate of {late.rate_on} of '{model.vessel.name}' is limited from sample to sample, "
-            f"of which there is no continuous-time form: use step_function(), or limit the "
-            f"command outside."
+            f"the rate of {late.rate_on} of '{model.vessel.name}' is limited from sample to "
+            f"sample, of which there is no continuous-time form: use step_function(), or limit "
+            f"the command outside."
         )
     s = model.structure.symbols
     position = ca.SX.sym("position", 2)
