@@ -16,15 +16,13 @@ from numpy.typing import NDArray
 from greybox.diagnosis.base import Case
 from greybox.diagnosis.causes.hull import term_parameters
 from greybox.diagnosis.fitting import Problem
-from greybox.diagnosis.held_out import proof_of
 from greybox.diagnosis.hypothesis import Hypothesis
 from greybox.diagnosis.kinematics import denied
 from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.preparing import Prepared, context_of
 from greybox.diagnosis.refitting import SETTLE
-from greybox.diagnosis.search import Search, assess_candidate, pruned, search
+from greybox.diagnosis.search import Search, assess_candidate, search
 from greybox.diagnosis.ship import CURRENTS, Ship
-from greybox.diagnosis.thresholds import PROVEN
 from greybox.errors import ExcitationError, GreyboxError
 from greybox.model.structure import Structure
 from greybox.model.terms import Term, parse_term
@@ -79,10 +77,9 @@ def from_chosen(
     held_out = case.held_out(fit.integrator)
     if any(p.held_fit.escaped for p in held_out.pairs(fit)):
         return None
-    causes = [
-        assess_candidate(held_out, plain, fit, a, len(hypotheses), problem.names) for a in named
-    ]
-    fit, causes = pruned(case, fit, causes, len(hypotheses))
+    proof = held_out.prove(plain, fit)
+    # each is weighed at the end, by leaving it out
+    causes = [assess_candidate(proof, plain, fit, a, len(hypotheses), problem.names) for a in named]
     other = search(
         case, fit, [a for a in hypotheses if a not in named], begun=causes, progress=progress
     )
@@ -98,17 +95,9 @@ def _choice(logs: Sequence[TrialLog]) -> TermChoice:
 
 
 def _better(case: Case, mine: Search, other: Fit) -> bool:
-    """Whether held-out logs prefer what was found from the chosen terms: likelier, and nearer.
-
-    A likelihood that takes slow errors for the sea's own may rise while the run gets worse.
-    """
-    held_out = case.held_out(mine.final.integrator)
-    if other.integrator == mine.final.integrator and not held_out.worse(mine.final, other) < 0:
-        return False
-    one, two = (case.held_out(f.integrator).contributions(f) for f in (other, mine.final))
-    with np.errstate(invalid="ignore"):
-        proof = proof_of(one - two)
-    return proof.gain > 0 and proof.p_value < PROVEN
+    """Whether held-out runs from the chosen terms are nearer than what was found before."""
+    one, two = (case.held_out(f.integrator).squares(f) for f in (other, mine.final))
+    return bool(np.log(two).mean() < np.log(one).mean())
 
 
 def _hypotheses(

@@ -79,6 +79,8 @@ class NoiseModel:
         """
         from scipy.signal import lfilter
 
+        if len(self.denominator) == 1:
+            return np.asarray(e / np.diag(self.root)[:, None])
         out = np.zeros(e.shape)
         for i, row in enumerate(self.numerators):
             for j, numerator in enumerate(row):

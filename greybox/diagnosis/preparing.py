@@ -128,7 +128,8 @@ def prepare(
     validate = [correct_log(log, vessel) for log in validate]
     start = _structure(structure, logs, model)
     context = _context(start, [*logs, *validate], model)
-    told = decided(findings)
+    # of a clock of one channel the kinematics tell all; an arm or a bias may be shared by all
+    told = decided(findings) | {a for a in kinematics.agreeing if a.startswith("clock_offset:")}
     known = [a for c in causes.values() for a in c.hypotheses(context)]
     hypotheses = [a for a in known if not denied(a.key, told)]
     case = _case(start, hypotheses, logs, validate)
