@@ -119,10 +119,12 @@ def _save(diagnosis: Diagnosis, path: str, record: dict[str, Any]) -> None:
     from dataclasses import replace
     from pathlib import Path
 
+    from greybox.diagnosis.result import file_word
+
     target = Path(path)
     told = {"diagnosis": diagnosis.to_dict(), "provenance": record}
     for name, model in diagnosis.alternatives.items():
         replace(model, record={**model.record, **told}).save(
-            target.with_name(f"{target.stem}.{name}{target.suffix or '.json'}")
+            target.with_name(f"{target.stem}.{file_word(name)}{target.suffix or '.json'}")
         )
     replace(diagnosis.model, record={**diagnosis.model.record, **told}).save(target)

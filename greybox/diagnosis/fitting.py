@@ -26,6 +26,8 @@ _MOST = 25
 # a point that −2 log L tells from another by less than this has its derivatives
 _NEAR = 1.0
 _DAMPING_LIMIT = 1e6
+# mean square of a log's errors, in that of all logs, that has a logarithm
+_LEAST_SIZE = 1e-12
 # values at which hills of a likelihood are looked for
 _HILLS = 25
 
@@ -324,7 +326,21 @@ class Problem:
 
     def contributions(self, fit: Fit) -> list[Array]:
         """Return what each sample adds to −2 log L, (N,) a log."""
-        return [(nu**2).sum(axis=1) + fit.noise.log_det for nu in fit.nu]
+        return self.added(fit.nu, fit.noise)
+
+    def added(self, nu: Sequence[Array], noise: Noise) -> list[Array]:
+        """Return what each sample of innovations adds to −2 log L, (N,) a log.
+
+        What a misfit leaves differs from log to log: by its size alone each log's errors have a
+        deviation of their own, lest the worst one speak for all.
+        """
+        if noise.coloured:
+            return [(n**2).sum(axis=1) + noise.log_det for n in nu]
+        sizes = [np.maximum((n**2).mean(axis=0), _LEAST_SIZE) for n in nu]
+        return [
+            (n**2 / size).sum(axis=1) + float(np.log(size).sum()) + noise.log_det
+            for n, size in zip(nu, sizes, strict=True)
+        ]
 
     def costs(self, fit: Fit) -> Array:
         """Return −2 log L of each group of channels, (groups,)."""

@@ -189,6 +189,7 @@ def _context(
     structure: Structure, logs: Sequence[TrialLog], model: ManoeuvringModel | None
 ) -> Context:
     first = logs[0]
+    moved = {c: [log[c] for log in logs] for c in first.vessel.commands}
     turns = "r" in structure.states and all("psi" in log for log in logs)
     return Context(
         structure=structure,
@@ -199,6 +200,11 @@ def _context(
         sample_time=first.sample_time,
         speeds={t.speed: float(np.median(np.abs(first[t.speed]))) for t in first.vessel.thrusters},
         current_known=model is not None and any(model.d[:2]),
+        ranges={c: max(float(np.ptp(x)) for x in v) for c, v in moved.items()},
+        fastest={
+            c: max(float(np.abs(np.diff(x)).max()) for x in v) / first.sample_time
+            for c, v in moved.items()
+        },
     )
 
 

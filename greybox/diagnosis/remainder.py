@@ -236,7 +236,7 @@ def contributions_beside(pair: Pair, use: Use = motion_and_commands) -> Array:
     errors = generic_force(pair, use).errors
     noise = held.noise_of(errors, held_fit.point, held_fit.noise)
     nu, _ = held.whitened(noise, errors)
-    return np.concatenate([(n**2).sum(axis=1) + noise.log_det for n in nu])
+    return np.concatenate(held.added(nu, noise))
 
 
 def _pushed(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -47,6 +48,11 @@ def finite(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
+def file_word(cause: str) -> str:
+    """Return the id of a cause as a part of a file's name."""
+    return re.sub(r"[^\w.+-]+", "_", cause)
+
+
 def _shown(p: float) -> str:
     """Return a p-value with its sign of relation; what underflows is no zero."""
     return f"= {p:.2g}" if p > 0 else "< 1e-300"
@@ -72,6 +78,7 @@ class Found:
     Parameters
     ----------
     id : str
+        Of the cause, with the place where the names of the parameters do not tell it.
     key : str
         Id with the place: which thruster, coefficient or channel.
     title : str

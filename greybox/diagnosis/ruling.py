@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from greybox.diagnosis.held_out import HeldOut, Pair, proof_of
 from greybox.diagnosis.omnibus import Omnibus, disagreement, omnibus
 from greybox.diagnosis.point import Fit
-from greybox.diagnosis.result import DiagnosisVerdict, Found, Gain
+from greybox.diagnosis.result import DiagnosisVerdict, Found, Gain, file_word
 from greybox.diagnosis.search import Candidate, Search
 from greybox.diagnosis.symptoms import coloured, word
 from greybox.diagnosis.thresholds import (
@@ -89,7 +89,7 @@ def rule(
     final, stand, leaning, notes = found.final, found.causes, found.leaning, []
     if final is not found.base and sum(g.after - g.before for g in gain.values()) < 0:
         # likelier errors are no better simulation: nothing is extended by them
-        helped = ", ".join(c.hypothesis.cause for c in stand) or "terms that the data chose"
+        helped = ", ".join(c.hypothesis.id for c in stand) or "terms that the data chose"
         notes.append(
             f"{helped} made the held-out errors likelier but the free run no better, so the "
             f"model was not extended."
@@ -282,8 +282,8 @@ def _remaining(final: Fit, pairs: Sequence[Pair], left: Omnibus, why: str) -> st
 def _next(verdict: DiagnosisVerdict, groups: Sequence[Sequence[Candidate]]) -> list[str]:
     out = [
         f"design a trial that tells {' from '.join(ids)}: greybox design "
-        f"--between {' '.join(f'MODEL.{i}.json' for i in ids[:2])}"
-        for ids in ([c.hypothesis.cause for c in pair] for pair in groups)
+        f"--between {' '.join(f'MODEL.{file_word(i)}.json' for i in ids[:2])}"
+        for ids in ([c.hypothesis.id for c in pair] for pair in groups)
     ]
     if verdict in (DiagnosisVerdict.UNEXPLAINED, DiagnosisVerdict.PARTLY):
         out.append(

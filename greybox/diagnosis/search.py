@@ -303,7 +303,7 @@ def _taken(hypothesis: Hypothesis, causes: Sequence[Candidate]) -> bool:
         hypothesis.key == c.hypothesis.key
         or (
             hypothesis.cause == c.hypothesis.cause
-            and set(_names(hypothesis)) & set(_names(c.hypothesis))
+            and (hypothesis.only or set(_names(hypothesis)) & set(_names(c.hypothesis)))
         )
         for c in causes
     )

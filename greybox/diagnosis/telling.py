@@ -81,8 +81,9 @@ class Report:
         quantities = self.quantities(candidate, fit)
         told = {k: (q.value, q.std) for k, q in quantities.items()}
         return Found(
-            candidate.hypothesis.cause, candidate.hypothesis.key, cause.title, quantities,
-            candidate.p_value, candidate.p_adjusted, cause.evidence(told), cause.extension,
+            candidate.hypothesis.id, candidate.hypothesis.key, cause.title, quantities,
+            candidate.p_value, candidate.p_adjusted,
+            cause.evidence_of(candidate.hypothesis, told), cause.extension,
             cause.reference, candidate.gain, candidate.proof.gain, candidate.proof.std,
         )  # fmt: skip
 
@@ -99,15 +100,18 @@ class Report:
             first = len(fit.point.places) + sum(map(len, fit.point.values[:k]))
             index = list(range(first, first + len(fit.point.values[k])))
         if not index:
-            return {hypothesis.key.split(":", 1)[1]: Quantity(-1.0, 0.0, "1")}
+            one = -1.0 if hypothesis.refit_from_scratch else 1.0
+            return {hypothesis.key.split(":", 1)[1]: Quantity(one, 0.0, "1")}
         wide = problem.spread(fit, hypothesis)
         weighed = candidate.standing
         # what a generic force would move a number by is a part of what is not known of it
         moved = np.zeros(len(index)) if weighed is None else weighed.moved[: len(index)]
         return {
             p.name: Quantity(
-                float(values[i]),
-                float(np.linalg.norm([max(std[i], wide.get(p.name, 0.0)), p.coarse, by])),
+                *p.told(
+                    float(values[i]),
+                    float(np.linalg.norm([max(std[i], wide.get(p.name, 0.0)), p.coarse, by])),
+                ),
                 p.unit,
             )
             for p, i, by in zip(hypothesis.parameters, index, moved, strict=True)
@@ -132,12 +136,12 @@ class Report:
         if final is not found.final:
             gain, runs, after = self.gain(before, before, validate, final)
         members = [c for pair in groups for c in pair]
-        alternatives = {c.hypothesis.cause: self.model(c.fit, self.record((c,))) for c in members}
+        alternatives = {c.hypothesis.id: self.model(c.fit, self.record((c,))) for c in members}
         notes = [*self._notes(after), *ruling.notes]
         return Diagnosis(
             verdict=ruling.verdict,
             causes=(*known, *(self.cause(c, final) for c in ruling.named)),
-            groups=tuple(tuple(c.hypothesis.cause for c in pair) for pair in groups),
+            groups=tuple(tuple(c.hypothesis.id for c in pair) for pair in groups),
             gain=gain,
             wrong=_symptoms(case.problem(found.before.integrator), found),
             residuals={
@@ -183,7 +187,7 @@ class Report:
             # of two causes each is alone where the other is left out, and no term stays beside
             alone = run([final, *others][-1]) if len(others) < 2 and not nameless else ()
             relative = _relative(self.quantities(c, final))
-            causes.append(Taken(c.hypothesis.cause, run(own[c.hypothesis.key]), alone, relative))
+            causes.append(Taken(c.hypothesis.id, run(own[c.hypothesis.key]), alone, relative))
         return error_budget(
             run(found.before), run(final), causes, waves, self.seed, nameless=nameless
         )
