@@ -85,7 +85,7 @@ def from_chosen(
     other = search(
         case, fit, [a for a in hypotheses if a not in named], begun=causes, progress=progress
     )
-    mine = replace(other, base=base, steps=other.steps, tried=len(hypotheses))
+    mine = replace(other, base=base, tried=len(hypotheses), chosen=fit)
     return (case, mine) if _better(case, mine, case.carried(found.final)) else None
 
 

@@ -272,6 +272,8 @@ class Diagnosis(DisplayMixin):
         In what the logs differ from each other, and from those of the model.
     budget : tuple of BudgetPart
         Whose the squared held-out error is; empty where a run leaves every bound.
+    gain_over_chosen : mapping of str to Gain
+        By state, against the terms that the data chose; empty where none were.
     """
 
     verdict: DiagnosisVerdict
@@ -295,6 +297,7 @@ class Diagnosis(DisplayMixin):
     residuals: Mapping[str, tuple[TestResult, ...]] = field(default_factory=dict)
     conditions: tuple[ConditionDifference, ...] = ()
     budget: tuple[BudgetPart, ...] = ()
+    gain_over_chosen: Mapping[str, Gain] = field(default_factory=dict)
 
     @property
     def headline(self) -> str:
@@ -323,6 +326,7 @@ class Diagnosis(DisplayMixin):
             "causes": [c.to_dict() for c in self.causes],
             "groups": [list(g) for g in self.groups],
             "gain": {k: g.to_dict() for k, g in self.gain.items()},
+            "gain_over_chosen": {k: g.to_dict() for k, g in self.gain_over_chosen.items()},
             "wrong": [s.sentence for s in self.wrong],
             "budget": [part.to_dict() for part in self.budget],
             "headline": self.headline,
@@ -361,6 +365,12 @@ class Diagnosis(DisplayMixin):
                 )
         if self.gain:
             lines += ["", *_gain_lines(self.gain, self.validated_on)]
+        if self.gain_over_chosen:
+            told = (
+                f"{s} {g.before:.1f} -> {g.after:.1f} ({g.ci[0]:.1f} to {g.ci[1]:.1f})"
+                for s, g in self.gain_over_chosen.items()
+            )
+            lines.append(f"Against the terms that the data chose: {', '.join(told)}.")
         lines += _budget_lines(self.budget)
         lines += ["", self.remaining, *(f"next: {n}" for n in self.next_steps)]
         lines += [f"note: {n}" for n in self.notes]

@@ -153,6 +153,8 @@ class Search:
         Causes that help, and do no more than a generic force would: no part of `final`.
     without : tuple of Fit
         The fit without each of the causes that stand.
+    chosen : Fit or None
+        Of the terms that the data chose, where the search went on from them.
     """
 
     base: Fit
@@ -163,6 +165,7 @@ class Search:
     given: Fit | None = None
     leaning: tuple[Candidate, ...] = ()
     without: tuple[Fit, ...] = ()
+    chosen: Fit | None = None
 
     @property
     def before(self) -> Fit:

@@ -135,6 +135,10 @@ class Report:
         final = ruling.final
         if final is not found.final:
             gain, runs, after = self.gain(before, before, validate, final)
+        over_chosen: dict[str, Gain] = {}
+        if found.chosen is not None and final is found.final and final is not found.chosen:
+            chosen = self.model(found.chosen, self.record(()))
+            over_chosen = self.gain(chosen, after, validate, final, found.chosen)[0]
         members = [c for pair in groups for c in pair]
         alternatives = {c.hypothesis.id: self.model(c.fit, self.record((c,))) for c in members}
         notes = [*self._notes(after), *ruling.notes]
@@ -143,6 +147,7 @@ class Report:
             causes=(*known, *(self.cause(c, final) for c in ruling.named)),
             groups=tuple(tuple(c.hypothesis.id for c in pair) for pair in groups),
             gain=gain,
+            gain_over_chosen=over_chosen,
             wrong=_symptoms(case.problem(found.before.integrator), found),
             residuals={
                 "before": residual_tests(
@@ -240,15 +245,20 @@ class Report:
         after: ManoeuvringModel,
         validate: Sequence[TrialLog],
         final: Fit,
+        first: Fit | None = None,
     ) -> tuple[dict[str, Gain], list[Runs], ManoeuvringModel]:
-        """Return the gain on what is held out, all runs, and the model as those logs saw it."""
+        """Return the gain on what is held out, all runs, and the model as those logs saw it.
+
+        From a first fit on, by default that of the model without causes.
+        """
+        first = self.found.base if first is None else first
         logs = list(validate)
         if logs:
             after = _likelier_story(after, logs)
             one = [run_on(before, log) for log in logs]
             two = [self._as_seen(run_on(after, log), log) for log in logs]
         else:
-            one = _held_runs(self.case.held_out(self.found.base.integrator).pairs(self.found.base))
+            one = _held_runs(self.case.held_out(first.integrator).pairs(first))
             two = _held_runs(self.case.held_out(final.integrator).pairs(final))
         runs = [
             Runs(
