@@ -106,18 +106,19 @@ def diagnose(
     say("model without causes")
     base = ready.base()
     problem = case.problem(base.integrator)
-    found = search(case, base, ready.hypotheses, progress=options.progress)
+    searched = search(case, base, ready.hypotheses, progress=options.progress)
     say("a generic force beside the causes")
-    found = weighed(case, found)
+    found = weighed(case, searched)
     keys = [c.hypothesis.key for c in found.causes]
     apart = sorted(key for key in keys if denied(key, ready.agreeing))
     if apart and leaves_more(found, case.held_out):
         # a defect that all sensors share would leave nothing; this one imitates what forces do
         say("causes without those that the sensors deny")
-        found = weighed(case, search(case, base, ready.of_forces, progress=options.progress))
+        searched = search(case, base, ready.of_forces, progress=options.progress)
+        found = weighed(case, searched)
     found = replace(found, given=ready.as_given())
     if model is None and leaves_more(found, case.held_out):
-        chosen = from_chosen(ready, found, say)
+        chosen = from_chosen(ready, searched, found, say)
         if chosen is not None:
             wider, mine = chosen
             mine = weighed(wider, mine)
