@@ -333,8 +333,8 @@ def free_run_noise(
     """Return the metric of least squares: each state's errors in their own deviation.
 
     What a misfit leaves is slow, and a colour that takes it for the sea's own hides every slow
-    cause. Here nothing is hidden; tests and standard errors must count the errors' memory. A heading
-    tells what its rate does, and does not count twice.
+    cause. Here nothing is hidden; tests and standard errors must count the errors' memory. A
+    heading tells what its rate does, and does not count twice.
 
     Parameters
     ----------
