@@ -38,8 +38,8 @@ class Standing:
     half : float
         One-sided p-value of a share no larger than `LEAST_SHARE`.
     moved : ndarray
-        How far each of its numbers moves when the generic force joins, and how far it lies on the
-        held-out logs beyond what chance explains, together.
+        How far each of its numbers moves when the generic force joins, and how far it differs
+        between logs beyond what chance explains, together.
     clear : float
         p-value of the null (Wald) where it is likeliest on the way that the generic force moves
         the numbers.
@@ -140,35 +140,38 @@ def _moved(
 
 
 def _scatter(pair: Pair, hypothesis: Hypothesis) -> Array:
-    """Return the variance of a hypothesis's numbers between logs that chance does not explain.
+    """Return the variance of a hypothesis's numbers by what differs from log to log.
 
-    Its numbers alone are fitted to the held-out logs, the rest of the model as it is. Of two
-    values half of their squared difference is their variance; what the standard errors of both
-    make of it is taken off.
+    Its numbers alone are fitted to each log, the rest of the model as it is. What their variance
+    exceeds that of chance by is shared by the logs that the model was fitted to; of few logs it is
+    hardly known, as the variance of Student's t tells.
     """
-    fit, held = pair.fit, pair.held
-    point = fit.point
+    point = pair.fit.point
     k = [h.key for h in point.hypotheses].index(hypothesis.key)
-    others = [
-        (h, v) for i, (h, v) in enumerate(zip(point.hypotheses, point.values, strict=True))
-        if i != k and h.apply is not None
-    ]  # fmt: skip
     base = point.base
-    for other, value in others:
-        base = other.apply(base, value) if other.apply is not None else base
-    places = () if hypothesis.apply is not None else tuple(held.numbers_at(hypothesis))
-    alone = Point(base, pair.held_fit.point.starts, places, (hypothesis,), (point.values[k],))
-    there = held.fit(alone, pair.held_fit.noise, most=_FEW)
-    here, spread = pair.problem.covariance(fit)
-    where = pair.problem.numbers_of(point, hypothesis)
-    numbers, own = held.covariance(there)
-    chance = np.diag(spread)[where] + np.diag(own)
-    reached = np.array([p.reach for p in hypothesis.parameters][: len(where)])
-    reached = np.pad(reached, (0, len(where) - len(reached)))
-    if there.escaped or not np.isfinite(chance).all():
-        return np.zeros(len(where))
-    excess = np.maximum((numbers - here[where]) ** 2 - chance, 0.0) / 2
-    return np.where(reached > 0, 0.0, excess)
+    for i, (other, value) in enumerate(zip(point.hypotheses, point.values, strict=True)):
+        if i != k and other.apply is not None:
+            base = other.apply(base, value)
+    places = () if hypothesis.apply is not None else tuple(pair.held.numbers_at(hypothesis))
+    numbers, chance = [], []
+    for problem, fit in ((pair.problem, pair.fit), (pair.held, pair.held_fit)):
+        for run, start in zip(problem.runs, fit.point.starts, strict=True):
+            one = Problem([run], problem.metric)
+            alone = Point(base, (start,), places, (hypothesis,), (point.values[k],))
+            found = one.fit(alone, fit.noise, most=_FEW)
+            if not found.escaped:
+                value, own = one.covariance(found)
+                numbers.append(value)
+                chance.append(np.diag(own))
+    count = len(pair.problem.numbers_of(point, hypothesis))
+    if len(numbers) < 2 or not np.isfinite(chance).all():
+        return np.zeros(count)
+    excess = np.var(numbers, axis=0, ddof=1) - np.mean(chance, axis=0)
+    wider = (len(numbers) - 1) / max(len(numbers) - 3, 1)
+    reached = np.array([p.reach for p in hypothesis.parameters][:count])
+    reached = np.pad(reached, (0, count - len(reached)))
+    shared = np.maximum(excess, 0.0) * wider / len(pair.problem.runs)
+    return np.where(reached > 0, 0.0, shared)
 
 
 def _own_arguments(problem: Problem, hypothesis: Hypothesis) -> Use | None:
