@@ -49,8 +49,12 @@ _WIDTH, _BEYOND = 1.0, 0.25
 # prior deviations of an equation's bumps, in those whose joint effect has the size of the
 # innovations, that are tried
 _STRENGTHS = np.concatenate([[0.0], np.geomspace(0.01, 30.0, 18)])
+# samples that the errors' noise remembers at most: a longer memory passes for what is missing
+_MEMORY = 10.0
 # times that the run is linearised anew, and halvings of a step that does not help
 _ROUNDS, _HALVINGS = 8, 6
+# fall of the squared held-out errors from which on bumps are worth their numbers
+_LEAST = 0.05
 # rounds over the equations' strengths
 _SWEEPS = 4
 _LETTERS = {state: letter for letter, state in EQUATIONS.items()}
@@ -147,10 +151,7 @@ def with_remainder(
         reason = "No force without a name is added: the free run leaves every bound without it."
         return replace(told, remainder=replace(empty, reason=reason))
     terms = bump_terms(problem, fit, seed)
-    wide = Case(
-        case.structure, case.universe.with_terms(*terms), case.logs, case.held_out_logs,
-        case.kind, case.regime, case.metric,
-    )  # fmt: skip
+    wide = wider(case, terms)
     made = fit_black_box(wide.problem(fit.integrator), wide.carried(fit), terms)
     size = {t.state: float(d) for t, d in zip(terms, made.deviation, strict=True)}
     found = replace(
@@ -170,8 +171,8 @@ def with_remainder(
         one, two = held_runs(pairs), held_runs([_beside(wide, p, terms) for p in pairs])
     found = replace(found, gain=gains(one, two, problem.sample_time, seed))
     fall = 1 - float(np.exp(2 * np.mean([_log_ratio(g) for g in found.gain.values()])))
-    added = fall > 0 and any(g.ci[0] > 0 for g in found.gain.values())
-    found = replace(found, added=added, reason=_reason(found, added, fall))
+    added = fall > _LEAST and any(g.ci[0] > 0 for g in found.gain.values())
+    found = replace(found, added=added, reason=_reason(found, fall))
     record = {**model.record, "remainder": found.to_dict()}
     return replace(
         told, remainder=found, model=replace(model, record=record) if added else told.model
@@ -184,21 +185,22 @@ def _log_ratio(gain: Gain) -> float:
     return float(np.log(two / one))
 
 
-def _reason(found: Remainder, added: bool, fall: float) -> str:
+def _reason(found: Remainder, fall: float) -> str:
     where = ", ".join(f"{n} in {s}" for s, n in found.terms.items() if n)
-    if added:
+    what = f"A smooth force without a name (bumps: {where})"
+    if found.added:
+        worse = [s for s, g in found.gain.items() if g.ci[1] < 0]
+        but = f"; {', '.join(worse)} alone are worse" if worse else ""
         return (
-            f"A smooth force without a name is in the model (bumps: {where}): the squared errors "
-            f"of held-out free runs fall by {100 * fall:.0f} % with it (mean of the states)."
+            f"{what} is in the model: the squared errors of held-out free runs fall by "
+            f"{100 * fall:.0f} % with it (mean of the states{but})."
         )
-    if fall > 0:
-        return (
-            f"A smooth force without a name (bumps: {where}) is not added: the gain of held-out "
-            f"free runs is not told from chance in any state."
-        )
+    if fall > _LEAST:
+        return f"{what} is not added: no state's held-out free run surely gains by it."
+    how = f"fall by {100 * fall:.2g} %" if fall > 0 else f"grow by {-100 * fall:.2g} %"
     return (
-        f"A smooth force without a name (bumps: {where}) is not added: the squared errors of "
-        f"held-out free runs grow by {-100 * fall:.0f} % with it (mean of the states)."
+        f"{what} is not added: the squared errors of held-out free runs {how} with it (mean of "
+        f"the states; at least {100 * _LEAST:.0f} % less are asked for)."
     )
 
 
@@ -208,6 +210,14 @@ def _beside(wide: Case, pair: Pair, terms: Sequence[Term]) -> Pair:
     made = fit_black_box(fitting, wide.carried(pair.fit), terms)
     after = held.fit_starts(made.fit.point, pair.held_fit.noise)
     return Pair(fitting, made.fit, held, after)
+
+
+def wider(case: Case, terms: Sequence[Term]) -> Case:
+    """Return a case with bumps among the terms of its universe."""
+    return Case(
+        case.structure, case.universe.with_terms(*terms), case.logs, case.held_out_logs,
+        case.kind, case.regime, case.metric,
+    )  # fmt: skip
 
 
 def _wider(problem: Problem, structure: Structure) -> Problem:
@@ -244,7 +254,7 @@ def extended_by(model: ManoeuvringModel, terms: Sequence[Term], made: BlackBox) 
         structure=structure.with_terms(*(terms[k] for k in kept)),
         theta=np.append(model.theta, made.values[kept]),
         covariance=full[:m, :m],
-        disturbance_covariance=full[:, m:],
+        disturbance_covariance=full[:, m:] if known else np.zeros((0, 0)),
         residual_std=one_step_deviations(made.problem, white),
         noise=noise_levels(made.problem, white),
     )
@@ -288,6 +298,8 @@ class BlackBox:
         places = tuple(self.problem.place(n) for n in others)
         line = _linearised(self.problem, replace(self.fit, point=_free(self.fit.point, places)))
         mine = _linearised(self.problem, self.fit)
+        if line is None or mine is None:
+            return np.zeros((len(self.deviation), len(places)))
         return -self.posterior @ mine.across.T @ line.across
 
 
@@ -304,12 +316,15 @@ def fit_black_box(problem: Problem, fit: Fit, terms: Sequence[Term]) -> BlackBox
     """
     # what hypotheses made of the ship is fixed
     point = replace(fit.point, base=fit.point.ship, hypotheses=(), values=())
-    fit = replace(fit, point=_free(point, tuple(problem.place(t.name) for t in terms)))
+    point = _free(point, tuple(problem.place(t.name) for t in terms))
+    fit = problem.forgetful(replace(fit, point=point), _MEMORY)
     equations = [[k for k, t in enumerate(terms) if t.state == s] for s in problem.structure.states]
     m = len(terms)
     best = BlackBox(problem, fit, np.zeros(m), np.zeros((m, m)))
     for _ in range(_ROUNDS):
         line = _linearised(problem, fit)
+        if line is None:
+            break
         now = fit.point.vector()
         deviation = _deviations(line, now[:m], equations)
         wanted, posterior = _ridge(line, now[:m], deviation)
@@ -317,9 +332,7 @@ def fit_black_box(problem: Problem, fit: Fit, terms: Sequence[Term]) -> BlackBox
         better = _stepped(problem, fit, step, deviation, line.alike)
         if better is None:
             break
-        noise = problem.noise_of(better.errors, better.point, better.noise)
-        nu, cost = problem.whitened(noise, better.errors)
-        fit = replace(better, noise=noise, nu=tuple(nu), cost=cost)
+        fit = problem.forgetful(better, _MEMORY)
         if _missed(problem, fit) >= _missed(problem, best.fit):
             # likelier by a colour that gives one state away for another
             break
@@ -368,8 +381,11 @@ class _Linear:
         return np.asarray(np.linalg.lstsq(self.begun, left, rcond=1e-8)[0])
 
 
-def _linearised(problem: Problem, fit: Fit) -> _Linear:
+def _linearised(problem: Problem, fit: Fit) -> _Linear | None:
+    """Return the free runs to first order; None at the edge of stability."""
     rows = np.concatenate([r.reshape(-1, r.shape[2]) for r in problem.rows(fit.point, fit.noise)])
+    if not np.isfinite(rows).all():
+        return None
     own, begun = np.split(rows, [len(fit.point.places)], axis=1)
     seen = np.concatenate([n.ravel() for n in fit.nu])
     alike = float(np.sqrt(correlation_factor(np.concatenate(fit.nu))))
