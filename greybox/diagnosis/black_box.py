@@ -172,7 +172,8 @@ def with_remainder(
     found = replace(found, gain=gains(one, two, problem.sample_time, seed))
     fall = 1 - float(np.exp(2 * np.mean([_log_ratio(g) for g in found.gain.values()])))
     added = fall > _LEAST and any(g.ci[0] > 0 for g in found.gain.values())
-    found = replace(found, added=added, reason=_reason(found, fall))
+    found = replace(found, added=added)
+    found = replace(found, reason=_reason(found, fall))
     record = {**model.record, "remainder": found.to_dict()}
     return replace(
         told, remainder=found, model=replace(model, record=record) if added else told.model

@@ -149,6 +149,22 @@ class ManoeuvringModel(DisplayMixin):
         covariance = self.covariance * np.outer(now, now)
         return replace(self, theta=self.theta * now, covariance=covariance, changes=())
 
+    def without_bumps(self) -> ManoeuvringModel:
+        """Return the model without its force without a name: all its other numbers as they are."""
+        kept = [i for i, t in enumerate(self.structure.terms) if not t.local]
+        if len(kept) == len(self.theta):
+            return self
+        shared = self.disturbance_covariance
+        rows = [*kept, *range(len(self.theta), len(shared))]
+        terms = tuple(self.structure.terms[i] for i in kept)
+        return replace(
+            self,
+            structure=replace(self.structure, terms=terms),
+            theta=self.theta[kept],
+            covariance=self.covariance[np.ix_(kept, kept)],
+            disturbance_covariance=shared[rows] if shared.size else shared,
+        )
+
     def coefficient_model(self) -> ManoeuvringModel:
         """Return the model whose coefficients mean what their names say, as far as any does.
 

@@ -141,6 +141,7 @@ def test_a_diagnosis_adds_it(trial, validated: bool) -> None:
     )
     told(found)
     assert found.remainder.added
+    assert "is in the model" in found.remainder.reason
     assert found.remainder.gain["v"].ci[0] > 0
     added = sum(found.remainder.terms.values())
     assert len(found.model.names) == len(found.base.names) + added
@@ -158,4 +159,5 @@ def test_where_nothing_is_missing_nothing_is_added() -> None:
     found = diagnose([sailed.estimation], options=ASKED, **logs)
     told(found)
     assert not found.remainder.added
+    assert "added" in found.remainder.reason
     assert found.model == without.model

@@ -104,6 +104,15 @@ def test_bumps_are_pure_numbers_and_one_line_of_the_equations(model: Manoeuvring
     assert "X_g1" not in to_prime({"X_g1": 1.0, "Xu": 1.0}, model.structure, length=1, speed=1)
 
 
+def test_without_its_bumps_a_model_is_what_it_was(model: ManoeuvringModel) -> None:
+    plain = model.without_bumps()
+    assert plain.structure == get_structure("thesis")
+    p = len(plain.theta)
+    np.testing.assert_array_equal(plain.theta, model.theta[:p])
+    np.testing.assert_array_equal(plain.covariance, model.covariance[:p, :p])
+    assert plain.without_bumps() is plain
+
+
 def test_two_bumps_are_two_functions() -> None:
     base = get_structure("thesis")
     wide = base.with_terms(Term("X_g1", "u", (BUMP,)), Term("X_g2", "u", (FLAT,)))
