@@ -55,6 +55,8 @@ _MEMORY = 10.0
 _ROUNDS, _HALVINGS = 8, 6
 # fall of the squared held-out errors from which on bumps are worth their numbers
 _LEAST = 0.05
+# points of the fit (6.12) by which a state may surely lose
+_TRIFLE = 0.5
 # rounds over the equations' strengths
 _SWEEPS = 4
 _LETTERS = {state: letter for letter, state in EQUATIONS.items()}
@@ -171,8 +173,8 @@ def with_remainder(
         one, two = held_runs(pairs), held_runs([_beside(wide, p, terms) for p in pairs])
     found = replace(found, gain=gains(one, two, problem.sample_time, seed))
     fall = 1 - float(np.exp(2 * np.mean([_log_ratio(g) for g in found.gain.values()])))
-    added = fall > _LEAST and any(g.ci[0] > 0 for g in found.gain.values())
-    found = replace(found, added=added)
+    surely = any(g.ci[0] > 0 for g in found.gain.values())
+    found = replace(found, added=fall > _LEAST and surely and not _worse(found))
     found = replace(found, reason=_reason(found, fall))
     record = {**model.record, "remainder": found.to_dict()}
     return replace(
@@ -186,15 +188,24 @@ def _log_ratio(gain: Gain) -> float:
     return float(np.log(two / one))
 
 
+def _worse(found: Remainder) -> list[str]:
+    """Return the states whose held-out fit surely falls, by more than a trifle."""
+    return [s for s, g in found.gain.items() if g.ci[1] < -_TRIFLE]
+
+
 def _reason(found: Remainder, fall: float) -> str:
     where = ", ".join(f"{n} in {s}" for s, n in found.terms.items() if n)
     what = f"A smooth force without a name (bumps: {where})"
     if found.added:
-        worse = [s for s, g in found.gain.items() if g.ci[1] < 0]
-        but = f"; {', '.join(worse)} alone are worse" if worse else ""
         return (
             f"{what} is in the model: the squared errors of held-out free runs fall by "
-            f"{100 * fall:.0f} % with it (mean of the states{but})."
+            f"{100 * fall:.0f} % with it (mean of the states)."
+        )
+    if fall > _LEAST and _worse(found):
+        return (
+            f"{what} is not added: the squared errors of held-out free runs fall by "
+            f"{100 * fall:.0f} % with it (mean of the states), but {', '.join(_worse(found))} would "
+            f"be worse."
         )
     if fall > _LEAST:
         return f"{what} is not added: no state's held-out free run surely gains by it."

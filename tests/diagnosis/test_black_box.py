@@ -13,12 +13,12 @@ from free_runs import calm, program, run_program, wanted
 from schemas import schema
 
 from greybox.commands.common import provenance
-from greybox.diagnosis.black_box import bump_terms, extended_by, fit_black_box, wider
+from greybox.diagnosis.black_box import _reason, bump_terms, extended_by, fit_black_box, wider
 from greybox.diagnosis.diagnose import DiagnosisOptions, diagnose
 from greybox.diagnosis.extension import extended_model
 from greybox.diagnosis.gain import run_on
 from greybox.diagnosis.preparing import prepare
-from greybox.diagnosis.result import Diagnosis
+from greybox.diagnosis.result import Diagnosis, Gain, Remainder
 from greybox.model.model import load_model
 from greybox.public import one_thread
 from greybox.report.diagnosis import diagnosis_page
@@ -161,3 +161,17 @@ def test_where_nothing_is_missing_nothing_is_added() -> None:
     assert not found.remainder.added
     assert "added" in found.remainder.reason
     assert found.model == without.model
+
+
+@pytest.mark.parametrize(
+    ("fall", "low", "high", "said"),
+    [
+        (0.3, 1.0, 5.0, "is not added: no state's"),
+        (0.3, -9.0, -2.0, "but u would be worse"),
+        (0.02, 1.0, 5.0, "at least 5 % less are asked for"),
+        (-0.1, -9.0, -2.0, "grow by 10 %"),
+    ],
+)
+def test_what_is_not_added_is_said_with_the_reason(fall, low, high, said: str) -> None:
+    gain = {"u": Gain(80.0, 80.0, (low, high))}
+    assert said in _reason(Remainder(False, {"u": 24}, {"u": 0.1}, gain, "", ""), fall)
