@@ -178,7 +178,7 @@ def with_remainder(
     found = replace(found, reason=_reason(found, fall))
     record = {**model.record, "remainder": found.to_dict()}
     return replace(
-        told, remainder=found, model=replace(model, record=record) if added else told.model
+        told, remainder=found, model=replace(model, record=record) if found.added else told.model
     )
 
 
@@ -204,8 +204,8 @@ def _reason(found: Remainder, fall: float) -> str:
     if fall > _LEAST and _worse(found):
         return (
             f"{what} is not added: the squared errors of held-out free runs fall by "
-            f"{100 * fall:.0f} % with it (mean of the states), but {', '.join(_worse(found))} would "
-            f"be worse."
+            f"{100 * fall:.0f} % with it (mean of the states), but {', '.join(_worse(found))} "
+            f"would be worse."
         )
     if fall > _LEAST:
         return f"{what} is not added: no state's held-out free run surely gains by it."

@@ -369,7 +369,9 @@ class Problem:
         mean = np.mean(found, axis=0)
         return np.array([mean[i, i] if i < nx else 1.0 for i in range(len(self.runs[0].outputs))])
 
-    def noise_of(self, errors: Sequence[Array], point: Point, start: Noise | None = None) -> Noise:
+    def noise_of(
+        self, errors: Sequence[Array], point: Point, start: Noise | None = None
+    ) -> Noise:
         """Return what errors are weighed by."""
         if self.metric == "free run":
             return free_run_noise(errors, self.groups, start)

@@ -461,10 +461,7 @@ def _at_null(problem: Problem, fit: Fit, hypothesis: Hypothesis) -> Array:
     if np.isfinite(rows).all() and len(where):
         normal, across = rows[:, rest].T @ rows[:, rest], rows[:, rest].T @ rows[:, where]
         moved = bounded_step(
-            normal,
-            -across @ change,
-            *(b[rest] - vector[rest] for b in problem.bounds(fit.point)),
-            0.0,
+            normal, -across @ change, *(b[rest] - vector[rest] for b in problem.bounds(fit.point)), 0.0
         )
         vector[rest] += moved
     vector[where] = null
