@@ -47,6 +47,13 @@ CAUSES = {
     "thruster_gain": (6, "u", lambda g, run: g["n2"] * np.cos(g["alpha2"]), "n2 cos(alpha2)"),
     "thruster_lag": (2, "u", lambda g, run: change(push(g)), "change of the force in 10 s"),
     "input_delay": (3, "u", lambda g, run: change(push(g)), "change of the force in 10 s"),
+    "rate_limit": (1, "r", lambda g, run: change(g["alpha1"]), "change of alpha1 in 10 s [rad]"),
+    "feedback_sampling": (
+        6,
+        "u",
+        lambda g, run: np.gradient(push(g)),
+        "change of the force in 1 s",
+    ),
     "quadratic_thrust": (3, "u", lambda g, run: push(g), "force along the bow"),
     "advance_speed": (3, "v", lambda g, run: g["u"] * push(g, np.sin), "u times the side force"),
     "angle_offset": (1, "r", lambda g, run: g["n1"] * np.cos(g["alpha1"]), "n1 cos(alpha1)"),

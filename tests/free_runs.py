@@ -88,7 +88,7 @@ def with_thrusters(model: ManoeuvringModel, *changed: dict) -> ManoeuvringModel:
 
 KINDS = (
     "plain", "rk4", "current", "wind", "changes", "changes of rk4", "lag", "lag of speeds",
-    "lag of commands", "delay", "whole delay", "late", "thrusters", "terms", "bumps",
+    "lag of commands", "delay", "whole delay", "late", "one late", "thrusters", "terms", "bumps",
     "bumps of rk4",
 )  # fmt: skip
 
@@ -111,6 +111,10 @@ def variants(model: ManoeuvringModel) -> dict[str, ManoeuvringModel]:
         "lag of speeds": with_actuation(model, lag=4.0, lag_on="speed", lag_held="mean"),
         "lag of commands": with_actuation(model, lag=2.5, lag_on="command", lag_held="end"),
         "delay": with_actuation(model, delay=2.6),
+        "one late": with_actuation(
+            model, lag=3.0, lag_on="alpha1", lag_held="mean", delay=1.3, delay_on="n",
+            rate_limit=0.02, rate_on="alpha2",
+        ),
         "whole delay": with_actuation(model, delay=3.0),
         "late": replace(
             with_actuation(model, lag=3.0, lag_held="mean", delay=0.4),

@@ -14,9 +14,9 @@ from greybox.registry import entry_points
 # written out, since loading them takes longer than one waits for Tab; tests hold them to the truth
 STRUCTURES = ("thesis", "surge", "linear", "blanke", "modulus", "abkowitz", "siso")
 CAUSES = (
-    "current", "wind", "thruster_gain", "thruster_lag", "input_delay", "quadratic_thrust",
-    "advance_speed", "cubic_damping", "quadratic_yaw_damping", "crossflow", "inertia_coupling",
-    "side_force", "asymmetry",
+    "current", "wind", "thruster_gain", "thruster_lag", "input_delay", "rate_limit",
+    "feedback_sampling", "quadratic_thrust", "advance_speed", "cubic_damping",
+    "quadratic_yaw_damping", "crossflow", "inertia_coupling", "side_force", "asymmetry",
     "heading_bias", "lever_arm", "angle_offset", "clock_offset", "sign", "parameter_change",
     "waves",
 )  # fmt: skip

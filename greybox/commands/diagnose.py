@@ -59,7 +59,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "logs show, where it makes held-out free runs better",
     )
     parser.add_argument(
-        "--sample-time", type=positive, metavar="S", help="decimate the logs to this sample time"
+        "--sample-time",
+        type=positive,
+        metavar="S",
+        help="decimate the logs to this sample time; by default that of MODEL, or what suits the "
+        "ship's pace",
     )
     add_seed(parser)
 
@@ -91,6 +95,7 @@ def run(options: argparse.Namespace) -> None:
             causes=options.causes,
             seed=options.seed,
             remainder=options.remainder,
+            own_pace=options.sample_time is None,
             progress=activity(),
         ),
     )
@@ -121,10 +126,12 @@ def _save(diagnosis: Diagnosis, path: str, record: dict[str, Any]) -> None:
     from dataclasses import replace
     from pathlib import Path
 
+    from greybox.diagnosis.result import file_word
+
     target = Path(path)
     told = {"diagnosis": diagnosis.to_dict(), "provenance": record}
     for name, model in diagnosis.alternatives.items():
         replace(model, record={**model.record, **told}).save(
-            target.with_name(f"{target.stem}.{name}{target.suffix or '.json'}")
+            target.with_name(f"{target.stem}.{file_word(name)}{target.suffix or '.json'}")
         )
     replace(diagnosis.model, record={**diagnosis.model.record, **told}).save(target)

@@ -13,23 +13,21 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.base import Case
+from greybox.diagnosis.base import INTEGRATORS, Case
 from greybox.diagnosis.causes.hull import term_parameters
 from greybox.diagnosis.fitting import Problem
-from greybox.diagnosis.held_out import proof_of
 from greybox.diagnosis.hypothesis import Hypothesis
 from greybox.diagnosis.kinematics import denied
+from greybox.diagnosis.noise import Noise
 from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.preparing import Prepared, context_of
 from greybox.diagnosis.refitting import SETTLE
-from greybox.diagnosis.search import Search, assess_candidate, pruned, search
+from greybox.diagnosis.search import Search, assess_candidate, search
 from greybox.diagnosis.ship import CURRENTS, Ship
-from greybox.diagnosis.thresholds import PROVEN
 from greybox.errors import ExcitationError, GreyboxError
 from greybox.model.structure import Structure
 from greybox.model.terms import Term, parse_term
 from greybox.selection.cross_validation import Refit
-from greybox.selection.estimate import at_own_pace
 from greybox.selection.term_selection import TermChoice, select_terms
 from greybox.trial.log import TrialLog
 
@@ -42,73 +40,91 @@ _QUADRATIC = "quadratic_thrust"
 
 
 def from_chosen(
-    ready: Prepared, found: Search, progress: Callable[[str], None]
+    ready: Prepared, searched: Search, found: Search, progress: Callable[[str], None]
 ) -> tuple[Case, Search] | None:
-    """Search from the terms that the data choose; None where that predicts no better.
+    """Search with errors weighed by their size alone; None where that predicts no better.
+
+    It begins with the terms that the data choose, or with what the search from (3.51) ended with:
+    whichever follows the held-out logs more nearly.
 
     Parameters
     ----------
     ready : Prepared
         Without a model of its own.
-    found : Search
-        From (3.51).
+    searched, found : Search
+        From (3.51), before and after its causes were weighed.
     progress : callable
     """
     progress("terms that the data choose")
     try:
         choice = _choice(ready.case.logs)
     except GreyboxError:
-        return None
-    terms = choice.terms.structure
-    case = ready.case.wider(terms.parameters, "free run")
+        choice = None
+    terms = () if choice is None else choice.terms.structure.parameters
+    case = ready.case.wider(terms, "free run")
     base = case.carried(found.base)
+    plain = case.problem(base.integrator).settle(base)
+    fit = _bounded(case, case.carried(searched.final).point, plain.noise)
+    named, hypotheses = [c.hypothesis for c in searched.causes], ready.hypotheses
+    by_data = None
+    if choice is not None:
+        chosen, every = _hypotheses(ready, case, choice)
+        by_data = _bounded(case, _start(ready, case, choice, chosen, base), plain.noise)
+        if by_data is not None and (fit is None or _nearer(case, by_data, fit)):
+            fit, named, hypotheses = by_data, chosen, tuple(every)
+    if fit is None:
+        return None
+    proof = case.held_out(fit.integrator).prove(plain, fit)
+    names = case.problem(fit.integrator).names
+    # each is weighed at the end, by leaving it out
+    causes = [assess_candidate(proof, plain, fit, a, len(hypotheses), names) for a in named]
+    others = [a for a in hypotheses if a not in named]
+    other = search(case, fit, others, begun=causes, progress=progress)
+    mine = replace(other, base=base, tried=len(hypotheses), chosen=by_data)
+    return (case, mine) if _nearer(case, mine.final, case.carried(found.final)) else None
+
+
+def _start(
+    ready: Prepared, case: Case, choice: TermChoice, named: Sequence[Hypothesis], base: Fit
+) -> Point:
+    """Return the chosen terms, those that stand for causes in force."""
     problem = case.problem(base.integrator)
-    plain = problem.settle(base)
-    named, hypotheses = _hypotheses(ready, case, choice)
     in_force = {n for a in named for n in a.columns}
-    free = dict.fromkeys((*terms.parameters, *_replaced(ready.structure, named)))
+    free = dict.fromkeys(
+        (*choice.terms.structure.parameters, *_replaced(ready.structure, named))
+    )  # fmt: skip
     places = tuple(problem.place(n) for n in free if n not in in_force)
     start = Point(_ship(problem, choice, base), base.point.starts, places)
     for hypothesis in named:
         value = None if hypothesis.apply is None else np.array([_share(choice)])
         start = problem.add(start, hypothesis, value)
-    begun = problem.fit(start, plain.noise)
-    if begun.escaped:
-        return None
-    fit = case.other_integrator(problem.settle(begun, SETTLE))
-    held_out = case.held_out(fit.integrator)
-    if any(p.held_fit.escaped for p in held_out.pairs(fit)):
-        return None
-    causes = [
-        assess_candidate(held_out, plain, fit, a, len(hypotheses), problem.names) for a in named
-    ]
-    fit, causes = pruned(case, fit, causes, len(hypotheses))
-    other = search(
-        case, fit, [a for a in hypotheses if a not in named], begun=causes, progress=progress
-    )
-    mine = replace(other, base=base, steps=other.steps, tried=len(hypotheses))
-    return (case, mine) if _better(case, mine, case.carried(found.final)) else None
+    return start
+
+
+def _bounded(case: Case, start: Point, noise: Noise) -> Fit | None:
+    """Return the likelier fit by either integrator whose held-out runs have bounds, if any."""
+    fits = []
+    for integrator in INTEGRATORS:
+        problem = case.problem(integrator)
+        fit = replace(
+            problem.settle(problem.fit(start, noise), SETTLE), integrator=integrator
+        )  # fmt: skip
+        if not fit.escaped and np.isfinite(case.held_out(integrator).squares(fit)).all():
+            fits.append(fit)
+    return min(fits, key=lambda f: f.cost, default=None)
 
 
 def _choice(logs: Sequence[TrialLog]) -> TermChoice:
     def none(_: Sequence[TrialLog]) -> None:
         raise ExcitationError("no model stands before.")
 
-    return select_terms(at_own_pace(logs, []), "no model", 0, Refit(none))  # type: ignore[arg-type]
+    return select_terms(logs, "no model", 0, Refit(none))  # type: ignore[arg-type]
 
 
-def _better(case: Case, mine: Search, other: Fit) -> bool:
-    """Whether held-out logs prefer what was found from the chosen terms: likelier, and nearer.
-
-    A likelihood that takes slow errors for the sea's own may rise while the run gets worse.
-    """
-    held_out = case.held_out(mine.final.integrator)
-    if other.integrator == mine.final.integrator and not held_out.worse(mine.final, other) < 0:
-        return False
-    one, two = (case.held_out(f.integrator).contributions(f) for f in (other, mine.final))
-    with np.errstate(invalid="ignore"):
-        proof = proof_of(one - two)
-    return proof.gain > 0 and proof.p_value < PROVEN
+def _nearer(case: Case, fit: Fit, other: Fit) -> bool:
+    """Whether a fit follows the held-out logs more nearly than another one."""
+    one, two = (case.held_out(f.integrator).squares(f) for f in (other, fit))
+    return bool(np.log(two).mean() < np.log(one).mean())
 
 
 def _hypotheses(

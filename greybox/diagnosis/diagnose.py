@@ -19,7 +19,10 @@ from greybox.diagnosis.telling import Report
 from greybox.diagnosis.waves import find_waves, found_waves
 from greybox.model.model import ManoeuvringModel
 from greybox.public import known_keywords, one_thread
-from greybox.trial.log import Logs
+from greybox.regression.regression import common_sample_time
+from greybox.selection.estimate import at_own_pace
+from greybox.trial.kinematics import decimate_segments
+from greybox.trial.log import Logs, TrialLog
 from greybox.trial.segments import as_segments
 from greybox.trial.validity import other_conditions, pooled_conditions
 
@@ -41,6 +44,9 @@ class DiagnosisOptions:
     remainder : bool
         Whether a smooth force without a name is added to the extended model where it makes
         held-out free runs better: see `greybox.diagnosis.black_box`.
+    own_pace : bool
+        Whether logs that are sampled faster than the ship moves are taken at a longer sample
+        time, as an estimate takes them; not where a model has its own.
     progress : callable
         Told what is being done.
     """
@@ -49,6 +55,7 @@ class DiagnosisOptions:
     causes: Sequence[str] | None = None
     seed: int = 0
     remainder: bool = False
+    own_pace: bool = True
     progress: Callable[[str], None] = field(default=lambda _: None)
 
 
@@ -96,27 +103,31 @@ def diagnose(
 
     say("log checks")
     logs, validate = as_segments(logs), as_segments(validate, 0)
+    paced: list[str] = []
+    if model is None and options.own_pace:
+        logs, validate = _at_own_pace(logs, validate, paced)
     ready = prepare(logs, validate, model, options.structure, options.causes)
     case = ready.case
     say("model without causes")
     base = ready.base()
     problem = case.problem(base.integrator)
-    found = search(case, base, ready.hypotheses, progress=options.progress)
+    searched = search(case, base, ready.hypotheses, progress=options.progress)
     say("a generic force beside the causes")
-    found = weighed(case, found)
+    found = weighed(case, searched)
     keys = [c.hypothesis.key for c in found.causes]
     apart = sorted(key for key in keys if denied(key, ready.agreeing))
     if apart and leaves_more(found, case.held_out):
         # a defect that all sensors share would leave nothing; this one imitates what forces do
         say("causes without those that the sensors deny")
-        found = weighed(case, search(case, base, ready.of_forces, progress=options.progress))
+        searched = search(case, base, ready.of_forces, progress=options.progress)
+        found = weighed(case, searched)
     found = replace(found, given=ready.as_given())
     if model is None and leaves_more(found, case.held_out):
-        chosen = from_chosen(ready, found, say)
+        chosen = from_chosen(ready, searched, found, say)
         if chosen is not None:
             wider, mine = chosen
             mine = weighed(wider, mine)
-            if mine.causes:
+            if mine.causes or not found.causes:
                 case, found = wider, mine
                 problem = case.problem(found.base.integrator)
     say("what is left")
@@ -127,7 +138,7 @@ def diagnose(
         white = problem.forgetful(fit, np.inf)
         lines.append(find_waves(white.nu, white.errors, names, problem.sample_time))
     say("gain")
-    notes = []
+    notes = paced
     if apart and not any(c.hypothesis.key in apart for c in found.causes):
         notes.append(
             f"{', '.join(apart)} would help, but positions, heading and velocities of these logs "
@@ -152,3 +163,17 @@ def diagnose(
         say("a black-box part")
         made = with_remainder(case, report.fit_told, made, ready.validate, options.seed)
     return replace(made, conditions=conditions)
+
+
+def _at_own_pace(
+    logs: Sequence[TrialLog], validate: Sequence[TrialLog], notes: list[str]
+) -> tuple[list[TrialLog], list[TrialLog]]:
+    """Return all logs at the sample time that suits how fast the ship of the first ones moves."""
+    common_sample_time([*logs, *validate])
+    slower = list(at_own_pace(logs, notes))
+    step = slower[0].sample_time
+    if step == logs[0].sample_time or not validate:
+        return slower, list(validate)
+    held, left_out = decimate_segments(validate, step)
+    notes += left_out
+    return slower, held

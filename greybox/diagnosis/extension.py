@@ -22,6 +22,8 @@ from greybox.vessel.vessel import Thruster, Vessel
 
 Array = NDArray[np.float64]
 
+# what of an actuation may name a column
+_ON = ("lag_on", "delay_on", "rate_on")
 # where wind is not among the terms, these coefficients stand for sums
 _SUMS = {"Xuu": ("Xuu", "Wuu"), "Yvv": ("Yvv", "Wvv"), "Nuv": ("Nuv", "Wuv")}
 
@@ -130,7 +132,9 @@ def extended_vessel(
     thrusters = tuple(
         _rewired(t, swaps, others if alike else None) if swaps else t for t in vessel.thrusters
     )
-    return replace(vessel, sensors=said, thrusters=thrusters)
+    late = vessel.actuation
+    on = {k: swaps.get(v, v) for k in _ON if (v := getattr(late, k)) is not None}
+    return replace(vessel, sensors=said, thrusters=thrusters, actuation=replace(late, **on))
 
 
 def _rewired(

@@ -26,6 +26,8 @@ _MOST = 25
 # a point that −2 log L tells from another by less than this has its derivatives
 _NEAR = 1.0
 _DAMPING_LIMIT = 1e6
+# mean square of a log's errors, in that of all logs, that has a logarithm
+_LEAST_SIZE = 1e-12
 # values at which hills of a likelihood are looked for
 _HILLS = 25
 
@@ -121,6 +123,12 @@ class Problem:
         """Return least and largest values of the free numbers of a point."""
         size = len(point.vector())
         low, high = np.full(size, -np.inf), np.full(size, np.inf)
+        if self.metric == "free run":
+            # chosen damping takes energy out, as its choice had it
+            terms = self.structure.terms
+            high[
+                [k for k, i in enumerate(point.places) if i < len(terms) and terms[i].dissipates]
+            ] = 0.0
         for hypothesis in point.hypotheses:
             # coefficients that only become free beside it have no bounds
             for k, parameter in zip(
@@ -318,7 +326,21 @@ class Problem:
 
     def contributions(self, fit: Fit) -> list[Array]:
         """Return what each sample adds to −2 log L, (N,) a log."""
-        return [(nu**2).sum(axis=1) + fit.noise.log_det for nu in fit.nu]
+        return self.added(fit.nu, fit.noise)
+
+    def added(self, nu: Sequence[Array], noise: Noise) -> list[Array]:
+        """Return what each sample of innovations adds to −2 log L, (N,) a log.
+
+        What a misfit leaves differs from log to log: by its size alone each log's errors have a
+        deviation of their own, lest the worst one speak for all.
+        """
+        if noise.coloured:
+            return [(n**2).sum(axis=1) + noise.log_det for n in nu]
+        sizes = [np.maximum((n**2).mean(axis=0), _LEAST_SIZE) for n in nu]
+        return [
+            (n**2 / size).sum(axis=1) + float(np.log(size).sum()) + noise.log_det
+            for n, size in zip(nu, sizes, strict=True)
+        ]
 
     def costs(self, fit: Fit) -> Array:
         """Return −2 log L of each group of channels, (groups,)."""
@@ -369,9 +391,7 @@ class Problem:
         mean = np.mean(found, axis=0)
         return np.array([mean[i, i] if i < nx else 1.0 for i in range(len(self.runs[0].outputs))])
 
-    def noise_of(
-        self, errors: Sequence[Array], point: Point, start: Noise | None = None
-    ) -> Noise:
+    def noise_of(self, errors: Sequence[Array], point: Point, start: Noise | None = None) -> Noise:
         """Return what errors are weighed by."""
         if self.metric == "free run":
             return free_run_noise(errors, self.groups, start)

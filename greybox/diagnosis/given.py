@@ -92,7 +92,7 @@ def _likeliest(
     asked = [(fit, score) for score in scores[:_FORMS]]
     if slow(fit):
         asked += seen_as_slow(problem, fit, near)
-    fits = likelier(refits(problem, asked))
+    fits = [(a, f) for a, f, _ in likelier(refits(problem, asked, lambda _: None))]
     if not fit.point.hypotheses:
         # coefficients of their own forget the causes before: only the first can have them
         fits += case.restart(fit, hypotheses, [s.hypothesis for s in scores if s.gain == -np.inf])

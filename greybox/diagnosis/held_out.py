@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,12 +45,16 @@ class Proof:
 
 @dataclass(frozen=True)
 class Pair:
-    """A hypothesis where it was fitted, and where it has to prove itself."""
+    """A hypothesis where it was fitted, and where it has to prove itself.
+
+    `known` holds what was computed of it already.
+    """
 
     problem: Problem
     fit: Fit
     held: Problem
     held_fit: Fit
+    known: dict[object, Any] = field(default_factory=dict, init=False, compare=False, repr=False)
 
 
 class HeldOut(ABC):

@@ -37,6 +37,9 @@ class Parameter:
         For its derivative by differences, and its scale.
     least : float
         Distance from the null below which sampling itself looks alike.
+    over : float
+        What is told is this over the number, where it is not 0: a rate of which the number is the
+        time, so that no limit is at zero and not at infinity.
     """
 
     name: str
@@ -49,6 +52,14 @@ class Parameter:
     least: float = 0.0
     coarse: float = 0.0
     reach: float = 0.0
+    over: float = 0.0
+
+    def told(self, value: float, std: float) -> tuple[float, float]:
+        """Return what is told of an estimate, and its standard error."""
+        if not self.over:
+            return value, std
+        size = max(abs(value), self.step)
+        return self.over / size, self.over / size * (std / size)
 
 
 @dataclass(frozen=True)
@@ -80,6 +91,11 @@ class Hypothesis:
     refit_from_scratch : bool
         Whether the coefficients must be sought anew: what it changes is too much for
         derivatives.
+    place : str
+        What of the vessel it is of alone, such as the column of one command, where no name of its
+        parameters tells it.
+    only : bool
+        Whether a ship has room for one hypothesis of this cause.
     """
 
     cause: str
@@ -92,6 +108,13 @@ class Hypothesis:
     co_freed: tuple[str, ...] = ()
     arguments: tuple[str, ...] = ()
     refit_from_scratch: bool = False
+    place: str = ""
+    only: bool = False
+
+    @property
+    def id(self) -> str:
+        """The cause's id, with the place where there is one, as results name it."""
+        return f"{self.cause}:{self.place}" if self.place else self.cause
 
     @property
     def start(self) -> Array:

@@ -65,7 +65,9 @@ def judged_by_kinematics(logs: Sequence[TrialLog]) -> Kinematics:
     if not logs or not all(set(_POSITIONS) <= log.channels.keys() for log in logs):
         return Kinematics()
     try:
-        reports = check_recordings([recording_of(log) for log in logs], logs[0].vessel)
+        reports = check_recordings(
+            [recording_of(log) for log in logs], logs[0].vessel, forces=False
+        )
     except GreyboxError:
         return Kinematics()
     each = [[f for f in report.findings if _kinematic(f)] for report in reports]

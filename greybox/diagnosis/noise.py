@@ -79,6 +79,8 @@ class NoiseModel:
         """
         from scipy.signal import lfilter
 
+        if len(self.denominator) == 1:
+            return np.asarray(e / np.diag(self.root)[:, None])
         out = np.zeros(e.shape)
         for i, row in enumerate(self.numerators):
             for j, numerator in enumerate(row):
@@ -123,6 +125,11 @@ class Noise:
         for group in self.groups:
             out[:, group.outputs] = group.whiten(e[:, group.outputs])
         return out
+
+    @property
+    def coloured(self) -> bool:
+        """Whether errors are weighed by a colour that was fitted, and not by their size alone."""
+        return bool(self.parameters)
 
     @property
     def log_det(self) -> float:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.diagnosis.held_out import Pair, Proof, proof_of
-from greybox.diagnosis.remainder import anything, generic_force
+from greybox.diagnosis.remainder import Use, anything, generic_force
 from greybox.numerics.linalg import scaled_inverse
 
 Array = NDArray[np.float64]
@@ -38,19 +38,21 @@ class Omnibus:
     explicable: float
 
 
-def omnibus(pairs: Sequence[Pair]) -> Omnibus:
+def omnibus(pairs: Sequence[Pair], use: Use = anything) -> Omnibus:
     """Fit any force to what a model leaves, and prove it on other logs.
 
     Parameters
     ----------
     pairs : sequence of Pair
         The hypothesis on the estimation and the held-out logs.
+    use : callable
+        What forces there may be.
     """
     along, size, total = [], 0.0, 0.0
     for pair in pairs:
         if pair.fit.escaped or pair.held_fit.escaped:
             continue
-        force = generic_force(pair, anything)
+        force = generic_force(pair, use)
         predicted, seen = force.predicted, force.seen
         channels = pair.held_fit.nu[0].shape[1]
         along.append((seen * predicted).reshape(-1, channels).sum(axis=1))

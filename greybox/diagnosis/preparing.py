@@ -128,7 +128,8 @@ def prepare(
     validate = [correct_log(log, vessel) for log in validate]
     start = _structure(structure, logs, model)
     context = _context(start, [*logs, *validate], model)
-    told = decided(findings)
+    # of a clock of one channel the kinematics tell all; an arm or a bias may be shared by all
+    told = decided(findings) | {a for a in kinematics.agreeing if a.startswith("clock_offset:")}
     known = [a for c in causes.values() for a in c.hypotheses(context)]
     hypotheses = [a for a in known if not denied(a.key, told)]
     case = _case(start, hypotheses, logs, validate)
@@ -188,6 +189,7 @@ def _context(
     structure: Structure, logs: Sequence[TrialLog], model: ManoeuvringModel | None
 ) -> Context:
     first = logs[0]
+    moved = {c: [log[c] for log in logs] for c in first.vessel.commands}
     turns = "r" in structure.states and all("psi" in log for log in logs)
     return Context(
         structure=structure,
@@ -198,6 +200,11 @@ def _context(
         sample_time=first.sample_time,
         speeds={t.speed: float(np.median(np.abs(first[t.speed]))) for t in first.vessel.thrusters},
         current_known=model is not None and any(model.d[:2]),
+        ranges={c: max(float(np.ptp(x)) for x in v) for c, v in moved.items()},
+        fastest={
+            c: max(float(np.abs(np.diff(x)).max()) for x in v) / first.sample_time
+            for c, v in moved.items()
+        },
     )
 
 

@@ -40,11 +40,18 @@ def refit(problem: Problem, fit: Fit, score: Score) -> Fit:
     return problem.settle(problem.scan(first, score.hypothesis), 1)
 
 
-def refits(problem: Problem, asked: Sequence[tuple[Fit, Score]]) -> list[tuple[Hypothesis, Fit]]:
-    """Return the fits with one more hypothesis each."""
+def refits(
+    problem: Problem, asked: Sequence[tuple[Fit, Score]], tell: Callable[[Fit], Told]
+) -> list[tuple[Hypothesis, Fit, Told]]:
+    """Return the fits with one more hypothesis each, and what is told of each."""
     points = [problem.add(fit.point, score.hypothesis) for fit, score in asked]
-    found = on_all_processors(points, lambda k: (refit(problem, *asked[k]), None))
-    return [(score.hypothesis, fit) for (_, score), (fit, _) in zip(asked, found, strict=True)]
+
+    def work(k: int) -> tuple[Fit, Told]:
+        fit = refit(problem, *asked[k])
+        return fit, tell(fit)
+
+    found = on_all_processors(points, work)
+    return [(score.hypothesis, *one) for (_, score), one in zip(asked, found, strict=True)]
 
 
 def on_all_processors(
@@ -116,12 +123,14 @@ def seen_as_slow(
     return [(plain, score) for score in promising[:_SECOND]]
 
 
-def likelier(fits: Sequence[tuple[Hypothesis, Fit]]) -> list[tuple[Hypothesis, Fit]]:
+def likelier(
+    fits: Sequence[tuple[Hypothesis, Fit, Told]],
+) -> list[tuple[Hypothesis, Fit, Told]]:
     """Return the likeliest fit of each hypothesis."""
-    best: dict[str, tuple[Hypothesis, Fit]] = {}
-    for hypothesis, fit in fits:
+    best: dict[str, tuple[Hypothesis, Fit, Told]] = {}
+    for hypothesis, fit, told in fits:
         if hypothesis.key not in best or fit.cost < best[hypothesis.key][1].cost:
-            best[hypothesis.key] = (hypothesis, fit)
+            best[hypothesis.key] = (hypothesis, fit, told)
     return list(best.values())
 
 
@@ -130,6 +139,9 @@ def final_refit(case: Case, fit: Fit, hypothesis: Hypothesis) -> Fit:
     problem = case.problem(fit.integrator)
     # what the noise had taken for its own until now would pass for more causes
     better = loosened(problem, problem.settle(fit, SETTLE))
+    if case.metric == "free run":
+        # terms that were chosen stand in for what least squares and other steps would find
+        return problem.scan(case.likeliest_variant(better, hypothesis), hypothesis)
     if not any(a.refit_from_scratch for a in better.point.hypotheses):
         better = case.refit_from_least_squares(better)
     better = case.likeliest_variant(case.other_integrator(better), hypothesis)

@@ -25,6 +25,7 @@ from greybox.diagnosis.linear import NOWHERE, sensitivities
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.ship import LogRun, shifted, wired
 from greybox.numerics.lagged_moments import correlation_factor
+from greybox.numerics.linalg import tall_svd
 from greybox.rotation import ned_to_body
 
 Array = NDArray[np.float64]
@@ -37,7 +38,8 @@ _STRENGTHS = np.geomspace(0.05, 100.0, 24)
 _LAGS = (2.0, 5.0, 10.0)
 # quantiles of a state's size from which on a force may begin
 _KNOTS = (0.3, 0.6, 0.85)
-# singular values, as a share of the largest, below which a direction is not known
+# singular values of the nuisance, and squares of the force's, as a share of the largest, below
+# which a direction is not known
 _UNKNOWN = 1e-8
 # what no smooth force of motion and present commands is a function of
 HEADING, TIME, PAST = "heading", "time", "past commands"
@@ -174,18 +176,27 @@ def generic_force(pair: Pair, use: Use = motion_and_commands) -> GenericForce:
     Parameters
     ----------
     pair : Pair
-        Whose runs stay bounded.
+        Whose runs stay bounded; computed once for each use.
     use : callable
         Which features push which equation.
     """
+    if use not in pair.known:
+        pair.known[use] = _generic_force(pair, use)
+    found: GenericForce = pair.known[use]
+    return found
+
+
+def _generic_force(pair: Pair, use: Use) -> GenericForce:
     problem, fit, held, held_fit = pair.problem, pair.fit, pair.held, pair.held_fit
     nuisance = _stacked(problem.rows(fit.point, fit.noise))
     free = nuisance.shape[1] - sum(map(len, fit.point.starts))
     scale = np.sqrt((nuisance**2).sum(axis=0))
     scale[scale == 0] = 1.0
-    left, values, right = np.linalg.svd(nuisance / scale, full_matrices=False)
-    kept = values > _UNKNOWN * values[0]
-    left = left[:, kept]
+    if not np.isfinite(nuisance).all():
+        # a run at the edge of stability has no derivatives
+        seen = np.concatenate([n.ravel() for n in held_fit.nu])
+        return GenericForce(np.zeros_like(seen), seen, held_fit.errors, np.zeros(free))
+    left, values, right = tall_svd(nuisance / scale, _UNKNOWN)
     knots = knots_of(problem)
     pushed, scales = _pushed(problem, fit, knots, use, None)
     raw = _stacked([fit.noise.whiten(c) for c in pushed])
@@ -198,7 +209,7 @@ def generic_force(pair: Pair, use: Use = motion_and_commands) -> GenericForce:
     alike = np.sqrt(correlation_factor(np.concatenate(fit.nu)))
     delta = _ridge((raw - left @ along) / alike, (nu - left @ (left.T @ nu)) / alike)
     # what the coefficients give back, where they can imitate
-    back = (-((right[kept].T / values[kept]) @ (along @ delta)) / scale)[:free]
+    back = (-((right.T / values) @ (along @ delta)) / scale)[:free]
     moved, _ = _pushed(held, held_fit, knots, use, scales)
     point = replace(fit.point, starts=held_fit.point.starts)
     shown = held.slopes(point)
@@ -225,7 +236,7 @@ def contributions_beside(pair: Pair, use: Use = motion_and_commands) -> Array:
     errors = generic_force(pair, use).errors
     noise = held.noise_of(errors, held_fit.point, held_fit.noise)
     nu, _ = held.whitened(noise, errors)
-    return np.concatenate([(n**2).sum(axis=1) + noise.log_det for n in nu])
+    return np.concatenate(held.added(nu, noise))
 
 
 def _pushed(
@@ -263,10 +274,10 @@ def _stacked(parts: Sequence[Array]) -> Array:
 
 def _ridge(rows: Array, nu: Array) -> Array:
     """Return coefficients (m,) by the strength that makes the innovations likeliest."""
-    left, values, right = np.linalg.svd(rows, full_matrices=False)
-    known = values > _UNKNOWN * values[0]
-    left, values, right = left[:, known], values[known], right[known]
-    share = left.T @ nu
+    squares, vectors = np.linalg.eigh(rows.T @ rows)
+    known = squares > _UNKNOWN * squares[-1]
+    values, right = np.sqrt(squares[known]), vectors[:, known].T
+    share = right @ (rows.T @ nu) / values
     best, chosen = np.inf, _STRENGTHS[0]
     for strength in _STRENGTHS:
         grown = 1 + (strength * values) ** 2

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -47,6 +48,11 @@ def finite(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
+def file_word(cause: str) -> str:
+    """Return the id of a cause as a part of a file's name."""
+    return re.sub(r"[^\w.+-]+", "_", cause)
+
+
 def _shown(p: float) -> str:
     """Return a p-value with its sign of relation; what underflows is no zero."""
     return f"= {p:.2g}" if p > 0 else "< 1e-300"
@@ -72,6 +78,7 @@ class Found:
     Parameters
     ----------
     id : str
+        Of the cause, with the place where the names of the parameters do not tell it.
     key : str
         Id with the place: which thruster, coefficient or channel.
     title : str
@@ -307,6 +314,8 @@ class Diagnosis(DisplayMixin):
     remainder : Remainder, optional
         A smooth force without a name, where it was asked for. `gain`, `runs` and `budget`
         are without it.
+    gain_over_chosen : mapping of str to Gain
+        By state, against the terms that the data chose; empty where none were.
     """
 
     verdict: DiagnosisVerdict
@@ -331,6 +340,7 @@ class Diagnosis(DisplayMixin):
     conditions: tuple[ConditionDifference, ...] = ()
     budget: tuple[BudgetPart, ...] = ()
     remainder: Remainder | None = None
+    gain_over_chosen: Mapping[str, Gain] = field(default_factory=dict)
 
     @property
     def headline(self) -> str:
@@ -359,6 +369,7 @@ class Diagnosis(DisplayMixin):
             "causes": [c.to_dict() for c in self.causes],
             "groups": [list(g) for g in self.groups],
             "gain": {k: g.to_dict() for k, g in self.gain.items()},
+            "gain_over_chosen": {k: g.to_dict() for k, g in self.gain_over_chosen.items()},
             "wrong": [s.sentence for s in self.wrong],
             "budget": [part.to_dict() for part in self.budget],
             "headline": self.headline,
@@ -397,6 +408,12 @@ class Diagnosis(DisplayMixin):
                 )
         if self.gain:
             lines += ["", *_gain_lines(self.gain, self.validated_on)]
+        if self.gain_over_chosen:
+            told = (
+                f"{s} {g.before:.1f} -> {g.after:.1f} ({g.ci[0]:.1f} to {g.ci[1]:.1f})"
+                for s, g in self.gain_over_chosen.items()
+            )
+            lines.append(f"Against the terms that the data chose: {', '.join(told)}.")
         lines += _budget_lines(self.budget)
         lines += ["", self.remaining]
         if self.remainder is not None:

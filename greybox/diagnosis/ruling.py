@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from greybox.diagnosis.held_out import HeldOut, Pair, proof_of
 from greybox.diagnosis.omnibus import Omnibus, disagreement, omnibus
 from greybox.diagnosis.point import Fit
-from greybox.diagnosis.result import DiagnosisVerdict, Found, Gain
+from greybox.diagnosis.result import DiagnosisVerdict, Found, Gain, file_word
 from greybox.diagnosis.search import Candidate, Search
 from greybox.diagnosis.symptoms import coloured, word
 from greybox.diagnosis.thresholds import (
@@ -49,6 +49,8 @@ class Ruling:
     next_steps : list of str
     before, omnibus : Omnibus
         Of the model without causes, and of what was found.
+    final : Fit
+        Of the extended model; that without causes where nothing is extended.
     notes : tuple of str
     """
 
@@ -59,6 +61,7 @@ class Ruling:
     next_steps: list[str]
     before: Omnibus
     omnibus: Omnibus
+    final: Fit
     notes: tuple[str, ...] = ()
 
 
@@ -84,9 +87,9 @@ def rule(
         Fit of the held-out free run without causes and with them.
     """
     final, stand, leaning, notes = found.final, found.causes, found.leaning, []
-    if stand and sum(g.after - g.before for g in gain.values()) < 0:
+    if final is not found.base and sum(g.after - g.before for g in gain.values()) < 0:
         # likelier errors are no better simulation: nothing is extended by them
-        helped = ", ".join(c.hypothesis.cause for c in stand)
+        helped = ", ".join(c.hypothesis.id for c in stand) or "terms that the data chose"
         notes.append(
             f"{helped} made the held-out errors likelier but the free run no better, so the "
             f"model was not extended."
@@ -100,6 +103,12 @@ def rule(
     why = _wrong(found.base, final, pairs, left, explained, bool(stand))
     if found.given is not None and not why:
         why = _other_coefficients(diagnosed, held_out(found.base.integrator).pairs(found.base))
+    if not (why or stand or known) and final is not found.base:
+        taken = 1 - np.exp(held_out(final.integrator).worse(final, found.base))
+        why = (
+            f"terms of motion and commands that no cause stands for lower the squared error of the "
+            f"held-out runs by {100 * taken:.0f} %"
+        )
     named = tuple(c for c in stand if not _grouped(c, groups))
     if named or known:
         verdict = DiagnosisVerdict.PARTLY if why else DiagnosisVerdict.NAMED
@@ -109,7 +118,7 @@ def rule(
         verdict = DiagnosisVerdict.UNEXPLAINED if why else DiagnosisVerdict.NONE
     return Ruling(
         verdict, named, tuple(leaning), _remaining(final, pairs, left, why),
-        _next(verdict, groups), first, left, tuple(notes),
+        _next(verdict, groups), first, left, final, tuple(notes),
     )  # fmt: skip
 
 
@@ -273,8 +282,8 @@ def _remaining(final: Fit, pairs: Sequence[Pair], left: Omnibus, why: str) -> st
 def _next(verdict: DiagnosisVerdict, groups: Sequence[Sequence[Candidate]]) -> list[str]:
     out = [
         f"design a trial that tells {' from '.join(ids)}: greybox design "
-        f"--between {' '.join(f'MODEL.{i}.json' for i in ids[:2])}"
-        for ids in ([c.hypothesis.cause for c in pair] for pair in groups)
+        f"--between {' '.join(f'MODEL.{file_word(i)}.json' for i in ids[:2])}"
+        for ids in ([c.hypothesis.id for c in pair] for pair in groups)
     ]
     if verdict in (DiagnosisVerdict.UNEXPLAINED, DiagnosisVerdict.PARTLY):
         out.append(

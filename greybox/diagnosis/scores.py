@@ -19,6 +19,7 @@ from greybox.diagnosis.linear import sensitivities
 from greybox.diagnosis.noise import Noise
 from greybox.diagnosis.normal import bounded_step
 from greybox.diagnosis.point import Fit, Point
+from greybox.numerics.linalg import tall_svd
 
 Array = NDArray[np.float64]
 
@@ -66,8 +67,7 @@ class ProjectedScores:
         nuisance = _stacked(problem.rows(fit.point, self.noise))
         scale = np.sqrt((nuisance**2).sum(axis=0))
         scale[scale == 0] = 1.0
-        left, values, _ = np.linalg.svd(nuisance / scale, full_matrices=False)
-        self.basis = left[:, values > 1e-8 * values[0]]
+        self.basis = tall_svd(nuisance / scale, 1e-8)[0]
         self.nu = self._clear(_stacked(problem.whitened(self.noise, fit.errors)[0]))
 
     def _clear(self, rows: Array) -> Array:

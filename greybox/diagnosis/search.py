@@ -31,12 +31,12 @@ from greybox.diagnosis.refitting import (
     shortlist,
     slow,
 )
+from greybox.diagnosis.remainder import contributions_beside
 from greybox.diagnosis.scores import MOMENTS, ProjectedScores, Score, score_hypotheses
-from greybox.diagnosis.standing import Standing, standing
+from greybox.diagnosis.standing import Standing, level_of, standing
 from greybox.diagnosis.thresholds import (
     BACKWARDS,
     MOST_CAUSES,
-    PROVEN,
     RELEVANT,
     SIGNIFICANT,
     WORTH,
@@ -111,7 +111,8 @@ class Candidate:
     @property
     def holds(self) -> bool:
         """Whether the cause matters, is significant, and predicts."""
-        return self.relevant and self.p_adjusted < SIGNIFICANT and self.proof.p_value < PROVEN
+        proven = self.proof.p_value < level_of(self.fit)
+        return self.relevant and self.p_adjusted < SIGNIFICANT and proven
 
 
 @dataclass(frozen=True)
@@ -152,6 +153,8 @@ class Search:
         Causes that help, and do no more than a generic force would: no part of `final`.
     without : tuple of Fit
         The fit without each of the causes that stand.
+    chosen : Fit or None
+        Of the terms that the data chose, where the search went on from them.
     """
 
     base: Fit
@@ -162,6 +165,7 @@ class Search:
     given: Fit | None = None
     leaning: tuple[Candidate, ...] = ()
     without: tuple[Fit, ...] = ()
+    chosen: Fit | None = None
 
     @property
     def before(self) -> Fit:
@@ -225,8 +229,10 @@ def search(
         )  # fmt: skip
         if step.taken is None:
             break
-        causes = [*causes, step.taken]
-        fit, causes = _backward(case, step.taken.fit, causes, len(hypotheses))
+        fit, causes = step.taken.fit, [*causes, step.taken]
+        if case.metric == "coloured":
+            # those beside chosen terms are weighed at the end
+            fit, causes = _backward(case, fit, causes, len(hypotheses))
         # what a better noise would gain must not count for the next cause
         fit = case.problem(fit.integrator).settle(fit, SETTLE)
     return Search(base, fit, tuple(steps), tuple(causes), len(hypotheses))
@@ -243,13 +249,15 @@ def take_step(
     asked = [(fit, score) for score in shortlist(scores)]
     if slow(fit):
         asked += seen_as_slow(problem, fit, near)
-    fits = likelier(refits(problem, asked))
+    held_out.contributions(fit)
+    fits = likelier(refits(problem, asked, lambda found: held_out.prove(fit, found)))
     if not causes:
-        fits += case.restart(fit, left, [s.hypothesis for s in scores if s.gain == -np.inf])
+        again = case.restart(fit, left, [s.hypothesis for s in scores if s.gain == -np.inf])
+        fits += [(hypothesis, found, held_out.prove(fit, found)) for hypothesis, found in again]
     candidates = sorted(
         (
-            assess_candidate(held_out, fit, found, hypothesis, len(left), problem.names)
-            for hypothesis, found in fits
+            assess_candidate(proof, fit, found, hypothesis, len(left), problem.names)
+            for hypothesis, found, proof in fits
         ),
         key=_bic,
     )
@@ -298,7 +306,7 @@ def _taken(hypothesis: Hypothesis, causes: Sequence[Candidate]) -> bool:
         hypothesis.key == c.hypothesis.key
         or (
             hypothesis.cause == c.hypothesis.cause
-            and set(_names(hypothesis)) & set(_names(c.hypothesis))
+            and (hypothesis.only or set(_names(hypothesis)) & set(_names(c.hypothesis)))
         )
         for c in causes
     )
@@ -330,20 +338,19 @@ def backwards(fit: Fit, names: Sequence[str]) -> list[str]:
 
 
 def assess_candidate(
-    held_out: HeldOut,
+    proof: Proof,
     before: Fit,
     fit: Fit,
     hypothesis: Hypothesis,
     tried: int,
     names: tuple[str, ...] = (),
 ) -> Candidate:
-    """Return a refitted cause with its significance and what it does for held-out logs."""
+    """Return a refitted cause with its significance, and what it does for held-out logs."""
     from scipy.stats import chi2
 
     gain = before.cost - fit.cost if np.isfinite(fit.cost) else -np.inf
     numbers = freed(before, fit, hypothesis)
     p = float(chi2.sf(max(gain, 0.0), numbers))
-    proof = held_out.prove(before, fit)
     # the best of many moments is likelier than any one
     tried *= MOMENTS if any(parameter.reach > 0 for parameter in hypothesis.parameters) else 1
     return Candidate(hypothesis, fit, gain, p, min(1.0, p * tried), proof, names, tried, numbers)
@@ -352,33 +359,30 @@ def assess_candidate(
 def _backward(
     case: Case, fit: Fit, causes: list[Candidate], tried: int
 ) -> tuple[Fit, list[Candidate]]:
-    """Drop causes that a later one made needless."""
-    fit, kept = pruned(case, fit, causes[:-1], tried)
-    return fit, [*kept, causes[-1]]
-
-
-def pruned(
-    case: Case, fit: Fit, causes: Sequence[Candidate], tried: int
-) -> tuple[Fit, list[Candidate]]:
-    """Leave out causes that do not hold, one after another; those kept are told against that."""
+    """Drop causes that a later one made needless; those kept are told against that."""
     kept = list(causes)
     problem, held_out = case.problem(fit.integrator), case.held_out(fit.integrator)
-    for cause in causes:
+    for cause in causes[:-1]:
         without = _without(problem, fit, cause)
-        alone = assess_candidate(held_out, without, fit, cause.hypothesis, tried, cause.names)
-        alone = _wald_checked(case, alone) if alone.holds else alone
+        proof = held_out.prove(without, fit)
+        alone = assess_candidate(proof, without, fit, cause.hypothesis, tried, cause.names)
         place = [c.hypothesis.key for c in kept].index(cause.hypothesis.key)
         if alone.holds:
             kept[place] = alone
         else:
             _log.info("%s is left out", cause.hypothesis.key)
-            fit = fit if _needed(case, fit, without) else without
+            fit = without
             del kept[place]
     return fit, kept
 
 
 def _needed(case: Case, fit: Fit, without: Fit) -> bool:
-    """Whether held-out runs are worse without a term, by more than is told of a deviation."""
+    """Whether a model that the data chose predicts worse without what has no name in it.
+
+    By more of the squared error than is told of a deviation.
+    """
+    if case.metric != "free run":
+        return False
     return without.escaped or case.held_out(fit.integrator).worse(without, fit) > np.log1p(WORTH)
 
 
@@ -392,45 +396,53 @@ def weighed(case: Case, found: Search) -> Search:
     leaning: list[Candidate] = []
     left: list[Fit] = []
     while kept:
-        tried = _stood(case, fit, kept)
-        kept, left = [cause for cause, _ in tried], [without for _, without in tried]
-        fallen = [(cause, without) for cause, without in tried if not _stands(cause)]
+        stood = _stood(case, fit, kept, found.tried)
+        kept, left = [cause for cause, _ in stood], [without for _, without in stood]
+        fallen = [(cause, without) for cause, without in stood if not _stands(cause)]
         if not fallen:
             break
         least, without = min(fallen, key=lambda item: _beyond(item[0]))
         leaning.append(least)
         kept = [c for c in kept if c.hypothesis.key != least.hypothesis.key]
         if _needed(case, fit, without):
-            if least.hypothesis.apply is not None and without.escaped:
-                # what does not stand holds the run within bounds: nothing of it can be told
-                return replace(found, final=found.base, causes=(), leaning=(*leaning, *kept))
-            if least.hypothesis.apply is None:
-                continue
+            continue
+        if without.escaped:
+            # what does not stand holds the run within bounds: nothing of it can be told
+            return replace(found, final=found.base, causes=(), leaning=(*leaning, *kept))
         fit = case.problem(fit.integrator).settle(without, SETTLE)
     return replace(
         found, final=fit, causes=tuple(kept), leaning=tuple(leaning), without=tuple(left)
     )
 
 
-def _stood(case: Case, fit: Fit, causes: Sequence[Candidate]) -> list[tuple[Candidate, Fit]]:
+def _stood(
+    case: Case, fit: Fit, causes: Sequence[Candidate], tried: int
+) -> list[tuple[Candidate, Fit]]:
     """Return causes with what each does beside a generic force, and the fits without them."""
     problem, held_out = case.problem(fit.integrator), case.held_out(fit.integrator)
     pairs = held_out.pairs(fit)
+    if not any(p.held_fit.escaped or p.fit.escaped for p in pairs):
+        # once for all of them
+        for pair in pairs:
+            contributions_beside(pair)
 
-    def work(k: int) -> tuple[Fit, Standing]:
+    def work(k: int) -> tuple[Fit, tuple[Standing, Proof]]:
         without = _without(problem, fit, causes[k])
         hypothesis = causes[k].hypothesis
-        return without, standing(problem, hypothesis, fit, pairs, held_out.pairs(without))
+        weight = standing(problem, hypothesis, fit, pairs, held_out.pairs(without))
+        return without, (weight, held_out.prove(without, fit))
 
     found = on_all_processors([problem.drop(fit.point, c.hypothesis) for c in causes], work)
-    return [
-        (replace(cause, fit=fit, standing=weight), without)
-        for cause, (without, weight) in zip(causes, found, strict=True)
-    ]
+    out = []
+    for cause, (without, (weight, proof)) in zip(causes, found, strict=True):
+        alone = assess_candidate(proof, without, fit, cause.hypothesis, tried, cause.names)
+        alone = _wald_checked(case, replace(alone, standing=weight))
+        out.append((alone, without))
+    return out
 
 
 def _stands(cause: Candidate) -> bool:
-    return cause.standing is not None and cause.standing.stands
+    return cause.standing is not None and cause.standing.stands and cause.holds
 
 
 def _beyond(cause: Candidate) -> float:
@@ -461,7 +473,10 @@ def _at_null(problem: Problem, fit: Fit, hypothesis: Hypothesis) -> Array:
     if np.isfinite(rows).all() and len(where):
         normal, across = rows[:, rest].T @ rows[:, rest], rows[:, rest].T @ rows[:, where]
         moved = bounded_step(
-            normal, -across @ change, *(b[rest] - vector[rest] for b in problem.bounds(fit.point)), 0.0
+            normal,
+            -across @ change,
+            *(b[rest] - vector[rest] for b in problem.bounds(fit.point)),
+            0.0,
         )
         vector[rest] += moved
     vector[where] = null
@@ -482,8 +497,8 @@ def instead(
     for other in others[:_INSTEAD]:
         k = [a.key for a in other.fit.point.hypotheses].index(other.hypothesis.key)
         value = other.fit.point.values[k]
-        score = Score(other.hypothesis, value, other.gain)
-        out.append(
-            assess_candidate(held_out, without, refit(problem, without, score), other.hypothesis, 1)
-        )
-    return without, assess_candidate(held_out, without, fit, best.hypothesis, 1), out
+        found = refit(problem, without, Score(other.hypothesis, value, other.gain))
+        proof = held_out.prove(without, found)
+        out.append(assess_candidate(proof, without, found, other.hypothesis, 1))
+    proof = held_out.prove(without, fit)
+    return without, assess_candidate(proof, without, fit, best.hypothesis, 1), out

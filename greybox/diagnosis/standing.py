@@ -11,13 +11,16 @@ from numpy.typing import NDArray
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.held_out import Pair, Proof, proof_of
 from greybox.diagnosis.hypothesis import Hypothesis
-from greybox.diagnosis.point import Fit
+from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.remainder import Use, contributions_beside, generic_force
 from greybox.diagnosis.ship import CURRENTS
-from greybox.diagnosis.thresholds import LEAST_SHARE, OWN_SHARE, PROVEN, SAME
+from greybox.diagnosis.thresholds import AS_CHOSEN, LEAST_SHARE, OWN_SHARE, PROVEN, SAME
 from greybox.model.terms import parse_term
 
 Array = NDArray[np.float64]
+
+# iterations of a fit of a cause's numbers alone
+_FEW = 6
 
 
 @dataclass(frozen=True)
@@ -35,12 +38,15 @@ class Standing:
     half : float
         One-sided p-value of a share no larger than `LEAST_SHARE`.
     moved : ndarray
-        How far each of its numbers moves when the generic force joins.
+        How far each of its numbers moves when the generic force joins, and how far it lies on the
+        held-out logs beyond what chance explains, together.
     clear : float
         p-value of the null (Wald) where it is likeliest on the way that the generic force moves
         the numbers.
     told : float
         That of the surest of the numbers with its movement counted as a standard error.
+    level : float
+        Significance that a gain on held-out logs must have.
     """
 
     beyond: Proof
@@ -49,12 +55,13 @@ class Standing:
     moved: Array
     clear: float
     told: float
+    level: float = PROVEN
 
     @property
     def stands(self) -> bool:
         """Whether the cause does what no force without a name does as well."""
-        gains = self.beyond.gain > 0 and self.beyond.p_value < PROVEN
-        own = self.share is not None and self.share >= OWN_SHARE and self.half < PROVEN
+        gains = self.beyond.gain > 0 and self.beyond.p_value < self.level
+        own = self.share is not None and self.share >= OWN_SHARE and self.half < self.level
         # that a run leaves every bound without it tells nothing of a cause's size
         sure = self.told < (SAME if np.isfinite(self.beyond.gain) else PROVEN)
         return (gains or own) and self.clear < PROVEN and sure
@@ -77,7 +84,7 @@ def standing(problem: Problem, hypothesis: Hypothesis, with_it: Fit, pairs: Sequ
     if any(p.held_fit.escaped or p.fit.escaped for p in (*pairs, *without)):
         better = not any(p.held_fit.escaped for p in pairs)
         proof = proof_of(np.array([np.inf if better else -np.inf]))
-        return Standing(proof, None, 1.0, moved, *sure)
+        return Standing(proof, None, 1.0, moved, *sure, level_of(with_it))
     beside = [contributions_beside(p) for p in pairs]
     beyond = proof_of(np.concatenate([contributions_beside(p) for p in without])
                       - np.concatenate(beside))  # fmt: skip
@@ -90,7 +97,12 @@ def standing(problem: Problem, hypothesis: Hypothesis, with_it: Fit, pairs: Sequ
         gained, could = plain - own, plain - generic
         share = float(gained.sum() / could.sum()) if could.sum() > 0 else np.inf
         half = proof_of(gained - LEAST_SHARE * could).p_value
-    return Standing(beyond, share, half, moved, *sure)
+    return Standing(beyond, share, half, moved, *sure, level_of(with_it))
+
+
+def level_of(fit: Fit) -> float:
+    """Return the significance that a gain on held-out logs must have."""
+    return PROVEN if fit.noise.coloured else AS_CHOSEN
 
 
 def _moved(
@@ -104,6 +116,7 @@ def _moved(
     if not where or not bounded:
         return np.zeros(len(where)), 0.0, 0.0
     moved = np.mean([generic_force(p).moved[where] for p in bounded], axis=0)
+    scatter = np.sqrt(np.mean([_scatter(p, hypothesis) for p in bounded], axis=0))
     numbers, covariance = problem.covariance(fit)
     own = covariance[np.ix_(where, where)]
     null = np.zeros(len(where))
@@ -113,7 +126,7 @@ def _moved(
         # a number with many hills has no null
         tested = np.array([p.reach == 0 for p in hypothesis.parameters])
     if not np.isfinite(own).all() or not tested.any():
-        return np.abs(moved), *[1.0 if tested.any() else 0.0] * 2
+        return np.hypot(moved, scatter), *[1.0 if tested.any() else 0.0] * 2
     away, far = (numbers[where] - null)[tested], moved[tested]
     inverse = np.linalg.pinv(own[np.ix_(tested, tested)])
     # the null must not lie on the way, either
@@ -121,8 +134,40 @@ def _moved(
     share = float(np.clip(-(away @ inverse @ far) / size, 0.0, 1.0)) if size > 0 else 0.0
     near = away + share * far
     passed = float(chi2.sf(float(near @ inverse @ near), int(tested.sum())))
-    told = away**2 / np.maximum(np.diag(own)[tested] + far**2, 1e-300)
-    return np.abs(moved), passed, float(chi2.sf(told.max(), 1))
+    told = away**2 / np.maximum(np.diag(own)[tested] + far**2 + scatter[tested] ** 2, 1e-300)
+    return np.hypot(moved, scatter), passed, float(chi2.sf(told.max(), 1))
+
+
+def _scatter(pair: Pair, hypothesis: Hypothesis) -> Array:
+    """Return the variance of a hypothesis's numbers between logs that chance does not explain.
+
+    Its numbers alone are fitted to the held-out logs, the rest of the model as it is. Of two
+    values half of their squared difference is their variance; what the standard errors of both
+    make of it is taken off.
+    """
+    fit, held = pair.fit, pair.held
+    point = fit.point
+    k = [h.key for h in point.hypotheses].index(hypothesis.key)
+    others = [
+        (h, v) for i, (h, v) in enumerate(zip(point.hypotheses, point.values, strict=True))
+        if i != k and h.apply is not None
+    ]  # fmt: skip
+    base = point.base
+    for other, value in others:
+        base = other.apply(base, value) if other.apply is not None else base
+    places = () if hypothesis.apply is not None else tuple(held.numbers_at(hypothesis))
+    alone = Point(base, pair.held_fit.point.starts, places, (hypothesis,), (point.values[k],))
+    there = held.fit(alone, pair.held_fit.noise, most=_FEW)
+    here, spread = pair.problem.covariance(fit)
+    where = pair.problem.numbers_of(point, hypothesis)
+    numbers, own = held.covariance(there)
+    chance = np.diag(spread)[where] + np.diag(own)
+    reached = np.array([p.reach for p in hypothesis.parameters][: len(where)])
+    reached = np.pad(reached, (0, len(where) - len(reached)))
+    if there.escaped or not np.isfinite(chance).all():
+        return np.zeros(len(where))
+    excess = np.maximum((numbers - here[where]) ** 2 - chance, 0.0) / 2
+    return np.where(reached > 0, 0.0, excess)
 
 
 def _own_arguments(problem: Problem, hypothesis: Hypothesis) -> Use | None:

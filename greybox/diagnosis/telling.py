@@ -88,8 +88,9 @@ class Report:
         quantities = self.quantities(candidate, fit)
         told = {k: (q.value, q.std) for k, q in quantities.items()}
         return Found(
-            candidate.hypothesis.cause, candidate.hypothesis.key, cause.title, quantities,
-            candidate.p_value, candidate.p_adjusted, cause.evidence(told), cause.extension,
+            candidate.hypothesis.id, candidate.hypothesis.key, cause.title, quantities,
+            candidate.p_value, candidate.p_adjusted,
+            cause.evidence_of(candidate.hypothesis, told), cause.extension,
             cause.reference, candidate.gain, candidate.proof.gain, candidate.proof.std,
         )  # fmt: skip
 
@@ -106,15 +107,18 @@ class Report:
             first = len(fit.point.places) + sum(map(len, fit.point.values[:k]))
             index = list(range(first, first + len(fit.point.values[k])))
         if not index:
-            return {hypothesis.key.split(":", 1)[1]: Quantity(-1.0, 0.0, "1")}
+            one = -1.0 if hypothesis.refit_from_scratch else 1.0
+            return {hypothesis.key.split(":", 1)[1]: Quantity(one, 0.0, "1")}
         wide = problem.spread(fit, hypothesis)
         weighed = candidate.standing
         # what a generic force would move a number by is a part of what is not known of it
         moved = np.zeros(len(index)) if weighed is None else weighed.moved[: len(index)]
         return {
             p.name: Quantity(
-                float(values[i]),
-                float(np.linalg.norm([max(std[i], wide.get(p.name, 0.0)), p.coarse, by])),
+                *p.told(
+                    float(values[i]),
+                    float(np.linalg.norm([max(std[i], wide.get(p.name, 0.0)), p.coarse, by])),
+                ),
                 p.unit,
             )
             for p, i, by in zip(hypothesis.parameters, index, moved, strict=True)
@@ -131,21 +135,26 @@ class Report:
         found, case = self.found, self.case
         groups = self._groups()
         before = self.model(found.base, self.record(()))
-        after = self.model(found.final, self.record(found.causes)) if found.causes else before
+        changed = found.final is not found.base
+        after = self.model(found.final, self.record(found.causes)) if changed else before
         gain, runs, after = self.gain(before, after, validate, found.final)
         ruling = rule(found, case.held_out, groups, known, gain)
-        final = found.final
-        if not (ruling.named or groups) and found.causes:
-            final = self.final = found.base
+        final = self.final = ruling.final
+        if final is not found.final:
             gain, runs, after = self.gain(before, before, validate, final)
+        over_chosen: dict[str, Gain] = {}
+        if found.chosen is not None and final is found.final and final is not found.chosen:
+            chosen = self.model(found.chosen, self.record(()))
+            over_chosen = self.gain(chosen, after, validate, final, found.chosen)[0]
         members = [c for pair in groups for c in pair]
-        alternatives = {c.hypothesis.cause: self.model(c.fit, self.record((c,))) for c in members}
+        alternatives = {c.hypothesis.id: self.model(c.fit, self.record((c,))) for c in members}
         notes = [*self._notes(after), *ruling.notes]
         return Diagnosis(
             verdict=ruling.verdict,
             causes=(*known, *(self.cause(c, final) for c in ruling.named)),
-            groups=tuple(tuple(c.hypothesis.cause for c in pair) for pair in groups),
+            groups=tuple(tuple(c.hypothesis.id for c in pair) for pair in groups),
             gain=gain,
+            gain_over_chosen=over_chosen,
             wrong=_symptoms(case.problem(found.before.integrator), found),
             residuals={
                 "before": residual_tests(
@@ -190,7 +199,7 @@ class Report:
             # of two causes each is alone where the other is left out, and no term stays beside
             alone = run([final, *others][-1]) if len(others) < 2 and not nameless else ()
             relative = _relative(self.quantities(c, final))
-            causes.append(Taken(c.hypothesis.cause, run(own[c.hypothesis.key]), alone, relative))
+            causes.append(Taken(c.hypothesis.id, run(own[c.hypothesis.key]), alone, relative))
         return error_budget(
             run(found.before), run(final), causes, waves, self.seed, nameless=nameless
         )
@@ -243,15 +252,20 @@ class Report:
         after: ManoeuvringModel,
         validate: Sequence[TrialLog],
         final: Fit,
+        first: Fit | None = None,
     ) -> tuple[dict[str, Gain], list[Runs], ManoeuvringModel]:
-        """Return the gain on what is held out, all runs, and the model as those logs saw it."""
+        """Return the gain on what is held out, all runs, and the model as those logs saw it.
+
+        From a first fit on, by default that of the model without causes.
+        """
+        first = self.found.base if first is None else first
         logs = list(validate)
         if logs:
             after = _likelier_story(after, logs)
             one = [run_on(before, log) for log in logs]
             two = [self._as_seen(run_on(after, log), log) for log in logs]
         else:
-            one = held_runs(self.case.held_out(self.found.base.integrator).pairs(self.found.base))
+            one = held_runs(self.case.held_out(first.integrator).pairs(first))
             two = held_runs(self.case.held_out(final.integrator).pairs(final))
         runs = [
             Runs(

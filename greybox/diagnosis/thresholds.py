@@ -13,6 +13,9 @@ from __future__ import annotations
 SIGNIFICANT = 0.01
 # significance of what it does for held-out logs, and of what it does beside a generic force
 PROVEN = 0.05
+# the same where errors are weighed by their size alone: one standard error, as terms are chosen,
+# since few samples of errors with a long memory are independent. Foreign ships, real tanker
+AS_CHOSEN = 0.16
 # fall of −2 log L a measured number from which on a cause matters: blind, |r|r for r³ gained 0.1 %
 RELEVANT = 0.005
 # causes at most: a fifth has never been right

@@ -19,7 +19,7 @@ from greybox.export.names import line
 from greybox.export.ports import Port, channel_port, command_ports, distinct_ports
 from greybox.model.disturbances import WIND
 from greybox.model.model import ManoeuvringModel
-from greybox.model.run.actuators import Memory, actuators, column
+from greybox.model.run.actuators import Memory, actuators, column, without_rate
 
 # earlier commands that a step carries at most
 _MOST = 1000
@@ -161,8 +161,8 @@ def sampled_model(
     rate, no_rate = None, ""
     if late.rate is None:
         no_rate = (
-            f"the model delays its commands by {model.vessel.actuation.delay:g} s, which a rate "
-            f"of finitely many states cannot"
+            f"the model {without_rate(model.vessel.actuation)}, which a rate of finitely many "
+            f"states cannot"
         )
     else:
         clock = ca.SX.ones(len(count)) / model.sample_time
@@ -235,7 +235,7 @@ def _require_ship(model: ManoeuvringModel) -> None:
 
 
 def _require_memory(model: ManoeuvringModel) -> None:
-    delay, commands = model.vessel.actuation.delay, len(model.vessel.commands)
+    delay, commands = model.vessel.actuation.delay, len(model.vessel.delayed_commands)
     whole, share = model.vessel.actuation.delay_samples(model.sample_time)
     length = whole + (share > 0)
     if length * commands > _MOST:
@@ -247,14 +247,17 @@ def _require_memory(model: ManoeuvringModel) -> None:
 
 
 def _memory_port(memory: Memory, model: ManoeuvringModel, commands: list[Port]) -> Port:
-    lag, unit = model.vessel.actuation.lag, model.vessel.force_unit
+    late, unit = model.vessel.actuation, model.vessel.force_unit
     newtons = {"taun": "m N"}.get(memory.of, "N") if unit == "N" else None
     units = {port.name: port.unit for port in commands}
     own = "1" if memory.of in ("rudder", "rudder_drag") else units.get(memory.of, newtons)
-    meaning = f"{memory.of} {memory.before} samples ago"
-    return Port(
-        memory.name, own, meaning if memory.before else f"{memory.of} behind a lag of {lag:g} s"
-    )
+    if memory.before:
+        meaning = f"{memory.of} {memory.before} samples ago"
+    elif memory.limited:
+        meaning = f"{memory.of} as it moved by at most {late.rate_limit:g} per second"
+    else:
+        meaning = f"{memory.of} behind a lag of {late.lag:g} s"
+    return Port(memory.name, own, meaning)
 
 
 def _notes(model: ManoeuvringModel, heading: Heading, wind: Wind) -> tuple[str, ...]:

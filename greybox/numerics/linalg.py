@@ -69,3 +69,24 @@ def quadratic_form(
     whitening = np.zeros((int(good.sum()), len(moments)))
     whitening[:, used] = (vectors[:, good] / np.sqrt(values[good])).T / size[used]
     return float(((whitening @ moments) ** 2).sum()), int(good.sum()), whitening
+
+
+def tall_svd(rows: Array, unknown: float) -> tuple[Array, Array, Array]:
+    """Return the singular value decomposition of many rows in few columns, by QR first.
+
+    Parameters
+    ----------
+    rows : ndarray
+        (n, q), n much larger than q.
+    unknown : float
+        Singular values below this share of the largest are left out.
+
+    Returns
+    -------
+    left, values, right : ndarray
+        (n, k), (k,) and (k, q).
+    """
+    orthogonal, triangle = np.linalg.qr(rows)
+    left, values, right = np.linalg.svd(triangle)
+    kept = values > unknown * values[0]
+    return orthogonal @ left[:, kept], values[kept], right[kept]

@@ -115,6 +115,7 @@ def sail(
     before = len(start.motion)
     most = before + max(1, math.ceil(min(longest / step, _MOST)))
     delay = model.vessel.actuation.delay_samples(step)
+    late = np.isin(model.vessel.commands, model.vessel.delayed_commands)
 
     def carried(psi: Array) -> Array:
         """Return what the flow adds to u, v, r (3, R)."""
@@ -145,7 +146,7 @@ def sail(
             commands.append(moved)
             if np.all((orders.complete >= 0) | diverged):
                 break
-            after = ship(state, _earlier(commands, k, delay))
+            after = ship(state, _earlier(commands, k, delay, late))
             share = orders.react(since, own, after[nx] - heading)
             if share is not None:
                 # the sample is sailed again with the mean of both orders over it
@@ -153,7 +154,7 @@ def sail(
                 reached, first = _moved(at, wanted, rates, share)
                 after_order, second = _moved(reached, new, rates, 1 - share)
                 commands[k] = share * first + (1 - share) * second
-                after = ship(state, _earlier(commands, k, delay))
+                after = ship(state, _earlier(commands, k, delay, late))
             at = after_order
             for push in pushes:
                 after[:nx] += push(since, state, commands[k])
@@ -179,8 +180,11 @@ def _moved(at: Array, wanted: Array, rates: Array, share: Array | float) -> tupl
     return end, mean
 
 
-def _earlier(commands: list[Array], k: int, delay: tuple[int, float]) -> Array:
+def _earlier(
+    commands: list[Array], k: int, delay: tuple[int, float], late: NDArray[np.bool_]
+) -> Array:
     """Return the commands that act at sample `k`, linear between samples; the first were held."""
     whole, share = delay
     here, before = (commands[max(k - n, 0)] for n in (whole, whole + 1))
-    return (1 - share) * here + share * before if share else here
+    acting = (1 - share) * here + share * before if share else here
+    return np.where(late[:, None], acting, commands[k])

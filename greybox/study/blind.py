@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from greybox.errors import UsageError
 from greybox.files import make_folder, write_json, write_text
-from greybox.study.blind_causes import Effect, Typical
+from greybox.study.blind_causes import OF_ONE, Effect, Typical
 from greybox.study.blind_conditions import Conditions, blind_vessel, vessel_text
 from greybox.study.blind_effects import act, check_effects, draw_effect
 from greybox.study.blind_inputs import KINDS, steer
@@ -132,9 +132,10 @@ def draw_many(
     """
     for order in orders:
         check_effects(order.effects, conditions.kind)
-        if conditions.single and "thruster_gain" in order.effects:
+        own = {"thruster_gain", *(n for n in OF_ONE if n.endswith((":n1", ":n2")))}
+        if conditions.single and own & set(order.effects):
             raise UsageError(
-                "a weak thruster cannot be told where both have 1 speed column: draw with 2."
+                "one thruster cannot be told where both have 1 speed column: draw with 2."
             )
     trials: dict[int, Trial] = {}
     for _ in range(_ATTEMPTS):

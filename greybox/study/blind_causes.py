@@ -8,14 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.study.blind_inputs import RATES
 from greybox.study.blind_ship import EXTRA, LEAD, NAMES, Ship
 
 Array = NDArray[np.float64]
 Value = float | str
+# the commands, in the order of a ship's programme
+COLUMNS = ("n1", "n2", "alpha1", "alpha2")
 
 
 @dataclass(frozen=True)
@@ -132,6 +136,47 @@ def _delay(rng: np.random.Generator, size: float, typical: Typical) -> dict[str,
 
 def _delayed(ship: Ship, effect: Effect, later: bool) -> Ship:
     return replace(ship, delay=effect.number("delay"))
+
+
+def _with_own(ship: Ship, field: str, column: str, value: float) -> Ship:
+    """Return the ship with one command that acts otherwise than the others."""
+    own = list(getattr(ship, field))
+    own[COLUMNS.index(column)] = value
+    changed: dict[str, Any] = {field: tuple(own)}
+    return replace(ship, **changed)
+
+
+def _one_slow(column: str) -> Kind:
+    def act(ship: Ship, effect: Effect, later: bool) -> Ship:
+        return _with_own(ship, "own_lag", column, effect.number("lag"))
+
+    return Kind(uniform("lag", 4, 9), act)
+
+
+def _one_late(column: str) -> Kind:
+    def act(ship: Ship, effect: Effect, later: bool) -> Ship:
+        return _with_own(ship, "own_delay", column, effect.number("delay"))
+
+    return Kind(_delay, act)
+
+
+def _rate(rng: np.random.Generator, size: float, typical: Typical) -> dict[str, Value]:
+    column = int(rng.integers(2, 4))
+    # so many times as slow as the command that is logged
+    return {f"rate_{COLUMNS[column]}": float(RATES[column]) / (1 + size * rng.uniform(2, 5))}
+
+
+def _rate_limited(ship: Ship, effect: Effect, later: bool) -> Ship:
+    ((name, rate),) = effect.parameters.items()
+    return _with_own(ship, "own_rate", name.removeprefix("rate_"), float(rate))
+
+
+def _unheld(rng: np.random.Generator, size: float, typical: Typical) -> dict[str, Value]:
+    return {"interpolated": float(size > 0)}
+
+
+def _moving(ship: Ship, effect: Effect, later: bool) -> Ship:
+    return replace(ship, moving=effect.number("interpolated"))
 
 
 def _quadratic(rng: np.random.Generator, size: float, typical: Typical) -> dict[str, Value]:
@@ -257,6 +302,8 @@ CAUSES: dict[str, Kind] = {
     "thruster_gain": Kind(_gain, _weak),
     "thruster_lag": Kind(_lag, _lagged),
     "input_delay": Kind(_delay, _delayed),
+    "rate_limit": Kind(_rate, _rate_limited),
+    "feedback_sampling": Kind(_unheld, _moving),
     "quadratic_thrust": Kind(_quadratic, _squared),
     "advance_speed": Kind(uniform("loss", 0.04, 0.12), _advancing),
     "cubic_damping": Kind(_relative("X_uuu", "Y_vvv", "N_rrr"), with_terms),
@@ -272,4 +319,10 @@ CAUSES: dict[str, Kind] = {
     "parameter_change": Kind(_change, _changed),
     "waves": Kind(_waves),
     "sign": Kind(_sign),
+}
+# lag and delay of one command, by the id and place that a diagnosis tells
+OF_ONE: dict[str, Kind] = {
+    f"{cause}:{column}": kind(column)
+    for cause, kind in (("thruster_lag", _one_slow), ("input_delay", _one_late))
+    for column in COLUMNS
 }

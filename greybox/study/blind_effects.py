@@ -9,6 +9,7 @@ import numpy as np
 from greybox.errors import UsageError, suggestion
 from greybox.study.blind_causes import (
     CAUSES,
+    OF_ONE,
     Effect,
     Kind,
     Typical,
@@ -92,7 +93,7 @@ UNKNOWN: dict[str, Kind] = {
     "uneven_damping": Kind(uniform("unevenness", 0.5, 1.5), _uneven),
     "shallow": Kind(_shallow, _over_shoal),
 }
-EFFECTS = CAUSES | UNKNOWN
+EFFECTS = CAUSES | OF_ONE | UNKNOWN
 # those that add terms to the equations, so that several may stand together
 _TERMS = tuple(name for name, kind in CAUSES.items() if kind.act is with_terms)
 

@@ -57,6 +57,11 @@ class Ship:
         Of each thruster.
     speed_lag, force_lag, delay : float
         First-order lag of the speeds, of the force, and delay of all commands [s].
+    own_lag, own_delay, own_rate : tuple of float
+        (4,) first-order lag and delay [s], and fastest movement per second, of n1, n2, alpha1,
+        alpha2 each.
+    moving : float
+        1 where commands go on a straight line from one second to the next, else 0.
     quadratic, reference : float
         Share of the thrust that goes as n|n|/reference.
     advance : float
@@ -88,6 +93,10 @@ class Ship:
     speed_lag: float = 0.0
     force_lag: float = 0.0
     delay: float = 0.0
+    own_lag: tuple[float, ...] = (0.0,) * 4
+    own_delay: tuple[float, ...] = (0.0,) * 4
+    own_rate: tuple[float, ...] = (np.inf,) * 4
+    moving: float = 0.0
     quadratic: float = 0.0
     reference: float = 1.0
     advance: float = 0.0
@@ -138,7 +147,10 @@ class _Fleet:
         self.theta = stack("theta")
         self.current, self.extra, self.gain = stack("current"), stack("extra"), stack("gain")
         self.speed_lag, self.force_lag = stack("speed_lag"), stack("force_lag")
-        self.delay, self.quadratic = stack("delay"), stack("quadratic")
+        self.delay, self.quadratic = stack("delay") + stack("own_delay"), stack("quadratic")
+        self.own_lag, self.own_rate = stack("own_lag"), stack("own_rate")
+        self.own = bool(self.own_lag.any() or np.isfinite(self.own_rate).any())
+        self.moving = stack("moving") > 0
         self.reference, self.advance = stack("reference"), stack("advance")
         self.change, self.dead_band = stack("change"), stack("dead_band")
         self.interaction, self.backlash = stack("interaction"), stack("backlash")
@@ -150,7 +162,7 @@ class _Fleet:
 
     def decay(self, lag: Array, step: float) -> Array:
         """Return what remains of a lagged value at the start, middle and end of a step."""
-        after = np.array([0.0, 0.5, 1.0])[:, None] * step
+        after = np.array([0.0, 0.5, 1.0]).reshape(3, *[1] * lag.ndim) * step
         return np.where(lag > 0, np.exp(-after / np.where(lag > 0, lag, 1.0)), 0.0)
 
     def thrust(self, n: Array, angle: Array) -> Array:
@@ -242,9 +254,12 @@ def simulate_ships(
     commands[0] = helm.targets[0]
     speed, play = commands[0, :2].copy(), commands[0, 2:].copy()
     force = fleet.thrust(speed[:, None], play[:, None])[:, 0]
+    reached, moved = commands[0].copy(), commands[0].copy()
+    keep_own = fleet.decay(fleet.own_lag, step).transpose(1, 0, 2)
     keep_speed, keep_force = fleet.decay(fleet.speed_lag, step), fleet.decay(fleet.force_lag, step)
     stages = np.array([0.0, 0.5, 1.0])[:, None] * step
-    everyone = np.arange(count)
+    everyone, each = np.arange(count), np.arange(4)[:, None]
+    straight = fleet.moving | linear
     with np.errstate(all="ignore"):
         for k in range(seconds - 1):
             commands[k + 1] = helm.next(k, x[3], commands[k])
@@ -257,13 +272,18 @@ def simulate_ships(
                 # the middle of the step tells which second it lies in
                 at = np.clip(t + step / 2 - fleet.delay, 0, seconds - 1)
                 before = np.floor(at + 1e-9).astype(int)
-                wanted = commands[before, :, everyone].T[:, None]
-                if linear:
-                    share = np.maximum(t + stages - fleet.delay, 0) - before
-                    after = commands[np.minimum(before + 1, k + 1), :, everyone].T[:, None]
-                    wanted = wanted + share * (after - wanted)
-                else:
-                    wanted = np.repeat(wanted, 3, axis=1)
+                wanted = np.repeat(commands[before, each, everyone][:, None], 3, axis=1)
+                if straight.any():
+                    share = np.maximum(t + stages - fleet.delay[:, None], 0) - before[:, None]
+                    after = commands[np.minimum(before + 1, k + 1), each, everyone][:, None]
+                    wanted = np.where(straight, wanted + share * (after - wanted), wanted)
+                if fleet.own:
+                    most = fleet.own_rate[:, None] * np.maximum(stages, 1e-12)
+                    way = np.clip(wanted - reached[:, None], -most, most)
+                    wanted = np.where(np.isinf(most), wanted, reached[:, None] + way)
+                    reached = wanted[:, 2]
+                    wanted = wanted + (moved[:, None] - wanted) * keep_own
+                    moved = wanted[:, 2]
                 n = wanted[:2] + (speed[:, None] - wanted[:2]) * keep_speed
                 angle = np.clip(
                     play[:, None], wanted[2:] - fleet.backlash, wanted[2:] + fleet.backlash

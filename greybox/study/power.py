@@ -100,7 +100,7 @@ def judge_by_diagnosis(trial: Trial) -> Judgement:
 
 def oracle_by_fit(trial: Trial) -> Oracle:
     """Fit the causes that act to the estimation log, and measure them on the other."""
-    ids = [e.id for e in trial.truth]
+    ids = [e.id.partition(":")[0] for e in trial.truth]
     given = fit_given([trial.estimation], ids, validate=[trial.validation])
     return Oracle(given.fall, {state: g.after - g.before for state, g in given.gain.items()})
 

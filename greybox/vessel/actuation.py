@@ -1,12 +1,16 @@
-"""The force that follows commands late: a pure delay and a first-order lag.
+"""The force that follows commands late: a pure delay, a rate limit and a first-order lag.
 
 A command c held from sample to sample moves a first-order lag of time constant
 T, ẋ = (c − x)/T, exactly by x[k+1] = a x[k] + (1 − a) c[k] with a = exp(−Ts/T).
+One that moves no faster than a rate ρ is at x[k] = x[k−1] + d[k], d[k] = clip(c[k] − x[k−1],
+±ρTs), at the end of the sample; under way for |d|/ρ of it, it acts by its mean
+x[k] − d[k]|d[k]|/(2ρTs).
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import accumulate
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +20,7 @@ from greybox.vessel.vessel import Actuation, LagHeld, Vessel
 
 Array = NDArray[np.float64]
 
-__all__ = ["Actuation", "actuated_force", "delayed", "lagged", "with_actuators_of"]
+__all__ = ["Actuation", "actuated_force", "delayed", "lagged", "limited", "with_actuators_of"]
 
 
 def actuated_force(
@@ -44,32 +48,26 @@ def actuated_force(
         (..., N) each input of `force_inputs`.
     """
     late = vessel.actuation
-    delay = late.delay
-    if late.between == "interpolated":
-        delay -= (sample_time if logged is None else logged) / 2
-    moved = {c: delayed(commands[c], delay / sample_time) for c in vessel.commands}
-    if late.lag == 0:
-        return generalised_force(vessel, moved)
+    early = (sample_time if logged is None else logged) / 2 if late.between != "held" else 0.0
+    delays = dict.fromkeys(vessel.delayed_commands, late.delay)
+    moved = {
+        c: delayed(commands[c], (delays.get(c, 0.0) - early) / sample_time) for c in vessel.commands
+    }
+    if late.rate_on is not None and late.rate_limit is not None:
+        moved[late.rate_on] = limited(moved[late.rate_on], late.rate_limit * sample_time)
     samples = late.lag / sample_time
-    if late.lag_on == "force":
-        made = generalised_force(vessel, moved)
-        return {name: lagged(value, samples, late.lag_held) for name, value in made.items()}
-    speeds = {t.speed for t in vessel.thrusters}
-    return generalised_force(
-        vessel,
-        {
-            c: lagged(value, samples, late.lag_held)
-            if late.lag_on == "command" or c in speeds
-            else value
-            for c, value in moved.items()
-        },
-    )
+    for c in vessel.lagged_commands:
+        moved[c] = lagged(moved[c], samples, late.lag_held)
+    made = generalised_force(vessel, moved)
+    if late.lag == 0 or late.lag_on != "force":
+        return made
+    return {name: lagged(value, samples, late.lag_held) for name, value in made.items()}
 
 
 def with_actuators_of(vessel: Vessel, known: Vessel) -> Vessel:
     """Return a vessel whose thrusters act as those of another description of it.
 
-    Thrust laws, gains, angle offsets, lag and delay are taken over: parameters
+    Thrust laws, gains, angle offsets, lag, delay and rate limit are taken over: parameters
     that were estimated with them mean nothing without. Places, limits, columns
     and sensors stay, and commands are held, as those of a plan are.
 
@@ -124,6 +122,22 @@ def lagged(value: Array, samples: float, held: LagHeld = "start") -> Array:
     a = decay(samples)
     out, _ = lfilter([0.0, 1.0 - a], [1.0, -a], value, axis=-1, zi=value[..., :1])
     return np.asarray(value + (out - value) * held_share(samples, held))
+
+
+def limited(value: Array, most: float) -> Array:
+    """Return the mean over each sample of a signal (..., N) that follows by so much at most.
+
+    It is at rest on the first value.
+    """
+    value = np.asarray(value, float)
+
+    def follow(now: float, wanted: float) -> float:
+        return now + min(max(wanted - now, -most), most)
+
+    rows = [list(accumulate(row, follow)) for row in value.reshape(-1, value.shape[-1]).tolist()]
+    end = np.array(rows).reshape(value.shape)
+    way = np.diff(end, axis=-1, prepend=end[..., :1])
+    return np.asarray(end - way * np.abs(way) / (2 * most))
 
 
 def decay(samples: float) -> float:

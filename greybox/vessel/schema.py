@@ -153,6 +153,9 @@ class ActuationTable(Table):
     delay: Number = 0.0
     lag_held: str = "start"
     between: str = "held"
+    delay_on: str = "command"
+    rate_limit: Positive | None = None
+    rate_on: str | None = None
 
 
 class ClosedLoopTable(Table):

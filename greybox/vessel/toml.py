@@ -174,7 +174,7 @@ def vessel_to_dict(vessel: Vessel) -> dict[str, Any]:
     if vessel.mass is not None:
         data["mass"] = vessel.mass
     if vessel.actuation != Actuation():
-        data["actuation"] = vars(vessel.actuation).copy()
+        data["actuation"] = {k: v for k, v in vars(vessel.actuation).items() if v is not None}
     if vessel.conditions:
         data["conditions"] = vessel.conditions.to_dict()
     return data

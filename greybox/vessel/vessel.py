@@ -151,7 +151,9 @@ class Thruster:
         return tuple(found)
 
 
+# what follows slowly, beside one column by its name
 LagOn = Literal["force", "speed", "command"]
+DelayOn = Literal["command"]
 LagHeld = Literal["start", "mean", "end"]
 Between = Literal["held", "interpolated"]
 
@@ -164,25 +166,34 @@ _WHOLE = 1e-9
 class Actuation:
     """How the force follows the logged commands: how late, and what they are between samples.
 
+    A command is delayed, then moves no faster than its rate limit, then passes the lag.
+
     Parameters
     ----------
     lag : float
         Time constant of a first-order lag [s], 0 for none.
-    lag_on : {"force", "speed", "command"}
-        What follows slowly: each generalised force, the propeller speeds, or
-        all commands.
+    lag_on : str
+        What follows slowly: each generalised ``force``, the propellers' ``speed``, each
+        ``command``, or one command by the name of its column.
     delay : float
-        Pure delay of all commands [s].
+        Pure delay [s].
     lag_held : {"start", "mean", "end"}
         Which value of what follows slowly acts during a sample.
     between : {"held", "interpolated"}
         Whether a logged command stays as it is until the next one, as orders do, or moves on a
         straight line towards it, as measured angles and speeds do.
+    delay_on : str
+        What is delayed: each ``command``, or one by the name of its column.
+    rate_limit : float, optional
+        Fastest movement of one command, in the unit of its column per second.
+    rate_on : str, optional
+        That column.
 
     Raises
     ------
     VesselError
-        A time is negative or not finite, or `lag_on`, `lag_held` or `between` is none of those.
+        A time is negative or not finite, a rate is not positive, `lag_held` or `between` is
+        none of those, or one of `rate_limit` and `rate_on` stands without the other.
     """
 
     lag: float = 0.0
@@ -190,6 +201,9 @@ class Actuation:
     delay: float = 0.0
     lag_held: LagHeld = "start"
     between: Between = "held"
+    delay_on: str = "command"
+    rate_limit: float | None = None
+    rate_on: str | None = None
 
     def __post_init__(self) -> None:
         for name, value in (("lag", self.lag), ("delay", self.delay)):
@@ -198,8 +212,18 @@ class Actuation:
                     f"{name} of [actuation] is {value:g} s, it must be zero or positive: "
                     f"correct it."
                 )
+        if self.rate_limit is not None and not 0 < self.rate_limit < inf:
+            raise VesselError(
+                f"rate_limit of [actuation] is {self.rate_limit:g}, it must be positive: correct "
+                f"it, or leave it out."
+            )
+        if (self.rate_limit is None) != (self.rate_on is None):
+            has, lacks = ("rate_limit", "rate_on")[:: 1 if self.rate_on is None else -1]
+            raise VesselError(
+                f"[actuation] has {has} but no {lacks}: name the column that moves no faster "
+                f"(rate_on) and how fast it moves (rate_limit, per second), or leave both out."
+            )
         for key, chosen, known in (
-            ("lag_on", self.lag_on, get_args(LagOn)),
             ("lag_held", self.lag_held, get_args(LagHeld)),
             ("between", self.between, get_args(Between)),
         ):
@@ -210,7 +234,7 @@ class Actuation:
                 )
 
     def __bool__(self) -> bool:
-        return self.lag > 0 or self.delay > 0
+        return self.lag > 0 or self.delay > 0 or self.rate_limit is not None
 
     def delay_samples(self, sample_time: float) -> tuple[int, float]:
         """Return the delay as whole samples and the share of a further one."""
@@ -221,10 +245,16 @@ class Actuation:
 
     @property
     def sentence(self) -> str:
-        """Lag and delay in words."""
+        """Lag, delay and rate limit in words."""
         of = {"force": "each force", "speed": "the propeller speeds", "command": "all commands"}
-        parts = [f"a lag of {self.lag:g} s of {of[self.lag_on]}"] if self.lag else []
-        parts += [f"a delay of {self.delay:g} s"] if self.delay else []
+        parts = []
+        if self.lag:
+            parts.append(f"a lag of {self.lag:g} s of {of.get(self.lag_on, self.lag_on)}")
+        if self.delay:
+            whose = "" if self.delay_on == "command" else f" of {self.delay_on}"
+            parts.append(f"a delay of {self.delay:g} s{whose}")
+        if self.rate_limit is not None:
+            parts.append(f"a rate limit of {self.rate_limit:g} per second of {self.rate_on}")
         late = " and ".join(parts) or "no lag and no delay"
         return late if self.between == "held" else f"{late}, interpolated between samples"
 
@@ -259,6 +289,11 @@ class Vessel(DisplayMixin):
     actuation : Actuation
     conditions : Conditions
         Those of a log that does not state its own.
+
+    Raises
+    ------
+    VesselError
+        `actuation` names a column that moves no thruster.
     """
 
     name: str
@@ -271,10 +306,39 @@ class Vessel(DisplayMixin):
     actuation: Actuation = Actuation()
     conditions: Conditions = field(default_factory=Conditions)
 
+    def __post_init__(self) -> None:
+        for key, words in (
+            ("lag_on", get_args(LagOn)), ("delay_on", get_args(DelayOn)), ("rate_on", ()),
+        ):  # fmt: skip
+            chosen, known = getattr(self.actuation, key), (*words, *self.commands)
+            if chosen is not None and chosen not in known:
+                raise VesselError(
+                    f"{key} of [actuation] is '{chosen}'.{suggestion(str(chosen), known)} Use "
+                    f"{', '.join(words)}{' or ' if words else ''}a column that moves a thruster: "
+                    f"{', '.join(self.commands)}."
+                )
+
     @property
     def commands(self) -> tuple[str, ...]:
         """Log columns that move the thrusters, each once."""
         return tuple(dict.fromkeys(c for t in self.thrusters for c in t.columns))
+
+    @property
+    def delayed_commands(self) -> tuple[str, ...]:
+        """Those of `commands` that act after the delay of `actuation`."""
+        on = self.actuation.delay_on
+        return tuple(c for c in self.commands if self.actuation.delay and on in ("command", c))
+
+    @property
+    def lagged_commands(self) -> tuple[str, ...]:
+        """Those of `commands` that pass the lag of `actuation`; none where forces do."""
+        lag, on = self.actuation.lag, self.actuation.lag_on
+        # the words stand before a column of the same name
+        if lag == 0 or on == "force":
+            return ()
+        speeds = {t.speed for t in self.thrusters}
+        of = {"command": set(self.commands), "speed": speeds}.get(on, {on})
+        return tuple(c for c in self.commands if c in of)
 
     @property
     def angle_commands(self) -> frozenset[str]:

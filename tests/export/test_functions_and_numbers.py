@@ -8,7 +8,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from free_runs import CURRENT, KINDS, calm, variants, wanted
+from free_runs import CURRENT, KINDS, calm, variants, wanted, with_actuation
 from scipy.io import loadmat
 from virtual import virtual_log
 
@@ -125,6 +125,14 @@ def test_the_rate_is_that_of_the_step(model, tmp_path):
     assert rate[0] - still[0] == pytest.approx((theta["Xmu"] + theta["Xkappa"] * x[0]) * force)
 
 
+def test_a_rate_limit_has_no_rate(model, tmp_path):
+    limited = with_actuation(model, rate_limit=0.05, rate_on="alpha1")
+    export_model(limited, "casadi", tmp_path / "ship.casadi")
+    side, functions = loaded(tmp_path / "ship.casadi")
+    assert set(functions) == {"step", "begin"}
+    assert "limits the rate of alpha1 from sample to sample, which a rate" in side["no_rhs"]
+
+
 def test_a_delay_has_no_rate(model, tmp_path):
     exported = export_model(variants(model)["delay"], "casadi", tmp_path / "ship.casadi")
     side, functions = loaded(tmp_path / "ship.casadi")
@@ -151,6 +159,7 @@ def test_the_mat_file_holds_the_model(model, tmp_path):
         "current_north": 0.3, "current_east": -0.2,
     }  # fmt: skip
     assert (struct["lag"], struct["lag_held"], struct["delay"]) == (3.0, "mean", 0.4)
+    assert (struct["delay_on"], struct["rate_limit"]) == ("command", np.inf)
     assert list(struct["change_names"]) == ["Xu", "Nr", "Xu"]
     assert struct["thrusters"][0]["speed"] == "n"
     assert list(struct["input_names"][:3]) == ["n", "alpha1", "alpha2"]

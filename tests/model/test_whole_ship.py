@@ -1,5 +1,6 @@
 """The whole ship as one CasADi function is the free run, sample by sample."""
 
+import re
 import warnings
 from dataclasses import replace
 
@@ -51,7 +52,8 @@ def rolled(model, log, **inputs):
     forces = log.forces(model.structure.inputs)[0]
     at_rest |= dict(zip(model.structure.inputs, forces, strict=True))
     start |= {"x_n": 0.0, "y_n": 0.0}
-    before = [n.removesuffix("_lagged").rsplit("_before_", 1)[0] for n in names]
+    suffixes = re.compile("(_lagged|_limited|_before_[0-9]+)$")
+    before = [suffixes.sub("", n) for n in names]
     states = [np.array([(start | at_rest)[n] for n in before])]
     for command in commands[:-1]:
         states.append(np.array(step(x=states[-1], command=command, **inputs)["x_next"]).ravel())
@@ -66,6 +68,11 @@ LATE = [
     Actuation(lag=2.5, lag_on="command", delay=1.3),
     Actuation(delay=2.0),
     Actuation(delay=0.4),
+    Actuation(lag=2.5, lag_on="alpha1", lag_held="mean"),
+    Actuation(delay=1.3, delay_on="alpha2"),
+    Actuation(rate_limit=0.01, rate_on="alpha1"),
+    Actuation(lag=3.0, lag_on="n", delay=0.7, delay_on="n", rate_limit=0.2, rate_on="n"),
+    Actuation(lag=3.0, lag_on="force", delay=2.0, rate_limit=0.01, rate_on="alpha2"),
 ]
 
 
@@ -97,7 +104,7 @@ def test_wind_is_an_input_where_there_are_wind_terms(ship, true_theta, log):
     assert a_model(ship, true_theta, names=few).step_function().name_in() == ["x", "command"]
 
 
-@pytest.mark.parametrize("lag_on", ["force", "command", "speed"])
+@pytest.mark.parametrize("lag_on", ["force", "command", "speed", "n"])
 def test_rate_is_the_step_over_the_sample_time(ship, true_theta, lag_on):
     model = a_model(ship, true_theta)
     x, command = [1.4, 0.3, 0.02, 0.7, 5.0, -3.0], [15.0, 0.8, 0.9]
@@ -114,6 +121,7 @@ def test_rate_is_the_step_over_the_sample_time(ship, true_theta, lag_on):
         ),
         "command": np.array(command),
         "speed": np.array(command[:1]),
+        "n": np.array(command[:1]),
     }[lag_on]
     np.testing.assert_allclose(rate[6:].ravel(), (goal - 0.5) / 2.0)
 
@@ -126,6 +134,9 @@ def test_what_has_no_step_is_refused(ship, true_theta):
     late = a_model(ship, true_theta, actuation=Actuation(delay=1.5))
     with pytest.raises(UsageError, match=r"act 1\.5 s late, .*: use step_function"):
         late.rhs_function()
+    limited = a_model(ship, true_theta, actuation=Actuation(rate_limit=0.1, rate_on="alpha1"))
+    with pytest.raises(UsageError, match=r"the rate of alpha1 .* no continuous-time form: use"):
+        limited.rhs_function()
 
 
 def test_function_takes_symbols_and_is_differentiable(ship, true_theta):

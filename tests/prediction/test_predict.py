@@ -96,6 +96,14 @@ def test_intervals_are_those_of_the_parameters():
         {"delay": 0.37, "lag": 0.8},
         {"lag": 0.8, "lag_on": "speed", "lag_held": "mean"},
         {"lag": 0.8, "lag_on": "command", "lag_held": "end", "delay": 0.1},
+        {
+            "lag": 0.8,
+            "lag_on": "delta",
+            "delay": 0.37,
+            "delay_on": "delta",
+            "rate_limit": 0.15,
+            "rate_on": "delta",
+        },
     ],
 )
 def test_a_run_is_the_models_own_free_run(actuation, integrator):

@@ -97,6 +97,20 @@ def corrected(name, trial):
     if name == "thruster_gain":
         weak = {c: v * p.get(f"gain_{c}", 1.0) for c, v in n.items()}
         return one_step(trial, tau=forces(log, **weak))
+    cause, _, column = name.partition(":")
+    if column and cause == "thruster_lag":
+        return one_step(trial, tau=forces(log, **{column: lagged(log[column], p["lag"])}))[150:]
+    if column:
+        late = round(p["delay"])
+        return one_step(trial, tau=forces(log, **{column: np.roll(log[column], late)}))[late:]
+    if name == "rate_limit":
+        ((key, rate),) = p.items()
+        column = key.removeprefix("rate_")
+        wanted, reached = log[column], log[column].copy()
+        for k in range(1, len(reached)):
+            reached[k] = reached[k - 1] + np.clip(wanted[k - 1] - reached[k - 1], -rate, rate)
+        # where it was caught up once, nothing is left of how it began
+        return one_step(trial, tau=forces(log, **{column: reached}))[200:]
     if name == "thruster_lag":
         if p["variant"] == "speed":
             slow = {c: lagged(v, p["lag"]) for c, v in n.items()}
@@ -157,7 +171,16 @@ def corrected(name, trial):
     return left
 
 
-SENSOR = ("heading_bias", "lever_arm", "angle_offset", "clock_offset", "waves", "sign")
+# Euler's rule reads a command at the samples, where it is the same whatever lies between
+SENSOR = (
+    "feedback_sampling",
+    "heading_bias",
+    "lever_arm",
+    "angle_offset",
+    "clock_offset",
+    "waves",
+    "sign",
+)
 
 
 @pytest.mark.parametrize("name", [n for n in ("none", *EFFECTS) if n not in SENSOR])
@@ -166,6 +189,16 @@ def test_the_effect_in_the_model_leaves_nothing(name, trials):
     np.testing.assert_allclose(corrected(name, trial), 0, atol=1e-9)
     if name != "none":
         assert np.abs(one_step(trial)).max() > 1e-3
+
+
+def test_a_feedback_is_not_held_between_samples():
+    """The same as a ship all of whose commands move on straight lines, and no held one."""
+    made = {"noise": 0.0, "process": 0.0, "samples": 200}
+    own = draw(np.random.default_rng(SEED), ("feedback_sampling",), **made).estimation
+    moving = draw(np.random.default_rng(SEED), (), linear=True, **made).estimation
+    held = draw(np.random.default_rng(SEED), (), **made).estimation
+    np.testing.assert_array_equal(own["u"], moving["u"])
+    assert np.abs(own["u"] - held["u"]).max() > 1e-4
 
 
 def test_heading_bias_turns_heading_and_perhaps_velocities(trials):

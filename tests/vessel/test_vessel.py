@@ -13,7 +13,7 @@ import pytest
 
 from greybox.errors import VesselError
 from greybox.trial.log import make_log
-from greybox.vessel.actuation import Actuation, actuated_force
+from greybox.vessel.actuation import Actuation, actuated_force, limited
 from greybox.vessel.force import force_expressions, force_inputs, generalised_force
 from greybox.vessel.thrust import ThrustLaw
 from greybox.vessel.toml import load_vessel, vessel_from_dict, vessel_to_dict
@@ -167,6 +167,43 @@ def test_late_force_equals_the_recursion(on, delay):
             np.testing.assert_allclose(got[name][run], value, atol=1e-11)
 
 
+def test_one_command_is_late_and_the_other_is_not():
+    """Delay, then rate limit, then lag, each of one column, sample by sample."""
+    on = {"lag": 2.0, "lag_on": "a", "delay": 0.8, "delay_on": "n", "rate_limit": 0.4,
+          "rate_on": "a"}  # fmt: skip
+    v = vessel(AZIMUTH, actuation=on)
+    assert (v.delayed_commands, v.lagged_commands) == (("n",), ("a",))
+    rng = np.random.default_rng(4)
+    n, a, step = rng.uniform(-9, 9, 200), rng.uniform(-3, 3, 200), 0.5
+    t = np.arange(200) * step
+    keep, at, acts, slow = math.exp(-step / 2.0), a[0], [a[0]], [a[0]]
+    for k in range(1, 200):
+        slow.append(keep * slow[-1] + (1 - keep) * acts[-1])
+        # the mean of where it is, moment by moment within the sample
+        inner = [at + np.clip(a[k] - at, -0.4 * s, 0.4 * s) for s in (np.arange(2000) + 0.5) / 4e3]
+        acts.append(np.mean(inner))
+        at = at + np.clip(a[k] - at, -0.2, 0.2)
+    want = generalised_force(vessel(AZIMUTH), {"n": np.interp(t - 0.8, t, n), "a": np.array(slow)})
+    got = actuated_force(v, {"n": n, "a": a}, step)
+    for name, value in want.items():
+        np.testing.assert_allclose(got[name], value, atol=1e-5)
+    assert v.actuation.sentence == (
+        "a lag of 2 s of a and a delay of 0.8 s of n and a rate limit of 0.4 per second of a"
+    )
+
+
+@pytest.mark.parametrize("shape", [(50,), (3, 50)])
+def test_a_limited_signal_catches_up_and_no_faster(shape):
+    wanted = np.random.default_rng(2).uniform(-1, 1, shape)
+    got = limited(wanted, 0.3)
+    assert np.abs(np.diff(got)).max() <= 0.3 + 1e-12
+    np.testing.assert_array_equal(got[..., 0], wanted[..., 0])
+    np.testing.assert_allclose(limited(wanted, 1e12), wanted, atol=1e-9)
+    level = np.concatenate([np.zeros((*shape[:-1], 1)), np.ones((*shape[:-1], 9))], axis=-1)
+    want = [0, 0.125, 0.375, 0.625, 0.875, 1, 1, 1, 1, 1]
+    np.testing.assert_allclose(limited(level, 0.25), np.broadcast_to(want, level.shape))
+
+
 def test_a_lag_is_exact_for_held_commands():
     """The step response of a first-order lag, and none without lag and delay."""
     commands = {"n": np.array([1.0] + [3.0] * 40), "a": np.zeros(41)}
@@ -207,10 +244,11 @@ def test_all_that_a_diagnosis_adds_survives_a_round_trip():
         {**AZIMUTH, "gain": 0.8, "angle_offset": -0.03,
          "thrust": {"quadratic_share": 0.25, "reference": 15}},
         columns={"yaw": {"name": "r", "unit": "rad/s", "sign": -1}},
-        actuation={"lag": 1.5, "lag_on": "speed", "delay": 0.4},
+        actuation={"lag": 1.5, "lag_on": "a", "delay": 0.4, "delay_on": "n", "rate_limit": 0.1,
+                   "rate_on": "a"},
     )  # fmt: skip
     assert v.thrusters[0].thrust == ThrustLaw("linear", (), 0.25, 15.0)
-    assert v.actuation == Actuation(1.5, "speed", 0.4)
+    assert v.actuation == Actuation(1.5, "a", 0.4, delay_on="n", rate_limit=0.1, rate_on="a")
     assert vessel_from_dict(json.loads(json.dumps(vessel_to_dict(v)))) == v
     plain = vessel_to_dict(vessel(AZIMUTH))
     assert not {"actuation", "gain", "angle_offset"} & (plain.keys() | plain["thruster"][0].keys())
@@ -273,6 +311,15 @@ def test_bad_thrusters(change, message):
         ({"actuation": {"delay": math.inf}}, "delay of \\[actuation\\] is inf, a finite number"),
         ({"actuation": {"lag_on": "forc"}}, "Did you mean 'force'"),
         ({"actuation": {"lagg": 1}}, "Did you mean 'lag'"),
+        (
+            {"actuation": {"lag_on": "nn"}},
+            "'nn'. Did you mean 'n'\\? Use force, speed, command or a",
+        ),
+        ({"actuation": {"delay_on": "m"}}, "a column that moves a thruster: n, a"),
+        ({"actuation": {"rate_limit": 1, "rate_on": "b"}}, "rate_on of \\[actuation\\] is 'b'"),
+        ({"actuation": {"rate_limit": 1}}, "has rate_limit but no rate_on"),
+        ({"actuation": {"rate_on": "n"}}, "has rate_on but no rate_limit"),
+        ({"actuation": {"rate_limit": 0, "rate_on": "n"}}, "is 0, it must be positive"),
     ],
 )
 def test_bad_vessels(more, message):

@@ -23,8 +23,10 @@ from greybox.diagnosis.causes.sensors import (
 from greybox.diagnosis.causes.thrusters import (
     AdvanceSpeed,
     AngleOffset,
+    FeedbackSampling,
     InputDelay,
     QuadraticThrust,
+    RateLimit,
     ThrusterGain,
     ThrusterLag,
 )
@@ -34,7 +36,8 @@ from greybox.registry import entry_points
 __all__ = ["Cause", "Context", "known_causes"]
 
 _OWN: tuple[type[Cause], ...] = (
-    Current, Wind, ThrusterGain, ThrusterLag, InputDelay, QuadraticThrust, AdvanceSpeed,
+    Current, Wind, ThrusterGain, ThrusterLag, InputDelay, RateLimit, FeedbackSampling,
+    QuadraticThrust, AdvanceSpeed,
     CubicDamping, QuadraticYawDamping, Crossflow, InertiaCoupling, SideForce, Asymmetry,
     HeadingBias, LeverArm, AngleOffset, ClockOffset, Sign, ParameterChange, Waves,
 )  # fmt: skip

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -40,6 +40,10 @@ class Context:
         Typical size of each propeller speed.
     current_known : bool
         Whether the model has a current already.
+    ranges : mapping of str to float
+        Largest less smallest value of each command.
+    fastest : mapping of str to float
+        Fastest change of each command from sample to sample [per second].
     """
 
     structure: Structure
@@ -50,6 +54,8 @@ class Context:
     sample_time: float
     speeds: Mapping[str, float]
     current_known: bool = False
+    ranges: Mapping[str, float] = field(default_factory=dict)
+    fastest: Mapping[str, float] = field(default_factory=dict)
 
     def lacking(self, *terms: str) -> tuple[str, ...]:
         """Return those of the terms that the structure could have and has not, by their names.
@@ -128,3 +134,7 @@ class Cause(DisplayMixin):
         values : mapping of str to (float, float)
             Parameter name -> estimate and standard error.
         """
+
+    def evidence_of(self, hypothesis: Hypothesis, values: Mapping[str, tuple[float, float]]) -> str:
+        """Return the sentence for one of the hypotheses, where its place is worth a word."""
+        return self.evidence(values)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,12 +14,16 @@ from greybox.diagnosis.causes.hull import listed, term_hypothesis
 from greybox.diagnosis.causes.sensors import UNRESOLVED
 from greybox.diagnosis.hypothesis import Hypothesis, Parameter
 from greybox.diagnosis.ship import Ship
-from greybox.vessel.vessel import LagHeld, LagOn, Thruster
+from greybox.vessel.vessel import Actuation, LagHeld, LagOn, Thruster
 
 Array = NDArray[np.float64]
 
 # slowest thruster and longest delay that are looked for, as shares of a log and in seconds
 _SHARE, _LONGEST = 0.1, 120.0
+# strongest thrusters beside the others'; shares of the fastest logged movement from which a
+# limit of the rate is sought, and the least
+_STRONGEST = 10.0
+_RATES, _LEAST_RATE = (0.5, 0.2, 0.06), 0.01
 
 
 def with_thruster(ship: Ship, index: int, **changes: object) -> Ship:
@@ -27,6 +31,32 @@ def with_thruster(ship: Ship, index: int, **changes: object) -> Ship:
     thrusters = list(ship.vessel.thrusters)
     thrusters[index] = replace(thrusters[index], **changes)  # type: ignore[arg-type]
     return replace(ship, vessel=replace(ship.vessel, thrusters=tuple(thrusters)))
+
+
+def with_actuation(ship: Ship, **changes: Any) -> Ship:
+    """Return the ship with its commands followed otherwise."""
+    late = replace(ship.vessel.actuation, **changes)
+    return replace(ship, vessel=replace(ship.vessel, actuation=late))
+
+
+def _single_commands(context: Context) -> tuple[str, ...]:
+    """Return the columns that may be late by themselves; one that never moves is not."""
+    commands = context.vessel.commands
+    moving = tuple(c for c in commands if context.ranges.get(c, 1.0) > 0)
+    return moving if len(commands) > 1 else ()
+
+
+def _groups(context: Context) -> list[list[int]]:
+    """Return the thrusters of one type and distance from midship together."""
+    found: dict[tuple[str, float], list[int]] = {}
+    for i, t in enumerate(context.vessel.thrusters):
+        found.setdefault((t.type, abs(t.x)), []).append(i)
+    return list(found.values())
+
+
+def _speeds(context: Context, group: Sequence[int]) -> str:
+    """Return the speed columns of a group of thrusters, by which it is called."""
+    return "+".join(dict.fromkeys(context.vessel.thrusters[i].speed for i in group))
 
 
 def _steered_by(thruster: Thruster) -> str | None:
@@ -41,7 +71,7 @@ def _driven_by(thruster: Thruster) -> tuple[str, ...]:
 
 
 class ThrusterGain(Cause):
-    """One thruster weaker than the others' model says."""
+    """One thruster, or a group of them, weaker or stronger than the others' model says."""
 
     id = "thruster_gain"
     kind = "thruster"
@@ -51,25 +81,34 @@ class ThrusterGain(Cause):
     reference = "Fossen (2011), section 12.3"
 
     def hypotheses(self, context: Context) -> Sequence[Hypothesis]:
-        """Return one a thruster, where there are several to compare with."""
-        if len(context.vessel.thrusters) < 2:
+        """Return one a thruster, and one a group where groups may be of different strength."""
+        thrusters = context.vessel.thrusters
+        if len(thrusters) < 2:
             return ()
+        groups = _groups(context)
+
+        def gain(members: Sequence[int], key: str, most: float) -> Hypothesis:
+            def apply(ship: Ship, value: Array) -> Ship:
+                for i in members:
+                    own = ship.vessel.thrusters[i].gain
+                    ship = with_thruster(ship, i, gain=own * float(value[0]))
+                return ship
+
+            parameter = Parameter(f"gain_{thrusters[members[0]].speed}", "1", 0.85, 0.0, most, 1.0)
+            driven = dict.fromkeys(c for i in members for c in _driven_by(thrusters[i]))
+            return Hypothesis(
+                self.id, f"{self.id}:{key}", (parameter,), (), apply, arguments=tuple(driven)
+            )
+
         out = []
-        for i, thruster in enumerate(context.vessel.thrusters):
-
-            def apply(ship: Ship, value: Array, i: int = i) -> Ship:
-                own = ship.vessel.thrusters[i].gain
-                return with_thruster(ship, i, gain=own * float(value[0]))
-
-            name = f"gain_{thruster.speed}"
-            key = f"{self.id}:{thruster.speed}:{_steered_by(thruster) or i}"
-            out.append(
-                Hypothesis(
-                    self.id, key, (Parameter(name, "1", 0.85, 0.0, 1.0, 1.0),), (), apply,
-                    arguments=_driven_by(thruster),
-                )
-            )  # fmt: skip
-        return out
+        for i, t in enumerate(thrusters):
+            most = _STRONGEST if [i] in groups and len(groups) > 1 else 1.0
+            out.append(gain([i], f"{t.speed}:{_steered_by(t) or i}", most))
+        several = [g for g in groups if len(g) > 1]
+        if len(groups) < 3:
+            # of two groups the strength of one says that of the other
+            several = several[:1] if len(several) == 2 else []
+        return out + [gain(g, _speeds(context, g), _STRONGEST) for g in several]
 
     def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
         """Say which and how weak."""
@@ -91,30 +130,45 @@ class ThrusterLag(Cause):
     reference = "Fossen (2011), section 9.1"
 
     def hypotheses(self, context: Context) -> Sequence[Hypothesis]:
-        """Return a lag of the forces, the propeller speeds, or all commands."""
+        """Return a lag of the forces, the propeller speeds, all commands, or one of them."""
         longest = min(_LONGEST, _SHARE * context.duration)
         first = 2 * context.sample_time
         parameter = Parameter(
             "lag", "s", first, 1e-3, longest, step=1e-3, least=UNRESOLVED * context.sample_time
         )
 
-        def lag(on: LagOn, held: LagHeld, variants: tuple[Hypothesis, ...] = ()) -> Hypothesis:
+        words: tuple[str, ...] = get_args(LagOn)
+
+        def lag(on: str, held: LagHeld, variants: tuple[Hypothesis, ...] = ()) -> Hypothesis:
             def apply(ship: Ship, value: Array) -> Ship:
-                late = replace(ship.vessel.actuation, lag=float(value[0]), lag_on=on, lag_held=held)
-                return replace(ship, vessel=replace(ship.vessel, actuation=late))
+                return with_actuation(ship, lag=float(value[0]), lag_on=on, lag_held=held)
 
             return Hypothesis(
-                self.id, f"{self.id}:{on}", (parameter,), (), apply, ((4 * first,),), variants
-            )
+                self.id, f"{self.id}:{on}", (parameter,), (), apply, ((4 * first,),), variants,
+                place="" if on in words else on,
+            )  # fmt: skip
 
+        speeds = {t.speed for t in context.vessel.thrusters}
+        # a single propeller speed is all of them, and a ship has one lag
+        own = [c for c in _single_commands(context) if {c} != speeds and c not in words]
+        places = words if context.vessel.actuation.lag else (*words, *own)
         # a simulated trial may hold another value than the mean during a sample
-        out = [lag(on, "mean", (lag(on, "start"), lag(on, "end"))) for on in get_args(LagOn)]
-        return out
+        return [lag(on, "mean", (lag(on, "start"), lag(on, "end"))) for on in places]
 
     def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
         """Say how slow."""
         value, std = values["lag"]
         return f"forces follow their commands with a time constant of {value:.1f} ± {std:.1g} s"
+
+    def evidence_of(self, hypothesis: Hypothesis, values: Mapping[str, tuple[float, float]]) -> str:
+        """Say which command is slow, where it is one."""
+        value, std = values["lag"]
+        if not hypothesis.place:
+            return self.evidence(values)
+        return (
+            f"{hypothesis.place} alone acts with a time constant of {value:.1f} ± {std:.1g} s "
+            f"after it is logged"
+        )
 
 
 class InputDelay(Cause):
@@ -128,30 +182,120 @@ class InputDelay(Cause):
     reference = "Ljung (1999), section 14.3"
 
     def hypotheses(self, context: Context) -> Sequence[Hypothesis]:
-        """Return one delay of all commands."""
+        """Return a delay of all commands, or of one of them."""
         longest = min(_LONGEST, _SHARE * context.duration)
-
-        def apply(ship: Ship, value: Array) -> Ship:
-            late = replace(ship.vessel.actuation, delay=float(value[0]))
-            return replace(ship, vessel=replace(ship.vessel, actuation=late))
-
         first = 1.5 * context.sample_time
         parameter = Parameter("delay", "s", first, 0.0, longest, step=0.1 * context.sample_time,
                               least=UNRESOLVED * context.sample_time)  # fmt: skip
-        return (
-            Hypothesis(
-                self.id, self.id, (parameter,), (), apply, starts=((3 * first,), (6 * first,))
-            ),
-        )
+
+        def delay(on: str) -> Hypothesis:
+            def apply(ship: Ship, value: Array) -> Ship:
+                return with_actuation(ship, delay=float(value[0]), delay_on=on)
+
+            place = "" if on == "command" else on
+            return Hypothesis(
+                self.id, f"{self.id}:{place}" if place else self.id, (parameter,), (), apply,
+                starts=((3 * first,), (6 * first,)), place=place,
+            )  # fmt: skip
+
+        # a ship has one delay
+        own = () if context.vessel.actuation.delay else _single_commands(context)
+        return [delay("command"), *(delay(c) for c in own if c != "command")]
 
     def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
         """Say how late."""
         value, std = values["delay"]
         return f"commands act {value:.1f} ± {std:.1g} s after they are logged"
 
+    def evidence_of(self, hypothesis: Hypothesis, values: Mapping[str, tuple[float, float]]) -> str:
+        """Say which command is late, where it is one."""
+        value, std = values["delay"]
+        if not hypothesis.place:
+            return self.evidence(values)
+        return f"{hypothesis.place} alone acts {value:.1f} ± {std:.1g} s after it is logged"
+
+
+class RateLimit(Cause):
+    """An actuator that cannot move as fast as its column."""
+
+    id = "rate_limit"
+    kind = "thruster"
+    title = "actuator of limited rate"
+    signature = "errors after large changes of one command, and none after small ones"
+    extension = "a limit of that command's rate"
+    reference = "Fossen (2011), section 9.1"
+
+    def hypotheses(self, context: Context) -> Sequence[Hypothesis]:
+        """Return one a command that moves; a ship has one."""
+        if context.vessel.actuation.rate_limit is not None:
+            return ()
+        out = []
+        for column in context.vessel.commands:
+            way, fastest = context.ranges.get(column, 0.0), context.fastest.get(column, 0.0)
+            if way <= 0 or fastest <= 0:
+                continue
+
+            def apply(ship: Ship, value: Array, column: str = column, way: float = way) -> Ship:
+                if value[0] <= 0:
+                    return ship
+                return with_actuation(ship, rate_limit=way / float(value[0]), rate_on=column)
+
+            # the number is the time of the whole way, which is zero without a limit
+            quick = way / fastest
+            times = [quick / share for share in _RATES]
+            parameter = Parameter(
+                f"rate_{column}", f"{context.vessel.unit(column) or 'n'}/s", times[0], 0.0,
+                quick / _LEAST_RATE, step=1e-3 * quick, least=quick, over=way,
+            )  # fmt: skip
+            out.append(
+                Hypothesis(
+                    self.id, f"{self.id}:{column}", (parameter,), (), apply,
+                    tuple((t,) for t in times[1:]), only=True,
+                )
+            )  # fmt: skip
+        return out
+
+    def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
+        """Say which and how fast."""
+        name, (value, std) = next(iter(values.items()))
+        return (
+            f"{name.removeprefix('rate_')} moves by at most {value:.2g} ± {std:.1g} per second, "
+            f"slower than it is logged"
+        )
+
+
+class FeedbackSampling(Cause):
+    """Measured commands that the model holds from sample to sample."""
+
+    id = "feedback_sampling"
+    kind = "thruster"
+    title = "feedback that is not held"
+    signature = "the motion comes half a sample before what held commands make of it"
+    extension = 'commands that move on straight lines between samples (between = "interpolated")'
+    reference = "Ljung (1999), section 13.3"
+
+    def hypotheses(self, context: Context) -> Sequence[Hypothesis]:
+        """Return the one way, where columns may be measured and are taken to be held."""
+        vessel = context.vessel
+        held = vessel.actuation.between == Actuation().between
+        if not held or all(t.drive == "command" for t in vessel.thrusters):
+            return ()
+
+        def apply(ship: Ship, value: Array) -> Ship:
+            return with_actuation(ship, between="interpolated")
+
+        return (Hypothesis(self.id, f"{self.id}:interpolated", (), (), apply),)
+
+    def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
+        """Say what the log shows."""
+        return (
+            "the logged angles and speeds are measured at the samples and move between them: what "
+            "acts is the mean of this sample and the next"
+        )
+
 
 class QuadraticThrust(Cause):
-    """Thrust by n|n| where the model says n."""
+    """Thrust by n|n| where the model says n, of all thrusters or of a group."""
 
     id = "quadratic_thrust"
     kind = "thruster"
@@ -161,7 +305,7 @@ class QuadraticThrust(Cause):
     reference = "Fossen (2011), section 9.1"
 
     def hypotheses(self, context: Context) -> Sequence[Hypothesis]:
-        """Return one share for all thrusters with a linear law."""
+        """Return one share for all thrusters with a linear law, and one for each group."""
         linear = [
             i for i, t in enumerate(context.vessel.thrusters)
             if t.thrust.kind == "linear" and t.thrust.quadratic_share == 0
@@ -169,21 +313,36 @@ class QuadraticThrust(Cause):
         ]  # fmt: skip
         if not linear:
             return ()
+        thrusters = context.vessel.thrusters
 
-        # one for all, so that the thrusters keep their proportions
-        columns = [context.vessel.thrusters[i].speed for i in linear]
-        reference = float(np.mean([context.speeds[c] for c in columns]))
+        def share(members: Sequence[int], place: str) -> Hypothesis:
+            # one for all of them, so that they keep their proportions
+            reference = float(np.mean([context.speeds[thrusters[i].speed] for i in members]))
 
-        def apply(ship: Ship, value: Array) -> Ship:
-            for i in linear:
-                thruster = ship.vessel.thrusters[i]
-                law = replace(thruster.thrust, quadratic_share=float(value[0]), reference=reference)
-                ship = with_thruster(ship, i, thrust=law)
-            return ship
+            def apply(ship: Ship, value: Array) -> Ship:
+                for i in members:
+                    law = replace(
+                        ship.vessel.thrusters[i].thrust,
+                        quadratic_share=float(value[0]), reference=reference,
+                    )  # fmt: skip
+                    ship = with_thruster(ship, i, thrust=law)
+                return ship
 
-        parameter = Parameter("quadratic_share", "1", 0.3, 0.0, 1.0)
-        driven = dict.fromkeys(c for i in linear for c in _driven_by(context.vessel.thrusters[i]))
-        return (Hypothesis(self.id, self.id, (parameter,), (), apply, arguments=tuple(driven)),)
+            parameter = Parameter("quadratic_share", "1", 0.3, 0.0, 1.0)
+            driven = dict.fromkeys(c for i in members for c in _driven_by(thrusters[i]))
+            return Hypothesis(
+                self.id, f"{self.id}:{place}" if place else self.id, (parameter,), (), apply,
+                arguments=tuple(driven), place=place,
+            )  # fmt: skip
+
+        groups = [g for all_ in _groups(context) if (g := [i for i in all_ if i in linear])]
+        own = groups if len(groups) > 1 else []
+        return [share(linear, ""), *(share(g, _speeds(context, g)) for g in own)]
+
+    def evidence_of(self, hypothesis: Hypothesis, values: Mapping[str, tuple[float, float]]) -> str:
+        """Say of which thrusters, where not of all."""
+        said = self.evidence(values)
+        return f"{said}, of those driven by {hypothesis.place}" if hypothesis.place else said
 
     def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
         """Say the share."""

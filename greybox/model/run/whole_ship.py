@@ -28,8 +28,9 @@ _BODY = ("u", "v", "r")
 def state_names(model: ManoeuvringModel) -> tuple[str, ...]:
     """Return the names of ``x`` of `whole_step`.
 
-    ``u, v, r, psi, x_n, y_n``; then ``…_before_k`` of commands that still are to act and
-    ``…_lagged`` of what follows slowly, where the vessel's thrusters are late.
+    ``u, v, r, psi, x_n, y_n``; then ``…_before_k`` of commands that still are to act,
+    ``…_limited`` of one that moves at a limited rate and ``…_lagged`` of what follows slowly,
+    where the vessel's thrusters are late.
     """
     late = _late(model, ca.SX.sym("command", len(model.vessel.commands)))
     return (*model.structure.states, "psi", "x_n", "y_n", *[m.name for m in late.memory])
@@ -96,27 +97,33 @@ def whole_rate(model: ManoeuvringModel) -> ca.Function:
     StructureError
         As `whole_step`.
     UsageError
-        The thrusters have a pure delay, which no ordinary differential equation has.
+        The thrusters have a pure delay or a rate limit, of which there is no such form.
     """
     model = _checked(model)
-    delay = model.vessel.actuation.delay
-    if delay:
+    late = model.vessel.actuation
+    if late.delay:
         raise UsageError(
-            f"the thrusters of '{model.vessel.name}' act {delay:g} s late, which no ordinary "
+            f"the thrusters of '{model.vessel.name}' act {late.delay:g} s late, which no ordinary "
             f"differential equation can hold: use step_function(), or delay the commands outside."
+        )
+    if late.rate_limit is not None:
+        raise UsageError(
+            f"the rate of {late.rate_on} of '{model.vessel.name}' is limited from sample to "
+            f"sample, of which there is no continuous-time form: use step_function(), or limit "
+            f"the command outside."
         )
     s = model.structure.symbols
     position = ca.SX.sym("position", 2)
     command = ca.SX.sym("command", len(model.vessel.commands))
     wind = ca.SX.sym("wind", 2)
-    late = _late(model, command)
-    assert late.rate is not None
-    tau = column(late.rate_forces[n] for n in model.structure.inputs)
+    slow = _late(model, command)
+    assert slow.rate is not None
+    tau = column(slow.rate_forces[n] for n in model.structure.inputs)
     d, dt = _disturbance(model, wind), model.sample_time
     step = StepModel(model.structure, heading="simulated")
     rate = (step(s.x, s.psi, tau, d, ca.SX(2, 1), model.theta, dt) - step.symbolic.state) / dt
-    x = ca.vertcat(s.x, s.psi, position, late.symbols)
-    x_dot = ca.vertcat(rate, *body_to_ned(s.x[0], s.x[1], s.psi), late.rate)
+    x = ca.vertcat(s.x, s.psi, position, slow.symbols)
+    x_dot = ca.vertcat(rate, *body_to_ned(s.x[0], s.x[1], s.psi), slow.rate)
     return _function("rhs", model, x, command, wind, x_dot, "x_dot")
 
 

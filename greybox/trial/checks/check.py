@@ -121,7 +121,9 @@ def check_recording(recording: Recording, vessel: Vessel) -> CheckReport:
     return check_recordings([recording], vessel)[0]
 
 
-def check_recordings(recordings: Sequence[Recording], vessel: Vessel) -> list[CheckReport]:
+def check_recordings(
+    recordings: Sequence[Recording], vessel: Vessel, *, forces: bool = True
+) -> list[CheckReport]:
     """Check recordings of one ship: samples log by log, instruments over all logs together.
 
     Parameters
@@ -129,6 +131,8 @@ def check_recordings(recordings: Sequence[Recording], vessel: Vessel) -> list[Ch
     recordings : sequence of Recording
         Canonical signals as they were recorded; what they say was derived proves nothing.
     vessel : Vessel
+    forces : bool
+        Whether wind, thrusters and actuators are checked, too.
 
     Returns
     -------
@@ -137,8 +141,10 @@ def check_recordings(recordings: Sequence[Recording], vessel: Vessel) -> list[Ch
     """
     logs = [_signal_quality(recording, vessel) for recording in recordings]
     _kinematics(logs, vessel)
-    _forces(logs, vessel)
-    actuators = _actuators(logs, vessel)
+    actuators: tuple[ActuatorEstimate, ...] = ()
+    if forces:
+        _forces(logs, vessel)
+        actuators = _actuators(logs, vessel)
     return [
         CheckReport(
             log.recorded.name,
