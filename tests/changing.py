@@ -66,6 +66,8 @@ def fitted(log: TrialLog, moment: float) -> tuple[Problem, Hypothesis, Fit]:
 class OneProblem:
     """A case that knows one problem."""
 
+    metric = "coloured"
+
     def __init__(self, problem: Problem) -> None:
         self._problem = problem
 

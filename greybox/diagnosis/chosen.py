@@ -65,7 +65,9 @@ def from_chosen(
     base = case.carried(found.base)
     plain = case.problem(base.integrator).settle(base)
     fit = _bounded(case, case.carried(searched.final).point, plain.noise)
-    named, hypotheses = [c.hypothesis for c in searched.causes], ready.hypotheses
+    # what the sensors deny imitates what forces do
+    hypotheses = ready.of_forces
+    named = [c.hypothesis for c in searched.causes]
     by_data = None
     if choice is not None:
         chosen, every = _hypotheses(ready, case, choice)

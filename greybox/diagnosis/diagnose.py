@@ -116,13 +116,15 @@ def diagnose(
     found = weighed(case, searched)
     keys = [c.hypothesis.key for c in found.causes]
     apart = sorted(key for key in keys if denied(key, ready.agreeing))
-    if apart and leaves_more(found, case.held_out):
+    more = leaves_more(found, case.held_out)
+    if apart and more:
         # a defect that all sensors share would leave nothing; this one imitates what forces do
         say("causes without those that the sensors deny")
         searched = search(case, base, ready.of_forces, progress=options.progress)
         found = weighed(case, searched)
+        more = leaves_more(found, case.held_out)
     found = replace(found, given=ready.as_given())
-    if model is None and leaves_more(found, case.held_out):
+    if model is None and more:
         chosen = from_chosen(ready, searched, found, say)
         if chosen is not None:
             wider, mine = chosen

@@ -80,7 +80,7 @@ class NoiseModel:
         from scipy.signal import lfilter
 
         if len(self.denominator) == 1:
-            return np.asarray(e / np.diag(self.root)[:, None])
+            return np.asarray(e * np.diag(self.numerators[:, :, 0])[:, None])
         out = np.zeros(e.shape)
         for i, row in enumerate(self.numerators):
             for j, numerator in enumerate(row):
@@ -330,10 +330,11 @@ def fit_noise(
 def free_run_noise(
     errors: Sequence[Array], groups: Sequence[tuple[int, ...]], start: Noise | None = None
 ) -> Noise:
-    """Return the metric of least squares: each channel's errors in their own deviation.
+    """Return the metric of least squares: each state's errors in their own deviation.
 
     What a misfit leaves is slow, and a colour that takes it for the sea's own hides every slow
-    cause. Here nothing is hidden; tests and standard errors must count the errors' memory.
+    cause. Here nothing is hidden; tests and standard errors must count the errors' memory. A
+    heading tells what its rate does, and does not count twice.
 
     Parameters
     ----------
@@ -349,14 +350,15 @@ def free_run_noise(
     made = []
     for g, group in enumerate(groups):
         k = len(group)
-        own = size[list(group)]
+        own = np.ones(k)
+        own[0] = size[group[0]]
         sensor = (
             np.array([max(white_noise([e[:, i] for e in errors]) or 0.0, 1e-12) for i in group])
             if start is None
             else start.groups[g].sensor
         )
         numerators = np.zeros((k, k, 1))
-        numerators[:, :, 0] = np.diag(1 / own)
+        numerators[0, 0, 0] = 1 / own[0]
         made.append(NoiseModel(group, numerators, np.ones(1), np.diag(own), sensor))
     return Noise(tuple(made), ())
 

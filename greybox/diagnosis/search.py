@@ -472,13 +472,8 @@ def _at_null(problem: Problem, fit: Fit, hypothesis: Hypothesis) -> Array:
     change = null - vector[where]
     if np.isfinite(rows).all() and len(where):
         normal, across = rows[:, rest].T @ rows[:, rest], rows[:, rest].T @ rows[:, where]
-        moved = bounded_step(
-            normal,
-            -across @ change,
-            *(b[rest] - vector[rest] for b in problem.bounds(fit.point)),
-            0.0,
-        )
-        vector[rest] += moved
+        low, high = (b[rest] - vector[rest] for b in problem.bounds(fit.point))
+        vector[rest] += bounded_step(normal, -across @ change, low, high, 0.0)
     vector[where] = null
     return vector
 

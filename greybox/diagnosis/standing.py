@@ -80,11 +80,12 @@ def standing(problem: Problem, hypothesis: Hypothesis, with_it: Fit, pairs: Sequ
     pairs, without : sequence of Pair
         That fit, and the one without the cause, on what is held out.
     """
-    moved, *sure = _moved(problem, hypothesis, with_it, pairs)
+    moved, clear, told = _moved(problem, hypothesis, with_it, pairs)
+    level = level_of(with_it)
     if any(p.held_fit.escaped or p.fit.escaped for p in (*pairs, *without)):
         better = not any(p.held_fit.escaped for p in pairs)
         proof = proof_of(np.array([np.inf if better else -np.inf]))
-        return Standing(proof, None, 1.0, moved, *sure, level_of(with_it))
+        return Standing(proof, None, 1.0, moved, clear, told, level)
     beside = [contributions_beside(p) for p in pairs]
     beyond = proof_of(np.concatenate([contributions_beside(p) for p in without])
                       - np.concatenate(beside))  # fmt: skip
@@ -97,7 +98,7 @@ def standing(problem: Problem, hypothesis: Hypothesis, with_it: Fit, pairs: Sequ
         gained, could = plain - own, plain - generic
         share = float(gained.sum() / could.sum()) if could.sum() > 0 else np.inf
         half = proof_of(gained - LEAST_SHARE * could).p_value
-    return Standing(beyond, share, half, moved, *sure, level_of(with_it))
+    return Standing(beyond, share, half, moved, clear, told, level)
 
 
 def level_of(fit: Fit) -> float:

@@ -30,18 +30,15 @@ def changed() -> TrialLog:
 
 
 def test_a_change_counts_for_as_many_causes_as_moments_were_tried(changed: TrialLog) -> None:
-    class Nowhere:
-        def prove(self, before, after):
-            return None
-
+    nothing = proof_of(np.zeros(100))
     _, hypothesis, fit = fitted(changed, MOMENT)
     worse = replace(fit, cost=fit.cost + 20.0)
-    found = assess_candidate(Nowhere(), worse, fit, hypothesis, 10)
+    found = assess_candidate(nothing, worse, fit, hypothesis, 10)
     assert found.p_adjusted == pytest.approx(found.p_value * 10 * MOMENTS)
     plain = replace(
         hypothesis, parameters=tuple(replace(p, reach=0.0) for p in hypothesis.parameters)
     )
-    assert assess_candidate(Nowhere(), worse, fit, plain, 10).p_adjusted == pytest.approx(
+    assert assess_candidate(nothing, worse, fit, plain, 10).p_adjusted == pytest.approx(
         10 * found.p_value
     )
 

@@ -97,10 +97,10 @@ def test_damping_brakes_and_cross_terms_have_no_sign(ready) -> None:
 
 def test_a_cubic_force_that_drives_is_not_called_damping(ready) -> None:
     base = ready.base()
-    problem = ready.case.wider(["X_uuu"]).problem(base.integrator)
+    problem = ready.case.wider(["X_uuu"], "coloured").problem(base.integrator)
     found = known_causes()["cubic_damping"].hypotheses(context_of(ready.structure, ready))
     hypothesis = next(h for h in found if h.columns == ("X_uuu",))
-    carried = ready.case.wider(["X_uuu"]).carried(base)
+    carried = ready.case.wider(["X_uuu"], "coloured").carried(base)
     k = problem.place("X_uuu")
     # what these logs would show of a ship that a cubic force drives
     driving = replace(carried.point, base=carried.point.base.with_value(k, 0.004))
