@@ -144,7 +144,7 @@ def test_a_diagnosis_adds_it(trial, validated: bool) -> None:
     assert "is in the model" in found.remainder.reason
     assert found.remainder.gain["v"].ci[0] > 0
     added = sum(found.remainder.terms.values())
-    assert len(found.model.names) == len(found.base.names) + added
+    assert sum(t.local for t in found.model.structure.terms) == added
     assert "bumps]" in found.model.summary()
     assert found.model.record["remainder"]["added"]
 
