@@ -150,6 +150,13 @@ def prepare_request(
         for c in dict.fromkeys(changes)
     ]
     model = model.at_final_parameters()
+    named = model.without_bumps()
+    if named is not model:
+        notes.append(
+            f"the force without a name ({len(model.names) - len(named.names)} bumps) is left out: "
+            f"the trial is designed for the coefficients that have one"
+        )
+        model = named
     if vessel is not None and vessel != (acting := with_actuators_of(vessel, model.vessel)):
         vessel = acting
         notes.append(
@@ -306,7 +313,7 @@ def _margins(
 def _prior(model: ManoeuvringModel | None) -> tuple[tuple[str, ...], Array] | None:
     if model is None:
         return None
-    model = model.at_final_parameters()
+    model = model.at_final_parameters().without_bumps()
     if not (model.std > 0).all():
         name = model.names[int(np.argmin(model.std))]
         raise UsageError(

@@ -17,6 +17,7 @@ from greybox.model.predictor import build_predictor
 from greybox.model.run.changes import Change
 from greybox.model.run.simulation import positions
 from greybox.model.run.step import held
+from greybox.model.terms import Factor, Term
 from greybox.selection.fit_single import estimate_ls
 from greybox.trial.convert.read import read_log
 from greybox.trial.kinematics import decimate
@@ -87,7 +88,8 @@ def with_thrusters(model: ManoeuvringModel, *changed: dict) -> ManoeuvringModel:
 
 KINDS = (
     "plain", "rk4", "current", "wind", "changes", "changes of rk4", "lag", "lag of speeds",
-    "lag of commands", "delay", "whole delay", "late", "one late", "thrusters", "terms",
+    "lag of commands", "delay", "whole delay", "late", "one late", "thrusters", "terms", "bumps",
+    "bumps of rk4",
 )  # fmt: skip
 
 
@@ -97,6 +99,7 @@ def variants(model: ManoeuvringModel) -> dict[str, ManoeuvringModel]:
     table = ThrustLaw("table", ((0.0, 0.0), (12.0, 9.0), (20.0, 25.0)))
     wide = model.structure.with_terms("N_|r|r", "Y_|r|v", "X_uuu", "Y_0")
     more = np.array([-0.3, 0.05, -1e-3, 1e-4])
+    humped = with_bumps(model)
     return {
         "plain": model,
         "rk4": replace(model, integrator="rk4"),
@@ -124,7 +127,25 @@ def variants(model: ManoeuvringModel) -> dict[str, ManoeuvringModel]:
             model, structure=wide, theta=np.concatenate([model.theta, more]),
             covariance=np.zeros((22, 22)),
         ),
+        "bumps": humped,
+        "bumps of rk4": replace(humped, integrator="rk4", disturbances=CURRENT),
     }  # fmt: skip
+
+
+def with_bumps(model: ManoeuvringModel) -> ManoeuvringModel:
+    """A force without a name that the runs of these tests go in and out of."""
+    around = [Factor("u", centre=1.5, width=0.6), Factor("v", centre=0.6, width=1.5, flat=0.1)]
+    thrust = Factor("taux", centre=12.0, width=30.0)
+    terms = [
+        Term("X_g1", "u", (*around, thrust)),
+        Term("Y_g1", "v", tuple(around)),
+        Term("N_g1", "r", (*around, Factor("r", centre=0.01, width=0.2))),
+    ]
+    return replace(
+        model, structure=model.structure.with_terms(*terms),
+        theta=np.append(model.theta, [0.02, -0.03, 0.004]),
+        covariance=np.diag(np.append(np.diag(model.covariance), [1e-5, 1e-5, 1e-7])),
+    )  # fmt: skip
 
 
 def wanted(model: ManoeuvringModel, log: TrialLog, heading: str = "simulated") -> np.ndarray:

@@ -53,6 +53,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--causes", nargs="+", metavar="ID", help="look for these causes only (all that are known)"
     )
     parser.add_argument(
+        "--remainder",
+        action="store_true",
+        help="add a smooth force without a name to the extended model, zero away from what the "
+        "logs show, where it makes held-out free runs better",
+    )
+    parser.add_argument(
         "--sample-time",
         type=positive,
         metavar="S",
@@ -88,6 +94,7 @@ def run(options: argparse.Namespace) -> None:
             structure=options.structure,
             causes=options.causes,
             seed=options.seed,
+            remainder=options.remainder,
             own_pace=options.sample_time is None,
             progress=activity(),
         ),

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from greybox.diagnosis.black_box import with_remainder
 from greybox.diagnosis.chosen import from_chosen
 from greybox.diagnosis.kinematics import causes_of, denied
 from greybox.diagnosis.preparing import SHORTEST, prepare
@@ -39,7 +40,10 @@ class DiagnosisOptions:
     causes : sequence of str, optional
         Ids to look for; all that are known by default.
     seed : int
-        Of the bootstrap.
+        Of the bootstrap, and of where the bumps of a black-box part stand.
+    remainder : bool
+        Whether a smooth force without a name is added to the extended model where it makes
+        held-out free runs better: see `greybox.diagnosis.black_box`.
     own_pace : bool
         Whether logs that are sampled faster than the ship moves are taken at a longer sample
         time, as an estimate takes them; not where a model has its own.
@@ -50,6 +54,7 @@ class DiagnosisOptions:
     structure: str = "thesis"
     causes: Sequence[str] | None = None
     seed: int = 0
+    remainder: bool = False
     own_pace: bool = True
     progress: Callable[[str], None] = field(default=lambda _: None)
 
@@ -156,6 +161,9 @@ def diagnose(
     if lines[1] is not None and "waves" in ready.causes:
         causes.append(found_waves(lines[1], ready.causes["waves"], ready.tried))
     made = report.made(causes, ready.validate, ready.tried, lines)
+    if options.remainder:
+        say("a black-box part")
+        made = with_remainder(case, report.fit_told, made, ready.validate, options.seed)
     return replace(made, conditions=conditions)
 
 

@@ -94,8 +94,8 @@ def extended_model(
         vessel=extended_vessel(ship.vessel, ship.sensors, ship.wires, logs[0]),
         integrator=fit.integrator,
         disturbances=disturbances,
-        residual_std=_one_step(problem, white),
-        noise=_noise(problem, white),
+        residual_std=one_step_deviations(problem, white),
+        noise=noise_levels(problem, white),
         sums=summed,
         changes=tuple(Change(names[c.index], c.factor, c.time) for c in ship.changes),
         conditions=pooled_conditions(logs).values,
@@ -148,7 +148,7 @@ def _rewired(
     return replace(thruster, **changed)
 
 
-def _one_step(problem: Problem, fit: Fit) -> Array:
+def one_step_deviations(problem: Problem, fit: Fit) -> Array:
     """Return the deviation of the innovations of each state, (nx,)."""
     nx = len(problem.structure.states)
     out = np.zeros(nx)
@@ -160,7 +160,7 @@ def _one_step(problem: Problem, fit: Fit) -> Array:
     return out
 
 
-def _noise(problem: Problem, fit: Fit) -> NoiseLevels:
+def noise_levels(problem: Problem, fit: Fit) -> NoiseLevels:
     """Return the colours in the terms of a model file."""
     states = problem.structure.states
     outputs = problem.runs[0].outputs

@@ -147,6 +147,45 @@ class Gain:
 
 
 @dataclass(frozen=True)
+class Remainder:
+    """A smooth force without a name beside the causes: the black-box part of the model.
+
+    Parameters
+    ----------
+    added : bool
+        Whether it is in the extended model.
+    terms : mapping of str to int
+        Bumps in the equation of each state, as fitted; none where the logs ask for none.
+    deviation : mapping of str to float
+        Prior standard deviation of their coefficients, by marginal likelihood of the
+        estimation logs [unit of the state, a sample].
+    gain : mapping of str to Gain
+        Held-out fit without and with it, by state; empty where nothing was fitted.
+    validated_on : str
+    reason : str
+        Why it was added or not, one sentence.
+    """
+
+    added: bool
+    terms: Mapping[str, int]
+    deviation: Mapping[str, float]
+    gain: Mapping[str, Gain]
+    validated_on: str
+    reason: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return it for JSON."""
+        return {
+            "added": self.added,
+            "terms": dict(self.terms),
+            "deviation": dict(self.deviation),
+            "gain": {k: g.to_dict() for k, g in self.gain.items()},
+            "validated_on": self.validated_on,
+            "reason": self.reason,
+        }
+
+
+@dataclass(frozen=True)
 class BudgetPart:
     """A part of the squared held-out error.
 
@@ -272,6 +311,9 @@ class Diagnosis(DisplayMixin):
         In what the logs differ from each other, and from those of the model.
     budget : tuple of BudgetPart
         Whose the squared held-out error is; empty where a run leaves every bound.
+    remainder : Remainder, optional
+        A smooth force without a name, where it was asked for. `gain`, `runs` and `budget`
+        are without it.
     gain_over_chosen : mapping of str to Gain
         By state, against the terms that the data chose; empty where none were.
     """
@@ -297,6 +339,7 @@ class Diagnosis(DisplayMixin):
     residuals: Mapping[str, tuple[TestResult, ...]] = field(default_factory=dict)
     conditions: tuple[ConditionDifference, ...] = ()
     budget: tuple[BudgetPart, ...] = ()
+    remainder: Remainder | None = None
     gain_over_chosen: Mapping[str, Gain] = field(default_factory=dict)
 
     @property
@@ -341,7 +384,7 @@ class Diagnosis(DisplayMixin):
             "tried": self.tried,
             "notes": list(self.notes),
             "condition_differences": [d.to_dict() for d in self.conditions],
-        }
+        } | ({} if self.remainder is None else {"remainder": self.remainder.to_dict()})
 
     def summary(self) -> str:
         """Return the diagnosis as text."""
@@ -372,7 +415,12 @@ class Diagnosis(DisplayMixin):
             )
             lines.append(f"Against the terms that the data chose: {', '.join(told)}.")
         lines += _budget_lines(self.budget)
-        lines += ["", self.remaining, *(f"next: {n}" for n in self.next_steps)]
+        lines += ["", self.remaining]
+        if self.remainder is not None:
+            lines.append(self.remainder.reason)
+            if self.remainder.gain:
+                lines += _gain_lines(self.remainder.gain, self.remainder.validated_on)
+        lines += [f"next: {n}" for n in self.next_steps]
         lines += [f"note: {n}" for n in self.notes]
         return "\n".join(lines)
 
@@ -391,6 +439,7 @@ class Diagnosis(DisplayMixin):
             _gain_table(self.gain, self.validated_on),
             items("What the simulation gets wrong", [s.sentence for s in self.wrong]),
             text(self.remaining),
+            text("" if self.remainder is None else self.remainder.reason),
             items("Next", self.next_steps),
         )
 

@@ -63,6 +63,8 @@ class Report:
         self.notes, self.agreeing = list(notes), agreeing
         self.case, self.structure, self.causes = case, structure, causes
         self.found, self.given, self.seed = found, given, seed
+        # the hypothesis that the extended model is
+        self.final = found.final
         self.current: dict[str, tuple[float, float]] = {}
         if given is not None:
             self.current = {n: v for n, v in given.disturbances.items() if n in CURRENTS}
@@ -74,6 +76,11 @@ class Report:
         if self.found.base is fit and self.given is not None:
             return self.given
         return made
+
+    @property
+    def fit_told(self) -> Fit:
+        """The fit that the extended model is: the given one's own where nothing extends it."""
+        return self.found.before if self.final is self.found.base else self.final
 
     def cause(self, candidate: Candidate, fit: Fit) -> Found:
         """Return a candidate as it stands in a fit."""
@@ -132,7 +139,7 @@ class Report:
         after = self.model(found.final, self.record(found.causes)) if changed else before
         gain, runs, after = self.gain(before, after, validate, found.final)
         ruling = rule(found, case.held_out, groups, known, gain)
-        final = ruling.final
+        final = self.final = ruling.final
         if final is not found.final:
             gain, runs, after = self.gain(before, before, validate, final)
         over_chosen: dict[str, Gain] = {}
@@ -258,8 +265,8 @@ class Report:
             one = [run_on(before, log) for log in logs]
             two = [self._as_seen(run_on(after, log), log) for log in logs]
         else:
-            one = _held_runs(self.case.held_out(first.integrator).pairs(first))
-            two = _held_runs(self.case.held_out(final.integrator).pairs(final))
+            one = held_runs(self.case.held_out(first.integrator).pairs(first))
+            two = held_runs(self.case.held_out(final.integrator).pairs(final))
         runs = [
             Runs(
                 a.log, held,
@@ -389,7 +396,8 @@ def _symptoms(problem: Problem, found: Search) -> tuple[Symptom, ...]:
     return tuple(told)
 
 
-def _held_runs(pairs: Sequence[Pair]) -> list[LogFit]:
+def held_runs(pairs: Sequence[Pair]) -> list[LogFit]:
+    """Return the free runs on what is held out."""
     out = []
     for pair in pairs:
         ship = pair.held_fit.point.ship

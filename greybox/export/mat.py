@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from greybox.export.numbers import MEANING, exponents, numbers, regressor_text, signals
+from greybox.export.numbers import MEANING, bumps, exponents, numbers, regressor_text, signals
 from greybox.export.sampled import SampledModel
 from greybox.model.model import ManoeuvringModel
 
@@ -27,6 +27,8 @@ def mat_file(model: ManoeuvringModel, sampled: SampledModel) -> bytes:
     from scipy.io import savemat
 
     power, modulus = exponents(model)
+    names = signals(model)
+    found = [(i, b) for i, row in enumerate(bumps(model)) for b in row]
     tables = numbers(model, sampled)
     struct = {
         "vessel": model.vessel.name,
@@ -44,9 +46,16 @@ def mat_file(model: ManoeuvringModel, sampled: SampledModel) -> bytes:
         "covariance": model.covariance,
         "equation": _cells([t.state for t in model.structure.terms]),
         "regressors": _cells(regressor_text(model)),
-        "signals": _cells(signals(model)),
+        "signals": _cells(names),
         "power": power.astype(float),
         "modulus": modulus.astype(float),
+        # a row a bump: number of its regressor and of its signal, centre, width, flat
+        "bumps": np.array(
+            [
+                [i + 1, names.index(b["signal"]) + 1, b["centre"], b["width"], b["flat"]]
+                for i, b in found
+            ]
+        ).reshape(-1, 5),
         "disturbance_names": _cells(list(model.disturbances)),
         "disturbances": _column([v for v, _ in model.disturbances.values()]),
         "disturbance_std": _column([e for _, e in model.disturbances.values()]),

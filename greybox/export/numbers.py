@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,8 @@ FORMAT = "greybox-numbers"
 _SHOWN = {"u": "u_r", "v": "v_r", "uq": "u_q", "vq": "v_q"}
 MEANING = (
     "state(k+1) = state(k) + sum over parameters of its equation of value * regressor, with "
-    "regressor = product over signals of signal^power * |signal|^modulus; u_r, v_r through the "
+    "regressor = product over signals of signal^power * |signal|^modulus, times the product over "
+    "its bumps of max(0, 1 - (max(0, |signal - centre| - flat) / width)^2)^2; u_r, v_r through the "
     "water, u_q, v_q through the air, r yaw rate, taux, tauy, taun the thrusters' force. With "
     "rk4 this increment is that of a rate over one sample time, integrated by the classical rule."
 )
@@ -42,18 +44,37 @@ def exponents(model: ManoeuvringModel) -> tuple[np.ndarray, np.ndarray]:
     modulus = np.zeros_like(power)
     for i, term in enumerate(model.structure.terms):
         for factor in term.factors:
+            if factor.bump:
+                continue
             (modulus if factor.modulus else power)[
                 i, names.index(_SHOWN.get(factor.signal, factor.signal))
             ] += 1
     return power, modulus
 
 
+def bumps(model: ManoeuvringModel) -> list[list[dict[str, Any]]]:
+    """Return the bumps of each regressor, most often none."""
+    return [
+        [
+            {
+                "signal": _SHOWN.get(f.signal, f.signal),
+                "centre": f.centre,
+                "width": f.width,
+                "flat": f.flat,
+            }
+            for f in term.factors
+            if f.bump
+        ]
+        for term in model.structure.terms
+    ]
+
+
 def regressor_text(model: ManoeuvringModel) -> list[str]:
     """Return each regressor as text, such as ``|u_r|*u_r``; ``1`` for a constant force."""
     texts = []
     for term in model.structure.terms:
-        shown = [(_SHOWN.get(f.signal, f.signal), f.modulus) for f in term.factors]
-        texts.append("*".join(f"|{n}|" if m else n for n, m in shown) or "1")
+        shown = [str(replace(f, signal=_SHOWN.get(f.signal, f.signal))) for f in term.factors]
+        texts.append("*".join(shown) or "1")
     return texts
 
 
@@ -70,7 +91,7 @@ def numbers(model: ManoeuvringModel, sampled: SampledModel) -> dict[str, Any]:
     power, modulus = exponents(model)
     rows = zip(
         model.names, structure.terms, regressor_text(model), model.units, model.theta, model.std,
-        power, modulus, strict=True,
+        power, modulus, bumps(model), strict=True,
     )  # fmt: skip
     vessel = vessel_to_dict(model.vessel)
     return {
@@ -97,8 +118,9 @@ def numbers(model: ManoeuvringModel, sampled: SampledModel) -> dict[str, Any]:
                 "stands_for": list(model.sums.get(name, (name,))),
                 "power": p,
                 "modulus": m,
+                "bumps": b,
             }
-            for name, term, text, unit, value, std, p, m in rows
+            for name, term, text, unit, value, std, p, m, b in rows
         ],
         "covariance": model.covariance,
         "disturbances": [

@@ -178,7 +178,7 @@ def to_prime(
     Parameters
     ----------
     coefficients : mapping of str to float
-        As `to_continuous` gives them; terms with inputs are left out.
+        As `to_continuous` gives them; terms with inputs and those with bumps are left out.
     length, speed : float
         L [m] and U [m/s].
     density : float
@@ -191,7 +191,8 @@ def to_prime(
     scale = {"u": speed, "v": speed, "uq": speed, "vq": speed, "r": speed / length}
     found = {}
     for term in structure.terms:
-        if term.name not in coefficients or any(f.signal not in scale for f in term.factors):
+        known = all(f.signal in scale and not f.bump for f in term.factors)
+        if term.name not in coefficients or not known:
             continue
         force = 0.5 * density * speed**2 * length ** (3 if term.state == "r" else 2)
         regressor = float(np.prod([scale[f.signal] for f in term.factors]))

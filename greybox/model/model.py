@@ -149,6 +149,22 @@ class ManoeuvringModel(DisplayMixin):
         covariance = self.covariance * np.outer(now, now)
         return replace(self, theta=self.theta * now, covariance=covariance, changes=())
 
+    def without_bumps(self) -> ManoeuvringModel:
+        """Return the model without its force without a name: all its other numbers as they are."""
+        kept = [i for i, t in enumerate(self.structure.terms) if not t.local]
+        if len(kept) == len(self.theta):
+            return self
+        shared = self.disturbance_covariance
+        rows = [*kept, *range(len(self.theta), len(shared))]
+        terms = tuple(self.structure.terms[i] for i in kept)
+        return replace(
+            self,
+            structure=replace(self.structure, terms=terms),
+            theta=self.theta[kept],
+            covariance=self.covariance[np.ix_(kept, kept)],
+            disturbance_covariance=shared[rows] if shared.size else shared,
+        )
+
     def coefficient_model(self) -> ManoeuvringModel:
         """Return the model whose coefficients mean what their names say, as far as any does.
 
@@ -207,10 +223,10 @@ class ManoeuvringModel(DisplayMixin):
             "",
             f"{'parameter':<16}{'value':>13}{'std err':>12}{'per second':>13}  unit per sample",
         ]
-        for i, name in enumerate(self.names):
+        for name, value, std, unit in self.shown_parameters():
             lines.append(
-                f"{self.label(name):<16}{self.theta[i]:>13.5g}{self.std[i]:>12.2g}"
-                f"{self.theta[i] / self.sample_time:>13.5g}  {self.units[i]}"
+                f"{self.label(name):<16}{value:>13.5g}{std:>12.2g}"
+                f"{value / self.sample_time:>13.5g}  {unit}"
             )
         for name, (value, std) in self.disturbances.items():
             lines.append(f"{name:<16}{value:>13.5g}{std:>12.2g}{'':>13}  m/s")
@@ -219,13 +235,25 @@ class ManoeuvringModel(DisplayMixin):
             lines.append(f"estimated at {in_words(self.conditions)}")
         return "\n".join(lines)
 
+    def shown_parameters(self) -> list[tuple[str, float, float, str]]:
+        """Return name, value, standard error and unit; of an equation's bumps the largest one."""
+        rows = []
+        local: dict[str, list[int]] = {}
+        for i, term in enumerate(self.structure.terms):
+            if term.local:
+                local.setdefault(term.state, []).append(i)
+            else:
+                rows.append((term.name, i))
+        for state, at in local.items():
+            most = max(at, key=lambda i: abs(self.theta[i]))
+            rows.append((f"g_{state} at most", most))
+        units = self.units
+        return [(name, float(self.theta[i]), float(self.std[i]), units[i]) for name, i in rows]
+
     def _parts(self) -> tuple[str, ...]:
         judged = self.record.get("verdict")
         said = judged if isinstance(judged, dict) else {}
-        rows = [
-            (self.label(n), float(v), float(s), unit)
-            for n, v, s, unit in zip(self.names, self.theta, self.std, self.units, strict=True)
-        ]
+        rows = [(self.label(n), v, s, u) for n, v, s, u in self.shown_parameters()]
         known = [(n, value, std, "m/s") for n, (value, std) in self.disturbances.items()]
         return (
             *(
@@ -333,7 +361,7 @@ def model_from_dict(data: Any, source: str = "model") -> ManoeuvringModel:
             Term(
                 str(t["name"]),
                 str(t["state"]),
-                tuple(Factor(str(f).strip("|"), str(f).startswith("|")) for f in t["factors"]),
+                tuple(Factor.read(str(f)) for f in t["factors"]),
             )
             for t in s["terms"]
         )

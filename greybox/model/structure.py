@@ -201,7 +201,10 @@ class Structure(DisplayMixin):
         return items("Increment of a sample", self.equations()), text(self.reference)
 
     def equations(self) -> list[str]:
-        """Return the equations as readable lines, such as ``u⁺ = u + Xu·u_r + …``."""
+        """Return the equations as readable lines, such as ``u⁺ = u + Xu·u_r + …``.
+
+        Terms with bumps are one function g of the signals that they see.
+        """
         shown = {"u": "u_r", "v": "v_r", "uq": "u_q", "vq": "v_q"} if self.marine else {}
         lines = []
         for state in self.states:
@@ -216,8 +219,13 @@ class Structure(DisplayMixin):
                     ]
                 )
                 for t in self.terms
-                if t.state == state
+                if t.state == state and not t.local
             ]
             start = [state] if self.increment else []
+            local = [t for t in self.terms if t.state == state and t.local]
+            if local:
+                of = dict.fromkeys(f.signal for t in local for f in t.factors)
+                arguments = ", ".join(shown.get(n, n) for n in of)
+                terms.append(f"g_{state}({arguments})  [{len(local)} bumps]")
             lines.append(f"{state}⁺ = " + " + ".join(start + terms))
         return lines

@@ -11,6 +11,7 @@ import re
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
+from math import isfinite
 
 import casadi as ca
 
@@ -40,16 +41,93 @@ _UNITS = {
     "r": (0, -1, 0),
 }
 SIGNALS = tuple(_UNITS)
+# characters of a damaged factor that a message repeats
+_LONGEST = 40
+_NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+_BUMP = re.compile(rf"bump\(([A-Za-z_]\w*),({_NUMBER}),({_NUMBER})(?:,({_NUMBER}))?\)", re.ASCII)
 
 
 @dataclass(frozen=True)
 class Factor:
-    """One signal, or its modulus, in a product."""
+    """One signal, its modulus, or a bump of it, in a product.
+
+    Parameters
+    ----------
+    signal : str
+    modulus : bool
+        Its modulus instead.
+    centre, width, flat : float, optional
+        The bump max(0, 1 − (d/width)²)² instead, with d = max(0, |s − centre| − flat) and one
+        continuous derivative: one up to `flat` from the centre, and zero from `flat` + `width`
+        on; in the unit of the signal.
+
+    Raises
+    ------
+    StructureError
+        The width of a bump is not positive, the flat part is negative, or a number is not finite.
+
+    References
+    ----------
+    Wendland (1995), on kernels that vanish beyond a distance.
+    """
 
     signal: str
     modulus: bool = False
+    centre: float = 0.0
+    width: float | None = None
+    flat: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.width is None:
+            return
+        numbers = (self.centre, self.width, self.flat)
+        if not (all(map(isfinite, numbers)) and self.width > 0 and self.flat >= 0):
+            raise StructureError(
+                f"a bump of {self.signal} has the centre {self.centre:g}, the width "
+                f"{self.width:g} and a flat part of {self.flat:g}: all must be finite, the width "
+                f"positive and the flat part not negative."
+            )
+
+    @classmethod
+    def read(cls, text: str) -> Factor:
+        """Return the factor that a model file writes as ``u``, ``|u|`` or ``bump(u,0.4,0.3)``.
+
+        Raises
+        ------
+        StructureError
+            It begins as a bump and is none.
+        """
+        if not text.startswith("bump("):
+            return cls(text.strip("|"), text.startswith("|"))
+        match = _BUMP.fullmatch(text)
+        if match is None:
+            raise StructureError(
+                f"the factor '{text[:_LONGEST]}' is no bump: bump(SIGNAL,CENTRE,WIDTH) or "
+                f"bump(SIGNAL,CENTRE,WIDTH,FLAT) with numbers is needed."
+            )
+        signal, *numbers = match.groups()
+        centre, width, flat = (float(n or 0.0) for n in numbers)
+        return cls(signal, centre=centre, width=width, flat=flat)
+
+    @property
+    def bump(self) -> bool:
+        """Whether it is a bump: a pure number between 0 and 1."""
+        return self.width is not None
+
+    def of(self, value: ca.SX) -> ca.SX:
+        """Return the factor of the signal's value."""
+        if self.width is not None:
+            away = value - self.centre
+            if self.flat:
+                away = ca.fmax(0, ca.fabs(away) - self.flat)
+            return ca.fmax(0, 1 - (away / self.width) ** 2) ** 2
+        return ca.fabs(value) if self.modulus else value
 
     def __str__(self) -> str:
+        if self.width is not None:
+            # digits enough to read the same numbers back
+            numbers = (self.centre, self.width, *((self.flat,) if self.flat else ()))
+            return f"bump({','.join([self.signal, *(repr(float(n)) for n in numbers)])})"
         return f"|{self.signal}|" if self.modulus else self.signal
 
 
@@ -87,20 +165,28 @@ class Term:
                     f"does not have.{suggestion(factor.signal, signals)} "
                     f"It has: {', '.join(signals)}."
                 )
-            value = signals[factor.signal]
-            product = product * (ca.fabs(value) if factor.modulus else value)
+            product = product * factor.of(signals[factor.signal])
         return product
 
     @property
-    def key(self) -> tuple[str, tuple[tuple[str, bool], ...]]:
+    def local(self) -> bool:
+        """Whether it is zero outside a range of some signal, as with a bump among its factors."""
+        return any(f.bump for f in self.factors)
+
+    @property
+    def key(self) -> tuple[str, tuple[tuple[str, bool, float, float, float], ...]]:
         """Equation and factors without order: equal for terms that are the same function."""
-        return self.state, tuple(sorted((f.signal, f.modulus) for f in self.factors))
+        return self.state, tuple(
+            sorted((f.signal, f.modulus, f.centre, f.width or 0.0, f.flat) for f in self.factors)
+        )
 
     @property
     def even(self) -> bool:
         """Whether the regressor stays the same when port and starboard change places."""
         turned = [f for f in self.factors if not f.modulus and f.signal in _TURNED]
-        return len(turned) % 2 == 0
+        if any(f.bump and f.centre != 0 for f in turned):
+            return False
+        return sum(not f.bump for f in turned) % 2 == 0
 
     @property
     def dissipates(self) -> bool:
@@ -110,7 +196,8 @@ class Term:
         """
         powers: dict[str, int] = {}
         for factor in self.factors:
-            if not factor.modulus:
+            # neither a modulus nor a bump is ever negative
+            if not factor.modulus and not factor.bump:
                 signal = _AIR.get(factor.signal, factor.signal)
                 powers[signal] = powers.get(signal, 0) + 1
         powers[self.state] = powers.get(self.state, 0) + 1
@@ -214,7 +301,7 @@ def parameter_unit(term: Term, force_unit: str = "n") -> str:
     total = Counter(dict(enumerate(_UNITS[term.state])))
     for factor in term.factors:
         for i, power in enumerate(_UNITS[factor.signal]):
-            total[i] -= power
+            total[i] -= 0 if factor.bump else power
     up, down = [], []
     for i, symbol in enumerate(("m", "s", force_unit)):
         power = abs(total[i])

@@ -49,7 +49,7 @@ def diagnosis_page(diagnosis: Diagnosis, record: Mapping[str, Any]) -> Page:
         cause_section(diagnosis),
         _equations(diagnosis),
         _gain(diagnosis),
-        Section("5. What remains", [diagnosis.remaining], tables=_tests(diagnosis, "after")),
+        _remains(diagnosis),
         Section("6. What to do next", points=diagnosis.next_steps),
     ]
     if diagnosis.notes:
@@ -81,6 +81,26 @@ def _summary(diagnosis: Diagnosis) -> list[str]:
         )
         told.append(f"The fit of the free run (100 % is perfect) goes: {gains}.")
     return told
+
+
+def _remains(diagnosis: Diagnosis) -> Section:
+    """Show what is left, and the force without a name where one was asked for."""
+    told, tables = [diagnosis.remaining], _tests(diagnosis, "after")
+    remainder = diagnosis.remainder
+    if remainder is not None:
+        told.append(remainder.reason)
+        if remainder.gain:
+            rows = [
+                [
+                    _NAMES.get(s, s), _percent(g.before), _percent(g.after),
+                    f"{g.ci[0]:.1f} to {g.ci[1]:.1f}",
+                ]
+                for s, g in remainder.gain.items()
+            ]  # fmt: skip
+            caption = f"Fit of the free run (6.12) {remainder.validated_on}"
+            head = ["state", "without that force", "with it", "95 % of the gain"]
+            tables = [Table(caption, head, rows), *tables]
+    return Section("5. What remains", told, tables=tables)
 
 
 def _changed(diagnosis: Diagnosis) -> bool:

@@ -75,10 +75,7 @@ def _note(
 
 
 def _values(model: ManoeuvringModel) -> _Values:
-    found = {
-        n: (float(v), float(s), u)
-        for n, v, s, u in zip(model.names, model.theta, model.std, model.units, strict=True)
-    }
+    found = {n: (v, s, u) for n, v, s, u in model.shown_parameters()}
     return found | {n: (v, s, "m/s") for n, (v, s) in model.disturbances.items()}
 
 

@@ -286,6 +286,22 @@ def _pieces(
         yield first + 1, run.x[:, 1:]
 
 
+def joint_covariance(model: ManoeuvringModel) -> Array:
+    """Return the covariance of the parameters, then of the known disturbance means, (p + m, p + m).
+
+    Without a common covariance the two are independent.
+    """
+    p = len(model.theta)
+    joint = np.zeros((p + len(model.disturbances),) * 2)
+    joint[:p, :p] = model.covariance
+    if model.disturbance_covariance.size:
+        joint[:, p:] = model.disturbance_covariance
+        joint[p:, :p] = model.disturbance_covariance[:p].T
+    else:
+        np.fill_diagonal(joint[p:, p:], [std**2 for _, std in model.disturbances.values()])
+    return joint
+
+
 def draw_parameters(
     model: ManoeuvringModel, rng: np.random.Generator, runs: int
 ) -> tuple[Array, Array | None]:
@@ -306,13 +322,7 @@ def draw_parameters(
     p, known = len(model.theta), list(model.disturbances)
     if not known:
         return _normal(rng, model.theta, model.covariance, runs), None
-    joint = np.zeros((p + len(known),) * 2)
-    joint[:p, :p] = model.covariance
-    if model.disturbance_covariance.size:
-        joint[:, p:] = model.disturbance_covariance
-        joint[p:, :p] = model.disturbance_covariance[:p].T
-    else:
-        np.fill_diagonal(joint[p:, p:], [std**2 for _, std in model.disturbances.values()])
+    joint = joint_covariance(model)
     mean = np.append(model.theta, [value for value, _ in model.disturbances.values()])
     drawn = _normal(rng, mean, joint, runs)
     d = np.zeros((runs, 1, len(model.structure.disturbances)))

@@ -168,9 +168,10 @@ def test_the_mat_file_holds_the_model(model, tmp_path):
     assert first == (tmp_path / "again.mat").read_bytes()
 
 
-def test_regressors_follow_from_the_exponents(model, log, tmp_path):
+@pytest.mark.parametrize("kind", ["terms", "bumps"])
+def test_regressors_follow_from_the_exponents(model, log, tmp_path, kind):
     """The increments of a run, computed from the file's numbers alone."""
-    model = replace(variants(model)["terms"], disturbances={})
+    model = replace(variants(model)[kind], disturbances={})
     export_model(model, "mat", tmp_path / "ship.mat")
     struct = loadmat(tmp_path / "ship.mat", squeeze_me=True, simplify_cells=True)["model"]
     export_model(model, "json", tmp_path / "ship.json")
@@ -186,6 +187,14 @@ def test_regressors_follow_from_the_exponents(model, log, tmp_path):
     signals = np.array([known[n] for n in struct["signals"]])[None]
     power, modulus = struct["power"][..., None], struct["modulus"][..., None]
     phi = np.prod(signals**power * np.abs(signals) ** modulus, axis=1)
+    for i, k, centre, width, flat in struct["bumps"].reshape(-1, 5):
+        away = np.maximum(np.abs(signals[0, int(k) - 1] - centre) - flat, 0.0)
+        phi[int(i) - 1] *= np.maximum(1 - (away / width) ** 2, 0.0) ** 2
+    told = [(i + 1, b) for i, p in enumerate(table["parameters"]) for b in p["bumps"]]
+    np.testing.assert_array_equal(
+        [[i, b["centre"], b["width"], b["flat"]] for i, b in told],
+        struct["bumps"].reshape(-1, 5)[:, [0, 2, 3, 4]] if told else [],
+    )
     for i, state in enumerate(model.structure.states):
         mine = struct["equation"] == state
         change = struct["theta"][mine] @ phi[mine]
@@ -200,7 +209,7 @@ def test_the_json_is_flat_and_documented(model, tmp_path):
         "name": "Xuu", "equation": "u", "regressor": "|u_r|*u_r", "value": -0.05,
         "std": pytest.approx(model.std[2]), "unit": "s/m", "per_second": -0.05,
         "stands_for": ["Xuu"], "power": by_name["Xuu"]["power"],
-        "modulus": by_name["Xuu"]["modulus"],
+        "modulus": by_name["Xuu"]["modulus"], "bumps": [],
     }  # fmt: skip
     assert table["disturbances"][0] == {
         "name": "current_north", "value": 0.3, "std": 0.01, "unit": "m/s",
