@@ -1,9 +1,9 @@
 # The promised names, the only list of them: `greybox.public` reads it, and so do type checkers.
+from greybox.diagnosis.assumed_causes import fit_given as fit_given
 from greybox.diagnosis.causes import known_causes as known_causes
 from greybox.diagnosis.causes.cause import Cause as Cause
 from greybox.diagnosis.diagnose import DiagnosisOptions as DiagnosisOptions
 from greybox.diagnosis.diagnose import diagnose as diagnose
-from greybox.diagnosis.given import fit_given as fit_given
 from greybox.diagnosis.result import Diagnosis as Diagnosis
 from greybox.diagnosis.result import Given as Given
 from greybox.estimation.output_error import OutputErrorOptions as OutputErrorOptions

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from greybox.diagnosis.causes import Context, known_causes
+from greybox.diagnosis.evidence.held_out import proof_of
 from greybox.diagnosis.fitting import Problem
-from greybox.diagnosis.held_out import proof_of
 from greybox.diagnosis.hypothesis import Hypothesis
 from greybox.diagnosis.noise import fit_noise
 from greybox.diagnosis.point import Fit, Point

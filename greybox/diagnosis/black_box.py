@@ -22,16 +22,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.base import Case
+from greybox.diagnosis.builder import held_runs
+from greybox.diagnosis.evidence.held_out import Pair
+from greybox.diagnosis.evidence.remainder import through_water
 from greybox.diagnosis.extension import noise_levels, one_step_deviations
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.gain import gains, run_on
-from greybox.diagnosis.held_out import Pair
+from greybox.diagnosis.null_model import DiagnosisProblem
 from greybox.diagnosis.point import Fit, Point
-from greybox.diagnosis.remainder import through_water
 from greybox.diagnosis.result import Diagnosis, Gain, Remainder
 from greybox.diagnosis.ship import LogRun
-from greybox.diagnosis.telling import held_runs
 from greybox.model.model import ManoeuvringModel
 from greybox.model.structure import Structure
 from greybox.model.terms import EQUATIONS, Factor, Term
@@ -129,7 +129,7 @@ def _centres(values: Array, seed: int) -> Array:
 
 
 def with_remainder(
-    case: Case, fit: Fit, told: Diagnosis, validate: Sequence[TrialLog], seed: int
+    case: DiagnosisProblem, fit: Fit, told: Diagnosis, validate: Sequence[TrialLog], seed: int
 ) -> Diagnosis:
     """Return a diagnosis with a force of bumps beside its extended model.
 
@@ -138,7 +138,7 @@ def with_remainder(
 
     Parameters
     ----------
-    case : Case
+    case : DiagnosisProblem
     fit : Fit
         Which the extended model is.
     told : Diagnosis
@@ -216,7 +216,7 @@ def _reason(found: Remainder, fall: float) -> str:
     )
 
 
-def _beside(wide: Case, pair: Pair, terms: Sequence[Term]) -> Pair:
+def _beside(wide: DiagnosisProblem, pair: Pair, terms: Sequence[Term]) -> Pair:
     """Return what a fit to a part of the logs does for the rest with bumps of its own."""
     fitting, held = (_wider(p, wide.universe) for p in (pair.problem, pair.held))
     made = fit_black_box(fitting, wide.carried(pair.fit), terms)
@@ -224,9 +224,9 @@ def _beside(wide: Case, pair: Pair, terms: Sequence[Term]) -> Pair:
     return Pair(fitting, made.fit, held, after)
 
 
-def wider(case: Case, terms: Sequence[Term]) -> Case:
+def wider(case: DiagnosisProblem, terms: Sequence[Term]) -> DiagnosisProblem:
     """Return a case with bumps among the terms of its universe."""
-    return Case(
+    return DiagnosisProblem(
         case.structure, case.universe.with_terms(*terms), case.logs, case.held_out_logs,
         case.kind, case.regime, case.metric,
     )  # fmt: skip

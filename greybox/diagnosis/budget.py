@@ -15,11 +15,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.diagnosis.evidence.held_out import Pair
+from greybox.diagnosis.evidence.remainder import generic_force
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.gain import blocks
-from greybox.diagnosis.held_out import Pair
 from greybox.diagnosis.noise import Noise, fit_noise
-from greybox.diagnosis.remainder import generic_force
 from greybox.diagnosis.result import BudgetPart
 from greybox.diagnosis.thresholds import GUST
 from greybox.diagnosis.waves import Waves

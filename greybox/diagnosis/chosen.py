@@ -13,12 +13,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.base import INTEGRATORS, Case
 from greybox.diagnosis.causes.hull import term_parameters
+from greybox.diagnosis.evidence.kinematics import denied
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.hypothesis import Hypothesis
-from greybox.diagnosis.kinematics import denied
 from greybox.diagnosis.noise import Noise
+from greybox.diagnosis.null_model import INTEGRATORS, DiagnosisProblem
 from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.preparing import Prepared, context_of
 from greybox.diagnosis.refitting import SETTLE
@@ -41,7 +41,7 @@ _QUADRATIC = "quadratic_thrust"
 
 def from_chosen(
     ready: Prepared, searched: Search, found: Search, progress: Callable[[str], None]
-) -> tuple[Case, Search] | None:
+) -> tuple[DiagnosisProblem, Search] | None:
     """Search with errors weighed by their size alone; None where that predicts no better.
 
     It begins with the terms that the data choose, or with what the search from (3.51) ended with:
@@ -87,7 +87,11 @@ def from_chosen(
 
 
 def _start(
-    ready: Prepared, case: Case, choice: TermChoice, named: Sequence[Hypothesis], base: Fit
+    ready: Prepared,
+    case: DiagnosisProblem,
+    choice: TermChoice,
+    named: Sequence[Hypothesis],
+    base: Fit,
 ) -> Point:
     """Return the chosen terms, those that stand for causes in force."""
     problem = case.problem(base.integrator)
@@ -103,7 +107,7 @@ def _start(
     return start
 
 
-def _bounded(case: Case, start: Point, noise: Noise) -> Fit | None:
+def _bounded(case: DiagnosisProblem, start: Point, noise: Noise) -> Fit | None:
     """Return the likelier fit by either integrator whose held-out runs have bounds, if any."""
     fits = []
     for integrator in INTEGRATORS:
@@ -123,14 +127,14 @@ def _choice(logs: Sequence[TrialLog]) -> TermChoice:
     return select_terms(logs, "no model", 0, Refit(none))  # type: ignore[arg-type]
 
 
-def _nearer(case: Case, fit: Fit, other: Fit) -> bool:
+def _nearer(case: DiagnosisProblem, fit: Fit, other: Fit) -> bool:
     """Whether a fit follows the held-out logs more nearly than another one."""
     one, two = (case.held_out(f.integrator).squares(f) for f in (other, fit))
     return bool(np.log(two).mean() < np.log(one).mean())
 
 
 def _hypotheses(
-    ready: Prepared, case: Case, choice: TermChoice
+    ready: Prepared, case: DiagnosisProblem, choice: TermChoice
 ) -> tuple[list[Hypothesis], list[Hypothesis]]:
     """Return the causes that the chosen terms stand for, and all that are to be tried."""
     structure, terms = ready.structure, choice.terms.structure

@@ -9,13 +9,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from greybox.diagnosis.black_box import with_remainder
+from greybox.diagnosis.builder import DiagnosisBuilder
 from greybox.diagnosis.chosen import from_chosen
-from greybox.diagnosis.kinematics import causes_of, denied
+from greybox.diagnosis.evidence.kinematics import causes_of, denied
 from greybox.diagnosis.preparing import SHORTEST, prepare
 from greybox.diagnosis.result import Diagnosis
 from greybox.diagnosis.ruling import leaves_more
 from greybox.diagnosis.search import search, weighed
-from greybox.diagnosis.telling import Report
 from greybox.diagnosis.waves import find_waves, found_waves
 from greybox.model.model import ManoeuvringModel
 from greybox.public import known_keywords, one_thread
@@ -154,7 +154,7 @@ def diagnose(
     if model is not None:
         conditions = (*conditions, *other_conditions(model.conditions, case.logs))
     notes += [d.sentence for d in conditions]
-    report = Report(
+    report = DiagnosisBuilder(
         case, ready.structure, ready.causes, found, model, options.seed, notes, ready.agreeing
     )
     causes = causes_of(ready.findings, ready.causes, ready.tried)

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from greybox.diagnosis.base import Case
 from greybox.diagnosis.causes import Cause, Context, known_causes
+from greybox.diagnosis.evidence.kinematics import decided, denied, judged_by_kinematics, mended
 from greybox.diagnosis.hypothesis import Hypothesis
-from greybox.diagnosis.kinematics import decided, denied, judged_by_kinematics, mended
+from greybox.diagnosis.null_model import DiagnosisProblem
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.ship import CURRENTS
 from greybox.errors import LogError, UsageError, suggestion
@@ -35,7 +35,7 @@ class Prepared:
 
     Parameters
     ----------
-    case : Case
+    case : DiagnosisProblem
     structure : Structure
         Without any cause.
     causes : mapping of str to Cause
@@ -52,7 +52,7 @@ class Prepared:
         Causes or places of which the kinematics show nothing though they could, or all there is.
     """
 
-    case: Case
+    case: DiagnosisProblem
     structure: Structure
     causes: Mapping[str, Cause]
     hypotheses: tuple[Hypothesis, ...]
@@ -213,13 +213,13 @@ def _case(
     hypotheses: Sequence[Hypothesis],
     logs: Sequence[TrialLog],
     validate: Sequence[TrialLog],
-) -> Case:
+) -> DiagnosisProblem:
     names = dict.fromkeys(n for a in hypotheses for n in (*a.columns, *a.co_freed))
     added = [n for n in names if n not in structure.parameters and n not in CURRENTS]
     universe = structure.with_terms(*added)
     wind = universe.uses_air and all(log.has_wind for log in [*logs, *validate])
     both: tuple[int, ...] = (1, -1)
-    return Case(
+    return DiagnosisProblem(
         structure, universe, logs, validate,
         "basic+wind" if wind and structure.uses_air else "basic",
         tuple((s, both) for s in structure.states),

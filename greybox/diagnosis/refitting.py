@@ -9,10 +9,10 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.base import Case
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.hypothesis import Hypothesis
 from greybox.diagnosis.noise import SEEN
+from greybox.diagnosis.null_model import DiagnosisProblem
 from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.scores import ProjectedScores, Score, score_hypotheses
 from greybox.numerics.forked import map_forked
@@ -134,7 +134,7 @@ def likelier(
     return list(best.values())
 
 
-def final_refit(case: Case, fit: Fit, hypothesis: Hypothesis) -> Fit:
+def final_refit(case: DiagnosisProblem, fit: Fit, hypothesis: Hypothesis) -> Fit:
     """Return the likeliest fit that a cause allows once it is in force."""
     problem = case.problem(fit.integrator)
     # what the noise had taken for its own until now would pass for more causes

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.diagnosis.evidence.omnibus import Omnibus
 from greybox.diagnosis.fitting import Problem
-from greybox.diagnosis.omnibus import Omnibus
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.symptoms import word
 from greybox.diagnosis.waves import Waves

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.held_out import HeldOut, Pair, proof_of
-from greybox.diagnosis.omnibus import Omnibus, disagreement, omnibus
+from greybox.diagnosis.evidence.held_out import HeldOut, Pair, proof_of
+from greybox.diagnosis.evidence.omnibus import Omnibus, disagreement, omnibus
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.result import DiagnosisVerdict, Found, Gain, file_word
 from greybox.diagnosis.search import Candidate, Search

@@ -13,11 +13,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.base import Case
+from greybox.diagnosis.evidence.held_out import HeldOut, Proof, proof_of
+from greybox.diagnosis.evidence.remainder import contributions_beside
+from greybox.diagnosis.evidence.standing import Standing, level_of, standing
 from greybox.diagnosis.fitting import Problem
-from greybox.diagnosis.held_out import HeldOut, Proof, proof_of
 from greybox.diagnosis.hypothesis import Hypothesis
 from greybox.diagnosis.normal import bounded_step
+from greybox.diagnosis.null_model import DiagnosisProblem
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.refitting import (
     FIRST,
@@ -31,9 +33,7 @@ from greybox.diagnosis.refitting import (
     shortlist,
     slow,
 )
-from greybox.diagnosis.remainder import contributions_beside
 from greybox.diagnosis.scores import MOMENTS, ProjectedScores, Score, score_hypotheses
-from greybox.diagnosis.standing import Standing, level_of, standing
 from greybox.diagnosis.thresholds import (
     BACKWARDS,
     MOST_CAUSES,
@@ -189,7 +189,7 @@ def freed(before: Fit, after: Fit, hypothesis: Hypothesis) -> int:
 
 
 def search(
-    case: Case,
+    case: DiagnosisProblem,
     base: Fit,
     hypotheses: Sequence[Hypothesis],
     *,
@@ -201,7 +201,7 @@ def search(
 
     Parameters
     ----------
-    case : Case
+    case : DiagnosisProblem
     base : Fit
         Of the model without any cause, its noise settled.
     hypotheses : sequence of Hypothesis
@@ -239,7 +239,7 @@ def search(
 
 
 def take_step(
-    case: Case, fit: Fit, causes: Sequence[Candidate], hypotheses: Sequence[Hypothesis]
+    case: DiagnosisProblem, fit: Fit, causes: Sequence[Candidate], hypotheses: Sequence[Hypothesis]
 ) -> Step:
     """Score what is left, refit the best, and take the likeliest if it holds."""
     left = [a for a in hypotheses if not _taken(a, causes)]
@@ -271,7 +271,7 @@ def take_step(
     return Step(fit, tuple(scores), tuple(candidates), taken)
 
 
-def _wald_checked(case: Case, candidate: Candidate) -> Candidate:
+def _wald_checked(case: DiagnosisProblem, candidate: Candidate) -> Candidate:
     """Return the candidate with p-values that its robust covariance bears out, too (Wald).
 
     Where errors have another colour than theirs, or come in bursts, the likelihood falls
@@ -357,7 +357,7 @@ def assess_candidate(
 
 
 def _backward(
-    case: Case, fit: Fit, causes: list[Candidate], tried: int
+    case: DiagnosisProblem, fit: Fit, causes: list[Candidate], tried: int
 ) -> tuple[Fit, list[Candidate]]:
     """Drop causes that a later one made needless; those kept are told against that."""
     kept = list(causes)
@@ -376,7 +376,7 @@ def _backward(
     return fit, kept
 
 
-def _needed(case: Case, fit: Fit, without: Fit) -> bool:
+def _needed(case: DiagnosisProblem, fit: Fit, without: Fit) -> bool:
     """Whether a model that the data chose predicts worse without what has no name in it.
 
     By more of the squared error than is told of a deviation.
@@ -386,7 +386,7 @@ def _needed(case: Case, fit: Fit, without: Fit) -> bool:
     return without.escaped or case.held_out(fit.integrator).worse(without, fit) > np.log1p(WORTH)
 
 
-def weighed(case: Case, found: Search) -> Search:
+def weighed(case: DiagnosisProblem, found: Search) -> Search:
     """Return the search without causes that do not stand beside a generic force.
 
     The least of them goes first: what it imitated may be another's once it is gone. Terms
@@ -416,7 +416,7 @@ def weighed(case: Case, found: Search) -> Search:
 
 
 def _stood(
-    case: Case, fit: Fit, causes: Sequence[Candidate], tried: int
+    case: DiagnosisProblem, fit: Fit, causes: Sequence[Candidate], tried: int
 ) -> list[tuple[Candidate, Fit]]:
     """Return causes with what each does beside a generic force, and the fits without them."""
     problem, held_out = case.problem(fit.integrator), case.held_out(fit.integrator)
@@ -479,7 +479,7 @@ def _at_null(problem: Problem, fit: Fit, hypothesis: Hypothesis) -> Array:
 
 
 def instead(
-    case: Case, fit: Fit, best: Candidate, others: Sequence[Candidate]
+    case: DiagnosisProblem, fit: Fit, best: Candidate, others: Sequence[Candidate]
 ) -> tuple[Fit, Candidate, list[Candidate]]:
     """Return the fit without one of several causes, that cause, and others in its place.
 

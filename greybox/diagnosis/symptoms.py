@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.channels import CHANNELS
+from greybox.diagnosis.evidence.held_out import long_run_variance
 from greybox.diagnosis.fitting import Problem
-from greybox.diagnosis.held_out import long_run_variance
 from greybox.diagnosis.noise import SEEN
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.result import Symptom

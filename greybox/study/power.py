@@ -14,8 +14,8 @@ from functools import partial
 
 import numpy as np
 
+from greybox.diagnosis.assumed_causes import fit_given
 from greybox.diagnosis.diagnose import diagnose
-from greybox.diagnosis.given import fit_given
 from greybox.diagnosis.result import DiagnosisVerdict
 from greybox.errors import GreyboxError, UsageError
 from greybox.numerics.binomial import wilson_interval

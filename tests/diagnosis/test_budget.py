@@ -10,7 +10,7 @@ import pytest
 
 from greybox.diagnosis.budget import MOTION, REST, SENSOR, Taken, error_budget
 from greybox.diagnosis.diagnose import diagnose
-from greybox.diagnosis.held_out import Pair
+from greybox.diagnosis.evidence.held_out import Pair
 from greybox.diagnosis.preparing import prepare
 from greybox.study.blind import draw
 

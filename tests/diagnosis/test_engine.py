@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from greybox.diagnosis.base import _as_it_should_be
 from greybox.diagnosis.causes import Context, known_causes
+from greybox.diagnosis.evidence.held_out import long_run_variance, proof_of
 from greybox.diagnosis.fitting import Problem
-from greybox.diagnosis.held_out import long_run_variance, proof_of
 from greybox.diagnosis.hypothesis import Hypothesis, Parameter
 from greybox.diagnosis.linear import NOWHERE, sensitivities
 from greybox.diagnosis.noise import Likelihood, Noise, NoiseModel, fit_noise
 from greybox.diagnosis.normal import bounded_step
+from greybox.diagnosis.null_model import _as_it_should_be
 from greybox.diagnosis.point import Point
 from greybox.diagnosis.ship import Change, LogRun, Sensors, Ship, shifted, wired
 from greybox.diagnosis.simulator import VaryingSimulator

@@ -12,9 +12,9 @@ from scipy.stats import chi2
 
 from greybox.diagnosis import search as searching
 from greybox.diagnosis.diagnose import diagnose
+from greybox.diagnosis.evidence.held_out import OtherLogs, Pair, proof_of
+from greybox.diagnosis.evidence.omnibus import disagreement
 from greybox.diagnosis.fitting import Problem
-from greybox.diagnosis.held_out import OtherLogs, Pair, proof_of
-from greybox.diagnosis.omnibus import disagreement
 from greybox.diagnosis.scores import MOMENTS
 from greybox.diagnosis.search import Step, _wald_checked, assess_candidate
 from greybox.diagnosis.ship import LogRun

@@ -7,9 +7,9 @@ import zlib
 import numpy as np
 import pytest
 
+from greybox.diagnosis.assumed_causes import fit_given
 from greybox.diagnosis.diagnose import diagnose
 from greybox.diagnosis.gain import run_on
-from greybox.diagnosis.given import fit_given
 from greybox.study.blind import draw
 
 

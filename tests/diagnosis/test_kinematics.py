@@ -9,7 +9,7 @@ import pytest
 from foreign_ships import write_campaign
 
 from greybox.diagnosis.causes import known_causes
-from greybox.diagnosis.kinematics import causes_of, judged_by_kinematics
+from greybox.diagnosis.evidence.kinematics import causes_of, judged_by_kinematics
 from greybox.diagnosis.preparing import prepare
 from greybox.study.blind import draw
 from greybox.trial.checks.finding import Finding

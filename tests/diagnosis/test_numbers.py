@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from greybox.diagnosis.causes import known_causes
-from greybox.diagnosis.held_out import proof_of
+from greybox.diagnosis.evidence.held_out import proof_of
 from greybox.diagnosis.hypothesis import Hypothesis, Parameter
 from greybox.diagnosis.preparing import context_of, prepare
 from greybox.diagnosis.result import Found, Quantity

@@ -10,11 +10,11 @@ import pytest
 from changing import FACTOR, MOMENT, changed_log, fitted
 
 from greybox.diagnosis.diagnose import diagnose
-from greybox.diagnosis.held_out import Pair
+from greybox.diagnosis.evidence.held_out import Pair
+from greybox.diagnosis.evidence.remainder import features, knots_of
 from greybox.diagnosis.noise import fit_noise
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.refitting import loosened
-from greybox.diagnosis.remainder import features, knots_of
 from greybox.diagnosis.ruling import _drifts
 from greybox.study.blind import draw
 from greybox.trial.log import TrialLog

@@ -5,11 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from greybox.diagnosis.held_out import Proof
+from greybox.diagnosis.evidence.held_out import Proof
+from greybox.diagnosis.evidence.remainder import (
+    anything,
+    features,
+    generic_force,
+    motion_and_commands,
+)
+from greybox.diagnosis.evidence.standing import Standing, _own_arguments, standing
 from greybox.diagnosis.preparing import prepare
-from greybox.diagnosis.remainder import anything, features, generic_force, motion_and_commands
 from greybox.diagnosis.search import FIRST, Search, weighed
-from greybox.diagnosis.standing import Standing, _own_arguments, standing
 from greybox.study.blind import draw
 
 

@@ -9,15 +9,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.base import FOLDS, Case
 from greybox.diagnosis.budget import Taken, error_budget
 from greybox.diagnosis.causes import Cause
-from greybox.diagnosis.confusion import rivals
+from greybox.diagnosis.evidence.confusion import rivals
+from greybox.diagnosis.evidence.held_out import Pair
+from greybox.diagnosis.evidence.kinematics import denied
+from greybox.diagnosis.evidence.standing import standing
 from greybox.diagnosis.extension import extended_model
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.gain import gains, run_on
-from greybox.diagnosis.held_out import Pair
-from greybox.diagnosis.kinematics import denied
+from greybox.diagnosis.null_model import FOLDS, DiagnosisProblem
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.residuals import residual_tests
 from greybox.diagnosis.result import (
@@ -34,7 +35,6 @@ from greybox.diagnosis.result import (
 from greybox.diagnosis.ruling import rule
 from greybox.diagnosis.search import Candidate, Search, backwards, instead
 from greybox.diagnosis.ship import CURRENTS
-from greybox.diagnosis.standing import standing
 from greybox.diagnosis.symptoms import find_symptoms
 from greybox.diagnosis.waves import Waves
 from greybox.model.model import ManoeuvringModel
@@ -46,12 +46,12 @@ from greybox.validation.fit import LogFit, fit_on
 Array = NDArray[np.float64]
 
 
-class Report:
+class DiagnosisBuilder:
     """Turns a search into what the user gets."""
 
     def __init__(
         self,
-        case: Case,
+        case: DiagnosisProblem,
         structure: Structure,
         causes: Mapping[str, Cause],
         found: Search,

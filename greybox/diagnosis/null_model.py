@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.diagnosis.evidence.held_out import Folds, HeldOut, OtherLogs
 from greybox.diagnosis.fitting import Metric, Problem
-from greybox.diagnosis.held_out import Folds, HeldOut, OtherLogs
 from greybox.diagnosis.hypothesis import Hypothesis
 from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.ship import LogRun, Ship, shifted, wired
@@ -43,7 +43,7 @@ FOLDS = 3
 _SHORTEST = 60
 
 
-class Case:
+class DiagnosisProblem:
     """Logs, a structure to diagnose, and a wider one that every cause fits in.
 
     Parameters
@@ -75,11 +75,11 @@ class Case:
         self._problems: dict[Integrator, Problem] = {}
         self._held: dict[Integrator, HeldOut] = {}
 
-    def wider(self, names: Sequence[str], metric: Metric) -> Case:
+    def wider(self, names: Sequence[str], metric: Metric) -> DiagnosisProblem:
         """Return the case with more terms that a hypothesis may use, and errors weighed anew."""
         known = {t.key for t in self.universe.terms}
         more = [n for n in names if parse_term(n).key not in known]
-        return Case(
+        return DiagnosisProblem(
             self.structure, self.universe.with_terms(*more), self.logs, self.held_out_logs,
             self.kind, self.regime, metric,
         )  # fmt: skip

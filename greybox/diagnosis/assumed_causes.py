@@ -7,15 +7,15 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.base import Case
+from greybox.diagnosis.builder import DiagnosisBuilder
 from greybox.diagnosis.hypothesis import Hypothesis
+from greybox.diagnosis.null_model import DiagnosisProblem
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.preparing import prepare
 from greybox.diagnosis.refitting import final_refit, likelier, refits, seen_as_slow, slow
 from greybox.diagnosis.result import Given
 from greybox.diagnosis.scores import ProjectedScores, score_hypotheses
 from greybox.diagnosis.search import Search, freed
-from greybox.diagnosis.telling import Report
 from greybox.public import known_keywords, one_thread
 from greybox.trial.log import Logs
 from greybox.trial.segments import as_segments
@@ -75,7 +75,7 @@ def fit_given(
         final = found[1]
         left.discard(found[0].cause)
     search = Search(base, final, (), (), ready.tried)
-    report = Report(case, ready.structure, ready.causes, search, None, seed, ())
+    report = DiagnosisBuilder(case, ready.structure, ready.causes, search, None, seed, ())
     record = {"method": "given causes", "causes": list(ids)}
     before, after = (report.model(f, record) for f in (base, final))
     gain, _, after = report.gain(before, after, ready.validate, final)
@@ -84,7 +84,7 @@ def fit_given(
 
 
 def _likeliest(
-    case: Case, fit: Fit, hypotheses: Sequence[Hypothesis]
+    case: DiagnosisProblem, fit: Fit, hypotheses: Sequence[Hypothesis]
 ) -> tuple[Hypothesis, Fit] | None:
     problem = case.problem(fit.integrator)
     near = [a for a in hypotheses if not a.refit_from_scratch]

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.diagnosis.evidence.held_out import Pair, Proof, proof_of
+from greybox.diagnosis.evidence.remainder import Use, contributions_beside, generic_force
 from greybox.diagnosis.fitting import Problem
-from greybox.diagnosis.held_out import Pair, Proof, proof_of
 from greybox.diagnosis.hypothesis import Hypothesis
 from greybox.diagnosis.point import Fit, Point
-from greybox.diagnosis.remainder import Use, contributions_beside, generic_force
 from greybox.diagnosis.ship import CURRENTS
 from greybox.diagnosis.thresholds import AS_CHOSEN, LEAST_SHARE, OWN_SHARE, PROVEN, SAME
 from greybox.model.terms import parse_term

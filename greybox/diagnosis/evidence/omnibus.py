@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.held_out import Pair, Proof, proof_of
-from greybox.diagnosis.remainder import Use, anything, generic_force
+from greybox.diagnosis.evidence.held_out import Pair, Proof, proof_of
+from greybox.diagnosis.evidence.remainder import Use, anything, generic_force
 from greybox.numerics.linalg import scaled_inverse
 
 Array = NDArray[np.float64]

@@ -12,8 +12,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.diagnosis.evidence.held_out import HeldOut, proof_of
 from greybox.diagnosis.fitting import Problem
-from greybox.diagnosis.held_out import HeldOut, proof_of
 from greybox.diagnosis.search import Candidate
 from greybox.diagnosis.thresholds import CHANCE, DECISIVE
 from greybox.model.run.step import Integrator

@@ -19,8 +19,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.diagnosis.evidence.held_out import Pair
 from greybox.diagnosis.fitting import Problem
-from greybox.diagnosis.held_out import Pair
 from greybox.diagnosis.linear import NOWHERE, sensitivities
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.ship import LogRun, shifted, wired
