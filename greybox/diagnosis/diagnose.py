@@ -111,7 +111,9 @@ def diagnose(
     say("model without causes")
     base = ready.base()
     problem = case.problem(base.integrator)
-    searched = search(case, base, ready.hypotheses, progress=options.progress)
+    searched = search(
+        case, base, ready.hypotheses, progress=options.progress, alone=model is not None
+    )
     say("a generic force beside the causes")
     found = weighed(case, searched)
     keys = [c.hypothesis.key for c in found.causes]
@@ -120,7 +122,9 @@ def diagnose(
     if apart and more:
         # a defect that all sensors share would leave nothing; this one imitates what forces do
         say("causes without those that the sensors deny")
-        searched = search(case, base, ready.of_forces, progress=options.progress)
+        searched = search(
+            case, base, ready.of_forces, progress=options.progress, alone=model is not None
+        )
         found = weighed(case, searched)
         more = leaves_more(found, case.held_out)
     found = replace(found, given=ready.as_given())

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.diagnosis.evidence.held_out import HeldOut, Proof, proof_of
-from greybox.diagnosis.evidence.remainder import contributions_beside
+from greybox.diagnosis.evidence.omnibus import omnibus
+from greybox.diagnosis.evidence.remainder import contributions_beside, motion_and_commands
 from greybox.diagnosis.evidence.standing import Standing, level_of, standing
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.hypothesis import Hypothesis
@@ -39,6 +40,7 @@ from greybox.diagnosis.thresholds import (
     MOST_CAUSES,
     RELEVANT,
     SIGNIFICANT,
+    SURE,
     WORTH,
 )
 from greybox.model.run.step import Integrator
@@ -195,9 +197,13 @@ def search(
     *,
     begun: Sequence[Candidate] = (),
     most: int = MOST_CAUSES,
+    alone: bool = True,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Search:
     """Look for causes until none proves itself any more.
+
+    One that is not alone, after which the terms that the data choose may go on, ends, too, once
+    forces of motion and commands are left that a cause did not take.
 
     Parameters
     ----------
@@ -209,6 +215,8 @@ def search(
         Causes that are in force from the beginning.
     most : int
         Causes at most beside those.
+    alone : bool
+        Whether no other search may follow.
     progress : callable
         Told what is being done.
     """
@@ -229,13 +237,25 @@ def search(
         )  # fmt: skip
         if step.taken is None:
             break
+        left = _left_to_motion(case, fit)
         fit, causes = step.taken.fit, [*causes, step.taken]
         if case.metric == "coloured":
             # those beside chosen terms are weighed at the end
             fit, causes = _backward(case, fit, causes, len(hypotheses))
         # what a better noise would gain must not count for the next cause
         fit = case.problem(fit.integrator).settle(fit, SETTLE)
+        if not alone and left and _left_to_motion(case, fit):
+            _log.info("forces of motion and commands are left that one cause does not take")
+            break
     return Search(base, fit, tuple(steps), tuple(causes), len(hypotheses))
+
+
+def _left_to_motion(case: DiagnosisProblem, fit: Fit) -> bool:
+    """Whether a force of motion and commands would explain more than a deviation to be told."""
+    pairs = case.held_out(fit.integrator).pairs(fit)
+    numbers = sum(nu.size for pair in pairs for nu in pair.held_fit.nu)
+    left = omnibus(pairs, motion_and_commands)
+    return left.proof.p_value < SURE and left.gain > WORTH * numbers
 
 
 def take_step(
@@ -392,26 +412,26 @@ def weighed(case: DiagnosisProblem, found: Search) -> Search:
     The least of them goes first: what it imitated may be another's once it is gone. Terms
     without which held-out runs are worse stay in the model, and lose their name.
     """
-    fit, kept = found.final, list(found.causes)
-    leaning: list[Candidate] = []
-    left: list[Fit] = []
-    while kept:
-        stood = _stood(case, fit, kept, found.tried)
-        kept, left = [cause for cause, _ in stood], [without for _, without in stood]
-        fallen = [(cause, without) for cause, without in stood if not _stands(cause)]
-        if not fallen:
-            break
+    fit, leaning = found.final, []
+    stood = _stood(case, fit, found.causes, found.tried)
+    while fallen := [(cause, without) for cause, without in stood if not _stands(cause)]:
         least, without = min(fallen, key=lambda item: _beyond(item[0]))
         leaning.append(least)
-        kept = [c for c in kept if c.hypothesis.key != least.hypothesis.key]
+        stood = [item for item in stood if item[0] is not least]
         if _needed(case, fit, without):
             continue
+        kept = [cause for cause, _ in stood]
         if without.escaped:
             # what does not stand holds the run within bounds: nothing of it can be told
             return replace(found, final=found.base, causes=(), leaning=(*leaning, *kept))
         fit = case.problem(fit.integrator).settle(without, SETTLE)
+        stood = _stood(case, fit, kept, found.tried)
     return replace(
-        found, final=fit, causes=tuple(kept), leaning=tuple(leaning), without=tuple(left)
+        found,
+        final=fit,
+        causes=tuple(cause for cause, _ in stood),
+        leaning=tuple(leaning),
+        without=tuple(without for _, without in stood),
     )
 
 
