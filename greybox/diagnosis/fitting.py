@@ -62,7 +62,8 @@ class _Normal:
     def near(self, vector: Array) -> bool:
         """Whether these derivatives do for a vector, too."""
         away = vector - self.at
-        return bool(away @ self.matrix @ away < _NEAR)
+        with np.errstate(over="ignore", invalid="ignore"):
+            return bool(away @ self.matrix @ away < _NEAR)
 
 
 class Problem:

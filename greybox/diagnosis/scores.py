@@ -64,7 +64,8 @@ class ProjectedScores:
     def __init__(self, problem: Problem, fit: Fit, noise: Noise | None = None) -> None:
         self.problem, self.fit = problem, fit
         self.noise = fit.noise if noise is None else noise
-        nuisance = _stacked(problem.rows(fit.point, self.noise))
+        # a run at the edge of stability has derivatives beyond numbers' range, which tell nothing
+        nuisance = np.nan_to_num(_stacked(problem.rows(fit.point, self.noise)), posinf=0, neginf=0)
         scale = np.sqrt((nuisance**2).sum(axis=0))
         scale[scale == 0] = 1.0
         self.basis = tall_svd(nuisance / scale, 1e-8)[0]
@@ -98,7 +99,7 @@ class ProjectedScores:
         """
         own = (cleared**2).sum(axis=0) > _OWN * before
         coefficients = np.zeros(cleared.shape[1])
-        if not own.any():
+        if not own.any() or not np.isfinite(cleared[:, own]).all():
             return 0.0, coefficients
         rows = cleared[:, own]
         if bounds is None:
