@@ -237,14 +237,14 @@ def search(
         )  # fmt: skip
         if step.taken is None:
             break
-        left = _left_to_motion(case, fit)
+        left = not alone and _left_to_motion(case, fit)
         fit, causes = step.taken.fit, [*causes, step.taken]
         if case.metric == "coloured":
             # those beside chosen terms are weighed at the end
             fit, causes = _backward(case, fit, causes, len(hypotheses))
         # what a better noise would gain must not count for the next cause
         fit = case.problem(fit.integrator).settle(fit, SETTLE)
-        if not alone and left and _left_to_motion(case, fit):
+        if left and _left_to_motion(case, fit):
             _log.info("forces of motion and commands are left that one cause does not take")
             break
     return Search(base, fit, tuple(steps), tuple(causes), len(hypotheses))
