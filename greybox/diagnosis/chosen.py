@@ -21,7 +21,7 @@ from greybox.diagnosis.noise import Noise
 from greybox.diagnosis.null_model import INTEGRATORS, DiagnosisProblem
 from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.preparing import Prepared, context_of
-from greybox.diagnosis.refitting import SETTLE
+from greybox.diagnosis.refitting import SETTLE, on_all_processors
 from greybox.diagnosis.search import Search, assess_candidate, search
 from greybox.diagnosis.ship import CURRENTS, Ship
 from greybox.errors import ExcitationError, GreyboxError
@@ -64,16 +64,19 @@ def from_chosen(
     case = ready.case.wider(terms, "free run")
     base = case.carried(found.base)
     plain = case.problem(base.integrator).settle(base)
-    fit = _bounded(case, case.carried(searched.final).point, plain.noise)
+    starts = [case.carried(searched.final).point]
     # what the sensors deny imitates what forces do
     hypotheses = ready.of_forces
     named = [c.hypothesis for c in searched.causes]
-    by_data = None
+    chosen: list[Hypothesis] = []
+    every: list[Hypothesis] = []
     if choice is not None:
         chosen, every = _hypotheses(ready, case, choice)
-        by_data = _bounded(case, _start(ready, case, choice, chosen, base), plain.noise)
-        if by_data is not None and (fit is None or _nearer(case, by_data, fit)):
-            fit, named, hypotheses = by_data, chosen, tuple(every)
+        starts.append(_start(ready, case, choice, chosen, base))
+    fit, *rest = _bounded(case, starts, plain.noise)
+    by_data = rest[0] if rest else None
+    if by_data is not None and (fit is None or _nearer(case, by_data, fit)):
+        fit, named, hypotheses = by_data, chosen, tuple(every)
     if fit is None:
         return None
     proof = case.held_out(fit.integrator).prove(plain, fit)
@@ -107,17 +110,27 @@ def _start(
     return start
 
 
-def _bounded(case: DiagnosisProblem, start: Point, noise: Noise) -> Fit | None:
-    """Return the likelier fit by either integrator whose held-out runs have bounds, if any."""
-    fits = []
-    for integrator in INTEGRATORS:
+def _bounded(case: DiagnosisProblem, starts: Sequence[Point], noise: Noise) -> list[Fit | None]:
+    """Return of each start the likelier fit by either integrator whose held-out runs have bounds.
+
+    None where there is none.
+    """
+    ways = [(start, integrator) for start in starts for integrator in INTEGRATORS]
+
+    def work(k: int) -> tuple[Fit, bool]:
+        start, integrator = ways[k]
         problem = case.problem(integrator)
-        fit = replace(
-            problem.settle(problem.fit(start, noise), SETTLE), integrator=integrator
-        )  # fmt: skip
-        if not fit.escaped and np.isfinite(case.held_out(integrator).squares(fit)).all():
-            fits.append(fit)
-    return min(fits, key=lambda f: f.cost, default=None)
+        fit = problem.settle(problem.fit(start, noise), SETTLE)
+        fit = replace(fit, integrator=integrator)
+        held = not fit.escaped and np.isfinite(case.held_out(integrator).squares(fit)).all()
+        return fit, bool(held)
+
+    found = on_all_processors([start for start, _ in ways], work)
+    best = []
+    for k in range(0, len(ways), len(INTEGRATORS)):
+        fits = [fit for fit, held in found[k : k + len(INTEGRATORS)] if held]
+        best.append(min(fits, key=lambda f: f.cost, default=None))
+    return best
 
 
 def _choice(logs: Sequence[TrialLog]) -> TermChoice:

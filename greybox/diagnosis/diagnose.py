@@ -28,6 +28,10 @@ from greybox.trial.validity import other_conditions, pooled_conditions
 
 _log = logging.getLogger(__name__)
 
+# share of length over speed that a sample may take: twice that of an estimate, for a diagnosis fits
+# many models
+_PACE = 0.1
+
 
 @dataclass(frozen=True)
 class DiagnosisOptions:
@@ -46,7 +50,7 @@ class DiagnosisOptions:
         held-out free runs better: see `greybox.diagnosis.black_box`.
     own_pace : bool
         Whether logs that are sampled faster than the ship moves are taken at a longer sample
-        time, as an estimate takes them; not where a model has its own.
+        time, a tenth of length over speed at most; not where a model has its own.
     progress : callable
         Told what is being done.
     """
@@ -176,7 +180,7 @@ def _at_own_pace(
 ) -> tuple[list[TrialLog], list[TrialLog]]:
     """Return all logs at the sample time that suits how fast the ship of the first ones moves."""
     common_sample_time([*logs, *validate])
-    slower = list(at_own_pace(logs, notes))
+    slower = list(at_own_pace(logs, notes, _PACE))
     step = slower[0].sample_time
     if step == logs[0].sample_time or not validate:
         return slower, list(validate)

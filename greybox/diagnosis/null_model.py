@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,7 @@ from greybox.model.predictor_kinds import PREDICTORS
 from greybox.model.run.step import Integrator
 from greybox.model.structure import Structure
 from greybox.model.terms import parse_term
+from greybox.numerics.forked import map_forked
 from greybox.regression.regression import build_regression
 from greybox.rotation import body_to_ned
 from greybox.trial.log import TrialLog
@@ -165,7 +167,8 @@ class DiagnosisProblem:
                 break
             # further starts run with the integrator that the first one preferred
             tried = [min(found, key=lambda f: f.cost).integrator] if found else INTEGRATORS
-            fits = [self._fit(values(), current, i) for i in tried]
+            first = values()
+            fits = map_forked(partial(self._fit, first, current), tried)
             found += [f for f in fits if f is not None and not f.escaped]
             if any(self._follows(f) for f in found):
                 break

@@ -371,18 +371,28 @@ def _named(request: Request) -> tuple[object, ...]:
     return request.predictor, request.structure, request.nominal
 
 
-def at_own_pace(logs: Sequence[TrialLog], notes: list[str]) -> Sequence[TrialLog]:
+def at_own_pace(
+    logs: Sequence[TrialLog], notes: list[str], share: float = _SHARE
+) -> Sequence[TrialLog]:
     """Return logs at a sample time that suits how fast the ship moves; `notes` are told.
 
     A ship answers in times of the order of its length over its speed: a twentieth of that
     shows all of it, and more samples hold sensor noise and cost time.
+
+    Parameters
+    ----------
+    logs : sequence of TrialLog
+    notes : list of str
+        What was done is added to them.
+    share : float
+        Of length over speed that a sample may take.
     """
     speeds = [np.hypot(log["u"], log["v"]) for log in logs if {"u", "v"} <= log.channels.keys()]
     if not speeds:
         return logs
     speed = float(np.sqrt(np.mean(np.concatenate(speeds) ** 2)))
     length, own = logs[0].vessel.length, logs[0].sample_time
-    times = int(_SHARE * length / speed / own) if speed > 0 else 1
+    times = int(share * length / speed / own) if speed > 0 else 1
     if times < 2:
         return logs
     try:
@@ -391,7 +401,7 @@ def at_own_pace(logs: Sequence[TrialLog], notes: list[str]) -> Sequence[TrialLog
         return logs
     notes.append(
         f"the logs were taken at {times * own:g} s instead of {own:g} s, the next multiple below "
-        f"a twentieth of length over speed ({length:g} m, {speed:.3g} m/s); --sample-time sets it."
+        f"{share:g} of length over speed ({length:g} m, {speed:.3g} m/s); --sample-time sets it."
     )
     notes += left_out
     return slower
