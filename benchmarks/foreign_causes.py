@@ -52,6 +52,8 @@ HOLDS: dict[str, set[str]] = {
     "wake_drift": {"asymmetry", "advance_speed"},
     "asymmetry": {"asymmetry", "side_force", "thruster_gain"},
     "propeller_walk": {"side_force", "asymmetry"}, "interaction": {"thruster_gain"},
+    # what is logged of them are samples of a motion that goes on between
+    "actuator_dynamics": {"feedback_sampling"},
 }  # fmt: skip
 # seconds between logged samples; the simulators' own are shorter
 SAMPLE_TIMES = {
