@@ -28,9 +28,9 @@ from greybox.trial.validity import other_conditions, pooled_conditions
 
 _log = logging.getLogger(__name__)
 
-# share of length over speed that a sample may take: twice that of an estimate, for a diagnosis fits
-# many models
-_PACE = 0.1
+# share of length over speed, and seconds, that a sample may take beyond the pace of an estimate: a
+# diagnosis fits many models, and what actuators do shows within a second
+_PACE, _FINE = 0.1, 0.5
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,8 @@ class DiagnosisOptions:
         held-out free runs better: see `greybox.diagnosis.black_box`.
     own_pace : bool
         Whether logs that are sampled faster than the ship moves are taken at a longer sample
-        time, a tenth of length over speed at most; not where a model has its own.
+        time, a tenth of length over speed up to half a second, a twentieth beyond; not where a
+        model has its own.
     progress : callable
         Told what is being done.
     """
@@ -180,7 +181,12 @@ def _at_own_pace(
 ) -> tuple[list[TrialLog], list[TrialLog]]:
     """Return all logs at the sample time that suits how fast the ship of the first ones moves."""
     common_sample_time([*logs, *validate])
-    slower = list(at_own_pace(logs, notes, _PACE))
+    said: list[str] = []
+    slower = list(at_own_pace(logs, said, _PACE))
+    if slower[0].sample_time > _FINE:
+        said = []
+        slower = list(at_own_pace(logs, said))
+    notes += said
     step = slower[0].sample_time
     if step == logs[0].sample_time or not validate:
         return slower, list(validate)
