@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+from foreign_ships import Current, presets
+from foreign_ships.manoeuvres import kinds
 from scipy.signal import lfilter
 
+from greybox import load_vessel, read_log
+from greybox.diagnosis.diagnose import diagnose
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.noise import free_run_noise
 from greybox.numerics.lagged_moments import (
@@ -78,3 +84,24 @@ def test_no_log_speaks_for_all() -> None:
     ]
     # a tenth more error costs as much in the quiet log as in the loud one
     assert apart == pytest.approx([500 * 3 * 2 * np.log(1.1)] * 2, rel=1e-9)
+
+
+@pytest.mark.long
+def test_a_current_is_named_in_a_ship_of_no_family(tmp_path: Path) -> None:
+    preset = presets()["kvlcc2-7m"]
+    (tmp_path / "vessel.toml").write_text(preset.ship.vessel_toml())
+    vessel = load_vessel(tmp_path / "vessel.toml")
+    current = Current(0.16, 1.8)
+    logs = []
+    for i, kind in enumerate(("random", "zigzag-20", "turn-port-15", "random")):
+        trial = preset.sail(kinds()[kind], seed=1000 + i, current=current)
+        logs.append(read_log(trial.write_csv(tmp_path / f"{i}.csv", 5), vessel))
+    found = diagnose(logs[:2], validate=logs[2:])
+    assert found.verdict in ("named", "partly")
+    (named,) = (c for c in found.causes if c.id == "current")
+    true = {"current_north": 0.16 * np.cos(1.8), "current_east": 0.16 * np.sin(1.8)}
+    for name, value in true.items():
+        quantity = named.parameters[name]
+        assert abs(quantity.value - value) < 4 * quantity.std, name
+    assert all(found.gain[s].after > found.gain[s].before for s in ("u", "v"))
+    assert found.budget
