@@ -8,8 +8,10 @@ or with none, and `greybox.diagnose` is asked without being told anything:
 
 A case stands in FILE (a JSON line) and is not made again. An effect counts where switching it off
 changes the squared held-out error of the model without causes by 1 % or more in some state. What a
-ship holds beyond (3.51) by itself is listed in `HOLDS` by the switches of its simulator; a cause
-that stands and is neither planted nor listed is wrong.
+ship holds beyond (3.51) by itself is measured first, in the same way: each switch of its simulator
+is turned off, and those that count stand for the causes in `HOLDS`. A cause that stands and is
+neither planted nor held is wrong. The budget's share of the planted cause stands beside the share
+that switching it off took.
 """
 
 from __future__ import annotations
@@ -78,9 +80,13 @@ EFFECTS = (
 )  # fmt: skip
 
 
-def sail(name: str, effect: str, seed: int, clean: bool) -> tuple[str, list[Trial], Planted] | None:
+def sail(
+    name: str, effect: str, seed: int, clean: bool, ship: Any = None
+) -> tuple[str, list[Trial], Planted] | None:
     """Return the vessel file and the trials, the effect left out where they are to be clean."""
     preset: Preset = presets()[name]
+    if ship is not None:
+        preset = replace(preset, ship=ship)
     ship, rng = preset.ship, np.random.default_rng([seed, 99])
     where: dict[str, Any] = {}
     faults: dict[str, Any] = {}
@@ -142,10 +148,10 @@ def _delay(preset: Preset) -> float:
 
 
 def write(
-    folder: Path, name: str, effect: str, seed: int, clean: bool = False
+    folder: Path, name: str, effect: str, seed: int, clean: bool = False, ship: Any = None
 ) -> tuple[list[TrialLog], Planted] | None:
     """Write the logs of a case, and read them as a user does."""
-    made = sail(name, effect, seed, clean)
+    made = sail(name, effect, seed, clean, ship)
     if made is None:
         return None
     text, trials, planted = made
@@ -181,21 +187,37 @@ def squares(logs: Sequence[TrialLog]) -> np.ndarray[Any, np.dtype[np.float64]]:
     return ready.case.held_out(base.integrator).squares(base)
 
 
-def case(name: str, effect: str, seed: int) -> dict[str, Any] | None:
+def switches(name: str) -> dict[str, float]:
+    """Return the largest change of a squared held-out error by each switch of a simulator."""
+    preset: Preset = presets()[name]
+    found = {}
+    with tempfile.TemporaryDirectory() as place:
+        made = write(Path(place) / "all", name, "none", 0)
+        assert made is not None
+        whole = squares(made[0])
+        for switch in fields(preset.ship.mechanisms):
+            less = replace(preset.ship.mechanisms, **{switch.name: False})
+            ship = replace(preset.ship, mechanisms=less)
+            made = write(Path(place) / switch.name, name, "none", 0, ship=ship)
+            assert made is not None
+            found[switch.name] = float(np.max(np.abs(1 - squares(made[0]) / whole)))
+    return found
+
+
+def case(name: str, effect: str, seed: int, switches: Sequence[str]) -> dict[str, Any] | None:
     """Return what a diagnosis says of one case."""
     with tempfile.TemporaryDirectory() as place:
         made = write(Path(place) / "logs", name, effect, seed)
         if made is None:
             return None
         logs, planted = made
-        share = 0.0
+        shares = np.zeros(3)
         if effect != "none":
             again = write(Path(place) / "clean", name, effect, seed, clean=True)
             assert again is not None
-            share = float(np.max(1 - squares(again[0]) / squares(logs)))
+            shares = 1 - squares(again[0]) / squares(logs)
         begun = time.perf_counter()
         found = diagnose(logs[:-HELD_OUT], validate=logs[-HELD_OUT:]).to_dict()
-    switches = [f.name for f in fields(presets()[name].ship.mechanisms)]
     held = set().union(*(HOLDS.get(s, set()) for s in switches))
     ids = [c["id"].split(":")[0] for c in found["causes"]]
     groups = [[c.split(":")[0] for c in g] for g in found["groups"]]
@@ -206,8 +228,10 @@ def case(name: str, effect: str, seed: int) -> dict[str, Any] | None:
         if k in dict(planted.numbers)
     ]  # fmt: skip
     return {
-        "ship": name, "effect": effect, "seed": seed, "share": share,
-        "counts": share >= COUNTS, "verdict": found["verdict"], "causes": ids, "groups": groups,
+        "ship": name, "effect": effect, "seed": seed, "share": float(shares.max()),
+        "counts": bool(shares.max() >= COUNTS),
+        "budget": _budget(found["budget"], true, shares), "verdict": found["verdict"],
+        "causes": ids, "groups": groups,
         "partial": [c["id"] for c in found["partial"]],
         "stands": bool(true & {*ids, *(c for g in groups for c in g)}),
         "headline": bool(true & {*ids}) if ids else bool(true & {c for g in groups for c in g}),
@@ -215,6 +239,17 @@ def case(name: str, effect: str, seed: int) -> dict[str, Any] | None:
         "gain": {k: (g["before"], g["after"]) for k, g in found["gain"].items()},
         "seconds": time.perf_counter() - begun,
     }  # fmt: skip
+
+
+def _budget(
+    parts: Sequence[dict[str, Any]], true: set[str], shares: Sequence[float]
+) -> list[tuple[float, float, float, float]]:
+    """Return the share of the planted cause by state: measured, told, and its interval."""
+    return [
+        (measured, part["share"][state], *part["ci"][state])
+        for part in parts if part["part"].split(":")[0] in true
+        for state, measured in zip(part["share"], map(float, shares), strict=True)
+    ]  # fmt: skip
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
@@ -230,6 +265,7 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
         )
 
     counted = [r for r in rows if r["counts"]]
+    shares = [b for r in counted for b in r["budget"]]
     inside = [abs(v - t) <= 1.96 * s for r in rows for _, v, s, t in r["numbers"]]
     return "\n".join(
         [
@@ -239,6 +275,10 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
             line("the same on ships as they are",
                  [bool(r["wrong"]) for r in rows if r["effect"] == "none"]),
             line("95 % intervals that hold the planted number", inside),
+            line("shares of the budget within 10 points",
+                 [abs(told - true) <= 0.1 for true, told, _, _ in shares]),
+            line("95 % intervals that hold the share",
+                 [low <= true <= high for true, _, low, high in shares]),
         ]
     )  # fmt: skip
 
@@ -253,10 +293,16 @@ def main() -> None:
     lines = options.out.read_text().splitlines() if options.out.exists() else []
     rows = [json.loads(line) for line in lines]
     known = {(r["ship"], r["effect"], r["seed"]) for r in rows}
+    held = {}
+    for name in options.ships:
+        held[name] = [s for s, share in switches(name).items() if share >= COUNTS]
+        print(f"{name} holds {', '.join(held[name])}", flush=True)
     for seed in options.seeds:
         for effect in options.effects:
             for name in options.ships:
-                row = None if (name, effect, seed) in known else case(name, effect, seed)
+                row = None
+                if (name, effect, seed) not in known:
+                    row = case(name, effect, seed, held[name])
                 if row is None:
                     continue
                 rows.append(row)

@@ -105,6 +105,30 @@ def test_a_generic_force_takes_most_of_what_no_term_is_there_for() -> None:
     assert force.predicted.shape == force.seen.shape
 
 
+def test_a_held_out_run_at_the_edge_of_stability_leaves_the_errors_as_they_are(
+    sailed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # its derivatives overflow, as those of a 1.2 m catamaran in a current did
+    ready, base, *_ = sailed
+    (pair,) = ready.case.held_out(base.integrator).pairs(base)
+    pair.known.clear()
+    slopes = type(pair.held).slopes
+
+    def overflowing(self, point):
+        return [s * (1e200 if self is pair.held else 1.0) for s in slopes(self, point)]
+
+    monkeypatch.setattr(type(pair.held), "slopes", overflowing)
+    force = generic_force(pair)
+    assert np.isfinite(force.predicted).all()
+    monkeypatch.setattr(
+        type(pair.held), "slopes", lambda self, point: [np.inf * s for s in slopes(self, point)]
+    )
+    pair.known.clear()
+    force = generic_force(pair)
+    assert not force.predicted.any()
+    assert all(np.array_equal(a, b) for a, b in zip(force.errors, pair.held_fit.errors))
+
+
 def test_own_arguments_are_those_of_the_terms_factors(sailed) -> None:
     ready, _, problem, _, _ = sailed
     hypotheses = {a.key: a for a in ready.hypotheses}

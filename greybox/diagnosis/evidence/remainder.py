@@ -192,15 +192,19 @@ def _generic_force(pair: Pair, use: Use) -> GenericForce:
     free = nuisance.shape[1] - sum(map(len, fit.point.starts))
     scale = np.sqrt((nuisance**2).sum(axis=0))
     scale[scale == 0] = 1.0
+    seen = np.concatenate([n.ravel() for n in held_fit.nu])
+    # a run at the edge of stability has no derivatives
+    none = GenericForce(np.zeros_like(seen), seen, held_fit.errors, np.zeros(free))
     if not np.isfinite(nuisance).all():
-        # a run at the edge of stability has no derivatives
-        seen = np.concatenate([n.ravel() for n in held_fit.nu])
-        return GenericForce(np.zeros_like(seen), seen, held_fit.errors, np.zeros(free))
+        return none
     left, values, right = tall_svd(nuisance / scale, _UNKNOWN)
     knots = knots_of(problem)
     pushed, scales = _pushed(problem, fit, knots, use, None)
     raw = _stacked([fit.noise.whiten(c) for c in pushed])
-    size = np.sqrt((raw**2).sum(axis=0))
+    with np.errstate(over="ignore"):
+        size = np.sqrt((raw**2).sum(axis=0))
+    if not np.isfinite(size).all():
+        return none
     size[size == 0] = 1.0
     raw /= size
     along = left.T @ raw
@@ -221,12 +225,13 @@ def _generic_force(pair: Pair, use: Use) -> GenericForce:
     noise = held_fit.noise
     whitened = _stacked([noise.whiten(p[:, :, None]) for p in parts])[:, 0]
     starts = _stacked([noise.whiten(s) for s in begun])
+    if not (np.isfinite(whitened).all() and np.isfinite(starts).all()):
+        return none
     taken = np.linalg.lstsq(starts, whitened, rcond=_UNKNOWN)[0]
     errors = tuple(
         e - (part - slopes @ taken)
         for e, part, slopes in zip(held_fit.errors, parts, begun, strict=True)
     )
-    seen = np.concatenate([n.ravel() for n in held_fit.nu])
     return GenericForce(whitened - starts @ taken, seen, errors, back)
 
 
