@@ -2,7 +2,7 @@
 
 Surge, x⁺ = x + a x + b x|x| + c u (steps of 1 s), the speed x measured after each
 step with white noise, the first speed known, and u free within two limits in
-each of N intervals. The yardstick is log det of the Cramér-Rao information of
+each of N intervals. The criterion is log det of the Cramér-Rao information of
 (a, b, c), F = Σ S(k)ᵀ S(k) / σ², which is what Pyomo.DoE maximises too. It writes
 S by central differences between copies of the model; here S follows from its
 recursion. Every design is judged by the same function, this package's exact F,
@@ -42,15 +42,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from experiment_design.criteria import Criterion
-from experiment_design.inputs import prbs
-from experiment_design.limits import LimitProgram, TrialLimits
-from experiment_design.problem import Scenario, TrialProblem
-from experiment_design.rollout import Rollout
-from experiment_design.schedule import make_schedule
-from experiment_design.search import draw_two_level, within_reach
-from experiment_design.sensitivities import SensitivityProgram
-from experiment_design.solve import make_shooting, run_ipopt
+from experiment_design.constraints.limit_program import LimitProgram
+from experiment_design.constraints.limits import TrialLimits
+from experiment_design.excitation.inputs import prbs
+from experiment_design.excitation.rollout import Rollout
+from experiment_design.excitation.schedule import make_schedule
+from experiment_design.information.criteria import Criterion
+from experiment_design.information.sensitivities import SensitivityProgram
+from experiment_design.optimise.search import draw_two_level, within_reach
+from experiment_design.optimise.solve import make_shooting, run_ipopt
+from experiment_design.request.problem import Scenario, TrialProblem
 from greybox.model.catalogue import get_structure
 from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import build_predictor

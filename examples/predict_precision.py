@@ -4,7 +4,7 @@ import numpy as np
 
 import greybox as gb
 from experiment_design import Wishes, build_problem, predict_precision, prepare_request
-from experiment_design.inputs import prbs, random_two_level, zig_zags
+from experiment_design.excitation.inputs import prbs, random_two_level, zig_zags
 from greybox.errors import ExcitationError
 from greybox.study.chapter6 import START, TRUE
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 import greybox as gb
-from experiment_design import Rival, Wishes, design_between, prepare_request
+from experiment_design import CandidateModel, Wishes, design_between, prepare_request
 from greybox.study.chapter6 import TRUE
 
 ship = gb.load_vessel("thesis")
@@ -17,7 +17,7 @@ in_current = gb.ManoeuvringModel(
 )  # fmt: skip
 damping = theta.copy()
 damping[structure.index("Nvr")] = -0.06
-weaker = Rival("damping", structure, damping, np.zeros(4))
+weaker = CandidateModel("damping", structure, damping, np.zeros(4))
 
 prepared = prepare_request(in_current, Wishes(200.0, regime="u+v+", margin_u=0.3, margin_v=0.2))
 request = replace(prepared.request, effort=0.5)

@@ -1,4 +1,8 @@
-"""Which trial to run: thruster sequences that tell most, and what they would tell.
+"""Design of trials: the most informative thruster sequences, and what they would tell.
+
+Imports run down this list, never up: `command` and `demo`; what a program calls
+(`discriminate`, `design`, `prepare`, `precision`); `output`; `certificate` and
+`feasibility`; `optimise`; `request`; `information` and `constraints`; `excitation`.
 
 Stands on `greybox` and is never imported by it. The names here are the promised
 ones; each is loaded when it is first used.

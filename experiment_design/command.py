@@ -6,8 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from experiment_design.estimators import ESTIMATORS
-from experiment_design.optimality import CRITERIA
+from experiment_design.information.estimators import ESTIMATORS
+from experiment_design.information.optimality import CRITERIA
 from greybox.commands.common import add_seed, count, positive, progress, provenance, say
 from greybox.model.predictor_kinds import PREDICTORS
 from greybox.registry import Registry
@@ -207,9 +207,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Read, design, write."""
     from experiment_design.design import design_trial
+    from experiment_design.optimise.duration import least_duration
+    from experiment_design.output.result import write_plan
     from experiment_design.prepare import prepare_request
-    from experiment_design.result import write_plan
-    from experiment_design.timing import least_duration
     from greybox.errors import UsageError
     from greybox.files import check_targets, write_json
     from greybox.model.model import load_model
@@ -217,7 +217,7 @@ def run(options: argparse.Namespace) -> None:
 
     check_targets(options.out, options.json, options.sheet, options.report)
     if options.sheet:
-        from experiment_design.sheet import sheet_kind
+        from experiment_design.output.trial_sheet import sheet_kind
 
         sheet_kind(options.sheet)
     if options.between is None and options.model is None:
@@ -264,8 +264,8 @@ def run(options: argparse.Namespace) -> None:
 def _run_between(options: argparse.Namespace, request: Any, notes: tuple[str, ...]) -> None:
     """Design the trial between two models and write it."""
     from experiment_design.discriminate import design_between
-    from experiment_design.request import Rival, full_structure
-    from experiment_design.result import write_plan
+    from experiment_design.output.result import write_plan
+    from experiment_design.request.request import CandidateModel, full_structure
     from greybox.errors import UsageError
     from greybox.files import write_json
     from greybox.model.model import load_model
@@ -289,7 +289,7 @@ def _run_between(options: argparse.Namespace, request: Any, notes: tuple[str, ..
     vessel = with_actuators_of(request.vessel, other.vessel)
     found = design_between(
         request,
-        Rival(second, structure, theta, other.d, vessel, other.integrator),
+        CandidateModel(second, structure, theta, other.d, vessel, other.integrator),
         (first, second),
         best_effort=options.best_effort,
         progress=progress("design"),
@@ -316,11 +316,11 @@ def _show(
 ) -> None:
     """Write the sheet and the page that were asked for."""
     if options.sheet:
-        from experiment_design.sheet import write_sheet
+        from experiment_design.output.trial_sheet import write_sheet
 
         write_sheet(design, options.sheet)
     if options.report:
-        from experiment_design.report import design_page
+        from experiment_design.output.report import design_page
         from greybox.report.page import write_page
 
         page = design_page(design, notes, provenance(options), headline)
@@ -330,9 +330,9 @@ def _show(
 def _wishes(options: argparse.Namespace, model: Any) -> Any:
     import numpy as np
 
-    from experiment_design.expressions import gradient_of
-    from experiment_design.limits import Circle, TrialLimits
+    from experiment_design.constraints.limits import Circle, TrialLimits
     from experiment_design.prepare import Wishes
+    from experiment_design.request.expressions import gradient_of
     from greybox.errors import UsageError
     from greybox.model.model import load_model
 

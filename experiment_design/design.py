@@ -9,19 +9,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from experiment_design.air import air_notes
-from experiment_design.campaign import (
-    Found,
-    Progress,
-    add_up,
-    own_moments,
-    random_campaign,
-    search_campaign,
-)
-from experiment_design.certificate import absent, certify
-from experiment_design.classical import Alternative, compare_classical
-from experiment_design.criteria import Criterion
-from experiment_design.demands import (
+from experiment_design.certificate.certificate import absent, certify
+from experiment_design.constraints.limits import LimitReport
+from experiment_design.excitation.rollout import Motion
+from experiment_design.feasibility.actuator_delay import late_notes
+from experiment_design.feasibility.checks import (
     feasible_or_reason,
     require_horizon,
     require_informative,
@@ -29,16 +21,28 @@ from experiment_design.demands import (
     require_start,
     unexcited,
 )
-from experiment_design.feasible import closest, moved_constant, stirred
-from experiment_design.lateness import late_notes
-from experiment_design.moments import MomentProgram, Moments
-from experiment_design.problem import TrialProblem
-from experiment_design.request import DesignRequest, build_problem, wanted_parameters
-from experiment_design.result import Design, LimitReport, logdet_information
-from experiment_design.robust import Keeping, keep_probability
-from experiment_design.rollout import Motion
-from experiment_design.search import Candidate, assess, limit_scale, to_unit, within_reach
-from experiment_design.solve import EXACT_COLUMNS, Outcome, solve_ipopt
+from experiment_design.feasibility.constraint_satisfaction import (
+    ConstraintSatisfaction,
+    keep_probability,
+)
+from experiment_design.feasibility.least_violation import closest, moved_constant, perturbed
+from experiment_design.information.criteria import Criterion
+from experiment_design.information.moments import MomentProgram, Moments
+from experiment_design.optimise.campaign import (
+    Found,
+    Progress,
+    add_up,
+    own_moments,
+    random_campaign,
+    search_campaign,
+)
+from experiment_design.optimise.classical import Alternative, compare_classical
+from experiment_design.optimise.search import Candidate, assess, limit_scale, to_unit, within_reach
+from experiment_design.optimise.solve import EXACT_COLUMNS, Outcome, solve_ipopt
+from experiment_design.output.result import Design, logdet_information
+from experiment_design.request.apparent_wind import air_notes
+from experiment_design.request.problem import TrialProblem
+from experiment_design.request.request import DesignRequest, build_problem, wanted_parameters
 from greybox.errors import InfeasibleError
 
 Array = NDArray[np.float64]
@@ -171,7 +175,7 @@ def _design(
                 raise InfeasibleError(sentence)
             status = "limits not kept: the closest plan that was found"
             notes.append(sentence)
-    keeping: Keeping | None = None
+    keeping: ConstraintSatisfaction | None = None
     if request.uncertain and not stopped:
         try:
             request, problems, candidates, keeping, more = _tighten(
@@ -271,7 +275,7 @@ def _from_closest(
     An ascent from outside may be stopped by a limit that no path crosses, such as
     a component of the velocity through the air that keeps either sign.
     """
-    lively = [stirred(p, c, request.seed) for p, c in zip(problems, nearest, strict=True)]
+    lively = [perturbed(p, c, request.seed) for p, c in zip(problems, nearest, strict=True)]
     if not all(c.feasible for c in lively):
         return None
     first = [c.unit for c in lively]
@@ -309,9 +313,9 @@ def _polish(
 
 def _active(problem: TrialProblem, candidate: Candidate) -> bool:
     """Whether some limit on the motion is missed or nearly reached, and IPOPT can weigh it."""
-    yardstick = problem.scenarios[0].yardstick
-    if isinstance(yardstick, MomentProgram) and (
-        not yardstick.white and yardstick.columns > EXACT_COLUMNS
+    information = problem.scenarios[0].information
+    if isinstance(information, MomentProgram) and (
+        not information.white and information.columns > EXACT_COLUMNS
     ):
         return False
     if len(problem.scenarios) > 1 or problem.criterion.prior is not None:
@@ -337,7 +341,7 @@ def _tighten(
     problems: list[TrialProblem],
     candidates: list[Candidate],
     workers: int | None,
-) -> tuple[DesignRequest, list[TrialProblem], list[Candidate], Keeping, int]:
+) -> tuple[DesignRequest, list[TrialProblem], list[Candidate], ConstraintSatisfaction, int]:
     """Tighten the path limits until they are kept with the wanted probability."""
     spent = 0
     plain = replace(request, backoff=())

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from experiment_design.campaign import Progress
-from experiment_design.contrast import Contrast, Pair
 from experiment_design.design import design_trial
-from experiment_design.request import DesignRequest, Rival, build_problem
-from experiment_design.result import Design
-from experiment_design.search import draw_two_level
+from experiment_design.information.t_optimality import Contrast, Pair
+from experiment_design.optimise.campaign import Progress
+from experiment_design.optimise.search import draw_two_level
+from experiment_design.output.result import Design
+from experiment_design.request.request import CandidateModel, DesignRequest, build_problem
 from greybox.errors import UsageError
 from greybox.notebook import DisplayMixin, items, number, sparkline, table
 
@@ -148,7 +148,7 @@ def probability_right(ratio: float) -> float:
 
 def design_between(
     request: DesignRequest,
-    rival: Rival,
+    rival: CandidateModel,
     names: tuple[str, str],
     *,
     best_effort: bool = False,
@@ -164,7 +164,7 @@ def design_between(
     ----------
     request : DesignRequest
         Of one trial, with the first explanation as its model.
-    rival : Rival
+    rival : CandidateModel
         The second one.
     names : (str, str)
     best_effort : bool
@@ -189,7 +189,7 @@ def design_between(
     """
     if request.trials != 1:
         raise UsageError("--between designs one trial at a time: leave out --trials.")
-    first = Rival(
+    first = CandidateModel(
         names[0], request.structure, request.theta, request.d, integrator=request.integrator
     )
     pairs = [(first, rival)]
@@ -273,7 +273,7 @@ def _judge(
     return Discrimination(design, names, ratio, left, nested, random)
 
 
-def _fitted(explanation: Rival, step: Array) -> Rival:
+def _fitted(explanation: CandidateModel, step: Array) -> CandidateModel:
     """Return an explanation after one Gauss-Newton step towards the other's motion."""
     both = np.concatenate([explanation.theta, explanation.d])
     free = _free(explanation)

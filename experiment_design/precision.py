@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from experiment_design.campaign import add_up
-from experiment_design.limits import LimitName
-from experiment_design.moments import Moments
-from experiment_design.request import DesignRequest, build_problem, wanted_parameters
+from experiment_design.constraints.limits import LimitName
+from experiment_design.information.moments import Moments
+from experiment_design.optimise.campaign import add_up
+from experiment_design.request.request import DesignRequest, build_problem, wanted_parameters
 from greybox.errors import ExcitationError, UsageError
 from greybox.notebook import DisplayMixin, items, number, table
 from greybox.numerics.linalg import scaled_logdet
@@ -74,7 +74,7 @@ def predict_precision(
     Parameters
     ----------
     request : DesignRequest
-        The prior model, the start of each trial and the yardstick.
+        The prior model, the start of each trial and the criterion.
     plans : sequence of mapping of str to ndarray
         (N,) each command of each trial, at the sample time: speeds in the unit of
         the log, angles [rad].

@@ -8,12 +8,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from experiment_design.air import clear_heading
-from experiment_design.campaign import random_campaign
-from experiment_design.demands import ROOM, tells_enough, with_margins
-from experiment_design.limits import TrialLimits
-from experiment_design.noise import noise_levels
-from experiment_design.regimes import (
+from experiment_design.constraints.limits import TrialLimits
+from experiment_design.feasibility.checks import ROOM, tells_enough, with_margins
+from experiment_design.feasibility.stability import unstable_sentence
+from experiment_design.optimise.campaign import random_campaign
+from experiment_design.request.apparent_wind import clear_heading
+from experiment_design.request.noise import noise_levels
+from experiment_design.request.regimes import (
     Signs,
     Steady,
     candidate_regimes,
@@ -22,8 +23,7 @@ from experiment_design.regimes import (
     steady_motions,
     steady_start,
 )
-from experiment_design.request import DesignRequest, build_problem, full_structure
-from experiment_design.stability import unstable_sentence
+from experiment_design.request.request import DesignRequest, build_problem, full_structure
 from greybox.errors import InfeasibleError, StructureError, UsageError
 from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor_kinds import PREDICTORS

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from experiment_design.limits import TrialLimits
-from experiment_design.request import DesignRequest
+from experiment_design.constraints.limits import TrialLimits
+from experiment_design.request.request import DesignRequest
 from greybox.model.catalogue import get_structure
 from greybox.model.model import ManoeuvringModel
 from greybox.model.noise import NoiseLevels

@@ -30,8 +30,8 @@ STEPS = {
     "diagnose": "diagnose DiagnosisOptions Diagnosis fit_given Given known_causes Cause",
     "design": "prepare_request Wishes TrialLimits Circle DesignRequest build_problem noise_levels "
     "NoiseLevels design_trial Design write_plan certify Certificate predict_precision "
-    "PredictedPrecision design_between Rival Discrimination least_duration prbs random_two_level "
-    "to_log",
+    "PredictedPrecision design_between CandidateModel Discrimination least_duration prbs "
+    "random_two_level to_log",
 }
 _PACKAGES = (greybox, experiment_design)
 

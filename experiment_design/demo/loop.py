@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from experiment_design.demo.steps import Demo, Files, Step
 from experiment_design.design import design_trial
+from experiment_design.output.result import Design, write_plan
 from experiment_design.prepare import Wishes, prepare_request
-from experiment_design.result import Design, write_plan
 from greybox.diagnosis.diagnose import DiagnosisOptions, diagnose
 from greybox.diagnosis.result import Diagnosis, Found
 from greybox.errors import UsageError, suggestion

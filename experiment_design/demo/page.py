@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from experiment_design.demo.steps import Demo, Step
-from experiment_design.report import design_page
-from experiment_design.result import Design
+from experiment_design.output.report import design_page
+from experiment_design.output.result import Design
 from greybox.diagnosis.result import Diagnosis
 from greybox.model.model import ManoeuvringModel
 from greybox.report.chart import chart_of

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from experiment_design.result import Design
+from experiment_design.output.result import Design
 from greybox.diagnosis.result import Diagnosis
 from greybox.estimation.result import Estimate
 from greybox.files import sha256

@@ -9,10 +9,10 @@ import pytest
 from designs import make_request, thesis_model
 
 from experiment_design import TrialLimits, Wishes, design_trial, prepare_request
-from experiment_design.air import air_velocity, clear_heading, share_near_zero
-from experiment_design.campaign import random_campaign
-from experiment_design.feasible import moved_constant
-from experiment_design.request import build_problem, draw_gusts
+from experiment_design.feasibility.least_violation import moved_constant
+from experiment_design.optimise.campaign import random_campaign
+from experiment_design.request.apparent_wind import air_velocity, clear_heading, share_near_zero
+from experiment_design.request.request import build_problem, draw_gusts
 from greybox.errors import UsageError
 
 WIND = (5.0, 2.0)

@@ -9,16 +9,17 @@ import numpy as np
 import pytest
 from designs import limited_ship, make_request
 
-from experiment_design.certificate import _FEW, _information, _Tangent, certify
-from experiment_design.criteria import Criterion
+from experiment_design.certificate.certificate import _FEW, _information, _Tangent, certify
+from experiment_design.certificate.surge_bound import _Programme, _Sums, _Trial, why_not_surge
+from experiment_design.constraints.limit_program import LimitProgram
+from experiment_design.constraints.limits import TrialLimits
 from experiment_design.design import design_trial
-from experiment_design.limits import LimitProgram, TrialLimits
-from experiment_design.moments import MomentProgram
-from experiment_design.problem import Scenario, TrialProblem
-from experiment_design.rollout import Rollout
-from experiment_design.schedule import make_schedule
-from experiment_design.search import ascend, climb, draw_two_level
-from experiment_design.surge_bound import _Programme, _Sums, _Trial, why_not_surge
+from experiment_design.excitation.rollout import Rollout
+from experiment_design.excitation.schedule import make_schedule
+from experiment_design.information.criteria import Criterion
+from experiment_design.information.moments import MomentProgram
+from experiment_design.optimise.search import ascend, climb, draw_two_level
+from experiment_design.request.problem import Scenario, TrialProblem
 from greybox.model.catalogue import get_structure
 from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import build_predictor
@@ -40,14 +41,14 @@ def make_problem(ship, name, duration, kind="D", *, white=False, start=None, pre
     schedule = make_schedule(ship, duration, 10.0, 1.0)
     first = start or ((1.5, 0.0) if nx == 1 else (1.5, 1.2, 0.0, 0.0))
     rollout = Rollout(ship, structure, theta, STILL, np.array(first), 1.0)
-    yardstick = MomentProgram(model, theta, STILL, noise, 1.0, white=white)
+    information = MomentProgram(model, theta, STILL, noise, 1.0, white=white)
     wanted = tuple(model.parameter_columns)
     scale = np.array([abs(sum(TRUE[t] for t in model.columns[i].terms)) for i in wanted])
     signs = {"u": 1} if nx == 1 else {"u": 1, "v": 1}
     limits = TrialLimits(signs, {"u": 0.5} if nx == 1 else {"u": 0.5, "v": 0.4})
     return TrialProblem(
         schedule,
-        (Scenario(rollout, yardstick, LimitProgram(rollout, schedule, limits)),),
+        (Scenario(rollout, information, LimitProgram(rollout, schedule, limits)),),
         Criterion(kind, wanted, scale, 1 / scale),
     )
 
@@ -157,8 +158,11 @@ def test_dynamic_programme_equals_all_sequences(ship):
     for i in (100, 2000):
         _, slope = trial.value(sums[i])
         noisy = slope.gram * (1 + 0.2 * rng.random((4, 4)))
-        slope = _Sums((noisy + noisy.T) / 2, slope.score)
-        values = [(slope.gram * s.gram).sum() + (slope.score * s.score).sum() for s in sums]
+        slope = _Sums((noisy + noisy.T) / 2, slope.score_covariance)
+        values = [
+            (slope.gram * s.gram).sum() + (slope.score_covariance * s.score_covariance).sum()
+            for s in sums
+        ]
         best, found = programme.maximise(slope)
         assert best == pytest.approx(max(values), rel=2e-3)
         assert everything[int(np.argmax(values))] == pytest.approx(found)
@@ -172,7 +176,7 @@ def test_sums_and_derivatives_of_a_surge_trial(ship):
     value, slope = trial.value(sums)
     assert value == pytest.approx(problem.evaluate(unit[None]).value[0], abs=1e-8)
     draw = np.random.default_rng(5).normal(size=(4, 4))
-    for which, step in (("gram", 1e-5), ("score", 1e-9)):
+    for which, step in (("gram", 1e-5), ("score_covariance", 1e-9)):
         ends = []
         for sign in (1, -1):
             moved = replace(sums, **{which: getattr(sums, which) + sign * step * (draw + draw.T)})
@@ -200,7 +204,9 @@ def test_a_campaign_of_two_trials(ship):
     best = -np.inf
     for i in range(len(units)):
         pair = replace(
-            sums[1], gram=sums[0].gram[i] + sums[1].gram, score=sums[0].score[i] + sums[1].score
+            sums[1],
+            gram=sums[0].gram[i] + sums[1].gram,
+            score_covariance=sums[0].score_covariance[i] + sums[1].score_covariance,
         )
         best = max(best, float(problem.criterion.value(pair).max()))
     found = certify([problem, other], [units[85], units[90]], budget=1200)

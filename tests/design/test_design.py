@@ -19,11 +19,11 @@ from experiment_design import (
     predict_precision,
     prepare_request,
 )
-from experiment_design.expressions import gradient_of
-from experiment_design.inputs import multisines, prbs, random_two_level, zig_zags
-from experiment_design.regimes import parse_regime, spell_regime
-from experiment_design.request import build_problem
-from experiment_design.search import assess, best_random, exchange
+from experiment_design.excitation.inputs import multisines, prbs, random_two_level, zig_zags
+from experiment_design.optimise.search import assess, best_random, exchange
+from experiment_design.request.expressions import gradient_of
+from experiment_design.request.regimes import parse_regime, spell_regime
+from experiment_design.request.request import build_problem
 from greybox.errors import ExcitationError, InfeasibleError, StructureError, UsageError
 from greybox.files import plain
 from greybox.model.catalogue import get_structure

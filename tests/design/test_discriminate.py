@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from designs import make_request
 
-from experiment_design import Rival, design_between, design_trial
-from experiment_design.contrast import Pair
+from experiment_design import CandidateModel, design_between, design_trial
 from experiment_design.discriminate import probability_right
-from experiment_design.request import build_problem
+from experiment_design.information.t_optimality import Pair
+from experiment_design.request.request import build_problem
 from greybox.errors import UsageError
 from greybox.model.run.simulation import simulate
 
@@ -22,11 +22,11 @@ def _rival(request, current=(0.0, 0.0), **parameters):
         theta[request.structure.index(name)] = value
     d = np.zeros(4)
     d[:2] = current
-    return Rival("rival", request.structure, theta, d)
+    return CandidateModel("rival", request.structure, theta, d)
 
 
 def _first(request):
-    return Rival("first", request.structure, request.theta, request.d)
+    return CandidateModel("first", request.structure, request.theta, request.d)
 
 
 def _commands(problem, seed=0):

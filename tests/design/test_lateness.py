@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from designs import limited_ship, make_request, thesis_model
 
-from experiment_design import Rival, design_trial
-from experiment_design.lateness import late_notes
-from experiment_design.prediction import predict_motion
+from experiment_design import CandidateModel, design_trial
+from experiment_design.constraints.limits import LimitReport
+from experiment_design.excitation.rollout import Rollout
+from experiment_design.feasibility.actuator_delay import late_notes
+from experiment_design.output.prediction import predict_motion
 from experiment_design.prepare import Wishes, prepare_request
-from experiment_design.request import build_problem
-from experiment_design.result import LimitReport
-from experiment_design.rollout import Rollout
+from experiment_design.request.request import build_problem
 from greybox.model.run.changes import Change
 from greybox.trial.log import make_log
 from greybox.validation.fit import run_model
@@ -53,7 +53,7 @@ def test_a_limit_that_the_late_motion_misses_is_named():
     commands = problem.schedule.expand(problem.levels(np.zeros(problem.shape)))
     motion = problem.scenarios[0].rollout.run(commands[None], late=True)
     reports = (LimitReport(0, "u", 0.5, "m/s", 0.0), LimitReport(0, "v", 0.4, "m/s", 0.123))
-    asked = replace(request, contrasts=((Rival("a", *_explanation(request)),) * 2,))
+    asked = replace(request, contrasts=((CandidateModel("a", *_explanation(request)),) * 2,))
     notes = late_notes(asked, [problem], (motion,), reports, np.eye(2))
     assert notes[1] == (
         "with it trial 1 misses the limit of v by 0.12 m/s: ask for so much more room there"
@@ -111,9 +111,9 @@ def test_two_explanations_may_differ_in_a_thruster():
     request = make_request(duration=60.0)
     ship = request.vessel
     weak = replace(ship, thrusters=(ship.thrusters[0], replace(ship.thrusters[1], gain=0.6)))
-    first = Rival("whole", *_explanation(request))
+    first = CandidateModel("whole", *_explanation(request))
     for vessel, told in ((None, False), (weak, True)):
-        rival = Rival("weak", *_explanation(request), vessel)
+        rival = CandidateModel("weak", *_explanation(request), vessel)
         problem = build_problem(replace(request, contrasts=((first, rival),)))
         unit = np.random.default_rng(3).random((1, *problem.shape))
         value = problem.contrast.value(problem.schedule.expand(problem.levels(unit)))

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from designs import limited_ship, make_request
 
-from experiment_design.demands import feasible_or_reason
-from experiment_design.feasible import moved_constant
-from experiment_design.limits import Circle, LimitProgram, TrialLimits
-from experiment_design.request import build_problem
-from experiment_design.schedule import make_schedule
-from experiment_design.search import assess
+from experiment_design.constraints.limit_program import LimitProgram
+from experiment_design.constraints.limits import Circle, TrialLimits
+from experiment_design.excitation.schedule import make_schedule
+from experiment_design.feasibility.checks import feasible_or_reason
+from experiment_design.feasibility.least_violation import moved_constant
+from experiment_design.optimise.search import assess
+from experiment_design.request.request import build_problem
 from greybox.errors import UsageError, VesselError
 from greybox.vessel.toml import load_vessel
 from greybox.vessel.vessel import Limits

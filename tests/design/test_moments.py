@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from designs import make_request
 
-from experiment_design.criteria import Criterion
-from experiment_design.moments import Moments
-from experiment_design.noise import noise_levels
-from experiment_design.request import build_problem
+from experiment_design.information.criteria import Criterion
+from experiment_design.information.moments import Moments
+from experiment_design.request.noise import noise_levels
+from experiment_design.request.request import build_problem
 from greybox.errors import UsageError
 from greybox.model.noise import NoiseLevels
 from greybox.model.run.simulation import simulate
@@ -74,8 +74,8 @@ def test_the_slopes_are_those_of_the_priors_integrator():
     problem, _, motion = _random_motion(request)
     k = 7
     x, tau = motion.state[0, k, :4], motion.tau[0, k]
-    yardstick = problem.scenarios[0].yardstick
-    _, slopes = yardstick.regressors(x[None, None, :3], x[None, None, 3], tau[None, None])
+    information = problem.scenarios[0].information
+    _, slopes = information.regressors(x[None, None, :3], x[None, None, 3], tau[None, None])
     for j in range(4):
         ends = []
         for step in (1e-6, -1e-6):
@@ -256,7 +256,7 @@ def test_an_unknown_criterion():
 
 
 def test_casadi_is_what_differentiates():
-    """The yardstick's slopes follow a new term without any other edit."""
+    """The information model's slopes follow a new term without any other edit."""
     request = make_request(structure="thesis")
     longer = request.structure.with_terms("N_|r|r")
     request = replace(request, structure=longer, theta=np.append(request.theta, -0.3))

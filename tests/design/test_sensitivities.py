@@ -10,13 +10,14 @@ import pytest
 from designs import thesis_model
 
 from experiment_design import Wishes, predict_precision, prepare_request
-from experiment_design.criteria import Criterion
-from experiment_design.limits import LimitProgram, TrialLimits
-from experiment_design.problem import Scenario, TrialProblem
-from experiment_design.rollout import Rollout
-from experiment_design.schedule import make_schedule
-from experiment_design.search import ascend
-from experiment_design.sensitivities import SensitivityProgram
+from experiment_design.constraints.limit_program import LimitProgram
+from experiment_design.constraints.limits import TrialLimits
+from experiment_design.excitation.rollout import Rollout
+from experiment_design.excitation.schedule import make_schedule
+from experiment_design.information.criteria import Criterion
+from experiment_design.information.sensitivities import SensitivityProgram
+from experiment_design.optimise.search import ascend
+from experiment_design.request.problem import Scenario, TrialProblem
 from greybox.errors import UsageError
 from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import build_predictor
@@ -93,7 +94,7 @@ def test_information_is_the_sum(ship, thesis, true_theta):
     found = program(*signals)
     expected = np.einsum("rkip,i,rkiq->rpq", s, noise.measurement**-2.0, s)
     np.testing.assert_allclose(found.gram, expected, rtol=1e-10)
-    assert found.score is found.gram
+    assert found.score_covariance is found.gram
 
 
 @pytest.mark.parametrize("kind", ["D", "A", "E", "c"])

@@ -15,18 +15,24 @@ import numpy as np
 import pytest
 from browser import require_legible, without_scripts
 
-from experiment_design.briefing import brief, clock, compass, plain_name, signed
-from experiment_design.campaign import add_up, own_moments
-from experiment_design.classical import Alternative
-from experiment_design.limits import Circle, TrialLimits
-from experiment_design.pictures import forbidden
-from experiment_design.prediction import edge_distance, predict_motion
+from experiment_design.constraints.limits import Circle, LimitReport, TrialLimits
+from experiment_design.feasibility.constraint_satisfaction import ConstraintSatisfaction
+from experiment_design.optimise.campaign import add_up, own_moments
+from experiment_design.optimise.classical import Alternative
+from experiment_design.output.pictures import forbidden
+from experiment_design.output.prediction import edge_distance, predict_motion
+from experiment_design.output.report import design_page, random_std
+from experiment_design.output.result import Design
+from experiment_design.output.sheet_contents import (
+    clock,
+    compass,
+    plain_name,
+    sheet_contents,
+    signed,
+)
+from experiment_design.output.trial_sheet import sheet_figures, sheet_kind, write_sheet
 from experiment_design.prepare import Wishes, prepare_request
-from experiment_design.report import design_page, random_std
-from experiment_design.request import build_problem
-from experiment_design.result import Design, LimitReport
-from experiment_design.robust import Keeping
-from experiment_design.sheet import sheet_figures, sheet_kind, write_sheet
+from experiment_design.request.request import build_problem
 from greybox.commands.main import main
 from greybox.errors import UsageError
 from greybox.model.model import ManoeuvringModel
@@ -160,8 +166,8 @@ def test_a_model_that_runs_away_is_counted(known):
     )
     assert 0 < band.lost < 50
     assert np.isfinite(band.low).all()
-    briefing = brief(replace(known, request=replace(known.request, covariance=wild)), band)
-    assert any("run away" in w for w in briefing.warnings)
+    contents = sheet_contents(replace(known, request=replace(known.request, covariance=wild)), band)
+    assert any("run away" in w for w in contents.warnings)
 
 
 def test_distance_to_the_edge():
@@ -182,9 +188,9 @@ def test_words_of_numbers():
 def test_way_points_are_the_changes(known):
     (band,) = predict_motion(known)
     same = tuple(np.repeat(v[::2], 2, axis=0) for v in known.levels)
-    briefing = brief(replace(known, levels=same), band)
-    assert briefing.rows == 31
-    cells = {c.name: c.cells for c in briefing.columns}
+    contents = sheet_contents(replace(known, levels=same), band)
+    assert contents.rows == 31
+    cells = {c.name: c.cells for c in contents.columns}
     assert cells["time"][:3] == ("0:00", "0:20", "0:40")
     assert cells["time"][-1] == "10:00"
     angle = same[0][0, 1]
@@ -196,16 +202,16 @@ def test_way_points_are_the_changes(known):
 
 def test_abort_limits_in_words(unsure, known):
     (band,) = predict_motion(unsure)
-    said = "\n".join(brief(unsure, band).abort)
+    said = "\n".join(sheet_contents(unsure, band).abort)
     assert "Speed over ground above 4.00 m/s (7.8 kn)" in said
     assert "11.5°/s (0.200 rad/s)" in said
     assert "Nearer than 20 m to the edge" in said
     assert "Surge ahead below 0.50 m/s" in said
     assert "columns ±" in said
-    facts = dict(brief(unsure, band).facts)
+    facts = dict(sheet_contents(unsure, band).facts)
     assert facts["Expected"] == "current 0.22 m/s (0.4 kn) setting towards 027°"
     (band,) = predict_motion(known)
-    said = "\n".join(brief(known, band).abort)
+    said = "\n".join(sheet_contents(known, band).abort)
     assert "Heading more than 10° or position more than 30 m off the table." in said
     assert "no cap was set" in said
 
@@ -213,15 +219,15 @@ def test_abort_limits_in_words(unsure, known):
 def test_wind_is_named_by_where_it_comes_from(known):
     design = replace(known, request=replace(known.request, d=np.array([0, 0, -5.0, 0])))
     (band,) = predict_motion(known)
-    assert "wind 5.0 m/s (10 kn) from 000°" in dict(brief(design, band).facts)["Expected"]
+    assert "wind 5.0 m/s (10 kn) from 000°" in dict(sheet_contents(design, band).facts)["Expected"]
 
 
 def test_broken_limits_are_shouted(known):
     broken = (LimitReport(0, "sea room", 0.0, "m", 16.0),)
-    keeping = Keeping(0.4, 0.3, 0.5, 400, np.zeros(1), {})
+    keeping = ConstraintSatisfaction(0.4, 0.3, 0.5, 400, np.zeros(1), {})
     design = replace(known, limits=broken, keeping=keeping)
     (band,) = predict_motion(design)
-    warnings = brief(design, band).warnings
+    warnings = sheet_contents(design, band).warnings
     assert warnings[0] == "This plan breaks its limits: sea room by 16 m."
     assert "probability 0.40 only" in warnings[1]
 
@@ -241,7 +247,7 @@ def test_margins_forbid_what_the_current_takes(unsure):
 def test_sixty_holds_fit_one_page(request, tmp_path, which):
     design = request.getfixturevalue(which)
     (band,) = predict_motion(design)
-    assert brief(design, band).rows == 61
+    assert sheet_contents(design, band).rows == 61
     (figure,) = sheet_figures(design, band)
     assert figure.get_size_inches() == pytest.approx((210 / 25.4, 297 / 25.4))
     figure.canvas.draw()
@@ -269,7 +275,7 @@ def test_a_long_table_goes_on(ship, thesis, true_theta):
     figures = sheet_figures(design, band)
     assert len(figures) > 1
     written = [t.get_text() for f in figures for t in f.axes[0].texts]
-    times = brief(design, band).columns[0].cells
+    times = sheet_contents(design, band).columns[0].cells
     assert [t for t in written if t in set(times)] == list(times)
 
 

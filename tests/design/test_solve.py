@@ -9,15 +9,16 @@ import numpy as np
 import pytest
 from scipy.sparse import csc_matrix
 
-from experiment_design.criteria import Criterion
-from experiment_design.limits import Circle, LimitProgram, TrialLimits
-from experiment_design.moments import MomentProgram
-from experiment_design.problem import Scenario, TrialProblem
-from experiment_design.rollout import Rollout
-from experiment_design.schedule import make_schedule
-from experiment_design.search import assess, draw_two_level
-from experiment_design.sensitivities import SensitivityProgram
-from experiment_design.solve import Outcome, make_shooting, run_ipopt, solve_ipopt
+from experiment_design.constraints.limit_program import LimitProgram
+from experiment_design.constraints.limits import Circle, TrialLimits
+from experiment_design.excitation.rollout import Rollout
+from experiment_design.excitation.schedule import make_schedule
+from experiment_design.information.criteria import Criterion
+from experiment_design.information.moments import MomentProgram
+from experiment_design.information.sensitivities import SensitivityProgram
+from experiment_design.optimise.search import assess, draw_two_level
+from experiment_design.optimise.solve import Outcome, make_shooting, run_ipopt, solve_ipopt
+from experiment_design.request.problem import Scenario, TrialProblem
 from greybox.errors import UsageError
 from greybox.model.catalogue import get_structure
 from greybox.model.noise import NoiseLevels
@@ -48,12 +49,12 @@ def problem(
     schedule = make_schedule(vessel, duration, hold, 1.0)
     d = np.array([current, -current / 2, 0.0, 0.0])
     rollout = Rollout(vessel, thesis, theta, d, np.array([1.5, 1.2, 0.0, 0.0]), 1.0)
-    yardstick = MomentProgram(columns, theta, d, noise, 1.0, white=white)
+    information = MomentProgram(columns, theta, d, noise, 1.0, white=white)
     wanted = tuple(columns.parameter_columns)
     weights = np.linspace(-1, 1, len(wanted))
     criterion = Criterion(kind, wanted, np.abs(theta[list(range(len(wanted)))]), weights)
     program = LimitProgram(rollout, schedule, limits)
-    return TrialProblem(schedule, (Scenario(rollout, yardstick, program),), criterion)
+    return TrialProblem(schedule, (Scenario(rollout, information, program),), criterion)
 
 
 @pytest.mark.parametrize("kind", ["D", "A", "c"])
@@ -188,10 +189,10 @@ def test_output_error_polish():
 
 def test_output_error_of_many_unknowns_is_refused(ship, thesis, true_theta):
     p = problem(ship, thesis, true_theta)
-    y = p.scenarios[0].yardstick
+    y = p.scenarios[0].information
     noise = NoiseLevels(thesis.states, np.full(3, 0.014), np.zeros(3))
     program = SensitivityProgram(y.predictor, true_theta, np.zeros(4), noise, 1.0)
-    other = dataclasses.replace(p.scenarios[0], yardstick=program)
+    other = dataclasses.replace(p.scenarios[0], information=program)
     with pytest.raises(UsageError, match="at most 8 unknowns, and this one has 18"):
         make_shooting(dataclasses.replace(p, scenarios=(other,)), np.full(p.shape, 0.5))
 
@@ -236,7 +237,7 @@ def test_refusals_are_values(ship, thesis, true_theta):
     assert "not smooth" in found.status
     assert found.value == assess(p, unit[None])[0].value
     p = problem(ship, thesis, true_theta)
-    other = dataclasses.replace(p.scenarios[0], yardstick=lambda *a: None)
+    other = dataclasses.replace(p.scenarios[0], information=lambda *a: None)
     with pytest.raises(UsageError, match="zero-mean IV"):
         make_shooting(dataclasses.replace(p, scenarios=(other,)), unit)
 

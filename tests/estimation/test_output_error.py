@@ -681,7 +681,7 @@ class TestInnovations:
 
 class TestLimits:
     def test_information_equals_that_of_the_design(self, predictor):
-        from experiment_design.sensitivities import SensitivityProgram
+        from experiment_design.information.sensitivities import SensitivityProgram
 
         log = virtual_log(9, 300, spread=0.0, noise=0.0)
         model, data, p = problem(predictor, log)

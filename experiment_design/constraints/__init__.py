@@ -1,0 +1,1 @@
+"""What a trial must keep, as plain data and as compiled functions."""

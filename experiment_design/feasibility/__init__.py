@@ -1,0 +1,1 @@
+"""Whether a trial can be run at all, whether its limits hold, and what to change if not."""

@@ -1,0 +1,279 @@
+"""Feasibility checks before and after the search, and their messages."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from experiment_design.constraints.limits import (
+    TOLERANCE,
+    Circle,
+    LimitKind,
+    LimitName,
+    TrialLimits,
+)
+from experiment_design.feasibility.least_violation import (
+    in_words,
+    least_change,
+    moved_constant,
+    perturbed,
+)
+from experiment_design.feasibility.stability import unstable_sentence
+from experiment_design.information.estimators import ESTIMATORS
+from experiment_design.information.optimality import CRITERIA
+from experiment_design.optimise.campaign import (
+    add_up,
+    own_moments,
+    random_campaign,
+)
+from experiment_design.optimise.duration import telling_duration
+from experiment_design.optimise.search import Candidate, ascend, assess
+from experiment_design.request.problem import TrialProblem
+from experiment_design.request.regimes import steady_motions
+from experiment_design.request.request import DesignRequest, build_problem, wanted_parameters
+from greybox.errors import InfeasibleError
+from greybox.model.predictor_kinds import PREDICTORS
+from greybox.numerics.linalg import scaled
+
+Array = NDArray[np.float64]
+
+# relative standard error from which nothing was learnt of a parameter
+_VAGUE = 2.0
+# evaluations by which it is found out whether a trial tells enough
+_BRIEF = 200
+# shares of what is reached at best that are tried as margins
+ROOM = (0.95, 0.9, 0.8, 0.65, 0.4, 0.2)
+
+
+def require_horizon(request: DesignRequest) -> None:
+    """Raise where the trial has fewer samples than an equation has unknowns."""
+    predictor = request.build_predictor()
+    samples = request.schedule.samples
+    most = max(len(predictor.equation(s)) + 1 for s in request.structure.states)
+    if samples * request.trials <= most:
+        longer = max(2 * most * request.sample_time, 6 * request.hold)
+        fewer = PREDICTORS[request.predictor].plain
+        other = "." if fewer == request.predictor else f", or --predictor {fewer}."
+        raise InfeasibleError(
+            f"a trial of {request.duration:g} s has {samples} samples, too few for the {most} "
+            f"unknowns of one equation: use --duration {longer:g} or more{other}"
+        )
+
+
+def require_informative(
+    request: DesignRequest,
+    problems: list[TrialProblem],
+    units: list[Array],
+    hopeless: float = 1.0,
+) -> list[str]:
+    """Raise where the trial is too short to tell most parameters; return notes on doubtful ones.
+
+    `hopeless` is how many times vaguer random sequences may be than the design.
+    """
+    if request.targets or request.contrasts or CRITERIA[request.criterion].combined:
+        return []
+    names = [c.name for c in wanted_parameters(request, problems[0].criterion)]
+    share = _relative_errors(problems, units)
+    if hopeless > 1 and not np.isfinite(share).all():
+        return []
+    vague = [n for n, s in zip(names, share, strict=True) if s > hopeless * _VAGUE]
+    if 2 * len(vague) > len(names):
+        longer = telling_duration(request, _VAGUE)
+        other = "--want fewer parameters"
+        fewer = PREDICTORS[request.predictor].plain
+        if request.predictor != fewer:
+            other = f"--predictor {fewer}"
+        if request.limits.margin_air:
+            other = "a lower --margin-air"
+        advice = f"Use {other}" if longer is None else f"Use --duration {longer:g}, or {other}"
+        raise InfeasibleError(
+            f"a trial of {request.duration:g} s is too short: the predicted standard error of "
+            f"{', '.join(vague)} is more than {_VAGUE:g} times the prior value "
+            f"({share.max():.2g} times at worst). {advice}."
+        )
+    doubtful = [n for n, s in zip(names, share, strict=True) if s > 1]
+    if not doubtful:
+        return []
+    one = len(doubtful) == 1
+    return [
+        f"{', '.join(doubtful)} will stay unknown by more than {'its' if one else 'their'} prior "
+        f"value: lengthen the trial, or leave {'it' if one else 'them'} out with --want"
+    ]
+
+
+def _relative_errors(problems: list[TrialProblem], units: list[Array]) -> Array:
+    """Return the predicted standard errors as shares of the prior values."""
+    criterion = problems[0].criterion
+    sums = add_up([own_moments(p, u) for p, u in zip(problems, units, strict=True)])
+    return np.asarray(np.sqrt(np.diag(criterion.covariance(sums[0])[0])) / criterion.scale)
+
+
+def require_start(problem: TrialProblem, request: DesignRequest, trial: int) -> None:
+    """Raise where the start itself breaks a limit."""
+    program = problem.scenarios[0].limits
+    start = np.zeros(program.nx + 3)
+    start[: program.nx + 1] = request.starts[trial]
+    missed = program.path_values(start[None])[:, 0]
+    for name, m, more in zip(
+        program.path_names, missed, [*request.backoff, *[0.0] * len(missed)], strict=False
+    ):
+        if m - more > TOLERANCE:
+            where = (
+                f"{m:.1f} m outside the sea room"
+                if name.kind is LimitKind.SEA_ROOM
+                else f"{m:.3g} {name.unit} beyond the {name.name} of {name.bound:g} {name.unit}"
+            )
+            if name.kind is LimitKind.SEA_ROOM:
+                raise InfeasibleError(
+                    f"the trial starts {where}: move it by --position, or the sea room."
+                )
+            # a start on the limit itself could be left on one side only
+            room = f"{1.2 * m:.2g}"
+            raise InfeasibleError(
+                f"the trial starts {where}: change --start, or relax {name.option} by {room}."
+            )
+
+
+def require_stable(request: DesignRequest) -> None:
+    """Raise where the prior model runs away under any constant command."""
+    sentence = unstable_sentence(request, request.starts[0])
+    if sentence:
+        raise InfeasibleError(sentence)
+
+
+def feasible_or_reason(
+    problem: TrialProblem, request: DesignRequest, trial: int, best: Candidate, nearest: Candidate
+) -> tuple[Candidate, str]:
+    """Return the better of two candidates, and why limits cannot be kept, empty if they can."""
+    chosen = nearest if nearest.missed.max(initial=0) < best.missed.max(initial=0) else best
+    if (chosen.missed <= TOLERANCE).all():
+        if np.isfinite(chosen.value):
+            return chosen, ""
+        if not np.isfinite(best.value):
+            return chosen, unexcited([problem], [chosen.unit], request)
+        # what keeps the limits tells nothing, so that the limits are what stops the trial
+        chosen = best
+    changes = least_change(problem, chosen)
+    name, amount = changes[0]
+    more = _turning(request) if name.kind is LimitKind.SEA_ROOM else ""
+    if name.kind is LimitKind.MARGIN and request.d[:2].any():
+        more += (
+            f" Margins are kept through the water too, and a current of "
+            f"{float(np.hypot(*request.d[:2])):.2g} m/s is expected."
+        )
+    lower = ""
+    if all(n.kind is LimitKind.MARGIN for n, _ in changes):
+        lower = _margins_within_reach(request, trial, chosen, changes)
+    return chosen, in_words(name, amount, more, lower)
+
+
+def _margins_within_reach(
+    request: DesignRequest, trial: int, chosen: Candidate, changes: list[tuple[LimitName, float]]
+) -> str:
+    """Return the margins, as options, under which sequences around one keep every limit.
+
+    What it reaches itself leaves no room to move in, so that shares of it are tried.
+    """
+    reached = {n.margin: n.bound - m for n, m in changes}
+    for share in ROOM:
+        margins = {n: np.floor(1e3 * share * v) / 1e3 for n, v in reached.items()}
+        if min(margins.values()) < 0:
+            return ""
+        problem = build_problem(
+            replace(request, limits=with_margins(request.limits, margins)), trial
+        )
+        if perturbed(problem, assess(problem, chosen.unit[None])[0], request.seed).feasible:
+            return " ".join(f"--margin-{n} {v:g}" for n, v in margins.items())
+    return ""
+
+
+def with_margins(limits: TrialLimits, margins: dict[str, float]) -> TrialLimits:
+    """Return the limits with other margins, that through the air under the name ``air``."""
+    kept = {k: v for k, v in margins.items() if k != "air"}
+    return replace(
+        limits,
+        margins=dict(limits.margins) | kept,
+        margin_air=margins.get("air", limits.margin_air),
+    )
+
+
+def tells_enough(request: DesignRequest) -> bool:
+    """Whether one ascent a trial finds sequences that keep the limits and tell enough."""
+    problems = [build_problem(request, t) for t in range(request.trials)]
+    units, _ = random_campaign(problems, request.seed)
+    if units is None:
+        moved = [moved_constant(p, request.seed) for p in problems]
+        units = [c.unit for c in moved if c is not None]
+    if len(units) < len(problems):
+        return False
+    for t, problem in enumerate(problems):
+        here = problem
+        if request.trials > 1:
+            pairs = zip(problems, units, strict=True)
+            here = problem.with_known(
+                add_up([own_moments(p, u) for o, (p, u) in enumerate(pairs) if o != t])
+            )
+        found = ascend(here, units[t], _BRIEF)
+        if found.feasible:
+            units[t] = found.unit
+    if request.targets or request.contrasts or CRITERIA[request.criterion].combined:
+        return True
+    share = _relative_errors(problems, units)
+    return bool(2 * (share > _VAGUE).sum() <= share.size)
+
+
+def _turning(request: DesignRequest) -> str:
+    """Return what the turning circle has to do with the sea room, where it has."""
+    steady = steady_motions(request)
+    signs = np.ones(len(steady.x), bool)
+    for state, sign in request.regimes[0]:
+        column = steady.x[:, request.structure.states.index(state)]
+        signs &= column * sign >= request.limits.margins.get(state, 0.0)
+    if not signs.any():
+        return ""
+    smallest = float(steady.diameter[signs].min())
+    area = request.limits.area
+    if isinstance(area, Circle):
+        width = 2 * area.radius
+    else:
+        corners = np.asarray(area, float)
+        width = float(np.ptp(corners, axis=0).min())
+    if not np.isfinite(smallest):
+        return " No constant command within the limits turns the vessel."
+    return (
+        f" The sea room is {width:.0f} m across; the smallest circle that the vessel turns within "
+        f"these limits is {smallest:.0f} m."
+    )
+
+
+def unexcited(problems: list[TrialProblem], units: list[Array], request: DesignRequest) -> str:
+    """Return which regressor no sequence moves enough to be told from the others."""
+    if ESTIMATORS[request.estimator].free_run:
+        return (
+            "this trial cannot tell the parameters of an output-error fit apart: lengthen it, "
+            "widen the limits, or use --predictor basic."
+        )
+    sums = add_up([own_moments(p, u) for p, u in zip(problems, units, strict=True)])[0]
+    predictor = request.build_predictor()
+    worst, label, state = np.inf, "", ""
+    for name in request.structure.states:
+        mine = predictor.equation(name)
+        gram = sums.gram[0][np.ix_(mine, mine)]
+        size = np.sqrt(np.maximum(np.diag(gram), 0.0))
+        if (size <= 0).any():
+            still = predictor.columns[mine[int(size.argmin())]].label
+            return (
+                f"no sequence within these limits moves {still}: its regressor varies by 0. "
+                f"Widen the limits, or leave it out of the structure."
+            )
+        values, vectors = np.linalg.eigh(scaled(gram)[0])
+        if values[0] < worst:
+            worst, state = float(values[0]), name
+            label = predictor.columns[mine[int(np.abs(vectors[:, 0]).argmax())]].label
+    return (
+        f"this trial cannot tell the regressors of {state} apart: along {label} their smallest "
+        f"eigenvalue is {max(worst, 0):.1e} of the largest, 1e-12 is needed. Lengthen the trial, "
+        f"widen the limits, use --predictor basic, or plan --trials 2 in other regimes."
+    )

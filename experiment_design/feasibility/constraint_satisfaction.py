@@ -1,0 +1,115 @@
+"""Whether a plan keeps its limits when the prior model is not exactly true."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from experiment_design.constraints.limit_program import LimitProgram
+from experiment_design.excitation.rollout import Rollout
+from experiment_design.request.request import DesignRequest
+from greybox.model.predictor_kinds import PREDICTORS
+
+Array = NDArray[np.float64]
+
+_DRAWS = 400
+
+
+@dataclass(frozen=True)
+class ConstraintSatisfaction:
+    """Probability of keeping the limits under models drawn from the prior.
+
+    Parameters
+    ----------
+    probability : float
+        Share of the draws under which every path limit is kept all the time.
+    lower, upper : float
+        95 % Wilson interval.
+    draws : int
+    shortfall : ndarray
+        (m,) by how much each path limit is missed at the wanted quantile, in its unit.
+    margins : dict of str to float
+        The margins that are kept with the wanted probability.
+    """
+
+    probability: float
+    lower: float
+    upper: float
+    draws: int
+    shortfall: Array
+    margins: dict[str, float]
+
+    def sentence(self) -> str:
+        """Return one sentence for the summary."""
+        return (
+            f"limits are kept with probability {self.probability:.2f} "
+            f"({self.lower:.2f} to {self.upper:.2f}) under {self.draws} models drawn from the prior"
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fields for JSON."""
+        return {
+            "probability": self.probability,
+            "ci": [self.lower, self.upper],
+            "draws": self.draws,
+        }
+
+
+def wilson(hits: int, count: int) -> tuple[float, float]:
+    """Return the 95 % Wilson interval of a share."""
+    z, p = 1.959963984540054, hits / count
+    centre = (p + z**2 / (2 * count)) / (1 + z**2 / count)
+    half = z * np.sqrt(p * (1 - p) / count + z**2 / (4 * count**2)) / (1 + z**2 / count)
+    return max(0.0, float(centre - half)), min(1.0, float(centre + half))
+
+
+def keep_probability(
+    request: DesignRequest, units: list[Array], draws: int = _DRAWS
+) -> ConstraintSatisfaction:
+    """Run the plan under models drawn from the prior and count which keep every limit.
+
+    Parameters
+    ----------
+    request : DesignRequest
+        With a covariance.
+    units : list of ndarray
+        (K, nc) unit coordinates a trial.
+    draws : int
+    """
+    schedule = request.schedule
+    commands = [
+        schedule.expand(schedule.lower + (schedule.upper - schedule.lower) * u) for u in units
+    ]
+    kept = np.ones(draws, bool)
+    missed: list[Array] = []
+    thetas = request.draw_models(draws, 1)
+    plain = replace(request, backoff=())
+    kind = PREDICTORS[plain.predictor]
+    wind = kind.captures and not kind.air_measured
+    for t, c in enumerate(commands):
+        nominal = Rollout(
+            plain.vessel, plain.structure, plain.theta, plain.d, plain.starts[t],
+            plain.sample_time, plain.integrator,
+        )  # fmt: skip
+        program = LimitProgram(nominal, schedule, plain.trial_limits(t), wind_matters=wind)
+        motion = nominal.run_models(thetas, c, late=True)
+        over = program.path_values(motion.state[:, 1:]).max(axis=-1)
+        over[:, ~motion.stable] = np.inf
+        kept &= (over <= 1e-3).all(axis=0) & motion.stable
+        missed.append(over)
+    worst = np.max(missed, axis=0)
+    quantile = min(0.995, request.probability + 0.5 * (1 - request.probability))
+    shortfall = np.array([float(np.quantile(w[np.isfinite(w)], quantile)) for w in worst])
+    hits = int(kept.sum())
+    low, high = wilson(hits, draws)
+    margins = {}
+    for i, name in enumerate(request.trial_limits(0).signs):
+        margins[name] = request.limits.margins.get(name, 0.0) - float(
+            np.quantile(worst[i][np.isfinite(worst[i])], request.probability)
+        )
+    return ConstraintSatisfaction(
+        hits / draws, low, high, draws, np.maximum(shortfall, 0.0), margins
+    )

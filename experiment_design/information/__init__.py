@@ -1,0 +1,1 @@
+"""What a motion tells of the parameters: information, covariances, and optimality criteria."""

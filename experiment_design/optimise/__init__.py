@@ -1,0 +1,1 @@
+"""Search for the most informative sequences: ascent, campaigns, multiple shooting, duration."""

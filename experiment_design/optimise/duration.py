@@ -1,0 +1,154 @@
+"""How long a trial must be: to tell most parameters at all, or to wanted standard errors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from experiment_design.excitation.schedule import MOST_SAMPLES
+from experiment_design.optimise.campaign import (
+    Progress,
+    add_up,
+    own_moments,
+    random_campaign,
+    search_campaign,
+)
+from experiment_design.request.problem import TrialProblem
+from experiment_design.request.request import DesignRequest, build_problem, wanted_columns
+from greybox.errors import InfeasibleError, UsageError
+
+Array = NDArray[np.float64]
+
+# share of the usual search that each tried duration gets
+_QUICK = 0.15
+_DOUBLINGS = 8
+# a duration is settled to this share of itself, or to one hold
+_SETTLED = 0.03
+
+
+def random_shares(request: DesignRequest) -> Array | None:
+    """Return the relative standard errors that the best random two-level campaign would give."""
+    problems = [build_problem(request, t) for t in range(request.trials)]
+    units, _ = random_campaign(problems, request.seed)
+    if units is None:
+        return None
+    return _std(problems, units) / problems[0].criterion.scale
+
+
+def _std(problems: list[TrialProblem], units: list[Array]) -> Array:
+    sums = add_up([own_moments(p, u) for p, u in zip(problems, units, strict=True)])
+    covariance = problems[0].criterion.covariance(sums[0])[0]
+    return np.asarray(np.sqrt(np.diag(covariance)))
+
+
+def telling_duration(request: DesignRequest, vague: float) -> float | None:
+    """Return a duration at which random sequences tell at least half of the parameters.
+
+    None where they never do, or keep no limits.
+
+    Parameters
+    ----------
+    vague : float
+        Relative standard error from which nothing was learnt.
+    """
+    duration = request.duration
+    for _ in range(_DOUBLINGS):
+        duration *= 2
+        if duration > MOST_SAMPLES * request.sample_time:
+            return None
+        share = random_shares(replace(request, duration=duration))
+        if share is None:
+            # limits that no random sequence keeps are kept no longer
+            return None
+        if 2 * (share > vague).sum() <= len(share):
+            return duration
+    return None
+
+
+def least_duration(
+    request: DesignRequest,
+    targets: Mapping[str, float],
+    *,
+    progress: Progress | None = None,
+    workers: int | None = None,
+) -> DesignRequest:
+    """Return the request with the least duration whose design reaches wanted standard errors.
+
+    Parameters
+    ----------
+    request : DesignRequest
+        Its duration is the longest that is allowed.
+    targets : mapping of str to float
+        Wanted standard error of each named parameter, in its unit.
+    progress : callable, optional
+        Called with steps done and steps in all.
+    workers : int, optional
+        Processes.
+
+    Returns
+    -------
+    DesignRequest
+        Of the least duration, in whole holds, with the A criterion scaled by the targets.
+
+    Raises
+    ------
+    UsageError
+        A target is no positive number.
+    InfeasibleError
+        Even the longest trial does not reach them; says how far it gets.
+    """
+    for name, value in targets.items():
+        if not 0 < value < np.inf:
+            raise UsageError(f"the target of {name} is {value:g}, it must be positive.")
+    predictor = request.build_predictor()
+    names = tuple(predictor.columns[i].name for i in wanted_columns(predictor, tuple(targets)))
+    wanted = replace(request, criterion="A", wanted=names, targets=tuple(targets.values()))
+    goal = np.array(list(targets.values()))
+    tried = [0]
+
+    def reached(duration: float) -> tuple[float, int]:
+        trial = replace(wanted, duration=duration)
+        problems = [build_problem(trial, t) for t in range(trial.trials)]
+        start, _ = random_campaign(problems, trial.seed)
+        found = search_campaign(
+            trial, problems, start, effort=_QUICK * request.effort, workers=workers
+        )
+        tried[0] += 1
+        if progress is not None:
+            progress(min(tried[0], 14), 15)
+        if not all(c.feasible for c in found.candidates) and trial.trials == 1:
+            return np.inf, 0
+        ratio = _std(problems, [c.unit for c in found.candidates]) / goal
+        return float(ratio.max()), int(ratio.argmax())
+
+    longest = request.duration
+    ratio, worst = reached(longest)
+    if ratio > 1:
+        name = list(targets)[worst]
+        raise InfeasibleError(
+            f"{longest:g} s do not reach the target: the standard error of {name} would be "
+            f"{ratio:.2g} times the {targets[name]:.3g} that is wanted. Allow about "
+            f"--duration {float(f'{longest * ratio**2:.2g}'):g}, or a larger --target."
+        )
+    hold = request.hold
+    least = 2 * hold
+    low, high = least, longest
+    while high - low > max(hold, _SETTLED * high):
+        # standard errors fall with the square root of time
+        guess = np.clip(
+            high * ratio**2 * 1.02, low + 0.15 * (high - low), high - 0.15 * (high - low)
+        )
+        duration = float(round(guess / hold) * hold)
+        if not low < duration < high:
+            break
+        now, _ = reached(duration)
+        if now <= 1:
+            high, ratio = duration, now
+        else:
+            low = duration
+    if progress is not None:
+        progress(15, 15)
+    return replace(wanted, duration=high)

@@ -1,0 +1,1 @@
+"""A design and its forms: plan, page, trial sheet."""

@@ -1,0 +1,285 @@
+"""What a design is: sequences, what they are worth, and how they stand to the limits."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from experiment_design.certificate.certificate import Certificate
+from experiment_design.constraints.limits import LimitReport
+from experiment_design.excitation.rollout import Motion
+from experiment_design.feasibility.constraint_satisfaction import ConstraintSatisfaction
+from experiment_design.information.optimality import CRITERIA
+from experiment_design.optimise.classical import Alternative
+from experiment_design.optimise.search import REFERENCE
+from experiment_design.request.regimes import spell_regime
+from experiment_design.request.request import DesignRequest
+from greybox.files import replacing
+from greybox.notebook import DisplayMixin, interval, items, number, sparkline, table, text
+from greybox.numerics.linalg import scaled_logdet
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, repr=False)
+class Design(DisplayMixin):
+    """Sequences for the next trials and what they are worth.
+
+    Parameters
+    ----------
+    request : DesignRequest
+    commands : tuple of ndarray
+        (N, nc) a trial: speeds in the log's unit, angles [rad].
+    levels : tuple of ndarray
+        (K, nc) a trial, one row a hold.
+    motions : tuple of Motion
+        Predicted motion of each trial under the nominal model.
+    names : tuple of str
+        The wanted parameters.
+    values : ndarray
+        (p_w,) their prior values.
+    covariance : ndarray
+        (p_w, p_w) predicted covariance of their estimates.
+    criterion_value : float
+        On the scale of `Criterion`.
+    efficiency_vs_random : float or None
+        Against the best of 200 random two-level sequences that keep the limits;
+        None where none of them does.
+    random_value : float
+        Criterion of that one, nan where there is none.
+    random_kept : int
+        How many were found that keep the limits.
+    certificate : Certificate
+    margins : dict of str to float
+        Least |u_r| and |v_r| (or |r|) over all trials.
+    limits : tuple of LimitReport
+    keeping : ConstraintSatisfaction or None
+        Probability of keeping the limits under models drawn from the prior.
+    alternatives : tuple of Alternative
+        Classical sequences by the same criterion, for the first trial of one.
+    status : str
+        A sentence on how the design ended.
+    notes : tuple of str
+    evaluations : int
+    seconds : float
+    """
+
+    request: DesignRequest
+    commands: tuple[Array, ...]
+    levels: tuple[Array, ...]
+    motions: tuple[Motion, ...]
+    names: tuple[str, ...]
+    values: Array
+    covariance: Array
+    criterion_value: float
+    efficiency_vs_random: float | None
+    random_value: float
+    random_kept: int
+    certificate: Certificate
+    margins: dict[str, float]
+    limits: tuple[LimitReport, ...]
+    keeping: ConstraintSatisfaction | None
+    alternatives: tuple[Alternative, ...]
+    status: str
+    notes: tuple[str, ...]
+    evaluations: int
+    seconds: float
+
+    @property
+    def std(self) -> Array:
+        """Predicted standard errors (p_w,)."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    @property
+    def logdet(self) -> float:
+        """−log det of the predicted covariance."""
+        return logdet_information(self.covariance)
+
+    def efficiency(self, covariance: Array) -> float:
+        """Return (det C_other / det C)^(1/p) of another covariance (p_w, p_w)."""
+        gain = self.logdet - logdet_information(covariance)
+        return float(np.exp(gain / len(self.names)))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fields for JSON, those of the contract first."""
+        r = self.request
+        return {
+            "status": self.status,
+            "criterion": r.criterion,
+            "logdet": self.logdet,
+            "efficiency_vs_random": self.efficiency_vs_random,
+            "efficiency_lower_bound": self.certificate.efficiency_lower_bound,
+            "predicted_std": dict(zip(self.names, self.std, strict=True)),
+            "margins": self.margins,
+            "wall_s": self.seconds,
+            "parameters": dict(zip(self.names, self.values, strict=True)),
+            "predictor": r.predictor,
+            "estimator": r.estimator,
+            "trials": r.trials,
+            "duration": r.duration,
+            "hold": r.hold,
+            "regimes": [spell_regime(s) for s in r.regimes],
+            "starts": [dict(zip((*r.structure.states, "psi"), s, strict=True)) for s in r.starts],
+            "random_kept": self.random_kept,
+            "certificate": self.certificate.to_dict(),
+            "limits": [
+                {
+                    "trial": x.trial + 1,
+                    "name": x.name,
+                    "bound": x.bound,
+                    "unit": x.unit,
+                    "missed": x.missed,
+                }
+                for x in self.limits
+            ],
+            "keeps_limits": None if self.keeping is None else self.keeping.to_dict(),
+            "alternatives": [
+                {
+                    "name": a.name,
+                    "tried": a.tried,
+                    "kept": a.kept,
+                    "efficiency_of_design": self._gain(a),
+                }
+                for a in self.alternatives
+            ],
+            "noise": {
+                "measurement": dict(zip(r.structure.states, r.noise.measurement, strict=True)),
+                "process": dict(zip(r.structure.states, r.noise.process, strict=True)),
+                "source": r.noise.source,
+            },
+            "evaluations": self.evaluations,
+            "notes": list(self.notes),
+        }
+
+    def _gain(self, alternative: Alternative) -> float | None:
+        if not np.isfinite(alternative.value):
+            return None
+        size = len(self.names) if CRITERIA[self.request.criterion].determinant else 1
+        return float(np.exp((self.criterion_value - alternative.value) / size))
+
+    def summary(self) -> str:
+        """Return the design as text."""
+        r = self.request
+        lines = [
+            f"Plan for {r.vessel.name}: {r.trials} trial{'s' if r.trials > 1 else ''} of "
+            f"{r.duration:g} s, commands change every {r.hold:g} s, regime "
+            f"{', '.join(spell_regime(s) for s in r.regimes)}",
+            f"{self.status}",
+        ]
+        if self.efficiency_vs_random is not None:
+            lines.append(
+                f"{self.efficiency_vs_random:.2f} times the information of the best of "
+                f"{min(self.random_kept, REFERENCE)} random two-level sequences, which would need "
+                f"{self.efficiency_vs_random * r.duration * r.trials:.0f} s for the same precision"
+            )
+        else:
+            lines.append("no random two-level sequence keeps the limits, so there is none to beat")
+        lines.append(self.certificate.sentence())
+        margins = ", ".join(f"{k} {v:.3g}" for k, v in self.margins.items())
+        if margins:
+            lines.append(f"least distance from zero: {margins} (m/s, rad/s)")
+        if self.keeping is not None:
+            lines.append(self.keeping.sentence())
+        lines += ["", f"{'parameter':<14}{'prior':>12}{'std err':>12}{'relative':>11}"]
+        for name, value, std in zip(self.names, self.values, self.std, strict=True):
+            share = f"{abs(std / value):.1%}" if value else "-"
+            lines.append(f"{name:<14}{value:>12.4g}{std:>12.2g}{share:>11}")
+        if self.alternatives:
+            lines += ["", f"{'instead of':<28}{'tried':>7}{'kept':>7}  this plan gives"]
+            for a in self.alternatives:
+                gain = self._gain(a)
+                shown = "-" if gain is None else f"{gain:.2f} times"
+                if gain is None or gain > 1000:
+                    shown = "tells nothing"
+                if not a.kept:
+                    shown += " (breaks limits)"
+                lines.append(f"{a.name:<28}{a.tried:>7}{a.kept:>7}  {shown}")
+        lines += [f"Note: {n}" for n in self.notes]
+        return "\n".join(lines)
+
+    def to_pandas(self) -> pd.DataFrame:
+        """Return the plan as `write_plan` writes it.
+
+        Returns
+        -------
+        DataFrame
+            Index ``t`` [s], or ``trial``, ``t`` where there are several trials; one column
+            a command. Each row holds until the next.
+        """
+        import pandas as pd
+
+        r = self.request
+        frames = []
+        for trial, commands in enumerate(self.commands):
+            t = np.arange(len(commands)) * r.sample_time
+            frame = pd.DataFrame(commands, columns=list(r.schedule.commands))
+            frames.append(frame.assign(trial=trial + 1, t=t))
+        index = ["trial", "t"] if r.trials > 1 else ["t"]
+        plan = pd.concat(frames).set_index(index)[list(r.schedule.commands)]
+        plan.attrs = {"sample_time": r.sample_time, "vessel": r.vessel.name}
+        return plan
+
+    def _line(self) -> str:
+        return (
+            f"plan for {self.request.vessel.name}: {self.request.trials} of "
+            f"{self.request.duration:g} s; {self.status}"
+        )
+
+    def _parts(self) -> tuple[str, ...]:
+        names = self.request.schedule.commands
+        missed = [f"{x.name}: missed by {x.missed:.3g} {x.unit}" for x in self.limits if x.missed]
+        told = zip(self.names, self.values, self.std, strict=True)
+        return (
+            text(f"{self.certificate.sentence()[0].upper()}{self.certificate.sentence()[1:]}."),
+            items("Limits not kept", missed),
+            table(
+                ("trial", "command", "least", "most", "over time"),
+                [
+                    (k + 1, n, number(c.min()), number(c.max()), sparkline(c))
+                    for k, plan in enumerate(self.commands)
+                    for n, c in zip(names, plan.T, strict=True)
+                ],
+            ),
+            table(
+                ("parameter", "prior", "predicted std err", "95 % of the estimate"),
+                [(n, number(v), number(s, 2), interval(v, s)) for n, v, s in told],
+            ),
+            items("Notes", self.notes),
+        )
+
+
+def logdet_information(covariance: Array) -> float:
+    """Return −log det of a covariance, scaled so that units cost no digits."""
+    d = np.diag(covariance)
+    if not np.isfinite(d).all() or not (d > 0).all():
+        return float("-inf")
+    return -float(scaled_logdet(covariance))
+
+
+def write_plan(design: Design, path: str | Path) -> None:
+    """Write the commands as CSV of ``t`` and the thruster columns, ``trial`` first if several.
+
+    Each row holds from its time on until the next.
+
+    Parameters
+    ----------
+    design : Design
+    path : str or Path
+    """
+    r = design.request
+    names = r.schedule.commands
+    several = r.trials > 1
+    with replacing(path) as handle:
+        handle.write(",".join([*(["trial"] if several else []), "t", *names]) + "\n")
+        for trial, commands in enumerate(design.commands):
+            t = np.arange(len(commands)) * r.sample_time
+            for k, row in enumerate(commands):
+                cells = [f"{t[k]:.10g}", *(f"{v:.10g}" for v in row)]
+                handle.write(",".join([*([str(trial + 1)] if several else []), *cells]) + "\n")

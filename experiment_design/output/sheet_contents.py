@@ -1,0 +1,342 @@
+"""What the bridge needs to know of one trial, in words and cells: no layout."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from experiment_design.constraints.limits import TOLERANCE
+from experiment_design.output.prediction import MotionBand
+from experiment_design.output.result import Design
+from experiment_design.request.regimes import spell_regime
+
+Array = NDArray[np.float64]
+
+KNOT = 0.514444
+# corridor that no helmsman or sensor is asked to keep closer than, and its least in ship lengths
+HEADING_FLOOR = np.deg2rad(10.0)
+POSITION_FLOOR = 10.0
+# heading past which "off the plan" has no meaning
+_BLIND = np.deg2rad(90.0)
+_LONGEST_NAME = 60
+_SIDES = {
+    ("u", 1): "ahead",
+    ("u", -1): "astern",
+    ("v", 1): "to starboard",
+    ("v", -1): "to port",
+    ("r", 1): "to starboard",
+    ("r", -1): "to port",
+}
+_WORDS = {"u": "Surge", "v": "Sway", "r": "Yaw rate"}
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of the way-point table: name and unit, and a cell for each way-point."""
+
+    name: str
+    unit: str
+    cells: tuple[str, ...]
+
+    @property
+    def width(self) -> int:
+        """Characters that it needs."""
+        return max(len(c) for c in (self.name, self.unit, *self.cells))
+
+
+@dataclass(frozen=True)
+class SheetContents:
+    """One trial in words.
+
+    Parameters
+    ----------
+    title, subtitle : str
+    facts : tuple of (str, str)
+        What holds at the start and around the trial.
+    warnings : tuple of str
+        What the master must know before he agrees, empty where all is kept.
+    abort : tuple of str
+    columns : tuple of Column
+        Way-points in time, with angles in degrees and radians.
+    narrow : tuple of Column
+        The same with angles in degrees only.
+    note : str
+        How the table is read.
+    """
+
+    title: str
+    subtitle: str
+    facts: tuple[tuple[str, str], ...]
+    warnings: tuple[str, ...]
+    abort: tuple[str, ...]
+    columns: tuple[Column, ...]
+    narrow: tuple[Column, ...]
+    note: str
+
+    @property
+    def rows(self) -> int:
+        """Number of way-points."""
+        return len(self.columns[0].cells)
+
+
+def clock(seconds: float) -> str:
+    """Return a time as minutes and seconds, such as 4:05."""
+    tenths = round(seconds * 10)
+    minutes, rest = divmod(tenths, 600)
+    return f"{minutes}:{rest // 10:02d}" + (f".{rest % 10}" if rest % 10 else "")
+
+
+def compass(angle: float) -> str:
+    """Return an angle [rad] as a compass direction in degrees, 000 to 359."""
+    return f"{round(np.rad2deg(angle)) % 360:03d}"
+
+
+def signed(value: float, decimals: int = 0) -> str:
+    """Return a number with a true minus sign and no negative zero."""
+    return f"{round(value, decimals) + 0.0:.{decimals}f}".replace("-", "−")
+
+
+def tie(text: str) -> str:
+    """Return text in which a line does not end between a number and its unit."""
+    tied = re.sub(r"(?<=\d) (?=(?:m/s|rad/s|kn|m|s|%|min)(?:\W|$))", "\u00a0", text)
+    return tied.replace("(N, E)", "(N,\u00a0E)")
+
+
+def plain_name(name: str) -> str:
+    """Return a vessel's name as one line of a bearable length."""
+    line = " ".join("".join(c if c.isprintable() else " " for c in name).split())
+    return line if len(line) <= _LONGEST_NAME else line[: _LONGEST_NAME - 1] + "…"
+
+
+def sheet_contents(design: Design, band: MotionBand) -> SheetContents:
+    """Return one trial of a design as the words and cells of its sheet."""
+    r = design.request
+    which = f"trial {band.trial + 1} of {r.trials}" if r.trials > 1 else "trial"
+    regime = r.regimes[band.trial]
+    sides = ", ".join(
+        f"{_WORDS[s].lower()} {_SIDES[s, sign]}" for s, sign in regime if (s, sign) in _SIDES
+    )
+    ramp = max(r.schedule.ramp) > 1
+    note = (
+        "Commands "
+        + ("start to move, at the rate limit, at" if ramp else "change at")
+        + " the time of their row and hold until the next row; times without a change are left "
+        "out. Heading, speed over ground and position (N, E) are those expected at that time."
+    )
+    if not band.certain:
+        note += " ±: 95 % of the predicted motions have stayed within since the start."
+    return SheetContents(
+        f"{plain_name(r.vessel.name)}: identification {which}",
+        f"Duration {clock(r.duration)} min, commands change at most every {r.hold:g} s, regime "
+        f"{spell_regime(regime)}" + (f" ({sides})" if sides else ""),
+        _facts(design, band),
+        _warnings(design, band),
+        _abort(design, band),
+        _columns(design, band, radians=True),
+        _columns(design, band, radians=False),
+        note,
+    )
+
+
+def _facts(design: Design, band: MotionBand) -> tuple[tuple[str, str], ...]:
+    r = design.request
+    start = [f"heading {compass(band['psi'].nominal[0])}°"]
+    for name in r.structure.states:
+        if name not in _WORDS:
+            continue
+        value = float(band[name].nominal[0])
+        side = _SIDES[name, 1 if value >= 0 else -1] if round(value, 3) else ""
+        if name == "r":
+            text = f"yaw rate {abs(np.rad2deg(value)):.2f}°/s"
+        else:
+            text = f"{_WORDS[name].lower()} {abs(value):.2f} m/s ({abs(value) / KNOT:.1f} kn)"
+        start.append(f"{text} {side}".rstrip())
+    where = f"N {signed(band['x_n'].nominal[0])} m, E {signed(band['y_n'].nominal[0])} m"
+    d = np.zeros(4)
+    d[: min(4, r.d.size)] = r.d[:4]
+    expected = []
+    if d[:2].any():
+        speed = float(np.hypot(*d[:2]))
+        expected.append(
+            f"current {speed:.2f} m/s ({speed / KNOT:.1f} kn) setting towards "
+            f"{compass(np.arctan2(d[1], d[0]))}°"
+        )
+    if d[2:].any():
+        speed = float(np.hypot(*d[2:]))
+        expected.append(
+            f"wind {speed:.1f} m/s ({speed / KNOT:.0f} kn) from "
+            f"{compass(np.arctan2(-d[3], -d[2]))}°"
+        )
+    return (
+        ("Start", "; ".join(start)),
+        ("Position", f"{where} at the start (metres from the origin of the plan)"),
+        ("Expected", " and ".join(expected) or "no current, no wind"),
+    )
+
+
+def _warnings(design: Design, band: MotionBand) -> tuple[str, ...]:
+    found = []
+    broken = [
+        x.name + (f" by {x.missed:.3g} {x.unit}".rstrip() if np.isfinite(x.missed) else "")
+        for x in design.limits
+        if x.trial == band.trial and x.missed > 10 * TOLERANCE
+    ]
+    if broken:
+        found.append(f"This plan breaks its limits: {', '.join(broken)}.")
+    keeping = design.keeping
+    if keeping is not None and keeping.probability < design.request.probability:
+        found.append(
+            f"Limits are kept with probability {keeping.probability:.2f} only; "
+            f"{design.request.probability:g} was asked for."
+        )
+    if band.lost:
+        found.append(
+            f"{band.lost} of {band.draws} models drawn from the prior run away on this plan."
+        )
+    return tuple(found)
+
+
+def corridor(design: Design, band: MotionBand) -> tuple[Array, Array]:
+    """Return how far heading [rad] and position [m] may be off the plan, each (N+1,)."""
+    floor = max(POSITION_FLOOR, design.request.vessel.length)
+    return np.maximum(band.heading_off, HEADING_FLOOR), np.maximum(band.position_off, floor)
+
+
+def _abort(design: Design, band: MotionBand) -> tuple[str, ...]:
+    r = design.request
+    limits = r.limits
+    said = []
+    speed = band["speed"]
+    most = max(speed.nominal.max(), speed.high.max())
+    if limits.speed_cap is not None:
+        said.append(
+            f"Speed over ground above {limits.speed_cap:.2f} m/s ({limits.speed_cap / KNOT:.1f} "
+            f"kn); expected at most {most:.2f} m/s."
+        )
+    else:
+        over = 1.1 * most
+        said.append(
+            f"Speed over ground above {over:.2f} m/s ({over / KNOT:.1f} kn), 10 % more than "
+            f"expected; no cap was set."
+        )
+    if "r" in band:
+        rate = band["r"]
+        most = float(np.abs([rate.nominal, rate.low, rate.high]).max())
+        cap, why = limits.yaw_cap, f"expected at most {np.rad2deg(most):.1f}°/s"
+        if cap is None:
+            cap, why = 1.1 * most, "10 % more than expected; no cap was set"
+        said.append(
+            f"Yaw rate above {np.rad2deg(cap):.1f}°/s ({cap:.3f} rad/s) to either side"
+            + (f"; {why}." if limits.yaw_cap is not None else f", {why}.")
+        )
+    if "edge" in band:
+        edge = band["edge"]
+        text = (
+            f"Nearer than {limits.clearance:.0f} m to the edge of the sea room"
+            if limits.clearance
+            else "Reaching the edge of the sea room"
+        )
+        text += f"; the plan comes within {signed(edge.nominal.min())} m"
+        if not band.certain:
+            low = band.edge_kept
+            text += (
+                f", 97.5 % of the predicted motions stay at least {low:.0f} m inside"
+                if low > 0
+                else f", 2.5 % of the predicted motions come {-low:.0f} m or more outside"
+            )
+        said.append(text + ".")
+    heading, place = corridor(design, band)
+    if band.certain:
+        said.append(
+            f"Heading more than {np.rad2deg(heading[-1]):.0f}° or position more than "
+            f"{place[-1]:.0f} m off the table."
+        )
+    else:
+        blind = heading > _BLIND
+        last = len(heading) - 1 if not blind.any() else max(int(blind.argmax()) - 1, 0)
+        half = last // 2
+        text = (
+            f"Heading more than {np.rad2deg(heading[half]):.0f}° or position more than "
+            f"{place[half]:.0f} m off the table until {clock(band.t[half])}, "
+            f"{np.rad2deg(heading[last]):.0f}° or {place[last]:.0f} m until "
+            f"{clock(band.t[last])} (between: columns ±)"
+        )
+        if blind.any():
+            text += (
+                f". After that the model cannot tell the heading within "
+                f"{np.rad2deg(_BLIND):.0f}°: keep the other limits, position within "
+                f"{place[-1]:.0f} m"
+            )
+        said.append(text + ".")
+    for name, sign in r.regimes[band.trial]:
+        margin = limits.margins.get(name, 0.0)
+        symbol = {"u": "|u|", "v": "|v|"}.get(name, f"|{name}|")
+        least = design.margins.get(name)
+        if name == "r":
+            bound = f"{np.rad2deg(margin):.2f}°/s"
+        else:
+            bound = f"{margin:.2f} m/s ({margin / KNOT:.1f} kn)"
+        text = f"{_WORDS.get(name, name)} {_SIDES.get((name, sign), '')} below {bound}"
+        text += f", margin of {symbol}"
+        if least is not None and name != "r":
+            text += f"; least expected {signed(least, 2)} m/s"
+        said.append(text + ". Not dangerous, but the trial loses its worth.")
+    return tuple(said)
+
+
+def _columns(design: Design, band: MotionBand, *, radians: bool) -> tuple[Column, ...]:
+    r = design.request
+    schedule = r.schedule
+    levels = design.levels[band.trial]
+    made = [
+        _command_cells(
+            name,
+            levels[:, i],
+            float(schedule.upper[i] - schedule.lower[i]),
+            name in r.vessel.angle_commands,
+            radians,
+        )
+        for i, name in enumerate(schedule.commands)
+    ]
+    rows = list(zip(*[c.cells for c in made], strict=True))
+    changed = [k for k in range(len(rows)) if k == 0 or rows[k] != rows[k - 1]]
+    samples = np.array([*(k * schedule.hold for k in changed), len(band.t) - 1])
+    heading, place = band["psi"].nominal[samples], [
+        band[n].nominal[samples] for n in ("x_n", "y_n")
+    ]  # fmt: skip
+    fine = 0 if max(np.abs(p).max() for p in place) >= 100 else 1
+    columns = [Column("time", "min:s", tuple(clock(band.t[k]) for k in samples))]
+    for c in made:
+        cells = [*(c.cells[k] for k in changed), "end"]
+        columns.append(Column(c.name, c.unit, tuple(cells)))
+    columns += [
+        Column("hdg", "°", tuple(compass(h) for h in heading)),
+        Column("speed", "m/s", tuple(f"{v:.2f}" for v in band["speed"].nominal[samples])),
+        Column("N", "m", tuple(signed(v, fine) for v in place[0])),
+        Column("E", "m", tuple(signed(v, fine) for v in place[1])),
+    ]
+    if not band.certain:
+        off = corridor(design, band)
+        turned = np.rad2deg(off[0][samples])
+        blind = np.rad2deg(_BLIND)
+        columns += [
+            Column("±", "°", tuple(f"{v:.0f}" if v <= blind else "–" for v in turned)),
+            Column("±", "m", tuple(f"{v:.0f}" for v in off[1][samples])),
+        ]
+    return tuple(columns)
+
+
+def _command_cells(name: str, values: Array, span: float, angle: bool, radians: bool) -> Column:
+    """Return a command's levels as text: angles in degrees, speeds in the log's unit."""
+    if angle:
+        degrees = [signed(float(np.rad2deg(v)), 1) for v in values]
+        if not radians:
+            return Column(name, "°", tuple(degrees))
+        both = [f"{d} ({signed(float(v), 2)})" for d, v in zip(degrees, values, strict=True)]
+        return Column(name, "° (rad)", tuple(both))
+    size = span or float(np.abs(values).max(initial=0.0)) or 1.0
+    decimals = int(np.clip(2 - np.floor(np.log10(size)), 0, 4))
+    return Column(name, "as log", tuple(signed(float(v), decimals) for v in values))

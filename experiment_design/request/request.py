@@ -1,0 +1,395 @@
+"""What is asked of a design, as plain data, and the problem that follows from it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from experiment_design.constraints.limit_program import LimitProgram
+from experiment_design.constraints.limits import TrialLimits
+from experiment_design.excitation.rollout import Rollout
+from experiment_design.excitation.schedule import Schedule, make_schedule
+from experiment_design.information.criteria import Criterion
+from experiment_design.information.estimators import ESTIMATORS
+from experiment_design.information.moments import Moments
+from experiment_design.information.optimality import CRITERIA
+from experiment_design.information.t_optimality import Contrast
+from experiment_design.request.problem import Scenario, TrialProblem
+from greybox.errors import UsageError, suggestion
+from greybox.model.model import ManoeuvringModel
+from greybox.model.noise import NoiseLevels
+from greybox.model.predictor import Column, Predictor, Regime, build_predictor
+from greybox.model.run.simulation import stationary_disturbance
+from greybox.model.run.step import Integrator
+from greybox.model.structure import Structure
+from greybox.numerics.linalg import scaled_root
+from greybox.vessel.vessel import Vessel
+
+Array = NDArray[np.float64]
+Signs = tuple[tuple[str, int], ...]
+# memory of the wind's variation [s]
+_GUST_SECONDS = 20.0
+
+
+@dataclass(frozen=True)
+class CandidateModel:
+    """One explanation of the ship's motion: its structure, parameters and disturbances.
+
+    Parameters
+    ----------
+    name : str
+    structure : Structure
+    theta : ndarray
+        (p,) discrete parameters at the request's sample time.
+    d : ndarray
+        (nd,) disturbance means [m/s].
+    vessel : Vessel, optional
+        How its thrusters act, where that is another than the request's.
+    integrator : {"euler", "rk4"}
+    """
+
+    name: str
+    structure: Structure
+    theta: Array
+    d: Array
+    vessel: Vessel | None = None
+    integrator: Integrator = "euler"
+
+
+# the name that scripts may still import
+Rival = CandidateModel
+
+
+@dataclass(frozen=True)
+class DesignRequest:
+    """Everything that a design depends on; equal requests give equal designs.
+
+    Parameters
+    ----------
+    vessel : Vessel
+    structure : Structure
+    theta : ndarray
+        (p,) prior parameters at `sample_time`.
+    sample_time : float
+        [s]
+    noise : NoiseLevels
+    duration, hold : float
+        Of each trial, and between changes of command [s].
+    regimes : tuple of Signs
+        Signs that the states keep, one entry a trial, such as ``(("u", 1), ("v", 1))``.
+    starts : tuple of ndarray
+        (nx + 1,) initial states and heading a trial [m/s, rad/s, rad].
+    limits : TrialLimits
+        Those that all trials share; its signs are replaced by each trial's.
+    predictor : str
+        ``basic``, ``augmented``, ``wind`` or ``basic+wind``.
+    estimator : {"iv", "iv-white", "oe"}
+        Zero-mean IV with its moving-average or white equation error, or the
+        Cramér-Rao information of an output-error fit.
+    criterion : {"D", "A", "E", "c"}
+    wanted : tuple of str
+        Parameters that count; empty for all of the undisturbed model.
+    combination : mapping of str to float
+        Gradient of the function of the parameters for ``c``.
+    targets : tuple of float
+        Wanted standard errors of `wanted`, the scale of A and E in place of prior values.
+    d : ndarray
+        (nd,) expected current and wind [m/s].
+    gust : float
+        Standard deviation of each component of the wind about its mean [m/s].
+    prior : (tuple of str, ndarray), optional
+        Names and information matrix of earlier trials.
+    covariance : ndarray, optional
+        (p, p) uncertainty of `theta`; None or zero: known exactly.
+    scenarios : int
+        Further prior models drawn from it that the criterion is expected over.
+    worst_case : bool
+        Look at the worst scenario instead of the expectation.
+    probability : float
+        With which the path limits are to be kept under models drawn from it.
+    backoff : tuple of float
+        By how much each path limit is tightened for that, in its unit.
+    contrasts : tuple of (CandidateModel, CandidateModel)
+        Pairs of explanations that the trial is to tell apart in place of
+        measuring parameters; the first of the first pair is the prior model.
+    seed : int
+    effort : float
+        Evaluations of the search, 1 being the usual number.
+    integrator : {"euler", "rk4"}
+        Of the prior model.
+    """
+
+    vessel: Vessel
+    structure: Structure
+    theta: Array
+    sample_time: float
+    noise: NoiseLevels
+    duration: float
+    hold: float
+    regimes: tuple[Signs, ...]
+    starts: tuple[Array, ...]
+    limits: TrialLimits = field(default_factory=TrialLimits)
+    predictor: str = "augmented"
+    estimator: str = "iv"
+    criterion: str = "D"
+    wanted: tuple[str, ...] = ()
+    combination: Mapping[str, float] = field(default_factory=dict)
+    targets: tuple[float, ...] = ()
+    d: Array = field(default_factory=lambda: np.zeros(4))
+    gust: float = 0.0
+    prior: tuple[tuple[str, ...], Array] | None = None
+    covariance: Array | None = None
+    scenarios: int = 0
+    worst_case: bool = False
+    probability: float = 0.9
+    backoff: tuple[float, ...] = ()
+    contrasts: tuple[tuple[CandidateModel, CandidateModel], ...] = ()
+    seed: int = 0
+    effort: float = 1.0
+    integrator: Integrator = "euler"
+
+    @property
+    def trials(self) -> int:
+        """Number of trials of the campaign."""
+        return len(self.regimes)
+
+    @property
+    def schedule(self) -> Schedule:
+        """When and how far commands change."""
+        return make_schedule(self.vessel, self.duration, self.hold, self.sample_time)
+
+    def build_predictor(self) -> Predictor:
+        """Return the predictor over the signs that the trials together take."""
+        signs: dict[str, tuple[int, ...]] = {}
+        for state in self.structure.states:
+            taken = {dict(r).get(state, 0) for r in self.regimes}
+            signs[state] = (1, -1) if 0 in taken or len(taken) > 1 else (taken.pop(),)
+        regime: Regime = tuple(signs.items())
+        return build_predictor(self.structure, self.predictor, regime)
+
+    def trial_limits(self, trial: int) -> TrialLimits:
+        """Return the limits of one trial."""
+        return replace(self.limits, signs=dict(self.regimes[trial]))
+
+    def draw_models(self, count: int, seed: int) -> Array:
+        """Draw prior models (count, p) from the covariance."""
+        rng = np.random.default_rng([13, self.seed, seed])
+        theta = np.asarray(self.theta, float)
+        if self.covariance is None:
+            return np.repeat(theta[None], count, axis=0)
+        half = rng.standard_normal((-(-count // 2), theta.size))
+        # pairs around the nominal model, so that few draws have its mean
+        both = np.stack([half, -half], axis=1).reshape(-1, theta.size)[:count]
+        return np.asarray(theta + both @ scaled_root(self.covariance).T)
+
+    @property
+    def uncertain(self) -> bool:
+        """Whether the prior model has a covariance."""
+        return self.covariance is not None and bool(np.diag(self.covariance).max(initial=0.0) > 0)
+
+    def thetas(self) -> Array:
+        """Return the prior models (S+1, p), the nominal one first."""
+        nominal = np.asarray(self.theta, float)[None]
+        if not self.scenarios or not self.uncertain:
+            return nominal
+        return np.vstack([nominal, self.draw_models(self.scenarios, 0)])
+
+
+def full_structure(model: ManoeuvringModel) -> tuple[Structure, Array]:
+    """Return a model's structure with the terms that its sums absorbed, and its parameters.
+
+    An estimate without wind measurement keeps Xuu for Xuu + Wuu; the disturbed
+    trial needs both terms. The absorbed ones are put back with the value zero.
+    """
+    absorbed = [n for names in model.sums.values() for n in names if n not in model.names]
+    if not absorbed:
+        return model.structure, np.asarray(model.theta, float)
+    structure = model.structure.with_terms(*absorbed)
+    return structure, np.concatenate([model.theta, np.zeros(len(absorbed))])
+
+
+def wanted_columns(predictor: Predictor, names: tuple[str, ...]) -> tuple[int, ...]:
+    """Return the positions of the wanted parameters, all of them where none is named.
+
+    Raises
+    ------
+    UsageError
+        A name is no parameter of the predictor; the nearest is suggested.
+    """
+    known = {c.name: i for i, c in enumerate(predictor.columns) if not c.is_bias}
+    for i, column in enumerate(predictor.columns):
+        known |= {t: i for t in column.terms if t not in known}
+        if column.terms:
+            known.setdefault(column.label, i)
+    if not names:
+        return tuple(i for i in predictor.parameter_columns if i not in predictor.constants)
+    for name in names:
+        if name not in known:
+            raise UsageError(
+                f"'{name}' is no parameter of this model.{suggestion(name, known)} "
+                f"It has: {', '.join(predictor.parameter_names)}."
+            )
+    return tuple(dict.fromkeys(known[n] for n in names))
+
+
+def build_criterion(request: DesignRequest, predictor: Predictor) -> Criterion:
+    """Return the criterion over the predictor's columns.
+
+    Raises
+    ------
+    UsageError
+        A name is unknown, or ``c`` has no function to look at.
+    """
+    chosen = wanted_columns(predictor, request.wanted or tuple(request.combination))
+    names = [predictor.columns[i].name for i in chosen]
+    structure = request.structure
+    scale = np.array(
+        [
+            abs(sum(float(request.theta[structure.index(t)]) for t in predictor.columns[i].terms))
+            for i in chosen
+        ]
+    )
+    # a parameter that is zero a priori is measured by what the others of its equation are
+    scale = np.where(scale > 0, scale, scale[scale > 0].min(initial=1.0))
+    if request.targets:
+        scale = np.array(request.targets, float)
+    combination = np.zeros(len(names))
+    for name, slope in request.combination.items():
+        combination[chosen.index(wanted_columns(predictor, (name,))[0])] += slope
+    if CRITERIA[request.criterion].combined and not combination.any():
+        raise UsageError(
+            "criterion c looks at one coefficient or one function of the parameters: name it, "
+            "such as --of Yvv or --of 'Xuu/Xmu'."
+        )
+    prior = None
+    if request.prior is not None:
+        prior = _prior_information(names, *request.prior)
+    wanted = chosen
+    if ESTIMATORS[request.estimator].free_run:
+        # sensitivities stand in the order of the parameters, bias-capturing columns left out
+        wanted = tuple(predictor.parameter_columns.index(i) for i in chosen)
+    return Criterion(request.criterion, wanted, scale, combination, prior)
+
+
+def wanted_parameters(request: DesignRequest, criterion: Criterion) -> tuple[Column, ...]:
+    """Return the predictor's columns of the wanted parameters, in the order of the criterion."""
+    predictor = request.build_predictor()
+    places = predictor.parameter_columns
+    if ESTIMATORS[request.estimator].free_run:
+        return tuple(predictor.columns[places[i]] for i in criterion.wanted)
+    return tuple(predictor.columns[i] for i in criterion.wanted)
+
+
+def _prior_information(names: list[str], known: tuple[str, ...], information: Array) -> Array:
+    """Return the information on `names`, the other parameters unknown."""
+    shared = [n for n in names if n in known]
+    if not shared:
+        raise UsageError(
+            f"the prior model knows none of the wanted parameters {', '.join(names)}: it has "
+            f"{', '.join(known)}."
+        )
+    keep = [known.index(n) for n in shared]
+    rest = [i for i in range(len(known)) if i not in keep]
+    part = information[np.ix_(keep, keep)]
+    if rest:
+        cross = information[np.ix_(keep, rest)]
+        part = part - cross @ np.linalg.pinv(information[np.ix_(rest, rest)]) @ cross.T
+    out = np.zeros((len(names), len(names)))
+    where = [names.index(n) for n in shared]
+    out[np.ix_(where, where)] = (part + part.T) / 2
+    return out
+
+
+def build_problem(
+    request: DesignRequest, trial: int = 0, known: tuple[Moments, ...] = ()
+) -> TrialProblem:
+    """Return the problem of one trial of a request.
+
+    Parameters
+    ----------
+    request : DesignRequest
+    trial : int
+    known : tuple of Moments
+        Sums of the other trials, one a scenario.
+
+    Returns
+    -------
+    TrialProblem
+    """
+    predictor = request.build_predictor()
+    assumed = ESTIMATORS[request.estimator]
+    gust = draw_gusts(request) if predictor.air_measured else None
+    criterion = build_criterion(request, predictor)
+    schedule = request.schedule
+    limits = request.trial_limits(trial)
+    scenarios = []
+    for k, theta in enumerate(request.thetas()):
+        rollout = Rollout(
+            request.vessel, request.structure, theta, request.d, request.starts[trial],
+            request.sample_time, request.integrator,
+        )  # fmt: skip
+        program = LimitProgram(
+            rollout,
+            schedule,
+            limits,
+            wind_matters=predictor.augmented and not predictor.air_measured,
+            backoff=request.backoff,
+        )
+        information = assumed.information(
+            predictor,
+            theta,
+            request.d,
+            request.noise,
+            request.sample_time,
+            request.integrator,
+            gust,
+        )
+        scenarios.append(Scenario(rollout, information, program, 1.0 if k else 2.0))
+    contrast = None
+    if request.contrasts:
+        pairs = [
+            (_candidate_rollout(request, a, trial), _candidate_rollout(request, b, trial))
+            for a, b in request.contrasts
+        ]
+        other = pairs[0][1]
+        program = LimitProgram(other, schedule, limits, backoff=request.backoff)
+        scenarios.append(Scenario(other, scenarios[0].information, program, 0.0))
+        contrast = Contrast(pairs, request.noise, schedule)
+    return TrialProblem(schedule, tuple(scenarios), criterion, known, request.worst_case, contrast)
+
+
+def _candidate_rollout(request: DesignRequest, candidate: CandidateModel, trial: int) -> Rollout:
+    start = candidate_start(request, candidate, trial)
+    vessel = request.vessel if candidate.vessel is None else candidate.vessel
+    return Rollout(
+        vessel,
+        candidate.structure,
+        candidate.theta,
+        candidate.d,
+        start,
+        request.sample_time,
+        candidate.integrator,
+    )
+
+
+def candidate_start(request: DesignRequest, candidate: CandidateModel, trial: int) -> Array:
+    """Return a candidate's initial states and heading, those that it lacks left out."""
+    start = dict(zip((*request.structure.states, "psi"), request.starts[trial], strict=True))
+    return np.array([start.get(s, 0.0) for s in (*candidate.structure.states, "psi")])
+
+
+def draw_gusts(request: DesignRequest) -> Array:
+    """Draw what the wind adds to its mean, (N, 2) [m/s]; the same for every sequence."""
+    rng = np.random.default_rng([31, request.seed])
+    drawn = stationary_disturbance(
+        rng,
+        np.zeros(2),
+        request.gust,
+        request.schedule.samples,
+        correlation_time=_GUST_SECONDS,
+        sample_time=request.sample_time,
+    )
+    return np.asarray(drawn[0], float)
