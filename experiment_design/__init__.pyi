@@ -19,6 +19,5 @@ from experiment_design.prepare import prepare_request as prepare_request
 from experiment_design.request.noise import noise_levels as noise_levels
 from experiment_design.request.request import CandidateModel as CandidateModel
 from experiment_design.request.request import DesignRequest as DesignRequest
-from experiment_design.request.request import Rival as Rival
 from experiment_design.request.request import build_problem as build_problem
 from greybox.model.noise import NoiseLevels as NoiseLevels

@@ -123,7 +123,7 @@ def test_public_results_are_all_there(results):
     shown = {type(r).__name__ for r in results}
     asked = {
         "DiagnosisOptions", "ImportOptions", "OutputErrorOptions", "Request", "Circle",
-        "CandidateModel", "DesignRequest", "Rival", "TrialLimits", "Wishes",
+        "CandidateModel", "DesignRequest", "TrialLimits", "Wishes",
     }  # fmt: skip
     promised = {n for p in (gb, ed) for n in p.__all__ if n[0].isupper()} - asked
     promised -= {"Cause", "TrustLevel", "PredictionLevel"}

@@ -60,7 +60,6 @@ class CandidateModel:
 
 
 # the name that scripts may still import
-Rival = CandidateModel
 
 
 @dataclass(frozen=True)
