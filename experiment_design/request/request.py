@@ -59,9 +59,6 @@ class CandidateModel:
     integrator: Integrator = "euler"
 
 
-# the name that scripts may still import
-
-
 @dataclass(frozen=True)
 class DesignRequest:
     """Everything that a design depends on; equal requests give equal designs.

@@ -126,7 +126,9 @@ def test_a_held_out_run_at_the_edge_of_stability_leaves_the_errors_as_they_are(
     pair.known.clear()
     force = generic_force(pair)
     assert not force.predicted.any()
-    assert all(np.array_equal(a, b) for a, b in zip(force.errors, pair.held_fit.errors, strict=False))
+    assert all(
+        np.array_equal(a, b) for a, b in zip(force.errors, pair.held_fit.errors, strict=False)
+    )
 
 
 def test_own_arguments_are_those_of_the_terms_factors(sailed) -> None:
