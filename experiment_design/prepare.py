@@ -150,13 +150,12 @@ def prepare_request(
         for c in dict.fromkeys(changes)
     ]
     model = model.at_final_parameters()
-    named = model.without_bumps()
-    if named is not model:
+    bumps = sum(t.local for t in model.structure.terms)
+    if bumps:
         notes.append(
-            f"the force without a name ({len(model.names) - len(named.names)} bumps) is left out: "
-            f"the trial is designed for the coefficients that have one"
+            f"the force without a name ({bumps} bumps) moves the ship in this plan as it is: the "
+            f"trial is designed for the coefficients that have a name"
         )
-        model = named
     if vessel is not None and vessel != (acting := with_actuators_of(vessel, model.vessel)):
         vessel = acting
         notes.append(

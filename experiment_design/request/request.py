@@ -158,13 +158,17 @@ class DesignRequest:
         return make_schedule(self.vessel, self.duration, self.hold, self.sample_time)
 
     def build_predictor(self) -> Predictor:
-        """Return the predictor over the signs that the trials together take."""
+        """Return the predictor over the signs that the trials together take.
+
+        A force without a name moves the ship, and none of its coefficients is a column.
+        """
         signs: dict[str, tuple[int, ...]] = {}
         for state in self.structure.states:
             taken = {dict(r).get(state, 0) for r in self.regimes}
             signs[state] = (1, -1) if 0 in taken or len(taken) > 1 else (taken.pop(),)
         regime: Regime = tuple(signs.items())
-        return build_predictor(self.structure, self.predictor, regime)
+        found = build_predictor(self.structure.without_bumps(), self.predictor, regime)
+        return replace(found, structure=self.structure)
 
     def trial_limits(self, trial: int) -> TrialLimits:
         """Return the limits of one trial."""

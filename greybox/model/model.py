@@ -156,10 +156,9 @@ class ManoeuvringModel(DisplayMixin):
             return self
         shared = self.disturbance_covariance
         rows = [*kept, *range(len(self.theta), len(shared))]
-        terms = tuple(self.structure.terms[i] for i in kept)
         return replace(
             self,
-            structure=replace(self.structure, terms=terms),
+            structure=self.structure.without_bumps(),
             theta=self.theta[kept],
             covariance=self.covariance[np.ix_(kept, kept)],
             disturbance_covariance=shared[rows] if shared.size else shared,

@@ -155,6 +155,10 @@ class Structure(DisplayMixin):
         drop = {self.parameters[self.index(n)] for n in names}
         return replace(self, terms=tuple(t for t in self.terms if t.name not in drop))
 
+    def without_bumps(self) -> Structure:
+        """Return the structure without its force without a name."""
+        return replace(self, terms=tuple(t for t in self.terms if not t.local))
+
     @property
     def symbols(self) -> Symbols:
         """The symbols that every expression of this structure is written in."""
