@@ -25,6 +25,43 @@ EXAMPLES = """examples:
 """
 
 
+# what a trial may be designed for; options that ask for coefficients by themselves
+PURPOSES = ("coefficients", "prediction")
+IMPLY_COEFFICIENTS = ("criterion", "want", "of", "target", "estimator", "regime", "prior", "robust")
+
+
+def _told(names: tuple[str, ...]) -> str:
+    return ", ".join(f"--{n.replace('_', '-')}" for n in names)
+
+
+def _purpose(options: argparse.Namespace) -> str:
+    """Return what the trial is for, refusing options that say two things.
+
+    Raises
+    ------
+    UsageError
+        An option of one purpose stands beside the other.
+    """
+    from greybox.errors import UsageError
+
+    given = [n for n in IMPLY_COEFFICIENTS if getattr(options, n)]
+    if options.between:
+        if options.purpose == "prediction" or options.envelope:
+            raise UsageError("--between tells two explanations apart: leave out --for, --envelope.")
+        return "coefficients"
+    if options.purpose == "prediction" and given:
+        raise UsageError(
+            f"--for prediction covers all coefficients and both sides: leave out "
+            f"{_told((given[0],))}, or use --for coefficients."
+        )
+    purpose: str = options.purpose or ("coefficients" if given else "prediction")
+    if purpose == "coefficients" and options.envelope:
+        raise UsageError(
+            "--envelope says what predictions are wanted for: use --for prediction with it."
+        )
+    return purpose
+
+
 def _listed(registry: Registry[Any]) -> str:
     """Return the words of all entries, for a help text."""
     *others, last = (entry.words for entry in registry.values())
@@ -86,9 +123,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--report", metavar="HTML", help="write a page with pictures and what the plan is worth")
     goal = parser.add_argument_group("what is to be learnt")
     goal.add_argument(
+        "--for",
+        dest="purpose",
+        choices=PURPOSES,
+        help="what the estimate is wanted for: predictions over the operating envelope, both "
+        f"sides, misfit included (prediction, unless one of {_told(IMPLY_COEFFICIENTS)} is "
+        "given), or the precision of coefficients in one regime",
+    )
+    goal.add_argument(
+        "--envelope",
+        nargs="+",
+        default=[],
+        metavar="COLUMN=LOW:HIGH",
+        help="commands that predictions are wanted for (those of the prior's trial, both sides)",
+    )
+    goal.add_argument(
         "--criterion",
         choices=tuple(CRITERIA),
-        default="D",
         help=f"of the covariance of the wanted parameters: {_listed(CRITERIA)} (D)",
     )
     goal.add_argument(
@@ -112,7 +163,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     goal.add_argument(
         "--estimator",
         choices=tuple(ESTIMATORS),
-        default="iv",
         help=f"{_listed(ESTIMATORS)} (iv)",
     )
     goal.add_argument("--prior", metavar="MODEL", help="model of earlier trials, its information")
@@ -120,7 +170,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--between", nargs=2, metavar=("A", "B"), help="tell two explanations apart instead"
     )
     motion = parser.add_argument_group("what the trial must keep")
-    motion.add_argument("--regime", default="auto", metavar="u+v+", help="signs to keep (auto)")
+    motion.add_argument("--regime", metavar="u+v+", help="signs to keep (auto)")
     motion.add_argument("--margin-u", type=_not_negative, metavar="M", help="least |u_r| [m/s]")
     motion.add_argument("--margin-v", type=_not_negative, metavar="M", help="least |v_r| [m/s]")
     motion.add_argument(
@@ -130,7 +180,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="least |u_q| and |v_q|, of either sign, where the wind is measured [m/s]",
     )
     motion.add_argument(
-        "--hold", type=positive, default=10.0, metavar="S", help="commands change every S s (10)"
+        "--hold",
+        type=positive,
+        metavar="S",
+        help="commands change every S s (10; for prediction when the ship has sailed three "
+        "quarters of her length)",
     )
     motion.add_argument("--start", type=_floats, metavar="u,v,r,psi", help="state at the start")
     motion.add_argument(
@@ -222,10 +276,16 @@ def run(options: argparse.Namespace) -> None:
         sheet_kind(options.sheet)
     if options.between is None and options.model is None:
         raise UsageError("--model is missing: name a prior model, or two with --between A B.")
-    model = load_model(options.between[0] if options.between else options.model).coefficient_model()
+    purpose = _purpose(options)
+    model = load_model(options.between[0] if options.between else options.model)
+    if purpose == "coefficients":
+        model = model.coefficient_model()
     vessel = load_vessel(options.vessel)
     if options.duration is None:
         raise UsageError("--duration is missing: say how long the trial may last, in seconds.")
+    if purpose == "prediction":
+        _run_for_prediction(options, model, vessel)
+        return
     wishes = _wishes(options, model)
     prepared = prepare_request(model, wishes, vessel)
     request = prepared.request
@@ -259,6 +319,62 @@ def run(options: argparse.Namespace) -> None:
         for path in (options.out, options.sheet, options.report):
             if path:
                 say(f"wrote {path}")
+
+
+def _run_for_prediction(options: argparse.Namespace, model: Any, vessel: Any) -> None:
+    """Design the trial that serves predictions and write it."""
+    from experiment_design.for_prediction import design_for_prediction
+    from experiment_design.output.result import write_plan
+    from experiment_design.prepare import both_sides, prepare_request
+    from greybox.files import write_json
+
+    wishes = both_sides(_wishes(options, model), model, options.hold)
+    prepared = prepare_request(model, wishes, vessel)
+    # where the trial starts, and how near sway comes to zero, is told by the plan itself
+    own = [n for n in prepared.notes if not n.startswith(("the first trial", "margin of v"))]
+    prepared = replace(prepared, notes=tuple(own))
+    found = design_for_prediction(
+        prepared.request,
+        model,
+        envelope=dict(_range(text, vessel) for text in options.envelope),
+        keep_start=options.start is not None,
+    )
+    write_plan(found.design, options.out)
+    if options.json:
+        data = found.to_dict()
+        data["notes"] = [*prepared.notes, *data["notes"]]
+        write_json(data | {"provenance": provenance(options)}, options.json)
+    _show(options, found.design, prepared.notes, found.headline())
+    if options.json != "-":
+        say(found.summary())
+        for note in prepared.notes:
+            say(f"Note: {note}")
+        for path in (options.out, options.sheet, options.report):
+            if path:
+                say(f"wrote {path}")
+
+
+def _range(text: str, vessel: Any) -> tuple[str, tuple[float, float]]:
+    from greybox.errors import UsageError, suggestion
+
+    name, _, rest = text.partition("=")
+    low, _, high = rest.partition(":")
+    try:
+        first, last = float(low), float(high)
+    except ValueError as error:
+        raise UsageError(
+            f"--envelope '{text}' cannot be read: write COLUMN=LOW:HIGH, such as delta=-0.5:0.5."
+        ) from error
+    if name not in vessel.commands:
+        raise UsageError(
+            f"--envelope names '{name}', which is no command of {vessel.name}."
+            f"{suggestion(name, vessel.commands)} It has {', '.join(vessel.commands)}."
+        )
+    if not first < last:
+        raise UsageError(
+            f"--envelope {name} runs from {first:g} to {last:g}: give the lower first."
+        )
+    return name, (first, last)
 
 
 def _run_between(options: argparse.Namespace, request: Any, notes: tuple[str, ...]) -> None:
@@ -360,21 +476,21 @@ def _wishes(options: argparse.Namespace, model: Any) -> Any:
     if options.of:
         values = dict(zip(model.names, model.at_final_parameters().theta, strict=True))
         combination = gradient_of(options.of, values)
-    criterion = CRITERIA[options.criterion]
+    criterion = CRITERIA[options.criterion or "D"]
     if options.of and criterion.determinant:
         # of one function's variance alone, that is the criterion of one function
         criterion = next(c for c in CRITERIA.values() if c.combined)
     process = None if options.process_noise is None else np.array(options.process_noise)
     return Wishes(
         duration=options.duration,
-        hold=options.hold,
-        regime=options.regime,
+        hold=options.hold or 10.0,
+        regime=options.regime or "auto",
         margin_u=options.margin_u,
         margin_v=options.margin_v,
         start=options.start,
         trials=options.trials,
         predictor=options.predictor,
-        estimator=options.estimator,
+        estimator=options.estimator or "iv",
         criterion=criterion.name,
         wanted=tuple(options.want),
         combination=combination,

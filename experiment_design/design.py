@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from experiment_design.certificate.certificate import absent, certify
+from experiment_design.certificate.certificate import Certificate, absent, certify
 from experiment_design.constraints.limits import LimitReport
 from experiment_design.excitation.rollout import Motion
 from experiment_design.feasibility.actuator_delay import late_notes
@@ -191,15 +191,69 @@ def _design(
                 f"model less by a first short trial."
             )
     units = [c.unit for c in candidates]
-    criterion = problems[0].criterion
-    sums = add_up([own_moments(p, u) for p, u in zip(problems, units, strict=True)])
-    covariance = criterion.covariance(sums[0])[0]
+    covariance = _covariance(problems, units)
     if not np.isfinite(covariance).all() and not request.contrasts:
         raise InfeasibleError(unexcited(problems, units, request))
-    columns = wanted_parameters(request, criterion)
-    names = tuple(c.name for c in columns)
     if not missing or not best_effort:
         notes += require_informative(request, problems, units)
+    certificate = absent("the user stopped the design")
+    if not stopped:
+        try:
+            certificate = certify(problems, units, effort=min(1.0, request.effort))
+        except KeyboardInterrupt:
+            stopped = True
+    design = described(
+        request, problems, units, reference, kept, certificate=certificate, keeping=keeping,
+        status="stopped by the user: the best plan found so far" if stopped else status,
+        notes=tuple(notes), evaluations=evaluations, began=began,
+    )  # fmt: skip
+    if not alternatives or request.trials > 1 or stopped:
+        return design
+    classical = compare_classical(problems[0], request.seed)
+    if reference is not None:
+        value = float(problems[0].evaluate(reference[0][None]).value[0])
+        two = Alternative("random two-level", kept, kept, value, reference[0])
+        classical = (two, *classical)
+    return replace(design, alternatives=classical, seconds=time.perf_counter() - began)
+
+
+def described(
+    request: DesignRequest,
+    problems: list[TrialProblem],
+    units: list[Array],
+    reference: list[Array] | None,
+    kept: int,
+    *,
+    certificate: Certificate,
+    keeping: ConstraintSatisfaction | None,
+    status: str,
+    notes: tuple[str, ...],
+    evaluations: int,
+    began: float,
+) -> Design:
+    """Return what sequences are worth, and how they stand to the limits.
+
+    Parameters
+    ----------
+    request : DesignRequest
+    problems : list of TrialProblem
+        One a trial.
+    units : list of ndarray
+        (K, nc) unit coordinates a trial.
+    reference : list of ndarray or None
+        The best random two-level sequences, and `kept`, how many of them keep the limits.
+    kept : int
+    certificate : Certificate
+    keeping : ConstraintSatisfaction or None
+    status : str
+    notes : tuple of str
+    evaluations : int
+    began : float
+        When the work began, by `time.perf_counter`.
+    """
+    criterion = problems[0].criterion
+    covariance = _covariance(problems, units)
+    columns = wanted_parameters(request, criterion)
     versus, random_value = None, float("nan")
     if reference is not None:
         other = add_up([own_moments(p, u) for p, u in zip(problems, reference, strict=True)])
@@ -213,12 +267,6 @@ def _design(
             versus = float(
                 np.exp(_criterion_value(problems, units, criterion, covariance) - random_value)
             )
-    certificate = absent("the user stopped the design")
-    if not stopped:
-        try:
-            certificate = certify(problems, units, effort=min(1.0, request.effort))
-        except KeyboardInterrupt:
-            stopped = True
     values = np.array(
         [sum(float(request.theta[request.structure.index(n)]) for n in c.terms) for c in columns]
     )
@@ -229,23 +277,13 @@ def _design(
         for p, c in zip(problems, commands, strict=True)
     )
     reports = _limit_reports(problems, motions)
-    notes += late_notes(request, problems, motions, reports, covariance)
-    notes += air_notes(request, motions)
-    classical: tuple[Alternative, ...] = ()
-    if alternatives and request.trials == 1 and not stopped:
-        classical = compare_classical(problems[0], request.seed)
-        if reference is not None:
-            value = float(problems[0].evaluate(reference[0][None]).value[0])
-            two = Alternative("random two-level", kept, kept, value, reference[0])
-            classical = (two, *classical)
-    if stopped:
-        status = "stopped by the user: the best plan found so far"
+    late = late_notes(request, problems, motions, reports, covariance)
     return Design(
         request,
         commands,
         levels,
         motions,
-        names,
+        tuple(c.name for c in columns),
         values,
         covariance,
         _criterion_value(problems, units, criterion, covariance),
@@ -256,12 +294,18 @@ def _design(
         _margins(problems, motions),
         reports,
         keeping,
-        classical,
+        (),
         status,
-        tuple(notes),
+        (*notes, *late, *air_notes(request, motions)),
         evaluations,
         time.perf_counter() - began,
     )
+
+
+def _covariance(problems: list[TrialProblem], units: list[Array]) -> Array:
+    """Return the covariance that sequences would give under the nominal prior model."""
+    sums = add_up([own_moments(p, u) for p, u in zip(problems, units, strict=True)])
+    return np.asarray(problems[0].criterion.covariance(sums[0])[0])
 
 
 def _from_closest(

@@ -36,6 +36,8 @@ Array = NDArray[np.float64]
 
 # a disturbance bound of A10 where nothing is known of currents and wind [m/s]
 _DISTURBANCE = 0.1
+# lengths that are sailed between changes of command in a trial for prediction
+_HOLD = 0.75
 # turbulence intensity of the wind over the sea, as a share of its mean
 _GUSTINESS = 0.15
 
@@ -266,6 +268,32 @@ def prepare_request(
         )
         notes.append(f"the first trial starts from a steady motion: {shown} (--start to change)")
     return Prepared(replace(base, regimes=regimes, starts=starts), tuple(notes))
+
+
+def both_sides(wishes: Wishes, model: ManoeuvringModel, hold: float | None) -> Wishes:
+    """Return wishes of a trial for prediction: surge keeps its sign, the other states do not.
+
+    Parameters
+    ----------
+    wishes : Wishes
+    model : ManoeuvringModel
+        The prior, with the range of surge that its trial showed.
+    hold : float or None
+        Time between changes of command [s]; by default what three quarters of a length take
+        at the speed of the prior's trial.
+    """
+    ranges = model.record.get("ranges")
+    shown = ranges.get("u") if isinstance(ranges, Mapping) else None
+    ahead = shown is None or float(shown[0]) >= 0
+    dt, length = model.sample_time, model.vessel.length
+    if hold is None:
+        hold = wishes.hold
+        if shown is not None and length:
+            hold = _HOLD * length / max(abs(float(shown[0])), abs(float(shown[1])), 1e-3)
+        hold = max(2, round(hold / dt)) * dt
+    return replace(
+        wishes, hold=hold, regime="u+" if ahead else "", predictor=wishes.predictor or "basic"
+    )
 
 
 def _predictor(

@@ -174,13 +174,7 @@ class Rollout:
         """
         state, commands = motion.state[0], motion.commands[0]
         samples, n = len(commands), state.shape[1]
-        out = np.empty((self._slopes.size, samples))
-        self._slopes([*state[:-1].T, *commands.T], out)
-        blocks, first = [], 0
-        for rows, columns in self._shapes:
-            blocks.append(out[first : first + rows * columns].reshape(rows, columns, samples))
-            first += rows * columns
-        in_state, in_command, force = blocks
+        in_state, in_command, force = self._derivatives(state[:-1], commands)
         # costates p(k) = g(k) + Fᵀ(k) p(k+1): one upper banded system
         band = np.zeros((2 * n, n * (samples + 1)))
         band[-1] = 1.0
@@ -195,6 +189,22 @@ class Rollout:
             + np.einsum("ian,ni->na", force, d_tau)
             + np.einsum("ian,ni->na", in_command, costate[1:])
         )
+
+    def slopes(self, motion: Motion) -> Array:
+        """Return the derivatives of the next state in the state, (n, n, R, N)."""
+        return self._derivatives(motion.state[:, :-1], motion.commands)[0]
+
+    def _derivatives(self, state: Array, commands: Array) -> list[Array]:
+        """Return derivatives (rows, columns, ...) at states (..., n) and commands (..., nc)."""
+        shape = state.shape[:-1]
+        signals = [*np.moveaxis(state, -1, 0), *np.moveaxis(commands, -1, 0)]
+        out = np.empty((self._slopes.size, *shape))
+        self._slopes([np.ascontiguousarray(s) for s in signals], out)
+        blocks, first = [], 0
+        for rows, columns in self._shapes:
+            blocks.append(out[first : first + rows * columns].reshape(rows, columns, *shape))
+            first += rows * columns
+        return blocks
 
 
 def force_vector(vessel: Vessel, structure: Structure, commands: ca.SX) -> ca.SX:

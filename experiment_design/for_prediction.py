@@ -1,0 +1,355 @@
+"""The trial after which a model predicts best, over all that the ship is used for."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from experiment_design.certificate.certificate import absent
+from experiment_design.design import described
+from experiment_design.feasibility.checks import require_horizon
+from experiment_design.feasibility.constraint_satisfaction import (
+    ConstraintSatisfaction,
+    keep_probability,
+)
+from experiment_design.information.envelope import Envelope, build_envelope
+from experiment_design.optimise.campaign import random_campaign
+from experiment_design.optimise.envelope_search import (
+    VALIDATION,
+    EnvelopeSearch,
+    search_envelope,
+)
+from experiment_design.output.result import Design
+from experiment_design.request.request import DesignRequest, build_problem
+from greybox.errors import InfeasibleError
+from greybox.model.model import ManoeuvringModel
+from greybox.model.predictor import build_predictor
+
+Array = NDArray[np.float64]
+
+# rounds of tightening limits until they are kept with the wanted probability
+_TIGHTENINGS = 3
+# misfit of a prior that nothing was held out for, as a share of the spread of each state
+_UNKNOWN_MISFIT = 0.3
+# deviations of its sensor within which the sign of sway is not known (A10)
+_CLOSE = 3.0
+# of the range of a speed in the prior's trial: what the plan may go beyond; slowest speed
+# ahead, as a share of the limit, where no trial has shown one
+_BEYOND, _SLOWEST = 0.1, 0.3
+
+
+@dataclass(frozen=True)
+class PredictionDesign:
+    """A plan with the error of predictions that its estimate is expected to leave.
+
+    Parameters
+    ----------
+    design : Design
+    noise, misfit : dict of str to float
+        Root mean squared error of each state over the envelope [m/s, rad/s]: by noise in the
+        coefficients, and by what the structure lacks.
+    random : float
+        Root mean squared error of the median of random sequences of the same length, over
+        that of the plan.
+    commands : dict of str to (float, float)
+        Range of each command in the envelope, in the log's unit, angles in rad.
+    crossings : tuple of (float, float)
+        When the sign of sway is not known by its sensor, beginning and end [s], of the first
+        trial.
+    level : str
+        Verdict on the prior's predictions, empty where it has none.
+    """
+
+    design: Design
+    noise: dict[str, float]
+    misfit: dict[str, float]
+    random: float
+    commands: dict[str, tuple[float, float]]
+    crossings: tuple[tuple[float, float], ...]
+    level: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fields for JSON: those of the design, and what is expected of predictions."""
+        return self.design.to_dict() | {
+            "for": "prediction",
+            "prediction": {
+                "error_by_noise": self.noise,
+                "error_by_misfit": self.misfit,
+                "random_error_over_this": self.random,
+                "envelope": {n: list(r) for n, r in self.commands.items()},
+                "validation_share": VALIDATION,
+                "crossings": [list(c) for c in self.crossings],
+                "prior": self.level,
+            },
+        }
+
+    def headline(self) -> str:
+        """Return in one sentence what the plan is for and what is expected of it."""
+        error = ", ".join(f"{n} {np.hypot(self.noise[n], self.misfit[n]):.2g}" for n in self.noise)
+        said = (
+            f"After this trial predictions over the operating envelope are expected to be off by "
+            f"{error} (rms, m/s and rad/s, beside what no coefficient of this structure can mend); "
+            f"after random steps of the same length by {self.random:.2f} times as much"
+        )
+        if self.level in ("poor", "limited"):
+            said += (
+                f". The prior's own predictions are {self.level}: take these numbers as a guess, "
+                f"and design again after the first part of the trial (--after)"
+            )
+        return f"{said}."
+
+    def summary(self) -> str:
+        """Return the plan as text."""
+        r = self.design.request
+        ranges = ", ".join(
+            f"{n} {low:.4g} to {high:.4g}" for n, (low, high) in self.commands.items()
+        )
+        lines = [
+            f"Plan for {r.vessel.name}: {r.trials} trial{'s' if r.trials > 1 else ''} of "
+            f"{r.duration:g} s for prediction, both sides, {ranges}",
+            self.headline(),
+            f"the last {VALIDATION:.0%} of each trial are usual manoeuvres, a two-sided zig-zag "
+            f"and a turn, by which an estimate judges itself",
+        ]
+        if self.crossings:
+            part = sum(b - a for a, b in self.crossings) / r.duration
+            lines.append(
+                f"sway comes within {_CLOSE:g} deviations of its sensor from zero "
+                f"{len(self.crossings)} times, {part:.0%} of the trial: --margin-v of greybox "
+                f"estimate cuts these samples (Remark 4.2)"
+            )
+        if self.design.keeping is not None:
+            lines.append(self.design.keeping.sentence())
+        broken = [
+            f"{x.name}: missed by {x.missed:.3g} {x.unit}" for x in self.design.limits if x.missed
+        ]
+        lines += broken
+        return "\n".join([*lines, *[f"Note: {n}" for n in self.design.notes]])
+
+
+def command_ranges(
+    model: ManoeuvringModel, given: Mapping[str, tuple[float, float]]
+) -> dict[str, tuple[float, float]]:
+    """Return the range in which each command is used, to both sides.
+
+    What is given stands; else what the prior's trial showed, and without one the limits, speeds
+    from a third of full ahead.
+
+    Parameters
+    ----------
+    model : ManoeuvringModel
+    given : mapping of str to (float, float)
+    """
+    shown = model.record.get("ranges")
+    shown = shown if isinstance(shown, Mapping) else {}
+    angles = {t.rudder for t in model.vessel.thrusters} | {
+        t.angle for t in model.vessel.thrusters if isinstance(t.angle, str)
+    }
+    tunnels = {t.speed for t in model.vessel.thrusters if t.type == "tunnel"}
+    found = {}
+    for name, limits in model.vessel.limits.items():
+        low = -np.inf if limits.lower is None else limits.lower
+        high = np.inf if limits.upper is None else limits.upper
+        if name in given:
+            found[name] = given[name]
+            continue
+        both = name in angles or name in tunnels
+        if name in shown:
+            first, last = (float(v) for v in shown[name])
+            wide = _BEYOND * (last - first)
+            first, last = first - wide, last + wide
+            if both:
+                last = max(abs(first), abs(last))
+                first = -last
+        else:
+            first, last = (low, high) if both else (max(low, _SLOWEST * high), high)
+        found[name] = (max(low, first), min(high, last))
+    return found
+
+
+def prior_misfit(model: ManoeuvringModel) -> tuple[Array, str]:
+    """Return the error of a prior's free runs as a share of each spread (nx,), and its verdict."""
+    verdict = model.record.get("verdict")
+    prediction = verdict.get("prediction") if isinstance(verdict, Mapping) else None
+    if not isinstance(prediction, Mapping):
+        return np.full(len(model.structure.states), _UNKNOWN_MISFIT), ""
+    fit = prediction.get("fit")
+    fit = fit if isinstance(fit, Mapping) else {}
+    shares = [
+        min(1.0, max(0.0, 1 - float(fit[s]) / 100)) if isinstance(fit.get(s), int | float)
+        else _UNKNOWN_MISFIT
+        for s in model.structure.states
+    ]  # fmt: skip
+    return np.array(shares), str(prediction.get("level", ""))
+
+
+def design_for_prediction(
+    request: DesignRequest,
+    model: ManoeuvringModel,
+    *,
+    envelope: Mapping[str, tuple[float, float]] | None = None,
+    keep_start: bool = False,
+) -> PredictionDesign:
+    """Design the trial that leaves the least error of predictions over the operating envelope.
+
+    Parameters
+    ----------
+    request : DesignRequest
+        Of both sides, as `prepare_request` gives it.
+    model : ManoeuvringModel
+        The prior, with what its own trial showed.
+    envelope : mapping of str to (float, float), optional
+        Range of commands that the model is wanted for; see `command_ranges`.
+    keep_start : bool
+        Whether the trial starts as the request says; else on a straight course in the envelope.
+
+    Returns
+    -------
+    PredictionDesign
+
+    Raises
+    ------
+    InfeasibleError
+        The prior holds the ship under too few commands, or the limits cannot be kept.
+
+    References
+    ----------
+    Box and Draper (1959); DuMouchel and Jones (1994).
+    """
+    from threadpoolctl import threadpool_limits
+
+    with threadpool_limits(1, "blas"):
+        return _design(request, model, envelope or {}, keep_start)
+
+
+def _design(
+    request: DesignRequest,
+    model: ManoeuvringModel,
+    given: Mapping[str, tuple[float, float]],
+    keep_start: bool,
+) -> PredictionDesign:
+    began = time.perf_counter()
+    require_horizon(request)
+    misfit, level = prior_misfit(model)
+    ranges = command_ranges(model, given)
+    shown = model.record.get("ranges")
+    speeds = None
+    if isinstance(shown, Mapping) and "u" in shown:
+        speeds = (float(shown["u"][0]), float(shown["u"][1]))
+    states = request.structure.states
+    named = request.structure.without_bumps()
+    predictor = replace(
+        build_predictor(named, "basic", tuple((s, (1, -1)) for s in states)),
+        structure=request.structure,
+    )
+    problem = build_problem(request)
+    found = build_envelope(
+        problem.scenarios[0].rollout, predictor, request.noise, request.schedule, ranges, speeds,
+        misfit, request.seed,
+    )  # fmt: skip
+    if not keep_start:
+        request = replace(request, starts=(found.rollout.start,) * request.trials)
+    asked = request
+    request, searches, keeping = _searched(request, found)
+    problems = [build_problem(asked, t) for t in range(asked.trials)]
+    reference, kept = random_campaign(problems, asked.seed)
+    units = [s.candidate.unit for s in searches]
+    short = [
+        (name, float(m))
+        for search in searches
+        for name, m in zip(problems[0].scenarios[0].limits.names, search.candidate.missed,
+                           strict=True)
+        if m > 1e-3
+    ]  # fmt: skip
+    if short and not request.backoff:
+        name, amount = max(short, key=lambda item: item[1])
+        raise InfeasibleError(
+            f"no plan was found that keeps the {name.name} of {name.bound:g} {name.unit}: the "
+            f"best misses it by {amount:.3g} {name.unit}. Widen it ({name.option}), or narrow "
+            f"--envelope."
+        )
+    start = ", ".join(
+        f"{n} {x:.3g}" for n, x in zip((*states, "psi"), asked.starts[0], strict=True)
+    )
+    design = described(
+        asked, problems, units, reference, kept,
+        certificate=absent("a plan for prediction has no bound to be measured against"),
+        keeping=keeping,
+        status="solved: exchange of settings of the operating envelope",
+        notes=(f"each trial starts from a steady motion: {start} (--start to change)",),
+        evaluations=sum(s.evaluations for s in searches), began=began,
+    )  # fmt: skip
+    others = [found.information(m)[0] for m in design.motions[1:]]
+    known = np.sum(others, axis=0) if others else None
+    noise, bias = found.errors(design.motions[0], known)
+    whole = np.sqrt(float((noise + bias).mean()))
+    usual = float(np.median(np.exp(-searches[0].random)))
+    v = states.index("v") if "v" in states else None
+    crossings: tuple[tuple[float, float], ...] = ()
+    if v is not None:
+        margin = _CLOSE * float(asked.noise.measurement[v])
+        near = np.abs(design.motions[0].state[0, :-1, v]) < margin
+        crossings = _stretches(near, asked.sample_time)
+    return PredictionDesign(
+        design,
+        {s: float(np.sqrt(noise[0, i]) * found.spread[i]) for i, s in enumerate(states)},
+        {s: float(np.sqrt(bias[0, i]) * found.spread[i]) for i, s in enumerate(states)},
+        usual / whole if asked.trials == 1 else float("nan"),
+        {n: (float(a), float(b)) for n, a, b in
+         zip(asked.schedule.commands, found.lower, found.upper, strict=True)},
+        crossings,
+        level,
+    )  # fmt: skip
+
+
+def _searched(
+    request: DesignRequest, envelope: Envelope
+) -> tuple[DesignRequest, list[EnvelopeSearch], ConstraintSatisfaction | None]:
+    """Search all trials, with limits tightened until they are kept with the wanted probability."""
+    searches = _campaign(request, envelope)
+    if not request.uncertain:
+        return request, searches, None
+    plain = request
+    keeping = keep_probability(plain, [s.candidate.unit for s in searches])
+    best = (request, searches, keeping)
+    backoff, shortfall = np.zeros(len(keeping.shortfall)), keeping.shortfall
+    for _ in range(_TIGHTENINGS):
+        if best[2].probability >= request.probability or not shortfall.any():
+            break
+        backoff = backoff + 1.1 * shortfall
+        tighter = replace(plain, backoff=tuple(backoff))
+        again = _campaign(tighter, envelope)
+        now = keep_probability(plain, [s.candidate.unit for s in again])
+        shortfall = now.shortfall
+        if now.probability > best[2].probability:
+            best = (tighter, again, now)
+    return best
+
+
+def _campaign(request: DesignRequest, envelope: Envelope) -> list[EnvelopeSearch]:
+    found: list[EnvelopeSearch] = []
+    known: Array | None = None
+    for trial in range(request.trials):
+        problem = build_problem(request, trial)
+        search = search_envelope(
+            problem, envelope, request.seed + 1000 * trial, request.effort, known
+        )
+        found.append(search)
+        commands = problem.schedule.expand(problem.levels(search.candidate.unit))
+        own = envelope.information(problem.scenarios[0].rollout.run(commands[None]))[0]
+        known = own if known is None else known + own
+    return found
+
+
+def _stretches(inside: NDArray[np.bool_], sample_time: float) -> tuple[tuple[float, float], ...]:
+    """Return beginning and end [s] of each run of true samples."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], inside.astype(int), [0]])))
+    return tuple(
+        (float(a * sample_time), float(b * sample_time))
+        for a, b in zip(edges[::2], edges[1::2], strict=True)
+    )

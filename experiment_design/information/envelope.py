@@ -1,0 +1,361 @@
+"""The operating envelope of a ship, and the error of predictions over it that a trial would leave.
+
+No real ship is in the family of its prior model. What the terms do not say is a smooth force of
+motion and commands: in each equation potential terms g stand beside the primary terms φ, with a
+prior variance (DuMouchel and Jones, 1994). A trial with the moments G = Σ [φ; g][φ; g]ᵀ leaves
+coefficients that are off by
+
+    noise    σ² G₁₁⁻¹,
+    misfit   (G₁₁⁻¹ G₁₂ − P) β,   P = W₁₁⁻¹ W₁₂,
+
+where β are the coefficients of the potential terms and P what the best coefficients for the
+envelope make of them. W are the moments of the sensitivities of free runs over the envelope, so
+the mean squared error of predicted motion, variance plus squared bias (Box and Draper, 1959), is
+
+    σ² tr W₁₁ G₁₁⁻¹ + τ² tr Dᵀ W₁₁ D,   D = G₁₁⁻¹ G₁₂ − P,
+
+and what no coefficient can mend, which no trial changes. The second part is small where the
+trial moves as the ship will be used, the first where it moves much and long.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from experiment_design.excitation.rollout import Motion, Rollout
+from experiment_design.excitation.schedule import Schedule
+from greybox.errors import InfeasibleError
+from greybox.model.noise import NoiseLevels
+from greybox.model.predictor import Predictor
+from greybox.model.run.step import StepModel
+from greybox.numerics.vectorised import Vectorised
+
+Array = NDArray[np.float64]
+
+# constant commands that are tried, and for how many time scales each is held
+_TRIED, _SETTLING = 1000, 60.0
+# sequences that stand for the envelope, their length, and after how long a free run begins anew
+_SEQUENCES, _LENGTH, _RUN = 40, 40.0, 20.0
+# how long a command is held in them, in time scales: half a length to six lengths sailed
+HOLDS = (0.5, 6.0)
+# centres of the potential terms
+_CENTRES = 40
+# samples of a motion that its moments are summed over
+_SAMPLES = 400
+# slowest and fastest steady motion that counts, in what the prior's trial showed
+_SLOWEST, _FASTEST = 0.7, 1.3
+# share of the commands under which the prior must hold the ship
+HELD = 0.25
+# least misfit, as a share of the spread of each state
+_LEAST_MISFIT = 0.05
+
+
+@dataclass(frozen=True)
+class Envelope:
+    """How a ship is used, and what a trial has to tell of it.
+
+    Parameters
+    ----------
+    rollout : Rollout
+        The prior model, from a steady motion of the envelope.
+    predictor : Predictor
+        Whose columns are the primary terms.
+    variance : ndarray
+        (nx,) of the equation errors a sample, without the misfit.
+    lower, upper : ndarray
+        (nc,) range of each command.
+    settings : ndarray
+        (S, nc) constant commands within it that hold the ship in the envelope.
+    steady : ndarray
+        (S, nx) the motions that they settle to [m/s, rad/s].
+    time_scale : float
+        Time in which the ship sails her length [s].
+    misfit : ndarray
+        (nx,) error of the prior's free runs as a share of the spread of each state.
+    spread : ndarray
+        (nx,) standard deviation of each state over the envelope.
+    """
+
+    rollout: Rollout
+    predictor: Predictor
+    variance: Array
+    lower: Array
+    upper: Array
+    settings: Array
+    steady: Array
+    time_scale: float
+    misfit: Array
+    spread: Array
+    _features: _Features = field(repr=False)
+    _moments: tuple[Array, ...] = field(repr=False)
+    _best: Array = field(repr=False)
+    _tau: Array = field(repr=False)
+
+    def errors(self, motion: Motion, known: Array | None = None) -> tuple[Array, Array]:
+        """Return what estimates from R motions would leave of the error of predictions.
+
+        Parameters
+        ----------
+        motion : Motion
+        known : ndarray, optional
+            (p, p) moments of other trials, as `information` gives them.
+
+        Returns
+        -------
+        tuple of ndarray
+            (R, nx) mean squared error of each state by noise, and by misfit, in the variance
+            of the state; inf where a run is unstable or a term not excited.
+        """
+        runs, nx = len(motion.state), self.rollout.nx
+        noise, bias = np.full((runs, nx), np.inf), np.full((runs, nx), np.inf)
+        good = np.flatnonzero(motion.stable)
+        if not len(good):
+            return noise, bias
+        gram = self.information(motion, good)
+        if known is not None:
+            gram = gram + known
+        p = len(self.predictor.columns)
+        own = gram[:, :p, :p]
+        size = np.sqrt(np.maximum(np.diagonal(own, axis1=1, axis2=2), 0.0))
+        excited = (size > 0).all(axis=1)
+        good, gram, size = good[excited], gram[excited], size[excited]
+        if not len(good):
+            return noise, bias
+        outer = size[:, :, None] * size[:, None, :]
+        # a direction that is hardly excited stays what the prior says it is
+        inverse = np.linalg.inv(gram[:, :p, :p] / outer + 1e-9 * np.eye(p)) / outer
+        per_column = np.concatenate(
+            [np.full(len(self.predictor.equation(n)), v) for n, v in
+             zip(self.rollout.structure.states, self.variance, strict=True)]
+        )  # fmt: skip
+        off = inverse @ gram[:, :p, p:] - self._best
+        for i, w in enumerate(self._moments):
+            # equations do not share columns, so that the inverse is block by block
+            noise[good, i] = np.einsum("ab,rab,b->r", w[:p, :p], inverse, per_column)
+            bias[good, i] = np.einsum("rab,ac,rcb,b->r", off, w[:p, :p], off, self._tau)
+        return noise, bias
+
+    def information(self, motion: Motion, which: NDArray[np.intp] | None = None) -> Array:
+        """Return the moments G (R, p + q, p + q) of primary and potential terms."""
+        nx = self.rollout.nx
+        which = np.arange(len(motion.state)) if which is None else which
+        every = max(1, motion.tau.shape[1] // _SAMPLES)
+        x = motion.state[which][:, :-1:every]
+        z, g = self._features(
+            x[..., :nx], x[..., nx], motion.tau[which][:, ::every],
+            motion.commands[which][:, ::every],
+        )  # fmt: skip
+        z, g = np.moveaxis(z, 0, 1), np.moveaxis(g, 0, 1)
+        p, k = z.shape[1], g.shape[1]
+        gram = np.zeros((len(which), p + nx * k, p + nx * k))
+        for i, name in enumerate(self.rollout.structure.states):
+            rows = self.predictor.equation(name)
+            both = np.concatenate([z[:, rows], g], axis=1)
+            at = np.array([*rows, *range(p + i * k, p + (i + 1) * k)])
+            gram[:, at[:, None], at] = every * (both @ both.transpose(0, 2, 1))
+        return gram
+
+    def draw(self, samples: int, rng: np.random.Generator) -> Array:
+        """Draw commands (N, nc) as the ship is used: settings that are held short and long."""
+        return _drawn(self.settings, samples, self.time_scale / self.rollout.sample_time, rng)
+
+
+def _drawn(settings: Array, samples: int, scale: float, rng: np.random.Generator) -> Array:
+    out = np.empty((samples, settings.shape[1]))
+    first = 0
+    while first < samples:
+        held = max(1, round(scale * float(np.exp(rng.uniform(*np.log(HOLDS))))))
+        out[first : first + held] = settings[rng.integers(len(settings))]
+        first += held
+    return out
+
+
+class _Features:
+    """Primary regressors of a predictor, and potential terms, along motions.
+
+    The potential terms are the Nyström features of a Gaussian process of states and commands
+    (Rasmussen and Williams, 2006, section 8.1), the same in each equation: with independent
+    coefficients of one variance their sum has the covariance exp(−|s − s'|² / 2 m) of signals s
+    in their standard deviations, m of them.
+    """
+
+    def __init__(self, rollout: Rollout, predictor: Predictor, signals: Array, seed: int) -> None:
+        from scipy.cluster.vq import kmeans2
+
+        step = StepModel.free(rollout.structure, rollout.integrator)
+        s = step.symbolic
+        terms = s.at(ca.vertcat(*predictor.expressions), rollout.d, rollout.theta,
+                     rollout.sample_time)  # fmt: skip
+        terms = ca.substitute(terms, s.air, ca.DM.zeros(2))
+        self._terms = Vectorised(
+            ca.vertsplit(terms), [*ca.vertsplit(s.x), s.psi, *ca.vertsplit(s.tau)]
+        )
+        self._mean, std = signals.mean(axis=0), signals.std(axis=0)
+        self._std = np.where(std > 0, std, 1.0)
+        scaled = (signals - self._mean) / self._std
+        self._centres = kmeans2(scaled, _CENTRES, minit="++", seed=seed)[0]
+        self._width = float(signals.shape[1])
+        values, vectors = np.linalg.eigh(self._kernel(self._centres))
+        kept = values > 1e-6 * values[-1]
+        self._root = vectors[:, kept] / np.sqrt(values[kept])
+
+    def _kernel(self, signals: Array) -> Array:
+        square = ((signals**2).sum(axis=-1)[..., None] + (self._centres**2).sum(axis=1)
+                  - 2 * signals @ self._centres.T)  # fmt: skip
+        return np.asarray(np.exp(-np.maximum(square, 0.0) / (2 * self._width)))
+
+    def __call__(self, x: Array, psi: Array, tau: Array, commands: Array) -> tuple[Array, Array]:
+        """Return regressors (p, R, N) and potential terms (k, R, N)."""
+        rows = [x[..., i] for i in range(x.shape[-1])]
+        rows += [psi, *[tau[..., i] for i in range(tau.shape[-1])]]
+        z = np.empty((self._terms.size, *psi.shape))
+        self._terms([np.ascontiguousarray(r) for r in rows], z)
+        signals = (np.concatenate([x, commands], axis=-1) - self._mean) / self._std
+        return z, np.moveaxis(self._kernel(signals) @ self._root, -1, 0)
+
+
+def build_envelope(
+    rollout: Rollout,
+    predictor: Predictor,
+    noise: NoiseLevels,
+    schedule: Schedule,
+    commands: Mapping[str, tuple[float, float]],
+    speeds: tuple[float, float] | None,
+    misfit: Array,
+    seed: int,
+) -> Envelope:
+    """Find out how a ship can be used, and what her prior model says of it.
+
+    Parameters
+    ----------
+    rollout : Rollout
+        The prior model.
+    predictor : Predictor
+        Its primary terms.
+    noise : NoiseLevels
+    schedule : Schedule
+        With the commands' limits.
+    commands : mapping of str to (float, float)
+        Range of each command that is used: speeds in the log's unit, angles [rad].
+    speeds : (float, float), optional
+        Slowest and fastest surge that the prior's trial showed [m/s].
+    misfit : ndarray
+        (nx,) error of the prior's free runs as a share of the spread of each state.
+    seed : int
+
+    Raises
+    ------
+    InfeasibleError
+        The prior model holds the ship under too few of the commands.
+    """
+    rng = np.random.default_rng([37, seed])
+    limits = zip(schedule.commands, schedule.lower, schedule.upper, strict=True)
+    lower, upper = np.array(
+        [(max(a, commands[n][0]), min(b, commands[n][1])) for n, a, b in limits]
+    ).T
+    dt, nx, length = rollout.sample_time, rollout.nx, rollout.vessel.length
+    tried = lower + (upper - lower) * rng.random((_TRIED, len(lower)))
+    fast = 1.0 if speeds is None else max(abs(speeds[0]), abs(speeds[1]))
+    scale = max((length or 20 * fast) / fast, 4 * dt)
+    settled = rollout.run(np.repeat(tried[:, None], int(_SETTLING * scale / dt), axis=1))
+    steady = settled.state[:, -1, :nx]
+    held = settled.stable
+    if speeds is not None and speeds[0] > 0:
+        held &= (steady[:, 0] >= _SLOWEST * speeds[0]) & (steady[:, 0] <= _FASTEST * speeds[1])
+    elif speeds is None:
+        fast = float(np.quantile(steady[held, 0], 0.98)) if held.any() else 1.0
+        held &= steady[:, 0] >= 0.2 * fast
+        scale = max((length or 20 * fast) / fast, 4 * dt)
+    if held.mean() < HELD:
+        raise InfeasibleError(
+            f"the prior model holds the ship within the speeds of its own trial under "
+            f"{100 * held.mean():.0f} % of the commands, {100 * HELD:.0f} % are needed to plan "
+            f"with it: estimate it on a longer trial, or use --prior none."
+        )
+    settings, steady = tried[held], steady[held]
+    # the straightest of the faster motions, where a crew would begin
+    quick = steady[:, 0] >= np.quantile(steady[:, 0], 0.5)
+    aside = np.abs(steady[:, 1:]) / steady.std(axis=0)[1:] if nx > 1 else np.zeros((len(steady), 1))
+    order = np.where(quick, aside.sum(axis=1), np.inf)
+    start = np.append(steady[int(order.argmin())], 0.0)
+    rollout = Rollout(
+        rollout.vessel, rollout.structure, rollout.theta, rollout.d, start, dt, rollout.integrator
+    )
+    samples = int(_LENGTH * scale / dt)
+    used = np.array([_drawn(settings, samples, scale / dt, rng) for _ in range(_SEQUENCES)])
+    motion = rollout.run(used)
+    good = motion.stable
+    if good.mean() < HELD:
+        raise InfeasibleError(
+            f"the prior model runs away in {100 * (1 - good.mean()):.0f} % of the usual "
+            f"manoeuvres: estimate it on a longer trial, or use --prior none."
+        )
+    motion = Motion(motion.state[good], motion.tau[good], motion.commands[good], good[good])
+    x = motion.state[:, :-1, :nx]
+    signals = np.concatenate([x, motion.commands], axis=-1)
+    features = _Features(rollout, predictor, signals.reshape(-1, signals.shape[-1])[::7], seed)
+    moments = _sensitivity_moments(rollout, predictor, features, motion, int(_RUN * scale / dt))
+    p = len(predictor.columns)
+    total = sum(moments)
+    size = np.sqrt(np.diag(total))
+    size[size == 0] = 1.0
+    unit = total / np.outer(size, size)
+    best = np.linalg.solve(unit[:p, :p] + 1e-9 * np.eye(p), unit[:p, p:])
+    best = best * size[p:] / size[:p, None]
+    share = np.maximum(misfit, _LEAST_MISFIT)
+    tau = _prior_variance(moments, best, share, nx)
+    variance = np.asarray(noise.process, float) ** 2 + 2 * np.asarray(noise.measurement) ** 2
+    return Envelope(
+        rollout, predictor, variance, lower, upper, settings, steady, scale, share,
+        x.reshape(-1, nx).std(axis=0), features, moments, best, tau,
+    )  # fmt: skip
+
+
+def _sensitivity_moments(
+    rollout: Rollout, predictor: Predictor, features: _Features, motion: Motion, run: int
+) -> tuple[Array, ...]:
+    """Return the mean of S Sᵀ of each state in its variance, (p + q, p + q) each."""
+    nx, states = rollout.nx, rollout.structure.states
+    x = motion.state[:, :-1]
+    z, g = features(x[..., :nx], x[..., nx], motion.tau, motion.commands)
+    slopes = rollout.slopes(motion)[:nx, :nx]
+    p, k = len(z), len(g)
+    variance = x[..., :nx].reshape(-1, nx).var(axis=0)
+    variance[variance == 0] = 1.0
+    s = np.zeros((len(x), nx, p + nx * k))
+    total = [np.zeros((p + nx * k, p + nx * k)) for _ in states]
+    for j in range(x.shape[1]):
+        if j % run == 0:
+            s[:] = 0.0
+        s = slopes[:, :, :, j].transpose(2, 0, 1) @ s
+        for i, name in enumerate(states):
+            rows = predictor.equation(name)
+            s[:, i, rows] += z[rows, :, j].T
+            s[:, i, p + i * k : p + (i + 1) * k] += g[:, :, j].T
+        for i in range(nx):
+            total[i] += s[:, i].T @ s[:, i] / variance[i]
+    return tuple(t / (len(x) * x.shape[1]) for t in total)
+
+
+def _prior_variance(moments: tuple[Array, ...], best: Array, share: Array, nx: int) -> Array:
+    """Return the variance (q,) of the potential terms' coefficients, one for each equation.
+
+    With it the best coefficients for the envelope leave the misfit that the prior has shown.
+    """
+    from scipy.optimize import nnls
+
+    p = len(best)
+    k = (len(moments[0]) - p) // nx
+    left = np.empty((nx, nx))
+    for i, w in enumerate(moments):
+        rest = w[p:, p:] - best.T @ w[:p, p:] - w[p:, :p] @ best + best.T @ w[:p, :p] @ best
+        left[i] = np.maximum(np.diag(rest), 0.0).reshape(nx, k).sum(axis=1)
+    found, _ = nnls(left / share[:, None] ** 2, np.ones(nx))
+    # an equation that others could speak for keeps a tenth of what it alone would need
+    floor = 0.1 * share**2 / np.maximum(np.diag(left), 1e-300)
+    return np.repeat(np.maximum(found, floor), k)

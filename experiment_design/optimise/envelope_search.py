@@ -1,0 +1,193 @@
+"""Search for sequences that leave the least error of predictions over the operating envelope.
+
+Levels are exchanged with those of a candidate set (Fedorov, 1972; Meyer and Nachtsheim, 1995):
+settings that hold the ship in her envelope, so that no plan goes where its prior model was
+never near. Several chains start from the best of random sequences of these settings.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from experiment_design.constraints.limits import TOLERANCE
+from experiment_design.information.envelope import HOLDS, Envelope
+from experiment_design.optimise.search import Candidate, limit_scale
+from experiment_design.request.problem import TrialProblem
+from greybox.numerics.forked import map_forked
+
+Array = NDArray[np.float64]
+
+# random sequences that a search begins with, and that a plan is compared with
+RANDOM = 200
+# share of the trial that is kept for usual manoeuvres: by the last third of a log an estimate
+# chooses its terms
+VALIDATION = 1 / 3
+_CHAINS, _KEPT, _TOGETHER, _ROUNDS = 4, 12, 64, 14
+# of the largest steady yaw rate: how hard the zig-zag turns; time scales of each of its legs
+_TURN, _LEG = 0.6, 3.0
+# share of moves that draw a stretch anew; the others swap two
+_ANEW = 0.7
+
+
+@dataclass(frozen=True)
+class EnvelopeSearch:
+    """What a search found.
+
+    Parameters
+    ----------
+    candidate : Candidate
+        Its value is −½ log of the mean squared error of predictions.
+    random : ndarray
+        (R,) values of the random sequences, −inf where a run is unstable.
+    evaluations : int
+    """
+
+    candidate: Candidate
+    random: Array
+    evaluations: int
+
+
+def usual_manoeuvres(envelope: Envelope, holds: int, hold: float) -> Array:
+    """Return a two-sided zig-zag at two speeds and a turn, levels (K, nc).
+
+    Parameters
+    ----------
+    envelope : Envelope
+    holds : int
+        K
+    hold : float
+        [s]
+    """
+    settings, steady = envelope.settings, envelope.steady
+    leg = max(1, round(_LEG * envelope.time_scale / hold))
+    rate = steady[:, -1] if steady.shape[1] > 1 else np.zeros(len(steady))
+    middle = np.median(steady[:, 0])
+    sides = []
+    for fast in (True, False):
+        part = steady[:, 0] >= middle if fast else steady[:, 0] < middle
+        # straight motion passes for both sides of a ship that cannot turn
+        wanted = _TURN * np.abs(rate[part]).max(initial=0.0)
+        sides.append(
+            [settings[part][int(np.abs(rate[part] - s * wanted).argmin())] for s in (1, -1)]
+        )
+    (right, left), (slow_right, slow_left) = sides
+    order = [right, left, right, left, slow_left, slow_right, slow_left, slow_right]
+    zigzag = np.repeat(order, leg, axis=0)
+    turn = np.repeat([left], max(2 * leg, holds - len(zigzag)), axis=0)
+    whole = np.concatenate([zigzag, turn])
+    if holds < len(zigzag) + leg:
+        # too short for all of it: every leg gets its share
+        whole = np.array(order)[np.arange(holds) * len(order) // max(holds, 1)]
+    return np.asarray(whole[:holds])
+
+
+def search_envelope(
+    problem: TrialProblem,
+    envelope: Envelope,
+    seed: int,
+    effort: float = 1.0,
+    known: Array | None = None,
+) -> EnvelopeSearch:
+    """Search for the sequence that leaves the least error of predictions.
+
+    Parameters
+    ----------
+    problem : TrialProblem
+        With the limits, its run starting where the envelope's does.
+    envelope : Envelope
+    seed : int
+    effort : float
+        Times the usual number of evaluations.
+    known : ndarray, optional
+        (p, p) moments of other trials.
+    """
+    holds = problem.shape[0]
+    hold = problem.schedule.hold * problem.schedule.sample_time
+    tail = usual_manoeuvres(envelope, round(VALIDATION * holds), hold)
+    free = holds - len(tail)
+    longest = max(1, min(free, round(HOLDS[1] * envelope.time_scale / hold)))
+
+    def whole(levels: Array) -> Array:
+        both = np.concatenate([levels, np.broadcast_to(tail, (len(levels), *tail.shape))], axis=1)
+        return problem.schedule.within_reach(both)
+
+    def judged(levels: Array) -> list[tuple[Array, Candidate]]:
+        out = []
+        for first in range(0, len(levels), _TOGETHER):
+            part = levels[first : first + _TOGETHER]
+            complete = whole(part)
+            motion = problem.scenarios[0].rollout.run(problem.schedule.expand(complete))
+            noise, bias = envelope.errors(motion, known)
+            with np.errstate(divide="ignore"):
+                value = -0.5 * np.log((noise + bias).mean(axis=1))
+            missed = problem.scenarios[0].limits.violations(motion)
+            s = problem.schedule
+            span = np.where(s.upper > s.lower, s.upper - s.lower, 1.0)
+            unit = (complete - s.lower) / span
+            out += [
+                (p, Candidate(u, float(v), missed[:, i]))
+                for i, (p, u, v) in enumerate(zip(part, unit, value, strict=True))
+            ]
+        return out
+
+    def drawn(count: int, rng: np.random.Generator) -> Array:
+        out = np.empty((count, free, len(problem.schedule.commands)))
+        for levels in out:
+            k = 0
+            while k < free:
+                held = _held(rng, longest)
+                levels[k : k + held] = envelope.settings[rng.integers(len(envelope.settings))]
+                k += held
+        return out
+
+    def moved(levels: Array, rng: np.random.Generator) -> Array:
+        out = levels.copy()
+        for _ in range(int(rng.integers(1, 4))):
+            held = _held(rng, longest)
+            i = int(rng.integers(free - held + 1))
+            if rng.random() < _ANEW:
+                out[i : i + held] = envelope.settings[rng.integers(len(envelope.settings))]
+            else:
+                j = int(rng.integers(free - held + 1))
+                out[i : i + held], out[j : j + held] = (
+                    out[j : j + held].copy(), out[i : i + held].copy(),
+                )  # fmt: skip
+        return out
+
+    scale = limit_scale(problem)
+
+    def better(found: list[tuple[Array, Candidate]]) -> list[tuple[Array, Candidate]]:
+        return sorted(found, key=lambda f: _rank(f[1], scale))[:_KEPT]
+
+    begun = judged(drawn(RANDOM, np.random.default_rng([41, seed])))
+    rounds = max(2, round(_ROUNDS * effort))
+
+    def chain(number: int) -> tuple[Array, Candidate]:
+        rng = np.random.default_rng([43, seed, number])
+        pool = better(begun)
+        for _ in range(rounds):
+            parents = rng.integers(len(pool), size=_TOGETHER)
+            children = np.array([moved(pool[i][0], rng) for i in parents])
+            pool = better(pool + judged(children))
+        return pool[0]
+
+    found = better(map_forked(chain, range(_CHAINS)))
+    values = np.array([c.value for _, c in begun])
+    return EnvelopeSearch(found[0][1], values, RANDOM + _CHAINS * rounds * _TOGETHER)
+
+
+def _held(rng: np.random.Generator, longest: int) -> int:
+    """Draw for how many holds a setting is kept, as often long as short in their logarithm."""
+    return min(longest, max(1, int(np.exp(rng.uniform(0.0, np.log(longest + 1))))))
+
+
+def _rank(candidate: Candidate, scale: Array) -> tuple[float, float]:
+    """Return what candidates are ordered by: limits first, then the value."""
+    over = np.where(candidate.missed > TOLERANCE, candidate.missed, 0.0) / scale
+    short = float(over.sum()) if over.size else 0.0
+    if not np.isfinite(candidate.value):
+        short += 1e6
+    return short, -candidate.value
