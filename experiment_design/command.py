@@ -323,6 +323,8 @@ def run(options: argparse.Namespace) -> None:
 
 def _run_for_prediction(options: argparse.Namespace, model: Any, vessel: Any) -> None:
     """Design the trial that serves predictions and write it."""
+    from dataclasses import replace
+
     from experiment_design.for_prediction import design_for_prediction
     from experiment_design.output.result import write_plan
     from experiment_design.prepare import both_sides, prepare_request
