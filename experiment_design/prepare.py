@@ -27,6 +27,7 @@ from experiment_design.stability import unstable_sentence
 from greybox.errors import InfeasibleError, StructureError, UsageError
 from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor_kinds import PREDICTORS
+from greybox.model.semi_empirical import METHOD as SEMI_EMPIRICAL
 from greybox.model.structure import Structure
 from greybox.numerics.linalg import scaled_inverse
 from greybox.vessel.actuation import with_actuators_of
@@ -149,6 +150,8 @@ def prepare_request(
         f"{c.sentence}, and the trial is designed for what it is from then on"
         for c in dict.fromkeys(changes)
     ]
+    if model.record.get("method") == SEMI_EMPIRICAL:
+        notes += model.record.get("notes", [])
     model = model.at_final_parameters()
     named = model.without_bumps()
     if named is not model:
@@ -215,6 +218,7 @@ def prepare_request(
         theta=theta,
         sample_time=model.sample_time,
         integrator=model.integrator,
+        untried=model.record.get("method") == SEMI_EMPIRICAL,
         noise=noise,
         duration=wishes.duration,
         hold=wishes.hold,
