@@ -12,6 +12,8 @@ from greybox.commands.common import add_seed, count, positive, progress, provena
 from greybox.model.predictor_kinds import PREDICTORS
 from greybox.registry import Registry
 
+# word of --prior that stands for no model of any trial
+NO_PRIOR = "none"
 HELP = "design the thruster sequences of the next trial"
 EXAMPLES = """examples:
   greybox design --vessel ship.toml --model model.json --duration 600 --out plan.csv
@@ -22,6 +24,7 @@ EXAMPLES = """examples:
   greybox design --vessel ship.toml --model model.json --duration 600 --trials 2 --out plan.csv
   greybox design --vessel ship.toml --model model.json --duration 600 \\
       --between plain.json current.json --out plan.csv
+  greybox design --vessel ship.toml --prior none --duration 900 --out plan.csv
 """
 
 
@@ -44,7 +47,7 @@ def _purpose(options: argparse.Namespace) -> str:
     """
     from greybox.errors import UsageError
 
-    given = [n for n in IMPLY_COEFFICIENTS if getattr(options, n)]
+    given = [n for n in IMPLY_COEFFICIENTS if getattr(options, n) not in (None, [], 0, NO_PRIOR)]
     if options.between:
         if options.purpose == "prediction" or options.envelope:
             raise UsageError("--between tells two explanations apart: leave out --for, --envelope.")
@@ -165,7 +168,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=tuple(ESTIMATORS),
         help=f"{_listed(ESTIMATORS)} (iv)",
     )
-    goal.add_argument("--prior", metavar="MODEL", help="model of earlier trials, its information")
+    goal.add_argument(
+        "--prior",
+        metavar="MODEL",
+        help="model of earlier trials, its information; none: no trial and no --model, start from "
+        "the vessel's main dimensions",
+    )
     goal.add_argument(
         "--between", nargs=2, metavar=("A", "B"), help="tell two explanations apart instead"
     )
@@ -267,6 +275,7 @@ def run(options: argparse.Namespace) -> None:
     from greybox.errors import UsageError
     from greybox.files import check_targets, write_json
     from greybox.model.model import load_model
+    from greybox.model.semi_empirical import semi_empirical_model
     from greybox.vessel.toml import load_vessel
 
     check_targets(options.out, options.json, options.sheet, options.report)
@@ -274,13 +283,26 @@ def run(options: argparse.Namespace) -> None:
         from experiment_design.output.trial_sheet import sheet_kind
 
         sheet_kind(options.sheet)
-    if options.between is None and options.model is None:
-        raise UsageError("--model is missing: name a prior model, or two with --between A B.")
+    untried = options.prior == NO_PRIOR
+    if untried and (options.model or options.between):
+        given = f"--model {options.model}" if options.model else "--between"
+        raise UsageError(
+            f"--prior none starts without any model and {given} names one: leave one of them out."
+        )
+    if options.between is None and options.model is None and not untried:
+        raise UsageError(
+            "--model is missing: name a prior model, two with --between A B, or start without one "
+            "by --prior none."
+        )
     purpose = _purpose(options)
-    model = load_model(options.between[0] if options.between else options.model)
-    if purpose == "coefficients":
-        model = model.coefficient_model()
     vessel = load_vessel(options.vessel)
+    if untried:
+        model = semi_empirical_model(vessel)
+    else:
+        first = options.between[0] if options.between else options.model
+        model = load_model(first)
+        if purpose == "coefficients":
+            model = model.coefficient_model()
     if options.duration is None:
         raise UsageError("--duration is missing: say how long the trial may last, in seconds.")
     if purpose == "prediction":
@@ -501,7 +523,9 @@ def _wishes(options: argparse.Namespace, model: Any) -> Any:
         gust=options.gust,
         process_noise=process,
         limits=limits,
-        prior=None if options.prior is None else load_model(options.prior).coefficient_model(),
+        prior=None
+        if options.prior in (None, NO_PRIOR)
+        else load_model(options.prior).coefficient_model(),
         robust=options.robust,
         worst_case=options.worst_case,
         probability=options.probability,

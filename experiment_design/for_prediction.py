@@ -96,10 +96,16 @@ class PredictionDesign:
             f"{error} (rms, m/s and rad/s, beside what no coefficient of this structure can mend); "
             f"after random steps of the same length by {self.random:.2f} times as much"
         )
-        if self.level in ("poor", "limited"):
+        if self.design.request.untried:
+            said += (
+                ". No estimated model stands behind these numbers, only the ship's main "
+                "dimensions: take them as a guess, and design again after the first part of the "
+                "trial"
+            )
+        elif self.level in ("poor", "limited"):
             said += (
                 f". The prior's own predictions are {self.level}: take these numbers as a guess, "
-                f"and design again after the first part of the trial (--after)"
+                f"and design again after the first part of the trial"
             )
         return f"{said}."
 

@@ -27,6 +27,7 @@ from experiment_design.request.request import DesignRequest, build_problem, full
 from greybox.errors import InfeasibleError, StructureError, UsageError
 from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor_kinds import PREDICTORS
+from greybox.model.semi_empirical import METHOD as SEMI_EMPIRICAL
 from greybox.model.structure import Structure
 from greybox.numerics.linalg import scaled_inverse
 from greybox.vessel.actuation import with_actuators_of
@@ -151,6 +152,8 @@ def prepare_request(
         f"{c.sentence}, and the trial is designed for what it is from then on"
         for c in dict.fromkeys(changes)
     ]
+    if model.record.get("method") == SEMI_EMPIRICAL:
+        notes += model.record.get("notes", [])
     model = model.at_final_parameters()
     bumps = sum(t.local for t in model.structure.terms)
     if bumps:
@@ -216,6 +219,7 @@ def prepare_request(
         theta=theta,
         sample_time=model.sample_time,
         integrator=model.integrator,
+        untried=model.record.get("method") == SEMI_EMPIRICAL,
         noise=noise,
         duration=wishes.duration,
         hold=wishes.hold,

@@ -31,6 +31,10 @@ _SIZE = 9.0
 # times the information from which the other sequence tells nothing
 _TELLS_NOTHING = 1000.0
 _SHOWN = ("u", "v", "r", "psi")
+# what stands before all else where no trial is behind the prior model
+UNTRIED = (
+    "Planned without an estimated model, from main dimensions: the figures are as good as these. "
+)
 
 
 def design_page(
@@ -64,7 +68,7 @@ def design_page(
     said = [design.status, *keeping, *notes, *design.notes]
     return Page(
         title=f"Plan for {plain_name(r.vessel.name)}: {trials}",
-        headline=headline or saving(design),
+        headline=headline or (UNTRIED if r.untried else "") + saving(design),
         sentences=[_sentence(s) for s in said],
         pictures=[*(one.pictures if one else []), *_std_pictures(design, reference)],
         tables=[

@@ -172,6 +172,7 @@ class Design(DisplayMixin):
             f"{r.duration:g} s, commands change every {r.hold:g} s, regime "
             f"{', '.join(spell_regime(s) for s in r.regimes)}",
             f"{self.status}",
+            *(["planned without an estimated model, from main dimensions"] if r.untried else []),
         ]
         if self.efficiency_vs_random is not None:
             lines.append(

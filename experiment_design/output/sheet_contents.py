@@ -129,7 +129,8 @@ def sheet_contents(design: Design, band: MotionBand) -> SheetContents:
     if not band.certain:
         note += " ±: 95 % of the predicted motions have stayed within since the start."
     return SheetContents(
-        f"{plain_name(r.vessel.name)}: identification {which}",
+        f"{plain_name(r.vessel.name)}: identification {which}"
+        + (", planned without an estimated model" if r.untried else ""),
         f"Duration {clock(r.duration)} min, commands change at most every {r.hold:g} s, regime "
         f"{spell_regime(regime)}" + (f" ({sides})" if sides else ""),
         _facts(design, band),

@@ -116,6 +116,8 @@ class DesignRequest:
         Evaluations of the search, 1 being the usual number.
     integrator : {"euler", "rk4"}
         Of the prior model.
+    untried : bool
+        Whether the prior model comes from main dimensions, no trial behind it.
     """
 
     vessel: Vessel
@@ -146,6 +148,7 @@ class DesignRequest:
     seed: int = 0
     effort: float = 1.0
     integrator: Integrator = "euler"
+    untried: bool = False
 
     @property
     def trials(self) -> int:

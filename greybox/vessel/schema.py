@@ -187,6 +187,8 @@ class VesselTable(Table):
     sensors: SensorsTable = SensorsTable()
     closed_loop: ClosedLoopTable | None = None
     mass: Positive | None = None
+    beam: Positive | None = None
+    service_speed: Positive | None = None
     actuation: ActuationTable = ActuationTable()
     conditions: ConditionsTable = ConditionsTable()
 
@@ -291,7 +293,7 @@ def _place(loc: tuple[int | str, ...]) -> _Place:
     return _Place(VesselTable, "the vessel file", loc)
 
 
-def checked(data: Any) -> VesselTable:
+def checked(data: Any, source: str = "") -> VesselTable:
     """Return the file's tables as the schema has them.
 
     Raises
@@ -302,10 +304,10 @@ def checked(data: Any) -> VesselTable:
     try:
         return VesselTable.model_validate(data)
     except ValidationError as error:
-        raise VesselError(_sentence(error)) from None
+        raise VesselError(_sentence(error, source)) from None
 
 
-def _sentence(error: ValidationError) -> str:
+def _sentence(error: ValidationError, source: str) -> str:
     """Return in one sentence what a file does wrong first, unknown keys before all else."""
     first = min(error.errors(include_url=False), key=lambda e: e["type"] != "extra_forbidden")
     kind, value, place = first["type"], first["input"], _place(first["loc"])
@@ -314,7 +316,10 @@ def _sentence(error: ValidationError) -> str:
     if kind == "missing" and place.table is not ClosedLoopTable:
         what = _COLUMNS.get(place.key)
         add = f"name the log column of {what}" if what else "add it"
-        return f"{place.where} has no '{place.key}': {add} (see the vessel format)."
+        where = place.where
+        if source and place.table is VesselTable:
+            where = f"{where} '{source}'"
+        return f"{where} has no '{place.key}': {add} (see the vessel format)."
     tag = first.get("ctx", {}).get("tag")
     number, word = place.name, tag or (value if isinstance(value, str) else "")
     if place.table is SensorsTable and len(place.path) == 1:

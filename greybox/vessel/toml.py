@@ -80,18 +80,20 @@ def load_vessel(path: str | Path) -> Vessel:
         raise VesselError(f"'{source}' is not a text file: name a TOML vessel file.") from error
     except (ValueError, RecursionError) as error:  # TOMLDecodeError, and an integer too long
         raise VesselError(f"'{source}' is not TOML: {error}. Correct that line.") from error
-    vessel = vessel_from_dict(data)
+    vessel = vessel_from_dict(data, source.name)
     _log.info("read vessel %s: %s, %d thruster(s)", source, vessel.name, len(vessel.thrusters))
     return vessel
 
 
-def vessel_from_dict(data: dict[str, Any]) -> Vessel:
+def vessel_from_dict(data: dict[str, Any], source: str = "") -> Vessel:
     """Build a vessel from the tables of its file.
 
     Parameters
     ----------
     data : dict
         As ``tomllib`` reads them.
+    source : str
+        Name of the file, for what is said of it.
 
     Returns
     -------
@@ -105,7 +107,7 @@ def vessel_from_dict(data: dict[str, Any]) -> Vessel:
     # here, so that commands that load no vessel start fast
     from greybox.vessel.schema import checked
 
-    table = checked(data)
+    table = checked(data, source)
     thrusters = tuple(_thruster(t, f"thruster {i}") for i, t in enumerate(table.thruster, 1))
     loop = table.closed_loop
     vessel = Vessel(
@@ -114,6 +116,8 @@ def vessel_from_dict(data: dict[str, Any]) -> Vessel:
         thrusters=thrusters,
         closed_loop=None if loop is None else (loop.column, tuple(map(str, loop.values))),
         mass=table.mass,
+        beam=table.beam,
+        service_speed=table.service_speed,
         actuation=Actuation(**vars(table.actuation)),
         conditions=_conditions(table.conditions),
     )
@@ -171,8 +175,8 @@ def vessel_to_dict(vessel: Vessel) -> dict[str, Any]:
             "column": vessel.closed_loop[0],
             "values": list(vessel.closed_loop[1]),
         }
-    if vessel.mass is not None:
-        data["mass"] = vessel.mass
+    stated = {"mass": vessel.mass, "beam": vessel.beam, "service_speed": vessel.service_speed}
+    data |= {name: value for name, value in stated.items() if value is not None}
     if vessel.actuation != Actuation():
         data["actuation"] = {k: v for k, v in vars(vessel.actuation).items() if v is not None}
     if vessel.conditions:

@@ -289,6 +289,10 @@ class Vessel(DisplayMixin):
     actuation : Actuation
     conditions : Conditions
         Those of a log that does not state its own.
+    beam : float, optional
+        [m]
+    service_speed : float, optional
+        With all propellers at their limit ahead [m/s].
 
     Raises
     ------
@@ -305,6 +309,8 @@ class Vessel(DisplayMixin):
     mass: float | None = None
     actuation: Actuation = Actuation()
     conditions: Conditions = field(default_factory=Conditions)
+    beam: float | None = None
+    service_speed: float | None = None
 
     def __post_init__(self) -> None:
         for key, words in (
