@@ -25,7 +25,7 @@ programme.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 
 import casadi as ca
@@ -46,12 +46,11 @@ from greybox.vessel.force import generalised_force
 Array = NDArray[np.float64]
 Whole = NDArray[np.int64]
 
-# bytes of the table of sums, and points of an axis, of the first and of the finer grid
-_BYTES = (60e6, 240e6)
-_POINTS = (15, 23)
+# of the first and of the finer grid: points of an axis, forces that are tried at each
+# point, bytes of the table of sums, and samples that are simulated for it
+_POINTS, _FORCES = (15, 22), (36, 64)
+_BYTES, _SAMPLES = (80e6, 240e6), (2e6, 8e6)
 _FEWEST = 5
-# forces that are tried at each point, of the first and of the finer grid
-_FORCES = (27, 64)
 # combinations of commands that forces are chosen from, and levels of each
 _COMBINATIONS = 20_000
 _LEVELS = 9
@@ -144,6 +143,7 @@ def bound_trajectory(
     *,
     limits: LimitProgram | None = None,
     relaxed: bool = False,
+    share: float = 1.0,
 ) -> TrajectoryBound:
     """Bound the criterion of a trial over all sequences within the limits.
 
@@ -160,6 +160,8 @@ def bound_trajectory(
         the grid is left out; limits on place, end, energy and headings are ignored.
     relaxed : bool
         Give the error the variance of the process noise alone.
+    share : float
+        Of the points and forces of the grids, for a bound that is one of several.
 
     References
     ----------
@@ -168,11 +170,11 @@ def bound_trajectory(
     """
     rng = np.random.default_rng([23, seed])
     trial = _Trial(problem, unit, rng, limits, relaxed)
-    coarse = _Programme(trial, 0)
+    coarse = _programme(trial, 0, share)
     chord = _Chord.between(*coarse.variances(), trial)
     mixture = _Mixture(trial, chord)
     mixture.improve(coarse, _STEPS[0])
-    fine = _Programme(trial, 1)
+    fine = _programme(trial, 1, share)
     low, high = fine.variances()
     chord = _Chord.between(np.minimum(low, chord.low), np.maximum(high, chord.high), trial)
     mixture = _Mixture(trial, chord, mixture)
@@ -434,11 +436,12 @@ class _Chord:
 
     @classmethod
     def between(cls, low: Array, high: Array, trial: _Trial) -> _Chord:
-        """Return the chords, or the value at the least variance where no determinant counts."""
+        """Return the chords, or the value at the least variance for more than a determinant."""
         with np.errstate(divide="ignore", invalid="ignore"):
             slope = np.where(high > low * (1 + 1e-9), np.log(high / low) / (high - low), 1 / low)
-        counted = trial.wanted if trial.problem.criterion.optimality.determinant else 0.0
-        return cls(low, high, slope * counted)
+        criterion = trial.problem.criterion
+        plain = criterion.optimality.determinant and criterion.prior is None
+        return cls(low, high, slope * (trial.wanted if plain else 0.0))
 
     def gap(self, wanted: Array) -> float:
         """Return by how much the chords lie above −log s at most, all parameters together."""
@@ -487,13 +490,9 @@ class _Grid:
 class _Programme:
     """Maximises linear functionals of the sums on a grid, each stage a hold."""
 
-    def __init__(self, trial: _Trial, level: int) -> None:
-        self.trial = trial
-        self.tau = _draw_forces(trial.candidates, _FORCES[level])
+    def __init__(self, trial: _Trial, tau: Array, shape: tuple[int, ...]) -> None:
+        self.trial, self.tau = trial, tau
         entries = trial.entries + trial.nx
-        room = _BYTES[level] / (4.0 * entries * len(self.tau))
-        points = max(_FEWEST, min(_POINTS[level], int(room ** (1 / trial.axes))))
-        shape = (points,) * trial.axes
         intervals = np.array(shape) - 1
         if trial.heading:
             intervals[-1] += 1
@@ -581,6 +580,8 @@ class _Programme:
                     break
             total += sums[j]
             point = ends[j]
+            if not trial.heading:
+                trial.low, trial.high = np.minimum(trial.low, point), np.maximum(trial.high, point)
         return bound, total
 
     def variances(self) -> tuple[Array, Array]:
@@ -598,6 +599,17 @@ class _Programme:
             low[i] = -self.maximise(-scale * weights)[0] / scale
         met = trial.known[:, trial.entries :] / trial.samples
         return np.minimum(low, met.min(axis=0)), np.maximum(high, met.max(axis=0))
+
+
+def _programme(trial: _Trial, level: int, share: float) -> _Programme:
+    """Return the programme of the first or of the finer grid, as fine as time and memory allow."""
+    tau = _draw_forces(trial.candidates, _FORCES[level])
+    room = share * min(
+        _BYTES[level] / (4.0 * (trial.entries + trial.nx) * len(tau)),
+        _SAMPLES[level] / (trial.hold * len(tau)),
+    )
+    points = max(_FEWEST, min(_POINTS[level], int(room ** (1 / trial.axes))))
+    return _Programme(trial, tau, (points,) * trial.axes)
 
 
 class _Mixture:
