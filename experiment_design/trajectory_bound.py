@@ -48,8 +48,8 @@ Whole = NDArray[np.int64]
 
 # of the first and of the finer grid: points of an axis, forces that are tried at each
 # point, bytes of the table of sums, and samples that are simulated for it
-_POINTS, _FORCES = (15, 22), (36, 64)
-_BYTES, _SAMPLES = (80e6, 240e6), (2e6, 8e6)
+_POINTS, _FORCES = (14, 18), (36, 64)
+_BYTES, _SAMPLES = (60e6, 160e6), (2e6, 6e6)
 _FEWEST = 5
 # combinations of commands that forces are chosen from, and levels of each
 _COMBINATIONS = 20_000
@@ -61,8 +61,13 @@ _PROBES = 300
 # by how much of its span the range of a state is widened
 _WIDER = 0.06
 # most steps of the mixture on each grid, and the gap a parameter that ends them
-_STEPS = (60, 25)
+_STEPS = (40, 6)
 _ENOUGH = 0.01
+# ranges of the variance on the first grid, and how many of them the finer one looks at
+_RANGES, _FINER = 9, 4
+# by how much the range of the variance is widened, and the part of a cell by which a
+# limit may be missed: the nearest point of the grid lies no farther
+_SPREAD, _MISSED = 1.03, 0.5
 # random two-level sequences that the mixture starts from
 _DRAWS = 64
 _KEPT = 12
@@ -83,13 +88,13 @@ class TrajectoryBound:
     grid : float
         By how much the finer grid raised the bound; part of it.
     chord : float
-        Most that the chord of the variance may add to the bound.
+        Most that the chord of the variance may have added to the bound.
     points, finer : tuple of int
         Points of each axis of both grids.
     forces : tuple of int
         Forces that were tried at each point of both.
-    mixture, evaluations : int
-        Sequences in the mixture, programmes solved.
+    mixture, ranges, evaluations : int
+        Sequences in the mixture, ranges of the variance, programmes solved.
     relaxed : bool
         Whether the error was given the variance of the process noise alone.
     """
@@ -103,6 +108,7 @@ class TrajectoryBound:
     finer: tuple[int, ...]
     forces: tuple[int, ...]
     mixture: int
+    ranges: int
     evaluations: int
     relaxed: bool
 
@@ -171,22 +177,54 @@ def bound_trajectory(
     rng = np.random.default_rng([23, seed])
     trial = _Trial(problem, unit, rng, limits, relaxed)
     coarse = _programme(trial, 0, share)
-    chord = _Chord.between(*coarse.variances(), trial)
-    mixture = _Mixture(trial, chord)
-    mixture.improve(coarse, _STEPS[0])
+    value = trial.true_value(trial.known[0])
+    ranges = _branch(trial, coarse, value)
     fine = _programme(trial, 1, share)
-    low, high = fine.variances()
-    chord = _Chord.between(np.minimum(low, chord.low), np.maximum(high, chord.high), trial)
-    mixture = _Mixture(trial, chord, mixture)
-    least = mixture.improve(fine, _STEPS[1])
-    weights = mixture.tangent()[1]
-    raised = max(0.0, fine.maximise(weights)[0] - coarse.maximise(weights)[0])
-    value = mixture.tangent()[0]
-    bound = max(least, value) + raised
+    raised, looked = 0.0, set[int]()
+    while True:
+        bounds = [m.least + (0.0 if i in looked else raised) for i, m in enumerate(ranges)]
+        worst = int(np.argmax(bounds))
+        if worst in looked or len(looked) == _FINER:
+            break
+        before = ranges[worst]
+        ranges[worst] = mixture = _Mixture(trial, before.chord, before)
+        mixture.improve(fine, _STEPS[1], value)
+        weights = mixture.tangent()[1]
+        more = max(0.0, fine.maximise(weights)[0] - coarse.maximise(weights)[0])
+        mixture.least += more
+        raised = max(raised, more)
+        looked.add(worst)
+    mixture, bound = ranges[worst], max(bounds[worst], value)
+    reached = mixture.tangent()[0]
     return TrajectoryBound(
-        bound, bound - value, value, raised, chord.gap(trial.wanted), coarse.grid.shape,
-        fine.grid.shape, (len(coarse.tau), len(fine.tau)), mixture.members, mixture.solved, relaxed,
+        bound, bound - reached, reached, raised, mixture.chord.gap.sum(), coarse.grid.shape,
+        fine.grid.shape, (len(coarse.tau), len(fine.tau)), mixture.members, len(ranges),
+        coarse.solved + fine.solved, relaxed,
     )  # fmt: skip
+
+
+def _branch(trial: _Trial, programme: _Programme, value: float) -> list[_Mixture]:
+    """Split the ranges of the variances where the bound is largest; a mixture for each.
+
+    Outside its range a chord lies below −log s, so that each mixture may hold any
+    sequence and still bounds those whose variances lie inside.
+    """
+    low, high = programme.variances()
+    ranges = [_Mixture(trial, _Chord.between(low, high, trial))]
+    ranges[0].improve(programme, _STEPS[0], value)
+    enough = _ENOUGH * len(trial.problem.criterion.wanted)
+    while len(ranges) < _RANGES:
+        worst = max(range(len(ranges)), key=lambda i: ranges[i].least)
+        before = ranges[worst]
+        if before.chord.gap.sum() < enough or before.least < value + enough:
+            break
+        ranges.pop(worst)
+        for chord in before.chord.halves(trial):
+            part = _Mixture(trial, chord, before)
+            part.improve(programme, _STEPS[0], value)
+            part.least = min(part.least, before.least)
+            ranges.append(part)
+    return ranges
 
 
 def _heading_acts(rollout: Rollout, yardstick: MomentProgram) -> bool:
@@ -360,6 +398,11 @@ class _Trial:
         value -= float(chord.slope @ (sums[first:] / self.samples - chord.low))
         return value, slope
 
+    def true_value(self, sums: Array) -> float:
+        """Return the criterion of one sequence, its own variance in place of any range."""
+        own = sums[self.entries :] / self.samples
+        return self.value(sums, _Chord(own, own, np.zeros(self.nx), np.zeros(self.nx)))[0]
+
     def _reach(self) -> tuple[Array, Array]:
         """Return the range of the states (axes,) that many sequences reach."""
         rng, holds = self.rng, self.problem.schedule.holds
@@ -372,7 +415,9 @@ class _Trial:
         turn = (np.arange(holds) // period[:, None]) % 2
         which[-len(pairs) :] = np.take_along_axis(pairs, turn, axis=1)
         point = np.broadcast_to(self.start, (_PROBES, self.axes))
-        found = [self.first[0].reshape(-1, self.nx)]
+        found = [np.array(self.rollout.start[None, : self.nx])]
+        x, psi, _ = self.first
+        found.append(x[~self.misses(x, psi, 0.0)].reshape(-1, self.nx))
         for k in range(holds):
             x, psi, good = self.run(point, pick[which[:, k]], self.hold)
             good &= ~self.misses(x, psi, 0.0)
@@ -401,15 +446,15 @@ class _Trial:
         end = x[:, -1]
         return np.column_stack([end, psi[:, -1] % (2 * np.pi)]) if self.heading else end
 
-    def misses(self, x: Array, psi: Array, cell: Array | float) -> NDArray[np.bool_]:
-        """Return which runs miss a limit on the speeds by more than a cell, (R,)."""
+    def misses(self, x: Array, psi: Array, room: Array | float) -> NDArray[np.bool_]:
+        """Return which runs miss a limit on the speeds by more than `room` of each axis, (R,)."""
         if self.limits is None or not self.limits.path_names:
             return np.zeros(len(x), bool)
         state = np.zeros((*psi.shape, self.nx + 3))
         state[..., : self.nx], state[..., self.nx] = x, psi
         missed = self.limits.path_values(state[:, 1:]).max(axis=-1)
         names = self.rollout.structure.states
-        sides = np.broadcast_to(cell, (self.axes,))
+        sides = np.broadcast_to(room, (self.axes,))
         side = {n: float(sides[i]) for i, n in enumerate(names)}
         both = float(np.hypot(side.get("u", 0.0), side.get("v", 0.0)))
         out = np.zeros(len(x), bool)
@@ -417,22 +462,27 @@ class _Trial:
             if name.kind is LimitKind.SEA_ROOM:
                 continue
             if name.kind is LimitKind.YAW_RATE:
-                room = side.get("r", 0.0)
+                most = side.get("r", 0.0)
             elif name.kind is LimitKind.MARGIN and name.margin in side:
-                room = side[name.margin]
+                most = side[name.margin]
             else:
-                room = both
-            out |= values > room
+                most = both
+            out |= values > most
         return out
 
 
 @dataclass(frozen=True)
 class _Chord:
-    """Straight lines above −log s between the least and the largest variance, (nx,)."""
+    """Straight lines above −log s between the least and the largest variance, (nx,).
+
+    ``counted`` says how many wanted parameters each equation has, ``slope`` how steep
+    the line is for all of them.
+    """
 
     low: Array
     high: Array
     slope: Array
+    counted: Array
 
     @classmethod
     def between(cls, low: Array, high: Array, trial: _Trial) -> _Chord:
@@ -441,13 +491,22 @@ class _Chord:
             slope = np.where(high > low * (1 + 1e-9), np.log(high / low) / (high - low), 1 / low)
         criterion = trial.problem.criterion
         plain = criterion.optimality.determinant and criterion.prior is None
-        return cls(low, high, slope * (trial.wanted if plain else 0.0))
+        counted = trial.wanted if plain else np.zeros(trial.nx)
+        return cls(low, high, slope * counted, counted)
 
-    def gap(self, wanted: Array) -> float:
-        """Return by how much the chords lie above −log s at most, all parameters together."""
+    @property
+    def gap(self) -> Array:
+        """By how much the chords lie above −log s at most, all parameters together, (nx,)."""
         ratio = np.maximum(self.high / self.low, 1 + 1e-9)
         rise = np.log(ratio) / (ratio - 1)
-        return float((wanted * np.maximum(rise - 1 - np.log(rise), 0.0)).sum())
+        return np.maximum(rise - 1 - np.log(rise), 0.0) * self.counted
+
+    def halves(self, trial: _Trial) -> tuple[_Chord, _Chord]:
+        """Return the chords of both halves of the range that is farthest from −log s."""
+        i = int(np.argmax(self.gap))
+        low, high = self.low.copy(), self.high.copy()
+        low[i] = high[i] = np.sqrt(self.low[i] * self.high[i])
+        return _Chord.between(self.low, high, trial), _Chord.between(low, self.high, trial)
 
 
 @dataclass(frozen=True)
@@ -512,6 +571,7 @@ class _Programme:
             self._fill(start[k // len(self.tau)], self.tau[k % len(self.tau)], k, ends, barred)
         self.bar = barred.reshape(-1, len(self.tau))
         self.next = self.grid.weights(ends)
+        self.solved = 0
 
     def _fill(
         self, point: Array, tau: Array, k: Whole, ends: Array, barred: NDArray[np.bool_]
@@ -523,7 +583,7 @@ class _Programme:
         if self.last != trial.hold:
             n = self.last
             self.final[k] = trial.sums(x[:, : n + 1], psi[:, : n + 1], held[:, :n])
-        barred[k] = ~good | trial.misses(x, psi, self.grid.step)
+        barred[k] = ~good | trial.misses(x, psi, _MISSED * self.grid.step)
         ends[k] = trial.place(x, psi)
 
     def maximise(self, weights: Array, *, follow: bool = False) -> tuple[float, Array]:
@@ -533,6 +593,7 @@ class _Programme:
         value is interpolated, unless all around are such.
         """
         trial = self.trial
+        self.solved += 1
         w = weights.astype(np.float32)
         whole, end = self.table @ w, self.final @ w
         holds, width = trial.problem.schedule.holds, len(self.tau)
@@ -570,7 +631,7 @@ class _Programme:
             step = self.grid.weights(ends)
             weight = step @ alive
             found = sums @ weights + step @ value / np.maximum(weight, 1e-6)
-            allowed = good & ~trial.misses(x, psi, self.grid.step) & (weight > 1e-3)
+            allowed = good & ~trial.misses(x, psi, _MISSED * self.grid.step) & (weight > 1e-3)
             if allowed.any():
                 found = np.where(allowed, found, -np.inf)
             j = int(np.argmax(found))
@@ -598,7 +659,8 @@ class _Programme:
             high[i] = self.maximise(scale * weights)[0] / scale
             low[i] = -self.maximise(-scale * weights)[0] / scale
         met = trial.known[:, trial.entries :] / trial.samples
-        return np.minimum(low, met.min(axis=0)), np.maximum(high, met.max(axis=0))
+        low, high = np.minimum(low, met.min(axis=0)), np.maximum(high, met.max(axis=0))
+        return (low, high) if trial.relaxed else (low / _SPREAD, high * _SPREAD)
 
 
 def _programme(trial: _Trial, level: int, share: float) -> _Programme:
@@ -621,10 +683,11 @@ class _Mixture:
             values = [trial.value(s, chord)[0] for s in trial.known]
             order = np.argsort(-np.nan_to_num(np.array(values), neginf=-1e300))
             keep = np.unique(np.append(0, order[:_KEPT]))
-            self.sums, self.solved = trial.known[keep], 0
+            self.sums = trial.known[keep]
             self.weights = np.full(len(keep), 1.0 / len(keep))
         else:
-            self.sums, self.weights, self.solved = before.sums, before.weights, before.solved
+            self.sums, self.weights = before.sums, before.weights
+        self.least = np.inf
         self._renew()
 
     @property
@@ -638,22 +701,19 @@ class _Mixture:
         value, slope = self.trial.value(mixed, self.chord)
         return value, slope, float(slope @ mixed)
 
-    def improve(self, programme: _Programme, steps: int) -> float:
-        """Add sequences until the gap is small, and return the least bound."""
-        least = np.inf
+    def improve(self, programme: _Programme, steps: int, floor: float) -> None:
+        """Add sequences until the gap is small, or the bound no higher than a floor."""
         enough = _ENOUGH * len(self.trial.problem.criterion.wanted)
         for _ in range(steps):
             value, slope, base = self.tangent()
             best, sums = programme.maximise(slope, follow=True)
-            self.solved += 1
-            least = min(least, value + max(best - base, 0.0))
+            self.least = min(self.least, value + max(best - base, 0.0))
             gain = float(slope @ sums) - base
-            if least - value < enough or gain <= enough / 20:
+            if self.least < max(value, floor) + enough or gain <= enough / 20:
                 break
             self.sums = np.concatenate([self.sums, sums[None]])
             self.weights = np.append(0.9 * self.weights, 0.1)
             self._renew()
-        return least
 
     def _renew(self) -> None:
         """Give the sequences the weights that maximise the criterion."""
