@@ -48,8 +48,8 @@ Whole = NDArray[np.int64]
 
 # of the first and of the finer grid: points of an axis, forces that are tried at each
 # point, bytes of the table of sums, and samples that are simulated for it
-_POINTS, _FORCES = (14, 18), (36, 64)
-_BYTES, _SAMPLES = (60e6, 160e6), (2e6, 6e6)
+_POINTS, _FORCES = (16, 22), (27, 48)
+_BYTES, _SAMPLES = (60e6, 180e6), (2e6, 6e6)
 _FEWEST = 5
 # combinations of commands that forces are chosen from, and levels of each
 _COMBINATIONS = 20_000
@@ -68,6 +68,8 @@ _RANGES, _FINER = 9, 4
 # by how much the range of the variance is widened, and the part of a cell by which a
 # limit may be missed: the nearest point of the grid lies no farther
 _SPREAD, _MISSED = 1.03, 0.5
+# share of the points around a state that must lead on, for it to do so; and to be preferred
+_ALIVE, _SAFE = 0.1, 0.5
 # random two-level sequences that the mixture starts from
 _DRAWS = 64
 _KEPT = 12
@@ -586,8 +588,11 @@ class _Programme:
         barred[k] = ~good | trial.misses(x, psi, _MISSED * self.grid.step)
         ends[k] = trial.place(x, psi)
 
-    def maximise(self, weights: Array, *, follow: bool = False) -> tuple[float, Array]:
+    def maximise(self, weights: Array, *, follow: bool = False) -> tuple[float, Array | None]:
         """Return the largest ⟨weights, sums⟩ over all sequences, and the sums of one near it.
+
+        None in place of the latter unless it is to be followed, or where it comes to
+        a state that no force leads on from.
 
         Points from which every force misses a limit count for nothing where the
         value is interpolated, unless all around are such.
@@ -607,7 +612,7 @@ class _Programme:
             if not alive.all():
                 weight = self.next @ alive
                 future = future / np.maximum(weight, 1e-6)
-                bar = bar | (weight < 1e-3).reshape(-1, width)
+                bar = bar | (weight < _ALIVE).reshape(-1, width)
             total = np.where(bar, -np.inf, now + future.reshape(-1, width)).max(axis=1)
             good = np.isfinite(total)
             ahead.append((np.where(good, total, 0.0).astype(np.float32), good.astype(np.float32)))
@@ -618,8 +623,8 @@ class _Programme:
 
     def _forward(
         self, weights: Array, ahead: list[tuple[Array, Array]], follow: bool
-    ) -> tuple[float, Array]:
-        """Take the best force at each hold from the true state."""
+    ) -> tuple[float, Array | None]:
+        """Take the best force at each hold from the true state, as long as one is allowed."""
         trial = self.trial
         point, bound, total = trial.start, -np.inf, np.zeros(len(weights))
         for k, (value, alive) in enumerate(ahead):
@@ -631,14 +636,15 @@ class _Programme:
             step = self.grid.weights(ends)
             weight = step @ alive
             found = sums @ weights + step @ value / np.maximum(weight, 1e-6)
-            allowed = good & ~trial.misses(x, psi, _MISSED * self.grid.step) & (weight > 1e-3)
-            if allowed.any():
-                found = np.where(allowed, found, -np.inf)
-            j = int(np.argmax(found))
+            allowed = good & ~trial.misses(x, psi, _MISSED * self.grid.step) & (weight >= _ALIVE)
             if k == 0:
-                bound = float(found[j])
-                if not follow:
-                    break
+                # limits that no force keeps from the start say nothing
+                some = allowed if allowed.any() else good
+                bound = float(np.where(some, found, -np.inf).max())
+            if not follow or not allowed.any():
+                return bound, None
+            safe = allowed & (weight >= _SAFE)
+            j = int(np.argmax(np.where(safe if safe.any() else allowed, found, -np.inf)))
             total += sums[j]
             point = ends[j]
             if not trial.heading:
@@ -708,6 +714,8 @@ class _Mixture:
             value, slope, base = self.tangent()
             best, sums = programme.maximise(slope, follow=True)
             self.least = min(self.least, value + max(best - base, 0.0))
+            if sums is None:
+                break
             gain = float(slope @ sums) - base
             if self.least < max(value, floor) + enough or gain <= enough / 20:
                 break
