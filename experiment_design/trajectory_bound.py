@@ -144,6 +144,19 @@ def why_not_trajectory(problem: TrialProblem, *, relaxed: bool = False) -> str:
     return ""
 
 
+def relaxed_value(problem: TrialProblem, unit: Array) -> float:
+    """Return the criterion of a design if its error were the process noise alone."""
+    motion = problem.scenarios[0].rollout.run(problem.schedule.expand(problem.levels(unit[None])))
+    yardstick = problem.scenarios[0].yardstick
+    assert isinstance(yardstick, MomentProgram)
+    gram = problem.moments(motion, 0).gram
+    score = np.zeros_like(gram)
+    for rows, std in zip(yardstick.equations, yardstick.process_std, strict=True):
+        block = np.ix_(rows, rows)
+        score[0][block] = std**2 * gram[0][block]
+    return float(problem.criterion.value(Moments(gram, score))[0])
+
+
 def bound_trajectory(
     problem: TrialProblem,
     unit: Array,
@@ -199,7 +212,7 @@ def bound_trajectory(
     mixture, bound = ranges[worst], max(bounds[worst], value)
     reached = mixture.tangent()[0]
     return TrajectoryBound(
-        bound, bound - reached, reached, raised, mixture.chord.gap.sum(), coarse.grid.shape,
+        bound, bound - reached, reached, raised, float(mixture.chord.gap.sum()), coarse.grid.shape,
         fine.grid.shape, (len(coarse.tau), len(fine.tau)), mixture.members, len(ranges),
         coarse.solved + fine.solved, relaxed,
     )  # fmt: skip
@@ -501,7 +514,7 @@ class _Chord:
         """By how much the chords lie above −log s at most, all parameters together, (nx,)."""
         ratio = np.maximum(self.high / self.low, 1 + 1e-9)
         rise = np.log(ratio) / (ratio - 1)
-        return np.maximum(rise - 1 - np.log(rise), 0.0) * self.counted
+        return np.asarray(np.maximum(rise - 1 - np.log(rise), 0.0) * self.counted)
 
     def halves(self, trial: _Trial) -> tuple[_Chord, _Chord]:
         """Return the chords of both halves of the range that is farthest from −log s."""
