@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.optimize import minimize
 from scipy.sparse import csr_matrix
+from scipy.spatial import ConvexHull
 
 from experiment_design.limits import LimitKind, LimitProgram
 from experiment_design.moments import MomentProgram, Moments
@@ -51,6 +52,8 @@ Whole = NDArray[np.int64]
 _POINTS, _FORCES = (16, 22), (27, 48)
 _BYTES, _SAMPLES = (60e6, 180e6), (2e6, 6e6)
 _FEWEST = 5
+# share of the forces that are extreme; forces that are tried along the best sequence
+_CORNERS, _RICH = 0.75, 300
 # combinations of commands that forces are chosen from, and levels of each
 _COMBINATIONS = 20_000
 _LEVELS = 9
@@ -252,18 +255,36 @@ def _heading_acts(rollout: Rollout, yardstick: MomentProgram) -> bool:
 
 
 def _draw_forces(candidates: Array, count: int) -> Array:
-    """Choose forces (count, nu) that lie far from one another, the outermost first."""
+    """Choose forces (at most count, nu): most of them extreme, far from one another.
+
+    The sums are convex in the forces of a hold but for the bends of the motion, so
+    that the best is nearly always a corner of their convex hull.
+    """
     span = np.ptp(candidates, axis=0)
-    scaled = (candidates - candidates.min(axis=0)) / np.where(span > 0, span, 1.0)
-    chosen = [int(np.argmax(((scaled - scaled.mean(axis=0)) ** 2).sum(axis=1)))]
-    distance = np.full(len(scaled), np.inf)
+    scaled = (candidates - candidates.mean(axis=0)) / np.where(span > 0, span, 1.0)
+    values, axes = np.linalg.svd(scaled, full_matrices=False)[1:]
+    flat = scaled @ axes[values > 1e-9 * max(values[0], 1e-300)].T
+    if not flat.shape[1]:
+        return candidates[:1]
+    corners = np.array([flat[:, 0].argmin(), flat[:, 0].argmax()])
+    if flat.shape[1] > 1:
+        corners = ConvexHull(flat).vertices
+    chosen = _spread(flat, list(corners), [], max(2, round(_CORNERS * count)))
+    return candidates[_spread(flat, list(range(len(flat))), chosen, count)]
+
+
+def _spread(points: Array, among: list[int], chosen: list[int], count: int) -> list[int]:
+    """Add those points that lie farthest from all chosen, until there are so many."""
+    chosen = list(chosen) or [max(among, key=lambda i: float((points[i] ** 2).sum()))]
+    part = points[among]
+    distance = np.min([((part - points[i]) ** 2).sum(axis=1) for i in chosen], axis=0)
     while len(chosen) < count:
-        distance = np.minimum(distance, ((scaled - scaled[chosen[-1]]) ** 2).sum(axis=1))
-        chosen.append(int(np.argmax(distance)))
-        if distance[chosen[-1]] < 1e-12:
-            chosen.pop()
+        j = int(np.argmax(distance))
+        if distance[j] < 1e-12:
             break
-    return candidates[chosen]
+        chosen.append(among[j])
+        distance = np.minimum(distance, ((part - part[j]) ** 2).sum(axis=1))
+    return chosen
 
 
 class _Trial:
@@ -566,6 +587,8 @@ class _Programme:
 
     def __init__(self, trial: _Trial, tau: Array, shape: tuple[int, ...]) -> None:
         self.trial, self.tau = trial, tau
+        # along a sequence more forces are tried than at each point
+        self.rich = np.concatenate([tau, _draw_forces(trial.candidates, _RICH)])
         entries = trial.entries + trial.nx
         intervals = np.array(shape) - 1
         if trial.heading:
@@ -601,11 +624,13 @@ class _Programme:
         barred[k] = ~good | trial.misses(x, psi, _MISSED * self.grid.step)
         ends[k] = trial.place(x, psi)
 
-    def maximise(self, weights: Array, *, follow: bool = False) -> tuple[float, Array | None]:
+    def maximise(self, weights: Array) -> tuple[float, Array | None]:
         """Return the largest ⟨weights, sums⟩ over all sequences, and the sums of one near it.
 
-        None in place of the latter unless it is to be followed, or where it comes to
-        a state that no force leads on from.
+        None in place of the latter where it comes to a state that no force leads on from.
+        What a richer choice of forces adds along that sequence is added: by the identity
+        of the difference of two policies (Kakade and Langford, 2002) that is the whole
+        difference where the value of the grid is right.
 
         Points from which every force misses a limit count for nothing where the
         value is interpolated, unless all around are such.
@@ -632,30 +657,36 @@ class _Programme:
             if k == 1:
                 break
         ahead.reverse()
-        return self._forward(weights, ahead[:holds], follow)
+        return self._forward(weights, ahead[:holds])
 
     def _forward(
-        self, weights: Array, ahead: list[tuple[Array, Array]], follow: bool
+        self, weights: Array, ahead: list[tuple[Array, Array]]
     ) -> tuple[float, Array | None]:
         """Take the best force at each hold from the true state, as long as one is allowed."""
         trial = self.trial
         point, bound, total = trial.start, -np.inf, np.zeros(len(weights))
         for k, (value, alive) in enumerate(ahead):
             n = self.last if k == len(ahead) - 1 else trial.hold
-            x, psi, good = trial.run(np.tile(point, (len(self.tau), 1)), self.tau, n)
-            held = np.broadcast_to(self.tau[:, None], (len(self.tau), n, self.tau.shape[1]))
+            x, psi, good = trial.run(np.tile(point, (len(self.rich), 1)), self.rich, n)
+            held = np.broadcast_to(self.rich[:, None], (len(self.rich), n, self.rich.shape[1]))
             sums = trial.sums(x, psi, held)
             ends = trial.place(x, psi)
             step = self.grid.weights(ends)
             weight = step @ alive
             found = sums @ weights + step @ value / np.maximum(weight, 1e-6)
             allowed = good & ~trial.misses(x, psi, _MISSED * self.grid.step) & (weight >= _ALIVE)
-            if k == 0:
+            if k == 0 and not allowed.any():
                 # limits that no force keeps from the start say nothing
-                some = allowed if allowed.any() else good
-                bound = float(np.where(some, found, -np.inf).max())
-            if not follow or not allowed.any():
+                return float(np.where(good, found, -np.inf).max()), None
+            if not allowed.any():
                 return bound, None
+            found = np.where(allowed, found, -np.inf)
+            known = found[: len(self.tau)].max()
+            if k == 0:
+                bound = float(found.max())
+            elif np.isfinite(known):
+                # what more forces add at this hold, hold by hold the whole difference of values
+                bound += float(found.max() - known)
             safe = allowed & (weight >= _SAFE)
             j = int(np.argmax(np.where(safe if safe.any() else allowed, found, -np.inf)))
             total += sums[j]
@@ -725,7 +756,7 @@ class _Mixture:
         enough = _ENOUGH * len(self.trial.problem.criterion.wanted)
         for _ in range(steps):
             value, slope, base = self.tangent()
-            best, sums = programme.maximise(slope, follow=True)
+            best, sums = programme.maximise(slope)
             self.least = min(self.least, value + max(best - base, 0.0))
             if sums is None:
                 break

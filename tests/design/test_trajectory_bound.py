@@ -71,7 +71,7 @@ def test_programme_finds_the_best_of_all_sequences(ship, name, duration):
         for i in np.argsort(-values)[[0, 40, 400]]:
             slope = trial.value(total[i], chord)[1]
             exact = float((total @ slope).max())
-            best, sums = programme.maximise(slope, follow=True)
+            best, sums = programme.maximise(slope)
             assert sums @ slope <= exact * (1 + 1e-6)
             assert sums @ slope >= 0.97 * exact
             gaps.append(best / exact - 1)
