@@ -72,7 +72,7 @@ _RANGES, _FINER = 9, 4
 # limit may be missed: the nearest point of the grid lies no farther
 _SPREAD, _MISSED = 1.03, 0.5
 # share of the points around a state that must lead on, for it to do so; and to be preferred
-_ALIVE, _SAFE = 0.1, 0.5
+_ALIVE, _SAFE = 0.1, (0.5, 0.99)
 # random two-level sequences that the mixture starts from
 _DRAWS = 64
 _KEPT = 12
@@ -657,10 +657,14 @@ class _Programme:
             if k == 1:
                 break
         ahead.reverse()
-        return self._forward(weights, ahead[:holds])
+        # where the limits leave no way on, once more with a wider berth
+        bound, sums = self._forward(weights, ahead[:holds], _SAFE[0])
+        if sums is None:
+            sums = self._forward(weights, ahead[:holds], _SAFE[1])[1]
+        return bound, sums
 
     def _forward(
-        self, weights: Array, ahead: list[tuple[Array, Array]]
+        self, weights: Array, ahead: list[tuple[Array, Array]], berth: float
     ) -> tuple[float, Array | None]:
         """Take the best force at each hold from the true state, as long as one is allowed."""
         trial = self.trial
@@ -687,7 +691,7 @@ class _Programme:
             elif np.isfinite(known):
                 # what more forces add at this hold, hold by hold the whole difference of values
                 bound += float(found.max() - known)
-            safe = allowed & (weight >= _SAFE)
+            safe = allowed & (weight >= berth)
             j = int(np.argmax(np.where(safe if safe.any() else allowed, found, -np.inf)))
             total += sums[j]
             point = ends[j]

@@ -67,6 +67,7 @@ def test_programme_finds_the_best_of_all_sequences(ship, name, duration):
     errors = []
     for points in (9, 18):
         programme = _Programme(trial, tau, (points,) * 3)
+        programme.rich = tau
         gaps = []
         for i in np.argsort(-values)[[0, 40, 400]]:
             slope = trial.value(total[i], chord)[1]
