@@ -9,8 +9,12 @@ is concave in I, so that with any mixture X = Σ wᵢ Iᵢ of sequences
 the equivalence theorem of optimal design. What remains is to maximise the linear
 functional ⟨∇F(X), I⟩ over all sequences; the weights are improved until the
 maximum adds little. That maximisation is by many ascents, so that the bound is
-numerical. A trial in surge alone has one state and one force, and dynamic
-programming replaces the ascents (`surge_bound`).
+numerical. Dynamic programming replaces the ascents for a trial in surge alone, with
+one state and one force (`surge_bound`), and for the information of an equation
+error, a sum over samples (`trajectory_bound`): that of white residuals, and
+G M⁻¹ G ⪯ ΦᵀΦ/q of zero-mean IV with the process noise of variance q as the floor of
+the error. Output error has its sensitivities as states of their own, too many for a
+grid, and no bound.
 """
 
 from __future__ import annotations
@@ -18,6 +22,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
+from enum import Enum
 from typing import Any
 
 import numpy as np
@@ -25,10 +30,17 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from experiment_design.certificate.surge_bound import bound_surge, why_not_surge
+from experiment_design.certificate.trajectory_bound import (
+    TrajectoryBound,
+    bound_trajectory,
+    relaxed_value,
+    why_not_trajectory,
+)
 from experiment_design.constraints.limit_program import LimitProgram
 from experiment_design.constraints.limits import TrialLimits
 from experiment_design.information.criteria import Criterion
 from experiment_design.information.moments import Moments
+from experiment_design.information.sensitivities import SensitivityProgram
 from experiment_design.optimise.search import ascend, draw_two_level, perturb
 from experiment_design.request.problem import TrialProblem
 from greybox.notebook import DisplayMixin, text
@@ -54,6 +66,8 @@ _FEW = 3
 # smallest eigenvalue of a correlation-scaled score matrix that is inverted
 _FLOOR = 1e-13
 _TOLERANCE = 1e-4
+# efficiency below which a bound says nothing
+INFORMATIVE = 0.1
 
 _HULL = (
     "Equivalence theorem on mixtures of the information matrices of whole sequences; the linear "
@@ -74,6 +88,27 @@ _SURGE_CHECKED = (
     "stands for the maximum; the starts agree within {spread:.2g}, a grid twice as fine moved the "
     "bound by {grid:.2g}, which is added; compared with exhaustive search in the tests."
 )
+_GRID = (
+    "Equivalence theorem on mixtures of the summed information of whole sequences; each step "
+    "maximises its linear functional over all sequences by dynamic programming on a grid of "
+    "{points} states with {forces} forces, which keeps limits on the speeds to half a cell and "
+    "ignores other limits."
+)
+_FLOORED = " The process noise alone stands for the error: G M⁻¹ G ⪯ ΦᵀΦ/q."
+_GRID_CHECKED = (
+    "Numerical: a grid of {points} states with {forces} forces raised the bound by {grid:.2g}, "
+    "which is added; the average variance of the error was split into {ranges} ranges, whose "
+    "chords add {chord:.2g} at most; compared with exhaustive search in the tests."
+)
+
+
+class Kind(Enum):
+    """What a certificate says."""
+
+    PROVEN = "proven"
+    NUMERICAL = "numerical"
+    NOT_INFORMATIVE = "not informative"
+    NOT_AVAILABLE = "not available"
 
 
 @dataclass(frozen=True, repr=False)
@@ -84,7 +119,7 @@ class Certificate(DisplayMixin):
     ----------
     efficiency_lower_bound : float or None
         (det C_bound / det C)^(1/p) for D, the ratio of the criterion's variances
-        for A, E and c; None where not available.
+        for A, E and c; None where not available, or below 0.1 and not informative.
     value, bound : float
         Criterion of the design, and what no admissible input exceeds.
     gap : float
@@ -115,8 +150,17 @@ class Certificate(DisplayMixin):
     reason: str = ""
     wall_s: float = 0.0
 
+    @property
+    def kind(self) -> Kind:
+        """Whether the bound is proven, numerical, too low to say anything, or missing."""
+        if self.efficiency_lower_bound is not None:
+            return Kind.PROVEN if self.rigorous else Kind.NUMERICAL
+        return Kind.NOT_AVAILABLE if self.reason else Kind.NOT_INFORMATIVE
+
     def sentence(self) -> str:
         """Return one sentence for the summary of a design."""
+        if self.kind is Kind.NOT_INFORMATIVE:
+            return "certificate: not informative"
         if self.efficiency_lower_bound is None:
             return f"certificate: not available because {self.reason}"
         kind = "proven" if self.rigorous else "numerical bound"
@@ -125,19 +169,29 @@ class Certificate(DisplayMixin):
 
     def summary(self) -> str:
         """Return the sentence with how the bound was found and checked."""
-        parts = [self.sentence(), self.method, self.checked]
-        return "\n  ".join(p for p in parts if p)
+        return "\n  ".join([self.sentence(), *self._told()])
+
+    def _told(self) -> list[str]:
+        """Return how a bound was found and checked that says something."""
+        if self.kind is Kind.NOT_INFORMATIVE:
+            return []
+        return [p for p in (self.method, self.checked) if p]
 
     def _line(self) -> str:
         return self.sentence()
 
     def _parts(self) -> tuple[str, ...]:
-        return text(self.method), text(self.checked)
+        return tuple(text(p) for p in self._told())
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the fields for JSON, without the wall time; not finite numbers as None."""
+        """Return the fields for JSON, without the wall time; not finite numbers as None.
+
+        Of a bound that is not informative, only that.
+        """
+        if self.kind is Kind.NOT_INFORMATIVE:
+            return {"kind": self.kind.value}
         out = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "wall_s"}
-        return {
+        return {"kind": self.kind.value} | {
             k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in out.items()
         }
 
@@ -382,6 +436,11 @@ def certify(
     first = problems[0]
     if any(p.contrast is not None for p in problems):
         return absent("discrimination between models maximises no information matrix", began)
+    if any(isinstance(s.information, SensitivityProgram) for p in problems for s in p.scenarios):
+        return absent(
+            "output error has its sensitivities as states of their own, and no bound is known",
+            began,
+        )
     count = len(first.scenarios)
     if count > _SCENARIOS:
         return absent(
@@ -401,7 +460,8 @@ def certify(
         value = float(first.criterion.value(sum(total[1:], total[0]))[0])
         if not np.isfinite(value):
             return absent("the design leaves some direction without excitation", began)
-        parts.append(_bound(alone, units, value, seed, spend))
+        limits = first.scenarios[i].limits
+        parts.append(_bound(alone, units, value, seed, spend, limits, 1.0 / count))
     if min(p.gap for p in parts) < _CONVERGED and first.scenarios[0].rollout.nx > 1:
         return absent(
             "its search met no sequence beside the design that tells more, which is too good to be "
@@ -415,8 +475,9 @@ def certify(
     bound = float(bounds.min() if first.worst_case else bounds @ share / share.sum())
     size = len(first.criterion.wanted) if first.criterion.optimality.determinant else 1
     several = f"Each of {count} scenarios by itself. " if count > 1 else ""
+    efficiency = float(np.exp(min(value - bound, 0.0) / size))
     return Certificate(
-        float(np.exp(min(value - bound, 0.0) / size)),
+        efficiency if efficiency >= INFORMATIVE else None,
         value,
         bound,
         max(p.gap for p in parts),
@@ -452,9 +513,15 @@ def _single(problem: TrialProblem, scenario: int, known: bool) -> TrialProblem:
 
 
 def _bound(
-    problems: list[TrialProblem], units: Sequence[Array], value: float, seed: int, budget: int
+    problems: list[TrialProblem],
+    units: Sequence[Array],
+    value: float,
+    seed: int,
+    budget: int,
+    limits: LimitProgram,
+    share: float,
 ) -> _Part:
-    """Bound one scenario."""
+    """Bound one scenario, whose own limits the problems have lost."""
     criterion = problems[0].criterion
     if len(problems) == 1 and not why_not_surge(problems[0]):
         found = bound_surge(problems[0], units[0], seed)
@@ -467,10 +534,41 @@ def _bound(
             _SURGE.format(starts=found.starts),
             _SURGE_CHECKED.format(spread=found.spread, grid=found.grid),
         )
+    if len(problems) == 1 and not why_not_trajectory(problems[0]):
+        grid = bound_trajectory(problems[0], units[0], seed, limits=limits, share=share)
+        return _of_grid(grid, criterion, value)
     bound, gap, members, spent, ascents = _bound_hull(problems, units, seed, budget)
-    return _Part(
+    part = _Part(
         value, max(bound, value), gap, members, spent, _HULL.format(count=ascents), _HULL_CHECKED
     )
+    if len(problems) == 1 and not why_not_trajectory(problems[0], relaxed=True):
+        # even if the design had the most information that the floor allows
+        least = relaxed_value(problems[0], units[0])
+        size = len(criterion.wanted) if criterion.optimality.determinant else 1
+        if least < part.bound and value - least > size * np.log(INFORMATIVE):
+            grid = bound_trajectory(
+                problems[0], units[0], seed, limits=limits, relaxed=True, share=share
+            )
+            floored = _of_grid(grid, criterion, value)
+            part = min(part, floored, key=lambda p: p.bound)
+    return part
+
+
+def _of_grid(grid: TrajectoryBound, criterion: Criterion, value: float) -> _Part:
+    """Return what dynamic programming on a grid of states found."""
+    return _Part(
+        value,
+        max(grid.bound + _slack(criterion), value),
+        grid.gap,
+        grid.mixture,
+        grid.evaluations,
+        _GRID.format(points=int(np.prod(grid.points)), forces=grid.forces[0])
+        + _FLOORED * grid.relaxed,
+        _GRID_CHECKED.format(
+            points=int(np.prod(grid.finer)), forces=grid.forces[1], grid=grid.grid,
+            ranges=grid.ranges, chord=grid.chord,
+        ),
+    )  # fmt: skip
 
 
 def absent(reason: str, began: float | None = None) -> Certificate:

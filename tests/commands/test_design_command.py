@@ -74,7 +74,12 @@ def test_plan_and_json(folder, capsys):
     data = json.loads(out.read_text())
     schema("design-1", "experiment_design").validate(data)
     assert data["efficiency_vs_random"] > 0.9
-    assert 0 < data["efficiency_lower_bound"] <= 1
+    # fifteen parameters by zero-mean IV: the bound of ascents says little
+    if data["certificate"]["kind"] == "numerical":
+        assert 0.1 <= data["efficiency_lower_bound"] <= 1
+    else:
+        assert data["certificate"] == {"kind": "not informative"}
+        assert data["efficiency_lower_bound"] is None
     assert data["margins"]["v"] >= 0.4
     assert data["starts"] == [{"u": 1.5, "v": 1.2, "r": 0.0, "psi": 0.0}]
     assert data["criterion"] == "D"
