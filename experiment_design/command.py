@@ -30,7 +30,10 @@ EXAMPLES = """examples:
 
 # what a trial may be designed for; options that ask for coefficients by themselves
 PURPOSES = ("coefficients", "prediction")
-IMPLY_COEFFICIENTS = ("criterion", "want", "of", "target", "estimator", "regime", "prior", "robust")
+IMPLY_COEFFICIENTS = (
+    "criterion", "want", "of", "target", "estimator", "regime", "prior", "robust", "margin_v",
+    "margin_air",
+)  # fmt: skip
 
 
 def _told(names: tuple[str, ...]) -> str:

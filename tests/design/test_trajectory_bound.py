@@ -5,12 +5,12 @@ from __future__ import annotations
 import itertools
 from dataclasses import replace
 
-import experiment_design.trajectory_bound as trajectory_bound
 import numpy as np
 import pytest
 from designs import make_request
 from test_certificate import make_problem
 
+from experiment_design.certificate import trajectory_bound
 from experiment_design.certificate.certificate import INFORMATIVE, Certificate, Kind, certify
 from experiment_design.certificate.trajectory_bound import (
     _Chord,

@@ -1,0 +1,240 @@
+"""Plans after which a model predicts best: what they minimise, and what they keep."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from designs import limited_ship, make_request, thesis_model
+
+from experiment_design.constraints.limits import TrialLimits
+from experiment_design.excitation.rollout import Rollout
+from experiment_design.for_prediction import (
+    command_ranges,
+    design_for_prediction,
+    prior_misfit,
+)
+from experiment_design.information.envelope import build_envelope
+from experiment_design.optimise.envelope_search import VALIDATION, usual_manoeuvres
+from greybox.commands.main import main
+from greybox.errors import InfeasibleError
+from greybox.model.model import ManoeuvringModel
+from greybox.model.predictor import build_predictor
+from greybox.study.chapter6 import TRUE
+
+BOTH = ((("u", 1),),)
+
+
+def request_of(**changes):
+    changes = {"regimes": BOTH, "limits": TrialLimits(margins={"u": 0.2}), **changes}
+    return make_request(**changes)
+
+
+def envelope_of(request, seed=0):
+    predictor = build_predictor(request.structure, "basic", (("u", (1, -1)),))
+    rollout = Rollout(
+        request.vessel, request.structure, request.theta, request.d, request.starts[0],
+        request.sample_time, request.integrator,
+    )  # fmt: skip
+    ranges = {n: (float(v.lower), float(v.upper)) for n, v in request.vessel.limits.items()}
+    return build_envelope(
+        rollout, predictor, request.noise, request.schedule, ranges, None, np.full(3, 0.2), seed
+    )
+
+
+@pytest.fixture(scope="module")
+def envelope():
+    return envelope_of(request_of())
+
+
+def motion_of(envelope, samples=150, seed=1):
+    rng = np.random.default_rng(seed)
+    return envelope.rollout.run(envelope.draw(samples, rng)[None])
+
+
+def test_the_errors_are_those_of_least_squares(envelope) -> None:
+    motion = motion_of(envelope)
+    noise, bias = envelope.errors(motion)
+    x, nx = motion.state[:, :-1], 3
+    z, g = envelope._features(x[..., :nx], x[..., nx], motion.tau, motion.commands)
+    p, k = len(z), len(g)
+    rng = np.random.default_rng(2)
+    states = envelope.rollout.structure.states
+    draws = 2000
+    off = np.zeros((2, draws, p))
+    for i, name in enumerate(states):
+        rows = envelope.predictor.equation(name)
+        phi = z[rows, 0].T
+        white = rng.normal(0, np.sqrt(envelope.variance[i]), (len(phi), draws))
+        off[0][:, rows] = np.linalg.lstsq(phi, white, rcond=None)[0].T
+        # what no term stands for goes into the coefficients, less what is best for the envelope
+        beta = rng.standard_normal((k, draws)) * np.sqrt(envelope._tau[i * k])
+        taken = np.linalg.lstsq(phi, g[:, 0].T @ beta, rcond=None)[0]
+        off[1][:, rows] += taken.T
+        off[1] -= (envelope._best[:, i * k : (i + 1) * k] @ beta).T
+    for found, told in ((off[0], noise), (off[1], bias)):
+        for i, w in enumerate(envelope._moments):
+            each = np.einsum("na,ab,nb->n", found, w[:p, :p], found)
+            assert told[0, i] == pytest.approx(each.mean(), abs=5 * each.std() / np.sqrt(draws))
+
+
+def test_the_moments_are_those_of_free_runs(envelope) -> None:
+    # one coefficient a little off moves free runs by its sensitivity
+    r = envelope.rollout
+    name = "Yv"
+    place = r.structure.index(name)
+    column = next(i for i, c in enumerate(envelope.predictor.columns) if name in c.terms)
+    step = 1e-4 * abs(TRUE[name])
+    theta = r.theta.copy()
+    theta[place] += step
+    other = Rollout(r.vessel, r.structure, theta, r.d, r.start, r.sample_time, r.integrator)
+    samples = int(20 * envelope.time_scale / r.sample_time)
+    moved, spread = [], []
+    for seed in range(60):
+        commands = envelope.draw(samples, np.random.default_rng([3, seed]))[None]
+        x = r.run(commands).state[0, 1:, :3]
+        moved.append((other.run(commands).state[0, 1:, :3] - x) / step)
+        spread.append(x)
+    variance = np.concatenate(spread).var(axis=0)
+    mean = (np.concatenate(moved) ** 2).mean(axis=0) / variance
+    told = [w[column, column] for w in envelope._moments]
+    # sequences of another draw: within a third
+    np.testing.assert_allclose(told[1], mean[1], rtol=0.35)
+
+
+def test_more_samples_leave_less_and_a_run_that_escapes_nothing(envelope) -> None:
+    short, long = motion_of(envelope, 100), motion_of(envelope, 400)
+    assert envelope.errors(long)[0].sum() < envelope.errors(short)[0].sum()
+    lost = replace(short, stable=np.array([False]))
+    assert not np.isfinite(envelope.errors(lost)[0]).any()
+    # another trial's moments add to its own
+    known = envelope.information(long)[0]
+    assert envelope.errors(short, known)[0].sum() < envelope.errors(long)[0].sum()
+
+
+def test_usual_manoeuvres_go_to_both_sides_at_two_speeds(envelope) -> None:
+    hold = envelope.time_scale
+    levels = usual_manoeuvres(envelope, 60, hold)
+    assert levels.shape == (60, 3)
+    states = np.array(
+        [envelope.steady[np.abs(envelope.settings - v).sum(axis=1).argmin()] for v in levels]
+    )
+    assert states[:, 2].max() > 0 > states[:, 2].min() or np.ptp(states[:, 2]) > 0
+    assert np.ptp(states[:, 0]) > 0
+    assert len(usual_manoeuvres(envelope, 5, hold)) == 5
+
+
+@pytest.fixture(scope="module")
+def model() -> ManoeuvringModel:
+    found = thesis_model(spread=0.02)
+    verdict = {"prediction": {"level": "poor", "fit": {"u": 40.0, "v": 70.0, "r": 90.0}}}
+    return replace(found, record={"verdict": verdict})
+
+
+@pytest.fixture(scope="module")
+def found(model):
+    request = request_of(duration=200.0, covariance=model.covariance)
+    return design_for_prediction(request, model)
+
+
+def test_a_plan_leaves_less_than_random_sequences(found) -> None:
+    assert found.random > 1.2
+    total = {n: np.hypot(found.noise[n], found.misfit[n]) for n in found.noise}
+    assert set(total) == {"u", "v", "r"}
+    assert all(np.isfinite(v) and v > 0 for v in total.values())
+    told = found.to_dict()
+    assert told["for"] == "prediction"
+    assert told["prediction"]["prior"] == "poor"
+    assert json.dumps(told["prediction"])
+    assert "poor" in found.headline()
+    # commands stay in the envelope, the motion keeps way on
+    commands = found.design.commands[0]
+    for i, (low, high) in enumerate(found.commands.values()):
+        assert commands[:, i].min() >= low - 1e-9
+        assert commands[:, i].max() <= high + 1e-9
+    assert found.design.motions[0].state[0, :, 0].min() > 0.2 - 1e-3
+    # the last third are usual manoeuvres
+    holds = found.design.levels[0].shape[0]
+    assert round(VALIDATION * holds) > 3
+
+
+def test_the_same_request_gives_the_same_plan(found, model) -> None:
+    again = design_for_prediction(request_of(duration=200.0, covariance=model.covariance), model)
+    assert np.array_equal(again.design.commands[0], found.design.commands[0])
+    assert again.misfit == found.misfit
+
+
+def test_the_misfit_of_a_prior_is_what_its_verdict_says(model) -> None:
+    share, level = prior_misfit(model)
+    assert share == pytest.approx([0.6, 0.3, 0.1])
+    assert level == "poor"
+    share, level = prior_misfit(replace(model, record={}))
+    assert (share == 0.3).all()
+    assert level == ""
+
+
+def test_ranges_are_those_of_the_trial_to_both_sides(model) -> None:
+    assert command_ranges(model, {})["alpha1"] == (0.6, 1.1)
+    ship = limited_ship(angles=(-1.0, 1.0))
+    shown = {"n": [12.0, 16.0], "alpha1": [-0.1, 0.4], "alpha2": [-0.5, 0.0]}
+    ranges = command_ranges(replace(model, vessel=ship, record={"ranges": shown}), {})
+    assert ranges["n"] == pytest.approx((11.6, 16.4))
+    assert ranges["alpha1"] == pytest.approx((-0.45, 0.45))
+    given = command_ranges(replace(model, vessel=ship), {"n": (11.0, 13.0)})
+    assert given["n"] == (11.0, 13.0)
+
+
+def test_a_prior_that_cannot_hold_the_ship_is_refused() -> None:
+    request = request_of()
+    theta = request.theta.copy()
+    theta[request.structure.index("Xu")] = 0.4
+    theta[request.structure.index("Xuu")] = 0.0
+    with pytest.raises(InfeasibleError, match="--prior none"):
+        envelope_of(replace(request, theta=theta))
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    place = tmp_path_factory.mktemp("prediction")
+    thesis_model(spread=0.02).save(place / "model.json")
+    (place / "ship.toml").write_text(
+        'name = "Thesis ship"\nlength = 30.0\n'
+        + "".join(
+            f'[[thruster]]\ntype = "azimuth"\nx = {x}\ny = 0.0\nspeed = "n"\nangle = "{a}"\n'
+            f"speed_limits = [10.0, 20.0]\nangle_limits = [0.6, 1.1]\n"
+            for x, a in ((9.0, "alpha1"), (-9.0, "alpha2"))
+        )
+        + "[sensors]\nu_std = 0.0141\nv_std = 0.0141\nr_std = 0.0141\n"
+    )
+    return place
+
+
+def test_the_command(files, capsys: pytest.CaptureFixture[str]) -> None:
+    plan = files / "plan.csv"
+    asked = ["design", "--vessel", str(files / "ship.toml"), "--model", str(files / "model.json"),
+             "--duration", "120", "--out", str(plan), "--json", "-", "--process-noise", "0.002,0.002,0.0004",
+             "--effort", "0.2", "--for", "prediction"]  # fmt: skip
+    assert main(asked) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["prediction"]["random_error_over_this"] > 1
+    assert plan.read_text().startswith("t,")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--for", "prediction", "--want", "Yv"], "leave out --want"),
+        (["--for", "coefficients", "--envelope", "n=1:2"], "use --for prediction"),
+        (["--envelope", "n"], "COLUMN=LOW:HIGH"),
+        (["--envelope", "m=1:2"], "no command of"),
+        (["--envelope", "n=3:2"], "give the lower first"),
+    ],
+)
+def test_options_that_do_not_go_together(files, options, message, capsys) -> None:
+    asked = ["design", "--vessel", str(files / "ship.toml"), "--model", str(files / "model.json"),
+             "--duration", "100", "--out", str(files / "none.csv"), *options]  # fmt: skip
+    assert main(asked) == 1
+    assert message in capsys.readouterr().err
+    assert not (files / "none.csv").exists()
