@@ -47,6 +47,10 @@ HOLDS = (0.5, 6.0)
 _CENTRES = 40
 # samples of a motion that its moments are summed over
 _SAMPLES = 400
+# share of the settings that count as straight, and how often one of these is held
+_STRAIGHT, _COURSE = 0.1, 0.25
+# speed at the start, as a share of the fastest straight motion
+_APPROACH = 0.9
 # slowest and fastest steady motion that counts, in what the prior's trial showed
 _SLOWEST, _FASTEST = 0.7, 1.3
 # share of the commands under which the prior must hold the ship
@@ -73,6 +77,8 @@ class Envelope:
         (S, nc) constant commands within it that hold the ship in the envelope.
     steady : ndarray
         (S, nx) the motions that they settle to [m/s, rad/s].
+    straight : ndarray of int
+        (m,) those of them that hold a course best.
     time_scale : float
         Time in which the ship sails her length [s].
     misfit : ndarray
@@ -88,6 +94,7 @@ class Envelope:
     upper: Array
     settings: Array
     steady: Array
+    straight: NDArray[np.intp]
     time_scale: float
     misfit: Array
     spread: Array
@@ -160,17 +167,34 @@ class Envelope:
             gram[:, at[:, None], at] = every * (both @ both.transpose(0, 2, 1))
         return gram
 
+    def pick(self, rng: np.random.Generator) -> Array:
+        """Draw one setting (nc,): any, or now and then one that holds a course."""
+        return _picked(self.settings, self.straight, rng)
+
     def draw(self, samples: int, rng: np.random.Generator) -> Array:
         """Draw commands (N, nc) as the ship is used: settings that are held short and long."""
-        return _drawn(self.settings, samples, self.time_scale / self.rollout.sample_time, rng)
+        scale = self.time_scale / self.rollout.sample_time
+        return _drawn(self.settings, self.straight, samples, scale, rng)
 
 
-def _drawn(settings: Array, samples: int, scale: float, rng: np.random.Generator) -> Array:
+def _picked(settings: Array, straight: NDArray[np.intp], rng: np.random.Generator) -> Array:
+    if rng.random() < _COURSE:
+        return np.asarray(settings[straight[rng.integers(len(straight))]])
+    return np.asarray(settings[rng.integers(len(settings))])
+
+
+def _drawn(
+    settings: Array,
+    straight: NDArray[np.intp],
+    samples: int,
+    scale: float,
+    rng: np.random.Generator,
+) -> Array:
     out = np.empty((samples, settings.shape[1]))
     first = 0
     while first < samples:
         held = max(1, round(scale * float(np.exp(rng.uniform(*np.log(HOLDS))))))
-        out[first : first + held] = settings[rng.integers(len(settings))]
+        out[first : first + held] = _picked(settings, straight, rng)
         first += held
     return out
 
@@ -278,16 +302,19 @@ def build_envelope(
             f"with it: estimate it on a longer trial, or use --prior none."
         )
     settings, steady = tried[held], steady[held]
-    # the straightest of the faster motions, where a crew would begin
-    quick = steady[:, 0] >= np.quantile(steady[:, 0], 0.5)
-    aside = np.abs(steady[:, 1:]) / steady.std(axis=0)[1:] if nx > 1 else np.zeros((len(steady), 1))
-    order = np.where(quick, aside.sum(axis=1), np.inf)
-    start = np.append(steady[int(order.argmin())], 0.0)
+    aside = (np.abs(steady[:, 1:]) / np.maximum(steady[:, 1:].std(axis=0), 1e-12)).sum(axis=1)
+    straight = np.argsort(aside, kind="stable")[: max(1, round(_STRAIGHT * len(steady)))]
+    # where a crew would begin: on a course, at speed
+    ahead = steady[straight, 0]
+    begun = straight[int(np.abs(ahead - _APPROACH * ahead.max()).argmin())]
+    start = np.append(steady[begun], 0.0)
     rollout = Rollout(
         rollout.vessel, rollout.structure, rollout.theta, rollout.d, start, dt, rollout.integrator
     )
     samples = int(_LENGTH * scale / dt)
-    used = np.array([_drawn(settings, samples, scale / dt, rng) for _ in range(_SEQUENCES)])
+    used = np.array(
+        [_drawn(settings, straight, samples, scale / dt, rng) for _ in range(_SEQUENCES)]
+    )
     motion = rollout.run(used)
     good = motion.stable
     if good.mean() < HELD:
@@ -311,7 +338,7 @@ def build_envelope(
     tau = _prior_variance(moments, best, share, nx)
     variance = np.asarray(noise.process, float) ** 2 + 2 * np.asarray(noise.measurement) ** 2
     return Envelope(
-        rollout, predictor, variance, lower, upper, settings, steady, scale, share,
+        rollout, predictor, variance, lower, upper, settings, steady, straight, scale, share,
         x.reshape(-1, nx).std(axis=0), features, moments, best, tau,
     )  # fmt: skip
 

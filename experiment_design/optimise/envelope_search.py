@@ -51,7 +51,7 @@ class EnvelopeSearch:
 
 
 def usual_manoeuvres(envelope: Envelope, holds: int, hold: float) -> Array:
-    """Return a two-sided zig-zag at two speeds and a turn, levels (K, nc).
+    """Return an approach, a two-sided zig-zag at two speeds, and a turn, levels (K, nc).
 
     Parameters
     ----------
@@ -74,7 +74,10 @@ def usual_manoeuvres(envelope: Envelope, holds: int, hold: float) -> Array:
             [settings[part][int(np.abs(rate[part] - s * wanted).argmin())] for s in (1, -1)]
         )
     (right, left), (slow_right, slow_left) = sides
-    order = [right, left, right, left, slow_left, slow_right, slow_left, slow_right]
+    course = envelope.straight[int(steady[envelope.straight, 0].argmax())]
+    order = [
+        settings[course], right, left, right, left, slow_left, slow_right, slow_left, slow_right,
+    ]  # fmt: skip
     zigzag = np.repeat(order, leg, axis=0)
     turn = np.repeat([left], max(2 * leg, holds - len(zigzag)), axis=0)
     whole = np.concatenate([zigzag, turn])
@@ -139,7 +142,7 @@ def search_envelope(
             k = 0
             while k < free:
                 held = _held(rng, longest)
-                levels[k : k + held] = envelope.settings[rng.integers(len(envelope.settings))]
+                levels[k : k + held] = envelope.pick(rng)
                 k += held
         return out
 
@@ -149,7 +152,7 @@ def search_envelope(
             held = _held(rng, longest)
             i = int(rng.integers(free - held + 1))
             if rng.random() < _ANEW:
-                out[i : i + held] = envelope.settings[rng.integers(len(envelope.settings))]
+                out[i : i + held] = envelope.pick(rng)
             else:
                 j = int(rng.integers(free - held + 1))
                 out[i : i + held], out[j : j + held] = (

@@ -214,8 +214,8 @@ def files(tmp_path_factory):
 def test_the_command(files, capsys: pytest.CaptureFixture[str]) -> None:
     plan = files / "plan.csv"
     asked = ["design", "--vessel", str(files / "ship.toml"), "--model", str(files / "model.json"),
-             "--duration", "120", "--out", str(plan), "--json", "-", "--process-noise", "0.002,0.002,0.0004",
-             "--effort", "0.2", "--for", "prediction"]  # fmt: skip
+             "--duration", "120", "--out", str(plan), "--json", "-", "--process-noise",
+             "0.002,0.002,0.0004", "--effort", "0.2", "--for", "prediction"]  # fmt: skip
     assert main(asked) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["prediction"]["random_error_over_this"] > 1
