@@ -42,7 +42,8 @@ class Taken:
     without : sequence of Pair
         The model with all other causes, its coefficients fitted anew, on what is held out.
     alone : sequence of Pair
-        The model with this cause alone, likewise; empty where it was not fitted.
+        The model with this cause alone, likewise, for the cause that takes most: it takes what
+        switching it off would. Empty for the others, which are told beside it.
     relative : float
         Standard error of its size, as a share of the size.
     """
@@ -84,7 +85,7 @@ def error_budget(
         which each cause's size varies by its standard error; empty where a run leaves every
         bound.
     """
-    every = [*base, *final, *(p for c in causes for p in (*c.without, *c.alone))]
+    every = [*base, *final, *(p for c in causes for p in c.without)]
     if not base or any(p.fit.escaped or p.held_fit.escaped for p in every):
         return ()
     problem = final[0].held
@@ -92,9 +93,8 @@ def error_budget(
     e0, e1 = _errors(base), _errors(final)
     series = {c.id: np.zeros_like(e0) for c in causes}
     for cause in causes:
-        last = _errors(cause.without) - e1
-        first = e0 - _errors(cause.alone) if cause.alone else last
-        series[cause.id] += (first + last) / 2
+        alone = cause.alone and not any(p.held_fit.escaped for p in cause.alone)
+        series[cause.id] += e0 - _errors(cause.alone) if alone else _errors(cause.without) - e1
     beside = e0 - e1 - sum(series.values())
     plain, noise = [], []
     for pair in final:

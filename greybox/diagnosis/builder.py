@@ -20,6 +20,7 @@ from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.gain import gains, run_on
 from greybox.diagnosis.null_model import FOLDS, DiagnosisProblem
 from greybox.diagnosis.point import Fit
+from greybox.diagnosis.refitting import refit
 from greybox.diagnosis.residuals import residual_tests
 from greybox.diagnosis.result import (
     BudgetPart,
@@ -33,6 +34,7 @@ from greybox.diagnosis.result import (
     finite,
 )
 from greybox.diagnosis.ruling import rule
+from greybox.diagnosis.scores import Score
 from greybox.diagnosis.search import Candidate, Search, backwards, instead
 from greybox.diagnosis.ship import CURRENTS
 from greybox.diagnosis.symptoms import find_symptoms
@@ -193,16 +195,30 @@ class DiagnosisBuilder:
         problem = self.case.problem(final.integrator)
         more = set(final.point.places) - set(found.base.point.places)
         nameless = bool(more - {i for c in found.causes for i in problem.numbers_at(c.hypothesis)})
-        causes = []
-        for c in named:
-            others = [fit for key, fit in own.items() if key != c.hypothesis.key]
-            # of two causes each is alone where the other is left out, and no term stays beside
-            alone = run([final, *others][-1]) if len(others) < 2 and not nameless else ()
-            relative = _relative(self.quantities(c, final))
-            causes.append(Taken(c.hypothesis.id, run(own[c.hypothesis.key]), alone, relative))
-        return error_budget(
-            run(found.before), run(final), causes, waves, self.seed, nameless=nameless
-        )
+        base, left = run(found.before), run(final)
+        whole = _squares(base)
+        takes = {
+            c.hypothesis.key: float((_squares(run(own[c.hypothesis.key])) / whole).sum())
+            for c in named
+        }
+        # the others are told beside it: alone each would take what is not its own
+        main = max(takes, key=lambda key: takes[key], default="")
+        causes = [
+            Taken(
+                c.hypothesis.id, run(own[c.hypothesis.key]),
+                run(self._alone(final, c)) if c.hypothesis.key == main else (),
+                _relative(self.quantities(c, final)),
+            )
+            for c in named
+        ]  # fmt: skip
+        return error_budget(run(found.before), left, causes, waves, self.seed, nameless=nameless)
+
+    def _alone(self, final: Fit, cause: Candidate) -> Fit:
+        """Return the fit of the model without causes with one of them alone in force."""
+        before = self.found.before
+        place = [a.key for a in final.point.hypotheses].index(cause.hypothesis.key)
+        score = Score(cause.hypothesis, final.point.values[place], cause.gain)
+        return refit(self.case.problem(before.integrator), before, score)
 
     def record(self, causes: Sequence[Candidate]) -> dict[str, Any]:
         """Return what a model file tells beside."""
@@ -328,6 +344,15 @@ class DiagnosisBuilder:
         for change in after.changes:
             out.append(f"the extended model tells the log's own clock: {change.sentence}.")
         return out
+
+
+def _squares(pairs: Sequence[Pair]) -> Array:
+    """Return the mean squared held-out error of each state (nx,)."""
+    if not pairs or any(p.held_fit.escaped for p in pairs):
+        return np.full(1, np.inf)
+    count = len(pairs[0].held.structure.states)
+    errors = np.concatenate([e[:, :count] for p in pairs for e in p.held_fit.errors])
+    return np.asarray((errors**2).mean(axis=0))
 
 
 def _relative(quantities: Mapping[str, Quantity]) -> float:
