@@ -7,12 +7,13 @@ never near. Several chains start from the best of random sequences of these sett
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from experiment_design.constraints.limits import TOLERANCE
+from experiment_design.constraints.limits import TOLERANCE, UNIT_SCALE
+from experiment_design.excitation.rollout import Motion
 from experiment_design.information.envelope import HOLDS, Envelope
 from experiment_design.optimise.search import Candidate, limit_scale
 from experiment_design.request.problem import TrialProblem
@@ -28,6 +29,9 @@ VALIDATION = 1 / 3
 _CHAINS, _KEPT, _TOGETHER, _ROUNDS = 4, 12, 64, 14
 # of the largest steady yaw rate: how hard the zig-zag turns; time scales of each of its legs
 _TURN, _LEG = 0.6, 3.0
+# share of the trial that either sign of sway and of yaw rate takes at least, where the envelope
+# has both
+_EITHER = 0.35
 # share of moves that draw a stretch anew; the others swap two
 _ANEW = 0.7
 
@@ -127,11 +131,12 @@ def search_envelope(
             with np.errstate(divide="ignore"):
                 value = -0.5 * np.log((noise + bias).mean(axis=1))
             missed = problem.scenarios[0].limits.violations(motion)
+            aside = one_sided(envelope, motion)
             s = problem.schedule
             span = np.where(s.upper > s.lower, s.upper - s.lower, 1.0)
             unit = (complete - s.lower) / span
             out += [
-                (p, Candidate(u, float(v), missed[:, i]))
+                (p, Candidate(u, float(v), np.append(missed[:, i], aside[i])))
                 for i, (p, u, v) in enumerate(zip(part, unit, value, strict=True))
             ]
         return out
@@ -160,7 +165,7 @@ def search_envelope(
                 )  # fmt: skip
         return out
 
-    scale = limit_scale(problem)
+    scale = np.append(limit_scale(problem), UNIT_SCALE[""])
 
     def better(found: list[tuple[Array, Candidate]]) -> list[tuple[Array, Candidate]]:
         return sorted(found, key=lambda f: _rank(f[1], scale))[:_KEPT]
@@ -179,7 +184,20 @@ def search_envelope(
 
     found = better(map_forked(chain, range(_CHAINS)))
     values = np.array([c.value for _, c in begun])
-    return EnvelopeSearch(found[0][1], values, RANDOM + _CHAINS * rounds * _TOGETHER)
+    best = replace(found[0][1], missed=found[0][1].missed[:-1])
+    return EnvelopeSearch(best, values, RANDOM + _CHAINS * rounds * _TOGETHER)
+
+
+def one_sided(envelope: Envelope, motion: Motion) -> Array:
+    """Return by how much the rarer sign of sway or yaw rate falls short of its share, (R,)."""
+    short = np.zeros(len(motion.state))
+    for i, name in enumerate(envelope.rollout.structure.states):
+        to_starboard = (envelope.steady[:, i] > 0).mean()
+        if name not in ("v", "r") or min(to_starboard, 1 - to_starboard) < _EITHER / 2:
+            continue
+        share = (motion.state[:, :, i] > 0).mean(axis=1)
+        short = np.maximum(short, _EITHER - np.minimum(share, 1 - share))
+    return short
 
 
 def _held(rng: np.random.Generator, longest: int) -> int:

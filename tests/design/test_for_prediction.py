@@ -17,7 +17,7 @@ from experiment_design.for_prediction import (
     prior_misfit,
 )
 from experiment_design.information.envelope import build_envelope
-from experiment_design.optimise.envelope_search import VALIDATION, usual_manoeuvres
+from experiment_design.optimise.envelope_search import VALIDATION, one_sided, usual_manoeuvres
 from greybox.commands.main import main
 from greybox.errors import InfeasibleError
 from greybox.model.model import ManoeuvringModel
@@ -102,6 +102,19 @@ def test_the_moments_are_those_of_free_runs(envelope) -> None:
     told = [w[column, column] for w in envelope._moments]
     # sequences of another draw: within a third
     np.testing.assert_allclose(told[1], mean[1], rtol=0.35)
+
+
+def test_a_trial_goes_to_both_sides(envelope) -> None:
+    motion = motion_of(envelope)
+    r = motion.state[..., 2]
+    both = replace(envelope, steady=np.vstack([envelope.steady, -envelope.steady]))
+    turned = replace(motion, state=np.abs(motion.state))
+    assert one_sided(both, turned)[0] == pytest.approx(0.35)
+    share = min((r > 0).mean(), (r < 0).mean())
+    assert one_sided(both, motion)[0] >= 0.35 - share - 1e-12
+    # a ship that turns to one side only is not asked to do otherwise
+    alone = replace(envelope, steady=np.abs(envelope.steady))
+    assert one_sided(alone, turned)[0] == 0.0
 
 
 def test_more_samples_leave_less_and_a_run_that_escapes_nothing(envelope) -> None:
