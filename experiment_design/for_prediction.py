@@ -263,7 +263,7 @@ def _design(
     asked = request
     request, searches, keeping = _searched(request, found)
     problems = [build_problem(asked, t) for t in range(asked.trials)]
-    reference, kept = random_campaign(problems, asked.seed)
+    reference, number = random_campaign(problems, asked.seed)
     units = [s.candidate.unit for s in searches]
     short = [
         (name, float(m))
@@ -283,7 +283,7 @@ def _design(
         f"{n} {x:.3g}" for n, x in zip((*states, "psi"), asked.starts[0], strict=True)
     )
     design = described(
-        asked, problems, units, reference, kept,
+        asked, problems, units, reference, number,
         certificate=absent("a plan for prediction has no bound to be measured against"),
         keeping=keeping,
         status="solved: exchange of settings of the operating envelope",
@@ -294,7 +294,8 @@ def _design(
     known = np.sum(others, axis=0) if others else None
     noise, bias = found.errors(design.motions[0], known)
     whole = np.sqrt(float((noise + bias).mean()))
-    usual = float(np.median(np.exp(-searches[0].random)))
+    kept = searches[0].random[np.isfinite(searches[0].random)]
+    usual = float(np.median(np.exp(-kept))) if len(kept) else float("nan")
     v = states.index("v") if "v" in states else None
     crossings: tuple[tuple[float, float], ...] = ()
     if v is not None:
