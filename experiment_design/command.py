@@ -8,7 +8,15 @@ from typing import Any
 
 from experiment_design.information.estimators import ESTIMATORS
 from experiment_design.information.optimality import CRITERIA
-from greybox.commands.common import add_seed, count, positive, progress, provenance, say
+from greybox.commands.common import (
+    add_seed,
+    count,
+    positive,
+    progress,
+    provenance,
+    require_apart,
+    say,
+)
 from greybox.model.predictor_kinds import PREDICTORS
 from greybox.registry import Registry
 
@@ -126,6 +134,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--out", required=True, metavar="PLAN", help="where to write the commands (CSV)")
     add("--json", metavar="F", help="write the design as JSON; - is stdout")
     add("--sheet", metavar="FILE", help="write the sheet to take on board: .pdf, .html, .svg, .png")
+    add(
+        "--legs",
+        nargs="?",
+        const="",
+        metavar="FILE",
+        help="write the plan as legs, too, that end by time, heading, speed or yaw rate: JSON with "
+        "a CSV beside it, and on the sheet (PLAN's name with .legs.json)",
+    )
     add("--report", metavar="HTML", help="write a page with pictures and what the plan is worth")
     goal = parser.add_argument_group("what is to be learnt")
     goal.add_argument(
@@ -281,7 +297,8 @@ def run(options: argparse.Namespace) -> None:
     from greybox.model.semi_empirical import semi_empirical_model
     from greybox.vessel.toml import load_vessel
 
-    check_targets(options.out, options.json, options.sheet, options.report)
+    _place_legs(options)
+    check_targets(options.out, options.json, options.sheet, options.report, options.legs)
     if options.sheet:
         from experiment_design.output.trial_sheet import sheet_kind
 
@@ -331,19 +348,15 @@ def run(options: argparse.Namespace) -> None:
         workers=options.workers,
     )
     write_plan(design, options.out)
+    legs = _write_legs(options, design)
     record = provenance(options)
     if options.json:
-        data: dict[str, Any] = design.to_dict()
+        data: dict[str, Any] = design.to_dict() | _told_of(legs, options)
         data["notes"] = [*prepared.notes, *data["notes"]]
         write_json(data | {"provenance": record}, options.json)
-    _show(options, design, prepared.notes)
+    _show(options, design, prepared.notes, legs=legs)
     if options.json != "-":
-        say(design.summary())
-        for note in prepared.notes:
-            say(f"Note: {note}")
-        for path in (options.out, options.sheet, options.report):
-            if path:
-                say(f"wrote {path}")
+        _say(options, design.summary(), prepared.notes, legs)
 
 
 def _run_for_prediction(options: argparse.Namespace, model: Any, vessel: Any) -> None:
@@ -367,18 +380,14 @@ def _run_for_prediction(options: argparse.Namespace, model: Any, vessel: Any) ->
         keep_start=options.start is not None,
     )
     write_plan(found.design, options.out)
+    legs = _write_legs(options, found.design)
     if options.json:
-        data = found.to_dict()
+        data = found.to_dict() | _told_of(legs, options)
         data["notes"] = [*prepared.notes, *data["notes"]]
         write_json(data | {"provenance": provenance(options)}, options.json)
-    _show(options, found.design, prepared.notes, found.headline())
+    _show(options, found.design, prepared.notes, found.headline(), legs)
     if options.json != "-":
-        say(found.summary())
-        for note in prepared.notes:
-            say(f"Note: {note}")
-        for path in (options.out, options.sheet, options.report):
-            if path:
-                say(f"wrote {path}")
+        _say(options, found.summary(), prepared.notes, legs)
 
 
 def _range(text: str, vessel: Any) -> tuple[str, tuple[float, float]]:
@@ -439,29 +448,83 @@ def _run_between(options: argparse.Namespace, request: Any, notes: tuple[str, ..
         workers=options.workers,
     )
     write_plan(found.design, options.out)
+    legs = _write_legs(options, found.design)
     if options.json:
-        data = found.to_dict()
+        data = found.to_dict() | _told_of(legs, options)
         data["notes"] = [*notes, *data["notes"]]
         write_json(data | {"provenance": provenance(options)}, options.json)
     lines = found.summary().splitlines()
-    _show(options, found.design, notes, f"{lines[0]}: {lines[3]}.")
+    _show(options, found.design, notes, f"{lines[0]}: {lines[3]}.", legs)
     if options.json != "-":
-        say(found.summary())
-        for note in notes:
-            say(f"Note: {note}")
-        for path in (options.out, options.sheet, options.report):
-            if path:
-                say(f"wrote {path}")
+        _say(options, found.summary(), notes, legs)
+
+
+def _place_legs(options: argparse.Namespace) -> None:
+    """Name the file of legs where it was left open, and refuse one that cannot be it.
+
+    Raises
+    ------
+    UsageError
+        It is no JSON, or it or the CSV beside it would replace another file.
+    """
+    from experiment_design.output.legs import csv_twin
+    from greybox.errors import UsageError
+
+    if options.legs is None:
+        return
+    if not options.legs:
+        options.legs = str(Path(options.out).with_suffix(".legs.json"))
+    if Path(options.legs).suffix.lower() != ".json":
+        raise UsageError(f"--legs '{options.legs}' has no ending .json: name a JSON file.")
+    require_apart(options)
+    twin = csv_twin(options.legs)
+    others = (options.out, options.json, options.area, options.sheet)
+    if twin.resolve() in [Path(p).resolve() for p in others if p]:
+        raise UsageError(
+            f"--legs writes '{twin}' too, which another option names: name another file, such as "
+            f"{Path(options.out).with_suffix('.legs.json')}."
+        )
+
+
+def _write_legs(options: argparse.Namespace, design: Any) -> Any:
+    """Write the plan as legs where they were asked for, and return them, else None."""
+    if options.legs is None:
+        return None
+    from experiment_design.output.legs import legs_of, write_legs
+
+    legs = legs_of(design)
+    write_legs(legs, design, options.legs)
+    return legs
+
+
+def _told_of(legs: Any, options: argparse.Namespace) -> dict[str, Any]:
+    return {} if legs is None else {"legs": legs.to_dict(options.legs)}
+
+
+def _say(options: argparse.Namespace, summary: str, notes: tuple[str, ...], legs: Any) -> None:
+    """Print what was found and which files were written."""
+    say(summary)
+    if legs is not None:
+        say(legs.sentence())
+    for note in notes:
+        say(f"Note: {note}")
+    for path in (options.out, options.legs, options.sheet, options.report):
+        if path:
+            say(f"wrote {path}")
 
 
 def _show(
-    options: argparse.Namespace, design: Any, notes: tuple[str, ...], headline: str = ""
+    options: argparse.Namespace,
+    design: Any,
+    notes: tuple[str, ...],
+    headline: str = "",
+    legs: Any = None,
 ) -> None:
     """Write the sheet and the page that were asked for."""
     if options.sheet:
         from experiment_design.output.trial_sheet import write_sheet
 
-        write_sheet(design, options.sheet)
+        write_sheet(design, options.sheet, None if legs is None else legs.trials)
     if options.report:
         from experiment_design.output.report import design_page
         from greybox.report.page import write_page

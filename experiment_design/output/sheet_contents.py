@@ -2,35 +2,27 @@
 
 from __future__ import annotations
 
-import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from experiment_design.constraints.limits import TOLERANCE
+from experiment_design.output.legs import Leg
 from experiment_design.output.prediction import MotionBand
 from experiment_design.output.result import Design
+from experiment_design.output.words import KNOT, SIDES, WORDS, clock, compass, signed
 from experiment_design.request.regimes import spell_regime
 
 Array = NDArray[np.float64]
 
-KNOT = 0.514444
 # corridor that no helmsman or sensor is asked to keep closer than, and its least in ship lengths
 HEADING_FLOOR = np.deg2rad(10.0)
 POSITION_FLOOR = 10.0
 # heading past which "off the plan" has no meaning
 _BLIND = np.deg2rad(90.0)
 _LONGEST_NAME = 60
-_SIDES = {
-    ("u", 1): "ahead",
-    ("u", -1): "astern",
-    ("v", 1): "to starboard",
-    ("v", -1): "to port",
-    ("r", 1): "to starboard",
-    ("r", -1): "to port",
-}
-_WORDS = {"u": "Surge", "v": "Sway", "r": "Yaw rate"}
 
 
 @dataclass(frozen=True)
@@ -82,42 +74,28 @@ class SheetContents:
         return len(self.columns[0].cells)
 
 
-def clock(seconds: float) -> str:
-    """Return a time as minutes and seconds, such as 4:05."""
-    tenths = round(seconds * 10)
-    minutes, rest = divmod(tenths, 600)
-    return f"{minutes}:{rest // 10:02d}" + (f".{rest % 10}" if rest % 10 else "")
-
-
-def compass(angle: float) -> str:
-    """Return an angle [rad] as a compass direction in degrees, 000 to 359."""
-    return f"{round(np.rad2deg(angle)) % 360:03d}"
-
-
-def signed(value: float, decimals: int = 0) -> str:
-    """Return a number with a true minus sign and no negative zero."""
-    return f"{round(value, decimals) + 0.0:.{decimals}f}".replace("-", "−")
-
-
-def tie(text: str) -> str:
-    """Return text in which a line does not end between a number and its unit."""
-    tied = re.sub(r"(?<=\d) (?=(?:m/s|rad/s|kn|m|s|%|min)(?:\W|$))", "\u00a0", text)
-    return tied.replace("(N, E)", "(N,\u00a0E)")
-
-
 def plain_name(name: str) -> str:
     """Return a vessel's name as one line of a bearable length."""
     line = " ".join("".join(c if c.isprintable() else " " for c in name).split())
     return line if len(line) <= _LONGEST_NAME else line[: _LONGEST_NAME - 1] + "…"
 
 
-def sheet_contents(design: Design, band: MotionBand) -> SheetContents:
-    """Return one trial of a design as the words and cells of its sheet."""
+def sheet_contents(design: Design, band: MotionBand, legs: Sequence[Leg] = ()) -> SheetContents:
+    """Return one trial of a design as the words and cells of its sheet.
+
+    Parameters
+    ----------
+    design : Design
+    band : MotionBand
+        Of the trial.
+    legs : sequence of Leg
+        Of the trial, to stand in the table in place of the commands by the clock.
+    """
     r = design.request
     which = f"trial {band.trial + 1} of {r.trials}" if r.trials > 1 else "trial"
     regime = r.regimes[band.trial]
     sides = ", ".join(
-        f"{_WORDS[s].lower()} {_SIDES[s, sign]}" for s, sign in regime if (s, sign) in _SIDES
+        f"{WORDS[s].lower()} {SIDES[s, sign]}" for s, sign in regime if (s, sign) in SIDES
     )
     ramp = max(r.schedule.ramp) > 1
     note = (
@@ -126,6 +104,13 @@ def sheet_contents(design: Design, band: MotionBand) -> SheetContents:
         + " the time of their row and hold until the next row; times without a change are left "
         "out. Heading, speed over ground and position (N, E) are those expected at that time."
     )
+    if legs:
+        note = (
+            "Hold the commands of a row as its column 'hold' says, never longer than the time "
+            "given there, and go on with the next row. Changes of heading count from the start of "
+            "the leg; turn is the yaw rate. Time, heading, speed over ground and position (N, E) "
+            "are those expected at the start of the leg; compare them by legs, not by the clock."
+        )
     if not band.certain:
         note += " ±: 95 % of the predicted motions have stayed within since the start."
     return SheetContents(
@@ -136,8 +121,8 @@ def sheet_contents(design: Design, band: MotionBand) -> SheetContents:
         _facts(design, band),
         _warnings(design, band),
         _abort(design, band),
-        _columns(design, band, radians=True),
-        _columns(design, band, radians=False),
+        _columns(design, band, legs, radians=True),
+        _columns(design, band, legs, radians=False),
         note,
     )
 
@@ -146,14 +131,14 @@ def _facts(design: Design, band: MotionBand) -> tuple[tuple[str, str], ...]:
     r = design.request
     start = [f"heading {compass(band['psi'].nominal[0])}°"]
     for name in r.structure.states:
-        if name not in _WORDS:
+        if name not in WORDS:
             continue
         value = float(band[name].nominal[0])
-        side = _SIDES[name, 1 if value >= 0 else -1] if round(value, 3) else ""
+        side = SIDES[name, 1 if value >= 0 else -1] if round(value, 3) else ""
         if name == "r":
             text = f"yaw rate {abs(np.rad2deg(value)):.2f}°/s"
         else:
-            text = f"{_WORDS[name].lower()} {abs(value):.2f} m/s ({abs(value) / KNOT:.1f} kn)"
+            text = f"{WORDS[name].lower()} {abs(value):.2f} m/s ({abs(value) / KNOT:.1f} kn)"
         start.append(f"{text} {side}".rstrip())
     where = f"N {signed(band['x_n'].nominal[0])} m, E {signed(band['y_n'].nominal[0])} m"
     d = np.zeros(4)
@@ -280,7 +265,7 @@ def _abort(design: Design, band: MotionBand) -> tuple[str, ...]:
             bound = f"{np.rad2deg(margin):.2f}°/s"
         else:
             bound = f"{margin:.2f} m/s ({margin / KNOT:.1f} kn)"
-        text = f"{_WORDS.get(name, name)} {_SIDES.get((name, sign), '')} below {bound}"
+        text = f"{WORDS.get(name, name)} {SIDES.get((name, sign), '')} below {bound}"
         text += f", margin of {symbol}"
         if least is not None and name != "r":
             text += f"; least expected {signed(least, 2)} m/s"
@@ -288,10 +273,14 @@ def _abort(design: Design, band: MotionBand) -> tuple[str, ...]:
     return tuple(said)
 
 
-def _columns(design: Design, band: MotionBand, *, radians: bool) -> tuple[Column, ...]:
+def _columns(
+    design: Design, band: MotionBand, legs: Sequence[Leg], *, radians: bool
+) -> tuple[Column, ...]:
     r = design.request
     schedule = r.schedule
     levels = design.levels[band.trial]
+    if legs:
+        levels = np.array([[leg.commands[n] for n in schedule.commands] for leg in legs])
     made = [
         _command_cells(
             name,
@@ -305,6 +294,10 @@ def _columns(design: Design, band: MotionBand, *, radians: bool) -> tuple[Column
     rows = list(zip(*[c.cells for c in made], strict=True))
     changed = [k for k in range(len(rows)) if k == 0 or rows[k] != rows[k - 1]]
     samples = np.array([*(k * schedule.hold for k in changed), len(band.t) - 1])
+    if legs:
+        changed = list(range(len(legs)))
+        took = np.cumsum([0.0, *(leg.expected for leg in legs)]) / r.sample_time
+        samples = np.minimum(np.rint(took).astype(int), len(band.t) - 1)
     heading, place = band["psi"].nominal[samples], [
         band[n].nominal[samples] for n in ("x_n", "y_n")
     ]  # fmt: skip
@@ -313,6 +306,9 @@ def _columns(design: Design, band: MotionBand, *, radians: bool) -> tuple[Column
     for c in made:
         cells = [*(c.cells[k] for k in changed), "end"]
         columns.append(Column(c.name, c.unit, tuple(cells)))
+    if legs:
+        said = [leg.words if radians else leg.short for leg in legs]
+        columns.append(Column("hold", "", (*said, "")))
     columns += [
         Column("hdg", "°", tuple(compass(h) for h in heading)),
         Column("speed", "m/s", tuple(f"{v:.2f}" for v in band["speed"].nominal[samples])),

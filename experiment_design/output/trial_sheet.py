@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import textwrap
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,10 +15,12 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from experiment_design.output.legs import Leg
 from experiment_design.output.pictures import draw_commands, draw_plan_track
 from experiment_design.output.prediction import MotionBand, predict_motion
 from experiment_design.output.result import Design
-from experiment_design.output.sheet_contents import Column, SheetContents, sheet_contents, tie
+from experiment_design.output.sheet_contents import Column, SheetContents, sheet_contents
+from experiment_design.output.words import tie
 from greybox.errors import UsageError
 from greybox.files import replacing, write_text
 from greybox.report.figures import new_figure, to_svg
@@ -75,7 +77,9 @@ def sheet_kind(path: str | Path) -> str:
     return ".html" if kind == ".htm" else kind
 
 
-def write_sheet(design: Design, path: str | Path) -> None:
+def write_sheet(
+    design: Design, path: str | Path, legs: Sequence[Sequence[Leg]] | None = None
+) -> None:
     """Write the sheet to take on board, one A4 page a trial.
 
     Several pages are stacked in an SVG or PNG. A table of more way-points than one
@@ -86,6 +90,8 @@ def write_sheet(design: Design, path: str | Path) -> None:
     design : Design
     path : path
         Ends in .pdf, .html, .svg or .png.
+    legs : sequence of sequence of Leg, optional
+        The plan as legs, one entry a trial, to stand in the table.
 
     Raises
     ------
@@ -96,15 +102,21 @@ def write_sheet(design: Design, path: str | Path) -> None:
     bands = predict_motion(design)
     with _quiet_fonts():
         if kind == ".html":
-            write_text(_html(design, bands), path)
+            write_text(_html(design, bands, legs), path)
             return
-        pages = [page for band in bands for page in sheet_figures(design, band)]
+        pages = [
+            page for band in bands for page in sheet_figures(design, band, _of(legs, band.trial))
+        ]
         if kind == ".svg":
             write_text(_stacked_svg(pages), path)
             return
         data = _pdf(pages) if kind == ".pdf" else _stacked_png(pages)
     with replacing(path, "wb") as handle:
         handle.write(data)
+
+
+def _of(legs: Sequence[Sequence[Leg]] | None, trial: int) -> Sequence[Leg]:
+    return legs[trial] if legs else ()
 
 
 def wrap(text: str, width: int, **options: Any) -> list[str]:
@@ -221,7 +233,7 @@ class _Paper:
         )
 
 
-def sheet_figures(design: Design, band: MotionBand) -> list[Figure]:
+def sheet_figures(design: Design, band: MotionBand, legs: Sequence[Leg] = ()) -> list[Figure]:
     """Return the pages of one trial as figures, one unless the table is too long.
 
     Parameters
@@ -229,8 +241,10 @@ def sheet_figures(design: Design, band: MotionBand) -> list[Figure]:
     design : Design
     band : MotionBand
         Of the trial.
+    legs : sequence of Leg
+        Of the trial, empty for commands by the clock.
     """
-    contents = sheet_contents(design, band)
+    contents = sheet_contents(design, band, legs)
     paper = _Paper()
     top = _head(paper, contents)
     bottom = _HEIGHT - _EDGE
@@ -485,18 +499,20 @@ section + section { border-top: 2px solid #ddd; margin-top: 2rem; padding-top: 1
 """
 
 
-def _html(design: Design, bands: tuple[MotionBand, ...]) -> str:
+def _html(
+    design: Design, bands: tuple[MotionBand, ...], legs: Sequence[Sequence[Leg]] | None
+) -> str:
     from jinja2 import Environment
 
-    trials = [_section(design, band) for band in bands]
+    trials = [_section(design, band, _of(legs, band.trial)) for band in bands]
     environment = Environment(autoescape=True, trim_blocks=True)
     environment.filters["tie"] = tie
     return environment.from_string(_TEMPLATE).render(trials=trials)
 
 
-def _section(design: Design, band: MotionBand) -> dict[str, Any]:
+def _section(design: Design, band: MotionBand, legs: Sequence[Leg]) -> dict[str, Any]:
     """Return what the page needs of one trial."""
-    contents = sheet_contents(design, band)
+    contents = sheet_contents(design, band, legs)
     count = len(design.request.schedule.commands)
     fixed = 34 + 15 + 8 + 5 * (len(" ".join(contents.warnings)) // 110 + bool(contents.warnings))
     parts = lay_out_page(contents, count, _HEIGHT - 2 * 10 - fixed)

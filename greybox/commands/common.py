@@ -91,7 +91,7 @@ _INPUTS = (
     "logs", "log", "models", "model", "nominal", "validate", "estimate", "vessel", "prior",
     "between", "area", "raw", "trial",
 )  # fmt: skip
-_OUTPUTS = ("out", "json", "report", "sheet")
+_OUTPUTS = ("out", "json", "report", "sheet", "legs")
 # raw files are hashed as they are imported
 _HASHED = tuple(n for n in _INPUTS if n != "raw")
 # what is typed for the terminal's sake, and changes no result
