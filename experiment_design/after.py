@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +48,15 @@ class Sailed:
     logs: int
     end: Array
     place: tuple[float, float] | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fields for JSON, motions left out."""
+        return {
+            "seconds": self.seconds,
+            "logs": self.logs,
+            "end": self.end.tolist(),
+            "place": None if self.place is None else list(self.place),
+        }
 
     def sentence(self) -> str:
         """Return how much has been sailed."""

@@ -355,7 +355,7 @@ def run(options: argparse.Namespace) -> None:
     write_plan(design, options.out)
     record = provenance(options)
     if options.json:
-        data: dict[str, Any] = design.to_dict()
+        data: dict[str, Any] = design.to_dict() | _of_sailed(sailed)
         data["notes"] = [*prepared.notes, *data["notes"]]
         write_json(data | {"provenance": record}, options.json)
     _show(options, design, prepared.notes)
@@ -363,7 +363,7 @@ def run(options: argparse.Namespace) -> None:
         say(design.summary())
         for note in prepared.notes:
             say(f"Note: {note}")
-        for path in (options.out, options.sheet, options.report):
+        for path in (options.out, options.sheet, options.report, options.save_model):
             if path:
                 say(f"wrote {path}")
 
@@ -469,6 +469,11 @@ def _after(options: argparse.Namespace, vessel: Any) -> tuple[Any, Any, tuple[st
     return model, sailed, (said, *told)
 
 
+def _of_sailed(sailed: Any) -> dict[str, Any]:
+    """Return what the JSON says of what has been sailed."""
+    return {} if sailed is None else {"after": sailed.to_dict()}
+
+
 def _with_known(wishes: Any, options: argparse.Namespace, model: Any) -> Any:
     """Return wishes with what the sailed logs told, at a hold of the model's own samples."""
     from dataclasses import replace
@@ -535,7 +540,7 @@ def _run_for_prediction(
     )
     write_plan(found.design, options.out)
     if options.json:
-        data = found.to_dict()
+        data = found.to_dict() | _of_sailed(sailed)
         data["notes"] = [*prepared.notes, *data["notes"]]
         write_json(data | {"provenance": provenance(options)}, options.json)
     _show(options, found.design, prepared.notes, found.headline())
@@ -543,7 +548,7 @@ def _run_for_prediction(
         say(found.summary())
         for note in prepared.notes:
             say(f"Note: {note}")
-        for path in (options.out, options.sheet, options.report):
+        for path in (options.out, options.sheet, options.report, options.save_model):
             if path:
                 say(f"wrote {path}")
 

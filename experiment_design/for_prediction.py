@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from experiment_design.after import log_moments
 from experiment_design.certificate.certificate import absent
 from experiment_design.design import described
+from experiment_design.excitation.rollout import Motion
 from experiment_design.feasibility.checks import require_horizon
 from experiment_design.feasibility.constraint_satisfaction import (
     ConstraintSatisfaction,
     keep_probability,
 )
-from experiment_design.excitation.rollout import Motion
 from experiment_design.information.envelope import Envelope, build_envelope
 from experiment_design.optimise.campaign import random_campaign
 from experiment_design.optimise.envelope_search import (
@@ -288,14 +288,14 @@ def _design(
             f"--envelope."
         )
     start = ", ".join(
-        f"{n} {x:.3g}" for n, x in zip((*states, "psi"), asked.starts[0], strict=True)
+        f"{n} {x:.3g}" for n, x in zip((*states, "psi"), asked.starts[-1], strict=True)
     )
     design = described(
         asked, problems, units, reference, kept,
         certificate=absent("a plan for prediction has no bound to be measured against"),
         keeping=keeping,
         status="solved: exchange of settings of the operating envelope",
-        notes=(_of_start(start, kept_starts, asked.trials),),
+        notes=_of_start(start, kept_starts, asked.trials),
         evaluations=sum(s.evaluations for s in searches), began=began,
     )  # fmt: skip
     known = _sum(before, log_moments(found, design.motions[1:]))
@@ -320,12 +320,11 @@ def _design(
     )  # fmt: skip
 
 
-def _of_start(start: str, kept: int, trials: int) -> str:
-    if not kept:
-        return f"each trial starts from a steady motion: {start} (--start to change)"
-    if kept < trials:
-        return f"the first trial starts with {start}, the others from a steady motion"
-    return f"{'each' if trials > 1 else 'the'} trial starts with {start}"
+def _of_start(start: str, kept: int, trials: int) -> tuple[str, ...]:
+    if kept >= trials:
+        return ()
+    which = "each trial but the first starts" if kept else "each trial starts"
+    return (f"{which} from a steady motion: {start} (--start to change)",)
 
 
 def _sum(first: Array | None, second: Array | None) -> Array | None:

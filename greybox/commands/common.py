@@ -156,8 +156,9 @@ def require_apart(options: argparse.Namespace) -> None:
             place = Path(path).resolve()
             # a device takes everything
             if place in taken and (place.is_file() or not place.exists()):
+                option = name.replace("_", "-")
                 raise UsageError(
-                    f"--{name.replace('_', '-')} would write over '{path}', which {taken[place]} names too: name "
+                    f"--{option} would write over '{path}', which {taken[place]} names too: name "
                     f"another file."
                 )
             taken[place] = name
