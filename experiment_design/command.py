@@ -33,6 +33,7 @@ EXAMPLES = """examples:
   greybox design --vessel ship.toml --model model.json --duration 600 \\
       --between plain.json current.json --out plan.csv
   greybox design --vessel ship.toml --prior none --duration 900 --out plan.csv
+  greybox design --vessel ship.toml --after part1.csv --remaining 900 --out part2.csv
 """
 
 
@@ -131,6 +132,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--vessel", required=True, metavar="V", help="vessel file (TOML) with limits")
     add("--model", metavar="MODEL", help="prior model of greybox estimate")
     add("--duration", type=positive, metavar="S", help="length of each trial [s]")
+    add(
+        "--after",
+        nargs="+",
+        default=[],
+        metavar="LOG",
+        help="what has been sailed, in this order: the model is estimated on it unless --model "
+        "names one, and the rest of the trial covers what it has not",
+    )
+    add("--remaining", type=positive, metavar="S", help="--duration of that rest [s]")
+    add("--save-model", metavar="FILE", help="write the model that --after estimates (JSON)")
     add("--out", required=True, metavar="PLAN", help="where to write the commands (CSV)")
     add("--json", metavar="F", help="write the design as JSON; - is stdout")
     add("--sheet", metavar="FILE", help="write the sheet to take on board: .pdf, .html, .svg, .png")
@@ -213,7 +224,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="commands change every S s (10; for prediction when the ship has sailed three "
         "quarters of her length)",
     )
-    motion.add_argument("--start", type=_floats, metavar="u,v,r,psi", help="state at the start")
+    motion.add_argument(
+        "--start",
+        type=_floats,
+        metavar="u,v,r,psi",
+        help="state at the start (chosen; with --after where the last log ended)",
+    )
     motion.add_argument(
         "--trials", type=_whole, default=1, metavar="K", help="trials of a campaign (1)"
     )
@@ -224,9 +240,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     motion.add_argument(
         "--position",
         type=_pair,
-        default=(0.0, 0.0),
         metavar="N,E",
-        help="place of the start [m] (0,0)",
+        help="place of the start [m] (0,0; with --after where the last log ended)",
     )
     motion.add_argument(
         "--clearance",
@@ -287,10 +302,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Read, design, write."""
+    from dataclasses import replace
+
     from experiment_design.design import design_trial
     from experiment_design.optimise.duration import least_duration
     from experiment_design.output.result import write_plan
-    from experiment_design.prepare import prepare_request
     from greybox.errors import UsageError
     from greybox.files import check_targets, write_json
     from greybox.model.model import load_model
@@ -298,7 +314,9 @@ def run(options: argparse.Namespace) -> None:
     from greybox.vessel.toml import load_vessel
 
     _place_legs(options)
-    check_targets(options.out, options.json, options.sheet, options.report, options.legs)
+    check_targets(
+        options.out, options.json, options.sheet, options.report, options.legs, options.save_model
+    )
     if options.sheet:
         from experiment_design.output.trial_sheet import sheet_kind
 
@@ -309,27 +327,33 @@ def run(options: argparse.Namespace) -> None:
         raise UsageError(
             f"--prior none starts without any model and {given} names one: leave one of them out."
         )
-    if options.between is None and options.model is None and not untried:
+    _require_stages(options)
+    if options.between is None and options.model is None and not untried and not options.after:
         raise UsageError(
-            "--model is missing: name a prior model, two with --between A B, or start without one "
-            "by --prior none."
+            "--model is missing: name a prior model, two with --between A B, what has been sailed "
+            "with --after LOG, or start without one by --prior none."
         )
     purpose = _purpose(options)
     vessel = load_vessel(options.vessel)
-    if untried:
+    _duration(options)
+    sailed: Any = None
+    told: tuple[str, ...] = ()
+    if options.after:
+        model, sailed, told = _after(options, vessel)
+    elif untried:
         model = semi_empirical_model(vessel)
     else:
-        first = options.between[0] if options.between else options.model
-        model = load_model(first)
-        if purpose == "coefficients":
-            model = model.coefficient_model()
-    if options.duration is None:
-        raise UsageError("--duration is missing: say how long the trial may last, in seconds.")
+        model = load_model(options.between[0] if options.between else options.model)
     if purpose == "prediction":
-        _run_for_prediction(options, model, vessel)
+        _run_for_prediction(options, model, vessel, sailed, told)
         return
-    wishes = _wishes(options, model)
-    prepared = prepare_request(model, wishes, vessel)
+    if not untried:
+        model = model.coefficient_model()
+    wishes = _wishes(options, model, sailed)
+    if sailed is not None:
+        wishes = _with_known(wishes, options, model)
+    prepared, _ = _prepared(options, model, wishes, vessel, sailed)
+    prepared = replace(prepared, notes=(*told, *prepared.notes))
     request = prepared.request
     if options.between:
         _run_between(options, request, prepared.notes)
@@ -351,7 +375,7 @@ def run(options: argparse.Namespace) -> None:
     legs = _write_legs(options, design)
     record = provenance(options)
     if options.json:
-        data: dict[str, Any] = design.to_dict() | _told_of(legs, options)
+        data: dict[str, Any] = design.to_dict() | _told_of(legs, options) | _of_sailed(sailed)
         data["notes"] = [*prepared.notes, *data["notes"]]
         write_json(data | {"provenance": record}, options.json)
     _show(options, design, prepared.notes, legs=legs)
@@ -359,30 +383,180 @@ def run(options: argparse.Namespace) -> None:
         _say(options, design.summary(), prepared.notes, legs)
 
 
-def _run_for_prediction(options: argparse.Namespace, model: Any, vessel: Any) -> None:
+def _require_stages(options: argparse.Namespace) -> None:
+    """Refuse options that contradict a trial in stages.
+
+    Raises
+    ------
+    UsageError
+        Says which to leave out.
+    """
+    from greybox.errors import UsageError
+
+    if not options.after:
+        if options.save_model:
+            raise UsageError("--save-model writes the model that --after LOG estimates: name LOG.")
+        return
+    if options.prior == NO_PRIOR:
+        raise UsageError(
+            "--prior none starts without any trial and --after names one: leave one of them out."
+        )
+    if options.prior:
+        raise UsageError(
+            "--after takes what its logs told as known beforehand: leave out --prior, and name all "
+            "logs behind --after."
+        )
+    if options.between:
+        raise UsageError(
+            "--after designs the rest of a trial for one model and --between tells two apart: "
+            "leave one of them out."
+        )
+    if options.save_model and options.model:
+        raise UsageError(
+            "--save-model writes the model that --after estimates and --model names one that is "
+            "there: leave one of them out."
+        )
+
+
+def _duration(options: argparse.Namespace) -> float:
+    """Return how long the trial may last [s], by either of its names.
+
+    Raises
+    ------
+    UsageError
+        Neither name is given, or both with different numbers.
+    """
+    from greybox.errors import UsageError
+
+    first, second = options.duration, options.remaining
+    if first is not None and second is not None and first != second:
+        raise UsageError(
+            f"--duration is {first:g} and --remaining {second:g}, two names of one time: give one."
+        )
+    found = second if first is None else first
+    if found is None:
+        raise UsageError(
+            "--remaining is missing: say how long the rest of the trial may last, in seconds."
+            if options.after
+            else "--duration is missing: say how long the trial may last, in seconds."
+        )
+    return float(found)
+
+
+def _after(options: argparse.Namespace, vessel: Any) -> tuple[Any, Any, tuple[str, ...]]:
+    """Return the model of what has been sailed, that itself, and sentences on both."""
+    from dataclasses import replace
+
+    from experiment_design.after import sailed_trial
+    from greybox.commands.common import read_logs
+    from greybox.model.catalogue import get_structure
+    from greybox.model.model import load_model
+    from greybox.selection.estimate import estimate_requested
+    from greybox.selection.prediction import as_read, require_distinct
+    from greybox.selection.request import Request
+    from greybox.trial.kinematics import decimate_segments
+    from greybox.validation.fit import at_model_rate
+
+    count = len(options.after)
+    if options.model:
+        model = load_model(options.model)
+        logs, told = read_logs(options.after, vessel, None, model.structure.states)
+        require_distinct(logs)
+        at_model_rate(logs[0], model)
+        acting = [replace(log, vessel=model.vessel) for log in logs]
+        logs, left_out = decimate_segments(acting, model.sample_time)
+        sailed = sailed_trial(model, logs, count)
+        said = f"{sailed.sentence()} count as known, moved as {Path(options.model).name} says"
+        return model, sailed, (said, *told, *left_out)
+    logs, told = read_logs(options.after, vessel, None, get_structure("thesis").states)
+    estimate = estimate_requested(logs, Request(seed=options.seed))
+    estimate = replace(estimate, notes=(*told, *estimate.notes))
+    model = estimate.model()
+    model = replace(model, record={**model.record, "provenance": provenance(options)})
+    if options.save_model:
+        model.save(options.save_model)
+    sailed = sailed_trial(model, as_read(logs, estimate), count)
+    level = estimate.prediction.level if estimate.prediction else "not judged"
+    said = (
+        f"estimated on {sailed.sentence()}: {estimate.method} of structure "
+        f"'{model.structure.name}', its prediction is {level}"
+    )
+    return model, sailed, (said, *told)
+
+
+def _of_sailed(sailed: Any) -> dict[str, Any]:
+    """Return what the JSON says of what has been sailed."""
+    return {} if sailed is None else {"after": sailed.to_dict()}
+
+
+def _with_known(wishes: Any, options: argparse.Namespace, model: Any) -> Any:
+    """Return wishes with what the sailed logs told, at a hold of the model's own samples."""
+    from dataclasses import replace
+
+    hold = wishes.hold
+    if options.hold is None:
+        hold = max(1, round(hold / model.sample_time)) * model.sample_time
+    return replace(wishes, hold=hold, prior=model)
+
+
+def _prepared(
+    options: argparse.Namespace, model: Any, wishes: Any, vessel: Any, sailed: Any
+) -> tuple[Any, bool]:
+    """Return the prepared request, and whether its first trial starts where the logs ended."""
+    from dataclasses import replace
+
+    from experiment_design.after import lacking_margin
+    from experiment_design.prepare import prepare_request
+    from greybox.errors import InfeasibleError
+
+    if sailed is None or options.start is not None:
+        return prepare_request(model, wishes, vessel), False
+    ended = ", ".join(
+        f"{n} {x:.3g}" for n, x in zip((*model.structure.states, "psi"), sailed.end, strict=True)
+    )
+    try:
+        found = prepare_request(model, replace(wishes, start=sailed.end), vessel)
+        lacking = lacking_margin(found.request)
+    except InfeasibleError:
+        lacking = "some state"
+    if not lacking:
+        said = f"it starts where the last log ended: {ended} (--start to change)"
+        return replace(found, notes=(said, *found.notes)), True
+    found = prepare_request(model, wishes, vessel)
+    said = (
+        f"the last log ended with {ended}, where {lacking} does not keep its margin: steady the "
+        f"ship before this plan begins"
+    )
+    return replace(found, notes=(said, *found.notes)), False
+
+
+def _run_for_prediction(
+    options: argparse.Namespace, model: Any, vessel: Any, sailed: Any, told: tuple[str, ...]
+) -> None:
     """Design the trial that serves predictions and write it."""
     from dataclasses import replace
 
     from experiment_design.for_prediction import design_for_prediction
     from experiment_design.output.result import write_plan
-    from experiment_design.prepare import both_sides, prepare_request
+    from experiment_design.prepare import both_sides
     from greybox.files import write_json
 
-    wishes = both_sides(_wishes(options, model), model, options.hold)
-    prepared = prepare_request(model, wishes, vessel)
+    wishes = both_sides(_wishes(options, model, sailed), model, options.hold)
+    prepared, ended = _prepared(options, model, wishes, vessel, sailed)
     # where the trial starts, and how near sway comes to zero, is told by the plan itself
     own = [n for n in prepared.notes if not n.startswith(("the first trial", "margin of v"))]
-    prepared = replace(prepared, notes=tuple(own))
+    prepared = replace(prepared, notes=(*told, *own))
     found = design_for_prediction(
         prepared.request,
         model,
         envelope=dict(_range(text, vessel) for text in options.envelope),
-        keep_start=options.start is not None,
+        kept_starts=options.trials if options.start is not None else int(ended),
+        sailed=sailed.motions if sailed is not None else (),
     )
     write_plan(found.design, options.out)
     legs = _write_legs(options, found.design)
     if options.json:
-        data = found.to_dict() | _told_of(legs, options)
+        data = found.to_dict() | _told_of(legs, options) | _of_sailed(sailed)
         data["notes"] = [*prepared.notes, *data["notes"]]
         write_json(data | {"provenance": provenance(options)}, options.json)
     _show(options, found.design, prepared.notes, found.headline(), legs)
@@ -508,7 +682,7 @@ def _say(options: argparse.Namespace, summary: str, notes: tuple[str, ...], legs
         say(legs.sentence())
     for note in notes:
         say(f"Note: {note}")
-    for path in (options.out, options.legs, options.sheet, options.report):
+    for path in (options.out, options.legs, options.sheet, options.report, options.save_model):
         if path:
             say(f"wrote {path}")
 
@@ -533,7 +707,7 @@ def _show(
         write_page(page, options.report)
 
 
-def _wishes(options: argparse.Namespace, model: Any) -> Any:
+def _wishes(options: argparse.Namespace, model: Any, sailed: Any = None) -> Any:
     import numpy as np
 
     from experiment_design.constraints.limits import Circle, TrialLimits
@@ -551,10 +725,13 @@ def _wishes(options: argparse.Namespace, model: Any) -> Any:
         if len(options.circle) != 3 or not options.circle[2] > 0:
             raise UsageError("--circle needs three numbers: north, east and a positive radius.")
         area = Circle(*options.circle)
+    place = (0.0, 0.0) if options.position is None else options.position
+    if options.position is None and area is not None and sailed is not None and sailed.place:
+        place = sailed.place
     limits = TrialLimits(
         margin_air=options.margin_air,
         area=area,
-        position=options.position,
+        position=place,
         clearance=options.clearance,
         speed_cap=options.speed_cap,
         yaw_cap=options.yaw_cap,
@@ -572,7 +749,7 @@ def _wishes(options: argparse.Namespace, model: Any) -> Any:
         criterion = next(c for c in CRITERIA.values() if c.combined)
     process = None if options.process_noise is None else np.array(options.process_noise)
     return Wishes(
-        duration=options.duration,
+        duration=_duration(options),
         hold=options.hold or 10.0,
         regime=options.regime or "auto",
         margin_u=options.margin_u,

@@ -377,7 +377,9 @@ def _criterion_value(
 ) -> float:
     if problems[0].contrast is not None:
         return float(problems[0].evaluate(units[0][None]).value[0])
-    return float(criterion.of_covariance(covariance[None])[0])
+    # of a parameter that the trial does not tell the covariance is infinite
+    with np.errstate(invalid="ignore"):
+        return float(criterion.of_covariance(covariance[None])[0])
 
 
 def _tighten(

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from experiment_design.after import log_moments
 from experiment_design.certificate.certificate import absent
 from experiment_design.design import described
+from experiment_design.excitation.rollout import Motion
 from experiment_design.feasibility.checks import require_horizon
 from experiment_design.feasibility.constraint_satisfaction import (
     ConstraintSatisfaction,
@@ -199,7 +201,8 @@ def design_for_prediction(
     model: ManoeuvringModel,
     *,
     envelope: Mapping[str, tuple[float, float]] | None = None,
-    keep_start: bool = False,
+    kept_starts: int = 0,
+    sailed: Sequence[Motion] = (),
 ) -> PredictionDesign:
     """Design the trial that leaves the least error of predictions over the operating envelope.
 
@@ -211,8 +214,11 @@ def design_for_prediction(
         The prior, with what its own trial showed.
     envelope : mapping of str to (float, float), optional
         Range of commands that the model is wanted for; see `command_ranges`.
-    keep_start : bool
-        Whether the trial starts as the request says; else on a straight course in the envelope.
+    kept_starts : int
+        Trials, from the first, that start as the request says; the others on a straight course
+        in the envelope.
+    sailed : sequence of Motion
+        What has been sailed, as `sailed_trial` gives it: the plan covers what it has not.
 
     Returns
     -------
@@ -230,14 +236,15 @@ def design_for_prediction(
     from threadpoolctl import threadpool_limits
 
     with threadpool_limits(1, "blas"):
-        return _design(request, model, envelope or {}, keep_start)
+        return _design(request, model, envelope or {}, kept_starts, sailed)
 
 
 def _design(
     request: DesignRequest,
     model: ManoeuvringModel,
     given: Mapping[str, tuple[float, float]],
-    keep_start: bool,
+    kept_starts: int,
+    sailed: Sequence[Motion],
 ) -> PredictionDesign:
     began = time.perf_counter()
     require_horizon(request)
@@ -258,10 +265,11 @@ def _design(
         problem.scenarios[0].rollout, predictor, request.noise, request.schedule, ranges, speeds,
         misfit, request.seed,
     )  # fmt: skip
-    if not keep_start:
-        request = replace(request, starts=(found.rollout.start,) * request.trials)
+    others = (found.rollout.start,) * request.trials
+    request = replace(request, starts=(*request.starts[:kept_starts], *others[kept_starts:]))
     asked = request
-    request, searches, keeping = _searched(request, found)
+    before = log_moments(found, sailed)
+    request, searches, keeping = _searched(request, found, before)
     problems = [build_problem(asked, t) for t in range(asked.trials)]
     reference, number = random_campaign(problems, asked.seed)
     units = [s.candidate.unit for s in searches]
@@ -280,18 +288,17 @@ def _design(
             f"--envelope."
         )
     start = ", ".join(
-        f"{n} {x:.3g}" for n, x in zip((*states, "psi"), asked.starts[0], strict=True)
+        f"{n} {x:.3g}" for n, x in zip((*states, "psi"), asked.starts[-1], strict=True)
     )
     design = described(
         asked, problems, units, reference, number,
         certificate=absent("a plan for prediction has no bound to be measured against"),
         keeping=keeping,
         status="solved: exchange of settings of the operating envelope",
-        notes=(f"each trial starts from a steady motion: {start} (--start to change)",),
+        notes=_of_start(start, kept_starts, asked.trials),
         evaluations=sum(s.evaluations for s in searches), began=began,
     )  # fmt: skip
-    others = [found.information(m)[0] for m in design.motions[1:]]
-    known = np.sum(others, axis=0) if others else None
+    known = _sum(before, log_moments(found, design.motions[1:]))
     noise, bias = found.errors(design.motions[0], known)
     whole = np.sqrt(float((noise + bias).mean()))
     kept = searches[0].random[np.isfinite(searches[0].random)]
@@ -314,11 +321,24 @@ def _design(
     )  # fmt: skip
 
 
+def _of_start(start: str, kept: int, trials: int) -> tuple[str, ...]:
+    if kept >= trials:
+        return ()
+    which = "each trial but the first starts" if kept else "each trial starts"
+    return (f"{which} from a steady motion: {start} (--start to change)",)
+
+
+def _sum(first: Array | None, second: Array | None) -> Array | None:
+    if first is None or second is None:
+        return second if first is None else first
+    return first + second
+
+
 def _searched(
-    request: DesignRequest, envelope: Envelope
+    request: DesignRequest, envelope: Envelope, before: Array | None
 ) -> tuple[DesignRequest, list[EnvelopeSearch], ConstraintSatisfaction | None]:
     """Search all trials, with limits tightened until they are kept with the wanted probability."""
-    searches = _campaign(request, envelope)
+    searches = _campaign(request, envelope, before)
     if not request.uncertain:
         return request, searches, None
     plain = request
@@ -330,7 +350,7 @@ def _searched(
             break
         backoff = backoff + 1.1 * shortfall
         tighter = replace(plain, backoff=tuple(backoff))
-        again = _campaign(tighter, envelope)
+        again = _campaign(tighter, envelope, before)
         now = keep_probability(plain, [s.candidate.unit for s in again])
         shortfall = now.shortfall
         if now.probability > best[2].probability:
@@ -338,9 +358,11 @@ def _searched(
     return best
 
 
-def _campaign(request: DesignRequest, envelope: Envelope) -> list[EnvelopeSearch]:
+def _campaign(
+    request: DesignRequest, envelope: Envelope, before: Array | None
+) -> list[EnvelopeSearch]:
     found: list[EnvelopeSearch] = []
-    known: Array | None = None
+    known = before
     for trial in range(request.trials):
         problem = build_problem(request, trial)
         search = search_envelope(
@@ -348,8 +370,9 @@ def _campaign(request: DesignRequest, envelope: Envelope) -> list[EnvelopeSearch
         )
         found.append(search)
         commands = problem.schedule.expand(problem.levels(search.candidate.unit))
-        own = envelope.information(problem.scenarios[0].rollout.run(commands[None]))[0]
-        known = own if known is None else known + own
+        known = _sum(
+            known, envelope.information(problem.scenarios[0].rollout.run(commands[None]))[0]
+        )
     return found
 
 

@@ -48,7 +48,7 @@ _NAMED = {
 _PATHS = frozenset(_METAVARS.values()) - {Kind.PARAMETER}
 # as greybox.vessel.toml knows them, which takes long to load
 EXAMPLE_VESSELS = ("thesis", "ferry")
-_OUTPUTS = ("out", "json", "report", "sheet", "legs")
+_OUTPUTS = ("out", "json", "report", "sheet", "legs", "save_model")
 
 
 def kind_of(action: argparse.Action) -> Kind:

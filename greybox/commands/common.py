@@ -89,9 +89,9 @@ def read_logs(
 # options that name files to read, and to write
 _INPUTS = (
     "logs", "log", "models", "model", "nominal", "validate", "estimate", "vessel", "prior",
-    "between", "area", "raw", "trial",
+    "between", "area", "raw", "trial", "after",
 )  # fmt: skip
-_OUTPUTS = ("out", "json", "report", "sheet", "legs")
+_OUTPUTS = ("out", "json", "report", "sheet", "legs", "save_model")
 # raw files are hashed as they are imported
 _HASHED = tuple(n for n in _INPUTS if n != "raw")
 # what is typed for the terminal's sake, and changes no result
@@ -156,8 +156,9 @@ def require_apart(options: argparse.Namespace) -> None:
             place = Path(path).resolve()
             # a device takes everything
             if place in taken and (place.is_file() or not place.exists()):
+                option = name.replace("_", "-")
                 raise UsageError(
-                    f"--{name} would write over '{path}', which {taken[place]} names too: name "
+                    f"--{option} would write over '{path}', which {taken[place]} names too: name "
                     f"another file."
                 )
             taken[place] = name

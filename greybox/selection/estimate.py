@@ -248,6 +248,10 @@ def _leaves_more(estimate: Estimate) -> bool:
     told = LargeError | RunsDiverge | RefitsDiverge | Divergence | Elsewhere
     if any(isinstance(r, told) for r in judged.because):
         return True
+    if ESTIMATORS[estimate.method].instruments:
+        # instruments that contradict a structure are told by their own test, and where they do
+        # not, its runs err by the noise in the coefficients
+        return False
     return any(
         c.rmse**2 - (c.noise or 0.0) ** 2 > (_SMALL * c.spread) ** 2
         for c in judged.channels
