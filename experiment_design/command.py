@@ -8,15 +8,7 @@ from typing import Any
 
 from experiment_design.information.estimators import ESTIMATORS
 from experiment_design.information.optimality import CRITERIA
-from greybox.commands.common import (
-    add_seed,
-    count,
-    positive,
-    progress,
-    provenance,
-    require_apart,
-    say,
-)
+from greybox.commands.common import add_seed, count, positive, progress, provenance, say
 from greybox.model.predictor_kinds import PREDICTORS
 from greybox.registry import Registry
 
@@ -145,15 +137,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--out", required=True, metavar="PLAN", help="where to write the commands (CSV)")
     add("--json", metavar="F", help="write the design as JSON; - is stdout")
     add("--sheet", metavar="FILE", help="write the sheet to take on board: .pdf, .html, .svg, .png")
+    add("--report", metavar="HTML", help="write a page with pictures and what the plan is worth")
     add(
         "--legs",
         nargs="?",
         const="",
         metavar="FILE",
-        help="write the plan as legs, too, that end by time, heading, speed or yaw rate: JSON with "
-        "a CSV beside it, and on the sheet (PLAN's name with .legs.json)",
+        help="write the plan as legs too, that end by time, heading, speed or yaw rate: JSON, a "
+        "CSV beside it, and words on the sheet (PLAN with the ending .legs.json)",
     )
-    add("--report", metavar="HTML", help="write a page with pictures and what the plan is worth")
     goal = parser.add_argument_group("what is to be learnt")
     goal.add_argument(
         "--for",
@@ -313,9 +305,15 @@ def run(options: argparse.Namespace) -> None:
     from greybox.model.semi_empirical import semi_empirical_model
     from greybox.vessel.toml import load_vessel
 
-    _place_legs(options)
+    legs = None
+    if options.legs is not None:
+        from experiment_design.output.legs_file import csv_path, legs_path
+
+        legs = legs_path(options.legs, options.out)
+        options.legs = str(legs)
+    twin = None if legs is None else csv_path(legs)
     check_targets(
-        options.out, options.json, options.sheet, options.report, options.legs, options.save_model
+        options.out, options.json, options.sheet, options.report, legs, twin, options.save_model
     )
     if options.sheet:
         from experiment_design.output.trial_sheet import sheet_kind
@@ -372,15 +370,23 @@ def run(options: argparse.Namespace) -> None:
         workers=options.workers,
     )
     write_plan(design, options.out)
-    legs = _write_legs(options, design)
+    legs, said = _legs(options, design)
     record = provenance(options)
     if options.json:
-        data: dict[str, Any] = design.to_dict() | _told_of(legs, options) | _of_sailed(sailed)
+        data: dict[str, Any] = design.to_dict() | said | _of_sailed(sailed)
         data["notes"] = [*prepared.notes, *data["notes"]]
         write_json(data | {"provenance": record}, options.json)
-    _show(options, design, prepared.notes, legs=legs)
+    _show(options, design, prepared.notes, legs)
     if options.json != "-":
-        _say(options, design.summary(), prepared.notes, legs)
+        say(design.summary())
+        _say_legs(legs)
+        for note in prepared.notes:
+            say(f"Note: {note}")
+        for path in (
+            options.out, options.legs, options.sheet, options.report, options.save_model,
+        ):  # fmt: skip
+            if path:
+                say(f"wrote {path}")
 
 
 def _require_stages(options: argparse.Namespace) -> None:
@@ -554,14 +560,22 @@ def _run_for_prediction(
         sailed=sailed.motions if sailed is not None else (),
     )
     write_plan(found.design, options.out)
-    legs = _write_legs(options, found.design)
+    legs, said = _legs(options, found.design)
     if options.json:
-        data = found.to_dict() | _told_of(legs, options) | _of_sailed(sailed)
+        data = found.to_dict() | said | _of_sailed(sailed)
         data["notes"] = [*prepared.notes, *data["notes"]]
         write_json(data | {"provenance": provenance(options)}, options.json)
-    _show(options, found.design, prepared.notes, found.headline(), legs)
+    _show(options, found.design, prepared.notes, legs, found.headline())
     if options.json != "-":
-        _say(options, found.summary(), prepared.notes, legs)
+        say(found.summary())
+        _say_legs(legs)
+        for note in prepared.notes:
+            say(f"Note: {note}")
+        for path in (
+            options.out, options.legs, options.sheet, options.report, options.save_model,
+        ):  # fmt: skip
+            if path:
+                say(f"wrote {path}")
 
 
 def _range(text: str, vessel: Any) -> tuple[str, tuple[float, float]]:
@@ -622,83 +636,55 @@ def _run_between(options: argparse.Namespace, request: Any, notes: tuple[str, ..
         workers=options.workers,
     )
     write_plan(found.design, options.out)
-    legs = _write_legs(options, found.design)
+    legs, said = _legs(options, found.design)
     if options.json:
-        data = found.to_dict() | _told_of(legs, options)
+        data = found.to_dict() | said
         data["notes"] = [*notes, *data["notes"]]
         write_json(data | {"provenance": provenance(options)}, options.json)
     lines = found.summary().splitlines()
-    _show(options, found.design, notes, f"{lines[0]}: {lines[3]}.", legs)
+    _show(options, found.design, notes, legs, f"{lines[0]}: {lines[3]}.")
     if options.json != "-":
-        _say(options, found.summary(), notes, legs)
+        say(found.summary())
+        _say_legs(legs)
+        for note in notes:
+            say(f"Note: {note}")
+        for path in (options.out, options.legs, options.sheet, options.report):
+            if path:
+                say(f"wrote {path}")
 
 
-def _place_legs(options: argparse.Namespace) -> None:
-    """Name the file of legs where it was left open, and refuse one that cannot be it.
-
-    Raises
-    ------
-    UsageError
-        It is no JSON, or it or the CSV beside it would replace another file.
-    """
-    from experiment_design.output.legs import csv_twin
-    from greybox.errors import UsageError
-
+def _legs(options: argparse.Namespace, design: Any) -> tuple[Any, dict[str, Any]]:
+    """Return the plan as legs, written where asked for, and what the JSON says of them."""
     if options.legs is None:
-        return
-    if not options.legs:
-        options.legs = str(Path(options.out).with_suffix(".legs.json"))
-    if Path(options.legs).suffix.lower() != ".json":
-        raise UsageError(f"--legs '{options.legs}' has no ending .json: name a JSON file.")
-    require_apart(options)
-    twin = csv_twin(options.legs)
-    others = (options.out, options.json, options.area, options.sheet)
-    if twin.resolve() in [Path(p).resolve() for p in others if p]:
-        raise UsageError(
-            f"--legs writes '{twin}' too, which another option names: name another file, such as "
-            f"{Path(options.out).with_suffix('.legs.json')}."
-        )
+        return None, {}
+    from threadpoolctl import threadpool_limits
+
+    from experiment_design.output.legs import legs_of
+    from experiment_design.output.legs_file import write_legs
+
+    with threadpool_limits(1, "blas"):
+        plan = legs_of(design)
+    write_legs(design, plan, Path(options.legs))
+    return plan, {"legs": {"file": options.legs, **plan.to_dict()}}
 
 
-def _write_legs(options: argparse.Namespace, design: Any) -> Any:
-    """Write the plan as legs where they were asked for, and return them, else None."""
-    if options.legs is None:
-        return None
-    from experiment_design.output.legs import legs_of, write_legs
-
-    legs = legs_of(design)
-    write_legs(legs, design, options.legs)
-    return legs
-
-
-def _told_of(legs: Any, options: argparse.Namespace) -> dict[str, Any]:
-    return {} if legs is None else {"legs": legs.to_dict(options.legs)}
-
-
-def _say(options: argparse.Namespace, summary: str, notes: tuple[str, ...], legs: Any) -> None:
-    """Print what was found and which files were written."""
-    say(summary)
+def _say_legs(legs: Any) -> None:
     if legs is not None:
         say(legs.sentence())
-    for note in notes:
-        say(f"Note: {note}")
-    for path in (options.out, options.legs, options.sheet, options.report, options.save_model):
-        if path:
-            say(f"wrote {path}")
 
 
 def _show(
     options: argparse.Namespace,
     design: Any,
     notes: tuple[str, ...],
-    headline: str = "",
     legs: Any = None,
+    headline: str = "",
 ) -> None:
     """Write the sheet and the page that were asked for."""
     if options.sheet:
         from experiment_design.output.trial_sheet import write_sheet
 
-        write_sheet(design, options.sheet, None if legs is None else legs.trials)
+        write_sheet(design, options.sheet, legs)
     if options.report:
         from experiment_design.output.report import design_page
         from greybox.report.page import write_page

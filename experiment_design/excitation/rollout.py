@@ -116,8 +116,8 @@ class Rollout:
         return self._run(self.theta, commands, late)
 
     def run_models(self, thetas: Array, commands: Array, *, late: bool = False) -> Motion:
-        """Run other parameters (R, p) on the same commands (N, nc)."""
-        together = np.broadcast_to(commands, (len(thetas), *commands.shape))
+        """Run other parameters (R, p) on the same commands (N, nc), or each on its own."""
+        together = np.broadcast_to(commands, (len(thetas), *commands.shape[-2:]))
         return self._run(thetas, together, late)
 
     def _run(self, theta: Array, commands: Array, late: bool) -> Motion:

@@ -1,353 +1,301 @@
-"""A plan as legs that end by time, change of heading, speed or yaw rate.
+"""A plan as legs: settings that are held until the ship has done something, at most for a time.
 
-A plan by the clock takes the ship where its model says. Where the ship turns or slows down
-otherwise, headings drift away from the plan with every hold. A crew, or an autopilot, that
-ends a leg by what the ship does brings her back to the plan at its end.
+A sequence by the clock asks of a ship that differs from the prior what it asks of the prior: each
+difference adds up over the trial. A leg that ends when the heading has changed by what the plan is
+about gives it back at its end. Which end serves a leg best is found by sailing it, in closed loop,
+under models drawn from the prior's uncertainty.
 """
 
 from __future__ import annotations
 
-import json
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any, Literal, get_args
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from experiment_design.excitation.rollout import Rollout
+from experiment_design.constraints.limit_program import LimitProgram
+from experiment_design.excitation.rollout import Motion, Rollout
+from experiment_design.excitation.schedule import Schedule
 from experiment_design.output.result import Design
-from experiment_design.output.words import SIDES
 from experiment_design.request.request import DesignRequest
-from greybox.errors import LogError
-from greybox.files import replacing, write_json
-from greybox.model.run.simulation import simulate
-from greybox.model.structure import Structure
-from greybox.vessel.actuation import actuated_force
+from greybox.model.predictor_kinds import PREDICTORS
 
 Array = NDArray[np.float64]
-Kind = Literal["time", "heading", "speed", "yaw_rate"]
+Samples = NDArray[np.intp]
+End = Literal["time", "heading", "speed", "yaw_rate"]
+Since = Literal["leg", "trial"]
 
-FORMAT, VERSION = "greybox-legs", 1
-# models drawn to choose the triggers by, and the stream of their chance
-DRAWS, _STREAM = 40, 23
-# by which share, up or down, the damping of a drawn model is off beside the prior's covariance:
-# what the structure lacks is in no covariance
-MISFIT = 0.15
-# holds with commands nearer than this share of their range are one leg
-_ALIKE = 0.01
-# latest end over the expected one; least change of heading [rad] and samples of a leg that
-# ends otherwise than by time; by how much another trigger must be better than time
-_LATEST, _LEAST_TURN, _LEAST_SAMPLES, _BETTER = 1.5, np.deg2rad(10.0), 3, 0.9
-# share of the drawn models that may end a leg before this share of its expected time
-_FEW, _SHORTEST = 0.05, 1 / 3
-# share of its spread below which a state is as good as on the plan
-_FINE = 0.1
-# what a crew reads and sets: heading and yaw rate in deg and deg/s, speed in m/s
-# deviations of its sensor by which a speed or yaw rate must change to be seen to
-_SEEN = 5.0
-_ROUND: dict[Kind, float] = {"heading": np.deg2rad(1), "speed": 0.01, "yaw_rate": np.deg2rad(0.01)}
-# triggers that a trial may be restricted to, beside time; the last one is time alone
-_CHOICES: tuple[Kind | None, ...] = (None, "heading", "yaw_rate", "time")
-_STATE: dict[Kind, str] = {"heading": "psi", "speed": "u", "yaw_rate": "r"}
-_FIELD: dict[Kind, str] = {
-    "time": "after", "heading": "change", "speed": "value", "yaw_rate": "value",
-}  # fmt: skip
-# magnitude past which a state counts as run away [m/s, rad/s]
-_BOUND = 100.0
-# lags after which a command of before is forgotten
-_FORGOTTEN = 10.0
+# models that ends are chosen under, and that the limits are judged under
+_CHOICE, _JUDGED = 40, 200
+# relative standard error of each coefficient where the prior states none: an estimate of one
+# trial predicts other trials about as well as this
+_MISFIT = 0.15
+# changes of heading that a helmsman would not wait for; samples of the shortest leg that waits
+_LEAST_TURN, _LEAST_SAMPLES = np.deg2rad(10.0), 3
+# and above which a compass shows the same heading twice on the way, or nearly
+_MOST_TURN = np.deg2rad(270.0)
+# what the scatter must fall by before a leg ends by anything but the clock
+_GAIN = 0.1
+# how much the end of the trial, sailed on by the clock, counts beside the end of the leg
+_LATER = 0.25
+# share of a leg by which its end under the prior may differ from the plan, and by which the noise
+# of the sensor may move it
+_SHIFT, _NOISY = 0.15, 0.1
+# latest end over the expected one: least and most; share of the models that have ended by then
+_LATEST = (1.2, 2.0)
+_ENDED = 0.95
+# scatter that no sensor or helmsman would see: heading [rad]; place [ship lengths]
+_HEADING_SEEN, _PLACE_SEEN = np.deg2rad(1.0), 0.2
 
 
 @dataclass(frozen=True)
 class Leg:
-    """Commands that are held until something happens.
+    """Commands that are held until the ship has done something.
 
     Parameters
     ----------
-    commands : dict of str to float
-        Column -> value, in the log's unit, angles [rad].
-    kind : {"time", "heading", "speed", "yaw_rate"}
-        What ends the leg.
+    commands : mapping of str to float
+        Each column: speeds in the log's unit, angles [rad].
+    until : {"time", "heading", "speed", "yaw_rate"}
+        What ends it.
     value : float
-        Time since the leg's start [s]; signed change of heading since then, positive to
-        starboard [rad]; surge speed [m/s]; yaw rate [rad/s].
+        Time since its start [s], change of heading [rad], speed over ground [m/s] or yaw
+        rate [rad/s].
     at_most : float
-        Time after which the leg ends whatever happens [s].
+        When it ends at the latest, since its start [s].
     expected : float
-        Time that it takes by the plan [s].
+        When it ends under the prior model [s].
+    at_least : float
+        Before which only the clock may end it [s].
     rising : bool
-        Whether speed or yaw rate rise to the value, or fall to it.
+        Whether what ends it is reached from below; else from above.
+    since : {"leg", "trial"}
+        Whose start a change of heading counts from.
     """
 
     commands: Mapping[str, float]
-    kind: Kind
+    until: End
     value: float
     at_most: float
     expected: float
+    at_least: float = 0.0
     rising: bool = True
+    since: Since = "leg"
 
-    @property
-    def words(self) -> str:
-        """When the leg ends, as it is said to a crew."""
-        if self.kind == "time":
-            return f"for {_seconds(self.value)}"
-        return f"until the {self._event()}, at the latest after {_seconds(self.at_most)}"
+    def until_dict(self) -> dict[str, Any]:
+        """Return what ends it, for JSON."""
+        if self.until == "time":
+            return {"kind": "time", "after": self.value}
+        crossing = {"crossing": "up" if self.rising else "down"}
+        if self.until == "heading":
+            return {"kind": "heading", "change": self.value, "since": self.since, **crossing}
+        return {"kind": self.until, "value": self.value, **crossing}
 
-    @property
-    def short(self) -> str:
-        """The same for a narrow cell of a table."""
-        if self.kind == "time":
-            return f"for {_seconds(self.value)}"
-        event = self._event().replace("yaw rate", "turn").replace(" has changed", "")
-        event = event.replace(" has risen", "").replace(" has fallen", "")
-        return f"until {event}, at most {_seconds(self.at_most)}"
 
-    def _event(self) -> str:
-        moved = "risen" if self.rising else "fallen"
-        if self.kind == "heading":
-            side = SIDES["r", 1 if self.value >= 0 else -1]
-            return f"heading has changed {abs(np.rad2deg(self.value)):.0f}° {side}"
-        if self.kind == "speed":
-            ahead = f" {SIDES['u', -1]}" if self.value < 0 else ""
-            if self.value < 0:
-                moved = "fallen" if self.rising else "risen"
-            return f"speed has {moved} to {abs(self.value):.2f} m/s{ahead}"
-        rate = abs(np.rad2deg(self.value))
-        if round(rate, 2) == 0:
-            return "yaw rate is zero"
-        side = SIDES["r", 1 if self.value > 0 else -1]
-        if self.value < 0:
-            moved = "fallen" if self.rising else "risen"
-        return f"yaw rate has {moved} to {rate:.2f}°/s {side}"
+@dataclass(frozen=True)
+class SailedLegs:
+    """Legs sailed by R models.
 
-    def first(self, path: Array, sample_time: float) -> NDArray[np.intp]:
-        """Return after how many samples each run (R, ≥M+1, n) of signals ends the leg.
+    Parameters
+    ----------
+    motion : Motion
+        (R, N+1, ·); each model's states after the end of its last leg mean nothing.
+    ends : ndarray of int
+        (R, L) sample at which each leg ended.
+    """
 
-        Parameters
-        ----------
-        path : ndarray
-            (R, M+1) the state that `kind` looks at, from the leg's start.
-        sample_time : float
-            [s]
-        """
-        most = min(max(1, round(self.at_most / sample_time)), path.shape[1] - 1)
-        if self.kind == "time":
-            return np.full(len(path), most, np.intp)
-        seen = path[:, 1 : most + 1]
-        if self.kind == "heading":
-            there = np.sign(self.value) * (seen - path[:, :1]) >= abs(self.value) - 1e-9
-        else:
-            there = seen >= self.value if self.rising else seen <= self.value
-        return np.asarray(np.where(there.any(axis=1), there.argmax(axis=1) + 1, most), np.intp)
+    motion: Motion
+    ends: Samples
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the fields for JSON."""
-        until: dict[str, Any] = {"kind": self.kind, _FIELD[self.kind]: self.value}
-        if self.kind in ("speed", "yaw_rate"):
-            until["when"] = "rising" if self.rising else "falling"
-        return {
-            "commands": dict(self.commands),
-            "until": until,
-            "at_most": self.at_most,
-            "expected": self.expected,
-            "words": self.words,
-        }
+    def at_ends(self) -> Array:
+        """Return the states (R, L, nx+3) at the end of each leg."""
+        return np.asarray(np.take_along_axis(self.motion.state, self.ends[..., None], axis=1))
 
 
 @dataclass(frozen=True)
 class LegPlan:
-    """The legs of a design, and how far headings are off the plan at their ends.
+    """A plan as legs, and how they stand to the sequence by the clock.
 
     Parameters
     ----------
     trials : tuple of tuple of Leg
-    scatter, by_clock : float
-        Root mean square of the heading about the plan at the legs' ends, over drawn models:
-        of the legs, and of the same commands by the clock [rad].
+    keeps_limits, by_clock : float
+        Probability of keeping the path limits, as legs and by the clock.
+    off, off_by_clock : dict of str to float
+        Root mean squared distance from the plan at the ends of legs [m/s, rad/s, rad], as
+        legs and by the clock; ``place`` [m] where there is a sea room.
+    draws : int
+        Models that these were sailed under.
+    assumed : bool
+        Whether their scatter was assumed, the prior stating none.
     """
 
     trials: tuple[tuple[Leg, ...], ...]
-    scatter: float
+    keeps_limits: float
     by_clock: float
+    off: dict[str, float]
+    off_by_clock: dict[str, float]
+    draws: int
+    assumed: bool
 
-    def to_dict(self, file: str) -> dict[str, Any]:
-        """Return what the design's JSON says of the legs."""
-        return {"file": file, "scatter": {"legs": self.scatter, "clock": self.by_clock}}
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fields for the JSON of a design."""
+        return {
+            "keeps_limits": self.keeps_limits,
+            "by_clock": self.by_clock,
+            "off_plan": self.off,
+            "off_plan_by_clock": self.off_by_clock,
+            "draws": self.draws,
+            "scatter_assumed": self.assumed,
+        }
 
     def sentence(self) -> str:
-        """Return in one sentence what the legs are and what they gain."""
-        legs = [leg for trial in self.trials for leg in trial]
-        events = sum(leg.kind != "time" for leg in legs)
-        return (
-            f"as legs: {len(legs)}, of which {events} end by heading, speed or yaw rate; at their "
-            f"ends the heading is expected to be off the plan by {_degrees(self.scatter)} (rms), "
-            f"by the clock {_degrees(self.by_clock)}"
+        """Return one sentence for the summary."""
+        count = Counter(leg.until.replace("_", " ") for legs in self.trials for leg in legs)
+        kinds = ", ".join(f"{n} by {kind}" for kind, n in count.most_common())
+        models = f"{self.draws} models " + (
+            f"with coefficients {_MISFIT:.0%} off" if self.assumed else "drawn from the prior"
         )
-
-
-@dataclass(frozen=True)
-class Sailed:
-    """Legs that many models sailed, each ended by its own motion.
-
-    Parameters
-    ----------
-    ends : ndarray
-        (R, L, nx+1) states and heading at the end of each leg [m/s, rad/s, rad].
-    seconds : ndarray
-        (R, L) how long each took [s].
-    stable : ndarray of bool
-        (R,) whether the run stayed within every plausible bound.
-    """
-
-    ends: Array
-    seconds: Array
-    stable: NDArray[np.bool_]
-
-
-@dataclass
-class _Fleet:
-    """Models under way: where each stands, and what it was commanded before.
-
-    Within a leg the commands depend on nothing but time, so a leg is a free run of all models;
-    each is then left where the leg ended for it.
-    """
-
-    rollout: Rollout
-    thetas: Array
-    ramp: Array
-    x: Array
-    psi: Array
-    before: Array
-    alive: NDArray[np.bool_] = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.alive = np.ones(len(self.thetas), bool)
-
-    @classmethod
-    def of(cls, rollout: Rollout, thetas: Array, commands: Array, ramp: Sequence[int]) -> _Fleet:
-        """Return all models at the start, with the commands (nc,) of the first leg."""
-        count, late = len(thetas), rollout.vessel.actuation
-        past = 1 + int(np.ceil((late.delay + _FORGOTTEN * late.lag) / rollout.sample_time))
-        if late.rate_on is not None and late.rate_limit:
-            reach = rollout.vessel.limits[late.rate_on]
-            if reach.lower is not None and reach.upper is not None:
-                pace = late.rate_limit * rollout.sample_time
-                past += int(np.ceil((reach.upper - reach.lower) / pace))
-        return cls(
-            rollout,
-            thetas,
-            np.asarray(ramp, float),
-            np.repeat(rollout.start[None, :-1], count, axis=0),
-            np.full(count, rollout.start[-1]),
-            np.broadcast_to(commands, (count, past, len(commands))).copy(),
+        said = (
+            f"as legs, of which {kinds} end, the limits are kept with probability "
+            f"{self.keeps_limits:.2f}, by the clock {self.by_clock:.2f}, under {models}"
         )
+        if "psi" in self.off:
+            mine, other = (np.rad2deg(o["psi"]) for o in (self.off, self.off_by_clock))
+            said += (
+                f"; at the ends of legs the heading is off the plan by {mine:.0f}° (rms), by the "
+                f"clock {other:.0f}°"
+            )
+        return said
 
-    def ahead(self, commands: Array, samples: int) -> tuple[Array, Array]:
-        """Return signals (R, M+1, nx+1) under held commands (nc,), and these (R, M, nc)."""
-        r, structure = self.rollout, self.rollout.structure
-        share = np.minimum(1.0, (np.arange(samples)[:, None] + 1) / self.ramp)
-        last = self.before[:, -1:, :]
-        given = last + share * (commands - last)
-        whole = np.concatenate([self.before, given], axis=1)
-        columns = {n: whole[..., i] for i, n in enumerate(r.vessel.commands)}
-        made = actuated_force(r.vessel, columns, r.sample_time)
-        none = np.zeros(whole.shape[:2])
-        tau = np.stack([made.get(n, none) for n in structure.inputs], axis=-1)[:, -samples:]
-        turns = "r" in structure.states
-        free = simulate(
-            structure, self.thetas, self.x, tau, r.sample_time,
-            psi=None if turns else np.repeat(self.psi[:, None], samples + 1, axis=1),
-            psi0=self.psi,
-            d=np.broadcast_to(r.d, (samples, r.d.size)) if r.d.any() else None,
-            integrator=r.integrator,
-            bound=np.full(r.nx, _BOUND),
-        )  # fmt: skip
-        psi = np.asarray(free.psi)[..., None]
-        path = np.concatenate([free.x, np.broadcast_to(psi, (*free.x.shape[:2], 1))], axis=-1)
-        lost = (free.diverged >= 0) | ~np.isfinite(path).all(axis=(1, 2))
-        self.alive &= ~lost
-        path[~self.alive] = 0.0
-        return path, given
 
-    def leave(self, path: Array, given: Array, at: NDArray[np.intp]) -> Array:
-        """Leave each model after `at` (R,) samples of what `ahead` gave, and return its signals."""
-        rows = np.arange(len(path))
-        end = np.asarray(path[rows, at])
-        self.x, self.psi = end[:, :-1].copy(), end[:, -1].copy()
-        whole = np.concatenate([self.before, given], axis=1)
-        past = self.before.shape[1]
-        self.before = whole[rows[:, None], at[:, None] + np.arange(past)]
-        return end
+def drawn_models(request: DesignRequest, count: int, seed: int) -> Array:
+    """Draw models (count, p) that a plan may meet, the prior itself first.
+
+    From the prior's covariance; where it has none, each coefficient of an equation of motion is
+    off by a normal share of itself, 15 % standard deviation, independently of the others.
+    """
+    theta = np.asarray(request.theta, float)
+    if request.uncertain:
+        drawn = request.draw_models(count - 1, seed)
+    elif request.structure.increment:
+        rng = np.random.default_rng([37, request.seed, seed])
+        drawn = theta * (1 + _MISFIT * rng.standard_normal((count - 1, theta.size)))
+    else:
+        drawn = np.repeat(theta[None], count - 1, axis=0)
+    return np.vstack([theta, drawn])
+
+
+class _Way:
+    """R models on their way through legs: what was commanded, and where each leg began."""
+
+    def __init__(self, rollout: Rollout, thetas: Array, schedule: Schedule, samples: int) -> None:
+        self.rollout, self.thetas, self.schedule = rollout, thetas, schedule
+        runs = len(thetas)
+        self.commands = np.zeros((runs, samples, len(schedule.commands)))
+        self.start: Samples = np.zeros(runs, np.intp)
+        self.before: Array | None = None
+
+    @property
+    def earliest(self) -> int:
+        """Samples before which only the clock ends a leg.
+
+        Where a command cannot cross its range in one hold, it has to arrive before it may be sent
+        on: the step from where it is could be larger than its rate allows.
+        """
+        slow = self.schedule.ramp if self.schedule.limited else ()
+        return max((_LEAST_SAMPLES, *slow))
+
+    def hold(self, level: Array, samples: int) -> Motion:
+        """Run to `samples` after the last start with `level` held from each start on."""
+        last = min(int(self.start.max()) + samples, self.commands.shape[1])
+        k = np.arange(last) - self.start[:, None]
+        before = level if self.before is None else self.before
+        share = np.clip((k[..., None] + 1) / np.array(self.schedule.ramp), 0.0, 1.0)
+        held = before + share * (level - before)
+        self.commands[:, :last] = np.where(k[..., None] >= 0, held, self.commands[:, :last])
+        return self.run(self.commands[:, :last])
+
+    def run(self, commands: Array) -> Motion:
+        """Run on commands (R, N, nc), lag and delay of the vessel included."""
+        return self.rollout.run_models(self.thetas, commands, late=True)
+
+    def turn_over(self, ends: Samples) -> None:
+        """Begin the next leg where each model has ended this one."""
+        self.before = self.commands[np.arange(len(ends)), ends - 1][:, None]
+        self.start = ends
+
+
+def _signal(leg: Leg, states: tuple[str, ...], state: Array, start: Samples) -> Array:
+    """Return what ends a leg (R, N+1)."""
+    if leg.until == "heading":
+        psi = state[..., len(states)]
+        base = psi[:, :1]
+        if leg.since == "leg":
+            base = np.take_along_axis(psi, start[:, None], axis=1)
+        return np.asarray(psi - base)
+    if leg.until == "speed":
+        v = state[..., states.index("v")] if "v" in states else 0.0
+        return np.asarray(np.hypot(state[..., states.index("u")], v))
+    return np.asarray(state[..., states.index("r")])
+
+
+def _ends(leg: Leg, states: tuple[str, ...], motion: Motion, start: Samples, dt: float) -> Samples:
+    """Return the sample (R,) at which a leg that began at samples `start` ends."""
+    latest = start + round(leg.at_most / dt)
+    if leg.until == "time":
+        return np.asarray(start + round(leg.value / dt), np.intp)
+    sign = 1.0 if leg.rising else -1.0
+    value = sign * _signal(leg, states, motion.state, start)
+    k = np.arange(value.shape[1])
+    after = k >= (start + round(leg.at_least / dt))[:, None]
+    done = after & ((value >= sign * leg.value) | (k >= latest[:, None]))
+    return np.asarray(np.minimum(done.argmax(axis=1), latest), np.intp)
 
 
 def sail_legs(
-    rollout: Rollout, thetas: Array, legs: Sequence[Leg], ramp: Sequence[int] | None = None
-) -> Sailed:
-    """Sail legs in closed loop: each model goes on to the next leg when its own motion says so.
+    rollout: Rollout, thetas: Array, legs: Sequence[Leg], schedule: Schedule
+) -> SailedLegs:
+    """Sail legs in closed loop under several models at once.
+
+    Commands move to the setting of each leg as the schedule's rates allow; the vessel's lag and
+    delay act behind them.
 
     Parameters
     ----------
     rollout : Rollout
-        The vessel and where she starts; its own parameters are not used.
+        Where and how the trial starts.
     thetas : ndarray
-        (R, p) models.
+        (R, p)
     legs : sequence of Leg
-    ramp : sequence of int, optional
-        Samples over which each command moves to a new value; by default at once.
+    schedule : Schedule
+        Of the plan.
 
     Returns
     -------
-    Sailed
+    SailedLegs
     """
-    names = rollout.vessel.commands
-    table = [np.array([leg.commands[n] for n in names]) for leg in legs]
-    fleet = _Fleet.of(rollout, thetas, table[0], ramp or [1] * len(names))
-    signals = (*rollout.structure.states, "psi")
-    ends, seconds = [], []
-    for leg, commands in zip(legs, table, strict=True):
-        path, given = fleet.ahead(commands, max(1, round(leg.at_most / rollout.sample_time)))
-        at = leg.first(path[..., _watched(leg.kind, signals)], rollout.sample_time)
-        ends.append(fleet.leave(path, given, at))
-        seconds.append(at * rollout.sample_time)
-    return Sailed(np.stack(ends, axis=1), np.stack(seconds, axis=1), fleet.alive)
-
-
-def drawn_models(request: DesignRequest, count: int = DRAWS) -> Array:
-    """Draw models (count + 1, p) that the ship may turn out to be, the nominal one first.
-
-    From the prior's covariance where there is one; beside it each damping parameter is off by
-    `MISFIT`, up or down.
-
-    Parameters
-    ----------
-    request : DesignRequest
-    count : int
-    """
-    drawn = request.draw_models(count, _STREAM)
-    rng = np.random.default_rng([_STREAM, request.seed])
-    damps = _damping(request.structure)
-    side = rng.choice([-1.0, 1.0], (-(-count // 2), len(damps)))
-    side = np.stack([side, -side], axis=1).reshape(-1, len(damps))[:count]
-    drawn[:, damps] *= 1 + MISFIT * side
-    return np.vstack([np.asarray(request.theta, float), drawn])
-
-
-def _damping(structure: Structure) -> list[int]:
-    # the parameters of a map are no rates, and a share of them is no share of the damping
-    if not structure.increment:
-        return []
-    return [structure.index(t.name) for t in structure.terms if t.dissipates]
+    dt, states = rollout.sample_time, rollout.structure.states
+    way = _Way(rollout, thetas, schedule, sum(round(leg.at_most / dt) for leg in legs) + 1)
+    ends = np.zeros((len(thetas), len(legs)), np.intp)
+    for i, leg in enumerate(legs):
+        level = np.array([leg.commands[n] for n in schedule.commands])
+        motion = way.hold(level, round(leg.at_most / dt))
+        ends[:, i] = _ends(leg, states, motion, way.start, dt)
+        way.turn_over(ends[:, i])
+    return SailedLegs(motion, ends)
 
 
 def legs_of(design: Design) -> LegPlan:
-    """Return a plan as legs, each ended by what keeps the motion nearest to the plan.
+    """Return a plan as legs, each ended by what keeps its purpose best.
 
-    Holds with nearly the same commands are one leg. Leg by leg, models drawn from the prior's
-    uncertainty (`drawn_models`) sail on from where the legs before left them; the leg ends by
-    time, unless another trigger leaves u, v, r and the heading at its end nearer to the plan by
-    a tenth, each state measured in its spread over the plan.
+    Holds with equal commands are one leg. For each leg in turn its possible ends are sailed under
+    models drawn from the prior (see `drawn_models`), the legs before it as they were chosen and
+    the rest of the trial by the clock. Taken is the end after which the states scatter least
+    about the plan, relative to an end by the clock; the clock where nothing gains 10 %.
 
     Parameters
     ----------
@@ -356,248 +304,195 @@ def legs_of(design: Design) -> LegPlan:
     Returns
     -------
     LegPlan
+
+    Notes
+    -----
+    The scatter is the mean, over heading, surge, sway, yaw rate and (with a sea room) place, of
+    each root mean square over that of the clock, at the end of the leg and, with a quarter of
+    the weight, of the trial. What its sensor would not see is added to both.
     """
     r = design.request
-    models = drawn_models(r)
-    trials, off, clock = [], [], []
-    for trial in range(r.trials):
+    schedule = r.schedule
+    trials, off, off_clock, kept, kept_clock = [], [], [], [], []
+    judged = drawn_models(r, _JUDGED, 4)
+    for trial, commands in enumerate(design.commands):
         rollout = Rollout(
             r.vessel, r.structure, r.theta, r.d, r.starts[trial], r.sample_time, r.integrator
         )
-        motion = rollout.run_models(models, design.commands[trial], late=True)
-        # a model that runs away on the plan by the clock tells nothing
-        kept = models[motion.stable]
-        plan = design.motions[trial].state[0, :, : rollout.nx + 1]
-        merged = _merged(design, trial)
-        spread = plan.std(axis=0)
-        weight = np.divide(1.0, spread, out=np.zeros_like(spread), where=spread > 1e-9)
-        ends = np.array([last for _, last, _ in merged])
-        found = []
-        for only in _CHOICES:
-            legs = _triggered(design, rollout, kept, plan, weight, merged, only)
-            sailed = sail_legs(rollout, kept, legs, r.schedule.ramp)
-            away = (sailed.ends[sailed.stable][1:] - plan[ends]).reshape(-1, plan.shape[1])
-            lost = int((~sailed.stable).sum())
-            heading = float(_rms(away[:, -1]))
-            found.append((lost, heading, _together(_rms(away * weight, axis=0)), legs, away[:, -1]))
-        by_time = found[-1]
-        legs, away = min((f for f in found if f[:2] <= by_time[:2]), key=lambda f: (f[0], f[2]))[3:]
-        off.append(away)
-        by = motion.state[motion.stable][1:, ends, rollout.nx]
-        clock.append((by - plan[ends, -1]).ravel())
+        legs = _chosen(design, trial, rollout)
         trials.append(legs)
+        sailed = sail_legs(rollout, judged, legs, schedule)
+        clock = rollout.run_models(judged, commands, late=True)
+        planned = planned_ends(design.levels[trial], schedule)[1]
+        plan = design.motions[trial].state[0, planned]
+        off.append(_scatter(r, sailed.at_ends()[sailed.motion.stable] - plan))
+        off_clock.append(_scatter(r, clock.state[clock.stable][:, planned] - plan))
+        last = sailed.ends[:, -1:, None]
+        index = np.minimum(np.arange(sailed.motion.state.shape[1])[None, :, None], last)
+        until_end = np.take_along_axis(sailed.motion.state, index, axis=1)
+        kept.append(_keeps(r, rollout, trial, until_end) & sailed.motion.stable)
+        kept_clock.append(_keeps(r, rollout, trial, clock.state) & clock.stable)
+    names = _names(r)
     return LegPlan(
-        tuple(trials), float(_rms(np.concatenate(off))), float(_rms(np.concatenate(clock)))
+        tuple(trials),
+        float(np.all(kept, axis=0).mean()),
+        float(np.all(kept_clock, axis=0).mean()),
+        dict(zip(names, np.sqrt(np.mean(np.square(off), axis=0)).tolist(), strict=True)),
+        dict(zip(names, np.sqrt(np.mean(np.square(off_clock), axis=0)).tolist(), strict=True)),
+        _JUDGED,
+        not r.uncertain,
     )
 
 
-def _merged(design: Design, trial: int) -> list[tuple[int, int, Array]]:
-    """Return first and last sample and the commands (nc,) of each leg."""
-    schedule = design.request.schedule
-    levels = design.levels[trial]
-    near = _ALIKE * (schedule.upper - schedule.lower) + 1e-9
-    groups: list[list[int]] = []
-    for k, level in enumerate(levels):
-        if groups and (np.abs(level - levels[groups[-1][0]]) <= near).all():
-            groups[-1].append(k)
-        else:
-            groups.append([k])
-    return [
-        (g[0] * schedule.hold, min((g[-1] + 1) * schedule.hold, schedule.samples),
-         levels[g].mean(axis=0))
-        for g in groups
-    ]  # fmt: skip
+def planned_ends(levels: Array, schedule: Schedule) -> tuple[Samples, Samples]:
+    """Return the first hold of each leg, and the sample at which it ends by the clock."""
+    changed = np.any(np.abs(np.diff(levels, axis=0)) > 1e-9, axis=1)
+    first = np.concatenate([[0], np.flatnonzero(changed) + 1])
+    ends = np.append(first[1:] * schedule.hold, schedule.samples)
+    return first, np.asarray(ends, np.intp)
 
 
-def _triggered(
-    design: Design,
-    rollout: Rollout,
-    models: Array,
-    plan: Array,
-    weight: Array,
-    merged: list[tuple[int, int, Array]],
-    only: Kind | None,
-) -> tuple[Leg, ...]:
-    """Return the legs with the triggers that keep the models nearest to the plan (N+1, nx+1)."""
-    names, dt = rollout.vessel.commands, rollout.sample_time
-    signals = (*rollout.structure.states, "psi")
-    fleet = _Fleet.of(rollout, models, merged[0][2], design.request.schedule.ramp)
-    least = dict(zip(signals, _SEEN * design.request.noise.measurement, strict=False))
+def _chosen(design: Design, trial: int, rollout: Rollout) -> tuple[Leg, ...]:
+    """Return the legs of one trial, chosen first to last."""
+    r = design.request
+    schedule, states, dt = r.schedule, r.structure.states, r.sample_time
+    levels, plan = design.levels[trial], design.motions[trial].state[0]
+    holds, planned = planned_ends(levels, schedule)
+    thetas = drawn_models(r, _CHOICE, 3)
+    thetas = thetas[rollout.run_models(thetas, design.commands[trial], late=True).stable]
+    way = _Way(rollout, thetas, schedule, 2 * schedule.samples + 2 * len(holds))
+    begins = np.concatenate([[0], planned[:-1]])
     legs = []
-    for first, last, commands in merged:
-        samples = last - first
-        named = {n: float(c) for n, c in zip(names, commands, strict=True)}
-        path, given = fleet.ahead(commands, _most(samples))
-        best: tuple[float, Leg, NDArray[np.intp]] | None = None
-        by_time = np.inf
-        for leg in _candidates(named, plan[first : last + 1], signals, dt, least):
-            if only is not None and leg.kind not in ("time", only):
+    for hold, begin, end in zip(holds, begins, planned, strict=True):
+        level = levels[hold]
+        commands = dict(zip(schedule.commands, map(float, level), strict=True))
+        seconds = float((end - begin) * dt)
+        by_clock = Leg(commands, "time", seconds, seconds, seconds)
+        most = int(np.floor(_LATEST[1] * (end - begin)))
+        motion = way.hold(level, most)
+        options: list[tuple[Leg, Samples]] = []
+        for leg in _ends_to_try(r, by_clock, plan, begin, end, way.earliest * dt, most * dt):
+            ends = _ends(leg, states, motion, way.start, dt)
+            own = float(ends[0] - way.start[0]) * dt
+            if abs(own - seconds) > max(_SHIFT * seconds, dt):
                 continue
-            at = leg.first(path[..., _watched(leg.kind, signals)], dt)
-            # under the prior itself it must end when the plan says, and under no model at once
-            if abs(int(at[0]) - samples) > max(1, 0.1 * samples):
-                continue
-            if np.quantile(at, _FEW) < _SHORTEST * samples:
-                continue
-            end = path[np.arange(len(path)), at][fleet.alive]
-            off = _rms((end - plan[last]) * weight, axis=0)
-            if leg.kind == "time":
-                by_time = off[-1]
-            # speeds forget how the legs before ended, the heading does not
-            if off[-1] > by_time:
-                continue
-            cost = _together(off)
-            if best is None or cost < (_BETTER if best[1].kind == "time" else 1) * best[0]:
-                best = cost, leg, at
-        assert best is not None
-        legs.append(best[1])
-        fleet.leave(path, given, best[2])
+            late = float(np.quantile(ends - way.start, _ENDED)) * dt
+            at_most = _whole(max(late, _LATEST[0] * seconds), dt)
+            leg = replace(leg, at_most=float(min(at_most, most * dt)), expected=own)
+            options.append((leg, _ends(leg, states, motion, way.start, dt)))
+        clocked = (by_clock, _ends(by_clock, states, motion, way.start, dt))
+        best = clocked
+        if options:
+            reference = _off(design, trial, way, motion, clocked[1], end)
+            least = 1.0 - _GAIN
+            weight = np.array([[1.0], [_LATER if end < schedule.samples else 0.0]])
+            for option in options:
+                ratio = _off(design, trial, way, motion, option[1], end) / reference
+                value = float((weight * ratio).sum() / weight.sum() / ratio.shape[1])
+                if value < least:
+                    best, least = option, value
+        legs.append(best[0])
+        way.turn_over(best[1])
     return tuple(legs)
 
 
-def _candidates(
-    commands: dict[str, float],
-    plan: Array,
-    signals: tuple[str, ...],
-    dt: float,
-    least: Mapping[str, float],
+def _whole(seconds: float, dt: float) -> float:
+    """Return a time [s] rounded up to samples, and to whole seconds where these are samples."""
+    per_second = round(1 / dt)
+    step = 1.0 if per_second and abs(per_second * dt - 1) < 1e-9 else dt
+    return float(np.ceil(seconds / step - 1e-9) * step)
+
+
+def _ends_to_try(
+    r: DesignRequest, by_clock: Leg, plan: Array, begin: int, end: int, least: float, most: float
 ) -> list[Leg]:
-    """Return what could end a leg whose planned signals are (M+1, nx+1), time first."""
-    samples = len(plan) - 1
-    expected = samples * dt
-    found = [Leg(commands, "time", expected, expected, expected)]
-    if samples < _LEAST_SAMPLES:
-        return found
-    for kind, step in _ROUND.items():
-        if _STATE[kind] not in signals or (kind == "heading" and "r" not in signals):
+    """Return the ways in which a leg of the plan, from one sample to another, might end."""
+    states, nx = r.structure.states, len(r.structure.states)
+    seconds = by_clock.expected
+    if end - begin < _LEAST_SAMPLES or seconds <= least or "u" not in states:
+        return []
+    at = np.array([begin, end])
+    leg = replace(by_clock, at_least=least, at_most=most)
+    noise = dict(zip(states, np.asarray(r.noise.measurement, float), strict=True))
+    found = []
+    if "r" in states:
+        psi = plan[:, nx]
+        turned = float(psi[end] - psi[begin])
+        if abs(turned) >= _LEAST_TURN:
+            changes: list[tuple[Since, float]] = [("leg", turned)]
+            if abs(turned) <= _MOST_TURN:
+                changes.insert(0, ("trial", float(psi[end] - psi[0])))
+            for since, change in changes:
+                value = float(np.deg2rad(round(float(np.rad2deg(change)))))
+                found.append(
+                    replace(leg, until="heading", value=value, rising=turned > 0, since=since)
+                )
+    signals: tuple[tuple[End, str], ...] = (("speed", "u"), ("yaw_rate", "r"))
+    for until, name in signals:
+        if name not in states:
             continue
-        values = plan[:, signals.index(_STATE[kind])]
-        change = float(values[-1] - values[0])
-        value = step * round((change if kind == "heading" else float(values[-1])) / step)
-        if kind == "heading" and abs(change) < _LEAST_TURN:
+        wanted = replace(leg, until=until)
+        path = _signal(wanted, states, plan[None], at[:1])[0]
+        change, slope = float(path[end] - path[begin]), float(path[end] - path[end - 1])
+        # where it hardly changes any more, the noise of its sensor says when it is reached
+        if slope * change <= 0 or abs(slope) * _NOISY * (end - begin) < noise[name]:
             continue
-        if kind != "heading" and abs(change) < max(2 * step, least[_STATE[kind]]):
-            continue
-        at_most = _most(samples) * dt
-        found.append(Leg(commands, kind, float(value), at_most, expected, change > 0))
+        unit = np.deg2rad(1.0) if until == "yaw_rate" else 1.0
+        step = unit * 10.0 ** np.floor(np.log10(max(abs(change) / unit, 1e-6)) - 1)
+        value = float(step * np.round(path[end] / step))
+        found.append(replace(wanted, value=value, rising=change > 0))
     return found
 
 
-def _most(samples: int) -> int:
-    return int(np.ceil(_LATEST * samples - 1e-9))
-
-
-def _watched(kind: Kind, signals: tuple[str, ...]) -> int:
-    return signals.index(_STATE.get(kind, "psi"))
-
-
-def _rms(values: Array, axis: int | None = None) -> Any:
-    return np.sqrt(np.mean(np.square(values), axis=axis)) if values.size else np.float64(0.0)
-
-
-def _together(off: Array) -> float:
-    """Return one number for what the states (nx+1,) are off the plan, in their spreads.
-
-    The geometric mean: a model that is too fast is too fast whatever ends a leg, which in a sum
-    would hide what a trigger does to the other states.
-    """
-    return float(np.exp(np.log(np.hypot(off, _FINE)).mean()))
-
-
-def _seconds(value: float) -> str:
-    return f"{round(value, 1):g} s"
-
-
-def _degrees(angle: float) -> str:
-    return f"{np.rad2deg(angle):.1f}°"
-
-
-def csv_twin(path: str | Path) -> Path:
-    """Return where the CSV of the same legs is written: beside the JSON, ending in .csv."""
-    return Path(path).with_suffix(".csv")
-
-
-def write_legs(plan: LegPlan, design: Design, path: str | Path) -> None:
-    """Write legs as JSON, and the same as a CSV of one row a leg beside it.
-
-    Parameters
-    ----------
-    plan : LegPlan
-    design : Design
-        Whose legs they are.
-    path : path
-        Of the JSON.
-    """
+def _off(design: Design, trial: int, way: _Way, motion: Motion, ends: Samples, end: int) -> Array:
+    """Return the scatter (2, m) about the plan, at the end of a leg and of the trial."""
     r = design.request
-    starts = [
-        dict(zip((*r.structure.states, "psi"), (float(v) for v in s), strict=True))
-        | dict(zip(("x_n", "y_n"), (float(v) for v in r.limits.position), strict=True))
-        for s in r.starts
-    ]
-    write_json(
-        {
-            "format": FORMAT,
-            "version": VERSION,
-            "vessel": r.vessel.name,
-            "start": starts[0],
-            **({"starts": starts} if len(starts) > 1 else {}),
-            "legs": [
-                {"trial": k + 1} | leg.to_dict() for k, legs in enumerate(plan.trials)
-                for leg in legs
-            ],
-        },
-        path,
+    plan, commands = design.motions[trial].state[0], design.commands[trial]
+    runs = np.arange(len(ends))
+    here = _scatter(r, (motion.state[runs, ends] - plan[end])[:, None])
+    seen = _seen(r)
+    rest = len(commands) - end
+    if not rest:
+        return np.stack([here + seen, here + seen])
+    last = ends + rest
+    k = np.arange(int(last.max()))
+    place = np.clip(end + k - ends[:, None], 0, len(commands) - 1)
+    so_far = np.zeros((len(ends), len(k), commands.shape[1]))
+    width = min(way.commands.shape[1], len(k))
+    so_far[:, :width] = way.commands[:, :width]
+    after = (k >= ends[:, None])[..., None]
+    sailed = way.run(np.where(after, commands[place], so_far))
+    away = (sailed.state[runs, last] - plan[-1])[sailed.stable]
+    return np.stack([here + seen, _scatter(r, away[:, None]) + seen])
+
+
+def _names(r: DesignRequest) -> tuple[str, ...]:
+    states = tuple(n for n in r.structure.states if n in ("u", "v", "r"))
+    heading = ("psi",) if "r" in states else ()
+    return (*states, *heading, *(("place",) if r.limits.area is not None else ()))
+
+
+def _scatter(r: DesignRequest, away: Array) -> Array:
+    """Return the root mean square (m,) of distances (R, L, nx+3) from the plan, by `_names`."""
+    states = r.structure.states
+    columns = {n: away[..., i] for i, n in enumerate((*states, "psi"))}
+    columns["place"] = np.linalg.norm(away[..., -2:], axis=-1)
+    return np.array([float(np.sqrt(np.mean(columns[n] ** 2))) for n in _names(r)])
+
+
+def _seen(r: DesignRequest) -> Array:
+    """Return the scatter (m,) that its sensor or a helmsman would not see."""
+    noise = dict(zip(r.structure.states, np.asarray(r.noise.measurement, float), strict=True))
+    noise |= {"psi": _HEADING_SEEN, "place": _PLACE_SEEN * r.vessel.length}
+    return np.array([noise[n] for n in _names(r)])
+
+
+def _keeps(r: DesignRequest, rollout: Rollout, trial: int, state: Array) -> NDArray[np.bool_]:
+    """Return which runs (R, N+1, nx+3) keep the path limits all the time."""
+    kind = PREDICTORS[r.predictor]
+    program = LimitProgram(
+        rollout, r.schedule, r.trial_limits(trial),
+        wind_matters=kind.captures and not kind.air_measured,
     )  # fmt: skip
-    names = r.schedule.commands
-    with replacing(csv_twin(path)) as handle:
-        handle.write(",".join(["trial", *names, "until", "value", "when", "at_most", "expected"]))
-        handle.write(",words\n")
-        for k, legs in enumerate(plan.trials):
-            for leg in legs:
-                when = leg.to_dict()["until"].get("when", "")
-                cells = [str(k + 1), *(f"{leg.commands[n]:.10g}" for n in names), leg.kind]
-                cells += [f"{leg.value:.10g}", when, f"{leg.at_most:.10g}", f"{leg.expected:.10g}"]
-                handle.write(",".join([*cells, f'"{leg.words}"']) + "\n")
-
-
-def read_legs(path: str | Path) -> tuple[tuple[Leg, ...], ...]:
-    """Read legs that `write_legs` wrote, a tuple for each trial.
-
-    Raises
-    ------
-    LogError
-        The file cannot be read, or holds no legs of this version.
-    """
-    path = Path(path)
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-        if (data["format"], data["version"]) != (FORMAT, VERSION):
-            raise LogError(
-                f"'{path.name}' holds no legs that this version reads: it says "
-                f"{data['format']} {data['version']}, {FORMAT} {VERSION} is needed."
-            )
-        trials: dict[int, list[Leg]] = {}
-        for item in data["legs"]:
-            until = item["until"]
-            if until["kind"] not in get_args(Kind):
-                raise LogError(
-                    f"'{path.name}' has a leg that ends by '{until['kind']}': it is one of "
-                    f"{', '.join(get_args(Kind))}."
-                )
-            value = float(until[_FIELD[until["kind"]]])
-            rising = until.get("when", "rising") == "rising"
-            if until["kind"] == "heading":
-                rising = value > 0
-            leg = Leg(
-                item["commands"], until["kind"], value, item["at_most"], item["expected"], rising
-            )
-            trials.setdefault(int(item["trial"]), []).append(leg)
-    except LogError:
-        raise
-    except OSError as error:
-        raise LogError(f"cannot read the legs '{path}': {error.strerror}.") from error
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise LogError(
-            f"'{path.name}' is no file of legs: write one by greybox design --legs."
-        ) from error
-    return tuple(tuple(trials[k]) for k in sorted(trials))
+    over = program.path_values(state[:, 1:]).max(axis=-1)
+    return np.asarray((over <= 1e-3).all(axis=0))

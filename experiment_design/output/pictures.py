@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from experiment_design.constraints.limits import Circle
 from experiment_design.output.prediction import MotionBand, edge_distance
 from experiment_design.output.result import Design
-from experiment_design.output.words import clock
+from experiment_design.output.sheet_contents import clock
 from greybox.report.figures import BLACK, BLUE, COLOURS, GREEN, VERMILION, tidy
 from greybox.rotation import ned_to_body
 

@@ -16,8 +16,7 @@ from experiment_design.optimise.search import REFERENCE
 from experiment_design.output.pictures import draw_commands, draw_plan_track, draw_states
 from experiment_design.output.prediction import MotionBand, predict_motion
 from experiment_design.output.result import Design
-from experiment_design.output.sheet_contents import plain_name
-from experiment_design.output.words import clock, signed
+from experiment_design.output.sheet_contents import clock, plain_name, signed
 from experiment_design.request.regimes import spell_regime
 from experiment_design.request.request import build_problem
 from greybox.report.chart import chart_of

@@ -2,36 +2,50 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from experiment_design.constraints.limits import TOLERANCE
-from experiment_design.output.legs import Leg
+from experiment_design.output.legs import Leg, planned_ends
 from experiment_design.output.prediction import MotionBand
 from experiment_design.output.result import Design
-from experiment_design.output.words import KNOT, SIDES, WORDS, clock, compass, signed
 from experiment_design.request.regimes import spell_regime
 
 Array = NDArray[np.float64]
+Samples = NDArray[np.intp]
 
+KNOT = 0.514444
 # corridor that no helmsman or sensor is asked to keep closer than, and its least in ship lengths
 HEADING_FLOOR = np.deg2rad(10.0)
 POSITION_FLOOR = 10.0
 # heading past which "off the plan" has no meaning
 _BLIND = np.deg2rad(90.0)
 _LONGEST_NAME = 60
+_SIDES = {
+    ("u", 1): "ahead",
+    ("u", -1): "astern",
+    ("v", 1): "to starboard",
+    ("v", -1): "to port",
+    ("r", 1): "to starboard",
+    ("r", -1): "to port",
+}
+_WORDS = {"u": "Surge", "v": "Sway", "r": "Yaw rate"}
 
 
 @dataclass(frozen=True)
 class Column:
-    """A column of the way-point table: name and unit, and a cell for each way-point."""
+    """A column of the way-point table: name and unit, and a cell for each way-point.
+
+    One of `words` is read from its left edge.
+    """
 
     name: str
     unit: str
     cells: tuple[str, ...]
+    words: bool = False
 
     @property
     def width(self) -> int:
@@ -74,13 +88,38 @@ class SheetContents:
         return len(self.columns[0].cells)
 
 
+def clock(seconds: float) -> str:
+    """Return a time as minutes and seconds, such as 4:05."""
+    tenths = round(seconds * 10)
+    minutes, rest = divmod(tenths, 600)
+    return f"{minutes}:{rest // 10:02d}" + (f".{rest % 10}" if rest % 10 else "")
+
+
+def compass(angle: float) -> str:
+    """Return an angle [rad] as a compass direction in degrees, 000 to 359."""
+    return f"{round(np.rad2deg(angle)) % 360:03d}"
+
+
+def signed(value: float, decimals: int = 0) -> str:
+    """Return a number with a true minus sign and no negative zero."""
+    return f"{round(value, decimals) + 0.0:.{decimals}f}".replace("-", "−")
+
+
+def tie(text: str) -> str:
+    """Return text in which a line does not end between a number and its unit."""
+    tied = re.sub(r"(?<=\d) (?=(?:m/s|rad/s|kn|m|s|%|min)(?:\W|$))", "\u00a0", text)
+    return tied.replace("(N, E)", "(N,\u00a0E)")
+
+
 def plain_name(name: str) -> str:
     """Return a vessel's name as one line of a bearable length."""
     line = " ".join("".join(c if c.isprintable() else " " for c in name).split())
     return line if len(line) <= _LONGEST_NAME else line[: _LONGEST_NAME - 1] + "…"
 
 
-def sheet_contents(design: Design, band: MotionBand, legs: Sequence[Leg] = ()) -> SheetContents:
+def sheet_contents(
+    design: Design, band: MotionBand, legs: tuple[Leg, ...] | None = None
+) -> SheetContents:
     """Return one trial of a design as the words and cells of its sheet.
 
     Parameters
@@ -88,14 +127,14 @@ def sheet_contents(design: Design, band: MotionBand, legs: Sequence[Leg] = ()) -
     design : Design
     band : MotionBand
         Of the trial.
-    legs : sequence of Leg
-        Of the trial, to stand in the table in place of the commands by the clock.
+    legs : tuple of Leg, optional
+        Of the trial, in place of its commands by the clock.
     """
     r = design.request
     which = f"trial {band.trial + 1} of {r.trials}" if r.trials > 1 else "trial"
     regime = r.regimes[band.trial]
     sides = ", ".join(
-        f"{WORDS[s].lower()} {SIDES[s, sign]}" for s, sign in regime if (s, sign) in SIDES
+        f"{_WORDS[s].lower()} {_SIDES[s, sign]}" for s, sign in regime if (s, sign) in _SIDES
     )
     ramp = max(r.schedule.ramp) > 1
     note = (
@@ -104,15 +143,15 @@ def sheet_contents(design: Design, band: MotionBand, legs: Sequence[Leg] = ()) -
         + " the time of their row and hold until the next row; times without a change are left "
         "out. Heading, speed over ground and position (N, E) are those expected at that time."
     )
-    if legs:
+    if legs is not None:
         note = (
-            "Hold the commands of a row as its column 'hold' says, never longer than the time "
-            "given there, and go on with the next row. Changes of heading count from the start of "
-            "the leg; turn is the yaw rate. Time, heading, speed over ground and position (N, E) "
-            "are those expected at the start of the leg; compare them by legs, not by the clock."
+            "Each row is held until what it says has happened; commands move at the rate limit. "
+            "Times within a row count from its start. Time in the first column, heading, speed "
+            "over ground and position (N, E) are those expected at its start."
         )
     if not band.certain:
-        note += " ±: 95 % of the predicted motions have stayed within since the start."
+        by = " by the clock" if legs is not None else ""
+        note += f" ±: 95 % of the motions predicted{by} have stayed within since the start."
     return SheetContents(
         f"{plain_name(r.vessel.name)}: identification {which}"
         + (", planned without an estimated model" if r.untried else ""),
@@ -127,18 +166,80 @@ def sheet_contents(design: Design, band: MotionBand, legs: Sequence[Leg] = ()) -
     )
 
 
+def leg_words(leg: Leg, design: Design, trial: int) -> str:
+    """Return a leg in a seaman's words.
+
+    Parameters
+    ----------
+    leg : Leg
+    design : Design
+        What it is a leg of.
+    trial : int
+        Counted from 0.
+    """
+    r = design.request
+    rudders = [t.rudder for t in r.vessel.thrusters if t.rudder is not None]
+    said = []
+    for i, (name, value) in enumerate(leg.commands.items()):
+        if name not in r.vessel.angle_commands:
+            span = float(r.schedule.upper[i] - r.schedule.lower[i])
+            said.append(f"{name} {_speed_cells(np.array([value]), span)[0]}")
+            continue
+        what = name
+        if name in rudders:
+            what = "rudder" if len(set(rudders)) == 1 else f"rudder {name}"
+        angle = degrees(value)
+        said.append(f"{what} {side(value)} {angle}" if angle != "0°" else f"{what} midships")
+    words = ", ".join(sorted(said, key=lambda text: not text.startswith("rudder")))
+    return f"{words[0].upper()}{words[1:]}; {_until_words(leg, float(r.starts[trial][-1]))}"
+
+
+def side(value: float) -> str:
+    """Return the side of an angle or rate of turn."""
+    return "starboard" if value > 0 else "port"
+
+
+def degrees(value: float) -> str:
+    """Return the size of an angle [rad] in degrees, to a tenth where there is one."""
+    return f"{round(abs(float(np.rad2deg(value))), 1):g}°"
+
+
+def _until_words(leg: Leg, start: float) -> str:
+    latest = f", at the latest after {_seconds(leg.at_most)}"
+    if leg.until == "time":
+        return f"for {_seconds(leg.value)}"
+    if leg.until == "heading":
+        turn = "starboard" if leg.rising else "port"
+        if leg.since == "trial":
+            heading = compass(start + leg.value)
+            return f"until heading is {heading}°, turning to {turn}{latest}"
+        return f"until heading has changed {degrees(leg.value)} to {turn}{latest}"
+    away = leg.rising == (leg.value > 0)
+    if leg.until == "speed":
+        how = "risen" if leg.rising else "fallen"
+        return f"until speed has {how} to {leg.value:.3g} m/s ({leg.value / KNOT:.1f} kn){latest}"
+    if leg.value == 0:
+        return f"until she has stopped turning{latest}"
+    rate = f"{abs(float(np.rad2deg(leg.value))):.3g}°/s to {side(leg.value)}"
+    return f"until yaw rate has {'risen' if away else 'fallen'} to {rate}{latest}"
+
+
+def _seconds(value: float) -> str:
+    return f"{value:.4g} s" if value < 120 else f"{clock(value)} min"
+
+
 def _facts(design: Design, band: MotionBand) -> tuple[tuple[str, str], ...]:
     r = design.request
     start = [f"heading {compass(band['psi'].nominal[0])}°"]
     for name in r.structure.states:
-        if name not in WORDS:
+        if name not in _WORDS:
             continue
         value = float(band[name].nominal[0])
-        side = SIDES[name, 1 if value >= 0 else -1] if round(value, 3) else ""
+        side = _SIDES[name, 1 if value >= 0 else -1] if round(value, 3) else ""
         if name == "r":
             text = f"yaw rate {abs(np.rad2deg(value)):.2f}°/s"
         else:
-            text = f"{WORDS[name].lower()} {abs(value):.2f} m/s ({abs(value) / KNOT:.1f} kn)"
+            text = f"{_WORDS[name].lower()} {abs(value):.2f} m/s ({abs(value) / KNOT:.1f} kn)"
         start.append(f"{text} {side}".rstrip())
     where = f"N {signed(band['x_n'].nominal[0])} m, E {signed(band['y_n'].nominal[0])} m"
     d = np.zeros(4)
@@ -265,7 +366,7 @@ def _abort(design: Design, band: MotionBand) -> tuple[str, ...]:
             bound = f"{np.rad2deg(margin):.2f}°/s"
         else:
             bound = f"{margin:.2f} m/s ({margin / KNOT:.1f} kn)"
-        text = f"{WORDS.get(name, name)} {SIDES.get((name, sign), '')} below {bound}"
+        text = f"{_WORDS.get(name, name)} {_SIDES.get((name, sign), '')} below {bound}"
         text += f", margin of {symbol}"
         if least is not None and name != "r":
             text += f"; least expected {signed(least, 2)} m/s"
@@ -274,13 +375,16 @@ def _abort(design: Design, band: MotionBand) -> tuple[str, ...]:
 
 
 def _columns(
-    design: Design, band: MotionBand, legs: Sequence[Leg], *, radians: bool
+    design: Design, band: MotionBand, legs: tuple[Leg, ...] | None, *, radians: bool
 ) -> tuple[Column, ...]:
+    if legs is not None:
+        ends = planned_ends(design.levels[band.trial], design.request.schedule)[1]
+        words = tuple(leg_words(leg, design, band.trial) for leg in legs)
+        own = [Column("do", "", (*words, "end"), words=True)]
+        return _table_of(design, band, np.array([0, *ends]), own)
     r = design.request
     schedule = r.schedule
     levels = design.levels[band.trial]
-    if legs:
-        levels = np.array([[leg.commands[n] for n in schedule.commands] for leg in legs])
     made = [
         _command_cells(
             name,
@@ -294,22 +398,25 @@ def _columns(
     rows = list(zip(*[c.cells for c in made], strict=True))
     changed = [k for k in range(len(rows)) if k == 0 or rows[k] != rows[k - 1]]
     samples = np.array([*(k * schedule.hold for k in changed), len(band.t) - 1])
-    if legs:
-        changed = list(range(len(legs)))
-        took = np.cumsum([0.0, *(leg.expected for leg in legs)]) / r.sample_time
-        samples = np.minimum(np.rint(took).astype(int), len(band.t) - 1)
+    return _table_of(
+        design,
+        band,
+        samples,
+        [Column(c.name, c.unit, (*(c.cells[k] for k in changed), "end")) for c in made],
+    )
+
+
+def _table_of(
+    design: Design, band: MotionBand, samples: Samples, made: list[Column]
+) -> tuple[Column, ...]:
+    """Return what is done, with what is expected at the samples (M,) where it begins."""
     heading, place = band["psi"].nominal[samples], [
         band[n].nominal[samples] for n in ("x_n", "y_n")
     ]  # fmt: skip
     fine = 0 if max(np.abs(p).max() for p in place) >= 100 else 1
     columns = [Column("time", "min:s", tuple(clock(band.t[k]) for k in samples))]
-    for c in made:
-        cells = [*(c.cells[k] for k in changed), "end"]
-        columns.append(Column(c.name, c.unit, tuple(cells)))
-    if legs:
-        said = [leg.words if radians else leg.short for leg in legs]
-        columns.append(Column("hold", "", (*said, "")))
     columns += [
+        *made,
         Column("hdg", "°", tuple(compass(h) for h in heading)),
         Column("speed", "m/s", tuple(f"{v:.2f}" for v in band["speed"].nominal[samples])),
         Column("N", "m", tuple(signed(v, fine) for v in place[0])),
@@ -334,6 +441,10 @@ def _command_cells(name: str, values: Array, span: float, angle: bool, radians: 
             return Column(name, "°", tuple(degrees))
         both = [f"{d} ({signed(float(v), 2)})" for d, v in zip(degrees, values, strict=True)]
         return Column(name, "° (rad)", tuple(both))
+    return Column(name, "as log", tuple(_speed_cells(values, span)))
+
+
+def _speed_cells(values: Array, span: float) -> list[str]:
     size = span or float(np.abs(values).max(initial=0.0)) or 1.0
     decimals = int(np.clip(2 - np.floor(np.log10(size)), 0, 4))
-    return Column(name, "as log", tuple(signed(float(v), decimals) for v in values))
+    return [signed(float(v), decimals) for v in values]

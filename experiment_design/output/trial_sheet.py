@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import textwrap
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,12 +15,11 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from experiment_design.output.legs import Leg
+from experiment_design.output.legs import LegPlan
 from experiment_design.output.pictures import draw_commands, draw_plan_track
 from experiment_design.output.prediction import MotionBand, predict_motion
 from experiment_design.output.result import Design
-from experiment_design.output.sheet_contents import Column, SheetContents, sheet_contents
-from experiment_design.output.words import tie
+from experiment_design.output.sheet_contents import Column, SheetContents, sheet_contents, tie
 from greybox.errors import UsageError
 from greybox.files import replacing, write_text
 from greybox.report.figures import new_figure, to_svg
@@ -77,9 +76,7 @@ def sheet_kind(path: str | Path) -> str:
     return ".html" if kind == ".htm" else kind
 
 
-def write_sheet(
-    design: Design, path: str | Path, legs: Sequence[Sequence[Leg]] | None = None
-) -> None:
+def write_sheet(design: Design, path: str | Path, legs: LegPlan | None = None) -> None:
     """Write the sheet to take on board, one A4 page a trial.
 
     Several pages are stacked in an SVG or PNG. A table of more way-points than one
@@ -90,8 +87,8 @@ def write_sheet(
     design : Design
     path : path
         Ends in .pdf, .html, .svg or .png.
-    legs : sequence of sequence of Leg, optional
-        The plan as legs, one entry a trial, to stand in the table.
+    legs : LegPlan, optional
+        What the table holds in place of commands by the clock.
 
     Raises
     ------
@@ -104,19 +101,13 @@ def write_sheet(
         if kind == ".html":
             write_text(_html(design, bands, legs), path)
             return
-        pages = [
-            page for band in bands for page in sheet_figures(design, band, _of(legs, band.trial))
-        ]
+        pages = [page for band in bands for page in sheet_figures(design, band, legs)]
         if kind == ".svg":
             write_text(_stacked_svg(pages), path)
             return
         data = _pdf(pages) if kind == ".pdf" else _stacked_png(pages)
     with replacing(path, "wb") as handle:
         handle.write(data)
-
-
-def _of(legs: Sequence[Sequence[Leg]] | None, trial: int) -> Sequence[Leg]:
-    return legs[trial] if legs else ()
 
 
 def wrap(text: str, width: int, **options: Any) -> list[str]:
@@ -233,7 +224,7 @@ class _Paper:
         )
 
 
-def sheet_figures(design: Design, band: MotionBand, legs: Sequence[Leg] = ()) -> list[Figure]:
+def sheet_figures(design: Design, band: MotionBand, legs: LegPlan | None = None) -> list[Figure]:
     """Return the pages of one trial as figures, one unless the table is too long.
 
     Parameters
@@ -241,10 +232,10 @@ def sheet_figures(design: Design, band: MotionBand, legs: Sequence[Leg] = ()) ->
     design : Design
     band : MotionBand
         Of the trial.
-    legs : sequence of Leg
-        Of the trial, empty for commands by the clock.
+    legs : LegPlan, optional
+        What the table holds in place of commands by the clock.
     """
-    contents = sheet_contents(design, band, legs)
+    contents = _contents(design, band, legs)
     paper = _Paper()
     top = _head(paper, contents)
     bottom = _HEIGHT - _EDGE
@@ -281,6 +272,10 @@ def sheet_figures(design: Design, band: MotionBand, legs: Sequence[Leg] = ()) ->
                 ha="right", va="top", fontsize=7,
             )  # fmt: skip
     return pages
+
+
+def _contents(design: Design, band: MotionBand, legs: LegPlan | None) -> SheetContents:
+    return sheet_contents(design, band, None if legs is None else legs.trials[band.trial])
 
 
 def _head(paper: _Paper, contents: SheetContents) -> float:
@@ -342,11 +337,12 @@ def _table(paper: _Paper, layout: TableLayout, top: float, first: int) -> None:
         across = float((widths + gap).sum() * unit)
         paper.box(left, top, across, 2.2 * line, facecolor="#dde6ee")
         for column, right in zip(layout.columns, rights, strict=True):
-            place = float(right) - 0.5 * gap * unit
+            place = _edge_of(column, float(right) - 0.5 * gap * unit, unit)
             for k, words in enumerate((column.name, column.unit)):
                 paper.text(
                     place, top + (0.6 + k) * line, words, layout.size - 0.4,
-                    ha="right", va="center", fontweight="bold" if k == 0 else "normal",
+                    ha="left" if column.words else "right", va="center",
+                    fontweight="bold" if k == 0 else "normal",
                 )  # fmt: skip
         for k in range(begin, min(begin + layout.rows, last)):
             y = top + (k - begin + 2.75) * line
@@ -354,10 +350,16 @@ def _table(paper: _Paper, layout: TableLayout, top: float, first: int) -> None:
                 paper.box(left, y - 0.5 * line, across, line, facecolor=_GREY)
             for i, (column, right) in enumerate(zip(layout.columns, rights, strict=True)):
                 paper.text(
-                    float(right) - 0.5 * gap * unit, y, column.cells[k], layout.size,
-                    ha="right", va="center", fontweight="bold" if i == 0 else "normal",
+                    _edge_of(column, float(right) - 0.5 * gap * unit, unit), y, column.cells[k],
+                    layout.size, ha="left" if column.words else "right", va="center",
+                    fontweight="bold" if i == 0 else "normal",
                     color="0.3" if i >= expected else "black",
                 )  # fmt: skip
+
+
+def _edge_of(column: Column, right: float, unit: float) -> float:
+    """Return where the cells of a column stand: at its right edge, words at its left."""
+    return right - column.width * unit if column.words else right
 
 
 def _sign(paper: _Paper, bottom: float) -> None:
@@ -443,6 +445,7 @@ figure svg { width: 100%; height: auto; display: block; }
 table { border-collapse: collapse; font-size: 0.85rem; line-height: 1.3; width: 100%;
         font-variant-numeric: tabular-nums; }
 th, td { text-align: right; padding: 0 0.35rem; white-space: nowrap; }
+th.words, td.words { text-align: left; white-space: normal; }
 th { background: #dde6ee; } th span { display: block; font-weight: 400; }
 tbody th { background: none; } tbody tr:nth-child(even) { background: #f0f0f0; }
 .sign { margin-top: 0.6rem; }
@@ -485,9 +488,11 @@ section + section { border-top: 2px solid #ddd; margin-top: 2rem; padding-top: 1
  line-height: {{ trial.leading }}; } }</style>
 <div class="blocks" id="points{{ loop.index }}">
 {% for rows in trial.blocks %}<div class="wide"><table>
-<thead><tr>{% for c in trial.columns %}<th scope="col">{{ c.name }}<span>{{ c.unit }}</span></th>
+<thead><tr>{% for c in trial.columns %}<th scope="col"
+{%- if c.words %} class="words"{% endif %}>{{ c.name }}<span>{{ c.unit }}</span></th>
 {%- endfor %}</tr></thead>
-<tbody>{% for row in rows %}<tr><th scope="row">{{ row[0] }}</th>{% for cell in row[1:] %}<td>
+<tbody>{% for row in rows %}<tr><th scope="row">{{ row[0] }}</th>{% for cell in row[1:] %}<td
+{%- if trial.columns[loop.index].words %} class="words"{% endif %}>
 {{- cell }}</td>{% endfor %}</tr>
 {% endfor %}</tbody></table></div>
 {% endfor %}</div>
@@ -499,20 +504,18 @@ section + section { border-top: 2px solid #ddd; margin-top: 2rem; padding-top: 1
 """
 
 
-def _html(
-    design: Design, bands: tuple[MotionBand, ...], legs: Sequence[Sequence[Leg]] | None
-) -> str:
+def _html(design: Design, bands: tuple[MotionBand, ...], legs: LegPlan | None) -> str:
     from jinja2 import Environment
 
-    trials = [_section(design, band, _of(legs, band.trial)) for band in bands]
+    trials = [_section(design, band, legs) for band in bands]
     environment = Environment(autoescape=True, trim_blocks=True)
     environment.filters["tie"] = tie
     return environment.from_string(_TEMPLATE).render(trials=trials)
 
 
-def _section(design: Design, band: MotionBand, legs: Sequence[Leg]) -> dict[str, Any]:
+def _section(design: Design, band: MotionBand, legs: LegPlan | None) -> dict[str, Any]:
     """Return what the page needs of one trial."""
-    contents = sheet_contents(design, band, legs)
+    contents = _contents(design, band, legs)
     count = len(design.request.schedule.commands)
     fixed = 34 + 15 + 8 + 5 * (len(" ".join(contents.warnings)) // 110 + bool(contents.warnings))
     parts = lay_out_page(contents, count, _HEIGHT - 2 * 10 - fixed)

@@ -1,333 +1,361 @@
-"""Plans as legs that end by what the ship does: what they hold, and what they gain."""
+"""Plans as legs: what ends them, how they are sailed and written, and foreign ships on them."""
 
 from __future__ import annotations
 
 import csv
 import json
-import tomllib
+import math
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from designs import make_request, thesis_model
+from designs import limited_ship, make_request, thesis_model
 from foreign_ships import manoeuvres, presets
+from schemas import schema
 
+from experiment_design.certificate.certificate import absent
+from experiment_design.constraints.limits import Circle, TrialLimits
 from experiment_design.excitation.rollout import Rollout
-from experiment_design.for_prediction import design_for_prediction
-from experiment_design.output.legs import (
-    MISFIT,
-    Leg,
-    LegPlan,
-    csv_twin,
-    drawn_models,
-    legs_of,
-    read_legs,
-    sail_legs,
-    write_legs,
-)
+from experiment_design.output.legs import Leg, drawn_models, legs_of, planned_ends, sail_legs
+from experiment_design.output.legs_file import csv_path, legs_path, legs_to_dict, write_legs
 from experiment_design.output.prediction import predict_motion
-from experiment_design.output.sheet_contents import sheet_contents
-from experiment_design.output.trial_sheet import sheet_figures
+from experiment_design.output.result import Design
+from experiment_design.output.sheet_contents import leg_words, sheet_contents
+from experiment_design.output.trial_sheet import write_sheet
 from experiment_design.prepare import Wishes, both_sides, prepare_request
 from greybox.commands.main import main
-from greybox.errors import LogError
+from greybox.errors import UsageError
 from greybox.model.semi_empirical import semi_empirical_model
-from greybox.vessel.toml import vessel_from_dict
-from greybox.vessel.vessel import Actuation
+from greybox.vessel.toml import load_vessel
 
-HELD = {"n": 15.0, "alpha1": 0.8, "alpha2": 0.9}
+# main dimensions of the tanker of the foreign ships, as a crew knows them
+DIMENSIONS = "beam = 1.27\nmass = 3270.0\nservice_speed = 1.18\n"
+# n and delta of each hold
+ZIGZAG = np.array(
+    [(11.0, d) for d in (0.0, 0.35, 0.35, -0.35, -0.35, 0.35, 0.35, 0.0, -0.5, -0.5, -0.5, 0.2)]
+)
 
 
-def leg(kind, value, at_most=40.0, rising=True):
-    return Leg(HELD, kind, value, at_most, 30.0, rising)
-
-
-def plan_of(levels, **changes):
-    """What legs ask of a design, of levels (K, nc)."""
-    levels = np.asarray(levels, float)
-    request = make_request(duration=10.0 * len(levels), **changes)
-    rollout = rollout_of(request)
-    commands = request.schedule.expand(levels)
-    motion = rollout.run(commands[None], late=True)
-    return SimpleNamespace(
-        request=request, levels=(levels,), commands=(commands,), motions=(motion,), limits=(),
-        keeping=None, margins={},
+def design_of(request, *levels):
+    """A design of given levels, one array a trial; what it is worth is not asked."""
+    commands = tuple(request.schedule.expand(x) for x in levels)
+    motions = tuple(rollout_of(request, t).run(c[None], late=True) for t, c in enumerate(commands))
+    unknown = float("nan")
+    return Design(
+        request, commands, levels, motions, (), np.zeros(0), np.zeros((0, 0)), unknown, None,
+        unknown, 0, absent("no bound was looked for"), {}, (), None, (), "given", (), 0, 0.0,
     )  # fmt: skip
 
 
-def rollout_of(request):
+def rollout_of(request, trial=0):
     return Rollout(
-        request.vessel, request.structure, request.theta, request.d, request.starts[0],
+        request.vessel, request.structure, request.theta, request.d, request.starts[trial],
         request.sample_time, request.integrator,
     )  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def plan():
-    rng = np.random.default_rng(3)
-    levels = rng.uniform([10, 0.6, 0.6], [20, 1.1, 1.1], (12, 3))
-    return plan_of(np.repeat(levels, 2, axis=0))
+def tanker_plan(folder, seed):
+    """A plan for the foreign tanker by a prior 20 % wrong, beside what published formulas say."""
+    path = folder / "ship.toml"
+    text = presets()["kvlcc2-7m"].ship.vessel_toml("quadratic")
+    path.write_text(text.replace("length = 7\n", f"length = 7\n{DIMENSIONS}"))
+    vessel = load_vessel(path)
+    model = semi_empirical_model(vessel)
+    theta = np.asarray(model.theta)
+    wrong = 1 + 0.2 * np.random.default_rng(seed).choice([-1, 1], theta.size)
+    model = replace(model, theta=theta * wrong, covariance=np.diag((0.2 * theta) ** 2))
+    wishes = Wishes(duration=180.0, hold=15.0, start=[0.9, 0, 0, 0], limits=TrialLimits())
+    request = prepare_request(model, both_sides(wishes, model, 15.0), vessel).request
+    design = design_of(request, ZIGZAG)
+    return design, legs_of(design)
 
 
 @pytest.fixture(scope="module")
-def legs(plan):
-    return legs_of(plan)
+def tanker(tmp_path_factory):
+    return tanker_plan(tmp_path_factory.mktemp("tanker"), 1)
 
 
-def test_equal_holds_are_one_leg(legs, plan) -> None:
-    (trial,) = legs.trials
-    assert len(trial) == 12
-    assert [leg.expected for leg in trial] == [20.0] * 12
-    nearly = plan.levels[0] + 0.002 * np.arange(24)[:, None] % 2
-    assert len(legs_of(plan_of(nearly)).trials[0]) == 12
-    np.testing.assert_allclose(list(trial[3].commands.values()), plan.levels[0][6])
+def simple_legs(**changes):
+    base = Leg({"n": 11.0, "delta": 0.3}, "time", 20.0, 20.0, 20.0)
+    return replace(base, **changes)
 
 
-@pytest.mark.parametrize(
-    "late",
-    [{}, {"lag": 2.0, "lag_on": "force"}, {"lag": 1.5, "lag_on": "command", "delay": 1.4},
-     {"rate_limit": 0.05, "rate_on": "alpha1"}],
-)  # fmt: skip
-def test_legs_by_time_are_the_plan_itself(plan, late) -> None:
-    vessel = replace(plan.request.vessel, actuation=Actuation(**late))
-    request = replace(plan.request, vessel=vessel)
-    held = [
-        Leg(dict(zip(HELD, level, strict=True)), "time", 10.0, 10.0, 10.0)
-        for level in plan.levels[0]
+def test_equal_holds_are_one_leg(tanker) -> None:
+    design, plan = tanker
+    first, ends = planned_ends(design.levels[0], design.request.schedule)
+    assert first.tolist() == [0, 1, 3, 5, 7, 8, 11]
+    assert ends[-1] == design.request.schedule.samples
+    legs = plan.trials[0]
+    assert [leg.commands["delta"] for leg in legs] == ZIGZAG[first, 1].tolist()
+    for leg in legs:
+        assert leg.at_least < leg.expected <= leg.at_most <= 2 * leg.expected + 1
+
+
+def test_legs_by_the_clock_are_the_plan(tanker) -> None:
+    design, plan = tanker
+    request = design.request
+    ends = planned_ends(design.levels[0], request.schedule)[1]
+    seconds = np.diff([0, *ends]) * request.sample_time
+    legs = [
+        replace(leg, until="time", value=float(s), at_most=float(s))
+        for leg, s in zip(plan.trials[0], seconds, strict=True)
     ]
-    models = drawn_models(request, 4)
-    sailed = sail_legs(rollout_of(request), models, held)
-    by_clock = rollout_of(request).run_models(models, plan.commands[0], late=True)
-    # what a lag keeps of commands long before is left out
-    np.testing.assert_allclose(sailed.ends, by_clock.state[:, 10::10, :4], atol=1e-3)
-    if not late:
-        np.testing.assert_allclose(sailed.ends, by_clock.state[:, 10::10, :4], atol=1e-9)
-    assert sailed.stable.all()
-    np.testing.assert_array_equal(sailed.seconds, 10.0)
-
-
-def test_models_are_off_in_their_damping(plan) -> None:
-    request = plan.request
-    models = drawn_models(request, 6)
-    share = models[1:] / request.theta - 1
-    names = request.structure.parameters
-    np.testing.assert_allclose(np.abs(share[:, names.index("Yvv")]), MISFIT)
-    np.testing.assert_allclose(share[:, names.index("Ymu")], 0, atol=1e-12)
-    np.testing.assert_allclose(models.mean(axis=0), request.theta)
-
-
-def test_legs_end_by_their_triggers(plan) -> None:
-    path = np.array([[0.0, 0.1, 0.2, 0.3, 0.25, 0.2], [0.0, -0.2, -0.3, -0.4, -0.5, -0.5]])
-    ends = [
-        leg("time", 3.0, 3.0), leg("heading", 0.2), leg("heading", -0.3), leg("speed", 0.25),
-        leg("speed", -0.2, rising=False), leg("yaw_rate", 0.9, at_most=2.0),
-    ]  # fmt: skip
-    found = [list(e.first(path, 1.0)) for e in ends]
-    assert found == [[3, 3], [2, 5], [5, 2], [3, 5], [5, 1], [2, 2]]
-    # change of heading counts from where the leg began
-    assert list(leg("heading", 0.2).first(path + 3, 1.0)) == [2, 5]
-    rollout = rollout_of(plan.request)
-    two = [leg("heading", -0.3), leg("time", 5.0, 5.0)]
-    models = drawn_models(plan.request, 8)
-    sailed = sail_legs(rollout, models, two)
-    turned = sailed.ends[:, 0, -1] - plan.request.starts[0][-1]
-    early = sailed.seconds[:, 0] < 40
-    assert early.any()
-    assert (turned[early] <= -0.3 + 1e-9).all()
-    assert (sailed.seconds[:, 1] == 5).all()
-
-
-def test_words_of_a_seaman() -> None:
-    assert leg("time", 30.0).words == "for 30 s"
-    turn = leg("heading", np.deg2rad(20))
-    assert turn.words == (
-        "until the heading has changed 20° to starboard, at the latest after 40 s"
-    )
-    assert turn.short == "until heading 20° to starboard, at most 40 s"
-    assert "speed has fallen to 1.20 m/s," in leg("speed", 1.2, rising=False).words
-    assert "speed has fallen to 0.50 m/s astern," in leg("speed", -0.5).words
-    assert "yaw rate has risen to 1.50°/s to port," in (
-        leg("yaw_rate", np.deg2rad(-1.5), rising=False).words
-    )
-    assert "yaw rate is zero," in leg("yaw_rate", 0.0).words
-
-
-def test_a_file_of_legs_reads_back(legs, plan, tmp_path) -> None:
-    mixed = LegPlan(
-        ((leg("heading", -0.3, rising=False), leg("speed", 1.2, rising=False)),
-         (leg("yaw_rate", 0.02), leg("time", 30.0))), 0.1, 0.2,
-    )  # fmt: skip
-    for which in (legs, mixed):
-        path = tmp_path / "plan.legs.json"
-        write_legs(which, plan, path)
-        assert read_legs(path) == which.trials
-        data = json.loads(path.read_text())
-        assert (data["format"], data["version"]) == ("greybox-legs", 1)
-        assert data["start"]["u"] == 1.5
-        with open(csv_twin(path), encoding="utf-8") as handle:
-            rows = list(csv.DictReader(handle))
-        assert [r["words"] for r in rows] == [x["words"] for x in data["legs"]]
-        assert [int(r["trial"]) for r in rows] == [x["trial"] for x in data["legs"]]
-    assert data["legs"][0]["until"] == {"kind": "heading", "change": -0.3}
-    assert data["legs"][1]["until"] == {"kind": "speed", "value": 1.2, "when": "falling"}
+    thetas = drawn_models(request, 5, 0)
+    sailed = sail_legs(rollout_of(request), thetas, legs, request.schedule)
+    clock = rollout_of(request).run_models(thetas, design.commands[0], late=True)
+    np.testing.assert_array_equal(sailed.ends, np.tile(ends, (5, 1)))
+    np.testing.assert_allclose(sailed.motion.state, clock.state, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    "leg",
     [
-        ("{}", "is no file of legs"),
-        ("[", "is no file of legs"),
-        ('{"format": "greybox-legs", "version": 2, "legs": []}', "greybox-legs 1 is needed"),
-        ('{"format": "greybox-legs", "version": 1, "legs": [{"until": {"kind": "x"}}]}', "'x'"),
+        simple_legs(until="heading", value=0.3, at_most=60.0),
+        simple_legs(until="speed", value=0.8, at_most=60.0, rising=False),
+        simple_legs(until="yaw_rate", value=0.02, at_most=60.0),
     ],
+    ids=lambda leg: leg.until,
 )
-def test_files_that_hold_no_legs(tmp_path, text, message) -> None:
-    path = tmp_path / "bad.json"
-    path.write_text(text)
-    with pytest.raises(LogError, match=message):
-        read_legs(path)
-    with pytest.raises(LogError, match="cannot read the legs"):
-        read_legs(tmp_path / "none.json")
+def test_every_model_ends_where_it_should(tanker, leg) -> None:
+    request = tanker[0].request
+    thetas = drawn_models(request, 12, 1)
+    sailed = sail_legs(rollout_of(request), thetas, [leg], request.schedule)
+    state, dt = sailed.motion.state, request.sample_time
+    signal = {
+        "heading": state[..., 3] - state[:, :1, 3],
+        "speed": np.hypot(state[..., 0], state[..., 1]),
+        "yaw_rate": state[..., 2],
+    }[leg.until]
+    sign = 1 if leg.rising else -1
+    assert len(set(sailed.ends[:, 0].tolist())) > 2
+    for value, end in zip(signal, sailed.ends[:, 0], strict=True):
+        if end < round(leg.at_most / dt):
+            assert sign * value[end] >= sign * leg.value > sign * value[end - 1]
+        else:
+            assert (sign * value[1:end] < sign * leg.value).all()
 
 
-def test_the_sheet_has_a_row_a_leg(legs, plan) -> None:
-    (band,) = predict_motion(plan)
-    contents = sheet_contents(plan, band, legs.trials[0])
-    cells = {c.name: c.cells for c in contents.columns}
-    assert cells["hold"] == (*(leg.words for leg in legs.trials[0]), "")
-    assert cells["time"][:3] == ("0:00", "0:20", "0:40")
-    assert cells["time"][-1] == "4:00"
-    assert "go on with the next row" in contents.note
-    assert "hold" not in {c.name for c in sheet_contents(plan, band).columns}
-    (figure,) = sheet_figures(plan, band, legs.trials[0])
-    written = [t.get_text() for t in figure.axes[0].texts]
-    assert legs.trials[0][0].words in written or legs.trials[0][0].short in written
+def test_under_the_prior_legs_give_its_plan_back(tanker) -> None:
+    design, plan = tanker
+    request = design.request
+    legs = plan.trials[0]
+    sailed = sail_legs(rollout_of(request), request.theta[None], legs, request.schedule)
+    ends = planned_ends(design.levels[0], request.schedule)[1]
+    expected = np.diff([0, *sailed.ends[0]]) * request.sample_time
+    # what was chosen was sailed the same way
+    np.testing.assert_allclose(expected, [leg.expected for leg in legs], atol=1e-9)
+    psi = design.motions[0].state[0, ends, 3]
+    assert np.rad2deg(np.abs(sailed.at_ends()[0, :, 3] - psi)).max() < 5
 
 
-@pytest.fixture(scope="module")
-def files(tmp_path_factory):
-    place = tmp_path_factory.mktemp("legs")
-    thesis_model(spread=0.02).save(place / "model.json")
-    (place / "ship.toml").write_text(
-        'name = "Thesis ship"\nlength = 30.0\n'
-        + "".join(
-            f'[[thruster]]\ntype = "azimuth"\nx = {x}\ny = 0.0\nspeed = "n"\nangle = "{a}"\n'
-            f"speed_limits = [10.0, 20.0]\nangle_limits = [0.6, 1.1]\n"
-            for x, a in ((9.0, "alpha1"), (-9.0, "alpha2"))
-        )
-        + "[sensors]\nu_std = 0.0141\nv_std = 0.0141\nr_std = 0.0141\n"
-    )
-    return place
+def test_legs_scatter_less_than_the_clock(tanker) -> None:
+    plan = tanker[1]
+    assert {leg.until for leg in plan.trials[0]} > {"heading"}
+    assert plan.off["psi"] < 0.9 * plan.off_by_clock["psi"]
+    assert plan.keeps_limits >= plan.by_clock - 0.05
+    assert not plan.assumed
 
 
-def asked(files, *options):
-    return [
-        "design", "--vessel", str(files / "ship.toml"), "--model", str(files / "model.json"),
-        "--duration", "100", "--out", str(files / "plan.csv"), "--effort", "0.05",
-        "--workers", "1", *options,
-    ]  # fmt: skip
-
-
-def test_the_command_for_coefficients(files, capsys) -> None:
-    out, sheet = files / "design.json", files / "sheet.html"
-    given = ["--predictor", "basic", "--regime", "u+v+", "--trials", "2", "--legs"]
-    assert main(asked(files, *given, "--json", str(out), "--sheet", str(sheet))) == 0
-    told = json.loads(out.read_text())["legs"]
-    assert told["file"] == str(files / "plan.legs.json")
-    assert 0 <= told["scatter"]["legs"] <= told["scatter"]["clock"]
-    trials = read_legs(told["file"])
-    assert len(trials) == 2
-    assert all(sum(leg.expected for leg in t) == pytest.approx(100) for t in trials)
-    assert csv_twin(told["file"]).exists()
-    page = sheet.read_text()
-    assert trials[0][0].words in page or trials[0][0].short in page
-    assert "as legs: " in capsys.readouterr().out
-
-
-def test_the_command_for_prediction(files, capsys) -> None:
-    path = files / "own.json"
-    assert main(asked(files, "--for", "prediction", "--json", "-", "--legs", str(path))) == 0
-    assert json.loads(capsys.readouterr().out)["legs"]["file"] == str(path)
-    assert read_legs(path)
-
-
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("plan.json", "which another option names"),
-        ("legs.csv", "has no ending .json"),
-        ("model.json", "would write over"),
-    ],
-)
-def test_files_that_legs_cannot_have(files, capsys, name, message) -> None:
-    assert main(asked(files, "--legs", str(files / name))) == 1
-    said = capsys.readouterr().err
-    assert message in said
-    assert said.count("\n") == 1
-
-
-def autopilot(legs, columns, reached):
-    """Sail legs as a crew does, and note the heading at the end of each."""
+def steered(legs):
+    """Sail the JSON's legs on a ship that knows nothing of the product; times of their ends."""
+    ended: list[tuple[float, float]] = []
 
     def manoeuvre(ship, rng):
-        now = [0, 0.0, None]
+        place, since, psi, first, before = 0, 0.0, None, None, None
+        turned = 0.0
 
         def helm(motion):
-            if now[2] is None:
-                now[2] = motion.psi
-            if now[0] < len(legs):
-                leg = legs[now[0]]
-                spent = motion.t - now[1]
-                done = spent >= leg.at_most - 1e-6
-                if leg.kind == "heading":
-                    done |= np.sign(leg.value) * (motion.psi - now[2]) >= abs(leg.value)
-                elif leg.kind in ("speed", "yaw_rate") and spent > 0:
-                    seen = motion.u if leg.kind == "speed" else motion.r
-                    done |= seen >= leg.value if leg.rising else seen <= leg.value
-                if done:
-                    reached.append(motion.psi)
-                    now[:] = [now[0] + 1, motion.t, motion.psi]
-            leg = legs[min(now[0], len(legs) - 1)]
-            return [leg.commands[c] for c in columns]
+            nonlocal place, since, psi, first, before, turned
+            if before is not None:
+                turned += math.remainder(motion.psi - before, 2 * math.pi)
+            before = motion.psi
+            psi = turned if psi is None else psi
+            leg = legs[place]
+            end, past = leg["until"], motion.t - since
+            signal = {
+                "time": past,
+                "heading": turned - (psi if end.get("since") == "leg" else 0.0),
+                "speed": math.hypot(motion.u, motion.v),
+                "yaw_rate": motion.r,
+            }[end["kind"]]
+            value = end.get("change", end.get("value", end.get("after")))
+            sign = 1 if end.get("crossing", "up") == "up" else -1
+            done = past >= leg["at_least"] and sign * signal >= sign * value
+            if place < len(legs) and (done or past >= leg["at_most"]):
+                ended.append((motion.t, turned))
+                if place + 1 < len(legs):
+                    place, since, psi = place + 1, motion.t, turned
+            return list(legs[place]["commands"].values())
 
         return helm
 
-    return manoeuvre
+    return manoeuvre, ended
 
 
-def test_a_foreign_ship_keeps_nearer_to_the_plan_by_legs() -> None:
-    preset = presets()["kvlcc2-7m"]
-    ship = preset.ship
-    tables = tomllib.loads(ship.vessel_toml()) | {
-        "beam": ship.beam, "mass": ship.inertia[0], "service_speed": ship.service_speed,
-        "conditions": {"draught": ship.draught},
-    }  # fmt: skip
-    vessel = vessel_from_dict(tables)
-    model = semi_empirical_model(vessel)
-    dt = model.sample_time
-    hold, duration = (dt * round(k * ship.time_scale / dt) for k in (4, 100))
-    off = {"legs": [], "clock": []}
-    columns = [a.column for a in ship.actuators]
-    for seed in range(2):
-        wishes = both_sides(Wishes(duration=duration, seed=seed, effort=0.1), model, hold)
-        request = prepare_request(model, wishes, vessel).request
-        design = design_for_prediction(request, model).design
-        found = legs_of(design)
-        assert found.scatter < found.by_clock
-        (legs,) = found.trials
-        assert {leg.kind for leg in legs} > {"time"}
-        ends = np.cumsum([leg.expected for leg in legs])
-        planned = design.motions[0].state[0, np.rint(ends / dt).astype(int), 3]
-        begin = design.request.starts[0]
-        where = {"start_speed": float(begin[0]), "start_heading": float(begin[-1])}
-        reached: list[float] = []
-        preset.sail(autopilot(legs, columns, reached), 1.5 * duration, **where)
-        assert len(reached) == len(legs)
-        off["legs"].append(np.array(reached) - planned)
-        rows = [[leg.commands[c] for c in columns] for leg in legs]
-        table = manoeuvres.table([0.0, *ends[:-1]], rows)
-        sailed = preset.sail(table, duration + 1, **where)
-        off["clock"].append(np.interp(ends, sailed.t, sailed.true["psi"]) - planned)
-    rms = {k: float(np.sqrt(np.mean(np.concatenate(v) ** 2))) for k, v in off.items()}
-    assert rms["legs"] < rms["clock"]
+def heading_off(design, plan):
+    """RMS distance [deg] from the plan at ends of legs on the foreign tanker, legs and clock."""
+    legs = json.loads(json.dumps(legs_to_dict(design, plan)))["legs"]
+    preset, dt = presets()["kvlcc2-7m"], design.request.sample_time
+    where = {"start_speed": 0.9, "start_heading": 0.0, "seed": 1}
+    manoeuvre, ended = steered(legs)
+    preset.sail(manoeuvre, sum(leg["at_most"] for leg in legs), **where)
+    times = np.arange(len(design.commands[0])) * dt
+    clock = preset.sail(manoeuvres.table(times, design.commands[0].tolist()), 180.0, **where)
+    ends = planned_ends(design.levels[0], design.request.schedule)[1]
+    by_clock = np.interp(ends * dt, clock.t, np.unwrap(clock.true["psi"]))
+    by_legs = np.array([psi for _, psi in ended[: len(legs)]])
+    planned = design.motions[0].state[0, ends, 3]
+    return [float(np.rad2deg(np.sqrt(np.mean((x - planned) ** 2)))) for x in (by_legs, by_clock)]
+
+
+def test_a_foreign_ship_keeps_the_plan_better_by_legs(tanker, tmp_path) -> None:
+    found = [heading_off(*tanker), *(heading_off(*tanker_plan(tmp_path, s)) for s in (2, 3))]
+    for by_legs, by_clock in found:
+        assert by_legs < by_clock
+    by_legs, by_clock = np.mean(found, axis=0)
+    assert by_legs < 0.6 * by_clock
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({}, "Rudder starboard 17.2°, n 11.0; for 20 s"),
+        ({"commands": {"n": 11.0, "delta": 0.0}}, "Rudder midships, n 11.0; for 20 s"),
+        (
+            {"until": "heading", "value": math.radians(-20), "at_most": 40.0, "rising": False},
+            "until heading has changed 20° to port, at the latest after 40 s",
+        ),
+        (
+            {"until": "heading", "value": math.radians(-20), "at_most": 150.0, "since": "trial"},
+            "until heading is 340°, turning to starboard, at the latest after 2:30 min",
+        ),
+        (
+            {"until": "speed", "value": 1.5, "at_most": 40.0, "rising": False},
+            "until speed has fallen to 1.5 m/s (2.9 kn), at the latest after 40 s",
+        ),
+        (
+            {"until": "yaw_rate", "value": math.radians(-2), "at_most": 40.0, "rising": False},
+            "until yaw rate has risen to 2°/s to port, at the latest after 40 s",
+        ),
+        (
+            {"until": "yaw_rate", "value": math.radians(2), "at_most": 40.0, "rising": False},
+            "until yaw rate has fallen to 2°/s to starboard, at the latest after 40 s",
+        ),
+        (
+            {"until": "yaw_rate", "value": 0.0, "at_most": 40.0},
+            "until she has stopped turning, at the latest after 40 s",
+        ),
+    ],
+)
+def test_words(tanker, changes, words) -> None:
+    assert leg_words(simple_legs(**changes), tanker[0], 0).endswith(words)
+
+
+def test_files(tanker, tmp_path) -> None:
+    design, plan = tanker
+    path = legs_path("", tmp_path / "plan.csv")
+    assert path.name == "plan.legs.json"
+    write_legs(design, plan, path)
+    data = json.loads(path.read_text())
+    schema("legs-1", "experiment_design").validate(data)
+    assert data["start"] == {"u": 0.9, "v": 0, "r": 0, "psi": 0, "x_n": 0, "y_n": 0}
+    with open(tmp_path / "plan.legs.csv", newline="") as handle:
+        rows = list(csv.DictReader(handle))
+    assert [int(row["leg"]) for row in rows] == [*range(1, len(data["legs"]) + 1)]
+    for row, leg in zip(rows, data["legs"], strict=True):
+        assert row["until"] == leg["until"]["kind"]
+        assert row["words"] == leg["words"]
+        assert float(row["delta"]) == pytest.approx(leg["commands"]["delta"])
+
+
+def test_the_csv_never_replaces_the_plan(tmp_path) -> None:
+    assert csv_path(legs_path(str(tmp_path / "plan.json"), "plan.csv")).name == "plan.legs.csv"
+    with pytest.raises(UsageError, match=r"ends in \.json, such as plan\.legs\.json"):
+        legs_path("plan.csv", "plan.csv")
+
+
+def test_the_sheet_holds_the_legs(tanker, tmp_path) -> None:
+    design, plan = tanker
+    (band,) = predict_motion(design, 20)
+    contents = sheet_contents(design, band, plan.trials[0])
+    (do,) = [c for c in contents.columns if c.words]
+    assert do.cells[:-1] == tuple(leg_words(leg, design, 0) for leg in plan.trials[0])
+    assert contents.columns[0].cells[0] == "0:00"
+    write_sheet(design, tmp_path / "sheet.html", plan)
+    page = (tmp_path / "sheet.html").read_text()
+    assert do.cells[1] in page
+    write_sheet(design, tmp_path / "sheet.pdf", plan)
+    assert (tmp_path / "sheet.pdf").read_bytes().startswith(b"%PDF")
+
+
+def test_several_trials_with_ramps_in_a_sea_room_and_no_stated_scatter() -> None:
+    regime = (("u", 1),)
+    start = np.array([1.5, 1.2, 0.0, 0.0])
+    request = make_request(
+        vessel=limited_ship(speed=2.0, angle=0.2), regimes=(regime,) * 2, starts=(start,) * 2,
+        limits=TrialLimits(area=Circle(0.0, 0.0, 400.0)), duration=80.0,
+    )  # fmt: skip
+    schedule = request.schedule
+    rng = np.random.default_rng(1)
+    span = schedule.upper - schedule.lower
+    levels = [
+        schedule.within_reach(schedule.lower + span * rng.uniform(0, 1, (8, len(span))))
+        for _ in range(2)
+    ]
+    design = design_of(request, *levels)
+    plan = legs_of(design)
+    assert plan.assumed
+    assert [len(legs) for legs in plan.trials] == [8, 8]
+    assert "place" in plan.off
+    # as sailed, commands keep their rates
+    thetas = drawn_models(request, 6, 9)
+    commands = sail_legs(rollout_of(request), thetas, plan.trials[0], schedule).motion.commands
+    pace = np.abs(np.diff(commands, axis=1)).max(axis=(0, 1))
+    assert (pace <= span / np.array(schedule.ramp) + 1e-9).all()
+    data = legs_to_dict(design, plan)
+    schema("legs-1", "experiment_design").validate(data)
+    assert len(data["start"]) == 2
+    assert [leg["trial"] for leg in data["legs"]] == [1] * 8 + [2] * 8
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """The tanker's vessel file, and models of the thesis's ship."""
+    where = tmp_path_factory.mktemp("line")
+    text = presets()["kvlcc2-7m"].ship.vessel_toml("quadratic")
+    (where / "tanker.toml").write_text(text.replace("length = 7\n", f"length = 7\n{DIMENSIONS}"))
+    thesis_model("surge", spread=0.1).save(where / "surge.json")
+    thesis_model().save(where / "one.json")
+    theta = thesis_model().theta.copy()
+    theta[thesis_model().names.index("Nvr")] = -0.08
+    replace(thesis_model(), theta=theta).save(where / "other.json")
+    return where
+
+
+@pytest.mark.parametrize(
+    ("options", "duration"),
+    [
+        ("--vessel tanker.toml --prior none --predictor basic --hold 8", 160),
+        ("--vessel thesis --model surge.json --criterion D", 160),
+        ("--vessel thesis --between one.json other.json --regime u+v+ --start 1.5,1.2,0,0", 100),
+    ],
+    ids=["prediction", "coefficients", "between"],
+)
+def test_from_the_command_line(folder, monkeypatch, capsys, options, duration) -> None:
+    monkeypatch.chdir(folder)
+    status = main(
+        ["design", *options.split(), "--duration", str(duration), "--effort", "0.02", "--workers",
+         "1", "--out", "plan.csv", "--legs", "--json", "design.json"]
+    )  # fmt: skip
+    assert status == 0
+    data = json.loads((folder / "design.json").read_text())
+    schema("design-1", "experiment_design").validate(data)
+    legs = data["legs"]
+    assert legs["file"] == "plan.legs.json"
+    assert 0 <= legs["keeps_limits"] <= 1
+    assert 0 <= legs["by_clock"] <= 1
+    written = json.loads((folder / "plan.legs.json").read_text())
+    assert sum(leg["expected"] for leg in written["legs"]) == pytest.approx(duration, rel=0.1)
+    said = capsys.readouterr()
+    assert "as legs, of which" in said.out + said.err
+    assert "wrote plan.legs.json" in said.out + said.err

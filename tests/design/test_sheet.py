@@ -23,9 +23,14 @@ from experiment_design.output.pictures import forbidden
 from experiment_design.output.prediction import edge_distance, predict_motion
 from experiment_design.output.report import design_page, random_std
 from experiment_design.output.result import Design
-from experiment_design.output.sheet_contents import plain_name, sheet_contents
+from experiment_design.output.sheet_contents import (
+    clock,
+    compass,
+    plain_name,
+    sheet_contents,
+    signed,
+)
 from experiment_design.output.trial_sheet import sheet_figures, sheet_kind, write_sheet
-from experiment_design.output.words import clock, compass, signed
 from experiment_design.prepare import Wishes, prepare_request
 from experiment_design.request.request import build_problem
 from greybox.commands.main import main
