@@ -9,8 +9,6 @@ import numpy as np
 import pandas as pd
 import pytest
 from designs import make_request, thesis_model
-from foreign_ships.manoeuvres import everyday, random_steps, table
-from foreign_ships.presets import presets
 from virtual import virtual_log, write_csv
 
 from experiment_design.after import lacking_margin, log_moments, log_motion, sailed_trial
@@ -26,11 +24,8 @@ from greybox.commands.main import main
 from greybox.errors import LogError
 from greybox.model.model import load_model
 from greybox.model.predictor import build_predictor
-from greybox.selection.estimate import estimate_model
-from greybox.trial.convert.read import read_log
 from greybox.trial.log import TrialLog, make_log
 from greybox.validation.fit import run_model
-from greybox.vessel.toml import load_vessel
 
 SHIP = (
     'name = "Thesis ship"\nlength = 30.0\n'
@@ -263,75 +258,3 @@ def test_a_log_without_its_columns_is_named(files, capsys) -> None:
 def test_nothing_to_save_without_logs(files, capsys) -> None:
     assert run(files, "--prior", "none", "--duration", "99", "--save-model", "s.json") == 1
     assert "--after LOG estimates" in capsys.readouterr().err
-
-
-SECONDS = 300.0
-
-
-def _sail_on(preset, folder, name, seed, begun, plan=None):
-    """Sail on from where the trials of `begun` ended; return the log and all commands so far."""
-    ship, dt = preset.ship, preset.dt
-    columns = [a.column for a in ship.actuators]
-    if plan is None:
-        trial = preset.sail(random_steps(), SECONDS, seed=seed, start_heading=0.5)
-        rows = np.column_stack([trial.true[f"{c}_command"] for c in columns])
-    else:
-        steps = pd.read_csv(plan)
-        every = round(float(steps["t"][1] - steps["t"][0]) / dt)
-        rows = np.concatenate([begun, np.repeat(steps[columns].to_numpy(), every, axis=0)])
-        # the whole trial again, up to where it is now, in the same calm water
-        helm = table(np.arange(len(rows)) * dt, rows.tolist())
-        trial = preset.sail(helm, (len(rows) - 1) * dt, seed=seed, start_heading=0.5)
-    sailed = {n: x[0 if plan is None else len(begun) :] for n, x in trial.columns().items()}
-    values = np.column_stack(list(sailed.values()))
-    np.savetxt(folder / name, values, delimiter=",", header=",".join(sailed), comments="")
-    return folder / name, rows
-
-
-def _held_out(preset, folder, model, vessel, seed):
-    """Return the mean fit of a model on everyday manoeuvres that it never saw."""
-    path = preset.sail(everyday(), 600.0, seed=900 + seed).write_csv(folder / "other.csv")
-    fit = run_model(model, read_log(path, vessel)).fit
-    return float(np.mean([max(v, -100.0) for v in fit.values()]))
-
-
-def staged_fits(folder, seed: int, stages: int = 3) -> tuple[float, float, float]:
-    """Return held-out fits [%] after a first trial, and after one or several more of it."""
-    preset = presets()["kvlcc2-7m"]
-    file = folder / "ship.toml"
-    file.write_text(preset.ship.vessel_toml())
-    vessel = load_vessel(file)
-    log, rows = _sail_on(preset, folder, "first.csv", seed, None)
-
-    def rest(logs, begun, seconds, name, known=None):
-        plan, model = folder / f"{name}.plan.csv", folder / f"{name}.json"
-        given = ["--model", str(known)] if known else ["--save-model", str(model)]
-        status = main(["design", "--vessel", str(file), "--after", *map(str, logs), "--remaining",
-                       str(seconds), "--out", str(plan), *given])  # fmt: skip
-        assert status == 0
-        new, sailed = _sail_on(preset, folder, f"{name}.csv", seed, begun, plan)
-        return [*logs, new], sailed
-
-    several, begun = [log], rows
-    for k in range(stages):
-        several, begun = rest(several, begun, SECONDS, f"stage{k}")
-    whole, _ = rest([log], rows, stages * SECONDS, "whole", folder / "stage0.json")
-    models = [load_model(folder / "stage0.json")]
-    models += [
-        estimate_model([read_log(p, vessel) for p in logs]).model() for logs in (whole, several)
-    ]
-    first, one, staged = (_held_out(preset, folder, m, vessel, seed) for m in models)
-    print(f"seed {seed}: first {first:.1f} %, one more {one:.1f} %, {stages} more {staged:.1f} %")
-    return first, one, staged
-
-
-@pytest.mark.long
-def test_three_stages_and_one_after_the_same_first_trial(tmp_path) -> None:
-    fits = []
-    for seed in (1, 2):
-        folder = tmp_path / str(seed)
-        folder.mkdir()
-        fits.append(staged_fits(folder, seed))
-    first, one, staged = np.mean(fits, axis=0)
-    assert staged > one - 5.0
-    assert min(staged, one) > first - 2.0
