@@ -120,6 +120,7 @@ class PredictionDesign:
         lines = [
             f"Plan for {r.vessel.name}: {r.trials} trial{'s' if r.trials > 1 else ''} of "
             f"{r.duration:g} s for prediction, both sides, {ranges}",
+            *(["planned without an estimated model, from main dimensions"] if r.untried else []),
             self.headline(),
             f"the last {VALIDATION:.0%} of each trial are usual manoeuvres, a two-sided zig-zag "
             f"and a turn, by which an estimate judges itself",

@@ -73,7 +73,7 @@ def test_a_plan_comes_for_each_kind_of_ship(tmp_path, capsys, name, duration, ho
         ("research-catamaran-29m", "300", "10"),
     ],
 )
-def test_whole_model_in_a_chosen_regime(tmp_path, capsys, name, duration, hold):
+def test_a_plan_for_prediction_of_the_whole_model(tmp_path, capsys, name, duration, hold):
     out = tmp_path / "design.json"
     status, plan = design(
         tmp_path, vessel_file(tmp_path, name), "--prior", "none", "--duration", duration,
