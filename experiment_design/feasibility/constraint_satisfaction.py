@@ -102,14 +102,21 @@ def keep_probability(
         missed.append(over)
     worst = np.max(missed, axis=0)
     quantile = min(0.995, request.probability + 0.5 * (1 - request.probability))
-    shortfall = np.array([float(np.quantile(w[np.isfinite(w)], quantile)) for w in worst])
+    # no limit that is tightened helps models that all run away
+    shortfall = np.array([_quantile(w, quantile, 0.0) for w in worst])
     hits = int(kept.sum())
     low, high = wilson(hits, draws)
     margins = {}
     for i, name in enumerate(request.trial_limits(0).signs):
-        margins[name] = request.limits.margins.get(name, 0.0) - float(
-            np.quantile(worst[i][np.isfinite(worst[i])], request.probability)
+        margins[name] = request.limits.margins.get(name, 0.0) - _quantile(
+            worst[i], request.probability, np.inf
         )
     return ConstraintSatisfaction(
         hits / draws, low, high, draws, np.maximum(shortfall, 0.0), margins
     )
+
+
+def _quantile(values: Array, share: float, otherwise: float) -> float:
+    """Return a quantile of the finite values, or another number where there are none."""
+    finite = values[np.isfinite(values)]
+    return float(np.quantile(finite, share)) if finite.size else otherwise

@@ -12,6 +12,7 @@ from experiment_design.constraints.limit_program import LimitProgram
 from experiment_design.constraints.limits import Circle, TrialLimits
 from experiment_design.excitation.schedule import make_schedule
 from experiment_design.feasibility.checks import feasible_or_reason
+from experiment_design.feasibility.constraint_satisfaction import keep_probability
 from experiment_design.feasibility.least_violation import moved_constant
 from experiment_design.optimise.search import assess
 from experiment_design.request.request import build_problem
@@ -202,3 +203,17 @@ def test_where_only_what_tells_nothing_keeps_the_limits_the_limit_is_named():
     assert "regressor" in reason
     lively = replace(silent, value=1.0)
     assert feasible_or_reason(problem, request, 0, telling, lively) == (lively, "")
+
+
+def test_models_that_all_run_away_keep_no_limit():
+    request = make_request(limits=TrialLimits(margins={"u": 0.2, "v": 0.2}, speed_cap=5.0))
+    spread = np.zeros(len(request.theta))
+    for name in ("Xu", "Yv", "Nr"):
+        # damping either drives her beyond every bound, or stops her with a jerk that grows
+        spread[request.structure.index(name)] = 1e3
+    request = replace(request, covariance=np.diag(spread**2))
+    problem = build_problem(request)
+    found = keep_probability(request, [np.full(problem.shape, 0.5)], draws=50)
+    assert found.probability == 0.0
+    assert not found.shortfall.any()
+    assert found.margins["u"] == -np.inf
