@@ -298,9 +298,8 @@ def run(options: argparse.Namespace) -> None:
 
     from experiment_design.design import design_trial
     from experiment_design.optimise.duration import least_duration
-    from experiment_design.output.result import write_plan
     from greybox.errors import UsageError
-    from greybox.files import check_targets, write_json
+    from greybox.files import check_targets
     from greybox.model.model import load_model
     from greybox.model.semi_empirical import semi_empirical_model
     from greybox.vessel.toml import load_vessel
@@ -369,24 +368,38 @@ def run(options: argparse.Namespace) -> None:
         progress=progress("design"),
         workers=options.workers,
     )
+    _deliver(options, design, design, prepared.notes, _of_sailed(sailed))
+
+
+def _deliver(
+    options: argparse.Namespace,
+    design: Any,
+    found: Any,
+    notes: tuple[str, ...],
+    more: dict[str, Any],
+    headline: str = "",
+) -> None:
+    """Write the plan and all that was asked for beside it, and tell what was found."""
+    from experiment_design.output.result import write_plan
+    from greybox.files import write_json
+
     write_plan(design, options.out)
     legs, said = _legs(options, design)
-    record = provenance(options)
     if options.json:
-        data: dict[str, Any] = design.to_dict() | said | _of_sailed(sailed)
-        data["notes"] = [*prepared.notes, *data["notes"]]
-        write_json(data | {"provenance": record}, options.json)
-    _show(options, design, prepared.notes, legs)
-    if options.json != "-":
-        say(design.summary())
-        _say_legs(legs)
-        for note in prepared.notes:
-            say(f"Note: {note}")
-        for path in (
-            options.out, options.legs, options.sheet, options.report, options.save_model,
-        ):  # fmt: skip
-            if path:
-                say(f"wrote {path}")
+        data: dict[str, Any] = found.to_dict() | said | more
+        data["notes"] = [*notes, *data["notes"]]
+        write_json(data | {"provenance": provenance(options)}, options.json)
+    _show(options, design, notes, legs, headline)
+    if options.json == "-":
+        return
+    say(found.summary())
+    if legs is not None:
+        say(legs.sentence())
+    for note in notes:
+        say(f"Note: {note}")
+    for path in (options.out, options.legs, options.sheet, options.report, options.save_model):
+        if path:
+            say(f"wrote {path}")
 
 
 def _require_stages(options: argparse.Namespace) -> None:
@@ -543,9 +556,7 @@ def _run_for_prediction(
     from dataclasses import replace
 
     from experiment_design.for_prediction import design_for_prediction
-    from experiment_design.output.result import write_plan
     from experiment_design.prepare import both_sides
-    from greybox.files import write_json
 
     wishes = both_sides(_wishes(options, model, sailed), model, options.hold)
     prepared, ended = _prepared(options, model, wishes, vessel, sailed)
@@ -559,23 +570,7 @@ def _run_for_prediction(
         kept_starts=options.trials if options.start is not None else int(ended),
         sailed=sailed.motions if sailed is not None else (),
     )
-    write_plan(found.design, options.out)
-    legs, said = _legs(options, found.design)
-    if options.json:
-        data = found.to_dict() | said | _of_sailed(sailed)
-        data["notes"] = [*prepared.notes, *data["notes"]]
-        write_json(data | {"provenance": provenance(options)}, options.json)
-    _show(options, found.design, prepared.notes, legs, found.headline())
-    if options.json != "-":
-        say(found.summary())
-        _say_legs(legs)
-        for note in prepared.notes:
-            say(f"Note: {note}")
-        for path in (
-            options.out, options.legs, options.sheet, options.report, options.save_model,
-        ):  # fmt: skip
-            if path:
-                say(f"wrote {path}")
+    _deliver(options, found.design, found, prepared.notes, _of_sailed(sailed), found.headline())
 
 
 def _range(text: str, vessel: Any) -> tuple[str, tuple[float, float]]:
@@ -604,10 +599,8 @@ def _range(text: str, vessel: Any) -> tuple[str, tuple[float, float]]:
 def _run_between(options: argparse.Namespace, request: Any, notes: tuple[str, ...]) -> None:
     """Design the trial between two models and write it."""
     from experiment_design.discriminate import design_between
-    from experiment_design.output.result import write_plan
     from experiment_design.request.request import CandidateModel, full_structure
     from greybox.errors import UsageError
-    from greybox.files import write_json
     from greybox.model.model import load_model
     from greybox.vessel.actuation import with_actuators_of
 
@@ -635,22 +628,8 @@ def _run_between(options: argparse.Namespace, request: Any, notes: tuple[str, ..
         progress=progress("design"),
         workers=options.workers,
     )
-    write_plan(found.design, options.out)
-    legs, said = _legs(options, found.design)
-    if options.json:
-        data = found.to_dict() | said
-        data["notes"] = [*notes, *data["notes"]]
-        write_json(data | {"provenance": provenance(options)}, options.json)
     lines = found.summary().splitlines()
-    _show(options, found.design, notes, legs, f"{lines[0]}: {lines[3]}.")
-    if options.json != "-":
-        say(found.summary())
-        _say_legs(legs)
-        for note in notes:
-            say(f"Note: {note}")
-        for path in (options.out, options.legs, options.sheet, options.report):
-            if path:
-                say(f"wrote {path}")
+    _deliver(options, found.design, found, notes, {}, f"{lines[0]}: {lines[3]}.")
 
 
 def _legs(options: argparse.Namespace, design: Any) -> tuple[Any, dict[str, Any]]:
@@ -666,11 +645,6 @@ def _legs(options: argparse.Namespace, design: Any) -> tuple[Any, dict[str, Any]
         plan = legs_of(design)
     write_legs(design, plan, Path(options.legs))
     return plan, {"legs": {"file": options.legs, **plan.to_dict()}}
-
-
-def _say_legs(legs: Any) -> None:
-    if legs is not None:
-        say(legs.sentence())
 
 
 def _show(

@@ -12,6 +12,7 @@ from experiment_design.constraints.limit_program import LimitProgram
 from experiment_design.excitation.rollout import Rollout
 from experiment_design.request.request import DesignRequest
 from greybox.model.predictor_kinds import PREDICTORS
+from greybox.numerics.binomial import wilson_interval
 
 Array = NDArray[np.float64]
 
@@ -58,14 +59,6 @@ class ConstraintSatisfaction:
         }
 
 
-def wilson(hits: int, count: int) -> tuple[float, float]:
-    """Return the 95 % Wilson interval of a share."""
-    z, p = 1.959963984540054, hits / count
-    centre = (p + z**2 / (2 * count)) / (1 + z**2 / count)
-    half = z * np.sqrt(p * (1 - p) / count + z**2 / (4 * count**2)) / (1 + z**2 / count)
-    return max(0.0, float(centre - half)), min(1.0, float(centre + half))
-
-
 def keep_probability(
     request: DesignRequest, units: list[Array], draws: int = _DRAWS
 ) -> ConstraintSatisfaction:
@@ -105,7 +98,7 @@ def keep_probability(
     # no limit that is tightened helps models that all run away
     shortfall = np.array([_quantile(w, quantile, 0.0) for w in worst])
     hits = int(kept.sum())
-    low, high = wilson(hits, draws)
+    low, high = wilson_interval(hits / draws, draws)
     margins = {}
     for i, name in enumerate(request.trial_limits(0).signs):
         margins[name] = request.limits.margins.get(name, 0.0) - _quantile(

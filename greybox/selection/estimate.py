@@ -78,8 +78,9 @@ _FOR_FREE_RUN, _FOR_TERMS, _FOR_VERDICT = 0.3, 0.7, 0.25
 # error of held-out free runs beyond the sensors' noise, as a share of the spread, up to which a
 # published structure is not compared with terms that the data select. Ships written by others
 # were followed to 63 % where selected terms follow them to 76 %; short logs of ships in the
-# family leave as much by the noise in their coefficients alone
-_SMALL = 0.2
+# family leave as much by the noise in their coefficients alone, and follow their own logs, which
+# must be left by this much too
+_SMALL, _OWN = 0.2, 0.1
 
 
 @known_keywords
@@ -252,8 +253,15 @@ def _leaves_more(estimate: Estimate) -> bool:
         # instruments that contradict a structure are told by their own test, and where they do
         # not, its runs err by the noise in the coefficients
         return False
+
+    def beyond(error: float | None, noise: float | None, spread: float) -> float:
+        """Return an error without the sensors' noise, as a share of the spread."""
+        left = max((np.inf if error is None else error) ** 2 - (noise or 0.0) ** 2, 0.0)
+        return float(np.sqrt(left)) / spread
+
+    # what is not there on the logs of the estimate is the noise of its coefficients
     return any(
-        c.rmse**2 - (c.noise or 0.0) ** 2 > (_SMALL * c.spread) ** 2
+        beyond(c.rmse, c.noise, c.spread) > _SMALL and beyond(c.own, c.noise, c.spread) > _OWN
         for c in judged.channels
         if c.moves
     )

@@ -124,7 +124,7 @@ def test_what_the_log_cannot_tell_from_damping_is_damping(modulus_log):
 
 
 def test_a_published_structure_stays_where_it_follows_within_noise():
-    found = estimate_model([virtual_log(4, 1500, wind=0.0, spread=1e-12, current=(0.0, 0.0))])
+    found = estimate_model([virtual_log(4, 600, wind=0.0, spread=1e-12, current=(0.0, 0.0))])
     assert found.predictor.structure.name.startswith(("thesis", "linear"))
     assert not any("selected" in note for note in found.notes)
 
