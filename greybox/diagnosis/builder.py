@@ -20,6 +20,7 @@ from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.gain import gains, run_on
 from greybox.diagnosis.null_model import FOLDS, DiagnosisProblem
 from greybox.diagnosis.point import Fit
+from greybox.diagnosis.quantities import quantities_of
 from greybox.diagnosis.refitting import refit
 from greybox.diagnosis.residuals import residual_tests
 from greybox.diagnosis.result import (
@@ -87,7 +88,7 @@ class DiagnosisBuilder:
     def cause(self, candidate: Candidate, fit: Fit) -> Found:
         """Return a candidate as it stands in a fit."""
         cause = self.causes[candidate.hypothesis.cause]
-        quantities = self.quantities(candidate, fit)
+        quantities = quantities_of(self.case.problem(fit.integrator), candidate, fit)
         told = {k: (q.value, q.std) for k, q in quantities.items()}
         return Found(
             candidate.hypothesis.id, candidate.hypothesis.key, cause.title, quantities,
@@ -95,36 +96,6 @@ class DiagnosisBuilder:
             cause.evidence_of(candidate.hypothesis, told), cause.extension,
             cause.reference, candidate.gain, candidate.proof.gain, candidate.proof.std,
         )  # fmt: skip
-
-    def quantities(self, candidate: Candidate, fit: Fit) -> dict[str, Quantity]:
-        """Return a cause's parameters with standard errors."""
-        problem = self.case.problem(fit.integrator)
-        values, covariance = problem.covariance(fit)
-        std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-        hypothesis = candidate.hypothesis
-        if hypothesis.apply is None:
-            index = [fit.point.places.index(problem.place(n)) for n in hypothesis.columns]
-        else:
-            k = [a.key for a in fit.point.hypotheses].index(hypothesis.key)
-            first = len(fit.point.places) + sum(map(len, fit.point.values[:k]))
-            index = list(range(first, first + len(fit.point.values[k])))
-        if not index:
-            one = -1.0 if hypothesis.refit_from_scratch else 1.0
-            return {hypothesis.key.split(":", 1)[1]: Quantity(one, 0.0, "1")}
-        wide = problem.spread(fit, hypothesis)
-        weighed = candidate.standing
-        # what a generic force would move a number by is a part of what is not known of it
-        moved = np.zeros(len(index)) if weighed is None else weighed.moved[: len(index)]
-        return {
-            p.name: Quantity(
-                *p.told(
-                    float(values[i]),
-                    float(np.linalg.norm([max(std[i], wide.get(p.name, 0.0)), p.coarse, by])),
-                ),
-                p.unit,
-            )
-            for p, i, by in zip(hypothesis.parameters, index, moved, strict=True)
-        }
 
     def made(
         self,
@@ -207,7 +178,7 @@ class DiagnosisBuilder:
             Taken(
                 c.hypothesis.id, run(own[c.hypothesis.key]),
                 run(self._alone(final, c)) if c.hypothesis.key == main else (),
-                _relative(self.quantities(c, final)),
+                _relative(quantities_of(problem, c, final)),
             )
             for c in named
         ]  # fmt: skip

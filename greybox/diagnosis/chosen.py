@@ -2,7 +2,8 @@
 
 Where (3.51) with a few causes leaves more than noise, `estimate`'s choice of terms begins: each
 that stands for a cause is in force as one, is tested by leaving it out, and what else is wrong is
-sought beside them.
+sought beside them. Lags, delays and rate limits that stood before are held at their values, for
+the choice of terms, too.
 """
 
 from __future__ import annotations
@@ -21,8 +22,9 @@ from greybox.diagnosis.noise import Noise
 from greybox.diagnosis.null_model import INTEGRATORS, DiagnosisProblem
 from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.preparing import Prepared, context_of
+from greybox.diagnosis.quantities import quantities_of
 from greybox.diagnosis.refitting import SETTLE, on_all_processors
-from greybox.diagnosis.search import Search, assess_candidate, search
+from greybox.diagnosis.search import Candidate, Search, assess_candidate, search
 from greybox.diagnosis.ship import CURRENTS, Ship
 from greybox.errors import ExcitationError, GreyboxError
 from greybox.model.structure import Structure
@@ -56,6 +58,8 @@ def from_chosen(
     progress : callable
     """
     progress("terms that the data choose")
+    late = _late(ready.case, found)
+    ready = replace(ready, case=ready.case.acting(found.final.point.ship.vessel)) if late else ready
     try:
         choice = _choice(ready.case.logs)
     except GreyboxError:
@@ -64,15 +68,16 @@ def from_chosen(
     case = ready.case.wider(terms, "free run")
     base = case.carried(found.base)
     plain = case.problem(base.integrator).settle(base)
-    starts = [case.carried(searched.final).point]
+    starts = [_holding(case, case.carried(searched.final).point, late)]
     # what the sensors deny imitates what forces do
     hypotheses = ready.of_forces
-    named = [c.hypothesis for c in searched.causes]
+    keys = {c.hypothesis.key for c in late}
+    named = [c.hypothesis for c in searched.causes if c.hypothesis.key not in keys]
     chosen: list[Hypothesis] = []
     every: list[Hypothesis] = []
     if choice is not None:
         chosen, every = _hypotheses(ready, case, choice)
-        starts.append(_start(ready, case, choice, chosen, base))
+        starts.append(_holding(case, _start(ready, case, choice, chosen, base), late))
     fit, *rest = _bounded(case, starts, plain.noise)
     by_data = rest[0] if rest else None
     if by_data is not None and (fit is None or _nearer(case, by_data, fit)):
@@ -84,9 +89,35 @@ def from_chosen(
     # each is weighed at the end, by leaving it out
     causes = [assess_candidate(proof, plain, fit, a, len(hypotheses), names) for a in named]
     others = [a for a in hypotheses if a not in named]
-    other = search(case, fit, others, begun=causes, progress=progress)
+    other = search(case, fit, others, begun=[*causes, *late], progress=progress)
     mine = replace(other, base=base, tried=len(hypotheses), chosen=by_data)
     return (case, mine) if _nearer(case, mine.final, case.carried(found.final)) else None
+
+
+def _late(case: DiagnosisProblem, found: Search) -> list[Candidate]:
+    """Return the causes of past commands that stand, held at what innovations tell of them.
+
+    Innovations forget the structure's misfit within seconds and show what commands do late; errors
+    of whole runs do not.
+    """
+    out = []
+    for cause in found.causes:
+        hypothesis, fit = cause.hypothesis, found.final
+        if not hypothesis.past:
+            continue
+        value = fit.point.values[[h.key for h in fit.point.hypotheses].index(hypothesis.key)]
+        told = quantities_of(case.problem(fit.integrator), cause, fit)
+        out.append(replace(cause, hypothesis=hypothesis.held_at(value), told=told))
+    return out
+
+
+def _holding(case: DiagnosisProblem, point: Point, late: Sequence[Candidate]) -> Point:
+    """Return a point with causes held at their values."""
+    for cause in late:
+        if any(h.key == cause.hypothesis.key for h in point.hypotheses):
+            point = case.problem("euler").drop(point, cause.hypothesis)
+        point = case.problem("euler").add(point, cause.hypothesis)
+    return point
 
 
 def _start(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,6 +96,9 @@ class Hypothesis:
         parameters tells it.
     only : bool
         Whether a ship has room for one hypothesis of this cause.
+    past : bool
+        Whether it changes how a force follows earlier commands, as no force of motion and present
+        commands can.
     """
 
     cause: str
@@ -110,11 +113,21 @@ class Hypothesis:
     refit_from_scratch: bool = False
     place: str = ""
     only: bool = False
+    past: bool = False
 
     @property
     def id(self) -> str:
         """The cause's id, with the place where there is one, as results name it."""
         return f"{self.cause}:{self.place}" if self.place else self.cause
+
+    def held_at(self, value: Array) -> Hypothesis:
+        """Return the hypothesis in force with these values, none of them free."""
+        apply = self.apply
+        assert apply is not None
+        return replace(
+            self, parameters=(), apply=lambda ship, _: apply(ship, value), starts=(), variants=(),
+            only=True,
+        )  # fmt: skip
 
     @property
     def start(self) -> Array:

@@ -26,6 +26,7 @@ from greybox.numerics.forked import map_forked
 from greybox.regression.regression import build_regression
 from greybox.rotation import body_to_ned
 from greybox.trial.log import TrialLog
+from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
 
@@ -85,6 +86,19 @@ class DiagnosisProblem:
             self.structure, self.universe.with_terms(*more), self.logs, self.held_out_logs,
             self.kind, self.regime, metric,
         )  # fmt: skip
+
+    def acting(self, vessel: Vessel) -> DiagnosisProblem:
+        """Return the case with logs whose commands act as they do in a vessel."""
+        logs, held_out = (
+            [
+                replace(log, vessel=replace(log.vessel, actuation=vessel.actuation))
+                for log in every
+            ]
+            for every in (self.logs, self.held_out_logs)
+        )  # fmt: skip
+        return DiagnosisProblem(
+            self.structure, self.universe, logs, held_out, self.kind, self.regime, self.metric
+        )
 
     def carried(self, fit: Fit) -> Fit:
         """Return a fit of a case with fewer terms as one of this."""

@@ -7,7 +7,7 @@ correction for all that were tried, and when it predicts logs that it was not fi
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -34,6 +34,7 @@ from greybox.diagnosis.refitting import (
     shortlist,
     slow,
 )
+from greybox.diagnosis.result import Quantity
 from greybox.diagnosis.scores import MOMENTS, ProjectedScores, Score, score_hypotheses
 from greybox.diagnosis.thresholds import (
     BACKWARDS,
@@ -78,6 +79,8 @@ class Candidate:
         Numbers that the cause frees.
     standing : Standing or None
         What it does beside a generic force; None until that is asked.
+    told : mapping of str to Quantity, optional
+        Its parameters where they stand already, and the fit holds it at them.
     """
 
     hypothesis: Hypothesis
@@ -90,6 +93,7 @@ class Candidate:
     tried: int = 1
     freed: int = 1
     standing: Standing | None = None
+    told: Mapping[str, Quantity] | None = None
 
     @property
     def relevant(self) -> bool:
@@ -101,7 +105,7 @@ class Candidate:
     @property
     def unresolved(self) -> bool:
         """Whether sampling itself would look alike."""
-        if self.hypothesis.apply is None:
+        if self.hypothesis.apply is None or self.told is not None:
             return False
         k = [a.key for a in self.fit.point.hypotheses].index(self.hypothesis.key)
         values = self.fit.point.values[k]
@@ -202,8 +206,8 @@ def search(
 ) -> Search:
     """Look for causes until none proves itself any more.
 
-    One that is not alone, after which the terms that the data choose may go on, ends, too, once
-    forces of motion and commands are left that a cause did not take.
+    One that is not alone, after which the terms that the data choose may go on, looks for what
+    past commands do only, once forces of motion and commands are left that a cause did not take.
 
     Parameters
     ----------
@@ -246,7 +250,10 @@ def search(
         fit = case.problem(fit.integrator).settle(fit, SETTLE)
         if left and _left_to_motion(case, fit):
             _log.info("forces of motion and commands are left that one cause does not take")
-            break
+            # those have no past
+            hypotheses = [h for h in hypotheses if h.past]
+            if not hypotheses:
+                break
     return Search(base, fit, tuple(steps), tuple(causes), len(hypotheses))
 
 
@@ -326,7 +333,11 @@ def _taken(hypothesis: Hypothesis, causes: Sequence[Candidate]) -> bool:
         hypothesis.key == c.hypothesis.key
         or (
             hypothesis.cause == c.hypothesis.cause
-            and (hypothesis.only or set(_names(hypothesis)) & set(_names(c.hypothesis)))
+            and (
+                hypothesis.only
+                or c.hypothesis.only
+                or set(_names(hypothesis)) & set(_names(c.hypothesis))
+            )
         )
         for c in causes
     )
@@ -455,6 +466,9 @@ def _stood(
     found = on_all_processors([problem.drop(fit.point, c.hypothesis) for c in causes], work)
     out = []
     for cause, (without, (weight, proof)) in zip(causes, found, strict=True):
+        if cause.told is not None:
+            out.append((cause, without))
+            continue
         alone = assess_candidate(proof, without, fit, cause.hypothesis, tried, cause.names)
         alone = _wald_checked(case, replace(alone, standing=weight))
         out.append((alone, without))
@@ -462,6 +476,8 @@ def _stood(
 
 
 def _stands(cause: Candidate) -> bool:
+    if cause.told is not None:
+        return True
     return cause.standing is not None and cause.standing.stands and cause.holds
 
 

@@ -12,9 +12,10 @@ from greybox.diagnosis.causes import Context, known_causes
 from greybox.diagnosis.diagnose import DiagnosisOptions, diagnose
 from greybox.diagnosis.extension import extended_vessel
 from greybox.diagnosis.hypothesis import Hypothesis, Parameter
-from greybox.diagnosis.result import file_word
+from greybox.diagnosis.quantities import quantities_of
+from greybox.diagnosis.result import Quantity, file_word
 from greybox.diagnosis.search import Candidate, _taken
-from greybox.diagnosis.ship import Sensors
+from greybox.diagnosis.ship import Sensors, Ship
 from greybox.model.catalogue import structure_for
 from greybox.model.model import load_model
 from greybox.study.blind import draw
@@ -75,6 +76,19 @@ def test_a_ship_has_one_lag_one_delay_and_one_limit() -> None:
     # of the candidate nothing but its hypothesis is asked
     known = Candidate(one, None, 0.0, 0.0, 0.0, None)  # type: ignore[arg-type]
     assert _taken(two, [known])
+
+
+def test_a_cause_held_at_its_value_is_in_force_and_lets_no_other_of_its_kind_in() -> None:
+    ship = Ship(np.zeros(1), np.zeros(2), vessel(RUDDER))
+    lags = hypotheses(ship.vessel, "thruster_lag")
+    held = lags["thruster_lag:delta"].held_at(np.array([2.5]))
+    late = held.apply(ship, np.zeros(0)).vessel.actuation
+    assert (late.lag, late.lag_on, held.parameters) == (2.5, "delta", ())
+    told = {"lag": Quantity(2.5, 0.1, "s")}
+    known = Candidate(held, None, 0.0, 0.0, 0.0, None, told=told)  # type: ignore[arg-type]
+    assert _taken(lags["thruster_lag:speed"], [known])
+    assert not known.unresolved
+    assert quantities_of(None, known, None) == told  # type: ignore[arg-type]
 
 
 def test_a_single_command_is_all_commands() -> None:

@@ -145,7 +145,7 @@ class ThrusterLag(Cause):
 
             return Hypothesis(
                 self.id, f"{self.id}:{on}", (parameter,), (), apply, ((4 * first,),), variants,
-                place="" if on in words else on,
+                place="" if on in words else on, past=True,
             )  # fmt: skip
 
         speeds = {t.speed for t in context.vessel.thrusters}
@@ -195,7 +195,7 @@ class InputDelay(Cause):
             place = "" if on == "command" else on
             return Hypothesis(
                 self.id, f"{self.id}:{place}" if place else self.id, (parameter,), (), apply,
-                starts=((3 * first,), (6 * first,)), place=place,
+                starts=((3 * first,), (6 * first,)), place=place, past=True,
             )  # fmt: skip
 
         # a ship has one delay
@@ -250,7 +250,7 @@ class RateLimit(Cause):
             out.append(
                 Hypothesis(
                     self.id, f"{self.id}:{column}", (parameter,), (), apply,
-                    tuple((t,) for t in times[1:]), only=True,
+                    tuple((t,) for t in times[1:]), only=True, past=True,
                 )
             )  # fmt: skip
         return out

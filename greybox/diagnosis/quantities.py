@@ -1,0 +1,39 @@
+"""The numbers of a cause, with standard errors."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from greybox.diagnosis.fitting import Problem
+from greybox.diagnosis.point import Fit
+from greybox.diagnosis.result import Quantity
+from greybox.diagnosis.search import Candidate
+
+
+def quantities_of(problem: Problem, candidate: Candidate, fit: Fit) -> dict[str, Quantity]:
+    """Return a cause's parameters with standard errors, by name."""
+    hypothesis, weighed = candidate.hypothesis, candidate.standing
+    if candidate.told is not None:
+        return dict(candidate.told)
+    values, covariance = problem.covariance(fit)
+    std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    if hypothesis.apply is None:
+        index = [fit.point.places.index(problem.place(n)) for n in hypothesis.columns]
+    else:
+        index = problem.numbers_of(fit.point, hypothesis)
+    if not index:
+        one = -1.0 if hypothesis.refit_from_scratch else 1.0
+        return {hypothesis.key.split(":", 1)[1]: Quantity(one, 0.0, "1")}
+    wide = problem.spread(fit, hypothesis)
+    # what a generic force would move a number by is a part of what is not known of it
+    moved = np.zeros(len(index)) if weighed is None else weighed.moved[: len(index)]
+    return {
+        p.name: Quantity(
+            *p.told(
+                float(values[i]),
+                float(np.linalg.norm([max(std[i], wide.get(p.name, 0.0)), p.coarse, by])),
+            ),
+            p.unit,
+        )
+        for p, i, by in zip(hypothesis.parameters, index, moved, strict=True)
+    }
