@@ -24,13 +24,15 @@ EXAMPLES = """examples:
   greybox design --vessel ship.toml --model model.json --duration 600 --trials 2 --out plan.csv
   greybox design --vessel ship.toml --model model.json --duration 600 \\
       --between plain.json current.json --out plan.csv
+  greybox design --vessel ship.toml --model model.json --for causes --diagnosis d.json \\
+      --duration 600 --out plan.csv
   greybox design --vessel ship.toml --prior none --duration 900 --out plan.csv
   greybox design --vessel ship.toml --after part1.csv --remaining 900 --out part2.csv
 """
 
 
 # what a trial may be designed for; options that ask for coefficients by themselves
-PURPOSES = ("coefficients", "prediction")
+PURPOSES = ("coefficients", "prediction", "causes")
 IMPLY_COEFFICIENTS = (
     "criterion", "want", "of", "target", "estimator", "regime", "prior", "robust", "margin_v",
     "margin_air",
@@ -52,10 +54,19 @@ def _purpose(options: argparse.Namespace) -> str:
     from greybox.errors import UsageError
 
     given = [n for n in IMPLY_COEFFICIENTS if getattr(options, n) not in (None, [], 0, NO_PRIOR)]
+    about_causes = bool(options.causes or options.diagnosis)
     if options.between:
-        if options.purpose == "prediction" or options.envelope:
-            raise UsageError("--between tells two explanations apart: leave out --for, --envelope.")
+        if options.purpose in ("prediction", "causes") or options.envelope or about_causes:
+            raise UsageError(
+                "--between tells two explanations apart: leave out --for, --envelope, --causes and "
+                "--diagnosis."
+            )
         return "coefficients"
+    if options.purpose == "causes" or (about_causes and options.purpose is None):
+        _require_causes(options, given)
+        return "causes"
+    if about_causes:
+        raise UsageError("--causes and --diagnosis say what is open: use --for causes with them.")
     if options.purpose == "prediction" and given:
         raise UsageError(
             f"--for prediction covers all coefficients and both sides: leave out "
@@ -67,6 +78,30 @@ def _purpose(options: argparse.Namespace) -> str:
             "--envelope says what predictions are wanted for: use --for prediction with it."
         )
     return purpose
+
+
+def _require_causes(options: argparse.Namespace, given: list[str]) -> None:
+    """Refuse what does not go with a trial that tells causes apart, or says not which.
+
+    Raises
+    ------
+    UsageError
+        Says what to leave out or to give.
+    """
+    from greybox.errors import UsageError
+
+    if given:
+        raise UsageError(
+            f"--for causes tests causes and not coefficients: leave out {_told((given[0],))}."
+        )
+    if options.after or options.prior == NO_PRIOR:
+        other = "--after" if options.after else "--prior none"
+        raise UsageError(
+            f"--for causes needs the model that was diagnosed: leave out {other} and give it by "
+            f"--model."
+        )
+    if options.causes and options.diagnosis:
+        raise UsageError("--causes and --diagnosis both say what is open: give one of them.")
 
 
 def _listed(registry: Registry[Any]) -> str:
@@ -153,7 +188,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=PURPOSES,
         help="what the estimate is wanted for: predictions over the operating envelope, both "
         f"sides, misfit included (prediction, unless one of {_told(IMPLY_COEFFICIENTS)} is "
-        "given), or the precision of coefficients in one regime",
+        "given), the precision of coefficients in one regime, or telling causes apart",
+    )
+    goal.add_argument(
+        "--diagnosis",
+        metavar="D",
+        help="JSON of greybox diagnose, whose open causes are told apart (that of MODEL)",
+    )
+    goal.add_argument(
+        "--causes",
+        nargs="+",
+        default=[],
+        metavar="ID",
+        help="or their ids, with the place where there are several, such as thruster_lag:n",
     )
     goal.add_argument(
         "--envelope",
@@ -346,6 +393,9 @@ def run(options: argparse.Namespace) -> None:
         return
     if not untried:
         model = model.coefficient_model()
+    if purpose == "causes":
+        _run_for_causes(options, model, vessel)
+        return
     wishes = _wishes(options, model, sailed)
     if sailed is not None:
         wishes = _with_known(wishes, options, model)
@@ -571,6 +621,42 @@ def _run_for_prediction(
         sailed=sailed.motions if sailed is not None else (),
     )
     _deliver(options, found.design, found, prepared.notes, _of_sailed(sailed), found.headline())
+
+
+def _run_for_causes(options: argparse.Namespace, model: Any, vessel: Any) -> None:
+    """Design the trial that tells causes apart and write it."""
+    from experiment_design.for_causes import (
+        AskedCauses,
+        causes_left_open,
+        design_for_causes,
+        read_diagnosis,
+    )
+    from experiment_design.prepare import both_sides, prepare_request
+    from greybox.errors import UsageError
+
+    if options.causes:
+        asked = AskedCauses({name: {} for name in options.causes}, named=True)
+    elif options.diagnosis:
+        asked = causes_left_open(read_diagnosis(options.diagnosis), options.diagnosis)
+    elif "diagnosis" in model.record:
+        asked = causes_left_open(model.record["diagnosis"], options.model)
+    else:
+        raise UsageError(
+            f"--for causes needs to know which are open, and {options.model} is no model of "
+            f"greybox diagnose: give --diagnosis D, the JSON of greybox diagnose --json D, or name "
+            f"them, such as --causes current heading_bias."
+        )
+    wishes = both_sides(_wishes(options, model), model, options.hold)
+    prepared = prepare_request(model, wishes, vessel)
+    notes = tuple(n for n in prepared.notes if not n.startswith(("the first trial", "margin of v")))
+    found = design_for_causes(
+        prepared.request,
+        model,
+        asked,
+        envelope=dict(_range(text, vessel) for text in options.envelope),
+        kept_start=options.start is not None,
+    )
+    _deliver(options, found.design, found, notes, {}, found.headline())
 
 
 def _range(text: str, vessel: Any) -> tuple[str, tuple[float, float]]:

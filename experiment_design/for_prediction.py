@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -240,6 +240,37 @@ def design_for_prediction(
         return _design(request, model, envelope or {}, kept_starts, sailed)
 
 
+def operating_envelope(
+    request: DesignRequest, model: ManoeuvringModel, given: Mapping[str, tuple[float, float]]
+) -> tuple[Envelope, str]:
+    """Return how the ship is used, and the verdict on the prior's predictions.
+
+    Parameters
+    ----------
+    request : DesignRequest
+    model : ManoeuvringModel
+        The prior, with what its own trial showed.
+    given : mapping of str to (float, float)
+        See `command_ranges`.
+    """
+    misfit, level = prior_misfit(model)
+    shown = model.record.get("ranges")
+    speeds = None
+    if isinstance(shown, Mapping) and "u" in shown:
+        speeds = (float(shown["u"][0]), float(shown["u"][1]))
+    named = request.structure.without_bumps()
+    predictor = replace(
+        build_predictor(named, "basic", tuple((s, (1, -1)) for s in request.structure.states)),
+        structure=request.structure,
+    )
+    rollout = build_problem(request).scenarios[0].rollout
+    found = build_envelope(
+        rollout, predictor, request.noise, request.schedule, command_ranges(model, given), speeds,
+        misfit, request.seed,
+    )  # fmt: skip
+    return found, level
+
+
 def _design(
     request: DesignRequest,
     model: ManoeuvringModel,
@@ -249,55 +280,15 @@ def _design(
 ) -> PredictionDesign:
     began = time.perf_counter()
     require_horizon(request)
-    misfit, level = prior_misfit(model)
-    ranges = command_ranges(model, given)
-    shown = model.record.get("ranges")
-    speeds = None
-    if isinstance(shown, Mapping) and "u" in shown:
-        speeds = (float(shown["u"][0]), float(shown["u"][1]))
+    found, level = operating_envelope(request, model, given)
     states = request.structure.states
-    named = request.structure.without_bumps()
-    predictor = replace(
-        build_predictor(named, "basic", tuple((s, (1, -1)) for s in states)),
-        structure=request.structure,
-    )
-    problem = build_problem(request)
-    found = build_envelope(
-        problem.scenarios[0].rollout, predictor, request.noise, request.schedule, ranges, speeds,
-        misfit, request.seed,
-    )  # fmt: skip
     others = (found.rollout.start,) * request.trials
-    request = replace(request, starts=(*request.starts[:kept_starts], *others[kept_starts:]))
-    asked = request
+    asked = replace(request, starts=(*request.starts[:kept_starts], *others[kept_starts:]))
     before = log_moments(found, sailed)
-    request, searches, keeping = _searched(request, found, before)
-    problems = [build_problem(asked, t) for t in range(asked.trials)]
-    reference, number = random_campaign(problems, asked.seed)
-    units = [s.candidate.unit for s in searches]
-    short = [
-        (name, float(m))
-        for search in searches
-        for name, m in zip(problems[0].scenarios[0].limits.names, search.candidate.missed,
-                           strict=True)
-        if m > 1e-3
-    ]  # fmt: skip
-    if short and not request.backoff:
-        name, amount = max(short, key=lambda item: item[1])
-        raise InfeasibleError(
-            f"no plan was found that keeps the {name.name} of {name.bound:g} {name.unit}: the "
-            f"best misses it by {amount:.3g} {name.unit}. Widen it ({name.option}), or narrow "
-            f"--envelope."
-        )
-    start = ", ".join(
-        f"{n} {x:.3g}" for n, x in zip((*states, "psi"), asked.starts[-1], strict=True)
-    )
-    design = described(
-        asked, problems, units, reference, number,
-        certificate=absent("a plan for prediction has no bound to be measured against"),
-        keeping=keeping,
-        status="solved: exchange of settings of the operating envelope",
-        notes=_of_start(start, kept_starts, asked.trials),
-        evaluations=sum(s.evaluations for s in searches), began=began,
+    tightened, searches, keeping = tightened_search(asked, lambda r: _campaign(r, found, before))
+    design = described_plan(
+        asked, tightened, searches, keeping, kept_starts=kept_starts, began=began,
+        certificate="a plan for prediction has no bound to be measured against",
     )  # fmt: skip
     known = _sum(before, log_moments(found, design.motions[1:]))
     noise, bias = found.errors(design.motions[0], known)
@@ -335,11 +326,81 @@ def _sum(first: Array | None, second: Array | None) -> Array | None:
     return first + second
 
 
-def _searched(
-    request: DesignRequest, envelope: Envelope, before: Array | None
+def described_plan(
+    request: DesignRequest,
+    tightened: DesignRequest,
+    searches: Sequence[EnvelopeSearch],
+    keeping: ConstraintSatisfaction | None,
+    *,
+    kept_starts: int,
+    began: float,
+    certificate: str,
+) -> Design:
+    """Return the design that searches over settings of an envelope found.
+
+    Parameters
+    ----------
+    request, tightened : DesignRequest
+        As asked for, and with the limits of the last search.
+    searches : sequence of EnvelopeSearch
+        One a trial.
+    keeping : ConstraintSatisfaction or None
+    kept_starts : int
+        Trials, from the first, whose start was given.
+    began : float
+        When the work began, by `time.perf_counter`.
+    certificate : str
+        Why there is no bound.
+
+    Raises
+    ------
+    InfeasibleError
+        The best plan misses a limit.
+    """
+    problems = [build_problem(request, t) for t in range(request.trials)]
+    short = [
+        (name, float(m))
+        for search in searches
+        for name, m in zip(problems[0].scenarios[0].limits.names, search.candidate.missed,
+                           strict=True)
+        if m > 1e-3
+    ]  # fmt: skip
+    if short and not tightened.backoff:
+        name, amount = max(short, key=lambda item: item[1])
+        raise InfeasibleError(
+            f"no plan was found that keeps the {name.name} of {name.bound:g} {name.unit}: the "
+            f"best misses it by {amount:.3g} {name.unit}. Widen it ({name.option}), or narrow "
+            f"--envelope."
+        )
+    reference, number = random_campaign(problems, request.seed)
+    shown = zip((*request.structure.states, "psi"), request.starts[-1], strict=True)
+    start = ", ".join(f"{n} {x:.3g}" for n, x in shown)
+    return described(
+        request, problems, [s.candidate.unit for s in searches], reference, number,
+        certificate=absent(certificate), keeping=keeping,
+        status="solved: exchange of settings of the operating envelope",
+        notes=_of_start(start, kept_starts, request.trials),
+        evaluations=sum(s.evaluations for s in searches), began=began,
+    )  # fmt: skip
+
+
+def tightened_search(
+    request: DesignRequest, campaign: Callable[[DesignRequest], list[EnvelopeSearch]]
 ) -> tuple[DesignRequest, list[EnvelopeSearch], ConstraintSatisfaction | None]:
-    """Search all trials, with limits tightened until they are kept with the wanted probability."""
-    searches = _campaign(request, envelope, before)
+    """Search all trials, with limits tightened until they are kept with the wanted probability.
+
+    Parameters
+    ----------
+    request : DesignRequest
+    campaign : callable
+        Searches the trials of a request.
+
+    Returns
+    -------
+    tuple
+        The request with the limits of that search, what was found, and how the limits are kept.
+    """
+    searches = campaign(request)
     if not request.uncertain:
         return request, searches, None
     plain = request
@@ -351,7 +412,7 @@ def _searched(
             break
         backoff = backoff + 1.1 * shortfall
         tighter = replace(plain, backoff=tuple(backoff))
-        again = _campaign(tighter, envelope, before)
+        again = campaign(tighter)
         now = keep_probability(plain, [s.candidate.unit for s in again])
         shortfall = now.shortfall
         if now.probability > best[2].probability:

@@ -7,6 +7,7 @@ never near. Several chains start from the best of random sequences of these sett
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from experiment_design.constraints.limits import TOLERANCE, UNIT_SCALE
 from experiment_design.excitation.rollout import Motion
 from experiment_design.information.envelope import HOLDS, Envelope
-from experiment_design.optimise.search import Candidate, limit_scale
+from experiment_design.optimise.search import Candidate, limit_scale, to_unit
 from experiment_design.request.problem import TrialProblem
 from greybox.numerics.forked import map_forked
 
@@ -43,14 +44,17 @@ class EnvelopeSearch:
     Parameters
     ----------
     candidate : Candidate
-        Its value is −½ log of the mean squared error of predictions.
+        Its value is what was searched for: −½ log of the mean squared error of predictions.
     random : ndarray
         (R,) values of the random sequences, −inf where a run is unstable.
+    reference : Candidate
+        The best of these.
     evaluations : int
     """
 
     candidate: Candidate
     random: Array
+    reference: Candidate
     evaluations: int
 
 
@@ -111,14 +115,53 @@ def search_envelope(
     known : ndarray, optional
         (p, p) moments of other trials.
     """
+
+    def worth(motion: Motion) -> Array:
+        noise, bias = envelope.errors(motion, known)
+        with np.errstate(divide="ignore"):
+            return np.asarray(-0.5 * np.log((noise + bias).mean(axis=1)))
+
     holds = problem.shape[0]
     hold = problem.schedule.hold * problem.schedule.sample_time
     tail = usual_manoeuvres(envelope, round(VALIDATION * holds), hold)
-    free = holds - len(tail)
+    return exchange_settings(problem, envelope, worth, seed, effort=effort, tail=tail)
+
+
+def exchange_settings(
+    problem: TrialProblem,
+    envelope: Envelope,
+    worth: Callable[[Motion], Array],
+    seed: int,
+    *,
+    effort: float = 1.0,
+    tail: Array | None = None,
+    tries: int = _TOGETHER,
+) -> EnvelopeSearch:
+    """Search for the sequence of settings of an envelope that is worth most.
+
+    Parameters
+    ----------
+    problem : TrialProblem
+        With the limits, its run starting where the envelope's does.
+    envelope : Envelope
+    worth : callable
+        Value of R motions, (R,); −inf where one tells nothing.
+    seed : int
+    effort : float
+        Times the usual number of rounds.
+    tail : ndarray, optional
+        (k, nc) levels that every sequence ends with.
+    tries : int
+        Sequences that each round of each chain tries.
+    """
+    holds = problem.shape[0]
+    hold = problem.schedule.hold * problem.schedule.sample_time
+    end = np.zeros((0, problem.shape[1])) if tail is None else tail
+    free = holds - len(end)
     longest = max(1, min(free, round(HOLDS[1] * envelope.time_scale / hold)))
 
     def whole(levels: Array) -> Array:
-        both = np.concatenate([levels, np.broadcast_to(tail, (len(levels), *tail.shape))], axis=1)
+        both = np.concatenate([levels, np.broadcast_to(end, (len(levels), *end.shape))], axis=1)
         return problem.schedule.within_reach(both)
 
     def judged(levels: Array) -> list[tuple[Array, Candidate]]:
@@ -127,17 +170,14 @@ def search_envelope(
             part = levels[first : first + _TOGETHER]
             complete = whole(part)
             motion = problem.scenarios[0].rollout.run(problem.schedule.expand(complete))
-            noise, bias = envelope.errors(motion, known)
-            with np.errstate(divide="ignore"):
-                value = -0.5 * np.log((noise + bias).mean(axis=1))
+            value = worth(motion)
             missed = problem.scenarios[0].limits.violations(motion)
             aside = one_sided(envelope, motion)
-            s = problem.schedule
-            span = np.where(s.upper > s.lower, s.upper - s.lower, 1.0)
-            unit = (complete - s.lower) / span
             out += [
                 (p, Candidate(u, float(v), np.append(missed[:, i], aside[i])))
-                for i, (p, u, v) in enumerate(zip(part, unit, value, strict=True))
+                for i, (p, u, v) in enumerate(
+                    zip(part, to_unit(problem, complete), value, strict=True)
+                )
             ]
         return out
 
@@ -177,15 +217,16 @@ def search_envelope(
         rng = np.random.default_rng([43, seed, number])
         pool = better(begun)
         for _ in range(rounds):
-            parents = rng.integers(len(pool), size=_TOGETHER)
+            parents = rng.integers(len(pool), size=tries)
             children = np.array([moved(pool[i][0], rng) for i in parents])
             pool = better(pool + judged(children))
         return pool[0]
 
     found = better(map_forked(chain, range(_CHAINS)))
     values = np.array([c.value for _, c in begun])
-    best = replace(found[0][1], missed=found[0][1].missed[:-1])
-    return EnvelopeSearch(best, values, RANDOM + _CHAINS * rounds * _TOGETHER)
+    # the sides that a sequence goes to are no limit of the trial
+    best, reference = (replace(c, missed=c.missed[:-1]) for _, c in (found[0], better(begun)[0]))
+    return EnvelopeSearch(best, values, reference, RANDOM + _CHAINS * rounds * tries)
 
 
 def one_sided(envelope: Envelope, motion: Motion) -> Array:

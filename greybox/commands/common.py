@@ -89,7 +89,7 @@ def read_logs(
 # options that name files to read, and to write
 _INPUTS = (
     "logs", "log", "models", "model", "nominal", "validate", "estimate", "vessel", "prior",
-    "between", "area", "raw", "trial", "after",
+    "between", "area", "raw", "trial", "after", "diagnosis",
 )  # fmt: skip
 _OUTPUTS = ("out", "json", "report", "sheet", "legs", "save_model")
 # raw files are hashed as they are imported

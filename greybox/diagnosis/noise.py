@@ -327,6 +327,45 @@ def fit_noise(
     return Noise(tuple(found), tuple(chosen))
 
 
+def assumed_noise(
+    sensor: Array,
+    process: Array,
+    poles: Array,
+    sample_time: float,
+    groups: Sequence[tuple[int, ...]],
+    memory: float = 0.0,
+) -> Noise:
+    """Return the colours that errors of a trial not sailed yet are expected to have.
+
+    Parameters
+    ----------
+    sensor : ndarray
+        (ny,) deviation of each channel's sensor.
+    process : ndarray
+        (ny,) deviation of what moves each state beside the model, per sample.
+    poles : ndarray
+        (ny,) as of `fit_noise`.
+    sample_time : float
+        [s]
+    groups : sequence of tuple of int
+        As of `fit_noise`.
+    memory : float
+        Share of what moves the states that is left after a sample.
+    """
+    kept = float(np.clip(memory, 1e-9, 0.9999 * _LONGEST))
+    logit = float(np.clip(np.log(kept / (_LONGEST - kept)), *_MEMORY))
+    found, chosen = [], []
+    for group in groups:
+        first = group[0]
+        level = np.maximum(sensor[list(group)], 1e-3 * process[first])
+        share = float(np.log(max(process[first] / level[0], np.exp(_SHARE[0]))))
+        x = np.array([share, logit, *np.zeros(len(group))])
+        rest = (level, float(np.clip(poles[first], 0.0, _LONGEST)), sample_time)
+        found.append(_colour(group, rest, x))
+        chosen.append(x)
+    return Noise(tuple(found), tuple(chosen))
+
+
 def free_run_noise(
     errors: Sequence[Array], groups: Sequence[tuple[int, ...]], start: Noise | None = None
 ) -> Noise:

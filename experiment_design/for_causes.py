@@ -1,0 +1,409 @@
+"""The trial after which a diagnosis tells the causes apart that the last one left open."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from experiment_design.feasibility.checks import require_horizon
+from experiment_design.for_prediction import (
+    command_ranges,
+    described_plan,
+    operating_envelope,
+    tightened_search,
+)
+from experiment_design.information.cause_power import (
+    WANTED,
+    CausePower,
+    OpenCause,
+    PowerReport,
+)
+from experiment_design.optimise.envelope_search import (
+    EnvelopeSearch,
+    exchange_settings,
+    usual_manoeuvres,
+)
+from experiment_design.output.result import Design
+from experiment_design.request.request import DesignRequest, build_problem
+from greybox.diagnosis.causes import Context, known_causes
+from greybox.diagnosis.hypothesis import Hypothesis, Parameter
+from greybox.diagnosis.result import finite
+from greybox.diagnosis.thresholds import SIGNIFICANT
+from greybox.errors import LogError, UsageError, suggestion
+from greybox.files import nearest_file
+from greybox.model.model import ManoeuvringModel
+from greybox.public import one_thread
+
+Array = NDArray[np.float64]
+
+# sequences that each round of a chain tries: a free run for each parameter of each cause
+_TRIES = 12
+
+
+@dataclass(frozen=True)
+class AskedCauses:
+    """Causes that a trial is to tell apart, as they were asked for.
+
+    Parameters
+    ----------
+    estimates : mapping of str to mapping
+        Key or id of each cause -> its parameters as the JSON of a diagnosis has them; empty
+        where no diagnosis estimated them.
+    tried : int
+        Hypotheses that the last diagnosis tried; 0 where there is none.
+    named : bool
+        Whether a user named them: one that cannot be at work is an error then, and else left out.
+    """
+
+    estimates: Mapping[str, Mapping[str, Any]]
+    tried: int = 0
+    named: bool = False
+
+
+def read_diagnosis(path: str) -> Any:
+    """Read the JSON of `greybox diagnose`.
+
+    Raises
+    ------
+    LogError
+        It cannot be read.
+    """
+    try:
+        return json.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise LogError(
+            f"cannot read the diagnosis '{path}': {error.strerror}.{nearest_file(path)} Give the "
+            f"JSON of greybox diagnose --json."
+        ) from error
+    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
+        raise LogError(
+            f"the diagnosis '{path}' is no JSON: give that of greybox diagnose --json."
+        ) from error
+
+
+def causes_left_open(diagnosis: Any, name: str = "diagnosis") -> AskedCauses:
+    """Return what a diagnosis left open: members of its groups, and causes that do not stand.
+
+    Parameters
+    ----------
+    diagnosis : object
+        The JSON of `greybox diagnose`.
+    name : str
+        Of its file.
+
+    Raises
+    ------
+    UsageError
+        It is no diagnosis, or leaves no cause open.
+    """
+    own = diagnosis if isinstance(diagnosis, Mapping) else {}
+    verdict, candidates = own.get("verdict"), own.get("candidates")
+    if not isinstance(verdict, str) or not isinstance(candidates, list):
+        raise UsageError(f"'{name}' is no diagnosis: give the JSON of greybox diagnose --json.")
+    found = [*candidates, *own.get("partial", [])]
+    if not found:
+        raise UsageError(
+            f"the diagnosis '{name}' leaves no cause open (its verdict is {verdict}): name those "
+            f"to be told apart, such as --causes current heading_bias."
+        )
+    return AskedCauses(
+        {c.get("place") or c["id"]: c["parameters"] for c in found}, int(own.get("tried", 0))
+    )
+
+
+def open_causes(
+    request: DesignRequest, model: ManoeuvringModel, asked: AskedCauses
+) -> tuple[tuple[OpenCause, ...], int, tuple[str, ...]]:
+    """Return the causes beside a model, how many hypotheses a diagnosis tries, and notes.
+
+    Terms of a cause that the model has already count as the cause's, not as the model's.
+
+    Parameters
+    ----------
+    request : DesignRequest
+    model : ManoeuvringModel
+    asked : AskedCauses
+
+    Raises
+    ------
+    UsageError
+        A name is none of this ship's causes or stands for several places, or none is left.
+    """
+    terms = {n for k, e in asked.estimates.items() for n in (*e, *k.partition(":")[2].split("+"))}
+    own = [n for n in request.structure.parameters if n in terms]
+    structure = request.structure.without(*own) if own else request.structure
+    used = command_ranges(model, {})
+    steps = zip(request.schedule.commands, request.schedule.ramp, strict=True)
+    context = Context(
+        structure=structure,
+        vessel=request.vessel,
+        outputs=(*structure.states, "psi") if "r" in structure.states else structure.states,
+        has_wind=bool(request.d[2:].any()),
+        duration=request.duration,
+        sample_time=request.sample_time,
+        speeds={t.speed: float(np.abs(used[t.speed]).mean()) for t in request.vessel.thrusters},
+        current_known=bool(request.d[:2].any()),
+        ranges={n: high - low for n, (low, high) in used.items()},
+        fastest={n: (used[n][1] - used[n][0]) / (k * request.sample_time) for n, k in steps},
+    )
+    known = [h for cause in known_causes().values() for h in cause.hypotheses(context)]
+    found, notes = [], []
+    for name, estimate in asked.estimates.items():
+        try:
+            hypothesis = _named(name, known)
+        except UsageError as error:
+            if asked.named:
+                raise
+            notes.append(f"{name} is left out: {error}")
+            continue
+        found.append(_sized(hypothesis, estimate))
+    if not found:
+        raise UsageError(f"no open cause can be designed for: {' '.join(notes)}")
+    return tuple(found), asked.tried or len(known), tuple(notes)
+
+
+def _named(name: str, known: Sequence[Hypothesis]) -> Hypothesis:
+    """Return the hypothesis of a key or an id."""
+    exact = [h for h in known if h.key == name]
+    like = exact or [h for h in known if h.id == name]
+    if len(like) == 1:
+        return like[0]
+    if like:
+        raise UsageError(
+            f"'{name}' may be at work in {len(like)} places: name one of "
+            f"{', '.join(h.key for h in like)}."
+        )
+    ids = list(dict.fromkeys(h.id for h in known))
+    raise UsageError(
+        f"'{name}' is no cause that a trial of this ship with this model could show."
+        f"{suggestion(name, ids)} There are {', '.join(ids)}."
+    )
+
+
+def _sized(hypothesis: Hypothesis, estimate: Mapping[str, Any]) -> OpenCause:
+    """Return a cause with the sizes that a diagnosis estimated, zero where it did not."""
+    tested = [p for p in hypothesis.parameters if not p.reach]
+    away = np.array([_away(p, estimate.get(p.name)) for p in tested])
+    estimated = not tested or bool(away.any())
+    return OpenCause(hypothesis, away, estimated)
+
+
+def _away(parameter: Parameter, estimate: Any) -> float:
+    """Return how far an estimate, as it is told, lies from the null value."""
+    value = estimate.get("value") if isinstance(estimate, Mapping) else None
+    if not isinstance(value, int | float) or not np.isfinite(value):
+        return 0.0
+    if parameter.over:
+        value = parameter.over / value if value else parameter.null
+    return float(np.clip(value, parameter.low, parameter.high)) - parameter.null
+
+
+@dataclass(frozen=True)
+class CauseDesign:
+    """A plan with how surely the diagnosis of its trial will find and tell the open causes.
+
+    Parameters
+    ----------
+    design : Design
+    causes : tuple of OpenCause
+    plan, random, usual : PowerReport or None
+        Of the plan, of the best of 200 random sequences of steps, and of usual manoeuvres (an
+        approach, a two-sided zig-zag, a turn), all of one length; None where the ship leaves
+        every bound.
+    level : float
+        Significance that the diagnosis will ask for, corrected for what it tries.
+    """
+
+    design: Design
+    causes: tuple[OpenCause, ...]
+    plan: PowerReport
+    random: PowerReport | None
+    usual: PowerReport | None
+    level: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fields for JSON: those of the design, and the power of causes and pairs."""
+        named = (("", self.plan), ("_random", self.random), ("_usual", self.usual))
+
+        def power(i: int, j: int | None = None) -> dict[str, float | None]:
+            return {
+                f"power{of}": None
+                if r is None
+                else float(r.power[i] if j is None else r.pairs[i, j])
+                for of, r in named
+            }
+
+        def share(i: int) -> dict[str, float | None]:
+            return {
+                f"detectable_share{of}": None if r is None else finite(r.detectable_share[i])
+                for of, r in named
+            }
+
+        return self.design.to_dict() | {
+            "for": "causes",
+            "level": self.level,
+            "causes": [
+                {
+                    "id": c.id,
+                    "place": c.hypothesis.key,
+                    "parameters": {
+                        c.hypothesis.parameters[i].name: {
+                            "away_from_null": float(s),
+                            "unit": c.hypothesis.parameters[i].unit,
+                            "estimated": c.estimated,
+                        }
+                        for i, s in zip(c.tested, c.size, strict=True)
+                    },
+                    **power(i),
+                    **share(i),
+                }
+                for i, c in enumerate(self.causes)
+            ],
+            "pairs": [
+                {"ids": [self.causes[i].id, self.causes[j].id], **power(i, j)}
+                for i in range(len(self.causes))
+                for j in range(i)
+            ],
+        }
+
+    def headline(self) -> str:
+        """Return in one sentence what the plan is for and how surely it will do it."""
+        k = int(self.plan.detectable_share.argmax())
+        said = (
+            f"The diagnosis of this trial finds {self.causes[k].id}, the hardest of the open "
+            f"causes, beside the others with a probability of {self.plan.power[k]:.2f}, and with "
+            f"{WANTED:g} where it is {self.plan.detectable_share[k]:.2g} of the size that is "
+            f"expected"
+        )
+        for r, what in ((self.random, "the best of random steps"), (self.usual, "a usual zig-zag")):
+            if r is not None:
+                said += f"; {what}: {r.power.min():.2f}, {r.detectable_share.max():.2g}"
+        return f"{said}."
+
+    def summary(self) -> str:
+        """Return the plan as text."""
+        r = self.design.request
+        m = len(self.causes)
+        lines = [
+            f"Plan for {r.vessel.name}: {r.duration:g} s to tell the causes apart that are open",
+            self.headline(),
+            f"{'power':<44}{'plan':>8}{'random':>8}{'usual':>8}",
+        ]
+        every = (self.plan, self.random, self.usual)
+        for i, c in enumerate(self.causes):
+            cells = ["-" if p is None else f"{p.power[i]:.2f}" for p in every]
+            lines.append(f"  {c.hypothesis.key:<42}" + "".join(f"{x:>8}" for x in cells))
+        for i in range(m if m > 2 else 0):
+            for j in range(i):
+                cells = ["-" if p is None else f"{p.pairs[i, j]:.2f}" for p in every]
+                name = f"{self.causes[j].id} or {self.causes[i].id}"
+                lines.append(f"  {name:<42}" + "".join(f"{x:>8}" for x in cells))
+        lines += [f"expected: {_sizes(c)}" for c in self.causes if c.tested]
+        if self.plan.power.min() < WANTED:
+            lines.append(
+                f"Note: below {WANTED:g} the trial may leave the question open: lengthen it, widen "
+                f"the limits, or measure what tells the causes apart by itself"
+            )
+        if self.design.keeping is not None:
+            lines.append(self.design.keeping.sentence())
+        return "\n".join([*lines, *[f"Note: {n}" for n in self.design.notes]])
+
+
+def _sizes(cause: OpenCause) -> str:
+    told = ", ".join(
+        f"{cause.hypothesis.parameters[i].name} "
+        f"{cause.hypothesis.parameters[i].null + s:.3g} {cause.hypothesis.parameters[i].unit}"
+        for i, s in zip(cause.tested, cause.size, strict=True)
+    )
+    return f"{told} ({'as estimated' if cause.estimated else 'a typical size'})"
+
+
+@one_thread
+def design_for_causes(
+    request: DesignRequest,
+    model: ManoeuvringModel,
+    asked: AskedCauses,
+    *,
+    envelope: Mapping[str, tuple[float, float]] | None = None,
+    kept_start: bool = False,
+) -> CauseDesign:
+    """Design the trial that makes the least power over open causes largest.
+
+    The power is that of the chi-square test of each cause's parameters, at the significance of
+    the diagnosis, with the coefficients, the start and all other open causes projected out.
+
+    Parameters
+    ----------
+    request : DesignRequest
+        Of both sides and one trial, as `prepare_request` gives it.
+    model : ManoeuvringModel
+        The prior, with what its own trial showed.
+    asked : AskedCauses
+    envelope : mapping of str to (float, float), optional
+        Range of commands that the trial may use; see `command_ranges`.
+    kept_start : bool
+        Whether the trial starts as the request says; else on a straight course in the envelope.
+
+    Raises
+    ------
+    UsageError
+        Several trials are asked for, or a cause is unknown.
+    InfeasibleError
+        The prior holds the ship under too few commands, or the limits cannot be kept.
+
+    References
+    ----------
+    Atkinson, Donev and Tobias (2007), section 20.3; Ljung (1999), section 16.4.
+    """
+    if request.trials != 1:
+        raise UsageError("--for causes designs one trial at a time: leave out --trials.")
+    began = time.perf_counter()
+    require_horizon(request)
+    causes, tried, notes = open_causes(request, model, asked)
+    found, _ = operating_envelope(request, model, envelope or {})
+    if not kept_start:
+        request = replace(request, starts=(found.rollout.start,))
+    problem = build_problem(request)
+    rollout, schedule = problem.scenarios[0].rollout, problem.schedule
+    usual = rollout.run(
+        schedule.expand(
+            schedule.within_reach(usual_manoeuvres(found, schedule.holds, request.hold))
+        )[None]
+    )
+    first = (
+        usual if usual.stable[0] else rollout.run(found.draw(schedule.samples, _rng(request))[None])
+    )
+    power = CausePower(rollout, causes, request.noise, SIGNIFICANT, tried).with_typical_sizes(first)
+
+    def campaign(r: DesignRequest) -> list[EnvelopeSearch]:
+        return [
+            exchange_settings(
+                build_problem(r), found, power.values, r.seed, effort=r.effort, tries=_TRIES
+            )
+        ]
+
+    tightened, searches, keeping = tightened_search(request, campaign)
+    design = described_plan(
+        request, tightened, searches, keeping, kept_starts=int(kept_start), began=began,
+        certificate="a plan for causes has no bound to be measured against",
+    )  # fmt: skip
+
+    def reported(motion: Any) -> PowerReport | None:
+        return power.report(motion) if motion.stable[0] else None
+
+    best = searches[0].reference
+    random = rollout.run(schedule.expand(problem.levels(best.unit))[None])
+    design = replace(design, notes=(*notes, *design.notes))
+    plan = power.report(rollout.run(design.commands[0][None]))
+    return CauseDesign(design, power.causes, plan, reported(random), reported(usual), power.level)
+
+
+def _rng(request: DesignRequest) -> np.random.Generator:
+    return np.random.default_rng([47, request.seed])
