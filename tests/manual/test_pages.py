@@ -80,7 +80,16 @@ def places(page: str) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    "page", ["method.md", "validation.md", "causes.md", "checks.md", "design.md", "cases.md", "extending.md"]
+    "page",
+    [
+        "method.md",
+        "validation.md",
+        "causes.md",
+        "checks.md",
+        "design.md",
+        "cases.md",
+        "extending.md",
+    ],
 )
 def test_places_in_the_code_exist(page):
     folders = [ROOT / "experiment_design", ROOT / "greybox"]
