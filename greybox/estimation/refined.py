@@ -229,8 +229,9 @@ def estimate_refined_iv(
     -------
     Estimate
         ``prefilter`` is ``noise`` and ``noise`` holds the levels. Where a motion
-        diverges, the step is halved; where that does not help, the last estimate
-        with bounded motions is given and ``status`` says so.
+        diverges, the step is halved. Where the rounds do not converge, the estimate of the
+        round before their moves grew is given, or the last one with bounded motions, and
+        ``status`` says which.
 
     Raises
     ------
@@ -374,9 +375,11 @@ def _refine(
     work: _Refinement, point: _Point, theta: Array, keep: Sequence[NDArray[np.bool_]]
 ) -> _Refined:
     """Find noise, coefficients and motions in turn until the coefficients settle."""
-    status = f"still moving after {_MOST} rounds"
+    status, given = f"still moving after {_MOST} rounds", ""
     fit = work.first_levels(point, keep, theta)
     settling, settled, converged = False, False, False
+    nearest: tuple[float, _Refined] | None = None
+    apart = False
     for rounds in range(1, _MOST + 1):
         require_time()
         bands = work.bands(point, keep)
@@ -403,10 +406,12 @@ def _refine(
         # a halfway motion settles too, but is not that of an estimate
         halfway = point.theta is not theta
         theta = new
-        _log.debug(
-            "refinement %d: largest move %.3g standard errors", rounds,
-            float((moved / np.maximum(std, 1e-300)).max()),
-        )  # fmt: skip
+        move = float((moved / np.maximum(std, 1e-300)).max())
+        _log.debug("refinement %d: largest move %.3g standard errors", rounds, move)
+        if settled and not apart:
+            apart = nearest is not None and move > nearest[0]
+            if not apart:
+                nearest = move, _Refined(theta, inverse, rows, bands, fit, rounds, "", False, keep)
         near = not halfway and bool((moved < std + rounding).all())
         settling = not settled and (near or rounds >= _NOISE_ROUNDS)
         if settled and not halfway and (moved < _SETTLED * std + rounding).all():
@@ -416,12 +421,16 @@ def _refine(
         if following.diverged >= 0:
             status = (
                 f"stopped after {rounds} rounds: the motion predicted for "
-                f"'{work.logs[following.diverged].name}' diverges; the last estimate with "
-                f"bounded instruments is given"
+                f"'{work.logs[following.diverged].name}' diverges"
             )
+            given = "; the last estimate with bounded instruments is given"
             break
         point = following
-    return _Refined(theta, inverse, rows, bands, fit, rounds, status, converged, keep)
+    if apart and not converged and nearest is not None:
+        # what follows once the moves grow hangs on the last digit of the logs
+        given = f"; the estimate of round {nearest[1].rounds}, before the moves grew, is given"
+        return replace(nearest[1], rounds=rounds, status=status + given)
+    return _Refined(theta, inverse, rows, bands, fit, rounds, status + given, converged, keep)
 
 
 def _change(work: _Refinement, found: _Refined) -> Array:

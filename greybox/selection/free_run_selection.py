@@ -128,6 +128,9 @@ class FreeRunSelection:
         self.model = output_model(predictor, step, integrator=integrator)
         data = [measured(self.model, log) for log in logs]
         self.deviation = deviations(data)
+        # a channel that rests shows no size by which its errors were small: its unit stands for one
+        rests = np.ptp(np.concatenate([d.y for d in data]), axis=0) == 0
+        self._least = np.where(rests, 1.0, _LEAST)
         self._whole = cut(data, max(len(d.y) for d in data))
         self._change = np.maximum(changes(data), 1e-9 * self.deviation)
         self.runs = FreeRuns(self.model, self._whole, self.deviation)
@@ -236,7 +239,7 @@ class FreeRunSelection:
 
     def _noise(self, r: Array) -> Array:
         """Return the mean squared residual of each output, (ny,)."""
-        return np.asarray((r**2).sum(axis=(0, 1)) / self._samples + _LEAST)
+        return np.asarray((r**2).sum(axis=(0, 1)) / self._samples + self._least)
 
     def _value(self, runs: _Runs, p: Array) -> float:
         """Return −log L, the noise of each output concentrated, infinite where a run escapes."""

@@ -45,3 +45,18 @@ def test_a_number_that_moves_is_seen():
     assert apart == pytest.approx(2e-9, rel=1e-6)
     assert where == "/theta[1]"
     assert difference({"theta": [1.0, -2.0]}, want)[0] == np.inf
+
+
+def test_the_last_digit_of_a_log_decides_nothing(folder, tmp_path):
+    """Refinements of parts of this log do not converge; where they end must not be chance."""
+    (fixed,) = (f for f in COMMANDS if f.name == "iv-nominal")
+    found = [run(fixed, folder)]
+    for name in ("ship.toml", "plain.json"):
+        shutil.copy(folder / name, tmp_path)
+    head, *lines = (folder / "pushed.csv").read_text().splitlines()
+    rows = np.array([line.split(",") for line in lines], float)
+    rows[:, 1:] *= 1 + 1e-12 * np.random.default_rng(1).standard_normal(rows[:, 1:].shape)
+    np.savetxt(tmp_path / "pushed.csv", rows, "%.17g", ",", header=head, comments="")
+    found.append(run(fixed, tmp_path))
+    for key in ("theta", "calibration"):
+        assert difference(found[1][key], found[0][key])[0] < 1e-7
