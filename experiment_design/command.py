@@ -603,16 +603,12 @@ def _run_for_prediction(
     options: argparse.Namespace, model: Any, vessel: Any, sailed: Any, told: tuple[str, ...]
 ) -> None:
     """Design the trial that serves predictions and write it."""
-    from dataclasses import replace
-
     from experiment_design.for_prediction import design_for_prediction
     from experiment_design.prepare import both_sides
 
     wishes = both_sides(_wishes(options, model, sailed), model, options.hold)
     prepared, ended = _prepared(options, model, wishes, vessel, sailed)
-    # where the trial starts, and how near sway comes to zero, is told by the plan itself
-    own = [n for n in prepared.notes if not n.startswith(("the first trial", "margin of v"))]
-    prepared = replace(prepared, notes=(*told, *own))
+    notes = (*told, *prepared.of_both_sides)
     found = design_for_prediction(
         prepared.request,
         model,
@@ -620,7 +616,7 @@ def _run_for_prediction(
         kept_starts=options.trials if options.start is not None else int(ended),
         sailed=sailed.motions if sailed is not None else (),
     )
-    _deliver(options, found.design, found, prepared.notes, _of_sailed(sailed), found.headline())
+    _deliver(options, found.design, found, notes, _of_sailed(sailed), found.headline())
 
 
 def _run_for_causes(options: argparse.Namespace, model: Any, vessel: Any) -> None:
@@ -648,7 +644,6 @@ def _run_for_causes(options: argparse.Namespace, model: Any, vessel: Any) -> Non
         )
     wishes = both_sides(_wishes(options, model), model, options.hold)
     prepared = prepare_request(model, wishes, vessel)
-    notes = tuple(n for n in prepared.notes if not n.startswith(("the first trial", "margin of v")))
     found = design_for_causes(
         prepared.request,
         model,
@@ -656,7 +651,7 @@ def _run_for_causes(options: argparse.Namespace, model: Any, vessel: Any) -> Non
         envelope=dict(_range(text, vessel) for text in options.envelope),
         kept_start=options.start is not None,
     )
-    _deliver(options, found.design, found, notes, {}, found.headline())
+    _deliver(options, found.design, found, prepared.of_both_sides, {}, found.headline())
 
 
 def _range(text: str, vessel: Any) -> tuple[str, tuple[float, float]]:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -36,8 +34,8 @@ from greybox.diagnosis.causes import Context, known_causes
 from greybox.diagnosis.hypothesis import Hypothesis, Parameter
 from greybox.diagnosis.result import finite
 from greybox.diagnosis.thresholds import SIGNIFICANT
-from greybox.errors import LogError, UsageError, suggestion
-from greybox.files import nearest_file
+from greybox.errors import UsageError, suggestion
+from greybox.files import read_json
 from greybox.model.model import ManoeuvringModel
 from greybox.public import one_thread
 
@@ -73,19 +71,9 @@ def read_diagnosis(path: str) -> Any:
     Raises
     ------
     LogError
-        It cannot be read.
+        It cannot be read, or is too large.
     """
-    try:
-        return json.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise LogError(
-            f"cannot read the diagnosis '{path}': {error.strerror}.{nearest_file(path)} Give the "
-            f"JSON of greybox diagnose --json."
-        ) from error
-    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
-        raise LogError(
-            f"the diagnosis '{path}' is no JSON: give that of greybox diagnose --json."
-        ) from error
+    return read_json(path, "the diagnosis", "Give the JSON of greybox diagnose --json.")
 
 
 def causes_left_open(diagnosis: Any, name: str = "diagnosis") -> AskedCauses:
@@ -104,18 +92,24 @@ def causes_left_open(diagnosis: Any, name: str = "diagnosis") -> AskedCauses:
         It is no diagnosis, or leaves no cause open.
     """
     own = diagnosis if isinstance(diagnosis, Mapping) else {}
-    verdict, candidates = own.get("verdict"), own.get("candidates")
-    if not isinstance(verdict, str) or not isinstance(candidates, list):
+    verdict, tried = own.get("verdict"), own.get("tried", 0)
+    lists = own.get("candidates"), own.get("partial", [])
+    found = [c for known in lists if isinstance(known, list) for c in known]
+    told = [
+        isinstance(c, Mapping)
+        and isinstance(c.get("id"), str)
+        and isinstance(c.get("parameters"), Mapping)
+        for c in found
+    ]
+    whole = all(isinstance(known, list) for known in lists) and isinstance(tried, int)
+    if not (isinstance(verdict, str) and whole and all(told)):
         raise UsageError(f"'{name}' is no diagnosis: give the JSON of greybox diagnose --json.")
-    found = [*candidates, *own.get("partial", [])]
     if not found:
         raise UsageError(
             f"the diagnosis '{name}' leaves no cause open (its verdict is {verdict}): name those "
             f"to be told apart, such as --causes current heading_bias."
         )
-    return AskedCauses(
-        {c.get("place") or c["id"]: c["parameters"] for c in found}, int(own.get("tried", 0))
-    )
+    return AskedCauses({str(c.get("place") or c["id"]): c["parameters"] for c in found}, tried)
 
 
 def open_causes(

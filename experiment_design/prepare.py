@@ -114,10 +114,25 @@ class Wishes:
 
 @dataclass(frozen=True)
 class Prepared:
-    """A request, and a sentence for each choice that was made for the user."""
+    """A request, and a sentence for each choice that was made for the user.
+
+    Parameters
+    ----------
+    request : DesignRequest
+    notes : tuple of str
+    of_regime : tuple of str
+        Those of `notes` on what one regime needs: its steady start, and its margin of sway. A plan
+        of both sides has a start of its own, and crosses zero.
+    """
 
     request: DesignRequest
     notes: tuple[str, ...]
+    of_regime: tuple[str, ...] = ()
+
+    @property
+    def of_both_sides(self) -> tuple[str, ...]:
+        """The notes that hold for a plan of both sides, too."""
+        return tuple(n for n in self.notes if n not in self.of_regime)
 
 
 def prepare_request(
@@ -203,7 +218,9 @@ def prepare_request(
                 f"the wind is taken to vary by {gust:.2g} m/s about its mean, without which its "
                 f"terms could not be told from the water's (--gust to change)"
             )
-    margins = _margins(model, structure, noise.measurement, wishes, notes)
+    margins, chosen = _margins(model, structure, noise.measurement, wishes)
+    notes += chosen.values()
+    of_regime = [note for state, note in chosen.items() if state != "u"]
     if (np.diag(model.covariance) < 0).any():
         name = model.names[int(np.diag(model.covariance).argmin())]
         raise UsageError(
@@ -270,8 +287,12 @@ def prepare_request(
         shown = ", ".join(
             f"{n} {v:.2f}" for n, v in zip((*structure.states, "psi"), starts[0], strict=True)
         )
-        notes.append(f"the first trial starts from a steady motion: {shown} (--start to change)")
-    return Prepared(replace(base, regimes=regimes, starts=starts), tuple(notes))
+        of_regime.append(
+            f"the first trial starts from a steady motion: {shown} (--start to change)"
+        )
+        notes.append(of_regime[-1])
+    request = replace(base, regimes=regimes, starts=starts)
+    return Prepared(request, tuple(notes), tuple(of_regime))
 
 
 def both_sides(wishes: Wishes, model: ManoeuvringModel, hold: float | None) -> Wishes:
@@ -320,25 +341,27 @@ def _margins(
     structure: Structure,
     measurement: Array,
     wishes: Wishes,
-    notes: list[str],
-) -> dict[str, float]:
-    """Return the margins asked for; else three noise deviations plus a disturbance bound (A10)."""
+) -> tuple[dict[str, float], dict[str, str]]:
+    """Return the margins asked for, and a sentence on each that was not.
+
+    Those are three noise deviations plus a disturbance bound (A10).
+    """
     given = {"u": wishes.margin_u, "v": wishes.margin_v}
     known = [e for _, e in model.disturbances.values()]
     bound = 2 * max(known) if known and max(known) > 0 else _DISTURBANCE
-    margins = {}
+    margins, notes = {}, {}
     for i, state in enumerate(structure.states):
         if state not in ("u", "v"):
             continue
         value = given[state]
         if value is None:
             value = 3.0 * float(measurement[i]) + bound
-            notes.append(
+            notes[state] = (
                 f"margin of {state}: {value:.3f} m/s, three standard deviations of its noise and "
                 f"{bound:.3g} m/s for disturbances (A10)"
             )
         margins[state] = float(value)
-    return margins
+    return margins, notes
 
 
 def _prior(model: ManoeuvringModel | None) -> tuple[tuple[str, ...], Array] | None:

@@ -1,4 +1,4 @@
-"""Writing files so that nothing half-written is ever left behind."""
+"""Files: written whole or not at all, and JSON read within bounds."""
 
 from __future__ import annotations
 
@@ -20,6 +20,8 @@ import numpy as np
 from greybox.errors import LogError, suggestion
 
 _MOST_NAMES = 10_000
+# largest JSON file that is read
+_MOST_BYTES = 50_000_000
 
 _log = logging.getLogger(__name__)
 
@@ -143,6 +145,39 @@ def plain(value: Any) -> Any:
 def to_json(value: Any) -> str:
     """Return `value` as indented JSON that ends in a newline."""
     return json.dumps(plain(value), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def read_json(path: str | Path, what: str, advice: str) -> Any:
+    """Read a JSON file of bounded size.
+
+    Parameters
+    ----------
+    path : str or Path
+    what : str
+        What the file should be, such as ``the diagnosis``.
+    advice : str
+        A sentence on what to give instead.
+
+    Raises
+    ------
+    LogError
+        It is missing, too large, or no JSON.
+    """
+    path = Path(path)
+    try:
+        size = path.stat().st_size
+        if size > _MOST_BYTES:
+            raise LogError(
+                f"{what} '{path}' has {size / 1e6:.0f} MB, at most {_MOST_BYTES / 1e6:.0f} MB are "
+                f"read. {advice}"
+            )
+        return json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise LogError(
+            f"cannot read {what} '{path}': {error.strerror}.{nearest_file(path)} {advice}"
+        ) from error
+    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
+        raise LogError(f"{what} '{path}' is no JSON: {error}. {advice}") from error
 
 
 def write_json(value: Any, path: str | Path) -> None:

@@ -180,8 +180,13 @@ def test_what_a_diagnosis_left_open() -> None:
     assert asked.tried == 40
     with pytest.raises(UsageError, match=r"leaves no cause open \(its verdict is named\)"):
         causes_left_open(told | {"verdict": "named", "candidates": []})
-    with pytest.raises(UsageError, match=r"'m\.json' is no diagnosis"):
-        causes_left_open([], "m.json")
+    broken = (
+        [], told | {"candidates": ["current"]}, told | {"candidates": [{"id": "current"}]},
+        told | {"partial": None}, told | {"tried": "many"}, told | {"verdict": 3},
+    )  # fmt: skip
+    for data in broken:
+        with pytest.raises(UsageError, match=r"'m\.json' is no diagnosis"):
+            causes_left_open(data, "m.json")
 
 
 def test_causes_that_cannot_be_at_work_are_named(model) -> None:
