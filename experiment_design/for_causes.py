@@ -271,14 +271,16 @@ class CauseDesign:
         """Return in one sentence what the plan is for and how surely it will do it."""
         k = int(self.plan.detectable_share.argmax())
         said = (
-            f"The diagnosis of this trial finds {self.causes[k].id}, the hardest of the open "
-            f"causes, beside the others with a probability of {self.plan.power[k]:.2f}, and with "
-            f"{WANTED:g} where it is {self.plan.detectable_share[k]:.2g} of the size that is "
-            f"expected"
+            f"A diagnosis of this trial would find {self.causes[k].id}, the hardest of the open "
+            f"causes, beside the others with probability {self.plan.power[k]:.2f}, and with "
+            f"probability {WANTED:g} if it were {self.plan.detectable_share[k]:.2g} times as large "
+            f"as expected"
         )
-        for r, what in ((self.random, "the best of random steps"), (self.usual, "a usual zig-zag")):
+        for r, what in ((self.random, "the best random steps"), (self.usual, "a usual zig-zag")):
             if r is not None:
-                said += f"; {what}: {r.power.min():.2f}, {r.detectable_share.max():.2g}"
+                said += (
+                    f"; after {what}: {r.power.min():.2f}, and {r.detectable_share.max():.2g} times"
+                )
         return f"{said}."
 
     def summary(self) -> str:
