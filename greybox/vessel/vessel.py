@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from math import floor, inf, isfinite
 from typing import Any, Literal, get_args
@@ -152,8 +152,8 @@ class Thruster:
 
 
 # what follows slowly, beside one column by its name
-LagOn = Literal["force", "speed", "command"]
-DelayOn = Literal["command"]
+LagOn = Literal["force", "speed", "angle", "command"]
+DelayOn = Literal["speed", "angle", "command"]
 LagHeld = Literal["start", "mean", "end"]
 Between = Literal["held", "interpolated"]
 
@@ -174,7 +174,8 @@ class Actuation:
         Time constant of a first-order lag [s], 0 for none.
     lag_on : str
         What follows slowly: each generalised ``force``, the propellers' ``speed``, each
-        ``command``, or one command by the name of its column.
+        ``angle`` of thrusters and rudders, each ``command``, or one command by the name of its
+        column.
     delay : float
         Pure delay [s].
     lag_held : {"start", "mean", "end"}
@@ -183,7 +184,7 @@ class Actuation:
         Whether a logged command stays as it is until the next one, as orders do, or moves on a
         straight line towards it, as measured angles and speeds do.
     delay_on : str
-        What is delayed: each ``command``, or one by the name of its column.
+        What is delayed: each ``speed``, ``angle`` or ``command``, or one by the name of its column.
     rate_limit : float, optional
         Fastest movement of one command, in the unit of its column per second.
     rate_on : str, optional
@@ -246,12 +247,17 @@ class Actuation:
     @property
     def sentence(self) -> str:
         """Lag, delay and rate limit in words."""
-        of = {"force": "each force", "speed": "the propeller speeds", "command": "all commands"}
+        of = {
+            "force": "each force", "speed": "the propeller speeds", "angle": "all angles",
+            "command": "all commands",
+        }  # fmt: skip
         parts = []
         if self.lag:
             parts.append(f"a lag of {self.lag:g} s of {of.get(self.lag_on, self.lag_on)}")
         if self.delay:
-            whose = "" if self.delay_on == "command" else f" of {self.delay_on}"
+            whose = (
+                "" if self.delay_on == "command" else f" of {of.get(self.delay_on, self.delay_on)}"
+            )
             parts.append(f"a delay of {self.delay:g} s{whose}")
         if self.rate_limit is not None:
             parts.append(f"a rate limit of {self.rate_limit:g} per second of {self.rate_on}")
@@ -332,19 +338,23 @@ class Vessel(DisplayMixin):
     @property
     def delayed_commands(self) -> tuple[str, ...]:
         """Those of `commands` that act after the delay of `actuation`."""
-        on = self.actuation.delay_on
-        return tuple(c for c in self.commands if self.actuation.delay and on in ("command", c))
+        return self._meant(self.actuation.delay_on) if self.actuation.delay else ()
 
     @property
     def lagged_commands(self) -> tuple[str, ...]:
         """Those of `commands` that pass the lag of `actuation`; none where forces do."""
         lag, on = self.actuation.lag, self.actuation.lag_on
+        return () if lag == 0 or on == "force" else self._meant(on)
+
+    def _meant(self, on: str) -> tuple[str, ...]:
+        """Return those of `commands` that a word or a column of `actuation` stands for."""
         # the words stand before a column of the same name
-        if lag == 0 or on == "force":
-            return ()
-        speeds = {t.speed for t in self.thrusters}
-        of = {"command": set(self.commands), "speed": speeds}.get(on, {on})
-        return tuple(c for c in self.commands if c in of)
+        of: dict[str, Collection[str]] = {
+            "command": self.commands,
+            "speed": {t.speed for t in self.thrusters},
+            "angle": self.angle_commands,
+        }
+        return tuple(c for c in self.commands if c in of.get(on, {on}))
 
     @property
     def angle_commands(self) -> frozenset[str]:

@@ -14,7 +14,7 @@ from greybox.diagnosis.causes.hull import listed, term_hypothesis
 from greybox.diagnosis.causes.sensors import UNRESOLVED
 from greybox.diagnosis.hypothesis import Hypothesis, Parameter
 from greybox.diagnosis.ship import Ship
-from greybox.vessel.vessel import Actuation, LagHeld, LagOn, Thruster
+from greybox.vessel.vessel import Actuation, DelayOn, LagHeld, LagOn, Thruster
 
 Array = NDArray[np.float64]
 
@@ -44,6 +44,20 @@ def _single_commands(context: Context) -> tuple[str, ...]:
     commands = context.vessel.commands
     moving = tuple(c for c in commands if context.ranges.get(c, 1.0) > 0)
     return moving if len(commands) > 1 else ()
+
+
+def _together(context: Context, words: Sequence[str]) -> tuple[str, ...]:
+    """Return the words for what may be late together; a single angle has its column's name."""
+    several = len(context.vessel.angle_commands) > 1
+    return tuple(w for w in words if w != "angle" or several)
+
+
+def _late(hypothesis: Hypothesis) -> str:
+    """Return what is late with its verb, where not all commands are."""
+    on = hypothesis.key.partition(":")[2]
+    if hypothesis.place:
+        return f"{hypothesis.place} alone acts"
+    return {"speed": "the propeller speeds act", "angle": "the angles act"}.get(on, "")
 
 
 def _groups(context: Context) -> list[list[int]]:
@@ -130,14 +144,14 @@ class ThrusterLag(Cause):
     reference = "Fossen (2011), section 9.1"
 
     def hypotheses(self, context: Context) -> Sequence[Hypothesis]:
-        """Return a lag of the forces, the propeller speeds, all commands, or one of them."""
+        """Return a lag of the forces, the speeds, the angles, all commands, or one of them."""
         longest = min(_LONGEST, _SHARE * context.duration)
         first = 2 * context.sample_time
         parameter = Parameter(
             "lag", "s", first, 1e-3, longest, step=1e-3, least=UNRESOLVED * context.sample_time
         )
 
-        words: tuple[str, ...] = get_args(LagOn)
+        words = _together(context, get_args(LagOn))
 
         def lag(on: str, held: LagHeld, variants: tuple[Hypothesis, ...] = ()) -> Hypothesis:
             def apply(ship: Ship, value: Array) -> Ship:
@@ -161,14 +175,13 @@ class ThrusterLag(Cause):
         return f"forces follow their commands with a time constant of {value:.1f} ± {std:.1g} s"
 
     def evidence_of(self, hypothesis: Hypothesis, values: Mapping[str, tuple[float, float]]) -> str:
-        """Say which command is slow, where it is one."""
+        """Say which commands are slow, where not all of them are."""
         value, std = values["lag"]
-        if not hypothesis.place:
+        what = _late(hypothesis)
+        if not what:
             return self.evidence(values)
-        return (
-            f"{hypothesis.place} alone acts with a time constant of {value:.1f} ± {std:.1g} s "
-            f"after it is logged"
-        )
+        they = "it is" if hypothesis.place else "they are"
+        return f"{what} with a time constant of {value:.1f} ± {std:.1g} s after {they} logged"
 
 
 class InputDelay(Cause):
@@ -182,25 +195,32 @@ class InputDelay(Cause):
     reference = "Ljung (1999), section 14.3"
 
     def hypotheses(self, context: Context) -> Sequence[Hypothesis]:
-        """Return a delay of all commands, or of one of them."""
+        """Return a delay of all commands, the speeds, the angles, or one of them."""
         longest = min(_LONGEST, _SHARE * context.duration)
         first = 1.5 * context.sample_time
         parameter = Parameter("delay", "s", first, 0.0, longest, step=0.1 * context.sample_time,
                               least=UNRESOLVED * context.sample_time)  # fmt: skip
 
+        words: tuple[str, ...] = get_args(DelayOn)
+
         def delay(on: str) -> Hypothesis:
             def apply(ship: Ship, value: Array) -> Ship:
                 return with_actuation(ship, delay=float(value[0]), delay_on=on)
 
-            place = "" if on == "command" else on
+            key = self.id if on == "command" else f"{self.id}:{on}"
             return Hypothesis(
-                self.id, f"{self.id}:{place}" if place else self.id, (parameter,), (), apply,
-                starts=((3 * first,), (6 * first,)), place=place, past=True,
+                self.id, key, (parameter,), (), apply, starts=((3 * first,), (6 * first,)),
+                place="" if on in words else on, past=True,
             )  # fmt: skip
 
-        # a ship has one delay
-        own = () if context.vessel.actuation.delay else _single_commands(context)
-        return [delay("command"), *(delay(c) for c in own if c != "command")]
+        # a ship has one delay; what steers may be late together, and what drives
+        places = ["command"]
+        if not context.vessel.actuation.delay:
+            if len({t.speed for t in context.vessel.thrusters}) > 1:
+                places.append("speed")
+            places += _together(context, ("angle",))
+            places += [c for c in _single_commands(context) if c not in words]
+        return [delay(on) for on in places]
 
     def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
         """Say how late."""
@@ -208,11 +228,11 @@ class InputDelay(Cause):
         return f"commands act {value:.1f} ± {std:.1g} s after they are logged"
 
     def evidence_of(self, hypothesis: Hypothesis, values: Mapping[str, tuple[float, float]]) -> str:
-        """Say which command is late, where it is one."""
+        """Say which commands are late, where not all of them are."""
         value, std = values["delay"]
-        if not hypothesis.place:
-            return self.evidence(values)
-        return f"{hypothesis.place} alone acts {value:.1f} ± {std:.1g} s after it is logged"
+        they = "it is" if hypothesis.place else "they are"
+        what = _late(hypothesis) or "commands act"
+        return f"{what} {value:.1f} ± {std:.1g} s after {they} logged"
 
 
 class RateLimit(Cause):
