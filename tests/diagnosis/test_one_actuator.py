@@ -66,6 +66,22 @@ def test_a_rudder_may_be_late_by_itself() -> None:
     assert said == "delta alone acts with a time constant of 2.0 ± 0.1 s after it is logged"
 
 
+def test_angles_of_one_make_may_be_late_together() -> None:
+    ship = vessel(*PAIR)
+    assert "thruster_lag:angle" in hypotheses(ship, "thruster_lag")
+    delays = hypotheses(ship, "input_delay")
+    assert [h.id for h in delays.values()][:3] == ["input_delay"] * 3
+    late = (
+        delays["input_delay:angle"]
+        .apply(Ship(np.zeros(1), np.zeros(2), ship), np.array([1.5]))
+        .vessel
+    )
+    assert late.delayed_commands == ("alpha_port", "alpha_star")
+    assert known_causes()["input_delay"].evidence_of(
+        delays["input_delay:angle"], {"delay": (1.5, 0.1)}
+    ) == "the angles act 1.5 ± 0.1 s after they are logged"  # fmt: skip
+
+
 def test_a_ship_has_one_lag_one_delay_and_one_limit() -> None:
     late = Actuation(lag=1.0, delay=1.0, rate_limit=1.0, rate_on="n")
     ship = replace(vessel(RUDDER), actuation=late)

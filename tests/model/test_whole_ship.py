@@ -66,7 +66,9 @@ LATE = [
     Actuation(lag=3.0, lag_held="mean"),
     Actuation(lag=2.5, lag_on="speed", lag_held="end"),
     Actuation(lag=2.5, lag_on="command", delay=1.3),
+    Actuation(lag=2.5, lag_on="angle", delay=1.3, delay_on="speed"),
     Actuation(delay=2.0),
+    Actuation(delay=0.7, delay_on="angle"),
     Actuation(delay=0.4),
     Actuation(lag=2.5, lag_on="alpha1", lag_held="mean"),
     Actuation(delay=1.3, delay_on="alpha2"),
@@ -104,7 +106,7 @@ def test_wind_is_an_input_where_there_are_wind_terms(ship, true_theta, log):
     assert a_model(ship, true_theta, names=few).step_function().name_in() == ["x", "command"]
 
 
-@pytest.mark.parametrize("lag_on", ["force", "command", "speed", "n"])
+@pytest.mark.parametrize("lag_on", ["force", "command", "speed", "angle", "n"])
 def test_rate_is_the_step_over_the_sample_time(ship, true_theta, lag_on):
     model = a_model(ship, true_theta)
     x, command = [1.4, 0.3, 0.02, 0.7, 5.0, -3.0], [15.0, 0.8, 0.9]
@@ -121,6 +123,7 @@ def test_rate_is_the_step_over_the_sample_time(ship, true_theta, lag_on):
         ),
         "command": np.array(command),
         "speed": np.array(command[:1]),
+        "angle": np.array(command[1:]),
         "n": np.array(command[:1]),
     }[lag_on]
     np.testing.assert_allclose(rate[6:].ravel(), (goal - 0.5) / 2.0)

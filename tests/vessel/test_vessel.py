@@ -313,7 +313,7 @@ def test_bad_thrusters(change, message):
         ({"actuation": {"lagg": 1}}, "Did you mean 'lag'"),
         (
             {"actuation": {"lag_on": "nn"}},
-            "'nn'. Did you mean 'n'\\? Use force, speed, command or a",
+            "'nn'. Did you mean 'n'\\? Use force, speed, angle, command or a",
         ),
         ({"actuation": {"delay_on": "m"}}, "a column that moves a thruster: n, a"),
         ({"actuation": {"rate_limit": 1, "rate_on": "b"}}, "rate_on of \\[actuation\\] is 'b'"),
