@@ -225,7 +225,7 @@ def test_a_plan_tells_more_than_random_and_usual_trials(found) -> None:
     assert 0 < first["power_random"] <= 1
     (pair,) = told["pairs"]
     assert pair["ids"] == ["current", "heading_bias"]
-    assert f"{worst:.2g} of the size" in found.headline()
+    assert f"{worst:.2g} times as large" in found.headline()
     assert "heading_bias 0.006 rad (as estimated)" in found.summary()
     assert found.design.motions[0].state[0, :, 0].min() > 0.2 - 1e-3
 
