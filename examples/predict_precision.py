@@ -3,7 +3,7 @@
 import numpy as np
 
 import greybox as gb
-from experiment_design import Wishes, build_problem, predict_precision, prepare_request
+from experiment_design import DesignRequest, build_problem, predict_precision, prepare_request
 from experiment_design.excitation.inputs import prbs, random_two_level, zig_zags
 from greybox.errors import ExcitationError
 from greybox.study.chapter6 import START, TRUE
@@ -12,8 +12,8 @@ ship = gb.load_vessel("thesis")
 structure = gb.get_structure("thesis")
 theta = np.array([TRUE[name] for name in structure.parameters])
 prior = gb.ManoeuvringModel(structure, theta, np.zeros((theta.size,) * 2), 1.0, ship)
-wishes = Wishes(1200.0, hold=20.0, regime="u+v+", start=[*START, 0.0], predictor="basic")
-request = prepare_request(prior, wishes).request
+asked = DesignRequest(1200.0, hold=20.0, regime="u+v+", start=[*START, 0.0], predictor="basic")
+request = prepare_request(prior, asked)
 schedule = build_problem(request).schedule
 holds, commands = schedule.holds, len(schedule.commands)
 sequences = {

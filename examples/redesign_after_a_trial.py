@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 import greybox as gb
-from experiment_design import Wishes, design_trial, prepare_request
+from experiment_design import DesignRequest, TrialLimits, design_trial, prepare_request
 from greybox.study.chapter6 import TRUE
 from greybox.trial.log import make_log
 
@@ -30,14 +30,15 @@ def sail(design):
 # what is believed at first: parameters off by a tenth
 guess = true * (1 + 0.1 * rng.standard_normal(true.size))
 model = gb.ManoeuvringModel(structure, guess, np.zeros((18, 18)), 1.0, ship)
-wishes = Wishes(400.0, regime="u+v+", margin_u=0.5, margin_v=0.4, predictor="basic", effort=0.3)
-first = design_trial(prepare_request(model, wishes).request, alternatives=False)
+limits = TrialLimits(margins={"u": 0.5, "v": 0.4})
+asked = DesignRequest(400.0, limits, regime="u+v+", predictor="basic", effort=0.3)
+first = design_trial(prepare_request(model, asked), alternatives=False)
 estimate = gb.estimate_model(sail(first), method="iv", predictor="basic")
 model = estimate.model()
 
 # the second trial adds to the first one's information, and keeps its limits in nine of ten models
-again = replace(wishes, prior=model)
-second = design_trial(prepare_request(model, again).request, alternatives=False)
+again = replace(asked, prior=model)
+second = design_trial(prepare_request(model, again), alternatives=False)
 print(f"{'parameter':<10}{'after one':>12}{'after both':>12}")
 for name, one, both in zip(second.names, model.std, second.std, strict=True):
     print(f"{name:<10}{one:>12.2g}{both:>12.2g}")

@@ -5,7 +5,13 @@ from dataclasses import replace
 import numpy as np
 
 import greybox as gb
-from experiment_design import CandidateModel, Wishes, design_between, prepare_request
+from experiment_design import (
+    CandidateModel,
+    DesignRequest,
+    TrialLimits,
+    design_between,
+    prepare_request,
+)
 from greybox.study.chapter6 import TRUE
 
 ship = gb.load_vessel("thesis")
@@ -19,6 +25,7 @@ damping = theta.copy()
 damping[structure.index("Nvr")] = -0.06
 weaker = CandidateModel("damping", structure, damping, np.zeros(4))
 
-prepared = prepare_request(in_current, Wishes(200.0, regime="u+v+", margin_u=0.3, margin_v=0.2))
-request = replace(prepared.request, effort=0.5)
+limits = TrialLimits(margins={"u": 0.3, "v": 0.2})
+prepared = prepare_request(in_current, DesignRequest(200.0, limits, regime="u+v+"))
+request = replace(prepared, effort=0.5)
 print(design_between(request, weaker, ("current", "damping")).summary())

@@ -3,12 +3,13 @@
 from dataclasses import replace
 
 import greybox as gb
-from experiment_design import Wishes, design_trial, prepare_request
+from experiment_design import DesignRequest, TrialLimits, design_trial, prepare_request
 from experiment_design.demo.loop import prior_model, virtual_sea
 
 prior = prior_model()
-wishes = Wishes(300.0, regime="u+v+", margin_u=0.3, margin_v=0.3, predictor="basic", effort=0.05)
-design = design_trial(prepare_request(prior, wishes).request, alternatives=False)
+limits = TrialLimits(margins={"u": 0.3, "v": 0.3})
+asked = DesignRequest(300.0, limits, regime="u+v+", predictor="basic", effort=0.05)
+design = design_trial(prepare_request(prior, asked), alternatives=False)
 print(design.summary())
 
 # a ship that feels a current which no model is told of; its second trial stays aside
@@ -23,5 +24,5 @@ found = gb.diagnose([trial], validate=[other])
 print(found.summary())
 print("what had been hidden:", dict(sea.truth[0].parameters))
 
-again = replace(wishes, prior=found.model)
-print(design_trial(prepare_request(found.model, again).request, alternatives=False).summary())
+again = replace(asked, prior=found.model)
+print(design_trial(prepare_request(found.model, again), alternatives=False).summary())

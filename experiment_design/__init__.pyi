@@ -14,10 +14,10 @@ from experiment_design.output.result import Design as Design
 from experiment_design.output.result import write_plan as write_plan
 from experiment_design.precision import PredictedPrecision as PredictedPrecision
 from experiment_design.precision import predict_precision as predict_precision
-from experiment_design.prepare import Wishes as Wishes
 from experiment_design.prepare import prepare_request as prepare_request
 from experiment_design.request.noise import noise_levels as noise_levels
 from experiment_design.request.request import CandidateModel as CandidateModel
 from experiment_design.request.request import DesignRequest as DesignRequest
+from experiment_design.request.request import PreparedRequest as PreparedRequest
 from experiment_design.request.request import build_problem as build_problem
 from greybox.model.noise import NoiseLevels as NoiseLevels

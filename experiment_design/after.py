@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from experiment_design.excitation.rollout import Motion
 from experiment_design.information.envelope import Envelope
-from experiment_design.request.request import DesignRequest
+from experiment_design.request.request import PreparedRequest
 from greybox.errors import LogError
 from greybox.model.model import ManoeuvringModel
 from greybox.trial.log import TrialLog
@@ -149,7 +149,7 @@ def log_moments(envelope: Envelope, motions: Sequence[Motion]) -> Array | None:
     return np.asarray(np.sum(told, axis=0)) if told else None
 
 
-def lacking_margin(request: DesignRequest) -> str:
+def lacking_margin(request: PreparedRequest) -> str:
     """Return the name of a state whose margin the first trial's start does not keep, or ``""``."""
     start = dict(zip(request.structure.states, request.starts[0], strict=False))
     margins: Mapping[str, float] = request.limits.margins

@@ -396,14 +396,13 @@ def run(options: argparse.Namespace) -> None:
     if purpose == "causes":
         _run_for_causes(options, model, vessel)
         return
-    wishes = _wishes(options, model, sailed)
+    asked = _asked(options, model, sailed)
     if sailed is not None:
-        wishes = _with_known(wishes, options, model)
-    prepared, _ = _prepared(options, model, wishes, vessel, sailed)
-    prepared = replace(prepared, notes=(*told, *prepared.notes))
-    request = prepared.request
+        asked = replace(asked, prior=model)
+    request, _ = _prepared(options, model, asked, vessel, sailed)
+    notes = (*told, *request.notes)
     if options.between:
-        _run_between(options, request, prepared.notes)
+        _run_between(options, request, notes)
         return
     if options.target:
         request = least_duration(
@@ -418,7 +417,7 @@ def run(options: argparse.Namespace) -> None:
         progress=progress("design"),
         workers=options.workers,
     )
-    _deliver(options, design, design, prepared.notes, _of_sailed(sailed))
+    _deliver(options, design, design, notes, _of_sailed(sailed))
 
 
 def _deliver(
@@ -558,18 +557,8 @@ def _of_sailed(sailed: Any) -> dict[str, Any]:
     return {} if sailed is None else {"after": sailed.to_dict()}
 
 
-def _with_known(wishes: Any, options: argparse.Namespace, model: Any) -> Any:
-    """Return wishes with what the sailed logs told, at a hold of the model's own samples."""
-    from dataclasses import replace
-
-    hold = wishes.hold
-    if options.hold is None:
-        hold = max(1, round(hold / model.sample_time)) * model.sample_time
-    return replace(wishes, hold=hold, prior=model)
-
-
 def _prepared(
-    options: argparse.Namespace, model: Any, wishes: Any, vessel: Any, sailed: Any
+    options: argparse.Namespace, model: Any, asked: Any, vessel: Any, sailed: Any
 ) -> tuple[Any, bool]:
     """Return the prepared request, and whether its first trial starts where the logs ended."""
     from dataclasses import replace
@@ -579,19 +568,19 @@ def _prepared(
     from greybox.errors import InfeasibleError
 
     if sailed is None or options.start is not None:
-        return prepare_request(model, wishes, vessel), False
+        return prepare_request(model, asked, vessel), False
     ended = ", ".join(
         f"{n} {x:.3g}" for n, x in zip((*model.structure.states, "psi"), sailed.end, strict=True)
     )
     try:
-        found = prepare_request(model, replace(wishes, start=sailed.end), vessel)
-        lacking = lacking_margin(found.request)
+        found = prepare_request(model, replace(asked, start=sailed.end), vessel)
+        lacking = lacking_margin(found)
     except InfeasibleError:
         lacking = "some state"
     if not lacking:
         said = f"it starts where the last log ended: {ended} (--start to change)"
         return replace(found, notes=(said, *found.notes)), True
-    found = prepare_request(model, wishes, vessel)
+    found = prepare_request(model, asked, vessel)
     said = (
         f"the last log ended with {ended}, where {lacking} does not keep its margin: steady the "
         f"ship before this plan begins"
@@ -606,11 +595,11 @@ def _run_for_prediction(
     from experiment_design.for_prediction import design_for_prediction
     from experiment_design.prepare import both_sides
 
-    wishes = both_sides(_wishes(options, model, sailed), model, options.hold)
-    prepared, ended = _prepared(options, model, wishes, vessel, sailed)
-    notes = (*told, *prepared.of_both_sides)
+    asked = both_sides(_asked(options, model, sailed), model)
+    request, ended = _prepared(options, model, asked, vessel, sailed)
+    notes = (*told, *request.of_both_sides)
     found = design_for_prediction(
-        prepared.request,
+        request,
         model,
         envelope=dict(_range(text, vessel) for text in options.envelope),
         kept_starts=options.trials if options.start is not None else int(ended),
@@ -631,27 +620,26 @@ def _run_for_causes(options: argparse.Namespace, model: Any, vessel: Any) -> Non
     from greybox.errors import UsageError
 
     if options.causes:
-        asked = AskedCauses({name: {} for name in options.causes}, named=True)
+        causes = AskedCauses({name: {} for name in options.causes}, named=True)
     elif options.diagnosis:
-        asked = causes_left_open(read_diagnosis(options.diagnosis), options.diagnosis)
+        causes = causes_left_open(read_diagnosis(options.diagnosis), options.diagnosis)
     elif "diagnosis" in model.record:
-        asked = causes_left_open(model.record["diagnosis"], options.model)
+        causes = causes_left_open(model.record["diagnosis"], options.model)
     else:
         raise UsageError(
             f"--for causes needs to know which are open, and {options.model} is no model of "
             f"greybox diagnose: give --diagnosis D, the JSON of greybox diagnose --json D, or name "
             f"them, such as --causes current heading_bias."
         )
-    wishes = both_sides(_wishes(options, model), model, options.hold)
-    prepared = prepare_request(model, wishes, vessel)
+    request = prepare_request(model, both_sides(_asked(options, model), model), vessel)
     found = design_for_causes(
-        prepared.request,
+        request,
         model,
-        asked,
+        causes,
         envelope=dict(_range(text, vessel) for text in options.envelope),
         kept_start=options.start is not None,
     )
-    _deliver(options, found.design, found, prepared.of_both_sides, {}, found.headline())
+    _deliver(options, found.design, found, request.of_both_sides, {}, found.headline())
 
 
 def _range(text: str, vessel: Any) -> tuple[str, tuple[float, float]]:
@@ -748,12 +736,12 @@ def _show(
         write_page(page, options.report)
 
 
-def _wishes(options: argparse.Namespace, model: Any, sailed: Any = None) -> Any:
+def _asked(options: argparse.Namespace, model: Any, sailed: Any = None) -> Any:
     import numpy as np
 
     from experiment_design.constraints.limits import Circle, TrialLimits
-    from experiment_design.prepare import Wishes
     from experiment_design.request.expressions import gradient_of
+    from experiment_design.request.request import DesignRequest
     from greybox.errors import UsageError
     from greybox.model.model import load_model
 
@@ -769,7 +757,9 @@ def _wishes(options: argparse.Namespace, model: Any, sailed: Any = None) -> Any:
     place = (0.0, 0.0) if options.position is None else options.position
     if options.position is None and area is not None and sailed is not None and sailed.place:
         place = sailed.place
+    margins = {"u": options.margin_u, "v": options.margin_v}
     limits = TrialLimits(
+        margins={n: m for n, m in margins.items() if m is not None},
         margin_air=options.margin_air,
         area=area,
         position=place,
@@ -789,12 +779,10 @@ def _wishes(options: argparse.Namespace, model: Any, sailed: Any = None) -> Any:
         # of one function's variance alone, that is the criterion of one function
         criterion = next(c for c in CRITERIA.values() if c.combined)
     process = None if options.process_noise is None else np.array(options.process_noise)
-    return Wishes(
+    return DesignRequest(
         duration=_duration(options),
-        hold=options.hold or 10.0,
+        hold=options.hold,
         regime=options.regime or "auto",
-        margin_u=options.margin_u,
-        margin_v=options.margin_v,
         start=options.start,
         trials=options.trials,
         predictor=options.predictor,

@@ -42,7 +42,7 @@ from experiment_design.optimise.solve import EXACT_COLUMNS, Outcome, solve_ipopt
 from experiment_design.output.result import Design, logdet_information
 from experiment_design.request.apparent_wind import air_notes
 from experiment_design.request.problem import TrialProblem
-from experiment_design.request.request import DesignRequest, build_problem, wanted_parameters
+from experiment_design.request.request import PreparedRequest, build_problem, wanted_parameters
 from greybox.errors import InfeasibleError
 
 Array = NDArray[np.float64]
@@ -58,7 +58,7 @@ _log = logging.getLogger(__name__)
 
 
 def design_trial(
-    request: DesignRequest,
+    request: PreparedRequest,
     *,
     best_effort: bool = False,
     progress: Progress | None = None,
@@ -70,7 +70,7 @@ def design_trial(
 
     Parameters
     ----------
-    request : DesignRequest
+    request : PreparedRequest
     best_effort : bool
         Return the closest plan when limits cannot be kept.
     progress : callable, optional
@@ -105,7 +105,7 @@ def design_trial(
 
 
 def _design(
-    request: DesignRequest,
+    request: PreparedRequest,
     best_effort: bool,
     progress: Progress | None,
     workers: int | None,
@@ -218,7 +218,7 @@ def _design(
 
 
 def described(
-    request: DesignRequest,
+    request: PreparedRequest,
     problems: list[TrialProblem],
     units: list[Array],
     reference: list[Array] | None,
@@ -235,7 +235,7 @@ def described(
 
     Parameters
     ----------
-    request : DesignRequest
+    request : PreparedRequest
     problems : list of TrialProblem
         One a trial.
     units : list of ndarray
@@ -309,7 +309,7 @@ def _covariance(problems: list[TrialProblem], units: list[Array]) -> Array:
 
 
 def _from_closest(
-    request: DesignRequest,
+    request: PreparedRequest,
     problems: list[TrialProblem],
     nearest: tuple[Candidate, ...],
     workers: int | None,
@@ -383,11 +383,11 @@ def _criterion_value(
 
 
 def _tighten(
-    request: DesignRequest,
+    request: PreparedRequest,
     problems: list[TrialProblem],
     candidates: list[Candidate],
     workers: int | None,
-) -> tuple[DesignRequest, list[TrialProblem], list[Candidate], ConstraintSatisfaction, int]:
+) -> tuple[PreparedRequest, list[TrialProblem], list[Candidate], ConstraintSatisfaction, int]:
     """Tighten the path limits until they are kept with the wanted probability."""
     spent = 0
     plain = replace(request, backoff=())

@@ -14,7 +14,7 @@ from experiment_design.information.t_optimality import Contrast, Pair
 from experiment_design.optimise.campaign import Progress
 from experiment_design.optimise.search import draw_two_level
 from experiment_design.output.result import Design
-from experiment_design.request.request import CandidateModel, DesignRequest, build_problem
+from experiment_design.request.request import CandidateModel, PreparedRequest, build_problem
 from greybox.errors import UsageError
 from greybox.notebook import DisplayMixin, items, number, sparkline, table
 
@@ -147,7 +147,7 @@ def probability_right(ratio: float) -> float:
 
 
 def design_between(
-    request: DesignRequest,
+    request: PreparedRequest,
     rival: CandidateModel,
     names: tuple[str, str],
     *,
@@ -162,7 +162,7 @@ def design_between(
 
     Parameters
     ----------
-    request : DesignRequest
+    request : PreparedRequest
         Of one trial, with the first explanation as its model.
     rival : CandidateModel
         The second one.
@@ -222,7 +222,7 @@ def design_between(
     return best
 
 
-def _require_different(request: DesignRequest, names: tuple[str, str]) -> None:
+def _require_different(request: PreparedRequest, names: tuple[str, str]) -> None:
     """Raise where two explanations move the ship alike under every drawn sequence."""
     problem = build_problem(request)
     drawn = draw_two_level(problem, np.random.default_rng([29, request.seed]), 5)

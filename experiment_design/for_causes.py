@@ -29,7 +29,7 @@ from experiment_design.optimise.envelope_search import (
     usual_manoeuvres,
 )
 from experiment_design.output.result import Design
-from experiment_design.request.request import DesignRequest, build_problem
+from experiment_design.request.request import PreparedRequest, build_problem
 from greybox.diagnosis.causes import Context, known_causes
 from greybox.diagnosis.hypothesis import Hypothesis, Parameter
 from greybox.diagnosis.result import finite
@@ -113,7 +113,7 @@ def causes_left_open(diagnosis: Any, name: str = "diagnosis") -> AskedCauses:
 
 
 def open_causes(
-    request: DesignRequest, model: ManoeuvringModel, asked: AskedCauses
+    request: PreparedRequest, model: ManoeuvringModel, asked: AskedCauses
 ) -> tuple[tuple[OpenCause, ...], int, tuple[str, ...]]:
     """Return the causes beside a model, how many hypotheses a diagnosis tries, and notes.
 
@@ -121,7 +121,7 @@ def open_causes(
 
     Parameters
     ----------
-    request : DesignRequest
+    request : PreparedRequest
     model : ManoeuvringModel
     asked : AskedCauses
 
@@ -323,7 +323,7 @@ def _sizes(cause: OpenCause) -> str:
 
 @one_thread
 def design_for_causes(
-    request: DesignRequest,
+    request: PreparedRequest,
     model: ManoeuvringModel,
     asked: AskedCauses,
     *,
@@ -337,7 +337,7 @@ def design_for_causes(
 
     Parameters
     ----------
-    request : DesignRequest
+    request : PreparedRequest
         Of both sides and one trial, as `prepare_request` gives it.
     model : ManoeuvringModel
         The prior, with what its own trial showed.
@@ -378,7 +378,7 @@ def design_for_causes(
     )
     power = CausePower(rollout, causes, request.noise, SIGNIFICANT, tried).with_typical_sizes(first)
 
-    def campaign(r: DesignRequest) -> list[EnvelopeSearch]:
+    def campaign(r: PreparedRequest) -> list[EnvelopeSearch]:
         return [
             exchange_settings(
                 build_problem(r), found, power.values, r.seed, effort=r.effort, tries=_TRIES
@@ -401,5 +401,5 @@ def design_for_causes(
     return CauseDesign(design, power.causes, plan, reported(random), reported(usual), power.level)
 
 
-def _rng(request: DesignRequest) -> np.random.Generator:
+def _rng(request: PreparedRequest) -> np.random.Generator:
     return np.random.default_rng([47, request.seed])

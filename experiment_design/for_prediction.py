@@ -27,7 +27,7 @@ from experiment_design.optimise.envelope_search import (
     search_envelope,
 )
 from experiment_design.output.result import Design
-from experiment_design.request.request import DesignRequest, build_problem
+from experiment_design.request.request import PreparedRequest, build_problem
 from greybox.errors import InfeasibleError
 from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor import build_predictor
@@ -198,7 +198,7 @@ def prior_misfit(model: ManoeuvringModel) -> tuple[Array, str]:
 
 
 def design_for_prediction(
-    request: DesignRequest,
+    request: PreparedRequest,
     model: ManoeuvringModel,
     *,
     envelope: Mapping[str, tuple[float, float]] | None = None,
@@ -209,7 +209,7 @@ def design_for_prediction(
 
     Parameters
     ----------
-    request : DesignRequest
+    request : PreparedRequest
         Of both sides, as `prepare_request` gives it.
     model : ManoeuvringModel
         The prior, with what its own trial showed.
@@ -241,13 +241,13 @@ def design_for_prediction(
 
 
 def operating_envelope(
-    request: DesignRequest, model: ManoeuvringModel, given: Mapping[str, tuple[float, float]]
+    request: PreparedRequest, model: ManoeuvringModel, given: Mapping[str, tuple[float, float]]
 ) -> tuple[Envelope, str]:
     """Return how the ship is used, and the verdict on the prior's predictions.
 
     Parameters
     ----------
-    request : DesignRequest
+    request : PreparedRequest
     model : ManoeuvringModel
         The prior, with what its own trial showed.
     given : mapping of str to (float, float)
@@ -272,7 +272,7 @@ def operating_envelope(
 
 
 def _design(
-    request: DesignRequest,
+    request: PreparedRequest,
     model: ManoeuvringModel,
     given: Mapping[str, tuple[float, float]],
     kept_starts: int,
@@ -327,8 +327,8 @@ def _sum(first: Array | None, second: Array | None) -> Array | None:
 
 
 def described_plan(
-    request: DesignRequest,
-    tightened: DesignRequest,
+    request: PreparedRequest,
+    tightened: PreparedRequest,
     searches: Sequence[EnvelopeSearch],
     keeping: ConstraintSatisfaction | None,
     *,
@@ -340,7 +340,7 @@ def described_plan(
 
     Parameters
     ----------
-    request, tightened : DesignRequest
+    request, tightened : PreparedRequest
         As asked for, and with the limits of the last search.
     searches : sequence of EnvelopeSearch
         One a trial.
@@ -385,13 +385,13 @@ def described_plan(
 
 
 def tightened_search(
-    request: DesignRequest, campaign: Callable[[DesignRequest], list[EnvelopeSearch]]
-) -> tuple[DesignRequest, list[EnvelopeSearch], ConstraintSatisfaction | None]:
+    request: PreparedRequest, campaign: Callable[[PreparedRequest], list[EnvelopeSearch]]
+) -> tuple[PreparedRequest, list[EnvelopeSearch], ConstraintSatisfaction | None]:
     """Search all trials, with limits tightened until they are kept with the wanted probability.
 
     Parameters
     ----------
-    request : DesignRequest
+    request : PreparedRequest
     campaign : callable
         Searches the trials of a request.
 
@@ -421,7 +421,7 @@ def tightened_search(
 
 
 def _campaign(
-    request: DesignRequest, envelope: Envelope, before: Array | None
+    request: PreparedRequest, envelope: Envelope, before: Array | None
 ) -> list[EnvelopeSearch]:
     found: list[EnvelopeSearch] = []
     known = before

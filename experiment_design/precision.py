@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from experiment_design.constraints.limits import LimitName
 from experiment_design.information.moments import Moments
 from experiment_design.optimise.campaign import add_up
-from experiment_design.request.request import DesignRequest, build_problem, wanted_parameters
+from experiment_design.request.request import PreparedRequest, build_problem, wanted_parameters
 from greybox.errors import ExcitationError, UsageError
 from greybox.notebook import DisplayMixin, items, number, table
 from greybox.numerics.linalg import scaled_logdet
@@ -67,13 +67,13 @@ class PredictedPrecision(DisplayMixin):
 
 
 def predict_precision(
-    request: DesignRequest, plans: Sequence[Mapping[str, Array]]
+    request: PreparedRequest, plans: Sequence[Mapping[str, Array]]
 ) -> PredictedPrecision:
     """Predict the standard errors that sequences of commands would give.
 
     Parameters
     ----------
-    request : DesignRequest
+    request : PreparedRequest
         The prior model, the start of each trial and the criterion.
     plans : sequence of mapping of str to ndarray
         (N,) each command of each trial, at the sample time: speeds in the unit of

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,13 @@ from experiment_design.request.regimes import (
     steady_motions,
     steady_start,
 )
-from experiment_design.request.request import DesignRequest, build_problem, full_structure
+from experiment_design.request.request import (
+    DesignRequest,
+    PreparedRequest,
+    TrialOptions,
+    build_problem,
+    full_structure,
+)
 from greybox.errors import InfeasibleError, StructureError, UsageError
 from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor_kinds import PREDICTORS
@@ -37,132 +43,42 @@ Array = NDArray[np.float64]
 
 # a disturbance bound of A10 where nothing is known of currents and wind [m/s]
 _DISTURBANCE = 0.1
+# between changes of command where nothing else is known [s]
+_USUAL_HOLD = 10.0
 # lengths that are sailed between changes of command in a trial for prediction
 _HOLD = 0.75
 # turbulence intensity of the wind over the sea, as a share of its mean
 _GUSTINESS = 0.15
 
 
-@dataclass(frozen=True)
-class Wishes:
-    """What a user may ask of a design; None where the product is to choose.
-
-    Parameters
-    ----------
-    duration, hold : float
-        [s]
-    regime : str
-        ``auto``, one regime such as ``u+v-``, or one a trial separated by commas.
-    margin_u, margin_v : float, optional
-        [m/s]
-    start : sequence of float, optional
-        Initial states and heading.
-    trials : int
-    predictor : str, optional
-    estimator : {"iv", "iv-white", "oe"}
-        Whose covariance is predicted.
-    criterion : {"D", "A", "E", "c"}
-    wanted : tuple of str
-        Parameters that count; all where empty.
-    combination : mapping of str to float
-        Gradient of the function of the parameters that criterion ``c`` looks at.
-    current, wind : (float, float), optional
-        Expected means, north and east [m/s].
-    gust : float, optional
-        Standard deviation of the wind about its mean [m/s]; by default 15 % of it.
-    process_noise : ndarray, optional
-        (nx,) per sample.
-    limits : TrialLimits
-        Sea room, caps, end state, energy, headings.
-    prior : ManoeuvringModel, optional
-        Whose information is added.
-    robust : int
-        Prior models drawn from the model's covariance that the criterion is expected over.
-    worst_case : bool
-        Whether the worst of these models counts instead of their mean.
-    probability : float
-        With which limits are kept under the prior's uncertainty.
-    seed : int
-    effort : float
-        Times the usual search.
-    """
-
-    duration: float
-    hold: float = 10.0
-    regime: str = "auto"
-    margin_u: float | None = None
-    margin_v: float | None = None
-    start: Sequence[float] | None = None
-    trials: int = 1
-    predictor: str | None = None
-    estimator: str = "iv"
-    criterion: str = "D"
-    wanted: tuple[str, ...] = ()
-    combination: Mapping[str, float] = field(default_factory=dict)
-    current: tuple[float, float] | None = None
-    wind: tuple[float, float] | None = None
-    gust: float | None = None
-    process_noise: Array | None = None
-    limits: TrialLimits = field(default_factory=TrialLimits)
-    prior: ManoeuvringModel | None = None
-    robust: int = 0
-    worst_case: bool = False
-    probability: float = 0.9
-    seed: int = 0
-    effort: float = 1.0
-
-
-@dataclass(frozen=True)
-class Prepared:
-    """A request, and a sentence for each choice that was made for the user.
-
-    Parameters
-    ----------
-    request : DesignRequest
-    notes : tuple of str
-    of_regime : tuple of str
-        Those of `notes` on what one regime needs: its steady start, and its margin of sway. A plan
-        of both sides has a start of its own, and crosses zero.
-    """
-
-    request: DesignRequest
-    notes: tuple[str, ...]
-    of_regime: tuple[str, ...] = ()
-
-    @property
-    def of_both_sides(self) -> tuple[str, ...]:
-        """The notes that hold for a plan of both sides, too."""
-        return tuple(n for n in self.notes if n not in self.of_regime)
-
-
 def prepare_request(
-    model: ManoeuvringModel, wishes: Wishes, vessel: Vessel | None = None
-) -> Prepared:
+    model: ManoeuvringModel, asked: DesignRequest, vessel: Vessel | None = None
+) -> PreparedRequest:
     """Complete what a user asked for.
 
     Parameters
     ----------
     model : ManoeuvringModel
         The prior: parameters, their covariance, residuals, known current.
-    wishes : Wishes
+    asked : DesignRequest
     vessel : Vessel, optional
         With limits and sensors; by default the model's own.
 
     Returns
     -------
-    Prepared
-        ``request`` (DesignRequest) and ``notes`` (tuple of str), a sentence for each choice.
+    PreparedRequest
+        With a sentence in ``notes`` for each choice that was made.
 
     Raises
     ------
     StructureError
         The model's structure has no surge speed.
     UsageError
-        Wishes that exclude one another.
+        DesignRequest that exclude one another.
     InfeasibleError
         No motion within the limits keeps the wanted signs.
     """
-    changes = (*model.changes, *(wishes.prior.changes if wishes.prior is not None else ()))
+    changes = (*model.changes, *(asked.prior.changes if asked.prior is not None else ()))
     notes: list[str] = [
         f"{c.sentence}, and the trial is designed for what it is from then on"
         for c in dict.fromkeys(changes)
@@ -189,18 +105,18 @@ def prepare_request(
             f"structure '{structure.name}' has no surge speed u, so no trial can be designed for "
             f"it: use a manoeuvring structure such as 'thesis' or 'surge'."
         )
-    if wishes.trials < 1:
-        raise UsageError(f"--trials is {wishes.trials}, it must be 1 or more.")
-    noise = noise_levels(model, vessel, wishes.process_noise)
+    if asked.trials < 1:
+        raise UsageError(f"--trials is {asked.trials}, it must be 1 or more.")
+    noise = noise_levels(model, vessel, asked.process_noise)
     notes.append(f"noise: {noise.source}")
-    predictor = _predictor(model, structure, wishes, notes)
-    d = np.array(model.d, float)
-    if wishes.current is not None:
-        d[:2] = wishes.current
-    if wishes.wind is not None:
-        d[2:] = wishes.wind
+    predictor = _predictor(model, structure, asked, notes)
+    d, dt = np.array(model.d, float), model.sample_time
+    if asked.current is not None:
+        d[:2] = asked.current
+    if asked.wind is not None:
+        d[2:] = asked.wind
     measuring = PREDICTORS[predictor].air_measured
-    if wishes.limits.margin_air is not None and not measuring:
+    if asked.limits.margin_air is not None and not measuring:
         raise UsageError(
             f"--margin-air keeps the measured velocity through the air from zero, and predictor "
             f"'{predictor}' does not measure it: leave it out, or use --predictor wind."
@@ -210,7 +126,7 @@ def prepare_request(
             f"predictor '{predictor}' measures the wind, and in still air its terms are those of "
             f"the water: give the wind to expect, such as --wind 5,0 (north, east, m/s)."
         )
-    gust = wishes.gust
+    gust = asked.gust
     if gust is None:
         gust = _GUSTINESS * float(np.hypot(*d[2:]))
         if measuring:
@@ -218,7 +134,7 @@ def prepare_request(
                 f"the wind is taken to vary by {gust:.2g} m/s about its mean, without which its "
                 f"terms could not be told from the water's (--gust to change)"
             )
-    margins, chosen = _margins(model, structure, noise.measurement, wishes)
+    margins, chosen = _margins(model, structure, noise.measurement, asked)
     notes += chosen.values()
     of_regime = [note for state, note in chosen.items() if state != "u"]
     if (np.diag(model.covariance) < 0).any():
@@ -230,57 +146,48 @@ def prepare_request(
     covariance = np.zeros((theta.size, theta.size))
     size = model.covariance.shape[0]
     covariance[:size, :size] = model.covariance
-    base = DesignRequest(
+    base = PreparedRequest(
+        **{f.name: getattr(asked, f.name) for f in fields(TrialOptions)},
         vessel=vessel,
         structure=structure,
         theta=theta,
-        sample_time=model.sample_time,
+        sample_time=dt,
         integrator=model.integrator,
         untried=model.record.get("method") == SEMI_EMPIRICAL,
         noise=noise,
-        duration=wishes.duration,
-        hold=wishes.hold,
+        hold=asked.hold or max(1, round(_USUAL_HOLD / dt)) * dt,
         regimes=((),),
         starts=(np.zeros(len(structure.states) + 1),),
-        limits=replace(wishes.limits, margins=margins),
         predictor=predictor,
-        estimator=wishes.estimator,
-        criterion=wishes.criterion,
-        wanted=wishes.wanted,
-        combination=wishes.combination,
         d=d,
         gust=gust,
-        prior=_prior(wishes.prior),
+        known=_known(asked.prior),
         covariance=covariance if covariance.any() else None,
-        scenarios=wishes.robust,
-        worst_case=wishes.worst_case,
-        probability=wishes.probability,
-        seed=wishes.seed,
-        effort=wishes.effort,
     )
+    base = replace(base, limits=replace(asked.limits, margins=margins))
     steady = steady_motions(base)
     if not len(steady.x):
         raise InfeasibleError(unstable_sentence(base))
-    start = _start(wishes, structure)
-    if wishes.regime.strip().lower() == "auto":
-        regimes = _choose_regimes(base, steady, start, wishes, notes)
+    start = _start(asked, structure)
+    automatic = asked.regime.strip().lower() == "auto"
+    if automatic:
+        regimes = _choose_regimes(base, steady, start, asked, notes)
     else:
-        parts = [parse_regime(p, structure.states) for p in wishes.regime.split(",")]
-        if len(parts) not in (1, wishes.trials):
+        parts = [parse_regime(p, structure.states) for p in asked.regime.split(",")]
+        if len(parts) not in (1, asked.trials):
             raise UsageError(
-                f"--regime names {len(parts)} regimes for {wishes.trials} "
-                f"trial{'s' if wishes.trials > 1 else ''}: give one, or one a trial."
+                f"--regime names {len(parts)} regimes for {asked.trials} "
+                f"trial{'s' if asked.trials > 1 else ''}: give one, or one a trial."
             )
-        regimes = tuple(parts * wishes.trials if len(parts) == 1 else parts)
-    caps = (wishes.limits.speed_cap, wishes.limits.yaw_cap)
-    if start is None and wishes.regime.strip().lower() != "auto":
+        regimes = tuple(parts * asked.trials if len(parts) == 1 else parts)
+    caps = (asked.limits.speed_cap, asked.limits.yaw_cap)
+    if start is None and not automatic:
         for signs in regimes:
             begin = steady_start(steady, structure.states, signs, margins, caps)
             if begin is not None and _depth(begin, signs, margins, structure.states) < -1e-6:
-                raise InfeasibleError(_beyond_reach(base, steady, [signs], wishes.limits))
+                raise InfeasibleError(_beyond_reach(base, steady, [signs], asked.limits))
     starts = tuple(
-        _start_of(signs, start, steady, structure, margins, caps, wishes.trials)
-        for signs in regimes
+        _start_of(signs, start, steady, structure, margins, caps, asked.trials) for signs in regimes
     )
     starts = tuple(s if s is start else _clear_of_wind(s, base) for s in starts)
     if start is None:
@@ -291,41 +198,42 @@ def prepare_request(
             f"the first trial starts from a steady motion: {shown} (--start to change)"
         )
         notes.append(of_regime[-1])
-    request = replace(base, regimes=regimes, starts=starts)
-    return Prepared(request, tuple(notes), tuple(of_regime))
+    return replace(
+        base, regimes=regimes, starts=starts, notes=tuple(notes), of_regime=tuple(of_regime)
+    )
 
 
-def both_sides(wishes: Wishes, model: ManoeuvringModel, hold: float | None) -> Wishes:
-    """Return wishes of a trial for prediction: surge keeps its sign, the other states do not.
+def both_sides(asked: DesignRequest, model: ManoeuvringModel) -> DesignRequest:
+    """Return the request of a trial for prediction: surge keeps its sign, the others do not.
 
     Parameters
     ----------
-    wishes : Wishes
+    asked : DesignRequest
+        Where it has no hold, commands change after three quarters of a length at the speed of
+        the prior's trial.
     model : ManoeuvringModel
         The prior, with the range of surge that its trial showed.
-    hold : float or None
-        Time between changes of command [s]; by default what three quarters of a length take
-        at the speed of the prior's trial.
     """
     ranges = model.record.get("ranges")
     shown = ranges.get("u") if isinstance(ranges, Mapping) else None
     ahead = shown is None or float(shown[0]) >= 0
     dt, length = model.sample_time, model.vessel.length
+    hold = asked.hold
     if hold is None:
-        hold = wishes.hold
+        hold = _USUAL_HOLD
         if shown is not None and length:
             hold = _HOLD * length / max(abs(float(shown[0])), abs(float(shown[1])), 1e-3)
         hold = max(2, round(hold / dt)) * dt
     return replace(
-        wishes, hold=hold, regime="u+" if ahead else "", predictor=wishes.predictor or "basic"
+        asked, hold=hold, regime="u+" if ahead else "", predictor=asked.predictor or "basic"
     )
 
 
 def _predictor(
-    model: ManoeuvringModel, structure: Structure, wishes: Wishes, notes: list[str]
+    model: ManoeuvringModel, structure: Structure, asked: DesignRequest, notes: list[str]
 ) -> str:
-    if wishes.predictor is not None:
-        return PREDICTORS[wishes.predictor].name
+    if asked.predictor is not None:
+        return PREDICTORS[asked.predictor].name
     if "r" not in structure.states:
         notes.append(
             "basic predictor: without a yaw rate the heading stays, and a current looks like the "
@@ -340,21 +248,20 @@ def _margins(
     model: ManoeuvringModel,
     structure: Structure,
     measurement: Array,
-    wishes: Wishes,
+    asked: DesignRequest,
 ) -> tuple[dict[str, float], dict[str, str]]:
     """Return the margins asked for, and a sentence on each that was not.
 
     Those are three noise deviations plus a disturbance bound (A10).
     """
-    given = {"u": wishes.margin_u, "v": wishes.margin_v}
     known = [e for _, e in model.disturbances.values()]
     bound = 2 * max(known) if known and max(known) > 0 else _DISTURBANCE
     margins, notes = {}, {}
     for i, state in enumerate(structure.states):
-        if state not in ("u", "v"):
-            continue
-        value = given[state]
+        value = asked.limits.margins.get(state)
         if value is None:
+            if state not in ("u", "v"):
+                continue
             value = 3.0 * float(measurement[i]) + bound
             notes[state] = (
                 f"margin of {state}: {value:.3f} m/s, three standard deviations of its noise and "
@@ -364,7 +271,7 @@ def _margins(
     return margins, notes
 
 
-def _prior(model: ManoeuvringModel | None) -> tuple[tuple[str, ...], Array] | None:
+def _known(model: ManoeuvringModel | None) -> tuple[tuple[str, ...], Array] | None:
     if model is None:
         return None
     model = model.at_final_parameters().without_bumps()
@@ -377,10 +284,10 @@ def _prior(model: ManoeuvringModel | None) -> tuple[tuple[str, ...], Array] | No
     return model.names, scaled_inverse(model.covariance)
 
 
-def _start(wishes: Wishes, structure: Structure) -> Array | None:
-    if wishes.start is None:
+def _start(asked: DesignRequest, structure: Structure) -> Array | None:
+    if asked.start is None:
         return None
-    given = np.asarray(wishes.start, float)
+    given = np.asarray(asked.start, float)
     expected = len(structure.states) + 1
     if given.size == 4 and expected < 4:
         # u,v,r,psi for a model of fewer states
@@ -436,7 +343,7 @@ def _depth(
     return min(abs(float(start[states.index(s)])) - margins.get(s, 0.0) for s, _ in signs)
 
 
-def _clear_of_wind(start: Array, base: DesignRequest) -> Array:
+def _clear_of_wind(start: Array, base: PreparedRequest) -> Array:
     """Return a chosen start, turned to where a margin through the air is kept best."""
     if base.limits.margin_air is None:
         return start
@@ -445,7 +352,7 @@ def _clear_of_wind(start: Array, base: DesignRequest) -> Array:
 
 
 def _beyond_reach(
-    base: DesignRequest, steady: Steady, candidates: list[Signs], limits: TrialLimits
+    base: PreparedRequest, steady: Steady, candidates: list[Signs], limits: TrialLimits
 ) -> str:
     """Return what margins steady motions reach, and which leave a trial room to tell enough."""
     states, asked = base.structure.states, dict(base.limits.margins)
@@ -487,14 +394,18 @@ def _beyond_reach(
 
 
 def _choose_regimes(
-    base: DesignRequest, steady: Steady, start: Array | None, wishes: Wishes, notes: list[str]
+    base: PreparedRequest,
+    steady: Steady,
+    start: Array | None,
+    asked: DesignRequest,
+    notes: list[str],
 ) -> tuple[Signs, ...]:
     """Return the regimes that can be held and tell most, one a trial."""
     states = base.structure.states
     margins = dict(base.limits.margins)
     worth: list[tuple[float, Signs]] = []
     for signs in candidate_regimes(states):
-        caps = (wishes.limits.speed_cap, wishes.limits.yaw_cap)
+        caps = (asked.limits.speed_cap, asked.limits.yaw_cap)
         begin = steady_start(steady, states, signs, margins, caps)
         if begin is None:
             continue
@@ -502,7 +413,7 @@ def _choose_regimes(
         if start is not None:
             if all(start[states.index(s)] * v >= 0 for s, v in signs):
                 own = start
-            elif wishes.trials == 1:
+            elif asked.trials == 1:
                 continue
         if _depth(own, signs, margins, states) < -1e-6 and own is not start:
             continue
@@ -510,7 +421,7 @@ def _choose_regimes(
             request = replace(base, regimes=(signs,), starts=(own,))
             problem = build_problem(request)
         except StructureError as error:
-            if wishes.trials == 1:
+            if asked.trials == 1:
                 raise
             del error
             worth.append((0.0, signs))
@@ -522,16 +433,16 @@ def _choose_regimes(
         worth.append((value, signs))
     if not worth:
         candidates = candidate_regimes(states)
-        raise InfeasibleError(_beyond_reach(base, steady, candidates, wishes.limits))
+        raise InfeasibleError(_beyond_reach(base, steady, candidates, asked.limits))
     worth.sort(key=lambda item: -item[0])
     chosen = [signs for _, signs in worth]
-    if wishes.trials == 1:
+    if asked.trials == 1:
         notes.append(
             f"regime {spell_regime(chosen[0])} chosen of "
             f"{', '.join(spell_regime(c) for c in chosen)}, where random sequences tell most"
         )
         return (chosen[0],)
-    picked = tuple(chosen[i % len(chosen)] for i in range(wishes.trials))
+    picked = tuple(chosen[i % len(chosen)] for i in range(asked.trials))
     shown = ", ".join(spell_regime(c) for c in picked)
     if len(chosen) > 1:
         notes.append(

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from experiment_design.constraints.limits import TrialLimits
-from experiment_design.request.request import DesignRequest
+from experiment_design.request.request import PreparedRequest
 from greybox.model.catalogue import get_structure
 from greybox.model.model import ManoeuvringModel
 from greybox.model.noise import NoiseLevels
@@ -29,13 +29,13 @@ def limited_ship(speed=None, angle=None, angles=(0.6, 1.1)):
     return replace(ship, thrusters=thrusters)
 
 
-def make_request(structure="thesis", duration=120.0, **changes) -> DesignRequest:
+def make_request(structure="thesis", duration=120.0, **changes) -> PreparedRequest:
     """The thesis's ship as issue and CONTRACT have it, with changes."""
     s = get_structure(structure)
     n = len(s.states)
     start = np.array([1.5, 1.2, 0.0, 0.0]) if n == 3 else np.array([1.5, 0.0])
     signs = tuple(p for p in REGIME if p[0] in s.states)
-    request = DesignRequest(
+    request = PreparedRequest(
         vessel=limited_ship(),
         structure=s,
         theta=np.array([TRUE[t] for t in s.parameters]),

@@ -57,11 +57,11 @@ def results(ship, thesis, true_theta):
     run = gb.run_model(model, log)
     clean = gb.ManoeuvringModel(thesis, true_theta, np.diag((0.1 * true_theta) ** 2), 1.0, vessel)
     prepared = ed.prepare_request(
-        clean, ed.Wishes(100.0, regime="u+v+", effort=0.02, hold=25.0, predictor="basic")
+        clean, ed.DesignRequest(100.0, regime="u+v+", effort=0.02, hold=25.0, predictor="basic")
     )
-    design = ed.design_trial(prepared.request, alternatives=False)
+    design = ed.design_trial(prepared, alternatives=False)
     design = replace(design, notes=(HOSTILE,))
-    plan = dict(zip(prepared.request.schedule.commands, design.commands[0].T, strict=True))
+    plan = dict(zip(prepared.schedule.commands, design.commands[0].T, strict=True))
     segments = gb.import_recording(
         gb.Recording(HOSTILE, tuple(Signal(n, log.t, a) for n, a in log.channels.items())), vessel
     )
@@ -95,9 +95,9 @@ def results(ship, thesis, true_theta):
         gb.known_causes()["current"],
         design,
         design.certificate,
-        ed.predict_precision(prepared.request, [plan]),
+        ed.predict_precision(prepared, [plan]),
         ed.Discrimination(design, (HOSTILE, "b"), (3.0, 4.0), (1.0, np.nan), False, np.nan),
-        replace(prepared.request.noise, source=HOSTILE),
+        replace(prepared.noise, source=HOSTILE),
         gb.predict_manoeuvre(clean, "turning", limited=False, command=15.0, draws=40),
         gb.Exported("c", (Path(HOSTILE.replace("\0", "")),), (HOSTILE,), (HOSTILE,), (HOSTILE,)),
     ]
@@ -123,7 +123,7 @@ def test_public_results_are_all_there(results):
     shown = {type(r).__name__ for r in results}
     asked = {
         "DiagnosisOptions", "ImportOptions", "OutputErrorOptions", "Request", "Circle",
-        "CandidateModel", "DesignRequest", "TrialLimits", "Wishes",
+        "CandidateModel", "PreparedRequest", "TrialLimits", "DesignRequest",
     }  # fmt: skip
     promised = {n for p in (gb, ed) for n in p.__all__ if n[0].isupper()} - asked
     promised -= {"Cause", "TrustLevel", "PredictionLevel"}

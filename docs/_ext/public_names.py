@@ -28,8 +28,8 @@ STEPS = {
     "OutputErrorOptions Estimate Verdict TrustLevel PredictionVerdict PredictionLevel TestResult",
     "compare": "run_model compare Comparison compare_models fit_percent",
     "diagnose": "diagnose DiagnosisOptions Diagnosis fit_given Given known_causes Cause",
-    "design": "prepare_request Wishes TrialLimits Circle DesignRequest build_problem noise_levels "
-    "NoiseLevels design_trial Design write_plan certify Certificate predict_precision "
+    "design": "prepare_request DesignRequest TrialLimits Circle PreparedRequest build_problem "
+    "noise_levels NoiseLevels design_trial Design write_plan certify Certificate predict_precision "
     "PredictedPrecision design_between CandidateModel Discrimination least_duration prbs "
     "random_two_level to_log",
 }

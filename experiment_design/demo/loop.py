@@ -8,10 +8,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from experiment_design.constraints.limits import TrialLimits
 from experiment_design.demo.steps import Demo, Files, Step
 from experiment_design.design import design_trial
 from experiment_design.output.result import Design, write_plan
-from experiment_design.prepare import Wishes, prepare_request
+from experiment_design.prepare import prepare_request
+from experiment_design.request.request import DesignRequest
 from greybox.diagnosis.diagnose import DiagnosisOptions, diagnose
 from greybox.diagnosis.result import Diagnosis, Found
 from greybox.errors import UsageError, suggestion
@@ -103,7 +105,7 @@ def run_demo(
     prior.save(files.prior)
     progress("designing the first trial")
     design = design_trial(
-        prepare_request(prior, _wishes(_SECONDS, seed)).request,
+        prepare_request(prior, _asked(_SECONDS, seed)),
         alternatives=False, workers=workers,
     )  # fmt: skip
     write_plan(design, files.plan)
@@ -141,10 +143,8 @@ def run_demo(
     done(_gained(diagnosis))
 
     progress("designing the next trial")
-    wishes = _wishes(_NEXT_SECONDS, seed, prior=better)
-    next_design = design_trial(
-        prepare_request(better, wishes).request, alternatives=False, workers=workers
-    )
+    asked = _asked(_NEXT_SECONDS, seed, prior=better)
+    next_design = design_trial(prepare_request(better, asked), alternatives=False, workers=workers)
     write_plan(next_design, files.next_plan)
     done(_designed_next(next_design, better))
     return Demo(
@@ -166,10 +166,10 @@ def prior_model() -> ManoeuvringModel:
     return ManoeuvringModel(structure, theta, covariance, 1.0, load_vessel(VESSEL))
 
 
-def _wishes(seconds: float, seed: int, prior: ManoeuvringModel | None = None) -> Wishes:
-    return Wishes(
-        seconds, regime=_REGIME, margin_u=_MARGIN_U, margin_v=_MARGIN_V, effort=_EFFORT,
-        estimator="oe", predictor="basic", seed=seed, prior=prior,
+def _asked(seconds: float, seed: int, prior: ManoeuvringModel | None = None) -> DesignRequest:
+    return DesignRequest(
+        seconds, TrialLimits(margins={"u": _MARGIN_U, "v": _MARGIN_V}), regime=_REGIME,
+        effort=_EFFORT, estimator="oe", predictor="basic", seed=seed, prior=prior,
     )  # fmt: skip
 
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from experiment_design.constraints.limits import LimitReport
 from experiment_design.excitation.rollout import Motion
 from experiment_design.request.problem import TrialProblem
-from experiment_design.request.request import DesignRequest
+from experiment_design.request.request import PreparedRequest
 
 Array = NDArray[np.float64]
 
@@ -19,7 +19,7 @@ _ROUNDING = 1e-3
 
 
 def late_notes(
-    request: DesignRequest,
+    request: PreparedRequest,
     problems: list[TrialProblem],
     motions: tuple[Motion, ...],
     reports: tuple[LimitReport, ...],
@@ -32,7 +32,7 @@ def late_notes(
 
     Parameters
     ----------
-    request : DesignRequest
+    request : PreparedRequest
     problems : list of TrialProblem
         One a trial.
     motions : tuple of Motion

@@ -32,7 +32,7 @@ from experiment_design.optimise.duration import telling_duration
 from experiment_design.optimise.search import Candidate, ascend, assess
 from experiment_design.request.problem import TrialProblem
 from experiment_design.request.regimes import steady_motions
-from experiment_design.request.request import DesignRequest, build_problem, wanted_parameters
+from experiment_design.request.request import PreparedRequest, build_problem, wanted_parameters
 from greybox.errors import InfeasibleError
 from greybox.model.predictor_kinds import PREDICTORS
 from greybox.numerics.linalg import scaled
@@ -47,7 +47,7 @@ _BRIEF = 200
 ROOM = (0.95, 0.9, 0.8, 0.65, 0.4, 0.2)
 
 
-def require_horizon(request: DesignRequest) -> None:
+def require_horizon(request: PreparedRequest) -> None:
     """Raise where the trial has fewer samples than an equation has unknowns."""
     predictor = request.build_predictor()
     samples = request.schedule.samples
@@ -63,7 +63,7 @@ def require_horizon(request: DesignRequest) -> None:
 
 
 def require_informative(
-    request: DesignRequest,
+    request: PreparedRequest,
     problems: list[TrialProblem],
     units: list[Array],
     hopeless: float = 1.0,
@@ -110,7 +110,7 @@ def _relative_errors(problems: list[TrialProblem], units: list[Array]) -> Array:
     return np.asarray(np.sqrt(np.diag(criterion.covariance(sums[0])[0])) / criterion.scale)
 
 
-def require_start(problem: TrialProblem, request: DesignRequest, trial: int) -> None:
+def require_start(problem: TrialProblem, request: PreparedRequest, trial: int) -> None:
     """Raise where the start itself breaks a limit."""
     program = problem.scenarios[0].limits
     start = np.zeros(program.nx + 3)
@@ -136,7 +136,7 @@ def require_start(problem: TrialProblem, request: DesignRequest, trial: int) -> 
             )
 
 
-def require_stable(request: DesignRequest) -> None:
+def require_stable(request: PreparedRequest) -> None:
     """Raise where the prior model runs away under any constant command."""
     sentence = unstable_sentence(request, request.starts[0])
     if sentence:
@@ -144,7 +144,7 @@ def require_stable(request: DesignRequest) -> None:
 
 
 def feasible_or_reason(
-    problem: TrialProblem, request: DesignRequest, trial: int, best: Candidate, nearest: Candidate
+    problem: TrialProblem, request: PreparedRequest, trial: int, best: Candidate, nearest: Candidate
 ) -> tuple[Candidate, str]:
     """Return the better of two candidates, and why limits cannot be kept, empty if they can."""
     chosen = nearest if nearest.missed.max(initial=0) < best.missed.max(initial=0) else best
@@ -170,7 +170,7 @@ def feasible_or_reason(
 
 
 def _margins_within_reach(
-    request: DesignRequest, trial: int, chosen: Candidate, changes: list[tuple[LimitName, float]]
+    request: PreparedRequest, trial: int, chosen: Candidate, changes: list[tuple[LimitName, float]]
 ) -> str:
     """Return the margins, as options, under which sequences around one keep every limit.
 
@@ -199,7 +199,7 @@ def with_margins(limits: TrialLimits, margins: dict[str, float]) -> TrialLimits:
     )
 
 
-def tells_enough(request: DesignRequest) -> bool:
+def tells_enough(request: PreparedRequest) -> bool:
     """Whether one ascent a trial finds sequences that keep the limits and tell enough."""
     problems = [build_problem(request, t) for t in range(request.trials)]
     units, _ = random_campaign(problems, request.seed)
@@ -224,7 +224,7 @@ def tells_enough(request: DesignRequest) -> bool:
     return bool(2 * (share > _VAGUE).sum() <= share.size)
 
 
-def _turning(request: DesignRequest) -> str:
+def _turning(request: PreparedRequest) -> str:
     """Return what the turning circle has to do with the sea room, where it has."""
     steady = steady_motions(request)
     signs = np.ones(len(steady.x), bool)
@@ -248,7 +248,7 @@ def _turning(request: DesignRequest) -> str:
     )
 
 
-def unexcited(problems: list[TrialProblem], units: list[Array], request: DesignRequest) -> str:
+def unexcited(problems: list[TrialProblem], units: list[Array], request: PreparedRequest) -> str:
     """Return which regressor no sequence moves enough to be told from the others."""
     if ESTIMATORS[request.estimator].free_run:
         return (

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from experiment_design.constraints.limit_program import LimitProgram
 from experiment_design.excitation.rollout import Rollout
-from experiment_design.request.request import DesignRequest
+from experiment_design.request.request import PreparedRequest
 from greybox.model.predictor_kinds import PREDICTORS
 from greybox.numerics.binomial import wilson_interval
 
@@ -60,13 +60,13 @@ class ConstraintSatisfaction:
 
 
 def keep_probability(
-    request: DesignRequest, units: list[Array], draws: int = _DRAWS
+    request: PreparedRequest, units: list[Array], draws: int = _DRAWS
 ) -> ConstraintSatisfaction:
     """Run the plan under models drawn from the prior and count which keep every limit.
 
     Parameters
     ----------
-    request : DesignRequest
+    request : PreparedRequest
         With a covariance.
     units : list of ndarray
         (K, nc) unit coordinates a trial.

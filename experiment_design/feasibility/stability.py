@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiment_design.request.regimes import steady_motions
-from experiment_design.request.request import DesignRequest
+from experiment_design.request.request import PreparedRequest
 
 Array = NDArray[np.float64]
 
@@ -30,12 +30,12 @@ class Damping:
     needed: float
 
 
-def unstable_sentence(request: DesignRequest, start: Array | None = None) -> str:
+def unstable_sentence(request: PreparedRequest, start: Array | None = None) -> str:
     """Return why no steady motion exists, empty where one does.
 
     Parameters
     ----------
-    request : DesignRequest
+    request : PreparedRequest
     start : ndarray, optional
         (nx + 1,) initial states and heading; by default nearly at rest.
     """
@@ -59,7 +59,7 @@ def unstable_sentence(request: DesignRequest, start: Array | None = None) -> str
     )
 
 
-def least_damping(request: DesignRequest, start: Array | None = None) -> Damping | None:
+def least_damping(request: PreparedRequest, start: Array | None = None) -> Damping | None:
     """Return the linear damping that falls least before some constant command is settled under.
 
     Values down to the one that stops a motion within one sample are tried, one

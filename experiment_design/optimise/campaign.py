@@ -26,7 +26,7 @@ from experiment_design.optimise.search import (
     within_reach,
 )
 from experiment_design.request.problem import TrialProblem
-from experiment_design.request.request import DesignRequest, build_problem
+from experiment_design.request.request import PreparedRequest, build_problem
 from greybox.numerics.forked import processors
 from greybox.study.parallel import map_pieces
 
@@ -51,7 +51,7 @@ _PARALLEL = 4.0
 class Piece:
     """One chain of a search: what a worker needs, as plain data."""
 
-    request: DesignRequest
+    request: PreparedRequest
     trial: int
     known: tuple[Moments, ...]
     starts: Array
@@ -63,7 +63,7 @@ _log = logging.getLogger(__name__)
 _problems: dict[bytes, TrialProblem] = {}
 
 
-def _problem_of(request: DesignRequest, trial: int) -> TrialProblem:
+def _problem_of(request: PreparedRequest, trial: int) -> TrialProblem:
     key = pickle.dumps((request, trial))
     if key not in _problems:
         if len(_problems) > 8:
@@ -137,7 +137,7 @@ def random_campaign(problems: list[TrialProblem], seed: int) -> tuple[list[Array
 
 
 def search_campaign(
-    request: DesignRequest,
+    request: PreparedRequest,
     problems: list[TrialProblem],
     first: list[Array] | None,
     *,

@@ -17,7 +17,7 @@ from experiment_design.optimise.campaign import (
     search_campaign,
 )
 from experiment_design.request.problem import TrialProblem
-from experiment_design.request.request import DesignRequest, build_problem, wanted_columns
+from experiment_design.request.request import PreparedRequest, build_problem, wanted_columns
 from greybox.errors import InfeasibleError, UsageError
 
 Array = NDArray[np.float64]
@@ -29,7 +29,7 @@ _DOUBLINGS = 8
 _SETTLED = 0.03
 
 
-def random_shares(request: DesignRequest) -> Array | None:
+def random_shares(request: PreparedRequest) -> Array | None:
     """Return the relative standard errors that the best random two-level campaign would give."""
     problems = [build_problem(request, t) for t in range(request.trials)]
     units, _ = random_campaign(problems, request.seed)
@@ -44,7 +44,7 @@ def _std(problems: list[TrialProblem], units: list[Array]) -> Array:
     return np.asarray(np.sqrt(np.diag(covariance)))
 
 
-def telling_duration(request: DesignRequest, vague: float) -> float | None:
+def telling_duration(request: PreparedRequest, vague: float) -> float | None:
     """Return a duration at which random sequences tell at least half of the parameters.
 
     None where they never do, or keep no limits.
@@ -69,17 +69,17 @@ def telling_duration(request: DesignRequest, vague: float) -> float | None:
 
 
 def least_duration(
-    request: DesignRequest,
+    request: PreparedRequest,
     targets: Mapping[str, float],
     *,
     progress: Progress | None = None,
     workers: int | None = None,
-) -> DesignRequest:
+) -> PreparedRequest:
     """Return the request with the least duration whose design reaches wanted standard errors.
 
     Parameters
     ----------
-    request : DesignRequest
+    request : PreparedRequest
         Its duration is the longest that is allowed.
     targets : mapping of str to float
         Wanted standard error of each named parameter, in its unit.
@@ -90,7 +90,7 @@ def least_duration(
 
     Returns
     -------
-    DesignRequest
+    PreparedRequest
         Of the least duration, in whole holds, with the A criterion scaled by the targets.
 
     Raises

@@ -20,7 +20,7 @@ from experiment_design.constraints.limit_program import LimitProgram
 from experiment_design.excitation.rollout import Motion, Rollout
 from experiment_design.excitation.schedule import Schedule
 from experiment_design.output.result import Design
-from experiment_design.request.request import DesignRequest
+from experiment_design.request.request import PreparedRequest
 from greybox.model.predictor_kinds import PREDICTORS
 
 Array = NDArray[np.float64]
@@ -172,7 +172,7 @@ class LegPlan:
         return said
 
 
-def drawn_models(request: DesignRequest, count: int, seed: int) -> Array:
+def drawn_models(request: PreparedRequest, count: int, seed: int) -> Array:
     """Draw models (count, p) that a plan may meet, the prior itself first.
 
     From the prior's covariance; where it has none, each coefficient of an equation of motion is
@@ -404,7 +404,7 @@ def _whole(seconds: float, dt: float) -> float:
 
 
 def _ends_to_try(
-    r: DesignRequest, by_clock: Leg, plan: Array, begin: int, end: int, least: float, most: float
+    r: PreparedRequest, by_clock: Leg, plan: Array, begin: int, end: int, least: float, most: float
 ) -> list[Leg]:
     """Return the ways in which a leg of the plan, from one sample to another, might end."""
     states, nx = r.structure.states, len(r.structure.states)
@@ -466,13 +466,13 @@ def _off(design: Design, trial: int, way: _Way, motion: Motion, ends: Samples, e
     return np.stack([here + seen, _scatter(r, away[:, None]) + seen])
 
 
-def _names(r: DesignRequest) -> tuple[str, ...]:
+def _names(r: PreparedRequest) -> tuple[str, ...]:
     states = tuple(n for n in r.structure.states if n in ("u", "v", "r"))
     heading = ("psi",) if "r" in states else ()
     return (*states, *heading, *(("place",) if r.limits.area is not None else ()))
 
 
-def _scatter(r: DesignRequest, away: Array) -> Array:
+def _scatter(r: PreparedRequest, away: Array) -> Array:
     """Return the root mean square (m,) of distances (R, L, nx+3) from the plan, by `_names`."""
     states = r.structure.states
     columns = {n: away[..., i] for i, n in enumerate((*states, "psi"))}
@@ -480,14 +480,14 @@ def _scatter(r: DesignRequest, away: Array) -> Array:
     return np.array([float(np.sqrt(np.mean(columns[n] ** 2))) for n in _names(r)])
 
 
-def _seen(r: DesignRequest) -> Array:
+def _seen(r: PreparedRequest) -> Array:
     """Return the scatter (m,) that its sensor or a helmsman would not see."""
     noise = dict(zip(r.structure.states, np.asarray(r.noise.measurement, float), strict=True))
     noise |= {"psi": _HEADING_SEEN, "place": _PLACE_SEEN * r.vessel.length}
     return np.array([noise[n] for n in _names(r)])
 
 
-def _keeps(r: DesignRequest, rollout: Rollout, trial: int, state: Array) -> NDArray[np.bool_]:
+def _keeps(r: PreparedRequest, rollout: Rollout, trial: int, state: Array) -> NDArray[np.bool_]:
     """Return which runs (R, N+1, nx+3) keep the path limits all the time."""
     kind = PREDICTORS[r.predictor]
     program = LimitProgram(

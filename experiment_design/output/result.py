@@ -17,7 +17,7 @@ from experiment_design.information.optimality import CRITERIA
 from experiment_design.optimise.classical import Alternative
 from experiment_design.optimise.search import REFERENCE
 from experiment_design.request.regimes import spell_regime
-from experiment_design.request.request import DesignRequest
+from experiment_design.request.request import PreparedRequest
 from greybox.files import replacing
 from greybox.notebook import DisplayMixin, interval, items, number, sparkline, table, text
 from greybox.numerics.linalg import scaled_logdet
@@ -34,7 +34,7 @@ class Design(DisplayMixin):
 
     Parameters
     ----------
-    request : DesignRequest
+    request : PreparedRequest
     commands : tuple of ndarray
         (N, nc) a trial: speeds in the log's unit, angles [rad].
     levels : tuple of ndarray
@@ -71,7 +71,7 @@ class Design(DisplayMixin):
     seconds : float
     """
 
-    request: DesignRequest
+    request: PreparedRequest
     commands: tuple[Array, ...]
     levels: tuple[Array, ...]
     motions: tuple[Motion, ...]

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiment_design.excitation.rollout import Motion
-from experiment_design.request.request import DesignRequest, draw_gusts
+from experiment_design.request.request import PreparedRequest, draw_gusts
 from greybox.model.predictor_kinds import PREDICTORS
 from greybox.rotation import ned_to_body
 
@@ -53,7 +53,7 @@ def clear_heading(velocity: Array, wind: Array) -> float:
     return float(psi[int(np.abs(through).min(axis=1).argmax())])
 
 
-def share_near_zero(request: DesignRequest, motions: tuple[Motion, ...]) -> float:
+def share_near_zero(request: PreparedRequest, motions: tuple[Motion, ...]) -> float:
     """Return the share of samples at which the measured velocity through the air may change sign.
 
     Those are the samples at which a component lies within three standard deviations
@@ -74,7 +74,7 @@ def share_near_zero(request: DesignRequest, motions: tuple[Motion, ...]) -> floa
     return float(np.concatenate(near).mean())
 
 
-def air_notes(request: DesignRequest, motions: tuple[Motion, ...]) -> list[str]:
+def air_notes(request: PreparedRequest, motions: tuple[Motion, ...]) -> list[str]:
     """Return what a plan that measures the wind has to say where no margin was asked for."""
     measured = PREDICTORS[request.predictor].air_measured
     if not measured or request.limits.margin_air is not None:

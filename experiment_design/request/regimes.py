@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiment_design.excitation.rollout import Rollout
-from experiment_design.request.request import DesignRequest
+from experiment_design.request.request import PreparedRequest
 from greybox.errors import UsageError
 
 Array = NDArray[np.float64]
@@ -41,12 +41,12 @@ class Steady:
     unstable: int
 
 
-def steady_motions(request: DesignRequest, start: Array | None = None) -> Steady:
+def steady_motions(request: PreparedRequest, start: Array | None = None) -> Steady:
     """Run constant commands on a grid of the limits until the motion has settled.
 
     Parameters
     ----------
-    request : DesignRequest
+    request : PreparedRequest
     start : ndarray, optional
         (nx + 1,) initial states and heading; by default nearly at rest.
     """

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -60,11 +60,96 @@ class CandidateModel:
 
 
 @dataclass(frozen=True)
-class DesignRequest:
+class TrialOptions:
+    """What is decided by the user alone, the same in a request and in its prepared form.
+
+    Parameters
+    ----------
+    duration : float
+        Of each trial [s].
+    limits : TrialLimits
+        Those that all trials share: margins, sea room, caps, end state, energy, headings.
+    estimator : {"iv", "iv-white", "oe"}
+        Whose covariance is predicted: zero-mean IV with its moving-average or white
+        equation error, or the Cramér-Rao information of an output-error fit.
+    criterion : {"D", "A", "E", "c"}
+    wanted : tuple of str
+        Parameters that count; empty for all of the undisturbed model.
+    combination : mapping of str to float
+        Gradient of the function of the parameters that criterion ``c`` looks at.
+    robust : int
+        Further prior models, drawn from its covariance, that the criterion is expected over.
+    worst_case : bool
+        Look at the worst of these models instead of the expectation.
+    probability : float
+        With which the path limits are to be kept under the prior's uncertainty.
+    seed : int
+    effort : float
+        Evaluations of the search, 1 being the usual number.
+    """
+
+    duration: float
+    limits: TrialLimits = field(default_factory=TrialLimits)
+    estimator: str = "iv"
+    criterion: str = "D"
+    wanted: tuple[str, ...] = ()
+    combination: Mapping[str, float] = field(default_factory=dict)
+    robust: int = 0
+    worst_case: bool = False
+    probability: float = 0.9
+    seed: int = 0
+    effort: float = 1.0
+
+
+@dataclass(frozen=True)
+class DesignRequest(TrialOptions):
+    """What a user may ask of a design; None where the product is to choose.
+
+    Parameters
+    ----------
+    duration, limits, estimator, criterion, wanted, combination, robust, worst_case, \
+    probability, seed, effort
+        See `TrialOptions`. A margin that `limits` does not name is chosen.
+    hold : float, optional
+        Between changes of command [s].
+    regime : str
+        ``auto``, one regime such as ``u+v-``, or one a trial separated by commas.
+    start : sequence of float, optional
+        Initial states and heading.
+    trials : int
+    predictor : str, optional
+        ``basic``, ``augmented``, ``wind`` or ``basic+wind``.
+    current, wind : (float, float), optional
+        Expected means, north and east [m/s].
+    gust : float, optional
+        Standard deviation of the wind about its mean [m/s]; by default 15 % of it.
+    process_noise : ndarray, optional
+        (nx,) per sample.
+    prior : ManoeuvringModel, optional
+        Whose information is added.
+    """
+
+    hold: float | None = None
+    regime: str = "auto"
+    start: Sequence[float] | None = None
+    trials: int = 1
+    predictor: str | None = None
+    current: tuple[float, float] | None = None
+    wind: tuple[float, float] | None = None
+    gust: float | None = None
+    process_noise: Array | None = None
+    prior: ManoeuvringModel | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class PreparedRequest(TrialOptions):
     """Everything that a design depends on; equal requests give equal designs.
 
     Parameters
     ----------
+    duration, limits, estimator, criterion, wanted, combination, robust, worst_case, \
+    probability, seed, effort
+        See `TrialOptions`; the signs of `limits` are replaced by each trial's.
     vessel : Vessel
     structure : Structure
     theta : ndarray
@@ -72,52 +157,38 @@ class DesignRequest:
     sample_time : float
         [s]
     noise : NoiseLevels
-    duration, hold : float
-        Of each trial, and between changes of command [s].
+    hold : float
+        Between changes of command [s].
     regimes : tuple of Signs
         Signs that the states keep, one entry a trial, such as ``(("u", 1), ("v", 1))``.
     starts : tuple of ndarray
         (nx + 1,) initial states and heading a trial [m/s, rad/s, rad].
-    limits : TrialLimits
-        Those that all trials share; its signs are replaced by each trial's.
     predictor : str
         ``basic``, ``augmented``, ``wind`` or ``basic+wind``.
-    estimator : {"iv", "iv-white", "oe"}
-        Zero-mean IV with its moving-average or white equation error, or the
-        Cramér-Rao information of an output-error fit.
-    criterion : {"D", "A", "E", "c"}
-    wanted : tuple of str
-        Parameters that count; empty for all of the undisturbed model.
-    combination : mapping of str to float
-        Gradient of the function of the parameters for ``c``.
     targets : tuple of float
         Wanted standard errors of `wanted`, the scale of A and E in place of prior values.
     d : ndarray
         (nd,) expected current and wind [m/s].
     gust : float
         Standard deviation of each component of the wind about its mean [m/s].
-    prior : (tuple of str, ndarray), optional
+    known : (tuple of str, ndarray), optional
         Names and information matrix of earlier trials.
     covariance : ndarray, optional
         (p, p) uncertainty of `theta`; None or zero: known exactly.
-    scenarios : int
-        Further prior models drawn from it that the criterion is expected over.
-    worst_case : bool
-        Look at the worst scenario instead of the expectation.
-    probability : float
-        With which the path limits are to be kept under models drawn from it.
     backoff : tuple of float
-        By how much each path limit is tightened for that, in its unit.
+        By how much each path limit is tightened, in its unit, to be kept with `probability`.
     contrasts : tuple of (CandidateModel, CandidateModel)
         Pairs of explanations that the trial is to tell apart in place of
         measuring parameters; the first of the first pair is the prior model.
-    seed : int
-    effort : float
-        Evaluations of the search, 1 being the usual number.
     integrator : {"euler", "rk4"}
         Of the prior model.
     untried : bool
         Whether the prior model comes from main dimensions, no trial behind it.
+    notes : tuple of str
+        A sentence for each choice that was made for the user.
+    of_regime : tuple of str
+        Those of `notes` on what one regime needs: its steady start, and its margin of sway. A
+        plan of both sides has a start of its own, and crosses zero.
     """
 
     vessel: Vessel
@@ -125,30 +196,26 @@ class DesignRequest:
     theta: Array
     sample_time: float
     noise: NoiseLevels
-    duration: float
     hold: float
     regimes: tuple[Signs, ...]
     starts: tuple[Array, ...]
-    limits: TrialLimits = field(default_factory=TrialLimits)
     predictor: str = "augmented"
-    estimator: str = "iv"
-    criterion: str = "D"
-    wanted: tuple[str, ...] = ()
-    combination: Mapping[str, float] = field(default_factory=dict)
     targets: tuple[float, ...] = ()
     d: Array = field(default_factory=lambda: np.zeros(4))
     gust: float = 0.0
-    prior: tuple[tuple[str, ...], Array] | None = None
+    known: tuple[tuple[str, ...], Array] | None = None
     covariance: Array | None = None
-    scenarios: int = 0
-    worst_case: bool = False
-    probability: float = 0.9
     backoff: tuple[float, ...] = ()
     contrasts: tuple[tuple[CandidateModel, CandidateModel], ...] = ()
-    seed: int = 0
-    effort: float = 1.0
     integrator: Integrator = "euler"
     untried: bool = False
+    notes: tuple[str, ...] = ()
+    of_regime: tuple[str, ...] = ()
+
+    @property
+    def of_both_sides(self) -> tuple[str, ...]:
+        """The notes that hold for a plan of both sides, too."""
+        return tuple(n for n in self.notes if n not in self.of_regime)
 
     @property
     def trials(self) -> int:
@@ -196,9 +263,9 @@ class DesignRequest:
     def thetas(self) -> Array:
         """Return the prior models (S+1, p), the nominal one first."""
         nominal = np.asarray(self.theta, float)[None]
-        if not self.scenarios or not self.uncertain:
+        if not self.robust or not self.uncertain:
             return nominal
-        return np.vstack([nominal, self.draw_models(self.scenarios, 0)])
+        return np.vstack([nominal, self.draw_models(self.robust, 0)])
 
 
 def full_structure(model: ManoeuvringModel) -> tuple[Structure, Array]:
@@ -238,7 +305,7 @@ def wanted_columns(predictor: Predictor, names: tuple[str, ...]) -> tuple[int, .
     return tuple(dict.fromkeys(known[n] for n in names))
 
 
-def build_criterion(request: DesignRequest, predictor: Predictor) -> Criterion:
+def build_criterion(request: PreparedRequest, predictor: Predictor) -> Criterion:
     """Return the criterion over the predictor's columns.
 
     Raises
@@ -268,8 +335,8 @@ def build_criterion(request: DesignRequest, predictor: Predictor) -> Criterion:
             "such as --of Yvv or --of 'Xuu/Xmu'."
         )
     prior = None
-    if request.prior is not None:
-        prior = _prior_information(names, *request.prior)
+    if request.known is not None:
+        prior = _prior_information(names, *request.known)
     wanted = chosen
     if ESTIMATORS[request.estimator].free_run:
         # sensitivities stand in the order of the parameters, bias-capturing columns left out
@@ -277,7 +344,7 @@ def build_criterion(request: DesignRequest, predictor: Predictor) -> Criterion:
     return Criterion(request.criterion, wanted, scale, combination, prior)
 
 
-def wanted_parameters(request: DesignRequest, criterion: Criterion) -> tuple[Column, ...]:
+def wanted_parameters(request: PreparedRequest, criterion: Criterion) -> tuple[Column, ...]:
     """Return the predictor's columns of the wanted parameters, in the order of the criterion."""
     predictor = request.build_predictor()
     places = predictor.parameter_columns
@@ -307,13 +374,13 @@ def _prior_information(names: list[str], known: tuple[str, ...], information: Ar
 
 
 def build_problem(
-    request: DesignRequest, trial: int = 0, known: tuple[Moments, ...] = ()
+    request: PreparedRequest, trial: int = 0, known: tuple[Moments, ...] = ()
 ) -> TrialProblem:
     """Return the problem of one trial of a request.
 
     Parameters
     ----------
-    request : DesignRequest
+    request : PreparedRequest
     trial : int
     known : tuple of Moments
         Sums of the other trials, one a scenario.
@@ -364,7 +431,7 @@ def build_problem(
     return TrialProblem(schedule, tuple(scenarios), criterion, known, request.worst_case, contrast)
 
 
-def _candidate_rollout(request: DesignRequest, candidate: CandidateModel, trial: int) -> Rollout:
+def _candidate_rollout(request: PreparedRequest, candidate: CandidateModel, trial: int) -> Rollout:
     start = candidate_start(request, candidate, trial)
     vessel = request.vessel if candidate.vessel is None else candidate.vessel
     return Rollout(
@@ -378,13 +445,13 @@ def _candidate_rollout(request: DesignRequest, candidate: CandidateModel, trial:
     )
 
 
-def candidate_start(request: DesignRequest, candidate: CandidateModel, trial: int) -> Array:
+def candidate_start(request: PreparedRequest, candidate: CandidateModel, trial: int) -> Array:
     """Return a candidate's initial states and heading, those that it lacks left out."""
     start = dict(zip((*request.structure.states, "psi"), request.starts[trial], strict=True))
     return np.array([start.get(s, 0.0) for s in (*candidate.structure.states, "psi")])
 
 
-def draw_gusts(request: DesignRequest) -> Array:
+def draw_gusts(request: PreparedRequest) -> Array:
     """Draw what the wind adds to its mean, (N, 2) [m/s]; the same for every sequence."""
     rng = np.random.default_rng([31, request.seed])
     drawn = stationary_disturbance(

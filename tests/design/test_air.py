@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from designs import make_request, thesis_model
 
-from experiment_design import TrialLimits, Wishes, design_trial, prepare_request
+from experiment_design import DesignRequest, TrialLimits, design_trial, prepare_request
 from experiment_design.feasibility.least_violation import moved_constant
 from experiment_design.optimise.campaign import random_campaign
 from experiment_design.request.apparent_wind import air_velocity, clear_heading, share_near_zero
@@ -25,12 +25,12 @@ def measured_wind(**changes):
     return replace(model, vessel=vessel)
 
 
-def wind_request(margin=None, **wishes):
-    asked = Wishes(
+def wind_request(margin=None, **asked):
+    asked = DesignRequest(
         300.0, predictor="wind", wind=WIND, effort=0.05, limits=TrialLimits(margin_air=margin),
-        **wishes,
+        **asked,
     )  # fmt: skip
-    return prepare_request(measured_wind(), asked).request
+    return prepare_request(measured_wind(), asked)
 
 
 def through_the_air(motion, wind):
@@ -93,7 +93,7 @@ def test_a_wind_sensor_of_unknown_noise():
 def test_only_a_measured_wind_has_a_margin():
     with pytest.raises(UsageError, match="predictor 'augmented' does not measure it"):
         prepare_request(
-            thesis_model(), Wishes(150.0, wind=WIND, limits=TrialLimits(margin_air=0.5))
+            thesis_model(), DesignRequest(150.0, wind=WIND, limits=TrialLimits(margin_air=0.5))
         )
     design = design_trial(make_request(effort=0.05), workers=1, alternatives=False)
     assert not [n for n in design.notes if "|u_q|" in n]

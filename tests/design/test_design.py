@@ -12,8 +12,8 @@ from designs import limited_ship, make_request, thesis_model
 
 from experiment_design import (
     Circle,
+    DesignRequest,
     TrialLimits,
-    Wishes,
     design_trial,
     least_duration,
     predict_precision,
@@ -119,7 +119,7 @@ def test_an_interrupt_after_the_search_keeps_the_plan(monkeypatch):
 
 def test_steady_starts_keep_the_caps():
     limits = TrialLimits(speed_cap=2.2, yaw_cap=0.05)
-    request = prepare_request(thesis_model(), Wishes(150.0, limits=limits)).request
+    request = prepare_request(thesis_model(), DesignRequest(150.0, limits=limits))
     u, v, r, _ = request.starts[0]
     assert np.hypot(u, v) <= 2.2
     assert abs(r) <= 0.05
@@ -195,11 +195,12 @@ def test_limits_are_kept(limits):
 def test_a_plan_keeps_its_margins_under_the_prior():
     """With the stated probability, judged by other draws and another integrator."""
     model = thesis_model(spread=0.1)
-    wishes = Wishes(
-        300.0, margin_u=1.0, margin_v=0.8, start=(1.5, 1.2, 0.0, 0.0), predictor="basic",
+    asked = DesignRequest(
+        300.0, TrialLimits(margins={"u": 1.0, "v": 0.8}), start=(1.5, 1.2, 0.0, 0.0),
+        predictor="basic",
         effort=0.25, probability=0.9,
     )  # fmt: skip
-    request = prepare_request(model, wishes).request
+    request = prepare_request(model, asked)
     design = design_trial(request, workers=1, alternatives=False)
     assert design.keeping.probability >= 0.9
     rng = np.random.default_rng(99)
@@ -214,7 +215,7 @@ def test_a_plan_keeps_its_margins_under_the_prior():
 
 def test_robust_designs_look_at_several_models():
     request = make_request(
-        covariance=np.diag((0.1 * make_request().theta) ** 2), scenarios=3, effort=0.05
+        covariance=np.diag((0.1 * make_request().theta) ** 2), robust=3, effort=0.05
     )
     expected = build_problem(request)
     worst = build_problem(replace(request, worst_case=True))
@@ -267,7 +268,7 @@ def test_earlier_trials_add_their_information():
     first = design_trial(request, workers=1, alternatives=False)
     information = np.linalg.inv(first.covariance)
     second = design_trial(
-        replace(request, prior=(first.names, information)), workers=1, alternatives=False
+        replace(request, known=(first.names, information)), workers=1, alternatives=False
     )
     assert (second.std < first.std).all()
     # the same trial twice halves the variance; a chosen second one does better
@@ -289,11 +290,14 @@ def test_least_trial_time():
 
 
 @pytest.mark.parametrize(
-    ("wishes", "message"),
+    ("asked", "message"),
     [
-        ({"margin_v": 1.9}, "no steady motion keeps the margins"),
+        ({"limits": TrialLimits(margins={"v": 1.9})}, "no steady motion keeps the margins"),
         ({"regime": "u-v+"}, "no constant command within the limits of the thrusters holds"),
-        ({"start": (0.2, 1.2, 0, 0), "margin_u": 0.5}, "starts 0.3 m/s beyond the margin of surge"),
+        (
+            {"start": (0.2, 1.2, 0, 0), "limits": TrialLimits(margins={"u": 0.5})},
+            "starts 0.3 m/s beyond the margin of surge",
+        ),
         ({"duration": 20.0, "predictor": "augmented"}, "a trial of 20 s is too short"),
         (
             {"duration": 30.0, "predictor": "wind", "wind": (5.0, 0.0)},
@@ -317,18 +321,18 @@ def test_least_trial_time():
         ),
     ],
 )
-def test_what_cannot_be_is_said(wishes, message):
-    asked = {"duration": 150.0, "predictor": "basic", "effort": 0.05} | wishes
+def test_what_cannot_be_is_said(asked, message):
+    asked = {"duration": 150.0, "predictor": "basic", "effort": 0.05} | asked
     with pytest.raises(InfeasibleError, match=message):
-        design_trial(prepare_request(thesis_model(), Wishes(**asked)).request, workers=1)
+        design_trial(prepare_request(thesis_model(), DesignRequest(**asked)), workers=1)
 
 
 @pytest.mark.long
 def test_the_closest_plan_on_request():
-    asked = Wishes(
+    asked = DesignRequest(
         150.0, predictor="basic", effort=0.05, limits=TrialLimits(headings=30.0), regime="u+v+"
     )
-    design = design_trial(prepare_request(thesis_model(), asked).request, best_effort=True)
+    design = design_trial(prepare_request(thesis_model(), asked), best_effort=True)
     assert design.status.startswith("limits not kept")
     assert any("headings cannot cover 30 rad" in n for n in design.notes)
 
@@ -339,7 +343,7 @@ def test_an_unstable_prior():
     theta[model.names.index("Xuu")] = 0.5
     theta[model.names.index("Yvv")] = 0.5
     with pytest.raises(InfeasibleError, match="unstable in free run") as told:
-        prepare_request(replace(model, theta=theta), Wishes(150.0))
+        prepare_request(replace(model, theta=theta), DesignRequest(150.0))
     assert "Lowering one of Xu, Yv, Nr alone does not help" in str(told.value)
 
 
@@ -351,7 +355,7 @@ def test_the_least_damping_of_an_unstable_prior():
     theta[place] = 0.3
     unstable = replace(model, theta=theta)
     with pytest.raises(InfeasibleError, match="unstable in free run") as told:
-        prepare_request(unstable, Wishes(150.0))
+        prepare_request(unstable, DesignRequest(150.0))
     name, value, needed = re.search(
         r"(\w+) would have to fall from (-?[\d.]+) to (-?[\d.]+) for", str(told.value)
     ).groups()
@@ -361,32 +365,32 @@ def test_the_least_damping_of_an_unstable_prior():
         changed[model.names.index(name)] += factor * (float(needed) - float(value))
         damped = replace(model, theta=changed)
         if factor == 1.0:
-            assert prepare_request(damped, Wishes(150.0)).request.theta is not None
+            assert prepare_request(damped, DesignRequest(150.0)).theta is not None
         else:
             with pytest.raises(InfeasibleError, match="unstable in free run"):
-                prepare_request(damped, Wishes(150.0))
+                prepare_request(damped, DesignRequest(150.0))
 
 
 def test_wishes_that_exclude_one_another():
     model = thesis_model()
     with pytest.raises(UsageError, match="--wind 5,0"):
-        prepare_request(model, Wishes(150.0, predictor="wind"))
+        prepare_request(model, DesignRequest(150.0, predictor="wind"))
     with pytest.raises(UsageError, match="names 2 regimes for 1 trial"):
-        prepare_request(model, Wishes(150.0, regime="u+v+,u+v-"))
+        prepare_request(model, DesignRequest(150.0, regime="u+v+,u+v-"))
     with pytest.raises(UsageError, match="--trials is 0"):
-        prepare_request(model, Wishes(150.0, trials=0))
+        prepare_request(model, DesignRequest(150.0, trials=0))
     with pytest.raises(UsageError, match="--start has 3 numbers, 4 are needed"):
-        prepare_request(model, Wishes(150.0, start=(1, 2, 3)))
+        prepare_request(model, DesignRequest(150.0, start=(1, 2, 3)))
     with pytest.raises(
         UsageError, match=r"'Xuw' is no parameter of this model\. Did you mean 'Xu'"
     ):
-        design_trial(prepare_request(model, Wishes(150.0, wanted=("Xuw",))).request)
+        design_trial(prepare_request(model, DesignRequest(150.0, wanted=("Xuw",))))
     with pytest.raises(UsageError, match="a standard error of 0"):
-        prepare_request(model, Wishes(150.0, prior=model))
+        prepare_request(model, DesignRequest(150.0, prior=model))
     siso = get_structure("siso")
     wrong = ManoeuvringModel(siso, np.array([-0.1, 1.0]), np.zeros((2, 2)), 1.0, model.vessel)
     with pytest.raises(StructureError, match="has no surge speed u"):
-        prepare_request(wrong, Wishes(150.0))
+        prepare_request(wrong, DesignRequest(150.0))
 
 
 def test_a_sum_of_terms_gets_its_parts_back():
@@ -398,7 +402,7 @@ def test_a_sum_of_terms_gets_its_parts_back():
         full.structure.without("Wuu", "Wvv", "Wuv"), theta, np.zeros((15, 15)), 1.0, full.vessel,
         sums={"Xuu": ("Xuu", "Wuu"), "Yvv": ("Yvv", "Wvv"), "Nuv": ("Nuv", "Wuv")},
     )  # fmt: skip
-    request = prepare_request(merged, Wishes(300.0, regime="u+v+")).request
+    request = prepare_request(merged, DesignRequest(300.0, regime="u+v+"))
     assert len(request.build_predictor().columns) == 41
 
 

@@ -13,8 +13,8 @@ from experiment_design.constraints.limits import LimitReport
 from experiment_design.excitation.rollout import Rollout
 from experiment_design.feasibility.actuator_delay import late_notes
 from experiment_design.output.prediction import predict_motion
-from experiment_design.prepare import Wishes, prepare_request
-from experiment_design.request.request import build_problem
+from experiment_design.prepare import prepare_request
+from experiment_design.request.request import DesignRequest, build_problem
 from greybox.model.run.changes import Change
 from greybox.trial.log import make_log
 from greybox.validation.fit import run_model
@@ -79,14 +79,14 @@ def test_a_late_rollout_without_lag_is_the_plain_one():
 def test_a_design_takes_the_model_as_it_is_after_its_changes():
     model = thesis_model(spread=0.01)
     changing = replace(model, changes=(Change("Xu", 1.5, 300.0),))
-    wishes = Wishes(60.0, regime="u+v+", start=(1.5, 1.2, 0.0, 0.0))
-    prepared = prepare_request(changing, replace(wishes, prior=changing))
+    asked = DesignRequest(60.0, regime="u+v+", start=(1.5, 1.2, 0.0, 0.0))
+    prepared = prepare_request(changing, replace(asked, prior=changing))
     at = model.names.index("Xu")
-    assert prepared.request.theta[at] == pytest.approx(1.5 * model.theta[at])
-    plain = prepare_request(model, replace(wishes, prior=model)).request
-    got, want = prepared.request, plain
+    assert prepared.theta[at] == pytest.approx(1.5 * model.theta[at])
+    plain = prepare_request(model, replace(asked, prior=model))
+    got, want = prepared, plain
     assert got.covariance[at, at] == pytest.approx(2.25 * want.covariance[at, at])
-    assert got.prior[1][at, at] == pytest.approx(want.prior[1][at, at] / 2.25)
+    assert got.known[1][at, at] == pytest.approx(want.known[1][at, at] / 2.25)
     assert [n for n in prepared.notes if "Xu is 1.5 times its value from 300 s on" in n]
 
 
@@ -95,16 +95,16 @@ def test_the_model_says_how_the_thrusters_act():
     ship = late_ship()
     weak = replace(ship, thrusters=(ship.thrusters[0], replace(ship.thrusters[1], gain=0.6)))
     model = replace(thesis_model(), vessel=weak)
-    wishes = Wishes(60.0, regime="u+v+", start=(1.5, 1.2, 0.0, 0.0))
+    asked = DesignRequest(60.0, regime="u+v+", start=(1.5, 1.2, 0.0, 0.0))
     file = limited_ship(speed=2.0)
-    prepared = prepare_request(model, wishes, file)
-    got = prepared.request.vessel
+    prepared = prepare_request(model, asked, file)
+    got = prepared.vessel
     assert [t.gain for t in got.thrusters] == [1.0, 0.6]
     assert got.actuation == LATE
     assert got.thrusters[1].speed_limits.rate == 2.0
     assert any("those that the model was estimated with" in n for n in prepared.notes)
     moved = replace(file, thrusters=(file.thrusters[0], replace(file.thrusters[1], x=-8.0)))
-    assert prepare_request(model, wishes, moved).request.vessel == moved
+    assert prepare_request(model, asked, moved).vessel == moved
 
 
 def test_two_explanations_may_differ_in_a_thruster():

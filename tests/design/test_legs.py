@@ -22,7 +22,8 @@ from experiment_design.output.prediction import predict_motion
 from experiment_design.output.result import Design
 from experiment_design.output.sheet_contents import leg_words, sheet_contents
 from experiment_design.output.trial_sheet import write_sheet
-from experiment_design.prepare import Wishes, both_sides, prepare_request
+from experiment_design.prepare import both_sides, prepare_request
+from experiment_design.request.request import DesignRequest
 from greybox.commands.main import main
 from greybox.errors import UsageError
 from greybox.model.semi_empirical import semi_empirical_model
@@ -64,8 +65,8 @@ def tanker_plan(folder, seed):
     theta = np.asarray(model.theta)
     wrong = 1 + 0.2 * np.random.default_rng(seed).choice([-1, 1], theta.size)
     model = replace(model, theta=theta * wrong, covariance=np.diag((0.2 * theta) ** 2))
-    wishes = Wishes(duration=180.0, hold=15.0, start=[0.9, 0, 0, 0], limits=TrialLimits())
-    request = prepare_request(model, both_sides(wishes, model, 15.0), vessel).request
+    asked = DesignRequest(duration=180.0, hold=15.0, start=[0.9, 0, 0, 0], limits=TrialLimits())
+    request = prepare_request(model, both_sides(asked, model), vessel)
     design = design_of(request, ZIGZAG)
     return design, legs_of(design)
 

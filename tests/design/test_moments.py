@@ -150,7 +150,7 @@ def test_measured_wind_is_told_by_its_gusts():
 
 def test_gradient_with_prior_and_known_trials():
     information = np.diag(1 / (0.3 * np.abs(make_request().theta[:2])) ** 2)
-    request = make_request(prior=(("Xu", "Xvr"), information), predictor="augmented",
+    request = make_request(known=(("Xu", "Xvr"), information), predictor="augmented",
                            duration=220.0)  # fmt: skip
     problem, unit, motion = _random_motion(request)
     other = (problem.moments(motion, 0),)

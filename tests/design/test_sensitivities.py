@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from designs import thesis_model
 
-from experiment_design import Wishes, predict_precision, prepare_request
+from experiment_design import DesignRequest, predict_precision, prepare_request
 from experiment_design.constraints.limit_program import LimitProgram
 from experiment_design.constraints.limits import TrialLimits
 from experiment_design.excitation.rollout import Rollout
@@ -149,13 +149,11 @@ def test_misuse(ship, thesis, true_theta):
 def test_predicted_precision_knows_the_integrator(ship, thesis, true_theta, estimator):
     """Of an RK4 prior it is that of the RK4 motion, here by differences of its simulation."""
     precise = replace(thesis_model(), integrator="rk4", noise=noise_of(thesis, 0.0))
-    wishes = Wishes(
+    asked = DesignRequest(
         120.0, regime="u+v+", start=START, predictor="basic", estimator=estimator,
-        margin_u=0.0, margin_v=0.0,
+        limits=TrialLimits(margins={"u": 0.0, "v": 0.0}),
     )  # fmt: skip
-    requests = [
-        prepare_request(m, wishes).request for m in (precise, replace(precise, integrator="euler"))
-    ]
+    requests = [prepare_request(m, asked) for m in (precise, replace(precise, integrator="euler"))]
     schedule = requests[0].schedule
     commands = random_commands(ship, schedule)[0]
     plan = dict(zip(schedule.commands, commands.T, strict=True))

@@ -31,8 +31,8 @@ from experiment_design.output.sheet_contents import (
     signed,
 )
 from experiment_design.output.trial_sheet import sheet_figures, sheet_kind, write_sheet
-from experiment_design.prepare import Wishes, prepare_request
-from experiment_design.request.request import build_problem
+from experiment_design.prepare import prepare_request
+from experiment_design.request.request import DesignRequest, build_problem
 from greybox.commands.main import main
 from greybox.errors import UsageError
 from greybox.model.model import ManoeuvringModel
@@ -48,14 +48,14 @@ def prior(ship, thesis, theta, uncertain):
     return ManoeuvringModel(thesis, theta, spread, 1.0, ship)
 
 
-def made(model, ship, *, duration=600.0, uncertain=False, trials=1, limits=None, **wishes):
+def made(model, ship, *, duration=600.0, uncertain=False, trials=1, limits=None, **asked):
     """A design of random levels: what is drawn does not ask how they were found."""
-    options = {"regime": "u+v+", "start": [1.5, 1.2, 0, 0], "margin_u": 0.5, "margin_v": 0.4}
-    asked = Wishes(
-        duration=duration, hold=10.0, trials=trials, predictor="basic",
-        limits=limits or TrialLimits(), **(options | wishes),
+    options = {"regime": "u+v+", "start": [1.5, 1.2, 0, 0]}
+    limits = replace(limits or TrialLimits(), margins={"u": 0.5, "v": 0.4})
+    asked = DesignRequest(
+        duration, limits, hold=10.0, trials=trials, predictor="basic", **(options | asked),
     )  # fmt: skip
-    request = prepare_request(model, asked, ship).request
+    request = prepare_request(model, asked, ship)
     problems = [build_problem(request, t) for t in range(trials)]
     rng = np.random.default_rng(0)
     units = [rng.random(p.shape).round(2) for p in problems]
