@@ -74,7 +74,7 @@ def prepare_request(
     StructureError
         The model's structure has no surge speed.
     UsageError
-        DesignRequest that exclude one another.
+        Options that exclude one another.
     InfeasibleError
         No motion within the limits keeps the wanted signs.
     """

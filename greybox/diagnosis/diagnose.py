@@ -66,6 +66,8 @@ class DiagnosisOptions:
 
 @known_keywords
 @one_thread
+# runs of ships that a hypothesis makes unstable leave every number's range, and are judged by that
+@np.errstate(over="ignore", invalid="ignore")
 def diagnose(
     logs: Logs,
     *,

@@ -222,11 +222,14 @@ def _score_changes(directions: ProjectedScores, hypotheses: Sequence[Hypothesis]
         slope = sensitivities(replace(linear, driven=both))
         columns.append(run.seen(ship, slope)[:, :, : both.shape[2]])
     cleared, before = directions.clear(columns)
-    squares = (cleared**2).sum(axis=0)
-    along = cleared.T @ directions.nu
-    with np.errstate(divide="ignore", invalid="ignore"):
-        gain = np.where(squares > _OWN * before, along**2 / squares, 0.0)
-        factor = np.where(squares > _OWN * before, along / squares, 0.0)
+    # a run at the edge of stability has derivatives beyond numbers' range, which tell nothing
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+        squares = (cleared**2).sum(axis=0)
+        along = cleared.T @ directions.nu
+        factor = along / squares
+        gain = along * factor
+        told = (squares > _OWN * before) & np.isfinite(gain)
+    gain, factor = np.where(told, gain, 0.0), np.where(told, factor, 0.0)
     gain, factor = gain.reshape(len(hypotheses), -1), factor.reshape(len(hypotheses), -1)
     out = []
     for k, hypothesis in enumerate(hypotheses):

@@ -371,7 +371,7 @@ def test_the_least_damping_of_an_unstable_prior():
                 prepare_request(damped, DesignRequest(150.0))
 
 
-def test_wishes_that_exclude_one_another():
+def test_options_that_exclude_one_another():
     model = thesis_model()
     with pytest.raises(UsageError, match="--wind 5,0"):
         prepare_request(model, DesignRequest(150.0, predictor="wind"))

@@ -190,12 +190,13 @@ def _generic_force(pair: Pair, use: Use) -> GenericForce:
     problem, fit, held, held_fit = pair.problem, pair.fit, pair.held, pair.held_fit
     nuisance = _stacked(problem.rows(fit.point, fit.noise))
     free = nuisance.shape[1] - sum(map(len, fit.point.starts))
-    scale = np.sqrt((nuisance**2).sum(axis=0))
+    with np.errstate(over="ignore", invalid="ignore"):
+        scale = np.sqrt((nuisance**2).sum(axis=0))
     scale[scale == 0] = 1.0
     seen = np.concatenate([n.ravel() for n in held_fit.nu])
     # a run at the edge of stability has no derivatives
     none = GenericForce(np.zeros_like(seen), seen, held_fit.errors, np.zeros(free))
-    if not np.isfinite(nuisance).all():
+    if not np.isfinite(scale).all():
         return none
     left, values, right = tall_svd(nuisance / scale, _UNKNOWN)
     knots = knots_of(problem)
