@@ -14,7 +14,7 @@ from greybox.model.predictor import build_predictor
 from greybox.model.run.simulation import simulate
 from greybox.study.inputs import offset_gaussian
 from greybox.study.monte_carlo import Batch, BatchRegression
-from greybox.study.parallel import map_pieces
+from greybox.numerics.parallel import map_pieces
 from greybox.study.tables import Row, normalised, published, summarise
 
 Array = NDArray[np.float64]
