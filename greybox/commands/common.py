@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
 
 __all__ = [
-    "add_cluster", "add_logs", "add_seed", "complain", "count", "positive", "progress", "provenance",
-    "read_logs", "say",
+    "add_cluster", "add_logs", "add_seed", "complain", "count", "positive", "progress",
+    "provenance", "read_logs", "say",
 ]  # fmt: skip
 
 # where a command computes changes no result
