@@ -8,7 +8,15 @@ from typing import Any
 
 from experiment_design.information.estimators import ESTIMATORS
 from experiment_design.information.optimality import CRITERIA
-from greybox.commands.common import add_seed, count, positive, progress, provenance, say
+from greybox.commands.common import (
+    add_cluster,
+    add_seed,
+    count,
+    positive,
+    progress,
+    provenance,
+    say,
+)
 from greybox.model.predictor_kinds import PREDICTORS
 from greybox.registry import Registry
 
@@ -336,6 +344,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     work.add_argument("--effort", type=positive, default=1.0, help="times the usual search (1)")
     work.add_argument("--workers", type=_whole, metavar="N", help="processes (as needed)")
+    add_cluster(work)
     add_seed(work)  # type: ignore[arg-type]
 
 

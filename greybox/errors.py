@@ -51,6 +51,14 @@ class OutOfTimeError(GreyboxError, TimeoutError):
     """What was to be tried did not end within the seconds that it was given."""
 
 
+class ClusterError(GreyboxError, ConnectionError):
+    """The cluster that is to compute is not there, has no workers, or was lost."""
+
+
+class WorkerError(GreyboxError, RuntimeError):
+    """Processes that computed a part of the work died again and again."""
+
+
 class UsageError(GreyboxError, ValueError):
     """Options that exclude one another, or that need another one beside them."""
 

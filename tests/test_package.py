@@ -35,7 +35,7 @@ def test_extras_repeat_nothing_that_is_installed_anyway(project):
     for extra, lines in project["optional-dependencies"].items():
         assert not core & names(lines), extra
     # commands that ask for these names go on working
-    assert {"parquet", "test", "lint", "cluster"} <= set(project["optional-dependencies"])
+    assert {"parquet", "test", "lint", "cluster", "dask"} <= set(project["optional-dependencies"])
 
 
 def test_the_metadata_is_whole():

@@ -27,8 +27,7 @@ from experiment_design.optimise.search import (
 )
 from experiment_design.request.problem import TrialProblem
 from experiment_design.request.request import PreparedRequest, build_problem
-from greybox.numerics.forked import processors
-from greybox.study.parallel import map_pieces
+from greybox.numerics.parallel import map_pieces, processors
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]
@@ -177,6 +176,10 @@ def search_campaign(
         budget = max(_LIMITED * budget, _LEAST // 2 if quick else _LEAST)
     total, done, spent, stopped = _CHAINS * rounds * passes * trials, 0, 0, False
     workers = workers or _worth_processes(problems[0], best[0].unit, budget * total)
+    if workers > 1:
+        # copies of this process then have what each would build in every round
+        for t in range(trials):
+            _problem_of(request, t)
     try:
         for _ in range(passes):
             for t, problem in enumerate(problems):

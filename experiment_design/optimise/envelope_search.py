@@ -18,7 +18,7 @@ from experiment_design.excitation.rollout import Motion
 from experiment_design.information.envelope import HOLDS, Envelope
 from experiment_design.optimise.search import Candidate, limit_scale, to_unit
 from experiment_design.request.problem import TrialProblem
-from greybox.numerics.forked import map_forked
+from greybox.numerics.parallel import map_forked
 
 Array = NDArray[np.float64]
 

@@ -19,11 +19,14 @@ if TYPE_CHECKING:
 
 
 __all__ = [
-    "add_logs", "add_seed", "complain", "count", "positive", "progress", "provenance",
-    "read_logs", "say",
+    "add_cluster", "add_logs", "add_seed", "complain", "count", "positive", "progress",
+    "provenance", "read_logs", "say",
 ]  # fmt: skip
 
-SHELL_ONLY = ("run", "typed", "verbose", "more_verbose", "quiet", "no_config", "configuration")
+# where a command computes changes no result
+SHELL_ONLY = (
+    "run", "typed", "verbose", "more_verbose", "quiet", "no_config", "configuration", "cluster",
+)  # fmt: skip
 
 
 def add_logs(parser: argparse.ArgumentParser) -> None:
@@ -56,6 +59,16 @@ def add_seed(parser: argparse.ArgumentParser) -> None:
     """Add --seed."""
     parser.add_argument(
         "--seed", type=count, default=0, metavar="N", help="seed of whatever is random (0)"
+    )
+
+
+def add_cluster(parser: argparse._ActionsContainer) -> None:
+    """Add --cluster, which `greybox.commands.main` heeds for the whole command."""
+    parser.add_argument(
+        "--cluster",
+        metavar="ADDRESS",
+        help="compute on the Dask cluster whose scheduler is there, such as tcp://host:8786; by "
+        "default that of GREYBOX_CLUSTER, or else this machine",
     )
 
 

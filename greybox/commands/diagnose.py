@@ -5,7 +5,15 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from greybox.commands.common import add_logs, add_seed, positive, provenance, read_logs, say
+from greybox.commands.common import (
+    add_cluster,
+    add_logs,
+    add_seed,
+    positive,
+    provenance,
+    read_logs,
+    say,
+)
 from greybox.commands.terminal import activity
 from greybox.public import one_thread
 
@@ -66,6 +74,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "ship's pace",
     )
     add_seed(parser)
+    add_cluster(parser)
 
 
 @one_thread

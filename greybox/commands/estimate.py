@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
 from greybox.commands.common import (
+    add_cluster,
     add_logs,
     add_seed,
     positive,
@@ -44,6 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", metavar="F", help="write the result as JSON; - is stdout")
     parser.add_argument("--report", metavar="HTML", help="write a page with plots and all tests")
     add_seed(parser)
+    add_cluster(parser)
     _add_model(parser)
     _add_data(parser)
     _add_instruments(parser)

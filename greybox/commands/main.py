@@ -27,7 +27,7 @@ EXAMPLES = """examples:
   greybox diagnose trial.csv --vessel ship.toml --model model.json
 
 'greybox help COMMAND' shows the options and examples of one command. Options that you
-repeat may stand in greybox.toml; NO_COLOR and GREYBOX_CONFIG are heeded.
+repeat may stand in greybox.toml; NO_COLOR, GREYBOX_CONFIG and GREYBOX_CLUSTER are heeded.
 """
 _log = logging.getLogger(__name__)
 
@@ -181,7 +181,13 @@ def _run(options: argparse.Namespace) -> None:
     if used is not None:
         _log.info("configuration %s gives %s", used["file"], ", ".join(used["options"]))
     require_apart(options)
-    options.run(options)
+    if hasattr(options, "cluster"):
+        from greybox.numerics.parallel import on_cluster
+
+        with on_cluster(options.cluster):
+            options.run(options)
+    else:
+        options.run(options)
     _log.info("done")
 
 

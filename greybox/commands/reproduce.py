@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from greybox.commands.common import add_seed, positive, progress, provenance, say
+from greybox.commands.common import add_cluster, add_seed, positive, progress, provenance, say
 
 HELP = "repeat the studies of the thesis, of the estimators' efficiency, of the diagnosis' power"
 EXAMPLES = """examples:
@@ -39,6 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--structure", metavar="NAME", help="chapter 7: structure (thesis)")
     parser.add_argument("--workers", type=int, metavar="N", help="processes (one a processor)")
+    add_cluster(parser)
     add_seed(parser)
 
 

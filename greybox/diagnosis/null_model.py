@@ -22,7 +22,7 @@ from greybox.model.predictor_kinds import PREDICTORS
 from greybox.model.run.step import Integrator
 from greybox.model.structure import Structure
 from greybox.model.terms import parse_term
-from greybox.numerics.forked import map_forked
+from greybox.numerics.parallel import map_forked
 from greybox.regression.regression import build_regression
 from greybox.rotation import body_to_ned
 from greybox.trial.log import TrialLog

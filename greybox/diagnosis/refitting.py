@@ -15,7 +15,7 @@ from greybox.diagnosis.noise import SEEN
 from greybox.diagnosis.null_model import DiagnosisProblem
 from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.scores import ProjectedScores, Score, score_hypotheses
-from greybox.numerics.forked import map_forked
+from greybox.numerics.parallel import map_forked
 
 Array = NDArray[np.float64]
 Told = TypeVar("Told")

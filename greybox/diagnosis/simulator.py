@@ -56,6 +56,10 @@ class VaryingSimulator:
         self._theta, self._drivers = np.zeros(0), np.zeros((0, 0))
         self._active: Active = ()
 
+    def __getstate__(self) -> dict[str, object]:
+        """Drop what belongs to one process when pickled."""
+        return self.__dict__ | {"_kernels": {}}
+
     def _kernel(self, changing: bool) -> FreeRunKernel:
         key = (self._active, changing)
         # the sets of terms that are compared come again and again; those of old steps do not

@@ -22,7 +22,7 @@ from greybox.estimation.output_error import Weights
 from greybox.estimation.registry import ESTIMATORS, automatic_estimators
 from greybox.estimation.result import Estimate
 from greybox.model.model import ManoeuvringModel
-from greybox.numerics.forked import map_forked
+from greybox.numerics.parallel import map_forked
 from greybox.selection.fit_single import estimate_once
 from greybox.selection.held_out import FLOOR, extent, folds, score_runs, spread_of
 from greybox.selection.request import Request

@@ -23,7 +23,7 @@ from greybox.model.predictor_kinds import PREDICTORS
 from greybox.model.run.step import Integrator
 from greybox.model.structure import Structure
 from greybox.numerics.effort import Shares, seconds_left, within
-from greybox.numerics.forked import Piece, Result, lanes, map_forked
+from greybox.numerics.parallel import Piece, Result, lanes, map_forked
 from greybox.selection.cross_validation import Refit, parts_of
 from greybox.selection.family import family_for, first_terms, spell_structure
 from greybox.selection.free_run_selection import FreeRunSelection, Selected

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from greybox.model.catalogue import get_structure
 from greybox.model.predictor import build_predictor
 from greybox.model.run.simulation import simulate
+from greybox.numerics.parallel import map_pieces
 from greybox.study.inputs import offset_gaussian
 from greybox.study.monte_carlo import Batch, BatchRegression
-from greybox.study.parallel import map_pieces
 from greybox.study.tables import Row, normalised, published, summarise
 
 Array = NDArray[np.float64]

@@ -27,10 +27,10 @@ from numpy.typing import NDArray
 from greybox.model.catalogue import get_structure
 from greybox.model.predictor import Predictor, build_predictor
 from greybox.model.run.simulation import simulate, stationary_disturbance
+from greybox.numerics.parallel import map_pieces
 from greybox.rotation import ned_to_body
 from greybox.study.inputs import smooth, zig_zag
 from greybox.study.monte_carlo import Batch, BatchEstimate, BatchRegression
-from greybox.study.parallel import map_pieces
 from greybox.study.tables import Row, normalised, published, summarise
 from greybox.validation.fit import fit_percent
 from greybox.vessel.force import generalised_force

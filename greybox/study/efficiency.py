@@ -27,10 +27,10 @@ from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import Predictor, Regime, build_predictor
 from greybox.model.run.simulation import simulate, stationary_disturbance
 from greybox.numerics.linalg import scaled_logdet
+from greybox.numerics.parallel import map_pieces
 from greybox.rotation import ned_to_body
 from greybox.selection.fit_single import estimate_iv
 from greybox.study.chapter6 import TRUE, pulse_commands
-from greybox.study.parallel import map_pieces
 from greybox.study.tables import Row, summarise
 from greybox.trial.log import TrialLog, make_log
 from greybox.vessel.toml import load_vessel

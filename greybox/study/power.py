@@ -19,12 +19,11 @@ from greybox.diagnosis.diagnose import diagnose
 from greybox.diagnosis.result import DiagnosisVerdict
 from greybox.errors import GreyboxError, UsageError
 from greybox.numerics.binomial import wilson_interval
-from greybox.numerics.forked import processors
+from greybox.numerics.parallel import map_pieces, processors
 from greybox.study.blind import Order, Trial, draw_many
 from greybox.study.blind_causes import CAUSES, Effect
 from greybox.study.blind_conditions import Conditions
 from greybox.study.blind_effects import UNKNOWN, shows
-from greybox.study.parallel import map_pieces
 from greybox.study.tables import Row
 
 ANSWERS = ("detected", "right", "group", "part", "wrong", "unexplained", "none", "failed")

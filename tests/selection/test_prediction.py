@@ -49,7 +49,7 @@ def test_an_estimate_in_its_family_predicts(estimate, logs):
 @pytest.fixture
 def here(monkeypatch):
     """Refits run in this process, which sees what they are given."""
-    monkeypatch.setattr("greybox.numerics.forked.lanes", lambda: 1)
+    monkeypatch.setattr("greybox.numerics.parallel.lanes", lambda: 1)
 
 
 @pytest.mark.usefixtures("here")

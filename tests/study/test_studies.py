@@ -14,7 +14,6 @@ from greybox.study.chapter7 import (
     virtual_day,
 )
 from greybox.study.inputs import offset_gaussian, smoothed_pulses, zig_zag
-from greybox.study.parallel import map_pieces
 from greybox.study.tables import published, summarise, to_csv
 
 
@@ -124,15 +123,6 @@ def test_inputs():
     assert offset_gaussian(rng, 1000).min() == 0.6  # (4.65)
     assert offset_gaussian(rng, 1000, None).min() < 0
     np.testing.assert_allclose(zig_zag(4, 1.0, amplitude=2, period=2, centre=1), [3, -1, 3, -1])
-
-
-def square(x):
-    return x * x
-
-
-def test_map_keeps_the_order():
-    assert list(map_pieces(square, [3, 1, 2], workers=1)) == [9, 1, 4]
-    assert list(map_pieces(square, [3, 1, 2], workers=2)) == [9, 1, 4]
 
 
 def test_tables():

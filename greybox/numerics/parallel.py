@@ -1,0 +1,411 @@
+"""One map over independent work: processes of this machine, or a Dask cluster by its address.
+
+Every piece of work carries its own seed, and results come in the order of the pieces, so they
+depend neither on how many processes there are nor on which of them computes what.
+"""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
+from hashlib import sha256
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from greybox.errors import ClusterError, UsageError, WorkerError
+from greybox.numerics.effort import seconds_left, within
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+Piece = TypeVar("Piece")
+Result = TypeVar("Result")
+
+ENVIRONMENT = "GREYBOX_CLUSTER"
+# workers that may die before work is given up: one may be killed by chance or for the memory that
+# others hold, a third one died of the work itself. The schedulers of Dask allow as many
+_DEATHS = 3
+# seconds within which a scheduler answers, and within which one without workers gets one
+_ANSWER, _PATIENCE = 10.0, 60.0
+# seconds between looks at whether the first process still runs
+_LOOK = 0.5
+# names under which Dask reports on what ends as one sentence here
+_LOGGERS = ("distributed", "tornado.application")
+_log = logging.getLogger(__name__)
+
+_address: ContextVar[str | None] = ContextVar("address", default=None)
+# whether this is computed for a cluster, whose own workers are all that there is
+_for_cluster: ContextVar[bool] = ContextVar("for_cluster", default=False)
+_clients: dict[str, Client] = {}
+_one_at_a_time = threading.Lock()
+# what the copies of this process are to do: they inherit it, so that it need not be sent
+_work: tuple[Callable[[Any], Any], Sequence[Any]] | None = None
+
+
+def processors() -> int:
+    """Return how many processors this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@contextmanager
+def on_cluster(address: str | None) -> Iterator[None]:
+    """Let the maps inside the block be computed by a Dask cluster.
+
+    Parameters
+    ----------
+    address : str, optional
+        Of its scheduler, such as ``tcp://host:8786``; by default that of the environment
+        variable ``GREYBOX_CLUSTER``, and without it this machine.
+
+    Raises
+    ------
+    ClusterError
+        There is no scheduler, or it gets no workers.
+    UsageError
+        A cluster is named but dask.distributed is not installed.
+    """
+    address = address or os.environ.get(ENVIRONMENT) or None
+    token = _address.set(address)
+    try:
+        if address is not None:
+            _client(address)
+        yield
+    finally:
+        _address.reset(token)
+        client = _clients.pop(address or "", None)
+        if client is not None:
+            client.close()
+
+
+def _first() -> bool:
+    """Whether this process is no worker of a map itself: those compute what is inside here."""
+    return not _for_cluster.get() and multiprocessing.current_process().name == "MainProcess"
+
+
+def _cluster() -> str | None:
+    """Return the address of the cluster that is to compute, None where this process is to."""
+    if not _first():
+        return None
+    return _address.get() or os.environ.get(ENVIRONMENT) or None
+
+
+def lanes() -> int:
+    """Return how many pieces `map_forked` computes at a time: 1 where it does so one by one.
+
+    A copy of a process is safe where no other thread runs in it; one of several that a study
+    started leaves the other processors to those.
+    """
+    address = _cluster()
+    if address is not None:
+        return max(1, len(_client(address).nthreads()))
+    return processors() if _may_fork() else 1
+
+
+def _may_fork() -> bool:
+    return sys.platform == "linux" and _first() and len(sys._current_frames()) == 1
+
+
+def map_pieces(
+    function: Callable[[Piece], Result],
+    pieces: Iterable[Piece],
+    *,
+    workers: int | None = None,
+) -> Iterator[Result]:
+    """Apply a function to independent pieces, results in the order of the pieces.
+
+    Parameters
+    ----------
+    function : callable
+        A module-level function of one piece.
+    pieces : iterable
+        With their seeds, where there is chance.
+    workers : int, optional
+        Processes; by default one a processor. 1 computes here. A cluster uses all that it has.
+
+    Raises
+    ------
+    ClusterError
+        The cluster named by `on_cluster` or ``GREYBOX_CLUSTER`` is not there, or is lost.
+    WorkerError
+        Three workers died.
+    """
+    work = list(pieces)
+    address = _cluster()
+    count = min(workers or processors(), len(work))
+    if address is not None:
+        yield from _by_cluster(address, function, work)
+    elif count < 2 or not _first():
+        yield from map(function, work)
+    elif _may_fork():
+        yield from _by_copies(function, work, count)
+    else:
+        yield from _by_processes(function, work, count)
+
+
+def map_forked(function: Callable[[Piece], Result], pieces: Sequence[Piece]) -> list[Result]:
+    """Apply a function to a few heavy pieces of one computation, results in their order.
+
+    Where no cluster computes, it is done in copies of this process, which know all that it
+    knows, so function and pieces may be anything; what they change is lost but for the
+    results, which must be picklable. Where a process cannot be copied, pieces are computed
+    here, one by one.
+
+    Parameters
+    ----------
+    function : callable
+    pieces : sequence
+
+    Raises
+    ------
+    Exception
+        The first one that the function raises.
+    """
+    address = _cluster()
+    if address is not None and len(pieces) > 1:
+        return list(_by_cluster(address, function, pieces))
+    count = min(lanes(), len(pieces)) if address is None else 1
+    if count < 2:
+        return [function(piece) for piece in pieces]
+    return list(_by_copies(function, pieces, count))
+
+
+def _by_copies(
+    function: Callable[[Piece], Result], pieces: Sequence[Piece], count: int
+) -> Iterator[Result]:
+    """Compute pieces in copies of this process."""
+
+    def begin(left: Sequence[int]) -> tuple[Executor, list[Future[Any]]]:
+        global _work
+        _work = (function, pieces)
+        try:
+            context = multiprocessing.get_context("fork")
+            pool = ProcessPoolExecutor(
+                min(count, len(left)), context, _begin_worker, (os.getpid(),)
+            )
+            # all copies are made when the first piece is given
+            return pool, [pool.submit(_one, k) for k in left]
+        finally:
+            _work = None
+
+    return _collected(begin, len(pieces))
+
+
+def _by_processes(
+    function: Callable[[Piece], Result], pieces: Sequence[Piece], count: int
+) -> Iterator[Result]:
+    """Compute pieces in processes that are begun anew, and kept for the next map."""
+    from joblib.externals.loky import get_reusable_executor
+
+    def begin(left: Sequence[int]) -> tuple[Executor, list[Future[Any]]]:
+        pool = get_reusable_executor(
+            max_workers=count, initializer=_begin_worker, initargs=(os.getpid(),)
+        )
+        return pool, [pool.submit(function, pieces[k]) for k in left]
+
+    return _collected(begin, len(pieces))
+
+
+def _one(index: int) -> Any:
+    assert _work is not None
+    function, pieces = _work
+    return function(pieces[index])
+
+
+def _begin_worker(first: int) -> None:
+    """Let a worker compute in one thread, leave Ctrl-C to the first process, and end with it."""
+    from threadpoolctl import threadpool_limits
+
+    threadpool_limits(1)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    def end_with_first() -> None:
+        while os.getppid() == first:
+            time.sleep(_LOOK)
+        os._exit(1)
+
+    threading.Thread(target=end_with_first, daemon=True).start()
+
+
+def _collected(
+    begin: Callable[[Sequence[int]], tuple[Executor, list[Future[Any]]]], count: int
+) -> Iterator[Any]:
+    """Yield results in order; what a dead worker was to compute is computed again by new ones."""
+    found: dict[int, Any] = {}
+    given = deaths = 0
+    while given < count:
+        left = [k for k in range(given, count) if k not in found]
+        here = set(multiprocessing.active_children())
+        pool, futures = begin(left)
+        waiting = dict(zip(left, futures, strict=True))
+        begun = set(multiprocessing.active_children()) - here
+        try:
+            while given < count:
+                if given not in found:
+                    found[given] = waiting.pop(given).result()
+                yield found.pop(given)
+                given += 1
+        except BrokenProcessPool as error:
+            deaths += 1
+            done = {k: f for k, f in waiting.items() if f.done() and f.exception() is None}
+            found |= {k: f.result() for k, f in done.items()}
+            _log.info("a worker died: %d pieces are computed again", len(left) - len(done))
+            if deaths == _DEATHS:
+                raise WorkerError(
+                    f"{deaths} worker processes died, the last while piece {given + 1} of {count} "
+                    f"was computed: the system may have ended them for lack of memory; try fewer "
+                    f"--workers."
+                ) from error
+        except BaseException:
+            _stop(pool, begun)
+            raise
+    # processes that are kept for the next map stay
+    if isinstance(pool, ProcessPoolExecutor):
+        pool.shutdown()
+
+
+def _stop(pool: Any, begun: set[Any]) -> None:
+    """End a pool with its processes, whatever they are at."""
+    for process in begun:
+        process.terminate()
+    if isinstance(pool, ProcessPoolExecutor):
+        pool.shutdown(cancel_futures=True)
+    else:
+        # only the pool knows the processes that an earlier map began
+        pool.shutdown(kill_workers=True)
+
+
+def _client(address: str) -> Client:
+    """Return the client of a cluster that is there and has workers, connected once."""
+    known = _clients.get(address)
+    if known is not None and known.status == "running":
+        return known
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise UsageError(
+            "a cluster needs dask.distributed: pip install 'greybox-marine[dask]'."
+        ) from error
+    for name in _LOGGERS:
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    try:
+        client = Client(address, timeout=_ANSWER, set_as_default=False)
+    except (OSError, ValueError, TypeError, ImportError) as error:
+        raise ClusterError(
+            f"no Dask scheduler answers at '{address}' within {_ANSWER:g} s: start one there with "
+            f"'dask scheduler' and workers with 'dask worker {address}', correct the address, or "
+            f"leave --cluster and {ENVIRONMENT} out."
+        ) from error
+    _clients[address] = client
+    _require_workers(client, address)
+    return client
+
+
+def _require_workers(client: Client, address: str) -> None:
+    """Wait for a worker.
+
+    Raises
+    ------
+    ClusterError
+        None comes.
+    """
+    end = time.monotonic() + _PATIENCE
+    while not client.nthreads():
+        if time.monotonic() > end:
+            raise ClusterError(
+                f"the Dask scheduler at '{address}' has 0 workers and got none within "
+                f"{_PATIENCE:g} s: start at least 1 with 'dask worker {address}'."
+            )
+        time.sleep(0.2)
+
+
+def _by_cluster(
+    address: str, function: Callable[[Piece], Result], pieces: Sequence[Piece]
+) -> Iterator[Result]:
+    """Compute pieces by a Dask cluster; its scheduler gives those of a dead worker to another."""
+    import warnings
+
+    from casadi import global_pickle_context
+    from distributed import KilledWorker
+    from distributed.protocol.pickle import dumps
+
+    client = _client(address)
+    _log.debug("%d pieces are computed at %s", len(pieces), address)
+    with global_pickle_context():
+        sent = dumps(function)
+    futures: list[Any] = []
+    try:
+        with warnings.catch_warnings():
+            # what is sent at once may be large: logs are
+            warnings.simplefilter("ignore", UserWarning)
+            # the result of a task, unlike what is only sent, is made again if its worker dies
+            held = client.submit(bytes, sent, key=f"function-{sha256(sent).hexdigest()}")
+            for piece in pieces:
+                with global_pickle_context():
+                    told = dumps(piece)
+                futures.append(client.submit(_remote, held, told, seconds_left(), pure=False))
+        for k, future in enumerate(futures):
+            yield _awaited(client, address, future)
+            # its place at the scheduler is free for others
+            futures[k] = None
+    except KilledWorker as error:
+        raise WorkerError(
+            f"more than {_DEATHS} workers of the cluster at '{address}' died of one of "
+            f"{len(pieces)} pieces: give workers more memory (dask worker --memory-limit)."
+        ) from error
+    except (CancelledError, OSError) as error:
+        if isinstance(error, OSError) and client.status == "running":
+            raise
+        raise ClusterError(
+            f"the Dask scheduler at '{address}' was lost while {len(pieces)} pieces were computed: "
+            f"start it again, and then this command."
+        ) from error
+    finally:
+        with suppress(Exception):
+            client.cancel([f for f in futures if f is not None], force=True)
+
+
+def _awaited(client: Client, address: str, future: Any) -> Any:
+    """Return a result; while it is awaited, make sure that there are workers."""
+    from casadi import global_unpickle_context
+    from distributed import TimeoutError as NotYet
+    from distributed.protocol.pickle import loads
+
+    while True:
+        try:
+            told = future.result(timeout=_PATIENCE)
+            break
+        except NotYet:
+            _require_workers(client, address)
+    with global_unpickle_context():
+        return loads(told)
+
+
+def _remote(sent: bytes, piece: bytes, seconds: float) -> bytes:
+    """Compute one piece on a worker, within the seconds that are left for it."""
+    from casadi import global_pickle_context, global_unpickle_context
+    from distributed.protocol.pickle import dumps, loads
+    from threadpoolctl import threadpool_limits
+
+    # CasADi and what a process caches know no second thread, which a worker may have
+    with _one_at_a_time:
+        token = _for_cluster.set(True)
+        try:
+            with threadpool_limits(1), within(seconds):
+                with global_unpickle_context():
+                    function = loads(sent)
+                with global_unpickle_context():
+                    given = loads(piece)
+                result = function(given)
+                with global_pickle_context():
+                    return bytes(dumps(result))
+        finally:
+            _for_cluster.reset(token)
