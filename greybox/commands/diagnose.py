@@ -6,7 +6,6 @@ import argparse
 from typing import TYPE_CHECKING, Any
 
 from greybox.commands.common import add_logs, add_seed, positive, provenance, read_logs, say
-from greybox.commands.terminal import activity
 from greybox.public import one_thread
 
 if TYPE_CHECKING:
@@ -96,7 +95,6 @@ def run(options: argparse.Namespace) -> None:
             seed=options.seed,
             remainder=options.remainder,
             own_pace=options.sample_time is None,
-            progress=activity(),
         ),
     )
     diagnosis = replace(diagnosis, notes=(*left_out, *also, *diagnosis.notes))
