@@ -103,11 +103,11 @@ def _show(text: str, done: int = 0, total: int | None = None) -> None:
     if total is not None and (done >= total or not counting):
         clear()
     if total is None or done < total:
+        text = _printable(text)
         if not _shown:
             _shown.append(_bar(total is not None))
-            _shown[0].add_task("", total=total, completed=done)
+            _shown[0].add_task(text, total=total, completed=done)
             _shown[0].start()
-        text = _printable(text)
         _shown[0].update(
             _shown[0].task_ids[0], description=text, completed=done, total=total, refresh=True
         )
