@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import textwrap
 
 from greybox.commands.common import add_seed, provenance, say
-from greybox.commands.terminal import activity
 
 HELP = (
     "go once round the loop on a virtual ship: design, sail, estimate, diagnose, extend, redesign"
@@ -16,6 +16,7 @@ EXAMPLES = """examples:
   greybox demo --effect current --seed 3 --out mydemo
 """
 _WIDTH = 92
+_log = logging.getLogger(__name__)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -58,12 +59,11 @@ def run(options: argparse.Namespace) -> None:
         ]
         say("\n".join(lines))
 
-    show = activity()
     with threadpool_limits(1):
         demo = run_demo(
-            options.out, effect=options.effect, seed=options.seed, tell=tell, progress=show
+            options.out, effect=options.effect, seed=options.seed, tell=tell, progress=_log.info
         )
-        show("drawing")
+        _log.info("drawing")
         report = demo.files.report
         record = provenance(options) | {"files": demo.files.hashes()}
         write_page(demo_page(demo, record), report)

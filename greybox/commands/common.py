@@ -11,6 +11,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from greybox.commands.parser import OUTPUTS
 from greybox.commands.terminal import complain, progress, say
 
 if TYPE_CHECKING:
@@ -99,12 +100,11 @@ def read_logs(
     return logs, (*told, *left_out)
 
 
-# options that name files to read, and to write
+# options that name files to read
 _INPUTS = (
     "logs", "log", "models", "model", "nominal", "validate", "estimate", "vessel", "prior",
     "between", "area", "raw", "trial", "after", "diagnosis",
 )  # fmt: skip
-_OUTPUTS = ("out", "json", "report", "sheet", "legs", "save_model")
 # raw files are hashed as they are imported
 _HASHED = tuple(n for n in _INPUTS if n != "raw")
 # what is typed for the terminal's sake, and changes no result
@@ -164,7 +164,7 @@ def require_apart(options: argparse.Namespace) -> None:
     taken: dict[Path, str] = {}
     for name in _INPUTS:
         taken |= {Path(p).resolve(): name for p in _paths(getattr(options, name, None))}
-    for name in _OUTPUTS:
+    for name in OUTPUTS:
         for path in _paths(getattr(options, name, None)):
             place = Path(path).resolve()
             # a device takes everything

@@ -14,7 +14,6 @@ from greybox.commands.common import (
     read_logs,
     say,
 )
-from greybox.commands.terminal import activity
 from greybox.public import one_thread
 
 if TYPE_CHECKING:
@@ -105,7 +104,6 @@ def run(options: argparse.Namespace) -> None:
             seed=options.seed,
             remainder=options.remainder,
             own_pace=options.sample_time is None,
-            progress=activity(),
         ),
     )
     diagnosis = replace(diagnosis, notes=(*left_out, *also, *diagnosis.notes))

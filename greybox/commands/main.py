@@ -12,7 +12,12 @@ from importlib.metadata import version
 from pathlib import Path
 
 from greybox.commands.common import require_apart
-from greybox.commands.parser import Parser, short_usage, sub_parsers
+from greybox.commands.configuration import (
+    find_configuration,
+    parse_configured,
+    read_configuration,
+)
+from greybox.commands.parser import UNKNOWN, Parser, require_known, short_usage, sub_parsers
 from greybox.commands.terminal import complain, telling
 from greybox.errors import GreyboxError, UsageError
 from greybox.registry import entry_points
@@ -41,13 +46,12 @@ def _add_shell(parser: argparse.ArgumentParser, *, after: bool) -> None:
         default=argparse.SUPPRESS if after else 0,
         help="tell on stderr what is read, chosen and solved, and when; -vv tells more",
     )  # fmt: skip
-    group.add_argument(
-        "-q", "--quiet", action="store_true", default=default,
-        help="show no results and no progress, errors only; files are written as always",
-    )  # fmt: skip
-    group.add_argument(
-        "--no-config", action="store_true", default=default, help="read no greybox.toml"
-    )
+    for names, told in (
+        (("-q", "--quiet"),
+         "show no results and no progress, errors only; files are written as always"),
+        (("--no-config",), "read no greybox.toml"),
+    ):  # fmt: skip
+        group.add_argument(*names, action="store_true", default=default, help=told)
 
 
 def build_parser(only: str | None = None) -> argparse.ArgumentParser:
@@ -69,8 +73,9 @@ def build_parser(only: str | None = None) -> argparse.ArgumentParser:
         help="show the version",
     )  # fmt: skip
     _add_shell(parser, after=False)
+    # without `prog` the usage would be rendered to find it, which loads what renders
     commands = parser.add_subparsers(
-        dest="command", metavar="COMMAND", required=True, title="commands"
+        dest="command", metavar="COMMAND", required=True, title="commands", prog="greybox"
     )
     found = {e.name: e.value for e in entry_points(group=GROUP)}
     known = [*(n for n in ORDER if n in found), *sorted(found.keys() - set(ORDER))]
@@ -101,7 +106,7 @@ def _parse(given: list[str]) -> argparse.Namespace:
     UsageError
         The folder that the command is run in does not exist.
     """
-    command = next((a for a in given if not a.startswith("-")), None)
+    command = next((a for a in given if not a.startswith("-")), "")
     if command == "help":
         at = given.index(command)
         given = [*given[at + 1 : at + 2], "--help"]
@@ -110,20 +115,23 @@ def _parse(given: list[str]) -> argparse.Namespace:
     if not given:
         parser.print_help(sys.stderr)
         parser.exit(2)
-    known = sub_parsers(parser)
+    own = sub_parsers(parser).get(command)
+    if own is None or {"-h", "--help", "--version"} & set(given):
+        return parser.parse_args(given)
+    at = given.index(command)
+    require_known(parser, given[:at])
+    require_known(own, given[at:])
     # options may be abbreviated
     unread = any(g.startswith("--no-c") and "--no-config".startswith(g) for g in given)
-    if command not in known or unread or {"-h", "--help", "--version"} & set(given):
-        return parser.parse_args(given)
-    from greybox.commands.configuration import find_configuration, read_configuration
-    from greybox.commands.defaults import Defaults
-
-    path = find_configuration(_folder(), os.environ)
-    if path is None:
-        return parser.parse_args(given)
-    names = tuple(n for n in known if n != "help")
-    defaults = Defaults(read_configuration(path), command, known[command], names, build_parser)
-    return defaults.fill(parser.parse_args(given))
+    path = None if unread else find_configuration(_folder(), os.environ)
+    options, left = (
+        parser.parse_known_args(given)
+        if path is None
+        else parse_configured(read_configuration(path), command, given, parser, build_parser)
+    )
+    if left:
+        own.error(UNKNOWN + " ".join(left))
+    return options
 
 
 def _folder() -> Path:
@@ -151,7 +159,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         0 done, 1 the input is at fault, 2 wrong usage (by SystemExit).
     """
     if "_ARGCOMPLETE" in os.environ:
-        from greybox.commands.completers import offer
+        from greybox.commands.completion import offer
 
         offer(build_parser())
     name = "greybox"

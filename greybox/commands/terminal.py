@@ -9,10 +9,14 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import TextIO
+from datetime import timedelta
+from typing import TYPE_CHECKING, TextIO
 
-# back to the first column, and the line erased
-CLEAR = "\r\x1b[K"
+from greybox.numerics.effort import seconds_left
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
 LOGGERS = ("greybox", "experiment_design")
 _QUIET: ContextVar[bool] = ContextVar("quiet", default=False)
 _RED, _GREEN, _YELLOW = "31", "32", "33"
@@ -22,6 +26,8 @@ _VERDICT = re.compile(
 )
 _TONES = {"trust": _GREEN, "good": _GREEN, "none": _GREEN, "do not trust": _RED, "poor": _RED,
           "unexplained": _RED}  # fmt: skip
+# the bar that is on the screen: one at most
+_shown: list[Progress] = []
 
 
 def coloured(stream: TextIO) -> bool:
@@ -33,17 +39,14 @@ def _paint(text: str, colour: str) -> str:
     return f"\x1b[1;{colour}m{text}\x1b[0m"
 
 
-def clear() -> None:
-    """Erase progress that was broken off."""
-    if sys.stderr.isatty():
-        sys.stderr.write(CLEAR)
-        sys.stderr.flush()
+def _printable(text: str) -> str:
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
 def complain(text: str) -> None:
     """Tell the user in one line what stopped a command, whatever names a damaged file holds."""
     clear()
-    text = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+    text = _printable(text)
     if coloured(sys.stderr):
         who, sign, what = text.partition(": ")
         text = _paint(who + sign.rstrip(), _RED) + " " * bool(sign) + what
@@ -62,52 +65,78 @@ def say(text: str) -> None:
     sys.stdout.write(text + "\n")
 
 
-def shows_progress() -> bool:
-    """Whether progress is to be shown: on a terminal, unless quiet was asked for."""
-    return sys.stderr.isatty() and not _QUIET.get()
+def clear() -> None:
+    """Take the bar off the screen."""
+    while _shown:
+        _shown.pop().stop()
+
+
+def _bar(counted: bool) -> Progress:
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        SpinnerColumn,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+    from rich.table import Column
+
+    one_line = Column(no_wrap=True, overflow="ellipsis")
+    text = TextColumn("{task.description}", markup=False, table_column=one_line)
+    time = (BarColumn(), TimeRemainingColumn(), "left") if counted else (TimeElapsedColumn(),)
+    # steps may take minutes, so the time left is told by all of them
+    return Progress(
+        SpinnerColumn(), text, *time, console=Console(stderr=True), transient=True,
+        speed_estimate_period=float("inf"), redirect_stdout=False, redirect_stderr=False,
+    )  # fmt: skip
+
+
+def _show(text: str, done: int = 0, total: int | None = None) -> None:
+    """Show what is being done: of some steps how many, with the time that is left."""
+    if _QUIET.get() or not sys.stderr.isatty() or os.environ.get("TERM") == "dumb":
+        return
+    counting = bool(_shown) and _shown[0].tasks[0].total is not None
+    if total is None and counting:
+        return
+    if total is not None and (done >= total or not counting):
+        clear()
+    if total is None or done < total:
+        text = _printable(text)
+        if not _shown:
+            _shown.append(_bar(total is not None))
+            _shown[0].add_task(text, total=total, completed=done)
+            _shown[0].start()
+        _shown[0].update(
+            _shown[0].task_ids[0], description=text, completed=done, total=total, refresh=True
+        )
 
 
 def progress(title: str) -> Callable[[int, int], None]:
     """Return a callback that shows progress on a terminal and is silent elsewhere."""
-    if not shows_progress():
-        return lambda done, total: None
-
-    def show(done: int, total: int) -> None:
-        text = "" if done >= total else f"{title}: {done} of {total}"
-        sys.stderr.write(CLEAR + text)
-        sys.stderr.flush()
-
-    return show
-
-
-def activity() -> Callable[[str], None]:
-    """Return a callback that shows what is being done on a terminal and is silent elsewhere."""
-    if not shows_progress():
-        return lambda text: None
-
-    def show(text: str) -> None:
-        sys.stderr.write(f"{CLEAR}{text} …")
-        sys.stderr.flush()
-
-    return show
+    return lambda done, total: _show(f"{title}: {done} of {total}", done, total)
 
 
 class _Teller(logging.Handler):
-    """Writes records to standard error, on a line of their own."""
+    """Writes records to standard error as lines, or shows the last one while it holds."""
+
+    def __init__(self, lines: bool) -> None:
+        super().__init__()
+        self._lines = lines
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Write one record."""
-        clear()
-        sys.stderr.write(self.format(record) + "\n")
-
-
-class _Elapsed(logging.Formatter):
-    """Seconds since the program began, then the message; its logger where all is told."""
-
-    def format(self, record: logging.LogRecord) -> str:
-        """Return the line of a record."""
-        name = f"{record.name}: " if record.levelno < logging.INFO else ""
-        return f"[{record.relativeCreated / 1000:7.2f} s] {name}{record.getMessage()}"
+        """Write or show one record; its logger where all is told."""
+        text = record.getMessage()
+        if self._lines:
+            clear()
+            name = f"{record.name}: " if record.levelno < logging.INFO else ""
+            # seconds since the program began
+            sys.stderr.write(f"[{record.relativeCreated / 1000:7.2f} s] {name}{text}\n")
+            return
+        left = seconds_left()
+        limit = "" if left == float("inf") else f" (at most {timedelta(seconds=int(left))} left)"
+        _show(text + limit)
 
 
 @contextmanager
@@ -117,21 +146,23 @@ def telling(verbose: int, quiet: bool) -> Iterator[None]:
     Parameters
     ----------
     verbose : int
-        0 tells nothing.
+        0 shows on a terminal what is being done, and leaves no line of it.
     quiet : bool
         Results and progress are not shown either.
     """
     token = _QUIET.set(quiet)
-    loggers = [logging.getLogger(name) for name in LOGGERS] if verbose else []
+    loggers = [logging.getLogger(name) for name in LOGGERS]
+    if not (verbose or sys.stderr.isatty()):
+        loggers = []
     levels = [logger.level for logger in loggers]
-    teller = _Teller()
-    teller.setFormatter(_Elapsed())
+    teller = _Teller(lines=verbose > 0)
     for logger in loggers:
         logger.addHandler(teller)
-        logger.setLevel(logging.INFO if verbose == 1 else logging.DEBUG)
+        logger.setLevel(logging.DEBUG if verbose > 1 else logging.INFO)
     try:
         yield
     finally:
+        clear()
         for logger, level in zip(loggers, levels, strict=True):
             logger.removeHandler(teller)
             logger.setLevel(level)

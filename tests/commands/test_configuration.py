@@ -155,9 +155,9 @@ def test_where_the_file_is_looked_for(tmp_path):
         ("[all]\nvessel = 3", "cannot read the vessel file '3'"),
         ("[all]\nvessel = true", "[all], vessel is True, a word or a number is needed"),
         ("[all]\nvessel = {a = 1}", "[all], vessel is {'a': 1}, a word or a number is needed"),
-        ("[estimate]\nmethod = 'ivv'", "must be one of ls, iv, oe. Did you mean 'iv'?"),
-        ("[estimate]\nmass = -3", "[estimate], mass is '-3', which is no positive number"),
-        ("[estimate]\nseed = 1.5", "seed is '1.5', which is no whole number of at least 0"),
+        ("[estimate]\nmethod = 'ivv'", "'ivv' is not known. Did you mean 'iv'? Known: ls, iv, oe."),
+        ("[estimate]\nmass = -3", "[estimate], mass: '-3' is no positive number."),
+        ("[estimate]\nseed = 1.5", "seed: '1.5' is no whole number of at least 0."),
         ("[estimate]\nreduce = 'yes'", "reduce is 'yes': write true or false"),
         ("[estimate]\nbound = []", "bound is an empty list"),
         ("[estimate]\nreduce = true\ncompare-structures = ['a']", "exclude one another"),
@@ -197,20 +197,20 @@ def test_the_record_of_an_output_tells_the_file(folder, capsys):
 
 
 def test_every_option_of_every_command_can_stand_in_a_file():
-    from greybox.commands.defaults import _configurable
+    from greybox.commands.configuration import configurable
     from greybox.commands.parser import sub_parsers
 
     for name, parser in sub_parsers(build_parser()).items():
         if name not in ("help", "completion"):
-            assert _configurable(parser), name
+            assert configurable(parser), name
 
 
 def test_a_letter_that_stands_for_a_number_is_no_file():
     import argparse
 
-    from greybox.commands.argument_types import Kind, is_path, kind_of
     from greybox.commands.common import positive
+    from greybox.commands.parser import endings
 
     parser = argparse.ArgumentParser()
-    assert kind_of(parser.add_argument("--vessel", metavar="V")) is Kind.VESSEL
-    assert not is_path(parser.add_argument("--speed", metavar="V", type=positive))
+    assert endings(parser.add_argument("--vessel", metavar="V")) == ("toml",)
+    assert endings(parser.add_argument("--speed", metavar="V", type=positive)) is None

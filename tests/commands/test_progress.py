@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pty
+import re
 import subprocess
 import sys
 
@@ -31,11 +32,18 @@ def on_a_terminal(*arguments: str, **environment: str) -> tuple[int, str]:
 
 
 def on_the_screen(shown: str) -> str:
-    """Return the line that a terminal is left with."""
-    line = ""
-    for part in shown.replace("\r\n", "\n").split("\r"):
-        line = part.removeprefix("\x1b[K") if part.startswith("\x1b[K") else part or line
-    return line
+    """Return the lines that a terminal is left with, control sequences carried out."""
+    lines = [""]
+    for part in re.findall(r"\x1b\[[?0-9;]*[A-Za-z]|[\r\n]|[^\x1b\r\n]+", shown):
+        if part == "\n":
+            lines.append("")
+        elif part.endswith("K"):
+            lines[-1] = ""
+        elif part.endswith("A") and part.startswith("\x1b"):
+            lines = lines[: len(lines) - int(part[2:-1] or 1)]
+        elif not part.startswith("\x1b") and part != "\r":
+            lines[-1] = part
+    return "\n".join(lines)
 
 
 def test_progress_shows_and_clears():

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from virtual import virtual_log, write_csv
 
-from greybox.commands import completers
+from greybox.commands import completion
 from greybox.commands.main import build_parser, main
 from greybox.commands.parser import sub_parsers
 from greybox.vessel.toml import EXAMPLES, example_vessel
@@ -224,14 +224,13 @@ def test_the_script_says_how_to_install_it(shell, capsys):
 
 
 def test_names_that_completion_has_by_heart_are_true():
-    from greybox.commands import argument_types
     from greybox.diagnosis.causes import _OWN
     from greybox.model.catalogue import get_structure, structure_names
 
-    assert structure_names() == completers.STRUCTURES
-    assert tuple(c.id for c in _OWN) == completers.CAUSES
-    assert get_structure("thesis").parameters == completers.PARAMETERS
-    assert argument_types.EXAMPLE_VESSELS == EXAMPLES
+    assert structure_names() == completion.STRUCTURES
+    assert tuple(c.id for c in _OWN) == completion.CAUSES
+    assert get_structure("thesis").parameters == completion.PARAMETERS
+    assert completion.VESSELS == EXAMPLES
 
 
 # quiet, verbose, colours
