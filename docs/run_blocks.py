@@ -21,7 +21,7 @@ from pathlib import Path
 
 SOURCES = Path(__file__).resolve().parents[1]
 BLOCK = re.compile(r"^```console\n(.*?)^```", re.M | re.S)
-_NUMBER = re.compile(r"[-+−]?\b\d+(?:[.,]\d+)*(?:e[-+]?\d+)?")  # noqa: RUF001
+_NUMBER = re.compile(r"[-+−]?\b\d+(?:[.,]\d+)*(?:e[-+]?\d+)?")
 _OUTER = "…"
 SECONDS = 900
 
@@ -108,7 +108,7 @@ def shown(step: Step, output: str) -> list[str]:
                 f"'{step.command}' no longer prints a line that begins with '{line}' there. "
                 f"It prints:\n{output}"
             )
-        found += _left_out(lines[last + 1 : at]) + [lines[at]]
+        found += [*_left_out(lines[last + 1 : at]), lines[at]]
         last = at
     return found + _left_out(lines[last + 1 :]) if found else []
 

@@ -1,4 +1,4 @@
-"""Directives ``session`` and ``made``: commands that run while the manual is built, and their files.
+"""Directives ``session`` and ``made``: commands run by the build, and their files.
 
 The commands of a page run in one folder, in the order of the page, and what they print stands in
 the page: a command that fails fails the build. Output is kept beside the doctrees until a command
@@ -28,7 +28,7 @@ from sphinx.util import logging
 from sphinx.util.docutils import SphinxDirective
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from run_blocks import SOURCES, Step, read_block, run, shown  # noqa: E402
+from run_blocks import SOURCES, Step, read_block, run, shown
 
 _BLOCK = re.compile(r"^```\{session\}\n(.*?)^```", re.M | re.S)
 _SCREEN = (1280, 800)
