@@ -11,7 +11,14 @@ author = "The greybox-marine authors"
 copyright = author
 version = release = installed("greybox-marine")
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "numpydoc", "option_tables", "public_names"]
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "numpydoc",
+    "option_tables",
+    "public_names",
+    "sessions",
+]
 exclude_patterns = ["_build", "_ext"]
 # single backticks in docstrings are names of code
 default_role = "code"

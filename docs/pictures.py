@@ -1,6 +1,7 @@
 """Draws the pictures of the manual from virtual logs: python docs/pictures.py [FOLDER].
 
-FOLDER holds the files of the tutorial; without it only the catalogues are drawn.
+FOLDER holds the files of the tutorial, whose pictures are drawn there; without it the catalogues
+are drawn.
 
 The files in docs/images/causes and docs/images/checks are made by this script and kept
 beside the text. A cause is shown on a log of a virtual ship that has it, beside the free
@@ -18,7 +19,6 @@ from PIL import Image
 
 import greybox as gb
 from greybox.report.checks import finding_figure
-from greybox.report.diagnosis_figures import ranking_figure
 from greybox.report.figures import new_figure, save_png, tidy
 from greybox.study.blind import draw
 from greybox.study.chapter6 import TRUE
@@ -277,16 +277,6 @@ def runs_figure(folder, names):
     return figure
 
 
-def search_figure(folder):
-    """Draw how the causes did at the first step of the search."""
-    ship = gb.load_vessel("thesis")
-    found = gb.diagnose(
-        [gb.read_log(folder / "trial.csv", ship)],
-        validate=[gb.read_log(folder / "other.csv", ship)],
-    )
-    return ranking_figure(found.steps[0], [c.key for c in found.causes])
-
-
 def save(figure, path):
     """Write a PNG of 64 colours."""
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -298,10 +288,9 @@ def save(figure, path):
 if __name__ == "__main__":
     if len(sys.argv) > 1:
         files = Path(sys.argv[1])
-        save(plan_figure(files), FOLDER / "tutorial" / "plan.png")
-        save(runs_figure(files, ["model"]), FOLDER / "tutorial" / "model.png")
-        save(runs_figure(files, ["model", "better"]), FOLDER / "tutorial" / "better.png")
-        save(search_figure(files), FOLDER / "tutorial" / "search.png")
+        save(plan_figure(files), files / "plan.png")
+        save(runs_figure(files, ["model"]), files / "model.png")
+        save(runs_figure(files, ["model", "better"]), files / "better.png")
         sys.exit()
     for name in CAUSES:
         save(cause_figure(name), FOLDER / "causes" / f"{name}.png")
