@@ -20,6 +20,8 @@ Array = NDArray[np.float64]
 
 # slowest thruster and longest delay that are looked for, as shares of a log and in seconds
 _SHARE, _LONGEST = 0.1, 120.0
+# standard deviation of what lies anywhere within half a sample, in samples
+_HALF = 0.5 / 3**0.5
 # strongest thrusters beside the others'; shares of the fastest logged movement from which a
 # limit of the rate is sought, and the least
 _STRONGEST = 10.0
@@ -50,6 +52,13 @@ def _together(context: Context, words: Sequence[str]) -> tuple[str, ...]:
     """Return the words for what may be late together; a single angle has its column's name."""
     several = len(context.vessel.angle_commands) > 1
     return tuple(w for w in words if w != "angle" or several)
+
+
+def _may_be_measured(context: Context) -> bool:
+    """Whether columns that the model holds from sample to sample may be measured between them."""
+    vessel = context.vessel
+    held = vessel.actuation.between == Actuation().between
+    return held and any(t.drive != "command" for t in vessel.thrusters)
 
 
 def _late(hypothesis: Hypothesis) -> str:
@@ -198,8 +207,13 @@ class InputDelay(Cause):
         """Return a delay of all commands, the speeds, the angles, or one of them."""
         longest = min(_LONGEST, _SHARE * context.duration)
         first = 1.5 * context.sample_time
-        parameter = Parameter("delay", "s", first, 0.0, longest, step=0.1 * context.sample_time,
-                              least=UNRESOLVED * context.sample_time)  # fmt: skip
+        # held or moving on between samples, the same commands act half a sample apart, and where
+        # they may be measured nothing tells which: that half, evenly spread
+        coarse = _HALF * context.sample_time if _may_be_measured(context) else 0.0
+        parameter = Parameter(
+            "delay", "s", first, 0.0, longest, step=0.1 * context.sample_time,
+            least=UNRESOLVED * context.sample_time, coarse=coarse,
+        )  # fmt: skip
 
         words: tuple[str, ...] = get_args(DelayOn)
 
@@ -296,9 +310,7 @@ class FeedbackSampling(Cause):
 
     def hypotheses(self, context: Context) -> Sequence[Hypothesis]:
         """Return the one way, where columns may be measured and are taken to be held."""
-        vessel = context.vessel
-        held = vessel.actuation.between == Actuation().between
-        if not held or all(t.drive == "command" for t in vessel.thrusters):
+        if not _may_be_measured(context):
             return ()
 
         def apply(ship: Ship, value: Array) -> Ship:
