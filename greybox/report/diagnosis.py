@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from greybox.diagnosis.result import Diagnosis, Runs
@@ -19,7 +20,13 @@ from greybox.report.diagnosis_figures import (
     run_figure,
     speed_figure,
 )
-from greybox.report.error_budget import budget_figure, budget_table, largest, negative
+from greybox.report.error_budget import (
+    budget_figure,
+    budget_table,
+    largest,
+    negative,
+    noise_sentence,
+)
 from greybox.report.free_run_errors import REGIMES, Errors, gather, simulations
 from greybox.report.model_difference import (
     coefficient_table,
@@ -44,13 +51,15 @@ def diagnosis_page(diagnosis: Diagnosis, record: Mapping[str, Any]) -> Page:
     record : mapping
         How it was computed: versions, command, hashes of the logs, seed.
     """
+    wrong, gain = _wrong(diagnosis), _gain(diagnosis)
+    # whose the error is says most; without it, what was gained; without that, the run itself
+    lead = next(iter([*_budget(diagnosis), *gain.pictures, *wrong.pictures[:1]]), None)
     sections = [
-        _wrong(diagnosis),
+        replace(wrong, pictures=[p for p in wrong.pictures if p is not lead]),
         cause_section(diagnosis),
         _equations(diagnosis),
-        _gain(diagnosis),
+        replace(gain, pictures=[p for p in gain.pictures if p is not lead]),
         _remains(diagnosis),
-        Section("6. What to do next", points=diagnosis.next_steps),
     ]
     if diagnosis.notes:
         sections.append(Section("Notes", points=diagnosis.notes))
@@ -60,6 +69,8 @@ def diagnosis_page(diagnosis: Diagnosis, record: Mapping[str, Any]) -> Page:
         headline=headline[:1].upper() + headline[1:],
         sentences=_summary(diagnosis),
         sections=sections,
+        lead=lead,
+        next_steps=[f"{step[:1].upper()}{step[1:].rstrip('.')}." for step in diagnosis.next_steps],
         computed=computed(dict(diagnosis.record) | dict(record))
         | {
             "causes scored": str(diagnosis.tried),
@@ -80,6 +91,8 @@ def _summary(diagnosis: Diagnosis) -> list[str]:
             for s, g in diagnosis.gain.items()
         )
         told.append(f"The fit of the free run (100 % is perfect) goes: {gains}.")
+    if diagnosis.budget:
+        told.append(noise_sentence(diagnosis.budget, diagnosis.gain))
     return told
 
 
@@ -136,7 +149,7 @@ def _wrong(diagnosis: Diagnosis) -> Section:
     return Section(
         "1. What the simulation gets wrong",
         sentences,
-        [*pictures, *_budget(diagnosis)],
+        pictures,
         [*_tests(diagnosis, "before"), *([budget_table(b)] if (b := diagnosis.budget) else [])],
         points=[s.sentence for s in diagnosis.wrong],
     )

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from greybox.diagnosis.budget import MOTION, REST, SENSOR, SLOW, WAVES
-from greybox.diagnosis.result import BudgetPart
+from greybox.diagnosis.result import BudgetPart, Gain
 from greybox.report.figures import (
     BLUE,
     GREEN,
@@ -93,6 +93,34 @@ def largest(budget: Sequence[BudgetPart]) -> str:
         name = LABELS.get(state, state).split(" [")[0]
         told.append(f"{name}: {part.part} {100 * part.share[state]:.0f} %")
     return "; ".join(told)
+
+
+def noise_sentence(budget: Sequence[BudgetPart], gain: Mapping[str, Gain]) -> str:
+    """Return how much of the error that is left is noise, and the fit that noise alone allows.
+
+    Parameters
+    ----------
+    budget : sequence of BudgetPart
+    gain : mapping of str to Gain
+        Fit (6.12) of the free run [%], by state.
+    """
+    (sensor,) = (p for p in budget if p.part == SENSOR)
+    told, bounds = [], []
+    for state, noise in sensor.after.items():
+        share = min(max(noise / max(sum(p.after[state] for p in budget), 1e-300), 0.0), 1.0)
+        name = LABELS.get(state, state).split(" ")[0] if state != "r" else "yaw rate"
+        told.append(f"{name} {100 * share:.0f} %")
+        if state in gain:
+            bounds.append(f"{name} {100 - (100 - gain[state].after) * share**0.5:.0f} %")
+    said = (
+        f"Of the squared error that is left, this much is noise of the sensors: {', '.join(told)}"
+    )
+    if bounds:
+        said += (
+            f". Measured with that noise, a perfect model would have a fit of about "
+            f"{', '.join(bounds)}"
+        )
+    return f"{said}."
 
 
 def negative(budget: Sequence[BudgetPart]) -> bool:

@@ -70,7 +70,22 @@ class Section:
 
 @dataclass(frozen=True)
 class Page:
-    """What a page shows, in its order."""
+    """What a page shows, in its order.
+
+    Parameters
+    ----------
+    title : str
+    headline : str
+        The verdict: whether what was made can be used.
+    lead : Picture, optional
+        What shows the verdict; with it and what to do next it fills the first screen.
+    next_steps : sequence of str
+        What to do next, the first first.
+    sentences, pictures, tables, texts, sections
+        What follows on the first screen.
+    computed : dict
+        How it was computed.
+    """
 
     title: str
     headline: str
@@ -80,19 +95,12 @@ class Page:
     texts: Sequence[tuple[str, str]] = ()
     computed: dict[str, Any] = field(default_factory=dict)
     sections: Sequence[Section] = ()
+    lead: Picture | None = None
+    next_steps: Sequence[str] = ()
 
 
 _NONE = "'none'"
-_TEMPLATE = """{% macro parts(of, level) %}
-{% if of.command %}<pre class="marked">{{ of.command }}</pre>
-{% endif %}
-{% for sentence in of.sentences %}<p>{{ sentence }}</p>
-{% endfor %}
-{% if of.points %}<ul>{% for point in of.points %}<li>{{ point }}</li>
-{% endfor %}</ul>
-{% endif %}
-{% if of.pictures %}<div class="pictures">
-{% for picture in of.pictures %}{% set chart = chart_of(picture) %}
+_TEMPLATE = """{% macro drawn(picture) %}{% set chart = chart_of(picture) %}
 <figure role="group" class="{{ 'narrow ' if picture.narrow }}{{ 'zoomable' if chart }}"
  aria-label="{{ picture.alternative or picture.caption }}">
 {{ picture.svg | safe }}
@@ -104,13 +112,25 @@ _TEMPLATE = """{% macro parts(of, level) %}
 <script type="application/json">{{ chart[1] | safe }}</script>
 {% endif %}
 <figcaption>{{ picture.caption }}</figcaption></figure>
-{% endfor %}
+{% endmacro %}
+{% macro figures(of) %}
+{% if of.pictures %}<div class="pictures">
+{% for picture in of.pictures %}{{ drawn(picture) }}{% endfor %}
 </div>
+{% endif %}
+{% endmacro %}
+{% macro words(of, level) %}
+{% for sentence in of.sentences %}<p>{{ sentence }}</p>
+{% endfor %}
+{% if of.points %}<ul>{% for point in of.points %}<li>{{ point }}</li>
+{% endfor %}</ul>
 {% endif %}
 {% for part in of.marked %}<{{ level }}>{{ part.title }}</{{ level }}><pre class="marked">
 {%- for text, mark in part.pieces %}{% if mark %}<{{ mark }}>{{ text }}</{{ mark }}>
 {%- else %}{{ text }}{% endif %}{% endfor %}</pre>
 {% endfor %}
+{% endmacro %}
+{% macro numbers(of) %}
 {% for table in of.tables %}<div class="wide"><table
 {%- if table.sentences %} class="sentences"{% endif %}><caption>{{ table.caption }}</caption>
 <thead><tr>{% for cell in table.header %}<th scope="col">{{ cell }}</th>{% endfor %}</tr></thead>
@@ -119,6 +139,8 @@ _TEMPLATE = """{% macro parts(of, level) %}
 {{- table.header[loop.index0] }}"{% endif %}>{{ cell }}</td>{% endfor %}</tr>
 {% endfor %}</tbody></table></div>
 {% endfor %}
+{% endmacro %}
+{% macro texts(of, level) %}
 {% for heading, text in of.texts %}<{{ level }}>{{ heading }}</{{ level }}><pre>{{ text }}</pre>
 {% endfor %}
 {% endmacro %}
@@ -138,6 +160,14 @@ section { border-top: 2px solid #ddd; margin-top: 2rem; }
 h3 { font-size: 1rem; margin: 1.2rem 0 0.3rem; }
 h2 { font-size: 1.15rem; margin: 1.6rem 0 0.4rem; }
 .headline { font-size: 1.15rem; border-left: 4px solid #0072B2; padding-left: 0.8rem; }
+.next h2 { margin: 0.8rem 0 0.2rem; } .next ul { margin: 0; padding-left: 1.2rem; }
+.next li { overflow-wrap: anywhere; }
+.lead figure { margin: 0.6rem 0 0; }
+@media screen and (min-width: 900px) {
+  .first.led { display: grid; grid-template: auto 1fr / minmax(0, 2fr) minmax(0, 3fr);
+               gap: 0 2rem; }
+  .led .lead { grid-area: 1 / 2 / 3 / 3; } .led .headline { margin-top: 0; }
+  .lead figure { margin: 0; } .lead figure > svg { max-height: 34rem; } }
 .pictures { display: grid; gap: 0 1.5rem; align-items: start;
             grid-template-columns: repeat(auto-fill, minmax(min(100%, 26rem), 1fr)); }
 figure { margin: 1rem 0; min-width: 0; grid-column: 1 / -1; }
@@ -186,11 +216,21 @@ del { background: #f9ddcc; }
 </head>
 <body>
 <h1>{{ page.title }}</h1>
+<div class="first{{ ' led' if page.lead }}">
 <p class="headline">{{ page.headline }}</p>
-{{ parts(page, "h2") }}
+{% if page.next_steps %}<div class="next"><h2>What to do next</h2>
+<ul>{% for step in page.next_steps %}<li>{{ step }}</li>
+{% endfor %}</ul></div>
+{% endif %}
+{% if page.lead %}<div class="lead">{{ drawn(page.lead) }}</div>
+{% endif %}
+</div>
+{{ figures(page) }}{{ numbers(page) }}{{ words(page, "h2") }}{{ texts(page, "h2") }}
 {% for section in page.sections %}<section>
 <h2>{{ section.title }}</h2>
-{{ parts(section, "h3") }}
+{% if section.command %}<pre class="marked">{{ section.command }}</pre>
+{% endif %}
+{{ figures(section) }}{{ words(section, "h3") }}{{ numbers(section) }}{{ texts(section, "h3") }}
 </section>
 {% endfor %}
 <h2>How this was computed</h2>
@@ -212,7 +252,11 @@ def render(page: Page) -> str:
     """
     charts: dict[int, tuple[str, str]] = {}
     scripts: list[str] = []
-    shown = [*page.pictures, *(p for section in page.sections for p in section.pictures)]
+    shown = [
+        *([page.lead] if page.lead else []),
+        *page.pictures,
+        *(p for section in page.sections for p in section.pictures),
+    ]
     zoomable = [p for p in shown if p.chart]
     if zoomable:
         from greybox.report.interactive import chart_json, library, opener
