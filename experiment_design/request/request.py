@@ -118,6 +118,8 @@ class DesignRequest:
         Of the prior model.
     untried : bool
         Whether the prior model comes from main dimensions, no trial behind it.
+    before : ndarray, optional
+        (nc,) commands that a lead-in ends with, from which the trial goes on.
     """
 
     vessel: Vessel
@@ -149,6 +151,7 @@ class DesignRequest:
     effort: float = 1.0
     integrator: Integrator = "euler"
     untried: bool = False
+    before: Array | None = None
 
     @property
     def trials(self) -> int:
@@ -158,7 +161,8 @@ class DesignRequest:
     @property
     def schedule(self) -> Schedule:
         """When and how far commands change."""
-        return make_schedule(self.vessel, self.duration, self.hold, self.sample_time)
+        found = make_schedule(self.vessel, self.duration, self.hold, self.sample_time)
+        return found if self.before is None else replace(found, before=self.before)
 
     def build_predictor(self) -> Predictor:
         """Return the predictor over the signs that the trials together take.
