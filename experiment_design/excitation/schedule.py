@@ -37,6 +37,8 @@ class Schedule:
         Samples over which each command moves to a new level; 1 is a step.
     reach : ndarray
         (nc,) largest step between neighbouring levels, inf where any is allowed.
+    before : ndarray, optional
+        (nc,) commands that a lead-in ends with; without one the trial begins at its first level.
     """
 
     commands: tuple[str, ...]
@@ -47,6 +49,7 @@ class Schedule:
     upper: Array
     ramp: tuple[int, ...]
     reach: Array
+    before: Array | None = None
 
     @property
     def holds(self) -> int:
@@ -63,7 +66,10 @@ class Schedule:
         out = np.repeat(levels, self.hold, axis=-2)[..., : self.samples, :]
         if max(self.ramp) == 1:
             return out
-        before = np.concatenate([levels[..., :1, :], levels[..., :-1, :]], axis=-2)
+        first = levels[..., :1, :]
+        if self.before is not None:
+            first = np.broadcast_to(self.before, first.shape)
+        before = np.concatenate([first, levels[..., :-1, :]], axis=-2)
         held = np.repeat(before, self.hold, axis=-2)[..., : self.samples, :]
         share = self._share()
         return np.asarray(held + share * (out - held))
@@ -77,7 +83,8 @@ class Schedule:
         out = np.add.reduceat(gradient * share, starts, axis=0)
         before = np.add.reduceat(gradient * (1 - share), starts, axis=0)
         out[:-1] += before[1:]
-        out[0] += before[0]
+        if self.before is None:
+            out[0] += before[0]
         return np.asarray(out)
 
     def _share(self) -> Array:
@@ -88,6 +95,10 @@ class Schedule:
         """Return levels (..., K, nc) clipped to the limits and to the rates, first to last."""
         out = np.clip(levels, self.lower, self.upper)
         if self.limited:
+            if self.before is not None:
+                out[..., 0, :] = np.clip(
+                    out[..., 0, :], self.before - self.reach, self.before + self.reach
+                )
             for k in range(1, out.shape[-2]):
                 before = out[..., k - 1, :]
                 out[..., k, :] = np.clip(out[..., k, :], before - self.reach, before + self.reach)

@@ -184,6 +184,8 @@ class PreparedRequest(TrialOptions):
         Of the prior model.
     untried : bool
         Whether the prior model comes from main dimensions, no trial behind it.
+    before : ndarray, optional
+        (nc,) commands that a lead-in ends with, from which the trial goes on.
     notes : tuple of str
         A sentence for each choice that was made for the user.
     of_regime : tuple of str
@@ -209,6 +211,7 @@ class PreparedRequest(TrialOptions):
     contrasts: tuple[tuple[CandidateModel, CandidateModel], ...] = ()
     integrator: Integrator = "euler"
     untried: bool = False
+    before: Array | None = None
     notes: tuple[str, ...] = ()
     of_regime: tuple[str, ...] = ()
 
@@ -225,7 +228,8 @@ class PreparedRequest(TrialOptions):
     @property
     def schedule(self) -> Schedule:
         """When and how far commands change."""
-        return make_schedule(self.vessel, self.duration, self.hold, self.sample_time)
+        found = make_schedule(self.vessel, self.duration, self.hold, self.sample_time)
+        return found if self.before is None else replace(found, before=self.before)
 
     def build_predictor(self) -> Predictor:
         """Return the predictor over the signs that the trials together take.

@@ -1,0 +1,319 @@
+"""The lead-in of a trial: commands that bring the ship from where she is into the regime.
+
+Margins are no limits on the way; sea room and caps are. Levels are drawn, and the best of them
+descend along the exact gradient of what the limits are missed by (single shooting).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from experiment_design.constraints.limit_program import LimitProgram
+from experiment_design.constraints.limits import TOLERANCE, LimitKind, LimitName, TrialLimits
+from experiment_design.excitation.rollout import Motion, Rollout
+from experiment_design.excitation.schedule import Schedule
+from experiment_design.request.request import PreparedRequest, build_problem
+from greybox.errors import InfeasibleError
+
+Array = NDArray[np.float64]
+
+# longest lead-in [s]: a ship of 30 m has forgotten her start by then, and one of 300 m has begun
+# to move; a crew that needs longer steadies her better by hand. In a refusal it is told as time
+# constants of the ship at hand
+LONGEST = 120.0
+# of each margin: what the end of a lead-in aims at, as a steady start does, and what it must reach;
+# a start on the margin itself could be left to one side only. Least margin that these are of [m/s]
+_AIM, _ENOUGH, _LEAST = 1.2, 1.05, 0.05
+# sequences drawn, those that descend, and iterations of each
+_DRAWN, _DESCENTS, _ITERATIONS = 128, 6, 60
+# scaled units by which a descent stays inside a limit
+_INSIDE = 0.01
+# holds over which the last commands are kept on, to see whether the ship stays in the regime
+_KEPT_ON = 3
+# what a limit is relaxed by, in what it is missed by, until a lead-in is found; shares of a margin
+# that are tried
+_RELAXED, _SHARES = (1.1, 1.5, 2.0, 3.0, 5.0), (0.95, 0.9, 0.8, 0.65, 0.4, 0.2)
+
+
+@dataclass(frozen=True)
+class LeadIn:
+    """Commands before a trial.
+
+    Parameters
+    ----------
+    levels : ndarray
+        (K, nc), one row a hold.
+    seconds : float
+        Its length [s].
+    end : ndarray
+        (nx + 1,) states [m/s, rad/s] and heading [rad] at its end.
+    place : (float, float)
+        North and east there [m].
+    """
+
+    levels: Array
+    seconds: float
+    end: Array
+    place: tuple[float, float]
+
+    def after(self, request: PreparedRequest) -> PreparedRequest:
+        """Return the request of the trial that begins where the lead-in ends."""
+        return replace(
+            request,
+            starts=(self.end,),
+            limits=replace(request.limits, position=self.place),
+            before=self.levels[-1],
+        )
+
+
+def short_of_margin(request: PreparedRequest, trial: int = 0) -> bool:
+    """Whether a trial's start misses margins and nothing else."""
+    program = build_problem(replace(request, backoff=()), trial).scenarios[0].limits
+    start = np.zeros(program.nx + 3)
+    start[: program.nx + 1] = request.starts[trial]
+    missed = program.path_values(start[None])[:, 0] > TOLERANCE
+    margins = np.array([n.kind is LimitKind.MARGIN for n in program.path_names], bool)
+    return bool((missed & margins).any() and not (missed & ~margins).any())
+
+
+def find_lead_in(request: PreparedRequest) -> LeadIn | None:
+    """Return the shortest lead-in into the regime, None where the start keeps its margins.
+
+    Parameters
+    ----------
+    request : PreparedRequest
+        Several trials begin as they are asked to.
+
+    Raises
+    ------
+    InfeasibleError
+        There is none of at most 120 s; says which limit stops it and what helps.
+    """
+    if request.trials > 1 or request.contrasts or not short_of_margin(request):
+        return None
+    most = int(LONGEST / request.hold + 1e-9)
+    if not most:
+        raise InfeasibleError(
+            f"the start does not keep its margins, and a lead-in of at most {LONGEST:g} s has no "
+            f"room for commands that are held {request.hold:g} s: use --hold {LONGEST:g} or less, "
+            f"or change --start."
+        )
+    for holds in range(1, most + 1):
+        found = _Shooting(request, holds).search()
+        if found is not None:
+            return found
+    raise InfeasibleError(_refusal(request, most))
+
+
+class _Shooting:
+    """Levels of a lead-in of some holds, and by how much they miss the limits."""
+
+    def __init__(self, request: PreparedRequest, holds: int) -> None:
+        self.request = request
+        problem = build_problem(replace(request, backoff=()))
+        self.rollout: Rollout = problem.scenarios[0].rollout
+        schedule = request.schedule
+        self.schedule: Schedule = replace(schedule, samples=holds * schedule.hold, before=None)
+        limits = request.limits
+        self.wanted = problem.scenarios[0].limits
+        self.way = LimitProgram(
+            self.rollout,
+            self.schedule,
+            TrialLimits(
+                area=limits.area,
+                position=limits.position,
+                clearance=limits.clearance,
+                speed_cap=limits.speed_cap,
+                yaw_cap=limits.yaw_cap,
+            ),
+        )
+        bound = np.array(
+            [
+                max(n.bound, _LEAST) if n.kind is LimitKind.MARGIN else 0.0
+                for n in self.wanted.path_names
+            ]
+        )
+        self.aim, self.enough = (_AIM - 1) * bound, (_ENOUGH - 1) * bound
+
+    @property
+    def names(self) -> tuple[LimitName, ...]:
+        """Limits of the way, then those at its end."""
+        return (*self.way.path_names, *self.wanted.path_names)
+
+    def missed(self, motion: Motion, *, aim: bool = False) -> Array:
+        """Return by how much R runs miss each limit at worst, (m, R), negative where kept."""
+        end = self.aim if aim else self.enough
+        way = self.way.path_values(motion.state[:, 1:]).max(axis=-1)
+        goal = self.wanted.path_values(motion.state[:, -1]) + end[:, None]
+        out = np.concatenate([way, goal])
+        out[:, ~motion.stable] = np.inf
+        return np.asarray(out)
+
+    def scale(self) -> Array:
+        """Return what counts as one of each limit, (m,)."""
+        return np.concatenate([self.way.path_scale, self.wanted.path_scale])
+
+    def levels(self, unit: Array) -> Array:
+        """Return levels (..., K, nc) of unit coordinates, within the rates."""
+        s = self.schedule
+        return s.within_reach(s.lower + (s.upper - s.lower) * unit)
+
+    def run(self, levels: Array) -> Motion:
+        """Run on levels (R, K, nc)."""
+        return self.rollout.run(self.schedule.expand(levels))
+
+    def candidates(self) -> Iterator[Array]:
+        """Yield levels (K, nc) that descents end at, from the most promising start on."""
+        rng = np.random.default_rng([53, self.request.seed])
+        shape = (self.schedule.holds, len(self.schedule.commands))
+        constant = np.repeat(rng.random((_DRAWN // 2, 1, shape[1])), shape[0], axis=1)
+        steps = rng.integers(0, 2, (_DRAWN // 2, *shape)).astype(float)
+        drawn = self.levels(np.concatenate([constant, steps]))
+        missed = self.missed(self.run(drawn), aim=True) / self.scale()[:, None]
+        cost = (np.maximum(missed, 0.0) ** 2).sum(axis=0)
+        s = self.schedule
+        span = np.where(s.upper > s.lower, s.upper - s.lower, 1.0)
+        for i in np.argsort(cost, kind="stable")[:_DESCENTS]:
+            unit = (drawn[i] - s.lower) / span
+            result = minimize(
+                self._cost, unit.ravel(), jac=True, method="L-BFGS-B",
+                bounds=[(0.0, 1.0)] * unit.size, options={"maxiter": _ITERATIONS},
+            )  # fmt: skip
+            yield self.levels(np.asarray(result.x).reshape(shape))
+
+    def _cost(self, flat: Array) -> tuple[float, Array]:
+        """Return the squares of what the limits are missed by, and the gradient."""
+        s = self.schedule
+        unit = flat.reshape(s.holds, len(s.commands))
+        span = s.upper - s.lower
+        motion = self.rollout.run(s.expand(s.lower + span * unit)[None])
+        if not motion.stable[0]:
+            return 1e9, np.zeros(flat.size)
+        state = motion.state[0]
+        on_way, at_end = self.way.path_scale[:, None], self.wanted.path_scale[:, None]
+        way = np.maximum(self.way.path_values(state) / on_way + _INSIDE, 0.0)
+        way[:, 0] = 0.0
+        goal = self.wanted.path_values(state[-1:]) + self.aim[:, None]
+        goal = np.maximum(goal / at_end + _INSIDE, 0.0)
+        d_state = self.way.path_pull(state, 2 * way / on_way)
+        d_state[-1] += self.wanted.path_pull(state[-1:], 2 * goal / at_end)[0]
+        back = self.rollout.pull(
+            motion, d_state, np.zeros_like(motion.tau[0]), np.zeros_like(motion.commands[0])
+        )
+        return float((way**2).sum() + (goal**2).sum()), (s.gather(back) * span).ravel()
+
+    def search(self) -> LeadIn | None:
+        """Return the lead-in after which the ship stays in the regime best, None without any."""
+        found = [
+            levels
+            for levels in self.candidates()
+            if (self.missed(self.run(levels[None])) <= TOLERANCE).all()
+        ]
+        return min(map(self._lead_in, found), key=self._leaving, default=None)
+
+    def _lead_in(self, levels: Array) -> LeadIn:
+        state = self.run(levels[None]).state[0, -1]
+        north, east = state[-2:] + np.asarray(self.request.limits.position, float)
+        return LeadIn(
+            levels,
+            self.schedule.samples * self.schedule.sample_time,
+            state[: self.rollout.nx + 1],
+            (float(north), float(east)),
+        )
+
+    def _leaving(self, found: LeadIn) -> float:
+        """Return by how much the ship misses the trial's limits where she goes on as she is."""
+        on = np.repeat(found.levels[-1:], _KEPT_ON, axis=0)
+        more = replace(self.schedule, samples=self.schedule.samples + _KEPT_ON * self.schedule.hold)
+        motion = self.rollout.run(more.expand(np.concatenate([found.levels, on]))[None])
+        if not motion.stable[0]:
+            return np.inf
+        after = self.wanted.path_values(motion.state[0, self.schedule.samples :])
+        return float((np.maximum(after.max(axis=1), 0.0) / self.wanted.path_scale).sum())
+
+    def nearest(self) -> Array:
+        """Return by how much the candidate that misses least misses each limit, (m,)."""
+        missed = [self.missed(self.run(levels[None]))[:, 0] for levels in self.candidates()]
+        scale = self.scale()
+        return min(missed, key=lambda m: float((np.maximum(m, 0.0) / scale).sum()))
+
+    def time_constant(self) -> float:
+        """Return the time in which the slowest part of the motion decays to 1/e [s]."""
+        middle = self.levels(np.full((self.schedule.holds, len(self.schedule.commands)), 0.5))
+        nx = self.rollout.nx
+        slopes = self.rollout.slopes(self.run(middle[None]))[:nx, :nx, 0, -1]
+        slowest = float(np.abs(np.linalg.eigvals(slopes)).max())
+        return -self.schedule.sample_time / np.log(slowest) if 0 < slowest < 1 else np.inf
+
+
+def _refusal(request: PreparedRequest, holds: int) -> str:
+    """Return which limit stops a lead-in, and the least change that was found to help."""
+    shooting = _Shooting(request, holds)
+    missed = shooting.nearest()
+    states = (*request.structure.states, "psi")
+    start = ", ".join(f"{n} {x:.3g}" for n, x in zip(states, request.starts[0], strict=True))
+    constant = shooting.time_constant()
+    told = f" ({LONGEST / constant:.2g} time constants of this ship)" if constant < np.inf else ""
+    said = (
+        f"the start {start} does not keep the margins, and no lead-in of at most {LONGEST:g} s"
+        f"{told} brings the ship into the regime"
+    )
+    order = np.argsort(-np.maximum(missed, 0.0) / shooting.scale(), kind="stable")
+    stopping = [(shooting.names[i], float(missed[i])) for i in order if missed[i] > TOLERANCE]
+    on_way = [n for n in shooting.way.path_names if n.kind is not LimitKind.MARGIN]
+    free = replace(request.limits, area=None, speed_cap=None, yaw_cap=None)
+    if on_way and _Shooting(replace(request, limits=free), holds).search() is not None:
+        # without the limits on the way there is one, so that one of them stops it
+        for name in on_way:
+            amount = max((m for n, m in stopping if n.kind is name.kind), default=0.0)
+            helps = _relaxed(request, holds, name, max(amount, 0.05 * _size(name)))
+            if helps:
+                # the bound of a sea room is the clearance from its edge
+                room = name.kind is LimitKind.SEA_ROOM
+                what = name.name if room else f"{name.name} of {name.bound:g} {name.unit}"
+                return f"{said}: the {what} stops it. {helps}"
+        names = ", ".join(n.name for n in on_way)
+        return f"{said}: the {names} together stop it. Widen them, or change --start."
+    name, amount = next(
+        (item for item in stopping if item[0].kind is LimitKind.MARGIN), stopping[0]
+    )
+    reached = name.bound - max(amount - (_ENOUGH - 1) * max(name.bound, _LEAST), 0.0)
+    said += f": the {name.name} of {name.bound:g} {name.unit} stops it, {reached:.3g} is reached"
+    margins = request.limits.margins
+    for share in _SHARES if reached > 0 and name.margin in margins else ():
+        lower = float(np.floor(1e3 * share * reached) / 1e3)
+        eased = replace(request.limits, margins=dict(margins) | {name.margin: lower})
+        if _Shooting(replace(request, limits=eased), holds).search() is not None:
+            return f"{said}. Use {name.option} {lower:g}, or a --start nearer to the regime."
+    return f"{said}. Choose another --regime, or a --start nearer to it."
+
+
+def _size(name: LimitName) -> float:
+    """Return a size of a limit that a small share of is worth a try, in its unit."""
+    return 100.0 if name.kind is LimitKind.SEA_ROOM else name.bound
+
+
+def _relaxed(request: PreparedRequest, holds: int, name: LimitName, amount: float) -> str:
+    """Return the least relaxation of a limit on the way that lets a lead-in be found."""
+    limits = request.limits
+    for times in _RELAXED:
+        more = times * amount
+        if name.kind is LimitKind.SPEED:
+            value = float(f"{name.bound + more:.3g}")
+            eased, helps = replace(limits, speed_cap=value), f"Use --speed-cap {value:g}"
+        elif name.kind is LimitKind.YAW_RATE:
+            value = float(f"{name.bound + more:.3g}")
+            eased, helps = replace(limits, yaw_cap=value), f"Use --yaw-cap {value:g}"
+        else:
+            # a clearance below zero is a room that is wider on every side
+            more = float(np.ceil(more))
+            eased = replace(limits, clearance=limits.clearance - more)
+            helps = f"Enlarge it by {more:g} m on every side"
+        if _Shooting(replace(request, limits=eased), holds).search() is not None:
+            return f"{helps}, or start elsewhere (--start, --position)."
+    return ""
