@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -294,6 +295,8 @@ def write_page(page: Page, path: str | Path) -> None:
     write_text(render(page), path)
 
 
+# files that a command line is still read with
+_MOST_TYPED = 3
 _MACHINES = ("program", "versions", "command", "line", "inputs", "logs", "validate")
 
 
@@ -315,6 +318,25 @@ def computed(record: Mapping[str, Any]) -> dict[str, str]:
     made = ", ".join(f"{n} {v}" for n, v in record["versions"].items())
     rows["computed with"] = f"{record['program']}, {made}"
     return rows | flatten({k: v for k, v in record.items() if k not in _MACHINES})
+
+
+def typed(record: Mapping[str, Any], option: str, stand_in: str) -> str:
+    """Return what a command was given for an option, as it is typed in the next one.
+
+    Parameters
+    ----------
+    record : mapping
+        As a command records it.
+    option : str
+        Its name in ``record["command"]``.
+    stand_in : str
+        What stands for it where it was not given, or where it is a long list.
+    """
+    given = record.get("command", {}).get(option)
+    several = [str(g) for g in (given if isinstance(given, (list, tuple)) else [given]) if g]
+    if not 0 < len(several) <= _MOST_TYPED or "-" in several:
+        return stand_in
+    return shlex.join(several)
 
 
 def flatten(record: dict[str, Any]) -> dict[str, str]:
