@@ -11,7 +11,7 @@ import numpy as np
 from greybox.model.model import ManoeuvringModel
 from greybox.report.chart import chart_of
 from greybox.report.figures import comparison_figure, to_svg
-from greybox.report.page import Page, Picture, Table, computed, typed
+from greybox.report.page import NextStep, Page, Picture, Table, computed, typed
 from greybox.report.thinning import points_for
 from greybox.validation.bands import LEVEL
 from greybox.validation.comparison import Comparison
@@ -119,7 +119,7 @@ def comparison_page(
         ],
         pictures=pictures,
         lead=lead,
-        next_steps=_next_steps(comparison, record),
+        next_steps=[_next_step(comparison, record)],
         tables=tables,
         texts=[
             (f"Model {name}", model.summary())
@@ -149,7 +149,8 @@ def _pictures(comparison: Comparison) -> list[Picture]:
         )
         if i == worst and len(by_log) > 1:
             caption += (
-                f" Of {len(by_log)} logs this is the one that {comparison.names[best]} fits worst."
+                f" Of {len(by_log)} logs this is the one that '{comparison.names[best]}' fits "
+                f"worst."
             )
         if any(b is not None and b.coverage for b in bands):
             caption += f" Shaded: where {100 * LEVEL:.0f} % of the measurements should lie."
@@ -173,16 +174,16 @@ def _pictures(comparison: Comparison) -> list[Picture]:
     return pictures
 
 
-def _next_steps(comparison: Comparison, record: Mapping[str, Any]) -> list[str]:
+def _next_step(comparison: Comparison, record: Mapping[str, Any]) -> NextStep:
     """Return the command that tells why the best model errs where it does."""
     models = record.get("command", {}).get("models", ())
     best = _best(comparison)
     model = shlex.quote(str(models[best])) if best < len(models) else "MODEL"
-    return [
-        f"Find what {comparison.names[best]} gets wrong in these logs, and why: greybox diagnose "
-        f"{typed(record, 'log', 'LOG…')} --vessel V --model {model} --report diagnosis.html "
-        f"--out better.json"
-    ]
+    return NextStep(
+        f"Find what '{comparison.names[best]}' gets wrong in these logs, and why",
+        f"greybox diagnose {typed(record, 'log', 'LOG…')} --vessel V --model {model} "
+        f"--report diagnosis.html",
+    )
 
 
 def _left_out(comparison: Comparison) -> list[str]:

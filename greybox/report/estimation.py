@@ -37,7 +37,7 @@ from greybox.report.estimation_figures import (
 )
 from greybox.report.figures import comparison_figure, to_svg
 from greybox.report.model_difference import shown_unit
-from greybox.report.page import Page, Picture, Section, Table, computed, typed
+from greybox.report.page import NextStep, Page, Picture, Section, Table, computed, typed
 from greybox.report.physical import physical_summary
 from greybox.report.thinning import points_for
 from greybox.selection.structures import StructureChoice
@@ -123,37 +123,44 @@ def headline(estimate: Estimate) -> str:
     return f"{told}. Its free run fits the logs it was estimated on by {fit} (100 is perfect)."
 
 
-def _next_steps(estimate: Estimate, record: Mapping[str, Any]) -> list[str]:
-    """Return a command for what the verdicts leave open, each with what it is for."""
+def _next_steps(estimate: Estimate, record: Mapping[str, Any]) -> list[NextStep]:
+    """Return what the verdicts ask for next."""
     vessel, model = typed(record, "vessel", "V"), typed(record, "out", "MODEL")
-    logs = typed(record, "logs", "LOG…")
-    validate = typed(record, "validate", "")
-    level = PredictionLevel.NOT_JUDGED
-    if estimate.prediction is not None:
-        level = estimate.prediction.level
+    logs, validate = typed(record, "logs", "LOG…"), typed(record, "validate", "")
+    level = estimate.prediction.level if estimate.prediction else PredictionLevel.NOT_JUDGED
     trust = estimate.meant.verdict.level
-    told = []
+    steps = []
     if level in (PredictionLevel.LIMITED, PredictionLevel.POOR) or trust is TrustLevel.DO_NOT_TRUST:
-        told.append(
-            f"Find what the simulation gets wrong, and why: greybox diagnose {logs} "
-            f"--vessel {vessel}{f' --validate {validate}' * bool(validate)} "
-            f"--report diagnosis.html --out better.json"
+        held = f" --validate {validate}" if validate else ""
+        steps.append(
+            NextStep(
+                "Find what the simulation gets wrong, and why",
+                f"greybox diagnose {logs} --vessel {vessel}{held} --report diagnosis.html",
+            )
         )
     if level is PredictionLevel.GOOD:
-        told.append(
-            f"Predict manoeuvres of the ship: greybox predict {model} zigzag --report zigzag.html"
+        steps.append(
+            NextStep(
+                "Predict manoeuvres of the ship",
+                f"greybox predict {model} zigzag --report zigzag.html",
+            )
         )
     if level is PredictionLevel.NOT_JUDGED:
-        told.append(
-            f"See how well it predicts a log that took no part: greybox compare {model} "
-            f"--log LOG --report compare.html"
+        steps.append(
+            NextStep(
+                "See how well it predicts a log that took no part",
+                f"greybox compare {model} --log LOG --report compare.html",
+            )
         )
     if trust is TrustLevel.TRUST_EXCEPT:
-        told.append(
-            f"Plan a trial that makes the coefficients surer: greybox design --vessel {vessel} "
-            f"--model {model} --for coefficients --duration 900 --out plan.csv"
+        steps.append(
+            NextStep(
+                "Plan a trial that makes the coefficients surer",
+                f"greybox design --vessel {vessel} --model {model} --for coefficients "
+                f"--duration 900 --out plan.csv",
+            )
         )
-    return told
+    return steps
 
 
 def _prediction(estimate: Estimate) -> list[Table]:
