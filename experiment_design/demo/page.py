@@ -104,7 +104,8 @@ def _plan(design: Design) -> list[Picture]:
 
 
 def _runs(comparison: Comparison, *models: ManoeuvringModel) -> Sequence[Picture]:
-    return comparison_page(comparison, models, {}).pictures
+    page = comparison_page(comparison, models, {})
+    return [p for p in (page.lead, *page.pictures) if p is not None]
 
 
 def _parameters(demo: Demo) -> Table:

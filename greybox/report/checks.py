@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,7 @@ from greybox.report.check_rows import (
 from greybox.report.check_ties import make_tie, tie_figure
 from greybox.report.figures import to_svg
 from greybox.report.log import facts, page_figures
-from greybox.report.page import Page, Picture, Section, Table, computed, write_page
+from greybox.report.page import NextStep, Page, Picture, Section, Table, computed, typed, write_page
 from greybox.trial.checks.finding import CheckReport, Finding, shared_findings, size_in_words
 from greybox.trial.convert.convert import import_recording
 from greybox.trial.log import TrialLog
@@ -108,6 +109,7 @@ def check_page(
         How it was computed: versions, command, hashes of the files.
     """
     sections = [_section(k, r, vessel) for k, r in enumerate(reports)]
+    lead, sections = _apart(reports, sections)
     made = computed(record or {}) | {"vessel": vessel.name}
     for report, path in zip(reports, paths, strict=True):
         files = report.recording.files if report.recording else ()
@@ -128,6 +130,8 @@ def check_page(
         title="What is wrong with the log" if len(reports) == 1 else "What is wrong with the logs",
         headline=headline(reports),
         sections=sections,
+        lead=lead,
+        next_steps=_next_steps(reports, record or {}),
         computed=made,
     )
     write_page(page, target)
@@ -141,7 +145,8 @@ def headline(reports: Sequence[CheckReport]) -> str:
         open_ids = sorted({o.id for r in reports for o in r.outcomes if o.status == "cannot tell"})
         vague = f"; nothing can be said of {', '.join(open_ids)}" if open_ids else ""
         return f"No findings in {logs}{vague}."
-    finding, report = min(found, key=_rank)
+    report = reports[_gravest(reports)]
+    finding = min(report.findings, key=_seriousness)
     several = {f.key for f in shared_findings(reports)}
     each = sum(f.key not in several for f, _ in found) + len(several)
     count = f"{each} finding" + "s" * (each != 1)
@@ -149,6 +154,51 @@ def headline(reports: Sequence[CheckReport]) -> str:
     where = f" ({name})" if len(reports) > 1 else ""
     lead = "the most serious" if each > 1 else "namely"
     return f"{count} in {logs}; {lead}{where}: {finding.evidence}."
+
+
+def _gravest(reports: Sequence[CheckReport]) -> int:
+    """Return which log has the most serious finding; the first one where none has any."""
+    ranks = [min(map(_seriousness, r.findings), default=len(_SERIOUS) + 1) for r in reports]
+    return ranks.index(min(ranks))
+
+
+def _apart(
+    reports: Sequence[CheckReport], sections: Sequence[Section]
+) -> tuple[Picture | None, list[Section]]:
+    """Return the picture of the most serious finding, or of a whole log, and what is left."""
+    k, left = _gravest(reports), list(sections)
+    if not left[k].pictures:
+        return None, left
+    first, *others = left[k].pictures
+    told = "Its most serious finding" if reports[k].findings else "Its first picture"
+    sentences = [*left[k].sentences, f"{told} is drawn at the top of the page."]
+    left[k] = replace(left[k], pictures=others, sentences=sentences)
+    if len(reports) > 1 and reports[k].findings:
+        first = replace(first, caption=f"{reports[k].name}: {first.caption}")
+    return first, left
+
+
+def _next_steps(reports: Sequence[CheckReport], record: Mapping[str, Any]) -> list[NextStep]:
+    """Return what to do with the logs as they were found."""
+    logs, vessel = typed(record, "logs", "LOG…"), typed(record, "vessel", "V")
+    found = [f for r in reports for f in r.findings]
+    target = "mended.csv" if len(reports) == 1 else "mended"
+    mend = f"greybox import {logs} --vessel {vessel} --out {target} --fix"
+    steps = []
+    if any(f.safe for f in found):
+        steps.append(NextStep("Mend what needs no judgement", mend))
+    judged = dict.fromkeys(f.id for f in found if f.repair and not f.safe)
+    if judged:
+        also = " ".join(f"--fix-also {i}" for i in judged)
+        steps.append(NextStep("Mend these too where their pictures convince you", f"{mend} {also}"))
+    if not steps:
+        steps.append(
+            NextStep(
+                "Estimate a model",
+                f"greybox estimate {logs} --vessel {vessel} --out model.json --report model.html",
+            )
+        )
+    return steps
 
 
 def finding_figure(finding: Finding, report: CheckReport, vessel: Vessel) -> Figure:
@@ -220,10 +270,6 @@ def _drawn(finding: Finding, report: CheckReport, vessel: Vessel) -> tuple[Figur
     if tie is None:
         return signals_figure(finding, recording, vessel), ""
     return tie_figure(finding, tie), "" if tie.helps else _DOUBT
-
-
-def _rank(item: tuple[Finding, CheckReport]) -> int:
-    return _SERIOUS.index(item[0].id) if item[0].id in _SERIOUS else len(_SERIOUS)
 
 
 def _section(number: int, report: CheckReport, vessel: Vessel) -> Section:

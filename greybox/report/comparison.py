@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import shlex
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,10 +11,11 @@ import numpy as np
 from greybox.model.model import ManoeuvringModel
 from greybox.report.chart import chart_of
 from greybox.report.figures import comparison_figure, to_svg
-from greybox.report.page import Page, Picture, Table, computed
+from greybox.report.page import NextStep, Page, Picture, Table, computed, typed
 from greybox.report.thinning import points_for
 from greybox.validation.bands import LEVEL
 from greybox.validation.comparison import Comparison
+from greybox.validation.fit import mean_fit
 
 _NAMES = {"u": "surge", "v": "sway", "r": "yaw rate", "psi": "heading"}
 # with more the page grows and tells nothing new
@@ -22,9 +24,7 @@ _MOST_LOGS = 8
 
 def headline(comparison: Comparison) -> str:
     """Return one sentence on which model fits best and how well."""
-    fits = comparison.fits()
-    means = [float(np.mean([max(v, -1000.0) for v in fit.values()])) for fit in fits]
-    best = int(np.argmax(means))
+    fits, best = comparison.fits(), _best(comparison)
     shown = ", ".join(f"{_NAMES.get(s, s)} {v:.0f} %" for s, v in fits[best].items())
     count = len(comparison.runs[0])
     logs = f"{count} log" + ("s" if count > 1 else "")
@@ -33,12 +33,17 @@ def headline(comparison: Comparison) -> str:
     return f"{comparison.names[best]} fits {logs} best: {shown} (free run, 100 is perfect)."
 
 
+def _best(comparison: Comparison) -> int:
+    """Return which model fits best, by the mean over the channels."""
+    return int(np.argmax([mean_fit(fit) for fit in comparison.fits()]))
+
+
 def comparison_page(
     comparison: Comparison, models: Sequence[ManoeuvringModel], record: dict[str, Any]
 ) -> Page:
     """Return the page: one picture a log, the fits, errors ahead, sign tests, equations."""
     states = list(comparison.runs[0][0].fit)
-    pictures = _pictures(comparison)
+    lead, *pictures = _pictures(comparison)
     fit_rows, ahead_rows = [], []
     for name, row, errors, aheads in zip(
         comparison.names, comparison.runs, comparison.rmse, comparison.ahead, strict=True
@@ -113,6 +118,8 @@ def comparison_page(
             *_left_out(comparison),
         ],
         pictures=pictures,
+        lead=lead,
+        next_steps=[_next_step(comparison, record)],
         tables=tables,
         texts=[
             (f"Model {name}", model.summary())
@@ -123,18 +130,28 @@ def comparison_page(
 
 
 def _pictures(comparison: Comparison) -> list[Picture]:
-    """Return one picture a log, as many as a page bears."""
-    drawn = min(len(comparison.runs[0]), _MOST_LOGS)
+    """Return one picture a log, as many as a page bears, the worst of the best model first."""
+    best = _best(comparison)
+    by_log = [mean_fit(run.fit) for run in comparison.runs[best]]
+    worst = int(np.argmin(by_log))
+    order = [worst, *(i for i in range(len(by_log)) if i != worst)][:_MOST_LOGS]
+    drawn = len(order)
     shaded = sum(b is not None and bool(b.coverage) for row in comparison.bands for b in row[:1])
     curves = drawn * len(comparison.runs[0][0].fit) * (1 + 2 * len(comparison.names) + 4 * shaded)
     pictures = []
-    for i, first in enumerate(comparison.runs[0][:drawn]):
+    for i in order:
+        first = comparison.runs[0][i]
         runs = [row[i] for row in comparison.runs]
         bands = [row[i] for row in comparison.bands]
         caption = (
             f"Free run on {first.log.name} ({len(first.log)} samples of "
             f"{first.log.sample_time:g} s): measured, simulated, and their difference below."
         )
+        if i == worst and len(by_log) > 1:
+            caption += (
+                f" Of {len(by_log)} logs this is the one that '{comparison.names[best]}' fits "
+                f"worst."
+            )
         if any(b is not None and b.coverage for b in bands):
             caption += f" Shaded: where {100 * LEVEL:.0f} % of the measurements should lie."
         fits = "; ".join(
@@ -157,11 +174,26 @@ def _pictures(comparison: Comparison) -> list[Picture]:
     return pictures
 
 
+def _next_step(comparison: Comparison, record: Mapping[str, Any]) -> NextStep:
+    """Return the command that tells why the best model errs where it does."""
+    models = record.get("command", {}).get("models", ())
+    best = _best(comparison)
+    model = shlex.quote(str(models[best])) if best < len(models) else "MODEL"
+    return NextStep(
+        f"Find what '{comparison.names[best]}' gets wrong in these logs, and why",
+        f"greybox diagnose {typed(record, 'log', 'LOG…')} --vessel V --model {model} "
+        f"--report diagnosis.html",
+    )
+
+
 def _left_out(comparison: Comparison) -> list[str]:
     count = len(comparison.runs[0])
     if count <= _MOST_LOGS:
         return []
-    return [f"Of {count} logs the first {_MOST_LOGS} are drawn; all are in the tables."]
+    return [
+        f"Of {count} logs the one of the lowest fit and the first {_MOST_LOGS - 1} others are "
+        f"drawn; all are in the tables."
+    ]
 
 
 def _percent(fit: float) -> str:

@@ -33,7 +33,7 @@ from greybox.report.model_difference import (
     marked_equations,
     other_changes,
 )
-from greybox.report.page import Page, Picture, Section, Table, computed
+from greybox.report.page import NextStep, Page, Picture, Section, Table, computed
 from greybox.report.thinning import points_for
 
 _NAMES = {"u": "surge", "v": "sway", "r": "yaw rate", "psi": "heading"}
@@ -70,7 +70,7 @@ def diagnosis_page(diagnosis: Diagnosis, record: Mapping[str, Any]) -> Page:
         sentences=_summary(diagnosis),
         sections=sections,
         lead=lead,
-        next_steps=[f"{step[:1].upper()}{step[1:].rstrip('.')}." for step in diagnosis.next_steps],
+        next_steps=[_step(step) for step in diagnosis.next_steps],
         computed=computed(dict(diagnosis.record) | dict(record))
         | {
             "causes scored": str(diagnosis.tried),
@@ -81,6 +81,12 @@ def diagnosis_page(diagnosis: Diagnosis, record: Mapping[str, Any]) -> Page:
             "memory (Liang and Zeger, 1986)",
         },
     )
+
+
+def _step(told: str) -> NextStep:
+    """Return a step with its command apart from the words before it."""
+    purpose, _, command = told.rstrip(".").partition(": greybox ")
+    return NextStep(purpose[:1].upper() + purpose[1:], f"greybox {command}" if command else "")
 
 
 def _summary(diagnosis: Diagnosis) -> list[str]:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.estimation.prediction_verdict import PredictionLevel
 from greybox.estimation.registry import ESTIMATORS
 from greybox.estimation.result import Estimate
 from greybox.estimation.summary import (
@@ -36,12 +37,12 @@ from greybox.report.estimation_figures import (
 )
 from greybox.report.figures import comparison_figure, to_svg
 from greybox.report.model_difference import shown_unit
-from greybox.report.page import Page, Picture, Section, Table, computed
+from greybox.report.page import NextStep, Page, Picture, Section, Table, computed, typed
 from greybox.report.physical import physical_summary
 from greybox.report.thinning import points_for
 from greybox.selection.structures import StructureChoice
 from greybox.trial.log import TrialLog
-from greybox.validation.fit import run_model
+from greybox.validation.fit import mean_fit, run_model
 
 Array = NDArray[np.float64]
 
@@ -75,8 +76,9 @@ def estimation_page(
     mass : float, optional
         m [kg], for physical coefficients.
     """
+    lead, run = _run(estimate, logs)
     sections = [
-        _run(estimate, logs),
+        run,
         _parameters(estimate),
         _residuals(estimate.meant),
         _visited(estimate, logs),
@@ -90,6 +92,8 @@ def estimation_page(
         sentences=_summary(estimate),
         tables=_prediction(estimate),
         sections=[s for s in sections if s is not None],
+        lead=lead,
+        next_steps=_next_steps(estimate, record),
         computed=computed(dict(record))
         | {
             "standard errors": f"{estimate.covariance_kind}, residuals remembered over "
@@ -117,6 +121,46 @@ def headline(estimate: Estimate) -> str:
         for s, v in estimate.fit.items()
     )
     return f"{told}. Its free run fits the logs it was estimated on by {fit} (100 is perfect)."
+
+
+def _next_steps(estimate: Estimate, record: Mapping[str, Any]) -> list[NextStep]:
+    """Return what the verdicts ask for next."""
+    vessel, model = typed(record, "vessel", "V"), typed(record, "out", "MODEL")
+    logs, validate = typed(record, "logs", "LOG…"), typed(record, "validate", "")
+    level = estimate.prediction.level if estimate.prediction else PredictionLevel.NOT_JUDGED
+    trust = estimate.meant.verdict.level
+    steps = []
+    if level in (PredictionLevel.LIMITED, PredictionLevel.POOR) or trust is TrustLevel.DO_NOT_TRUST:
+        held = f" --validate {validate}" if validate else ""
+        steps.append(
+            NextStep(
+                "Find what the simulation gets wrong, and why",
+                f"greybox diagnose {logs} --vessel {vessel}{held} --report diagnosis.html",
+            )
+        )
+    if level is PredictionLevel.GOOD:
+        steps.append(
+            NextStep(
+                "Predict manoeuvres of the ship",
+                f"greybox predict {model} zigzag --report zigzag.html",
+            )
+        )
+    if level is PredictionLevel.NOT_JUDGED:
+        steps.append(
+            NextStep(
+                "See how well it predicts a log that took no part",
+                f"greybox compare {model} --log LOG --report compare.html",
+            )
+        )
+    if trust is TrustLevel.TRUST_EXCEPT:
+        steps.append(
+            NextStep(
+                "Plan a trial that makes the coefficients surer",
+                f"greybox design --vessel {vessel} --model {model} --for coefficients "
+                f"--duration 900 --out plan.csv",
+            )
+        )
+    return steps
 
 
 def _prediction(estimate: Estimate) -> list[Table]:
@@ -155,14 +199,15 @@ def _summary(estimate: Estimate) -> list[str]:
     return told
 
 
-def _run(estimate: Estimate, logs: Sequence[TrialLog]) -> Section:
-    """Show the free run against the logs of the estimate."""
+def _run(estimate: Estimate, logs: Sequence[TrialLog]) -> tuple[Picture, Section]:
+    """Show the free run against the logs of the estimate, the worst of those drawn apart."""
     model = estimate.model()
     drawn = logs[:_MOST_LOGS]
     curves = 3 * len(drawn) * len(model.structure.states)
+    runs = [run_model(model, log) for log in drawn]
+    worst = int(np.argmin([mean_fit(run.fit) for run in runs]))
     pictures = []
-    for i, log in enumerate(drawn):
-        run = run_model(model, log)
+    for i, (log, run) in enumerate(zip(drawn, runs, strict=True)):
         caption = (
             f"Free run on {log.name} ({len(log)} samples of {log.sample_time:g} s), a log the "
             f"model was estimated on: measured, simulated, and their difference below."
@@ -187,7 +232,10 @@ def _run(estimate: Estimate, logs: Sequence[TrialLog]) -> Section:
     ]
     if len(logs) > len(drawn):
         sentences.append(f"Of {len(logs)} logs the first {len(drawn)} are drawn.")
-    return Section("1. Does its free run follow the log?", sentences, pictures)
+    first = "the one of lowest fit" if len(drawn) > 1 else "it"
+    sentences.append(f"At the top of the page stands {first}.")
+    lead = pictures.pop(worst)
+    return lead, Section("1. Does its free run follow the log?", sentences, pictures)
 
 
 def _parameters(predicts: Estimate) -> Section:

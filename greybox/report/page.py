@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -69,6 +70,14 @@ class Section:
 
 
 @dataclass(frozen=True)
+class NextStep:
+    """What to do next: what for, and the command for it, if there is one."""
+
+    purpose: str
+    command: str = ""
+
+
+@dataclass(frozen=True)
 class Page:
     """What a page shows, in its order.
 
@@ -79,7 +88,7 @@ class Page:
         The verdict: whether what was made can be used.
     lead : Picture, optional
         What shows the verdict; with it and what to do next it fills the first screen.
-    next_steps : sequence of str
+    next_steps : sequence of NextStep
         What to do next, the first first.
     sentences, pictures, tables, texts, sections
         What follows on the first screen.
@@ -96,7 +105,7 @@ class Page:
     computed: dict[str, Any] = field(default_factory=dict)
     sections: Sequence[Section] = ()
     lead: Picture | None = None
-    next_steps: Sequence[str] = ()
+    next_steps: Sequence[NextStep] = ()
 
 
 _NONE = "'none'"
@@ -161,7 +170,9 @@ h3 { font-size: 1rem; margin: 1.2rem 0 0.3rem; }
 h2 { font-size: 1.15rem; margin: 1.6rem 0 0.4rem; }
 .headline { font-size: 1.15rem; border-left: 4px solid #0072B2; padding-left: 0.8rem; }
 .next h2 { margin: 0.8rem 0 0.2rem; } .next ul { margin: 0; padding-left: 1.2rem; }
-.next li { overflow-wrap: anywhere; }
+.next li { overflow-wrap: anywhere; } .next li + li { margin-top: 0.4rem; }
+.next code { font-size: 0.85rem; background: #f6f6f6; }
+.next code span { display: inline-block; max-width: 100%; }
 .lead figure { margin: 0.6rem 0 0; }
 @media screen and (min-width: 900px) {
   .first.led { display: grid; grid-template: auto 1fr / minmax(0, 2fr) minmax(0, 3fr);
@@ -219,7 +230,9 @@ del { background: #f9ddcc; }
 <div class="first{{ ' led' if page.lead }}">
 <p class="headline">{{ page.headline }}</p>
 {% if page.next_steps %}<div class="next"><h2>What to do next</h2>
-<ul>{% for step in page.next_steps %}<li>{{ step }}</li>
+<ul>{% for step in page.next_steps %}<li>{{ step.purpose }}{% if step.command %}: <code>
+{%- for word in step.command.split(" ") %}<span>{{ word }}</span>{{ " " if not loop.last }}
+{%- endfor %}</code>{% else %}.{% endif %}</li>
 {% endfor %}</ul></div>
 {% endif %}
 {% if page.lead %}<div class="lead">{{ drawn(page.lead) }}</div>
@@ -294,6 +307,8 @@ def write_page(page: Page, path: str | Path) -> None:
     write_text(render(page), path)
 
 
+# files that a command line is still read with
+_MOST_TYPED = 3
 _MACHINES = ("program", "versions", "command", "line", "inputs", "logs", "validate")
 
 
@@ -315,6 +330,25 @@ def computed(record: Mapping[str, Any]) -> dict[str, str]:
     made = ", ".join(f"{n} {v}" for n, v in record["versions"].items())
     rows["computed with"] = f"{record['program']}, {made}"
     return rows | flatten({k: v for k, v in record.items() if k not in _MACHINES})
+
+
+def typed(record: Mapping[str, Any], option: str, stand_in: str) -> str:
+    """Return what a command was given for an option, as it is typed in the next one.
+
+    Parameters
+    ----------
+    record : mapping
+        As a command records it.
+    option : str
+        Its name in ``record["command"]``.
+    stand_in : str
+        What stands for it where it was not given, or where it is a long list.
+    """
+    given = record.get("command", {}).get(option)
+    several = [str(g) for g in (given if isinstance(given, (list, tuple)) else [given]) if g]
+    if not 0 < len(several) <= _MOST_TYPED or "-" in several:
+        return stand_in
+    return shlex.join(several)
 
 
 def flatten(record: dict[str, Any]) -> dict[str, str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -282,6 +282,11 @@ def _alike(changes: Sequence[Change], starts: Array, horizon: float) -> list[NDA
     groups = [np.flatnonzero(~crossing & (before == k)) for k in range(len(times) + 1)]
     # each of the others meets its change after another number of samples
     return [g for g in groups if len(g)] + [np.array([k]) for k in np.flatnonzero(crossing)]
+
+
+def mean_fit(fit: Mapping[str, float]) -> float:
+    """Return the mean of a run's fits (6.12) [%]; a state that diverged counts as −1000 %."""
+    return float(np.mean([max(value, -1000.0) for value in fit.values()]))
 
 
 def average_fit(fits: Sequence[LogFit]) -> dict[str, float]:

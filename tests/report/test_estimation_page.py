@@ -51,7 +51,7 @@ def test_all_is_told(estimate, page):
 
 
 def test_every_picture_says_what_it_shows(page):
-    pictures = [p for s in page.sections for p in s.pictures]
+    pictures = [page.lead, *(p for s in page.sections for p in s.pictures)]
     assert len(pictures) == 7
     assert all(len(p.alternative) > len(p.caption) for p in pictures if p.alternative != p.caption)
     assert all(p.alternative for p in pictures)
