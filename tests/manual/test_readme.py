@@ -10,7 +10,8 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 _spec = importlib.util.spec_from_file_location("run_blocks", ROOT / "docs" / "run_blocks.py")
-assert _spec is not None and _spec.loader is not None
+assert _spec is not None
+assert _spec.loader is not None
 run_blocks = importlib.util.module_from_spec(_spec)
 sys.modules[_spec.name] = run_blocks
 _spec.loader.exec_module(run_blocks)
