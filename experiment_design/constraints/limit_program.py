@@ -211,7 +211,7 @@ class LimitProgram:
         if np.any(since):
             early = np.arange(values.shape[-1]) < np.reshape(since, (-1, 1))
             margin = np.array([n.kind is LimitKind.MARGIN for n in self.path_names], bool)
-            values[margin[:, None, None] & early] = -np.inf
+            values = np.where(margin[:, None, None] & early, -np.inf, values)
         return np.asarray(values.max(axis=-1))
 
     def path_pull(self, state: Array, weights: Array) -> Array:

@@ -95,7 +95,7 @@ def test_a_start_at_rest_gets_a_lead_in(folder, capsys):
     status, plan = run(
         folder, *SHORT, "--regime", "u+v+", "--margin-u", "0.5", "--margin-v", "0.4", "--start",
         "0,0,0,0", "--speed-cap", "2.5", "--json", str(out), "--sheet", str(sheet), "--report",
-        str(page),
+        str(page), "--legs", model="prior.json",
     )  # fmt: skip
     assert status == 0, capsys.readouterr().err
     said = capsys.readouterr().out
@@ -122,6 +122,12 @@ def test_a_start_at_rest_gets_a_lead_in(folder, capsys):
     assert np.hypot(x[:, 0], x[:, 1]).max() < 2.501
     assert data["margins"]["v"] == pytest.approx(x[samples:, 1].min())
     assert all(x["missed"] <= 1e-3 for x in data["limits"])
+    # margins that are missed on the way alone are not missed
+    assert data["keeps_limits"]["probability"] > 0
+    assert data["legs"]["by_clock"] == pytest.approx(data["keeps_limits"]["probability"], abs=0.1)
+    legs = json.loads(plan.with_suffix(".legs.json").read_text())
+    assert legs["start"]["u"] == 0
+    assert sum(leg["expected"] for leg in legs["legs"]) == pytest.approx(lead + 100, rel=0.2)
     assert f"1 trial of 100 s behind a lead-in of {lead:g} s" in said
     assert f"Before it a lead-in of {lead:g} s" in page.read_text()
     assert "lead-in from 0:00 to" in sheet.read_text()
