@@ -25,8 +25,9 @@ from experiment_design.optimise.envelope_search import (
     VALIDATION,
     EnvelopeSearch,
     search_envelope,
+    validation_holds,
 )
-from experiment_design.output.result import Design
+from experiment_design.output.result import Design, PlanPart
 from experiment_design.request.request import PreparedRequest, build_problem
 from greybox.errors import InfeasibleError
 from greybox.model.model import ManoeuvringModel
@@ -290,6 +291,7 @@ def _design(
         asked, tightened, searches, keeping, kept_starts=kept_starts, began=began,
         certificate="a plan for prediction has no bound to be measured against",
     )  # fmt: skip
+    design = replace(design, parts=_parts(asked))
     known = _sum(before, log_moments(found, design.motions[1:]))
     noise, bias = found.errors(design.motions[0], known)
     whole = np.sqrt(float((noise + bias).mean()))
@@ -318,6 +320,18 @@ def _of_start(start: str, kept: int, trials: int) -> tuple[str, ...]:
         return ()
     which = "each trial but the first starts" if kept else "each trial starts"
     return (f"{which} from a steady motion: {start} (--start to change)",)
+
+
+def _parts(request: PreparedRequest) -> tuple[PlanPart, ...]:
+    """Return what is sailed for the estimate, and the usual manoeuvres at each trial's end."""
+    holds = request.schedule.holds
+    begin = (holds - validation_holds(holds)) * request.hold
+    if begin >= request.duration:
+        return ()
+    spans = (("trial", 0.0, begin), ("validation", begin, request.duration))
+    return tuple(
+        PlanPart(name, t, first, last) for t in range(request.trials) for name, first, last in spans
+    )
 
 
 def _sum(first: Array | None, second: Array | None) -> Array | None:

@@ -46,9 +46,10 @@ class PlanPart:
     begin: float
     end: float
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the fields for JSON, trials counted from 1."""
-        return {"part": self.name, "trial": self.trial + 1, "from": self.begin, "to": self.end}
+    @property
+    def seconds(self) -> float:
+        """Its length [s]."""
+        return self.end - self.begin
 
 
 def run_through(request: PreparedRequest, levels: Array) -> Motion:
@@ -133,7 +134,12 @@ class Design(DisplayMixin):
     @property
     def lead_in_s(self) -> float:
         """Length of the lead-in [s], 0 without one."""
-        return sum(p.end - p.begin for p in self.parts if p.name == "lead-in")
+        return sum(p.seconds for p in self.parts if p.name == "lead-in")
+
+    def share(self, part: PlanPart) -> float:
+        """Return what a part takes of its trial's time, lead-in included."""
+        own = [p.seconds for p in self.parts if p.trial == part.trial]
+        return part.seconds / sum(own) if own else 1.0
 
     def part_names(self, trial: int, t: NDArray[np.floating[Any]]) -> tuple[str, ...]:
         """Return the part that each of the times t (N,) [s] of a trial belongs to, if any does."""
@@ -193,7 +199,13 @@ class Design(DisplayMixin):
             "hold": r.hold,
             "lead_in_s": self.lead_in_s,
             "parts": [
-                p.to_dict()
+                {
+                    "part": p.name,
+                    "trial": p.trial + 1,
+                    "from": p.begin,
+                    "to": p.end,
+                    "share": self.share(p),
+                }
                 for p in self.parts
                 or [PlanPart("trial", t, 0.0, r.duration) for t in range(r.trials)]
             ],

@@ -170,7 +170,11 @@ def _parts_words(design: Design, band: MotionBand) -> str:
     own = [p for p in design.parts if p.trial == band.trial]
     if not own:
         return ""
-    return f" ({', '.join(f'{p.name} from {clock(p.begin)} to {clock(p.end)}' for p in own)})"
+    said = [f"{p.name} from {clock(p.begin)} to {clock(p.end)}" for p in own]
+    judged = [p for p in own if p.name == "validation"]
+    if judged:
+        said[-1] += f", {design.share(judged[0]):.0%}, by which the estimate is judged"
+    return f" ({', '.join(said)})"
 
 
 def leg_words(leg: Leg, design: Design, trial: int) -> str:

@@ -86,7 +86,7 @@ def test_plan_and_json(folder, capsys):
     assert data["starts"] == [{"u": 1.5, "v": 1.2, "r": 0.0, "psi": 0.0}]
     assert data["criterion"] == "D"
     assert data["lead_in_s"] == 0
-    assert data["parts"] == [{"part": "trial", "trial": 1, "from": 0.0, "to": 150.0}]
+    assert data["parts"] == [{"part": "trial", "trial": 1, "from": 0.0, "to": 150.0, "share": 1}]
     assert "predicted" not in capsys.readouterr().err
 
 
@@ -104,8 +104,8 @@ def test_a_start_at_rest_gets_a_lead_in(folder, capsys):
     lead = data["lead_in_s"]
     assert 0 < lead <= 120
     assert data["parts"] == [
-        {"part": "lead-in", "trial": 1, "from": 0.0, "to": lead},
-        {"part": "trial", "trial": 1, "from": lead, "to": lead + 100},
+        {"part": "lead-in", "trial": 1, "from": 0.0, "to": lead, "share": lead / (lead + 100)},
+        {"part": "trial", "trial": 1, "from": lead, "to": lead + 100, "share": 100 / (lead + 100)},
     ]
     assert data["starts"] == [{"u": 0.0, "v": 0.0, "r": 0.0, "psi": 0.0}]
     assert data["duration"] == 100
@@ -131,6 +131,16 @@ def test_a_start_at_rest_gets_a_lead_in(folder, capsys):
     assert f"1 trial of 100 s behind a lead-in of {lead:g} s" in said
     assert f"Before it a lead-in of {lead:g} s" in page.read_text()
     assert "lead-in from 0:00 to" in sheet.read_text()
+
+
+def test_a_plan_with_parts_is_read_as_a_log(folder, tmp_path):
+    plan, out = tmp_path / "plan.csv", tmp_path / "run.csv"
+    rows = [f"{k},{'lead-in' if k < 3 else 'trial'},{10 + k % 3},0.8,0.9\n" for k in range(20)]
+    plan.write_text("t,part,n,alpha1,alpha2\n" + "".join(rows))
+    status = main(["simulate", str(folder / "model.json"), str(plan), "--start", "1.5,1.2,0,0",
+                   "--heading", "simulated", "--out", str(out)])  # fmt: skip
+    assert status == 0
+    assert len(pd.read_csv(out)) == 20
 
 
 def test_same_seed_same_bytes(folder, designed):
