@@ -50,6 +50,7 @@ from experiment_design.request.request import (
     wanted_parameters,
 )
 from greybox.errors import InfeasibleError
+from greybox.trial.plan_parts import LEAD_IN, TRIAL
 
 Array = NDArray[np.float64]
 
@@ -320,8 +321,8 @@ def described(
 
 def _parts(lead: LeadIn, request: PreparedRequest) -> tuple[PlanPart, ...]:
     return (
-        PlanPart("lead-in", 0, 0.0, lead.seconds),
-        PlanPart("trial", 0, lead.seconds, lead.seconds + request.duration),
+        PlanPart(LEAD_IN, 0, 0.0, lead.seconds),
+        PlanPart(TRIAL, 0, lead.seconds, lead.seconds + request.duration),
     )
 
 

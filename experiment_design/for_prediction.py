@@ -32,6 +32,8 @@ from experiment_design.request.request import PreparedRequest, build_problem
 from greybox.errors import InfeasibleError
 from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor import build_predictor
+from greybox.trial.plan_parts import TRIAL
+from greybox.trial.plan_parts import VALIDATION as VALIDATION_PART
 
 Array = NDArray[np.float64]
 
@@ -328,7 +330,7 @@ def _parts(request: PreparedRequest) -> tuple[PlanPart, ...]:
     begin = (holds - validation_holds(holds)) * request.hold
     if begin >= request.duration:
         return ()
-    spans = (("trial", 0.0, begin), ("validation", begin, request.duration))
+    spans = ((TRIAL, 0.0, begin), (VALIDATION_PART, begin, request.duration))
     return tuple(
         PlanPart(name, t, first, last) for t in range(request.trials) for name, first, last in spans
     )

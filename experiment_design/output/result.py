@@ -21,6 +21,7 @@ from experiment_design.request.request import PreparedRequest, build_problem
 from greybox.files import replacing
 from greybox.notebook import DisplayMixin, interval, items, number, sparkline, table, text
 from greybox.numerics.linalg import scaled_logdet
+from greybox.trial.plan_parts import LEAD_IN, TRIAL
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -134,7 +135,7 @@ class Design(DisplayMixin):
     @property
     def lead_in_s(self) -> float:
         """Length of the lead-in [s], 0 without one."""
-        return sum(p.seconds for p in self.parts if p.name == "lead-in")
+        return sum(p.seconds for p in self.parts if p.name == LEAD_IN)
 
     def share(self, part: PlanPart) -> float:
         """Return what a part takes of its trial's time, lead-in included."""
@@ -207,7 +208,7 @@ class Design(DisplayMixin):
                     "share": self.share(p),
                 }
                 for p in self.parts
-                or [PlanPart("trial", t, 0.0, r.duration) for t in range(r.trials)]
+                or [PlanPart(TRIAL, t, 0.0, r.duration) for t in range(r.trials)]
             ],
             "regimes": [spell_regime(s) for s in r.regimes],
             "starts": [

@@ -13,6 +13,7 @@ from experiment_design.output.legs import Leg, planned_ends
 from experiment_design.output.prediction import MotionBand
 from experiment_design.output.result import Design
 from experiment_design.request.regimes import spell_regime
+from greybox.trial.plan_parts import VALIDATION
 
 Array = NDArray[np.float64]
 Samples = NDArray[np.intp]
@@ -171,7 +172,7 @@ def _parts_words(design: Design, band: MotionBand) -> str:
     if not own:
         return ""
     said = [f"{p.name} from {clock(p.begin)} to {clock(p.end)}" for p in own]
-    judged = [p for p in own if p.name == "validation"]
+    judged = [p for p in own if p.name == VALIDATION]
     if judged:
         said[-1] += f", {design.share(judged[0]):.0%}, by which the estimate is judged"
     return f" ({', '.join(said)})"
