@@ -166,7 +166,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--vessel", required=True, metavar="V", help="vessel file (TOML) with limits")
     add("--model", metavar="MODEL", help="prior model of greybox estimate")
-    add("--duration", type=positive, metavar="S", help="length of each trial [s]")
+    add("--duration", type=positive, metavar="S", help="length of each trial, lead-in left out [s]")
     add(
         "--after",
         nargs="+",

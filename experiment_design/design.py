@@ -37,13 +37,20 @@ from experiment_design.optimise.campaign import (
     search_campaign,
 )
 from experiment_design.optimise.classical import Alternative, compare_classical
+from experiment_design.optimise.lead_in import after_lead_in
 from experiment_design.optimise.search import Candidate, assess, limit_scale, to_unit, within_reach
 from experiment_design.optimise.solve import EXACT_COLUMNS, Outcome, solve_ipopt
-from experiment_design.output.result import Design, logdet_information
+from experiment_design.output.result import Design, PlanPart, logdet_information, run_through
 from experiment_design.request.apparent_wind import air_notes
 from experiment_design.request.problem import TrialProblem
-from experiment_design.request.request import PreparedRequest, build_problem, wanted_parameters
+from experiment_design.request.request import (
+    LeadIn,
+    PreparedRequest,
+    build_problem,
+    wanted_parameters,
+)
 from greybox.errors import InfeasibleError
+from greybox.trial.plan_parts import LEAD_IN, TRIAL
 
 Array = NDArray[np.float64]
 
@@ -68,6 +75,9 @@ def design_trial(
 ) -> Design:
     """Design the next trial, or the trials of a campaign.
 
+    A single trial whose start misses its margins begins behind the shortest lead-in that brings
+    the ship into the regime; what the plan is worth is said of the trial alone.
+
     Parameters
     ----------
     request : PreparedRequest
@@ -89,8 +99,8 @@ def design_trial(
     Raises
     ------
     InfeasibleError
-        Limits contradict or cannot be kept, the trial is too short for its
-        parameters, or the prior model is unstable.
+        Limits contradict or cannot be kept, no lead-in leads into the regime, the trial is
+        too short for its parameters, or the prior model is unstable.
 
     References
     ----------
@@ -114,6 +124,7 @@ def _design(
 ) -> Design:
     began = time.perf_counter()
     require_horizon(request)
+    request = after_lead_in(request)
     problems = [build_problem(request, t) for t in range(request.trials)]
     _log.info(
         "%d trial(s) of %g s, %d levels each, criterion %s", len(problems), request.duration,
@@ -276,7 +287,12 @@ def described(
         p.scenarios[0].rollout.run(c[None], late=True)
         for p, c in zip(problems, commands, strict=True)
     )
-    reports = _limit_reports(problems, motions)
+    parts: tuple[PlanPart, ...] = ()
+    led: tuple[str, ...] = ()
+    if request.lead_in is not None:
+        parts, led = _parts(request.lead_in, request), (_led(request.lead_in),)
+        motions = (_behind(request, run_through(request, levels[0])),)
+    reports = _limit_reports(request, problems, motions, levels)
     late = late_notes(request, problems, motions, reports, covariance)
     return Design(
         request,
@@ -296,10 +312,35 @@ def described(
         keeping,
         (),
         status,
-        (*notes, *late, *air_notes(request, motions)),
+        (*led, *notes, *late, *air_notes(request, motions)),
         evaluations,
         time.perf_counter() - began,
+        parts,
     )
+
+
+def _parts(lead: LeadIn, request: PreparedRequest) -> tuple[PlanPart, ...]:
+    return (
+        PlanPart(LEAD_IN, 0, 0.0, lead.seconds),
+        PlanPart(TRIAL, 0, lead.seconds, lead.seconds + request.duration),
+    )
+
+
+def _led(lead: LeadIn) -> str:
+    return (
+        f"a lead-in of {lead.seconds:g} s brings the ship from her start into the regime: sea room "
+        f"and caps hold in it and margins do not, and what the plan is worth counts the trial "
+        f"behind it alone"
+    )
+
+
+def _behind(request: PreparedRequest, motion: Motion) -> Motion:
+    """Return the motion of the trial itself, its place counted from where the lead-in ends."""
+    n = request.lead_in_samples
+    state = motion.state[:, n:].copy()
+    moved = np.array(request.limits.position) - request.from_first_command().limits.position
+    state[..., -2:] -= moved
+    return Motion(state, motion.tau[:, n:], motion.commands[:, n:], motion.stable)
 
 
 def _covariance(problems: list[TrialProblem], units: list[Array]) -> Array:
@@ -442,12 +483,21 @@ def _margins(problems: list[TrialProblem], motions: tuple[Motion, ...]) -> dict[
 
 
 def _limit_reports(
-    problems: list[TrialProblem], motions: tuple[Motion, ...]
+    request: PreparedRequest,
+    problems: list[TrialProblem],
+    motions: tuple[Motion, ...],
+    levels: tuple[Array, ...],
 ) -> tuple[LimitReport, ...]:
     found = []
     for t, (problem, motion) in enumerate(zip(problems, motions, strict=True)):
         program = problem.scenarios[0].limits
         missed = program.violations(motion)[:, 0]
+        if request.lead_in is not None and motion.stable[0]:
+            whole = run_through(request, levels[t])
+            plain = replace(request.from_first_command(), backoff=())
+            way = build_problem(plain, t).scenarios[0].limits
+            worst = way.worst(whole.state, request.lead_in_samples)[:, 0]
+            missed[: len(worst)] = np.maximum(missed[: len(worst)], worst)
         for name, m in zip(program.names, missed, strict=True):
             found.append(LimitReport(t, name.name, name.bound, name.unit, float(m)))
     return tuple(found)

@@ -25,12 +25,15 @@ from experiment_design.optimise.envelope_search import (
     VALIDATION,
     EnvelopeSearch,
     search_envelope,
+    validation_holds,
 )
-from experiment_design.output.result import Design
+from experiment_design.output.result import Design, PlanPart
 from experiment_design.request.request import PreparedRequest, build_problem
 from greybox.errors import InfeasibleError
 from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor import build_predictor
+from greybox.trial.plan_parts import TRIAL
+from greybox.trial.plan_parts import VALIDATION as VALIDATION_PART
 
 Array = NDArray[np.float64]
 
@@ -290,6 +293,7 @@ def _design(
         asked, tightened, searches, keeping, kept_starts=kept_starts, began=began,
         certificate="a plan for prediction has no bound to be measured against",
     )  # fmt: skip
+    design = replace(design, parts=_parts(asked))
     known = _sum(before, log_moments(found, design.motions[1:]))
     noise, bias = found.errors(design.motions[0], known)
     whole = np.sqrt(float((noise + bias).mean()))
@@ -318,6 +322,18 @@ def _of_start(start: str, kept: int, trials: int) -> tuple[str, ...]:
         return ()
     which = "each trial but the first starts" if kept else "each trial starts"
     return (f"{which} from a steady motion: {start} (--start to change)",)
+
+
+def _parts(request: PreparedRequest) -> tuple[PlanPart, ...]:
+    """Return what is sailed for the estimate, and the usual manoeuvres at each trial's end."""
+    holds = request.schedule.holds
+    begin = (holds - validation_holds(holds)) * request.hold
+    if begin >= request.duration:
+        return ()
+    spans = ((TRIAL, 0.0, begin), (VALIDATION_PART, begin, request.duration))
+    return tuple(
+        PlanPart(name, t, first, last) for t in range(request.trials) for name, first, last in spans
+    )
 
 
 def _sum(first: Array | None, second: Array | None) -> Array | None:

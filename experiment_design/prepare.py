@@ -411,10 +411,12 @@ def _choose_regimes(
             continue
         own = _clear_of_wind(begin, base)
         if start is not None:
-            if all(start[states.index(s)] * v >= 0 for s, v in signs):
+            if any(start[states.index(s)] * v < 0 for s, v in signs):
+                if asked.trials == 1:
+                    continue
+            elif asked.trials > 1 or _depth(start, signs, margins, states) >= 0:
+                # else a lead-in brings her to where the regime can be judged
                 own = start
-            elif asked.trials == 1:
-                continue
         if _depth(own, signs, margins, states) < -1e-6 and own is not start:
             continue
         try:

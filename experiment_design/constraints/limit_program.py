@@ -197,6 +197,23 @@ class LimitProgram:
         columns = [np.ascontiguousarray(state[..., i]) for i in range(state.shape[-1])]
         return self._path(columns, np.empty((len(self.path_names), *shape)))
 
+    def worst(self, state: Array, since: int | NDArray[np.intp] = 0) -> Array:
+        """Return by how much runs miss each path limit at worst, (m, R), negative where kept.
+
+        Parameters
+        ----------
+        state : ndarray
+            (R, N+1, n), of which the start is not looked at.
+        since : int or ndarray of int
+            Sample, or one a run (R,), after which margins count: none does during a lead-in.
+        """
+        values = self.path_values(state[:, 1:])
+        if np.any(since):
+            early = np.arange(values.shape[-1]) < np.reshape(since, (-1, 1))
+            margin = np.array([n.kind is LimitKind.MARGIN for n in self.path_names], bool)
+            values = np.where(margin[:, None, None] & early, -np.inf, values)
+        return np.asarray(values.max(axis=-1))
+
     def path_pull(self, state: Array, weights: Array) -> Array:
         """Carry weights (m, N+1) on the path limits back to states (N+1, n)."""
         if not self.path_names:
@@ -243,10 +260,7 @@ class LimitProgram:
 
         A run that is unstable misses every limit without bound.
         """
-        worst = [
-            self.path_values(motion.state[:, 1:]).max(axis=-1),
-            self.whole_values(motion),
-        ]
+        worst = [self.worst(motion.state), self.whole_values(motion)]
         out = np.maximum(np.concatenate(worst), 0.0)
         out[:, ~motion.stable] = np.inf
         return np.asarray(out)

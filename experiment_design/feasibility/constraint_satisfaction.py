@@ -64,6 +64,8 @@ def keep_probability(
 ) -> ConstraintSatisfaction:
     """Run the plan under models drawn from the prior and count which keep every limit.
 
+    A lead-in is run too; margins count after it.
+
     Parameters
     ----------
     request : PreparedRequest
@@ -72,10 +74,11 @@ def keep_probability(
         (K, nc) unit coordinates a trial.
     draws : int
     """
+    since, own = request.lead_in_samples, request.schedule
+    levels = [request.with_lead_in(own.lower + (own.upper - own.lower) * u) for u in units]
+    request = request.from_first_command()
     schedule = request.schedule
-    commands = [
-        schedule.expand(schedule.lower + (schedule.upper - schedule.lower) * u) for u in units
-    ]
+    commands = [schedule.expand(v) for v in levels]
     kept = np.ones(draws, bool)
     missed: list[Array] = []
     thetas = request.draw_models(draws, 1)
@@ -89,7 +92,7 @@ def keep_probability(
         )  # fmt: skip
         program = LimitProgram(nominal, schedule, plain.trial_limits(t), wind_matters=wind)
         motion = nominal.run_models(thetas, c, late=True)
-        over = program.path_values(motion.state[:, 1:]).max(axis=-1)
+        over = program.worst(motion.state, since)
         over[:, ~motion.stable] = np.inf
         kept &= (over <= 1e-3).all(axis=0) & motion.stable
         missed.append(over)

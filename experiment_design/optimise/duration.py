@@ -16,6 +16,7 @@ from experiment_design.optimise.campaign import (
     random_campaign,
     search_campaign,
 )
+from experiment_design.optimise.lead_in import after_lead_in
 from experiment_design.request.problem import TrialProblem
 from experiment_design.request.request import PreparedRequest, build_problem, wanted_columns
 from greybox.errors import InfeasibleError, UsageError
@@ -80,7 +81,7 @@ def least_duration(
     Parameters
     ----------
     request : PreparedRequest
-        Its duration is the longest that is allowed.
+        Its duration, behind a lead-in, is the longest that is allowed.
     targets : mapping of str to float
         Wanted standard error of each named parameter, in its unit.
     progress : callable, optional
@@ -103,6 +104,7 @@ def least_duration(
     for name, value in targets.items():
         if not 0 < value < np.inf:
             raise UsageError(f"the target of {name} is {value:g}, it must be positive.")
+    request = after_lead_in(request)
     predictor = request.build_predictor()
     names = tuple(predictor.columns[i].name for i in wanted_columns(predictor, tuple(targets)))
     wanted = replace(request, criterion="A", wanted=names, targets=tuple(targets.values()))

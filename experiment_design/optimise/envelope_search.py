@@ -95,6 +95,11 @@ def usual_manoeuvres(envelope: Envelope, holds: int, hold: float) -> Array:
     return np.asarray(whole[:holds])
 
 
+def validation_holds(holds: int) -> int:
+    """Return how many of a trial's holds, its last, are usual manoeuvres."""
+    return round(VALIDATION * holds)
+
+
 def search_envelope(
     problem: TrialProblem,
     envelope: Envelope,
@@ -123,7 +128,7 @@ def search_envelope(
 
     holds = problem.shape[0]
     hold = problem.schedule.hold * problem.schedule.sample_time
-    tail = usual_manoeuvres(envelope, round(VALIDATION * holds), hold)
+    tail = usual_manoeuvres(envelope, validation_holds(holds), hold)
     return exchange_settings(problem, envelope, worth, seed, effort=effort, tail=tail)
 
 

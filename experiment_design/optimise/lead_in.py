@@ -7,7 +7,7 @@ descend along the exact gradient of what the limits are missed by (single shooti
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from experiment_design.constraints.limit_program import LimitProgram
 from experiment_design.constraints.limits import TOLERANCE, LimitKind, LimitName, TrialLimits
 from experiment_design.excitation.rollout import Motion, Rollout
 from experiment_design.excitation.schedule import Schedule
-from experiment_design.request.request import PreparedRequest, build_problem
+from experiment_design.request.request import LeadIn, PreparedRequest, build_problem
 from greybox.errors import InfeasibleError
 
 Array = NDArray[np.float64]
@@ -38,37 +38,6 @@ _KEPT_ON = 3
 # what a limit is relaxed by, in what it is missed by, until a lead-in is found; shares of a margin
 # that are tried
 _RELAXED, _SHARES = (1.1, 1.5, 2.0, 3.0, 5.0), (0.95, 0.9, 0.8, 0.65, 0.4, 0.2)
-
-
-@dataclass(frozen=True)
-class LeadIn:
-    """Commands before a trial.
-
-    Parameters
-    ----------
-    levels : ndarray
-        (K, nc), one row a hold.
-    seconds : float
-        Its length [s].
-    end : ndarray
-        (nx + 1,) states [m/s, rad/s] and heading [rad] at its end.
-    place : (float, float)
-        North and east there [m].
-    """
-
-    levels: Array
-    seconds: float
-    end: Array
-    place: tuple[float, float]
-
-    def after(self, request: PreparedRequest) -> PreparedRequest:
-        """Return the request of the trial that begins where the lead-in ends."""
-        return replace(
-            request,
-            starts=(self.end,),
-            limits=replace(request.limits, position=self.place),
-            before=self.levels[-1],
-        )
 
 
 def short_of_margin(request: PreparedRequest, trial: int = 0) -> bool:
@@ -108,6 +77,12 @@ def find_lead_in(request: PreparedRequest) -> LeadIn | None:
         if found is not None:
             return found
     raise InfeasibleError(_refusal(request, most))
+
+
+def after_lead_in(request: PreparedRequest) -> PreparedRequest:
+    """Return the request of the trial behind the lead-in that `find_lead_in` finds, if any."""
+    found = find_lead_in(request)
+    return request if found is None else found.after(request)
 
 
 class _Shooting:
@@ -222,6 +197,8 @@ class _Shooting:
         return LeadIn(
             levels,
             self.schedule.samples * self.schedule.sample_time,
+            self.request.starts[0],
+            self.request.limits.position,
             state[: self.rollout.nx + 1],
             (float(north), float(east)),
         )

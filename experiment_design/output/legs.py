@@ -311,8 +311,9 @@ def legs_of(design: Design) -> LegPlan:
     each root mean square over that of the clock, at the end of the leg and, with a quarter of
     the weight, of the trial. What its sensor would not see is added to both.
     """
+    design = design.from_first_command()
     r = design.request
-    schedule = r.schedule
+    schedule, since = r.schedule, round(design.lead_in_s / r.sample_time)
     trials, off, off_clock, kept, kept_clock = [], [], [], [], []
     judged = drawn_models(r, _JUDGED, 4)
     for trial, commands in enumerate(design.commands):
@@ -330,8 +331,9 @@ def legs_of(design: Design) -> LegPlan:
         last = sailed.ends[:, -1:, None]
         index = np.minimum(np.arange(sailed.motion.state.shape[1])[None, :, None], last)
         until_end = np.take_along_axis(sailed.motion.state, index, axis=1)
-        kept.append(_keeps(r, rollout, trial, until_end) & sailed.motion.stable)
-        kept_clock.append(_keeps(r, rollout, trial, clock.state) & clock.stable)
+        led = sailed.ends[:, int(np.searchsorted(planned, since))] if since else 0
+        kept.append(_keeps(r, rollout, trial, until_end, led) & sailed.motion.stable)
+        kept_clock.append(_keeps(r, rollout, trial, clock.state, since) & clock.stable)
     names = _names(r)
     return LegPlan(
         tuple(trials),
@@ -487,12 +489,13 @@ def _seen(r: PreparedRequest) -> Array:
     return np.array([noise[n] for n in _names(r)])
 
 
-def _keeps(r: PreparedRequest, rollout: Rollout, trial: int, state: Array) -> NDArray[np.bool_]:
-    """Return which runs (R, N+1, nx+3) keep the path limits all the time."""
+def _keeps(
+    r: PreparedRequest, rollout: Rollout, trial: int, state: Array, since: int | Samples
+) -> NDArray[np.bool_]:
+    """Return which runs (R, N+1, nx+3) keep the path limits, margins from a sample on."""
     kind = PREDICTORS[r.predictor]
     program = LimitProgram(
         rollout, r.schedule, r.trial_limits(trial),
         wind_matters=kind.captures and not kind.air_measured,
     )  # fmt: skip
-    over = program.path_values(state[:, 1:]).max(axis=-1)
-    return np.asarray((over <= 1e-3).all(axis=0))
+    return np.asarray((program.worst(state, since) <= 1e-3).all(axis=0))

@@ -86,6 +86,7 @@ def write_legs(design: Design, plan: LegPlan, path: Path) -> None:
     path : Path
         Ends in .json.
     """
+    design = design.from_first_command()
     data = legs_to_dict(design, plan)
     write_json(data, path)
     names = design.request.schedule.commands

@@ -212,6 +212,13 @@ def time_axis(axes: Any, duration: float, size: float, *, label: bool = True) ->
         axes.set_xlabel("time [min:s]", fontsize=size)
 
 
+def draw_parts(axes: Any, design: Design, trial: int) -> None:
+    """Draw a line where each part of a plan but the first begins."""
+    for part in design.parts:
+        if part.trial == trial and part.begin:
+            axes.axvline(part.begin, color="0.25", linestyle="-.", linewidth=0.8, zorder=2)
+
+
 def draw_commands(axes: Any, design: Design, trial: int, size: float = 7.0) -> None:
     """Draw one panel a command against time, steps between dotted limits.
 
@@ -241,6 +248,7 @@ def draw_commands(axes: Any, design: Design, trial: int, size: float = 7.0) -> N
         unit = "rad" if angle else "as log"
         ax.set_ylabel(f"{shown}\n[{unit}]", fontsize=size, parse_math=False)
         tidy(ax)
+        draw_parts(ax, design, trial)
         time_axis(ax, float(t[-1]), size, label=i == len(schedule.commands) - 1)
         if angle:
             right = ax.secondary_yaxis("right", functions=(np.rad2deg, np.deg2rad))
@@ -250,7 +258,10 @@ def draw_commands(axes: Any, design: Design, trial: int, size: float = 7.0) -> N
 
 
 def forbidden(design: Design, band: MotionBand, name: str) -> list[tuple[Array, int]]:
-    """Return where a state must not go: edges (N+1,) and the side, 1 above or −1 below."""
+    """Return where a state must not go: edges (N+1,) and the side, 1 above or −1 below.
+
+    An edge is nan where it does not count.
+    """
     r = design.request
     limits = r.trial_limits(band.trial)
     zones: list[tuple[Array, int]] = []
@@ -268,6 +279,7 @@ def forbidden(design: Design, band: MotionBand, name: str) -> list[tuple[Array, 
             if matters and pair.any() and name in ("u", "v"):
                 moved.append(ned_to_body(pair[0], pair[1], psi)[name == "v"])
         edge = limits.margins.get(name, 0.0) + np.max([sign * m for m in moved], axis=0)
+        edge[band.t < design.lead_in_s - 0.5 * r.sample_time] = np.nan
         zones.append((sign * edge, -sign))
     if name == "r" and limits.yaw_cap is not None:
         zones += [(limits.yaw_cap * one, 1), (-limits.yaw_cap * one, -1)]
@@ -294,8 +306,8 @@ def draw_states(axes: Any, design: Design, band: MotionBand, size: float = 9.0) 
         values = [signal.nominal, signal.low, signal.high, *[edge for edge, _ in zones]]
         # a band that explodes must not flatten the nominal motion
         spread = float(np.ptp(signal.nominal)) or 0.1 * float(np.abs(signal.nominal).max()) or 0.1
-        low = max(min(float(v.min()) for v in values), signal.nominal.min() - 3 * spread)
-        high = min(max(float(v.max()) for v in values), signal.nominal.max() + 3 * spread)
+        low = max(min(float(np.nanmin(v)) for v in values), signal.nominal.min() - 3 * spread)
+        high = min(max(float(np.nanmax(v)) for v in values), signal.nominal.max() + 3 * spread)
         room = 0.08 * ((high - low) or spread)
         low, high = low - room, high + room
         for edge, side in zones:
@@ -313,6 +325,7 @@ def draw_states(axes: Any, design: Design, band: MotionBand, size: float = 9.0) 
         ax.set_ylabel(f"{word}\n[{unit}]", fontsize=size)
         ax.yaxis.set_major_locator(MaxNLocator(4))
         tidy(ax)
+        draw_parts(ax, design, band.trial)
         time_axis(ax, float(band.t[-1]), size, label=k == len(axes) - 1)
         if unit.startswith("rad"):
             right = ax.secondary_yaxis("right", functions=(np.rad2deg, np.deg2rad))

@@ -57,12 +57,15 @@ def design_page(
     Page
     """
     r = design.request
-    bands = predict_motion(design)
+    sailed = design.from_first_command()
+    bands = predict_motion(sailed)
     reference = None if headline else random_std(design)
     trials = f"{clock(r.duration)} min"
     if r.trials > 1:
         trials = f"{r.trials} trials of {trials}"
-    parts = [_trial(design, band) for band in bands]
+    if design.lead_in_s:
+        trials = f"lead-in of {clock(design.lead_in_s)} min, trial of {trials}"
+    parts = [_trial(sailed, band) for band in bands]
     one = parts[0] if len(parts) == 1 else None
     keeping = [design.keeping.sentence()] if design.keeping is not None else []
     said = [design.status, *keeping, *notes, *design.notes]
@@ -106,7 +109,13 @@ def saving(design: Design) -> str:
             f"{min(design.random_kept, REFERENCE)} random two-level sequences tells"
         )
     said = design.certificate.sentence().rstrip(".")
-    return f"{first}; {said}."
+    led = ""
+    if design.lead_in_s:
+        led = (
+            f" Before it a lead-in of {design.lead_in_s:g} s brings the ship into the regime, "
+            f"which these numbers leave out."
+        )
+    return f"{first}; {said}.{led}"
 
 
 def random_std(design: Design) -> Array | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,10 +17,11 @@ from experiment_design.information.optimality import CRITERIA
 from experiment_design.optimise.classical import Alternative
 from experiment_design.optimise.search import REFERENCE
 from experiment_design.request.regimes import spell_regime
-from experiment_design.request.request import PreparedRequest
+from experiment_design.request.request import PreparedRequest, build_problem
 from greybox.files import replacing
 from greybox.notebook import DisplayMixin, interval, items, number, sparkline, table, text
 from greybox.numerics.linalg import scaled_logdet
+from greybox.trial.plan_parts import LEAD_IN, TRIAL
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -28,9 +29,45 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 
+@dataclass(frozen=True)
+class PlanPart:
+    """A part of a plan: what a stretch of a trial is sailed for.
+
+    Parameters
+    ----------
+    name : {"lead-in", "trial", "validation"}
+    trial : int
+        Counted from 0.
+    begin, end : float
+        Since the trial's first command [s].
+    """
+
+    name: str
+    trial: int
+    begin: float
+    end: float
+
+    @property
+    def seconds(self) -> float:
+        """Its length [s]."""
+        return self.end - self.begin
+
+
+def run_through(request: PreparedRequest, levels: Array) -> Motion:
+    """Return the motion from the lead-in's first command to the end of a trial of levels (K, nc).
+
+    Lag and delay of the vessel are in it.
+    """
+    whole = request.from_first_command()
+    commands = whole.schedule.expand(request.with_lead_in(levels))
+    return build_problem(whole).scenarios[0].rollout.run(commands[None], late=True)
+
+
 @dataclass(frozen=True, repr=False)
 class Design(DisplayMixin):
     """Sequences for the next trials and what they are worth.
+
+    All fields but `parts` speak of the trials behind a lead-in; see `from_first_command`.
 
     Parameters
     ----------
@@ -69,6 +106,8 @@ class Design(DisplayMixin):
     notes : tuple of str
     evaluations : int
     seconds : float
+    parts : tuple of PlanPart
+        In order, lead-in included; empty where each trial is one part.
     """
 
     request: PreparedRequest
@@ -91,6 +130,40 @@ class Design(DisplayMixin):
     notes: tuple[str, ...]
     evaluations: int
     seconds: float
+    parts: tuple[PlanPart, ...] = ()
+
+    @property
+    def lead_in_s(self) -> float:
+        """Length of the lead-in [s], 0 without one."""
+        return sum(p.seconds for p in self.parts if p.name == LEAD_IN)
+
+    def share(self, part: PlanPart) -> float:
+        """Return what a part takes of its trial's time, lead-in included."""
+        own = [p.seconds for p in self.parts if p.trial == part.trial]
+        return part.seconds / sum(own) if own else 1.0
+
+    def part_names(self, trial: int, t: NDArray[np.floating[Any]]) -> tuple[str, ...]:
+        """Return the part that each of the times t (N,) [s] of a trial belongs to, if any does."""
+        own = [p for p in self.parts if p.trial == trial]
+        if not own:
+            return ()
+        # times are multiples of the sample time, parts begin at such
+        begins = np.array([p.begin for p in own]) - 0.5 * self.request.sample_time
+        return tuple(own[i].name for i in np.searchsorted(begins, t, side="right") - 1)
+
+    def from_first_command(self) -> Design:
+        """Return the plan as it is sailed: commands, levels, motion and start with the lead-in."""
+        r = self.request
+        if r.lead_in is None:
+            return self
+        motion = run_through(r, self.levels[0])
+        return replace(
+            self,
+            request=r.from_first_command(),
+            commands=(motion.commands[0],),
+            levels=(r.with_lead_in(self.levels[0]),),
+            motions=(motion,),
+        )
 
     @property
     def std(self) -> Array:
@@ -125,8 +198,23 @@ class Design(DisplayMixin):
             "trials": r.trials,
             "duration": r.duration,
             "hold": r.hold,
+            "lead_in_s": self.lead_in_s,
+            "parts": [
+                {
+                    "part": p.name,
+                    "trial": p.trial + 1,
+                    "from": p.begin,
+                    "to": p.end,
+                    "share": self.share(p),
+                }
+                for p in self.parts
+                or [PlanPart(TRIAL, t, 0.0, r.duration) for t in range(r.trials)]
+            ],
             "regimes": [spell_regime(s) for s in r.regimes],
-            "starts": [dict(zip((*r.structure.states, "psi"), s, strict=True)) for s in r.starts],
+            "starts": [
+                dict(zip((*r.structure.states, "psi"), s, strict=True))
+                for s in r.from_first_command().starts
+            ],
             "random_kept": self.random_kept,
             "certificate": self.certificate.to_dict(),
             "limits": [
@@ -164,12 +252,15 @@ class Design(DisplayMixin):
         size = len(self.names) if CRITERIA[self.request.criterion].determinant else 1
         return float(np.exp((self.criterion_value - alternative.value) / size))
 
+    def _behind(self) -> str:
+        return f" behind a lead-in of {self.lead_in_s:g} s" if self.lead_in_s else ""
+
     def summary(self) -> str:
         """Return the design as text."""
         r = self.request
         lines = [
             f"Plan for {r.vessel.name}: {r.trials} trial{'s' if r.trials > 1 else ''} of "
-            f"{r.duration:g} s, commands change every {r.hold:g} s, regime "
+            f"{r.duration:g} s{self._behind()}, commands change every {r.hold:g} s, regime "
             f"{', '.join(spell_regime(s) for s in r.regimes)}",
             f"{self.status}",
             *(["planned without an estimated model, from main dimensions"] if r.untried else []),
@@ -212,25 +303,27 @@ class Design(DisplayMixin):
         -------
         DataFrame
             Index ``t`` [s], or ``trial``, ``t`` where there are several trials; one column
-            a command. Each row holds until the next.
+            a command, behind ``part`` where there are parts. Each row holds until the next.
         """
         import pandas as pd
 
         r = self.request
         frames = []
-        for trial, commands in enumerate(self.commands):
+        for trial, commands in enumerate(self.from_first_command().commands):
             t = np.arange(len(commands)) * r.sample_time
             frame = pd.DataFrame(commands, columns=list(r.schedule.commands))
-            frames.append(frame.assign(trial=trial + 1, t=t))
+            frame = frame.assign(trial=trial + 1, t=t)
+            frames.append(frame.assign(part=self.part_names(trial, t)) if self.parts else frame)
         index = ["trial", "t"] if r.trials > 1 else ["t"]
-        plan = pd.concat(frames).set_index(index)[list(r.schedule.commands)]
+        columns = [*(["part"] if self.parts else []), *r.schedule.commands]
+        plan = pd.concat(frames).set_index(index)[columns]
         plan.attrs = {"sample_time": r.sample_time, "vessel": r.vessel.name}
         return plan
 
     def _line(self) -> str:
         return (
             f"plan for {self.request.vessel.name}: {self.request.trials} of "
-            f"{self.request.duration:g} s; {self.status}"
+            f"{self.request.duration:g} s{self._behind()}; {self.status}"
         )
 
     def _parts(self) -> tuple[str, ...]:
@@ -244,7 +337,7 @@ class Design(DisplayMixin):
                 ("trial", "command", "least", "most", "over time"),
                 [
                     (k + 1, n, number(c.min()), number(c.max()), sparkline(c))
-                    for k, plan in enumerate(self.commands)
+                    for k, plan in enumerate(self.from_first_command().commands)
                     for n, c in zip(names, plan.T, strict=True)
                 ],
             ),
@@ -267,7 +360,8 @@ def logdet_information(covariance: Array) -> float:
 def write_plan(design: Design, path: str | Path) -> None:
     """Write the commands as CSV of ``t`` and the thruster columns, ``trial`` first if several.
 
-    Each row holds from its time on until the next.
+    Each row holds from its time on until the next. A column ``part`` behind ``t`` says what a row
+    is sailed for, where there is more than one part.
 
     Parameters
     ----------
@@ -278,9 +372,15 @@ def write_plan(design: Design, path: str | Path) -> None:
     names = r.schedule.commands
     several = r.trials > 1
     with replacing(path) as handle:
-        handle.write(",".join([*(["trial"] if several else []), "t", *names]) + "\n")
-        for trial, commands in enumerate(design.commands):
+        handle.write(
+            ",".join(
+                [*(["trial"] if several else []), "t", *(["part"] if design.parts else []), *names]
+            )
+            + "\n"
+        )
+        for trial, commands in enumerate(design.from_first_command().commands):
             t = np.arange(len(commands)) * r.sample_time
+            part = design.part_names(trial, t)
             for k, row in enumerate(commands):
-                cells = [f"{t[k]:.10g}", *(f"{v:.10g}" for v in row)]
+                cells = [f"{t[k]:.10g}", *part[k : k + 1], *(f"{v:.10g}" for v in row)]
                 handle.write(",".join([*([str(trial + 1)] if several else []), *cells]) + "\n")

@@ -13,6 +13,7 @@ from experiment_design.output.legs import Leg, planned_ends
 from experiment_design.output.prediction import MotionBand
 from experiment_design.output.result import Design
 from experiment_design.request.regimes import spell_regime
+from greybox.trial.plan_parts import VALIDATION
 
 Array = NDArray[np.float64]
 Samples = NDArray[np.intp]
@@ -155,8 +156,8 @@ def sheet_contents(
     return SheetContents(
         f"{plain_name(r.vessel.name)}: identification {which}"
         + (", planned without an estimated model" if r.untried else ""),
-        f"Duration {clock(r.duration)} min, commands change at most every {r.hold:g} s, regime "
-        f"{spell_regime(regime)}" + (f" ({sides})" if sides else ""),
+        f"Duration {clock(r.duration)} min{_parts_words(design, band)}, commands change at most "
+        f"every {r.hold:g} s, regime {spell_regime(regime)}" + (f" ({sides})" if sides else ""),
         _facts(design, band),
         _warnings(design, band),
         _abort(design, band),
@@ -164,6 +165,17 @@ def sheet_contents(
         _columns(design, band, legs, radians=False),
         note,
     )
+
+
+def _parts_words(design: Design, band: MotionBand) -> str:
+    own = [p for p in design.parts if p.trial == band.trial]
+    if not own:
+        return ""
+    said = [f"{p.name} from {clock(p.begin)} to {clock(p.end)}" for p in own]
+    judged = [p for p in own if p.name == VALIDATION]
+    if judged:
+        said[-1] += f", {design.share(judged[0]):.0%}, by which the estimate is judged"
+    return f" ({', '.join(said)})"
 
 
 def leg_words(leg: Leg, design: Design, trial: int) -> str:
@@ -370,6 +382,8 @@ def _abort(design: Design, band: MotionBand) -> tuple[str, ...]:
         text += f", margin of {symbol}"
         if least is not None and name != "r":
             text += f"; least expected {signed(least, 2)} m/s"
+        if design.lead_in_s:
+            text += f"; from {clock(design.lead_in_s)} on, not in the lead-in"
         said.append(text + ". Not dangerous, but the trial loses its worth.")
     return tuple(said)
 
@@ -396,7 +410,10 @@ def _columns(
         for i, name in enumerate(schedule.commands)
     ]
     rows = list(zip(*[c.cells for c in made], strict=True))
-    changed = [k for k in range(len(rows)) if k == 0 or rows[k] != rows[k - 1]]
+    part = design.part_names(band.trial, np.arange(len(rows)) * r.hold) or ("",) * len(rows)
+    changed = [
+        k for k in range(len(rows)) if k == 0 or (rows[k], part[k]) != (rows[k - 1], part[k - 1])
+    ]
     samples = np.array([*(k * schedule.hold for k in changed), len(band.t) - 1])
     return _table_of(
         design,
@@ -415,6 +432,9 @@ def _table_of(
     ]  # fmt: skip
     fine = 0 if max(np.abs(p).max() for p in place) >= 100 else 1
     columns = [Column("time", "min:s", tuple(clock(band.t[k]) for k in samples))]
+    part = design.part_names(band.trial, band.t[samples[:-1]])
+    if part:
+        columns.append(Column("part", "", (*part, ""), words=True))
     columns += [
         *made,
         Column("hdg", "°", tuple(compass(h) for h in heading)),

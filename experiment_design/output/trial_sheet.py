@@ -96,6 +96,7 @@ def write_sheet(design: Design, path: str | Path, legs: LegPlan | None = None) -
         It ends otherwise.
     """
     kind = sheet_kind(path)
+    design = design.from_first_command()
     bands = predict_motion(design)
     with _quiet_fonts():
         if kind == ".html":

@@ -141,6 +141,43 @@ class DesignRequest(TrialOptions):
     prior: ManoeuvringModel | None = None
 
 
+@dataclass(frozen=True)
+class LeadIn:
+    """Commands before a trial, that bring the ship into its regime.
+
+    Parameters
+    ----------
+    levels : ndarray
+        (K, nc), one row a hold.
+    seconds : float
+        Its length [s].
+    start : ndarray
+        (nx + 1,) states [m/s, rad/s] and heading [rad] at its start.
+    position : (float, float)
+        North and east there [m].
+    end : ndarray
+        (nx + 1,) the same at its end.
+    place : (float, float)
+        North and east there [m].
+    """
+
+    levels: Array
+    seconds: float
+    start: Array
+    position: tuple[float, float]
+    end: Array
+    place: tuple[float, float]
+
+    def after(self, request: PreparedRequest) -> PreparedRequest:
+        """Return the request of the trial that begins where the lead-in ends."""
+        return replace(
+            request,
+            starts=(self.end,),
+            limits=replace(request.limits, position=self.place),
+            lead_in=self,
+        )
+
+
 @dataclass(frozen=True, kw_only=True)
 class PreparedRequest(TrialOptions):
     """Everything that a design depends on; equal requests give equal designs.
@@ -184,8 +221,8 @@ class PreparedRequest(TrialOptions):
         Of the prior model.
     untried : bool
         Whether the prior model comes from main dimensions, no trial behind it.
-    before : ndarray, optional
-        (nc,) commands that a lead-in ends with, from which the trial goes on.
+    lead_in : LeadIn, optional
+        After which the only trial begins: `starts`, `limits` and `duration` are the trial's own.
     notes : tuple of str
         A sentence for each choice that was made for the user.
     of_regime : tuple of str
@@ -211,7 +248,7 @@ class PreparedRequest(TrialOptions):
     contrasts: tuple[tuple[CandidateModel, CandidateModel], ...] = ()
     integrator: Integrator = "euler"
     untried: bool = False
-    before: Array | None = None
+    lead_in: LeadIn | None = None
     notes: tuple[str, ...] = ()
     of_regime: tuple[str, ...] = ()
 
@@ -229,7 +266,29 @@ class PreparedRequest(TrialOptions):
     def schedule(self) -> Schedule:
         """When and how far commands change."""
         found = make_schedule(self.vessel, self.duration, self.hold, self.sample_time)
-        return found if self.before is None else replace(found, before=self.before)
+        return found if self.lead_in is None else replace(found, before=self.lead_in.levels[-1])
+
+    def from_first_command(self) -> PreparedRequest:
+        """Return the request of lead-in and trial as one, which is the request without any."""
+        lead = self.lead_in
+        if lead is None:
+            return self
+        return replace(
+            self,
+            duration=lead.seconds + self.duration,
+            starts=(lead.start,),
+            limits=replace(self.limits, position=lead.position),
+            lead_in=None,
+        )
+
+    @property
+    def lead_in_samples(self) -> int:
+        """Samples of the lead-in, 0 without one."""
+        return 0 if self.lead_in is None else round(self.lead_in.seconds / self.sample_time)
+
+    def with_lead_in(self, levels: Array) -> Array:
+        """Return levels (K, nc) of the trial behind those of the lead-in."""
+        return levels if self.lead_in is None else np.concatenate([self.lead_in.levels, levels])
 
     def build_predictor(self) -> Predictor:
         """Return the predictor over the signs that the trials together take.

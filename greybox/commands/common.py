@@ -103,7 +103,7 @@ def read_logs(
 # options that name files to read
 _INPUTS = (
     "logs", "log", "models", "model", "nominal", "validate", "estimate", "vessel", "prior",
-    "between", "area", "raw", "trial", "after", "diagnosis",
+    "between", "area", "raw", "trial", "after", "diagnosis", "plan",
 )  # fmt: skip
 # raw files are hashed as they are imported
 _HASHED = tuple(n for n in _INPUTS if n != "raw")

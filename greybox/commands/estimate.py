@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from greybox.selection.request import Request
     from greybox.selection.structures import StructureChoice
     from greybox.trial.log import TrialLog
+    from greybox.trial.plan_parts import SailedPlan
 
 HELP = "estimate a model from logs, with standard errors and whether to trust them"
 EXAMPLES = """examples:
@@ -34,6 +35,7 @@ EXAMPLES = """examples:
   greybox estimate trial.csv --vessel ship.toml --structure 'thesis+N_|r|r-Xkappa' --out m.json
   greybox estimate trial.csv --vessel ship.toml --reduce --out m.json
   greybox estimate a.csv b.csv --vessel ship.toml --validate c.csv --out m.json
+  greybox estimate trial.csv --vessel ship.toml --plan plan.csv --out m.json
   greybox estimate a.csv b.csv --vessel ship.toml --compare-structures thesis linear modulus
 """
 
@@ -116,6 +118,12 @@ def _add_data(parser: argparse.ArgumentParser) -> None:
         metavar="LOG",
         help="logs that judge the prediction and take no part in the estimate; by default the logs "
         "are left out in turn",
+    )
+    group.add_argument(
+        "--plan",
+        metavar="PLAN",
+        help="plan of greybox design that the logs sailed: what it leads in with is left out, and "
+        "its validation judges the prediction as --validate does",
     )
     group.add_argument(
         "--margin-u",
@@ -279,6 +287,7 @@ def run(options: argparse.Namespace) -> None:
     from greybox.report.physical import physical_summary
     from greybox.selection.estimate import estimate_requested
     from greybox.selection.request import Request
+    from greybox.trial.plan_parts import by_parts, read_plan
     from greybox.vessel.toml import load_vessel
 
     check_targets(options.out, options.json, options.report)
@@ -288,6 +297,11 @@ def run(options: argparse.Namespace) -> None:
     states = get_structure(named.split("+")[0].split("-")[0]).states
     logs, left_out = read_logs(options.logs, vessel, options.sample_time, states)
     validate, no_part = read_logs(options.validate, vessel, options.sample_time, states)
+    parts: tuple[SailedPlan, ...] = ()
+    if options.plan:
+        logs, judges, parts = by_parts(logs, read_plan(options.plan, vessel))
+        validate = [*validate, *judges]
+        left_out = (*left_out, *(p.sentence for p in parts))
     margins = {k: v for k, v in (("u", options.margin_u), ("v", options.margin_v)) if v is not None}
     request = Request(
         method=options.method,
@@ -321,6 +335,8 @@ def run(options: argparse.Namespace) -> None:
     model = estimate.model()
     told = {"structure_choice": choice.to_list()} if choice else {}
     made = provenance(options)
+    if parts:
+        made["plan"] = [p.to_dict() for p in parts]
     model = replace(model, record={**model.record, **told, "provenance": made})
     mass = options.mass if options.mass is not None else vessel.mass
     if options.out:

@@ -159,20 +159,23 @@ def as_read(logs: Sequence[TrialLog], estimate: Estimate) -> Sequence[TrialLog]:
 
 
 def require_others(logs: Sequence[TrialLog], validate: Sequence[TrialLog]) -> None:
-    """Refuse a log that is to be estimated on and to validate the estimate.
+    """Refuse samples that are to be estimated on and to validate the estimate.
+
+    Parts of one log that share no time may do either.
 
     Raises
     ------
     UsageError
         Names it.
     """
-    own = {log.provenance.sha256 for log in logs if log.provenance.sha256}
     for log in validate:
-        if log.provenance.sha256 in own:
-            raise UsageError(
-                f"'{log.name}' is to be estimated on and to validate the estimate: a log that "
-                f"took part cannot judge. Name it once."
-            )
+        for own in logs:
+            same = own.provenance.sha256 == log.provenance.sha256 != ""
+            if same and own.t[0] <= log.t[-1] and log.t[0] <= own.t[-1]:
+                raise UsageError(
+                    f"'{log.name}' is to be estimated on and to validate the estimate: a log that "
+                    f"took part cannot judge. Name it once."
+                )
 
 
 def require_distinct(logs: Sequence[TrialLog]) -> None:

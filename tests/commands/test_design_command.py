@@ -12,6 +12,8 @@ from designs import thesis_model
 from schemas import schema
 
 from greybox.commands.main import main
+from greybox.model.run.simulation import simulate
+from greybox.vessel.force import generalised_force
 from greybox.vessel.toml import vessel_to_dict
 
 FAST = ["--effort", "0.05", "--workers", "1"]
@@ -83,7 +85,62 @@ def test_plan_and_json(folder, capsys):
     assert data["margins"]["v"] >= 0.4
     assert data["starts"] == [{"u": 1.5, "v": 1.2, "r": 0.0, "psi": 0.0}]
     assert data["criterion"] == "D"
+    assert data["lead_in_s"] == 0
+    assert data["parts"] == [{"part": "trial", "trial": 1, "from": 0.0, "to": 150.0, "share": 1}]
     assert "predicted" not in capsys.readouterr().err
+
+
+def test_a_start_at_rest_gets_a_lead_in(folder, capsys):
+    out, sheet, page = (folder / name for name in ("led.json", "led.html", "page.html"))
+    status, plan = run(
+        folder, *SHORT, "--regime", "u+v+", "--margin-u", "0.5", "--margin-v", "0.4", "--start",
+        "0,0,0,0", "--speed-cap", "2.5", "--json", str(out), "--sheet", str(sheet), "--report",
+        str(page), "--legs", model="prior.json",
+    )  # fmt: skip
+    assert status == 0, capsys.readouterr().err
+    said = capsys.readouterr().out
+    data = json.loads(out.read_text())
+    schema("design-1", "experiment_design").validate(data)
+    lead = data["lead_in_s"]
+    assert 0 < lead <= 120
+    assert data["parts"] == [
+        {"part": "lead-in", "trial": 1, "from": 0.0, "to": lead, "share": lead / (lead + 100)},
+        {"part": "trial", "trial": 1, "from": lead, "to": lead + 100, "share": 100 / (lead + 100)},
+    ]
+    assert data["starts"] == [{"u": 0.0, "v": 0.0, "r": 0.0, "psi": 0.0}]
+    assert data["duration"] == 100
+    table = pd.read_csv(plan)
+    assert list(table) == ["t", "part", "n", "alpha1", "alpha2"]
+    np.testing.assert_allclose(table["t"], np.arange(lead + 100))
+    assert (table["part"] == np.where(table["t"] < lead, "lead-in", "trial")).all()
+    # sailed from rest: margins hold behind the lead-in, the cap all the way
+    model, samples = thesis_model(), int(lead)
+    force = generalised_force(model.vessel, {n: table[n].to_numpy() for n in model.vessel.commands})
+    tau = np.stack([force[n] for n in model.structure.inputs], axis=-1)
+    x = simulate(model.structure, model.theta, np.zeros(3), tau[None], 1.0, psi0=0.0).x[0]
+    np.testing.assert_array_less([0.499, 0.399], x[samples:, :2].min(axis=0))
+    assert np.hypot(x[:, 0], x[:, 1]).max() < 2.501
+    assert data["margins"]["v"] == pytest.approx(x[samples:, 1].min())
+    assert all(x["missed"] <= 1e-3 for x in data["limits"])
+    # margins that are missed on the way alone are not missed
+    assert data["keeps_limits"]["probability"] > 0
+    assert data["legs"]["by_clock"] == pytest.approx(data["keeps_limits"]["probability"], abs=0.1)
+    legs = json.loads(plan.with_suffix(".legs.json").read_text())
+    assert legs["start"]["u"] == 0
+    assert sum(leg["expected"] for leg in legs["legs"]) == pytest.approx(lead + 100, rel=0.2)
+    assert f"1 trial of 100 s behind a lead-in of {lead:g} s" in said
+    assert f"Before it a lead-in of {lead:g} s" in page.read_text()
+    assert "lead-in from 0:00 to" in sheet.read_text()
+
+
+def test_a_plan_with_parts_is_read_as_a_log(folder, tmp_path):
+    plan, out = tmp_path / "plan.csv", tmp_path / "run.csv"
+    rows = [f"{k},{'lead-in' if k < 3 else 'trial'},{10 + k % 3},0.8,0.9\n" for k in range(20)]
+    plan.write_text("t,part,n,alpha1,alpha2\n" + "".join(rows))
+    status = main(["simulate", str(folder / "model.json"), str(plan), "--start", "1.5,1.2,0,0",
+                   "--heading", "simulated", "--out", str(out)])  # fmt: skip
+    assert status == 0
+    assert len(pd.read_csv(out)) == 20
 
 
 def test_same_seed_same_bytes(folder, designed):

@@ -14,6 +14,7 @@ from experiment_design.excitation.rollout import Rollout
 from experiment_design.for_prediction import (
     command_ranges,
     design_for_prediction,
+    operating_envelope,
     prior_misfit,
 )
 from experiment_design.information.envelope import build_envelope
@@ -171,6 +172,23 @@ def test_a_plan_leaves_less_than_random_sequences(found) -> None:
     # the last third are usual manoeuvres
     holds = found.design.levels[0].shape[0]
     assert round(VALIDATION * holds) > 3
+
+
+def test_the_usual_manoeuvres_are_marked_as_what_judges_the_estimate(found, model) -> None:
+    trial, validation = found.to_dict()["parts"]
+    assert (trial["part"], trial["from"]) == ("trial", 0.0)
+    assert (validation["part"], validation["to"]) == ("validation", 200.0)
+    assert trial["to"] == validation["from"]
+    r = found.design.request
+    assert validation["share"] == pytest.approx(VALIDATION, abs=0.5 * r.hold / r.duration)
+    begin = round(validation["from"] / r.sample_time)
+    plan = found.design.to_pandas()
+    assert list(plan["part"]) == ["trial"] * begin + ["validation"] * (len(plan) - begin)
+    # the marked ones are the manoeuvres, and nothing else is
+    count = len(found.design.levels[0]) - begin // r.schedule.hold
+    held = found.design.levels[0][-count:]
+    usual = usual_manoeuvres(operating_envelope(r, model, {})[0], count, r.hold)
+    np.testing.assert_allclose(held, usual)
 
 
 def test_the_same_request_gives_the_same_plan(found, model) -> None:

@@ -33,10 +33,11 @@ def design(folder, vessel, *options):
     return main(["design", "--vessel", str(vessel), "--out", str(plan), *options]), plan
 
 
-def require_plan(plan, name, said, notes):
+def require_plan(plan, name, said, notes, *parts):
     ship = presets()[name].ship
     table = pd.read_csv(plan)
-    assert list(table) == ["t", *(a.column for a in ship.actuators)]
+    assert list(table) == ["t", *["part"] * bool(parts), *(a.column for a in ship.actuators)]
+    assert not parts or set(table["part"]) == set(parts)
     for a in ship.actuators:
         low, high = (1.0001 * limit for limit in a.limits)
         assert table[a.column].between(low, high).all()
@@ -81,7 +82,8 @@ def test_a_plan_for_prediction_of_the_whole_model(tmp_path, capsys, name, durati
     )  # fmt: skip
     said = capsys.readouterr()
     assert status == 0, said.err
-    require_plan(plan, name, said.out, json.loads(out.read_text())["notes"])
+    notes = json.loads(out.read_text())["notes"]
+    require_plan(plan, name, said.out, notes, "trial", "validation")
 
 
 def test_sheet_and_page_say_it_first(tmp_path):

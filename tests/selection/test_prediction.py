@@ -167,6 +167,50 @@ def test_by_command(tmp_path, logs, capsys):
     assert "a log that took part cannot judge" in capsys.readouterr().err
 
 
+def test_parts_of_a_plan_are_left_out_and_judge(tmp_path, logs, capsys):
+    log, plan = logs[0], tmp_path / "plan.csv"
+    names = [*log.vessel.commands]
+    parts = ["lead-in"] * 40 + ["trial"] * 160 + ["validation"] * 100
+    rows = zip(parts, *(log[n] for n in names), strict=True)
+    plan.write_text(
+        f"t,part,{','.join(names)}\n"
+        + "".join(f"{k},{','.join(map(str, row))}\n" for k, row in enumerate(rows))
+    )
+    words = ["estimate", "--vessel", "thesis", "--method", "ls", "--predictor", "basic",
+             "--structure", "thesis", "--json", str(tmp_path / "m.json")]  # fmt: skip
+    found = []
+    # by its own clock; and on a clock that began 25 s before the plan
+    for late in (0, 25):
+        sailed = write_csv(replace(log, t=log.t + late), tmp_path / f"late{late}.csv")
+        assert main([*words, str(sailed), "--plan", str(plan)]) == 0
+        said = " ".join(capsys.readouterr().out.split())
+        assert "left out of the estimate are 40 of lead-in" in said
+        assert ("shifted by 25 s" in said) == bool(late)
+        data = json.loads((tmp_path / "m.json").read_text())
+        schema("model-4").validate(data)
+        assert data["provenance"]["plan"] == [
+            {"log": f"late{late}", "plan": "plan.csv", "shift": late, "followed": 1.0,
+             "samples": {"lead-in": 40, "trial": 160, "validation": 100}}
+        ]  # fmt: skip
+        assert data["verdict"]["prediction"]["judged_on"] == "validation"
+        assert data["verdict"]["prediction"]["logs"] == [f"late{late}, validation"]
+        found.append(data["theta"])
+    assert found[0] == found[1]
+    # what is left out tells nothing: the same estimate by the two parts as logs of their own
+    fit = write_csv(log.window(40, 200), tmp_path / "fit.csv")
+    judge = write_csv(log.window(200, 300), tmp_path / "judge.csv")
+    assert main([*words, str(fit), "--validate", str(judge)]) == 0
+    data = json.loads((tmp_path / "m.json").read_text())
+    np.testing.assert_allclose(found[0], data["theta"])
+    capsys.readouterr()
+    other = write_csv(logs[1], tmp_path / "other.csv")
+    assert main([*words, str(other), "--plan", str(plan)]) == 1
+    error = capsys.readouterr().err
+    assert "'other' follows the plan 'plan.csv' in " in error
+    assert "and 80% are needed" in error
+    assert error.count("\n") == 1
+
+
 def test_a_log_of_the_estimate_cannot_judge(estimate, logs):
     own = replace(logs[0], provenance=replace(logs[0].provenance, sha256="ab"))
     with pytest.raises(UsageError, match="Name it once"):
