@@ -15,37 +15,28 @@ from greybox.commands.completion import VESSELS, endings
 from greybox.commands.parser import Parser, sub_parsers
 from greybox.errors import ConfigurationError, suggestion
 
-NAME = "greybox.toml"
-VARIABLE = "GREYBOX_CONFIG"
 EVERYWHERE = "all"
 MOST_BYTES = 64_000
 _NEVER = ("--help", "--version", "--verbose", "--quiet", "--no-config")
 
 
 def find_configuration(folder: Path, environment: Mapping[str, str]) -> Path | None:
-    """Return the configuration file that holds in a folder.
+    """Return the file that ``$GREYBOX_CONFIG`` names, or the ``greybox.toml`` of a folder.
 
-    The one of ``$GREYBOX_CONFIG``, or else the nearest ``greybox.toml`` in the
-    folder and those above it, as far as the repository or the home folder. Where
-    neither is above it, only the folder itself is looked at: what strangers leave
-    in a shared folder, such as ``/tmp``, decides nothing.
-
-    Raises
-    ------
-    ConfigurationError
-        The variable names no file.
+    That is the nearest in the folder and those above it, as far as the repository or
+    the home folder. Where neither is above it, only the folder itself is looked at: what
+    strangers leave in a shared folder, such as ``/tmp``, decides nothing.
     """
-    if named := environment.get(VARIABLE):
-        path = Path(named).expanduser()
-        if not path.is_file():
-            raise ConfigurationError(
-                f"{VARIABLE} names '{named}', which is no file: correct or unset the variable."
-            )
-        return path
+    if named := environment.get("GREYBOX_CONFIG"):
+        if Path(named).expanduser().is_file():
+            return Path(named).expanduser()
+        raise ConfigurationError(
+            f"GREYBOX_CONFIG names '{named}', which is no file: correct or unset the variable."
+        )
     home = environment.get("HOME") or environment.get("USERPROFILE")
     places = [folder, *folder.parents]
     last = next((i for i, p in enumerate(places) if str(p) == home or (p / ".git").exists()), 0)
-    found = (p / NAME for p in places[: last + 1])
+    found = (p / "greybox.toml" for p in places[: last + 1])
     return next((p for p in found if os.access(p, os.R_OK) and p.is_file()), None)
 
 
@@ -58,27 +49,11 @@ def configure(
 ) -> tuple[list[str], dict[str, Any] | None]:
     """Return what a configuration file adds to a command line, and the record of it.
 
-    The command line wins: over the same option, and over one that it excludes.
-
-    Parameters
-    ----------
-    path : Path
-        Paths in the file are relative to its folder.
-    command : str
-    parsers : mapping of str to Parser
-        Of all commands, with the options of `command`.
-    typed : iterable of str
-        What stands on the command line itself, by its names in the namespace.
-    everything : callable
-        Returns the parser with the options of all commands.
-
-    Raises
-    ------
-    ConfigurationError
-        The file cannot be read, or a table, an option or a value in it is not known.
+    The command line wins: over the same option, and over one that it excludes. `typed` are its
+    options as the namespace names them, and `everything` makes the parser of all commands.
     """
     name, digest, tables = _read(path)
-    parser, words = parsers[command].for_parts(), {}
+    parser, folder, words = parsers[command].for_parts(), path.parent.resolve(), {}
     known = configurable(parser)
     allowed = (EVERYWHERE, *(n for n in parsers if n != "help"))
     for table in tables:
@@ -91,7 +66,7 @@ def configure(
         for key, value in tables.get(table, {}).items():
             parser.place = f"'{name}', [{table}], {key}"
             if key in known:
-                words[known[key].dest] = _words(known[key], value, parser.place, path.parent)
+                words[known[key].dest] = _words(known[key], value, parser.place, folder)
                 parser.parse_args(words[known[key].dest])
                 continue
             others = sub_parsers(everything()).values() if table == EVERYWHERE else ()
@@ -144,34 +119,34 @@ def configurable(parser: argparse.ArgumentParser) -> dict[str, argparse.Action]:
 
 
 def _words(action: argparse.Action, value: Any, where: str, folder: Path) -> list[str]:
-    """Return an option with its value as one would type it."""
-    option, single = action.option_strings[-1], action.nargs in (None, "?")
+    """Return an option with its value as one would type it in the working folder."""
+    option, single, files = action.option_strings[-1], action.nargs in (None, "?"), endings(action)
     if action.nargs == 0:
         if not isinstance(value, bool):
             raise ConfigurationError(f"{where} is {value!r}: write true or false.")
         return [option] * value
     joined = single and not isinstance(action, argparse._AppendAction)
-    listed = isinstance(value, list) and not (joined and endings(action))
-    values = value if listed else [value]
+    values = value if isinstance(value, list) and not (joined and files) else [value]
     if not values:
         raise ConfigurationError(f"{where} is an empty list: name a value, or leave it out.")
     if isinstance(action.nargs, int) and len(values) != action.nargs:
         raise ConfigurationError(
             f"{where} has {len(values)} values, {action.nargs} are needed: write a list of them."
         )
-    texts = [_text(action, v, where, folder) for v in values]
+    for one in values:
+        if isinstance(one, bool) or not isinstance(one, str | int | float):
+            raise ConfigurationError(
+                f"{where} is {one!r}, a word or a number is needed: correct it."
+            )
+    texts = [str(v) if files is None else _path(action, str(v), where, folder) for v in values]
     texts = [",".join(texts)] if joined else texts
     # a value of its own may begin with a minus
     return [f"{option}={t}" for t in texts] if single else [option, *texts]
 
 
-def _text(action: argparse.Action, value: Any, where: str, folder: Path) -> str:
-    if isinstance(value, bool) or not isinstance(value, str | int | float):
-        raise ConfigurationError(f"{where} is {value!r}, a word or a number is needed: correct it.")
-    text, output = str(value), action.dest in OUTPUTS
-    target = folder / Path(text).expanduser()
-    known = text == "-" if output else text in VESSELS and not target.exists()
-    if endings(action) is None or known:
+def _path(action: argparse.Action, text: str, where: str, folder: Path) -> str:
+    target, output = folder / Path(text).expanduser(), action.dest in OUTPUTS
+    if text == "-" if output else text in VESSELS and not target.exists():
         return text
     if output and not target.resolve().is_relative_to(folder):
         raise ConfigurationError(

@@ -45,23 +45,15 @@ def _add_shell(parser: argparse._ActionsContainer, verbose: str) -> None:
 
 
 def build_parser(only: str | None = None) -> argparse.ArgumentParser:
-    """Return the parser; modules of sub-commands are imported for their options only.
-
-    Parameters
-    ----------
-    only : str, optional
-        The sub-command that is going to run: the others are then not imported.
-    """
+    """Return the parser with the options of all sub-commands, or of the one that is to run."""
     parser = Parser(
         prog="greybox",
         description="Trustworthy ship models from sea trials: design the trial, read the log, "
         "estimate, show what the simulation gets wrong.",
         epilog=EXAMPLES,
     )
-    parser.add_argument(
-        "--version", action="version", version=f"greybox {version('greybox-marine')}",
-        help="show the version",
-    )  # fmt: skip
+    shown = f"greybox {version('greybox-marine')}"
+    parser.add_argument("--version", action="version", version=shown, help="show the version")
     _add_shell(parser, "verbose")
     parser.set_defaults(verbose=0, quiet=False, no_config=False)
     # without `prog` the usage would be rendered to find it, which loads what renders
@@ -75,9 +67,8 @@ def build_parser(only: str | None = None) -> argparse.ArgumentParser:
             commands.add_parser(name)
             continue
         module = import_module(found[name])
-        sub = commands.add_parser(
-            name, help=module.HELP, description=module.HELP, epilog=module.EXAMPLES
-        )
+        told = {"help": module.HELP, "description": module.HELP, "epilog": module.EXAMPLES}
+        sub = commands.add_parser(name, **told)
         module.add_arguments(sub)
         sub.usage = sub.short_usage()
         _add_shell(sub.add_argument_group("what is shown, and what is read"), "more_verbose")
@@ -94,10 +85,10 @@ def _parse(given: list[str]) -> argparse.Namespace:
     if command == "help":
         return _parse([*given[at + 1 : at + 2], "--help"])
     parser = build_parser(command)
-    parsers = sub_parsers(parser)
     if not given:
         parser.print_help(sys.stderr)
         parser.exit(2)
+    parsers = sub_parsers(parser)
     if command not in parsers:
         return parser.parse_args(given)
     typed = vars(parsers[command].for_parts().parse_args(given[at + 1 :]))
@@ -120,17 +111,9 @@ def _parse(given: list[str]) -> argparse.Namespace:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line and return its exit status.
+    """Run a command line, by default that of the process, and return its exit status.
 
-    Parameters
-    ----------
-    arguments : sequence of str, optional
-        By default those of the process.
-
-    Returns
-    -------
-    int
-        0 done, 1 the input is at fault, 2 wrong usage (by SystemExit).
+    0 is done, 1 that the input is at fault; wrong usage is a SystemExit with 2.
     """
     if "_ARGCOMPLETE" in os.environ:
         from greybox.commands.completion import offer
@@ -140,8 +123,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         options = _parse(list(sys.argv[1:] if arguments is None else arguments))
         name = f"greybox {options.command}"
-        verbose = options.verbose + getattr(options, "more_verbose", 0)
-        with telling(verbose, options.quiet):
+        with telling(options.verbose + getattr(options, "more_verbose", 0), options.quiet):
             _run(options)
     except GreyboxError as error:
         complain(f"{name}: {error}")

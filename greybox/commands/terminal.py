@@ -19,12 +19,9 @@ if TYPE_CHECKING:
 
 LOGGERS = ("greybox", "experiment_design")
 _QUIET: ContextVar[bool] = ContextVar("quiet", default=False)
-_RED, _GREEN, _YELLOW = "31", "32", "33"
-_VERDICT = re.compile(
-    r"^((?:[Vv]erdict|Prediction|Coefficients): )"
-    r"(?:(do not trust|poor|unexplained)|(trust(?! except)|good|none)|(trust except|\w+))\b",
-    re.MULTILINE,
-)
+# words of a verdict in red and green, and all others in yellow
+_TONES = {31: "do not trust|poor|unexplained", 32: "(?!trust except)trust|good|none",
+          33: r"trust except|\w+"}  # fmt: skip
 # the bar that is on the screen: one at most
 _shown: list[Progress] = []
 
@@ -32,10 +29,6 @@ _shown: list[Progress] = []
 def coloured(stream: TextIO) -> bool:
     """Whether a stream shows colours: a terminal, and neither NO_COLOR nor a dumb one."""
     return stream.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
-
-
-def _paint(text: str, colour: str) -> str:
-    return f"\x1b[1;{colour}m{text}\x1b[0m"
 
 
 def _printable(text: str) -> str:
@@ -47,8 +40,7 @@ def complain(text: str) -> None:
     clear()
     text = _printable(text)
     if coloured(sys.stderr):
-        who, sign, what = text.partition(": ")
-        text = _paint(who + sign.rstrip(), _RED) + " " * bool(sign) + what
+        text = re.sub("^[^:]*:?", "\x1b[1;31m\\g<0>\x1b[0m", text)
     sys.stderr.write(text + "\n")
 
 
@@ -58,10 +50,9 @@ def say(text: str) -> None:
         return
     clear()
     if coloured(sys.stdout):
-        tones = (_RED, _GREEN, _YELLOW)
-        text = _VERDICT.sub(
-            lambda m: m[1] + "".join(_paint(w, t) for w, t in zip(m.groups()[1:], tones) if w), text
-        )
+        for tone, words in _TONES.items():
+            verdict = rf"(?m)^((?:[Vv]erdict|Prediction|Coefficients): )({words})\b"
+            text = re.sub(verdict, f"\\1\x1b[1;{tone}m\\2\x1b[0m", text)
     sys.stdout.write(text + "\n")
 
 
