@@ -11,7 +11,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from greybox.commands.parser import OUTPUTS
 from greybox.commands.terminal import complain, progress, say
 
 if TYPE_CHECKING:
@@ -100,11 +99,12 @@ def read_logs(
     return logs, (*told, *left_out)
 
 
-# options that name files to read
+# options that name files to read, and to write
 _INPUTS = (
     "logs", "log", "models", "model", "nominal", "validate", "estimate", "vessel", "prior",
     "between", "area", "raw", "trial", "after", "diagnosis", "plan",
 )  # fmt: skip
+OUTPUTS = ("out", "json", "report", "sheet", "legs", "save_model")
 # raw files are hashed as they are imported
 _HASHED = tuple(n for n in _INPUTS if n != "raw")
 # what is typed for the terminal's sake, and changes no result

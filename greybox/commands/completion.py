@@ -5,11 +5,11 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from greybox.commands.common import say
-from greybox.commands.parser import FOLDER, endings, sub_parsers
 from greybox.registry import entry_points
 
 _INSTALL = {
@@ -24,28 +24,31 @@ _INSTALL = {
     ),
 }
 HELP = "print the script that makes Tab complete commands, options, names and files"
-EXAMPLES = "\n".join(
-    [
-        "examples:",
-        *(f"  greybox completion {shell}" for shell in _INSTALL),
-        "\nto install it, for this shell only and for those to come:",
-        *(f"  {shell:<8}{now}\n{'':10}{ever}" for shell, (now, ever) in _INSTALL.items()),
-    ]
+EXAMPLES = (
+    "examples:\n"
+    + "".join(f"  greybox completion {shell}\n" for shell in _INSTALL)
+    + "\nto install it, for this shell only and for those to come:\n"
+    + "\n".join(f"  {shell:<8}{now}\n{'':10}{ever}" for shell, (now, ever) in _INSTALL.items())
 )
 # written out, since loading them takes longer than one waits for Tab; tests hold them to the truth
 VESSELS = ("thesis", "ferry")
 STRUCTURES = ("thesis", "surge", "linear", "blanke", "modulus", "abkowitz", "siso")
-CAUSES = (
-    "current", "wind", "thruster_gain", "thruster_lag", "input_delay", "rate_limit",
-    "feedback_sampling", "quadratic_thrust", "advance_speed", "cubic_damping",
-    "quadratic_yaw_damping", "crossflow", "inertia_coupling", "side_force", "asymmetry",
-    "heading_bias", "lever_arm", "angle_offset", "clock_offset", "sign", "parameter_change",
-    "waves",
-)  # fmt: skip
-PARAMETERS = (
-    "Xu", "Xvr", "Xuu", "Wuu", "Xmu", "Xkappa", "Yv", "Yur", "Yvv", "Yvr", "Wvv", "Ymu",
-    "Nr", "Nuv", "Nvv", "Nvr", "Wuv", "Nmu",
-)  # fmt: skip
+CAUSES = tuple("""
+    current wind thruster_gain thruster_lag input_delay rate_limit feedback_sampling
+    quadratic_thrust advance_speed cubic_damping quadratic_yaw_damping crossflow inertia_coupling
+    side_force asymmetry heading_bias lever_arm angle_offset clock_offset sign parameter_change
+    waves
+""".split())  # fmt: skip
+PARAMETERS = tuple("""
+    Xu Xvr Xuu Wuu Xmu Xkappa Yv Yur Yvv Yvr Wvv Ymu Nr Nuv Nvv Nvr Wuv Nmu
+""".split())  # fmt: skip
+_FOLDER = ("/",)
+# the files that an argument names, by its metavar: their endings, none where any will do
+_ENDINGS: dict[str | tuple[str, ...] | None, tuple[str, ...]] = {
+    "V": ("toml",), "LOG": ("csv", "parquet", "pq"), "RAW": (), "MODEL": ("json",),
+    ("A", "B"): ("json",), "D": ("json",), "HTML": ("html",), "CSV": ("csv",), "PLAN": ("csv",),
+    "F": (), "FILE": (), "DIR": _FOLDER,
+}  # fmt: skip
 # a model has thousands; whoever names a log as one still waits no second for Tab
 MOST_BYTES = 5_000_000
 
@@ -64,45 +67,41 @@ def run(options: argparse.Namespace) -> None:
     say(f"{script.rstrip()}\n\n# in this shell only:  {now}\n# in those to come:    {ever}")
 
 
+def endings(action: argparse.Action) -> tuple[str, ...] | None:
+    """Return the endings of the files that an argument names, None where it names no file."""
+    # with a type it is a number, whatever letter stands for it
+    return None if action.type is not None else _ENDINGS.get(action.metavar)
+
+
 def offer(parser: argparse.ArgumentParser) -> None:
     """Answer the shell that asks, by the protocol of argcomplete, and end the process."""
-    import argcomplete
+    from argcomplete import autocomplete
+    from argcomplete.completers import BaseCompleter, DirectoriesCompleter, FilesCompleter
 
-    for command in sub_parsers(parser).values():
-        for action in command._actions:
-            if action.choices is None and action.nargs != 0:
-                vars(action)["completer"] = _offered
-    argcomplete.autocomplete(parser, always_complete_options=False)
+    class Offered(BaseCompleter):
+        def __call__(
+            self, *, prefix: str, action: argparse.Action, parsed_args: argparse.Namespace, **_: Any
+        ) -> Iterable[str]:
+            found = endings(action)
+            if action.dest in ("structure", "compare_structures"):
+                return STRUCTURES
+            if action.dest == "causes":
+                return (*CAUSES, *(e.name for e in entry_points(group="greybox.causes")))
+            if action.dest == "want":
+                return _parameters(parsed_args)
+            if str(action.metavar).startswith("NAME="):
+                return [f"{n}=" for n in _parameters(parsed_args)]
+            if found is None or found == _FOLDER:
+                return DirectoriesCompleter()(prefix) if found else ()
+            return (*(VESSELS if action.metavar == "V" else ()), *FilesCompleter(found)(prefix))
 
-
-def _offered(
-    prefix: str, action: argparse.Action, parsed_args: argparse.Namespace, **_: Any
-) -> Iterable[str]:
-    from argcomplete.completers import DirectoriesCompleter, FilesCompleter
-
-    names: Iterable[str] = ()
-    metavar, found = action.metavar, endings(action)
-    if action.dest in ("structure", "compare_structures"):
-        names = STRUCTURES
-    elif action.dest == "causes":
-        names = (*CAUSES, *(e.name for e in entry_points(group="greybox.causes")))
-    elif action.dest == "want":
-        names = _parameters(parsed_args)
-    elif metavar in ("NAME=LOW:HIGH", "NAME=VALUE:STD", "NAME=STD"):
-        names = (f"{n}=" for n in _parameters(parsed_args))
-    elif found == (FOLDER,):
-        return DirectoriesCompleter()(prefix)
-    elif found is not None:
-        names = (*(VESSELS if metavar == "V" else ()), *FilesCompleter(found)(prefix))
-    return [n for n in names if n.startswith(prefix)]
+    autocomplete(parser, always_complete_options=False, default_completer=Offered())
 
 
-def _parameters(given: argparse.Namespace) -> tuple[str, ...]:
+def _parameters(given: argparse.Namespace) -> Iterable[str]:
     """Return the parameters of the model that is named, those of (3.51) where it cannot be read."""
     path = Path(getattr(given, "model", None) or getattr(given, "nominal", None) or "")
-    try:
-        if path.stat().st_size > MOST_BYTES:
-            return PARAMETERS
-        return tuple(map(str, json.loads(path.read_text(encoding="utf-8"))["names"]))
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        return PARAMETERS
+    with suppress(OSError, ValueError, KeyError, TypeError, RecursionError):
+        if path.stat().st_size <= MOST_BYTES:
+            return tuple(map(str, json.loads(path.read_text(encoding="utf-8"))["names"]))
+    return PARAMETERS

@@ -30,7 +30,8 @@ EXAMPLES = """examples:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_logs(parser)
-    parser.add_argument(
+    base = parser.add_mutually_exclusive_group()
+    base.add_argument(
         "--model",
         metavar="MODEL",
         help="model to diagnose as it is; by default (3.51) in still water and air, estimated on "
@@ -50,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="MODEL",
         help="write the extended model; of causes that cannot be told apart, MODEL.<id>.json each",
     )
-    parser.add_argument(
+    base.add_argument(
         "--structure",
         default="thesis",
         metavar="NAME",

@@ -246,6 +246,30 @@ def _pairs(texts: list[str], what: str) -> dict[str, tuple[float, float]]:
     return found
 
 
+# what other methods do not heed, by those that do
+_ONLY = {
+    ("iv", "oe"): ("heading", "nominal"),
+    ("iv",): ("instruments", "prefilter"),
+    ("oe",): ("process_noise", "wind", "loss", "weights", "shooting", "bound", "prior", "damping"),
+}
+
+
+def _require_heeded(options: argparse.Namespace) -> None:
+    """Raise where an option is given that the method that is named does not heed."""
+    from greybox.errors import UsageError
+
+    parser = argparse.ArgumentParser()
+    add_arguments(parser)
+    for methods, names in _ONLY.items():
+        for name in names if options.method not in (None, *methods) else ():
+            # measured is how it is done where nothing is asked for
+            if getattr(options, name) not in (parser.get_default(name), "measured"):
+                raise UsageError(
+                    f"--{name.replace('_', '-')} is heeded by --method {' and '.join(methods)} "
+                    f"only, and --method is {options.method}: leave one of them out."
+                )
+
+
 _FORMS = {"bound": "LOW:HIGH", "prior": "VALUE:STD"}
 _EXAMPLES = {"bound": "Xu=-0.2:0", "prior": "Nr=-0.1:0.02"}
 _ROLES: dict[str | None, Literal["auto", "input", "output"]] = {
@@ -290,6 +314,7 @@ def run(options: argparse.Namespace) -> None:
     from greybox.trial.plan_parts import by_parts, read_plan
     from greybox.vessel.toml import load_vessel
 
+    _require_heeded(options)
     check_targets(options.out, options.json, options.report)
     vessel = load_vessel(options.vessel)
     # the vessel's own terms may be changed too: here only the states matter

@@ -127,6 +127,11 @@ def run(options: argparse.Namespace) -> None:
     from greybox.vessel.conditions import UNITS
     from greybox.vessel.toml import load_vessel
 
+    if options.fix_not and not (options.fix or options.fix_also):
+        raise UsageError(
+            f"--fix-not names {', '.join(options.fix_not)}, and nothing is mended without --fix or "
+            f"--fix-also: add one of them, or leave --fix-not out."
+        )
     folder = is_folder(options.raw, options.out)
     if not folder and Path(options.out).suffix.lower() not in ("", *LOG_SUFFIXES):
         raise UsageError(
@@ -173,6 +178,11 @@ def import_options(options: argparse.Namespace) -> ImportOptions:
         Conditions.read(notes := pairs(options.note, "--note"))
     except LogError as error:
         raise UsageError(f"--note: {error}") from None
+    if options.window != ImportOptions.window and options.velocities != "savgol":
+        raise UsageError(
+            f"--window is {options.window:g} s, and --velocities {options.velocities} has none: "
+            f"add --velocities savgol, or leave --window out."
+        )
     return ImportOptions(
         sample_time=options.sample_time,
         max_gap=options.hole,

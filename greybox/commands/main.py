@@ -12,12 +12,8 @@ from importlib.metadata import version
 from pathlib import Path
 
 from greybox.commands.common import require_apart
-from greybox.commands.configuration import (
-    find_configuration,
-    parse_configured,
-    read_configuration,
-)
-from greybox.commands.parser import UNKNOWN, Parser, require_known, short_usage, sub_parsers
+from greybox.commands.configuration import configure, find_configuration
+from greybox.commands.parser import Parser, sub_parsers
 from greybox.commands.terminal import complain, telling
 from greybox.errors import GreyboxError, UsageError
 from greybox.registry import entry_points
@@ -37,42 +33,29 @@ repeat may stand in greybox.toml; NO_COLOR, GREYBOX_CONFIG and GREYBOX_CLUSTER a
 _log = logging.getLogger(__name__)
 
 
-def _add_shell(parser: argparse.ArgumentParser, *, after: bool) -> None:
+def _add_shell(parser: argparse._ActionsContainer, verbose: str) -> None:
     """Add what every command takes, before or after its name."""
-    default = argparse.SUPPRESS if after else False
-    group = parser.add_argument_group("what is shown, and what is read") if after else parser
-    group.add_argument(
-        "-v", "--verbose", action="count", dest="more_verbose" if after else "verbose",
-        default=argparse.SUPPRESS if after else 0,
+    parser.add_argument(
+        "-v", "--verbose", action="count", dest=verbose, default=argparse.SUPPRESS,
         help="tell on stderr what is read, chosen and solved, and when; -vv tells more",
     )  # fmt: skip
-    for names, told in (
-        (("-q", "--quiet"),
-         "show no results and no progress, errors only; files are written as always"),
-        (("--no-config",), "read no greybox.toml"),
-    ):  # fmt: skip
-        group.add_argument(*names, action="store_true", default=default, help=told)
+    told = "show no results and no progress, errors only; files are written as always"
+    for names, text in ((("-q", "--quiet"), told), (("--no-config",), "read no greybox.toml")):
+        parser.add_argument(*names, action="store_true", default=argparse.SUPPRESS, help=text)
 
 
 def build_parser(only: str | None = None) -> argparse.ArgumentParser:
-    """Return the parser; modules of sub-commands are imported for their options only.
-
-    Parameters
-    ----------
-    only : str, optional
-        The sub-command that is going to run: the others are then not imported.
-    """
+    """Return the parser with the options of all sub-commands, or of the one that is to run."""
     parser = Parser(
         prog="greybox",
         description="Trustworthy ship models from sea trials: design the trial, read the log, "
         "estimate, show what the simulation gets wrong.",
         epilog=EXAMPLES,
     )
-    parser.add_argument(
-        "--version", action="version", version=f"greybox {version('greybox-marine')}",
-        help="show the version",
-    )  # fmt: skip
-    _add_shell(parser, after=False)
+    shown = f"greybox {version('greybox-marine')}"
+    parser.add_argument("--version", action="version", version=shown, help="show the version")
+    _add_shell(parser, "verbose")
+    parser.set_defaults(verbose=0, quiet=False, no_config=False)
     # without `prog` the usage would be rendered to find it, which loads what renders
     commands = parser.add_subparsers(
         dest="command", metavar="COMMAND", required=True, title="commands", prog="greybox"
@@ -84,12 +67,11 @@ def build_parser(only: str | None = None) -> argparse.ArgumentParser:
             commands.add_parser(name)
             continue
         module = import_module(found[name])
-        sub = commands.add_parser(
-            name, help=module.HELP, description=module.HELP, epilog=module.EXAMPLES
-        )
+        told = {"help": module.HELP, "description": module.HELP, "epilog": module.EXAMPLES}
+        sub = commands.add_parser(name, **told)
         module.add_arguments(sub)
-        sub.usage = short_usage(sub)
-        _add_shell(sub, after=True)
+        sub.usage = sub.short_usage()
+        _add_shell(sub.add_argument_group("what is shown, and what is read"), "more_verbose")
         sub.set_defaults(run=module.run)
     topic = commands.add_parser("help", help="show the help of a command", add_help=False)
     topic.add_argument("topic", nargs="?", choices=known, metavar="COMMAND")
@@ -97,66 +79,41 @@ def build_parser(only: str | None = None) -> argparse.ArgumentParser:
 
 
 def _parse(given: list[str]) -> argparse.Namespace:
-    """Return the options of the command line, with those of the configuration file.
-
-    Raises
-    ------
-    ConfigurationError
-        The configuration file is at fault.
-    UsageError
-        The folder that the command is run in does not exist.
-    """
+    """Return the options of the command line, with those of the configuration file."""
     command = next((a for a in given if not a.startswith("-")), "")
+    at = given.index(command) if command else len(given)
     if command == "help":
-        at = given.index(command)
-        given = [*given[at + 1 : at + 2], "--help"]
-        command = given[0]
+        return _parse([*given[at + 1 : at + 2], "--help"])
     parser = build_parser(command)
     if not given:
         parser.print_help(sys.stderr)
         parser.exit(2)
-    own = sub_parsers(parser).get(command)
-    if own is None or {"-h", "--help", "--version"} & set(given):
+    parsers = sub_parsers(parser)
+    if command not in parsers:
         return parser.parse_args(given)
-    at = given.index(command)
-    require_known(parser, given[:at])
-    require_known(own, given[at:])
-    # options may be abbreviated
-    unread = any(g.startswith("--no-c") and "--no-config".startswith(g) for g in given)
-    path = None if unread else find_configuration(_folder(), os.environ)
-    options, left = (
-        parser.parse_known_args(given)
-        if path is None
-        else parse_configured(read_configuration(path), command, given, parser, build_parser)
-    )
-    if left:
-        own.error(UNKNOWN + " ".join(left))
-    return options
-
-
-def _folder() -> Path:
-    """Return the folder that the command is run in."""
+    typed = vars(parsers[command].for_parts().parse_args(given[at + 1 :]))
     try:
-        return Path.cwd()
+        folder = Path.cwd()
     except FileNotFoundError:
         raise UsageError(
             "the folder that this is run in was deleted, so paths lead nowhere: change to a "
             "folder that exists."
         ) from None
+    # before a command, it is the only option that begins so
+    unread = "no_config" in typed or any(g.startswith("--no") for g in given[:at])
+    path = None if unread else find_configuration(folder, os.environ)
+    more, record = configure(path, command, parsers, typed, build_parser) if path else ([], None)
+    # behind the files, which an option that takes several would take too
+    end = given.index("--") if "--" in given else len(given)
+    options = parser.parse_args([*given[:end], *more, *given[end:]])
+    options.typed, options.configuration = given, record
+    return options
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line and return its exit status.
+    """Run a command line, by default that of the process, and return its exit status.
 
-    Parameters
-    ----------
-    arguments : sequence of str, optional
-        By default those of the process.
-
-    Returns
-    -------
-    int
-        0 done, 1 the input is at fault, 2 wrong usage (by SystemExit).
+    0 is done, 1 that the input is at fault; wrong usage is a SystemExit with 2.
     """
     if "_ARGCOMPLETE" in os.environ:
         from greybox.commands.completion import offer
@@ -164,12 +121,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         offer(build_parser())
     name = "greybox"
     try:
-        given = list(sys.argv[1:] if arguments is None else arguments)
-        options = _parse(given)
-        options.typed = given
+        options = _parse(list(sys.argv[1:] if arguments is None else arguments))
         name = f"greybox {options.command}"
-        verbose = options.verbose + getattr(options, "more_verbose", 0)
-        with telling(verbose, options.quiet):
+        with telling(options.verbose + getattr(options, "more_verbose", 0), options.quiet):
             _run(options)
     except GreyboxError as error:
         complain(f"{name}: {error}")
@@ -184,9 +138,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> None:
-    _folder()
-    used = getattr(options, "configuration", None)
-    if used is not None:
+    if used := options.configuration:
         _log.info("configuration %s gives %s", used["file"], ", ".join(used["options"]))
     require_apart(options)
     if hasattr(options, "cluster"):

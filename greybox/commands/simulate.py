@@ -68,6 +68,11 @@ def run(options: argparse.Namespace) -> None:
             )
         fill = dict(zip(("u", "v", "r", "psi"), values, strict=True))
     log = read_log(options.log, model.vessel, states=model.structure.states, fill=fill, gaps=True)
+    if fill and all(np.any(log[channel] != value) for channel, value in fill.items()):
+        raise UsageError(
+            f"--start is '{options.start}', and '{options.log}' holds u, v, r and psi from which "
+            f"its run starts: leave --start out, or name a log of commands only."
+        )
     heading: Literal["measured", "simulated"] = options.heading or (
         "simulated" if fill else "measured"
     )

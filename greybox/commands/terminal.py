@@ -7,7 +7,7 @@ import os
 import re
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from contextvars import ContextVar
 from datetime import timedelta
 from typing import TYPE_CHECKING, TextIO
@@ -19,13 +19,9 @@ if TYPE_CHECKING:
 
 LOGGERS = ("greybox", "experiment_design")
 _QUIET: ContextVar[bool] = ContextVar("quiet", default=False)
-_RED, _GREEN, _YELLOW = "31", "32", "33"
-_VERDICT = re.compile(
-    r"^(?P<label>(?:[Vv]erdict|Prediction|Coefficients): )(?P<word>do not trust|trust except|\w+)",
-    re.MULTILINE,
-)
-_TONES = {"trust": _GREEN, "good": _GREEN, "none": _GREEN, "do not trust": _RED, "poor": _RED,
-          "unexplained": _RED}  # fmt: skip
+# words of a verdict in red and green, and all others in yellow
+_TONES = {31: "do not trust|poor|unexplained", 32: "(?!trust except)trust|good|none",
+          33: r"trust except|\w+"}  # fmt: skip
 # the bar that is on the screen: one at most
 _shown: list[Progress] = []
 
@@ -33,10 +29,6 @@ _shown: list[Progress] = []
 def coloured(stream: TextIO) -> bool:
     """Whether a stream shows colours: a terminal, and neither NO_COLOR nor a dumb one."""
     return stream.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
-
-
-def _paint(text: str, colour: str) -> str:
-    return f"\x1b[1;{colour}m{text}\x1b[0m"
 
 
 def _printable(text: str) -> str:
@@ -48,8 +40,7 @@ def complain(text: str) -> None:
     clear()
     text = _printable(text)
     if coloured(sys.stderr):
-        who, sign, what = text.partition(": ")
-        text = _paint(who + sign.rstrip(), _RED) + " " * bool(sign) + what
+        text = re.sub("^[^:]*:?", "\x1b[1;31m\\g<0>\x1b[0m", text)
     sys.stderr.write(text + "\n")
 
 
@@ -59,9 +50,9 @@ def say(text: str) -> None:
         return
     clear()
     if coloured(sys.stdout):
-        text = _VERDICT.sub(
-            lambda m: m["label"] + _paint(m["word"], _TONES.get(m["word"], _YELLOW)), text
-        )
+        for tone, words in _TONES.items():
+            verdict = rf"(?m)^((?:[Vv]erdict|Prediction|Coefficients): )({words})\b"
+            text = re.sub(verdict, f"\\1\x1b[1;{tone}m\\2\x1b[0m", text)
     sys.stdout.write(text + "\n")
 
 
@@ -72,25 +63,20 @@ def clear() -> None:
 
 
 def _bar(counted: bool) -> Progress:
+    from rich import progress as rich
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        Progress,
-        SpinnerColumn,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-    from rich.table import Column
 
-    one_line = Column(no_wrap=True, overflow="ellipsis")
-    text = TextColumn("{task.description}", markup=False, table_column=one_line)
-    time = (BarColumn(), TimeRemainingColumn(), "left") if counted else (TimeElapsedColumn(),)
+    text = rich.TextColumn("{task.description}", markup=False)
+    left = (rich.BarColumn(), rich.TimeRemainingColumn(), "left")
     # steps may take minutes, so the time left is told by all of them
-    return Progress(
-        SpinnerColumn(), text, *time, console=Console(stderr=True), transient=True,
-        speed_estimate_period=float("inf"), redirect_stdout=False, redirect_stderr=False,
+    bar = rich.Progress(
+        rich.SpinnerColumn(), text, *(left if counted else [rich.TimeElapsedColumn()]),
+        console=Console(stderr=True), transient=True, speed_estimate_period=float("inf"),
+        redirect_stdout=False, redirect_stderr=False,
     )  # fmt: skip
+    bar.add_task("", total=None)
+    bar.start()
+    return bar
 
 
 def _show(text: str, done: int = 0, total: int | None = None) -> None:
@@ -98,19 +84,14 @@ def _show(text: str, done: int = 0, total: int | None = None) -> None:
     if _QUIET.get() or not sys.stderr.isatty() or os.environ.get("TERM") == "dumb":
         return
     counting = bool(_shown) and _shown[0].tasks[0].total is not None
-    if total is None and counting:
-        return
     if total is not None and (done >= total or not counting):
         clear()
-    if total is None or done < total:
-        text = _printable(text)
+    # steps that are counted stay on the screen while parts of one are told
+    if done < total if total is not None else not counting:
         if not _shown:
             _shown.append(_bar(total is not None))
-            _shown[0].add_task(text, total=total, completed=done)
-            _shown[0].start()
-        _shown[0].update(
-            _shown[0].task_ids[0], description=text, completed=done, total=total, refresh=True
-        )
+        (task,), text = _shown[0].task_ids, _printable(text)
+        _shown[0].update(task, description=text, completed=done, total=total, refresh=True)
 
 
 def progress(title: str) -> Callable[[int, int], None]:
@@ -121,49 +102,36 @@ def progress(title: str) -> Callable[[int, int], None]:
 class _Teller(logging.Handler):
     """Writes records to standard error as lines, or shows the last one while it holds."""
 
-    def __init__(self, lines: bool) -> None:
-        super().__init__()
-        self._lines = lines
+    lines = False
 
     def emit(self, record: logging.LogRecord) -> None:
         """Write or show one record; its logger where all is told."""
         text = record.getMessage()
-        if self._lines:
+        if self.lines:
             clear()
             name = f"{record.name}: " if record.levelno < logging.INFO else ""
             # seconds since the program began
             sys.stderr.write(f"[{record.relativeCreated / 1000:7.2f} s] {name}{text}\n")
-            return
-        left = seconds_left()
-        limit = "" if left == float("inf") else f" (at most {timedelta(seconds=int(left))} left)"
-        _show(text + limit)
+        else:
+            left = seconds_left()
+            limit = "" if left == float("inf") else f" (at most {timedelta(0, int(left))} left)"
+            _show(text + limit)
 
 
 @contextmanager
 def telling(verbose: int, quiet: bool) -> Iterator[None]:
-    """Tell what is done while the block runs: ``verbose`` 1 in few lines, 2 in all.
+    """Tell what is done while the block runs: ``verbose`` 1 in few lines, 2 in all, 0 by a bar.
 
-    Parameters
-    ----------
-    verbose : int
-        0 shows on a terminal what is being done, and leaves no line of it.
-    quiet : bool
-        Results and progress are not shown either.
+    Results and the bar are not shown where ``quiet`` is asked for.
     """
-    token = _QUIET.set(quiet)
-    loggers = [logging.getLogger(name) for name in LOGGERS]
-    if not (verbose or sys.stderr.isatty()):
-        loggers = []
-    levels = [logger.level for logger in loggers]
-    teller = _Teller(lines=verbose > 0)
-    for logger in loggers:
-        logger.addHandler(teller)
-        logger.setLevel(logging.DEBUG if verbose > 1 else logging.INFO)
-    try:
+    teller = _Teller()
+    teller.lines = verbose > 0
+    with ExitStack() as undo:
+        for logger in map(logging.getLogger, LOGGERS if verbose or sys.stderr.isatty() else ()):
+            undo.callback(logger.setLevel, logger.level)
+            undo.callback(logger.removeHandler, teller)
+            logger.addHandler(teller)
+            logger.setLevel(logging.DEBUG if verbose > 1 else logging.INFO)
+        undo.callback(_QUIET.reset, _QUIET.set(quiet))
+        undo.callback(clear)
         yield
-    finally:
-        clear()
-        for logger, level in zip(loggers, levels, strict=True):
-            logger.removeHandler(teller)
-            logger.setLevel(level)
-        _QUIET.reset(token)

@@ -275,7 +275,8 @@ def parse_term(name: str) -> Term:
         match = _TOKEN.match(body, position)
         if match is None:
             raise StructureError(
-                f"term '{name}' cannot be read at '{body[position:]}': factors are "
+                f"term '{name}' cannot be read at '{body[position:]}'."
+                f"{suggestion(body[position:], SIGNALS)} Factors are "
                 f"{', '.join(reversed(SIGNALS))}, in bars for the modulus."
             )
         signal = match["modulus"] or match["plain"]

@@ -106,6 +106,10 @@ def test_a_plan_of_commands_is_simulated_from_a_start(noisy_csv, tmp_path, capsy
     assert run("simulate", model, plan, "--start", "1.5,1.2,0,0", "--out", tmp_path / "r.csv") == 0
     assert run("simulate", model, plan, "--start", "1.5,1.2", "--out", tmp_path / "r.csv") == 1
     assert "four numbers are needed" in capsys.readouterr().err
+    given = ["simulate", model, noisy_csv, "--start", "1.5,1.2,0,0.5"]
+    assert run(*given, "--out", tmp_path / "none.csv") == 1
+    assert "leave --start out, or name a log of commands only." in capsys.readouterr().err
+    assert not (tmp_path / "none.csv").exists()
 
 
 @pytest.mark.parametrize(

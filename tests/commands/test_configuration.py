@@ -209,7 +209,7 @@ def test_a_letter_that_stands_for_a_number_is_no_file():
     import argparse
 
     from greybox.commands.common import positive
-    from greybox.commands.parser import endings
+    from greybox.commands.completion import endings
 
     parser = argparse.ArgumentParser()
     assert endings(parser.add_argument("--vessel", metavar="V")) == ("toml",)

@@ -149,6 +149,12 @@ def test_wrong_usage_is_one_sentence_with_the_nearest_name(capsys, line, message
         ("compare modle.json --log trial.csv", "Did you mean 'model.json'?"),
         ("estimate trial.csv --vessel ship.toml --structure thesys", "Did you mean 'thesis'?"),
         ("diagnose trial.csv --vessel ship.toml --causes curent", "Did you mean 'current'?"),
+        (
+            "estimate trial.csv --vessel ship.toml --structure thesis+N_|r|q",
+            "'N_|r|q' cannot be read at 'q'. Did you mean 'vq'?",
+        ),
+        ("estimate trial.csv --vessel ship.toml --structure thesis+Nrrr", "Did you mean 'Nr'?"),
+        ("estimate trial.csv --vessel ship.toml --structure thesis-Xkapa", "mean 'Xkappa'?"),
     ],
 )
 def test_names_that_nearly_exist_are_suggested(folder, monkeypatch, capsys, line, message):
@@ -157,6 +163,81 @@ def test_names_that_nearly_exist_are_suggested(folder, monkeypatch, capsys, line
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("replaced", "by", "message"),
+    [
+        ('angle = "alpha2"', 'angle = "alpa2"', "no column 'alpa2', which moves a thruster"),
+        (None, '"psi [dge]" = { name = "psi", unit = "deg" }', "Did you mean 'psi [deg]'?"),
+        (None, '"psi" = { name = "psii", unit = "deg" }', "Did you mean 'psi'?"),
+        (None, '"psi" = { name = "psi", unit = "degg" }', "Did you mean 'deg'?"),
+        (None, '"psi" = { name = "psi", unti = "deg" }', "Did you mean 'unit'?"),
+    ],
+)  # fmt: skip
+def test_names_in_a_vessel_file_are_suggested(
+    folder, tmp_path, monkeypatch, capsys, replaced, by, message
+):
+    monkeypatch.chdir(tmp_path)
+    vessel = (folder / "ship.toml").read_text()
+    changed = vessel.replace(replaced, by) if replaced else f"{vessel}\n[columns]\n{by}\n"
+    (tmp_path / "ship.toml").write_text(changed)
+    log = (folder / "trial.csv").read_text()
+    written = log.replace("psi", "psi [deg]", 1) if "[dge]" in by else log
+    (tmp_path / "trial.csv").write_text(written)
+    assert main(["estimate", "trial.csv", "--vessel", "ship.toml"]) == 1
+    error = capsys.readouterr().err
+    assert message in error
+    assert "Did you mean '" in error
+    assert error.count("\n") == 1
+
+
+# options that exclude one another
+
+
+@pytest.mark.parametrize(
+    ("line", "one", "other", "status"),
+    [
+        ("estimate trial.csv --vessel V --reduce --compare-structures thesis",
+         "--reduce", "--compare-structures", 2),
+        ("estimate trial.csv --vessel V --structure thesis --compare-structures thesis linear",
+         "--structure", "--compare-structures", 1),
+        ("diagnose trial.csv --vessel V --model m.json --structure linear",
+         "--model", "--structure", 2),
+        *((f"estimate trial.csv --vessel V --method {method} {given}",
+           given.split()[0], f"--method is {method}", 1)
+          for given, methods in {
+              "--instruments mean-kept": "ls oe", "--prefilter none": "ls oe",
+              "--heading simulated": "ls", "--nominal m.json": "ls",
+              "--process-noise": "ls iv", "--wind simulated": "ls iv", "--loss huber": "ls iv",
+              "--weights deviation": "ls iv", "--shooting multiple": "ls iv",
+              "--bound Xu=-1:0": "ls iv", "--prior Xu=-1:1": "ls iv",
+              "--damping enforce": "ls iv",
+          }.items() for method in methods.split()),
+        ("estimate trial.csv --vessel V --method oe --margin-u 1", "--margin-u", "--method iv", 1),
+        ("import trial.csv --vessel V --out o.csv --fix-not sign", "--fix-not", "--fix", 1),
+        ("import trial.csv --vessel V --out o.csv --fix-also sign --fix-not sign",
+         "--fix-also", "--fix-not", 1),
+        ("import trial.csv --vessel V --out o.csv --window 3", "--window", "--velocities", 1),
+    ],
+)  # fmt: skip
+def test_options_that_exclude_one_another_are_refused(
+    folder, tmp_path, monkeypatch, capsys, line, one, other, status
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "trial.csv").write_text((folder / "trial.csv").read_text())
+    given = line.replace(" V ", f" {folder / 'ship.toml'} ").split()
+    if status == 2:
+        with pytest.raises(SystemExit) as stop:
+            main(given)
+        assert stop.value.code == 2
+    else:
+        assert main(given) == 1
+    error = capsys.readouterr().err
+    assert one in error
+    assert other in error
+    assert error.count("\n") == 1
+    assert [p.name for p in tmp_path.iterdir()] == ["trial.csv"]
 
 
 # completion
