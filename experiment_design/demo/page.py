@@ -13,11 +13,12 @@ from greybox.model.model import ManoeuvringModel
 from greybox.report.chart import chart_of
 from greybox.report.comparison import comparison_page
 from greybox.report.diagnosed_causes import cause_section
-from greybox.report.diagnosis import diagnosis_page
+from greybox.report.diagnosis import diagnosis_page, gain_section
+from greybox.report.error_budget import noise_sentence
 from greybox.report.figures import to_svg
 from greybox.report.log import page_figures
 from greybox.report.model_difference import marked_equations
-from greybox.report.page import Marked, Page, Picture, Section, Table, flatten
+from greybox.report.page import Marked, NextStep, Page, Picture, Section, Table, flatten
 from greybox.validation.comparison import Comparison
 
 
@@ -42,6 +43,10 @@ def demo_page(demo: Demo, record: Mapping[str, Any]) -> Page:
     diagnosis, model = demo.diagnosis, demo.estimate.model()
     found = cause_section(diagnosis)
     wrong = diagnosis_page(diagnosis, {}).sections[0]
+    gain, *after = [
+        *gain_section(diagnosis).pictures,
+        *_runs(demo.after, model, diagnosis.model),
+    ]
     shown: list[tuple[Sequence[Picture], Sequence[Table], Sequence[Marked], Sequence[str]]] = [
         (_plan(demo.design), (), (), ()),
         ((), (), (), ()),
@@ -54,19 +59,32 @@ def demo_page(demo: Demo, record: Mapping[str, Any]) -> Page:
             marked_equations(diagnosis.base, diagnosis.model),
             diagnosis.next_steps,
         ),
-        (_runs(demo.after, model, diagnosis.model), (), (), ()),
+        (after, (), (), ()),
         (_plan(demo.next_design), (), (), ()),
     ]
     sections = [
         _section(number, step, *parts)
         for number, (step, parts) in enumerate(zip(demo.steps, shown, strict=True), 1)
     ]
+    budget = diagnosis.budget
     return Page(
         title="Once round the loop, on a virtual ship",
         headline=headline(diagnosis, demo),
         sentences=[
             "Each step below shows the command that does it; the files that it reads and writes "
-            "stand beside this page, so that every step can be taken again by hand."
+            "stand beside this page, so that every step can be taken again by hand.",
+            *([noise_sentence(budget, diagnosis.gain)] if budget else []),
+        ],
+        lead=gain,
+        next_steps=[
+            NextStep(
+                "Begin with a log of your own ship",
+                "greybox check LOG --vessel V --report check.html",
+            ),
+            NextStep(
+                "Find what a model of your ship gets wrong, and why",
+                "greybox diagnose LOG --vessel V --report diagnosis.html",
+            ),
         ],
         sections=sections,
         computed=flatten(dict(record)),
@@ -100,7 +118,8 @@ def _section(
 
 def _plan(design: Design) -> list[Picture]:
     """Return track and motion of a plan."""
-    return list(design_page(design, (), {}).pictures[:2])
+    page = design_page(design, (), {})
+    return [p for p in (page.lead, page.pictures[0]) if p is not None]
 
 
 def _runs(comparison: Comparison, *models: ManoeuvringModel) -> Sequence[Picture]:

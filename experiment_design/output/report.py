@@ -21,7 +21,7 @@ from experiment_design.request.regimes import spell_regime
 from experiment_design.request.request import build_problem
 from greybox.report.chart import chart_of
 from greybox.report.figures import BLUE, ORANGE, new_figure, tidy, to_svg
-from greybox.report.page import Page, Picture, Section, Table, computed
+from greybox.report.page import NextStep, Page, Picture, Section, Table, computed, typed
 
 Array = NDArray[np.float64]
 
@@ -66,22 +66,49 @@ def design_page(
     if design.lead_in_s:
         trials = f"lead-in of {clock(design.lead_in_s)} min, trial of {trials}"
     parts = [_trial(sailed, band) for band in bands]
-    one = parts[0] if len(parts) == 1 else None
+    one = len(parts) == 1
+    shown = [replace(p, pictures=p.pictures[i == 0 :]) for i, p in enumerate(parts)]
     keeping = [design.keeping.sentence()] if design.keeping is not None else []
     said = [design.status, *keeping, *notes, *design.notes]
     return Page(
         title=f"Plan for {plain_name(r.vessel.name)}: {trials}",
         headline=headline or (UNTRIED if r.untried else "") + saving(design),
         sentences=[_sentence(s) for s in said],
-        pictures=[*(one.pictures if one else []), *_std_pictures(design, reference)],
+        lead=parts[0].pictures[0],
+        next_steps=_next_steps(record, bool(headline)),
+        pictures=[*(shown[0].pictures if one else []), *_std_pictures(design, reference)],
         tables=[
             *([_std_table(design, reference)] if np.isfinite(design.std).all() else []),
             *([] if headline else _alternatives(design)),
             _limits(design),
         ],
         computed=computed(record),
-        sections=[] if one else parts,
+        sections=[] if one else shown,
     )  # fmt: skip
+
+
+def _next_steps(record: dict[str, Any], between: bool) -> list[NextStep]:
+    """Return what to do once the plan has been sailed."""
+    vessel = typed(record, "vessel", "V")
+    check = NextStep(
+        "Sail the plan, and check its log before you leave the place",
+        f"greybox check LOG --vessel {vessel} --report check.html",
+    )
+    if between:
+        return [
+            check,
+            NextStep(
+                "See which of the explanations the log bears out",
+                f"greybox diagnose LOG --vessel {vessel} --report diagnosis.html",
+            ),
+        ]
+    return [
+        check,
+        NextStep(
+            "Estimate the model from it",
+            f"greybox estimate LOG --vessel {vessel} --out model.json --report model.html",
+        ),
+    ]
 
 
 def _sentence(text: str) -> str:

@@ -204,7 +204,7 @@ def _no_prediction(pairs: Sequence[Pair]) -> str:
     if poor:
         return (
             f"the held-out free run of {' and '.join(map(word, poor))} is worse than a constant, "
-            f"and that is not noise"
+            f"and that is not only noise"
         )
     return ""
 
@@ -269,7 +269,7 @@ def _remaining(final: Fit, pairs: Sequence[Pair], left: Omnibus, why: str) -> st
     moved = coloured(problem.forgetful(final, np.inf), problem.runs[0].outputs)
     tail = f" In these logs {moved}." if moved else ""
     if why:
-        return f"What is left is not noise: {why}.{tail}"
+        return f"What is left is not only noise: {why}.{tail}"
     if left.proof.p_value < SURE and left.explicable > 0:
         return (
             f"What is left is hardly more than noise: forces that no cause stands for would "

@@ -51,7 +51,7 @@ def diagnosis_page(diagnosis: Diagnosis, record: Mapping[str, Any]) -> Page:
     record : mapping
         How it was computed: versions, command, hashes of the logs, seed.
     """
-    wrong, gain = _wrong(diagnosis), _gain(diagnosis)
+    wrong, gain = _wrong(diagnosis), gain_section(diagnosis)
     # whose the error is says most; without it, what was gained; without that, the run itself
     lead = next(iter([*_budget(diagnosis), *gain.pictures, *wrong.pictures[:1]]), None)
     sections = [
@@ -271,7 +271,7 @@ def _equations(diagnosis: Diagnosis) -> Section:
     )
 
 
-def _gain(diagnosis: Diagnosis) -> Section:
+def gain_section(diagnosis: Diagnosis) -> Section:
     """Show what the extended model gains on logs it was not fitted to."""
     if not diagnosis.gain:
         return Section("4. The gain", ["No gain was measured."])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from greybox.prediction.result import (
     verdict_line,
 )
 from greybox.report.figures import BLACK, BLUE, VERMILION, new_figure, tidy, to_svg
-from greybox.report.page import Page, Picture, Section, Table, flatten
+from greybox.report.page import NextStep, Page, Picture, Section, Table, flatten, typed
 from greybox.trial.manoeuvres import Compliance
 
 Array = NDArray[np.float64]
@@ -40,17 +41,52 @@ _DOUBTS = {
 
 def prediction_page(made: ManoeuvrePrediction, record: dict[str, Any]) -> Page:
     """Return the page: verdicts in the headline, a section with pictures for each manoeuvre."""
+    sections = [_section(m, f"prediction{i}") for i, m in enumerate(made.manoeuvres)]
+    lead, *others = sections[0].pictures
+    sections[0] = replace(sections[0], pictures=others)
     return Page(
         title=f"{made.vessel}: predicted {_TITLES[made.kind]}",
         headline=headline(made),
         sentences=[f"{made.steering[0].upper()}{made.steering[1:]}."],
         sections=[
-            *[_section(m, f"prediction{i}") for i, m in enumerate(made.manoeuvres)],
+            *sections,
             *([Section("What to know of these numbers", points=_points(made.notes))]
               if made.notes else []),
         ],
+        lead=replace(lead, caption=f"{sections[0].title}: {lead.caption}"),
+        next_steps=_next_steps(made, record),
         computed=flatten(record),
     )  # fmt: skip
+
+
+def _next_steps(made: ManoeuvrePrediction, record: dict[str, Any]) -> list[NextStep]:
+    """Return what makes the prediction surer, or puts it to the test."""
+    model = typed(record, "model", "MODEL")
+    agreements = [m.agreement for m in made.manoeuvres if m.agreement is not None]
+    steps = []
+    if any(c.verdict is Compliance.OPEN for m in made.manoeuvres for c in m.criteria):
+        steps.append(
+            NextStep(
+                "Plan a trial that narrows these intervals",
+                f"greybox design --vessel V --model {model} --duration 900 --out plan.csv",
+            )
+        )
+    if made.prediction in _DOUBTS or not all(r.agrees for a in agreements for r in a.rows):
+        steps.append(
+            NextStep(
+                "Find what the model gets wrong, and why",
+                f"greybox diagnose {typed(record, 'trial', 'LOG')} --vessel V --model {model} "
+                f"--report diagnosis.html",
+            )
+        )
+    if not agreements:
+        steps.append(
+            NextStep(
+                "Lay the manoeuvre beside it once it has been sailed",
+                f"greybox predict {model} {made.kind} --trial LOG --report beside.html",
+            )
+        )
+    return steps
 
 
 def headline(made: ManoeuvrePrediction) -> str:
