@@ -701,7 +701,6 @@ def _asked(options: argparse.Namespace, model: Any, sailed: Any = None) -> Any:
     if options.of:
         values = dict(zip(model.names, model.at_final_parameters().theta, strict=True))
         combination = gradient_of(options.of, values)
-    combined = next(c.name for c in CRITERIA.values() if c.combined)
     process = None if options.process_noise is None else np.array(options.process_noise)
     return DesignRequest(
         duration=_duration(options),
@@ -711,7 +710,7 @@ def _asked(options: argparse.Namespace, model: Any, sailed: Any = None) -> Any:
         trials=options.trials,
         predictor=options.predictor,
         estimator=options.estimator or "iv",
-        criterion=options.criterion or (combined if options.of else "D"),
+        criterion=options.criterion or ("c" if options.of else "D"),
         wanted=tuple(options.want),
         combination=combination,
         current=options.current,

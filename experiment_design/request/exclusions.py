@@ -64,22 +64,18 @@ class Exclusion:
         lacking : mapping of str to str
             Conditions that are not met, each with what is so instead.
         """
-        option = next((n for n in self.options if n in given), None)
-        if option is None:
+        option = next((n for n in self.options if n in given), "")
+        other = next((n for n in self.against if n in given), "")
+        unmet = next((lacking[n] for n in self.needs if n in lacking), "")
+        absent = self.needs and not given & set(self.needs)
+        if not option or not (other or unmet or (absent and self.needs[0] not in CONDITIONS)):
             return ""
-        other = next((n for n in self.against if n in given), None)
-        if other is None and (not self.needs or any(n in given for n in self.needs)):
-            return ""
-        conditions = [n for n in self.needs if n in CONDITIONS]
-        unmet = [lacking[n] for n in conditions if n in lacking]
-        if other is None and len(unmet) < len(conditions):
-            return ""
-        said = (
-            f"{self.why}: {self.instead}."
-            if not unmet
-            else (f"{self.why}, and {unmet[0]}: {self.instead}.")
-        )
-        return said.replace("{option}", spelt(option)).replace("{other}", spelt(other or ""))
+        return self.told(spelt(option), spelt(other), unmet)
+
+    def told(self, option: str, other: str, unmet: str = "") -> str:
+        """Return the sentence on two options, and on what is so instead of a condition."""
+        said = f"{self.why}, and {unmet}" if unmet else self.why
+        return f"{said}: {self.instead}.".replace("{option}", option).replace("{other}", other)
 
 
 def _beside(options: str, against: str, why: str, instead: str = "leave out {other}") -> Exclusion:
