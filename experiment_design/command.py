@@ -8,6 +8,7 @@ from typing import Any
 
 from experiment_design.information.estimators import ESTIMATORS
 from experiment_design.information.optimality import CRITERIA
+from experiment_design.request.exclusions import COEFFICIENTS, require_compatible, spelt
 from greybox.commands.common import (
     add_cluster,
     add_seed,
@@ -30,8 +31,8 @@ EXAMPLES = """examples:
   greybox design --vessel ship.toml --model model.json --duration 900 --area room.csv \\
       --speed-cap 3 --yaw-cap 0.1 --sheet sheet.html --out plan.csv
   greybox design --vessel ship.toml --model model.json --duration 600 --trials 2 --out plan.csv
-  greybox design --vessel ship.toml --model model.json --duration 600 \\
-      --between plain.json current.json --out plan.csv
+  greybox design --vessel ship.toml --between plain.json current.json --duration 600 \\
+      --out plan.csv
   greybox design --vessel ship.toml --model model.json --for causes --diagnosis d.json \\
       --duration 600 --out plan.csv
   greybox design --vessel ship.toml --prior none --duration 900 --out plan.csv
@@ -39,77 +40,30 @@ EXAMPLES = """examples:
 """
 
 
-# what a trial may be designed for; options that ask for coefficients by themselves
+# what a trial may be designed for
 PURPOSES = ("coefficients", "prediction", "causes")
-IMPLY_COEFFICIENTS = (
-    "criterion", "want", "of", "target", "estimator", "regime", "prior", "robust", "margin_v",
-    "margin_air",
-)  # fmt: skip
 
 
-def _told(names: tuple[str, ...]) -> str:
-    return ", ".join(f"--{n.replace('_', '-')}" for n in names)
+def _given(options: argparse.Namespace) -> set[str]:
+    """Return what is asked, as the rules on options that exclude one another name it."""
+    parser = argparse.ArgumentParser()
+    add_arguments(parser)
+    given = {a.dest for a in parser._actions if getattr(options, a.dest, a.default) != a.default}
+    if options.prior == NO_PRIOR:
+        given = given - {"prior"} | {"prior none"}
+    chosen = options.criterion
+    if CRITERIA[chosen].combined if chosen else options.of:
+        given.add("criterion c")
+    return given
 
 
-def _purpose(options: argparse.Namespace) -> str:
-    """Return what the trial is for, refusing options that say two things.
-
-    Raises
-    ------
-    UsageError
-        An option of one purpose stands beside the other.
-    """
-    from greybox.errors import UsageError
-
-    given = [n for n in IMPLY_COEFFICIENTS if getattr(options, n) not in (None, [], 0, NO_PRIOR)]
-    about_causes = bool(options.causes or options.diagnosis)
-    if options.between:
-        if options.purpose in ("prediction", "causes") or options.envelope or about_causes:
-            raise UsageError(
-                "--between tells two explanations apart: leave out --for, --envelope, --causes and "
-                "--diagnosis."
-            )
-        return "coefficients"
-    if options.purpose == "causes" or (about_causes and options.purpose is None):
-        _require_causes(options, given)
+def _purpose(options: argparse.Namespace, given: set[str]) -> str:
+    """Return what the trial is for, by --for or by options that ask for it themselves."""
+    if options.between or options.purpose:
+        return options.purpose or "coefficients"
+    if given & {"causes", "diagnosis"}:
         return "causes"
-    if about_causes:
-        raise UsageError("--causes and --diagnosis say what is open: use --for causes with them.")
-    if options.purpose == "prediction" and given:
-        raise UsageError(
-            f"--for prediction covers all coefficients and both sides: leave out "
-            f"{_told((given[0],))}, or use --for coefficients."
-        )
-    purpose: str = options.purpose or ("coefficients" if given else "prediction")
-    if purpose == "coefficients" and options.envelope:
-        raise UsageError(
-            "--envelope says what predictions are wanted for: use --for prediction with it."
-        )
-    return purpose
-
-
-def _require_causes(options: argparse.Namespace, given: list[str]) -> None:
-    """Refuse what does not go with a trial that tells causes apart, or says not which.
-
-    Raises
-    ------
-    UsageError
-        Says what to leave out or to give.
-    """
-    from greybox.errors import UsageError
-
-    if given:
-        raise UsageError(
-            f"--for causes tests causes and not coefficients: leave out {_told((given[0],))}."
-        )
-    if options.after or options.prior == NO_PRIOR:
-        other = "--after" if options.after else "--prior none"
-        raise UsageError(
-            f"--for causes needs the model that was diagnosed: leave out {other} and give it by "
-            f"--model."
-        )
-    if options.causes and options.diagnosis:
-        raise UsageError("--causes and --diagnosis both say what is open: give one of them.")
+    return "coefficients" if given.intersection(COEFFICIENTS) else "prediction"
 
 
 def _listed(registry: Registry[Any]) -> str:
@@ -195,8 +149,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         dest="purpose",
         choices=PURPOSES,
         help="what the estimate is wanted for: predictions over the operating envelope, both "
-        f"sides, misfit included (prediction, unless one of {_told(IMPLY_COEFFICIENTS)} is "
-        "given), the precision of coefficients in one regime, or telling causes apart",
+        "sides, misfit included (prediction, unless one of "
+        f"{', '.join(map(spelt, COEFFICIENTS))} is given), the precision of coefficients in one "
+        "regime, or telling causes apart",
     )
     goal.add_argument(
         "--diagnosis",
@@ -375,18 +330,14 @@ def run(options: argparse.Namespace) -> None:
 
         sheet_kind(options.sheet)
     untried = options.prior == NO_PRIOR
-    if untried and (options.model or options.between):
-        given = f"--model {options.model}" if options.model else "--between"
-        raise UsageError(
-            f"--prior none starts without any model and {given} names one: leave one of them out."
-        )
-    _require_stages(options)
+    given = _given(options)
+    purpose = _purpose(options, given)
+    require_compatible(given if options.between else given | {f"for {purpose}"})
     if options.between is None and options.model is None and not untried and not options.after:
         raise UsageError(
             "--model is missing: name a prior model, two with --between A B, what has been sailed "
             "with --after LOG, or start without one by --prior none."
         )
-    purpose = _purpose(options)
     vessel = load_vessel(options.vessel)
     _duration(options)
     sailed: Any = None
@@ -410,6 +361,12 @@ def run(options: argparse.Namespace) -> None:
         asked = replace(asked, prior=model)
     request, _ = _prepared(options, model, asked, vessel, sailed)
     notes = (*told, *request.notes)
+    if options.between and options.model not in (None, options.between[0]):
+        notes = (
+            f"--between begins from its first model, {options.between[0]}, and {options.model} "
+            f"takes no part",
+            *notes,
+        )
     if options.between:
         _run_between(options, request, notes)
         return
@@ -458,41 +415,6 @@ def _deliver(
     for path in (options.out, options.legs, options.sheet, options.report, options.save_model):
         if path:
             say(f"wrote {path}")
-
-
-def _require_stages(options: argparse.Namespace) -> None:
-    """Refuse options that contradict a trial in stages.
-
-    Raises
-    ------
-    UsageError
-        Says which to leave out.
-    """
-    from greybox.errors import UsageError
-
-    if not options.after:
-        if options.save_model:
-            raise UsageError("--save-model writes the model that --after LOG estimates: name LOG.")
-        return
-    if options.prior == NO_PRIOR:
-        raise UsageError(
-            "--prior none starts without any trial and --after names one: leave one of them out."
-        )
-    if options.prior:
-        raise UsageError(
-            "--after takes what its logs told as known beforehand: leave out --prior, and name all "
-            "logs behind --after."
-        )
-    if options.between:
-        raise UsageError(
-            "--after designs the rest of a trial for one model and --between tells two apart: "
-            "leave one of them out."
-        )
-    if options.save_model and options.model:
-        raise UsageError(
-            "--save-model writes the model that --after estimates and --model names one that is "
-            "there: leave one of them out."
-        )
 
 
 def _duration(options: argparse.Namespace) -> float:
@@ -612,6 +534,7 @@ def _run_for_prediction(
         model,
         envelope=dict(_range(text, vessel) for text in options.envelope),
         kept_starts=options.trials if options.start is not None else int(ended),
+        workers=options.workers,
         sailed=sailed.motions if sailed is not None else (),
     )
     _deliver(options, found.design, found, notes, _of_sailed(sailed), found.headline())
@@ -647,6 +570,7 @@ def _run_for_causes(options: argparse.Namespace, model: Any, vessel: Any) -> Non
         causes,
         envelope=dict(_range(text, vessel) for text in options.envelope),
         kept_start=options.start is not None,
+        workers=options.workers,
     )
     _deliver(options, found.design, found, request.of_both_sides, {}, found.headline())
 
@@ -754,8 +678,6 @@ def _asked(options: argparse.Namespace, model: Any, sailed: Any = None) -> Any:
     from greybox.errors import UsageError
     from greybox.model.model import load_model
 
-    if options.area and options.circle:
-        raise UsageError("--area and --circle exclude one another: give one sea room.")
     area: Any = None
     if options.area:
         area = read_area(options.area)
@@ -783,10 +705,6 @@ def _asked(options: argparse.Namespace, model: Any, sailed: Any = None) -> Any:
     if options.of:
         values = dict(zip(model.names, model.at_final_parameters().theta, strict=True))
         combination = gradient_of(options.of, values)
-    criterion = CRITERIA[options.criterion or "D"]
-    if options.of and criterion.determinant:
-        # of one function's variance alone, that is the criterion of one function
-        criterion = next(c for c in CRITERIA.values() if c.combined)
     process = None if options.process_noise is None else np.array(options.process_noise)
     return DesignRequest(
         duration=_duration(options),
@@ -796,7 +714,7 @@ def _asked(options: argparse.Namespace, model: Any, sailed: Any = None) -> Any:
         trials=options.trials,
         predictor=options.predictor,
         estimator=options.estimator or "iv",
-        criterion=criterion.name,
+        criterion=options.criterion or ("c" if options.of else "D"),
         wanted=tuple(options.want),
         combination=combination,
         current=options.current,

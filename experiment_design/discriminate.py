@@ -14,6 +14,7 @@ from experiment_design.information.t_optimality import Contrast, Pair
 from experiment_design.optimise.campaign import Progress
 from experiment_design.optimise.search import draw_two_level
 from experiment_design.output.result import Design
+from experiment_design.request.exclusions import require_compatible
 from experiment_design.request.request import CandidateModel, PreparedRequest, build_problem
 from greybox.errors import UsageError
 from greybox.notebook import DisplayMixin, items, number, sparkline, table
@@ -181,14 +182,13 @@ def design_between(
     Raises
     ------
     UsageError
-        The two predict the same motion, or several trials are asked for.
+        The two predict the same motion, or what is asked does not go with two models.
 
     References
     ----------
     Atkinson and Fedorov (1975), T-optimality; Kullback and Leibler (1951).
     """
-    if request.trials != 1:
-        raise UsageError("--between designs one trial at a time: leave out --trials.")
+    require_compatible(request.given | {"between"})
     first = CandidateModel(
         names[0], request.structure, request.theta, request.d, integrator=request.integrator
     )

@@ -29,6 +29,7 @@ from experiment_design.optimise.envelope_search import (
     usual_manoeuvres,
 )
 from experiment_design.output.result import Design
+from experiment_design.request.exclusions import require_compatible
 from experiment_design.request.request import PreparedRequest, build_problem
 from greybox.diagnosis.causes import Context, known_causes
 from greybox.diagnosis.hypothesis import Hypothesis, Parameter
@@ -329,6 +330,7 @@ def design_for_causes(
     *,
     envelope: Mapping[str, tuple[float, float]] | None = None,
     kept_start: bool = False,
+    workers: int | None = None,
 ) -> CauseDesign:
     """Design the trial that makes the least power over open causes largest.
 
@@ -346,11 +348,13 @@ def design_for_causes(
         Range of commands that the trial may use; see `command_ranges`.
     kept_start : bool
         Whether the trial starts as the request says; else on a straight course in the envelope.
+    workers : int, optional
+        Processes; by default one a processor. The result does not depend on it.
 
     Raises
     ------
     UsageError
-        Several trials are asked for, or a cause is unknown.
+        What is asked does not go with causes, or a cause is unknown.
     InfeasibleError
         The prior holds the ship under too few commands, or the limits cannot be kept.
 
@@ -358,8 +362,7 @@ def design_for_causes(
     ----------
     Atkinson, Donev and Tobias (2007), section 20.3; Ljung (1999), section 16.4.
     """
-    if request.trials != 1:
-        raise UsageError("--for causes designs one trial at a time: leave out --trials.")
+    require_compatible(request.given | {"for causes"})
     began = time.perf_counter()
     require_horizon(request)
     causes, tried, notes = open_causes(request, model, asked)
@@ -381,7 +384,13 @@ def design_for_causes(
     def campaign(r: PreparedRequest) -> list[EnvelopeSearch]:
         return [
             exchange_settings(
-                build_problem(r), found, power.values, r.seed, effort=r.effort, tries=_TRIES
+                build_problem(r),
+                found,
+                power.values,
+                r.seed,
+                effort=r.effort,
+                tries=_TRIES,
+                workers=workers,
             )
         ]
 

@@ -28,6 +28,7 @@ from experiment_design.optimise.envelope_search import (
     validation_holds,
 )
 from experiment_design.output.result import Design, PlanPart
+from experiment_design.request.exclusions import require_compatible
 from experiment_design.request.request import PreparedRequest, build_problem
 from greybox.errors import InfeasibleError
 from greybox.model.model import ManoeuvringModel
@@ -207,6 +208,7 @@ def design_for_prediction(
     envelope: Mapping[str, tuple[float, float]] | None = None,
     kept_starts: int = 0,
     sailed: Sequence[Motion] = (),
+    workers: int | None = None,
 ) -> PredictionDesign:
     """Design the trial that leaves the least error of predictions over the operating envelope.
 
@@ -223,6 +225,8 @@ def design_for_prediction(
         in the envelope.
     sailed : sequence of Motion
         What has been sailed, as `sailed_trial` gives it: the plan covers what it has not.
+    workers : int, optional
+        Processes; by default one a processor. The result does not depend on it.
 
     Returns
     -------
@@ -230,6 +234,8 @@ def design_for_prediction(
 
     Raises
     ------
+    UsageError
+        What is asked does not go with predictions.
     InfeasibleError
         The prior holds the ship under too few commands, or the limits cannot be kept.
 
@@ -240,7 +246,7 @@ def design_for_prediction(
     from threadpoolctl import threadpool_limits
 
     with threadpool_limits(1, "blas"):
-        return _design(request, model, envelope or {}, kept_starts, sailed)
+        return _design(request, model, envelope or {}, kept_starts, sailed, workers)
 
 
 def operating_envelope(
@@ -280,15 +286,19 @@ def _design(
     given: Mapping[str, tuple[float, float]],
     kept_starts: int,
     sailed: Sequence[Motion],
+    workers: int | None,
 ) -> PredictionDesign:
     began = time.perf_counter()
+    require_compatible(request.given | {"for prediction"})
     require_horizon(request)
     found, level = operating_envelope(request, model, given)
     states = request.structure.states
     others = (found.rollout.start,) * request.trials
     asked = replace(request, starts=(*request.starts[:kept_starts], *others[kept_starts:]))
     before = log_moments(found, sailed)
-    tightened, searches, keeping = tightened_search(asked, lambda r: _campaign(r, found, before))
+    tightened, searches, keeping = tightened_search(
+        asked, lambda r: _campaign(r, found, before, workers)
+    )
     design = described_plan(
         asked, tightened, searches, keeping, kept_starts=kept_starts, began=began,
         certificate="a plan for prediction has no bound to be measured against",
@@ -437,14 +447,14 @@ def tightened_search(
 
 
 def _campaign(
-    request: PreparedRequest, envelope: Envelope, before: Array | None
+    request: PreparedRequest, envelope: Envelope, before: Array | None, workers: int | None
 ) -> list[EnvelopeSearch]:
     found: list[EnvelopeSearch] = []
     known = before
     for trial in range(request.trials):
         problem = build_problem(request, trial)
         search = search_envelope(
-            problem, envelope, request.seed + 1000 * trial, request.effort, known
+            problem, envelope, request.seed + 1000 * trial, request.effort, known, workers
         )
         found.append(search)
         commands = problem.schedule.expand(problem.levels(search.candidate.unit))

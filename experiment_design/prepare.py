@@ -13,6 +13,14 @@ from experiment_design.feasibility.checks import ROOM, tells_enough, with_margin
 from experiment_design.feasibility.stability import unstable_sentence
 from experiment_design.optimise.campaign import random_campaign
 from experiment_design.request.apparent_wind import clear_heading
+from experiment_design.request.exclusions import (
+    COVARIANCE,
+    MEASURED_WIND,
+    SURGE_SIGN,
+    SWAY_SIGN,
+    YAW_RATE,
+    require_compatible,
+)
 from experiment_design.request.noise import noise_levels
 from experiment_design.request.regimes import (
     Signs,
@@ -116,11 +124,20 @@ def prepare_request(
     if asked.wind is not None:
         d[2:] = asked.wind
     measuring = PREDICTORS[predictor].air_measured
-    if asked.limits.margin_air is not None and not measuring:
-        raise UsageError(
-            f"--margin-air keeps the measured velocity through the air from zero, and predictor "
-            f"'{predictor}' does not measure it: leave it out, or use --predictor wind."
-        )
+    automatic = asked.regime.strip().lower() == "auto"
+    parts = candidate_regimes(structure.states)[:1]
+    if not automatic:
+        parts = [parse_regime(p, structure.states) for p in asked.regime.split(",")]
+    signed = {s for signs in parts for s, _ in signs}
+    unsigned = f"regime '{asked.regime}' has none for it"
+    lacking = {
+        YAW_RATE: "" if "r" in structure.states else f"structure '{structure.name}' has none",
+        MEASURED_WIND: "" if measuring else f"predictor '{predictor}' does not measure it",
+        COVARIANCE: "" if model.covariance.any() else "it has none",
+        SURGE_SIGN: "" if "u" in signed else unsigned,
+        SWAY_SIGN: "" if "v" in signed else unsigned,
+    }
+    require_compatible(asked.given, {n: said for n, said in lacking.items() if said})
     if measuring and not d[2:].any():
         raise UsageError(
             f"predictor '{predictor}' measures the wind, and in still air its terms are those of "
@@ -169,11 +186,9 @@ def prepare_request(
     if not len(steady.x):
         raise InfeasibleError(unstable_sentence(base))
     start = _start(asked, structure)
-    automatic = asked.regime.strip().lower() == "auto"
     if automatic:
         regimes = _choose_regimes(base, steady, start, asked, notes)
     else:
-        parts = [parse_regime(p, structure.states) for p in asked.regime.split(",")]
         if len(parts) not in (1, asked.trials):
             raise UsageError(
                 f"--regime names {len(parts)} regimes for {asked.trials} "

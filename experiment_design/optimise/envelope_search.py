@@ -106,6 +106,7 @@ def search_envelope(
     seed: int,
     effort: float = 1.0,
     known: Array | None = None,
+    workers: int | None = None,
 ) -> EnvelopeSearch:
     """Search for the sequence that leaves the least error of predictions.
 
@@ -119,6 +120,8 @@ def search_envelope(
         Times the usual number of evaluations.
     known : ndarray, optional
         (p, p) moments of other trials.
+    workers : int, optional
+        Processes.
     """
 
     def worth(motion: Motion) -> Array:
@@ -129,7 +132,9 @@ def search_envelope(
     holds = problem.shape[0]
     hold = problem.schedule.hold * problem.schedule.sample_time
     tail = usual_manoeuvres(envelope, validation_holds(holds), hold)
-    return exchange_settings(problem, envelope, worth, seed, effort=effort, tail=tail)
+    return exchange_settings(
+        problem, envelope, worth, seed, effort=effort, tail=tail, workers=workers
+    )
 
 
 def exchange_settings(
@@ -141,6 +146,7 @@ def exchange_settings(
     effort: float = 1.0,
     tail: Array | None = None,
     tries: int = _TOGETHER,
+    workers: int | None = None,
 ) -> EnvelopeSearch:
     """Search for the sequence of settings of an envelope that is worth most.
 
@@ -158,6 +164,8 @@ def exchange_settings(
         (k, nc) levels that every sequence ends with.
     tries : int
         Sequences that each round of each chain tries.
+    workers : int, optional
+        Processes.
     """
     holds = problem.shape[0]
     hold = problem.schedule.hold * problem.schedule.sample_time
@@ -227,7 +235,7 @@ def exchange_settings(
             pool = better(pool + judged(children))
         return pool[0]
 
-    found = better(map_forked(chain, range(_CHAINS)))
+    found = better(map_forked(chain, range(_CHAINS), workers=workers))
     values = np.array([c.value for _, c in begun])
     # the sides that a sequence goes to are no limit of the trial
     best, reference = (replace(c, missed=c.missed[:-1]) for _, c in (found[0], better(begun)[0]))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from experiment_design.information.estimators import ESTIMATORS
 from experiment_design.information.moments import Moments
 from experiment_design.information.optimality import CRITERIA
 from experiment_design.information.t_optimality import Contrast
+from experiment_design.request.exclusions import require_compatible
 from experiment_design.request.problem import Scenario, TrialProblem
 from greybox.errors import UsageError, suggestion
 from greybox.model.model import ManoeuvringModel
@@ -32,6 +33,8 @@ Array = NDArray[np.float64]
 Signs = tuple[tuple[str, int], ...]
 # memory of the wind's variation [s]
 _GUST_SECONDS = 20.0
+# options of the command that have another name than their field
+_OPTIONS = {"wanted": "want", "combination": "of"}
 
 
 @dataclass(frozen=True)
@@ -100,6 +103,23 @@ class TrialOptions:
     seed: int = 0
     effort: float = 1.0
 
+    @property
+    def given(self) -> frozenset[str]:
+        """What is asked beyond the usual, by the names of `exclusions.RULES`."""
+        usual = TrialOptions(self.duration)
+        told = {
+            _OPTIONS.get(f.name, f.name)
+            for f in fields(TrialOptions)
+            if f.name != "limits" and getattr(self, f.name) != getattr(usual, f.name)
+        }
+        limits = ("area", "margin_air", "speed_cap", "yaw_cap", "headings")
+        told |= {n for n in limits if getattr(self.limits, n) is not None}
+        if self.limits.clearance:
+            told.add("clearance")
+        if CRITERIA[self.criterion].combined:
+            told.add("criterion c")
+        return frozenset(told if any(self.combination.values()) else told - {"of"})
+
 
 @dataclass(frozen=True)
 class DesignRequest(TrialOptions):
@@ -139,6 +159,13 @@ class DesignRequest(TrialOptions):
     gust: float | None = None
     process_noise: Array | None = None
     prior: ManoeuvringModel | None = None
+
+    @property
+    def given(self) -> frozenset[str]:
+        """What is asked beyond the usual, by the names of `exclusions.RULES`."""
+        told = {n for n in ("gust", "prior") if getattr(self, n) is not None}
+        told |= {f"margin_{n}" for n in self.limits.margins}
+        return super().given | told
 
 
 @dataclass(frozen=True)
@@ -251,6 +278,11 @@ class PreparedRequest(TrialOptions):
     lead_in: LeadIn | None = None
     notes: tuple[str, ...] = ()
     of_regime: tuple[str, ...] = ()
+
+    @property
+    def given(self) -> frozenset[str]:
+        """What is asked beyond the usual, by the names of `exclusions.RULES`."""
+        return super().given | ({"trials"} if self.trials != 1 else set())
 
     @property
     def of_both_sides(self) -> tuple[str, ...]:
@@ -374,8 +406,9 @@ def build_criterion(request: PreparedRequest, predictor: Predictor) -> Criterion
     Raises
     ------
     UsageError
-        A name is unknown, or ``c`` has no function to look at.
+        A name is unknown, or options exclude one another.
     """
+    require_compatible(request.given)
     chosen = wanted_columns(predictor, request.wanted or tuple(request.combination))
     names = [predictor.columns[i].name for i in chosen]
     structure = request.structure
@@ -392,11 +425,6 @@ def build_criterion(request: PreparedRequest, predictor: Predictor) -> Criterion
     combination = np.zeros(len(names))
     for name, slope in request.combination.items():
         combination[chosen.index(wanted_columns(predictor, (name,))[0])] += slope
-    if CRITERIA[request.criterion].combined and not combination.any():
-        raise UsageError(
-            "criterion c looks at one coefficient or one function of the parameters: name it, "
-            "such as --of Yvv or --of 'Xuu/Xmu'."
-        )
     prior = None
     if request.known is not None:
         prior = _prior_information(names, *request.known)

@@ -151,7 +151,12 @@ def map_pieces(
         yield from _by_processes(function, work, count)
 
 
-def map_forked(function: Callable[[Piece], Result], pieces: Sequence[Piece]) -> list[Result]:
+def map_forked(
+    function: Callable[[Piece], Result],
+    pieces: Sequence[Piece],
+    *,
+    workers: int | None = None,
+) -> list[Result]:
     """Apply a function to a few heavy pieces of one computation, results in their order.
 
     Where no cluster computes, it is done in copies of this process, which know all that it
@@ -163,6 +168,8 @@ def map_forked(function: Callable[[Piece], Result], pieces: Sequence[Piece]) -> 
     ----------
     function : callable
     pieces : sequence
+    workers : int, optional
+        Processes; by default one a processor. A cluster uses all that it has.
 
     Raises
     ------
@@ -172,7 +179,7 @@ def map_forked(function: Callable[[Piece], Result], pieces: Sequence[Piece]) -> 
     address = _cluster()
     if address is not None and len(pieces) > 1:
         return list(_by_cluster(address, function, pieces))
-    count = min(lanes(), len(pieces)) if address is None else 1
+    count = min(workers or lanes(), len(pieces)) if address is None and _may_fork() else 1
     if count < 2:
         return [function(piece) for piece in pieces]
     return list(_by_copies(function, pieces, count))

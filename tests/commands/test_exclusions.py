@@ -1,0 +1,181 @@
+"""Options of `greybox design` that do not go together: each is honoured or refused."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import replace
+
+import pytest
+from designs import thesis_model
+from virtual import virtual_log, write_csv
+
+from experiment_design.command import add_arguments
+from greybox.commands.main import main
+from greybox.trial.log import make_log
+
+SHIP = """name = "Thesis ship"
+length = 30.0
+beam = 6.0
+mass = 300000.0
+service_speed = 3.0
+[conditions]
+draught = 2.0
+[sensors]
+u_std = 0.0141
+v_std = 0.0141
+r_std = 0.0141
+heading_std = 0.01
+""" + "".join(
+    f'[[thruster]]\ntype = "azimuth"\nx = {x}\ny = 0.0\nspeed = "n"\nangle = "{angle}"\n'
+    f"speed_limits = [10.0, 20.0]\nangle_limits = [-1.1, 1.1]\n"
+    for x, angle in ((9.0, "alpha1"), (-9.0, "alpha2"))
+)
+WIND = ("--predictor", "wind", "--wind", "5,3")
+ROOM = ("--circle", "0,0,400")
+# arguments of each option, and what has to stand beside it for a choice to be made
+VALUES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "model": (("--model", "model.json"), ()),
+    "duration": (("--duration", "80"), ()),
+    "remaining": (("--remaining", "60"), ()),
+    "after": (("--after", "log.csv"), ()),
+    "save_model": (("--save-model", "saved.json"), ()),
+    "purpose": (("--for", "prediction"), ()),
+    "diagnosis": (("--diagnosis", "diagnosis.json"), ()),
+    "causes": (("--causes", "current"), ()),
+    "envelope": (("--envelope", "n=14:17"), ()),
+    "criterion": (("--criterion", "E"), ()),
+    "want": (("--want", "Yvv", "Yv"), ()),
+    "of": (("--of", "Yvv/Ymu"), ()),
+    "target": (("--target", "Xuu=10"), ()),
+    "predictor": (("--predictor", "augmented"), ()),
+    "estimator": (("--estimator", "iv-white"), ()),
+    "prior": (("--prior", "earlier.json"), ()),
+    "between": (("--between", "model.json", "other.json"), ()),
+    "regime": (("--regime", "u+v-"), ()),
+    "margin_u": (("--margin-u", "0.9"), ()),
+    "margin_v": (("--margin-v", "0.3"), ()),
+    "margin_air": (("--margin-air", "0.3"), WIND),
+    "hold": (("--hold", "15"), ()),
+    "start": (("--start", "1.6,0.9,0,0.3"), ()),
+    "trials": (("--trials", "2"), ()),
+    "area": (("--area", "room.csv"), ()),
+    "circle": (ROOM, ()),
+    "position": (("--position", "20,10"), ROOM),
+    "clearance": (("--clearance", "30"), ROOM),
+    "speed_cap": (("--speed-cap", "3.5"), ()),
+    "yaw_cap": (("--yaw-cap", "0.2"), ()),
+    "end": (("--end", "u=1.5:1"), ()),
+    "energy": (("--energy", "0.9"), ()),
+    "headings": (("--headings", "0.2"), ()),
+    "current": (("--current", "0.05,0.02"), ()),
+    "wind": (("--wind", "2,1"), ()),
+    "gust": (("--gust", "2"), WIND),
+    "process_noise": (("--process-noise", "0.01,0.01,0.002"), ()),
+    "robust": (("--robust", "2"), ()),
+    "worst_case": (("--worst-case",), ("--robust", "2")),
+    "probability": (("--probability", "0.99"), ROOM),
+    "best_effort": (("--best-effort",), ()),
+    "effort": (("--effort", "0.2"), ()),
+    "cluster": (("--cluster", "tcp://127.0.0.1:9"), ()),
+    "workers": (("--workers", "1"), ()),
+    "seed": (("--seed", "5"), ()),
+}
+# options that may leave PLAN and JSON as they are, and why
+UNCHANGED = {
+    "vessel": "the vessel is that of the model",
+    "out": "names PLAN",
+    "json": "names the JSON",
+    "sheet": "another output",
+    "report": "another output",
+    "legs": "another output",
+    "help": "designs nothing",
+    "duration": "given in every way, as --remaining with --after",
+    "remaining": "another name of --duration",
+    "save_model": "another output",
+    "model": "given in every way that takes one",
+    "purpose": "is the way",
+    "after": "is the way",
+    "between": "is the way",
+    "causes": "given in the way that takes them",
+    "diagnosis": "names causes by its file",
+    "position": "moves the sheet's picture where the sea room has room for the trial",
+    "best_effort": "acts where limits cannot be kept",
+    "cluster": "says where it is computed, never what",
+    "workers": "says how many compute, never what",
+}
+WAYS = {
+    "coefficients": ("--for", "coefficients", "--model", "model.json", "--regime", "u+v+"),
+    "prediction": ("--for", "prediction", "--model", "model.json"),
+    "causes": ("--for", "causes", "--causes", "current", "heading_bias", "--model", "model.json"),
+    "between": ("--between", "model.json", "other.json"),
+    "after": ("--after", "log.csv", "--model", "model.json"),
+    "prior none": ("--prior", "none"),
+}
+
+
+def options_of_design() -> list[str]:
+    parser = argparse.ArgumentParser()
+    add_arguments(parser)
+    return [a.dest for a in parser._actions]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    from greybox.model.model import model_from_dict
+    from greybox.vessel.toml import load_vessel
+
+    where = tmp_path_factory.mktemp("exclusions")
+    (where / "ship.toml").write_text(SHIP)
+    ship = load_vessel(where / "ship.toml")
+    model = replace(thesis_model(spread=0.05), vessel=ship)
+    model.save(where / "model.json")
+    replace(thesis_model(spread=0.1), vessel=ship).save(where / "earlier.json")
+    replace(thesis_model(), vessel=ship).save(where / "exact.json")
+    replace(thesis_model("surge", spread=0.1), vessel=ship).save(where / "surge.json")
+    data = model.to_dict()
+    data["theta"][list(data["names"]).index("Nvr")] = -0.08
+    model_from_dict(data).save(where / "other.json")
+    log = virtual_log(1, 200, wind=0.0, current=(0.0, 0.0), spread=1e-6)
+    channels = {n: x for n, x in log.channels.items() if n not in ("u_q", "v_q")}
+    write_csv(make_log(ship, channels, 1.0, "log"), where / "log.csv")
+    (where / "room.csv").write_text("x_n,y_n\n-300,-300\n300,-300\n300,300\n-300,300\n")
+    causes = [
+        {"id": "current", "place": "current", "parameters": {}},
+        {"id": "heading_bias", "place": "heading_bias", "parameters": {}},
+    ]
+    told = {"verdict": "confused", "tried": 40, "partial": [], "candidates": causes}
+    (where / "diagnosis.json").write_text(json.dumps(told))
+    return where
+
+
+@pytest.fixture
+def design(folder, monkeypatch, capsys):
+    """Run the command in the folder: its status, what it wrote, and what it said of an error."""
+    monkeypatch.chdir(folder)
+
+    def run(*options):
+        for name in ("plan.csv", "plan.json"):
+            (folder / name).unlink(missing_ok=True)
+        status = main(
+            [
+                "design",
+                "--vessel",
+                "ship.toml",
+                "--out",
+                "plan.csv",
+                "--json",
+                "plan.json",
+                *options,
+            ]
+        )
+        error = capsys.readouterr().err
+        if status:
+            assert not (folder / "plan.csv").exists()
+            return status, None, error
+        data = json.loads((folder / "plan.json").read_text())
+        for name in ("provenance", "seconds"):
+            data.pop(name, None)
+        return status, ((folder / "plan.csv").read_text(), data), error
+
+    return run
