@@ -295,7 +295,8 @@ def test_least_trial_time():
         ({"limits": TrialLimits(margins={"v": 1.9})}, "no steady motion keeps the margins"),
         ({"regime": "u-v+"}, "no constant command within the limits of the thrusters holds"),
         (
-            {"start": (0.2, 1.2, 0, 0), "limits": TrialLimits(margins={"u": 0.5})},
+            # a lead-in is for a single trial
+            {"start": (0.2, 1.2, 0, 0), "limits": TrialLimits(margins={"u": 0.5}), "trials": 2},
             "starts 0.3 m/s beyond the margin of surge",
         ),
         ({"duration": 20.0, "predictor": "augmented"}, "a trial of 20 s is too short"),

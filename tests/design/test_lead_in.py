@@ -9,8 +9,11 @@ import pytest
 from designs import limited_ship, make_request
 
 from experiment_design.constraints.limits import Circle, TrialLimits
+from experiment_design.design import design_trial
 from experiment_design.excitation.rollout import Rollout
+from experiment_design.optimise.campaign import own_moments
 from experiment_design.optimise.lead_in import LONGEST, _Shooting, find_lead_in, short_of_margin
+from experiment_design.request.request import build_problem
 from greybox.errors import InfeasibleError
 
 MARGINS = {"u": 0.5, "v": 0.4}
@@ -58,6 +61,40 @@ def test_the_trial_goes_on_from_the_last_commands() -> None:
     whole = replace(request.schedule, samples=s.samples + len(found.levels) * s.hold)
     np.testing.assert_allclose(whole.within_reach(both), both)
     np.testing.assert_allclose(whole.expand(both)[-s.samples :], s.expand(levels))
+
+
+def test_a_design_keeps_rates_and_limits_from_its_first_command_on() -> None:
+    limits = {"speed_cap": 2.5, "area": Circle(0.0, 0.0, 300.0)}
+    design = design_trial(
+        at_rest(vessel=limited_ship(0.5, 0.02), limits=limits, effort=0.05), workers=1
+    )
+    whole = design.from_first_command()
+    lead, trial = design.parts
+    assert (lead.name, trial.name) == ("lead-in", "trial")
+    assert trial.seconds == 120.0
+    assert len(whole.commands[0]) == trial.end
+    steps = np.abs(np.diff(whole.commands[0], axis=0)).max(axis=0)
+    np.testing.assert_array_less(steps, [0.5 + 1e-9, 0.02 + 1e-9, 0.02 + 1e-9])
+    state = whole.motions[0].state[0]
+    assert not state[0].any()
+    assert np.hypot(state[:, 0], state[:, 1]).max() <= 2.5 + 1e-3
+    assert state[round(lead.end) :, 0].min() >= MARGINS["u"] - 1e-3
+    # the trial's own motion is the rest of it, its place counted from the lead-in's end
+    own = design.motions[0].state[0]
+    np.testing.assert_allclose(own[:, :4], state[-len(own) :, :4])
+    np.testing.assert_allclose(own[0, -2:], 0.0, atol=1e-9)
+    assert all(x.missed <= 1e-3 for x in design.limits)
+    assert "lead-in of" in design.notes[0]
+    # and what it is worth is that of the trial alone
+    alone = build_problem(design.request).criterion.covariance(
+        own_moments(build_problem(design.request), units_of(design))[0]
+    )[0]
+    np.testing.assert_allclose(design.covariance, alone)
+
+
+def units_of(design):
+    s = design.request.schedule
+    return (design.levels[0] - s.lower) / (s.upper - s.lower)
 
 
 def test_derivatives_are_carried_back_to_the_levels() -> None:
