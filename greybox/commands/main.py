@@ -18,10 +18,11 @@ from greybox.commands.terminal import complain, telling
 from greybox.errors import GreyboxError, UsageError
 from greybox.registry import entry_points
 
-GROUP = "greybox.commands"
 # as the work goes; commands of other packages follow
 ORDER = ("demo", "import", "check", "estimate", "simulate", "compare", "diagnose", "design",
          "predict", "export", "reproduce", "completion")  # fmt: skip
+ABOUT = ("Trustworthy ship models from sea trials: design the trial, read the log, estimate, show "
+         "what the simulation gets wrong.")  # fmt: skip
 EXAMPLES = """examples:
   greybox check trial.csv --vessel ship.toml
   greybox estimate trial.csv --vessel ship.toml --out model.json
@@ -46,12 +47,7 @@ def _add_shell(parser: argparse._ActionsContainer, verbose: str) -> None:
 
 def build_parser(only: str | None = None) -> argparse.ArgumentParser:
     """Return the parser with the options of all sub-commands, or of the one that is to run."""
-    parser = Parser(
-        prog="greybox",
-        description="Trustworthy ship models from sea trials: design the trial, read the log, "
-        "estimate, show what the simulation gets wrong.",
-        epilog=EXAMPLES,
-    )
+    parser = Parser(prog="greybox", description=ABOUT, epilog=EXAMPLES)
     shown = f"greybox {version('greybox-marine')}"
     parser.add_argument("--version", action="version", version=shown, help="show the version")
     _add_shell(parser, "verbose")
@@ -60,7 +56,7 @@ def build_parser(only: str | None = None) -> argparse.ArgumentParser:
     commands = parser.add_subparsers(
         dest="command", metavar="COMMAND", required=True, title="commands", prog="greybox"
     )
-    found = {e.name: e.value for e in entry_points(group=GROUP)}
+    found = {e.name: e.value for e in entry_points(group="greybox.commands")}
     known = [*(n for n in ORDER if n in found), *sorted(found.keys() - set(ORDER))]
     for name in known:
         if only in found and name != only:

@@ -15,7 +15,6 @@ from greybox.errors import ConfigurationError, suggestion
 _CHOICE = re.compile(r"invalid choice: (['\"])(?P<typed>.*)\1 \(choose from (?P<known>.*)\)$")
 _VALUE = re.compile(r"invalid (?P<kind>.*) value: (['\"])(?P<typed>.*)\2$")
 _BOTH = re.compile(r"argument (?P<one>\S+): not allowed with argument (?P<other>\S+)$")
-_PLAIN = {"int": "whole number", "float": "number"}
 
 
 class Formatter(RawDescriptionRichHelpFormatter):
@@ -75,16 +74,16 @@ class Parser(argparse.ArgumentParser):
             near = suggestion(found["typed"], known)
             message = f"{what} '{found['typed']}' is not known.{near} Known: {', '.join(known)}"
         elif found := _VALUE.search(message):
-            kind = _PLAIN.get(found["kind"], found["kind"])
+            kind = {"int": "whole number", "float": "number"}.get(found["kind"], found["kind"])
             message = f"{message[: found.start()]}'{found['typed']}' is no {kind}"
         elif found := _BOTH.search(message):
             message = f"{found['other']} and {found['one']} exclude one another: keep one of them"
         elif unknown != message:
             option = re.split("[ =]", unknown)[0]
-            near = suggestion(option, self._option_string_actions)
-            message = f"there is no option '{option}'.{near}"
-            if not option.startswith("-"):
-                message = f"'{option}' is one argument too many"
+            message = f"'{option}' is one argument too many"
+            if option.startswith("-"):
+                near = suggestion(option, self._option_string_actions)
+                message = f"there is no option '{option}'.{near}"
         message += "." * (not message.endswith((".", "?")))
         if self.place:
             raise ConfigurationError(f"{self.place}: {re.sub('^argument [^:]*: ', '', message)}")
