@@ -12,6 +12,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from greybox.commands.common import require_apart
+from greybox.commands.completion import offer
 from greybox.commands.configuration import configure, find_configuration
 from greybox.commands.parser import Parser, sub_parsers
 from greybox.commands.terminal import complain, telling
@@ -112,8 +113,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     0 is done, 1 that the input is at fault; wrong usage is a SystemExit with 2.
     """
     if "_ARGCOMPLETE" in os.environ:
-        from greybox.commands.completion import offer
-
         offer(build_parser())
     name = "greybox"
     try:

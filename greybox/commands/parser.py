@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import re
 from copy import deepcopy
+from functools import partial
 from typing import Any, NoReturn
 
 from rich_argparse import RawDescriptionRichHelpFormatter, RichHelpFormatter
@@ -22,9 +23,6 @@ class Formatter(RawDescriptionRichHelpFormatter):
 
     help_markup = text_markup = False  # [m/s] is a unit
     group_name_formatter = str
-
-    def __init__(self, prog: str, **given: Any) -> None:
-        super().__init__(prog, max_help_position=26, **given)
 
     def _rich_fill_text(self, text: Any, width: int, indent: Any) -> Any:
         kept = RawDescriptionRichHelpFormatter if "\n" in text.plain else RichHelpFormatter
@@ -44,7 +42,8 @@ class Parser(argparse.ArgumentParser):
     place = ""
 
     def __init__(self, *given: Any, **named: Any) -> None:
-        super().__init__(*given, **{"formatter_class": Formatter} | named)
+        usual = {"formatter_class": partial(Formatter, max_help_position=26)}
+        super().__init__(*given, **usual | named)
 
     def short_usage(self) -> str:
         """Return how a command is typed, its many options in one word."""
