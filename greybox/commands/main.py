@@ -46,7 +46,7 @@ def _add_shell(parser: argparse._ActionsContainer, verbose: str) -> None:
         parser.add_argument(*names, action="store_true", default=argparse.SUPPRESS, help=text)
 
 
-def build_parser(only: str | None = None) -> argparse.ArgumentParser:
+def build_parser(only: str | None = None) -> Parser:
     """Return the parser with the options of all sub-commands, or of the one that is to run."""
     parser = Parser(prog="greybox", description=ABOUT, epilog=EXAMPLES)
     shown = f"greybox {version('greybox-marine')}"
@@ -88,6 +88,7 @@ def _parse(given: list[str]) -> argparse.Namespace:
     parsers = sub_parsers(parser)
     if command not in parsers:
         return parser.parse_args(given)
+    before = parser.for_parts().parse_args(given[:at])
     typed = vars(parsers[command].for_parts().parse_args(given[at + 1 :]))
     try:
         folder = Path.cwd()
@@ -96,8 +97,7 @@ def _parse(given: list[str]) -> argparse.Namespace:
             "the folder that this is run in was deleted, so paths lead nowhere: change to a "
             "folder that exists."
         ) from None
-    # before a command, it is the only option that begins so
-    unread = "no_config" in typed or any(g.startswith("--no") for g in given[:at])
+    unread = before.no_config or "no_config" in typed
     path = None if unread else find_configuration(folder, os.environ)
     more, record = configure(path, command, parsers, typed, build_parser) if path else ([], None)
     # behind the files, which an option that takes several would take too
