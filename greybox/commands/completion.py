@@ -14,15 +14,11 @@ from greybox.registry import entry_points
 
 _INSTALL = {
     "bash": ('eval "$(greybox completion bash)"', "greybox completion bash >> ~/.bash_completion"),
-    "zsh": (
-        'eval "$(greybox completion zsh)"',
-        "echo 'eval \"$(greybox completion zsh)\"' >> ~/.zshrc     (after compinit)",
-    ),
-    "fish": (
-        "greybox completion fish | source",
-        "greybox completion fish > ~/.config/fish/completions/greybox.fish",
-    ),
-}
+    "zsh": ('eval "$(greybox completion zsh)"',
+            "echo 'eval \"$(greybox completion zsh)\"' >> ~/.zshrc     (after compinit)"),
+    "fish": ("greybox completion fish | source",
+             "greybox completion fish > ~/.config/fish/completions/greybox.fish"),
+}  # fmt: skip
 HELP = "print the script that makes Tab complete commands, options, names and files"
 EXAMPLES = (
     "examples:\n"
@@ -39,9 +35,9 @@ CAUSES = tuple("""
     side_force asymmetry heading_bias lever_arm angle_offset clock_offset sign parameter_change
     waves
 """.split())  # fmt: skip
-PARAMETERS = tuple("""
-    Xu Xvr Xuu Wuu Xmu Xkappa Yv Yur Yvv Yvr Wvv Ymu Nr Nuv Nvv Nvr Wuv Nmu
-""".split())  # fmt: skip
+PARAMETERS = tuple(
+    "Xu Xvr Xuu Wuu Xmu Xkappa Yv Yur Yvv Yvr Wvv Ymu Nr Nuv Nvv Nvr Wuv Nmu".split()
+)
 _FOLDER = ("/",)
 # the files that an argument names, by its metavar: their endings, none where any will do
 _ENDINGS: dict[str | tuple[str, ...] | None, tuple[str, ...]] = {

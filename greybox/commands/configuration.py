@@ -94,10 +94,8 @@ def _read(path: Path) -> tuple[str, str, Mapping[str, Mapping[str, Any]]]:
         with open(path, "rb") as handle:
             data = handle.read(MOST_BYTES + 1)
         if len(data) > MOST_BYTES:
-            raise ConfigurationError(
-                f"'{name}' has more than {MOST_BYTES} bytes, which no configuration needs: is it "
-                f"a log?"
-            )
+            most = f"{MOST_BYTES} bytes, which no configuration needs: is it a log?"
+            raise ConfigurationError(f"'{name}' has more than {most}")
         tables = tomllib.loads(data.decode("utf-8"))
     except OSError as error:
         raise ConfigurationError(f"cannot read '{name}': {error.strerror}.") from error
@@ -133,11 +131,10 @@ def _words(action: argparse.Action, value: Any, where: str, folder: Path) -> lis
         raise ConfigurationError(
             f"{where} has {len(values)} values, {action.nargs} are needed: write a list of them."
         )
-    for one in values:
-        if isinstance(one, bool) or not isinstance(one, str | int | float):
-            raise ConfigurationError(
-                f"{where} is {one!r}, a word or a number is needed: correct it."
-            )
+    if odd := [v for v in values if isinstance(v, bool) or not isinstance(v, str | int | float)]:
+        raise ConfigurationError(
+            f"{where} is {odd[0]!r}, a word or a number is needed: correct it."
+        )
     texts = [str(v) if files is None else _path(action, str(v), where, folder) for v in values]
     texts = [",".join(texts)] if joined else texts
     # a value of its own may begin with a minus

@@ -12,16 +12,18 @@ from importlib.metadata import version
 from pathlib import Path
 
 from greybox.commands.common import require_apart
+from greybox.commands.completion import offer
 from greybox.commands.configuration import configure, find_configuration
 from greybox.commands.parser import Parser, sub_parsers
 from greybox.commands.terminal import complain, telling
 from greybox.errors import GreyboxError, UsageError
 from greybox.registry import entry_points
 
-GROUP = "greybox.commands"
 # as the work goes; commands of other packages follow
 ORDER = ("demo", "import", "check", "estimate", "simulate", "compare", "diagnose", "design",
          "predict", "export", "reproduce", "completion")  # fmt: skip
+ABOUT = ("Trustworthy ship models from sea trials: design the trial, read the log, estimate, show "
+         "what the simulation gets wrong.")  # fmt: skip
 EXAMPLES = """examples:
   greybox check trial.csv --vessel ship.toml
   greybox estimate trial.csv --vessel ship.toml --out model.json
@@ -44,14 +46,9 @@ def _add_shell(parser: argparse._ActionsContainer, verbose: str) -> None:
         parser.add_argument(*names, action="store_true", default=argparse.SUPPRESS, help=text)
 
 
-def build_parser(only: str | None = None) -> argparse.ArgumentParser:
+def build_parser(only: str | None = None) -> Parser:
     """Return the parser with the options of all sub-commands, or of the one that is to run."""
-    parser = Parser(
-        prog="greybox",
-        description="Trustworthy ship models from sea trials: design the trial, read the log, "
-        "estimate, show what the simulation gets wrong.",
-        epilog=EXAMPLES,
-    )
+    parser = Parser(prog="greybox", description=ABOUT, epilog=EXAMPLES)
     shown = f"greybox {version('greybox-marine')}"
     parser.add_argument("--version", action="version", version=shown, help="show the version")
     _add_shell(parser, "verbose")
@@ -60,7 +57,7 @@ def build_parser(only: str | None = None) -> argparse.ArgumentParser:
     commands = parser.add_subparsers(
         dest="command", metavar="COMMAND", required=True, title="commands", prog="greybox"
     )
-    found = {e.name: e.value for e in entry_points(group=GROUP)}
+    found = {e.name: e.value for e in entry_points(group="greybox.commands")}
     known = [*(n for n in ORDER if n in found), *sorted(found.keys() - set(ORDER))]
     for name in known:
         if only in found and name != only:
@@ -91,6 +88,7 @@ def _parse(given: list[str]) -> argparse.Namespace:
     parsers = sub_parsers(parser)
     if command not in parsers:
         return parser.parse_args(given)
+    before = parser.for_parts().parse_args(given[:at])
     typed = vars(parsers[command].for_parts().parse_args(given[at + 1 :]))
     try:
         folder = Path.cwd()
@@ -99,8 +97,7 @@ def _parse(given: list[str]) -> argparse.Namespace:
             "the folder that this is run in was deleted, so paths lead nowhere: change to a "
             "folder that exists."
         ) from None
-    # before a command, it is the only option that begins so
-    unread = "no_config" in typed or any(g.startswith("--no") for g in given[:at])
+    unread = before.no_config or "no_config" in typed
     path = None if unread else find_configuration(folder, os.environ)
     more, record = configure(path, command, parsers, typed, build_parser) if path else ([], None)
     # behind the files, which an option that takes several would take too
@@ -116,8 +113,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     0 is done, 1 that the input is at fault; wrong usage is a SystemExit with 2.
     """
     if "_ARGCOMPLETE" in os.environ:
-        from greybox.commands.completion import offer
-
         offer(build_parser())
     name = "greybox"
     try:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import re
 from copy import deepcopy
+from functools import partial
 from typing import Any, NoReturn
 
 from rich_argparse import RawDescriptionRichHelpFormatter, RichHelpFormatter
@@ -15,7 +16,6 @@ from greybox.errors import ConfigurationError, suggestion
 _CHOICE = re.compile(r"invalid choice: (['\"])(?P<typed>.*)\1 \(choose from (?P<known>.*)\)$")
 _VALUE = re.compile(r"invalid (?P<kind>.*) value: (['\"])(?P<typed>.*)\2$")
 _BOTH = re.compile(r"argument (?P<one>\S+): not allowed with argument (?P<other>\S+)$")
-_PLAIN = {"int": "whole number", "float": "number"}
 
 
 class Formatter(RawDescriptionRichHelpFormatter):
@@ -23,9 +23,6 @@ class Formatter(RawDescriptionRichHelpFormatter):
 
     help_markup = text_markup = False  # [m/s] is a unit
     group_name_formatter = str
-
-    def __init__(self, prog: str, **given: Any) -> None:
-        super().__init__(prog, max_help_position=26, **given)
 
     def _rich_fill_text(self, text: Any, width: int, indent: Any) -> Any:
         kept = RawDescriptionRichHelpFormatter if "\n" in text.plain else RichHelpFormatter
@@ -45,7 +42,8 @@ class Parser(argparse.ArgumentParser):
     place = ""
 
     def __init__(self, *given: Any, **named: Any) -> None:
-        super().__init__(*given, **{"formatter_class": Formatter} | named)
+        usual = {"formatter_class": partial(Formatter, max_help_position=26)}
+        super().__init__(*given, **usual | named)
 
     def short_usage(self) -> str:
         """Return how a command is typed, its many options in one word."""
@@ -75,16 +73,16 @@ class Parser(argparse.ArgumentParser):
             near = suggestion(found["typed"], known)
             message = f"{what} '{found['typed']}' is not known.{near} Known: {', '.join(known)}"
         elif found := _VALUE.search(message):
-            kind = _PLAIN.get(found["kind"], found["kind"])
+            kind = {"int": "whole number", "float": "number"}.get(found["kind"], found["kind"])
             message = f"{message[: found.start()]}'{found['typed']}' is no {kind}"
         elif found := _BOTH.search(message):
             message = f"{found['other']} and {found['one']} exclude one another: keep one of them"
         elif unknown != message:
             option = re.split("[ =]", unknown)[0]
-            near = suggestion(option, self._option_string_actions)
-            message = f"there is no option '{option}'.{near}"
-            if not option.startswith("-"):
-                message = f"'{option}' is one argument too many"
+            message = f"'{option}' is one argument too many"
+            if option.startswith("-"):
+                near = suggestion(option, self._option_string_actions)
+                message = f"there is no option '{option}'.{near}"
         message += "." * (not message.endswith((".", "?")))
         if self.place:
             raise ConfigurationError(f"{self.place}: {re.sub('^argument [^:]*: ', '', message)}")

@@ -119,6 +119,7 @@ def test_the_parser_imports_nothing_heavy():
         ("estmate", "command 'estmate' is not known. Did you mean 'estimate'?"),
         ("help estmate", "Did you mean 'estimate'?"),
         ("estimate trial.csv --vesel s", "there is no option '--vesel'. Did you mean '--vessel'?"),
+        ("--quiett check", "greybox: there is no option '--quiett'. Did you mean '--quiet'?"),
         ("estimate trial.csv --vessel s --metod ls", "Did you mean '--method'?"),
         ("estimate trial.csv --vessel s --method ivv", "Did you mean 'iv'? Known: ls, iv, oe."),
         ("estimate trial.csv --vessel s --mass heavy", "--mass: 'heavy' is no positive number."),
