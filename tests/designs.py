@@ -1,13 +1,18 @@
-"""Requests that tests of the design share."""
+"""Requests and plans that tests of the design and of its page share."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 
-from experiment_design.constraints.limits import TrialLimits
-from experiment_design.request.request import PreparedRequest
+from experiment_design.constraints.limits import LimitReport, TrialLimits
+from experiment_design.optimise.campaign import add_up, own_moments
+from experiment_design.optimise.classical import Alternative
+from experiment_design.output.result import Design
+from experiment_design.prepare import prepare_request
+from experiment_design.request.request import DesignRequest, PreparedRequest, build_problem
 from greybox.model.catalogue import get_structure
 from greybox.model.model import ManoeuvringModel
 from greybox.model.noise import NoiseLevels
@@ -56,3 +61,47 @@ def thesis_model(structure="thesis", spread=0.0) -> ManoeuvringModel:
     s = get_structure(structure)
     theta = np.array([TRUE[t] for t in s.parameters])
     return ManoeuvringModel(s, theta, np.diag((spread * theta) ** 2), 1.0, limited_ship())
+
+
+def prior_model(ship, thesis, theta, uncertain):
+    spread = np.diag((0.01 * np.abs(theta)) ** 2) * uncertain
+    return ManoeuvringModel(thesis, theta, spread, 1.0, ship)
+
+
+def random_plan(model, ship, *, duration=600.0, uncertain=False, trials=1, limits=None, **asked):
+    """A design of random levels: what is drawn does not ask how they were found."""
+    options = {"regime": "u+v+", "start": [1.5, 1.2, 0, 0]}
+    limits = replace(limits or TrialLimits(), margins={"u": 0.5, "v": 0.4})
+    asked = DesignRequest(
+        duration, limits, hold=10.0, trials=trials, predictor="basic", **(options | asked),
+    )  # fmt: skip
+    request = prepare_request(model, asked, ship)
+    problems = [build_problem(request, t) for t in range(trials)]
+    rng = np.random.default_rng(0)
+    units = [rng.random(p.shape).round(2) for p in problems]
+    levels = tuple(p.levels(u) for p, u in zip(problems, units, strict=True))
+    commands = tuple(p.schedule.expand(v) for p, v in zip(problems, levels, strict=True))
+    motions = tuple(
+        p.scenarios[0].rollout.run(c[None]) for p, c in zip(problems, commands, strict=True)
+    )
+    criterion = problems[0].criterion
+    sums = add_up([own_moments(p, u) for p, u in zip(problems, units, strict=True)])
+    names = tuple(request.build_predictor().columns[i].name for i in criterion.wanted)
+    return Design(
+        request=request, commands=commands, levels=levels, motions=motions, names=names,
+        values=np.array([request.theta[request.structure.index(n)] for n in names]),
+        covariance=criterion.covariance(sums[0])[0], criterion_value=1.0,
+        efficiency_vs_random=1.25, random_value=0.8, random_kept=200,
+        certificate=SimpleNamespace(
+            sentence=lambda: "at least 0.7 of the best possible", efficiency_lower_bound=0.7,
+            to_dict=dict,
+        ),
+        margins={"u": 0.9, "v": 0.5},
+        limits=(LimitReport(0, "margin of surge", 0.5, "m/s", 0.0),),
+        keeping=None,
+        alternatives=(
+            Alternative("PRBS", 7, 7, 0.5, units[0]), Alternative("zig-zag", 8, 0, 0.1, units[0]),
+            Alternative("pulses", 8, 8, -np.inf, units[0]),
+        ),
+        status="solved", notes=("a note",), evaluations=1, seconds=1.0,
+    )  # fmt: skip

@@ -9,20 +9,17 @@ import tempfile
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from itertools import pairwise
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from browser import require_legible, without_scripts
+from designs import prior_model, random_plan
 
 from experiment_design.constraints.limits import Circle, LimitReport, TrialLimits
 from experiment_design.feasibility.constraint_satisfaction import ConstraintSatisfaction
-from experiment_design.optimise.campaign import add_up, own_moments
-from experiment_design.optimise.classical import Alternative
 from experiment_design.output.pictures import forbidden
 from experiment_design.output.prediction import edge_distance, predict_motion
 from experiment_design.output.report import design_page, random_std
-from experiment_design.output.result import Design
 from experiment_design.output.sheet_contents import (
     clock,
     compass,
@@ -31,11 +28,8 @@ from experiment_design.output.sheet_contents import (
     signed,
 )
 from experiment_design.output.trial_sheet import sheet_figures, sheet_kind, write_sheet
-from experiment_design.prepare import prepare_request
-from experiment_design.request.request import DesignRequest, build_problem
 from greybox.commands.main import main
 from greybox.errors import UsageError
-from greybox.model.model import ManoeuvringModel
 from greybox.report.page import render
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
@@ -43,65 +37,21 @@ ROOM = np.array([[-400.0, -300], [400, -300], [400, 300], [0, 200], [-400, 300]]
 HOSTILE = '</title><script>alert("x")</script> $\\frac{1}$ & 船'
 
 
-def prior(ship, thesis, theta, uncertain):
-    spread = np.diag((0.01 * np.abs(theta)) ** 2) * uncertain
-    return ManoeuvringModel(thesis, theta, spread, 1.0, ship)
-
-
-def made(model, ship, *, duration=600.0, uncertain=False, trials=1, limits=None, **asked):
-    """A design of random levels: what is drawn does not ask how they were found."""
-    options = {"regime": "u+v+", "start": [1.5, 1.2, 0, 0]}
-    limits = replace(limits or TrialLimits(), margins={"u": 0.5, "v": 0.4})
-    asked = DesignRequest(
-        duration, limits, hold=10.0, trials=trials, predictor="basic", **(options | asked),
-    )  # fmt: skip
-    request = prepare_request(model, asked, ship)
-    problems = [build_problem(request, t) for t in range(trials)]
-    rng = np.random.default_rng(0)
-    units = [rng.random(p.shape).round(2) for p in problems]
-    levels = tuple(p.levels(u) for p, u in zip(problems, units, strict=True))
-    commands = tuple(p.schedule.expand(v) for p, v in zip(problems, levels, strict=True))
-    motions = tuple(
-        p.scenarios[0].rollout.run(c[None]) for p, c in zip(problems, commands, strict=True)
-    )
-    criterion = problems[0].criterion
-    sums = add_up([own_moments(p, u) for p, u in zip(problems, units, strict=True)])
-    names = tuple(request.build_predictor().columns[i].name for i in criterion.wanted)
-    return Design(
-        request=request, commands=commands, levels=levels, motions=motions, names=names,
-        values=np.array([request.theta[request.structure.index(n)] for n in names]),
-        covariance=criterion.covariance(sums[0])[0], criterion_value=1.0,
-        efficiency_vs_random=1.25, random_value=0.8, random_kept=200,
-        certificate=SimpleNamespace(
-            sentence=lambda: "at least 0.7 of the best possible", efficiency_lower_bound=0.7,
-            to_dict=dict,
-        ),
-        margins={"u": 0.9, "v": 0.5},
-        limits=(LimitReport(0, "margin of surge", 0.5, "m/s", 0.0),),
-        keeping=None,
-        alternatives=(
-            Alternative("PRBS", 7, 7, 0.5, units[0]), Alternative("zig-zag", 8, 0, 0.1, units[0]),
-            Alternative("pulses", 8, 8, -np.inf, units[0]),
-        ),
-        status="solved", notes=("a note",), evaluations=1, seconds=1.0,
-    )  # fmt: skip
-
-
 @pytest.fixture(scope="module")
 def known(ship, thesis, true_theta):
-    return made(prior(ship, thesis, true_theta, 0), ship)
+    return random_plan(prior_model(ship, thesis, true_theta, 0), ship)
 
 
 @pytest.fixture(scope="module")
 def short(ship, thesis, true_theta):
-    return made(prior(ship, thesis, true_theta, 0), ship, duration=120.0)
+    return random_plan(prior_model(ship, thesis, true_theta, 0), ship, duration=120.0)
 
 
 @pytest.fixture(scope="module")
 def unsure(ship, thesis, true_theta):
     limits = TrialLimits(area=ROOM, clearance=20.0, speed_cap=4.0, yaw_cap=0.2)
-    design = made(
-        prior(ship, thesis, true_theta, 1), ship, limits=limits, current=(0.2, 0.1),
+    design = random_plan(
+        prior_model(ship, thesis, true_theta, 1), ship, limits=limits, current=(0.2, 0.1),
         process_noise=np.array([2e-3, 2e-3, 4e-4]),
     )  # fmt: skip
     return replace(design, request=replace(design.request, seed=4))
@@ -150,7 +100,9 @@ def test_bands_repeat_and_hold_new_draws(unsure):
 
 def test_positions_start_where_the_trial_does(ship, thesis, true_theta):
     limits = TrialLimits(position=(100.0, -50.0), area=Circle(100.0, -50.0, 500.0))
-    design = made(prior(ship, thesis, true_theta, 0), ship, limits=limits, duration=200.0)
+    design = random_plan(
+        prior_model(ship, thesis, true_theta, 0), ship, limits=limits, duration=200.0
+    )
     (band,) = predict_motion(design)
     assert (band["x_n"].nominal[0], band["y_n"].nominal[0]) == (100.0, -50.0)
     assert band["edge"].nominal[0] == 500.0
@@ -270,7 +222,7 @@ def test_sixty_holds_fit_one_page(request, tmp_path, which):
 
 
 def test_a_long_table_goes_on(ship, thesis, true_theta):
-    design = made(prior(ship, thesis, true_theta, 0), ship, duration=2400.0)
+    design = random_plan(prior_model(ship, thesis, true_theta, 0), ship, duration=2400.0)
     (band,) = predict_motion(design)
     figures = sheet_figures(design, band)
     assert len(figures) > 1
@@ -281,7 +233,7 @@ def test_a_long_table_goes_on(ship, thesis, true_theta):
 
 @pytest.mark.long
 def test_several_trials_are_several_pages(ship, thesis, true_theta, tmp_path):
-    design = made(prior(ship, thesis, true_theta, 0), ship, duration=120.0, trials=2)
+    design = random_plan(prior_model(ship, thesis, true_theta, 0), ship, duration=120.0, trials=2)
     for kind in ("pdf", "svg", "png", "html"):
         write_sheet(design, tmp_path / f"sheet.{kind}")
     assert pages_of(tmp_path / "sheet.pdf") == 2
@@ -355,7 +307,7 @@ def test_the_page_of_a_plan_that_nothing_equals(short):
 
 def test_command_writes_both(ship, thesis, true_theta, tmp_path, monkeypatch, short):
     monkeypatch.setattr("experiment_design.design.design_trial", lambda *a, **k: short)
-    prior(ship, thesis, true_theta, 0).save(tmp_path / "model.json")
+    prior_model(ship, thesis, true_theta, 0).save(tmp_path / "model.json")
     common = [
         "design", "--vessel", "thesis", "--model", str(tmp_path / "model.json"), "--duration",
         "600", "--regime", "u+v+", "--start", "1.5,1.2,0,0", "--out", str(tmp_path / "plan.csv"),

@@ -115,6 +115,13 @@ BIAS = Found(
     "surge and sway are turned against the ship's axes by 3.5 ± 0.1 deg",
     "the bias of the compass in the vessel", "Fossen (2011)", 61.2, 22.8, 9.4,
 )  # fmt: skip
+BUDGET = tuple(
+    BudgetPart(
+        name, dict.fromkeys("uvr", share), dict.fromkeys("uvr", (share - 0.05, share + 0.05)),
+        dict.fromkeys("uvr", 0.0 if name == "current" else share),
+    )
+    for name, share in {"sensor noise": 0.1, "current": 0.7, "not split": 0.2}.items()
+)  # fmt: skip
 STEPS = (
     (
         Ranked("current", 4800.0, 5210.4, 1804.2, 95.1),
@@ -241,15 +248,7 @@ def test_none(pages, written, told):
 
 
 def test_whose_the_error_is_stands_in_bars_and_numbers(told):
-    parts = {"sensor noise": 0.1, "current": 0.7, "not split": 0.2}
-    budget = tuple(
-        BudgetPart(
-            name, dict.fromkeys("uvr", share), dict.fromkeys("uvr", (share - 0.05, share + 0.05)),
-            dict.fromkeys("uvr", 0.0 if name == "current" else share),
-        )
-        for name, share in parts.items()
-    )  # fmt: skip
-    page = diagnosis_page(replace(diagnosis_of("named"), budget=budget), RECORD)
+    page = diagnosis_page(replace(diagnosis_of("named"), budget=BUDGET), RECORD)
     assert "Whose the squared error" in page.lead.caption
     assert "surge u: current 70 %" in page.lead.alternative
     assert "70.0 (65.0 to 75.0)" in text_of(without_scripts(render(page)))
