@@ -5,8 +5,8 @@ step with white noise, the first speed known, and u free within two limits in
 each of N intervals. The criterion is log det of the Cramér-Rao information of
 (a, b, c), F = Σ S(k)ᵀ S(k) / σ², which is what Pyomo.DoE maximises too. It writes
 S by central differences between copies of the model; here S follows from its
-recursion. Every design is judged by the same function, this package's exact F,
-which a loop over finite differences of simulations confirms.
+recursion. Our exact F is confirmed in each run by a loop over finite differences of
+simulations, which judges Pyomo's designs.
 
 Because u keeps x positive, x|x| is written x² for Pyomo, which spares it the
 modulus. Times include building the problem. Pyomo gets the same IPOPT library

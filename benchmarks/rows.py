@@ -338,7 +338,7 @@ def monte_carlo(runs: int) -> Iterator[Row]:
 
 def design(intervals: int) -> Iterator[Row]:
     """Time the D-optimal input of surge, held in N intervals; IPOPT here and in Pyomo.DoE."""
-    from benchmarks.design import middle, ours, pydex, pyomo_doe, sequences
+    from benchmarks.design import information, middle, ours, pydex, pyomo_doe, sequences
 
     given = sequences(intervals)
     first, candidates = middle(intervals), given[:20]
@@ -356,7 +356,10 @@ def design(intervals: int) -> Iterator[Row]:
         return made, how
 
     def said(name: str) -> str:
-        return f"log det here {found['here'].logdet:.3f}, it {found[name].logdet:.3f}"
+        mine, its = found["here"], found[name]
+        check = information(mine.u)
+        assert abs(check - mine.logdet) < 1e-4, (check, mine.logdet)
+        return f"log det here {mine.logdet:.3f}, it {its.logdet:.3f}; {its.note}"
 
     def doe(start: Array) -> Callable[[], Any]:
         return lambda: pyomo_doe(intervals, start)
@@ -411,12 +414,17 @@ def raw_import(megabytes: int) -> Iterator[Row]:
 
     pandas reads and writes the table, pynmea2 reads lines and keeps nothing, both in this process.
     """
+    import resource
     import tempfile
     from pathlib import Path
 
     import pandas as pd
 
     from benchmarks.import_speed import run_import, with_pynmea2, write_nmea, write_tables
+
+    def memory(_: str) -> str:
+        most = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 2**20
+        return f"imports so far took at most {most:.2f} GiB of memory"
 
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -436,7 +444,7 @@ def raw_import(megabytes: int) -> Iterator[Row]:
             # import does not write over a log that stands
             path = folder / out
             mine = lambda raw=raw, path=path: (path.unlink(missing_ok=True), run_import(raw, path))
-            yield from compare("import", size, "MB", mine, {alternative: (work, how)})
+            yield from compare("import", size, "MB", mine, {alternative: (work, how)}, memory)
 
 
 @dataclass(frozen=True)
