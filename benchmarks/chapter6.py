@@ -1,17 +1,11 @@
-"""Chapter 6 by this package, by NumPy vectorised over runs, and by a loop over runs.
+"""Chapter 6 by NumPy vectorised over runs: a row of `python -m benchmarks`.
 
-All three do the same work in the same run of this script: simulate disturbed
-ships, form the regressors of the three predictors, solve LS, refine IV2 and IV3
-to convergence and IV1 once. NumPy's regressors and model are typed by hand, which is
-what the package spares its users. Prints seconds a hundred runs and their ratios.
-
-    python benchmarks/chapter6.py [--runs 128] [--samples 5000]
+Both do the same work: simulate disturbed ships, form the regressors of the three predictors,
+solve LS, refine IV2 and IV3 to convergence and IV1 once. NumPy's regressors and model are typed
+by hand, which is what the package spares its users.
 """
 
 from __future__ import annotations
-
-import argparse
-import time
 
 import numpy as np
 
@@ -19,9 +13,7 @@ from greybox.study.chapter6 import (
     NOMINAL,
     START,
     TRUE,
-    predictors,
     pulse_forces,
-    reproduce_chapter6,
     virtual_batch,
 )
 
@@ -155,37 +147,3 @@ def agree(samples):
     return max(
         float(np.max(np.abs(ours[k][0] - theirs[k]) / (np.abs(theirs[k]) + 1e-9))) for k in theirs
     )
-
-
-def main():
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--runs", type=int, default=128)
-    parser.add_argument("--samples", type=int, default=5000)
-    options = parser.parse_args()
-    predictors()
-    tau = pulse_forces(options.samples)
-    print(f"largest relative difference of the estimates: {agree(options.samples):.1e}")
-    timed = {}
-    for name, workers in (("this package, all processors", None), ("this package, 1 process", 1)):
-        # the first call starts the processes and compiles
-        reproduce_chapter6(4, samples=options.samples, fit_runs=0, workers=workers)
-        start = time.perf_counter()
-        reproduce_chapter6(options.runs, samples=options.samples, fit_runs=0, workers=workers)
-        timed[name] = (time.perf_counter() - start) / options.runs
-    start = time.perf_counter()
-    for wind in (1, 10):
-        for first in range(0, options.runs, 64):
-            size = min(64, options.runs - first)
-            by_numpy(data_by_numpy(first, size, options.samples, wind, tau))
-    timed["NumPy over runs"] = (time.perf_counter() - start) / options.runs
-    start = time.perf_counter()
-    for wind in (1, 10):
-        by_numpy(data_by_numpy(0, 1, options.samples, wind, tau))
-    timed["loop over runs"] = time.perf_counter() - start
-    ours = timed["this package, all processors"]
-    for name, seconds in timed.items():
-        print(f"{name:<30}{100 * seconds:8.2f} s a hundred runs   ratio {seconds / ours:6.2f}")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,19 +1,18 @@
-"""D-optimal input design by this package, by Pyomo.DoE and by pydex, in one run.
+"""D-optimal input design here, by Pyomo.DoE and by pydex: a row of `python -m benchmarks`.
 
 Surge, x⁺ = x + a x + b x|x| + c u (steps of 1 s), the speed x measured after each
 step with white noise, the first speed known, and u free within two limits in
 each of N intervals. The criterion is log det of the Cramér-Rao information of
 (a, b, c), F = Σ S(k)ᵀ S(k) / σ², which is what Pyomo.DoE maximises too. It writes
 S by central differences between copies of the model; here S follows from its
-recursion. Every design is judged by the same function, this package's exact F,
-which a loop over finite differences of simulations confirms.
+recursion. Our exact F is confirmed in each run by a loop over finite differences of
+simulations, which judges Pyomo's designs.
 
 Because u keeps x positive, x|x| is written x² for Pyomo, which spares it the
 modulus. Times include building the problem. Pyomo gets the same IPOPT library
 as CasADi's where cyipopt was built against that, and is called in this process.
-Both tools start from mid-range and from the same two-level sequence, which ours has
-to draw as well; the mid-range start alone is shown beside both. The shortest of
-several repeats counts, for each start of Pyomo's by itself.
+Both tools start from mid-range, and from the same two-level sequence, which ours has
+to draw as well.
 
 pydex chooses among candidate sequences and weighs them; it has no free input, so
 this problem is beyond it. It is given the best of the two-level sequences that our
@@ -22,7 +21,6 @@ chose, which is what one trial can use, and in the notes its weighted mixture, a
 information that only several trials can have and that may exceed any one trial's.
 
     pip install ".[bench-design]"
-    python benchmarks/design.py [--intervals 25 50 100 200]
 
 cyipopt needs an IPOPT and Pyomo's ``pynumero_ASL``: `pip install cyipopt` with
 ``PKG_CONFIG_PATH`` at ``casadi/pkgconfig`` builds it against CasADi's IPOPT. An
@@ -31,11 +29,9 @@ cyipopt needs an IPOPT and Pyomo's ``pynumero_ASL``: `pip install cyipopt` with
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import io
 import logging
-import time
 import warnings
 from dataclasses import dataclass
 
@@ -70,10 +66,9 @@ NAMES = ("Xu", "Xuu", "Xmu")
 
 @dataclass(frozen=True)
 class Run:
-    """One tool's design: input (N,), seconds, and what there is to say."""
+    """One tool's design: input (N,), and what there is to say."""
 
     u: Array | None
-    seconds: float
     note: str = ""
     logdet: float = float("nan")
 
@@ -133,29 +128,23 @@ def middle(intervals: int) -> Array:
     return out
 
 
-def ours(intervals: int) -> tuple[list[Run], Array]:
-    """Design by IPOPT from mid-range alone, and from the best two-level sequence too; also those.
-
-    The first run's time is what the mid-range start alone takes, the second's
-    is that of everything.
-    """
-    began = time.perf_counter()
+def ours(intervals: int, two_level: bool) -> Run:
+    """Design by IPOPT from mid-range, and from the best two-level sequence too where wanted."""
     problem = ours_problem(intervals)
     s = problem.schedule
     first = ((middle(intervals) - s.lower) / (s.upper - s.lower))[:, None]
     program = make_shooting(problem, first)
-    alone = run_ipopt(program, first, barrier=0.1)
-    half = time.perf_counter() - began
-    unit, _ = starts(problem)
-    other = run_ipopt(program, unit[0], barrier=0.1)
-    best = max((alone, other), key=lambda f: f.value)
-    seconds = time.perf_counter() - began
-    note = "; ".join(f"{f.value:.4f} after {f.iterations} iterations" for f in (alone, other))
-    runs = [
-        Run(problem.levels(f.unit)[:, 0], t, note, f.value)
-        for f, t in ((alone, half), (best, seconds))
-    ]
-    return runs, problem.levels(unit)[:, :, 0]
+    from_ = [first, starts(problem)[0][0]] if two_level else [first]
+    found = [run_ipopt(program, unit, barrier=0.1) for unit in from_]
+    best = max(found, key=lambda f: f.value)
+    note = "; ".join(f"{f.value:.4f} after {f.iterations} iterations" for f in found)
+    return Run(problem.levels(best.unit)[:, 0], note, best.value)
+
+
+def sequences(intervals: int) -> Array:
+    """Return the two-level sequences (M, N) that our search draws, best first."""
+    problem = ours_problem(intervals)
+    return problem.levels(starts(problem)[0])[:, :, 0]
 
 
 def pyomo_solver():
@@ -210,10 +199,10 @@ def pyomo_doe(intervals: int, first: Array) -> Run:
         import pyomo.environ as pyo
         from pyomo.contrib.doe import DesignOfExperiments
     except ImportError as reason:
-        return Run(None, 0.0, f"skipped: {reason}")
+        return Run(None, f"skipped: {reason}")
     solver, text = pyomo_solver()
     if solver is None:
-        return Run(None, 0.0, f"skipped: {text}")
+        return Run(None, f"skipped: {text}")
 
     class Surge:
         """The experiment as Pyomo.DoE asks for it."""
@@ -246,7 +235,6 @@ def pyomo_doe(intervals: int, first: Array) -> Run:
             m.unknown_parameters.update((v, pyo.value(v)) for v in (m.a, m.b, m.c))
             return m
 
-    began = time.perf_counter()
     doe = DesignOfExperiments(
         Surge(), fd_formula="central", step=1e-3, objective_option="determinant",
         scale_nominal_param_value=True, scale_constant_value=1.0, solver=solver,
@@ -256,15 +244,14 @@ def pyomo_doe(intervals: int, first: Array) -> Run:
         with contextlib.redirect_stdout(io.StringIO()):
             doe.run_doe()
     except _NUMERICAL as reason:
-        return Run(None, time.perf_counter() - began, f"{text}: {type(reason).__name__}: {reason}")
-    seconds = time.perf_counter() - began
+        return Run(None, f"{text}: {type(reason).__name__}: {reason}")
     u = np.array(doe.results["Experiment Design"], float)
     note = (
         f"{text}, {doe.results['Termination Condition']}; build "
         f"{doe.results['Build Time']:.2f}, initialise {doe.results['Initialization Time']:.2f}, "
         f"solve {doe.results['Solve Time']:.2f} s"
     )
-    return Run(u, seconds, note, information(u))
+    return Run(u, note, information(u))
 
 
 def pydex(intervals: int, candidates: Array) -> Run:
@@ -275,7 +262,7 @@ def pydex(intervals: int, candidates: Array) -> Run:
             from cvxpy.error import SolverError
             from pydex.core.designer import Designer
     except ImportError as reason:
-        return Run(None, 0.0, f"skipped: {reason}")
+        return Run(None, f"skipped: {reason}")
 
     def simulate(ti_controls, sampling_times, model_parameters):
         a, b, c = np.array([A, B, C]) * model_parameters
@@ -285,7 +272,6 @@ def pydex(intervals: int, candidates: Array) -> Run:
             out.append(x)
         return np.array(out)[:, None]
 
-    began = time.perf_counter()
     try:
         with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
             warnings.simplefilter("ignore")
@@ -311,8 +297,7 @@ def pydex(intervals: int, candidates: Array) -> Run:
                 )
             efforts = np.asarray(designer.efforts, float).reshape(len(candidates), -1).sum(axis=1)
     except (SolverError, *_NUMERICAL) as reason:
-        return Run(None, time.perf_counter() - began, f"{type(reason).__name__}: {reason}")
-    seconds = time.perf_counter() - began
+        return Run(None, f"{type(reason).__name__}: {reason}")
     problem = ours_problem(intervals)
     s = problem.schedule
     unit = (candidates[..., None] - s.lower) / (s.upper - s.lower)
@@ -322,61 +307,4 @@ def pydex(intervals: int, candidates: Array) -> Run:
     chosen = np.flatnonzero(efforts > 1e-3)
     mixed = float(np.linalg.slogdet(mixture)[1])
     note = f"mixture of {len(chosen)} of {len(candidates)} given sequences, log det {mixed:.4f}"
-    return Run(None, seconds, note, float(np.linalg.slogdet(grams[chosen])[1].max()))
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description="D-optimal surge design against other tools.")
-    parser.add_argument("--intervals", type=int, nargs="+", default=[25, 50, 100, 200])
-    parser.add_argument("--candidates", type=int, default=50, help="sequences given to pydex")
-    parser.add_argument("--repeats", type=int, default=3, help="the shortest time counts")
-    options = parser.parse_args()
-    # imports and first compilations are nobody's design time
-    ours(10)
-    pyomo_doe(10, middle(10))
-    notes = []
-    print(
-        f"{'N':>4} {'alternative':<24}{'log det':>10}{'ours':>10}{'seconds':>10}{'ours':>8}"
-        f"{'ratio':>8}"
-    )
-    for n in options.intervals:
-        first, given = ours(n)
-        mine = [[r] for r in first]
-        theirs = [[pyomo_doe(n, middle(n))], [pyomo_doe(n, given[0])]]
-        for _ in range(options.repeats - 1):
-            for known, again in zip(mine, ours(n)[0], strict=True):
-                known.append(again)
-            for runs, start in zip(theirs, (middle(n), given[0]), strict=True):
-                if runs[0].u is not None:
-                    runs.append(pyomo_doe(n, start))
-        alone, both = (min(runs, key=lambda r: r.seconds) for runs in mine)
-        assert both.u is not None
-        check = information(both.u)
-        assert abs(check - both.logdet) < 1e-4, (check, both.logdet)
-        notes.append(f"N={n} ours: {both.note}")
-        shortest = [min(runs, key=lambda r: r.seconds) for runs in theirs]
-        for label, run in zip(("mid-range", "two-level"), shortest, strict=True):
-            notes.append(
-                f"N={n} Pyomo.DoE from {label}: {run.logdet:.4f}, {run.seconds:.2f} s; {run.note}"
-            )
-        rows: list[tuple[str, float, float, Run]] = []
-        if all(np.isfinite(r.logdet) for r in shortest):
-            middle_run = shortest[0]
-            rows.append(("Pyomo.DoE, mid-range", middle_run.logdet, middle_run.seconds, alone))
-            best = max(r.logdet for r in shortest)
-            rows.append(("Pyomo.DoE, both starts", best, sum(r.seconds for r in shortest), both))
-        other = pydex(n, given[: options.candidates])
-        notes.append(f"N={n} pydex: {other.note}")
-        if np.isfinite(other.logdet):
-            rows.append(("pydex, best it chose", other.logdet, other.seconds, both))
-        for name, value, seconds, own in rows or [("none installed", np.nan, np.nan, both)]:
-            print(
-                f"{n:>4} {name:<24}{value:>10.4f}{own.logdet:>10.4f}{seconds:>10.2f}"
-                f"{own.seconds:>8.3f}{seconds / own.seconds:>8.1f}",
-                flush=True,
-            )
-    print("\n".join(["", *notes]))
-
-
-if __name__ == "__main__":
-    main()
+    return Run(None, note, float(np.linalg.slogdet(grams[chosen])[1].max()))

@@ -1,20 +1,13 @@
-"""Speed of the import, as ratios to what else reads and writes the same files in the same run.
+"""Raw files for the import, and what else reads and writes them: rows of `python -m benchmarks`.
 
 The alternative for CSV is `pandas.read_csv` and `to_csv` of the whole table, for
-Parquet `read_parquet` and `to_parquet`, for NMEA 0183 `pynmea2.parse` line by
-line. Run it with the number of megabytes and of sentences:
-
-    python benchmarks/import_speed.py 100 200000
+Parquet `read_parquet` and `to_parquet`, for NMEA 0183 `pynmea2.parse` line by line.
 """
 
 from __future__ import annotations
 
-import resource
 import subprocess
 import sys
-import tempfile
-import time
-from collections.abc import Callable
 from functools import reduce
 from operator import xor
 from pathlib import Path
@@ -59,18 +52,11 @@ def write_nmea(path: Path, sentences: int) -> Path:
     return path
 
 
-def seconds(work: Callable[[], object]) -> float:
-    """Return the wall time of one call."""
-    start = time.perf_counter()
-    work()
-    return time.perf_counter() - start
-
-
-def import_seconds(raw: Path, out: Path) -> float:
-    """Return the wall time of `greybox import` in a process of its own."""
+def run_import(raw: Path, out: Path) -> None:
+    """Run `greybox import` in a process of its own."""
     command = [sys.executable, "-m", "greybox.commands.main", "import", str(raw)]
     command += ["--vessel", "thesis", "--out", str(out)]
-    return seconds(lambda: subprocess.run(command, check=True, capture_output=True))
+    subprocess.run(command, check=True, capture_output=True)
 
 
 def with_pynmea2(path: Path) -> int:
@@ -79,36 +65,3 @@ def with_pynmea2(path: Path) -> int:
 
     with open(path) as handle:
         return sum(pynmea2.parse(line.strip()) is not None for line in handle)
-
-
-def main(megabytes: float, sentences: int) -> None:
-    """Print one line a format."""
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        csv, parquet = write_tables(folder, megabytes)
-        nmea = write_nmea(folder / "raw.nmea", sentences)
-        other = folder / "other"
-        cases = (
-            ("CSV", csv, folder / "log.csv", "pandas.read_csv + to_csv",
-             lambda: pd.read_csv(csv).to_csv(other, index=False)),
-            ("Parquet", parquet, folder / "log.parquet", "pandas.read_parquet + to_parquet",
-             lambda: pd.read_parquet(parquet).to_parquet(other, index=False)),
-            ("NMEA 0183", nmea, folder / "log.csv", "pynmea2.parse", lambda: with_pynmea2(nmea)),
-        )  # fmt: skip
-        for kind, raw, out, alternative, work in cases:
-            size = raw.stat().st_size / 1e6
-            here = import_seconds(raw, out)
-            there = seconds(work)
-            print(
-                f"{kind}: {size:.0f} MB in {here:.1f} s; {alternative} {there:.1f} s: "
-                f"{there / here:.1f} times as fast as it"
-            )
-        most = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 2**20
-        print(f"largest memory of an import: {most:.2f} GiB")
-
-
-if __name__ == "__main__":
-    main(
-        float(sys.argv[1]) if len(sys.argv) > 1 else 100.0,
-        int(sys.argv[2]) if len(sys.argv) > 2 else 200_000,
-    )

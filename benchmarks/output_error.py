@@ -39,7 +39,6 @@ from itertools import chain
 from pathlib import Path
 from statistics import median
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
@@ -113,6 +112,8 @@ def step_function(model: OutputModel, arrays) -> Callable:
 
 def simulator(model: OutputModel) -> Callable[[Array, Array, Array], Array]:
     """Return the free run ``(z0, w, p) -> x``, compiled by Numba at its first call."""
+    import numba
+
     step = numba.njit(step_function(model, np))
 
     @numba.njit

@@ -15,6 +15,7 @@ extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
     "numpydoc",
+    "benchmark_table",
     "option_tables",
     "public_names",
     "sessions",
