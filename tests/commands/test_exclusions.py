@@ -7,12 +7,21 @@ import json
 from dataclasses import replace
 
 import pytest
-from designs import thesis_model
+from designs import make_request, thesis_model
 from virtual import virtual_log, write_csv
 
+from experiment_design import (
+    CandidateModel,
+    DesignRequest,
+    TrialLimits,
+    design_between,
+    prepare_request,
+)
 from experiment_design.command import add_arguments
+from experiment_design.for_prediction import design_for_prediction
 from experiment_design.request.exclusions import RULES, spelt
 from greybox.commands.main import main
+from greybox.errors import UsageError
 from greybox.trial.log import make_log
 
 SHIP = """name = "Thesis ship"
@@ -223,6 +232,42 @@ def test_every_rule_is_told_in_one_sentence(design, rule, option, other):
     said = rule.told(spelt(option), "" if rule.needs else spelt(other)).rsplit(":", 1)
     assert said[0] in error
     assert error.endswith(f":{said[1]}\n")
+
+
+@pytest.mark.parametrize(
+    ("structure", "spread", "asked", "message"),
+    [
+        ("thesis", 0.1, {"worst_case": True}, "--worst-case .* that --robust draws"),
+        ("thesis", 0.0, {"robust": 3}, "--robust .* and it has none"),
+        ("thesis", 0.0, {"probability": 0.99}, "--probability .* and it has none"),
+        ("thesis", 0.1, {"gust": 2.0, "wind": (5.0, 3.0)}, "'augmented' does not measure it"),
+        ("thesis", 0.1, {"limits": TrialLimits(clearance=5.0)}, "--clearance .* --area or"),
+        ("surge", 0.1, {"limits": TrialLimits(yaw_cap=0.1)}, "structure 'surge' has none"),
+        ("surge", 0.1, {"limits": TrialLimits(headings=1.0)}, "structure 'surge' has none"),
+        (
+            "thesis", 0.1, {"limits": TrialLimits(margins={"v": 0.3}), "regime": "u+"},
+            "--margin-v .* regime 'u\\+' has none",
+        ),
+        ("thesis", 0.1, {"criterion": "c"}, "name it, such as --of"),
+        ("thesis", 0.1, {"combination": {"Yv": 1.0}}, "use --criterion c"),
+        (
+            "thesis", 0.1, {"criterion": "c", "combination": {"Yv": 1.0}, "wanted": ("Yvv",)},
+            "leave out --want",
+        ),
+    ],
+)  # fmt: skip
+def test_a_request_meets_the_same_rules(structure, spread, asked, message):
+    with pytest.raises(UsageError, match=message):
+        prepare_request(thesis_model(structure, spread), DesignRequest(150.0, **asked))
+
+
+def test_two_models_and_predictions_meet_the_same_rules():
+    request = make_request(wanted=("Yv",))
+    rival = CandidateModel("b", request.structure, request.theta, request.d)
+    with pytest.raises(UsageError, match=r"--between .* leave out --want"):
+        design_between(request, rival, ("a", "b"))
+    with pytest.raises(UsageError, match=r"--for prediction .* leave out --want"):
+        design_for_prediction(request, thesis_model())
 
 
 # what every design of the next test is asked for, beside its way
