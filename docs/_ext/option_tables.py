@@ -1,7 +1,8 @@
 """Directives that show commands and their options as the parsers have them.
 
-``options NAME`` shows one command, ``commands`` lists all that are installed, and
-``other-commands`` shows those that have no page under howto.
+``options NAME`` shows one command, ``commands`` lists all that are installed, ``other-commands``
+shows those that have no page under howto, and ``exclusions`` the options of ``design`` that do not
+go together.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from docutils import nodes
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
+from experiment_design.request.exclusions import RULES, spelt
 from greybox.commands.main import build_parser
 
 
@@ -57,14 +59,17 @@ def _meaning(action: argparse.Action, parser: argparse.ArgumentParser) -> str:
     return "; ".join(said)
 
 
-def _table(head: tuple[str, str], rows: list[tuple[str, str]], widths: tuple[int, int]) -> Any:
-    group = nodes.tgroup("", *(nodes.colspec(colwidth=w) for w in widths), cols=2)
+def _table(
+    head: tuple[str, ...], rows: list[tuple[str, ...]], widths: tuple[int, ...]
+) -> nodes.table:
+    group = nodes.tgroup("", *(nodes.colspec(colwidth=w) for w in widths), cols=len(widths))
     top, body = nodes.thead(), nodes.tbody()
     for part, lines in ((top, [head]), (body, rows)):
-        for left, right in lines:
+        for left, *others in lines:
             first = nodes.Text(left) if part is top else nodes.literal("", left)
             cells = [
-                nodes.entry("", nodes.paragraph("", "", n)) for n in (first, nodes.Text(right))
+                nodes.entry("", nodes.paragraph("", "", n))
+                for n in (first, *map(nodes.Text, others))
             ]
             part += nodes.row("", *cells)
     group += [top, body]
@@ -111,6 +116,21 @@ class Commands(SphinxDirective):
         return [_table(("command", "does"), rows, (2, 5))]
 
 
+class Exclusions(SphinxDirective):
+    """The options of ``design`` that are refused beside others, or without what they act on."""
+
+    def run(self) -> list[nodes.Node]:
+        """Return one table."""
+        rows: list[tuple[str, ...]] = []
+        for rule in RULES:
+            options, against, needs = (
+                " or ".join(map(spelt, names)) for names in (rule.options, rule.against, rule.needs)
+            )
+            beside = f"beside {against}" if against else f"without {needs}"
+            rows.append((options, beside, rule.told(options, against)))
+        return [_table(("option", "is refused", "because, and what to do"), rows, (2, 3, 5))]
+
+
 class OtherCommands(SphinxDirective):
     """The arguments of every installed command without a page under howto."""
 
@@ -130,5 +150,6 @@ def setup(app: Sphinx) -> dict[str, Any]:
     """Register the directives."""
     app.add_directive("options", Options)
     app.add_directive("commands", Commands)
+    app.add_directive("exclusions", Exclusions)
     app.add_directive("other-commands", OtherCommands)
     return {"parallel_read_safe": True}

@@ -7,11 +7,21 @@ import json
 from dataclasses import replace
 
 import pytest
-from designs import thesis_model
+from designs import make_request, thesis_model
 from virtual import virtual_log, write_csv
 
+from experiment_design import (
+    CandidateModel,
+    DesignRequest,
+    TrialLimits,
+    design_between,
+    prepare_request,
+)
 from experiment_design.command import add_arguments
+from experiment_design.for_prediction import design_for_prediction
+from experiment_design.request.exclusions import RULES, spelt
 from greybox.commands.main import main
+from greybox.errors import UsageError
 from greybox.trial.log import make_log
 
 SHIP = """name = "Thesis ship"
@@ -35,7 +45,7 @@ WIND = ("--predictor", "wind", "--wind", "5,3")
 ROOM = ("--circle", "0,0,400")
 # arguments of each option, and what has to stand beside it for a choice to be made
 VALUES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
-    "model": (("--model", "model.json"), ()),
+    "model": (("--model", "earlier.json"), ()),
     "duration": (("--duration", "80"), ()),
     "remaining": (("--remaining", "60"), ()),
     "after": (("--after", "log.csv"), ()),
@@ -48,7 +58,7 @@ VALUES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "want": (("--want", "Yvv", "Yv"), ()),
     "of": (("--of", "Yvv/Ymu"), ()),
     "target": (("--target", "Xuu=10"), ()),
-    "predictor": (("--predictor", "augmented"), ()),
+    "predictor": (("--predictor", "basic+wind", "--wind", "5,3"), ("--wind", "5,3")),
     "estimator": (("--estimator", "iv-white"), ()),
     "prior": (("--prior", "earlier.json"), ()),
     "between": (("--between", "model.json", "other.json"), ()),
@@ -83,16 +93,16 @@ VALUES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 }
 # options that may leave PLAN and JSON as they are, and why
 UNCHANGED = {
-    "vessel": "the vessel is that of the model",
+    "vessel": "needed in every way",
     "out": "names PLAN",
     "json": "names the JSON",
-    "sheet": "another output",
-    "report": "another output",
-    "legs": "another output",
+    "sheet": "names another output",
+    "report": "names another output",
+    "legs": "names another output",
     "help": "designs nothing",
     "duration": "given in every way, as --remaining with --after",
     "remaining": "another name of --duration",
-    "save_model": "another output",
+    "save_model": "names another output",
     "model": "given in every way that takes one",
     "purpose": "is the way",
     "after": "is the way",
@@ -153,29 +163,151 @@ def folder(tmp_path_factory):
 def design(folder, monkeypatch, capsys):
     """Run the command in the folder: its status, what it wrote, and what it said of an error."""
     monkeypatch.chdir(folder)
+    # no cluster is there to answer
+    monkeypatch.setattr("greybox.numerics.parallel._client", lambda address: None)
 
     def run(*options):
         for name in ("plan.csv", "plan.json"):
             (folder / name).unlink(missing_ok=True)
-        status = main(
-            [
-                "design",
-                "--vessel",
-                "ship.toml",
-                "--out",
-                "plan.csv",
-                "--json",
-                "plan.json",
-                *options,
-            ]
-        )
+        given = ["design", "--vessel", "ship.toml", "--out", "plan.csv", "--json", "plan.json"]
+        status = main([*given, *options])
         error = capsys.readouterr().err
         if status:
             assert not (folder / "plan.csv").exists()
             return status, None, error
         data = json.loads((folder / "plan.json").read_text())
-        for name in ("provenance", "seconds"):
+        for name in ("provenance", "wall_s"):
             data.pop(name, None)
         return status, ((folder / "plan.csv").read_text(), data), error
 
     return run
+
+
+# what makes a condition not met
+UNMET = {
+    "a yaw rate": ("--model", "surge.json"),
+    "a covariance": ("--model", "exact.json", "--regime", "u+v+"),
+    "a measured wind": ("--model", "model.json", "--wind", "5,3"),
+    "a sign of surge": ("--model", "model.json", "--regime", "v+"),
+    "a sign of sway": ("--model", "model.json", "--regime", "u+"),
+}
+# what makes a rule the only one that is broken, where its two options alone do not
+BESIDE = {
+    ("of", "criterion c"): ("--criterion", "A"),
+    ("causes", "for causes"): ("--for", "coefficients"),
+    ("diagnosis", "for causes"): ("--for", "coefficients"),
+    ("envelope", "for prediction"): ("--for", "coefficients"),
+    ("save_model", "model"): ("--after", "log.csv"),
+}
+PAIRS = [
+    (rule, option, other)
+    for rule in RULES
+    for option in rule.options
+    for other in rule.against or rule.needs[:1]
+]
+
+
+def arguments(name: str, other: str) -> tuple[str, ...]:
+    """Return how an option, a purpose or a value is asked for on the command line."""
+    if name.startswith("for "):
+        causes = ("--causes", "current") if name == "for causes" and other != "diagnosis" else ()
+        return ("--for", name.removeprefix("for "), *causes)
+    written = {"prior none": ("--prior", "none"), "criterion c": ("--criterion", "c")}
+    return written.get(name) or VALUES[name][0]
+
+
+@pytest.mark.parametrize(
+    ("rule", "option", "other"), PAIRS, ids=[f"{spelt(a)} {spelt(b)}" for _, a, b in PAIRS]
+)
+def test_every_rule_is_told_in_one_sentence(design, rule, option, other):
+    asked = [*arguments(option, other), *BESIDE.get((option, other), UNMET.get(other, ()))]
+    if other in rule.against:
+        asked += arguments(other, option)
+    if not {"--model", "--between", "--after", "none"}.intersection(asked):
+        asked += ("--model", "model.json")
+    status, _, error = design("--duration", "60", *asked)
+    assert status == 1
+    assert error.startswith("greybox design: ")
+    assert error.count("\n") == 1
+    said = rule.told(spelt(option), "" if rule.needs else spelt(other)).rsplit(":", 1)
+    assert said[0] in error
+    assert error.endswith(f":{said[1]}\n")
+
+
+@pytest.mark.parametrize(
+    ("structure", "spread", "asked", "message"),
+    [
+        ("thesis", 0.1, {"worst_case": True}, "--worst-case .* that --robust draws"),
+        ("thesis", 0.0, {"robust": 3}, "--robust .* and it has none"),
+        ("thesis", 0.0, {"probability": 0.99}, "--probability .* and it has none"),
+        ("thesis", 0.1, {"gust": 2.0, "wind": (5.0, 3.0)}, "'augmented' does not measure it"),
+        ("thesis", 0.1, {"limits": TrialLimits(clearance=5.0)}, "--clearance .* --area or"),
+        ("surge", 0.1, {"limits": TrialLimits(yaw_cap=0.1)}, "structure 'surge' has none"),
+        ("surge", 0.1, {"limits": TrialLimits(headings=1.0)}, "structure 'surge' has none"),
+        (
+            "thesis", 0.1, {"limits": TrialLimits(margins={"v": 0.3}), "regime": "u+"},
+            "--margin-v .* regime 'u\\+' has none",
+        ),
+        ("thesis", 0.1, {"criterion": "c"}, "name it, such as --of"),
+        ("thesis", 0.1, {"combination": {"Yv": 1.0}}, "use --criterion c"),
+        (
+            "thesis", 0.1, {"criterion": "c", "combination": {"Yv": 1.0}, "wanted": ("Yvv",)},
+            "leave out --want",
+        ),
+    ],
+)  # fmt: skip
+def test_a_request_meets_the_same_rules(structure, spread, asked, message):
+    with pytest.raises(UsageError, match=message):
+        prepare_request(thesis_model(structure, spread), DesignRequest(150.0, **asked))
+
+
+def test_two_models_and_predictions_meet_the_same_rules():
+    request = make_request(wanted=("Yv",))
+    rival = CandidateModel("b", request.structure, request.theta, request.d)
+    with pytest.raises(UsageError, match=r"--between .* leave out --want"):
+        design_between(request, rival, ("a", "b"))
+    with pytest.raises(UsageError, match=r"--for prediction .* leave out --want"):
+        design_for_prediction(request, thesis_model())
+
+
+# what every design of the next test is asked for, beside its way
+BRIEF = ("--duration", "60", "--effort", "0.001", "--workers", "1", "--seed", "3")
+
+
+@pytest.fixture
+def hasty(monkeypatch):
+    """Searches of a few evaluations: what they aim at is tested, not how near they come."""
+    from experiment_design import design
+    from experiment_design.optimise import campaign
+
+    monkeypatch.setattr(campaign, "_LEAST", 20)
+    monkeypatch.setattr(design, "_TIGHTENINGS", 1)
+    monkeypatch.setattr(design, "_POLISH", 2)
+
+
+def test_every_option_has_a_value_to_try():
+    assert set(VALUES) | set(UNCHANGED) == set(options_of_design())
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("way", WAYS)
+def test_every_option_is_honoured_or_refused(hasty, design, way):
+    """In each way of designing it changes PLAN or JSON, or is refused, or says why it cannot."""
+    usual = {}
+    ignored = []
+    for name in sorted(VALUES.keys() - UNCHANGED.keys()):
+        value, beside = VALUES[name]
+        if beside not in usual:
+            usual[beside] = design(*BRIEF, *WAYS[way], *beside)
+        status, found, error = design(*BRIEF, *WAYS[way], *beside, *value)
+        if status:
+            assert error.count("\n") == 1
+            assert any(spelt(n) in error for n in (name, *rule_names(beside))), error
+        elif usual[beside][0] == 0 and found == usual[beside][1]:
+            ignored.append(name)
+    assert ignored == []
+
+
+def rule_names(beside):
+    """Return the options among arguments."""
+    return [a[2:].replace("-", "_") for a in beside if a.startswith("--")]
