@@ -40,6 +40,22 @@ _PLACES = re.compile(r' d="[^"]*"| [xy]="[^"]*"|translate\([^)]*\)')
 _LONG = re.compile(r"-?\d+\.\d{3,}")
 
 
+# markers of one look, one after the other
+_MARKS = re.compile(
+    r'<g( clip-path="[^"]*")>( <use [^>]* style="([^"]*)"/>(?: <use [^>]* style="\3"/>)+) </g>'
+)
+
+
+def _styled_once(found: re.Match[str]) -> str:
+    """Return a group of markers with their style written once, where they inherit it."""
+    clip, marks, style = found.groups()
+    # opacity of a group is not that of each of its members
+    if re.search(r"(^|\s)opacity:", style):
+        return found[0]
+    plain = marks.replace(f' style="{style}"', "")
+    return f'<g{clip} style="{style}">{plain} </g>'
+
+
 def _rounded(found: re.Match[str]) -> str:
     return f"{float(found[0]):.2f}"
 
@@ -321,6 +337,8 @@ def to_svg(figure: Figure, title: str) -> str:
     text = text[text.index("<svg") :]
     text = _PLACES.sub(lambda found: _LONG.sub(_rounded, found[0]), text)
     text = re.sub(r"\s*\n\s*", " ", text)
+    text = _MARKS.sub(_styled_once, text)
+    text = text.replace("DejaVuSans-", "")
     # identifiers are local to a page with many figures
     prefix = re.sub(r"\W", "", title)[:24]
     text = re.sub(r'\bid="([^"]+)"', rf'id="{prefix}-\1"', text)

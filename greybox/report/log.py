@@ -184,7 +184,7 @@ def _draw(
 ) -> None:
     for ax, panel in zip(axes, panels, strict=True):
         if panel.kind == "direction":
-            _draw_direction(ax, panel, clock)
+            _draw_direction(ax, panel, clock, min(points, _DOTS))
         else:
             _draw_lines(ax, panel, clock, points)
         ax.set_ylabel(panel.label, fontsize=8)
@@ -254,7 +254,7 @@ def _degree_ticks(values: Any) -> Any:
     return MultipleLocator(step or 10 ** np.ceil(np.log10(spread / 4)))
 
 
-def _draw_direction(ax: Any, panel: _Panel, clock: _Clock) -> None:
+def _draw_direction(ax: Any, panel: _Panel, clock: _Clock, dots: int) -> None:
     """Draw a direction on a circle as dots: lines would jump across the page at 0/360."""
     ((name, value),) = panel.lines.items()
     radians = np.radians(value)
@@ -263,7 +263,7 @@ def _draw_direction(ax: Any, panel: _Panel, clock: _Clock) -> None:
     if np.ptp(near) > 270:
         near = np.mod(value, 360)
     # extremes of a circle mean little: every so many samples, not the envelope
-    index = np.arange(0, len(near), -(-len(near) // _DOTS))
+    index = np.arange(0, len(near), -(-len(near) // dots))
     ax.plot(
         clock.time[index],
         near[index],
