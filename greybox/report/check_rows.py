@@ -423,7 +423,8 @@ def _draw(ax: Any, t: Array, value: Array, breaks: Sequence[tuple[float, float]]
         if breaks:
             starts = np.searchsorted(t, [b[0] for b in breaks]) - 1
             gaps = np.unique(np.r_[gaps, starts[(starts >= 0) & (starts < len(t) - 1)]])
-        index = thin(gaps, value, points=1600)
+        # twice the pixels of a panel of three
+        index = thin(gaps, value, points=800)
         t, value = pick(t, index), pick(value, index)
     ax.plot(t, value, color=BLUE, linewidth=0.9)
     ax.set_xlabel("time [s]", fontsize=9)

@@ -37,7 +37,7 @@ from greybox.vessel.vessel import Vessel
 Array = NDArray[np.float64]
 
 _UNITS = {"u": "m/s", "v": "m/s", "r": "rad/s"}
-_DOTS = 700
+_DOTS = 250
 _LAGS = 41
 _CURVE_SAMPLES = 12_000
 # what a mended pair must change by to be worth a column, in shares of the largest change
@@ -303,7 +303,7 @@ def _draw_pair(
         ):
             shown = np.interp(t[inside], t, value[key])
             gaps = find_gaps(t[inside], tie.motion.step)
-            index = thin(gaps, np.nan_to_num(shown), points=800)
+            index = thin(gaps, np.nan_to_num(shown), points=400)
             ax.plot(
                 pick(t[inside], index), pick(shown, index), style, color=colour, linewidth=1.3,
                 label=text,
@@ -374,7 +374,7 @@ def _draw_slopes(cells: Sequence[Sequence[Any]], finding: Finding, tie: Tie) -> 
         ):
             rest = agreement.implied[name] - agreement.logged[name]
             keep = np.isfinite(rest) & (np.abs(turn) <= fast)
-            every = max(1, int(keep.sum()) // _DOTS)
+            every = max(1, -(-int(keep.sum()) // _DOTS))
             ax.plot(
                 turn[keep][::every], rest[keep][::every], ".", color=BLUE, markersize=2,
                 alpha=0.6,
@@ -409,7 +409,7 @@ def _draw_angles(ax: Any, finding: Finding, tie: Tie) -> None:
         # the track lies anticlockwise of the logged direction where the heading is too large
         angle = np.degrees(np.angle(logged[keep] * np.conj(implied[keep])))
         heading = np.degrees(agreement.psi[keep]) % 360
-        every = max(1, len(angle) // _DOTS)
+        every = max(1, -(-len(angle) // _DOTS))
         ax.plot(
             heading[::every], angle[::every], marker, color=colour, markersize=2.5, alpha=0.7,
             label=words,

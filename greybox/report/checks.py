@@ -32,6 +32,7 @@ from greybox.report.check_ties import make_tie, tie_figure
 from greybox.report.figures import to_svg
 from greybox.report.log import facts, page_figures
 from greybox.report.page import NextStep, Page, Picture, Section, Table, computed, typed, write_page
+from greybox.report.thinning import points_for
 from greybox.trial.checks.finding import CheckReport, Finding, shared_findings, size_in_words
 from greybox.trial.convert.convert import import_recording
 from greybox.trial.log import TrialLog
@@ -108,7 +109,9 @@ def check_page(
     record : mapping, optional
         How it was computed: versions, command, hashes of the files.
     """
-    sections = [_section(k, r, vessel) for k, r in enumerate(reports)]
+    signals = sum(len(r.recording.signals) for r in reports if r.recording is not None)
+    points = points_for(signals)
+    sections = [_section(k, r, vessel, points) for k, r in enumerate(reports)]
     lead, sections = _apart(reports, sections)
     made = computed(record or {}) | {"vessel": vessel.name}
     for report, path in zip(reports, paths, strict=True):
@@ -272,7 +275,7 @@ def _drawn(finding: Finding, report: CheckReport, vessel: Vessel) -> tuple[Figur
     return tie_figure(finding, tie), "" if tie.helps else _DOUBT
 
 
-def _section(number: int, report: CheckReport, vessel: Vessel) -> Section:
+def _section(number: int, report: CheckReport, vessel: Vessel, points: int) -> Section:
     pictures: list[Picture] = []
     sentences: list[str] = []
     if not report.findings:
@@ -292,7 +295,7 @@ def _section(number: int, report: CheckReport, vessel: Vessel) -> Section:
             sentences.append(f"The log as a whole cannot be drawn: {error}")
         else:
             text = f"as it would be imported, nothing mended: {facts(log)}."
-            for part, figure in page_figures(log).items():
+            for part, figure in page_figures(log, points).items():
                 pictures.append(
                     Picture(
                         to_svg(figure, f"log{number}{part}"),

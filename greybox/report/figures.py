@@ -35,6 +35,31 @@ LABELS = {
 }
 
 
+# coordinates, whose third decimal (a thousandth of a point) no screen and no printer shows
+_PLACES = re.compile(r' d="[^"]*"| [xy]="[^"]*"|translate\([^)]*\)')
+_LONG = re.compile(r"-?\d+\.\d{3,}")
+
+
+# markers of one look, one after the other
+_MARKS = re.compile(
+    r'<g( clip-path="[^"]*")>( <use [^>]* style="([^"]*)"/>(?: <use [^>]* style="\3"/>)+) </g>'
+)
+
+
+def _styled_once(found: re.Match[str]) -> str:
+    """Return a group of markers with their style written once, where they inherit it."""
+    clip, marks, style = found.groups()
+    # opacity of a group is not that of each of its members
+    if re.search(r"(^|\s)opacity:", style):
+        return found[0]
+    plain = marks.replace(f' style="{style}"', "")
+    return f'<g{clip} style="{style}">{plain} </g>'
+
+
+def _rounded(found: re.Match[str]) -> str:
+    return f"{float(found[0]):.2f}"
+
+
 def new_figure(width: float, height: float) -> Figure:
     """Return an empty figure of a size in inches, laid out without overlaps."""
     return Figure(figsize=(width, height), layout="constrained")
@@ -310,6 +335,10 @@ def to_svg(figure: Figure, title: str) -> str:
         canvas.print_svg(out, metadata={"Date": None, "Creator": None})
     text = out.getvalue()
     text = text[text.index("<svg") :]
+    text = _PLACES.sub(lambda found: _LONG.sub(_rounded, found[0]), text)
+    text = re.sub(r"\s*\n\s*", " ", text)
+    text = _MARKS.sub(_styled_once, text)
+    text = text.replace("DejaVuSans-", "")
     # identifiers are local to a page with many figures
     prefix = re.sub(r"\W", "", title)[:24]
     text = re.sub(r'\bid="([^"]+)"', rf'id="{prefix}-\1"', text)

@@ -51,15 +51,17 @@ class _Panel:
     controlled: Sequence[tuple[float, float]] = field(default=())
 
 
-def page_figures(log: TrialLog) -> dict[str, Figure]:
+def page_figures(log: TrialLog, points: int = 2000) -> dict[str, Figure]:
     """Draw one log, as far as it has the channels, in two parts that are legible on a phone.
 
     Gaps (steps above 1.5 sample times) interrupt the lines and are shaded. Long
-    logs are drawn by their envelopes: about 2000 points a line, no peak lost.
+    logs are drawn by their envelopes, no peak lost.
 
     Parameters
     ----------
     log : TrialLog
+    points : int
+        About how many a line has.
 
     Returns
     -------
@@ -71,12 +73,12 @@ def page_figures(log: TrialLog) -> dict[str, Figure]:
     figures: dict[str, Figure] = {}
     if "x_n" in log and "y_n" in log:
         figures["track"] = new_figure(_PHONE, _PHONE)
-        draw_track(figures["track"].subplots(), log, clock.gaps)
+        draw_track(figures["track"].subplots(), log, clock.gaps, points)
     panels = [*_states(log), *_inputs(log, clock), *_wind(log)]
     if panels:
         figures["signals"] = new_figure(_PHONE, 1.25 * len(panels) + 0.6)
         axes = figures["signals"].subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
-        _draw(list(axes), panels, clock, columns=3)
+        _draw(list(axes), panels, clock, columns=3, points=points)
     return figures
 
 
@@ -177,9 +179,14 @@ def _facts(log: TrialLog, clock: _Clock) -> str:
     return ", ".join(found)
 
 
-def _draw(axes: list[Any], panels: Sequence[_Panel], clock: _Clock, columns: int = 6) -> None:
+def _draw(
+    axes: list[Any], panels: Sequence[_Panel], clock: _Clock, columns: int, points: int
+) -> None:
     for ax, panel in zip(axes, panels, strict=True):
-        (_draw_direction if panel.kind == "direction" else _draw_lines)(ax, panel, clock)
+        if panel.kind == "direction":
+            _draw_direction(ax, panel, clock, min(points, _DOTS))
+        else:
+            _draw_lines(ax, panel, clock, points)
         ax.set_ylabel(panel.label, fontsize=8)
         ax.tick_params(labelsize=8, labelbottom=ax is axes[-1])
         tidy(ax)
@@ -226,9 +233,9 @@ def _draw(axes: list[Any], panels: Sequence[_Panel], clock: _Clock, columns: int
             axes[0].set_xlim(clock.time[0], clock.time[-1])
 
 
-def _draw_lines(ax: Any, panel: _Panel, clock: _Clock) -> None:
+def _draw_lines(ax: Any, panel: _Panel, clock: _Clock, points: int) -> None:
     for j, (name, value) in enumerate(panel.lines.items()):
-        index = thin(clock.gaps, value)
+        index = thin(clock.gaps, value, points=points)
         ax.plot(
             pick(clock.time, index),
             pick(value, index),
@@ -247,7 +254,7 @@ def _degree_ticks(values: Any) -> Any:
     return MultipleLocator(step or 10 ** np.ceil(np.log10(spread / 4)))
 
 
-def _draw_direction(ax: Any, panel: _Panel, clock: _Clock) -> None:
+def _draw_direction(ax: Any, panel: _Panel, clock: _Clock, dots: int) -> None:
     """Draw a direction on a circle as dots: lines would jump across the page at 0/360."""
     ((name, value),) = panel.lines.items()
     radians = np.radians(value)
@@ -256,7 +263,7 @@ def _draw_direction(ax: Any, panel: _Panel, clock: _Clock) -> None:
     if np.ptp(near) > 270:
         near = np.mod(value, 360)
     # extremes of a circle mean little: every so many samples, not the envelope
-    index = np.arange(0, len(near), -(-len(near) // _DOTS))
+    index = np.arange(0, len(near), -(-len(near) // dots))
     ax.plot(
         clock.time[index],
         near[index],

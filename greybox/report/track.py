@@ -29,7 +29,7 @@ _LONGEST_ARROW = 0.12
 _HULL = np.array([[0.5, 0], [0.22, 0.13], [-0.5, 0.13], [-0.5, -0.13], [0.22, -0.13]])
 
 
-def draw_track(axes: Any, log: TrialLog, gaps: NDArray[np.intp]) -> None:
+def draw_track(axes: Any, log: TrialLog, gaps: NDArray[np.intp], points: int) -> None:
     """Draw the positions of a log as a map.
 
     Parameters
@@ -40,10 +40,12 @@ def draw_track(axes: Any, log: TrialLog, gaps: NDArray[np.intp]) -> None:
         origin, and measured wind with ``u``, ``v`` the arrows.
     gaps : ndarray of int
         Samples after which the line is interrupted (dotted across).
+    points : int
+        About how many the line has.
     """
     north, east = log["x_n"], log["y_n"]
     extent = max(float(np.ptp(north)), float(np.ptp(east)), 1e-3)
-    index = thin(gaps, north, east)
+    index = thin(gaps, north, east, points=points)
     axes.plot(pick(east, index), pick(north, index), color=BLUE, linewidth=1.1, label="track")
     if len(gaps):
         axes.plot(
