@@ -249,7 +249,7 @@ def iv(samples: int) -> Iterator[Row]:
         off = max(apart(*pair) for pair in pairs)
         return f"coefficients and covariances apart by {off:.0e}"
 
-    others = {name: (there, "pip install linearmodels")}
+    others = {name: (there, 'pip install ".[bench]"')}
     yield from compare("iv", samples, "samples", here, others, equal)
 
 
@@ -431,7 +431,7 @@ def raw_import(megabytes: int) -> Iterator[Row]:
         csv, parquet = write_tables(folder, megabytes)
         # a sentence has some 25 characters: files of a quarter of the table's size
         nmea, other = write_nmea(folder / "raw.nmea", 10_000 * megabytes), folder / "other"
-        install = "pip install pynmea2"
+        install = 'pip install ".[bench]"'
         cases: list[tuple[Path, str, str, Work, str]] = [
             (csv, "log.csv", "pandas read_csv, to_csv",
              lambda: pd.read_csv(csv).to_csv(other, index=False), ""),

@@ -70,20 +70,24 @@ class Picture(_Recorded):
     def run(self) -> list[nodes.Node]:
         """Return a figure."""
         timed = [r for r in self.record()["rows"] if r["ratio"] is not None]
-        # the formats of an import have sizes of their own
         works = [(n, list(g)) for n, g in groupby(timed, lambda r: r["name"])]
         figure = Figure(figsize=(9, 2.6 * -(-len(works) // 2)), layout="constrained")
         for k, (name, rows) in enumerate(works):
             axes = figure.add_subplot(-(-len(works) // 2), 2, k + 1)
+            ticks: set[float] = set()
             for n, alternative in enumerate(dict.fromkeys(r["alternative"] for r in rows)):
                 mine = [r for r in rows if r["alternative"] == alternative]
                 size = [r["size"] for r in mine]
+                ticks.update(size)
                 for who, line in (("ours", "--"), ("theirs", "-")):
                     axes.loglog(
                         size, [r[who]["median"] for r in mine], line, marker="o", color=f"C{n}",
                         label=alternative if who == "theirs" else None,
                     )  # fmt: skip
             axes.set(title=name, xlabel=rows[0]["unit"], ylabel="time [s]")
+            # only the sizes that were measured, a word each
+            axes.set_xticks(sorted(ticks), [f"{x:g}" for x in sorted(ticks)])
+            axes.set_xticks([], minor=True)
             axes.legend(fontsize="x-small")
         path = Path(self.env.doctreedir) / "benchmarks.png"
         path.parent.mkdir(parents=True, exist_ok=True)
