@@ -79,7 +79,7 @@ VALUES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "energy": (("--energy", "0.9"), ()),
     "headings": (("--headings", "0.2"), ()),
     "current": (("--current", "0.05,0.02"), ()),
-    "wind": (("--wind", "0.5,0.3"), ()),
+    "wind": (("--wind", "0.05,0.03"), ()),
     "gust": (("--gust", "2"), WIND),
     "process_noise": (("--process-noise", "0.01,0.01,0.002"), ()),
     "robust": (("--robust", "2"), ()),
