@@ -462,7 +462,7 @@ class Rows:
 ROWS = {
     "free-run": Rows(free_run, (1000, 5000), (50_000,)),
     "iv": Rows(iv, (2000, 20_000), (200_000,)),
-    "output-error": Rows(output_error, (2000, 5000), (20_000,)),
+    "output-error": Rows(output_error, (5000, 10_000), (2000, 20_000)),
     "monte-carlo": Rows(monte_carlo, (16, 64), (256,)),
     "design": Rows(design, (25, 50), (100, 200)),
     "diagnosis": Rows(diagnosis, (300, 600), (1200,)),
