@@ -40,6 +40,8 @@ EXAMPLES = """examples:
 """
 
 
+# bytes of a polygon of 500 corners, many times over
+_LARGEST_ROOM = 1_000_000
 # what a trial may be designed for
 PURPOSES = ("coefficients", "prediction", "causes")
 
@@ -771,27 +773,15 @@ def read_area(path: str | Path) -> Any:
     LogError
         The file cannot be read, or is no polygon.
     """
-    import csv
-
     import numpy as np
 
     from greybox.errors import LogError
-    from greybox.files import nearest_file
+    from greybox.files import read_csv_rows
 
     path = Path(path)
-    try:
-        if path.stat().st_size > 1_000_000:
-            raise LogError(f"'{path.name}' is larger than any sea room: is it a log?")
-        with open(path, encoding="utf-8-sig", newline="") as handle:
-            rows = [r for r in csv.reader(handle) if any(c.strip() for c in r)]
-    except OSError as error:
-        raise LogError(
-            f"cannot read the sea room '{path}': {error.strerror}.{nearest_file(path)} Name a CSV "
-            f"file with columns x_n and y_n [m]."
-        ) from error
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise LogError(f"cannot read the sea room '{path}': {error}.") from error
-    header = [c.strip() for c in rows[0]] if rows else []
+    header, rows = read_csv_rows(
+        path, "the sea room", "Name a CSV file with columns x_n and y_n [m].", _LARGEST_ROOM
+    )
     if "x_n" not in header or "y_n" not in header:
         raise LogError(
             f"the sea room '{path.name}' needs columns x_n and y_n [m] in its first line: it has "
@@ -799,7 +789,7 @@ def read_area(path: str | Path) -> Any:
         )
     places = [header.index("x_n"), header.index("y_n")]
     try:
-        corners = np.array([[float(r[p]) for p in places] for r in rows[1:]])
+        corners = np.array([[float(r[p]) for p in places] for r in rows])
     except (ValueError, IndexError) as error:
         raise LogError(f"the sea room '{path.name}' holds a corner that is no number.") from error
     if len(corners) > 1 and np.allclose(corners[0], corners[-1]):

@@ -1,7 +1,8 @@
-"""Files: written whole or not at all, and JSON read within bounds."""
+"""Files: written whole or not at all, small ones read within bounds."""
 
 from __future__ import annotations
 
+import csv
 import hashlib
 import json
 import logging
@@ -11,6 +12,7 @@ import sys
 import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from io import StringIO
 from itertools import islice
 from pathlib import Path
 from typing import IO, Any
@@ -20,7 +22,7 @@ import numpy as np
 from greybox.errors import LogError, suggestion
 
 _MOST_NAMES = 10_000
-# largest JSON file that is read
+# largest file that is read as a whole
 _MOST_BYTES = 50_000_000
 
 _log = logging.getLogger(__name__)
@@ -163,21 +165,57 @@ def read_json(path: str | Path, what: str, advice: str) -> Any:
     LogError
         It is missing, too large, or no JSON.
     """
+    text = _bounded_text(path, what, advice)
+    try:
+        return json.loads(text)
+    except (json.JSONDecodeError, RecursionError) as error:
+        raise LogError(f"{what} '{path}' is no JSON: {error}. {advice}") from error
+
+
+def read_csv_rows(
+    path: str | Path, what: str, advice: str, most: int = _MOST_BYTES
+) -> tuple[list[str], list[list[str]]]:
+    """Read a small CSV file of bounded size: its header, and the rows that hold anything.
+
+    Parameters
+    ----------
+    path : str or Path
+    what : str
+        What the file should be, such as ``the sea room``.
+    advice : str
+        A sentence on what to give instead.
+    most : int
+        Bytes that are read at most.
+
+    Raises
+    ------
+    LogError
+        It is missing, too large, or no text.
+    """
+    text = _bounded_text(path, what, advice, most)
+    try:
+        rows = [r for r in csv.reader(StringIO(text, newline="")) if any(c.strip() for c in r)]
+    except csv.Error as error:
+        raise LogError(f"cannot read {what} '{path}': {error}. {advice}") from error
+    return [c.strip() for c in rows[0]] if rows else [], rows[1:]
+
+
+def _bounded_text(path: str | Path, what: str, advice: str, most: int = _MOST_BYTES) -> str:
     path = Path(path)
     try:
         size = path.stat().st_size
-        if size > _MOST_BYTES:
+        if size > most:
             raise LogError(
-                f"{what} '{path}' has {size / 1e6:.0f} MB, at most {_MOST_BYTES / 1e6:.0f} MB are "
-                f"read. {advice}"
+                f"{what} '{path}' has {size / 1e6:.0f} MB, at most {most / 1e6:.0f} MB are read. "
+                f"{advice}"
             )
-        return json.loads(path.read_text(encoding="utf-8"))
+        return path.read_text(encoding="utf-8-sig")
     except OSError as error:
         raise LogError(
             f"cannot read {what} '{path}': {error.strerror}.{nearest_file(path)} {advice}"
         ) from error
-    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
-        raise LogError(f"{what} '{path}' is no JSON: {error}. {advice}") from error
+    except UnicodeDecodeError as error:
+        raise LogError(f"cannot read {what} '{path}': {error}. {advice}") from error
 
 
 def write_json(value: Any, path: str | Path) -> None:

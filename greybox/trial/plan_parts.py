@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby, pairwise
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.signal import correlate
 
 from greybox.errors import LogError
-from greybox.files import nearest_file
+from greybox.files import read_csv_rows
 from greybox.trial.convert.time_grid import MIN_SEGMENT
 from greybox.trial.log import TrialLog
 from greybox.trial.segments import join_segments, whole_name
@@ -169,17 +168,8 @@ def read_plan(path: str | Path, vessel: Vessel) -> tuple[PlannedTrial, ...]:
         The file cannot be read, a column is missing, a value is no number, or a part unknown.
     """
     path = Path(path)
-    try:
-        with open(path, encoding="utf-8-sig", newline="") as handle:
-            reader = csv.DictReader(handle)
-            rows, header = list(reader), [str(n) for n in reader.fieldnames or ()]
-    except OSError as error:
-        raise LogError(
-            f"cannot read the plan '{path}': {error.strerror}.{nearest_file(path)} Name the CSV "
-            f"that greybox design wrote."
-        ) from error
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise LogError(f"cannot read the plan '{path}': {error}.") from error
+    header, lines = read_csv_rows(path, "the plan", "Name the CSV that greybox design wrote.")
+    rows = [dict(zip(header, line, strict=False)) for line in lines]
     lacking = [n for n in ("t", *vessel.commands) if n not in header]
     if lacking:
         raise LogError(
@@ -198,7 +188,7 @@ def read_plan(path: str | Path, vessel: Vessel) -> tuple[PlannedTrial, ...]:
         own = list(group)
         try:
             values = np.array([[float(r[n]) for n in ("t", *vessel.commands)] for r in own])
-        except (ValueError, TypeError) as error:
+        except (ValueError, KeyError) as error:
             raise LogError(
                 f"the plan '{path.name}' holds a value that is no number: {error}."
             ) from error
