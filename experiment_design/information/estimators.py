@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from experiment_design.information.information_model import InformationModel
+    from experiment_design.information.moments import InformationModel
     from greybox.model.noise import NoiseLevels
     from greybox.model.predictor import Predictor
     from greybox.model.run.step import Integrator

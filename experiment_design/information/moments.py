@@ -15,6 +15,7 @@ has no memory. Both sums add over trials, each centred by itself.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import casadi as ca
 import numpy as np
@@ -39,6 +40,20 @@ class Moments:
 
     def __add__(self, other: Moments) -> Moments:
         return Moments(self.gram + other.gram, self.score_covariance + other.score_covariance)
+
+
+class InformationModel(Protocol):
+    """Sums over samples from which the covariance follows."""
+
+    def __call__(self, x: Array, psi: Array, tau: Array) -> Moments:
+        """Return the sums of R sequences."""
+        ...
+
+    def gradient(
+        self, x: Array, psi: Array, tau: Array, d_gram: Array, d_score: Array
+    ) -> tuple[Array, Array]:
+        """Carry derivatives in the sums back to states with heading, and inputs."""
+        ...
 
 
 def measured_air(structure: Structure, north: ca.SX, east: ca.SX) -> tuple[ca.SX, ca.SX]:

@@ -13,8 +13,7 @@ from experiment_design.constraints.limit_program import LimitProgram
 from experiment_design.excitation.rollout import Motion, Rollout
 from experiment_design.excitation.schedule import Schedule
 from experiment_design.information.criteria import Criterion
-from experiment_design.information.information_model import InformationModel
-from experiment_design.information.moments import Moments
+from experiment_design.information.moments import InformationModel, Moments
 
 Array = NDArray[np.float64]
 
