@@ -1,28 +1,32 @@
 """The error budget: which share of the squared error of a held-out free run is whose.
 
-The error of the model without causes is a sum of series: what each cause changes, what a generic
-force of motion and commands predicts of the rest, and what is left then, in which sensor noise,
-waves and a slow force are told apart by their spectra. A series c of an error e takes the share
-Σ c e / Σ e²: of two that go together each takes half of their product, which is the mean over the
-orders in which they may be taken away (Shapley, 1953).
+A cause takes what switching it off at sea would: the extended model says what the logs would show
+without it, the model without causes is fitted to that anew, and its held-out error is compared with
+what it was. What the extended model leaves is told apart into what a generic force of motion and
+commands predicts of it, and, of the rest, sensor noise, waves and a slow force by their spectra.
+Causes of which each lessens the error of the others take more together than there is, or less: the
+difference is not split.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.evidence.held_out import Pair
+from greybox.diagnosis.evidence.held_out import Pair, change_scenarios
 from greybox.diagnosis.evidence.remainder import generic_force
-from greybox.diagnosis.fitting import Problem
+from greybox.diagnosis.fitting import Metric, Problem
 from greybox.diagnosis.gain import blocks
 from greybox.diagnosis.noise import Noise, fit_noise
+from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.result import BudgetPart
+from greybox.diagnosis.ship import LogRun, Ship
 from greybox.diagnosis.thresholds import GUST
 from greybox.diagnosis.waves import Waves
+from greybox.trial.log import TrialLog
 
 Array = NDArray[np.float64]
 
@@ -33,34 +37,136 @@ _DRAWS = 1000
 
 
 @dataclass(frozen=True)
-class Taken:
-    """A cause whose share is asked for.
+class SwitchedOff:
+    """What would be held out if the ship had everything but one cause.
 
     Parameters
     ----------
     id : str
-    without : sequence of Pair
-        The model with all other causes, its coefficients fitted anew, on what is held out.
-    alone : sequence of Pair
-        The model with this cause alone, likewise, for the cause that takes most: it takes what
-        switching it off would. Empty for the others, which are told beside it.
+    errors : ndarray
+        (N, nx) of the model without causes, fitted anew to such logs, on what is held out; empty
+        where no run without the cause stays bounded.
     relative : float
-        Standard error of its size, as a share of the size.
+        Standard error of the cause's size, as a share of the size.
     """
 
     id: str
-    without: Sequence[Pair]
-    alone: Sequence[Pair]
+    errors: Array
     relative: float
+
+
+def errors_without(
+    final: Sequence[Pair],
+    before: Fit,
+    drop: Callable[[Problem, Point], Point],
+    first: Callable[[Sequence[TrialLog]], Mapping[str, float]],
+) -> Array:
+    """Return the held-out errors that the model without causes would have without one of them.
+
+    Parameters
+    ----------
+    final : sequence of Pair
+        The extended model, on what is held out.
+    before : Fit
+        The model without causes; its free numbers are fitted anew.
+    drop : callable
+        Takes a cause out of a point of the extended model.
+    first : callable
+        First coefficients of logs.
+
+    Returns
+    -------
+    ndarray
+        (N, nx), of all that is held out; empty where a run leaves every bound.
+    """
+    out = []
+    for pair in final:
+        less = drop(pair.problem, pair.fit.point)
+        logs = _runs_without(pair.problem, pair.fit.point, [pair.fit.point.ship], [less.ship])
+        held = _runs_without(
+            pair.held, pair.held_fit.point, change_scenarios(pair.fit.point), change_scenarios(less)
+        )
+        if not logs or not held:
+            return np.zeros((0, len(pair.held.structure.states)))
+        # a fit may end before a hill beyond which it would predict better
+        errors = _predicted(logs, held, _starts(logs, before, pair.fit, first), before.noise)
+        if not errors:
+            return np.zeros((0, len(pair.held.structure.states)))
+        out.append(min(errors, key=lambda e: float(np.log((e**2).sum(axis=0)).sum())))
+    return np.concatenate(out)
+
+
+def _runs_without(
+    problem: Problem, point: Point, ships: Sequence[Ship], without: Sequence[Ship]
+) -> list[LogRun]:
+    """Return the logs less what a cause changes in the extended model's runs; none without bounds.
+
+    Of the ships, with a change within the log or before it, that one counts that the point has.
+    """
+    ship = point.ship
+    k = next((k for k, s in enumerate(ships) if s.changes == ship.changes), 0)
+    other = without[min(k, len(without) - 1)]
+    runs = []
+    for run, start in zip(problem.runs, point.starts, strict=True):
+        changed = run.run(ship, start).y - run.run(other, start).y
+        if not np.isfinite(changed).all():
+            return []
+        runs.append(run.measuring(run.y - changed))
+    return runs
+
+
+def _starts(
+    runs: Sequence[LogRun],
+    before: Fit,
+    final: Fit,
+    first: Callable[[Sequence[TrialLog]], Mapping[str, float]],
+) -> list[Point]:
+    """Return the model without causes with its own coefficients and with others to begin from.
+
+    Its own may lie beyond a hill, as they are of logs with the cause.
+    """
+    base = before.point.base
+    starts = tuple(run.start() for run in runs)
+    begun = [replace(before.point, starts=starts)]
+    free = [i for i in before.point.places if i < len(base.theta)]
+    if free:
+        values = first([run.log for run in runs])
+        own = [values.get(n, 0.0) for n in runs[0].structure.parameters]
+        for found in (final.point.base.theta, own):
+            theta = base.theta.copy()
+            theta[free] = np.asarray(found)[free]
+            begun.append(replace(begun[0], base=replace(base, theta=theta)))
+    return begun
+
+
+def _predicted(
+    runs: Sequence[LogRun], held: Sequence[LogRun], begun: Sequence[Point], noise: Noise
+) -> list[Array]:
+    """Return the held-out errors (N, nx) of fits from several points whose runs have bounds.
+
+    They are weighed as those of the model without causes were.
+    """
+    metric: Metric = "coloured" if noise.coloured else "free run"
+    problem, other = Problem(runs, metric), Problem(held, metric)
+    out = []
+    for point in begun:
+        errors = problem.errors(point)
+        if not all(np.isfinite(e).all() for e in errors):
+            continue
+        fit = problem.settle(problem.fit(point, problem.noise_of(errors, point)), 2)
+        shown = fit if fit.escaped else other.fit_starts(fit.point, fit.noise)
+        if not shown.escaped:
+            out.append(_states(other, shown))
+    return out
 
 
 def error_budget(
     base: Sequence[Pair],
     final: Sequence[Pair],
-    causes: Sequence[Taken],
+    causes: Sequence[SwitchedOff],
+    plain: Sequence[Pair],
     waves: Waves | None,
     seed: int,
-    nameless: bool = False,
 ) -> tuple[BudgetPart, ...]:
     """Split the squared error of held-out free runs.
 
@@ -68,14 +174,13 @@ def error_budget(
     ----------
     base, final : sequence of Pair
         The model without causes, and with those that stand, on what is held out.
-    causes : sequence of Taken
+    causes : sequence of SwitchedOff
+    plain : sequence of Pair
+        The extended model without the terms that it has beside its causes, fitted anew.
     waves : Waves or None
         A line in what the causes leave.
     seed : int
         Of the bootstrap.
-    nameless : bool
-        Whether the model has terms of motion and commands beside its causes, to which belongs
-        what these do not explain; otherwise that is not split.
 
     Returns
     -------
@@ -85,67 +190,63 @@ def error_budget(
         which each cause's size varies by its standard error; empty where a run leaves every
         bound.
     """
-    every = [*base, *final, *(p for c in causes for p in c.without)]
+    every = [*base, *final]
     if not base or any(p.fit.escaped or p.held_fit.escaped for p in every):
         return ()
     problem = final[0].held
     names = problem.structure.states
-    e0, e1 = _errors(base), _errors(final)
-    series = {c.id: np.zeros_like(e0) for c in causes}
-    for cause in causes:
-        alone = cause.alone and not any(p.held_fit.escaped for p in cause.alone)
-        series[cause.id] += e0 - _errors(cause.alone) if alone else _errors(cause.without) - e1
-    beside = e0 - e1 - sum(series.values())
-    plain, noise = [], []
+    e0, e1 = (
+        np.concatenate([_states(p.held, p.held_fit) for p in pairs]) for pairs in (base, final)
+    )
+    parts, noise = [], []
     for pair in final:
         left = generic_force(pair).errors
-        plain.append(np.concatenate(left))
+        parts.append(np.concatenate(left))
         noise.append((_noise_of(pair, left), sum(map(len, left))))
-    rest = np.concatenate(plain)[:, : len(names)]
-    series[MOTION] = e1 - rest + (beside if nameless else 0.0)
+    rest = np.concatenate(parts)[:, : len(names)]
+    left_over = {MOTION: e1**2 - rest**2}
+    before = {c.id: e0**2 - c.errors**2 for c in causes if len(c.errors)} | left_over
+    if not any(p.held_fit.escaped for p in plain):
+        before[MOTION] = np.concatenate([_states(p.held, p.held_fit) for p in plain]) ** 2 - rest**2
     moments = _moments(noise, problem, names, waves, rest)
     rng = np.random.default_rng([seed, 11])
     starts, length = blocks(len(e0), problem.sample_time, _DRAWS, rng)
     wide = {c.id: 1 + c.relative * rng.standard_normal(_DRAWS) for c in causes}
+    whole, drawn_whole = (e0**2).sum(axis=0), _drawn(e0**2, starts, length)
+    length_drawn = starts.shape[1] * length
 
-    def shares(of: Array, parts: Mapping[str, Array]) -> tuple[dict[str, Array], dict[str, Array]]:
-        """Return the shares (nx,) and their draws (draws, nx) of the products with an error."""
-        whole, drawn = (e0**2).sum(axis=0), _drawn(e0**2, starts, length)
-        point, draws = {}, {}
-        for name, part in parts.items():
-            point[name] = (part * of).sum(axis=0) / whole
-            draws[name] = _drawn(part * of, starts, length) / drawn
-            if name in wide:
-                draws[name] *= wide[name][:, None]
+    def shares(parts: dict[str, Array], of: Array) -> tuple[dict[str, Array], dict[str, Array]]:
+        """Return the shares (nx,) and their draws (draws, nx) of parts of a squared error."""
+        point = {name: part.sum(axis=0) / whole for name, part in parts.items()}
+        draws = {name: _drawn(part, starts, length) / drawn_whole for name, part in parts.items()}
+        for name in set(parts) & set(wide):
+            draws[name] *= wide[name][:, None]
         for name, moment in moments.items():
             point[name] = len(e0) * moment / whole
-            draws[name] = starts.shape[1] * length * moment / drawn
-        total = (of**2).sum(axis=0) / whole, _drawn(of**2, starts, length) / drawn
-        point[REST] = total[0] - sum(point.values())
-        draws[REST] = total[1] - sum(draws.values())
+            draws[name] = length_drawn * moment / drawn_whole
+        point[REST] = of.sum(axis=0) / whole - sum(point.values())
+        draws[REST] = _drawn(of, starts, length) / drawn_whole - sum(draws.values())
         return point, draws
 
-    before, drawn = shares(e0, series)
-    after, _ = shares(e1, {MOTION: e1 - rest})
-    order = [SENSOR, *series, SLOW, WAVES, REST]
+    told, drawn = shares(before, e0**2)
+    after, _ = shares(left_over, e1**2)
     return tuple(
         BudgetPart(
             part,
-            {s: float(before[part][i]) for i, s in enumerate(names)},
+            {s: float(told[part][i]) for i, s in enumerate(names)},
             {
                 s: tuple(map(float, np.quantile(drawn[part][:, i], [0.025, 0.975])))
                 for i, s in enumerate(names)
             },
             {s: float(after[part][i]) if part in after else 0.0 for i, s in enumerate(names)},
         )
-        for part in order
+        for part in (SENSOR, *before, SLOW, WAVES, REST)
     )
 
 
-def _errors(pairs: Sequence[Pair]) -> Array:
+def _states(held: Problem, fit: Fit) -> Array:
     """Return the held-out errors of the states, (N, nx)."""
-    count = len(pairs[0].held.structure.states)
-    return np.concatenate([e[:, :count] for p in pairs for e in p.held_fit.errors])
+    return np.concatenate([e[:, : len(held.structure.states)] for e in fit.errors])
 
 
 def _noise_of(pair: Pair, errors: Sequence[Array]) -> Noise:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.budget import Taken, error_budget
+from greybox.diagnosis.budget import SwitchedOff, error_budget, errors_without
 from greybox.diagnosis.causes import Cause
 from greybox.diagnosis.evidence.confusion import rivals
 from greybox.diagnosis.evidence.held_out import Pair
@@ -19,9 +19,8 @@ from greybox.diagnosis.extension import extended_model
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.gain import gains, run_on
 from greybox.diagnosis.null_model import FOLDS, DiagnosisProblem
-from greybox.diagnosis.point import Fit
+from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.quantities import quantities_of
-from greybox.diagnosis.refitting import refit
 from greybox.diagnosis.residuals import residual_tests
 from greybox.diagnosis.result import (
     BudgetPart,
@@ -35,13 +34,13 @@ from greybox.diagnosis.result import (
     finite,
 )
 from greybox.diagnosis.ruling import rule
-from greybox.diagnosis.scores import Score
 from greybox.diagnosis.search import Candidate, Search, backwards, instead
 from greybox.diagnosis.ship import CURRENTS
 from greybox.diagnosis.symptoms import find_symptoms
 from greybox.diagnosis.waves import Waves
 from greybox.model.model import ManoeuvringModel
 from greybox.model.structure import Structure
+from greybox.numerics.parallel import map_forked
 from greybox.trial.log import TrialLog
 from greybox.trial.validity import ranges
 from greybox.validation.fit import LogFit, fit_on
@@ -158,38 +157,42 @@ class DiagnosisBuilder:
     ) -> tuple[BudgetPart, ...]:
         """Return whose the held-out error is; what stands for several causes is not split."""
         found, held_out = self.found, self.case.held_out
-        own = dict(zip((c.hypothesis.key for c in found.causes), found.without, strict=False))
-
-        def run(fit: Fit) -> Sequence[Pair]:
-            return held_out(fit.integrator).pairs(fit)
-
         problem = self.case.problem(final.integrator)
-        more = set(final.point.places) - set(found.base.point.places)
-        nameless = bool(more - {i for c in found.causes for i in problem.numbers_at(c.hypothesis)})
-        base, left = run(found.before), run(final)
-        whole = _squares(base)
-        takes = {
-            c.hypothesis.key: float((_squares(run(own[c.hypothesis.key])) / whole).sum())
-            for c in named
-        }
-        # the others are told beside it: alone each would take what is not its own
-        main = max(takes, key=lambda key: takes[key], default="")
-        causes = [
-            Taken(
-                c.hypothesis.id, run(own[c.hypothesis.key]),
-                run(self._alone(final, c)) if c.hypothesis.key == main else (),
-                _relative(quantities_of(problem, c, final)),
-            )
-            for c in named
-        ]  # fmt: skip
-        return error_budget(run(found.before), left, causes, waves, self.seed, nameless=nameless)
+        base = held_out(found.before.integrator).pairs(found.before)
+        pairs = held_out(final.integrator).pairs(final)
+        if any(p.fit.escaped or p.held_fit.escaped for p in (*base, *pairs)):
+            return ()
 
-    def _alone(self, final: Fit, cause: Candidate) -> Fit:
-        """Return the fit of the model without causes with one of them alone in force."""
-        before = self.found.before
-        place = [a.key for a in final.point.hypotheses].index(cause.hypothesis.key)
-        score = Score(cause.hypothesis, final.point.values[place], cause.gain)
-        return refit(self.case.problem(before.integrator), before, score)
+        def without(cause: Candidate) -> Array:
+            def drop(problem: Problem, point: Point) -> Point:
+                return problem.drop(point, cause.hypothesis)
+
+            return errors_without(pairs, found.before, drop, self.case.first)
+
+        causes = map(
+            SwitchedOff,
+            [c.hypothesis.id for c in named],
+            map_forked(without, named),
+            [_relative(quantities_of(problem, c, final)) for c in named],
+        )
+        nameless = self._without_nameless(final)
+        plain = pairs if nameless is None else held_out(final.integrator).pairs(nameless)
+        return error_budget(base, pairs, list(causes), plain, waves, self.seed)
+
+    def _without_nameless(self, final: Fit) -> Fit | None:
+        """Return the extended model without terms that stand for no cause; None if it has none."""
+        problem = self.case.problem(final.integrator)
+        own = {i for h in final.point.hypotheses for i in problem.numbers_at(h)}
+        nameless = set(final.point.places) - set(self.found.base.point.places) - own
+        if not nameless:
+            return None
+        base = final.point.base
+        for i in nameless:
+            base = base.with_value(i, 0.0)
+        places = tuple(i for i in final.point.places if i not in nameless)
+        point = replace(final.point, base=base, places=places)
+        fit = replace(problem.fit(point, final.noise), integrator=final.integrator)
+        return None if fit.escaped else fit
 
     def record(self, causes: Sequence[Candidate]) -> dict[str, Any]:
         """Return what a model file tells beside."""
@@ -315,15 +318,6 @@ class DiagnosisBuilder:
         for change in after.changes:
             out.append(f"the extended model tells the log's own clock: {change.sentence}.")
         return out
-
-
-def _squares(pairs: Sequence[Pair]) -> Array:
-    """Return the mean squared held-out error of each state (nx,)."""
-    if not pairs or any(p.held_fit.escaped for p in pairs):
-        return np.full(1, np.inf)
-    count = len(pairs[0].held.structure.states)
-    errors = np.concatenate([e[:, :count] for p in pairs for e in p.held_fit.errors])
-    return np.asarray((errors**2).mean(axis=0))
 
 
 def _relative(quantities: Mapping[str, Quantity]) -> float:

@@ -225,6 +225,10 @@ class DiagnosisProblem:
         yield lambda: steady(self.structure, self.logs, self.regime), True
         yield lambda: careful(*case, self.kind, self.regime), True
 
+    def first(self, logs: Sequence[TrialLog]) -> Mapping[str, float]:
+        """Return first coefficients of the structure on logs, by least squares."""
+        return rough(self.structure, logs, self.kind, self.regime)[0]
+
     def as_given(
         self, coefficients: Mapping[str, float], current: Array, integrator: Integrator
     ) -> Fit | None:

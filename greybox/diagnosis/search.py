@@ -157,8 +157,6 @@ class Search:
         The model as it was given, no coefficient of it estimated; None where there was none.
     leaning : tuple of Candidate
         Causes that help, and do no more than a generic force would: no part of `final`.
-    without : tuple of Fit
-        The fit without each of the causes that stand.
     chosen : Fit or None
         Of the terms that the data chose, where the search went on from them.
     """
@@ -170,7 +168,6 @@ class Search:
     tried: int
     given: Fit | None = None
     leaning: tuple[Candidate, ...] = ()
-    without: tuple[Fit, ...] = ()
     chosen: Fit | None = None
 
     @property
@@ -442,7 +439,6 @@ def weighed(case: DiagnosisProblem, found: Search) -> Search:
         final=fit,
         causes=tuple(cause for cause, _ in stood),
         leaning=tuple(leaning),
-        without=tuple(without for _, without in stood),
     )
 
 

@@ -6,6 +6,7 @@ their commands, a coefficient from some moment on, or how a sensor sees the moti
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -154,6 +155,14 @@ class LogRun:
         self._simulator = VaryingSimulator(step, len(log))
         self._forces: tuple[Vessel, tuple[Wire, ...], Array] | None = None
         self._last: tuple[Ship, Shown] | None = None
+
+    def measuring(self, y: Array) -> LogRun:
+        """Return the log with other outputs (N, ny)."""
+        other = copy.copy(self)
+        other.y, other._last = y, None
+        channels = dict(zip(self.outputs, y.T, strict=True))
+        other.log = replace(self.log, channels={**self.log.channels, **channels})
+        return other
 
     def forces(self, vessel: Vessel, wires: tuple[Wire, ...] = ()) -> Array:
         """Return the generalised inputs (N, nu) as the vessel's thrusters give them."""

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import permutations
 
 import numpy as np
 import pytest
 
-from greybox.diagnosis.budget import MOTION, REST, SENSOR, Taken, error_budget
+from greybox.diagnosis.budget import MOTION, REST, SENSOR, SwitchedOff, error_budget, errors_without
 from greybox.diagnosis.diagnose import diagnose
 from greybox.diagnosis.evidence.held_out import Pair
 from greybox.diagnosis.preparing import prepare
@@ -40,42 +39,55 @@ def two_series(pair: Pair) -> tuple[np.ndarray, np.ndarray]:
     return one, other
 
 
-def mean_over_orders(part: np.ndarray, others: list[np.ndarray], i: int) -> float:
-    """What adding a part adds to the squared error, the mean over all orders of adding."""
-    added = []
-    for order in permutations(range(len(others) + 1)):
-        before = sum((others[k - 1][:, i] for k in order[: order.index(0)]), np.zeros(len(part)))
-        added.append(((before + part[:, i]) ** 2).sum() - (before**2).sum())
-    return float(np.mean(added))
+def off(pair: Pair, *series: np.ndarray, relative: float = 0.0) -> SwitchedOff:
+    """A cause without which these series are left."""
+    (errors,) = beside(pair, *series).held_fit.errors
+    return SwitchedOff("current", errors[:, :3], relative)
 
 
-def test_shares_are_those_of_the_series_that_were_added(pair: Pair) -> None:
+def test_a_cause_takes_what_switching_it_off_does(pair: Pair) -> None:
     one, other = two_series(pair)
-    e1 = pair.held_fit.errors[0]
     base = beside(pair, one, other)
-    causes = [
-        Taken("current", [beside(pair, one)], [beside(pair, other)], 0.0),
-        Taken("wind", [beside(pair, other)], [beside(pair, one)], 0.0),
-    ]
-    budget = {p.part: p for p in error_budget([base], [pair], causes, None, 0)}
+    causes = [off(pair, other), replace(off(pair, one), id="wind")]
+    budget = {p.part: p for p in error_budget([base], [pair], causes, [pair], None, 0)}
     e0 = base.held_fit.errors[0]
     for i, state in enumerate("uvr"):
         whole = (e0[:, i] ** 2).sum()
         assert sum(p.share[state] for p in budget.values()) == pytest.approx(1.0)
-        for name, c in (("current", one), ("wind", other)):
-            brute = mean_over_orders(c, [other if c is one else one, e1], i) / whole
-            share = budget[name].share[state]
-            assert share == pytest.approx(brute, abs=1e-9)
-            low, high = budget[name].ci[state]
+        for cause in causes:
+            share = budget[cause.id].share[state]
+            assert share == pytest.approx(1 - (cause.errors[:, i] ** 2).sum() / whole, abs=1e-9)
+            low, high = budget[cause.id].ci[state]
             assert low <= share <= high
-            assert budget[name].after[state] == 0.0
+            assert budget[cause.id].after[state] == 0.0
+        # each takes what the two do only together
+        both = -2 * (one * other)[:, i].sum() / whole
+        assert budget[REST].share[state] == pytest.approx(both, abs=0.03)
+
+
+def test_a_cause_without_which_no_run_is_bounded_is_not_split(pair: Pair) -> None:
+    one, _ = two_series(pair)
+    lost = SwitchedOff("current", np.zeros((0, 3)), 0.1)
+    budget = {p.part: p for p in error_budget([beside(pair, one)], [pair], [lost], [pair], None, 0)}
+    assert "current" not in budget
+    assert budget[REST].share["r"] > 0.8
+
+
+def test_terms_without_a_name_belong_to_motion_and_commands(pair: Pair) -> None:
+    one, other = two_series(pair)
+    base, plain = beside(pair, one, other), beside(pair, other)
+    parts = error_budget([base], [pair], [off(pair, other)], [plain], None, 0)
+    share = {p.part: p.share for p in parts}[MOTION]
+    e0, e1 = (p.held_fit.errors[0] for p in (base, pair))
+    took = ((e1 + other) ** 2 - e1**2).sum(axis=0) / (e0**2).sum(axis=0)
+    for i, state in enumerate("uvr"):
+        assert share[state] == pytest.approx(took[i], abs=0.02)
 
 
 def test_the_noise_of_the_sensors_has_its_own_share(pair: Pair) -> None:
     one, _ = two_series(pair)
     base = beside(pair, one)
-    taken = Taken("current", [beside(pair, one)], [pair], 0.0)
-    budget = {p.part: p for p in error_budget([base], [pair], [taken], None, 0)}
+    budget = {p.part: p for p in error_budget([base], [pair], [off(pair)], [pair], None, 0)}
     e0 = base.held_fit.errors[0]
     true = 2e-4 * len(e0) / (e0[:, 2] ** 2).sum()
     assert budget[SENSOR].share["r"] == pytest.approx(true, rel=0.15)
@@ -88,8 +100,8 @@ def test_an_uncertain_cause_has_a_wider_interval(pair: Pair) -> None:
     base = beside(pair, one)
 
     def width(relative: float) -> float:
-        taken = Taken("current", [beside(pair, one)], [pair], relative)
-        parts = error_budget([base], [pair], [taken], None, 0)
+        cause = off(pair, relative=relative)
+        parts = error_budget([base], [pair], [cause], [pair], None, 0)
         low, high = next(p for p in parts if p.part == "current").ci["u"]
         return high - low
 
@@ -98,7 +110,13 @@ def test_an_uncertain_cause_has_a_wider_interval(pair: Pair) -> None:
 
 def test_a_run_that_leaves_every_bound_has_no_budget(pair: Pair) -> None:
     escaped = replace(pair, held_fit=replace(pair.held_fit, cost=np.inf))
-    assert error_budget([escaped], [pair], [], None, 0) == ()
+    assert error_budget([escaped], [pair], [], [pair], None, 0) == ()
+
+
+def test_nothing_changes_where_nothing_is_switched_off(pair: Pair) -> None:
+    errors = errors_without([pair], pair.fit, lambda _, point: point, lambda _: {})
+    own = pair.held_fit.errors[0][:, :3]
+    assert (errors**2).sum(axis=0) == pytest.approx((own**2).sum(axis=0), rel=0.02)
 
 
 def test_a_current_takes_what_it_would_if_it_were_not_there() -> None:
