@@ -23,8 +23,8 @@ from greybox.report.diagnosis_figures import (
 from greybox.report.error_budget import (
     budget_figure,
     budget_table,
+    cut_off,
     largest,
-    negative,
     noise_sentence,
 )
 from greybox.report.free_run_errors import REGIMES, Errors, gather, simulations
@@ -166,10 +166,10 @@ def _budget(diagnosis: Diagnosis) -> Iterator[Picture]:
     if diagnosis.budget:
         caption = (
             "Whose the squared error of the held-out free run is, before what was found is mended "
-            "and after."
+            "and after: of a cause, how much less it would be if the ship did not have it."
         )
-        if negative(diagnosis.budget):
-            caption += " Parts that take from each other have a negative share, which is not drawn."
+        if cut_off(diagnosis.budget):
+            caption += " Shares beyond the picture's edge stand in the table of the budget."
         told = f"{caption} Largest part of {largest(diagnosis.budget)}."
         yield narrow(budget_figure(diagnosis.budget), "budget", caption, told)
 

@@ -7,63 +7,46 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from greybox.diagnosis.budget import MOTION, REST, SENSOR, SLOW, WAVES
+from greybox.diagnosis.budget import SENSOR
 from greybox.diagnosis.result import BudgetPart, Gain
-from greybox.report.figures import (
-    BLUE,
-    GREEN,
-    LABELS,
-    ORANGE,
-    PURPLE,
-    SKY,
-    VERMILION,
-    new_figure,
-    tidy,
-)
+from greybox.report.figures import BLUE, LABELS, ORANGE, new_figure, tidy
 from greybox.report.page import Table
 
 # inches: letters stay legible where the page is 390 px wide
 _WIDTH = 4.4
-_NAMELESS = {SENSOR: "0.8", MOTION: "0.55", SLOW: "0.35", WAVES: SKY, REST: "white"}
-_CAUSES = (VERMILION, BLUE, ORANGE, GREEN, PURPLE)
-_HATCHES = ("", "//", "..", "\\\\", "xx", "++")
+# shares in percent that are drawn; what lies beyond is cut off
+_SHOWN = (-60.0, 140.0)
 
 
 def budget_figure(budget: Sequence[BudgetPart]) -> Figure:
-    """Draw the shares of each state as two stacked bars, before and after."""
+    """Draw the share of each part in each state with its interval, and what is left of it after."""
     states = list(budget[0].share)
-    figure = new_figure(_WIDTH, 0.85 * len(states) + 1.2 + 0.16 * len(budget))
-    ax = figure.subplots()
-    causes = [p.part for p in budget if p.part not in _NAMELESS]
-    places, names = [], []
-    for i, state in enumerate(states):
-        for j, when in enumerate(("before", "after")):
-            y = 2.5 * i + j
-            places.append(y)
-            names.append(f"{LABELS.get(state, state).split(' [')[0]}, {when}")
-            left = 0.0
-            for part in budget:
-                share = 100 * max((part.share if when == "before" else part.after)[state], 0.0)
-                k = causes.index(part.part) if part.part in causes else 0
-                own = part.part in causes
-                ax.barh(
-                    y, share, 0.8, left=left, edgecolor="0.2", linewidth=0.6,
-                    color=_CAUSES[k % len(_CAUSES)] if own else _NAMELESS[part.part],
-                    hatch=_HATCHES[k % len(_HATCHES)] if own else "",
-                    label=part.part if i == j == 0 else None,
-                )  # fmt: skip
-                left += share
-    ax.axvline(100, color="0.2", linewidth=0.8)
-    ax.set_yticks(places, names, fontsize=8.5)
-    ax.set_ylim(max(places) + 0.7, -0.7)
-    ax.set_xlabel("share of the squared error before mending [%]", fontsize=9)
-    ax.tick_params(axis="x", labelsize=8)
-    handles, labels = ax.get_legend_handles_labels()
+    figure = new_figure(_WIDTH, 1.0 + 0.3 * len(budget))
+    axes = figure.subplots(1, len(states), sharey=True, squeeze=False)[0]
+    places = np.arange(len(budget))
+    for ax, state in zip(axes, states, strict=True):
+        share = 100 * np.array([p.share[state] for p in budget])
+        low, high = 100 * np.array([p.ci[state] for p in budget]).T
+        ax.barh(places, share, 0.72, color=BLUE, edgecolor="0.2", linewidth=0.6, label="before")
+        ax.barh(
+            places, [100 * p.after[state] for p in budget], 0.3, color=ORANGE, edgecolor="0.2",
+            linewidth=0.6, label="after mending",
+        )  # fmt: skip
+        ax.hlines(places, low, high, color="0.2", linewidth=1.0, label="95 % interval of before")
+        ax.axvline(0, color="0.2", linewidth=0.8)
+        ax.set_xlim(*_SHOWN)
+        ax.set_xticks([0, 100])
+        ax.tick_params(axis="x", labelsize=8)
+        ax.set_title(LABELS.get(state, state).split(" [")[0], fontsize=9)
+        tidy(ax)
+    axes[0].set_yticks(places, [p.part for p in budget], fontsize=8.5)
+    axes[0].set_ylim(len(budget) - 0.4, -0.6)
+    figure.supxlabel("share of the squared error before mending [%]", fontsize=9)
+    handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(
-        handles, labels, loc="outside upper left", ncols=2, fontsize=8.5, frameon=False,
-        handlelength=1.6, columnspacing=1.2,
+        handles, labels, loc="outside upper left", ncols=3, fontsize=8, frameon=False,
+        handlelength=1.4, columnspacing=1.0,
     )  # fmt: skip
-    tidy(ax)
     return figure
 
 
@@ -123,6 +106,7 @@ def noise_sentence(budget: Sequence[BudgetPart], gain: Mapping[str, Gain]) -> st
     return f"{said}."
 
 
-def negative(budget: Sequence[BudgetPart]) -> bool:
-    """Whether a share is below zero beyond what a picture would hide."""
-    return bool(min(np.min(list(p.share.values())) for p in budget) < -0.02)
+def cut_off(budget: Sequence[BudgetPart]) -> bool:
+    """Whether a share lies beyond what the picture shows."""
+    low, high = _SHOWN
+    return any(not low <= 100 * share <= high for p in budget for share in p.share.values())
