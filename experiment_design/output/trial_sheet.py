@@ -284,7 +284,8 @@ def _printed(html: str, kind: str) -> bytes:
         book.set_metadata(printer.PDF_METADATA_CREATION_DATE, "")
         book.write_to_pdf_stream(out)
         return out.getvalue()
-    pages, zoom = book.get_page_count(), _DPI / 72
+    # a canvas of pixels is drawn on in pixels of CSS, 96 to the inch
+    pages, zoom = book.get_page_count(), _DPI / 96
     wide, high = (round(v / 25.4 * _DPI) for v in (_WIDTH, _HEIGHT))
     canvas = printer.ImageCanvas(wide, high * pages, printer.IMAGE_FORMAT_RGB24)
     canvas.clear_surface(1, 1, 1)
