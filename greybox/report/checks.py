@@ -100,7 +100,7 @@ def check_page(
     Parameters
     ----------
     reports : sequence of CheckReport
-        One a log.
+        One per log.
     paths : sequence of Path
         Of the logs, in the same order.
     vessel : Vessel
