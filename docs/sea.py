@@ -2,6 +2,7 @@
 
 python sea.py prior.json
 python sea.py plan.csv trial.csv --seed 1
+python sea.py plan.csv raw.csv --seed 1 --raw
 """
 
 import argparse
@@ -12,6 +13,8 @@ import numpy as np
 import greybox as gb
 from greybox.study.chapter6 import START, TRUE
 
+KNOT = 1852 / 3600  # m/s
+LATE = 2.0  # s, of the recorder's velocities
 LAG = 2.0  # s, of the true ship's forces behind their commands: what the model will lack
 
 ship, structure = gb.load_vessel("thesis"), gb.get_structure("thesis")
@@ -26,8 +29,8 @@ def believe(path):
     gb.ManoeuvringModel(structure, theta, covariance, 1.0, ship).save(path)
 
 
-def sail(plan, path, seed):
-    """Sail the true ship on the plan's commands, and log what its sensors measure."""
+def sail(plan, seed):
+    """Sail the true ship on the plan's commands, and return what its sensors measure."""
     start = dict(zip(("u", "v", "r"), START, strict=True)) | {"psi": 0.0}
     log = gb.read_log(plan, slow, fill=start)
     rng, steps = np.random.default_rng(seed), len(log) - 1
@@ -38,15 +41,38 @@ def sail(plan, path, seed):
     channels = {name: log[name] for name in ship.commands}
     channels |= dict(zip(("u", "v", "r"), measured.T, strict=True))
     channels["psi"] = run.psi[0] + 0.01 * rng.standard_normal(steps + 1)
-    gb.write_log([gb.make_log(ship, channels, 1.0)], path)
+    return channels
+
+
+def record(channels, path):
+    """Write a log as a recorder might: other names and units, a hole, and a slow velocity log."""
+    t = np.arange(len(channels["psi"]))
+    speed = (channels["u"] + 1j * channels["v"]) * np.exp(1j * channels["psi"])
+    place = np.r_[0, np.cumsum(speed[1:] + speed[:-1]) / 2]
+    raw = {
+        "Time [s]": t,
+        "North [m]": place.real,
+        "East [m]": place.imag,
+        "Heading [deg]": np.rad2deg(channels["psi"]) % 360,
+        "Surge [kn]": np.interp(t - LATE, t, channels["u"]) / KNOT,
+        "Sway [kn]": np.interp(t - LATE, t, channels["v"]) / KNOT,
+        "Yaw rate [deg/s]": np.rad2deg(channels["r"]),
+        **{name: channels[name] for name in ship.commands},
+    }
+    rows = np.column_stack(list(raw.values()))[(t < 300) | (t >= 320)]
+    np.savetxt(path, rows, "%.6g", ",", header=",".join(raw), comments="")
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()
     parser.add_argument("files", nargs="+")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--raw", action="store_true")
     given = parser.parse_args()
     if len(given.files) == 1:
         believe(given.files[0])
+    elif given.raw:
+        record(sail(given.files[0], given.seed), given.files[1])
     else:
-        sail(*given.files, given.seed)
+        measured = sail(given.files[0], given.seed)
+        gb.write_log([gb.make_log(ship, measured, 1.0)], given.files[1])

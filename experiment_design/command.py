@@ -121,17 +121,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
     add("--vessel", required=True, metavar="V", help="vessel file (TOML) with limits")
-    add("--model", metavar="MODEL", help="prior model of greybox estimate")
-    add("--duration", type=positive, metavar="S", help="length of each trial, lead-in left out [s]")
+    add("--model", metavar="MODEL", help="prior model: a file of greybox estimate")
+    add(
+        "--duration",
+        type=positive,
+        metavar="S",
+        help="length of each trial without its lead-in [s]",
+    )
     add(
         "--after",
         nargs="+",
         default=[],
         metavar="LOG",
-        help="what has been sailed, in this order: the model is estimated on it unless --model "
-        "names one, and the rest of the trial covers what it has not",
+        help="logs of what has been sailed, in this order: the model is estimated on them unless "
+        "--model names one, and the plan adds what they do not tell",
     )
-    add("--remaining", type=positive, metavar="S", help="--duration of that rest [s]")
+    add("--remaining", type=positive, metavar="S", help="as --duration, after --after [s]")
     add("--save-model", metavar="FILE", help="write the model that --after estimates (JSON)")
     add("--out", required=True, metavar="PLAN", help="where to write the commands (CSV)")
     add("--json", metavar="F", help="write the design as JSON; - is stdout")
@@ -142,30 +147,31 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="?",
         const="",
         metavar="FILE",
-        help="write the plan as legs too, that end by time, heading, speed or yaw rate: JSON, a "
-        "CSV beside it, and words on the sheet (PLAN with the ending .legs.json)",
+        help="write the plan as legs too, each of which ends by time, heading, speed or yaw rate: "
+        "as JSON, as CSV and in words on the sheet (PLAN with the ending .legs.json)",
     )
     goal = parser.add_argument_group("what is to be learnt")
     goal.add_argument(
         "--for",
         dest="purpose",
         choices=PURPOSES,
-        help="what the estimate is wanted for: predictions over the operating envelope, both "
-        "sides, misfit included (prediction, unless one of "
+        help="what the trial is for: predictions to both sides over the operating envelope, with "
+        "the misfit of the structure counted (prediction, unless one of "
         f"{', '.join(map(spelt, COEFFICIENTS))} is given), the precision of coefficients in one "
         "regime, or telling causes apart",
     )
     goal.add_argument(
         "--diagnosis",
         metavar="D",
-        help="JSON of greybox diagnose, whose open causes are told apart (that of MODEL)",
+        help="JSON of greybox diagnose: its open causes are to be told apart (that of MODEL)",
     )
     goal.add_argument(
         "--causes",
         nargs="+",
         default=[],
         metavar="ID",
-        help="or their ids, with the place where there are several, such as thruster_lag:n",
+        help="ids of the causes to tell apart, with their place where there are several, such as "
+        "thruster_lag:n",
     )
     goal.add_argument(
         "--envelope",
@@ -177,10 +183,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     goal.add_argument(
         "--criterion",
         choices=tuple(CRITERIA),
-        help=f"of the covariance of the wanted parameters: {_listed(CRITERIA)} (D)",
+        help=f"measure of the covariance of the wanted parameters: {_listed(CRITERIA)} (D)",
     )
     goal.add_argument(
-        "--want", nargs="+", default=[], metavar="NAME", help="parameters that count (all)"
+        "--want", nargs="+", default=[], metavar="NAME", help="parameters to estimate well (all)"
     )
     goal.add_argument(
         "--of", metavar="EXPR", help="function of the parameters for criterion c, such as Xuu/Xmu"
@@ -189,37 +195,42 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--target",
         nargs="+",
         metavar="NAME=STD",
-        help="least trial time for these standard errors, --duration at most",
+        help="find the shortest trial that reaches these standard errors, --duration at most",
     )
     goal.add_argument(
         "--predictor",
         choices=tuple(PREDICTORS),
-        help="that the estimate will use: which disturbances it captures or measures (augmented; "
-        "basic for a model without yaw rate)",
+        help="predictor of the later estimate: current and wind left out (basic), unknown "
+        "(augmented) or measured (wind) (augmented; basic for a model without yaw rate)",
     )
     goal.add_argument(
         "--estimator",
         choices=tuple(ESTIMATORS),
-        help=f"{_listed(ESTIMATORS)} (iv)",
+        help=f"estimator of the later estimate: {_listed(ESTIMATORS)} (iv)",
     )
     goal.add_argument(
         "--prior",
         metavar="MODEL",
-        help="model of earlier trials, its information; none: no trial and no --model, start from "
-        "the vessel's main dimensions",
+        help="model of earlier trials, whose information counts as known; none: start from the "
+        "vessel's main dimensions, without trial and --model",
     )
     goal.add_argument(
-        "--between", nargs=2, metavar=("A", "B"), help="tell two explanations apart instead"
+        "--between", nargs=2, metavar=("A", "B"), help="two models that the trial is to tell apart"
     )
     motion = parser.add_argument_group("what the trial must keep")
-    motion.add_argument("--regime", metavar="u+v+", help="signs to keep (auto)")
-    motion.add_argument("--margin-u", type=_not_negative, metavar="M", help="least |u_r| [m/s]")
-    motion.add_argument("--margin-v", type=_not_negative, metavar="M", help="least |v_r| [m/s]")
+    motion.add_argument("--regime", metavar="u+v+", help="signs of the velocities to keep (auto)")
+    for name, word in (("u", "surge"), ("v", "sway")):
+        motion.add_argument(
+            f"--margin-{name}",
+            type=_not_negative,
+            metavar="M",
+            help=f"keep {word} through the water at |{name}_r| of M or more [m/s]",
+        )
     motion.add_argument(
         "--margin-air",
         type=_not_negative,
         metavar="M",
-        help="least |u_q| and |v_q|, of either sign, where the wind is measured [m/s]",
+        help="keep the measured wind at |u_q| and |v_q| of M or more, of either sign [m/s]",
     )
     motion.add_argument(
         "--hold",
@@ -232,75 +243,96 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--start",
         type=_floats,
         metavar="u,v,r,psi",
-        help="state at the start (chosen; with --after where the last log ended)",
+        help="state at the start [m/s, m/s, rad/s, rad] (chosen; with --after the end of the last "
+        "log)",
     )
     motion.add_argument(
-        "--trials", type=_whole, default=1, metavar="K", help="trials of a campaign (1)"
+        "--trials", type=_whole, default=1, metavar="K", help="number of trials (1)"
     )
-    motion.add_argument("--area", metavar="CSV", help="sea room, a polygon of x_n, y_n [m]")
+    motion.add_argument("--area", metavar="CSV", help="sea room: the corners x_n, y_n [m]")
     motion.add_argument(
-        "--circle", type=_floats, metavar="N,E,R", help="round sea room: centre and radius [m]"
+        "--circle",
+        type=_floats,
+        metavar="N,E,R",
+        help="round sea room: north and east of its centre, radius [m]",
     )
     motion.add_argument(
         "--position",
         type=_pair,
         metavar="N,E",
-        help="place of the start [m] (0,0; with --after where the last log ended)",
+        help="north and east of the start [m] (0,0; with --after the end of the last log)",
     )
     motion.add_argument(
         "--clearance",
         type=_not_negative,
         default=0.0,
         metavar="M",
-        help="kept from the edge [m] (0)",
+        help="distance to keep from the edge of the sea room [m] (0)",
     )
-    motion.add_argument("--speed-cap", type=positive, metavar="M", help="largest speed [m/s]")
-    motion.add_argument("--yaw-cap", type=positive, metavar="R", help="largest yaw rate [rad/s]")
+    motion.add_argument(
+        "--speed-cap", type=positive, metavar="M", help="highest speed over ground [m/s]"
+    )
+    motion.add_argument("--yaw-cap", type=positive, metavar="R", help="highest yaw rate [rad/s]")
     motion.add_argument(
         "--end",
         nargs="+",
         default=[],
         metavar="NAME=VALUE:TOL",
-        help="final u, v, r, psi, x_n or y_n with tolerance (0.05)",
+        help="final u, v, r, psi, x_n or y_n, with its tolerance (0.05)",
     )
     motion.add_argument(
-        "--energy", type=positive, metavar="E", help="mean (n/n_max)^3 at most, such as 0.5"
+        "--energy", type=positive, metavar="E", help="highest mean of (n/n_max)^3, such as 0.5"
     )
     motion.add_argument(
         "--headings", type=positive, metavar="RAD", help="range of headings to cover [rad]"
     )
     belief = parser.add_argument_group("what is believed beforehand")
-    belief.add_argument("--current", type=_pair, metavar="N,E", help="expected current [m/s]")
-    belief.add_argument("--wind", type=_pair, metavar="N,E", help="expected wind [m/s]")
     belief.add_argument(
-        "--gust", type=_not_negative, metavar="M", help="wind about its mean [m/s] (15 %% of it)"
+        "--current", type=_pair, metavar="N,E", help="expected current, north and east [m/s]"
     )
     belief.add_argument(
-        "--process-noise", type=_floats, metavar="U,V,R", help="per sample, beside the model"
+        "--wind", type=_pair, metavar="N,E", help="expected wind, north and east [m/s]"
+    )
+    belief.add_argument(
+        "--gust",
+        type=_not_negative,
+        metavar="M",
+        help="standard deviation of the wind about its mean [m/s] (15 %% of the mean)",
+    )
+    belief.add_argument(
+        "--process-noise",
+        type=_floats,
+        metavar="U,V,R",
+        help="standard deviation of the process noise, per sample",
     )
     belief.add_argument(
         "--robust",
         type=count,
         default=0,
         metavar="S",
-        help="expect the criterion over S models drawn from the prior's covariance (0)",
+        help="plan for the mean of the criterion over S models drawn from the prior's covariance "
+        "(0)",
     )
     belief.add_argument(
-        "--worst-case", action="store_true", help="look at the worst of them instead"
+        "--worst-case", action="store_true", help="plan for the worst of the models of --robust"
     )
     belief.add_argument(
         "--probability",
         type=_share,
         default=0.9,
         metavar="P",
-        help="with which limits are kept under the prior's uncertainty (0.9)",
+        help="probability with which limits are to be kept under the prior's uncertainty (0.9)",
     )
     work = parser.add_argument_group("how")
     work.add_argument(
-        "--best-effort", action="store_true", help="write the closest plan if limits stop it"
+        "--best-effort",
+        action="store_true",
+        help="write the closest plan where the limits cannot all be kept",
     )
-    work.add_argument("--effort", type=positive, default=1.0, help="times the usual search (1)")
-    work.add_argument("--workers", type=_whole, metavar="N", help="processes (as needed)")
+    work.add_argument(
+        "--effort", type=positive, default=1.0, help="search this many times as long (1)"
+    )
+    work.add_argument("--workers", type=_whole, metavar="N", help="number of processes (as needed)")
     add_cluster(work)
     add_seed(work)  # type: ignore[arg-type]
 

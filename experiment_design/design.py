@@ -248,7 +248,7 @@ def described(
     ----------
     request : PreparedRequest
     problems : list of TrialProblem
-        One a trial.
+        One per trial.
     units : list of ndarray
         (K, nc) unit coordinates a trial.
     reference : list of ndarray or None

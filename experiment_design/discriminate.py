@@ -61,7 +61,7 @@ class Discrimination(DisplayMixin):
 
     @property
     def probability(self) -> float:
-        """Probability that the likelihood decides rightly, the worse of both cases."""
+        """Probability that the likelihood picks the true explanation, the lower of the two."""
         return probability_right(min(self.ratio))
 
     @property
@@ -71,7 +71,7 @@ class Discrimination(DisplayMixin):
 
     @property
     def telling(self) -> float:
-        """Log-likelihood ratio that is left when the wrong one is fitted anew."""
+        """Log-likelihood ratio that remains after the wrong explanation is fitted anew."""
         return max(self.ratio_refitted) if self.nested else min(self.ratio_refitted)
 
     def to_dict(self) -> dict[str, Any]:

@@ -369,7 +369,7 @@ def described_plan(
     request, tightened : PreparedRequest
         As asked for, and with the limits of the last search.
     searches : sequence of EnvelopeSearch
-        One a trial.
+        One per trial.
     keeping : ConstraintSatisfaction or None
     kept_starts : int
         Trials, from the first, whose start was given.

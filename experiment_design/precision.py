@@ -95,7 +95,7 @@ def predict_precision(
     Ljungberg (2020), eqs. 2.21 and 4.63.
     """
     if len(plans) != request.trials:
-        raise UsageError(f"{len(plans)} plans for {request.trials} trials: give one a trial.")
+        raise UsageError(f"{len(plans)} plans for {request.trials} trials: give one per trial.")
     names = request.schedule.commands
     samples = request.schedule.samples
     sums: list[tuple[Moments, ...]] = []

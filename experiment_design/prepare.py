@@ -192,7 +192,7 @@ def prepare_request(
         if len(parts) not in (1, asked.trials):
             raise UsageError(
                 f"--regime names {len(parts)} regimes for {asked.trials} "
-                f"trial{'s' if asked.trials > 1 else ''}: give one, or one a trial."
+                f"trial{'s' if asked.trials > 1 else ''}: give one, or one per trial."
             )
         regimes = tuple(parts * asked.trials if len(parts) == 1 else parts)
     caps = (asked.limits.speed_cap, asked.limits.yaw_cap)
@@ -415,7 +415,7 @@ def _choose_regimes(
     asked: DesignRequest,
     notes: list[str],
 ) -> tuple[Signs, ...]:
-    """Return the regimes that can be held and tell most, one a trial."""
+    """Return the regimes that can be held and tell most, one per trial."""
     states = base.structure.states
     margins = dict(base.limits.margins)
     worth: list[tuple[float, Signs]] = []

@@ -2,8 +2,9 @@
 
 The commands of a page run in one folder, in the order of the page, and what they print stands in
 the page: a command that fails fails the build. Output is kept beside the doctrees until a command
-before it or the sources change. ``made PAGE/FILE`` shows a picture that they wrote, or the first
-screen of a page that they wrote.
+before it or the sources change. A page whose blocks say ``:after: PAGE`` starts with the files of
+another page, and shows what a command printed there without running it again. ``made PAGE/FILE``
+shows a picture that they wrote, or the first screen of a page that they wrote.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from run_blocks import SOURCES, Step, read_block, run, shown
 
 _BLOCK = re.compile(r"^```\{session\}\n(.*?)^```", re.M | re.S)
+_AFTER = re.compile(r"^:after: (\S+)$", re.M)
 _SCREEN = (1280, 800)
 _log = logging.getLogger(__name__)
 
@@ -57,17 +59,25 @@ class Session:
         self.folder.mkdir(parents=True, exist_ok=True)
         self._kept = self.folder.with_suffix(".json")
         text = Path(env.doc2path(page)).read_text(encoding="utf-8")
-        self.steps = [s for block in _BLOCK.findall(text) for s in read_block(_body(block))]
+        blocks = _BLOCK.findall(text)
+        self.steps = [s for block in blocks for s in read_block(_body(block))]
+        named = next(filter(None, map(_AFTER.search, blocks)), None)
+        self.before = session_of(env, named[1]) if named else None
 
     def outputs(self) -> dict[str, str]:
         """Return what each command prints, run anew where nothing is kept."""
         kept = json.loads(self._kept.read_text("utf-8")) if self._kept.exists() else {}
-        key, found, now = _sources().hex(), {}, {}
+        found = self.before.outputs() if self.before else {}
+        key, now = "".join([_sources().hex(), *found]), {}
         for step in self.steps:
+            if self.before and step.command in self.before.outputs():
+                continue
             key = hashlib.sha256((key + step.command).encode()).hexdigest()
             if key not in kept:
                 _log.info("running %s", step.command)
                 kept = {}
+                if self.before and not now:
+                    shutil.copytree(self.before.folder, self.folder, dirs_exist_ok=True)
             now[key] = kept[key] if key in kept else run(step, self.folder)
             found[step.command] = now[key]
             self._kept.write_text(json.dumps(now), encoding="utf-8")
@@ -89,7 +99,7 @@ class Commands(SphinxDirective):
     """Commands and the lines of their output that are wanted, as they are printed now."""
 
     has_content = True
-    option_spec = {"hidden": directives.flag}  # noqa: RUF012
+    option_spec = {"hidden": directives.flag, "after": directives.unchanged}  # noqa: RUF012
 
     def run(self) -> list[nodes.Node]:
         """Return one block a command."""

@@ -414,7 +414,7 @@ def certify(
     Parameters
     ----------
     problems : sequence of TrialProblem
-        One a trial. Sums of earlier trials in ``known`` count for a single trial;
+        One per trial. Sums of earlier trials in ``known`` count for a single trial;
         in a campaign they are left out.
     units : sequence of ndarray
         (K, nc) unit coordinates of each trial's design.

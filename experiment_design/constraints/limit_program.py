@@ -1,6 +1,6 @@
 """The limits of a trial as compiled functions of its motion, with derivatives.
 
-Each limit is one number h at each sample or one a trial, negative where kept.
+Each limit is one number h at each sample or one per trial, negative where kept.
 Path limits are symbolic in the state, so that the search, IPOPT and the checks
 read the same expression.
 """
@@ -205,7 +205,7 @@ class LimitProgram:
         state : ndarray
             (R, N+1, n), of which the start is not looked at.
         since : int or ndarray of int
-            Sample, or one a run (R,), after which margins count: none does during a lead-in.
+            Sample, or one per run (R,), after which margins count: none does during a lead-in.
         """
         values = self.path_values(state[:, 1:])
         if np.any(since):

@@ -38,7 +38,7 @@ class Circle:
 
 @dataclass(frozen=True)
 class TrialLimits:
-    """What the captain and the method ask of a trial; None where nothing is asked.
+    """Limits that a trial must keep; None where there is no limit.
 
     Parameters
     ----------

@@ -34,7 +34,7 @@ def late_notes(
     ----------
     request : PreparedRequest
     problems : list of TrialProblem
-        One a trial.
+        One per trial.
     motions : tuple of Motion
         Of the plan, with lag and delay.
     reports : tuple of LimitReport

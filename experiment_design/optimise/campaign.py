@@ -154,7 +154,7 @@ def search_campaign(
     Parameters
     ----------
     first : list of ndarray, optional
-        (K, nc) a trial to start from, such as the best random ones or a design to be improved.
+        (K, nc) per trial to start from, such as the best random ones or a design to be improved.
     effort : float
         Share of the usual number of evaluations.
     quick : bool

@@ -225,7 +225,7 @@ def draw_commands(axes: Any, design: Design, trial: int, size: float = 7.0) -> N
     Parameters
     ----------
     axes : sequence of matplotlib.axes.Axes
-        One a command.
+        One per command.
     design : Design
     trial : int
     size : float
@@ -294,7 +294,7 @@ def draw_states(axes: Any, design: Design, band: MotionBand, size: float = 9.0) 
     Parameters
     ----------
     axes : mapping of str to matplotlib.axes.Axes
-        One a signal of the band.
+        One per signal of the band.
     design : Design
     band : MotionBand
     size : float

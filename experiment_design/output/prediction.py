@@ -115,7 +115,7 @@ def predict_motion(design: Design, draws: int = 200) -> tuple[MotionBand, ...]:
     Returns
     -------
     tuple of MotionBand
-        One a trial; equal requests give equal bands.
+        One per trial; equal requests give equal bands.
     """
     r = design.request
     process = np.asarray(r.noise.process, float)

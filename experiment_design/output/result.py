@@ -73,9 +73,9 @@ class Design(DisplayMixin):
     ----------
     request : PreparedRequest
     commands : tuple of ndarray
-        (N, nc) a trial: speeds in the log's unit, angles [rad].
+        (N, nc) per trial: speeds in the log's unit, angles [rad].
     levels : tuple of ndarray
-        (K, nc) a trial, one row a hold.
+        (K, nc) per trial, one row a hold.
     motions : tuple of Motion
         Predicted motion of each trial under the nominal model.
     names : tuple of str

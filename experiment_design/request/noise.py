@@ -19,7 +19,7 @@ def noise_levels(
     vessel: Vessel,
     process: Array | None = None,
 ) -> NoiseLevels:
-    """Return the noises that the vessel file and a previous estimate tell of.
+    """Return the noise levels that the vessel file and a previous estimate state.
 
     The one-step residual of (4.3) holds the measurement noise twice,
     var ε = σ² + Σ aⱼ² σⱼ² + w²; what its standard deviation leaves beyond the

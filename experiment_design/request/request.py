@@ -105,7 +105,7 @@ class TrialOptions:
 
     @property
     def given(self) -> frozenset[str]:
-        """What is asked beyond the usual, by the names of `exclusions.RULES`."""
+        """Options that differ from their defaults, by the names of `exclusions.RULES`."""
         usual = TrialOptions(self.duration)
         told = {
             _OPTIONS.get(f.name, f.name)
@@ -133,7 +133,7 @@ class DesignRequest(TrialOptions):
     hold : float, optional
         Between changes of command [s].
     regime : str
-        ``auto``, one regime such as ``u+v-``, or one a trial separated by commas.
+        ``auto``, one regime such as ``u+v-``, or one per trial separated by commas.
     start : sequence of float, optional
         Initial states and heading.
     trials : int
@@ -162,7 +162,7 @@ class DesignRequest(TrialOptions):
 
     @property
     def given(self) -> frozenset[str]:
-        """What is asked beyond the usual, by the names of `exclusions.RULES`."""
+        """Options that differ from their defaults, by the names of `exclusions.RULES`."""
         told = {n for n in ("gust", "prior") if getattr(self, n) is not None}
         told |= {f"margin_{n}" for n in self.limits.margins}
         return super().given | told
@@ -281,12 +281,12 @@ class PreparedRequest(TrialOptions):
 
     @property
     def given(self) -> frozenset[str]:
-        """What is asked beyond the usual, by the names of `exclusions.RULES`."""
+        """Options that differ from their defaults, by the names of `exclusions.RULES`."""
         return super().given | ({"trials"} if self.trials != 1 else set())
 
     @property
     def of_both_sides(self) -> tuple[str, ...]:
-        """The notes that hold for a plan of both sides, too."""
+        """Notes that also hold for a plan of both sides."""
         return tuple(n for n in self.notes if n not in self.of_regime)
 
     @property
@@ -319,7 +319,7 @@ class PreparedRequest(TrialOptions):
         return 0 if self.lead_in is None else round(self.lead_in.seconds / self.sample_time)
 
     def with_lead_in(self, levels: Array) -> Array:
-        """Return levels (K, nc) of the trial behind those of the lead-in."""
+        """Return the levels (K, nc) of the lead-in followed by those of the trial."""
         return levels if self.lead_in is None else np.concatenate([self.lead_in.levels, levels])
 
     def build_predictor(self) -> Predictor:
@@ -352,7 +352,7 @@ class PreparedRequest(TrialOptions):
 
     @property
     def uncertain(self) -> bool:
-        """Whether the prior model has a covariance."""
+        """Whether the parameters of the prior model are uncertain: it has a covariance."""
         return self.covariance is not None and bool(np.diag(self.covariance).max(initial=0.0) > 0)
 
     def thetas(self) -> Array:

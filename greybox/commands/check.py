@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Read, check, tell."""
+    """Run the command: read the logs, check them, show the findings."""
     from pathlib import Path
     from textwrap import indent
 

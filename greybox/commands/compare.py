@@ -21,12 +21,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--heading",
         choices=("measured", "simulated"),
         default="measured",
-        help="heading of the run: that of the log, or simulated too (measured)",
+        help="heading of the run: the log's, or a simulated one (measured)",
     )
     parser.add_argument("--json", metavar="F", help="write the result as JSON; - is stdout")
     parser.add_argument("--report", metavar="HTML", help="write a page with plots")
     parser.add_argument(
-        "--no-bands", action="store_true", help="leave out the bands that measurements should keep"
+        "--no-bands",
+        action="store_true",
+        help="leave out the bands in which 95 %% of the measurements should lie",
     )
     add_seed(parser)
 

@@ -59,32 +59,34 @@ def _add_model(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--method",
         choices=tuple(ESTIMATORS),
-        help=f"{', '.join(e.words for e in ESTIMATORS.values())}; by default chosen, and said why",
+        help=f"{', '.join(e.words for e in ESTIMATORS.values())}; chosen by default, with a "
+        "note that says why",
     )
     group.add_argument(
         "--predictor",
         choices=tuple(PREDICTORS),
-        help="which disturbances are captured or measured; by default chosen",
+        help="current and wind left out (basic), unknown (augmented) or measured (wind); chosen by "
+        "default",
     )
     group.add_argument(
         "--structure",
         metavar="NAME",
         help="thesis, surge, linear, blanke, modulus, abkowitz; +TERM and -TERM change it; "
-        "by default chosen",
+        "chosen by default",
     )
     group.add_argument(
         "--effort",
         type=positive,
         default=EFFORT,
         metavar="SECONDS",
-        help="what is left open is chosen within this time; what could not be tried is named, and "
-        f"the first estimate always ends ({EFFORT:g})",
+        help="time for choosing what you leave open [s]; notes name what it did not suffice for, "
+        f"and the first estimate is always completed ({EFFORT:g})",
     )
     chosen = group.add_mutually_exclusive_group()
     chosen.add_argument(
         "--reduce",
         action="store_true",
-        help="leave out the terms that earn least, as long as held-out free runs do not suffer",
+        help="leave out terms one by one, as long as held-out free runs get no worse",
     )
     chosen.add_argument(
         "--compare-structures",
@@ -95,8 +97,9 @@ def _add_model(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--covariance",
         choices=("cluster", "ma", "hac", "white", "bootstrap"),
-        help="standard errors: by the spread between segments where that is larger (default), "
-        "moving average, robust to coloured residuals, white, block bootstrap",
+        help="how standard errors are computed: by the spread between segments where that is "
+        "larger (default), for a moving average, for coloured residuals, for white ones, or by a "
+        "block bootstrap",
     )
     group.add_argument(
         "--mass", type=positive, metavar="KG", help="mass [kg], for physical coefficients"
@@ -116,14 +119,14 @@ def _add_data(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         default=[],
         metavar="LOG",
-        help="logs that judge the prediction and take no part in the estimate; by default the logs "
-        "are left out in turn",
+        help="logs on which the prediction is judged and that take no part in the estimate; by "
+        "default the logs are left out in turn",
     )
     group.add_argument(
         "--plan",
         metavar="PLAN",
-        help="plan of greybox design that the logs sailed: what it leads in with is left out, and "
-        "its validation judges the prediction as --validate does",
+        help="plan of greybox design that the ship followed: its lead-in is left out, and the "
+        "prediction is judged on its validation part as on logs of --validate",
     )
     group.add_argument(
         "--margin-u",
@@ -147,13 +150,14 @@ def _add_data(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--heading",
         choices=("measured", "simulated"),
-        help="heading inside the instruments (measured); with oe whether it drives the run, or is "
-        "simulated and compared (chosen)",
+        help="heading that the instruments are computed with (measured); with oe: whether the "
+        "measured heading drives the run, or a simulated one is compared with it (chosen)",
     )
     group.add_argument(
         "--nominal",
         metavar="MODEL",
-        help="model that simulates the first instruments, or starts oe (least squares by default)",
+        help="model that the first instruments are simulated with, or that oe starts from (the "
+        "least-squares estimate by default)",
     )
 
 
@@ -163,14 +167,14 @@ def _add_instruments(parser: argparse.ArgumentParser) -> None:
         "--instruments",
         choices=("zero-mean", "mean-kept"),
         default="zero-mean",
-        help="zero-mean instruments, IV2 and IV3, or with their mean, IV1 (zero-mean)",
+        help="instruments without their mean (IV2, IV3) or with it (IV1) (zero-mean)",
     )
     group.add_argument(
         "--prefilter",
         choices=("auto", "noise", "none"),
         default="auto",
-        help="refine by the noise, all equations jointly; auto: where nothing speaks against it "
-        "(auto)",
+        help="noise: filter all equations together by their noise model; auto: where the tests "
+        "allow it (auto)",
     )
 
 
@@ -179,52 +183,53 @@ def _add_output_error(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--process-noise",
         action="store_true",
-        help="estimate what moves the ship beside the model too: likelihood of the innovations",
+        help="estimate the process noise too, by the likelihood of the innovations",
     )
     group.add_argument(
         "--wind",
         choices=("measured", "simulated"),
         default="measured",
-        help="wind that drives the run, or a constant one that is compared (measured)",
+        help="take the measured wind as an input of the run, or simulate a constant wind and "
+        "compare it with the measured one (measured)",
     )
     group.add_argument(
         "--loss",
         choices=("gaussian", "huber"),
         default="gaussian",
-        help="how errors are weighed; huber resists outliers (gaussian)",
+        help="weight of large errors; huber gives outliers less (gaussian)",
     )
     group.add_argument(
         "--weights",
         choices=("noise", "deviation"),
         default="noise",
-        help="errors in units of the outputs' noise, or of their deviation where a model misfits "
-        "(noise)",
+        help="unit of the errors: the outputs' noise, or for a model that misfits their standard "
+        "deviation (noise)",
     )
     group.add_argument(
         "--shooting",
         choices=("auto", "single", "multiple"),
         default="auto",
-        help="whole runs, or segments that join, for long or unstable logs (auto)",
+        help="one run over each log, or for long or unstable ones segments that must join (auto)",
     )
     group.add_argument(
         "--bound",
         nargs="+",
         default=[],
         metavar="NAME=LOW:HIGH",
-        help="limits of parameters, such as Xu=-0.2:0",
+        help="range that a parameter is kept in, such as Xu=-0.2:0",
     )
     group.add_argument(
         "--prior",
         nargs="+",
         default=[],
         metavar="NAME=VALUE:STD",
-        help="what was known of parameters before, such as Nr=-0.1:0.02",
+        help="value and standard error of a parameter known beforehand, such as Nr=-0.1:0.02",
     )
     group.add_argument(
         "--damping",
         choices=("warn", "enforce"),
         default="warn",
-        help="tell of damping terms that drive the ship, or keep them from it (warn)",
+        help="warn of damping terms that would drive the ship, or keep their signs from it (warn)",
     )
 
 

@@ -19,8 +19,8 @@ TARGETS = ("c", "fmu", "casadi", "mat", "json")
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("model", metavar="MODEL", help="model file of estimate or diagnose")
-    parser.add_argument("--to", required=True, choices=TARGETS, help="what to write")
-    parser.add_argument("--out", required=True, metavar="F", help="where to write it")
+    parser.add_argument("--to", required=True, choices=TARGETS, help="format to write")
+    parser.add_argument("--out", required=True, metavar="F", help="file to write")
     parser.add_argument(
         "--heading",
         choices=("simulated", "measured"),
@@ -36,12 +36,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--settled",
         action="store_true",
-        help="the model as it is after the last change of its parameters",
+        help="export the model as it is after the last change of its parameters",
     )
     parser.add_argument(
         "--no-binary",
         action="store_true",
-        help="an FMU of C source only, even where there is a compiler",
+        help="write an FMU of C source only, even where there is a compiler",
     )
 
 

@@ -27,14 +27,18 @@ stated. Gaps stay gaps.
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument(
-        "raw", nargs="+", metavar="RAW", help="raw files of one trial, or of one each: see --out"
+        "raw",
+        nargs="+",
+        metavar="RAW",
+        help="raw files of one trial, or where --out is a folder of a trial each",
     )
     parser.add_argument("--vessel", required=True, metavar="V", help="vessel file (TOML)")
     parser.add_argument(
         "--out",
         required=True,
         metavar="LOG",
-        help="log, .csv or .parquet; or a folder, for one log a file, judged together by --fix",
+        help="the log to write, .csv or .parquet; or a folder, in which each raw file becomes a "
+        "log and --fix judges them together",
     )
     parser.add_argument(
         "--sample-time",
@@ -46,8 +50,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--hole",
         type=positive,
         metavar="S",
-        help="longest step that is bridged, a longer one is a gap [s]; 2.5 usual steps of the "
-        "sensor by default",
+        help="longest time without samples that is bridged [s], a longer one is a gap; 2.5 usual "
+        "steps of the sensor by default",
     )
     parser.add_argument(
         "--fix", action="store_true", help="mend what greybox check finds, where that is safe"

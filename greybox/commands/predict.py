@@ -28,15 +28,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "manoeuvre",
         choices=("turning", "zigzag", "stopping", "crash"),
-        help="stopping: thrust taken off; crash: full astern",
+        help="stopping: with the thrust taken off; crash: with full astern",
     )
     parser.add_argument("--json", metavar="F", help="write the quantities as JSON; - is stdout")
     parser.add_argument("--report", metavar="HTML", help="write a page with tracks and histories")
     parser.add_argument(
         "--out",
         metavar="CSV",
-        help="write the run of the estimate itself as a log; of several runs, one file each, "
-        "with side and angle in its name",
+        help="write the run that the intervals are about as a log; several runs become a file "
+        "each, with side and angle in its name",
     )
     how = parser.add_argument_group("manoeuvre")
     how.add_argument(
@@ -47,16 +47,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="steering angles [deg]; of a zig-zag also ANGLE/HEADING, such as 20/10 "
         "(35; 10/10 and 20/20)",
     )
-    how.add_argument("--side", choices=("port", "starboard"), help="of the first turn (both)")
+    how.add_argument("--side", choices=("port", "starboard"), help="side of the first turn (both)")
     how.add_argument(
         "--share",
         type=float,
         metavar="S",
-        help="where speeds steer: share by which those on either side differ from the approach's "
-        "(0.5), or of a tunnel thruster's greatest (1)",
+        help="for a ship that propeller speeds steer: share of the approach's speed by which the "
+        "two sides differ from it (0.5), or share of a tunnel thruster's highest speed (1)",
     )
     how.add_argument(
-        "--thrusters", nargs="+", default=[], metavar="COLUMN", help="columns that steer"
+        "--thrusters",
+        nargs="+",
+        default=[],
+        metavar="COLUMN",
+        help="columns of the thrusters that steer",
     )
     how.add_argument(
         "--astern", type=positive, metavar="N", help="propeller speed of a crash stop, positive"
@@ -72,7 +76,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--speed",
         type=positive,
         metavar="V",
-        help="over ground [m/s]; the propeller speed that holds it is solved for",
+        help="approach speed over ground [m/s], for which the propeller speed is found",
     )
     approach.add_argument(
         "--command",
@@ -80,11 +84,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         default=[],
         metavar="N",
-        help="propeller speed instead, or NAME=N each; by default the greatest of the logs that "
-        "the model was estimated on",
+        help="propeller speed of the approach in place of --speed, or NAME=N for each; by default "
+        "the highest in the logs that the model was estimated on",
     )
     approach.add_argument(
-        "--course", type=float, default=0.0, metavar="DEG", help="heading in a current [deg] (0)"
+        "--course", type=float, default=0.0, metavar="DEG", help="heading of the approach [deg] (0)"
     )
     approach.add_argument(
         "--current", action="store_true", help="keep the model's current; still water otherwise"
@@ -92,23 +96,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     approach.add_argument(
         "--no-limits",
         action="store_true",
-        help="predict as though the vessel file stated no ranges of commands; rates hold",
+        help="leave the vessel file's ranges of the commands, but keep its rates",
     )
     other = parser.add_argument_group("intervals and trial")
     other.add_argument("--trial", metavar="LOG", help="compare with the same manoeuvres in a log")
     other.add_argument(
         "--disturbed",
         action="store_true",
-        help="add the model's process noise: where one trial would lie",
+        help="add the model's process noise, so that the intervals hold a single trial",
     )
     other.add_argument(
         "--scale",
         type=positive,
         default=1.0,
         metavar="S",
-        help="length of the full-scale ship over the vessel's, for IMO limits (1)",
+        help="length of the full-scale ship divided by the vessel's, for the IMO limits (1)",
     )
-    other.add_argument("--draws", type=count, default=256, help="draws of the parameters (256)")
+    other.add_argument(
+        "--draws", type=count, default=256, help="number of draws of the parameters (256)"
+    )
     add_seed(parser)
 
 

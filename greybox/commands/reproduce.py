@@ -23,8 +23,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "study",
         choices=("chapter4", "chapter6", "chapter7", "efficiency", "power"),
-        help="a chapter's tables and figures; how near estimators come to the Cramér-Rao bound; "
-        "how often the diagnosis is right",
+        help="tables and figures of a chapter; efficiency: how near the estimators come to the "
+        "Cramér-Rao bound; power: how often the diagnosis is right",
     )
     parser.add_argument(
         "--runs", type=int, metavar="N",
@@ -35,10 +35,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--validate", nargs="+", metavar="LOG", help="chapter 7: validation logs")
     parser.add_argument("--vessel", metavar="V", help="chapter 7: vessel file of those logs")
     parser.add_argument(
-        "--sample-time", type=positive, metavar="S", help="chapter 7: decimate the logs to this [s]"
+        "--sample-time", type=positive, metavar="S", help="chapter 7: decimate to this [s]"
     )
     parser.add_argument("--structure", metavar="NAME", help="chapter 7: structure (thesis)")
-    parser.add_argument("--workers", type=int, metavar="N", help="processes (one a processor)")
+    parser.add_argument(
+        "--workers", type=int, metavar="N", help="number of processes (one per core)"
+    )
     add_cluster(parser)
     add_seed(parser)
 

@@ -1,4 +1,4 @@
-"""What a command shows, and where: results, errors, progress, what it is doing."""
+"""Results, errors and progress of a command, on a terminal and in a pipe."""
 
 from __future__ import annotations
 

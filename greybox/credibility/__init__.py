@@ -1,1 +1,1 @@
-"""Whether to believe an estimate: tests, each with its null in words, and one verdict."""
+"""Tests of an estimate, each with its null hypothesis in words, and one verdict."""

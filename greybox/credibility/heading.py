@@ -59,7 +59,7 @@ def heading_independence(evidence: Evidence, equation: Equation) -> TestResult:
 
 
 def _around(evidence: Evidence, equation: Equation) -> list[Array]:
-    """Return cosine and sine of the heading, (2, N) a log, zero-mean, zero where cut out."""
+    """Return cosine and sine of the heading, (2, N) per log, zero-mean, zero where cut out."""
     out = []
     for log, keep in zip(evidence.logs, equation.keep, strict=True):
         psi = log["psi"][: len(keep)]

@@ -36,7 +36,7 @@ def fit_given(
     structure: str = "thesis",
     seed: int = 0,
 ) -> Given:
-    """Estimate the model with causes that are taken for granted, in their likeliest forms.
+    """Estimate the model with causes that are known to act, each in its likeliest form.
 
     Parameters
     ----------

@@ -174,13 +174,13 @@ class Problem:
         return nu, cost + noise.log_det * sum(len(e) for e in errors)
 
     def rows(self, point: Point, noise: Noise) -> list[Array]:
-        """Return whitened derivatives of the outputs in the free numbers, (N, ny, q) a log."""
+        """Return whitened derivatives of the outputs in the free numbers, (N, ny, q) per log."""
         # of a run at the edge of stability the derivatives may leave every number's range
         with np.errstate(over="ignore", invalid="ignore"):
             return [noise.whiten(slopes) for slopes in self.slopes(point)]
 
     def slopes(self, point: Point) -> list[Array]:
-        """Return derivatives of the outputs in the free numbers, (N, ny, q) a log."""
+        """Return derivatives of the outputs in the free numbers, (N, ny, q) per log."""
         ship = point.ship
         places = np.array(point.places, int)
         own, starts = len(places), sum(map(len, point.starts))
@@ -326,11 +326,11 @@ class Problem:
         return self.fit(replace(frozen, base=point.ship), noise, most=8)
 
     def contributions(self, fit: Fit) -> list[Array]:
-        """Return what each sample adds to −2 log L, (N,) a log."""
+        """Return what each sample adds to −2 log L, (N,) per log."""
         return self.added(fit.nu, fit.noise)
 
     def added(self, nu: Sequence[Array], noise: Noise) -> list[Array]:
-        """Return what each sample of innovations adds to −2 log L, (N,) a log.
+        """Return what each sample of innovations adds to −2 log L, (N,) per log.
 
         What a misfit leaves differs from log to log: by its size alone each log's errors have a
         deviation of their own, lest the worst one speak for all.

@@ -363,7 +363,7 @@ class Diagnosis(DisplayMixin):
         return f"{_SAID[self.verdict][0].upper()}{_SAID[self.verdict][1:]}."
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the diagnosis as the documented JSON, with more beside."""
+        """Return the diagnosis as the documented JSON, and further entries."""
         return {
             "verdict": str(self.verdict),
             "causes": [c.to_dict() for c in self.causes],
@@ -446,7 +446,7 @@ class Diagnosis(DisplayMixin):
 
 @dataclass(frozen=True, repr=False)
 class Given(DisplayMixin):
-    """What causes do that are taken for granted.
+    """A model with causes that are known to act, and what they gain.
 
     Parameters
     ----------

@@ -67,7 +67,7 @@ def error_variance_profiles(
     residuals : sequence over equations of sequence over logs of ndarray
         (N,), zero in rows that do not take part.
     keep : sequence of ndarray of bool
-        (N,) a log.
+        (N,) per log.
     """
     nx = len(predictor.structure.states)
     slopes = [measured_slopes(predictor, log, theta) for log in logs]
@@ -112,7 +112,7 @@ def fit_scaled_arma_noise(
     Parameters
     ----------
     residuals : sequence of ndarray
-        (N,) a log, zero in rows that do not take part.
+        (N,) per log, zero in rows that do not take part.
     keep : sequence of ndarray of bool
     shapes : sequence of ErrorVarianceProfile
         Empty where none is told.

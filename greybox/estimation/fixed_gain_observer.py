@@ -21,7 +21,7 @@ class ObservedRuns:
     ----------
     model : OutputModel
     segments : Segments
-        One a log, none joined.
+        One per log, none joined.
     variance : ndarray
         (ny,) of the measurements.
     ratio : float

@@ -59,7 +59,7 @@ class WhiteEquations:
     Parameters
     ----------
     rows : tuple of WhiteRows
-        One a log.
+        One per log.
     inverse : ndarray
         (p, p) of Σ z φᵀ.
     equations : int

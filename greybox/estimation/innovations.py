@@ -51,7 +51,7 @@ class FilterRuns:
     ----------
     model : OutputModel
     segments : Segments
-        One a log, none joined.
+        One per log, none joined.
     noise : ndarray
         (ny + nz,) variances of the measurements and of what is added a step.
     kalman : Filter, optional

@@ -64,7 +64,7 @@ def on_stretches(keep: Sequence[NDArray[np.bool_]]) -> Sequence[NDArray[np.bool_
     Parameters
     ----------
     keep : sequence of ndarray of bool
-        (N,) a log: rows that take part.
+        (N,) per log: rows that take part.
     """
     rows = sum(int(k.sum()) for k in keep)
     if rows <= _ENOUGH:
@@ -96,13 +96,13 @@ class ErrorLikelihood:
     ----------
     bands : sequence of ErrorBand
     residuals : sequence of ndarray
-        (N, nx) a log.
+        (N, nx) per log.
     equations : sequence of bool
         (nx,) which equations have a constant of their own in each log.
     least : ndarray
         (nx,) spread below which errors count as none.
     regressors : sequence of ndarray, optional
-        (p, N, nx) a log, whose coefficients were estimated: what they took from the
+        (p, N, nx) per log, whose coefficients were estimated: what they took from the
         errors is then allowed for (restricted likelihood, each log by itself).
     """
 

@@ -521,7 +521,7 @@ def _covariance(
     Parameters
     ----------
     rows, residuals : sequence of ndarray
-        (q, N, ny) and (N, ny) a log.
+        (q, N, ny) and (N, ny) per log.
     lags : int
         Memory of the residuals in samples.
     bound : ndarray of bool

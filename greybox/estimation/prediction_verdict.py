@@ -537,12 +537,12 @@ class PredictionVerdict(DisplayMixin):
 
     @property
     def fit(self) -> dict[str, float]:
-        """Fit (6.12) a channel [%]."""
+        """Fit (6.12) of each channel [%]."""
         return {c.channel: c.fit for c in self.channels}
 
     @property
     def rmse(self) -> dict[str, float]:
-        """Error a channel [m/s, rad/s]."""
+        """Root mean square error of each channel [m/s, rad/s]."""
         return {c.channel: c.rmse for c in self.channels}
 
     @property
@@ -573,12 +573,12 @@ class PredictionVerdict(DisplayMixin):
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """One sentence a reason."""
+        """Reasons for the level, a sentence each."""
         return tuple(r.sentence for r in self.because)
 
     @property
     def judged_words(self) -> str:
-        """On what it was judged."""
+        """What the prediction was judged on, in words."""
         several = len(set(self.logs)) > 1
         return {
             JudgedOn.HELD_OUT: f"{self.parts} parts of the log{'s' * several}, each left out of "
@@ -589,11 +589,11 @@ class PredictionVerdict(DisplayMixin):
         }[self.judged_on]
 
     def summary(self) -> str:
-        """Return the level, its reasons, and a row a channel as text."""
+        """Return the level, its reasons and a row for each channel as text."""
         return "\n".join([self.text, *self.table()])
 
     def table(self) -> list[str]:
-        """Return a row a channel as lines of text, and below them on what they were judged."""
+        """Return a row for each channel as text, and below it what they were judged on."""
         head, rows = self.rows()
         wide = [max(len(r[i]) for r in [head, *rows]) for i in range(len(head))]
         lines = [
@@ -607,7 +607,7 @@ class PredictionVerdict(DisplayMixin):
         ]
 
     def rows(self) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-        """Return the head and a row a channel, as they stand in a table."""
+        """Return the header and a row for each channel, as cells of a table."""
         head = ("channel", "error", "noise alone", "spread", "unit", "fit [%]", "in the 95 % band",
                 "beats a constant", "")  # fmt: skip
         return head, [

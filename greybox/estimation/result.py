@@ -84,12 +84,12 @@ class Estimate(EstimateValues, DisplayMixin):
 
     @property
     def samples(self) -> int:
-        """Rows there were."""
+        """Number of rows of the regression."""
         return self.data.samples
 
     @property
     def kept(self) -> int:
-        """Rows that took part."""
+        """Number of rows that took part."""
         return self.data.kept
 
     @property
@@ -99,17 +99,17 @@ class Estimate(EstimateValues, DisplayMixin):
 
     @property
     def conditions(self) -> PooledConditions:
-        """Draught, depth and the like of the logs, and in what they differ."""
+        """Draught, depth and other conditions of the logs, and where the logs differ in them."""
         return self.data.conditions
 
     @property
     def actuators(self) -> tuple[ActuatorEstimate, ...]:
-        """Measured from command and feedback when the logs were imported."""
+        """Lags and delays of the actuators, as measured when the logs were imported."""
         return self.data.actuators
 
     @property
     def iterations(self) -> int:
-        """Steps of the iteration that it comes from, 0 where there was none."""
+        """Number of iterations of the estimator, 0 where it does not iterate."""
         return self.iteration.count
 
     @property

@@ -102,7 +102,7 @@ class Comparison(DisplayMixin):
 
     @property
     def decision(self) -> str:
-        """Which one was taken and why, as a sentence."""
+        """Which alternative was taken and why, in a sentence."""
         taken = (
             "None"
             if self.chosen is None
@@ -132,7 +132,7 @@ class Comparison(DisplayMixin):
         return "\n".join([*self.lines(len(self.rows)), f"  {self.decision}"])
 
     def table(self) -> tuple[list[str], list[list[str]]]:
-        """Return head and rows as they stand in a table."""
+        """Return the header and rows, as cells of a table."""
         head = ["structure", "taken", "terms", "method", "predictor", "thrust ~", "step [s]",
                 "integrator", "commands", "score [%]", "behind", "std error", ""]  # fmt: skip
         return head, [

@@ -435,7 +435,7 @@ class Verdict(DisplayMixin):
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """One sentence a reason."""
+        """Reasons for the level, a sentence each."""
         return tuple(r.sentence for r in self.because)
 
     def summary(self) -> str:

@@ -150,7 +150,7 @@ class ManoeuvringModel(DisplayMixin):
         return replace(self, theta=self.theta * now, covariance=covariance, changes=())
 
     def without_bumps(self) -> ManoeuvringModel:
-        """Return the model without its force without a name: all its other numbers as they are."""
+        """Return the model without the bumps of its black-box force; nothing else changes."""
         kept = [i for i, t in enumerate(self.structure.terms) if not t.local]
         if len(kept) == len(self.theta):
             return self

@@ -76,7 +76,7 @@ class BiasShare:
 
 @dataclass(frozen=True, repr=False)
 class Predictor(DisplayMixin):
-    """The regressors of every equation, in order, and the rule that gave them.
+    """The regressors of every equation in order, and how they were derived.
 
     Parameters
     ----------

@@ -104,7 +104,7 @@ class Structure(DisplayMixin):
 
     @property
     def marine(self) -> bool:
-        """Whether it is a ship's: a current and a wind that turn with the heading disturb it."""
+        """Whether the structure is of a ship, which current and wind push by its heading."""
         return self.disturbance == "marine"
 
     @property
@@ -156,7 +156,7 @@ class Structure(DisplayMixin):
         return replace(self, terms=tuple(t for t in self.terms if t.name not in drop))
 
     def without_bumps(self) -> Structure:
-        """Return the structure without its force without a name."""
+        """Return the structure without the bumps of its black-box force."""
         return replace(self, terms=tuple(t for t in self.terms if not t.local))
 
     @property

@@ -131,16 +131,16 @@ def model_notes(model: ManoeuvringModel, helm: Helm, asked: Conditions) -> tuple
         )
     elif not asked.disturbed:
         told.append(
-            "intervals hold what is uncertain of the parameters"
+            "intervals hold the uncertainty of the parameters"
             + (" and of the current" if asked.current and model.disturbances else "")
             + (
-                ", not how far the model misses logs that took no part, which the MODEL does not "
-                "say: estimate it again"
+                ". They leave out how far its free runs are off on held-out logs, which MODEL does "
+                "not state (estimate it again), and what waves"
                 if held_out_errors(model) is None
-                else " and forces that the model lacks, as large as its free runs on logs that "
-                "took no part missed them"
+                else " and the forces that the model lacks, by how far its free runs were off on "
+                "held-out logs. They leave out what waves"
             )
-            + "; not what waves and gusts do to one trial (--disturbed adds it)."
+            + " and gusts do to a single trial (--disturbed adds it)."
         )
     if asked.current and not model.disturbances:
         told.append("the model has no current, so --current adds nothing.")

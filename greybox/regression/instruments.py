@@ -41,7 +41,7 @@ class Instruments:
     Parameters
     ----------
     z : tuple of ndarray
-        (p, N) a log, rows in the order of the predictor's columns.
+        (p, N) per log, rows in the order of the predictor's columns.
     keep : tuple of ndarray of bool
         (N,) rows that take part: those whose simulated states keep the margins,
         which, unlike measured ones, do not select on the noise.
@@ -188,7 +188,7 @@ def build_instruments(
     margins : dict of str to float, optional
         Rows whose simulated states come closer to the origin are left out.
     keep : sequence of ndarray of bool, optional
-        (N,) a log: the rows that take part, in place of those that keep the margins.
+        (N,) per log: the rows that take part, in place of those that keep the margins.
 
     Returns
     -------

@@ -92,7 +92,7 @@ def build_regression(
     margins : dict of str to float, optional
         Rows with a measured |state| below its margin are left out (Remark 4.2).
     second_measurement : sequence of ndarray, optional
-        (N, nx) a log, measurements y2 of the disturbance: the regressors then see
+        (N, nx) per log, measurements y2 of the disturbance: the regressors then see
         y1 + y2 while y stays y1 (4.13), (4.14).
 
     Raises

@@ -100,7 +100,7 @@ def check_page(
     Parameters
     ----------
     reports : sequence of CheckReport
-        One a log.
+        One per log.
     paths : sequence of Path
         Of the logs, in the same order.
     vessel : Vessel
@@ -111,7 +111,12 @@ def check_page(
     """
     signals = sum(len(r.recording.signals) for r in reports if r.recording is not None)
     points = points_for(signals)
-    sections = [_section(k, r, vessel, points) for k, r in enumerate(reports)]
+    shown: dict[tuple[Any, ...], str] = {}
+    for report in reports:
+        if report.recording is not None:
+            for f in report.findings:
+                shown.setdefault(f.key, report.name)
+    sections = [_section(k, r, vessel, points, shown) for k, r in enumerate(reports)]
     lead, sections = _apart(reports, sections)
     made = computed(record or {}) | {"vessel": vessel.name}
     for report, path in zip(reports, paths, strict=True):
@@ -275,7 +280,18 @@ def _drawn(finding: Finding, report: CheckReport, vessel: Vessel) -> tuple[Figur
     return tie_figure(finding, tie), "" if tie.helps else _DOUBT
 
 
-def _section(number: int, report: CheckReport, vessel: Vessel, points: int) -> Section:
+def _section(
+    number: int,
+    report: CheckReport,
+    vessel: Vessel,
+    points: int,
+    shown: Mapping[tuple[Any, ...], str],
+) -> Section:
+    """Return the part of the page on one log.
+
+    ``shown`` names the log in which each finding is drawn. One that several logs share is
+    drawn again only where its repair does not help.
+    """
     pictures: list[Picture] = []
     sentences: list[str] = []
     if not report.findings:
@@ -286,6 +302,9 @@ def _section(number: int, report: CheckReport, vessel: Vessel, points: int) -> S
             sentences.append(said)
             continue
         figure, doubt = _drawn(f, report, vessel)
+        if len(f.logs) > 1 and shown[f.key] != report.name and not doubt:
+            sentences.append(f"{f.line}; drawn for {shown[f.key]}, with which it is shared.")
+            continue
         svg = to_svg(figure, f"log{number}finding{k}")
         pictures.append(Picture(svg, f"{said}{doubt}", f"{alternative(f)}{doubt}"))
     if report.recording is not None:

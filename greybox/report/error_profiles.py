@@ -60,7 +60,7 @@ def block_ids(errors: Sequence[Array]) -> Index:
     Parameters
     ----------
     errors : sequence of ndarray
-        One a log.
+        One per log.
     """
     out, first = [], 0
     for error in errors:

@@ -86,9 +86,9 @@ def comparison_figure(
     names : sequence of str
         Of the models.
     runs : sequence of LogFit
-        One a model, all of one log.
+        One per model, all of one log.
     bands : sequence of Bands, optional
-        One a model: where measurements should lie is shaded, about the run and about zero.
+        One per model: where measurements should lie is shaded, about the run and about zero.
     points : int
         About how many a line has: longer ones are drawn by their envelopes.
     """

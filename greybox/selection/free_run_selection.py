@@ -203,7 +203,7 @@ class FreeRunSelection:
         return self._selected(active, self._fitted(self.runs, found.p, active), found.change)
 
     def errors(self, p: Array) -> list[Array]:
-        """Return what a free run from each log's first samples leaves, (N, ny) a log.
+        """Return what a free run from each log's first samples leaves, (N, ny) per log.
 
         Infinite where it escapes.
         """

@@ -33,7 +33,7 @@ def _choices() -> dict[str, tuple[str, ...]]:
 
 @dataclass(frozen=True)
 class Request(EstimationOptions):
-    """What to estimate; None leaves the choice to the data.
+    """What an estimate is to be; None leaves a choice to the data.
 
     Parameters
     ----------

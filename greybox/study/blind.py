@@ -120,9 +120,9 @@ def draw_many(
     Parameters
     ----------
     rngs : sequence of numpy.random.Generator
-        One a trial.
+        One per trial.
     orders : sequence of Order
-        One a trial.
+        One per trial.
     conditions : Conditions
 
     Raises

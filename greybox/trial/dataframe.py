@@ -152,7 +152,7 @@ def log_from_xarray(
 def recording_from_pandas(
     frame: pd.DataFrame, vessel: Vessel, *, name: str = "frame", guess: bool = True
 ) -> Recording:
-    """Return a DataFrame as a recording, to be checked, mended and imported.
+    """Return a DataFrame as a recording, which can be checked, mended and imported.
 
     Unlike `log_from_pandas` it may have holes, jitter and gaps in its time, and names
     that are to be guessed, as `read_recording` reads them from a file. A frame that was a log

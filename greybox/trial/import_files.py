@@ -13,6 +13,7 @@ from typing import Any
 from greybox.errors import LogError
 from greybox.trial.checks.actuators import measure_actuators
 from greybox.trial.checks.check import check_recordings
+from greybox.trial.checks.signal_quality import angle_unit_findings
 from greybox.trial.convert.channel_mapping import read_trial
 from greybox.trial.convert.convert import Imported, import_recording
 from greybox.trial.convert.derived_signals import derive_signals
@@ -191,7 +192,10 @@ def _import_trial(
                 [f"note: {n}" for n in notes],
             )
     recording = read_trial(paths, vessel, **(reader or {}))
-    return _write(recording, vessel, out, options, extra, [])
+    # what no later step can tell from a large angle
+    degrees = angle_unit_findings(recording, vessel)
+    lines = [f"note: {f.evidence}; {f.fix}" for f in degrees]
+    return _write(recording, vessel, out, options, extra, lines)
 
 
 def _write(

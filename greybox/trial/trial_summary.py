@@ -98,7 +98,7 @@ def describe_logs(segments: Sequence[TrialLog]) -> Contents:
 
 
 def describe_recording(recording: Recording, vessel: Vessel) -> Contents:
-    """Make a log of a mended recording and describe it; say why where none can be made.
+    """Describe the log that a mended recording gives, or say why it gives none.
 
     Parameters
     ----------

@@ -87,7 +87,7 @@ class Comparison(DisplayMixin):
     conditions: tuple[tuple[ConditionDifference, ...], ...]
 
     def fits(self) -> list[dict[str, float]]:
-        """Return the mean fit a model [%]."""
+        """Return the mean fit of each model [%]."""
         return [
             {s: float(np.mean([r.fit[s] for r in row])) for s in row[0].fit} for row in self.runs
         ]

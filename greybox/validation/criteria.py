@@ -48,7 +48,7 @@ def independent_samples(residuals: Sequence[Array], about: Array | None = None) 
     Parameters
     ----------
     residuals : sequence of ndarray
-        (N, m) a log.
+        (N, m) per log.
     about : ndarray, optional
         (m,) what they vary about; by default the mean of each log.
 

@@ -84,7 +84,7 @@ class LogFit(DisplayMixin):
     psi : ndarray
         (N,) heading of the simulation [rad].
     fit : dict of str to float
-        (6.12) a state [%]; −inf where the run diverged.
+        (6.12) per state [%]; −inf where the run diverged.
     diverged : int
         First sample outside the bound, −1 if none.
     """

@@ -127,6 +127,22 @@ def test_guesses_are_stated(tmp_path, capsys):
     np.testing.assert_allclose(np.exp(1j * log["psi"]), np.exp(1j * columns["psi"]), atol=1e-9)
 
 
+def test_angles_that_cannot_be_radians_are_told(tmp_path, capsys):
+    raw = data()
+    raw["alpha1"] = np.degrees(raw["alpha1"])
+    raw["paint"] = 1.0
+    raw.to_csv(tmp_path / "raw.csv", index=False)
+    given = ["import", tmp_path / "raw.csv", "--vessel", "thesis", "--out", tmp_path / "log.csv"]
+    status, out, _ = run(capsys, *given)
+    assert status == 0
+    assert "note: alpha1 reaches 45.84, which cannot be radians" in out
+    assert "multiply alpha1 by pi/180 (import --fix does)" in out
+    assert "columns not used: paint (map those that belong to the log in" in out
+    status, out, _ = run(capsys, *given, "--fix", "--fix-not", "stuck")
+    assert "note: alpha1 reaches" not in out
+    assert "mended: unit of alpha1" in out
+
+
 def test_a_mapping_that_no_file_has_is_told(tmp_path, capsys):
     ship = tmp_path / "ship.toml"
     ship.write_text(

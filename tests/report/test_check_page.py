@@ -323,6 +323,21 @@ def test_page_says_all_and_escapes_it(tmp_path):
     assert not re.search(r'(src|href)="(?!#)', without_scripts(html))
 
 
+def test_what_logs_share_is_drawn_once_and_where_its_repair_does_not_help(tmp_path):
+    one = tie_case("lever arm")
+    shared = replace(one.findings[0], logs=("a", "b", "c"))
+    same = [replace(one, findings=(shared,), name=name) for name in ("a", "b")]
+    # of a log without a lever arm
+    other = replace(report_of([shared], as_recording(columns())), name="c")
+    path = tmp_path / "check.html"
+    check_page([*same, other], [Path(n) for n in "abc"], SHIP, path)
+    html = without_scripts(path.read_text())
+    # track and signals of each log beside them
+    assert html.count("<svg") == 2 + 3 * 2
+    assert html.count("drawn for a, with which it is shared.") == 1
+    assert "come no closer by this repair" in html
+
+
 @pytest.mark.long
 def test_identifiers_of_several_logs_do_not_collide(tmp_path):
     path = tmp_path / "check.html"

@@ -105,7 +105,7 @@ class Cause(DisplayMixin):
     reference: ClassVar[str]
 
     def summary(self) -> str:
-        """Return what it looks like and what mends it, as text."""
+        """Return how the cause shows in a log, and what mends it, as text."""
         return "\n".join([self._line(), *(f"  {name}: {said}" for name, said in self._said())])
 
     def _line(self) -> str:
@@ -127,7 +127,7 @@ class Cause(DisplayMixin):
 
     @abstractmethod
     def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
-        """Return one sentence that an engineer understands.
+        """Return the evidence for the cause in one sentence.
 
         Parameters
         ----------

@@ -98,7 +98,7 @@ class ClockOffset(Cause):
     reference = "Ljung (1999), section 14.3"
 
     def hypotheses(self, context: Context) -> Sequence[Hypothesis]:
-        """Return one a channel."""
+        """Return one per channel."""
         most = min(_LATEST, 0.1 * context.duration)
         out = []
         for name in context.outputs:

@@ -260,7 +260,7 @@ class RateLimit(Cause):
     reference = "Fossen (2011), section 9.1"
 
     def hypotheses(self, context: Context) -> Sequence[Hypothesis]:
-        """Return one a command that moves; a ship has one."""
+        """Return one per command that moves; a ship has one."""
         if context.vessel.actuation.rate_limit is not None:
             return ()
         out = []

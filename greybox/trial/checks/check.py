@@ -105,7 +105,7 @@ def check_files(paths: Sequence[str | Path], vessel: Vessel) -> list[CheckReport
 
 
 def check_recording(recording: Recording, vessel: Vessel) -> CheckReport:
-    """Check one recording by itself; see `check_recordings`.
+    """Check one recording, as `check_recordings` does several.
 
     Parameters
     ----------

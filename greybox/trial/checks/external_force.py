@@ -173,7 +173,7 @@ def _read(recording: Recording, vessel: Vessel) -> _Read | str:
     names = (*(_EARTH if earth else _STATES), "psi")
     missing = [c for c in (*names, *vessel.commands) if c not in recording]
     if missing:
-        return f"there is no {', '.join(missing)}"
+        return f"the log has no {', '.join(missing)}"
     motion = make_motion(recording, (*names, *(n for n in _AIR if n in recording)))
     if motion is None or not all(n in motion for n in names):
         return f"too few samples of {', '.join(names)} overlap"
@@ -189,7 +189,7 @@ def _read(recording: Recording, vessel: Vessel) -> _Read | str:
         keep = np.isfinite(signal.value) & np.isfinite(signal.t)
         t, first = np.unique(signal.t[keep], return_index=True)
         if not len(t):
-            return f"there is no {c}"
+            return f"the log has no value of {c}"
         commands[c] = hold_mean(make_clock(t), signal.value[keep][first], motion.t, motion.step)
     return _Read(replace(motion, values=values), commands)
 

@@ -65,7 +65,7 @@ class Finding(DisplayMixin):
 
     @property
     def key(self) -> tuple[Any, ...]:
-        """What a finding that several logs share is known by in each of them."""
+        """Key by which one finding is recognised in all logs that share it."""
         return (self.id, self.channels, self.value, self.logs)
 
     def summary(self) -> str:
@@ -78,7 +78,7 @@ class Finding(DisplayMixin):
         return f"{self.id} ({', '.join(self.channels or (self.channel,))}): {size_in_words(self)}"
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the finding as the documented JSON, with `channels`, `safe` and `logs` beside."""
+        """Return the finding as the documented JSON, with `channels`, `safe` and `logs` added."""
         vector = isinstance(self.value, tuple)
         pooled = {"logs": list(self.logs)} if len(self.logs) > 1 else {}
         return {
@@ -144,7 +144,7 @@ class CheckReport(DisplayMixin):
         return self.summary_beside(())
 
     def summary_beside(self, told: Sequence[Finding]) -> str:
-        """Return the findings as text, of those that were told before their size only."""
+        """Return the findings as text; of those that were shown before, only the size."""
         count = len(self.findings)
         untold = sum(o.status == "cannot tell" for o in self.outcomes)
         verdict = f"{count} finding{'s' if count > 1 else ''}" if count else "clean"
@@ -176,7 +176,7 @@ class CheckReport(DisplayMixin):
         )  # fmt: skip
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the report as the documented JSON, with `checks` and `notes` beside."""
+        """Return the report as the documented JSON, with `checks` and `notes` added."""
         return {
             "log": self.name,
             "findings": [f.to_dict() for f in self.findings],

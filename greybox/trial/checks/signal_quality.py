@@ -105,8 +105,8 @@ def _gaps(names: tuple[str, ...], t: Array) -> list[Finding]:
             size,
             (size, size),
             "s",
-            f"{len(wide)} time{'s' if len(wide) > 1 else ''} {listed(names)} has no value for "
-            f"more than {HOLE:g} usual steps of {usual:.4g} s, the longest {size:.4g} s after "
+            f"{len(wide)} hole{'s' if len(wide) > 1 else ''} in {listed(names)}: no value for more "
+            f"than {HOLE:g} usual steps of {usual:.4g} s; the longest hole lasts {size:.4g} s from "
             f"t = {t[longest]:.6g} s",
             "none needed: import keeps gaps as gaps, and each stretch becomes a segment",
             ("t",),

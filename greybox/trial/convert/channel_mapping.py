@@ -227,9 +227,10 @@ def table_columns(
     # what the vessel file maps itself is not made of the same columns once more
     assigned = {n: a for n, a in assigned.items() if not own & set(parts.get(a.raw, ()))}
     if "t" not in assigned:
+        advice = "Map" if guess else "Make a log of the file with greybox import, or map"
         raise LogError(
             f"'{table.path.name}' has no column 't'.{suggestion('t', table.columns)} "
-            f"Map the time column in the vessel file's [columns] with its unit. "
+            f"{advice} the time column in the vessel file's [columns] with its unit. "
             f"Its columns: {', '.join(table.columns[:30])}."
         )
     time = assigned["t"].raw
@@ -319,7 +320,10 @@ def batch_recording(
     used |= {c for made, of in parts.items() if made in used for c in of}
     ignored = [c for c in table.columns if c not in used]
     if ignored:
-        notes.append(f"columns not used: {shortened(ignored, 12)}")
+        notes.append(
+            f"columns not used: {shortened(ignored, 12)} (map those that belong to the log in the "
+            f"vessel file's [columns])"
+        )
     if alone and not set(assigned) & MOTION:
         notes.append(_NO_MOTION)
     return Recording(table.path.stem, tuple(signals), text, scale.epoch, notes=tuple(notes))

@@ -68,7 +68,7 @@ def find_offsets(logs: Sequence[Tied], vessel: Vessel) -> list[tuple[list[Findin
     Returns
     -------
     list of (findings, outcomes)
-        One a log: what was found, and what was compared or why nothing can show it.
+        One per log: what was found, and what was compared or why nothing can show it.
     """
     why = "needs heading and yaw rate, or positions, heading and velocities of their own sensor"
     out: list[tuple[list[Finding], list[Outcome]]] = [
