@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiment_design.certificate.certificate import Certificate, absent, certify
+from experiment_design.constraints.kinds.margin import Margin
 from experiment_design.constraints.limits import LimitReport
 from experiment_design.excitation.rollout import Motion
 from experiment_design.feasibility.actuator_delay import late_notes
@@ -471,14 +472,14 @@ def _margins(problems: list[TrialProblem], motions: tuple[Motion, ...]) -> dict[
         program = problem.scenarios[0].limits
         values = program.path_values(motion.state[0])
         states = problem.scenarios[0].rollout.structure.states
-        backoff = program.backoff
-        for i, (name, _) in enumerate(program.limits.signs.items()):
-            least = float((program.path_names[i].bound + backoff[i] - values[i]).min())
-            found[name] = min(found.get(name, np.inf), least)
+        kept = {}
+        for limit, back, value in zip(program.path_limits, program.backoff, values, strict=True):
+            if isinstance(limit, Margin):
+                kept[limit.state] = float((limit.bound + back - value).min())
         for i, name in enumerate(states):
-            if name in ("u", "v") and name not in program.limits.signs:
-                least = float(np.abs(motion.state[0, :, i]).min())
-                found[name] = min(found.get(name, np.inf), least)
+            if name in ("u", "v") and name not in kept:
+                kept[name] = float(np.abs(motion.state[0, :, i]).min())
+        found |= {n: min(found.get(n, np.inf), least) for n, least in kept.items()}
     return found
 
 
@@ -498,6 +499,6 @@ def _limit_reports(
             way = build_problem(plain, t).scenarios[0].limits
             worst = way.worst(whole.state, request.lead_in_samples)[:, 0]
             missed[: len(worst)] = np.maximum(missed[: len(worst)], worst)
-        for name, m in zip(program.names, missed, strict=True):
-            found.append(LimitReport(t, name.name, name.bound, name.unit, float(m)))
+        for limit, m in zip(program.all_limits, missed, strict=True):
+            found.append(LimitReport(t, limit.name, limit.bound, limit.unit, float(m)))
     return tuple(found)

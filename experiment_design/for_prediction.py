@@ -387,7 +387,7 @@ def described_plan(
     short = [
         (name, float(m))
         for search in searches
-        for name, m in zip(problems[0].scenarios[0].limits.names, search.candidate.missed,
+        for name, m in zip(problems[0].scenarios[0].limits.all_limits, search.candidate.missed,
                            strict=True)
         if m > 1e-3
     ]  # fmt: skip

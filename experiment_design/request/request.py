@@ -23,6 +23,7 @@ from greybox.errors import UsageError, suggestion
 from greybox.model.model import ManoeuvringModel
 from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import Column, Predictor, Regime, build_predictor
+from greybox.model.predictor_kinds import PREDICTORS
 from greybox.model.run.simulation import stationary_disturbance
 from greybox.model.run.step import Integrator
 from greybox.model.structure import Structure
@@ -339,6 +340,22 @@ class PreparedRequest(TrialOptions):
         """Return the limits of one trial."""
         return replace(self.limits, signs=dict(self.regimes[trial]))
 
+    @property
+    def wind_matters(self) -> bool:
+        """Whether the wind is captured and not measured, so that margins hold through the air."""
+        kind = PREDICTORS[self.predictor]
+        return kind.captures and not kind.air_measured
+
+    def limit_program(self, rollout: Rollout, trial: int) -> LimitProgram:
+        """Return the compiled limits of one trial under its own or another prior model."""
+        return LimitProgram(
+            rollout,
+            self.schedule,
+            self.trial_limits(trial),
+            wind_matters=self.wind_matters,
+            backoff=self.backoff,
+        )
+
     def draw_models(self, count: int, seed: int) -> Array:
         """Draw prior models (count, p) from the covariance."""
         rng = np.random.default_rng([13, self.seed, seed])
@@ -485,20 +502,13 @@ def build_problem(
     gust = draw_gusts(request) if predictor.air_measured else None
     criterion = build_criterion(request, predictor)
     schedule = request.schedule
-    limits = request.trial_limits(trial)
     scenarios = []
     for k, theta in enumerate(request.thetas()):
         rollout = Rollout(
             request.vessel, request.structure, theta, request.d, request.starts[trial],
             request.sample_time, request.integrator,
         )  # fmt: skip
-        program = LimitProgram(
-            rollout,
-            schedule,
-            limits,
-            wind_matters=predictor.augmented and not predictor.air_measured,
-            backoff=request.backoff,
-        )
+        program = request.limit_program(rollout, trial)
         information = assumed.information(
             predictor,
             theta,
@@ -516,7 +526,9 @@ def build_problem(
             for a, b in request.contrasts
         ]
         other = pairs[0][1]
-        program = LimitProgram(other, schedule, limits, backoff=request.backoff)
+        program = LimitProgram(
+            other, schedule, request.trial_limits(trial), backoff=request.backoff
+        )
         scenarios.append(Scenario(other, scenarios[0].information, program, 0.0))
         contrast = Contrast(pairs, request.noise, schedule)
     return TrialProblem(schedule, tuple(scenarios), criterion, known, request.worst_case, contrast)

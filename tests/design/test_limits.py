@@ -92,9 +92,9 @@ def test_the_velocity_through_the_air_keeps_a_margin_of_either_sign():
         predictor="wind", d=np.array([0.0, 0.0, 3.0, 4.0]), limits=TrialLimits(margin_air=0.7)
     )
     program = build_problem(request).scenarios[0].limits
-    names = [n.name for n in program.path_names[2:]]
+    names = [n.name for n in program.path_limits[2:]]
     assert names == ["margin of surge through the air", "margin of sway through the air"]
-    assert program.path_names[3].option == "--margin-air"
+    assert program.path_limits[3].option == "--margin-air"
     state = np.zeros((1, 6))
     state[0, :4] = 1.5, 1.2, 0.0, 0.4
     ground = np.array([[np.cos(0.4), -np.sin(0.4)], [np.sin(0.4), np.cos(0.4)]]) @ state[0, :2]
@@ -173,7 +173,7 @@ def test_a_backoff_tightens_path_limits_only():
     request = make_request()
     plain = build_problem(request).scenarios[0]
     tight = LimitProgram(
-        plain.rollout, plain.limits.schedule, request.trial_limits(0), backoff=(0.1, 0.2)
+        plain.rollout, request.schedule, request.trial_limits(0), backoff=(0.1, 0.2)
     )
     state = np.ones((1, 6))
     np.testing.assert_allclose(

@@ -15,10 +15,11 @@ import pytest
 from browser import require_legible, without_scripts
 from designs import prior_model, random_plan
 
+from experiment_design.constraints.kinds.sea_room import edge_distance
 from experiment_design.constraints.limits import Circle, LimitReport, TrialLimits
 from experiment_design.feasibility.constraint_satisfaction import ConstraintSatisfaction
 from experiment_design.output.pictures import forbidden
-from experiment_design.output.prediction import edge_distance, predict_motion
+from experiment_design.output.prediction import predict_motion
 from experiment_design.output.report import design_page, random_std
 from experiment_design.output.sheet_contents import (
     clock,

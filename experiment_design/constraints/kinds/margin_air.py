@@ -1,0 +1,63 @@
+"""Velocity through the air that stays away from zero, of either sign: ``--margin-air`` (A15)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from experiment_design.constraints.kinds.margin import WORDS, FromZero
+from experiment_design.constraints.limits import LimitedTrial, LimitKind, TrialLimits
+from greybox.errors import UsageError
+from greybox.rotation import ned_to_body
+
+
+@dataclass(frozen=True)
+class AirMargin(FromZero):
+    """A component of the velocity through the air, of either sign.
+
+    Parameters
+    ----------
+    state : {"u", "v"}
+    wind : (float, float)
+        North and east [m/s].
+    """
+
+    state: str
+    wind: tuple[float, float]
+    field = "margin_air"
+    option = "--margin-air"
+    unit = "m/s"
+    signal = ""
+    otherwise = "start on another heading (--start)"
+
+    @property
+    def name(self) -> str:
+        """The limit in words."""
+        return f"margin of {WORDS[self.state]} through the air"
+
+    def value(self, at: Mapping[str, ca.SX]) -> ca.SX:
+        """Return h."""
+        north, east = self.wind
+        blown = ned_to_body(ca.SX(north), ca.SX(east), at["psi"])[self.state == "v"]
+        return self.bound - ca.fabs(at[self.state] - blown)
+
+
+def _of(limits: TrialLimits, trial: LimitedTrial) -> Sequence[AirMargin]:
+    if limits.margin_air is None:
+        return []
+    wind = (float(trial.d[2]), float(trial.d[3]))
+    return [AirMargin(limits.margin_air, n, wind) for n in ("u", "v") if n in trial.states]
+
+
+def _check(limits: TrialLimits) -> None:
+    if limits.margin_air is not None and not 0 <= limits.margin_air < np.inf:
+        raise UsageError(
+            f"the margin of the velocity through the air is {limits.margin_air:g} m/s, it must "
+            f"be 0 or more."
+        )
+
+
+ENTRY = LimitKind("margin through the air", 1, _of, _check)
