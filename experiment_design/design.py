@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from experiment_design.certificate.certificate import Certificate, absent, certify
 from experiment_design.constraints.kinds.margin import Margin
 from experiment_design.constraints.limits import LimitReport
+from experiment_design.criteria.covariance import Criterion
 from experiment_design.excitation.rollout import Motion
 from experiment_design.feasibility.actuator_delay import late_notes
 from experiment_design.feasibility.checks import (
@@ -27,7 +28,6 @@ from experiment_design.feasibility.constraint_satisfaction import (
     keep_probability,
 )
 from experiment_design.feasibility.least_violation import closest, moved_constant, perturbed
-from experiment_design.information.criteria import Criterion
 from experiment_design.information.moments import MomentProgram, Moments
 from experiment_design.optimise.campaign import (
     Found,

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from experiment_design.constraints.kinds.margin import FromZero
 from experiment_design.constraints.limits import TOLERANCE, Circumstances, Limit
+from experiment_design.criteria.optimality import CRITERIA
 from experiment_design.feasibility.least_violation import (
     least_change,
     moved_constant,
@@ -16,7 +17,6 @@ from experiment_design.feasibility.least_violation import (
 )
 from experiment_design.feasibility.stability import unstable_sentence
 from experiment_design.information.estimators import ESTIMATORS
-from experiment_design.information.optimality import CRITERIA
 from experiment_design.optimise.campaign import (
     add_up,
     own_moments,

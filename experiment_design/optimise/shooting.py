@@ -701,5 +701,4 @@ class Shooting(ABC):
     def value(self, unit: Array) -> float:
         """Return the criterion that is climbed, at a sequence, in the units of `Criterion`."""
         f = self.functions["nlp"](x=self.begin(unit), p=ca.DM(0, 1))["f"]
-        size = len(self.wanted) if self.problem.criterion.optimality.determinant else 1
-        return -float(f) * size
+        return -float(f) * self.problem.criterion.shared_by

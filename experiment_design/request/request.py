@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from experiment_design.constraints.limit_program import LimitProgram
 from experiment_design.constraints.limits import TrialLimits
+from experiment_design.criteria.covariance import Criterion
+from experiment_design.criteria.optimality import CRITERIA
+from experiment_design.criteria.t_optimality import Contrast
 from experiment_design.excitation.rollout import Rollout
 from experiment_design.excitation.schedule import Schedule, make_schedule
-from experiment_design.information.criteria import Criterion
 from experiment_design.information.estimators import ESTIMATORS
 from experiment_design.information.moments import Moments
-from experiment_design.information.optimality import CRITERIA
-from experiment_design.information.t_optimality import Contrast
 from experiment_design.request.exclusions import require_compatible
 from experiment_design.request.problem import Scenario, TrialProblem
 from greybox.errors import UsageError, suggestion
