@@ -266,19 +266,15 @@ def described(
     criterion = problems[0].criterion
     covariance = _covariance(problems, units)
     columns = wanted_parameters(request, criterion)
-    versus, random_value = None, float("nan")
+    value = _criterion_value(problems, units, criterion, covariance)
+    versus, random_value, random_std = None, float("nan"), None
     if reference is not None:
-        other = add_up([own_moments(p, u) for p, u in zip(problems, reference, strict=True)])
-        gain = logdet_information(covariance) - logdet_information(
-            criterion.covariance(other[0])[0]
-        )
-        versus = float(np.exp(gain / len(covariance)))
-        random_value = float(criterion.value(other[0])[0])
-        if request.contrasts:
-            random_value = float(problems[0].evaluate(reference[0][None]).value[0])
-            versus = float(
-                np.exp(_criterion_value(problems, units, criterion, covariance) - random_value)
-            )
+        other = _covariance(problems, reference)
+        random_value = _criterion_value(problems, reference, criterion, other)
+        gain = (logdet_information(covariance) - logdet_information(other)) / len(covariance)
+        versus = float(np.exp(value - random_value if request.contrasts else gain))
+        with np.errstate(invalid="ignore"):
+            random_std = np.asarray(np.sqrt(np.diag(other)))
     values = np.array(
         [sum(float(request.theta[request.structure.index(n)]) for n in c.terms) for c in columns]
     )
@@ -303,7 +299,7 @@ def described(
         tuple(c.name for c in columns),
         values,
         covariance,
-        _criterion_value(problems, units, criterion, covariance),
+        value,
         versus,
         random_value,
         kept,
@@ -317,6 +313,7 @@ def described(
         evaluations,
         time.perf_counter() - began,
         parts,
+        random_std,
     )
 
 

@@ -108,6 +108,8 @@ class Design(DisplayMixin):
     seconds : float
     parts : tuple of PlanPart
         In order, lead-in included; empty where each trial is one part.
+    random_std : ndarray or None
+        (p_w,) predicted standard errors of the best random two-level sequences.
     """
 
     request: PreparedRequest
@@ -131,6 +133,7 @@ class Design(DisplayMixin):
     evaluations: int
     seconds: float
     parts: tuple[PlanPart, ...] = ()
+    random_std: Array | None = None
 
     @property
     def lead_in_s(self) -> float:

@@ -20,7 +20,7 @@ from experiment_design.constraints.limits import Circle, LimitReport, TrialLimit
 from experiment_design.feasibility.constraint_satisfaction import ConstraintSatisfaction
 from experiment_design.output.pictures import forbidden
 from experiment_design.output.prediction import predict_motion
-from experiment_design.output.report import design_page, random_std
+from experiment_design.output.report import design_page
 from experiment_design.output.sheet_contents import (
     clock,
     compass,
@@ -293,9 +293,7 @@ def test_the_page_says_what_is_saved(unsure, page):
     assert html.count("<figure ") == 4
     assert "tells nothing" in html
     assert "(breaks limits)" in html
-    reference = random_std(unsure)
-    assert reference is not None
-    assert f"<td>{reference[0]:.2g}</td>" in html
+    assert f"<td>{unsure.random_std[0]:.2g}</td>" in html
     assert "Regime chosen." in html
 
 
