@@ -28,14 +28,14 @@ from experiment_design.feasibility.constraint_satisfaction import (
     keep_probability,
 )
 from experiment_design.feasibility.least_violation import closest, moved_constant, perturbed
-from experiment_design.information.moments import MomentProgram, Moments
+from experiment_design.information.moments import MomentProgram
 from experiment_design.optimise.campaign import (
     Found,
     Progress,
-    add_up,
-    own_moments,
+    covariance_of,
     random_campaign,
     search_campaign,
+    sums_of_others,
 )
 from experiment_design.optimise.classical import Alternative, compare_classical
 from experiment_design.optimise.lead_in import after_lead_in
@@ -203,7 +203,7 @@ def _design(
                 f"model less by a first short trial."
             )
     units = [c.unit for c in candidates]
-    covariance = _covariance(problems, units)
+    covariance = covariance_of(problems, units)
     if not np.isfinite(covariance).all() and not request.contrasts:
         raise InfeasibleError(unexcited(problems, units, request))
     if not missing or not best_effort:
@@ -264,12 +264,12 @@ def described(
         When the work began, by `time.perf_counter`.
     """
     criterion = problems[0].criterion
-    covariance = _covariance(problems, units)
+    covariance = covariance_of(problems, units)
     columns = wanted_parameters(request, criterion)
     value = _criterion_value(problems, units, criterion, covariance)
     versus, random_value, random_std = None, float("nan"), None
     if reference is not None:
-        other = _covariance(problems, reference)
+        other = covariance_of(problems, reference)
         random_value = _criterion_value(problems, reference, criterion, other)
         gain = (logdet_information(covariance) - logdet_information(other)) / len(covariance)
         versus = float(np.exp(value - random_value if request.contrasts else gain))
@@ -341,12 +341,6 @@ def _behind(request: PreparedRequest, motion: Motion) -> Motion:
     return Motion(state, motion.tau[:, n:], motion.commands[:, n:], motion.stable)
 
 
-def _covariance(problems: list[TrialProblem], units: list[Array]) -> Array:
-    """Return the covariance that sequences would give under the nominal prior model."""
-    sums = add_up([own_moments(p, u) for p, u in zip(problems, units, strict=True)])
-    return np.asarray(problems[0].criterion.covariance(sums[0])[0])
-
-
 def _from_closest(
     request: PreparedRequest,
     problems: list[TrialProblem],
@@ -379,11 +373,7 @@ def _polish(
     for t, problem in enumerate(problems):
         if problem.contrast is not None or not _active(problem, out[t]):
             continue
-        known: tuple[Moments, ...] = ()
-        if len(problems) > 1:
-            pairs = enumerate(zip(problems, out, strict=True))
-            known = add_up([own_moments(p, c.unit) for o, (p, c) in pairs if o != t])
-        here = problem.with_known(known)
+        here = problem.with_known(sums_of_others(problems, [c.unit for c in out], t))
         result = solve_ipopt(here, out[t].unit, iterations=_POLISH, seconds=_PATIENCE)
         if result.outcome is Outcome.REFUSED:
             continue
@@ -497,5 +487,5 @@ def _limit_reports(
             worst = way.worst(whole.state, request.lead_in_samples)[:, 0]
             missed[: len(worst)] = np.maximum(missed[: len(worst)], worst)
         for limit, m in zip(program.all_limits, missed, strict=True):
-            found.append(LimitReport(t, limit.name, limit.bound, limit.unit, float(m)))
+            found.append(LimitReport(t, limit.words, limit.bound, limit.unit, float(m)))
     return tuple(found)

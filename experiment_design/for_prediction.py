@@ -394,7 +394,7 @@ def described_plan(
     if short and not tightened.backoff:
         name, amount = max(short, key=lambda item: item[1])
         raise InfeasibleError(
-            f"no plan was found that keeps the {name.name} of {name.bound:g} {name.unit}: the "
+            f"no plan was found that keeps the {name.words} of {name.bound:g} {name.unit}: the "
             f"best misses it by {amount:.3g} {name.unit}. Widen it ({name.option}), or narrow "
             f"--envelope."
         )

@@ -54,7 +54,7 @@ class PredictedPrecision(DisplayMixin):
         return "\n".join([*lines, *self._missed()])
 
     def _missed(self) -> list[str]:
-        return [f"{n.name} missed by {m:.3g} {n.unit}" for n, m in self.missed if m > 0]
+        return [f"{n.words} missed by {m:.3g} {n.unit}" for n, m in self.missed if m > 0]
 
     def _line(self) -> str:
         missed = len(self._missed())

@@ -8,13 +8,14 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from experiment_design.excitation.rollout import Motion
+from greybox.errors import UsageError
 from greybox.registry import Registry
 
 Array = NDArray[np.float64]
@@ -148,10 +149,28 @@ class Limit(ABC):
 
     bound: float
 
+    # of the kind; its place among limits, and the field of `TrialLimits` that sets it
+    name: ClassVar[str]
+    order: ClassVar[int]
+    field: ClassVar[str]
+
+    @classmethod
+    def of(cls, limits: TrialLimits, trial: LimitedTrial) -> Sequence[Limit]:
+        """Return the limits of this kind that a trial has."""
+        bound = getattr(limits, cls.field)
+        return [] if bound is None else [cls(bound)]
+
+    @classmethod
+    def check(cls, limits: TrialLimits) -> None:
+        """Refuse what cannot be asked for."""
+        bound = getattr(limits, cls.field)
+        if isinstance(bound, int | float) and not 0 < bound < np.inf:
+            raise UsageError(f"the {cls.name} is {bound:g}, it must be positive.")
+
     @property
-    @abstractmethod
-    def name(self) -> str:
+    def words(self) -> str:
         """The limit in words."""
+        return self.name
 
     @property
     @abstractmethod
@@ -162,11 +181,6 @@ class Limit(ABC):
     @abstractmethod
     def option(self) -> str:
         """Option of `greybox design` that sets it."""
-
-    @property
-    @abstractmethod
-    def field(self) -> str:
-        """Field of `TrialLimits` that sets it."""
 
     @property
     def scale(self) -> float:
@@ -181,7 +195,7 @@ class Limit(ABC):
     @property
     def phrase(self) -> str:
         """The limit in words, with its bound."""
-        return f"{self.name} of {self.bound:g} {self.unit}".rstrip()
+        return f"{self.words} of {self.bound:g} {self.unit}".rstrip()
 
     def with_bound(self, limits: TrialLimits, bound: float) -> TrialLimits:
         """Return the limits of a trial with another bound for this one."""
@@ -258,28 +272,7 @@ def rounded_up(amount: float) -> float:
     return float(np.ceil(amount * 1e3) / 1e3)
 
 
-@dataclass(frozen=True)
-class LimitKind:
-    """A kind of limit.
-
-    Parameters
-    ----------
-    name : str
-    order : int
-        Of the limits of a trial, by which a back-off finds them.
-    of : callable
-        Returns the limits of this kind that a trial has.
-    check : callable
-        Refuses what cannot be asked for.
-    """
-
-    name: str
-    order: int
-    of: Callable[[TrialLimits, LimitedTrial], Sequence[Limit]]
-    check: Callable[[TrialLimits], None]
-
-
-LIMITS: Registry[LimitKind] = Registry("limit", package="experiment_design.constraints.kinds")
+LIMITS: Registry[type[Limit]] = Registry("limit", package="experiment_design.constraints.kinds")
 
 
 def limits_of(limits: TrialLimits, trial: LimitedTrial) -> tuple[Limit, ...]:

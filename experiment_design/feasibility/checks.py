@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from experiment_design.constraints.kinds.margin import FromZero
 from experiment_design.constraints.limits import TOLERANCE, Circumstances, Limit
-from experiment_design.criteria.optimality import CRITERIA
 from experiment_design.feasibility.least_violation import (
     least_change,
     moved_constant,
@@ -18,9 +17,10 @@ from experiment_design.feasibility.least_violation import (
 from experiment_design.feasibility.stability import unstable_sentence
 from experiment_design.information.estimators import ESTIMATORS
 from experiment_design.optimise.campaign import (
-    add_up,
-    own_moments,
     random_campaign,
+    std_of,
+    sums_of_all,
+    sums_of_others,
 )
 from experiment_design.optimise.duration import telling_duration
 from experiment_design.optimise.search import Candidate, ascend, assess
@@ -66,10 +66,10 @@ def require_informative(
 
     `hopeless` is how many times vaguer random sequences may be than the design.
     """
-    if request.targets or request.contrasts or CRITERIA[request.criterion].combined:
+    if not request.tells_each:
         return []
     names = [c.name for c in wanted_parameters(request, problems[0].criterion)]
-    share = _relative_errors(problems, units)
+    share = std_of(problems, units) / problems[0].criterion.scale
     if hopeless > 1 and not np.isfinite(share).all():
         return []
     vague = [n for n, s in zip(names, share, strict=True) if s > hopeless * _VAGUE]
@@ -95,13 +95,6 @@ def require_informative(
         f"{', '.join(doubtful)} will stay unknown by more than {'its' if one else 'their'} prior "
         f"value: lengthen the trial, or leave {'it' if one else 'them'} out with --want"
     ]
-
-
-def _relative_errors(problems: list[TrialProblem], units: list[Array]) -> Array:
-    """Return the predicted standard errors as shares of the prior values."""
-    criterion = problems[0].criterion
-    sums = add_up([own_moments(p, u) for p, u in zip(problems, units, strict=True)])
-    return np.asarray(np.sqrt(np.diag(criterion.covariance(sums[0])[0])) / criterion.scale)
 
 
 def require_start(problem: TrialProblem, request: PreparedRequest, trial: int) -> None:
@@ -177,18 +170,13 @@ def tells_enough(request: PreparedRequest) -> bool:
     if len(units) < len(problems):
         return False
     for t, problem in enumerate(problems):
-        here = problem
-        if request.trials > 1:
-            pairs = zip(problems, units, strict=True)
-            here = problem.with_known(
-                add_up([own_moments(p, u) for o, (p, u) in enumerate(pairs) if o != t])
-            )
+        here = problem.with_known(sums_of_others(problems, units, t))
         found = ascend(here, units[t], _BRIEF)
         if found.feasible:
             units[t] = found.unit
-    if request.targets or request.contrasts or CRITERIA[request.criterion].combined:
+    if not request.tells_each:
         return True
-    share = _relative_errors(problems, units)
+    share = std_of(problems, units) / problems[0].criterion.scale
     return bool(2 * (share > _VAGUE).sum() <= share.size)
 
 
@@ -209,7 +197,7 @@ def unexcited(problems: list[TrialProblem], units: list[Array], request: Prepare
             "this trial cannot tell the parameters of an output-error fit apart: lengthen it, "
             "widen the limits, or use --predictor basic."
         )
-    sums = add_up([own_moments(p, u) for p, u in zip(problems, units, strict=True)])[0]
+    sums = sums_of_all(problems, units)
     predictor = request.build_predictor()
     worst, label, state = np.inf, "", ""
     for name in request.structure.states:

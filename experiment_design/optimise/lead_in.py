@@ -239,7 +239,7 @@ def _refusal(request: PreparedRequest, holds: int) -> str:
             helps = _relaxed(request, holds, limit, max(amount, 0.05 * limit.size))
             if helps:
                 return f"{said}: the {limit.phrase} stops it. {helps}"
-        names = ", ".join(x.name for x in on_way)
+        names = ", ".join(x.words for x in on_way)
         return f"{said}: the {names} together stop it. Widen them, or change --start."
     limit, amount = next((item for item in stopping if item[0].of_regime), stopping[0])
     reached = limit.bound - max(amount - (_ENOUGH - 1) * max(limit.bound, _LEAST), 0.0)

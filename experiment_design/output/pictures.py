@@ -13,7 +13,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator, MultipleLocator
 from numpy.typing import NDArray
 
 from experiment_design.constraints.kinds.sea_room import edge_distance
-from experiment_design.constraints.limits import Circle, LimitedTrial, PathLimit, limits_of
+from experiment_design.constraints.limits import Circle
 from experiment_design.output.prediction import MotionBand
 from experiment_design.output.result import Design
 from experiment_design.output.sheet_contents import clock
@@ -263,10 +263,9 @@ def forbidden(design: Design, band: MotionBand, name: str) -> list[tuple[Array, 
     An edge is nan where it does not count.
     """
     r = design.request
-    trial = LimitedTrial(r.structure.states, r.d, r.wind_matters)
     zones = []
-    for limit in limits_of(r.trial_limits(band.trial), trial):
-        if isinstance(limit, PathLimit) and limit.signal == name:
+    for limit in r.path_limits(band.trial):
+        if limit.signal == name:
             edges = limit.edges(band["psi"].nominal)
             if limit.of_regime:
                 for edge, _ in edges:

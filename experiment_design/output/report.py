@@ -12,7 +12,7 @@ from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
 
 from experiment_design.optimise.search import REFERENCE
-from experiment_design.output.pictures import draw_commands, draw_plan_track, draw_states
+from experiment_design.output.pictures import draw_commands, draw_plan_track, draw_states, forbidden
 from experiment_design.output.prediction import MotionBand, predict_motion
 from experiment_design.output.result import Design
 from experiment_design.output.sheet_contents import clock, plain_name, signed
@@ -149,8 +149,7 @@ def _trial(design: Design, band: MotionBand) -> Section:
     track = Figure(figsize=(_WIDTH, _WIDTH))
     draw_plan_track(track.add_axes((0.13, 0.09, 0.84, 0.8)), design, band, _SIZE)
     names = [n for n in _SHOWN if n in band]
-    if r.limits.speed_cap is not None:
-        names.append("speed")
+    names += [n for n in band.names if n not in names and forbidden(design, band, n)]
     states = new_figure(_WIDTH, 1.35 * len(names) + 0.4)
     panels = states.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
     draw_states(dict(zip(names, panels, strict=True)), design, band, _SIZE)

@@ -9,7 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiment_design.constraints.limit_program import LimitProgram
-from experiment_design.constraints.limits import TrialLimits
+from experiment_design.constraints.limits import (
+    LIMITS,
+    LimitedTrial,
+    PathLimit,
+    TrialLimits,
+    limits_of,
+)
 from experiment_design.criteria.covariance import Criterion
 from experiment_design.criteria.optimality import CRITERIA
 from experiment_design.criteria.t_optimality import Contrast
@@ -113,8 +119,8 @@ class TrialOptions:
             for f in fields(TrialOptions)
             if f.name != "limits" and getattr(self, f.name) != getattr(usual, f.name)
         }
-        limits = ("area", "margin_air", "speed_cap", "yaw_cap", "headings")
-        told |= {n for n in limits if getattr(self.limits, n) is not None}
+        limits = {kind.field: getattr(self.limits, kind.field) for kind in LIMITS.values()}
+        told |= {n for n, x in limits.items() if x is not None and not isinstance(x, Mapping)}
         if self.limits.clearance:
             told.add("clearance")
         if CRITERIA[self.criterion].combined:
@@ -341,6 +347,11 @@ class PreparedRequest(TrialOptions):
         return replace(self.limits, signs=dict(self.regimes[trial]))
 
     @property
+    def tells_each(self) -> bool:
+        """Whether each wanted parameter is to be told, by no standard error of its own."""
+        return not (self.targets or self.contrasts or CRITERIA[self.criterion].combined)
+
+    @property
     def wind_matters(self) -> bool:
         """Whether the wind is captured and not measured, so that margins hold through the air."""
         kind = PREDICTORS[self.predictor]
@@ -355,6 +366,12 @@ class PreparedRequest(TrialOptions):
             wind_matters=self.wind_matters,
             backoff=self.backoff,
         )
+
+    def path_limits(self, trial: int) -> tuple[PathLimit, ...]:
+        """Return the limits at each sample of a trial."""
+        about = LimitedTrial(self.structure.states, self.d, self.wind_matters)
+        every = limits_of(self.trial_limits(trial), about)
+        return tuple(x for x in every if isinstance(x, PathLimit))
 
     def draw_models(self, count: int, seed: int) -> Array:
         """Draw prior models (count, p) from the covariance."""

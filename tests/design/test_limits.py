@@ -92,7 +92,7 @@ def test_the_velocity_through_the_air_keeps_a_margin_of_either_sign():
         predictor="wind", d=np.array([0.0, 0.0, 3.0, 4.0]), limits=TrialLimits(margin_air=0.7)
     )
     program = build_problem(request).scenarios[0].limits
-    names = [n.name for n in program.path_limits[2:]]
+    names = [n.words for n in program.path_limits[2:]]
     assert names == ["margin of surge through the air", "margin of sway through the air"]
     assert program.path_limits[3].option == "--margin-air"
     state = np.zeros((1, 6))

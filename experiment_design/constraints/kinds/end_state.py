@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from experiment_design.constraints.limits import (
     Circumstances,
+    Limit,
     LimitedTrial,
-    LimitKind,
     TrialLimits,
     WholeLimit,
     rounded_up,
@@ -43,11 +43,13 @@ class EndState(WholeLimit):
     wanted: float
     place: int
     target: float
+    name = "end state"
+    order = 5
     field = "end"
     option = "--end"
 
     @property
-    def name(self) -> str:
+    def words(self) -> str:
         """The limit in words."""
         return f"end state of {self.signal} = {self.wanted:g}"
 
@@ -72,33 +74,30 @@ class EndState(WholeLimit):
     def advice(self, amount: float, circumstances: Circumstances) -> str:
         """Return the tolerance that is within reach."""
         return (
-            f"the {self.name} within {self.bound:g} {self.unit} cannot be reached: it is missed by "
-            f"{amount:.3g} {self.unit} beyond that. Raise the tolerance in --end to "
+            f"the {self.words} within {self.bound:g} {self.unit} cannot be reached: it is missed "
+            f"by {amount:.3g} {self.unit} beyond that. Raise the tolerance in --end to "
             f"{self.bound + rounded_up(amount):.4g} {self.unit}, or lengthen the trial."
         )
 
-
-def _of(limits: TrialLimits, trial: LimitedTrial) -> Sequence[EndState]:
-    found = []
-    for name, (value, tolerance) in limits.end.items():
-        if name not in trial.signals:
-            raise UsageError(
-                f"the end state names '{name}'.{suggestion(name, trial.signals)} It can name "
-                f"{', '.join(trial.signals)}."
-            )
-        if not (np.isfinite(value) and 0 < tolerance < np.inf):
-            raise UsageError(
-                f"the end state {name} = {value:g} has the tolerance {tolerance:g}, it must be "
-                f"positive: write --end {name}=VALUE:TOLERANCE."
-            )
-        shift = dict(zip(("x_n", "y_n"), limits.position, strict=True)).get(name, 0.0)
-        place = trial.signals.index(name)
-        found.append(EndState(tolerance, name, value, place, value - shift))
-    return found
-
-
-def _check(limits: TrialLimits) -> None:
-    """Nothing: which names there are depends on the model."""
+    @classmethod
+    def of(cls, limits: TrialLimits, trial: LimitedTrial) -> Sequence[Limit]:
+        """Return a tolerance for each value that is asked for."""
+        found = []
+        for name, (value, tolerance) in limits.end.items():
+            if name not in trial.signals:
+                raise UsageError(
+                    f"the end state names '{name}'.{suggestion(name, trial.signals)} It can name "
+                    f"{', '.join(trial.signals)}."
+                )
+            if not (np.isfinite(value) and 0 < tolerance < np.inf):
+                raise UsageError(
+                    f"the end state {name} = {value:g} has the tolerance {tolerance:g}, it must be "
+                    f"positive: write --end {name}=VALUE:TOLERANCE."
+                )
+            shift = dict(zip(("x_n", "y_n"), limits.position, strict=True)).get(name, 0.0)
+            place = trial.signals.index(name)
+            found.append(cls(tolerance, name, value, place, value - shift))
+        return found
 
 
-ENTRY = LimitKind("end state", 5, _of, _check)
+ENTRY = EndState

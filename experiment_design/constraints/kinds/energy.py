@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from experiment_design.constraints.limits import LimitedTrial, LimitKind, TrialLimits, WholeLimit
+from experiment_design.constraints.limits import Limit, LimitedTrial, TrialLimits, WholeLimit
 from experiment_design.excitation.rollout import Motion
 from greybox.errors import UsageError
 
@@ -29,6 +29,7 @@ class Energy(WholeLimit):
 
     speeds: tuple[tuple[int, float], ...]
     name = "energy"
+    order = 6
     field = "energy"
     option = "--energy"
     unit = ""
@@ -57,16 +58,18 @@ class Energy(WholeLimit):
         slope = 3 * share * np.abs(share) / share.size
         d_commands[:, self._places] += weight * slope / [full for _, full in self.speeds]
 
+    @classmethod
+    def of(cls, limits: TrialLimits, trial: LimitedTrial) -> Sequence[Limit]:
+        """Return the limit of all propellers together."""
+        return [] if limits.energy is None else [cls(limits.energy, trial.speeds)]
 
-def _of(limits: TrialLimits, trial: LimitedTrial) -> Sequence[Energy]:
-    return [] if limits.energy is None else [Energy(limits.energy, trial.speeds)]
+    @classmethod
+    def check(cls, limits: TrialLimits) -> None:
+        """Refuse what cannot be asked for."""
+        if limits.energy is not None and not 0 < limits.energy <= 1:
+            raise UsageError(
+                f"the energy share is {limits.energy:g}, it must lie between 0 and 1, full speed."
+            )
 
 
-def _check(limits: TrialLimits) -> None:
-    if limits.energy is not None and not 0 < limits.energy <= 1:
-        raise UsageError(
-            f"the energy share is {limits.energy:g}, it must lie between 0 and 1, full speed."
-        )
-
-
-ENTRY = LimitKind("energy", 6, _of, _check)
+ENTRY = Energy

@@ -10,14 +10,13 @@ from numpy.typing import NDArray
 
 from experiment_design.constraints.limits import (
     Circumstances,
+    Limit,
     LimitedTrial,
-    LimitKind,
     TrialLimits,
     WholeLimit,
     rounded_up,
 )
 from experiment_design.excitation.rollout import Motion
-from greybox.errors import UsageError
 
 Array = NDArray[np.float64]
 
@@ -34,6 +33,7 @@ class HeadingRange(WholeLimit):
 
     place: int
     name = "heading coverage"
+    order = 7
     field = "headings"
     option = "--headings"
     unit = "rad"
@@ -57,16 +57,12 @@ class HeadingRange(WholeLimit):
             f"most that was reached. Lower --headings to {least:g} or lengthen the trial."
         )
 
-
-def _of(limits: TrialLimits, trial: LimitedTrial) -> Sequence[HeadingRange]:
-    if limits.headings is None:
-        return []
-    return [HeadingRange(limits.headings, trial.signals.index("psi"))]
-
-
-def _check(limits: TrialLimits) -> None:
-    if limits.headings is not None and not limits.headings > 0:
-        raise UsageError(f"the heading coverage is {limits.headings:g} rad, must be positive.")
+    @classmethod
+    def of(cls, limits: TrialLimits, trial: LimitedTrial) -> Sequence[Limit]:
+        """Return the range that is to be covered."""
+        if limits.headings is None:
+            return []
+        return [cls(limits.headings, trial.signals.index("psi"))]
 
 
-ENTRY = LimitKind("heading coverage", 7, _of, _check)
+ENTRY = HeadingRange

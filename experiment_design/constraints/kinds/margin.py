@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from experiment_design.constraints.limits import (
     Circumstances,
+    Limit,
     LimitedTrial,
-    LimitKind,
     PathLimit,
     TrialLimits,
     rounded_up,
@@ -36,7 +36,7 @@ class FromZero(PathLimit):
         """Return which margin is within reach instead."""
         unit = f" {self.unit}"
         reached = self.bound - rounded_up(amount)
-        said = f"the {self.name}, {self.bound:g}{unit}, cannot be kept: "
+        said = f"the {self.words}, {self.bound:g}{unit}, cannot be kept: "
         if reached >= 0:
             lower = circumstances.lower or f"{self.option} {0.9 * reached:.3f}"
             said += (
@@ -71,10 +71,12 @@ class Margin(FromZero):
     state: str
     sign: int
     streams: tuple[tuple[float, float], ...] = ()
+    name = "margin"
+    order = 0
     field = "margins"
 
     @property
-    def name(self) -> str:
+    def words(self) -> str:
         """The limit in words."""
         return f"margin of {WORDS.get(self.state, self.state)}"
 
@@ -115,20 +117,22 @@ class Margin(FromZero):
         """Return limits with another margin of this state."""
         return replace(limits, margins=dict(limits.margins) | {self.state: bound})
 
+    @classmethod
+    def of(cls, limits: TrialLimits, trial: LimitedTrial) -> Sequence[Limit]:
+        """Return one margin for each sign that is kept."""
+        pairs = ((trial.d[:2], True), (trial.d[2:], trial.wind_matters))
+        streams = tuple((float(p[0]), float(p[1])) for p, matters in pairs if matters and np.any(p))
+        return [
+            cls(limits.margins.get(n, 0.0), n, sign, streams if n in ("u", "v") else ())
+            for n, sign in limits.signs.items()
+        ]
 
-def _of(limits: TrialLimits, trial: LimitedTrial) -> Sequence[Margin]:
-    pairs = ((trial.d[:2], True), (trial.d[2:], trial.wind_matters))
-    streams = tuple((float(p[0]), float(p[1])) for p, matters in pairs if matters and np.any(p))
-    return [
-        Margin(limits.margins.get(n, 0.0), n, sign, streams if n in ("u", "v") else ())
-        for n, sign in limits.signs.items()
-    ]
+    @classmethod
+    def check(cls, limits: TrialLimits) -> None:
+        """Refuse what cannot be asked for."""
+        for name, value in limits.margins.items():
+            if not 0 <= value < np.inf:
+                raise UsageError(f"the margin of {name} is {value:g} m/s, it must be 0 or more.")
 
 
-def _check(limits: TrialLimits) -> None:
-    for name, value in limits.margins.items():
-        if not 0 <= value < np.inf:
-            raise UsageError(f"the margin of {name} is {value:g} m/s, it must be 0 or more.")
-
-
-ENTRY = LimitKind("margin", 0, _of, _check)
+ENTRY = Margin

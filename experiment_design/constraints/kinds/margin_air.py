@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from experiment_design.constraints.kinds.margin import WORDS, FromZero
-from experiment_design.constraints.limits import LimitedTrial, LimitKind, TrialLimits
+from experiment_design.constraints.limits import Limit, LimitedTrial, TrialLimits
 from greybox.errors import UsageError
 from greybox.rotation import ned_to_body
 
@@ -27,6 +27,8 @@ class AirMargin(FromZero):
 
     state: str
     wind: tuple[float, float]
+    name = "margin through the air"
+    order = 1
     field = "margin_air"
     option = "--margin-air"
     unit = "m/s"
@@ -34,7 +36,7 @@ class AirMargin(FromZero):
     otherwise = "start on another heading (--start)"
 
     @property
-    def name(self) -> str:
+    def words(self) -> str:
         """The limit in words."""
         return f"margin of {WORDS[self.state]} through the air"
 
@@ -44,20 +46,22 @@ class AirMargin(FromZero):
         blown = ned_to_body(ca.SX(north), ca.SX(east), at["psi"])[self.state == "v"]
         return self.bound - ca.fabs(at[self.state] - blown)
 
+    @classmethod
+    def of(cls, limits: TrialLimits, trial: LimitedTrial) -> Sequence[Limit]:
+        """Return one margin for each component."""
+        if limits.margin_air is None:
+            return []
+        wind = (float(trial.d[2]), float(trial.d[3]))
+        return [cls(limits.margin_air, n, wind) for n in ("u", "v") if n in trial.states]
 
-def _of(limits: TrialLimits, trial: LimitedTrial) -> Sequence[AirMargin]:
-    if limits.margin_air is None:
-        return []
-    wind = (float(trial.d[2]), float(trial.d[3]))
-    return [AirMargin(limits.margin_air, n, wind) for n in ("u", "v") if n in trial.states]
+    @classmethod
+    def check(cls, limits: TrialLimits) -> None:
+        """Refuse what cannot be asked for."""
+        if limits.margin_air is not None and not 0 <= limits.margin_air < np.inf:
+            raise UsageError(
+                f"the margin of the velocity through the air is {limits.margin_air:g} m/s, it must "
+                f"be 0 or more."
+            )
 
 
-def _check(limits: TrialLimits) -> None:
-    if limits.margin_air is not None and not 0 <= limits.margin_air < np.inf:
-        raise UsageError(
-            f"the margin of the velocity through the air is {limits.margin_air:g} m/s, it must "
-            f"be 0 or more."
-        )
-
-
-ENTRY = LimitKind("margin through the air", 1, _of, _check)
+ENTRY = AirMargin

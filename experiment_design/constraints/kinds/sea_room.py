@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from experiment_design.constraints.limits import (
     Circle,
     Circumstances,
+    Limit,
     LimitedTrial,
-    LimitKind,
     PathLimit,
     TrialLimits,
 )
@@ -40,10 +40,18 @@ class SeaRoom(PathLimit):
     area: Array | Circle
     position: tuple[float, float]
     name = "sea room"
+    order = 4
     field = "area"
     option = "--area"
     unit = "m"
     signal = "edge"
+
+    @classmethod
+    def of(cls, limits: TrialLimits, trial: LimitedTrial) -> Sequence[Limit]:
+        """Return the clearance from the room's edge."""
+        if limits.area is None:
+            return []
+        return [cls(limits.clearance, limits.area, limits.position)]
 
     @property
     def size(self) -> float:
@@ -53,7 +61,7 @@ class SeaRoom(PathLimit):
     @property
     def phrase(self) -> str:
         """The limit in words: what is set is the room, and its bound is a clearance."""
-        return self.name
+        return self.words
 
     def value(self, at: Mapping[str, ca.SX]) -> ca.SX:
         """Return h."""
@@ -149,14 +157,4 @@ def edge_distance(area: Array | Circle, north: Array, east: Array) -> Array:
     return np.asarray(inside(pair, np.empty((1, *shape)))[0])
 
 
-def _of(limits: TrialLimits, trial: LimitedTrial) -> Sequence[SeaRoom]:
-    if limits.area is None:
-        return []
-    return [SeaRoom(limits.clearance, limits.area, limits.position)]
-
-
-def _check(limits: TrialLimits) -> None:
-    """Nothing: any room may be given."""
-
-
-ENTRY = LimitKind("sea room", 4, _of, _check)
+ENTRY = SeaRoom

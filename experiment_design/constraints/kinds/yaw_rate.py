@@ -9,8 +9,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from experiment_design.constraints.limits import LimitedTrial, LimitKind, PathLimit, TrialLimits
-from greybox.errors import UsageError
+from experiment_design.constraints.limits import Limit, LimitedTrial, PathLimit, TrialLimits
 
 Array = NDArray[np.float64]
 
@@ -20,6 +19,7 @@ class YawRateCap(PathLimit):
     """The largest rate of turn to either side [rad/s]."""
 
     name = "yaw-rate cap"
+    order = 3
     field = "yaw_cap"
     option = "--yaw-cap"
     unit = "rad/s"
@@ -37,15 +37,10 @@ class YawRateCap(PathLimit):
         """Return what the yaw rate must not pass."""
         return [(np.full(len(psi), s * self.bound), s) for s in (1, -1)]
 
-
-def _of(limits: TrialLimits, trial: LimitedTrial) -> Sequence[YawRateCap]:
-    known = limits.yaw_cap is not None and "r" in trial.states
-    return [YawRateCap(float(limits.yaw_cap or 0.0))] if known else []
-
-
-def _check(limits: TrialLimits) -> None:
-    if limits.yaw_cap is not None and not 0 < limits.yaw_cap < np.inf:
-        raise UsageError(f"the yaw-rate cap is {limits.yaw_cap:g}, it must be positive.")
+    @classmethod
+    def of(cls, limits: TrialLimits, trial: LimitedTrial) -> Sequence[Limit]:
+        """Return the cap of a ship that turns."""
+        return super().of(limits, trial) if "r" in trial.states else []
 
 
-ENTRY = LimitKind("yaw-rate cap", 3, _of, _check)
+ENTRY = YawRateCap
