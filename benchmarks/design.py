@@ -40,10 +40,10 @@ from numpy.typing import NDArray
 
 from experiment_design.constraints.limit_program import LimitProgram
 from experiment_design.constraints.limits import TrialLimits
+from experiment_design.criteria.covariance import Criterion
 from experiment_design.excitation.inputs import prbs
 from experiment_design.excitation.rollout import Rollout
 from experiment_design.excitation.schedule import make_schedule
-from experiment_design.information.criteria import Criterion
 from experiment_design.information.sensitivities import SensitivityProgram
 from experiment_design.optimise.search import draw_two_level, within_reach
 from experiment_design.optimise.solve import make_shooting, run_ipopt

@@ -2,7 +2,8 @@
 
 Imports run down this list, never up: `command` and `demo`; what a program calls
 (`discriminate`, `design`, `prepare`, `precision`); `output`; `certificate` and
-`feasibility`; `optimise`; `request`; `information` and `constraints`; `excitation`.
+`feasibility`; `optimise`; `request`; `criteria` and `constraints`; `information`;
+`excitation`.
 
 Stands on `greybox` and is never imported by it. The names here are the promised
 ones; each is loaded when it is first used.

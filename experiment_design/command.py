@@ -6,8 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from experiment_design.criteria.optimality import CRITERIA
 from experiment_design.information.estimators import ESTIMATORS
-from experiment_design.information.optimality import CRITERIA
 from experiment_design.request.exclusions import COEFFICIENTS, require_compatible, spelt
 from greybox.commands.common import (
     add_cluster,

@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiment_design.certificate.certificate import Certificate, absent, certify
+from experiment_design.constraints.kinds.margin import Margin
 from experiment_design.constraints.limits import LimitReport
+from experiment_design.criteria.covariance import Criterion
 from experiment_design.excitation.rollout import Motion
 from experiment_design.feasibility.actuator_delay import late_notes
 from experiment_design.feasibility.checks import (
@@ -26,15 +28,14 @@ from experiment_design.feasibility.constraint_satisfaction import (
     keep_probability,
 )
 from experiment_design.feasibility.least_violation import closest, moved_constant, perturbed
-from experiment_design.information.criteria import Criterion
-from experiment_design.information.moments import MomentProgram, Moments
+from experiment_design.information.moments import MomentProgram
 from experiment_design.optimise.campaign import (
     Found,
     Progress,
-    add_up,
-    own_moments,
+    covariance_of,
     random_campaign,
     search_campaign,
+    sums_of_others,
 )
 from experiment_design.optimise.classical import Alternative, compare_classical
 from experiment_design.optimise.lead_in import after_lead_in
@@ -202,7 +203,7 @@ def _design(
                 f"model less by a first short trial."
             )
     units = [c.unit for c in candidates]
-    covariance = _covariance(problems, units)
+    covariance = covariance_of(problems, units)
     if not np.isfinite(covariance).all() and not request.contrasts:
         raise InfeasibleError(unexcited(problems, units, request))
     if not missing or not best_effort:
@@ -263,21 +264,17 @@ def described(
         When the work began, by `time.perf_counter`.
     """
     criterion = problems[0].criterion
-    covariance = _covariance(problems, units)
+    covariance = covariance_of(problems, units)
     columns = wanted_parameters(request, criterion)
-    versus, random_value = None, float("nan")
+    value = _criterion_value(problems, units, criterion, covariance)
+    versus, random_value, random_std = None, float("nan"), None
     if reference is not None:
-        other = add_up([own_moments(p, u) for p, u in zip(problems, reference, strict=True)])
-        gain = logdet_information(covariance) - logdet_information(
-            criterion.covariance(other[0])[0]
-        )
-        versus = float(np.exp(gain / len(covariance)))
-        random_value = float(criterion.value(other[0])[0])
-        if request.contrasts:
-            random_value = float(problems[0].evaluate(reference[0][None]).value[0])
-            versus = float(
-                np.exp(_criterion_value(problems, units, criterion, covariance) - random_value)
-            )
+        other = covariance_of(problems, reference)
+        random_value = _criterion_value(problems, reference, criterion, other)
+        gain = (logdet_information(covariance) - logdet_information(other)) / len(covariance)
+        versus = float(np.exp(value - random_value if request.contrasts else gain))
+        with np.errstate(invalid="ignore"):
+            random_std = np.asarray(np.sqrt(np.diag(other)))
     values = np.array(
         [sum(float(request.theta[request.structure.index(n)]) for n in c.terms) for c in columns]
     )
@@ -302,7 +299,7 @@ def described(
         tuple(c.name for c in columns),
         values,
         covariance,
-        _criterion_value(problems, units, criterion, covariance),
+        value,
         versus,
         random_value,
         kept,
@@ -316,6 +313,7 @@ def described(
         evaluations,
         time.perf_counter() - began,
         parts,
+        random_std,
     )
 
 
@@ -341,12 +339,6 @@ def _behind(request: PreparedRequest, motion: Motion) -> Motion:
     moved = np.array(request.limits.position) - request.from_first_command().limits.position
     state[..., -2:] -= moved
     return Motion(state, motion.tau[:, n:], motion.commands[:, n:], motion.stable)
-
-
-def _covariance(problems: list[TrialProblem], units: list[Array]) -> Array:
-    """Return the covariance that sequences would give under the nominal prior model."""
-    sums = add_up([own_moments(p, u) for p, u in zip(problems, units, strict=True)])
-    return np.asarray(problems[0].criterion.covariance(sums[0])[0])
 
 
 def _from_closest(
@@ -381,11 +373,7 @@ def _polish(
     for t, problem in enumerate(problems):
         if problem.contrast is not None or not _active(problem, out[t]):
             continue
-        known: tuple[Moments, ...] = ()
-        if len(problems) > 1:
-            pairs = enumerate(zip(problems, out, strict=True))
-            known = add_up([own_moments(p, c.unit) for o, (p, c) in pairs if o != t])
-        here = problem.with_known(known)
+        here = problem.with_known(sums_of_others(problems, [c.unit for c in out], t))
         result = solve_ipopt(here, out[t].unit, iterations=_POLISH, seconds=_PATIENCE)
         if result.outcome is Outcome.REFUSED:
             continue
@@ -471,14 +459,14 @@ def _margins(problems: list[TrialProblem], motions: tuple[Motion, ...]) -> dict[
         program = problem.scenarios[0].limits
         values = program.path_values(motion.state[0])
         states = problem.scenarios[0].rollout.structure.states
-        backoff = program.backoff
-        for i, (name, _) in enumerate(program.limits.signs.items()):
-            least = float((program.path_names[i].bound + backoff[i] - values[i]).min())
-            found[name] = min(found.get(name, np.inf), least)
+        kept = {}
+        for limit, back, value in zip(program.path_limits, program.backoff, values, strict=True):
+            if isinstance(limit, Margin):
+                kept[limit.state] = float((limit.bound + back - value).min())
         for i, name in enumerate(states):
-            if name in ("u", "v") and name not in program.limits.signs:
-                least = float(np.abs(motion.state[0, :, i]).min())
-                found[name] = min(found.get(name, np.inf), least)
+            if name in ("u", "v") and name not in kept:
+                kept[name] = float(np.abs(motion.state[0, :, i]).min())
+        found |= {n: min(found.get(n, np.inf), least) for n, least in kept.items()}
     return found
 
 
@@ -498,6 +486,6 @@ def _limit_reports(
             way = build_problem(plain, t).scenarios[0].limits
             worst = way.worst(whole.state, request.lead_in_samples)[:, 0]
             missed[: len(worst)] = np.maximum(missed[: len(worst)], worst)
-        for name, m in zip(program.names, missed, strict=True):
-            found.append(LimitReport(t, name.name, name.bound, name.unit, float(m)))
+        for limit, m in zip(program.all_limits, missed, strict=True):
+            found.append(LimitReport(t, limit.words, limit.bound, limit.unit, float(m)))
     return tuple(found)

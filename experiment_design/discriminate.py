@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
 
+from experiment_design.criteria.t_optimality import Contrast, Pair
 from experiment_design.design import design_trial
-from experiment_design.information.t_optimality import Contrast, Pair
 from experiment_design.optimise.campaign import Progress
 from experiment_design.optimise.search import draw_two_level
 from experiment_design.output.result import Design
@@ -227,7 +227,8 @@ def _require_different(request: PreparedRequest, names: tuple[str, str]) -> None
     problem = build_problem(request)
     drawn = draw_two_level(problem, np.random.default_rng([29, request.seed]), 5)
     commands = problem.schedule.expand(problem.levels(drawn))
-    largest = float(problem.contrast.value(commands).max()) if problem.contrast else 0.0
+    assert isinstance(problem.contrast, Contrast)
+    largest = float(problem.contrast.value(commands).max())
     if largest < np.log(_SAME):
         raise UsageError(
             f"{names[0]} and {names[1]} predict the same motion within these limits: the expected "

@@ -10,18 +10,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from experiment_design.criteria.cause_power import (
+    WANTED,
+    CausePower,
+    OpenCause,
+    PowerReport,
+)
 from experiment_design.feasibility.checks import require_horizon
 from experiment_design.for_prediction import (
     command_ranges,
     described_plan,
     operating_envelope,
     tightened_search,
-)
-from experiment_design.information.cause_power import (
-    WANTED,
-    CausePower,
-    OpenCause,
-    PowerReport,
 )
 from experiment_design.optimise.envelope_search import (
     EnvelopeSearch,

@@ -387,14 +387,14 @@ def described_plan(
     short = [
         (name, float(m))
         for search in searches
-        for name, m in zip(problems[0].scenarios[0].limits.names, search.candidate.missed,
+        for name, m in zip(problems[0].scenarios[0].limits.all_limits, search.candidate.missed,
                            strict=True)
         if m > 1e-3
     ]  # fmt: skip
     if short and not tightened.backoff:
         name, amount = max(short, key=lambda item: item[1])
         raise InfeasibleError(
-            f"no plan was found that keeps the {name.name} of {name.bound:g} {name.unit}: the "
+            f"no plan was found that keeps the {name.words} of {name.bound:g} {name.unit}: the "
             f"best misses it by {amount:.3g} {name.unit}. Widen it ({name.option}), or narrow "
             f"--envelope."
         )

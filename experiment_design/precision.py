@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from experiment_design.constraints.limits import LimitName
+from experiment_design.constraints.limits import Limit
 from experiment_design.information.moments import Moments
 from experiment_design.optimise.campaign import add_up
 from experiment_design.request.request import PreparedRequest, build_problem, wanted_parameters
@@ -29,13 +29,13 @@ class PredictedPrecision(DisplayMixin):
         The wanted parameters.
     covariance : ndarray
         (p_w, p_w) of their estimates.
-    missed : tuple of (LimitName, float)
+    missed : tuple of (Limit, float)
         By how much each limit of the request is missed at worst, 0 where kept.
     """
 
     names: tuple[str, ...]
     covariance: Array
-    missed: tuple[tuple[LimitName, float], ...]
+    missed: tuple[tuple[Limit, float], ...]
 
     @property
     def std(self) -> Array:
@@ -54,7 +54,7 @@ class PredictedPrecision(DisplayMixin):
         return "\n".join([*lines, *self._missed()])
 
     def _missed(self) -> list[str]:
-        return [f"{n.name} missed by {m:.3g} {n.unit}" for n, m in self.missed if m > 0]
+        return [f"{n.words} missed by {m:.3g} {n.unit}" for n, m in self.missed if m > 0]
 
     def _line(self) -> str:
         missed = len(self._missed())
@@ -126,7 +126,7 @@ def predict_precision(
             f"these plans do not excite every direction: the regressor of {weakest} varies by "
             f"{size.min():.2g} over {samples} samples. Move what it multiplies."
         )
-    limits = problem.scenarios[0].limits.names
+    limits = problem.scenarios[0].limits.all_limits
     missed = np.max(worst, axis=0) if limits else np.zeros(0)
     return PredictedPrecision(
         tuple(c.name for c in wanted_parameters(request, criterion)),

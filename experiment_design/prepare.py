@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiment_design.constraints.limits import TrialLimits
-from experiment_design.feasibility.checks import ROOM, tells_enough, with_margins
+from experiment_design.feasibility.checks import ROOM, tells_enough
 from experiment_design.feasibility.stability import unstable_sentence
 from experiment_design.optimise.campaign import random_campaign
 from experiment_design.request.apparent_wind import clear_heading
@@ -400,7 +400,7 @@ def _beyond_reach(
             base,
             regimes=(held,) * base.trials,
             starts=(_clear_of_wind(start, base),) * base.trials,
-            limits=with_margins(base.limits, margins),
+            limits=replace(base.limits, margins=asked | margins),
         )
         if tells_enough(eased):
             options = " ".join(f"--margin-{n} {v:g}" for n, v in margins.items())

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from experiment_design.constraints.limits import LimitReport, TrialLimits
-from experiment_design.optimise.campaign import add_up, own_moments
+from experiment_design.optimise.campaign import covariance_of
 from experiment_design.optimise.classical import Alternative
 from experiment_design.output.result import Design
 from experiment_design.prepare import prepare_request
@@ -85,13 +85,15 @@ def random_plan(model, ship, *, duration=600.0, uncertain=False, trials=1, limit
         p.scenarios[0].rollout.run(c[None]) for p, c in zip(problems, commands, strict=True)
     )
     criterion = problems[0].criterion
-    sums = add_up([own_moments(p, u) for p, u in zip(problems, units, strict=True)])
+
     names = tuple(request.build_predictor().columns[i].name for i in criterion.wanted)
+    covariance = covariance_of(problems, units)
     return Design(
         request=request, commands=commands, levels=levels, motions=motions, names=names,
         values=np.array([request.theta[request.structure.index(n)] for n in names]),
-        covariance=criterion.covariance(sums[0])[0], criterion_value=1.0,
+        covariance=covariance, criterion_value=1.0,
         efficiency_vs_random=1.25, random_value=0.8, random_kept=200,
+        random_std=1.2 * np.sqrt(np.diag(covariance)),
         certificate=SimpleNamespace(
             sentence=lambda: "at least 0.7 of the best possible", efficiency_lower_bound=0.7,
             to_dict=dict,

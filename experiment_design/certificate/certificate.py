@@ -38,7 +38,7 @@ from experiment_design.certificate.trajectory_bound import (
 )
 from experiment_design.constraints.limit_program import LimitProgram
 from experiment_design.constraints.limits import TrialLimits
-from experiment_design.information.criteria import Criterion
+from experiment_design.criteria.covariance import Criterion
 from experiment_design.information.moments import Moments
 from experiment_design.information.sensitivities import SensitivityProgram
 from experiment_design.optimise.search import ascend, draw_two_level, perturb
@@ -473,7 +473,7 @@ def certify(
     bounds = np.array([p.bound for p in parts])
     value = float(values.min() if first.worst_case else values @ share / share.sum())
     bound = float(bounds.min() if first.worst_case else bounds @ share / share.sum())
-    size = len(first.criterion.wanted) if first.criterion.optimality.determinant else 1
+    size = first.criterion.shared_by
     several = f"Each of {count} scenarios by itself. " if count > 1 else ""
     efficiency = float(np.exp(min(value - bound, 0.0) / size))
     return Certificate(
@@ -544,8 +544,7 @@ def _bound(
     if len(problems) == 1 and not why_not_trajectory(problems[0], relaxed=True):
         # even if the design had the most information that the floor allows
         least = relaxed_value(problems[0], units[0])
-        size = len(criterion.wanted) if criterion.optimality.determinant else 1
-        if least < part.bound and value - least > size * np.log(INFORMATIVE):
+        if least < part.bound and value - least > criterion.shared_by * np.log(INFORMATIVE):
             grid = bound_trajectory(
                 problems[0], units[0], seed, limits=limits, relaxed=True, share=share
             )

@@ -41,7 +41,6 @@ from scipy.sparse import csr_matrix
 from scipy.spatial import ConvexHull
 
 from experiment_design.constraints.limit_program import LimitProgram
-from experiment_design.constraints.limits import LimitKind
 from experiment_design.excitation.rollout import Rollout
 from experiment_design.information.moments import MomentProgram, Moments
 from experiment_design.optimise.search import draw_two_level
@@ -489,7 +488,7 @@ class _Trial:
 
     def misses(self, x: Array, psi: Array, room: Array | float) -> NDArray[np.bool_]:
         """Return which runs miss a limit on the speeds by more than `room` of each axis, (R,)."""
-        if self.limits is None or not self.limits.path_names:
+        if self.limits is None or not self.limits.path_limits:
             return np.zeros(len(x), bool)
         state = np.zeros((*psi.shape, self.nx + 3))
         state[..., : self.nx], state[..., self.nx] = x, psi
@@ -497,19 +496,8 @@ class _Trial:
         names = self.rollout.structure.states
         sides = np.broadcast_to(room, (self.axes,))
         side = {n: float(sides[i]) for i, n in enumerate(names)}
-        both = float(np.hypot(side.get("u", 0.0), side.get("v", 0.0)))
-        out = np.zeros(len(x), bool)
-        for name, values in zip(self.limits.path_names, missed, strict=True):
-            if name.kind is LimitKind.SEA_ROOM:
-                continue
-            if name.kind is LimitKind.YAW_RATE:
-                most = side.get("r", 0.0)
-            elif name.kind is LimitKind.MARGIN and name.margin in side:
-                most = side[name.margin]
-            else:
-                most = both
-            out |= values > most
-        return out
+        most = np.array([limit.reach(side) for limit in self.limits.path_limits])
+        return np.asarray((missed > most[:, None]).any(axis=0))
 
 
 @dataclass(frozen=True)

@@ -1,15 +1,22 @@
-"""What a trial must keep: margins from the origin, sea room, caps, end state, energy, headings."""
+"""What a trial must keep, as plain data, and what a limit is; each kind is one file of `kinds`.
+
+A limit is one number h at each sample or one a trial, negative where it is kept.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from enum import Enum
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from experiment_design.excitation.rollout import Motion
 from greybox.errors import UsageError
+from greybox.registry import Registry
 
 Array = NDArray[np.float64]
 
@@ -79,73 +86,198 @@ class TrialLimits:
     headings: float | None = None
 
     def __post_init__(self) -> None:
-        for name, value in self.margins.items():
-            if not 0 <= value < np.inf:
-                raise UsageError(f"the margin of {name} is {value:g} m/s, it must be 0 or more.")
-        if self.margin_air is not None and not 0 <= self.margin_air < np.inf:
-            raise UsageError(
-                f"the margin of the velocity through the air is {self.margin_air:g} m/s, it must "
-                f"be 0 or more."
-            )
-        for what, cap in (("speed", self.speed_cap), ("yaw-rate", self.yaw_cap)):
-            if cap is not None and not 0 < cap < np.inf:
-                raise UsageError(f"the {what} cap is {cap:g}, it must be positive.")
-        if self.energy is not None and not 0 < self.energy <= 1:
-            raise UsageError(
-                f"the energy share is {self.energy:g}, it must lie between 0 and 1, full speed."
-            )
-        if self.headings is not None and not self.headings > 0:
-            raise UsageError(f"the heading coverage is {self.headings:g} rad, must be positive.")
-        kept = [self.margins.get(s, 0.0) for s in ("u", "v") if s in self.signs]
-        floor = float(np.linalg.norm(kept))
-        if self.speed_cap is not None and self.speed_cap <= floor:
-            raise UsageError(
-                f"the limits contradict: margins of {self.margins.get('u', 0.0):g} and "
-                f"{self.margins.get('v', 0.0):g} m/s in surge and sway need a speed of at least "
-                f"{floor:.3g} m/s, the cap is {self.speed_cap:g} m/s. Raise the cap above "
-                f"{floor:.3g}, or lower the margins."
-            )
-
-
-class LimitKind(Enum):
-    """What a limit bounds."""
-
-    MARGIN = "margin of"
-    SPEED = "speed cap"
-    YAW_RATE = "yaw-rate cap"
-    SEA_ROOM = "sea room"
-    END_STATE = "end state of"
-    ENERGY = "energy"
-    HEADINGS = "heading coverage"
+        for kind in LIMITS.values():
+            kind.check(self)
 
 
 @dataclass(frozen=True)
-class LimitName:
-    """One limit: what it bounds, in words too, its bound and unit, and the option that sets it.
+class LimitedTrial:
+    """What a limit has to know of the trial that it is set to.
 
     Parameters
     ----------
-    kind : LimitKind
-    bound : float
-    unit : str
-    option : str
-    of : str
-        What a margin or an end state is of, in words.
-    margin : str
-        Key of a margin: a state, or ``air``; empty for other limits.
+    states : tuple of str
+    d : ndarray
+        (nd,) means of current and wind, north and east [m/s].
+    wind_matters : bool
+        Whether the velocity through the air must keep its sign too (5.7), as it
+        must where the wind is not measured.
+    speeds : tuple of (int, float)
+        Place of each propeller speed among the commands, and its full speed.
     """
 
-    kind: LimitKind
-    bound: float
-    unit: str
-    option: str
-    of: str = ""
-    margin: str = ""
+    states: tuple[str, ...]
+    d: Array
+    wind_matters: bool = False
+    speeds: tuple[tuple[int, float], ...] = ()
 
     @property
-    def name(self) -> str:
+    def signals(self) -> tuple[str, ...]:
+        """Names of the entries of a motion's state."""
+        return (*self.states, "psi", "x_n", "y_n")
+
+
+@dataclass(frozen=True)
+class Circumstances:
+    """What may explain why a limit cannot be kept.
+
+    Parameters
+    ----------
+    current : float
+        Speed of the expected current [m/s].
+    smallest_circle : callable
+        Returns the diameter of the smallest circle that the vessel turns within the limits [m],
+        inf where she turns in none, None where no steady motion keeps them.
+    lower : str
+        Margins that were found to help, as options.
+    """
+
+    current: float
+    smallest_circle: Callable[[], float | None]
+    lower: str = ""
+
+
+@dataclass(frozen=True)
+class Limit(ABC):
+    """One limit of one trial.
+
+    Parameters
+    ----------
+    bound : float
+        In `unit`.
+    """
+
+    bound: float
+
+    # of the kind; its place among limits, and the field of `TrialLimits` that sets it
+    name: ClassVar[str]
+    order: ClassVar[int]
+    field: ClassVar[str]
+
+    @classmethod
+    def of(cls, limits: TrialLimits, trial: LimitedTrial) -> Sequence[Limit]:
+        """Return the limits of this kind that a trial has."""
+        bound = getattr(limits, cls.field)
+        return [] if bound is None else [cls(bound)]
+
+    @classmethod
+    def check(cls, limits: TrialLimits) -> None:
+        """Refuse what cannot be asked for."""
+        bound = getattr(limits, cls.field)
+        if isinstance(bound, int | float) and not 0 < bound < np.inf:
+            raise UsageError(f"the {cls.name} is {bound:g}, it must be positive.")
+
+    @property
+    def words(self) -> str:
         """The limit in words."""
-        return f"{self.kind.value} {self.of}".rstrip()
+        return self.name
+
+    @property
+    @abstractmethod
+    def unit(self) -> str:
+        """Unit of the bound and of what it is missed by."""
+
+    @property
+    @abstractmethod
+    def option(self) -> str:
+        """Option of `greybox design` that sets it."""
+
+    @property
+    def scale(self) -> float:
+        """What counts as one in the solvers, in its unit."""
+        return UNIT_SCALE[self.unit]
+
+    @property
+    def size(self) -> float:
+        """A size of which a small share is worth a try when it is relaxed, in its unit."""
+        return self.bound
+
+    @property
+    def phrase(self) -> str:
+        """The limit in words, with its bound."""
+        return f"{self.words} of {self.bound:g} {self.unit}".rstrip()
+
+    def with_bound(self, limits: TrialLimits, bound: float) -> TrialLimits:
+        """Return the limits of a trial with another bound for this one."""
+        changes: dict[str, Any] = {self.field: bound}
+        return replace(limits, **changes)
+
+    def eased(self, limits: TrialLimits, more: float) -> tuple[TrialLimits, str]:
+        """Return the limits of a trial with this one relaxed, and in words what to do for it."""
+        value = float(f"{self.bound + more:.3g}")
+        return self.with_bound(limits, value), f"Use {self.option} {value:g}"
+
+    def advice(self, amount: float, circumstances: Circumstances) -> str:
+        """Return why a trial cannot be, and the least change that was found to help.
+
+        Parameters
+        ----------
+        amount : float
+            By how much it is missed at best, in its unit.
+        circumstances : Circumstances
+        """
+        unit = f" {self.unit}".rstrip()
+        return (
+            f"the {self.phrase} cannot be kept: it is missed by {amount:.3g}{unit} at best. Raise "
+            f"{self.option} to {self.bound + rounded_up(amount):.4g}{unit}."
+        )
+
+
+class PathLimit(Limit):
+    """A limit at each sample of a trial."""
+
+    # whether it holds in the regime alone, and not on the way into it
+    of_regime = False
+
+    @property
+    @abstractmethod
+    def signal(self) -> str:
+        """Signal of a predicted motion that it bounds, empty where it is none of those shown."""
+
+    @abstractmethod
+    def value(self, at: Mapping[str, ca.SX]) -> ca.SX:
+        """Return h of states, heading, and north and east by their names."""
+
+    def reach(self, side: Mapping[str, float]) -> float:
+        """Return by how much h may rise where each speed differs by up to `side`."""
+        return float(np.hypot(side.get("u", 0.0), side.get("v", 0.0)))
+
+    def start_advice(self, missed: float) -> str:
+        """Return why a trial cannot start where it does, by what it misses the limit."""
+        # a start on the limit itself could be left on one side only
+        return (
+            f"the trial starts {missed:.3g} {self.unit} beyond the {self.phrase}: change --start, "
+            f"or relax {self.option} by {1.2 * missed:.2g}."
+        )
+
+    def edges(self, psi: Array) -> list[tuple[Array, int]]:
+        """Return what its signal must not pass on headings (N,) [rad], and the side of it, ±1."""
+        return []
+
+
+class WholeLimit(Limit):
+    """A limit on a trial as a whole."""
+
+    @abstractmethod
+    def values(self, motion: Motion) -> Array:
+        """Return h of R motions, (R,)."""
+
+    @abstractmethod
+    def pull(self, motion: Motion, weight: float, d_state: Array, d_commands: Array) -> None:
+        """Add the derivatives of weight · h of one motion in states and commands."""
+
+
+def rounded_up(amount: float) -> float:
+    """Return an amount to three decimals, not less than it is."""
+    return float(np.ceil(amount * 1e3) / 1e3)
+
+
+LIMITS: Registry[type[Limit]] = Registry("limit", package="experiment_design.constraints.kinds")
+
+
+def limits_of(limits: TrialLimits, trial: LimitedTrial) -> tuple[Limit, ...]:
+    """Return every limit of a trial, those on its path first."""
+    return tuple(x for kind in LIMITS.values() for x in kind.of(limits, trial))
 
 
 @dataclass(frozen=True)

@@ -7,26 +7,20 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from experiment_design.constraints.limits import (
-    TOLERANCE,
-    Circle,
-    LimitKind,
-    LimitName,
-    TrialLimits,
-)
+from experiment_design.constraints.kinds.margin import FromZero
+from experiment_design.constraints.limits import TOLERANCE, Circumstances, Limit
 from experiment_design.feasibility.least_violation import (
-    in_words,
     least_change,
     moved_constant,
     perturbed,
 )
 from experiment_design.feasibility.stability import unstable_sentence
 from experiment_design.information.estimators import ESTIMATORS
-from experiment_design.information.optimality import CRITERIA
 from experiment_design.optimise.campaign import (
-    add_up,
-    own_moments,
     random_campaign,
+    std_of,
+    sums_of_all,
+    sums_of_others,
 )
 from experiment_design.optimise.duration import telling_duration
 from experiment_design.optimise.search import Candidate, ascend, assess
@@ -72,10 +66,10 @@ def require_informative(
 
     `hopeless` is how many times vaguer random sequences may be than the design.
     """
-    if request.targets or request.contrasts or CRITERIA[request.criterion].combined:
+    if not request.tells_each:
         return []
     names = [c.name for c in wanted_parameters(request, problems[0].criterion)]
-    share = _relative_errors(problems, units)
+    share = std_of(problems, units) / problems[0].criterion.scale
     if hopeless > 1 and not np.isfinite(share).all():
         return []
     vague = [n for n, s in zip(names, share, strict=True) if s > hopeless * _VAGUE]
@@ -103,37 +97,15 @@ def require_informative(
     ]
 
 
-def _relative_errors(problems: list[TrialProblem], units: list[Array]) -> Array:
-    """Return the predicted standard errors as shares of the prior values."""
-    criterion = problems[0].criterion
-    sums = add_up([own_moments(p, u) for p, u in zip(problems, units, strict=True)])
-    return np.asarray(np.sqrt(np.diag(criterion.covariance(sums[0])[0])) / criterion.scale)
-
-
 def require_start(problem: TrialProblem, request: PreparedRequest, trial: int) -> None:
     """Raise where the start itself breaks a limit."""
     program = problem.scenarios[0].limits
     start = np.zeros(program.nx + 3)
     start[: program.nx + 1] = request.starts[trial]
     missed = program.path_values(start[None])[:, 0]
-    for name, m, more in zip(
-        program.path_names, missed, [*request.backoff, *[0.0] * len(missed)], strict=False
-    ):
+    for limit, m, more in zip(program.path_limits, missed, program.backoff, strict=True):
         if m - more > TOLERANCE:
-            where = (
-                f"{m:.1f} m outside the sea room"
-                if name.kind is LimitKind.SEA_ROOM
-                else f"{m:.3g} {name.unit} beyond the {name.name} of {name.bound:g} {name.unit}"
-            )
-            if name.kind is LimitKind.SEA_ROOM:
-                raise InfeasibleError(
-                    f"the trial starts {where}: move it by --position, or the sea room."
-                )
-            # a start on the limit itself could be left on one side only
-            room = f"{1.2 * m:.2g}"
-            raise InfeasibleError(
-                f"the trial starts {where}: change --start, or relax {name.option} by {room}."
-            )
+            raise InfeasibleError(limit.start_advice(float(m)))
 
 
 def require_stable(request: PreparedRequest) -> None:
@@ -156,47 +128,36 @@ def feasible_or_reason(
         # what keeps the limits tells nothing, so that the limits are what stops the trial
         chosen = best
     changes = least_change(problem, chosen)
-    name, amount = changes[0]
-    more = _turning(request) if name.kind is LimitKind.SEA_ROOM else ""
-    if name.kind is LimitKind.MARGIN and request.d[:2].any():
-        more += (
-            f" Margins are kept through the water too, and a current of "
-            f"{float(np.hypot(*request.d[:2])):.2g} m/s is expected."
-        )
-    lower = ""
-    if all(n.kind is LimitKind.MARGIN for n, _ in changes):
-        lower = _margins_within_reach(request, trial, chosen, changes)
-    return chosen, in_words(name, amount, more, lower)
+    circumstances = Circumstances(
+        float(np.hypot(*request.d[:2])),
+        lambda: _smallest_circle(request),
+        _margins_within_reach(request, trial, chosen, changes),
+    )
+    limit, amount = changes[0]
+    return chosen, limit.advice(amount, circumstances)
 
 
 def _margins_within_reach(
-    request: PreparedRequest, trial: int, chosen: Candidate, changes: list[tuple[LimitName, float]]
+    request: PreparedRequest, trial: int, chosen: Candidate, changes: list[tuple[Limit, float]]
 ) -> str:
     """Return the margins, as options, under which sequences around one keep every limit.
 
-    What it reaches itself leaves no room to move in, so that shares of it are tried.
+    Empty where margins are not all that is missed. What the sequence reaches itself leaves no
+    room to move in, so that shares of it are tried.
     """
-    reached = {n.margin: n.bound - m for n, m in changes}
+    if not all(isinstance(x, FromZero) for x, _ in changes):
+        return ""
     for share in ROOM:
-        margins = {n: np.floor(1e3 * share * v) / 1e3 for n, v in reached.items()}
-        if min(margins.values()) < 0:
-            return ""
-        problem = build_problem(
-            replace(request, limits=with_margins(request.limits, margins)), trial
-        )
+        limits, told = request.limits, {}
+        for limit, missed in changes:
+            bound = float(np.floor(1e3 * share * (limit.bound - missed)) / 1e3)
+            if bound < 0:
+                return ""
+            limits, told[limit.option] = limit.with_bound(limits, bound), bound
+        problem = build_problem(replace(request, limits=limits), trial)
         if perturbed(problem, assess(problem, chosen.unit[None])[0], request.seed).feasible:
-            return " ".join(f"--margin-{n} {v:g}" for n, v in margins.items())
+            return " ".join(f"{option} {bound:g}" for option, bound in told.items())
     return ""
-
-
-def with_margins(limits: TrialLimits, margins: dict[str, float]) -> TrialLimits:
-    """Return the limits with other margins, that through the air under the name ``air``."""
-    kept = {k: v for k, v in margins.items() if k != "air"}
-    return replace(
-        limits,
-        margins=dict(limits.margins) | kept,
-        margin_air=margins.get("air", limits.margin_air),
-    )
 
 
 def tells_enough(request: PreparedRequest) -> bool:
@@ -209,43 +170,24 @@ def tells_enough(request: PreparedRequest) -> bool:
     if len(units) < len(problems):
         return False
     for t, problem in enumerate(problems):
-        here = problem
-        if request.trials > 1:
-            pairs = zip(problems, units, strict=True)
-            here = problem.with_known(
-                add_up([own_moments(p, u) for o, (p, u) in enumerate(pairs) if o != t])
-            )
+        here = problem.with_known(sums_of_others(problems, units, t))
         found = ascend(here, units[t], _BRIEF)
         if found.feasible:
             units[t] = found.unit
-    if request.targets or request.contrasts or CRITERIA[request.criterion].combined:
+    if not request.tells_each:
         return True
-    share = _relative_errors(problems, units)
+    share = std_of(problems, units) / problems[0].criterion.scale
     return bool(2 * (share > _VAGUE).sum() <= share.size)
 
 
-def _turning(request: PreparedRequest) -> str:
-    """Return what the turning circle has to do with the sea room, where it has."""
+def _smallest_circle(request: PreparedRequest) -> float | None:
+    """Return the diameter of the smallest circle that keeps the regime [m], None without any."""
     steady = steady_motions(request)
     signs = np.ones(len(steady.x), bool)
     for state, sign in request.regimes[0]:
         column = steady.x[:, request.structure.states.index(state)]
         signs &= column * sign >= request.limits.margins.get(state, 0.0)
-    if not signs.any():
-        return ""
-    smallest = float(steady.diameter[signs].min())
-    area = request.limits.area
-    if isinstance(area, Circle):
-        width = 2 * area.radius
-    else:
-        corners = np.asarray(area, float)
-        width = float(np.ptp(corners, axis=0).min())
-    if not np.isfinite(smallest):
-        return " No constant command within the limits turns the vessel."
-    return (
-        f" The sea room is {width:.0f} m across; the smallest circle that the vessel turns within "
-        f"these limits is {smallest:.0f} m."
-    )
+    return float(steady.diameter[signs].min()) if signs.any() else None
 
 
 def unexcited(problems: list[TrialProblem], units: list[Array], request: PreparedRequest) -> str:
@@ -255,7 +197,7 @@ def unexcited(problems: list[TrialProblem], units: list[Array], request: Prepare
             "this trial cannot tell the parameters of an output-error fit apart: lengthen it, "
             "widen the limits, or use --predictor basic."
         )
-    sums = add_up([own_moments(p, u) for p, u in zip(problems, units, strict=True)])[0]
+    sums = sums_of_all(problems, units)
     predictor = request.build_predictor()
     worst, label, state = np.inf, "", ""
     for name in request.structure.states:

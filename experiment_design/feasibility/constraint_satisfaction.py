@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from experiment_design.constraints.limit_program import LimitProgram
+from experiment_design.constraints.kinds.margin import Margin
 from experiment_design.excitation.rollout import Rollout
 from experiment_design.request.request import PreparedRequest
-from greybox.model.predictor_kinds import PREDICTORS
 from greybox.numerics.binomial import wilson_interval
 
 Array = NDArray[np.float64]
@@ -83,14 +82,12 @@ def keep_probability(
     missed: list[Array] = []
     thetas = request.draw_models(draws, 1)
     plain = replace(request, backoff=())
-    kind = PREDICTORS[plain.predictor]
-    wind = kind.captures and not kind.air_measured
     for t, c in enumerate(commands):
         nominal = Rollout(
             plain.vessel, plain.structure, plain.theta, plain.d, plain.starts[t],
             plain.sample_time, plain.integrator,
         )  # fmt: skip
-        program = LimitProgram(nominal, schedule, plain.trial_limits(t), wind_matters=wind)
+        program = plain.limit_program(nominal, t)
         motion = nominal.run_models(thetas, c, late=True)
         over = program.worst(motion.state, since)
         over[:, ~motion.stable] = np.inf
@@ -103,10 +100,9 @@ def keep_probability(
     hits = int(kept.sum())
     low, high = wilson_interval(hits / draws, draws)
     margins = {}
-    for i, name in enumerate(request.trial_limits(0).signs):
-        margins[name] = request.limits.margins.get(name, 0.0) - _quantile(
-            worst[i], request.probability, np.inf
-        )
+    for limit, w in zip(program.path_limits, worst, strict=True):
+        if isinstance(limit, Margin):
+            margins[limit.state] = limit.bound - _quantile(w, request.probability, np.inf)
     return ConstraintSatisfaction(
         hits / draws, low, high, draws, np.maximum(shortfall, 0.0), margins
     )

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from experiment_design.constraints.limits import TOLERANCE, LimitKind, LimitName
+from experiment_design.constraints.limits import TOLERANCE, Limit
 from experiment_design.optimise.search import (
     Candidate,
     assess,
@@ -114,65 +114,8 @@ def _shortfall(flat: Array, problem: TrialProblem, penalty: float) -> tuple[floa
     return cost, (without[2] - with_penalty[2]).ravel()
 
 
-def least_change(problem: TrialProblem, best: Candidate) -> list[tuple[LimitName, float]]:
+def least_change(problem: TrialProblem, best: Candidate) -> list[tuple[Limit, float]]:
     """Return each limit that a sequence misses with the amount, the worst first."""
-    names = problem.scenarios[0].limits.names
-    scale = limit_scale(problem)
-    missed = [(name, float(m)) for name, m in zip(names, best.missed, strict=True) if m > TOLERANCE]
-    order = {n.name: s for n, s in zip(names, scale, strict=True)}
-    return sorted(missed, key=lambda item: -item[1] / order[item[0].name])
-
-
-def in_words(name: LimitName, amount: float, what: str = "", lower: str = "") -> str:
-    """Return one sentence: what stops the trial, and the least change that was found to help.
-
-    Parameters
-    ----------
-    name : LimitName
-    amount : float
-        By how much it is missed at best, in its unit.
-    what : str
-        What more there is to say.
-    lower : str
-        Margins to ask for instead, as options.
-    """
-    a = float(np.ceil(amount * 1e3) / 1e3)
-    unit = f" {name.unit}" if name.unit else ""
-    if name.kind is LimitKind.MARGIN:
-        reached = name.bound - a
-        if reached >= 0:
-            other = "start on another heading (--start)"
-            if name.margin != "air":
-                other = "choose another --regime"
-            return (
-                f"the {name.name}, {name.bound:g}{unit}, cannot be kept: {reached:.3f}{unit} is "
-                f"the most that was reached. Use {lower or f'{name.option} {0.9 * reached:.3f}'}, "
-                f"widen the limits of the thrusters, or {other}.{what}"
-            )
-        return (
-            f"the {name.name}, {name.bound:g}{unit}, cannot be kept: the sign changes by "
-            f"{-reached:.3f}{unit} in every sequence that was tried. Choose another --regime or "
-            f"widen the limits of the thrusters.{what}"
-        )
-    if name.kind is LimitKind.SEA_ROOM:
-        return (
-            f"the sea room is too small: the best sequence leaves it by {amount:.1f} m. Enlarge "
-            f"it by {np.ceil(amount):.0f} m on every side, or shorten the trial.{what}"
-        )
-    if name.kind is LimitKind.HEADINGS:
-        least = np.floor(99 * (name.bound - a)) / 100
-        return (
-            f"headings cannot cover {name.bound:.3g} rad: {name.bound - amount:.3g} rad is the "
-            f"most that was reached. Lower --headings to {least:g} or "
-            f"lengthen the trial.{what}"
-        )
-    if name.kind is LimitKind.END_STATE:
-        return (
-            f"the {name.name} within {name.bound:g}{unit} cannot be reached: it is missed by "
-            f"{amount:.3g}{unit} beyond that. Raise the tolerance in --end to "
-            f"{name.bound + a:.4g}{unit}, or lengthen the trial.{what}"
-        )
-    return (
-        f"the {name.name} of {name.bound:g}{unit} cannot be kept: it is missed by "
-        f"{amount:.3g}{unit} at best. Raise {name.option} to {name.bound + a:.4g}{unit}.{what}"
-    )
+    limits = problem.scenarios[0].limits.all_limits
+    missed = [(x, float(m)) for x, m in zip(limits, best.missed, strict=True) if m > TOLERANCE]
+    return sorted(missed, key=lambda item: -item[1] / item[0].scale)

@@ -21,6 +21,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from experiment_design.excitation.rollout import Motion
 from greybox.model.disturbances import velocity_through
 from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import Predictor
@@ -54,6 +55,15 @@ class InformationModel(Protocol):
     ) -> tuple[Array, Array]:
         """Carry derivatives in the sums back to states with heading, and inputs."""
         ...
+
+
+def moments_of(
+    information: InformationModel, motion: Motion, known: Moments | None = None
+) -> Moments:
+    """Return the sums of R motions, those of other trials included."""
+    nx = motion.state.shape[2] - 3
+    own = information(motion.state[:, :-1, :nx], motion.state[:, :-1, nx], motion.tau)
+    return own if known is None else own + known
 
 
 def measured_air(structure: Structure, north: ca.SX, east: ca.SX) -> tuple[ca.SX, ca.SX]:

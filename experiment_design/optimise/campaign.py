@@ -94,6 +94,31 @@ def add_up(parts: list[tuple[Moments, ...]]) -> tuple[Moments, ...]:
     return total
 
 
+def sums_of_others(problems: list[TrialProblem], units: list[Array], t: int) -> tuple[Moments, ...]:
+    """Return the sums of all trials but one, under each scenario; empty for a single trial."""
+    others = [
+        own_moments(p, u) for o, (p, u) in enumerate(zip(problems, units, strict=True)) if o != t
+    ]
+    return add_up(others) if others else ()
+
+
+def sums_of_all(problems: list[TrialProblem], units: list[Array]) -> Moments:
+    """Return the sums of all trials under the nominal prior model."""
+    return add_up([own_moments(p, u) for p, u in zip(problems, units, strict=True)])[0]
+
+
+def covariance_of(problems: list[TrialProblem], units: list[Array]) -> Array:
+    """Return the covariance (p_w, p_w) that sequences would give under the nominal prior model."""
+    return np.asarray(problems[0].criterion.covariance(sums_of_all(problems, units))[0])
+
+
+def std_of(problems: list[TrialProblem], units: list[Array]) -> Array:
+    """Return the standard errors (p_w,) that sequences would give."""
+    # of a parameter that the trial does not tell the covariance is infinite
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.sqrt(np.diag(covariance_of(problems, units))))
+
+
 @dataclass(frozen=True)
 class Found:
     """What a search found: a candidate a trial, and what it took.
@@ -128,10 +153,10 @@ def random_campaign(problems: list[TrialProblem], seed: int) -> tuple[list[Array
     best_value = -np.inf
     best_units: list[Array] | None = None
     for i in range(count):
-        parts = [own_moments(p, q[i]) for p, q in zip(problems, pools, strict=True)]
-        value = float(problems[0].criterion.value(add_up(parts)[0])[0])
+        units = [pool[i] for pool in pools]
+        value = float(problems[0].criterion.value(sums_of_all(problems, units))[0])
         if value > best_value:
-            best_value, best_units = value, [q[i] for q in pools]
+            best_value, best_units = value, units
     return best_units, count
 
 
@@ -183,12 +208,7 @@ def search_campaign(
     try:
         for _ in range(passes):
             for t, problem in enumerate(problems):
-                known: tuple[Moments, ...] = ()
-                if trials > 1:
-                    others = [
-                        own_moments(problems[o], best[o].unit) for o in range(trials) if o != t
-                    ]
-                    known = add_up(others)
+                known = sums_of_others(problems, [b.unit for b in best], t)
                 scale = limit_scale(problem)
                 here = problem.with_known(known)
                 best[t] = assess(here, best[t].unit[None])[0]

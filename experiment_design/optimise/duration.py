@@ -11,13 +11,11 @@ from numpy.typing import NDArray
 from experiment_design.excitation.schedule import MOST_SAMPLES
 from experiment_design.optimise.campaign import (
     Progress,
-    add_up,
-    own_moments,
     random_campaign,
     search_campaign,
+    std_of,
 )
 from experiment_design.optimise.lead_in import after_lead_in
-from experiment_design.request.problem import TrialProblem
 from experiment_design.request.request import PreparedRequest, build_problem, wanted_columns
 from greybox.errors import InfeasibleError, UsageError
 
@@ -36,13 +34,7 @@ def random_shares(request: PreparedRequest) -> Array | None:
     units, _ = random_campaign(problems, request.seed)
     if units is None:
         return None
-    return _std(problems, units) / problems[0].criterion.scale
-
-
-def _std(problems: list[TrialProblem], units: list[Array]) -> Array:
-    sums = add_up([own_moments(p, u) for p, u in zip(problems, units, strict=True)])
-    covariance = problems[0].criterion.covariance(sums[0])[0]
-    return np.asarray(np.sqrt(np.diag(covariance)))
+    return std_of(problems, units) / problems[0].criterion.scale
 
 
 def telling_duration(request: PreparedRequest, vague: float) -> float | None:
@@ -123,7 +115,7 @@ def least_duration(
             progress(min(tried[0], 14), 15)
         if not all(c.feasible for c in found.candidates) and trial.trials == 1:
             return np.inf, 0
-        ratio = _std(problems, [c.unit for c in found.candidates]) / goal
+        ratio = std_of(problems, [c.unit for c in found.candidates]) / goal
         return float(ratio.max()), int(ratio.argmax())
 
     longest = request.duration

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from experiment_design.constraints.limit_program import LimitProgram
-from experiment_design.constraints.limits import TOLERANCE, LimitKind, LimitName, TrialLimits
+from experiment_design.constraints.limits import TOLERANCE, Limit, PathLimit
 from experiment_design.excitation.rollout import Motion, Rollout
 from experiment_design.excitation.schedule import Schedule
 from experiment_design.request.request import LeadIn, PreparedRequest, build_problem
@@ -46,7 +47,7 @@ def short_of_margin(request: PreparedRequest, trial: int = 0) -> bool:
     start = np.zeros(program.nx + 3)
     start[: program.nx + 1] = request.starts[trial]
     missed = program.path_values(start[None])[:, 0] > TOLERANCE
-    margins = np.array([n.kind is LimitKind.MARGIN for n in program.path_names], bool)
+    margins = program.of_regime
     return bool((missed & margins).any() and not (missed & ~margins).any())
 
 
@@ -94,31 +95,17 @@ class _Shooting:
         self.rollout: Rollout = problem.scenarios[0].rollout
         schedule = request.schedule
         self.schedule: Schedule = replace(schedule, samples=holds * schedule.hold, before=None)
-        limits = request.limits
         self.wanted = problem.scenarios[0].limits
-        self.way = LimitProgram(
-            self.rollout,
-            self.schedule,
-            TrialLimits(
-                area=limits.area,
-                position=limits.position,
-                clearance=limits.clearance,
-                speed_cap=limits.speed_cap,
-                yaw_cap=limits.yaw_cap,
-            ),
-        )
+        self.way = LimitProgram(self.rollout, self.schedule, request.limits, on_way=True)
         bound = np.array(
-            [
-                max(n.bound, _LEAST) if n.kind is LimitKind.MARGIN else 0.0
-                for n in self.wanted.path_names
-            ]
+            [max(x.bound, _LEAST) if x.of_regime else 0.0 for x in self.wanted.path_limits]
         )
         self.aim, self.enough = (_AIM - 1) * bound, (_ENOUGH - 1) * bound
 
     @property
-    def names(self) -> tuple[LimitName, ...]:
+    def limits(self) -> tuple[PathLimit, ...]:
         """Limits of the way, then those at its end."""
-        return (*self.way.path_names, *self.wanted.path_names)
+        return (*self.way.path_limits, *self.wanted.path_limits)
 
     def missed(self, motion: Motion, *, aim: bool = False) -> Array:
         """Return by how much R runs miss each limit at worst, (m, R), negative where kept."""
@@ -241,56 +228,34 @@ def _refusal(request: PreparedRequest, holds: int) -> str:
         f"{told} brings the ship into the regime"
     )
     order = np.argsort(-np.maximum(missed, 0.0) / shooting.scale(), kind="stable")
-    stopping = [(shooting.names[i], float(missed[i])) for i in order if missed[i] > TOLERANCE]
-    on_way = [n for n in shooting.way.path_names if n.kind is not LimitKind.MARGIN]
-    free = replace(request.limits, area=None, speed_cap=None, yaw_cap=None)
+    stopping = [(shooting.limits[i], float(missed[i])) for i in order if missed[i] > TOLERANCE]
+    on_way = shooting.way.path_limits
+    nothing: dict[str, Any] = dict.fromkeys(x.field for x in on_way)
+    free = replace(request.limits, **nothing)
     if on_way and _Shooting(replace(request, limits=free), holds).search() is not None:
         # without the limits on the way there is one, so that one of them stops it
-        for name in on_way:
-            amount = max((m for n, m in stopping if n.kind is name.kind), default=0.0)
-            helps = _relaxed(request, holds, name, max(amount, 0.05 * _size(name)))
+        for limit in on_way:
+            amount = max((m for x, m in stopping if type(x) is type(limit)), default=0.0)
+            helps = _relaxed(request, holds, limit, max(amount, 0.05 * limit.size))
             if helps:
-                # the bound of a sea room is the clearance from its edge
-                room = name.kind is LimitKind.SEA_ROOM
-                what = name.name if room else f"{name.name} of {name.bound:g} {name.unit}"
-                return f"{said}: the {what} stops it. {helps}"
-        names = ", ".join(n.name for n in on_way)
+                return f"{said}: the {limit.phrase} stops it. {helps}"
+        names = ", ".join(x.words for x in on_way)
         return f"{said}: the {names} together stop it. Widen them, or change --start."
-    name, amount = next(
-        (item for item in stopping if item[0].kind is LimitKind.MARGIN), stopping[0]
-    )
-    reached = name.bound - max(amount - (_ENOUGH - 1) * max(name.bound, _LEAST), 0.0)
-    said += f": the {name.name} of {name.bound:g} {name.unit} stops it, {reached:.3g} is reached"
-    margins = request.limits.margins
-    for share in _SHARES if reached > 0 and name.margin in margins else ():
+    limit, amount = next((item for item in stopping if item[0].of_regime), stopping[0])
+    reached = limit.bound - max(amount - (_ENOUGH - 1) * max(limit.bound, _LEAST), 0.0)
+    said += f": the {limit.phrase} stops it, {reached:.3g} is reached"
+    for share in _SHARES if reached > 0 and limit.of_regime else ():
         lower = float(np.floor(1e3 * share * reached) / 1e3)
-        eased = replace(request.limits, margins=dict(margins) | {name.margin: lower})
+        eased = limit.with_bound(request.limits, lower)
         if _Shooting(replace(request, limits=eased), holds).search() is not None:
-            return f"{said}. Use {name.option} {lower:g}, or a --start nearer to the regime."
+            return f"{said}. Use {limit.option} {lower:g}, or a --start nearer to the regime."
     return f"{said}. Choose another --regime, or a --start nearer to it."
 
 
-def _size(name: LimitName) -> float:
-    """Return a size of a limit that a small share of is worth a try, in its unit."""
-    return 100.0 if name.kind is LimitKind.SEA_ROOM else name.bound
-
-
-def _relaxed(request: PreparedRequest, holds: int, name: LimitName, amount: float) -> str:
+def _relaxed(request: PreparedRequest, holds: int, limit: Limit, amount: float) -> str:
     """Return the least relaxation of a limit on the way that lets a lead-in be found."""
-    limits = request.limits
     for times in _RELAXED:
-        more = times * amount
-        if name.kind is LimitKind.SPEED:
-            value = float(f"{name.bound + more:.3g}")
-            eased, helps = replace(limits, speed_cap=value), f"Use --speed-cap {value:g}"
-        elif name.kind is LimitKind.YAW_RATE:
-            value = float(f"{name.bound + more:.3g}")
-            eased, helps = replace(limits, yaw_cap=value), f"Use --yaw-cap {value:g}"
-        else:
-            # a clearance below zero is a room that is wider on every side
-            more = float(np.ceil(more))
-            eased = replace(limits, clearance=limits.clearance - more)
-            helps = f"Enlarge it by {more:g} m on every side"
+        eased, helps = limit.eased(request.limits, times * amount)
         if _Shooting(replace(request, limits=eased), holds).search() is not None:
             return f"{helps}, or start elsewhere (--start, --position)."
     return ""

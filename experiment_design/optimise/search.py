@@ -77,8 +77,7 @@ class Candidate:
 
 def limit_scale(problem: TrialProblem) -> Array:
     """Return the unit of each limit (m,)."""
-    limits = problem.scenarios[0].limits
-    return np.concatenate([limits.path_scale, limits.whole_scale])
+    return problem.scenarios[0].limits.scale
 
 
 def assess(problem: TrialProblem, unit: Array, evaluations: int = 0) -> list[Candidate]:

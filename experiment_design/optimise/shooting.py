@@ -28,6 +28,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_matrix
 
+from experiment_design.constraints.kinds.end_state import EndState
+from experiment_design.constraints.kinds.energy import Energy
+from experiment_design.constraints.kinds.headings import HeadingRange
 from experiment_design.constraints.limits import UNIT_SCALE
 from experiment_design.optimise.logdet import Affine, LogDet, determinant_factor
 from experiment_design.optimise.sparse_assembly import Gatherer, Index, coordinates, to_dm
@@ -107,6 +110,7 @@ class Shooting(ABC):
         self._choose_states()
         self._cut()
         self._measure(unit)
+        self.headings = self.limits.each(HeadingRange)
         self._heading_pair = self._choose_headings(unit)
         self._index_sums()
         self.grams = len(self.gram_at)
@@ -180,8 +184,8 @@ class Shooting(ABC):
         """Leave positions out of the nodes where no limit looks at them."""
         nx = self.rollout.nx
         state = self.rollout.symbols[0]
-        self.ends = list(zip(self.limits.end_names, self.limits.end_values, strict=True))
-        used = {place for _, (place, _) in self.ends}
+        self.ends = self.limits.each(EndState)
+        used = {x.place for x in self.ends}
         if self.limits.path.numel():
             where = ca.which_depends(self.limits.path, state, 1, False)
             used |= {i for i, on in enumerate(where) if on}
@@ -204,7 +208,7 @@ class Shooting(ABC):
 
     def _choose_headings(self, unit: Array) -> tuple[int, int] | None:
         """Return the nodes at which the typical sequence heads furthest apart."""
-        if self.limits.limits.headings is None:
+        if not self.headings:
             return None
         state, _ = self._motion(unit)
         psi = state[self._node_samples(), self.rollout.nx]
@@ -291,7 +295,7 @@ class Shooting(ABC):
             left = s.samples - k * s.hold
             self.intervals += [(k, p[p < left]) for p in pieces if (p < left).any()]
         self.ramped = max(s.ramp) > 1
-        self.energy = self.limits.limits.energy is not None
+        self.energy = self.limits.each(Energy)
 
     def _build(self) -> None:
         self.nk = len(self.state_scale)
@@ -325,11 +329,10 @@ class Shooting(ABC):
             c = real[0] + shares[:, t] * (real[1] - real[0]) if self.ramped else real[1]
             self._look(passed, state, c, flags[0])
             state = step(state, c)
-            if self.limits.path_names:
+            if self.limits.path_limits:
                 kept_path.append(path(state) / ca.DM(self.limits.path_scale))
-            if self.energy:
-                for place, full in self.limits.speeds:
-                    used += ca.fabs(c[place] / full) ** 3
+            for energy in self.energy:
+                used += energy.mean_cube(c) / s.samples
         c = real[1] * mix[:, 1] + real[2] * mix[:, 2]
         if self.ramped:
             c = c + real[0] * mix[:, 0]
@@ -339,15 +342,14 @@ class Shooting(ABC):
         )
         ends = [kept, *self._carried(passed), *kept_path]
         single = list(passed.squares)
-        if self.energy:
-            single.append(used / (s.samples * len(self.limits.speeds)))
+        single += [used] * len(self.energy)
         first, last = ca.vertcat(*ends), ca.vertcat(*single)
         score_at = {
             (p, q): q * (q + 1) // 2 + p for q in range(len(self.order)) for p in range(q + 1)
         }
         quadratic: list[tuple[dict[tuple[int, int], int], list[list[ca.SX]]]]
         quadratic = [(self.gram_at, passed.vectors)] + [(score_at, passed.scores)] * self.exact
-        weights = ca.SX.sym("w", first.numel() + self.lifted + self.energy)
+        weights = ca.SX.sym("w", first.numel() + self.lifted + len(self.energy))
         sums: list[ca.SX] = []
         done = first.numel()
         # what is weighted is Σ zᵀ W z, whose slope is 2 W z carried back along z
@@ -383,9 +385,9 @@ class Shooting(ABC):
         """Write objective, constraints, Jacobian and Hessian as MX over mapped intervals."""
         nk = self.nk
         w = ca.MX.sym("w", self.variables)
-        path = len(self.limits.path_names)
+        path = len(self.limits.path_limits)
         count = len(self.intervals)
-        sums = self.lifted + self.energy
+        sums = self.lifted + len(self.energy)
         starts = np.cumsum([0, *[len(p) * path for _, p in self.intervals]])
         continuity, paths = 0, nk * count
         ties = paths + int(starts[-1])
@@ -462,7 +464,7 @@ class Shooting(ABC):
             w[self.nodes_at + nk : self.sums_at],
             ca.MX.zeros(int(starts[-1])),
             -w[self.sums_at : self.sums_at + self.lifted],
-            ca.MX.zeros(int(self.energy)),
+            ca.MX.zeros(len(self.energy)),
         )
         g = ca.vertcat(g - shift, ca.mtimes(ca.MX(to_dm(linear)), w), extra)
         empty = ca.MX.sym("p", 0)
@@ -475,13 +477,12 @@ class Shooting(ABC):
             "hess_lag": ca.Function("hess_lag", [w, empty, sigma, multipliers], [curve.matrix()]),
         }
         self.rows = rows
-        energy = [-np.inf] * self.energy
-        energy_bound = self.limits.limits.energy
+        energy = [-np.inf] * len(self.energy)
         self.lbg = np.concatenate(
             [np.zeros(nk * count), np.full(int(starts[-1]), -np.inf), np.zeros(self.lifted),
              energy, lower, np.zeros(self._terminal.constraints)]
         )  # fmt: skip
-        top = [] if energy_bound is None else [energy_bound - _INSIDE * UNIT_SCALE[""]]
+        top = [x.bound - _INSIDE * x.scale for x in self.energy]
         self.ubg = np.concatenate(
             [np.zeros(nk * count), np.full(int(starts[-1]), -_INSIDE), np.zeros(self.lifted),
              top, upper, np.zeros(self._terminal.constraints)]
@@ -534,10 +535,9 @@ class Shooting(ABC):
                 pair = [k * self.nc + c, (k - 1) * self.nc + c]
                 rows.append((pair, [1.0, -1.0], -reach, reach))
         if self._heading_pair is not None:
-            assert self.limits.limits.headings is not None
             place = self.kept.index(self.rollout.nx)
             nodes = [self.nodes_at + n * self.nk + place for n in self._heading_pair]
-            least = self.limits.limits.headings / self.state_scale[place]
+            least = self.headings[0].bound / self.state_scale[place]
             rows.append((nodes, [1.0, -1.0], float(least), np.inf))
         matrix = csc_matrix((len(rows), self.variables))
         if rows:
@@ -690,16 +690,15 @@ class Shooting(ABC):
         nk = self.nk
         first = slice(self.nodes_at, self.nodes_at + nk)
         lower[first] = upper[first] = self._first_node()
-        for name, (place, value) in self.ends:
-            column = self.kept.index(place)
+        for end in self.ends:
+            column = self.kept.index(end.place)
             at = self.sums_at - nk + column
-            room = max(name.bound - _INSIDE * UNIT_SCALE[name.unit], 0.0)
-            lower[at] = (value - room) / self.state_scale[column]
-            upper[at] = (value + room) / self.state_scale[column]
+            room = max(end.bound - _INSIDE * end.scale, 0.0)
+            lower[at] = (end.target - room) / self.state_scale[column]
+            upper[at] = (end.target + room) / self.state_scale[column]
         return lower, upper
 
     def value(self, unit: Array) -> float:
         """Return the criterion that is climbed, at a sequence, in the units of `Criterion`."""
         f = self.functions["nlp"](x=self.begin(unit), p=ca.DM(0, 1))["f"]
-        size = len(self.wanted) if self.problem.criterion.optimality.determinant else 1
-        return -float(f) * size
+        return -float(f) * self.problem.criterion.shared_by

@@ -16,12 +16,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from experiment_design.constraints.limit_program import LimitProgram
 from experiment_design.excitation.rollout import Motion, Rollout
 from experiment_design.excitation.schedule import Schedule
 from experiment_design.output.result import Design
 from experiment_design.request.request import PreparedRequest
-from greybox.model.predictor_kinds import PREDICTORS
 
 Array = NDArray[np.float64]
 Samples = NDArray[np.intp]
@@ -493,9 +491,5 @@ def _keeps(
     r: PreparedRequest, rollout: Rollout, trial: int, state: Array, since: int | Samples
 ) -> NDArray[np.bool_]:
     """Return which runs (R, N+1, nx+3) keep the path limits, margins from a sample on."""
-    kind = PREDICTORS[r.predictor]
-    program = LimitProgram(
-        rollout, r.schedule, r.trial_limits(trial),
-        wind_matters=kind.captures and not kind.air_measured,
-    )  # fmt: skip
+    program = replace(r, backoff=()).limit_program(rollout, trial)
     return np.asarray((program.worst(state, since) <= 1e-3).all(axis=0))

@@ -12,12 +12,12 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, MaxNLocator, MultipleLocator
 from numpy.typing import NDArray
 
+from experiment_design.constraints.kinds.sea_room import edge_distance
 from experiment_design.constraints.limits import Circle
-from experiment_design.output.prediction import MotionBand, edge_distance
+from experiment_design.output.prediction import MotionBand
 from experiment_design.output.result import Design
 from experiment_design.output.sheet_contents import clock
 from greybox.report.figures import BLACK, BLUE, COLOURS, GREEN, VERMILION, tidy
-from greybox.rotation import ned_to_body
 
 Array = NDArray[np.float64]
 
@@ -263,28 +263,14 @@ def forbidden(design: Design, band: MotionBand, name: str) -> list[tuple[Array, 
     An edge is nan where it does not count.
     """
     r = design.request
-    limits = r.trial_limits(band.trial)
-    zones: list[tuple[Array, int]] = []
-    one = np.ones(len(band.t))
-    if name in limits.signs:
-        sign = limits.signs[name]
-        psi = band["psi"].nominal
-        d = np.zeros(4)
-        d[: min(4, r.d.size)] = r.d[:4]
-        predictor = r.build_predictor()
-        wind = predictor.augmented and not predictor.air_measured
-        # over ground, through the water and, where its wind is not measured, through the air
-        moved = [0 * one]
-        for pair, matters in ((d[:2], True), (d[2:], wind)):
-            if matters and pair.any() and name in ("u", "v"):
-                moved.append(ned_to_body(pair[0], pair[1], psi)[name == "v"])
-        edge = limits.margins.get(name, 0.0) + np.max([sign * m for m in moved], axis=0)
-        edge[band.t < design.lead_in_s - 0.5 * r.sample_time] = np.nan
-        zones.append((sign * edge, -sign))
-    if name == "r" and limits.yaw_cap is not None:
-        zones += [(limits.yaw_cap * one, 1), (-limits.yaw_cap * one, -1)]
-    if name == "speed" and limits.speed_cap is not None:
-        zones.append((limits.speed_cap * one, 1))
+    zones = []
+    for limit in r.path_limits(band.trial):
+        if limit.signal == name:
+            edges = limit.edges(band["psi"].nominal)
+            if limit.of_regime:
+                for edge, _ in edges:
+                    edge[band.t < design.lead_in_s - 0.5 * r.sample_time] = np.nan
+            zones += edges
     return zones
 
 

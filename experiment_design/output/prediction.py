@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from experiment_design.constraints.limits import Circle
+from experiment_design.constraints.kinds.sea_room import edge_distance
 from experiment_design.output.result import Design
 from greybox.model.run.simulation import positions, simulate
 from greybox.vessel.actuation import actuated_force
@@ -202,24 +202,3 @@ def _signals(design: Design, x: Array, psi: Array) -> tuple[tuple[str, ...], Arr
 def _corridor(away: Array) -> Array:
     """Return within what (N+1,) most of the motions (R, N+1) have stayed since the start."""
     return np.asarray(np.quantile(np.maximum.accumulate(away, axis=1), _CORRIDOR, axis=0))
-
-
-def edge_distance(area: Array | Circle, north: Array, east: Array) -> Array:
-    """Return how far places are from the edge of a sea room, negative outside [m]."""
-    if isinstance(area, Circle):
-        return np.asarray(area.radius - np.hypot(north - area.north, east - area.east))
-    corners = np.asarray(area, float)
-    nearest = np.full(np.shape(north), np.inf)
-    inside = np.zeros(np.shape(north), bool)
-    for (n0, e0), (n1, e1) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        dn, de = n1 - n0, e1 - e0
-        length = dn**2 + de**2
-        if length == 0:
-            continue
-        share = np.clip(((north - n0) * dn + (east - e0) * de) / length, 0, 1)
-        nearest = np.minimum(nearest, np.hypot(north - n0 - share * dn, east - e0 - share * de))
-        if e0 != e1:
-            # a ray to the north crosses this edge once for a place inside
-            between = (min(e0, e1) <= east) & (east < max(e0, e1))
-            inside ^= between & (n0 + (east - e0) * dn / de > north)
-    return np.where(inside, nearest, -nearest)

@@ -11,14 +11,12 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
 
-from experiment_design.optimise.campaign import add_up, own_moments, random_campaign
 from experiment_design.optimise.search import REFERENCE
-from experiment_design.output.pictures import draw_commands, draw_plan_track, draw_states
+from experiment_design.output.pictures import draw_commands, draw_plan_track, draw_states, forbidden
 from experiment_design.output.prediction import MotionBand, predict_motion
 from experiment_design.output.result import Design
 from experiment_design.output.sheet_contents import clock, plain_name, signed
 from experiment_design.request.regimes import spell_regime
-from experiment_design.request.request import build_problem
 from greybox.report.chart import chart_of
 from greybox.report.figures import BLUE, ORANGE, new_figure, tidy, to_svg
 from greybox.report.page import NextStep, Page, Picture, Section, Table, computed, typed
@@ -59,7 +57,7 @@ def design_page(
     r = design.request
     sailed = design.from_first_command()
     bands = predict_motion(sailed)
-    reference = None if headline else random_std(design)
+    reference = None if headline else design.random_std
     trials = f"{clock(r.duration)} min"
     if r.trials > 1:
         trials = f"{r.trials} trials of {trials}"
@@ -145,27 +143,13 @@ def saving(design: Design) -> str:
     return f"{first}; {said}.{led}"
 
 
-def random_std(design: Design) -> Array | None:
-    """Return the standard errors (p_w,) of the best random two-level sequences, if any keep."""
-    plain = replace(design.request, backoff=())
-    problems = [build_problem(plain, t) for t in range(plain.trials)]
-    units, _ = random_campaign(problems, plain.seed)
-    if units is None:
-        return None
-    sums = add_up([own_moments(p, u) for p, u in zip(problems, units, strict=True)])
-    covariance = problems[0].criterion.covariance(sums[0])[0]
-    with np.errstate(invalid="ignore"):
-        return np.asarray(np.sqrt(np.diag(covariance)))
-
-
 def _trial(design: Design, band: MotionBand) -> Section:
     r = design.request
     north, east = band["x_n"].nominal, band["y_n"].nominal
     track = Figure(figsize=(_WIDTH, _WIDTH))
     draw_plan_track(track.add_axes((0.13, 0.09, 0.84, 0.8)), design, band, _SIZE)
     names = [n for n in _SHOWN if n in band]
-    if r.limits.speed_cap is not None:
-        names.append("speed")
+    names += [n for n in band.names if n not in names and forbidden(design, band, n)]
     states = new_figure(_WIDTH, 1.35 * len(names) + 0.4)
     panels = states.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
     draw_states(dict(zip(names, panels, strict=True)), design, band, _SIZE)

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from experiment_design.certificate.certificate import Certificate
 from experiment_design.constraints.limits import LimitReport
+from experiment_design.criteria.optimality import CRITERIA
 from experiment_design.excitation.rollout import Motion
 from experiment_design.feasibility.constraint_satisfaction import ConstraintSatisfaction
-from experiment_design.information.optimality import CRITERIA
 from experiment_design.optimise.classical import Alternative
 from experiment_design.optimise.search import REFERENCE
 from experiment_design.request.regimes import spell_regime
@@ -108,6 +108,8 @@ class Design(DisplayMixin):
     seconds : float
     parts : tuple of PlanPart
         In order, lead-in included; empty where each trial is one part.
+    random_std : ndarray or None
+        (p_w,) predicted standard errors of the best random two-level sequences.
     """
 
     request: PreparedRequest
@@ -131,6 +133,7 @@ class Design(DisplayMixin):
     evaluations: int
     seconds: float
     parts: tuple[PlanPart, ...] = ()
+    random_std: Array | None = None
 
     @property
     def lead_in_s(self) -> float:
@@ -249,7 +252,7 @@ class Design(DisplayMixin):
     def _gain(self, alternative: Alternative) -> float | None:
         if not np.isfinite(alternative.value):
             return None
-        size = len(self.names) if CRITERIA[self.request.criterion].determinant else 1
+        size = CRITERIA[self.request.criterion].shared_by(len(self.names))
         return float(np.exp((self.criterion_value - alternative.value) / size))
 
     def _behind(self) -> str:

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from experiment_design.constraints.limit_program import LimitProgram
+from experiment_design.criteria.covariance import Criterion
+from experiment_design.criteria.objective import Objective, Slope
 from experiment_design.excitation.rollout import Motion, Rollout
 from experiment_design.excitation.schedule import Schedule
-from experiment_design.information.criteria import Criterion
-from experiment_design.information.moments import InformationModel, Moments
+from experiment_design.information.moments import InformationModel, Moments, moments_of
 
 Array = NDArray[np.float64]
 
@@ -23,21 +23,12 @@ _TOGETHER = 64
 _INSIDE = 0.01
 
 
-class Objective(Protocol):
-    """A number to be made large that is no sum of information, such as a distance of models."""
-
-    def value(self, commands: Array) -> Array:
-        """Return the logarithm of it for sequences (R, N, nc)."""
-        ...
-
-    def gradient(self, commands: Array) -> tuple[float, Array]:
-        """Return it for one sequence with its derivative (N, nc)."""
-        ...
-
-
 @dataclass(frozen=True)
 class Scenario:
-    """One possible truth: a prior model, its information model, its limits, and its weight."""
+    """One possible truth: a prior model, its information model, its limits, and its weight.
+
+    Of one without weight only the limits count.
+    """
 
     rollout: Rollout
     information: InformationModel
@@ -80,7 +71,7 @@ class TrialProblem:
     worst_case : bool
         Look at the worst scenario instead of the expectation.
     contrast : Objective, optional
-        Takes the place of the criterion.
+        Takes the place of the criterion, such as a distance of models.
     """
 
     schedule: Schedule
@@ -89,6 +80,11 @@ class TrialProblem:
     known: tuple[Moments, ...] = ()
     worst_case: bool = False
     contrast: Objective | None = None
+
+    @property
+    def objective(self) -> Objective:
+        """What is to be made large."""
+        return self.contrast or self.criterion
 
     @cached_property
     def shape(self) -> tuple[int, int]:
@@ -106,11 +102,10 @@ class TrialProblem:
 
     def moments(self, motion: Motion, scenario: int) -> Moments:
         """Return the sums of a scenario's motion, the known ones included."""
-        nx = self.scenarios[scenario].rollout.nx
-        own = self.scenarios[scenario].information(
-            motion.state[:, :-1, :nx], motion.state[:, :-1, nx], motion.tau
-        )
-        return own + self.known[scenario] if self.known else own
+        return moments_of(self.scenarios[scenario].information, motion, self._known_to(scenario))
+
+    def _known_to(self, scenario: int) -> Moments | None:
+        return self.known[scenario] if self.known else None
 
     def evaluate(self, unit: Array) -> Evaluation:
         """Evaluate sequences (R, K, nc) of unit coordinates."""
@@ -120,10 +115,11 @@ class TrialProblem:
             each, worst = [], None
             for i, scenario in enumerate(self.scenarios):
                 motion = scenario.rollout.run(commands)
-                if self.contrast is None:
-                    value = self.criterion.value(self.moments(motion, i))
-                elif i == 0:
-                    value = self.contrast.value(commands)
+                value = np.zeros(len(commands))
+                if scenario.weight:
+                    value = self.objective.of_motion(
+                        motion, scenario.information, self._known_to(i)
+                    )
                 value[~motion.stable] = -np.inf
                 each.append(value)
                 v = scenario.limits.violations(motion)
@@ -165,42 +161,29 @@ class TrialProblem:
         s = self.schedule
         commands = s.expand(self.levels(unit))
         motions = [sc.rollout.run(commands[None]) for sc in self.scenarios]
-        parts: list[tuple[float, Array, Array]] = []
-        for i, motion in enumerate(motions):
-            if not motion.stable[0]:
-                parts.append((-np.inf, np.zeros(0), np.zeros(0)))
-                continue
-            if self.contrast is not None:
-                parts.append((0.0, np.zeros(0), np.zeros(0)))
-                continue
-            parts.append(self.criterion.gradient(self.moments(motion, i)))
-        each = np.array([[p[0]] for p in parts])
+        parts: list[Slope | None] = [
+            self.objective.slope(m, sc.information, self._known_to(i))
+            if sc.weight and m.stable[0]
+            else None
+            for i, (sc, m) in enumerate(zip(self.scenarios, motions, strict=True))
+        ]
+        each = np.array([[p.value if p else 0.0] for p in parts])
         span = s.upper - s.lower
-        if not np.isfinite(each).all():
+        if not (np.isfinite(each).all() and all(m.stable[0] for m in motions)):
             return -np.inf, -np.inf, np.zeros(self.shape), np.zeros(0)
         value, weights = self._combine(each)
-        size = len(self.criterion.wanted)
+        size = self.objective.size
         total = np.zeros_like(commands)
-        if self.contrast is not None:
-            size = 1
-            distance, total = self.contrast.gradient(commands)
-            value = np.array([distance])
-            if not np.isfinite(distance):
-                return -np.inf, -np.inf, np.zeros(self.shape), np.zeros(0)
         terms, rows, first = 0.0, [], 0
         for (sc, motion), part, weight in zip(
             zip(self.scenarios, motions, strict=True), parts, weights[:, 0], strict=True
         ):
-            nx, state = sc.rollout.nx, motion.state[0]
+            state = motion.state[0]
             d_state = np.zeros_like(state)
-            d_tau = np.zeros_like(motion.tau[0])
-            if weight > 0 and self.contrast is None:
-                d_x, d_tau = sc.information.gradient(
-                    state[:-1, :nx], state[:-1, nx], motion.tau[0], part[1], part[2]
-                )
-                d_state[:-1, : nx + 1] = d_x * weight / size
-                d_tau = d_tau * weight / size
-            d_commands = np.zeros_like(commands)
+            d_tau, d_commands = np.zeros_like(motion.tau[0]), np.zeros_like(commands)
+            if part is not None and weight > 0:
+                d_x, d_tau, d_commands = (d * weight / size for d in part.pull())
+                d_state[:-1, : sc.rollout.nx + 1] = d_x
             path = sc.limits.path_values(state) / sc.limits.path_scale[:, None]
             path[:, 0] = np.minimum(path[:, 0], 0.0)
             whole = sc.limits.whole_values(motion)[:, 0] / sc.limits.whole_scale

@@ -9,20 +9,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiment_design.constraints.limit_program import LimitProgram
-from experiment_design.constraints.limits import TrialLimits
+from experiment_design.constraints.limits import (
+    LIMITS,
+    LimitedTrial,
+    PathLimit,
+    TrialLimits,
+    limits_of,
+)
+from experiment_design.criteria.covariance import Criterion
+from experiment_design.criteria.optimality import CRITERIA
+from experiment_design.criteria.t_optimality import Contrast
 from experiment_design.excitation.rollout import Rollout
 from experiment_design.excitation.schedule import Schedule, make_schedule
-from experiment_design.information.criteria import Criterion
 from experiment_design.information.estimators import ESTIMATORS
 from experiment_design.information.moments import Moments
-from experiment_design.information.optimality import CRITERIA
-from experiment_design.information.t_optimality import Contrast
 from experiment_design.request.exclusions import require_compatible
 from experiment_design.request.problem import Scenario, TrialProblem
 from greybox.errors import UsageError, suggestion
 from greybox.model.model import ManoeuvringModel
 from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import Column, Predictor, Regime, build_predictor
+from greybox.model.predictor_kinds import PREDICTORS
 from greybox.model.run.simulation import stationary_disturbance
 from greybox.model.run.step import Integrator
 from greybox.model.structure import Structure
@@ -112,8 +119,8 @@ class TrialOptions:
             for f in fields(TrialOptions)
             if f.name != "limits" and getattr(self, f.name) != getattr(usual, f.name)
         }
-        limits = ("area", "margin_air", "speed_cap", "yaw_cap", "headings")
-        told |= {n for n in limits if getattr(self.limits, n) is not None}
+        limits = {kind.field: getattr(self.limits, kind.field) for kind in LIMITS.values()}
+        told |= {n for n, x in limits.items() if x is not None and not isinstance(x, Mapping)}
         if self.limits.clearance:
             told.add("clearance")
         if CRITERIA[self.criterion].combined:
@@ -339,6 +346,33 @@ class PreparedRequest(TrialOptions):
         """Return the limits of one trial."""
         return replace(self.limits, signs=dict(self.regimes[trial]))
 
+    @property
+    def tells_each(self) -> bool:
+        """Whether each wanted parameter is to be told, by no standard error of its own."""
+        return not (self.targets or self.contrasts or CRITERIA[self.criterion].combined)
+
+    @property
+    def wind_matters(self) -> bool:
+        """Whether the wind is captured and not measured, so that margins hold through the air."""
+        kind = PREDICTORS[self.predictor]
+        return kind.captures and not kind.air_measured
+
+    def limit_program(self, rollout: Rollout, trial: int) -> LimitProgram:
+        """Return the compiled limits of one trial under its own or another prior model."""
+        return LimitProgram(
+            rollout,
+            self.schedule,
+            self.trial_limits(trial),
+            wind_matters=self.wind_matters,
+            backoff=self.backoff,
+        )
+
+    def path_limits(self, trial: int) -> tuple[PathLimit, ...]:
+        """Return the limits at each sample of a trial."""
+        about = LimitedTrial(self.structure.states, self.d, self.wind_matters)
+        every = limits_of(self.trial_limits(trial), about)
+        return tuple(x for x in every if isinstance(x, PathLimit))
+
     def draw_models(self, count: int, seed: int) -> Array:
         """Draw prior models (count, p) from the covariance."""
         rng = np.random.default_rng([13, self.seed, seed])
@@ -485,20 +519,13 @@ def build_problem(
     gust = draw_gusts(request) if predictor.air_measured else None
     criterion = build_criterion(request, predictor)
     schedule = request.schedule
-    limits = request.trial_limits(trial)
     scenarios = []
     for k, theta in enumerate(request.thetas()):
         rollout = Rollout(
             request.vessel, request.structure, theta, request.d, request.starts[trial],
             request.sample_time, request.integrator,
         )  # fmt: skip
-        program = LimitProgram(
-            rollout,
-            schedule,
-            limits,
-            wind_matters=predictor.augmented and not predictor.air_measured,
-            backoff=request.backoff,
-        )
+        program = request.limit_program(rollout, trial)
         information = assumed.information(
             predictor,
             theta,
@@ -516,7 +543,9 @@ def build_problem(
             for a, b in request.contrasts
         ]
         other = pairs[0][1]
-        program = LimitProgram(other, schedule, limits, backoff=request.backoff)
+        program = LimitProgram(
+            other, schedule, request.trial_limits(trial), backoff=request.backoff
+        )
         scenarios.append(Scenario(other, scenarios[0].information, program, 0.0))
         contrast = Contrast(pairs, request.noise, schedule)
     return TrialProblem(schedule, tuple(scenarios), criterion, known, request.worst_case, contrast)

@@ -19,10 +19,10 @@ from experiment_design.certificate.certificate import (
 from experiment_design.certificate.surge_bound import _Programme, _Sums, _Trial, why_not_surge
 from experiment_design.constraints.limit_program import LimitProgram
 from experiment_design.constraints.limits import TrialLimits
+from experiment_design.criteria.covariance import Criterion
 from experiment_design.design import design_trial
 from experiment_design.excitation.rollout import Rollout
 from experiment_design.excitation.schedule import make_schedule
-from experiment_design.information.criteria import Criterion
 from experiment_design.information.moments import MomentProgram
 from experiment_design.optimise.search import ascend, climb, draw_two_level
 from experiment_design.request.problem import Scenario, TrialProblem

@@ -9,8 +9,8 @@ import pytest
 from designs import make_request
 
 from experiment_design import CandidateModel, design_between, design_trial
+from experiment_design.criteria.t_optimality import Pair
 from experiment_design.discriminate import probability_right
-from experiment_design.information.t_optimality import Pair
 from experiment_design.request.request import build_problem
 from greybox.errors import UsageError
 from greybox.model.run.simulation import simulate

@@ -11,13 +11,13 @@ from designs import PROCESS, limited_ship, make_request, thesis_model
 from scipy.stats import chi2, ncx2, norm
 
 from experiment_design.constraints.limits import TrialLimits
+from experiment_design.criteria.cause_power import WANTED, CausePower
 from experiment_design.for_causes import (
     AskedCauses,
     causes_left_open,
     design_for_causes,
     open_causes,
 )
-from experiment_design.information.cause_power import WANTED, CausePower
 from experiment_design.request.request import build_problem
 from greybox.commands.main import main
 from greybox.diagnosis.diagnose import DiagnosisOptions, diagnose

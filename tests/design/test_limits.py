@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import argparse
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from designs import limited_ship, make_request
 
+from experiment_design.command import add_arguments
 from experiment_design.constraints.limit_program import LimitProgram
-from experiment_design.constraints.limits import Circle, TrialLimits
+from experiment_design.constraints.limits import LIMITS, Circle, Circumstances, TrialLimits
 from experiment_design.excitation.schedule import make_schedule
 from experiment_design.feasibility.checks import feasible_or_reason
 from experiment_design.feasibility.constraint_satisfaction import keep_probability
@@ -73,6 +75,29 @@ def test_every_limit_has_its_derivative():
         assert slope[k, c] == pytest.approx(difference, rel=1e-4, abs=1e-5 * abs(slope).max())
 
 
+def test_every_limit_has_an_option_a_field_words_and_advice():
+    limits = TrialLimits(
+        margins={"u": 0.6, "v": 0.5}, margin_air=0.7, area=Circle(0.0, 0.0, 90.0), speed_cap=1.5,
+        yaw_cap=0.03, end={"psi": (1.0, 0.1)}, energy=0.2, headings=5.0,
+    )  # fmt: skip
+    request = make_request(limits=limits, predictor="wind", d=np.array([0.0, 0.0, 3.0, 4.0]))
+    found = build_problem(request).scenarios[0].limits.all_limits
+    assert [type(x) for x in found] == sorted(map(type, found), key=lambda k: k.order)
+    assert {type(x) for x in found} == set(LIMITS.values())
+    parser = argparse.ArgumentParser()
+    add_arguments(parser)
+    for limit in found:
+        assert limit.option in parser._option_string_actions
+        assert hasattr(limits, limit.field)
+        said = limit.advice(0.04, Circumstances(0.0, lambda: 30.0))
+        assert limit.words in said or f"{limit.bound:g} {limit.unit}" in said
+        assert said.endswith(".")
+    room = next(x for x in found if x.field == "area")
+    eased, helps = room.eased(limits, 12.3)
+    assert eased.clearance == -13.0
+    assert helps == "Enlarge it by 13 m on every side"
+
+
 def test_margins_see_the_current():
     """u_r and u must both keep their sign (5.7)."""
     request = make_request(d=np.array([0.3, 0.0, 0.0, 0.0]))
@@ -92,9 +117,9 @@ def test_the_velocity_through_the_air_keeps_a_margin_of_either_sign():
         predictor="wind", d=np.array([0.0, 0.0, 3.0, 4.0]), limits=TrialLimits(margin_air=0.7)
     )
     program = build_problem(request).scenarios[0].limits
-    names = [n.name for n in program.path_names[2:]]
+    names = [n.words for n in program.path_limits[2:]]
     assert names == ["margin of surge through the air", "margin of sway through the air"]
-    assert program.path_names[3].option == "--margin-air"
+    assert program.path_limits[3].option == "--margin-air"
     state = np.zeros((1, 6))
     state[0, :4] = 1.5, 1.2, 0.0, 0.4
     ground = np.array([[np.cos(0.4), -np.sin(0.4)], [np.sin(0.4), np.cos(0.4)]]) @ state[0, :2]
@@ -173,7 +198,7 @@ def test_a_backoff_tightens_path_limits_only():
     request = make_request()
     plain = build_problem(request).scenarios[0]
     tight = LimitProgram(
-        plain.rollout, plain.limits.schedule, request.trial_limits(0), backoff=(0.1, 0.2)
+        plain.rollout, request.schedule, request.trial_limits(0), backoff=(0.1, 0.2)
     )
     state = np.ones((1, 6))
     np.testing.assert_allclose(

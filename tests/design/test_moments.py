@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from designs import make_request
 
-from experiment_design.information.criteria import Criterion
+from experiment_design.criteria.covariance import Criterion
 from experiment_design.information.moments import Moments
 from experiment_design.request.noise import noise_levels
 from experiment_design.request.request import build_problem

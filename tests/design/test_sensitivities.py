@@ -12,9 +12,9 @@ from designs import thesis_model
 from experiment_design import DesignRequest, predict_precision, prepare_request
 from experiment_design.constraints.limit_program import LimitProgram
 from experiment_design.constraints.limits import TrialLimits
+from experiment_design.criteria.covariance import Criterion
 from experiment_design.excitation.rollout import Rollout
 from experiment_design.excitation.schedule import make_schedule
-from experiment_design.information.criteria import Criterion
 from experiment_design.information.sensitivities import SensitivityProgram
 from experiment_design.optimise.search import ascend
 from experiment_design.request.problem import Scenario, TrialProblem

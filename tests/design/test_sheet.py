@@ -16,11 +16,12 @@ from browser import require_legible, without_scripts
 from designs import prior_model, random_plan
 from matplotlib import image
 
+from experiment_design.constraints.kinds.sea_room import edge_distance
 from experiment_design.constraints.limits import Circle, LimitReport, TrialLimits
 from experiment_design.feasibility.constraint_satisfaction import ConstraintSatisfaction
 from experiment_design.output.pictures import forbidden
-from experiment_design.output.prediction import edge_distance, predict_motion
-from experiment_design.output.report import design_page, random_std
+from experiment_design.output.prediction import predict_motion
+from experiment_design.output.report import design_page
 from experiment_design.output.sheet_contents import (
     clock,
     compass,
@@ -297,9 +298,7 @@ def test_the_page_says_what_is_saved(unsure, page):
     assert html.count("<figure ") == 4
     assert "tells nothing" in html
     assert "(breaks limits)" in html
-    reference = random_std(unsure)
-    assert reference is not None
-    assert f"<td>{reference[0]:.2g}</td>" in html
+    assert f"<td>{unsure.random_std[0]:.2g}</td>" in html
     assert "Regime chosen." in html
 
 

@@ -11,9 +11,9 @@ from scipy.sparse import csc_matrix
 
 from experiment_design.constraints.limit_program import LimitProgram
 from experiment_design.constraints.limits import Circle, TrialLimits
+from experiment_design.criteria.covariance import Criterion
 from experiment_design.excitation.rollout import Rollout
 from experiment_design.excitation.schedule import make_schedule
-from experiment_design.information.criteria import Criterion
 from experiment_design.information.moments import MomentProgram
 from experiment_design.information.sensitivities import SensitivityProgram
 from experiment_design.optimise.search import assess, draw_two_level

@@ -17,8 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_discrete_are
 
-from experiment_design.excitation.rollout import Rollout, step_expression
+from experiment_design.criteria.objective import Objective, Slope
+from experiment_design.excitation.rollout import Motion, Rollout, step_expression
 from experiment_design.excitation.schedule import Schedule
+from experiment_design.information.moments import InformationModel, Moments
 from greybox.model.noise import NoiseLevels
 from greybox.model.run.kernels import accumulate
 
@@ -69,7 +71,7 @@ def steady_filter(rollout: Rollout, outputs: tuple[str, ...], noise: NoiseLevels
     return SteadyFilter(a @ p @ h.T @ np.linalg.inv(s), s)
 
 
-class Contrast:
+class Contrast(Objective):
     """Logarithm of the expected log-likelihood ratio between explanations.
 
     The two directions (which of them is true) are averaged; over several pairs
@@ -89,6 +91,23 @@ class Contrast:
         schedule: Schedule,
     ) -> None:
         self.pairs = [Pair(a, b, noise, schedule.samples) for a, b in pairs]
+
+    @property
+    def size(self) -> int:
+        """One: it is about no parameter."""
+        return 1
+
+    def of_motion(
+        self, motion: Motion, information: InformationModel, known: Moments | None
+    ) -> Array:
+        """Return the objective of R motions, (R,)."""
+        return self.value(motion.commands)
+
+    def slope(self, motion: Motion, information: InformationModel, known: Moments | None) -> Slope:
+        """Return the objective of one motion, with its derivatives."""
+        value, d_commands = self.gradient(motion.commands[0])
+        state, tau = motion.state[0, :-1, :-2], motion.tau[0]
+        return Slope(value, lambda: (np.zeros_like(state), np.zeros_like(tau), d_commands))
 
     def value(self, commands: Array) -> Array:
         """Return the objective of sequences (R, N, nc)."""

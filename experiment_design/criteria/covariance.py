@@ -12,8 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from experiment_design.information.moments import Moments
-from experiment_design.information.optimality import CRITERIA, Optimality
+from experiment_design.criteria.objective import Objective, Slope
+from experiment_design.criteria.optimality import CRITERIA, Optimality
+from experiment_design.excitation.rollout import Motion
+from experiment_design.information.moments import InformationModel, Moments, moments_of
 
 Array = NDArray[np.float64]
 # smallest eigenvalue of a correlation-scaled Gram matrix that counts as excited
@@ -21,7 +23,7 @@ _FLOOR = 1e-12
 
 
 @dataclass(frozen=True)
-class Criterion:
+class Criterion(Objective):
     """A scalar of the covariance C of the wanted parameters.
 
     Parameters
@@ -52,6 +54,34 @@ class Criterion:
     def optimality(self) -> Optimality:
         """The scalar itself."""
         return CRITERIA[self.kind]
+
+    @property
+    def size(self) -> int:
+        """Number of wanted parameters."""
+        return len(self.wanted)
+
+    @property
+    def shared_by(self) -> int:
+        """How many variances it counts together."""
+        return self.optimality.shared_by(self.size)
+
+    def of_motion(
+        self, motion: Motion, information: InformationModel, known: Moments | None
+    ) -> Array:
+        """Return the criterion of R motions, (R,)."""
+        return self.value(moments_of(information, motion, known))
+
+    def slope(self, motion: Motion, information: InformationModel, known: Moments | None) -> Slope:
+        """Return the criterion of one motion, with its derivatives."""
+        value, d_gram, d_score = self.gradient(moments_of(information, motion, known))
+        state, tau = motion.state[0, :-1], motion.tau[0]
+        nx = state.shape[1] - 3
+
+        def pull() -> tuple[Array, Array, Array]:
+            d_x, d_tau = information.gradient(state[:, :nx], state[:, nx], tau, d_gram, d_score)
+            return d_x, d_tau, np.zeros_like(motion.commands[0])
+
+        return Slope(value, pull)
 
     def covariance(self, moments: Moments) -> Array:
         """Return C, (R, p_w, p_w), prior included; infinite where a direction is not excited."""

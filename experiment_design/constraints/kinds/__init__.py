@@ -1,0 +1,1 @@
+"""The limits that a trial may have, one a file."""

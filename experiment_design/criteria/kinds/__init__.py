@@ -1,0 +1,1 @@
+"""Optimality criteria of the covariance, one a file."""
