@@ -2,13 +2,14 @@
 
 The estimate of unit i is compared with what the others predict of it,
 
-    y_i ~ N(X_i β₋ᵢ, C_i + Ω₋ᵢ + Cov(X_i β₋ᵢ)),
+    y_i ~ N(β₋ᵢ, V),    V = C_i + Ω₋ᵢ + Cov(β₋ᵢ),
 
-by its squared Mahalanobis distance. Ω₋ᵢ rests on few units, so along each principal direction of
-Ω₋ᵢ in units of the rest, the deviation is referred to Student's t with degrees of freedom after
-Satterthwaite (1946), as prediction intervals of meta-analyses are (Higgins, Thompson and
-Spiegelhalter, 2009), and its normal score takes its place in the sum, which is χ² with one degree
-a coefficient where the unit is like the others.
+by its squared Mahalanobis distance T. Were Ω₋ᵢ known, T would be χ² with one degree a coefficient;
+it rests on few units, and taking it as known names units that are like the others. So the tail of
+T is averaged over what Ω₋ᵢ may be: each variance ω + c, where c is what the estimates' own errors
+add to the spread between them, is ν s²/χ²_ν with the ν degrees of freedom of the other units, and ω
+at least 0. For one coefficient and small errors of the estimates this is Student's t, as in the
+prediction intervals of Higgins, Thompson and Spiegelhalter (2009).
 
 The unit that differs most is tested first. Where it differs, it takes no part when the rest is
 tested, so that one odd unit does not hide another; p-values are adjusted for the number of units by
@@ -17,22 +18,23 @@ Holm's (1979) step-down rule.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import eigh
-from scipy.stats import chi2, norm
-from scipy.stats import t as student
+from scipy.stats import chi2, qmc
 
-from greybox.fleet.pooling import Pooled, degrees_of_freedom, pool
+from greybox.errors import UsageError
+from greybox.fleet.pooling import Pooled, pool
 
 Array = NDArray[np.float64]
 
 # probability with which any unit of a fleet that is alike is said to differ
 SIGNIFICANCE = 0.05
-# units without which no spread between them can be estimated
+# units without which no spread between the others of one can be estimated
 FEWEST = 3
+# points of a fixed sequence over which a tail is averaged: Sobol's sequence needs a power of two
+_POINTS = 1024
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,7 @@ class Difference:
     coefficient : int
         Its place.
     value, std : float
-        By how much, were it the only ones of those that are named, and the standard error.
+        By how much, where nothing but what is named differs, and the standard error.
     expected : float
         The value that the others predict.
     """
@@ -64,9 +66,9 @@ class Comparison:
     unit : int
         Its place.
     statistic : float
-        Squared Mahalanobis distance of normal scores.
+        Squared Mahalanobis distance.
     df : int
-        Its degrees of freedom: the number of coefficients.
+        Number of coefficients.
     p_value, p_adjusted : float
         For this unit alone, and adjusted for all units.
     differences : tuple of Difference
@@ -86,9 +88,7 @@ class Comparison:
         return self.p_adjusted < SIGNIFICANCE
 
 
-def compare_units(
-    estimates: Array, covariances: Array, design: Array | None = None
-) -> tuple[Comparison, ...]:
+def compare_units(estimates: Array, covariances: Array) -> tuple[Comparison, ...]:
     """Test each unit against all others that do not differ themselves.
 
     Parameters
@@ -97,120 +97,140 @@ def compare_units(
         (k, p) of at least `FEWEST` units.
     covariances : ndarray
         (k, p, p)
-    design : ndarray, optional
-        (k, p, q) as for `pool`.
 
     Returns
     -------
     tuple of Comparison
         One a unit, in their order.
 
+    Raises
+    ------
+    UsageError
+        There are too few units.
+
     References
     ----------
     Holm (1979), A simple sequentially rejective multiple test procedure, Scand. J. Statist. 6;
-    Higgins, Thompson and Spiegelhalter (2009), J. R. Statist. Soc. A 172.
+    Higgins, Thompson and Spiegelhalter (2009), A re-evaluation of random-effects meta-analysis,
+    J. R. Statist. Soc. A 172.
     """
+    if len(estimates) < FEWEST:
+        raise UsageError(
+            f"{len(estimates)} units cannot show how much units differ: give at least {FEWEST}."
+        )
     left = list(range(len(estimates)))
-    adjusted = 0.0
     done: dict[int, Comparison] = {}
-
-    def against_others(unit: int) -> Comparison:
-        others = [i for i in left if i != unit]
-        x = None if design is None else design[others]
-        pooled = pool(estimates[others], covariances[others], x)
-        own = np.eye(estimates.shape[1]) if design is None else design[unit]
-        return _compared(unit, estimates[unit], covariances[unit], own, pooled)
-
-    while True:
-        found = {unit: against_others(unit) for unit in left}
-        worst = min(left, key=lambda unit: found[unit].p_value)
-        adjusted = max(adjusted, min(1.0, found[worst].p_value * len(left)))
-        if adjusted >= SIGNIFICANCE:
+    adjusted = 0.0
+    while len(left) >= FEWEST:
+        found = [_against_others(unit, left, estimates, covariances) for unit in left]
+        worst = min(found, key=lambda c: c.p_value)
+        if worst.p_value * len(left) >= SIGNIFICANCE:
             break
-        done[worst] = _adjusted(found[worst], adjusted)
-        left.remove(worst)
-        if len(left) < FEWEST:
-            found = {unit: c for unit, c in found.items() if unit in left}
-            break
-    # Holm's rule for those that remain
-    for place, unit in enumerate(sorted(left, key=lambda unit: found[unit].p_value)):
-        adjusted = max(adjusted, SIGNIFICANCE, found[unit].p_value * (len(left) - place))
-        done[unit] = _adjusted(found[unit], min(1.0, adjusted))
+        adjusted = max(adjusted, worst.p_value * len(left))
+        done[worst.unit] = replace(worst, p_adjusted=adjusted)
+        left.remove(worst.unit)
+    # Holm's rule for those that remain, none of which can be told from the others any more
+    remaining = sorted((c for c in found if c.unit in left), key=lambda c: c.p_value)
+    adjusted = max(adjusted, SIGNIFICANCE)
+    for place, one in enumerate(remaining):
+        adjusted = min(1.0, max(adjusted, one.p_value * (len(remaining) - place)))
+        done[one.unit] = replace(one, p_adjusted=adjusted, differences=())
     return tuple(done[unit] for unit in range(len(estimates)))
 
 
-def _adjusted(found: Comparison, p_adjusted: float) -> Comparison:
-    """Return a comparison with its adjusted p-value, and no differences where it is not odd."""
-    named = found.differences if p_adjusted < SIGNIFICANCE else ()
+def _against_others(
+    unit: int, units: list[int], estimates: Array, covariances: Array
+) -> Comparison:
+    others = [i for i in units if i != unit]
+    pooled = pool(estimates[others], covariances[others])
+    deviation = _Deviation(estimates[unit], covariances[unit], pooled)
+    p_value = deviation.p_value(())
+    # what explains it is looked for only where it may be told
+    named = deviation.explaining() if p_value * len(units) < SIGNIFICANCE else ()
     return Comparison(
-        found.unit, found.statistic, found.df, found.p_value, p_adjusted, named
-    )
+        unit,
+        deviation.distance(()),
+        estimates.shape[1],
+        p_value,
+        1.0,
+        tuple(
+            Difference(j, value, std, float(pooled.beta[j])) for j, value, std in named
+        ),
+    )  # fmt: skip
 
 
-def _compared(unit: int, estimate: Array, covariance: Array, x: Array, others: Pooled) -> Comparison:
-    expected = x @ others.beta
-    certain = covariance + x @ others.beta_covariance @ x.T
-    scores, whitening = normal_scores(estimate - expected, certain, others)
-    statistic = float(scores @ scores)
-    named = _explaining(scores, whitening, expected)
-    p_value = float(chi2.sf(statistic, len(scores)))
-    return Comparison(unit, statistic, len(scores), p_value, 1.0, named)
-
-
-def normal_scores(deviation: Array, certain: Array, pooled: Pooled) -> tuple[Array, Array]:
-    """Return independent standard normal scores of a deviation with an estimated Ω in its variance.
+def possible_variances(pooled: Pooled) -> Array:
+    """Return what the variances between units may be, (n, p), from what is known of them.
 
     Parameters
     ----------
-    deviation : ndarray
-        (p,) with covariance `certain` + Ω.
-    certain : ndarray
-        (p, p)
     pooled : Pooled
-        Has Ω, and what it is uncertain by.
-
-    Returns
-    -------
-    scores, whitening : ndarray
-        (p,), and (p, p) that gave them but for the Student's t in them.
     """
-    spread, directions = eigh(np.diag(pooled.omega), certain)
-    variance = 1 + np.maximum(spread, 0.0)
-    squares = directions.T**2
-    uncertain = np.einsum("mj,jl,ml->m", squares, pooled.omega_covariance, squares)
-    whitening = directions.T / np.sqrt(variance)[:, None]
-    ratio = whitening @ deviation
-    tail = student.logsf(np.abs(ratio), degrees_of_freedom(variance, uncertain))
-    return np.sign(ratio) * _normal_quantile(tail), whitening
+    units, size = pooled.estimates.shape
+    df = units - pooled.design.shape[2] / size
+    total = np.sqrt(df / 2 * np.diag(pooled.omega_covariance))
+    own = np.maximum(total - pooled.omega, 0.0)
+    total = pooled.omega + own
+    # not below what the estimates' own errors add
+    highest = chi2.cdf(df * total / np.maximum(own, np.finfo(float).tiny), df)
+    places = (qmc.Sobol(size, scramble=False).random(_POINTS) + 0.5 / _POINTS) * highest
+    return np.asarray(np.maximum(total * df / chi2.ppf(places, df) - own, 0.0))
 
 
-def _normal_quantile(log_tail: Array) -> Array:
-    """Return the normal quantile of a tail probability given by its logarithm."""
-    # beyond 38 standard deviations nothing is told apart, and the tail is no number any more
-    return np.asarray(norm.isf(np.exp(np.maximum(log_tail, -700.0))))
+class _Deviation:
+    """The deviation of an estimate from the mean of others, whose spread is not wholly known."""
 
+    def __init__(self, estimate: Array, covariance: Array, others: Pooled) -> None:
+        total = covariance + others.beta_covariance + np.diag(others.omega)
+        # coefficients of unit size
+        scale = np.sqrt(np.diag(total))
+        outer = np.outer(scale, scale)
+        self._scale, self._deviation = scale, (estimate - others.beta) / scale
+        self._inverse = np.linalg.inv(total / outer)
+        omega = possible_variances(others)
+        within = covariance + others.beta_covariance_at(omega)
+        self._possible = (within + omega[:, :, None] * np.eye(len(scale))) / outer
 
-def _explaining(scores: Array, whitening: Array, expected: Array) -> tuple[Difference, ...]:
-    """Return the fewest coefficients, one by one, whose change explains the deviation.
+    def _form(self, free: tuple[int, ...]) -> Array:
+        """Return the matrix of the squared distance when some coefficients may differ, (p, p)."""
+        if not free:
+            return self._inverse
+        columns = self._inverse[:, free]
+        return self._inverse - columns @ np.linalg.inv(columns[list(free)]) @ columns.T
 
-    Each time the one is taken that lowers the squared distance most, until what is left is what
-    chance does.
-    """
-    taken: list[int] = []
-    left, size = scores, len(scores)
-    value = covariance = np.zeros(0)
-    while len(taken) < size and float(left @ left) > chi2.isf(SIGNIFICANCE, size - len(taken)):
-        gains = np.full(size, -np.inf)
-        for j in set(range(size)) - set(taken):
-            fitted = np.linalg.lstsq(whitening[:, [*taken, j]], scores, rcond=None)[0]
-            rest = scores - whitening[:, [*taken, j]] @ fitted
-            gains[j] = -float(rest @ rest)
-        taken.append(int(np.argmax(gains)))
-        columns = whitening[:, taken]
-        covariance = np.linalg.inv(columns.T @ columns)
-        value = covariance @ columns.T @ scores
-        left = scores - columns @ value
-    return tuple(
-        Difference(j, float(value[n]), float(np.sqrt(covariance[n, n])), float(expected[j]))
-        for n, j in enumerate(taken)
-    )
+    def distance(self, free: tuple[int, ...]) -> float:
+        """Return the squared distance when some coefficients may differ."""
+        return float(self._deviation @ self._form(free) @ self._deviation)
+
+    def p_value(self, free: tuple[int, ...]) -> float:
+        """Return how probable as large a distance is, where no other coefficient differs.
+
+        The tail of each quadratic form is that of a multiple of χ² with its mean and variance
+        (Satterthwaite, 1946).
+        """
+        if len(free) == len(self._deviation):
+            return 1.0
+        shares = self._form(free) @ self._possible
+        mean = np.trace(shares, axis1=1, axis2=2)
+        half = np.einsum("nij,nji->n", shares, shares) / mean
+        return float(chi2.sf(self.distance(free) / half, mean / half).mean())
+
+    def explaining(self) -> list[tuple[int, float, float]]:
+        """Return the coefficients that explain the deviation: place, difference, standard error.
+
+        Each time the one is taken that leaves the least distance, until what is left is what
+        chance does.
+        """
+        taken: tuple[int, ...] = ()
+        while self.p_value(taken) < SIGNIFICANCE:
+            rest = [j for j in range(len(self._deviation)) if j not in taken]
+            taken = (*taken, min(rest, key=lambda j: self.distance((*taken, j))))
+        chosen = list(taken)
+        columns = self._inverse[:, chosen]
+        moves = np.linalg.inv(columns[chosen]) @ columns.T
+        value = moves @ self._deviation
+        spread = np.einsum("jl,nlm,jm->j", moves, self._possible, moves) / len(self._possible)
+        scale = self._scale[chosen]
+        return list(
+            zip(chosen, map(float, value * scale), map(float, np.sqrt(spread) * scale), strict=True)
+        )

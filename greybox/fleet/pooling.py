@@ -67,8 +67,6 @@ class Pooled:
     theta, theta_covariance : ndarray
         (k, p) posterior means, and (k, p, p) their mean squared error, which holds what β and Ω
         are uncertain by.
-    loglik : float
-        Restricted log-likelihood.
     """
 
     estimates: Array
@@ -80,7 +78,6 @@ class Pooled:
     omega_covariance: Array
     theta: Array
     theta_covariance: Array
-    loglik: float
 
     @property
     def shrinkage(self) -> Array:
@@ -101,15 +98,30 @@ class Pooled:
         """Standard errors of `beta`, (q,)."""
         return np.asarray(np.sqrt(np.diag(self.beta_covariance)))
 
+    @property
+    def _beta_slopes(self) -> Array:
+        """Slope in each ω of the covariance that `beta` has with its present weights, (p, q, q)."""
+        weights = np.linalg.inv(self.covariances + np.diag(self.omega))
+        moves = np.einsum("qr,kjr,kjl->klq", self.beta_covariance, self.design, weights)
+        return np.asarray(np.einsum("klq,klr->lqr", moves, moves))
+
+    def beta_covariance_at(self, omega: Array) -> Array:
+        """Return the covariance that `beta` has where the variances are others, (n, q, q).
+
+        Parameters
+        ----------
+        omega : ndarray
+            (n, p) variances between the units.
+        """
+        change = np.einsum("nj,jqr->nqr", omega - self.omega, self._beta_slopes)
+        return np.asarray(self.beta_covariance + change)
+
     def beta_df(self) -> Array:
         """Return the degrees of freedom of each standard error in `beta`, (q,).
 
         Those of Satterthwaite: twice the square of a variance over the variance of its estimate.
         """
-        weights = scaled_inverse(self.covariances + np.diag(self.omega))
-        # slope of (Σ XᵀWX)⁻¹ in each ω: the square of what each unit's coefficient moves β by
-        moves = np.einsum("qr,kjr,kjl->kql", self.beta_covariance, self.design, weights)
-        slopes = np.einsum("kql->ql", moves**2)
+        slopes = np.einsum("jqq->qj", self._beta_slopes)
         variance = np.einsum("qj,jl,ql->q", slopes, self.omega_covariance, slopes)
         return degrees_of_freedom(np.diag(self.beta_covariance), variance)
 
@@ -194,7 +206,6 @@ def pool(estimates: Array, covariances: Array, design: Array | None = None) -> P
         omega_covariance * np.outer(scale**2, scale**2),
         theta * scale,
         covariance * outer,
-        fit.loglik - units * float(np.log(scale).sum()),
     )
 
 
