@@ -11,6 +11,10 @@ add to the spread between them, is ν s²/χ²_ν with the ν degrees of freedom
 at least 0. For one coefficient and small errors of the estimates this is Student's t, as in the
 prediction intervals of Higgins, Thompson and Spiegelhalter (2009).
 
+A sum over many coefficients hides a difference in one of them, whose own deviation is compared too,
+with its tail averaged alike. The p-value of a unit is the smaller of both: that of T, and that of
+its most deviating coefficient times their number; times two, since either may name it (Bonferroni).
+
 The unit that differs most is tested first. Where it differs, it takes no part when the rest is
 tested, so that one odd unit does not hide another; p-values are adjusted for the number of units by
 Holm's (1979) step-down rule.
@@ -66,7 +70,7 @@ class Comparison:
     unit : int
         Its place.
     statistic : float
-        Squared Mahalanobis distance.
+        Squared Mahalanobis distance T.
     df : int
         Number of coefficients.
     p_value, p_adjusted : float
@@ -153,10 +157,8 @@ def _against_others(
         estimates.shape[1],
         p_value,
         1.0,
-        tuple(
-            Difference(j, value, std, float(pooled.beta[j])) for j, value, std in named
-        ),
-    )  # fmt: skip
+        tuple(Difference(j, value, std, float(pooled.beta[j])) for j, value, std in named),
+    )
 
 
 def possible_variances(pooled: Pooled) -> Array:
@@ -184,12 +186,20 @@ class _Deviation:
         total = covariance + others.beta_covariance + np.diag(others.omega)
         # coefficients of unit size
         scale = np.sqrt(np.diag(total))
+        size = len(scale)
         outer = np.outer(scale, scale)
         self._scale, self._deviation = scale, (estimate - others.beta) / scale
         self._inverse = np.linalg.inv(total / outer)
-        omega = possible_variances(others)
-        within = covariance + others.beta_covariance_at(omega)
-        self._possible = (within + omega[:, :, None] * np.eye(len(scale))) / outer
+        self._certain = total / outer
+        # the variance is linear in what each ω may be more or less
+        self._change = (possible_variances(others) - others.omega) / scale**2
+        own = np.zeros((size, size, size))
+        own[np.arange(size), np.arange(size), np.arange(size)] = 1.0
+        unit = scale[:, None, None] ** 2 / outer
+        self._slopes = own + others.beta_slopes * unit
+        single = 1 + self._change @ np.diagonal(self._slopes, axis1=1, axis2=2)
+        # of each coefficient alone
+        self._alone = chi2.sf(self._deviation**2 / single, 1).mean(axis=0)
 
     def _form(self, free: tuple[int, ...]) -> Array:
         """Return the matrix of the squared distance when some coefficients may differ, (p, p)."""
@@ -203,33 +213,58 @@ class _Deviation:
         return float(self._deviation @ self._form(free) @ self._deviation)
 
     def p_value(self, free: tuple[int, ...]) -> float:
+        """Return how probable as large deviations are, where no other coefficient differs."""
+        rest = self._rest(free)
+        if not rest:
+            return 1.0
+        alone = len(rest) * float(self._alone[rest].min())
+        # one coefficient is all of them
+        if len(self._deviation) == 1:
+            return alone
+        return min(1.0, 2 * min(self._together(free), alone))
+
+    def _rest(self, free: tuple[int, ...]) -> list[int]:
+        return [j for j in range(len(self._deviation)) if j not in free]
+
+    def _together(self, free: tuple[int, ...]) -> float:
         """Return how probable as large a distance is, where no other coefficient differs.
 
         The tail of each quadratic form is that of a multiple of χ² with its mean and variance
         (Satterthwaite, 1946).
         """
-        if len(free) == len(self._deviation):
-            return 1.0
-        shares = self._form(free) @ self._possible
-        mean = np.trace(shares, axis1=1, axis2=2)
-        half = np.einsum("nij,nji->n", shares, shares) / mean
+        form = self._form(free)
+        fixed, slopes = form @ self._certain, form @ self._slopes
+        mean = np.trace(fixed) + self._change @ np.trace(slopes, axis1=1, axis2=2)
+        square = (
+            np.sum(fixed * fixed.T)
+            + 2 * self._change @ np.einsum("jab,ba->j", slopes, fixed)
+            + np.einsum(
+                "nj,nj->n", self._change @ np.einsum("jab,lba->jl", slopes, slopes), self._change
+            )
+        )
+        half = square / mean
         return float(chi2.sf(self.distance(free) / half, mean / half).mean())
 
     def explaining(self) -> list[tuple[int, float, float]]:
         """Return the coefficients that explain the deviation: place, difference, standard error.
 
-        Each time the one is taken that leaves the least distance, until what is left is what
-        chance does.
+        Each time the most deviating one is taken, or the one that leaves the least distance where
+        only the distance tells, until what is left is what chance does.
         """
         taken: tuple[int, ...] = ()
         while self.p_value(taken) < SIGNIFICANCE:
-            rest = [j for j in range(len(self._deviation)) if j not in taken]
-            taken = (*taken, min(rest, key=lambda j: self.distance((*taken, j))))
+            rest = self._rest(taken)
+            alone = min(rest, key=lambda j: self._alone[j])
+            if 2 * len(rest) * self._alone[alone] < SIGNIFICANCE:
+                taken = (*taken, alone)
+            else:
+                taken = (*taken, min(rest, key=lambda j: self.distance((*taken, j))))
         chosen = list(taken)
         columns = self._inverse[:, chosen]
         moves = np.linalg.inv(columns[chosen]) @ columns.T
         value = moves @ self._deviation
-        spread = np.einsum("jl,nlm,jm->j", moves, self._possible, moves) / len(self._possible)
+        average = self._certain + np.tensordot(self._change.mean(axis=0), self._slopes, 1)
+        spread = np.diag(moves @ average @ moves.T)
         scale = self._scale[chosen]
         return list(
             zip(chosen, map(float, value * scale), map(float, np.sqrt(spread) * scale), strict=True)

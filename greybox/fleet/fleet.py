@@ -160,9 +160,7 @@ class Fleet(DisplayMixin):
     @property
     def differing(self) -> tuple[Comparison, ...]:
         """The ships that differ from the others, the most certain first."""
-        return tuple(
-            sorted((c for c in self.comparisons if c.differs), key=lambda c: c.p_value)
-        )
+        return tuple(sorted((c for c in self.comparisons if c.differs), key=lambda c: c.p_value))
 
     def pooled_of(self, ship: int) -> tuple[Array, Array, Array]:
         """Return the pooled coefficients of a ship, their standard errors and shrinkage, (p,) each.
@@ -502,9 +500,7 @@ def _estimated(task: _Task) -> ShipEstimate | LeftOut:
     """Return one ship's coefficients from all its logs and from each period, or why not."""
     assert task.model is not None
     model, ship = task.model, task.ship
-    request = Request(
-        model.method, model.predictor, model.structure, judged=False, seed=task.seed
-    )
+    request = Request(model.method, model.predictor, model.structure, judged=False, seed=task.seed)
     try:
         logs = _read(ship, model.sample_time)
         whole = estimate_requested([s for part in logs for s in part], request)
@@ -572,9 +568,7 @@ def _times(logs: Sequence[Sequence[TrialLog]]) -> tuple[Array, bool]:
     return (np.array(known) + np.array(starts)) / _YEAR, True
 
 
-def _of_one_structure(
-    ships: Sequence[ShipEstimate], left_out: list[LeftOut]
-) -> list[ShipEstimate]:
+def _of_one_structure(ships: Sequence[ShipEstimate], left_out: list[LeftOut]) -> list[ShipEstimate]:
     """Return the ships with the coefficients that most have; the others are left out."""
     if not ships:
         return []
@@ -594,4 +588,3 @@ def _of_one_structure(
             )
         )
     return kept
-

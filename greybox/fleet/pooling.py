@@ -99,29 +99,18 @@ class Pooled:
         return np.asarray(np.sqrt(np.diag(self.beta_covariance)))
 
     @property
-    def _beta_slopes(self) -> Array:
+    def beta_slopes(self) -> Array:
         """Slope in each ω of the covariance that `beta` has with its present weights, (p, q, q)."""
         weights = np.linalg.inv(self.covariances + np.diag(self.omega))
         moves = np.einsum("qr,kjr,kjl->klq", self.beta_covariance, self.design, weights)
         return np.asarray(np.einsum("klq,klr->lqr", moves, moves))
-
-    def beta_covariance_at(self, omega: Array) -> Array:
-        """Return the covariance that `beta` has where the variances are others, (n, q, q).
-
-        Parameters
-        ----------
-        omega : ndarray
-            (n, p) variances between the units.
-        """
-        change = np.einsum("nj,jqr->nqr", omega - self.omega, self._beta_slopes)
-        return np.asarray(self.beta_covariance + change)
 
     def beta_df(self) -> Array:
         """Return the degrees of freedom of each standard error in `beta`, (q,).
 
         Those of Satterthwaite: twice the square of a variance over the variance of its estimate.
         """
-        slopes = np.einsum("jqq->qj", self._beta_slopes)
+        slopes = np.einsum("jqq->qj", self.beta_slopes)
         variance = np.einsum("qj,jl,ql->q", slopes, self.omega_covariance, slopes)
         return degrees_of_freedom(np.diag(self.beta_covariance), variance)
 
