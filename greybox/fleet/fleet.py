@@ -202,8 +202,8 @@ class Fleet(DisplayMixin):
         if not comparison.differences:
             return f"'{name}' differs from the other ships in no single coefficient."
         told = ", ".join(
-            f"{self.names[d.coefficient]} by {d.value:+.3g} ± {1.96 * d.std:.2g} of {d.expected:.3g}"
-            f"{' ' + self.units[d.coefficient] if self.units[d.coefficient] else ''}"
+            f"{self.names[d.coefficient]} by {d.value:+.3g} ± {1.96 * d.std:.2g} (theirs: "
+            f"{d.expected:.3g}) {self.units[d.coefficient]}".removesuffix(" 1")
             for d in comparison.differences
         )
         return f"'{name}' differs from the other ships in {told} (p = {comparison.p_adjusted:.2g})."
