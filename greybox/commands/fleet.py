@@ -29,14 +29,33 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_seed(parser)
 
 
+def _require_outside(options: argparse.Namespace) -> None:
+    """Raise where an output would stand among the logs of a ship."""
+    from pathlib import Path
+
+    from greybox.errors import UsageError
+
+    fleet = Path(options.fleet).resolve()
+    for name in ("out", "json", "report"):
+        path = getattr(options, name)
+        if path is not None and path != "-" and fleet in Path(path).resolve().parent.parents:
+            raise UsageError(
+                f"--{name} names '{path}' in the folder of a ship, where it would be taken for one "
+                f"of its files: name a file outside."
+            )
+
+
 def run(options: argparse.Namespace) -> None:
     """Estimate, pool, tell."""
-    from greybox.files import check_targets, write_json
+    from greybox.files import check_targets, sha256, write_json
     from greybox.fleet.fleet import estimate_fleet
+    from greybox.fleet.ships import fleet_files
 
     check_targets(options.out, options.json, options.report)
+    _require_outside(options)
     fleet = estimate_fleet(options.fleet, seed=options.seed, progress=progress("ships"))
     record = provenance(options)
+    record["inputs"] = {str(path): sha256(path) for path in fleet_files(options.fleet)}
     if options.out:
         import pandas as pd
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -70,19 +70,29 @@ def find_ships(folder: str | Path) -> tuple[list[ShipFiles], list[LeftOut]]:
         )
     ships: list[ShipFiles] = []
     left_out: list[LeftOut] = []
-    for inside in sorted(p for p in place.iterdir() if p.is_dir() and p.name[0] != "."):
-        files = sorted(p for p in inside.iterdir() if p.is_file() and p.name[0] != ".")
-        vessels = [p for p in files if p.suffix == ".toml"]
-        logs = tuple(p for p in files if p.suffix in _LOGS)
-        if not vessels and not logs:
-            continue
+    for name, vessels, logs in _folders(place):
         try:
-            ships.append(ShipFiles(inside.name, _vessel(vessels, logs), logs))
-        except GreyboxError as error:
-            left_out.append(LeftOut(inside.name, str(error)))
+            ships.append(ShipFiles(name, _vessel(vessels, logs), tuple(logs)))
+        except (GreyboxError, OSError) as error:
+            left_out.append(LeftOut(name, str(error)))
     require_ships([s.name for s in ships], left_out, str(folder))
     _require_one_class(ships)
     return ships, left_out
+
+
+def fleet_files(folder: str | Path) -> list[Path]:
+    """Return the vessel files and logs of a fleet folder, ship by ship."""
+    return [p for _, vessels, logs in _folders(Path(folder)) for p in (*vessels, *logs)]
+
+
+def _folders(place: Path) -> Iterator[tuple[str, list[Path], list[Path]]]:
+    """Yield name, vessel files and logs of each folder that has any, in the order of names."""
+    for inside in sorted(p for p in place.iterdir() if p.is_dir() and p.name[0] != "."):
+        files = sorted(p for p in inside.iterdir() if p.is_file() and p.name[0] != ".")
+        vessels = [p for p in files if p.suffix == ".toml"]
+        logs = [p for p in files if p.suffix in _LOGS]
+        if vessels or logs:
+            yield inside.name, vessels, logs
 
 
 def require_ships(ships: Sequence[str], left_out: Sequence[LeftOut], folder: str) -> None:
