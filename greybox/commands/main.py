@@ -21,7 +21,7 @@ from greybox.registry import entry_points
 
 # as the work goes; commands of other packages follow
 ORDER = ("demo", "import", "check", "estimate", "simulate", "compare", "diagnose", "design",
-         "predict", "export", "reproduce", "completion")  # fmt: skip
+         "predict", "export", "fleet", "reproduce", "completion")  # fmt: skip
 ABOUT = ("Trustworthy ship models from sea trials: design the trial, read the log, estimate, show "
          "what the simulation gets wrong.")  # fmt: skip
 EXAMPLES = """examples:

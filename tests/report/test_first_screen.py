@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from browser import driven
 from designs import prior_model, random_plan
+from fleet.fleets import planted
 from manoeuvring import rudder_model
 from test_check_page import SHIP, row_case, tie_case
 from test_diagnosis_page import BUDGET, RECORD, diagnosis_of
@@ -23,6 +24,7 @@ from greybox.report.checks import check_page
 from greybox.report.comparison import comparison_page
 from greybox.report.diagnosis import diagnosis_page
 from greybox.report.estimation import estimation_page
+from greybox.report.fleet import fleet_page
 from greybox.report.page import write_page
 from greybox.report.prediction import prediction_page
 from greybox.selection.estimate import estimate_model
@@ -31,7 +33,7 @@ from greybox.study.chapter6 import TRUE
 from greybox.validation.comparison import compare
 from greybox.vessel.toml import load_vessel
 
-PAGES = ("estimate", "compare", "check", "predict", "design", "diagnose", "demo")
+PAGES = ("estimate", "compare", "check", "predict", "design", "diagnose", "demo", "fleet")
 # pixels: what a laptop shows of a page without scrolling
 SCREEN = (1280, 800)
 PHONE = 390
@@ -94,6 +96,10 @@ def written(request, tmp_path, logs, estimate, model, plan):
         ),
         "design": lambda: design_page(plan, ["A note."], record),
         "diagnose": lambda: diagnosis_page(replace(diagnosis_of("named"), budget=BUDGET), RECORD),
+        "fleet": lambda: fleet_page(
+            planted(12, odd=30.0, change=0.03, left_out=[("ship 13", "its folder has no logs.")]),
+            {"command": {"fleet": "ferries"}},
+        ),
         "demo": lambda: demo_page(demo_of(tmp_path, plan, logs[0], estimate), record),
     }[request.param]
     write_page(make(), path)

@@ -1,0 +1,76 @@
+"""`greybox fleet`: many ships of one class, with one table."""
+
+from __future__ import annotations
+
+import argparse
+
+from greybox.commands.common import add_cluster, add_seed, progress, provenance, say
+
+HELP = "estimate many ships of one class: what they share, which one differs, what changes in time"
+EXAMPLES = """examples:
+  greybox fleet ferries --out ferries.csv --report ferries.html
+  greybox fleet ferries --json ferries.json --cluster tcp://host:8786
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument(
+        "fleet", metavar="DIR",
+        help="folder with one folder a ship, each with a vessel file (*.toml) and logs (CSV, "
+        "Parquet), in order of time by their dates or names",
+    )  # fmt: skip
+    parser.add_argument("--json", metavar="F", help="write the result as JSON; - is stdout")
+    parser.add_argument(
+        "--out", metavar="CSV", help="write a table with a row for each coefficient of each ship"
+    )
+    parser.add_argument("--report", metavar="HTML", help="write a page with plots")
+    add_cluster(parser)
+    add_seed(parser)
+
+
+def _require_outside(options: argparse.Namespace) -> None:
+    """Raise where an output would stand among the logs of a ship."""
+    from pathlib import Path
+
+    from greybox.errors import UsageError
+
+    fleet = Path(options.fleet).resolve()
+    for name in ("out", "json", "report"):
+        path = getattr(options, name)
+        if path is not None and path != "-" and fleet in Path(path).resolve().parent.parents:
+            raise UsageError(
+                f"--{name} names '{path}' in the folder of a ship, where it would be taken for one "
+                f"of its files: name a file outside."
+            )
+
+
+def run(options: argparse.Namespace) -> None:
+    """Estimate, pool, tell."""
+    from greybox.files import check_targets, sha256, write_json
+    from greybox.fleet.fleet import estimate_fleet
+    from greybox.fleet.ships import fleet_files
+
+    check_targets(options.out, options.json, options.report)
+    _require_outside(options)
+    fleet = estimate_fleet(options.fleet, seed=options.seed, progress=progress("ships"))
+    record = provenance(options)
+    record["inputs"] = {str(path): sha256(path) for path in fleet_files(options.fleet)}
+    if options.out:
+        import pandas as pd
+
+        from greybox.files import write_text
+
+        write_text(pd.DataFrame(fleet.rows()).to_csv(index=False), options.out)
+    if options.json:
+        write_json(fleet.to_dict() | {"provenance": record}, options.json)
+    if options.report:
+        from greybox.report.fleet import fleet_page
+        from greybox.report.page import write_page
+
+        write_page(fleet_page(fleet, record), options.report)
+    if options.json != "-":
+        say(fleet.summary())
+        for path in (options.out, options.report):
+            if path:
+                say(f"\nwrote {path}")

@@ -1,0 +1,108 @@
+"""What changes in time in the coefficients of one ship: a straight line with its interval.
+
+The estimates of T periods are pooled about a line in time instead of a mean,
+
+    y_t ~ N(θ_t, C_t),    θ_t ~ N(a + b τ_t, Ω),
+
+so that what differs from trial to trial without a trend, by weather, draught or what the model
+lacks, widens the interval of the slope b and is not taken for fouling.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import t as student
+
+from greybox.fleet.pooling import LEVEL, pool
+
+Array = NDArray[np.float64]
+
+# periods that leave two degrees of freedom beside the two of a line
+FEWEST_PERIODS = 4
+
+
+@dataclass(frozen=True)
+class Trend:
+    """The coefficients of one ship over its periods, and the line through them.
+
+    Parameters
+    ----------
+    times : ndarray
+        (T,) of the periods.
+    estimates, std : ndarray
+        (T, p) of each period alone, and its standard errors.
+    slope, slope_std, slope_df : ndarray
+        (p,) change in one unit of time, its standard error, and degrees of freedom of that.
+    line, line_std : ndarray
+        (T, p) the line at the periods, and its standard errors, of the same degrees of freedom.
+    """
+
+    times: Array
+    estimates: Array
+    std: Array
+    slope: Array
+    slope_std: Array
+    slope_df: Array
+    line: Array
+    line_std: Array
+
+    @property
+    def p_values(self) -> Array:
+        """Of no change, for each coefficient alone, (p,)."""
+        return np.asarray(2 * student.sf(np.abs(self.slope) / self.slope_std, self.slope_df))
+
+    @property
+    def reach(self) -> Array:
+        """Standard errors that the half of a 95 % interval is long, (p,)."""
+        return np.asarray(student.ppf((1 + LEVEL) / 2, self.slope_df))
+
+    @property
+    def slope_interval(self) -> Array:
+        """95 % interval of each slope, (p, 2)."""
+        half = self.reach * self.slope_std
+        return np.column_stack([self.slope - half, self.slope + half])
+
+
+def fit_trend(times: Array, estimates: Array, covariances: Array) -> Trend:
+    """Fit a line in time to the estimates of several periods of one ship.
+
+    Parameters
+    ----------
+    times : ndarray
+        (T,) of at least `FEWEST_PERIODS` periods, not all the same.
+    estimates : ndarray
+        (T, p)
+    covariances : ndarray
+        (T, p, p)
+
+    Returns
+    -------
+    Trend
+
+    Raises
+    ------
+    UsageError
+        There are too few periods for a line.
+    """
+    size = estimates.shape[1]
+    # about the middle, so that level and slope are told apart well in any unit of time
+    middle, unit = float(np.mean(times)), float(np.ptp(times)) or 1.0
+    far = (times - middle) / unit
+    eye = np.broadcast_to(np.eye(size), covariances.shape)
+    design = np.concatenate([eye, far[:, None, None] * eye], axis=2)
+    pooled = pool(estimates, covariances, design)
+    line = design @ pooled.beta
+    line_covariance = design @ pooled.beta_covariance @ design.transpose(0, 2, 1)
+    return Trend(
+        times,
+        estimates,
+        np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)),
+        pooled.beta[size:] / unit,
+        pooled.beta_std[size:] / unit,
+        pooled.beta_df()[size:],
+        line,
+        np.sqrt(np.diagonal(line_covariance, axis1=1, axis2=2)),
+    )
