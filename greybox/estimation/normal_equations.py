@@ -19,7 +19,9 @@ Array = NDArray[np.float64]
 # instruments beyond this relative singular value are copies of one another
 _RANK = 1e-12
 # samples that are decomposed at once: what a processor keeps near
-_AT_ONCE = 4096
+_AT_ONCE = 2048
+# columns that are reflected together
+_REFLECTIONS = 8
 
 
 @dataclass(frozen=True)
@@ -137,20 +139,23 @@ class Sums:
     rows: int
 
     @classmethod
-    def of(cls, z: Array, phi: Array, y: Array) -> Sums:
-        """Sum the samples of z (p, N), phi (p, N) and y (N,)."""
-        whole = np.vstack([z, phi, y[None]])
-        k, n = whole.shape
-        triangle = np.zeros((k, k))
-        for start in range(0, n, _AT_ONCE):
-            triangle = _triangle([triangle, whole[:, start : start + _AT_ONCE].T])
-        return cls(triangle, whole.sum(axis=1), n)
+    def of(cls, z: Array | None, phi: Array, y: Array) -> Sums:
+        """Sum the samples of z (p, N), phi (p, N) and y (N,); without z, phi stands for it."""
+        own = np.vstack([phi, y[None]] if z is None else [z, phi, y[None]])
+        triangle, totals = _triangle(own), own.sum(axis=1)
+        if z is None:
+            p = len(phi)
+            places = [*range(p), *range(p), p]
+            totals, whole = totals[places], np.zeros((2 * p + 1, 2 * p + 1))
+            whole[: p + 1] = triangle[:, places]
+            triangle = whole
+        return cls(triangle, totals, own.shape[1])
 
     @classmethod
     def together(cls, sums: Sequence[Sums]) -> Sums:
         """Add sums of samples that are apart."""
         return cls(
-            _triangle([s.triangle for s in sums]),
+            _triangle(np.hstack([s.triangle.T for s in sums])),
             np.sum([s.totals for s in sums], axis=0),
             sum(s.rows for s in sums),
         )
@@ -204,8 +209,14 @@ class Sums:
         return own @ (self.triangle[:p, p:] @ np.append(-theta, 1.0)), own @ own.T
 
 
-def _triangle(blocks: Sequence[Array]) -> Array:
-    """Return R of the QR decomposition of blocks of rows, square."""
-    stacked = np.vstack(blocks)
-    found = np.linalg.qr(stacked, mode="r")
-    return np.vstack([found, np.zeros((stacked.shape[1] - len(found), stacked.shape[1]))])
+def _triangle(rows: Array) -> Array:
+    """Return R (k, k) of the QR decomposition of the samples of k rows (k, N)."""
+    from scipy.linalg.lapack import dtpqrt
+
+    k, n = rows.shape
+    triangle = np.zeros((k, k), order="F")
+    for start in range(0, n, _AT_ONCE):
+        block = np.array(rows[:, start : start + _AT_ONCE].T, order="F")
+        # no column is a block of reflections by itself where there are fewer
+        triangle = dtpqrt(0, min(_REFLECTIONS, k), triangle, block, overwrite_a=1, overwrite_b=1)[0]
+    return np.asarray(triangle)

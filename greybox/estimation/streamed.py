@@ -93,7 +93,8 @@ def sum_log(
     """
     predictor = problem.predictor
     own = build_experiment(predictor, log, margins=problem.margins)
-    keep, z = own.keep, own.phi
+    keep: NDArray[np.bool_] = own.keep
+    z: Array | None = None
     samples, none = len(keep), np.zeros((2, len(own.phi)))
     if theta is not None:
         simulate = partial(
@@ -110,10 +111,16 @@ def sum_log(
     equations = []
     for row, state in enumerate(predictor.structure.states):
         mine = predictor.equation(state)
-        parts = [a if keep.all() else a[..., keep] for a in (z[mine], own.phi[mine], own.y[row])]
-        equations.append(Sums.of(*parts))
-    largest = np.stack([largest_of(own.phi, keep), largest_of(z, keep)])
+        phi, y = _part(own.phi[mine], keep), _part(own.y[row], keep)
+        equations.append(Sums.of(None if z is None else _part(z[mine], keep), phi, y))
+    size = largest_of(own.phi, keep)
+    largest = np.stack([size, size if z is None else largest_of(z, keep)])
     return LogSums(samples, int(keep.sum()), tuple(equations), largest)
+
+
+def _part(rows: Array, keep: NDArray[np.bool_]) -> Array:
+    """Return the samples of rows (…, N) that take part."""
+    return rows if keep.all() else rows[..., keep]
 
 
 @dataclass(frozen=True)
