@@ -33,7 +33,7 @@ from greybox.trial.stream import LogStream
 Array = NDArray[np.float64]
 _log = logging.getLogger(__name__)
 
-# a coefficient has settled when it moves by less than this share of its standard error
+# a coefficient has settled when its next move would be less than this share of its standard error
 _SETTLED = 1e-2
 # share of the samples in segments whose simulation may leave its bound: they take no part
 _MAY_DIVERGE = 0.1
@@ -303,7 +303,8 @@ def estimate_sums(
         (p,) parameters of the structure that simulate the first instruments; least squares
         without them.
     refine : bool or int
-        As `estimate_iv`; it ends once no coefficient moves by a hundredth of its standard error.
+        As `estimate_iv`; it ends once the next move of each coefficient, by the ratio of the
+        last two, would be less than a hundredth of its standard error.
 
     Raises
     ------
@@ -320,13 +321,18 @@ def estimate_sums(
         sums = passes.sums(None, "measured")
         solutions = solve_sums(predictor, sums)
     else:
+        before = np.inf
 
         def settled(
             moved: Array, previous: Array, made: StreamSums, found: Sequence[Solution]
         ) -> bool:
+            nonlocal before
             std = np.sqrt(np.maximum(np.diag(_covariance(predictor, made, found)), 0.0))
-            _log.info("largest move %.3g standard errors", float((moved / std).max()))
-            return bool((moved <= _SETTLED * std).all())
+            move = float((moved / std).max())
+            _log.info("pass %d: largest move %.3g standard errors", passes.count, move)
+            # moves shrink by about the same factor each time
+            following, before = move * min(move / before, 1.0), move
+            return following < _SETTLED
 
         sums, solutions, iteration = iterate_instruments(
             predictor, start, "measured", passes.sums, partial(solve_sums, predictor), refine,

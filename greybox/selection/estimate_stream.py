@@ -56,7 +56,7 @@ class StreamEstimate:
         """Return for JSON what was read, and what rests on a part of it."""
         stream = self.streamed.sums.stream
         return {
-            "files": len(stream.files),
+            "files": len(stream.parts),
             "rows": stream.rows,
             "passes": self.streamed.passes,
             "segments_without_bounded_simulation": list(self.streamed.sums.lost),
@@ -162,14 +162,16 @@ def estimate_stream(
         estimate.predictor, tuple(logs), request.margins, settings.zero_mean, settings.heading,
         settings.wind, settings.lag,
     )  # fmt: skip
-    notes += [*first.notes, *dropped, drawn.sentence]
+    # how the estimate on the stretches ended says nothing of this one
+    ended = ESTIMATORS[first.method].ended.format(status=first.status)
+    notes += [*(n for n in first.notes if n != ended), *dropped, drawn.sentence]
     if instruments and kind.air_measured:
         notes.append(wind_note(settings.wind))
     if streamed.sums.lost:
         notes.append(
             f"{len(streamed.sums.lost)} segments take no part, since {streamed.sums.lost[0]}."
         )
-    estimate, diverged = with_runs(estimate, logs, list(dict.fromkeys(notes)))
+    estimate, diverged = with_runs(estimate, logs, notes)
     if request.judged:
         estimate = _judged(add_noise(regression, estimate), streamed, regression)
         estimate = replace(estimate, tests=(*estimate.tests, loop_test))

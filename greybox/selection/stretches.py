@@ -61,10 +61,11 @@ class Drawn:
     def sentence(self) -> str:
         """What rests on them alone."""
         return (
-            f"the choice of the predictor, noise levels, tests and the verdict on the prediction "
-            f"rest on {len(self.logs)} stretches of {self.samples} of {self.data.samples} samples "
-            f"({100 * self.share:.2g} %), those that tell the parameters apart best; the "
-            f"coefficients and their standard errors rest on all."
+            f"the coefficients and their standard errors rest on all {self.data.samples} samples, "
+            f"which were read in passes; the choice of the predictor, noise levels, tests, fit and "
+            f"the verdict on the prediction rest on {self.samples} of them "
+            f"({100 * self.share:.3g} %) in {len(self.logs)} stretches, those that tell the "
+            f"parameters apart best."
         )
 
 
@@ -170,15 +171,15 @@ def _data(
             least, most = found.get(name, (low, high))
             found[name] = min(low, least), max(high, most)
     # conditions are those of the records beside the files
-    heads = [replace(log.window(0, 2, f.file.name), provenance=f.known) for f in stream.files]
+    heads = [replace(log.window(0, 2, f.file.name), provenance=f.known) for f in stream.parts]
     samples = sum(s.samples for s in segments)
     return EstimationData(
         samples,
         samples,
         tuple(
-            {"name": f.file.name, "sha256": f.known.sha256, "samples": f.rows} for f in stream.files
+            {"name": f.file.name, "sha256": f.known.sha256, "samples": f.rows} for f in stream.parts
         ),
         found,
         pooled_conditions(heads),
-        known_actuators(f.known.actuators for f in stream.files),
+        known_actuators(f.known.actuators for f in stream.parts),
     )

@@ -80,9 +80,20 @@ class StreamedFile:
 
     def without(self, window: int, why: str) -> str:
         """Return the sentence that a window takes no part."""
+        if len(self.cuts) == 2:
+            return f"'{self.file.name}' was left out: {why}"
         first, stop = self.cuts[window : window + 2]
-        rows = f"rows {first + 1} to {stop} of " if len(self.cuts) > 2 else ""
-        return f"{rows}'{self.file.name}' were left out: {why}"
+        return f"rows {first + 1} to {stop} of '{self.file.name}' were left out: {why}"
+
+    @property
+    def windows(self) -> frozenset[int]:
+        """Positions of all windows."""
+        return frozenset(range(len(self.cuts) - 1))
+
+    @property
+    def gone(self) -> bool:
+        """Whether no window takes part."""
+        return self.skipped >= self.windows
 
 
 @dataclass(frozen=True)
@@ -101,6 +112,7 @@ class LogStream:
     Parameters
     ----------
     files : tuple of StreamedFile
+        Those that take no part any more among them, so that places stay.
     vessel : Vessel
     states : tuple of str
         That must be there, as `read_log`.
@@ -117,9 +129,14 @@ class LogStream:
     left_out: tuple[str, ...] = ()
 
     @property
+    def parts(self) -> tuple[StreamedFile, ...]:
+        """The files that take part."""
+        return tuple(f for f in self.files if not f.gone)
+
+    @property
     def rows(self) -> int:
-        """Rows of all files."""
-        return sum(f.rows for f in self.files)
+        """Rows of the files that take part."""
+        return sum(f.rows for f in self.parts)
 
     @property
     def interval(self) -> float:
@@ -150,8 +167,8 @@ class LogStream:
         Returns
         -------
         tuple of (LogStream, list of (Place, result))
-            The stream without the files that could not be read any more, which its `left_out`
-            names, and the results of the others in order. Places are those of this stream.
+            The stream without what could not be read any more, which its `left_out` names, and
+            the results of the rest in order.
 
         Raises
         ------
@@ -161,6 +178,7 @@ class LogStream:
         pieces = [
             _Piece(self, k, first, min(first + _A_PIECE, len(f.cuts) - 1))
             for k, f in enumerate(self.files)
+            if not f.gone
             for first in range(0, len(f.cuts) - 1, _A_PIECE)
         ]
         found: list[tuple[Place, Result]] = []
@@ -174,15 +192,17 @@ class LogStream:
         files: list[StreamedFile] = []
         told: list[str] = []
         for k, file in enumerate(self.files):
-            if k not in broken:
-                told += [file.without(w, why) for w, why in lost[k].items()]
-                files.append(replace(file, skipped=file.skipped | lost[k].keys()))
+            gone = lost.get(k, {})
+            if k in broken:
+                why = broken[k].rstrip(".")
+                told.append(
+                    f"'{file.file.name}' could not be read to its end ({why}): its {file.rows} "
+                    f"rows take no part."
+                )
+                files.append(replace(file, skipped=file.windows))
                 continue
-            why = broken[k].rstrip(".")
-            told.append(
-                f"'{file.file.name}' could not be read to its end ({why}): its {file.rows} rows "
-                f"take no part."
-            )
+            told += [file.without(w, why) for w, why in gone.items()]
+            files.append(replace(file, skipped=file.skipped | gone.keys()))
         found = [(p, r) for p, r in found if p.file not in broken]
         if not found:
             raise LogError(told[0] if told else "the files hold 0 segments, at least 1 is needed.")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 
+import numpy as np
 import pytest
 from virtual import virtual_log, write_csv
 
@@ -62,3 +63,53 @@ def test_a_folder_is_compared_and_checked_file_by_file(folder, tmp_path):
     assert len(json.loads(out.read_text())["provenance"]["logs"]) == 3
     main(["check", str(folder), "--vessel", "thesis", "--json", str(out)])
     assert len(json.loads(out.read_text())["logs"]) == 3
+
+
+def test_logs_beyond_the_memory_are_read_in_passes(folder, tmp_path, capsys):
+    named, _ = estimated(tmp_path, folder)
+    found, _ = estimated(tmp_path, folder, "--memory", "0.001")
+    told = found["stream"]
+    assert (told["files"], told["rows"]) == (3, 1200)
+    assert told["drawn"]["share"] == 1.0
+    assert [s["samples"] for s in told["drawn"]["stretches"]] == [400, 400, 400]
+    # least squares of segments is that of all samples
+    np.testing.assert_allclose(found["theta"], named["theta"], rtol=1e-7)
+    assert any("rest on 1200 of them (100 %) in 3 stretches" in n for n in found["notes"])
+    assert {t.split("_")[0] for t in found["tests"]} >= {"relevance", "input", "stability"}
+    assert found["verdict"]["prediction"]["level"] in ("good", "limited", "poor")
+
+
+def test_a_broken_file_of_a_stream_is_left_out_and_named(folder, tmp_path):
+    named, _ = estimated(tmp_path, folder, "--memory", "0.001")
+    (folder / "broken.csv").write_text("t,u\n0,1\n1,2\n2,3\n")
+    try:
+        found, _ = estimated(tmp_path, folder, "--memory", "0.001")
+    finally:
+        (folder / "broken.csv").unlink()
+    assert found["theta"] == named["theta"]
+    (told,) = found["stream"]["left_out"]
+    assert told.startswith("'broken.csv' was left out: ")
+    assert told in found["notes"]
+
+
+@pytest.mark.parametrize(
+    ("options", "asked"),
+    [
+        (["--method", "oe"], "--method oe"),
+        (["--method", "iv", "--prefilter", "noise"], "--prefilter noise"),
+        (["--method", "ls", "--covariance", "hac"], "--covariance hac"),
+    ],
+)
+def test_what_needs_all_samples_is_refused_of_a_stream(folder, capsys, options, asked):
+    common = ["estimate", str(folder), "--vessel", "thesis", "--memory", "0.001"]
+    assert main([*common, *options]) == 1
+    assert f"{asked} needs all samples in memory at a time" in capsys.readouterr().err
+
+
+def test_structures_are_compared_on_stretches_of_a_stream(folder, tmp_path):
+    out = tmp_path / "model.json"
+    options = ["--vessel", "thesis", "--method", "iv", "--memory", "0.001", "--json", str(out)]
+    main(["estimate", str(folder), *options, "--compare-structures", "thesis", "linear"])
+    found = json.loads(out.read_text())
+    assert found["structure_choice"]
+    assert found["stream"]["passes"] >= 2
