@@ -22,7 +22,7 @@ from greybox.numerics.effort import within
 from greybox.public import one_thread
 from greybox.regression.problem import RegressionProblem
 from greybox.selection.estimate import estimate_requested, weighed, with_runs
-from greybox.selection.prediction import refit_alike, require_others, with_prediction
+from greybox.selection.prediction import part_of_estimate, refit_alike, with_prediction
 from greybox.selection.request import Request
 from greybox.selection.stretches import Drawn
 
@@ -126,7 +126,7 @@ def estimate_stream(
     """
     require_adding(request)
     logs = list(drawn.logs)
-    require_others(logs, request.validate)
+    _require_others(drawn, request)
     notes: list[str] = []
     if request.method is None:
         notes.append(

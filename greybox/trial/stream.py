@@ -39,7 +39,7 @@ Result = TypeVar("Result")
 # rows of a window: at most so many, for memory; at least so many, for long runs of a model; and
 # so many windows or more, for a spread between them
 _MOST_ROWS, _LEAST_ROWS, _WINDOWS = 100_000, 5_000, 50
-# windows that one piece of work reads from a file
+# windows that one piece of work reads from a Parquet file
 _A_PIECE = 8
 # bytes in which the rows of a text table are counted
 _HEAD = 1 << 16
@@ -61,6 +61,8 @@ class StreamedFile:
         Of segments, as they follow from gaps and cuts, before each window.
     sample_time : float
         [s]
+    whole : bool
+        Whether rows can only be found by reading those before them, as in a text.
     skipped : frozenset of int
         Windows that hold no log.
     """
@@ -71,6 +73,7 @@ class StreamedFile:
     cuts: tuple[int, ...]
     numbers: tuple[int, ...]
     sample_time: float
+    whole: bool = False
     skipped: frozenset[int] = frozenset()
 
     @property
@@ -84,6 +87,11 @@ class StreamedFile:
             return f"'{self.file.name}' was left out: {why}"
         first, stop = self.cuts[window : window + 2]
         return f"rows {first + 1} to {stop} of '{self.file.name}' were left out: {why}"
+
+    @property
+    def piece(self) -> int:
+        """How many windows are read one after another."""
+        return len(self.cuts) if self.whole else _A_PIECE
 
     @property
     def windows(self) -> frozenset[int]:
@@ -176,10 +184,10 @@ class LogStream:
             No file can be read.
         """
         pieces = [
-            _Piece(self, k, first, min(first + _A_PIECE, len(f.cuts) - 1))
+            _Piece(self, k, first, min(first + f.piece, len(f.cuts) - 1))
             for k, f in enumerate(self.files)
             if not f.gone
-            for first in range(0, len(f.cuts) - 1, _A_PIECE)
+            for first in range(0, len(f.cuts) - 1, f.piece)
         ]
         found: list[tuple[Place, Result]] = []
         broken: dict[int, str] = {}
@@ -301,7 +309,8 @@ def _index(file: LogFile, vessel: Vessel, most: int) -> StreamedFile | str:
             known = known or Provenance(path.name)
             known = replace(known, sha256=known.sha256 or sha256(path))
             time = table_columns(table, own, guess=False)["t"]
-            return StreamedFile(file, known, own, *_cuts(table, time, most))
+            whole = not isinstance(table, ParquetFile)
+            return StreamedFile(file, known, own, *_cuts(table, time, most), whole)
     except (GreyboxError, OSError) as error:
         return str(error)
 
@@ -474,6 +483,8 @@ def _row_windows(
                 )
             held.append(batch)
             have += len(batch[columns[0]])
+            if at + have <= start:
+                at, have, held = at + have, 0, []
         whole = {c: np.concatenate([b[c] for b in held]) for c in columns}
         own = {c: v[start - at : stop - at] for c, v in whole.items()}
         held = [{c: v[stop - at :] for c, v in whole.items()}]

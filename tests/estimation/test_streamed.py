@@ -268,6 +268,8 @@ def test_one_segment_has_no_spread(folder, ship, thesis):
 def test_a_stream_is_read_from_csv_too(folder, ship, tmp_path, small):
     log = read_segments(folder / "day1.parquet", ship)
     write_log(log, tmp_path / "day1.csv")
-    _, found = opened(tmp_path, ship).run(_times)
+    stream, found = opened(tmp_path, ship).run(_times)
     assert len(found) == 4
     np.testing.assert_array_equal(np.concatenate([t for _, t in found]), log[0].t)
+    (last,) = stream.read([found[-1][0]])
+    np.testing.assert_array_equal(last.t, log[0].t[4500:])
