@@ -182,6 +182,14 @@ def estimate_stream(
     return StreamEstimate(replace(estimate, notes=told), drawn, streamed)
 
 
+def _require_others(drawn: Drawn, request: Request) -> None:
+    """Refuse a log that validates and is a file of the stream, drawn from or not."""
+    files = {f.known.sha256 for f in drawn.stream.parts}
+    for log in request.validate:
+        if log.provenance.sha256 in files:
+            raise part_of_estimate(log)
+
+
 def _judged(estimate: Estimate, streamed: Streamed, regression: RegressionProblem) -> Estimate:
     """Return an estimate with its tests on the stretches, which know what all samples tell."""
     information = [s.information for s in streamed.solutions]
