@@ -18,7 +18,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument(
         "logs", nargs="+", metavar="LOG",
-        help="logs, or raw files of any format; those of one ship are judged together",
+        help="logs, or raw files of any format; folders and patterns stand for the logs in them; "
+        "those of one ship are judged together",
     )  # fmt: skip
     parser.add_argument("--vessel", required=True, metavar="V", help="vessel file (TOML)")
     parser.add_argument("--json", metavar="F", help="write the findings as JSON; - is stdout")
@@ -33,13 +34,15 @@ def run(options: argparse.Namespace) -> None:
     from greybox.files import check_targets, write_json
     from greybox.trial.checks.check import check_files
     from greybox.trial.checks.finding import shared_findings
+    from greybox.trial.log_files import find_logs
     from greybox.trial.repair import apply_repairs
     from greybox.trial.trial_summary import Contents, describe_recording
     from greybox.vessel.toml import load_vessel
 
     check_targets(options.json, options.report)
     vessel = load_vessel(options.vessel)
-    reports = check_files([Path(p) for p in options.logs], vessel)
+    paths = [Path(file.path) for file in find_logs(options.logs)]
+    reports = check_files(paths, vessel)
     contents = [
         describe_recording(apply_repairs(r.recording, [f for f in r.findings if f.safe]), vessel)
         if r.recording is not None
@@ -60,7 +63,7 @@ def run(options: argparse.Namespace) -> None:
     if options.report:
         from greybox.report.checks import check_page
 
-        check_page(reports, [Path(p) for p in options.logs], vessel, options.report, record)
+        check_page(reports, paths, vessel, options.report, record)
     if options.json != "-":
         shared = shared_findings(reports)
         for finding in shared:

@@ -31,7 +31,13 @@ SHELL_ONLY = (
 
 def add_logs(parser: argparse.ArgumentParser) -> None:
     """Add the log files as positional arguments, and the vessel."""
-    parser.add_argument("logs", nargs="+", metavar="LOG", help="log files, CSV or Parquet")
+    parser.add_argument(
+        "logs",
+        nargs="+",
+        metavar="LOG",
+        help="logs, CSV or Parquet: files, folders, patterns in quotes, or addresses such as "
+        "s3://bucket/folder",
+    )
     parser.add_argument("--vessel", required=True, metavar="V", help="vessel file (TOML)")
 
 
@@ -78,23 +84,44 @@ def read_logs(
     sample_time: float | None = None,
     states: tuple[str, ...] = (),
 ) -> tuple[list[TrialLog], tuple[str, ...]]:
-    """Read log files as the segments between gaps, decimated where a sample time is asked for.
+    """Read logs as the segments between gaps, decimated where a sample time is asked for.
+
+    Parameters
+    ----------
+    paths : sequence of str
+        As `find_logs`. What a folder or a pattern holds beside logs is left out.
 
     Returns
     -------
     tuple of (list of TrialLog, tuple of str)
-        The segments, and a sentence for each gap and for each segment that was left out.
+        The segments, and a sentence for each gap and for each file and segment that was left
+        out.
     """
+    from greybox.errors import LogError
     from greybox.trial.convert.read import read_segments
     from greybox.trial.kinematics import decimate_segments
+    from greybox.trial.log_files import find_logs, local_copy
     from greybox.trial.segments import find_log_gaps, join_segments
 
-    files = [(path, read_segments(path, vessel, states=states)) for path in paths]
-    logs = [s for _, segments in files for s in segments]
-    whole = (join_segments(segments, Path(path).stem) for path, segments in files)
-    told = tuple(g.sentence for log in whole for g in find_log_gaps(log))
+    logs: list[TrialLog] = []
+    told: list[str] = []
+    refused: LogError | None = None
+    for file in find_logs(paths):
+        try:
+            with local_copy(file.path) as path:
+                segments = read_segments(path, vessel, states=states)
+        except LogError as error:
+            if not file.found:
+                raise
+            refused = refused or error
+            told.append(f"'{file.name}' was left out: {error}")
+            continue
+        logs += segments
+        told += [g.sentence for g in find_log_gaps(join_segments(segments, path.stem))]
+    if refused is not None and not logs:
+        raise refused
     if sample_time is None or not logs:
-        return logs, told
+        return logs, tuple(told)
     logs, left_out = decimate_segments(logs, sample_time)
     return logs, (*told, *left_out)
 
@@ -104,6 +131,8 @@ _INPUTS = (
     "logs", "log", "models", "model", "nominal", "validate", "estimate", "vessel", "prior",
     "between", "area", "raw", "trial", "after", "diagnosis", "plan",
 )  # fmt: skip
+# those of logs, which folders and patterns may stand for
+_LOGS = ("logs", "log", "validate", "estimate")
 OUTPUTS = ("out", "json", "report", "sheet", "legs", "save_model")
 # raw files are hashed as they are imported
 _HASHED = tuple(n for n in _INPUTS if n != "raw")
@@ -136,9 +165,14 @@ def provenance(options: argparse.Namespace) -> dict[str, Any]:
 
 def _hashes(shown: Mapping[str, Any]) -> dict[str, str]:
     """Return the SHA-256 of each file that options name to be read; built-in names have none."""
+    from greybox.trial.log_files import find_logs, is_address
+
     found: dict[str, str] = {}
     for name in _HASHED:
-        for path in _paths(shown.get(name)):
+        paths = [p for p in _paths(shown.get(name)) if not is_address(p)]
+        if name in _LOGS:
+            paths = [file.path for file in find_logs(paths)]
+        for path in paths:
             if Path(path).is_file():
                 with open(path, "rb") as handle:
                     found[path] = file_digest(handle, "sha256").hexdigest()

@@ -16,7 +16,13 @@ EXAMPLES = """examples:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("models", nargs="+", metavar="MODEL", help="model files")
-    parser.add_argument("--log", nargs="+", required=True, metavar="LOG", help="logs to compare on")
+    parser.add_argument(
+        "--log",
+        nargs="+",
+        required=True,
+        metavar="LOG",
+        help="logs to compare on; folders and patterns stand for the logs in them",
+    )
     parser.add_argument(
         "--heading",
         choices=("measured", "simulated"),
@@ -40,6 +46,7 @@ def run(options: argparse.Namespace) -> None:
     from greybox.files import check_targets, write_json
     from greybox.model.model import load_model
     from greybox.trial.convert.read import read_log
+    from greybox.trial.log_files import find_logs
     from greybox.validation.comparison import compare
 
     check_targets(options.json, options.report)
@@ -50,10 +57,11 @@ def run(options: argparse.Namespace) -> None:
     # one file may be compared with itself
     names = [n if n not in names[:i] else f"{n} ({i + 1})" for i, n in enumerate(names)]
     named = dict(zip(names, models, strict=True))
+    files = find_logs(options.log)
     logs = {
         name: [
-            read_log(path, model.vessel, states=model.structure.states, gaps=True)
-            for path in options.log
+            read_log(file.path, model.vessel, states=model.structure.states, gaps=True)
+            for file in files
         ]
         for name, model in named.items()
     }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from greybox.commands.common import (
     add_cluster,
@@ -21,8 +21,13 @@ from greybox.model.predictor_kinds import PREDICTORS
 from greybox.numerics.effort import EFFORT
 from greybox.public import one_thread
 
+# GiB that an estimate may hold by default: those of a usual machine, and of 260,000 samples
+MEMORY = 4.0
+
 if TYPE_CHECKING:
+    from greybox.selection.estimate_stream import StreamEstimate
     from greybox.selection.request import Request
+    from greybox.selection.stretches import Drawn
     from greybox.selection.structures import StructureChoice
     from greybox.trial.log import TrialLog
     from greybox.trial.plan_parts import SailedPlan
@@ -37,6 +42,7 @@ EXAMPLES = """examples:
   greybox estimate a.csv b.csv --vessel ship.toml --validate c.csv --out m.json
   greybox estimate trial.csv --vessel ship.toml --plan plan.csv --out m.json
   greybox estimate a.csv b.csv --vessel ship.toml --compare-structures thesis linear modulus
+  greybox estimate campaign/ --vessel ship.toml --method iv --predictor augmented --out m.json
 """
 
 
@@ -113,6 +119,14 @@ def _add_data(parser: argparse.ArgumentParser) -> None:
         type=positive,
         metavar="S",
         help="decimate the logs to this sample time [s]; by default that of the logs",
+    )
+    group.add_argument(
+        "--memory",
+        type=positive,
+        default=MEMORY,
+        metavar="GIB",
+        help="logs whose estimate would take more memory than this [GiB] are read in passes, and "
+        f"tests rest on the stretches that tell most ({MEMORY:g})",
     )
     group.add_argument(
         "--validate",
@@ -309,14 +323,20 @@ def _choose(
 @one_thread
 def run(options: argparse.Namespace) -> None:
     """Read, estimate, report, write."""
+    from greybox.errors import UsageError
     from greybox.estimation.output_error import OutputErrorOptions
     from greybox.files import check_targets, write_json
-    from greybox.model.catalogue import get_structure
+    from greybox.model.catalogue import get_structure, structure_for
     from greybox.model.model import load_model
     from greybox.report.physical import physical_summary
     from greybox.selection.estimate import estimate_requested
+    from greybox.selection.estimate_stream import BYTES, estimate_stream, require_adding
     from greybox.selection.request import Request
+    from greybox.selection.stretches import draw
+    from greybox.trial.log_files import find_logs
     from greybox.trial.plan_parts import by_parts, read_plan
+    from greybox.trial.stream import estimated_rows, open_stream
+    from greybox.vessel.force import force_inputs
     from greybox.vessel.toml import load_vessel
 
     _require_heeded(options)
@@ -325,7 +345,19 @@ def run(options: argparse.Namespace) -> None:
     # the vessel's own terms may be changed too: here only the states matter
     named = options.structure or (options.compare_structures or ["thesis"])[0]
     states = get_structure(named.split("+")[0].split("-")[0]).states
-    logs, left_out = read_logs(options.logs, vessel, options.sample_time, states)
+    files = find_logs(options.logs)
+    rows = estimated_rows(files)
+    streams = rows * BYTES > options.memory * 2**30
+    logs: list[TrialLog] = []
+    left_out: tuple[str, ...] = ()
+    if not streams:
+        logs, left_out = read_logs(options.logs, vessel, options.sample_time, states)
+    elif options.plan:
+        raise UsageError(
+            f"--plan needs the logs in memory, and {rows} rows take about "
+            f"{rows * BYTES / 2**30:.3g} GiB where --memory gives {options.memory:g}: give it "
+            f"more, or fewer logs."
+        )
     validate, no_part = read_logs(options.validate, vessel, options.sample_time, states)
     parts: tuple[SailedPlan, ...] = ()
     if options.plan:
@@ -359,11 +391,24 @@ def run(options: argparse.Namespace) -> None:
         validate=tuple(validate),
         effort=options.effort,
     )
+    drawn: Drawn | None = None
+    if streams:
+        require_adding(request)
+        stream = open_stream(files, vessel, states=states, sample_time=options.sample_time)
+        drawn = draw(stream, structure_for(named, force_inputs(vessel)))
+        logs = list(drawn.logs)
     choice = _choose(logs, request, options)
-    estimate = choice.estimate if choice else estimate_requested(logs, request)
+    found: StreamEstimate | None = None
+    if drawn is not None:
+        found = estimate_stream(drawn, request, choice.estimate if choice else None)
+        estimate = found.estimate
+    else:
+        estimate = choice.estimate if choice else estimate_requested(logs, request)
     estimate = replace(estimate, notes=(*left_out, *no_part, *estimate.notes))
     model = estimate.model()
-    told = {"structure_choice": choice.to_list()} if choice else {}
+    told: dict[str, Any] = {"structure_choice": choice.to_list()} if choice else {}
+    if found is not None:
+        told["stream"] = found.to_dict()
     made = provenance(options)
     if parts:
         made["plan"] = [p.to_dict() for p in parts]

@@ -87,13 +87,26 @@ def _of_equation(evidence: Evidence, equation: Equation) -> list[TestResult]:
     return [
         excitation(equation),
         *weak_instruments(equation, biases),
-        anderson_rubin(evidence, equation, biases),
+        _of_part("anderson_rubin", equation)
+        if equation.whole is not None
+        else anderson_rubin(evidence, equation, biases),
         overidentification(equation, biases),
         input_independence(evidence, equation),
         *_still_water(evidence, equation),
-        many_instruments(equation, biases),
+        _of_part("many_instruments", equation)
+        if equation.whole is not None
+        else many_instruments(equation, biases),
         endogeneity(equation, decisive=evidence.estimator.biased_by_noise),
     ]
+
+
+def _of_part(name: str, equation: Equation) -> TestResult:
+    """Return a test that says nothing of an estimate on more samples than the logs hold."""
+    reason = (
+        "the estimate rests on all samples, with as many instruments as parameters, and these "
+        "logs are a part of them"
+    )
+    return not_applicable(name, _OF_EQUATIONS[name], reason, equation.state)
 
 
 def _still_water(evidence: Evidence, equation: Equation) -> list[TestResult]:

@@ -57,6 +57,8 @@ class Equation:
         How measurement noise changes along each log; empty where it is alike everywhere.
     states : tuple of ndarray
         (nx, N) simulated states an experiment, in every row; empty where there are none.
+    whole : ndarray, optional
+        (p, p) Σ ẑ φᵀ of all samples, where the experiments are only a part of them.
     """
 
     state: str
@@ -69,6 +71,7 @@ class Equation:
     centred: bool
     shapes: tuple[ErrorVarianceProfile, ...] = ()
     states: tuple[Array, ...] = ()
+    whole: Array | None = None
 
     @property
     def rows(self) -> int:
@@ -128,6 +131,14 @@ class Equation:
         return np.asarray(np.sqrt(np.maximum(np.diag(inverse @ middle @ inverse.T), 0.0)))
 
     @cached_property
+    def gain(self) -> Array:
+        """How many times as much all samples tell of each parameter alone, (p,)."""
+        if self.whole is None:
+            return np.ones(len(self.labels))
+        here, there = scaled_inverse(self.solution.information), scaled_inverse(self.whole)
+        return np.asarray(np.diag(here) / np.diag(there))
+
+    @cached_property
     def obstacle(self) -> str:
         """Why this regression cannot be tested; empty where it can."""
         p = len(self.columns)
@@ -183,6 +194,8 @@ class Evidence:
         and plain instrumental variables do.
     white : WhiteEquations, optional
         The equations of a refined estimate, with their error made white.
+    information : tuple of ndarray, optional
+        (p, p) Σ ẑ φᵀ of each equation, where the estimate rests on more samples than the logs.
     """
 
     predictor: Predictor
@@ -198,6 +211,7 @@ class Evidence:
     margins: Mapping[str, float] | None = None
     solved: bool = True
     white: WhiteEquations | None = None
+    information: tuple[Array, ...] | None = None
 
     @property
     def estimator(self) -> Estimator:
@@ -243,6 +257,10 @@ def _equation(evidence: Evidence, row: int, state: str) -> Equation:
         y.append(_prepare(e.y[row][None], keep, centred)[0])
         phi.append(_prepare(e.phi[mine], keep, centred))
         z.append(_prepare(ze[mine], keep, centred))
+    whole = None
+    if evidence.information is not None:
+        own = [predictor.equation(state).index(i) for i in mine]
+        whole = evidence.information[row][np.ix_(own, own)]
     return Equation(
         state,
         tuple(mine),
@@ -253,6 +271,7 @@ def _equation(evidence: Evidence, row: int, state: str) -> Equation:
         evidence.instruments.keep,
         centred,
         states=tuple(x.T for x in evidence.instruments.x),
+        whole=whole,
     )
 
 

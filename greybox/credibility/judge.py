@@ -35,19 +35,43 @@ def run_tests(fitted: Fitted) -> Estimate:
     Tests that it has already stay, in place of those of the same name. Without a regression
     there are none, and the verdict refuses the estimate.
     """
-    estimate, problem, solved = fitted.estimate, fitted.regression, fitted.solved
-    predictor, logs = problem.predictor, problem.logs
+    estimate = fitted.estimate
     try:
-        regression = problem.regression
+        evidence = evidence_of(fitted)
     except ExcitationError as error:
         return replace(estimate, verdict=refused([NoRegression(str(error))], estimate.labels))
+    own = {t.name: t for t in estimate.tests}
+    tests: list[TestResult] = [own.pop(t.name, t) for t in assess(evidence)]
+    tests += [t for t in convergence(estimate) if t.name not in own]
+    tests += own.values()
+    return replace(estimate, tests=tuple(tests))
+
+
+def evidence_of(fitted: Fitted, information: Sequence[Array] | None = None) -> Evidence:
+    """Return what the tests of an estimate look at.
+
+    Parameters
+    ----------
+    fitted : Fitted
+    information : sequence of ndarray, optional
+        (p, p) Σ ẑ φᵀ of each equation, where the estimate rests on more samples than the logs
+        of the regression hold.
+
+    Raises
+    ------
+    ExcitationError
+        The logs hold no regression.
+    """
+    estimate, problem, solved = fitted.estimate, fitted.regression, fitted.solved
+    predictor, logs = problem.predictor, problem.logs
+    regression = problem.regression
     if solved is None:
         instruments = problem.instruments(estimate.structure_theta())
         keep = instruments.keep or tuple(e.keep for e in regression.experiments)
     else:
         instruments, keep = solved.simulated, tuple(solved.keep)
     theta, covariance = _coefficients(estimate, predictor)
-    evidence = Evidence(
+    return Evidence(
         predictor,
         regression,
         logs,
@@ -61,12 +85,8 @@ def run_tests(fitted: Fitted) -> Estimate:
         problem.margins,
         solved=solved is not None,
         white=fitted.white,
+        information=None if information is None else tuple(information),
     )
-    own = {t.name: t for t in estimate.tests}
-    tests: list[TestResult] = [own.pop(t.name, t) for t in assess(evidence)]
-    tests += [t for t in convergence(estimate) if t.name not in own]
-    tests += own.values()
-    return replace(estimate, tests=tuple(tests))
 
 
 def convergence(estimate: Estimate) -> tuple[TestResult, ...]:

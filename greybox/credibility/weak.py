@@ -98,8 +98,13 @@ def measure_strength(equation: Equation) -> Strength:
         own[i] = size**2 / _noise_variance(part, [v[i : i + 1] for v in noise], equation, q)
         first[i] = gram[i, i] / covariance[i, i] / q
     shea = np.diag(scaled_inverse(moments)) / np.diag(inverse)
-    joint = _joint(equation, bases, noise, covariance, noisy, q)
-    return Strength(first, shea, own, *joint)
+    donald, rank, rank_freedom, direction = _joint(equation, bases, noise, covariance, noisy, q)
+    # the noise of a sample is that of all, and what the instruments move adds up
+    gain = equation.gain
+    least = float(gain.min())
+    return Strength(
+        first * gain, shea, own * gain, donald * least, rank * least, rank_freedom, direction
+    )
 
 
 def _orthonormal(z: Array) -> Array:

@@ -105,6 +105,12 @@ class EstimationProblem(EstimationOptions):
         """Signs that the states take in the logs."""
         return regime_of(self.logs, self.structure)
 
+    @property
+    def instrument_wind(self) -> Literal["smoothed", "measured"]:
+        """The wind in the instruments: averaged where its sensor is noisy."""
+        noisy = float(self.logs[0].vessel.sensors.get("wind_std", 0.0)) > 0
+        return "smoothed" if noisy else "measured"
+
     @cached_property
     def nominal_theta(self) -> Array | None:
         """The nominal model's parameters in the order of the structure, absent ones zero.

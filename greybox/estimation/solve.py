@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,15 +78,76 @@ def solve_iv(
             "predictor leaves out: build it with an intercept, or use zero-mean instruments."
         )
     regression = problem.regression
-    theta = _start(problem, start)
-    # the first model may be far off: rows are first cut by the measured states
-    instruments = problem.instruments(theta, problem.keep)
+    instruments, solutions, iteration = iterate_instruments(
+        predictor,
+        _start(problem, start),
+        # the first model may be far off: rows are first cut by the measured states
+        problem.keep,
+        problem.instruments,
+        lambda made: _solve(regression, made, metric),
+        refine,
+    )
+    return Solved("iv", problem, instruments, solutions, iteration)
+
+
+class Made(Protocol):
+    """Instruments of a model, or what is made of them."""
+
+    @property
+    def diverged(self) -> str:
+        """Empty, or which simulation left its bound."""
+
+    @property
+    def keep(self) -> Any:
+        """Rows that take part."""
+
+
+Equations = TypeVar("Equations", bound=Made)
+
+
+def _stays(moved: Array, previous: Array, made: Any, solutions: Sequence[Solution]) -> bool:
+    """Whether coefficients moved by a small share of themselves."""
+    return bool((moved < _REFINE_TOLERANCE * (np.abs(previous) + 1e-12)).all())
+
+
+def iterate_instruments(
+    predictor: Predictor,
+    theta: Array,
+    measured: Any,
+    make: Callable[[Array, Any], Equations],
+    solve: Callable[[Equations], Sequence[Solution]],
+    refine: bool | int,
+    stays: Callable[[Array, Array, Equations, Sequence[Solution]], bool] = _stays,
+) -> tuple[Equations, Sequence[Solution], Iteration]:
+    """Solve with simulated instruments, and simulate them again by each estimate.
+
+    Parameters
+    ----------
+    predictor : Predictor
+    theta : ndarray
+        (p,) parameters of the structure that simulate the first instruments.
+    measured
+        Rows that are cut by the measured states.
+    make : callable
+        Simulates a model, on given rows or, where these are None, on its own.
+    solve : callable
+    refine : bool or int
+        As `estimate_iv`.
+    stays : callable
+        Whether an estimate has settled, of its move, the estimate before, and its equations.
+
+    Raises
+    ------
+    ExcitationError
+        Even the first simulation diverges, or as `solve`.
+    """
+    instruments = make(theta, measured)
     if instruments.diverged:
         raise ExcitationError(
             f"{instruments.diverged} already with the first model, so there are no instruments: "
             f"give a nominal model that is stable, or use --method ls."
         )
-    solutions = _solve(regression, instruments, metric)
+    solutions = solve(instruments)
     iteration = Iteration(0, "one step, instruments not refined")
     strongest = (_strength(solutions), theta, instruments, solutions)
     if refine:
@@ -96,33 +158,32 @@ def solve_iv(
             target = _structure_theta(predictor, previous)
             # rows are cut once by a refined model and then kept, or the cut would chatter
             rows = None if count == 1 else instruments.keep
-            candidate, fresh = target, problem.instruments(target, rows)
+            candidate, fresh = target, make(target, rows)
             for _ in range(4):
                 if not fresh.diverged:
                     break
                 candidate = (candidate + theta) / 2
-                fresh = problem.instruments(candidate, rows)
+                fresh = make(candidate, rows)
             if fresh.diverged:
                 ended = f"stopped after {count - 1} refinements: {fresh.diverged}; {_STRONGEST}"
                 iteration = Iteration(count, ended, False)
                 _, theta, instruments, solutions = strongest
                 break
             theta, instruments = candidate, fresh
-            solutions = _solve(regression, instruments, metric)
+            solutions = solve(instruments)
             strength = _strength(solutions)
             if strength > strongest[0]:
                 strongest = (strength, theta, instruments, solutions)
             moved = np.abs(_coefficients(solutions) - previous)
-            scale = np.abs(previous) + 1e-12
             # a halfway model settles too, but not at an estimate that can be simulated
-            if candidate is target and (moved < _REFINE_TOLERANCE * scale).all():
+            if candidate is target and stays(moved, previous, instruments, solutions):
                 iteration = Iteration(count, f"converged after {count} refinements")
                 break
         else:
             if refine is True:
                 iteration = replace(iteration, ended=f"{iteration.ended}; {_STRONGEST}")
                 _, theta, instruments, solutions = strongest
-    return Solved("iv", problem, instruments, solutions, iteration)
+    return instruments, solutions, iteration
 
 
 @dataclass(frozen=True)
@@ -253,25 +314,64 @@ def _coefficients(solutions: Sequence[Solution]) -> Array:
 def _solve(
     regression: Regression, instruments: Instruments, metric: str = "moments"
 ) -> list[Solution]:
-    predictor = regression.predictor
+    predictor, keep = regression.predictor, instruments.keep
+
+    def largest(rows: Sequence[Array]) -> Array:
+        return np.asarray(np.max([largest_of(r, k) for r, k in zip(rows, keep, strict=True)], 0))
+
+    def solved(row: int, mine: list[int]) -> Solution:
+        logs = list(zip(regression.experiments, keep, strict=True))
+        phi = [_part(e.phi, mine, k) for e, k in logs]
+        y = [e.y[row, k] for e, k in logs]
+        z = [_part(z, mine, k) for z, k in zip(instruments.z, keep, strict=True)]
+        return solve_stacked(z, phi, y, metric=metric)
+
+    return solve_equations(
+        predictor,
+        solved,
+        (largest([e.phi for e in regression.experiments]), largest(instruments.z)),
+        sum(int(k.sum()) for k in keep),
+        regression.samples,
+    )
+
+
+def solve_equations(
+    predictor: Predictor,
+    solved: Callable[[int, list[int]], Solution],
+    largest: tuple[Array, Array],
+    kept: int,
+    samples: int,
+) -> list[Solution]:
+    """Solve each equation, or say which of its parameters are not determined.
+
+    Parameters
+    ----------
+    predictor : Predictor
+    solved : callable
+        Solves an equation, of its position and the positions of its columns.
+    largest : tuple of ndarray
+        (p,) the largest size of each regressor, and of each instrument.
+    kept, samples : int
+        Rows that take part, and rows there are.
+
+    Raises
+    ------
+    ExcitationError
+        Some direction is not excited; its parameters are named.
+    """
     solutions = []
-    _require_excited(regression, instruments)
+    _require_excited(predictor, largest)
     for row, state in enumerate(predictor.structure.states):
         mine = predictor.equation(state)
-        kept = sum(int(k.sum()) for k in instruments.keep)
         if kept <= 2 * len(mine):
             raise ExcitationError(
-                f"{kept} of {regression.samples} samples keep the margins and the {state} equation "
+                f"{kept} of {samples} samples keep the margins and the {state} equation "
                 f"has {len(mine)} coefficients, more than {2 * len(mine)} are needed: use smaller "
                 f"margins or a longer log."
             )
-        logs = list(zip(regression.experiments, instruments.keep, strict=True))
-        phi = [_part(e.phi, mine, k) for e, k in logs]
-        y = [e.y[row, k] for e, k in logs]
-        z = [_part(z, mine, k) for z, k in zip(instruments.z, instruments.keep, strict=True)]
-        solution = solve_stacked(z, phi, y, metric=metric)
+        solution = solved(row, mine)
         if not solution.singular_values[-1] > SINGULAR * solution.singular_values[0]:
-            raise ExcitationError(_singular(predictor, mine, solution, regression))
+            raise ExcitationError(_singular(predictor, mine, solution, samples))
         solutions.append(solution)
     return solutions
 
@@ -282,19 +382,15 @@ def _part(rows: Array, mine: list[int], keep: NDArray[np.bool_]) -> Array:
     return own if keep.all() else own[:, keep]
 
 
-def _require_excited(regression: Regression, instruments: Instruments) -> None:
+def largest_of(rows: Array, keep: NDArray[np.bool_]) -> Array:
+    """Return the largest size of each of the rows (p, N) at the samples that take part, (p,)."""
+    return np.asarray(np.abs(rows if keep.all() else rows[:, keep]).max(axis=1, initial=0.0))
+
+
+def _require_excited(predictor: Predictor, largest: tuple[Array, Array]) -> None:
     """Name the parameters whose regressors, or else instruments, do not vary at all."""
-    predictor, keep = regression.predictor, instruments.keep
-    for rows, what in (([e.phi for e in regression.experiments], "regressor"),
-                       (instruments.z, "instrument")):  # fmt: skip
-        size = np.max(
-            [
-                np.abs(row if k.all() else row[:, k]).max(axis=1, initial=0.0)
-                for row, k in zip(rows, keep, strict=True)
-            ],
-            axis=0,
-        )[: len(predictor.columns)]
-        lost = np.flatnonzero(size < _STILL)
+    for size, what in zip(largest, ("regressor", "instrument"), strict=True):
+        lost = np.flatnonzero(size[: len(predictor.columns)] < _STILL)
         bias = next((int(i) for i in lost if predictor.columns[i].is_bias), None)
         if bias is not None:
             raise UnexcitedBiasError(bias, predictor.columns[bias].label)
@@ -310,16 +406,14 @@ def _require_excited(regression: Regression, instruments: Instruments) -> None:
             )
 
 
-def _singular(
-    predictor: Predictor, mine: list[int], solution: Solution, regression: Regression
-) -> str:
+def _singular(predictor: Predictor, mine: list[int], solution: Solution, samples: int) -> str:
     size = np.abs(solution.weakest)
     involved = [predictor.columns[mine[i]].label for i in np.argsort(-size) if size[i] > 0.2]
     ratio = solution.singular_values[-1] / solution.singular_values[0]
     return (
         f"the instruments are singular: {', '.join(involved)} cannot be told apart in the "
         f"{predictor.columns[mine[0]].state} equation (relative singular value {ratio:.1e}, "
-        f"needs {SINGULAR:.0e}) on {regression.samples} samples. Excite them separately, or "
+        f"needs {SINGULAR:.0e}) on {samples} samples. Excite them separately, or "
         f"leave one out."
     )
 

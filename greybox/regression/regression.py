@@ -106,29 +106,14 @@ def build_regression(
     ----------
     Ljungberg (2020), eqs. 4.3, 4.5, 4.13.
     """
-    structure = predictor.structure
     sample_time = common_sample_time(logs)
-    experiments = []
-    for i, log in enumerate(logs):
-        if predictor.air_measured and not log.has_wind:
-            raise LogError(
-                f"predictor '{predictor.kind}' needs the wind, and '{log.name}' has neither "
-                f"u_q, v_q nor V_q, gamma_q: use the predictor 'augmented' or 'basic'."
-            )
-        x = log.states(structure.states)
-        y = (np.diff(x, axis=0) if structure.increment else x[1:]).T
-        measured = x if second_measurement is None else x + second_measurement[i]
-        given = LogInputs.of(structure, log)
-        phi = predictor.evaluate(
-            [np.ascontiguousarray(measured[:-1, j]) for j in range(measured.shape[1])],
-            given.psi[:-1],
-            list(given.tau[:-1].T),
-            (log["u_q"][:-1], log["v_q"][:-1]) if predictor.air_measured else None,
-        )
-        keep = within_margins(x[:-1], structure.states, margins) & measured_rows(predictor, log)
-        experiments.append(Experiment(log.name, y, phi, keep))
+    second: Sequence[Array | None] = second_measurement or [None] * len(logs)
+    experiments = [
+        build_experiment(predictor, log, margins=margins, second_measurement=other)
+        for log, other in zip(logs, second, strict=True)
+    ]
     regression = Regression(predictor, tuple(experiments), sample_time)
-    most = max(len(predictor.equation(s)) for s in structure.states)
+    most = max(len(predictor.equation(s)) for s in predictor.structure.states)
     if regression.kept <= 2 * most:
         raise ExcitationError(
             f"{regression.kept} samples take part and one equation has {most} coefficients, "
@@ -136,6 +121,34 @@ def build_regression(
             f"smaller margins."
         )
     return regression
+
+
+def build_experiment(
+    predictor: Predictor,
+    log: TrialLog,
+    *,
+    margins: Mapping[str, float] | None = None,
+    second_measurement: Array | None = None,
+) -> Experiment:
+    """Form the rows of one log; parameters and errors as `build_regression`."""
+    structure = predictor.structure
+    if predictor.air_measured and not log.has_wind:
+        raise LogError(
+            f"predictor '{predictor.kind}' needs the wind, and '{log.name}' has neither "
+            f"u_q, v_q nor V_q, gamma_q: use the predictor 'augmented' or 'basic'."
+        )
+    x = log.states(structure.states)
+    y = (np.diff(x, axis=0) if structure.increment else x[1:]).T
+    measured = x if second_measurement is None else x + second_measurement
+    given = LogInputs.of(structure, log)
+    phi = predictor.evaluate(
+        [np.ascontiguousarray(measured[:-1, j]) for j in range(measured.shape[1])],
+        given.psi[:-1],
+        list(given.tau[:-1].T),
+        (log["u_q"][:-1], log["v_q"][:-1]) if predictor.air_measured else None,
+    )
+    keep = within_margins(x[:-1], structure.states, margins) & measured_rows(predictor, log)
+    return Experiment(log.name, y, phi, keep)
 
 
 def measured_rows(predictor: Predictor, log: TrialLog) -> NDArray[np.bool_]:

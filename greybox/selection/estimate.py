@@ -691,11 +691,43 @@ def _finished(
     estimate = estimate_once(
         logs, alternative.structure, alternative.method, alternative.kind, request, start
     )
+    reason = f"{alternative.label} was taken: {alternative.reason}." if alternative.reason else ""
+    estimate, diverged = with_runs(estimate, logs, notes, reason)
+    fit = estimate.fit
+    if request.judged:
+        found, trouble = limits_of(estimate, logs)
+        lacking = (f"bounds: {trouble}",) if trouble else ()
+        estimate = replace(
+            estimate,
+            verdict=weighed(estimate, diverged),
+            limits=found,
+            notes=(*estimate.notes, *lacking),
+        )
+    _log.info(
+        "%s: %d iterations, fit %s%s", alternative.label, estimate.iterations,
+        ", ".join(f"{k} {v:.1f} %" for k, v in fit.items()),
+        f"; verdict: {estimate.verdict.text}" if request.judged else "",
+    )  # fmt: skip
+    return estimate, diverged
+
+
+def with_runs(
+    estimate: Estimate, logs: Sequence[TrialLog], notes: Sequence[str] = (), reason: str = ""
+) -> tuple[Estimate, bool]:
+    """Return an estimate with its free-run fit and what that says, and whether a run diverges.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    logs : sequence of TrialLog
+    notes : sequence of str
+        Those that stand before its own.
+    reason : str
+        Why it was taken, behind them.
+    """
     model = estimate.model()
     runs = [run_model(model, log) for log in logs]
-    own = list(estimate.notes)
-    if alternative.reason:
-        own.append(f"{alternative.label} was taken: {alternative.reason}.")
+    own = [*estimate.notes, *([reason] if reason else [])]
     ended = ESTIMATORS[estimate.method].ended
     if ended:
         own.append(ended.format(status=estimate.status))
@@ -713,25 +745,10 @@ def _finished(
             f"was estimated on: this model does not explain that motion."
         )
     own += [d.sentence for d in estimate.conditions.differences]
-    estimate = replace(estimate, notes=(*notes, *own), fit=fit)
-    if request.judged:
-        found, trouble = limits_of(estimate, logs)
-        lacking = (f"bounds: {trouble}",) if trouble else ()
-        estimate = replace(
-            estimate,
-            verdict=_verdict(estimate, diverged),
-            limits=found,
-            notes=(*estimate.notes, *lacking),
-        )
-    _log.info(
-        "%s: %d iterations, fit %s%s", alternative.label, estimate.iterations,
-        ", ".join(f"{k} {v:.1f} %" for k, v in fit.items()),
-        f"; verdict: {estimate.verdict.text}" if request.judged else "",
-    )  # fmt: skip
-    return estimate, diverged
+    return replace(estimate, notes=(*notes, *own), fit=fit), diverged
 
 
-def _verdict(estimate: Estimate, diverged: bool) -> Verdict:
+def weighed(estimate: Estimate, diverged: bool) -> Verdict:
     """Weigh the tests again, now with the loop and the free run."""
     return weigh(
         estimate.tests,

@@ -172,10 +172,15 @@ def require_others(logs: Sequence[TrialLog], validate: Sequence[TrialLog]) -> No
         for own in logs:
             same = own.provenance.sha256 == log.provenance.sha256 != ""
             if same and own.t[0] <= log.t[-1] and log.t[0] <= own.t[-1]:
-                raise UsageError(
-                    f"'{log.name}' is to be estimated on and to validate the estimate: a log that "
-                    f"took part cannot judge. Name it once."
-                )
+                raise part_of_estimate(log)
+
+
+def part_of_estimate(log: TrialLog) -> UsageError:
+    """Return the error that a log validates an estimate which it is part of."""
+    return UsageError(
+        f"'{log.name}' is to be estimated on and to validate the estimate: a log that took part "
+        f"cannot judge. Name it once."
+    )
 
 
 def require_distinct(logs: Sequence[TrialLog]) -> None:

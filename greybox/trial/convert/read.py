@@ -211,7 +211,9 @@ def _recorded_grid(recording: Recording, table: TableFile, sample_time: float) -
     """Return the samples as they were recorded: every signal stands at each of them."""
     signals = recording.signals
     # a motion may have holes, over which the others go on
-    t = np.unique(np.concatenate([s.t for s in signals]))
+    t = signals[0].t
+    if not all(np.array_equal(s.t, t) for s in signals[1:]):
+        t = np.unique(np.concatenate([s.t for s in signals]))
     names = tuple(s.name for s in signals)
     return Plan(
         table.path.stem, sample_time, float(t[0]), len(t), dict.fromkeys(names, sample_time),

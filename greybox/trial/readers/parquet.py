@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,21 @@ class ParquetFile:
     format: str = "Parquet"
     first_row: int = 2
     steps: tuple[Step, ...] = ()
+    groups: tuple[int, ...] | None = None
+
+    def from_row(self, row: int) -> tuple[ParquetFile, int]:
+        """Return the file from the row group on that holds a row, and the rows before it."""
+        from pyarrow import parquet
+
+        with parquet.ParquetFile(self.path, memory_map=False) as file:
+            found = file.metadata
+            sizes = [found.row_group(k).num_rows for k in range(found.num_row_groups)]
+        before = 0
+        for k, size in enumerate(sizes):
+            if row < before + size:
+                return replace(self, groups=tuple(range(k, len(sizes)))), before
+            before += size
+        return replace(self, groups=()), before
 
     @property
     def cells(self) -> int:
@@ -62,7 +77,10 @@ class ParquetFile:
             ) as file:  # fmt: skip
                 _refuse_bombs(self.path, file.metadata, texts=bool(texts))
                 for batch in file.iter_batches(
-                    batch_size=limits().block_rows, columns=list(columns), use_threads=True
+                    batch_size=limits().block_rows,
+                    columns=list(columns),
+                    use_threads=True,
+                    row_groups=self.groups,
                 ):
                     yield {c: column_values(batch.column(c), self.kind(c)) for c in columns}
         except _ERRORS as error:

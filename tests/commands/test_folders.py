@@ -1,0 +1,121 @@
+"""A folder of logs is estimated as its files are when they are named."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from virtual import virtual_log, write_csv
+
+from greybox.commands.main import main
+
+OPTIONS = ("--vessel", "thesis", "--method", "ls", "--predictor", "basic")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    where = tmp_path_factory.mktemp("trials") / "logs"
+    where.mkdir()
+    for k in range(3):
+        write_csv(virtual_log(k, 400, wind=0.0, current=(0.0, 0.0)), where / f"day{k}.csv")
+    return where
+
+
+def estimated(tmp_path, *logs):
+    out = tmp_path / "model.json"
+    main(["estimate", *map(str, logs), *OPTIONS, "--json", str(out)])
+    found = json.loads(out.read_text())
+    made = found.pop("provenance")
+    return found, made
+
+
+def test_a_folder_gives_what_naming_its_files_gives(folder, tmp_path):
+    named, how = estimated(tmp_path, *sorted(folder.glob("*.csv")))
+    for typed in (folder, folder / "day*.csv"):
+        found, made = estimated(tmp_path, typed)
+        assert found == named
+        assert made["inputs"] == how["inputs"]
+
+
+def test_what_is_no_log_in_a_folder_is_left_out_and_named(folder, tmp_path):
+    named, _ = estimated(tmp_path, *sorted(folder.glob("*.csv")))
+    (folder / "broken.csv").write_text("t,u\n0,1\n1,2\n2,3\n")
+    try:
+        found, _ = estimated(tmp_path, folder)
+    finally:
+        (folder / "broken.csv").unlink()
+    assert found["theta"] == named["theta"]
+    assert any(n.startswith("'broken.csv' was left out: ") for n in found["notes"])
+
+
+def test_a_broken_file_that_is_named_stops_the_command(folder, tmp_path, capsys):
+    broken = tmp_path / "broken.csv"
+    broken.write_text("t,u\n0,1\n1,2\n2,3\n")
+    assert main(["estimate", str(folder), str(broken), *OPTIONS]) == 1
+    assert "broken.csv" in capsys.readouterr().err
+
+
+def test_a_folder_is_compared_and_checked_file_by_file(folder, tmp_path):
+    model, out = tmp_path / "m.json", tmp_path / "c.json"
+    main(["estimate", str(folder), *OPTIONS, "--out", str(model)])
+    main(["compare", str(model), "--log", str(folder), "--no-bands", "--json", str(out)])
+    assert len(json.loads(out.read_text())["provenance"]["logs"]) == 3
+    main(["check", str(folder), "--vessel", "thesis", "--json", str(out)])
+    assert len(json.loads(out.read_text())["logs"]) == 3
+
+
+def test_logs_beyond_the_memory_are_read_in_passes(folder, tmp_path, capsys):
+    named, _ = estimated(tmp_path, folder)
+    found, _ = estimated(tmp_path, folder, "--memory", "0.001")
+    told = found["stream"]
+    assert (told["files"], told["rows"]) == (3, 1200)
+    assert told["drawn"]["share"] == 1.0
+    assert [s["samples"] for s in told["drawn"]["stretches"]] == [400, 400, 400]
+    # least squares of segments is that of all samples
+    np.testing.assert_allclose(found["theta"], named["theta"], rtol=1e-7)
+    assert any("rest on 1200 of them (100 %) in 3 stretches" in n for n in found["notes"])
+    assert {t.split("_")[0] for t in found["tests"]} >= {"relevance", "input", "stability"}
+    assert found["verdict"]["prediction"]["level"] in ("good", "limited", "poor")
+
+
+def test_a_broken_file_of_a_stream_is_left_out_and_named(folder, tmp_path):
+    named, _ = estimated(tmp_path, folder, "--memory", "0.001")
+    (folder / "broken.csv").write_text("t,u\n0,1\n1,2\n2,3\n")
+    try:
+        found, _ = estimated(tmp_path, folder, "--memory", "0.001")
+    finally:
+        (folder / "broken.csv").unlink()
+    assert found["theta"] == named["theta"]
+    (told,) = found["stream"]["left_out"]
+    assert told.startswith("'broken.csv' was left out: ")
+    assert told in found["notes"]
+
+
+@pytest.mark.parametrize(
+    ("options", "asked"),
+    [
+        (["--method", "oe"], "--method oe"),
+        (["--method", "iv", "--prefilter", "noise"], "--prefilter noise"),
+        (["--method", "ls", "--covariance", "hac"], "--covariance hac"),
+    ],
+)
+def test_what_needs_all_samples_is_refused_of_a_stream(folder, capsys, options, asked):
+    common = ["estimate", str(folder), "--vessel", "thesis", "--memory", "0.001"]
+    assert main([*common, *options]) == 1
+    assert f"{asked} needs all samples in memory at a time" in capsys.readouterr().err
+
+
+def test_structures_are_compared_on_stretches_of_a_stream(folder, tmp_path):
+    out = tmp_path / "model.json"
+    options = ["--vessel", "thesis", "--method", "iv", "--memory", "0.001", "--json", str(out)]
+    main(["estimate", str(folder), *options, "--compare-structures", "thesis", "linear"])
+    found = json.loads(out.read_text())
+    assert found["structure_choice"]
+    assert found["stream"]["passes"] >= 2
+
+
+def test_a_file_of_a_stream_does_not_validate_it(folder, capsys):
+    options = [*OPTIONS, "--memory", "0.001", "--validate", str(folder / "day1.csv")]
+    assert main(["estimate", str(folder), *options]) == 1
+    assert "a log that took part cannot judge" in capsys.readouterr().err
