@@ -117,7 +117,8 @@ def fit(folder: Path, name: str, arm: str, seed: int) -> list[float]:
         held = sail(folder, name, "held-out", seed)
         found = greybox("compare", folder / f"{arm}.json", "--log", held, "--json", "-")
         channels = json.loads(found)["models"][0]["fit"]
-        told.write_text(json.dumps([channels[c] for c in ("u", "v", "r")]))
+        # a run that diverges predicts nothing
+        told.write_text(json.dumps([channels[c] or 0.0 for c in ("u", "v", "r")]))
     return [float(f) for f in json.loads(told.read_text())]
 
 
