@@ -5,10 +5,10 @@ prior, and a second trial of each kind is sailed and estimated with defaults, as
 
     PYTHONPATH=tests python -m benchmarks.foreign_designs --out DIR [--ships ...] [--seeds ...]
 
-`random` holds settings for half a length to two lengths, `long` is that for one and a half times
-the time, `zigzag` goes to both sides at three speeds, `plan` is `greybox design`. What stands in
-DIR is not made again. Fits (6.12) are means over surge, sway and yaw rate and over two held-out
-trials.
+Trials last sixty lengths, 5 to 15 min. `random` holds settings for half a length to two lengths,
+`zigzag` goes to both sides at three speeds, `plan` is `greybox design`; `long-` is half as long
+again. What stands in DIR is not made again. Errors are those of free runs over one long trial of
+the operating envelope: random steps, zig-zags and turns, to both sides at all speeds.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from foreign_ships import presets  # type: ignore[import-not-found]
@@ -30,40 +29,55 @@ from foreign_ships.manoeuvres import (  # type: ignore[import-not-found]
     turning_circle,
     zigzag,
 )
+from numpy.typing import NDArray
 
-SHIPS = ("kvlcc2-7m", "research-catamaran-29m", "survey-catamaran-2m")
-ARMS = ("random", "zigzag", "plan", "long")
-# lengths sailed in the first and in the second trial, and seconds between logged samples
-FIRST, SECOND = 50, 60
+Array = NDArray[np.float64]
+
+SHIPS = (
+    "kvlcc2-7m", "esso-osaka-3m", "training-ship-105m", "research-catamaran-29m",
+    "survey-catamaran-2m",
+)  # fmt: skip
+ARMS = ("random", "zigzag", "plan", "long-random", "long-zigzag")
+# lengths sailed in a trial, its least and its greatest duration [s], seconds between samples
+TRIAL, SHORTEST, LONGEST = 60, 300.0, 900.0
 EVERY = {
     "kvlcc2-7m": 0.5, "kvlcc2-320m": 2.0, "training-ship-105m": 1.0, "esso-osaka-3m": 0.5,
     "survey-catamaran-1.2m": 0.3, "survey-catamaran-2m": 0.4, "research-catamaran-29m": 0.8,
     "research-vessel-29m": 0.8, "workboat-12m": 0.8, "azimuth-ferry-18m": 0.8,
 }  # fmt: skip
+STEPS = random_steps(hold=(0.5, 2.0))
+ZIGZAGS = in_turn(
+    (zigzag(20, 20), 15), (zigzag(-20, 20, ahead=0.6), 15), (zigzag(10, 10), 10),
+    (zigzag(-30, 30, ahead=0.8), 15),
+)  # fmt: skip
+HELD_OUT = in_turn(
+    (random_steps(), 40), (zigzag(20, 20), 15), (turning_circle(-0.8, 0.5, lengths=10), 15),
+    (STEPS, 20), (turning_circle(0.6, lengths=12), 15), (zigzag(-10, 10, ahead=0.6), 15),
+    (turning_circle(-0.4, 0.75, lengths=12), 15), (zigzag(-30, 25, ahead=0.45), 15),
+    (turning_circle(0.3, 0.5, lengths=10), 15), (zigzag(15, 15, ahead=0.8), 15),
+    (turning_circle(-0.7, 0.9, lengths=10), 20),
+)  # fmt: skip
 MANOEUVRES = {
-    "first": random_steps(hold=(0.5, 2.0)),
-    "random": random_steps(hold=(0.5, 2.0)),
-    "long": random_steps(hold=(0.5, 2.0)),
-    "zigzag": in_turn(
-        (zigzag(20, 20), 15), (zigzag(-20, 20, ahead=0.6), 15), (zigzag(10, 10), 10),
-        (zigzag(-30, 30, ahead=0.8), 15),
-    ),
-    "held-out-1": random_steps(),
-    "held-out-2": in_turn(
-        (zigzag(20, 20), 25), (turning_circle(0.6, lengths=15), 20),
-        (turning_circle(-0.4, 0.7, lengths=15), 20),
-    ),
+    "first": STEPS, "random": STEPS, "long-random": STEPS, "zigzag": ZIGZAGS,
+    "long-zigzag": ZIGZAGS, "held-out": HELD_OUT,
 }  # fmt: skip
-LENGTHS = {
-    "first": FIRST, "random": SECOND, "zigzag": SECOND, "long": 1.5 * SECOND, "held-out-1": 100,
-    "held-out-2": 75,
-}  # fmt: skip
+# lengths of the trial that errors are measured by
+JUDGED = 200
 
 
 def greybox(*arguments: object) -> str:
     """Run a command as a user does, and return what it prints."""
     typed = [sys.executable, "-m", "greybox", *map(str, arguments)]
     return subprocess.run(typed, capture_output=True, text=True, check=True).stdout
+
+
+def lasting(name: str, arm: str) -> float:
+    """Return the duration of a trial [s]."""
+    scale = presets()[name].ship.time_scale
+    if arm == "held-out":
+        return float(round(JUDGED * scale))
+    usual = round(min(max(TRIAL * scale, SHORTEST), LONGEST))
+    return 1.5 * usual if arm.startswith("long") else float(usual)
 
 
 def sail(folder: Path, name: str, arm: str, seed: int) -> Path:
@@ -74,14 +88,15 @@ def sail(folder: Path, name: str, arm: str, seed: int) -> Path:
     preset = presets()[name]
     every = max(1, round(EVERY[name] / preset.dt))
     number = 100 * seed + sorted([*MANOEUVRES, "plan"]).index(arm)
+    duration = lasting(name, arm)
     if arm != "plan":
-        duration = round(LENGTHS[arm] * preset.ship.time_scale)
         preset.sail(MANOEUVRES[arm], duration, seed=number).write_csv(log, every)
         return log
-    plan, told = folder / "plan.plan.csv", folder / "plan.json"
+    fit(folder, name, "first", seed)
+    plan, told = folder / "plan.plan.csv", folder / "plan.design.json"
     greybox("design", "--vessel", folder / "vessel.toml", "--model", folder / "first.json",
-            "--duration", round(SECOND * preset.ship.time_scale), "--out", plan, "--json", told,
-            "--seed", seed)  # fmt: skip
+            "--duration", duration, "--out", plan, "--json", told, "--seed", seed,
+            "--workers", 1)  # fmt: skip
     rows = np.genfromtxt(plan, delimiter=",", names=True)
     commands = np.column_stack([rows[a.column] for a in preset.ship.actuators])
     begun = json.loads(told.read_text())["starts"][0]["u"]
@@ -92,46 +107,58 @@ def sail(folder: Path, name: str, arm: str, seed: int) -> Path:
     return log
 
 
-def fit(folder: Path, name: str, arm: str, seed: int) -> float:
-    """Return the mean held-out fit of the model estimated from one trial [%]."""
+def fit(folder: Path, name: str, arm: str, seed: int) -> list[float]:
+    """Return the held-out fits of surge, sway and yaw rate of the model of one trial [%]."""
     told = folder / f"{arm}.fit"
     if not told.exists():
         log = sail(folder, name, arm, seed)
         greybox("estimate", log, "--vessel", folder / "vessel.toml",
                 "--out", folder / f"{arm}.json")  # fmt: skip
-        held = [sail(folder, name, f"held-out-{k}", seed) for k in (1, 2)]
-        found = greybox("compare", folder / f"{arm}.json", "--log", *held, "--json", "-")
+        held = sail(folder, name, "held-out", seed)
+        found = greybox("compare", folder / f"{arm}.json", "--log", held, "--json", "-")
         channels = json.loads(found)["models"][0]["fit"]
-        told.write_text(str(float(np.mean([channels[c] for c in ("u", "v", "r")]))))
-    return float(told.read_text())
+        # a run that diverges predicts nothing
+        told.write_text(json.dumps([channels[c] or 0.0 for c in ("u", "v", "r")]))
+    return [float(f) for f in json.loads(told.read_text())]
 
 
-def case(place: Path, name: str, seed: int) -> dict[str, float]:
-    """Return the fit of each kind of trial of one ship."""
+def case(place: Path, name: str, seed: int) -> dict[str, list[float]]:
+    """Return the fits of each kind of trial of one ship."""
     folder = place / f"{name}-{seed}"
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "vessel.toml").write_text(presets()[name].ship.vessel_toml())
-    found: dict[str, float] = {}
+    found: dict[str, list[float]] = {}
     for arm in ("first", *ARMS):
         try:
             found[arm] = fit(folder, name, arm, seed)
         except subprocess.CalledProcessError as error:
             print(f"{name} {seed} {arm}: {error.stderr.strip().splitlines()[-1]}", flush=True)
-            found[arm] = float("nan")
+            found[arm] = [float("nan")] * 3
     return found
 
 
-def row(name: str, cases: Sequence[dict[str, Any]]) -> str:
-    """Return means, and the paired difference of the plan to the better of the two others."""
+def paired(logs: Array) -> str:
+    """Return the ratio of errors that logarithms (n,) tell, and its 95 % interval."""
+    logs = logs[np.isfinite(logs)]
+    half = 1.96 * logs.std(ddof=1) / np.sqrt(len(logs)) if len(logs) > 1 else np.nan
+    low, middle, high = np.exp([logs.mean() - half, logs.mean(), logs.mean() + half])
+    return f"{middle:.2f} ({low:.2f} to {high:.2f})"
+
+
+def row(name: str, cases: Sequence[dict[str, list[float]]]) -> str:
+    """Return mean fits, and errors of the better of the two others over that of the plan.
+
+    Which is better is told by the mean of the cases, not in each case.
+    """
     fits = {arm: np.array([c[arm] for c in cases]) for arm in ("first", *ARMS)}
-    means = "".join(f"{np.nanmean(fits[arm]):>9.1f}" for arm in ("first", *ARMS))
-    better = max(("random", "zigzag"), key=lambda arm: float(np.nanmean(fits[arm])))
-    paired = fits["plan"] - fits[better]
-    paired = paired[np.isfinite(paired)]
-    error = paired.std(ddof=1) / np.sqrt(len(paired)) if len(paired) > 1 else float("nan")
-    return (
-        f"{name:<26}{means}   {paired.mean():+.1f} ± {error:.1f} to {better}, {len(paired)} pairs"
-    )
+    means = "".join(f"{np.nanmean(f):>12.1f}" for f in fits.values())
+    # geometric mean over the states of the rms error in the deviation of each
+    errors = {arm: np.log(np.maximum(1 - f / 100, 1e-6)).mean(axis=1) for arm, f in fits.items()}
+    told = [
+        paired(min((errors[a] for a in arms), key=np.nanmean) - errors["plan"])
+        for arms in (("random", "zigzag"), ("long-random", "long-zigzag"))
+    ]
+    return f"{name:<24}{means}   {told[0]:<22} {told[1]:<22} {len(cases)}"
 
 
 def main() -> None:
@@ -140,15 +167,17 @@ def main() -> None:
     parser.add_argument("--ships", nargs="+", default=list(SHIPS), choices=sorted(presets()))
     parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3, 4])
     options = parser.parse_args()
-    found: dict[str, list[dict[str, float]]] = {name: [] for name in options.ships}
+    found: dict[str, list[dict[str, list[float]]]] = {name: [] for name in options.ships}
     for seed in options.seeds:
         for name in options.ships:
             found[name].append(case(options.out, name, seed))
-            told = {arm: round(v, 1) for arm, v in found[name][-1].items()}
+            told = {arm: round(float(np.mean(v)), 1) for arm, v in found[name][-1].items()}
             print(f"{name} {seed}: {told}", flush=True)
-    print(f"{'mean held-out fit [%]':<26}" + "".join(f"{arm:>9}" for arm in ("first", *ARMS)))
+    print(f"{'mean held-out fit [%]':<24}" + "".join(f"{arm:>12}" for arm in ("first", *ARMS))
+          + "   error over the plan's   of half as long again  cases")  # fmt: skip
     for name, cases in found.items():
         print(row(name, cases))
+    print(row("all", [c for cases in found.values() for c in cases]))
 
 
 if __name__ == "__main__":

@@ -27,13 +27,14 @@ from experiment_design.optimise.envelope_search import (
     search_envelope,
     validation_holds,
 )
+from experiment_design.optimise.lead_in import after_lead_in
 from experiment_design.output.result import Design, PlanPart
 from experiment_design.request.exclusions import require_compatible
 from experiment_design.request.request import PreparedRequest, build_problem
 from greybox.errors import InfeasibleError
 from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor import build_predictor
-from greybox.trial.plan_parts import TRIAL
+from greybox.trial.plan_parts import LEAD_IN, TRIAL
 from greybox.trial.plan_parts import VALIDATION as VALIDATION_PART
 
 Array = NDArray[np.float64]
@@ -295,6 +296,8 @@ def _design(
     states = request.structure.states
     others = (found.rollout.start,) * request.trials
     asked = replace(request, starts=(*request.starts[:kept_starts], *others[kept_starts:]))
+    if kept_starts:
+        asked = after_lead_in(asked)
     before = log_moments(found, sailed)
     tightened, searches, keeping = tightened_search(
         asked, lambda r: _campaign(r, found, before, workers)
@@ -303,7 +306,7 @@ def _design(
         asked, tightened, searches, keeping, kept_starts=kept_starts, began=began,
         certificate="a plan for prediction has no bound to be measured against",
     )  # fmt: skip
-    design = replace(design, parts=_parts(asked))
+    design = replace(design, parts=_parts(asked, design.parts))
     known = _sum(before, log_moments(found, design.motions[1:]))
     noise, bias = found.errors(design.motions[0], known)
     whole = np.sqrt(float((noise + bias).mean()))
@@ -334,15 +337,17 @@ def _of_start(start: str, kept: int, trials: int) -> tuple[str, ...]:
     return (f"{which} from a steady motion: {start} (--start to change)",)
 
 
-def _parts(request: PreparedRequest) -> tuple[PlanPart, ...]:
-    """Return what is sailed for the estimate, and the usual manoeuvres at each trial's end."""
+def _parts(request: PreparedRequest, led: tuple[PlanPart, ...]) -> tuple[PlanPart, ...]:
+    """Return what leads in, what is sailed for the estimate, and the usual manoeuvres behind it."""
     holds = request.schedule.holds
-    begin = (holds - validation_holds(holds)) * request.hold
-    if begin >= request.duration:
-        return ()
-    spans = ((TRIAL, 0.0, begin), (VALIDATION_PART, begin, request.duration))
-    return tuple(
-        PlanPart(name, t, first, last) for t in range(request.trials) for name, first, last in spans
+    first = 0.0 if request.lead_in is None else request.lead_in.seconds
+    begin, last = first + (holds - validation_holds(holds)) * request.hold, first + request.duration
+    if begin >= last:
+        return led
+    spans = ((TRIAL, first, begin), (VALIDATION_PART, begin, last))
+    return (
+        *(part for part in led if part.name == LEAD_IN),
+        *(PlanPart(name, t, a, b) for t in range(request.trials) for name, a, b in spans),
     )
 
 

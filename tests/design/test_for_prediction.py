@@ -269,3 +269,18 @@ def test_options_that_do_not_go_together(files, options, message, capsys) -> Non
     assert main(asked) == 1
     assert message in capsys.readouterr().err
     assert not (files / "none.csv").exists()
+
+
+def test_a_start_short_of_its_margins_is_led_in(model) -> None:
+    request = request_of(duration=200.0, covariance=None, starts=(np.zeros(4),), effort=0.1)
+    found = design_for_prediction(request, model, kept_starts=1)
+    lead, trial, validation = found.to_dict()["parts"]
+    assert [p["part"] for p in (lead, trial, validation)] == ["lead-in", "trial", "validation"]
+    assert lead["from"] == 0.0
+    assert lead["to"] == trial["from"] == found.design.lead_in_s > 0
+    assert trial["to"] == validation["from"]
+    assert validation["to"] == pytest.approx(lead["to"] + 200.0)
+    # the margin holds behind the lead-in, which begins at rest
+    assert found.design.motions[0].state[0, :, 0].min() >= 0.2 - 1e-3
+    with pytest.raises(InfeasibleError, match="lead-in"):
+        design_for_prediction(replace(request, hold=150.0, duration=300.0), model, kept_starts=1)
