@@ -377,8 +377,10 @@ def _as_it_should_be(log: TrialLog, ship: Ship) -> TrialLog:
             channels["v"] = channels["v"] - sensors.lever[0] * channels["r"]
         if ship.current.any():
             # forces are of the motion through the water
-            north, east = ned_to_body(*ship.current, log["psi"])
-            channels["u"], channels["v"] = channels["u"] - north, channels["v"] - east
+            north, east = map(float, ship.current)
+            forward, starboard = ned_to_body(north, east, log["psi"])
+            channels["u"] = channels["u"] - forward
+            channels["v"] = channels["v"] - starboard
     return replace(log, channels=channels, vessel=ship.vessel)
 
 
