@@ -27,6 +27,7 @@ from greybox.diagnosis.refitting import SETTLE, on_all_processors
 from greybox.diagnosis.search import Candidate, Search, assess_candidate, search
 from greybox.diagnosis.ship import CURRENTS, Ship
 from greybox.errors import ExcitationError, GreyboxError
+from greybox.model.disturbances import TURNING
 from greybox.model.structure import Structure
 from greybox.model.terms import Term, parse_term
 from greybox.selection.cross_validation import Refit
@@ -203,7 +204,9 @@ def _hypotheses(
     tried = [a for c in ready.causes.values() for a in c.hypotheses(context)]
     others = [a for a in tried if not denied(a.key, ready.agreeing)]
     if "current" in ready.causes and choice.terms.kind in ("wind", "augmented"):
-        named += [replace(a, co_freed=()) for a in others if a.cause == "current" and not a.apply]
+        turned = context.lacking(*TURNING)
+        current = [a for a in others if a.cause == "current" and not a.apply]
+        named += [replace(a, co_freed=turned) for a in current]
         others = [a for a in others if a.cause != "current"]
     if choice.logs[0].vessel.thrusters[0].thrust != vessel.thrusters[0].thrust:
         named += [a for a in others if a.cause == _QUADRATIC]

@@ -20,6 +20,8 @@ from greybox.numerics.vectorised import Vectorised
 
 Array = NDArray[np.float64]
 
+# share of a state that a step moves it by, from which on the step is long
+_LONG = 1.0
 # no number but the state
 NOWHERE = np.zeros(0, int)
 
@@ -59,6 +61,7 @@ class Slopes:
 
     Those of a step of several stages follow from the rate's at the middle of the step, as the
     exponential of its Jacobian to third order: right to the second power of the step's length.
+    Where that is long for what the rate does, they are carried through every stage.
 
     Parameters
     ----------
@@ -76,7 +79,8 @@ class Slopes:
         slopes = ca.jacobian(rate, ca.vertcat(s.x, s.theta, current, s.tau))
         self._states, self._columns = slopes.shape
         drivers = [s.x, s.tau, s.psi, s.air, current]
-        of_all = ca.Function("slopes", [*drivers, s.theta], [ca.densify(ca.vec(slopes.T))])
+        told = ca.vertcat(ca.densify(ca.vec(slopes.T)), ca.densify(rate))
+        of_all = ca.Function("slopes", [*drivers, s.theta], [told])
         own = ca.SX.sym("theta", len(active))
         # what only products with zeros lead to is not computed
         found = of_all(*drivers, with_zeros(own, active, s.theta.numel()))
@@ -98,24 +102,56 @@ class Slopes:
             (m,) coefficients, past them the current north and east, and past those the
             generalised inputs.
         """
-        steps, nx = len(x) - 1, self._states
-        euler = self._step.integrator == "euler"
+        nx, euler = self._states, self._step.integrator == "euler"
         at = x[:-1] if euler else (x[:-1] + x[1:]) / 2
-        values: list[Array | float] = [*at.T.copy(), *drivers[:-1].T.copy()]
-        own = theta[..., self._active]
-        values += list(map(float, own)) if own.ndim == 1 else list(own[:-1].T.copy())
-        columns = np.concatenate([np.arange(nx), nx + np.asarray(places, int)])
-        wanted = (np.arange(nx)[:, None] * self._columns + columns).ravel()
-        out = self._program(values, np.empty((len(wanted), steps)), wanted=wanted.tolist())
-        moved = out.reshape(nx, len(columns), steps).transpose(2, 0, 1)
-        state, driven = (np.ascontiguousarray(part) for part in np.split(moved, [nx], axis=2))
+        given = (drivers, theta, np.concatenate([np.arange(nx), nx + np.asarray(places, int)]))
+        state, driven = np.split(self._rates(at, *given)[1], [nx], axis=2)
         if not self._step.structure.increment:
             return Linear(state, driven)
         one = np.eye(nx)
         if euler:
             return Linear(one + state, driven)
+        if np.abs(state).sum(axis=2).max(initial=0.0) > _LONG:
+            return self._through_stages(x[:-1], *given)
         ahead = one + state @ (one / 2 + state / 6)
         return Linear(one + state @ ahead, ahead @ driven)
+
+    def _rates(
+        self, at: Array, drivers: Array, theta: Array, columns: NDArray[np.int_]
+    ) -> tuple[Array, Array]:
+        """Return the rate (N−1, nx) at states (N−1, nx), and its derivatives (N−1, nx, columns)."""
+        nx, steps = self._states, len(at)
+        values: list[Array | float] = [*at.T.copy(), *drivers[:-1].T.copy()]
+        own = theta[..., self._active]
+        values += list(map(float, own)) if own.ndim == 1 else list(own[:-1].T.copy())
+        wanted = (np.arange(nx)[:, None] * self._columns + columns).ravel()
+        rows = np.concatenate([wanted, nx * self._columns + np.arange(nx)])
+        out = self._program(values, np.empty((len(rows), steps)), wanted=rows.tolist())
+        slopes = out[:-nx].reshape(nx, len(columns), steps).transpose(2, 0, 1)
+        return out[-nx:].T, np.ascontiguousarray(slopes)
+
+    def _through_stages(
+        self, x: Array, drivers: Array, theta: Array, columns: NDArray[np.int_]
+    ) -> Linear:
+        """Return the derivatives of steps from states (N−1, nx), exactly."""
+        nx, size = self._states, len(columns)
+
+        def slope(full: Array) -> Array:
+            rate, slopes = self._rates(full[:, :, 0], drivers, theta, columns)
+            moved = slopes[:, :, :nx] @ full[:, :, 1:]
+            moved[:, :, nx:] += slopes[:, :, nx:]
+            return np.concatenate([rate[:, :, None], moved], axis=2)
+
+        start = np.concatenate(
+            [
+                x[:, :, None],
+                np.broadcast_to(np.eye(nx), (len(x), nx, nx)),
+                np.zeros((len(x), nx, size - nx)),
+            ],
+            axis=2,
+        )
+        after = self._step.moved(slope, start)
+        return Linear(*map(np.ascontiguousarray, (after[:, :, 1 : 1 + nx], after[:, :, 1 + nx :])))
 
 
 @lru_cache(maxsize=128)

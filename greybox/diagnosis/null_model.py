@@ -24,7 +24,7 @@ from greybox.model.structure import Structure
 from greybox.model.terms import parse_term
 from greybox.numerics.parallel import map_forked
 from greybox.regression.regression import build_regression
-from greybox.rotation import body_to_ned
+from greybox.rotation import body_to_ned, ned_to_body
 from greybox.trial.log import TrialLog
 from greybox.vessel.vessel import Vessel
 
@@ -375,6 +375,12 @@ def _as_it_should_be(log: TrialLog, ship: Ship) -> TrialLog:
         if "r" in channels:
             channels["u"] = channels["u"] + sensors.lever[1] * channels["r"]
             channels["v"] = channels["v"] - sensors.lever[0] * channels["r"]
+        if ship.current.any():
+            # forces are of the motion through the water
+            north, east = map(float, ship.current)
+            forward, starboard = ned_to_body(north, east, log["psi"])
+            channels["u"] = channels["u"] - forward
+            channels["v"] = channels["v"] - starboard
     return replace(log, channels=channels, vessel=ship.vessel)
 
 

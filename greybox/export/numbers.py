@@ -10,18 +10,19 @@ import numpy as np
 
 from greybox.export.ports import Port
 from greybox.export.sampled import SampledModel
+from greybox.model.disturbances import SHOWN
 from greybox.model.model import ManoeuvringModel
 from greybox.vessel.toml import vessel_to_dict
 
 FORMAT = "greybox-numbers"
 # names of signals in the equations
-_SHOWN = {"u": "u_r", "v": "v_r", "uq": "u_q", "vq": "v_q"}
 MEANING = (
     "state(k+1) = state(k) + sum over parameters of its equation of value * regressor, with "
     "regressor = product over signals of signal^power * |signal|^modulus, times the product over "
     "its bumps of max(0, 1 - (max(0, |signal - centre| - flat) / width)^2)^2; u_r, v_r through the "
-    "water, u_q, v_q through the air, r yaw rate, taux, tauy, taun the thrusters' force. With "
-    "rk4 this increment is that of a rate over one sample time, integrated by the classical rule."
+    "water, u_q, v_q through the air, u_c, v_c of the water, r yaw rate, taux, tauy, taun the "
+    "thrusters' force. With rk4 this increment is that of a rate over one sample time, integrated "
+    "by the classical rule."
 )
 
 
@@ -33,8 +34,8 @@ def port_rows(ports: Sequence[Port]) -> list[dict[str, Any]]:
 def signals(model: ManoeuvringModel) -> list[str]:
     """Return the signals of the regressors, as the equations name them."""
     used = {f.signal for t in model.structure.terms for f in t.factors}
-    order = [*model.structure.states, "uq", "vq", *model.structure.inputs]
-    return [_SHOWN.get(n, n) for n in order if n in used]
+    order = [*model.structure.states, "uq", "vq", "uc", "vc", *model.structure.inputs]
+    return [SHOWN.get(n, n) for n in order if n in used]
 
 
 def exponents(model: ManoeuvringModel) -> tuple[np.ndarray, np.ndarray]:
@@ -47,7 +48,7 @@ def exponents(model: ManoeuvringModel) -> tuple[np.ndarray, np.ndarray]:
             if factor.bump:
                 continue
             (modulus if factor.modulus else power)[
-                i, names.index(_SHOWN.get(factor.signal, factor.signal))
+                i, names.index(SHOWN.get(factor.signal, factor.signal))
             ] += 1
     return power, modulus
 
@@ -57,7 +58,7 @@ def bumps(model: ManoeuvringModel) -> list[list[dict[str, Any]]]:
     return [
         [
             {
-                "signal": _SHOWN.get(f.signal, f.signal),
+                "signal": SHOWN.get(f.signal, f.signal),
                 "centre": f.centre,
                 "width": f.width,
                 "flat": f.flat,
@@ -73,7 +74,7 @@ def regressor_text(model: ManoeuvringModel) -> list[str]:
     """Return each regressor as text, such as ``|u_r|*u_r``; ``1`` for a constant force."""
     texts = []
     for term in model.structure.terms:
-        shown = [str(replace(f, signal=_SHOWN.get(f.signal, f.signal))) for f in term.factors]
+        shown = [str(replace(f, signal=SHOWN.get(f.signal, f.signal))) for f in term.factors]
         texts.append("*".join(shown) or "1")
     return texts
 

@@ -19,6 +19,11 @@ DisturbanceKind = Literal["marine", "additive", "none"]
 
 CURRENT = ("current_north", "current_east")
 WIND = ("wind_north", "wind_east")
+# signals of a ship in a current and a wind -> how equations show them
+SHOWN = {"u": "u_r", "v": "v_r", "uq": "u_q", "vq": "v_q", "uc": "u_c", "vc": "v_c"}
+# what the velocity over ground gains in a sample because the water's turns in body axes, r v_c
+# and -r u_c, where forces change the velocity through the water (Fossen, 2011, section 8.3)
+TURNING = ("X_r*vc", "Y_r*uc")
 
 
 def disturbance_names(kind: DisturbanceKind, states: Sequence[str]) -> tuple[str, ...]:
@@ -86,6 +91,7 @@ def disturbed_signals(
     for name, through in zip(("u", "v"), velocity_through(states, psi, d[0], d[1]), strict=True):
         if name in states:
             signals[name] = through
+            signals[f"{name}c"] = states[name] - through
     air = ca.vertcat(*velocity_through(states, psi, d[2], d[3])) if air is None else air
     signals |= {f"{name}q": air[i] for i, name in enumerate(("u", "v")) if name in states}
     return signals

@@ -13,7 +13,7 @@ from functools import cache, cached_property
 import casadi as ca
 
 from greybox.errors import StructureError, suggestion
-from greybox.model.disturbances import DisturbanceKind, disturbance_names, disturbed_signals
+from greybox.model.disturbances import SHOWN, DisturbanceKind, disturbance_names, disturbed_signals
 from greybox.model.terms import SIGNALS, Term, parse_term
 from greybox.notebook import DisplayMixin, items, text
 
@@ -145,7 +145,7 @@ class Structure(DisplayMixin):
         inputs = self.inputs
         for term in added:
             for factor in term.factors:
-                known = factor.signal in (*self.states, *inputs, "uq", "vq")
+                known = factor.signal in (*self.states, *inputs, "uq", "vq", "uc", "vc")
                 if not known and factor.signal in SIGNALS:
                     inputs = (*inputs, factor.signal)
         return replace(self, terms=self.terms + added, inputs=inputs)
@@ -209,7 +209,7 @@ class Structure(DisplayMixin):
 
         Terms with bumps are one function g of the signals that they see.
         """
-        shown = {"u": "u_r", "v": "v_r", "uq": "u_q", "vq": "v_q"} if self.marine else {}
+        shown = SHOWN if self.marine else {}
         lines = []
         for state in self.states:
             terms = [

@@ -20,7 +20,7 @@ from greybox.errors import StructureError, suggestion
 # velocity through the air -> the state it would be in still air
 _AIR = {"uq": "u", "vq": "v"}
 # signals that change their sign when port and starboard change places
-_TURNED = {"v", "r", "vq", "tauy", "taun", "race", "rudder"}
+_TURNED = {"v", "r", "vq", "vc", "tauy", "taun", "race", "rudder"}
 # equation letter of SNAME -> state whose increment the equation gives
 EQUATIONS = {"X": "u", "Y": "v", "N": "r"}
 
@@ -36,6 +36,8 @@ _UNITS = {
     "taun": (1, 0, 1),
     "uq": (1, -1, 0),
     "vq": (1, -1, 0),
+    "uc": (1, -1, 0),
+    "vc": (1, -1, 0),
     "u": (1, -1, 0),
     "v": (1, -1, 0),
     "r": (0, -1, 0),

@@ -77,6 +77,23 @@ def test_run_equals_the_free_run_and_differences(log: TrialLog, integrator) -> N
     np.testing.assert_allclose(found[:, :, 4], slope, atol=max(1e-4, _CLOSE[integrator]))
 
 
+def test_slopes_of_a_step_longer_than_the_ship_are_differences(log: TrialLog) -> None:
+    """Damping that acts within a sample: no expansion about the middle of the step holds there."""
+    run = LogRun(WIDE, log, "rk4")
+    theta = _theta(WIDE)
+    theta[WIDE.index("Xu")] = -2.0
+    ship = Ship(theta, np.array([0.2, -0.1]), log.vessel)
+    start = run.start()
+    places = np.arange(len(theta) + 2)
+    slopes = run.columns(ship, run.run(ship, start), places)
+    for place in places:
+        value = [*theta, *ship.current][place]
+        ends = [run.run(ship.with_value(place, value + h), start).y for h in (-1e-6, 1e-6)]
+        difference = (ends[1] - ends[0]) / 2e-6
+        size = max(float(np.abs(difference).max()), 1e-6)
+        np.testing.assert_allclose(slopes[:, :, place], difference, atol=1e-4 * size)
+
+
 @pytest.mark.parametrize("late", [2.5, -1.25, 0.5])
 def test_a_late_channel_is_asked_only_for_what_the_log_holds(log: TrialLog, late: float) -> None:
     run = LogRun(WIDE, log, "rk4")

@@ -8,9 +8,12 @@ from scipy.integrate import solve_ivp
 
 from greybox.errors import DivergenceError, StructureError, UsageError
 from greybox.model.catalogue import get_structure
+from greybox.model.disturbances import TURNING
 from greybox.model.run.kernels import MANY_RUNS
-from greybox.model.run.simulation import positions, simulate, stationary_disturbance
+from greybox.model.run.simulation import FreeRun, positions, simulate, stationary_disturbance
 from greybox.model.run.step import StepModel
+from greybox.rotation import ned_to_body
+from greybox.study.chapter6 import TRUE
 
 
 def slow_run(structure, theta, x0, psi0, tau, d):
@@ -151,3 +154,25 @@ def test_a_map_cannot_be_integrated_by_rk4():
         StepModel(get_structure("siso"), "rk4")
     with pytest.raises(StructureError, match="no yaw rate"):
         StepModel(get_structure("surge"), heading="simulated")
+
+
+def test_a_ship_moves_through_a_current_as_through_still_water() -> None:
+    """Forces change the velocity through the water, which turns in body axes with the ship."""
+    structure = get_structure("thesis").without("Wuu", "Wvv", "Wuv").with_terms(*TURNING)
+    rate = np.array([TRUE.get(n, 0.0) for n in structure.parameters])
+    psi0, dt, d = 0.3, 0.05, np.array([0.3, -0.2, 0.0, 0.0])
+    theta = rate * dt
+    theta[structure.index("X_r*vc")], theta[structure.index("Y_r*uc")] = dt, -dt
+    tau = np.column_stack([np.full(4000, 3.0), np.full(4000, 0.4), np.full(4000, 2.0)])
+    x0 = np.array([0.6, 0.05, 0.02])
+
+    def run(current: np.ndarray, first: np.ndarray) -> FreeRun:
+        return simulate(structure, theta, first, tau, dt, d=current, psi0=psi0, integrator="rk4")
+
+    still = run(np.zeros(4), x0)
+    water = np.array(ned_to_body(d[0], d[1], np.array(psi0)))
+    moved = run(d, x0 + np.array([*water, 0.0]))
+    forward, starboard = ned_to_body(d[0], d[1], moved.psi)
+    through = moved.x - np.stack([forward, starboard, np.zeros_like(forward)], axis=-1)
+    assert np.ptp(still.psi) > 3.0
+    np.testing.assert_allclose(through, still.x, atol=2e-3)

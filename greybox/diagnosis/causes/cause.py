@@ -65,7 +65,7 @@ class Context:
         from greybox.model.terms import parse_term
 
         keys = {t.key for t in self.structure.terms}
-        signals = {*self.structure.states, *self.structure.inputs, "uq", "vq"}
+        signals = {*self.structure.states, *self.structure.inputs, "uq", "vq", "uc", "vc"}
         out = []
         for name in terms:
             term = parse_term(name)

@@ -8,6 +8,7 @@ import numpy as np
 
 from greybox.diagnosis.causes.cause import Cause, Context
 from greybox.diagnosis.hypothesis import Hypothesis, Parameter
+from greybox.model.disturbances import TURNING
 from greybox.model.terms import parameter_unit, parse_term
 
 # no current is stronger [m/s]
@@ -24,7 +25,10 @@ class Current(Cause):
         "errors of surge and sway over ground that turn with the heading: one compass direction "
         "is always too slow, the opposite too fast"
     )
-    extension = "the mean current, north and east; forces see the velocity through the water"
+    extension = (
+        "the mean current, north and east; forces see the velocity through the water, which turns "
+        "in body axes as the ship does"
+    )
     reference = "Ljungberg (2020), eq. 5.2; Fossen (2011), section 8.3"
 
     def hypotheses(self, context: Context) -> Sequence[Hypothesis]:
@@ -40,7 +44,9 @@ class Current(Cause):
                 ),
                 columns=("current_north", "current_east"),
                 # in still air the hull feels its velocity over ground, not through the water
-                co_freed=() if context.has_wind else context.lacking("Wuu", "Wvv", "Wuv"),
+                co_freed=context.lacking(
+                    *TURNING, *(() if context.has_wind else ("Wuu", "Wvv", "Wuv"))
+                ),
             ),
         )  # fmt: skip
 
