@@ -95,7 +95,10 @@ class TrialLimits:
                 f"the energy share is {self.energy:g}, it must lie between 0 and 1, full speed."
             )
         if self.headings is not None and not self.headings > 0:
-            raise UsageError(f"the heading coverage is {self.headings:g} rad, must be positive.")
+            raise UsageError(
+                f"the heading coverage is {self.headings:g} rad, it must be positive: leave "
+                f"--headings out where any will do."
+            )
         kept = [self.margins.get(s, 0.0) for s in ("u", "v") if s in self.signs]
         floor = float(np.linalg.norm(kept))
         if self.speed_cap is not None and self.speed_cap <= floor:
