@@ -193,7 +193,7 @@ def estimate_model(
     if request is not None:
         if asked != Request():
             raise UsageError(
-                "a Request is given and keywords too: give all that is asked as keywords, or in the Request."
+                "a Request is given and keywords too: give all of them in one of the two ways."
             )
         warnings.warn(
             "estimate_model(logs, Request(method=…)) is deprecated: write "
