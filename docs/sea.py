@@ -29,8 +29,8 @@ def believe(path):
     gb.ManoeuvringModel(structure, theta, covariance, 1.0, ship).save(path)
 
 
-def sail(plan, seed):
-    """Sail the true ship on the plan's commands, and return what its sensors measure."""
+def sail(plan, path, seed, raw=False):
+    """Sail the true ship on the plan's commands, and log what its sensors measure."""
     start = dict(zip(("u", "v", "r"), START, strict=True)) | {"psi": 0.0}
     log = gb.read_log(plan, slow, fill=start)
     rng, steps = np.random.default_rng(seed), len(log) - 1
@@ -41,7 +41,10 @@ def sail(plan, seed):
     channels = {name: log[name] for name in ship.commands}
     channels |= dict(zip(("u", "v", "r"), measured.T, strict=True))
     channels["psi"] = run.psi[0] + 0.01 * rng.standard_normal(steps + 1)
-    return channels
+    if raw:
+        record(channels, path)
+    else:
+        gb.write_log([gb.make_log(ship, channels, 1.0)], path)
 
 
 def record(channels, path):
@@ -71,8 +74,5 @@ if __name__ == "__main__":
     given = parser.parse_args()
     if len(given.files) == 1:
         believe(given.files[0])
-    elif given.raw:
-        record(sail(given.files[0], given.seed), given.files[1])
     else:
-        measured = sail(given.files[0], given.seed)
-        gb.write_log([gb.make_log(ship, measured, 1.0)], given.files[1])
+        sail(*given.files, given.seed, given.raw)

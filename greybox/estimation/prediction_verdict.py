@@ -83,7 +83,7 @@ class PredictionLimits:
 
 LIMITS = PredictionLimits()
 # why parts were not left out where seconds were few
-TOO_SHORT = "time was too short to estimate without a part (more --effort gives it more)"
+TOO_SHORT = "time was too short to estimate without a part: give it more with --effort"
 
 
 @dataclass(frozen=True)

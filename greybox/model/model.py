@@ -381,7 +381,10 @@ def model_from_dict(data: Any, source: str = "model") -> ManoeuvringModel:
                 f"estimate the model again."
             )
         if s["disturbance"] not in get_args(DisturbanceKind):
-            raise ModelFileError(f"'{source}' has the disturbance '{s['disturbance']}', unknown.")
+            raise ModelFileError(
+                f"'{source}' has the disturbance '{s['disturbance']}', which is not known: "
+                f"estimate the model again."
+            )
         if not 0 < float(data["sample_time"]) < float("inf"):
             raise ModelFileError(
                 f"'{source}' has the sample time {data['sample_time']}, it must be positive."
@@ -479,7 +482,10 @@ def load_model(path: str | Path) -> ManoeuvringModel:
     path = Path(path)
     try:
         if path.stat().st_size > _MAX_BYTES:
-            raise ModelFileError(f"'{path.name}' is larger than any model file: is it a log?")
+            raise ModelFileError(
+                f"'{path.name}' has {path.stat().st_size / 1e6:.0f} MB, and no model file has more "
+                f"than {_MAX_BYTES / 1e6:.0f} MB: is it a log?"
+            )
         data = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ModelFileError(

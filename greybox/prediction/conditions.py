@@ -133,7 +133,7 @@ def check(kind: Kind, model: ManoeuvringModel, asked: Conditions) -> None:
                         ("--thrusters", asked.thrusters)):  # fmt: skip
         if stops and given:
             raise UsageError(
-                f"{name} belongs to turning and zigzag, a {kind} is straight: leave it away."
+                f"{name} belongs to turning and zigzag, a {kind} is straight: leave it out."
             )
     for name, value, where in (
         ("--until", asked.until, stops),
@@ -142,7 +142,7 @@ def check(kind: Kind, model: ManoeuvringModel, asked: Conditions) -> None:
         if value is not None and not where:
             raise UsageError(
                 f"{name} belongs to {'stopping and crash' if name == '--until' else 'crash'}, "
-                f"not to {kind}: leave it away."
+                f"not to {kind}: leave it out."
             )
     if asked.until is not None and not 0 <= asked.until < 1:
         raise UsageError(

@@ -193,7 +193,7 @@ def estimate_model(
     if request is not None:
         if asked != Request():
             raise UsageError(
-                "a Request and keywords beside it say two things: give all of them as keywords."
+                "a Request is given and keywords too: give all of them in one of the two ways."
             )
         warnings.warn(
             "estimate_model(logs, Request(method=…)) is deprecated: write "
