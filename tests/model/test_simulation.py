@@ -163,7 +163,7 @@ def test_a_ship_moves_through_a_current_as_through_still_water() -> None:
     psi0, dt, d = 0.3, 0.05, np.array([0.3, -0.2, 0.0, 0.0])
     theta = rate * dt
     theta[structure.index("X_r*vc")], theta[structure.index("Y_r*uc")] = dt, -dt
-    tau = np.column_stack([np.full(4000, 3.0), np.full(4000, 0.4), np.full(4000, 2.0)])
+    tau = np.column_stack([np.full(4000, 3.0), np.full(4000, 0.4), np.full(4000, 6.0)])
     x0 = np.array([0.6, 0.05, 0.02])
 
     def run(current: np.ndarray, first: np.ndarray) -> FreeRun:
