@@ -65,6 +65,11 @@ class Criterion(Objective):
         """How many variances it counts together."""
         return self.optimality.shared_by(self.size)
 
+    @property
+    def directions(self) -> Array | None:
+        """Directions (k, p_w) whose variances it adds up, None where it is no such sum."""
+        return self.optimality.directions(self.scale, self.combination)
+
     def of_motion(
         self, motion: Motion, information: InformationModel, known: Moments | None
     ) -> Array:

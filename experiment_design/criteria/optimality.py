@@ -56,10 +56,9 @@ class Optimality(ABC):
         """Return how much what is climbed may lie below the criterion, of so many parameters."""
         return 0.0
 
-    @property
-    def smooth(self) -> bool:
-        """Whether the criterion itself can be climbed by Newton steps."""
-        return True
+    def directions(self, scale: Array, combination: Array) -> Array | None:
+        """Return directions (k, p) whose variances it adds up, None where it is no such sum."""
+        return None
 
     def shared_by(self, size: int) -> int:
         """Return how many variances it counts together: a gain over that is one of time."""
@@ -74,6 +73,26 @@ class Optimality(ABC):
     def combined(self) -> bool:
         """Whether it looks at one combination of the parameters."""
         return False
+
+
+class SumOfVariances(Optimality):
+    """−log of the sum of the variances along some directions."""
+
+    @abstractmethod
+    def directions(self, scale: Array, combination: Array) -> Array:
+        """Return them, (k, p)."""
+
+    def of_covariance(self, c: Array, scale: Array, combination: Array) -> Array:
+        """Return the criterion of covariances (R, p, p)."""
+        import numpy as np
+
+        along = self.directions(scale, combination)
+        return np.asarray(-np.log(np.einsum("ki,rij,kj->r", along, c, along)))
+
+    def slope(self, c: Array, scale: Array, combination: Array) -> Array:
+        """Return its derivative in a covariance (p, p)."""
+        along = self.directions(scale, combination)
+        return -(along.T @ along) / float((along @ c * along).sum())
 
 
 CRITERIA: Registry[Optimality] = Registry(

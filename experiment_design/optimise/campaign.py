@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiment_design.constraints.limits import TOLERANCE
-from experiment_design.excitation.inputs import prbs
 from experiment_design.information.moments import Moments
 from experiment_design.optimise.search import (
     REFERENCE,
@@ -23,7 +22,6 @@ from experiment_design.optimise.search import (
     draw_two_level,
     exchange,
     limit_scale,
-    within_reach,
 )
 from experiment_design.request.problem import TrialProblem
 from experiment_design.request.request import PreparedRequest, build_problem
@@ -251,13 +249,8 @@ def _tight(problem: TrialProblem, rng: np.random.Generator) -> bool:
 
 
 def _chain_starts(problem: TrialProblem, best: Candidate, rng: np.random.Generator) -> list[Array]:
-    """Return the starts of each chain: an exchanged one, the best two-level and PRBS sequences."""
-    drawn = np.concatenate(
-        [
-            draw_two_level(problem, rng, REFERENCE),
-            within_reach(problem, prbs(*problem.shape)),
-        ]
-    )
+    """Return the starts of each chain: an exchanged one, and the best two-level sequences."""
+    drawn = draw_two_level(problem, rng, REFERENCE)
     found = assess(problem, drawn)
     scale = limit_scale(problem)
     # feasible first; else those that miss least

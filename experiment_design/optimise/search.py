@@ -2,7 +2,7 @@
 
 Good designs switch between the limits, and the criterion has very many local
 maxima. One ascent by L-BFGS-B costs tens of milliseconds, so many are made: from
-the best random two-level and PRBS sequences, then from the best design so far
+the best random two-level sequences, then from the best design so far
 with one stretch drawn anew (iterated local search). Limits on the motion enter by
 an augmented Lagrangian, so that a start need not keep them.
 """

@@ -587,17 +587,13 @@ class Shooting(ABC):
         size = len(self.order)
         wanted = list(criterion.wanted)
         # C = D C' D with the scaled columns, D = 1 / size
-        if criterion.optimality.combined:
+        assert criterion.directions is not None
+        sides = []
+        for along in criterion.directions:
             h = np.zeros(size)
-            for weight, c in zip(criterion.combination, wanted, strict=True):
+            for weight, c in zip(along, wanted, strict=True):
                 h[place[c]] = weight / self.size[c]
-            sides = [h]
-        else:
-            sides = []
-            for unit, c in zip(criterion.scale, wanted, strict=True):
-                h = np.zeros(size)
-                h[place[c]] = 1 / (self.size[c] * unit * np.sqrt(len(wanted)))
-                sides.append(h)
+            sides.append(h)
         gram = Affine(size)
         self._gram_block(list(range(size)), gram, list(range(size)))
         score = Affine(size)

@@ -135,7 +135,8 @@ def make_shooting(problem: TrialProblem, unit: Array, exact: bool | None = None)
         The information model or the criterion has no such program.
     """
     information = problem.scenarios[0].information
-    if not problem.criterion.optimality.smooth:
+    criterion = problem.criterion
+    if not criterion.optimality.determinant and criterion.directions is None:
         raise UsageError(
             "IPOPT polishes D, A and c designs, and the largest variance (E) is not smooth: "
             "use the ascent (search.ascend), or --criterion A."

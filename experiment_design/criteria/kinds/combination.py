@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from experiment_design.criteria.optimality import Optimality
+from experiment_design.criteria.optimality import SumOfVariances
 
 if TYPE_CHECKING:
     import numpy as np
@@ -13,19 +13,11 @@ if TYPE_CHECKING:
     Array = NDArray[np.float64]
 
 
-class _Combination(Optimality):
+class _Combination(SumOfVariances):
     """−log of the variance of one combination."""
 
-    def of_covariance(self, c: Array, scale: Array, combination: Array) -> Array:
-        import numpy as np
-
-        return np.asarray(-np.log(np.einsum("i,rij,j->r", combination, c, combination)))
-
-    def slope(self, c: Array, scale: Array, combination: Array) -> Array:
-        import numpy as np
-
-        h = combination
-        return np.asarray(-np.outer(h, h) / float(h @ c @ h))
+    def directions(self, scale: Array, combination: Array) -> Array:
+        return combination[None]
 
     @property
     def combined(self) -> bool:

@@ -46,9 +46,5 @@ class _Largest(Optimality):
 
         return float(np.log(size) / _SHARP)
 
-    @property
-    def smooth(self) -> bool:
-        return False
-
 
 ENTRY = _Largest("E", "worst direction", 2)
