@@ -53,7 +53,7 @@ def test_a_ship_of_another_class_is_named(tmp_path):
     make_fleet(tmp_path)
     make_fleet(tmp_path, "d", vessel="ferry")
     with pytest.raises(
-        VesselError, match="ship 'd' has the thrusters .* 3 of 4 ships have azimuth"
+        VesselError, match=r"ship 'd' has the thrusters .* 3 of 4 ships have azimuth"
     ):
         find_ships(tmp_path)
 
