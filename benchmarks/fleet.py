@@ -26,7 +26,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--spreads", type=float, nargs="+", default=list(SPREADS),
                         help="between ships, in standard errors of one")  # fmt: skip
     parser.add_argument("--odd", type=float, default=ODD,
-                        help=f"standard deviations that the odd ship differs by ({ODD:g})")  # fmt: skip
+                        help=f"deviations of the odd ship ({ODD:g})")  # fmt: skip
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args(arguments)
     cells = study_fleets(given.runs, ships=given.ships, spreads=given.spreads,

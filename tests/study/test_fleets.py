@@ -27,8 +27,9 @@ def test_pooling_is_no_worse_and_the_odd_ship_is_found(spread):
     (cell,) = study_fleets(40, ships=[10], spreads=[spread])
     separate, complete, partial = cell.rmse()
     assert partial < separate
-    # where there is no spread at all nothing beats taking all ships as one
-    assert partial < 1.05 * complete
+    # where there is no spread at all nothing beats taking all ships as one, and looking for a
+    # spread costs a tenth of a ship's standard error at most
+    assert partial < complete + 0.1
     # 5 % are 2, and 7 or more come by chance in 0.3 % of cases
     assert sum(o.false for o in cell.outcomes) < 7
     assert sum(o.found for o in cell.outcomes) > 31
