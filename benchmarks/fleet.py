@@ -1,6 +1,6 @@
 """Planted fleets: errors with and without pooling, and how often the odd ship is found.
 
-    python -m benchmarks.fleet [--runs N] [--ships K ...] [--spreads S ...] [--seed N]
+    python -m benchmarks.fleet [--runs N] [--ships K ...] [--spreads S ...] [--odd D] [--seed N]
 
 One row for each number of ships and spread between them: root mean squared errors in standard
 errors of one ship, coverage of the 95 % intervals, and shares of fleets with intervals of Wilson.
@@ -25,10 +25,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--ships", type=int, nargs="+", default=list(SHIPS))
     parser.add_argument("--spreads", type=float, nargs="+", default=list(SPREADS),
                         help="between ships, in standard errors of one")  # fmt: skip
+    parser.add_argument("--odd", type=float, default=ODD,
+                        help=f"deviations of the odd ship ({ODD:g})")  # fmt: skip
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args(arguments)
-    cells = study_fleets(given.runs, ships=given.ships, spreads=given.spreads, seed=given.seed)
-    print(f"the odd ship differs by {ODD:g} standard deviations in one coefficient")
+    cells = study_fleets(given.runs, ships=given.ships, spreads=given.spreads,
+                         deviation=given.odd, seed=given.seed)  # fmt: skip
+    print(f"the odd ship differs by {given.odd:g} standard deviations in one coefficient")
     print(" | ".join(_HEAD))
     for cell in cells:
         held = sum(o.held for o in cell.outcomes) / len(cell.outcomes)

@@ -26,6 +26,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr
 from scipy.stats import chi2, qmc
 
 from greybox.errors import UsageError
@@ -38,7 +39,7 @@ SIGNIFICANCE = 0.05
 # units without which no spread between the others of one can be estimated
 FEWEST = 3
 # points of a fixed sequence over which a tail is averaged: Sobol's sequence needs a power of two
-_POINTS = 1024
+_POINTS = 512
 
 
 @dataclass(frozen=True)
@@ -199,7 +200,7 @@ class _Deviation:
         self._slopes = own + others.beta_slopes * unit
         single = 1 + self._change @ np.diagonal(self._slopes, axis1=1, axis2=2)
         # of each coefficient alone
-        self._alone = chi2.sf(self._deviation**2 / single, 1).mean(axis=0)
+        self._alone = 2 * ndtr(-np.abs(self._deviation) / np.sqrt(single)).mean(axis=0)
 
     def _form(self, free: tuple[int, ...]) -> Array:
         """Return the matrix of the squared distance when some coefficients may differ, (p, p)."""

@@ -28,7 +28,7 @@ ERROR = 0.1
 SPREADS = (0.0, 0.5, 1.0, 3.0)
 SHIPS = (5, 10, 20)
 # by how many standard deviations of a coefficient (error and spread) the odd ship differs
-ODD = 8.0
+ODD = 10.0
 # directions beside its own that the errors of an equation's coefficients share
 _SHARED = 2
 
@@ -150,9 +150,9 @@ class FleetCell:
         return (value, *wilson_interval(value, count))
 
 
-def judge_planted(piece: tuple[int, int, float]) -> FleetOutcome:
-    """Return what is found of the fleet of a seed, a number of ships and a spread."""
-    plain = plant_fleet(*piece)
+def judge_planted(piece: tuple[int, int, float, float]) -> FleetOutcome:
+    """Return what is found of the fleet of a seed, a number of ships, a spread, a deviation."""
+    plain = plant_fleet(*piece[:3])
     pooled = pool(plain.estimates, plain.covariances)
     weights = np.linalg.inv(plain.covariances)
     complete = np.linalg.solve(
@@ -162,7 +162,7 @@ def judge_planted(piece: tuple[int, int, float]) -> FleetOutcome:
     def squared(theta: Array) -> float:
         return float(np.mean(((theta - plain.theta) / plain.error) ** 2))
 
-    odd = plant_fleet(*piece, deviation=ODD)
+    odd = plant_fleet(*piece)
     compared = compare_units(odd.estimates, odd.covariances)
     first = compared[0].differences[:1]
     return FleetOutcome(
@@ -180,6 +180,7 @@ def study_fleets(
     *,
     ships: Sequence[int] = SHIPS,
     spreads: Sequence[float] = SPREADS,
+    deviation: float = ODD,
     seed: int = 0,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[FleetCell, ...]:
@@ -192,13 +193,15 @@ def study_fleets(
     ships : sequence of int
     spreads : sequence of float
         In standard errors of one ship.
+    deviation : float
+        Of the odd ship in one coefficient, in standard deviations of error and spread.
     seed : int
         Of the first; the others follow.
     progress : callable
         Is told how many fleets are done, and of how many.
     """
     places = [(k, s) for k in ships for s in spreads]
-    pieces = [(seed + run, k, s) for k, s in places for run in range(runs)]
+    pieces = [(seed + run, k, s, deviation) for k, s in places for run in range(runs)]
     outcomes = []
     for outcome in map_pieces(judge_planted, pieces):
         outcomes.append(outcome)

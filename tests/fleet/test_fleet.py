@@ -52,7 +52,9 @@ def test_a_folder_without_three_ships_is_refused(tmp_path):
 def test_a_ship_of_another_class_is_named(tmp_path):
     make_fleet(tmp_path)
     make_fleet(tmp_path, "d", vessel="ferry")
-    with pytest.raises(VesselError, match="ship 'd' has the thrusters .* 3 of 4 ships have azimuth"):
+    with pytest.raises(
+        VesselError, match=r"ship 'd' has the thrusters .* 3 of 4 ships have azimuth"
+    ):
         find_ships(tmp_path)
 
 

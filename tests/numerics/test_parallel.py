@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -21,6 +22,7 @@ from greybox.commands.main import main
 from greybox.errors import ClusterError, ExcitationError, WorkerError
 from greybox.numerics.effort import seconds_left, within
 from greybox.numerics.parallel import lanes, map_forked, map_pieces, on_cluster
+from greybox.vessel.toml import example_vessel
 
 # in a process of its own: a test runner has threads, and copies are then not made
 FORKED = """
@@ -254,12 +256,18 @@ def test_a_cluster_computes_the_same_though_a_worker_is_killed(cluster, tmp_path
 
 
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
-@pytest.mark.parametrize("command", ["estimate", "diagnose", "reproduce"])
+@pytest.mark.parametrize("command", ["estimate", "diagnose", "fleet", "reproduce"])
 def test_commands_write_the_same_wherever_they_compute(
     cluster, tmp_path, command, monkeypatch, caplog
 ):
     logs = [str(write_csv(virtual_log(k, 400), tmp_path / f"{k}.csv")) for k in (2, 3)]
+    for k in range(3 if command == "fleet" else 0):
+        ship = tmp_path / "fleet" / str(k)
+        ship.mkdir(parents=True)
+        shutil.copy(example_vessel("thesis"), ship / "ship.toml")
+        write_csv(virtual_log(k, 400), ship / "trial.csv")
     typed = {
+        "fleet": ["fleet", str(tmp_path / "fleet"), "--json"],
         "estimate": ["estimate", *logs, "--vessel", "thesis", "--predictor", "basic", "--json"],
         "diagnose": ["diagnose", logs[0], "--vessel", "thesis", "--validate", logs[1], "--json"],
         "reproduce": ["reproduce", "chapter4", "--runs", "4", "--seed", "1", "--out"],
