@@ -330,9 +330,10 @@ def estimate_sums(
             std = np.sqrt(np.maximum(np.diag(_covariance(predictor, made, found)), 0.0))
             move = float((moved / std).max())
             _log.info("pass %d: largest move %.3g standard errors", passes.count, move)
-            # moves shrink by about the same factor each time
-            following, before = move * min(move / before, 1.0), move
-            return following < _SETTLED
+            # moves shrink by about the same factor each time; the first tells of none
+            shrinks = min(move / before, 1.0) if np.isfinite(before) else 1.0
+            before = move
+            return move * shrinks < _SETTLED
 
         sums, solutions, iteration = iterate_instruments(
             predictor, start, "measured", passes.sums, partial(solve_sums, predictor), refine,

@@ -10,7 +10,6 @@ from greybox.credibility.assess import assess
 from greybox.credibility.judge import convergence, evidence_of
 from greybox.errors import UsageError
 from greybox.estimation.closed_loop import CLOSED_LOOP_LAG
-from greybox.estimation.estimators.iv import wind_note
 from greybox.estimation.problem import EstimationOptions, EstimationProblem, Fitted
 from greybox.estimation.refined import add_noise
 from greybox.estimation.registry import ESTIMATORS
@@ -165,8 +164,6 @@ def estimate_stream(
     # how the estimate on the stretches ended says nothing of this one
     ended = ESTIMATORS[first.method].ended.format(status=first.status)
     notes += [*(n for n in first.notes if n != ended), *dropped, drawn.sentence]
-    if instruments and kind.air_measured:
-        notes.append(wind_note(settings.wind))
     if streamed.sums.lost:
         notes.append(
             f"{len(streamed.sums.lost)} segments take no part, since {streamed.sums.lost[0]}."

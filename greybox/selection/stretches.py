@@ -141,7 +141,7 @@ def _look_at(predictor: Predictor, log: TrialLog) -> _Segment:
 def _greedy(moments: Array, count: int) -> list[int]:
     """Return positions of moments (n, k, k) in the order in which they add most, `count` at most.
 
-    Those that add nothing, since nothing moves in them, are left out.
+    Those that add nothing, since nothing moves in them, are left out where others do.
     """
     size = np.sqrt(np.mean(np.diagonal(moments, axis1=1, axis2=2), axis=0))
     moved = size > 0
@@ -153,7 +153,7 @@ def _greedy(moments: Array, count: int) -> list[int]:
     while left and len(order) < count:
         gains = np.linalg.slogdet(total + unit[left])[1]
         best = int(np.argmax(gains))
-        if not gains[best] > before:
+        if order and not gains[best] > before:
             break
         before = float(gains[best])
         order.append(left.pop(best))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from greybox.estimation.registry import Estimator
 
@@ -21,6 +21,7 @@ def _fit(problem: EstimationProblem) -> Fitted:
     from greybox.estimation.closed_loop import CLOSED_LOOP_LAG
     from greybox.estimation.problem import Fitted
     from greybox.estimation.solve import solve_iv
+    from greybox.regression.instruments import WIND_WINDOW
     from greybox.regression.problem import RegressionProblem
 
     closed, _ = problem.loop_test("iv")
@@ -36,27 +37,19 @@ def _fit(problem: EstimationProblem) -> Fitted:
     def finish(solved: Solved, notes: list[str]) -> Fitted:
         estimate, white = _prefiltered(solved, problem, closed, notes)
         if problem.kind.air_measured:
-            notes.append(wind_note(wind))
+            notes.append(
+                f"the wind in the instruments is the measured one averaged over {WIND_WINDOW:g} s, "
+                f"because its sensor is noisy; terms that only faster gusts could tell stay "
+                f"uncertain."
+                if wind == "smoothed"
+                else "the instruments hold the measured wind as it is: noise of its sensor would "
+                "move the wind terms towards zero and, in a nearly steady wind, the current with "
+                "them. Give wind_std in [sensors] where there is some; the wind is then averaged."
+            )
         return Fitted(estimate, solved.problem, white=white)
 
     predictor = problem.predictor(intercept=not problem.zero_mean)
     return problem.fit_regression("iv", predictor, plain, finish)
-
-
-def wind_note(wind: Literal["smoothed", "measured"]) -> str:
-    """Return what is to be said of the wind in the instruments."""
-    from greybox.regression.instruments import WIND_WINDOW
-
-    if wind == "smoothed":
-        return (
-            f"the wind in the instruments is the measured one averaged over {WIND_WINDOW:g} s, "
-            f"because its sensor is noisy; terms that only faster gusts could tell stay uncertain."
-        )
-    return (
-        "the instruments hold the measured wind as it is: noise of its sensor would move the wind "
-        "terms towards zero and, in a nearly steady wind, the current with them. Give wind_std in "
-        "[sensors] where there is some; the wind is then averaged."
-    )
 
 
 def _prefiltered(
