@@ -30,6 +30,7 @@ from foreign_ships.manoeuvres import (  # type: ignore[import-not-found]
     zigzag,
 )
 from numpy.typing import NDArray
+from scipy.special import stdtrit
 
 Array = NDArray[np.float64]
 
@@ -138,9 +139,10 @@ def case(place: Path, name: str, seed: int) -> dict[str, list[float]]:
 
 
 def paired(logs: Array) -> str:
-    """Return the ratio of errors that logarithms (n,) tell, and its 95 % interval."""
+    """Return the ratio of errors that logarithms (n,) tell, and its 95 % interval (Student's t)."""
     logs = logs[np.isfinite(logs)]
-    half = 1.96 * logs.std(ddof=1) / np.sqrt(len(logs)) if len(logs) > 1 else np.nan
+    n = len(logs)
+    half = stdtrit(n - 1, 0.975) * logs.std(ddof=1) / np.sqrt(n) if n > 1 else np.nan
     low, middle, high = np.exp([logs.mean() - half, logs.mean(), logs.mean() + half])
     return f"{middle:.2f} ({low:.2f} to {high:.2f})"
 
