@@ -36,7 +36,7 @@ def test_type_checkers_and_programs_see_the_same_names(package):
         ({"covariance": "robust"}, "'robust' is no covariance."),
         ({"loop": "close"}, "Did you mean 'closed'?"),
         ({"method": "refined-iv", "prefilter": "none"}, "use method 'iv'"),
-        ({"request": gb.Request(), "method": "ls"}, "give all of them as keywords"),
+        ({"request": gb.Request(), "method": "ls"}, "give all of them in one of the two ways"),
     ],
 )
 def test_what_is_unknown_is_refused_in_one_sentence(keywords, told):

@@ -299,7 +299,7 @@ def test_gap_nan_spike_stuck(ship):
     f = found_in(d, ship)
     assert set(f) == {"gap", "outlier", "nan", "stuck"}
     assert f["gap"].value == pytest.approx(20.2)
-    assert "2 times" in f["gap"].evidence
+    assert "2 holes" in f["gap"].evidence
     assert (f["outlier"].channel, f["outlier"].value) == ("u", pytest.approx(1.0, abs=0.06))
     assert (f["nan"].channel, f["nan"].value) == ("psi", 12)
     assert (f["stuck"].channel, f["stuck"].value) == ("x_n", pytest.approx(19.8))
