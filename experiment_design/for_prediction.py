@@ -268,7 +268,7 @@ def operating_envelope(
     speeds = None
     if isinstance(shown, Mapping) and "u" in shown:
         speeds = (float(shown["u"][0]), float(shown["u"][1]))
-    named = request.structure.without_bumps()
+    named = request.structure.estimable()
     predictor = replace(
         build_predictor(named, "basic", tuple((s, (1, -1)) for s in request.structure.states)),
         structure=request.structure,

@@ -289,7 +289,7 @@ def _margins(
 def _known(model: ManoeuvringModel | None) -> tuple[tuple[str, ...], Array] | None:
     if model is None:
         return None
-    model = model.at_final_parameters().without_bumps()
+    model = model.at_final_parameters().estimable()
     if not (model.std > 0).all():
         name = model.names[int(np.argmin(model.std))]
         raise UsageError(

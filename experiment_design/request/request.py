@@ -339,7 +339,7 @@ class PreparedRequest(TrialOptions):
             taken = {dict(r).get(state, 0) for r in self.regimes}
             signs[state] = (1, -1) if 0 in taken or len(taken) > 1 else (taken.pop(),)
         regime: Regime = tuple(signs.items())
-        found = build_predictor(self.structure.without_bumps(), self.predictor, regime)
+        found = build_predictor(self.structure.estimable(), self.predictor, regime)
         return replace(found, structure=self.structure)
 
     def trial_limits(self, trial: int) -> TrialLimits:

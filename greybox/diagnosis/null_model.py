@@ -283,10 +283,7 @@ class DiagnosisProblem:
         problem = self.problem(fit.integrator)
         base = fit.point.base
         theta = np.array(
-            [
-                first.get(n, 0.0) if n in self.structure.parameters else base.theta[i]
-                for i, n in enumerate(self.universe.parameters)
-            ]
+            [first.get(n, base.theta[i]) for i, n in enumerate(self.universe.parameters)]
         )
         point = replace(fit.point, base=replace(base, theta=theta))
         errors = problem.errors(point)
@@ -392,7 +389,7 @@ def rough(
     Noise biases them, but they are near enough to begin with; what the logs do not
     move stays at zero.
     """
-    predictor = build_predictor(structure, kind, regime)
+    predictor = build_predictor(structure.estimable(), kind, regime)
     regression = build_regression(predictor, logs)
     y = np.concatenate([e.y for e in regression.experiments], axis=1)
     phi = np.concatenate([e.phi for e in regression.experiments], axis=1)

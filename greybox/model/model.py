@@ -149,16 +149,16 @@ class ManoeuvringModel(DisplayMixin):
         covariance = self.covariance * np.outer(now, now)
         return replace(self, theta=self.theta * now, covariance=covariance, changes=())
 
-    def without_bumps(self) -> ManoeuvringModel:
-        """Return the model without the bumps of its black-box force; nothing else changes."""
-        kept = [i for i, t in enumerate(self.structure.terms) if not t.local]
+    def estimable(self) -> ManoeuvringModel:
+        """Return the model of the terms that a regression can find; nothing else changes."""
+        kept = [i for i, t in enumerate(self.structure.terms) if t.estimable]
         if len(kept) == len(self.theta):
             return self
         shared = self.disturbance_covariance
         rows = [*kept, *range(len(self.theta), len(shared))]
         return replace(
             self,
-            structure=self.structure.without_bumps(),
+            structure=self.structure.estimable(),
             theta=self.theta[kept],
             covariance=self.covariance[np.ix_(kept, kept)],
             disturbance_covariance=shared[rows] if shared.size else shared,

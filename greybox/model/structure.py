@@ -155,9 +155,9 @@ class Structure(DisplayMixin):
         drop = {self.parameters[self.index(n)] for n in names}
         return replace(self, terms=tuple(t for t in self.terms if t.name not in drop))
 
-    def without_bumps(self) -> Structure:
-        """Return the structure without the bumps of its black-box force."""
-        return replace(self, terms=tuple(t for t in self.terms if not t.local))
+    def estimable(self) -> Structure:
+        """Return the structure of the terms whose coefficients a regression can find."""
+        return replace(self, terms=tuple(t for t in self.terms if t.estimable))
 
     @property
     def symbols(self) -> Symbols:

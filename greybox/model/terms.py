@@ -19,6 +19,8 @@ from greybox.errors import StructureError, suggestion
 
 # velocity through the air -> the state it would be in still air
 _AIR = {"uq": "u", "vq": "v"}
+# velocity of the water, in body axes
+_WATER = {"uc", "vc"}
 # signals that change their sign when port and starboard change places
 _TURNED = {"v", "r", "vq", "vc", "tauy", "taun", "race", "rudder"}
 # equation letter of SNAME -> state whose increment the equation gives
@@ -174,6 +176,15 @@ class Term:
     def local(self) -> bool:
         """Whether it is zero outside a range of some signal, as with a bump among its factors."""
         return any(f.bump for f in self.factors)
+
+    @property
+    def estimable(self) -> bool:
+        """Whether a regression can find its coefficient.
+
+        None can where it has a bump, one of many that only together mean something, or the
+        water's own velocity, which is zero without a current.
+        """
+        return not self.local and all(f.signal not in _WATER for f in self.factors)
 
     @property
     def key(self) -> tuple[str, tuple[tuple[str, bool, float, float, float], ...]]:

@@ -105,12 +105,12 @@ def test_bumps_are_pure_numbers_and_one_line_of_the_equations(model: Manoeuvring
 
 
 def test_without_its_bumps_a_model_is_what_it_was(model: ManoeuvringModel) -> None:
-    plain = model.without_bumps()
+    plain = model.estimable()
     assert plain.structure == get_structure("thesis")
     p = len(plain.theta)
     np.testing.assert_array_equal(plain.theta, model.theta[:p])
     np.testing.assert_array_equal(plain.covariance, model.covariance[:p, :p])
-    assert plain.without_bumps() is plain
+    assert plain.estimable() is plain
 
 
 def test_two_bumps_are_two_functions() -> None:

@@ -10,6 +10,7 @@ import pytest
 
 from greybox.errors import StructureError
 from greybox.model.catalogue import get_structure, structure_names
+from greybox.model.disturbances import TURNING
 from greybox.model.run.step import StepModel
 from greybox.model.terms import Factor, Term, parameter_unit, parse_term
 from greybox.numerics.vectorised import Vectorised
@@ -19,6 +20,17 @@ def test_one_line_adds_a_term():
     structure = get_structure("thesis").with_terms("N_|r|r")
     assert structure.parameters[-1] == "N_|r|r"
     assert "N_|r|r·|r|·r" in structure.equations()[2]
+
+
+def test_what_no_regression_can_find_is_left_out_of_it():
+    """Without a current the water's own velocity is zero, and tells nothing of its coefficient."""
+    plain = get_structure("thesis")
+    wider = plain.with_terms(*TURNING)
+    assert wider.estimable() == plain
+    assert "X_r*vc·r·v_c" in wider.equations()[0]
+    s = wider.symbols
+    water = ca.substitute(ca.vertcat(*wider.regressors(air_measured=False)[-2:]), s.d, 0 * s.d)
+    assert water.is_zero()
 
 
 @pytest.mark.parametrize(
