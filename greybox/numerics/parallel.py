@@ -190,20 +190,20 @@ def _by_copies(
 ) -> Iterator[Result]:
     """Compute pieces in copies of this process."""
 
-    def begin(left: Sequence[int]) -> tuple[Executor, list[Future[Any]]]:
+    def begin(left: int) -> Executor:
+        context = multiprocessing.get_context("fork")
+        return ProcessPoolExecutor(min(count, left), context, _begin_worker, (os.getpid(),))
+
+    def give(pool: Executor, k: int) -> Future[Any]:
         global _work
+        # all copies are made when the first piece is given
         _work = (function, pieces)
         try:
-            context = multiprocessing.get_context("fork")
-            pool = ProcessPoolExecutor(
-                min(count, len(left)), context, _begin_worker, (os.getpid(),)
-            )
-            # all copies are made when the first piece is given
-            return pool, [pool.submit(_one, k) for k in left]
+            return pool.submit(_one, k)
         finally:
             _work = None
 
-    return _collected(begin, len(pieces))
+    return _collected(begin, give, len(pieces))
 
 
 def _by_processes(
@@ -212,13 +212,16 @@ def _by_processes(
     """Compute pieces in processes that are begun anew, and kept for the next map."""
     from joblib.externals.loky import get_reusable_executor
 
-    def begin(left: Sequence[int]) -> tuple[Executor, list[Future[Any]]]:
-        pool = get_reusable_executor(
+    def begin(_: int) -> Executor:
+        pool: Executor = get_reusable_executor(
             max_workers=count, initializer=_begin_worker, initargs=(os.getpid(),)
         )
-        return pool, [pool.submit(function, pieces[k]) for k in left]
+        return pool
 
-    return _collected(begin, len(pieces))
+    def give(pool: Executor, k: int) -> Future[Any]:
+        return pool.submit(function, pieces[k])
+
+    return _collected(begin, give, len(pieces))
 
 
 def _one(index: int) -> Any:
@@ -243,7 +246,7 @@ def _begin_worker(first: int) -> None:
 
 
 def _collected(
-    begin: Callable[[Sequence[int]], tuple[Executor, list[Future[Any]]]], count: int
+    begin: Callable[[int], Executor], give: Callable[[Executor, int], Future[Any]], count: int
 ) -> Iterator[Any]:
     """Yield results in order; what a dead worker was to compute is computed again by new ones."""
     found: dict[int, Any] = {}
@@ -251,10 +254,11 @@ def _collected(
     while given < count:
         left = [k for k in range(given, count) if k not in found]
         here = set(multiprocessing.active_children())
-        pool, futures = begin(left)
-        waiting = dict(zip(left, futures, strict=True))
-        begun = set(multiprocessing.active_children()) - here
+        pool = begin(len(left))
+        begun: set[Any] | None = None
         try:
+            waiting = {k: give(pool, k) for k in left}
+            begun = set(multiprocessing.active_children()) - here
             while given < count:
                 if given not in found:
                     found[given] = waiting.pop(given).result()
@@ -272,7 +276,8 @@ def _collected(
                     f"--workers."
                 ) from error
         except BaseException:
-            _stop(pool, begun)
+            # Ctrl-C may come while the pieces are given
+            _stop(pool, set(multiprocessing.active_children()) - here if begun is None else begun)
             raise
     # processes that are kept for the next map stay
     if isinstance(pool, ProcessPoolExecutor):
