@@ -153,7 +153,7 @@ def test_output_error_takes_over_where_it_is_trusted_and_instruments_are_not():
 def test_output_error_that_is_judged_no_better_is_left(monkeypatch):
     log = virtual_log(4, 1500, spread=0.0)
     doubtful = refused([NoRegression("a reason")], ())
-    monkeypatch.setattr("greybox.selection.estimate._verdict", lambda *_: doubtful)
+    monkeypatch.setattr("greybox.selection.estimate.weighed", lambda *_: doubtful)
     # of two that are not to be trusted the one that simulates is taken …
     e = estimate_model([log], structure="thesis")
     assert e.method == "oe"
