@@ -66,7 +66,7 @@ def evidence_of(fitted: Fitted, information: Sequence[Array] | None = None) -> E
     predictor, logs = problem.predictor, problem.logs
     regression = problem.regression
     if solved is None:
-        instruments = problem.instruments(estimate.structure_theta())
+        instruments = problem.instruments(estimate.structure_theta(predictor.structure))
         keep = instruments.keep or tuple(e.keep for e in regression.experiments)
     else:
         instruments, keep = solved.simulated, tuple(solved.keep)
@@ -119,11 +119,11 @@ def _coefficients(estimate: Estimate, predictor: Predictor) -> tuple[Array, Arra
     theta, covariance = np.zeros(p), np.zeros((p, p))
     place = {c.name: i for i, c in enumerate(predictor.columns) if not c.is_bias}
     own = estimate.predictor
-    there = np.array([place[own.columns[i].name] for i in own.parameter_columns])
-    theta[there] = estimate.theta[own.parameter_columns]
-    covariance[np.ix_(there, there)] = estimate.covariance[
-        np.ix_(own.parameter_columns, own.parameter_columns)
-    ]
+    # a regression has no column of what only a free run in a current shows
+    shared = [i for i in own.parameter_columns if own.columns[i].name in place]
+    there = np.array([place[own.columns[i].name] for i in shared])
+    theta[there] = estimate.theta[shared]
+    covariance[np.ix_(there, there)] = estimate.covariance[np.ix_(shared, shared)]
     if predictor is own:
         return estimate.theta, estimate.covariance
     return theta, covariance

@@ -130,7 +130,7 @@ def _start(
 ) -> Point:
     """Return the chosen terms, those that stand for causes in force."""
     problem = case.problem(base.integrator)
-    in_force = {n for a in named for n in a.columns}
+    in_force = {n for a in named for n in (*a.columns, *a.co_freed)}
     free = dict.fromkeys(
         (*choice.terms.structure.parameters, *_replaced(ready.structure, named))
     )  # fmt: skip
@@ -184,8 +184,9 @@ def _hypotheses(
     """Return the causes that the chosen terms stand for, and all that are to be tried."""
     structure, terms = ready.structure, choice.terms.structure
     vessel = case.logs[0].vessel
-    # what the chosen terms hold is no hypothesis of its own
-    context = context_of(structure.with_terms(*_lacking(structure, terms)), ready)
+    # what the chosen terms hold is no hypothesis of its own, but a current's turn is part of it
+    held = [name for name in _lacking(structure, terms) if name not in TURNING]
+    context = context_of(structure.with_terms(*held), ready)
     grouped: dict[tuple[str, str], list[Term]] = {}
     for term in terms.terms:
         cause = _cause_of(term, structure)

@@ -50,7 +50,7 @@ from greybox.estimation.shooting import (
 from greybox.estimation.solve import UnexcitedBiasError
 from greybox.estimation.values import Iteration, estimation_data
 from greybox.estimation.verdict import TestResult
-from greybox.model.disturbances import CURRENT, WIND
+from greybox.model.disturbances import CURRENT, WIND, turn_bounds, turn_of_water
 from greybox.model.noise import NoiseLevels
 from greybox.model.output import OutputModel, Role
 from greybox.model.predictor import Predictor
@@ -334,13 +334,15 @@ def _first(model: OutputModel, start: Array | Estimate | None) -> Array:
     if start is None:
         return p
     known: dict[str, float] = {}
+    values: dict[str, float] = {}
     if isinstance(start, Estimate):
+        values = turn_of_water(model.sample_time)
         theta = start.structure_theta()
         names = start.predictor.structure.parameters
         known = {n: value for n, value, _ in start.current}
     else:
         theta, names = np.asarray(start, float), predictor.structure.parameters
-    values = dict(zip(names, theta, strict=True))
+    values |= dict(zip(names, theta, strict=True))
     for i in predictor.parameter_columns:
         p[i] = values.get(predictor.columns[i].terms[0], 0.0)
     for i, name in enumerate(model.means):
@@ -357,6 +359,9 @@ def _restrictions(model: OutputModel, options: OutputErrorOptions) -> Restrictio
     for i, name in enumerate(model.means):
         most = _STRONGEST[name in WIND]
         low[len(predictor.columns) + i], high[len(predictor.columns) + i] = -most, most
+    for name, (least, most) in turn_bounds(model.sample_time).items():
+        if name in names:
+            low[names[name]], high[names[name]] = least, most
     mean, precision = np.zeros(q), np.zeros(q)
 
     def place(name: str, what: str) -> int:

@@ -42,11 +42,14 @@ def output_predictor(structure: Structure, kind: str, regime: Regime) -> Predict
     asked = PREDICTORS[kind]
     if not asked.captures:
         return build_predictor(structure, kind, regime)
-    if asked.air_measured:
-        return replace(build_predictor(structure, asked.plain, regime), kind=kind)
-    if not structure.marine or not structure.uses_air:
-        return replace(build_predictor(structure, asked.plain, regime), kind=kind)
-    return build_predictor(structure, kind, regime, disturbances=WIND, intercept=True)
+    # a run feels the current, and with it what is zero without one
+    turning = [t for t in structure.terms if t.of_water]
+    felt = structure.without(*(t.name for t in turning)) if turning else structure
+    if asked.air_measured or not structure.marine or not structure.uses_air:
+        found = replace(build_predictor(felt, asked.plain, regime), kind=kind)
+    else:
+        found = build_predictor(felt, kind, regime, disturbances=WIND, intercept=True)
+    return found.with_terms(structure, turning) if turning else found
 
 
 def output_model(

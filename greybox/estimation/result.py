@@ -15,6 +15,7 @@ from greybox.estimation.summary import estimated, summarise
 from greybox.estimation.values import EstimateValues
 from greybox.estimation.verdict import TestResult
 from greybox.model.model import ManoeuvringModel
+from greybox.model.structure import Structure
 from greybox.notebook import DisplayMixin, items, parameters, text
 from greybox.trial.actuator_estimate import ActuatorEstimate
 from greybox.trial.validity import PooledConditions
@@ -216,16 +217,18 @@ class Estimate(EstimateValues, DisplayMixin):
         place = list(self.predictor.parameter_columns)
         return wald_test(self.names, self.theta[place], self._covariance, restrictions)
 
-    def structure_theta(self) -> Array:
-        """Return the parameters of the predictor's full structure, (p_structure,).
+    def structure_theta(self, structure: Structure | None = None) -> Array:
+        """Return the parameters of a structure, (p,), by default the predictor's full one.
 
         A sum stands at its first term, the others of the sum at zero: that gives
         the same motion in still air.
         """
-        theta = np.zeros(len(self.predictor.structure.terms))
+        structure = structure or self.predictor.structure
+        theta = np.zeros(len(structure.terms))
         for i in self.predictor.parameter_columns:
             first = self.predictor.columns[i].terms[0]
-            theta[self.predictor.structure.index(first)] = self.theta[i]
+            if first in structure.parameters:
+                theta[structure.index(first)] = self.theta[i]
         return theta
 
     def model(self) -> ManoeuvringModel:

@@ -26,6 +26,23 @@ SHOWN = {"u": "u_r", "v": "v_r", "uq": "u_q", "vq": "v_q", "uc": "u_c", "vc": "v
 TURNING = ("X_r*vc", "Y_r*uc")
 
 
+def turn_of_water(sample_time: float) -> dict[str, float]:
+    """Return the coefficients of `TURNING` that kinematics gives, for a sample time [s]."""
+    return dict(zip(TURNING, (sample_time, -sample_time), strict=True))
+
+
+def turn_bounds(sample_time: float) -> dict[str, tuple[float, float]]:
+    """Return the least and the largest coefficient of each of `TURNING` for a sample time [s].
+
+    From none, as (3.51) has it, to twice what kinematics gives. Without bounds a fit may end
+    where a current of nothing turns with a coefficient beyond measure.
+    """
+    return {
+        name: (min(0.0, 2 * value), max(0.0, 2 * value))
+        for name, value in turn_of_water(sample_time).items()
+    }
+
+
 def disturbance_names(kind: DisturbanceKind, states: Sequence[str]) -> tuple[str, ...]:
     """Return the names of the disturbance means, in the order of their symbol ``d``."""
     if kind == "marine":

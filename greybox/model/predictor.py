@@ -10,6 +10,7 @@ points of the regime, constants apart (zero-mean instruments remove those).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from itertools import combinations_with_replacement
@@ -24,6 +25,7 @@ from greybox.model.disturbances import CURRENT, WIND
 from greybox.model.predictor_kinds import PREDICTORS
 from greybox.model.spelling import atoms, spelled_expression, spellings
 from greybox.model.structure import Structure
+from greybox.model.terms import Term
 from greybox.notebook import DisplayMixin, table
 from greybox.numerics.vectorised import Vectorised
 
@@ -171,6 +173,35 @@ class Predictor(DisplayMixin):
             self.columns[:column] + self.columns[column + 1 :],
             shares,
             self._spelled[:column] + self._spelled[column + 1 :],
+        )
+
+    def with_terms(self, structure: Structure, terms: Sequence[Term]) -> Predictor:
+        """Return the predictor of a larger structure, each further term a column of its own.
+
+        Parameters
+        ----------
+        structure : Structure
+            This predictor's with the terms.
+        terms : sequence of Term
+        """
+        columns, spelled, biases = list(self.columns), list(self._spelled), list(self.biases)
+        for term in terms:
+            mine = [i for i, c in enumerate(columns) if c.state == term.state]
+            position = sum(not columns[i].is_bias for i in mine)
+            columns.insert(mine[0] + position, Column(term.name, term.state, (term.name,)))
+            spelled.insert(mine[0] + position, "")
+            biases = [
+                replace(b, shares=(*b.shares[:position], 0.0, *b.shares[position:]))
+                if b.state == term.state
+                else b
+                for b in biases
+            ]
+        return replace(
+            self,
+            structure=structure,
+            columns=tuple(columns),
+            biases=tuple(biases),
+            _spelled=tuple(spelled),
         )
 
     @property
@@ -512,6 +543,13 @@ def build_predictor(
                 merged = columns[same[0]]
                 columns[same[0]] = Column(merged.name, state, (*merged.terms, term.name))
                 continue
+            if term.of_water:
+                raise StructureError(
+                    f"the regressor of {term.name} is zero where the water rests, so a regression "
+                    f"cannot find its coefficient: fit free runs in a current (--method oe "
+                    f"--predictor augmented), or leave it out "
+                    f"(--structure '{structure.name}-{term.name}')."
+                )
             if term.factors and not span.add_if_new(own[t]):
                 kept = ", ".join(
                     f"{s} {_SIGNS.get(v, 'of both signs')}"

@@ -181,10 +181,15 @@ class Term:
     def estimable(self) -> bool:
         """Whether a regression can find its coefficient.
 
-        None can where it has a bump, one of many that only together mean something, or the
-        water's own velocity, which is zero without a current.
+        None can where it has a bump, one of many that only together mean something, or is zero
+        without a current.
         """
-        return not self.local and all(f.signal not in _WATER for f in self.factors)
+        return not self.local and not self.of_water
+
+    @property
+    def of_water(self) -> bool:
+        """Whether it has the water's own velocity among its factors: zero without a current."""
+        return any(f.signal in _WATER for f in self.factors)
 
     @property
     def key(self) -> tuple[str, tuple[tuple[str, bool, float, float, float], ...]]:

@@ -3,9 +3,9 @@
 Hull forces of second order with and without moduli, the cubic ones that published models
 of tankers and catamarans use, constant forces, the cross terms of sway and yaw, thrust that
 speed takes from and that pushes beside its own axis, flow through propellers that damps
-whichever way they turn, a rudder in the race and beside it, and
-the wind where it was measured. Inertia that couples sway and yaw multiplies the forces of
-both equations by one matrix, so each force may push each of the two.
+whichever way they turn, a rudder in the race and beside it, the wind where it was measured,
+and the turn of a current in body axes. Inertia that couples sway and yaw multiplies the
+forces of both equations by one matrix, so each force may push each of the two.
 
 References
 ----------
@@ -17,6 +17,7 @@ from __future__ import annotations
 from functools import lru_cache
 
 from greybox.model.catalogue import structure_for
+from greybox.model.disturbances import TURNING
 from greybox.model.structure import Structure
 from greybox.model.terms import parse_term
 
@@ -41,7 +42,7 @@ _CORE = "Xu Yv Nr".split()
 
 
 @lru_cache
-def family_for(inputs: tuple[str, ...], wind: bool) -> Structure:
+def family_for(inputs: tuple[str, ...], wind: bool, current: bool) -> Structure:
     """Return all terms that selection may take.
 
     Parameters
@@ -50,13 +51,15 @@ def family_for(inputs: tuple[str, ...], wind: bool) -> Structure:
         Generalised inputs that the vessel's thrusters produce.
     wind : bool
         Whether the velocity through the air was measured.
+    current : bool
+        Whether the logs can show a current.
 
     Returns
     -------
     Structure
         Without two terms that are one function.
     """
-    names = [*_HULL, *(_WIND if wind else ())]
+    names = [*_HULL, *(_WIND if wind else ()), *(TURNING if current else ())]
     for name in inputs:
         names += _FORCE[name]
     terms = {term.key: term for term in map(parse_term, names)}

@@ -33,6 +33,7 @@ from greybox.estimation.shooting import (
     measured_starts,
     solve_step,
 )
+from greybox.model.disturbances import turn_bounds
 from greybox.model.run.step import Integrator
 from greybox.model.structure import Structure
 from greybox.numerics.effort import require_time, seconds_left
@@ -71,14 +72,16 @@ class _Point:
     known: Sequence[int]
     hessian: Array
     gradient: Array
-    most: Array
+    bounds: tuple[Array, Array]
 
     def solution(self, hessian: Array, gradient: Array, active: Array) -> Array:
         """Return the step (q,) that minimises the quadratic model over the active parameters."""
         step = np.zeros_like(self.p)
-        low, high = np.full(len(active), -np.inf), self.most[active] - self.p[active]
+        low, high = (bound[active] - self.p[active] for bound in self.bounds)
         part = np.ix_(active, active)
-        step[active] = solve_step(hessian[part], gradient[active], low, np.maximum(high, 0.0))
+        step[active] = solve_step(
+            hessian[part], gradient[active], np.minimum(low, 0.0), np.maximum(high, 0.0)
+        )
         return step
 
 
@@ -130,7 +133,7 @@ class FreeRunSelection:
         self.deviation = deviations(data)
         # a channel that rests shows no size by which its errors were small: its unit stands for one
         rests = np.ptp(np.concatenate([d.y for d in data]), axis=0) == 0
-        self._least = np.where(rests, 1.0, _LEAST)
+        self._floor = np.where(rests, 1.0, _LEAST)
         self._whole = cut(data, max(len(d.y) for d in data))
         self._change = np.maximum(changes(data), 1e-9 * self.deviation)
         self.runs = FreeRuns(self.model, self._whole, self.deviation)
@@ -139,7 +142,11 @@ class FreeRunSelection:
         self._used = self._whole.use.ravel() > 0
         self._samples = float(self._used.sum())
         # damping takes energy out
-        self._most = np.full(len(self.names), np.inf)
+        self._least, self._most = (np.full(len(self.names), b) for b in (-np.inf, np.inf))
+        for name, bounds in turn_bounds(step).items():
+            if name in self.names:
+                i = self.names.index(name)
+                self._least[i], self._most[i] = bounds
         for i in self.model.predictor.parameter_columns:
             terms = [family.terms[family.index(t)] for t in self.model.columns[i].terms]
             if all(t.dissipates for t in terms):
@@ -239,7 +246,7 @@ class FreeRunSelection:
 
     def _noise(self, r: Array) -> Array:
         """Return the mean squared residual of each output, (ny,)."""
-        return np.asarray((r**2).sum(axis=(0, 1)) / self._samples + self._least)
+        return np.asarray((r**2).sum(axis=(0, 1)) / self._samples + self._floor)
 
     def _value(self, runs: _Runs, p: Array) -> float:
         """Return −log L, the noise of each output concentrated, infinite where a run escapes."""
@@ -266,7 +273,7 @@ class FreeRunSelection:
                 right += (own.T @ r[:, i]) / (noise * runs.sigma[i])
         hessian, gradient = np.zeros((len(p), len(p))), np.zeros(len(p))
         hessian[np.ix_(known, known)], gradient[known] = normal, right
-        return _Point(p, cost, known, hessian, gradient, self._most)
+        return _Point(p, cost, known, hessian, gradient, (self._least, self._most))
 
     def _moved(self, runs: _Runs, at: _Point, step: Array, known: Sequence[int]) -> _Point | None:
         """Return where a step or a part of it leads downhill, None where it does not."""
@@ -329,9 +336,11 @@ class FreeRunSelection:
         left = own - np.einsum("ij,jk,ik->i", cross, inverse, cross)
         slope = gradient[out] - cross @ (inverse @ gradient[index])
         known = left > _OWN * np.maximum(own, 0.0)
-        known &= (self._most[out] > 0) | (slope < 0)
+        least, most = self._least[out], self._most[out]
+        known &= np.where(slope > 0, most > 0, least < 0)
         gains = np.where(known, 0.5 * slope**2 / np.where(known, left, 1.0), 0.0)
-        for i in np.argsort(-gains * np.where(self._most[out] > 0, 1.0, _BRAKES))[:_TRIED]:
+        brakes = (most == 0) & np.isneginf(least)
+        for i in np.argsort(-gains * np.where(brakes, _BRAKES, 1.0))[:_TRIED]:
             tried = np.append(index, out[i])
             if self._share(-gains[i]) > 1 - earns or frozenset(tried.tolist()) in seen:
                 continue

@@ -83,7 +83,7 @@ class Terms:
         values = dict(zip(selection.names, found.p, strict=True))
         kind = PREDICTORS[model.predictor.kind]
         if len(names) == len(found.terms):
-            kind = PREDICTORS[kind.plain]
+            kind, structure = PREDICTORS[kind.plain], structure.estimable()
         return cls(structure, kind.name, np.array([values[n] for n in structure.parameters]))
 
 
@@ -161,11 +161,11 @@ def select_terms(
         Time was over before every part had a set.
     """
     inputs, wind = force_inputs(logs[0].vessel), all(log.has_wind for log in logs)
-    family = family_for(inputs, wind)
     kind = "wind" if wind else "augmented"
     if heading_range(logs) < ADVISED_HEADING:
         # a current on one heading is a constant force
         kind = PREDICTORS[kind].plain
+    family = family_for(inputs, wind, PREDICTORS[kind].captures)
     beginnings, stay = first_terms(inputs)
     if len(logs) >= _ENOUGH:
         # many manoeuvres show Coriolis terms too, which few must be told of

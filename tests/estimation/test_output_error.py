@@ -33,6 +33,7 @@ from greybox.estimation.shooting import (
 from greybox.model.catalogue import get_structure
 from greybox.model.noise import NoiseLevels
 from greybox.model.output import OutputModel
+from greybox.model.predictor import build_predictor
 from greybox.model.run import output_runs
 from greybox.model.run.output_runs import Filter, Observer, Simulator
 from greybox.study.chapter6 import TRUE
@@ -919,3 +920,26 @@ def test_weights_say_nothing_of_the_noise(predictor, noisy):
     np.testing.assert_allclose(found.noise.measurement, usual.noise.measurement, rtol=0.05)
     errors = (found.theta - truth(predictor)) / np.sqrt(np.diag(found.covariance))
     assert np.sqrt((errors**2).mean()) < 2.0
+
+
+def test_a_regression_refuses_what_is_zero_where_the_water_rests():
+    with pytest.raises(StructureError, match=r"X_r\*vc is zero where the water rests.*--method oe"):
+        build_predictor(get_structure("thesis").with_terms("X_r*vc"), "augmented")
+
+
+def test_a_free_run_in_a_current_has_a_column_for_what_is_zero_without_one():
+    plain = output_predictor(get_structure("thesis"), "augmented", REGIME)
+    wider = output_predictor(
+        get_structure("thesis").with_terms("X_r*vc", "Y_r*uc"), "augmented", REGIME
+    )
+    assert {*wider.parameter_names} - {*plain.parameter_names} == {"X_r*vc", "Y_r*uc"}
+    states = [c.state for c in wider.columns]
+    assert states == sorted(states, key="uvr".index)
+    for state in "uvr":
+        biases = [wider.columns[i].is_bias for i in wider.equation(state)]
+        assert biases == sorted(biases)
+    assert all(len(b.shares) == len(wider.equation(b.state)) for b in wider.biases)
+    point = ([np.array([1.2]), np.array([0.3]), np.array([0.1])], 0.4, [np.array([1.0])] * 3)
+    old, new = plain.evaluate(*point), wider.evaluate(*point)
+    kept = [i for i, c in enumerate(wider.columns) if c.name not in ("X_r*vc", "Y_r*uc")]
+    np.testing.assert_array_equal(new[kept], old)

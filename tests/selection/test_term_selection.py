@@ -15,7 +15,7 @@ from greybox.model.catalogue import get_structure, structure_for
 from greybox.model.model import load_model
 from greybox.model.run.simulation import simulate
 from greybox.selection.cross_validation import Refit, parts_of
-from greybox.selection.estimate import at_own_pace, estimate_model
+from greybox.selection.estimate import at_own_pace, estimate_model, nominal_model
 from greybox.selection.family import family_for, first_terms, spell_structure
 from greybox.selection.free_run_selection import FreeRunSelection
 from greybox.selection.term_selection import select_terms
@@ -33,7 +33,7 @@ SHIPS = [("taux", "tauy", "taun"), ("taux", "taun"),
 @pytest.mark.parametrize("inputs", SHIPS)
 @pytest.mark.parametrize("wind", [False, True])
 def test_any_set_of_the_family_has_a_name_that_gives_it_back(inputs, wind):
-    names = family_for(inputs, wind).parameters
+    names = family_for(inputs, wind, False).parameters
     rng = np.random.default_rng(1)
     for share in (0.2, 0.5, 1.0):
         chosen = tuple(n for n in names if rng.random() < share)
@@ -64,7 +64,7 @@ def modulus_log():
 
 def test_the_terms_that_a_ship_has_enter_first(modulus_log):
     inputs = force_inputs(modulus_log.vessel)
-    selection = FreeRunSelection([modulus_log], family_for(inputs, False), "augmented")
+    selection = FreeRunSelection([modulus_log], family_for(inputs, False, True), "augmented")
     (_, first), stay = first_terms(inputs)
     sets = selection.path(first, stay, len(first) + 4)
     assert "N_|r|r" in sets[-1].terms
@@ -72,10 +72,39 @@ def test_the_terms_that_a_ship_has_enter_first(modulus_log):
     assert grown == sorted(grown, reverse=True)
 
 
+def test_a_current_in_which_the_ship_turns_brings_the_turn_of_the_water(modulus_log):
+    """What forces change is the velocity through the water (Fossen, 2011, section 8.3)."""
+    vessel, current = modulus_log.vessel, np.array([0.3, -0.2, 0.0, 0.0])
+    structure = get_structure("linear").with_terms("N_|r|r", "Xuu", "X_r*vc", "Y_r*uc")
+    values = {"Xu": -0.02, "Xmu": 1e-3, "Yv": -0.1, "Yur": -0.2, "Ymu": 1e-3, "Nr": -0.1,
+              "Nmu": 1e-4, "N_|r|r": -3.0, "Xuu": -0.01, "X_r*vc": 1.0, "Y_r*uc": -1.0}  # fmt: skip
+    theta = np.array([values.get(n, 0.0) for n in structure.parameters])
+    tau = modulus_log.forces(structure.inputs)
+    run = simulate(structure, theta, np.array([1.0, 0.0, 0.0]), tau[:-1], 1.0, d=current)
+    x = run.x[0] + np.random.default_rng(5).standard_normal(run.x[0].shape) * [0.02, 0.01, 1e-3]
+    channels = modulus_log.channels | dict(zip("uvr", x.T, strict=True)) | {"psi": run.psi[0]}
+    log = replace(modulus_log, channels=channels)
+    inputs = force_inputs(vessel)
+    selection = FreeRunSelection([log], family_for(inputs, False, True), "augmented")
+    (alone, _), stay = first_terms(inputs)
+    chosen = selection.path(alone, stay, len(alone) + 8)[-1]
+    assert {"X_r*vc", "Y_r*uc", "current_north", "current_east"} <= set(chosen.terms)
+    asked = structure_for("linear-Xvr-Nuv+N_|r|r+Xuu+X_r*vc+Y_r*uc", inputs)
+    begun = nominal_model(asked, np.array([0.8 * values[n] for n in asked.parameters]), [log])
+    model = estimate_model(
+        [log], structure=asked.name, method="oe", predictor="augmented", nominal=begun
+    ).model()
+    std = np.sqrt(np.diag(model.covariance))
+    for name in ("X_r*vc", "Y_r*uc", "Yur", "N_|r|r"):
+        i = model.names.index(name)
+        assert abs(model.theta[i] - values[name]) < 4 * std[i]
+        assert std[i] < 0.3 * abs(values[name])
+
+
 def test_what_enters_is_what_lowers_the_error_most_of_all_that_are_fitted(modulus_log):
     """Beside the score: every single term is fitted to the end."""
     inputs = force_inputs(modulus_log.vessel)
-    family = family_for(inputs, False)
+    family = family_for(inputs, False, False)
     selection = FreeRunSelection([modulus_log], family, "augmented")
     (_, first), _ = first_terms(inputs)
     chosen = selection.path(first, first, len(first) + 1)[1]
@@ -92,7 +121,7 @@ def test_what_enters_is_what_lowers_the_error_most_of_all_that_are_fitted(modulu
 
 def test_damping_never_drives_the_ship(modulus_log):
     inputs = force_inputs(modulus_log.vessel)
-    family = family_for(inputs, False)
+    family = family_for(inputs, False, False)
     selection = FreeRunSelection([modulus_log], family, "augmented")
     (_, first), stay = first_terms(inputs)
     for one in selection.path(first, stay, 20):
@@ -104,7 +133,7 @@ def test_damping_never_drives_the_ship(modulus_log):
 def test_a_channel_that_never_moves_lets_its_terms_leave(modulus_log):
     log = replace(modulus_log, channels=modulus_log.channels | {"v": 0 * modulus_log["v"]})
     inputs = force_inputs(log.vessel)
-    selection = FreeRunSelection([log], family_for(inputs, False), "basic")
+    selection = FreeRunSelection([log], family_for(inputs, False, False), "basic")
     (_, first), stay = first_terms(inputs)
     sets = selection.path(first, stay, len(first) + 2)
     assert np.isfinite(sets[-1].cost)
@@ -115,7 +144,7 @@ def test_what_the_log_cannot_tell_from_damping_is_damping(modulus_log):
     """u r and |u| r are one on a log ahead; astern the first would drive the ship."""
     assert (modulus_log["u"] > 0).all()
     inputs = force_inputs(modulus_log.vessel)
-    selection = FreeRunSelection([modulus_log], family_for(inputs, False), "augmented")
+    selection = FreeRunSelection([modulus_log], family_for(inputs, False, True), "augmented")
     (alone, _), stay = first_terms(inputs)
     sets = selection.path(alone, stay, len(alone) + 4)
     assert any(len(one.terms) > len(alone) for one in sets)

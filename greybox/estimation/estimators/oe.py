@@ -47,7 +47,7 @@ def _fit(problem: EstimationProblem) -> Fitted:
     )
     # a free run has the current in the model; a regression captures it by columns
     own = estimate.predictor
-    captured = build_predictor(own.structure, own.kind, own.regime)
+    captured = build_predictor(own.structure.estimable(), own.kind, own.regime)
     fitted = Fitted(estimate, RegressionProblem(captured, problem.logs))
     _, loop_test = problem.loop_test("oe")
     return fitted.with_more(loop_test, [*notes, *dropped])
@@ -63,7 +63,7 @@ def _quick_start(problem: EstimationProblem) -> tuple[Estimate | None, str]:
     from greybox.model.predictor import build_predictor
     from greybox.regression.problem import RegressionProblem
 
-    predictor = build_predictor(problem.structure, problem.kind.plain, problem.regime)
+    predictor = build_predictor(problem.structure.estimable(), problem.kind.plain, problem.regime)
     regression = RegressionProblem(predictor, problem.logs)
     try:
         found = solve_iv(regression, refine=_STARTING_REFINEMENTS).estimate("white")
