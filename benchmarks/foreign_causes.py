@@ -35,6 +35,7 @@ from foreign_ships.ship import Faults  # type: ignore[import-not-found]
 from foreign_ships.simulate import Trial  # type: ignore[import-not-found]
 
 from greybox import diagnose, load_vessel, read_log
+from greybox.diagnosis.budget import nearest
 from greybox.diagnosis.preparing import prepare
 from greybox.numerics.binomial import wilson_interval
 from greybox.trial.log import TrialLog
@@ -184,7 +185,10 @@ def squares(logs: Sequence[TrialLog]) -> np.ndarray[Any, np.dtype[np.float64]]:
     """Return the squared held-out error of each state of the model without causes."""
     ready = prepare(logs[:-HELD_OUT], logs[-HELD_OUT:], None, "thesis", None)
     base = ready.base()
-    return ready.case.held_out(base.integrator).squares(base)
+    pairs = ready.case.held_out(base.integrator).pairs(base)
+    (found,) = nearest(pairs, base, ready.case.first)
+    errors = np.concatenate([e[:, :3] for e in found.held_fit.errors])
+    return np.asarray((errors**2).mean(axis=0))
 
 
 def switches(name: str) -> dict[str, float]:

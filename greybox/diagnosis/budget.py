@@ -2,10 +2,11 @@
 
 A cause takes what switching it off at sea would: the extended model says what the logs would show
 without it, the model without causes is fitted to that anew, and its held-out error is compared with
-what it was. What the extended model leaves is told apart into what a generic force of motion and
-commands predicts of it, and, of the rest, sensor noise, waves and a slow force by their spectra.
-Causes of which each lessens the error of the others take more together than there is, or less: the
-difference is not split.
+what it was, both times with the coefficients whose free runs follow the logs most nearly. What the
+extended model leaves is told apart into what a generic force of motion and commands predicts of it,
+and, of the rest, sensor noise, waves and a slow force by their spectra. Causes of which each
+lessens the error of the others take more together than there is, or less: the difference is not
+split.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 
 from greybox.diagnosis.evidence.held_out import Pair, change_scenarios
 from greybox.diagnosis.evidence.remainder import generic_force
-from greybox.diagnosis.fitting import Metric, Problem
+from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.gain import blocks
 from greybox.diagnosis.noise import Noise, fit_noise
 from greybox.diagnosis.point import Fit, Point
@@ -55,6 +56,32 @@ class SwitchedOff:
     relative: float
 
 
+def nearest(
+    pairs: Sequence[Pair], before: Fit, first: Callable[[Sequence[TrialLog]], Mapping[str, float]]
+) -> list[Pair]:
+    """Return the model without causes where its free runs follow the logs as nearly as they can.
+
+    Parameters
+    ----------
+    pairs : sequence of Pair
+        Of the model without causes.
+    before : Fit
+        That model on all logs.
+    first : callable
+        First coefficients of logs.
+
+    Returns
+    -------
+    list of Pair
+        Empty where a run leaves every bound.
+    """
+    found = [
+        _nearest(p.problem.runs, p.held.runs, _starts(p.problem.runs, before, None, first))
+        for p in pairs
+    ]
+    return [p for p in found if p is not None] if all(found) else []
+
+
 def errors_without(
     final: Sequence[Pair],
     before: Fit,
@@ -86,13 +113,12 @@ def errors_without(
         held = _runs_without(
             pair.held, pair.held_fit.point, change_scenarios(pair.fit.point), change_scenarios(less)
         )
-        if not logs or not held:
+        found = None
+        if logs and held:
+            found = _nearest(logs, held, _starts(logs, before, pair.fit, first))
+        if found is None:
             return np.zeros((0, len(pair.held.structure.states)))
-        # a fit may end before a hill beyond which it would predict better
-        errors = _predicted(logs, held, _starts(logs, before, pair.fit, first), before.noise)
-        if not errors:
-            return np.zeros((0, len(pair.held.structure.states)))
-        out.append(min(errors, key=lambda e: float(np.log((e**2).sum(axis=0)).sum())))
+        out.append(_states(found.held, found.held_fit))
     return np.concatenate(out)
 
 
@@ -118,12 +144,12 @@ def _runs_without(
 def _starts(
     runs: Sequence[LogRun],
     before: Fit,
-    final: Fit,
+    final: Fit | None,
     first: Callable[[Sequence[TrialLog]], Mapping[str, float]],
 ) -> list[Point]:
     """Return the model without causes with its own coefficients and with others to begin from.
 
-    Its own may lie beyond a hill, as they are of logs with the cause.
+    Its own may lie beyond a hill, as they are of logs with the cause, and weighed by colour.
     """
     base = before.point.base
     starts = tuple(run.start() for run in runs)
@@ -132,23 +158,21 @@ def _starts(
     if free:
         values = first([run.log for run in runs])
         own = [values.get(n, 0.0) for n in runs[0].structure.parameters]
-        for found in (final.point.base.theta, own):
+        for found in (own, *(() if final is None else (final.point.base.theta,))):
             theta = base.theta.copy()
             theta[free] = np.asarray(found)[free]
             begun.append(replace(begun[0], base=replace(base, theta=theta)))
     return begun
 
 
-def _predicted(
-    runs: Sequence[LogRun], held: Sequence[LogRun], begun: Sequence[Point], noise: Noise
-) -> list[Array]:
-    """Return the held-out errors (N, nx) of fits from several points whose runs have bounds.
+def _nearest(runs: Sequence[LogRun], held: Sequence[LogRun], begun: Sequence[Point]) -> Pair | None:
+    """Return the best predicting of fits from several points; None where none has bounds.
 
-    They are weighed as those of the model without causes were.
+    Errors are weighed by their size: a fit that is weighed by their colour forgets what is slow
+    in them, and where much is missing it may end with runs that are farther off than no motion.
     """
-    metric: Metric = "coloured" if noise.coloured else "free run"
-    problem, other = Problem(runs, metric), Problem(held, metric)
-    out = []
+    problem, other = Problem(runs, "free run"), Problem(held, "free run")
+    found = []
     for point in begun:
         errors = problem.errors(point)
         if not all(np.isfinite(e).all() for e in errors):
@@ -156,8 +180,13 @@ def _predicted(
         fit = problem.settle(problem.fit(point, problem.noise_of(errors, point)), 2)
         shown = fit if fit.escaped else other.fit_starts(fit.point, fit.noise)
         if not shown.escaped:
-            out.append(_states(other, shown))
-    return out
+            found.append(Pair(problem, fit, other, shown))
+    # a fit may end before a hill beyond which it would predict better
+    return min(
+        found,
+        key=lambda p: float(np.log((_states(p.held, p.held_fit) ** 2).sum(axis=0)).sum()),
+        default=None,
+    )
 
 
 def error_budget(
@@ -173,7 +202,8 @@ def error_budget(
     Parameters
     ----------
     base, final : sequence of Pair
-        The model without causes, and with those that stand, on what is held out.
+        The model without causes as `nearest` returns it, and with those that stand, on what is
+        held out.
     causes : sequence of SwitchedOff
     plain : sequence of Pair
         The extended model without the terms that it has beside its causes, fitted anew.
@@ -187,8 +217,9 @@ def error_budget(
     tuple of BudgetPart
         Shares of each state, before and after the causes are mended, both of the squared error
         before, with 95 % intervals by a moving-block bootstrap of the samples (Künsch, 1989) in
-        which each cause's size varies by its standard error; empty where a run leaves every
-        bound.
+        which each cause's size varies by its standard error, and what the extended model leaves
+        beyond the sensors' noise goes with the error without the cause, or against it, as may
+        be; empty where a run leaves every bound.
     """
     every = [*base, *final]
     if not base or any(p.fit.escaped or p.held_fit.escaped for p in every):
@@ -213,6 +244,13 @@ def error_budget(
     starts, length = blocks(len(e0), problem.sample_time, _DRAWS, rng)
     wide = {c.id: 1 + c.relative * rng.standard_normal(_DRAWS) for c in causes}
     whole, drawn_whole = (e0**2).sum(axis=0), _drawn(e0**2, starts, length)
+    left = np.maximum((e1**2).sum(axis=0) - len(e0) * moments[SENSOR], 0.0)
+    # the ship without the cause is known as well as the extended model follows it
+    unsure = {
+        c.id: 2 * np.sqrt((c.errors**2).sum(axis=0) * left) / whole
+        * np.cos(rng.uniform(0, 2 * np.pi, (_DRAWS, len(names))))
+        for c in causes if len(c.errors)
+    }  # fmt: skip
     length_drawn = starts.shape[1] * length
 
     def shares(parts: dict[str, Array], of: Array) -> tuple[dict[str, Array], dict[str, Array]]:
@@ -220,7 +258,7 @@ def error_budget(
         point = {name: part.sum(axis=0) / whole for name, part in parts.items()}
         draws = {name: _drawn(part, starts, length) / drawn_whole for name, part in parts.items()}
         for name in set(parts) & set(wide):
-            draws[name] *= wide[name][:, None]
+            draws[name] = draws[name] * wide[name][:, None] + unsure[name]
         for name, moment in moments.items():
             point[name] = len(e0) * moment / whole
             draws[name] = length_drawn * moment / drawn_whole

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.budget import SwitchedOff, error_budget, errors_without
+from greybox.diagnosis.budget import SwitchedOff, error_budget, errors_without, nearest
 from greybox.diagnosis.causes import Cause
 from greybox.diagnosis.evidence.confusion import rivals
 from greybox.diagnosis.evidence.held_out import Pair
@@ -158,9 +158,11 @@ class DiagnosisBuilder:
         """Return whose the held-out error is; what stands for several causes is not split."""
         found, held_out = self.found, self.case.held_out
         problem = self.case.problem(final.integrator)
-        base = held_out(found.before.integrator).pairs(found.before)
         pairs = held_out(final.integrator).pairs(final)
-        if any(p.fit.escaped or p.held_fit.escaped for p in (*base, *pairs)):
+        base = nearest(
+            held_out(found.before.integrator).pairs(found.before), found.before, self.case.first
+        )
+        if any(p.fit.escaped or p.held_fit.escaped for p in pairs):
             return ()
 
         def without(cause: Candidate) -> Array:
